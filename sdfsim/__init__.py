@@ -1,0 +1,35 @@
+"""sdfsim: rigid-body simulation over learned signed-distance functions, from photos to motion.
+
+The names below load their modules on first use, so that `import sdfsim` stays light.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sdfsim.dynamics.rollout import Rollout
+    from sdfsim.dynamics.simulator import Simulator
+    from sdfsim.errors import SceneError, SdfsimError
+    from sdfsim.scene.load import load_scene
+    from sdfsim.shape.asset import Shape, load_shape
+
+__version__ = "0.1.0"
+__all__ = ["Rollout", "SceneError", "SdfsimError", "Shape", "Simulator", "load_scene", "load_shape"]
+
+_HOME = {
+    "Rollout": "sdfsim.dynamics.rollout",
+    "SceneError": "sdfsim.errors",
+    "SdfsimError": "sdfsim.errors",
+    "Shape": "sdfsim.shape.asset",
+    "Simulator": "sdfsim.dynamics.simulator",
+    "load_scene": "sdfsim.scene.load",
+    "load_shape": "sdfsim.shape.asset",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'sdfsim' has no attribute {name!r}")
+    return getattr(import_module(_HOME[name]), name)

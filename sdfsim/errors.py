@@ -1,0 +1,39 @@
+"""The one error type of the project; `cli.py` turns it into one line, a hint and an exit code."""
+
+from __future__ import annotations
+
+EXIT_ERROR = 1
+EXIT_USAGE = 2
+EXIT_QUALITY = 3
+EXIT_INTERRUPTED = 130
+
+
+class SdfsimError(Exception):
+    """Something a user can act on.
+
+    Args:
+        message: one line: what is wrong, with the file, line and field where they are known.
+        hint: what to try, in one line (may be empty).
+        exit_code: `EXIT_ERROR` (1), or `EXIT_QUALITY` (3) when the work ran but failed a quality check.
+    """
+
+    def __init__(self, message: str, hint: str = "", *, exit_code: int = EXIT_ERROR) -> None:
+        super().__init__(message)
+        self.message = message
+        self.hint = hint
+        self.exit_code = exit_code
+
+    def __str__(self) -> str:
+        return self.message
+
+
+class SceneError(SdfsimError):
+    """A scene file that cannot be used; `problems` lists every fault found in it.
+
+    Args:
+        problems: one line each, `FILE:LINE: FIELD: what is wrong (what is allowed)`.
+    """
+
+    def __init__(self, problems: list[str], hint: str = "") -> None:
+        super().__init__("\n".join(problems), hint)
+        self.problems = problems
