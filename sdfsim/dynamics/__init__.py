@@ -1,1 +1,1 @@
-
+"""Motion: free flight, contacts, the two networks, the step."""

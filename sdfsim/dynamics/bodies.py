@@ -1,0 +1,170 @@
+"""A scene as tensors in the model's units: what stays constant while it is simulated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sdfsim.dynamics import pose
+from sdfsim.scene.types import Scene
+from sdfsim.shape.mlp import SdfBank
+
+
+@dataclass(frozen=True)
+class Units:
+    """How many metres, seconds and kilograms one model unit is.
+
+    Rigid contact is invariant when lengths are scaled by `length`, times by sqrt(length / gravity) and masses by
+    anything (Froude scaling), so one trained model serves every size and every planet.
+    """
+
+    length: float
+    time: float
+    mass: float
+
+    @property
+    def velocity(self) -> float:
+        """m/s in one model unit of velocity."""
+        return self.length / self.time
+
+    @property
+    def acceleration(self) -> float:
+        """m/s^2 in one model unit of acceleration."""
+        return self.length / self.time**2
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """N bodies with M surface nodes; lengths, times and masses in model units.
+
+    Attributes:
+        shape: [N] int64 index into the SDF bank.
+        scale: [N] float64, shape metres -> model lengths.
+        com: [N, 3] float64, centre of mass from the shape's origin (shape axes, scaled).
+        mass: [N] float64 (0 for static).
+        inverse_mass: [N] float64, 0 for static bodies.
+        inertia: [N, 3, 3] float64 about the centre of mass, shape axes (identity for static bodies).
+        friction, restitution: [N] float64.
+        moves: [N] bool, False for static bodies.
+        bounds: [N, 2, 3] float64, box of the solid about the centre of mass, shape axes, scaled.
+        size: [N] float64, largest side of `bounds` (infinite for a plane).
+        node: [M, 3] float64, surface nodes about the centre of mass, shape axes, scaled.
+        node_start: [N + 1] int64, body k owns nodes node_start[k] : node_start[k + 1].
+        may_touch: [N, N] bool, or None when every pair with a body that moves may.
+        bank: signed distances of all shapes.
+    """
+
+    shape: Tensor
+    scale: Tensor
+    com: Tensor
+    mass: Tensor
+    inverse_mass: Tensor
+    inertia: Tensor
+    friction: Tensor
+    restitution: Tensor
+    moves: Tensor
+    bounds: Tensor
+    size: Tensor
+    node: Tensor
+    node_start: Tensor
+    may_touch: Tensor | None
+    bank: SdfBank
+
+    def __len__(self) -> int:
+        return len(self.shape)
+
+    @property
+    def device(self) -> torch.device:
+        return self.shape.device
+
+
+@dataclass(frozen=True)
+class State:
+    """Where N bodies are and how they move.
+
+    Attributes:
+        position: [N, 3] float64, centres of mass.
+        orientation: [N, 4] float64 xyzw, shape axes -> world.
+        velocity: [N, 3] float64, of the centres of mass.
+        angular_velocity: [N, 3] float64, world frame.
+        earlier_position, earlier_orientation: [2, N, 3] and [2, N, 4], the two poses before (oldest first),
+            for the *paper* network; None where nobody needs them.
+    """
+
+    position: Tensor
+    orientation: Tensor
+    velocity: Tensor
+    angular_velocity: Tensor
+    earlier_position: Tensor | None = None
+    earlier_orientation: Tensor | None = None
+
+
+def from_scene(scene: Scene, units: Units, device: torch.device) -> tuple[Bodies, State]:
+    """Bodies and initial state of a scene, in model units on `device`."""
+    shapes = [scene.shapes[b.shape] for b in scene.bodies]
+    scale = np.array([b.scale for b in scene.bodies]) / units.length
+    moves = np.array([b.motion == "dynamic" for b in scene.bodies])
+    mass = np.array([b.mass if m else 0.0 for b, m in zip(scene.bodies, moves, strict=True)]) / units.mass
+    inertia = np.stack([_inertia(b, s, m) for b, s, m in zip(scene.bodies, shapes, moves, strict=True)])
+    inertia[moves] /= units.mass * units.length**2
+    com = np.stack([s.com for s in shapes]) * scale[:, None]
+    bounds = np.stack([(s.sdf.bounds - s.com) * k for s, k in zip(shapes, scale, strict=True)])
+    nodes = [(s.nodes - s.com) * k for s, k in zip(shapes, scale, strict=True)]
+
+    def tensor(array, dtype=torch.float64) -> Tensor:
+        return torch.as_tensor(np.asarray(array), dtype=dtype, device=device)
+
+    bodies = Bodies(
+        shape=tensor([b.shape for b in scene.bodies], torch.int64),
+        scale=tensor(scale),
+        com=tensor(com),
+        mass=tensor(mass),
+        inverse_mass=tensor(np.divide(1.0, mass, out=np.zeros_like(mass), where=mass > 0)),
+        inertia=tensor(inertia),
+        friction=tensor([b.friction for b in scene.bodies]),
+        restitution=tensor([b.restitution for b in scene.bodies]),
+        moves=tensor(moves, torch.bool),
+        bounds=tensor(bounds),
+        size=tensor((bounds[:, 1] - bounds[:, 0]).max(-1)),
+        node=tensor(np.concatenate(nodes).reshape(-1, 3)),
+        node_start=tensor(np.concatenate([[0], np.cumsum([len(n) for n in nodes])]), torch.int64),
+        may_touch=_may_touch(scene, device),
+        bank=SdfBank([s.sdf for s in scene.shapes]).to(device),
+    )
+    orientation = tensor([b.quat_xyzw for b in scene.bodies])
+    origin = tensor([b.position for b in scene.bodies]) / units.length
+    state = State(
+        position=origin + pose.rotate(orientation, bodies.com),
+        orientation=orientation,
+        velocity=tensor([b.velocity for b in scene.bodies]) / units.velocity,
+        angular_velocity=tensor([b.angular_velocity for b in scene.bodies]) * units.time,
+    )
+    return bodies, state
+
+
+def _inertia(body, shape, moves: bool) -> np.ndarray:
+    """[3, 3] kg m^2 in shape axes; the identity for a body that does not move (it is never used)."""
+    if not moves:
+        return np.eye(3)
+    if body.inertia is not None:
+        return np.asarray(body.inertia, dtype=np.float64)
+    density = body.mass / (shape.volume * body.scale**3)
+    return density * shape.inertia * body.scale**5
+
+
+def _may_touch(scene: Scene, device: torch.device) -> Tensor | None:
+    if all(b.collides_with is None for b in scene.bodies):
+        return None
+    index = {b.name: k for k, b in enumerate(scene.bodies)}
+    allowed = torch.ones(len(scene.bodies), len(scene.bodies), dtype=torch.bool, device=device)
+    for k, body in enumerate(scene.bodies):
+        if body.collides_with is not None:
+            row = torch.zeros(len(scene.bodies), dtype=torch.bool, device=device)
+            row[[index[name] for name in body.collides_with]] = True
+            # A pair touches only when both sides agree.
+            allowed[k] &= row
+            allowed[:, k] &= row
+    return allowed

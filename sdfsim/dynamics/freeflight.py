@@ -1,0 +1,70 @@
+"""Free flight in closed form: ballistic motion, and torque-free rotation that keeps its angular momentum."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from sdfsim.dynamics.pose import from_rotvec, multiply, normalise, to_matrix
+
+MAX_TURN = 0.1  # rad of rotation per inner step of the torque-free rotation
+
+
+def ballistic(position: Tensor, velocity: Tensor, gravity: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+    """Position [N, 3] m and velocity [N, 3] m/s after `dt` s under constant `gravity` [3] m/s^2 (exact)."""
+    return position + velocity * dt + 0.5 * gravity * dt**2, velocity + gravity * dt
+
+
+def torque_free(orientation: Tensor, angular_velocity: Tensor, inertia: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+    """Rotation of bodies on which no torque acts.
+
+    The world angular momentum is held exactly; the orientation follows dR/dt = [R I^-1 R^T L] R by a
+    Runge-Kutta-Munthe-Kaas method of order 4, each inner step turning at most `MAX_TURN`.
+
+    Args:
+        orientation: [N, 4] xyzw, body -> world.
+        angular_velocity: [N, 3] rad/s, world.
+        inertia: [N, 3, 3] kg m^2, body axes.
+        dt: s.
+
+    Returns:
+        Orientation [N, 4] and angular velocity [N, 3] rad/s after `dt`.
+    """
+    if len(orientation) == 0:
+        return orientation, angular_velocity
+    inverse = torch.linalg.inv(inertia)
+    rotation = to_matrix(orientation)
+    momentum = _apply(rotation @ inertia @ rotation.mT, angular_velocity)
+    fastest = float(angular_velocity.norm(dim=-1).max())
+    steps = max(1, min(1000, math.ceil(fastest * abs(dt) / MAX_TURN)))
+    h = dt / steps
+
+    def spin(q: Tensor) -> Tensor:
+        r = to_matrix(q)
+        return _apply(r @ inverse @ r.mT, momentum)
+
+    for _ in range(steps):
+        orientation = normalise(_rkmk4(orientation, spin, h))
+    return orientation, spin(orientation)
+
+
+def _rkmk4(q: Tensor, spin: Callable[[Tensor], Tensor], h: float) -> Tensor:
+    """One Runge-Kutta-Munthe-Kaas step of order 4 for q' = spin(q) (world axes); it never leaves the unit sphere."""
+
+    def slope(u: Tensor) -> Tensor:
+        w = spin(multiply(from_rotvec(u), q))
+        uw = torch.linalg.cross(u, w)
+        return h * (w - 0.5 * uw + torch.linalg.cross(u, uw) / 12.0)  # dexp^-1, to the order needed
+
+    k1 = slope(torch.zeros_like(q[..., :3]))
+    k2 = slope(0.5 * k1)
+    k3 = slope(0.5 * k2)
+    k4 = slope(k3)
+    return multiply(from_rotvec((k1 + 2 * k2 + 2 * k3 + k4) / 6.0), q)
+
+
+def _apply(m: Tensor, v: Tensor) -> Tensor:
+    return (m @ v[..., None])[..., 0]

@@ -1,0 +1,195 @@
+"""The contact graph of the *impulse* network: bodies joined by contact edges, each with a frame of its own.
+
+Everything a network sees is a scalar in an edge's frame, made dimensionless by a speed and the time step, so that
+the prediction turns with the scene and does not depend on the choice of units.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+REST_SPEED = 0.2  # model units: what gravity adds to a speed in one step of training; slower counts as resting
+EDGE_FEATURES = 25
+
+
+@dataclass(frozen=True)
+class ContactGraph:
+    """N bodies and E contact edges in single precision, relative quantities only.
+
+    The edge's point is midway between the node of body `first` and the closest point of body `second`; `arm_*`
+    reach it from the centres of mass.
+
+    Attributes:
+        inverse_mass: [N], 0 for bodies that do not move.
+        inverse_inertia: [N, 3, 3], world axes, 0 for bodies that do not move.
+        velocity, angular: [N, 3] at the start of the step.
+        free_velocity, free_angular: [N, 3] at its end in free flight.
+        mean_velocity, mean_angular: [N, 3] the mean over the step in free flight.
+        first, second: [E] int64.
+        pair: [E] int64, number of the unordered pair of bodies, 0 ... pairs - 1.
+        pairs: how many pairs there are.
+        normal: [E, 3], outward from `second`.
+        arm_first, arm_second: [E, 3].
+        gap: [E] signed distance.
+        friction, restitution: [E] products of the two bodies' coefficients.
+        dt: the step.
+    """
+
+    inverse_mass: Tensor
+    inverse_inertia: Tensor
+    velocity: Tensor
+    angular: Tensor
+    free_velocity: Tensor
+    free_angular: Tensor
+    mean_velocity: Tensor
+    mean_angular: Tensor
+    first: Tensor
+    second: Tensor
+    pair: Tensor
+    pairs: int
+    normal: Tensor
+    arm_first: Tensor
+    arm_second: Tensor
+    gap: Tensor
+    friction: Tensor
+    restitution: Tensor
+    dt: float
+
+
+@dataclass(frozen=True)
+class EdgeFrames:
+    """What the rounds of message passing need of every edge, computed once a step.
+
+    Attributes:
+        axes: [E, 3, 3], rows normal, tangent, binormal.
+        speed: [E, 1], the scale that makes velocities dimensionless.
+        mass: [E, 3] effective mass along each axis.
+        turn_first, turn_second: [E, 3, 3], row a is the angular velocity that a unit impulse along axis a gives.
+        push_first, push_second: [E, 1] inverse masses.
+        start: [E, EDGE_FEATURES] input features.
+    """
+
+    axes: Tensor
+    speed: Tensor
+    mass: Tensor
+    turn_first: Tensor
+    turn_second: Tensor
+    push_first: Tensor
+    push_second: Tensor
+    start: Tensor
+
+
+def number_pairs(first: Tensor, second: Tensor, bodies: int) -> tuple[Tensor, int]:
+    """Number the unordered pairs {first, second} of [E] edges consecutively: [E] and how many."""
+    key = torch.minimum(first, second) * bodies + torch.maximum(first, second)
+    unique, pair = torch.unique(key, return_inverse=True)
+    return pair, len(unique)
+
+
+def edge_frames(graph: ContactGraph, *, mirrored: bool = False) -> EdgeFrames:
+    """Frames, effective masses and input features of all edges.
+
+    Args:
+        graph: bodies and edges.
+        mirrored: use left-handed frames, which is what the mirror image of the scene would show (augmentation).
+    """
+    g = graph
+    slip = relative_velocity(g, g.velocity, g.angular)
+    lift = relative_velocity(g, g.free_velocity, g.free_angular) - slip  # what gravity and free spin add
+    axes = _axes(g.normal, slip, lift)
+    if mirrored:
+        axes = axes * axes.new_tensor([1.0, 1.0, -1.0])[:, None]
+    speed = _speed_scale(g, slip)
+
+    turn_first, twist_first = _response(g.inverse_inertia[g.first], g.arm_first, axes)
+    turn_second, twist_second = _response(g.inverse_inertia[g.second], g.arm_second, axes)
+    push_first, push_second = g.inverse_mass[g.first, None], g.inverse_mass[g.second, None]
+    # Inverse effective mass matrix in the frame: how an impulse along one axis changes velocity along another.
+    compliance = twist_first + twist_second
+    direct = compliance.diagonal(dim1=-2, dim2=-1) + push_first + push_second
+    mass = 1.0 / direct.clamp_min(1e-12)
+    root = mass.sqrt()
+    coupling = torch.stack(
+        [compliance[:, a, b] * root[:, a] * root[:, b] for a, b in ((0, 1), (0, 2), (1, 2))],
+        -1,
+    )
+    share = torch.cat(
+        [push_first * mass[:, :1], push_second * mass[:, :1], twist_first[:, 0, 0, None] * mass[:, :1]], -1
+    )
+    count = torch.zeros(g.pairs, dtype=g.gap.dtype, device=g.gap.device).index_add_(
+        0, g.pair, torch.ones_like(g.gap)
+    )
+    in_frame = axes @ torch.stack([slip, lift, _centripetal(g)], -1)  # [E, axis, quantity]
+    scaled = (in_frame / speed[..., None]).flatten(1)
+    gap = g.gap[:, None] / (speed * g.dt)
+    fixed = torch.stack([(push_first == 0)[:, 0], (push_second == 0)[:, 0]], -1).to(gap.dtype)
+    start = torch.cat(
+        [
+            torch.asinh(gap),
+            g.gap[:, None] * 10.0,
+            scaled,
+            torch.log(speed / REST_SPEED),
+            torch.log(mass[:, 1:] / mass[:, :1]),
+            coupling,
+            share,
+            g.friction[:, None],
+            g.restitution[:, None],
+            torch.log(count[g.pair])[:, None] * 0.5,
+            fixed,
+        ],
+        -1,
+    )
+    return EdgeFrames(axes, speed, mass, turn_first, turn_second, push_first, push_second, start)
+
+
+def relative_velocity(graph: ContactGraph, velocity: Tensor, angular: Tensor) -> Tensor:
+    """[E, 3] velocity of `first`'s surface against `second`'s at the contact point, for body velocities [N, 3]."""
+    g = graph
+    one = velocity[g.first] + torch.linalg.cross(angular[g.first], g.arm_first)
+    two = velocity[g.second] + torch.linalg.cross(angular[g.second], g.arm_second)
+    return one - two
+
+
+def _axes(normal: Tensor, slip: Tensor, lift: Tensor) -> Tensor:
+    """[E, 3, 3] frames: normal; tangent along the sliding velocity, else gravity's tangential part; binormal."""
+
+    def tangential(v: Tensor) -> Tensor:
+        return v - (v * normal).sum(-1, keepdim=True) * normal
+
+    sliding, falling = tangential(slip), tangential(lift)
+    # Any fixed direction serves where neither exists: nothing tangential is at play there.
+    axis = torch.zeros_like(normal).scatter_(1, normal.abs().argmin(1, keepdim=True), 1.0)
+    tangent = torch.where(sliding.norm(dim=-1, keepdim=True) > 1e-4, sliding, falling)
+    tangent = torch.where(tangent.norm(dim=-1, keepdim=True) > 1e-5, tangent, tangential(axis))
+    tangent = tangent / tangent.norm(dim=-1, keepdim=True)
+    return torch.stack([normal, tangent, torch.linalg.cross(normal, tangent)], 1)
+
+
+def _speed_scale(g: ContactGraph, slip: Tensor) -> Tensor:
+    """[E, 1]: the fastest relative motion among the edges of the two bodies, at least `REST_SPEED`."""
+    own = (slip.square().sum(-1) + REST_SPEED**2).sqrt()
+    body = torch.full_like(g.inverse_mass, REST_SPEED)
+    body = body.scatter_reduce(0, g.first, own, "amax").scatter_reduce(0, g.second, own, "amax")
+    body = torch.where(g.inverse_mass > 0, body, torch.full_like(body, REST_SPEED))
+    return torch.maximum(body[g.first], body[g.second])[:, None]
+
+
+def _response(inverse_inertia: Tensor, arm: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
+    """Angular velocity [E, 3, 3] per unit impulse along each axis, and the velocity it gives the contact point
+    along each axis [E, 3, 3]."""
+    moment = torch.linalg.cross(arm[:, None].expand_as(axes), axes)
+    turn = moment @ inverse_inertia.mT
+    return turn, turn @ moment.mT
+
+
+def _centripetal(g: ContactGraph) -> Tensor:
+    """[E, 3] relative velocity that the turning of the arms adds over the step."""
+
+    def part(body: Tensor, arm: Tensor) -> Tensor:
+        w = g.angular[body]
+        return torch.linalg.cross(w, torch.linalg.cross(w, arm)) * g.dt
+
+    return part(g.first, g.arm_first) - part(g.second, g.arm_second)

@@ -1,0 +1,106 @@
+"""A trained model: network, the units it was trained in, and the ranges it has seen; its file."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from sdfsim.dynamics.impulse import ImpulseConfig, ImpulseNetwork
+from sdfsim.dynamics.paper import PaperConfig, PaperNetwork
+from sdfsim.errors import SdfsimError
+
+BUNDLED = Path(__file__).resolve().parent.parent / "models"
+DEFAULT_MODEL = "small"
+NETWORKS = {"impulse": (ImpulseConfig, ImpulseNetwork), "paper": (PaperConfig, PaperNetwork)}
+
+
+@dataclass(frozen=True)
+class Model:
+    """Weights with everything needed to use them.
+
+    Attributes:
+        name: bundled name or file stem.
+        kind: "impulse" or "paper".
+        network: in evaluation mode.
+        dt: s, the step of the training data.
+        gravity: m/s^2, its magnitude in the training data.
+        length: m, mean largest extent of the training bodies; scenes of other sizes are rescaled to it.
+        reach: m, contact radius D.
+        ranges: name -> [low, high] of what training saw (friction, restitution, mass_ratio, speed, size).
+        card: training record (data, steps, seconds, errors).
+    """
+
+    name: str
+    kind: str
+    network: nn.Module
+    dt: float
+    gravity: float
+    length: float
+    reach: float
+    ranges: dict[str, list[float]] = field(default_factory=dict)
+    card: dict[str, Any] = field(default_factory=dict)
+
+    def to(self, device: torch.device) -> Model:
+        """The same model with its weights on `device`."""
+        self.network.to(device)
+        return self
+
+    def save(self, path: Path) -> None:
+        """Write a `.safetensors` file whose metadata holds all that is not weights (temporary name, then renamed)."""
+        from safetensors.torch import save_file
+
+        info = {
+            "kind": self.kind,
+            "config": asdict(self.network.config),  # type: ignore[call-overload]
+            **{k: getattr(self, k) for k in ("dt", "gravity", "length", "reach", "ranges", "card")},
+        }
+        temporary = path.with_name(path.name + ".part")
+        weights = {k: v.detach().cpu().contiguous() for k, v in self.network.state_dict().items()}
+        save_file(weights, temporary, metadata={"sdfsim_model": json.dumps(info)})
+        os.replace(temporary, path)
+
+
+def new_network(kind: str, config: dict[str, Any]) -> nn.Module:
+    """An untrained network of `kind` ("impulse" or "paper")."""
+    make_config, make_network = NETWORKS[kind]
+    return make_network(make_config(**config))
+
+
+def bundled_models() -> list[str]:
+    """Names of the models that come with the package."""
+    return sorted(p.stem for p in BUNDLED.glob("*.safetensors"))
+
+
+def load_model(name: str | Path | None = None) -> Model:
+    """A bundled model by name, or any model file by path.
+
+    Args:
+        name: None for the default model.
+
+    Raises:
+        SdfsimError: unknown name, unreadable or foreign file.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    name = name or DEFAULT_MODEL
+    path = Path(name) if str(name).endswith(".safetensors") else BUNDLED / f"{name}.safetensors"
+    if not path.exists():
+        raise SdfsimError(
+            f"model {str(name)!r} not found", f"bundled: {', '.join(bundled_models())}; or the path of a .safetensors"
+        )
+    try:
+        with safe_open(path, framework="pt") as file:
+            info = json.loads((file.metadata() or {})["sdfsim_model"])
+            weights = {k: file.get_tensor(k) for k in file.keys()}
+        network = new_network(info["kind"], info.pop("config"))
+        network.load_state_dict(weights)
+    except (OSError, SafetensorError, KeyError, ValueError, TypeError, RuntimeError) as error:
+        raise SdfsimError(f"{path}: not a model of this version of sdfsim: {error}") from error
+    network.eval().requires_grad_(False)
+    return Model(name=path.stem, network=network, **info)

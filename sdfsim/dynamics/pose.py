@@ -1,0 +1,92 @@
+"""Rotations as unit quaternions (xyzw), batched over leading dimensions, in the dtype they are given."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def multiply(a: Tensor, b: Tensor) -> Tensor:
+    """Hamilton product `a b` of [..., 4] quaternions: first turn by `b`, then by `a`."""
+    av, aw = a[..., :3], a[..., 3:]
+    bv, bw = b[..., :3], b[..., 3:]
+    vector = aw * bv + bw * av + torch.linalg.cross(av, bv)
+    return torch.cat([vector, aw * bw - (av * bv).sum(-1, keepdim=True)], -1)
+
+
+def conjugate(q: Tensor) -> Tensor:
+    """The inverse rotation of a unit quaternion [..., 4]."""
+    return torch.cat([-q[..., :3], q[..., 3:]], -1)
+
+
+def normalise(q: Tensor) -> Tensor:
+    """The unit quaternion nearest to `q` [..., 4]."""
+    return q / q.norm(dim=-1, keepdim=True)
+
+
+def rotate(q: Tensor, v: Tensor) -> Tensor:
+    """Vectors `v` [..., 3] turned by `q` [..., 4]."""
+    t = 2.0 * torch.linalg.cross(q[..., :3], v)
+    return v + q[..., 3:] * t + torch.linalg.cross(q[..., :3], t)
+
+
+def to_matrix(q: Tensor) -> Tensor:
+    """Rotation matrices [..., 3, 3] of unit quaternions [..., 4]."""
+    x, y, z, w = q.unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    ]
+    return torch.stack(rows, -1).reshape(*q.shape[:-1], 3, 3)
+
+
+def from_matrix(m: Tensor) -> Tensor:
+    """Unit quaternions [..., 4] of rotation matrices [..., 3, 3].
+
+    The largest of the four candidates (Shepperd, 1978) is taken, so that it is exact near half turns too.
+    """
+    trace = m.diagonal(dim1=-2, dim2=-1).sum(-1)
+    d = m.diagonal(dim1=-2, dim2=-1)
+    squares = torch.stack([1 + 2 * d[..., 0] - trace, 1 + 2 * d[..., 1] - trace, 1 + 2 * d[..., 2] - trace, 1 + trace])
+    xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
+    wx, wy, wz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
+    candidates = torch.stack(
+        [
+            torch.stack([squares[0], xy, xz, wx], -1),
+            torch.stack([xy, squares[1], yz, wy], -1),
+            torch.stack([xz, yz, squares[2], wz], -1),
+            torch.stack([wx, wy, wz, squares[3]], -1),
+        ],
+        -2,
+    )
+    best = squares.movedim(0, -1).argmax(-1)[..., None, None].expand(*m.shape[:-2], 1, 4)
+    return normalise(candidates.gather(-2, best).squeeze(-2))
+
+
+def from_rotvec(r: Tensor) -> Tensor:
+    """Unit quaternions of rotation vectors [..., 3] rad (axis times angle)."""
+    angle = r.norm(dim=-1, keepdim=True)
+    half = 0.5 * angle
+    # torch.sinc is sin(pi x) / (pi x): smooth through zero.
+    return torch.cat([0.5 * torch.sinc(half / torch.pi) * r, half.cos()], -1)
+
+
+def to_rotvec(q: Tensor) -> Tensor:
+    """Rotation vectors [..., 3] rad, of at most half a turn, of unit quaternions [..., 4]."""
+    q = torch.where(q[..., 3:] < 0, -q, q)
+    s = q[..., :3].norm(dim=-1, keepdim=True)
+    angle = 2.0 * torch.atan2(s, q[..., 3:])
+    tiny = s < 1e-12
+    return torch.where(tiny, 2.0 * q[..., :3], q[..., :3] * (angle / s.clamp_min(1e-30)))
+
+
+def angle_between(a: Tensor, b: Tensor) -> Tensor:
+    """Angle [...] rad of the rotation from `a` to `b`, unit quaternions [..., 4]."""
+    return to_rotvec(multiply(b, conjugate(a))).norm(dim=-1)

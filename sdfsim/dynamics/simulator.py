@@ -1,0 +1,277 @@
+"""`Simulator`: a scene and a model in, a rollout out."""
+
+from __future__ import annotations
+
+import platform
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import sdfsim
+from sdfsim.dynamics import pose
+from sdfsim.dynamics.bodies import Bodies, State, Units, from_scene
+from sdfsim.dynamics.contacts import Contacts
+from sdfsim.dynamics.model import Model, load_model
+from sdfsim.dynamics.rollout import Rollout
+from sdfsim.dynamics.step import FreeFlight, Rules, step
+from sdfsim.errors import EXIT_QUALITY, SdfsimError
+from sdfsim.scene.effects import plan
+from sdfsim.scene.types import Scene
+
+EARTH = 9.81  # m/s^2, sets the time scale of scenes without gravity
+SPIN_LIMIT = 1e-5  # how far R'R may be from the identity
+
+
+class SimulationError(SdfsimError):
+    """The state broke; `rollout` holds what was computed before that.
+
+    Args:
+        message: names the step and the body.
+        rollout: everything up to the last good state.
+    """
+
+    def __init__(self, message: str, rollout: Rollout) -> None:
+        super().__init__(message, "try another model, or look for bodies that overlap at the start", exit_code=EXIT_QUALITY)
+        self.rollout = rollout
+
+
+def scene_units(scene: Scene, model: Model, dt: float | None = None) -> Units:
+    """Model units for a scene: bodies of the model's size, at the model's gravity (Froude scaling).
+
+    Args:
+        scene: what is to be simulated.
+        model: knows the size and gravity it was trained at.
+        dt: s, fixes the scale by the wanted step instead of by the bodies' size.
+    """
+    strength = float(np.linalg.norm(scene.gravity)) or EARTH
+    moving = [b for b in scene.bodies if b.motion == "dynamic"]
+    sizes = [float(np.ptp(scene.shapes[b.shape].sdf.bounds, axis=0).max()) * b.scale for b in moving]
+    if dt is not None:
+        length = (dt / model.dt) ** 2 * strength / model.gravity
+    else:
+        length = float(np.mean(sizes)) / model.length if sizes else 1.0
+    mass = float(np.mean([b.mass for b in moving])) if moving else 1.0
+    return Units(length=length, time=float(np.sqrt(length * model.gravity / strength)), mass=mass)
+
+
+class Simulator:
+    """Simulates one scene.
+
+    Args:
+        scene: bodies, shapes, gravity.
+        model: bundled name, path or `Model`; None takes the scene's, else the default one.
+        device: "cpu", "cuda" or "auto".
+        seed: of torch's generator (nothing in a step draws from it today; it is recorded).
+        dt: s, the step; None lets the size of the bodies decide (the model owns the step in its own units).
+        free_flight: "exact", or "learned" for the *paper* network's own formulation.
+
+    Attributes:
+        dt: s, the step in the scene's units.
+        units: metres, seconds and kilograms per model unit.
+
+    Raises:
+        SdfsimError: no such model or device, a body that moves without nodes or mass.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        model: str | Path | Model | None = None,
+        device: str = "cpu",
+        seed: int | None = None,
+        *,
+        dt: float | None = None,
+        free_flight: FreeFlight = "exact",
+    ) -> None:
+        self.scene = scene
+        self.device = pick_device(device)
+        model = model if model is not None else scene.model
+        self.model = (model if isinstance(model, Model) else load_model(model)).to(self.device)
+        if free_flight == "learned" and self.model.kind != "paper":
+            raise SdfsimError("free_flight 'learned' exists for the paper network only", "use --model paper")
+        self.seed = scene.seed if seed is None else seed
+        self.units = scene_units(scene, self.model, dt)
+        self.dt = self.model.dt * self.units.time
+        effects = plan(scene)
+        gravity = torch.tensor(scene.gravity / self.units.acceleration, dtype=torch.float64, device=self.device)
+        self.rules = Rules(
+            gravity=gravity,
+            dt=self.model.dt,
+            contact=effects.contact.on,
+            friction=effects.friction.on,
+            rotation=effects.rotation.on,
+            free_flight=free_flight,
+        )
+        self.bodies, self.state = from_scene(scene, self.units, self.device)
+        if self.model.kind == "paper":
+            self.state = with_history(self.state, self.bodies, self.rules)
+        self.contacts: Contacts | None = None
+        self.steps_done = 0
+
+    def steps(self, count: int) -> Iterator[State]:
+        """Advance by `count` steps, yielding the state after each (SI units).
+
+        Raises:
+            SimulationError: a state that is not finite or not a rotation (its `rollout` is one frame here).
+        """
+        for _ in range(count):
+            self._step()
+            yield self.si_state()
+
+    def run(
+        self,
+        seconds: float | None = None,
+        steps: int | None = None,
+        on_step: Callable[[Rollout], None] | None = None,
+    ) -> Rollout:
+        """Simulate and keep everything.
+
+        Args:
+            seconds: how long (default: the scene's duration).
+            steps: how many steps instead.
+            on_step: called after each step with its one frame.
+
+        Raises:
+            SimulationError: the state broke; what was computed is in its `rollout`.
+        """
+        if steps is None:
+            steps = max(1, round((self.scene.duration if seconds is None else seconds) / self.dt))
+        frames = [self.initial_rollout()]
+        for _ in range(steps):
+            started = time.perf_counter()
+            try:
+                self._step()
+            except SimulationError as error:
+                raise SimulationError(error.message, join(frames)) from None
+            frames.append(self._frame(1e3 * (time.perf_counter() - started)))
+            if on_step:
+                on_step(frames[-1])
+        return join(frames)
+
+    def initial_rollout(self) -> Rollout:
+        """The present state as a rollout of one frame."""
+        return self._frame(0.0)
+
+    def si_state(self) -> State:
+        """The present state in metres and seconds, on the CPU."""
+        s, u = self.state, self.units
+        return State(
+            position=(s.position * u.length).cpu(),
+            orientation=s.orientation.cpu(),
+            velocity=(s.velocity * u.velocity).cpu(),
+            angular_velocity=(s.angular_velocity / u.time).cpu(),
+        )
+
+    def _step(self) -> None:
+        after, contacts = step(self.model, self.bodies, self.state, self.rules)
+        self._check(after)
+        self.state, self.contacts = after, contacts
+        self.steps_done += 1
+
+    def _check(self, state: State) -> None:
+        for name in ("position", "orientation", "velocity", "angular_velocity"):
+            bad = ~getattr(state, name).isfinite().all(-1)
+            if bad.any():
+                self._broke(f"{name} is not finite", bad)
+        rotation = pose.to_matrix(state.orientation)
+        eye = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
+        bad = (rotation.mT @ rotation - eye).abs().amax((-2, -1)) > SPIN_LIMIT
+        if bad.any():
+            self._broke("orientation is no rotation", bad)
+
+    def _broke(self, what: str, bad: torch.Tensor) -> None:
+        name = self.scene.bodies[int(bad.nonzero()[0])].name
+        raise SimulationError(f"step {self.steps_done + 1}: body {name!r}: {what}", self.initial_rollout())
+
+    def _frame(self, milliseconds: float) -> Rollout:
+        state, c, u = self.si_state(), self.contacts, self.units
+        count = 0 if c is None else len(c)
+        points, pairs = np.zeros((0, 3)), np.zeros((0, 2), dtype=np.int64)
+        if c is not None and count:
+            # The edges were found before the step: they belong to where the nodes are at its start.
+            points = (self._contact_points(c) * u.length).cpu().numpy()
+            pairs = torch.stack([c.owner, c.body], -1).cpu().numpy()
+        depth = float((-c.distance).clamp_min(0.0).max()) * u.length if c is not None and count else 0.0
+        counters = {
+            **self._energies(state),
+            "contacts": float(count),
+            "worst_penetration": depth,
+            "sdf_queries": float(c.queries) if c is not None else 0.0,
+            "step_ms": milliseconds,
+        }
+        return Rollout(
+            time=np.array([self.steps_done * self.dt]),
+            position=state.position.numpy()[None],
+            orientation=state.orientation.numpy()[None],
+            velocity=state.velocity.numpy()[None],
+            angular_velocity=state.angular_velocity.numpy()[None],
+            contact_count=np.array([count]),
+            contact_point=points,
+            contact_body=pairs,
+            counters={k: np.array([v]) for k, v in counters.items()},
+            names=tuple(b.name for b in self.scene.bodies),
+            meta={
+                "model": self.model.name,
+                "seed": self.seed,
+                "dt": self.dt,
+                "device": str(self.device),
+                "free_flight": self.rules.free_flight,
+                "sdfsim": sdfsim.__version__,
+                "torch": torch.__version__,
+                "python": platform.python_version(),
+            },
+        )
+
+    def _contact_points(self, contacts: Contacts) -> torch.Tensor:
+        """[E, 3] world, model units: the nodes as they are now."""
+        turned = pose.rotate(self.state.orientation[contacts.owner], self.bodies.node[contacts.node])
+        return self.state.position[contacts.owner] + turned
+
+    def _energies(self, state: State) -> dict[str, float]:
+        """Kinetic and potential energy in joules of all bodies that move."""
+        u, b = self.units, self.bodies
+        rotation = pose.to_matrix(self.state.orientation)
+        spin = (rotation.mT @ self.state.angular_velocity[..., None])[..., 0]
+        turning = (spin * (b.inertia @ spin[..., None])[..., 0]).sum(-1) * b.moves
+        kinetic = 0.5 * (b.mass * self.state.velocity.square().sum(-1) + turning).sum()
+        potential = -(b.mass * (self.state.position @ self.rules.gravity)).sum()
+        joule = u.mass * u.velocity**2
+        return {"kinetic_energy": float(kinetic) * joule, "potential_energy": float(potential) * joule}
+
+
+def with_history(state: State, bodies: Bodies, rules: Rules) -> State:
+    """The same state with the two poses it would have come from in free flight (the *paper* network's input)."""
+    from sdfsim.dynamics.step import fly
+
+    back = replace(rules, dt=-rules.dt)
+    one = fly(bodies, state, back)
+    two = fly(bodies, one, back)
+    return replace(
+        state,
+        earlier_position=torch.stack([two.position, one.position]),
+        earlier_orientation=torch.stack([two.orientation, one.orientation]),
+    )
+
+
+def pick_device(name: str) -> torch.device:
+    """ "auto", "cpu" or "cuda" as a device. Raises SdfsimError when CUDA is asked for and absent."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise SdfsimError("--device cuda: no CUDA device here", "use --device cpu")
+    return torch.device(name)
+
+
+def join(frames: list[Rollout]) -> Rollout:
+    """One rollout out of consecutive pieces."""
+    arrays = ("time", "position", "orientation", "velocity", "angular_velocity")
+    arrays += ("contact_count", "contact_point", "contact_body")
+    return replace(
+        frames[0],
+        **{name: np.concatenate([getattr(f, name) for f in frames]) for name in arrays},
+        counters={k: np.concatenate([f.counters[k] for f in frames]) for k in frames[0].counters},
+    )

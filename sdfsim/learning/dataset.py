@@ -1,0 +1,139 @@
+"""The dataset format: one `.npz` a trajectory, `shapes/` with a Shape folder a name, and `dataset.json`."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sdfsim.errors import SdfsimError
+
+if TYPE_CHECKING:
+    from sdfsim.shape.asset import Shape
+
+
+FLOOR = (0.3, 0.5)  # friction and restitution of the recipes' floor, the plane z = 0
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """T recorded frames of N bodies above the static floor z = 0 (which is not among the N).
+
+    Attributes:
+        position: [T, N, 3] m, body-frame origin = centre of mass.
+        quat_xyzw: [T, N, 4].
+        velocity: [T, N, 3] m/s, world, at the end of the step.
+        angular_velocity: [T, N, 3] rad/s, world, at the end of the step.
+        shape: [N] names of the Shape folders.
+        scale: [N] uniform size factors.
+        mass: [N] kg.
+        inertia: [N, 3] kg m^2, principal, body axes.
+        friction: [N].
+        restitution: [N].
+        static: [N] bool.
+        dt: s.
+        gravity: [3] m/s^2.
+    """
+
+    position: np.ndarray
+    quat_xyzw: np.ndarray
+    velocity: np.ndarray
+    angular_velocity: np.ndarray
+    shape: np.ndarray
+    scale: np.ndarray
+    mass: np.ndarray
+    inertia: np.ndarray
+    friction: np.ndarray
+    restitution: np.ndarray
+    static: np.ndarray
+    dt: float
+    gravity: np.ndarray
+
+    def save(self, path: Path) -> None:
+        """Write to a temporary name, then rename."""
+        temporary = path.with_name(path.name + ".part")
+        with open(temporary, "wb") as handle:
+            np.savez_compressed(handle, **{f.name: np.asarray(getattr(self, f.name)) for f in fields(self)})
+        os.replace(temporary, path)
+
+    @classmethod
+    def load(cls, path: Path) -> Trajectory:
+        """Read and check one file. Raises SdfsimError naming the file and the field that is wrong."""
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                arrays = {k: data[k] for k in data.files}
+        except (OSError, ValueError, EOFError) as error:
+            raise SdfsimError(f"{path}: cannot be read as a trajectory: {error}") from error
+        missing = [f.name for f in fields(cls) if f.name not in arrays]
+        if missing:
+            raise SdfsimError(f"{path}: missing field(s) {', '.join(missing)}")
+        arrays = {f.name: arrays[f.name] for f in fields(cls)}
+        arrays["shape"] = arrays["shape"].astype(str)
+        arrays["dt"] = float(arrays["dt"])
+        _check(path, arrays)
+        return cls(**arrays)
+
+
+_TRAILING = {"position": (3,), "quat_xyzw": (4,), "velocity": (3,), "angular_velocity": (3,)}
+_PER_BODY = {"scale": (), "mass": (), "inertia": (3,), "friction": (), "restitution": (), "static": (), "shape": ()}
+
+
+def _check(path: Path, arrays: dict) -> None:
+    if arrays["position"].ndim != 3:
+        raise SdfsimError(f"{path}: position: must be [T, N, 3] (got {list(arrays['position'].shape)})")
+    frames, bodies = arrays["position"].shape[:2]
+    expected = {k: (frames, bodies, *t) for k, t in _TRAILING.items()}
+    expected |= {k: (bodies, *t) for k, t in _PER_BODY.items()} | {"gravity": (3,)}
+    for name, shape in expected.items():
+        if arrays[name].shape != shape:
+            raise SdfsimError(f"{path}: {name}: must be {list(shape)} (got {list(arrays[name].shape)})")
+        if name not in ("shape", "static") and not np.isfinite(arrays[name]).all():
+            raise SdfsimError(f"{path}: {name}: has values that are not finite")
+    moving = ~arrays["static"].astype(bool)
+    for name in ("mass", "inertia"):
+        if not (arrays[name][moving] > 0).all():
+            raise SdfsimError(f"{path}: {name}: must be > 0 for bodies that move")
+    if not (arrays["scale"] > 0).all() or not arrays["dt"] > 0:
+        raise SdfsimError(f"{path}: scale and dt must be > 0")
+
+
+def write_info(folder: Path, info: dict) -> None:
+    """Write `dataset.json` (recipe, seed, engine with version and settings)."""
+    temporary = folder / "dataset.json.part"
+    temporary.write_text(json.dumps(info, indent=2) + "\n")
+    os.replace(temporary, folder / "dataset.json")
+
+
+def read_info(folder: Path) -> dict:
+    """`dataset.json` of a dataset folder. Raises SdfsimError when it is absent or not JSON."""
+    path = folder / "dataset.json"
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise SdfsimError(f"{path}: cannot be read: {error}", "a dataset folder is what `sdfsim dataset` writes") from error
+
+
+def trajectory_files(folder: Path, split: str | None = None) -> list[Path]:
+    """Trajectory files of a dataset in name order: of `folder/split/` where that exists, else of `folder`.
+
+    Raises:
+        SdfsimError: when there are none.
+    """
+    home = folder / split if split and (folder / split).is_dir() else folder
+    files = sorted(p for p in home.glob("*.npz") if not p.name.startswith("."))
+    if not files:
+        raise SdfsimError(f"{home}: no trajectories (*.npz) here", "make some with `sdfsim dataset movi-b`")
+    return files
+
+
+def load_shapes(folder: Path, names: set[str]) -> dict[str, Shape]:
+    """The Shape folders `shapes/NAME` of a dataset (its own, or its parent's for a split folder)."""
+    # Here and not above: training from cached contact frames runs where only torch and numpy are installed.
+    from sdfsim.shape.asset import load_shape
+
+    home = folder / "shapes" if (folder / "shapes").is_dir() else folder.parent / "shapes"
+    return {name: load_shape(home / name) for name in sorted(names)}

@@ -1,0 +1,164 @@
+"""Contact frames: every recorded step in which something touches, with its contact edges found once.
+
+Training then needs no signed distances: a small rigid disturbance of the bodies changes an edge's gap by the normal
+component of the relative displacement, to first order.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from sdfsim.dynamics.freeflight import torque_free
+from sdfsim.dynamics.pose import conjugate, multiply, to_rotvec
+from sdfsim.errors import SdfsimError
+from sdfsim.learning.dataset import Trajectory, load_shapes, trajectory_files
+
+
+@dataclass(frozen=True)
+class ContactFrames:
+    """F frames with contact out of many trajectories, flattened; SI units.
+
+    A frame holds its trajectory's bodies that move or not, at the start of a step (rows of the body arrays), and
+    its contact edges. `second` = -1 means the floor.
+
+    Attributes:
+        body_start, edge_start: [F + 1] int64, frame k owns rows body_start[k] : body_start[k + 1].
+        orientation: [B, 4]; velocity, angular: [B, 3] at the start of the step.
+        free_angular, mean_angular: [B, 3] rad/s in free flight, at the end of the step and as its mean.
+        end_velocity, end_angular, moved, turned: [B, 3] recorded: velocities at the end of the step, and mean
+            linear and angular velocity over it.
+        mass: [B] kg, 0 for static bodies; inertia: [B, 3]; friction, restitution, size: [B].
+        first, second: [E] int16, bodies within the frame.
+        arm: [E, 3] m, from the first body's centre of mass to its node.
+        other: [E, 3] m, first body's centre of mass from the second's (from the floor's origin below it).
+        normal: [E, 3]; gap: [E] m.
+        dt: s; gravity: [3] m/s^2; reach: m, the contact radius used.
+    """
+
+    body_start: np.ndarray
+    edge_start: np.ndarray
+    orientation: np.ndarray
+    velocity: np.ndarray
+    angular: np.ndarray
+    free_angular: np.ndarray
+    mean_angular: np.ndarray
+    end_velocity: np.ndarray
+    end_angular: np.ndarray
+    moved: np.ndarray
+    turned: np.ndarray
+    mass: np.ndarray
+    inertia: np.ndarray
+    friction: np.ndarray
+    restitution: np.ndarray
+    size: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
+    arm: np.ndarray
+    other: np.ndarray
+    normal: np.ndarray
+    gap: np.ndarray
+    dt: float
+    gravity: np.ndarray
+    reach: float
+
+    def __len__(self) -> int:
+        return len(self.edge_start) - 1
+
+    def save(self, path: Path) -> None:
+        """Write to a temporary name, then rename."""
+        temporary = path.with_name(path.name + ".part")
+        with open(temporary, "wb") as handle:
+            np.savez(handle, **{f.name: np.asarray(getattr(self, f.name)) for f in fields(self)})
+        os.replace(temporary, path)
+
+    @classmethod
+    def load(cls, path: Path) -> ContactFrames:
+        """Read a cache file. Raises SdfsimError when it is not one."""
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                arrays = {f.name: data[f.name] for f in fields(cls)}
+        except (OSError, ValueError, KeyError, EOFError) as error:
+            raise SdfsimError(f"{path}: not readable as contact frames: {error}", "delete it to have it made") from error
+        return cls(**arrays | {"dt": float(arrays["dt"]), "reach": float(arrays["reach"])})
+
+
+def contact_frames(
+    data: Path, split: str, reach: float, *, on_progress: Callable[[float, str], None] | None = None
+) -> ContactFrames:
+    """The contact frames of a dataset split: from the cache file beside it, else found now and cached.
+
+    Raises:
+        SdfsimError: no trajectories, or unreadable ones.
+    """
+    files = trajectory_files(data, split)
+    cache = data / f"frames-{split}-{reach:g}-{len(files)}.npz"
+    if cache.exists():
+        return ContactFrames.load(cache)
+    from sdfsim.learning.merge import find_edges  # needs the SDFs, hence more than torch and numpy
+
+    trajectories = [Trajectory.load(f) for f in files]
+    shapes = load_shapes(data, {str(n) for t in trajectories for n in t.shape})
+    parts = []
+    for k, trajectory in enumerate(trajectories):
+        parts.append(_of_trajectory(trajectory, find_edges(trajectory, shapes, reach), shapes))
+        if on_progress:
+            on_progress((k + 1) / len(files), f"contacts of {split} trajectory {k + 1} of {len(files)}")
+    frames = _concatenate(parts, trajectories[0], reach)
+    frames.save(cache)
+    return frames
+
+
+def _of_trajectory(t: Trajectory, edges: dict[str, np.ndarray], shapes) -> dict[str, np.ndarray]:
+    """One trajectory's part of the arrays. `edges` come sorted by frame, `frame` telling which."""
+    count = np.bincount(edges["frame"], minlength=len(t.position) - 1)
+    used = np.flatnonzero(count)
+    bodies = t.position.shape[1]
+    now, then = used, used + 1
+
+    def rows(array: np.ndarray, when: np.ndarray) -> np.ndarray:
+        return array[when].reshape(-1, array.shape[-1])
+
+    def each(array: np.ndarray) -> np.ndarray:
+        return np.tile(array, (len(used),) + (1,) * (array.ndim - 1))
+
+    orientation, angular = rows(t.quat_xyzw, now), rows(t.angular_velocity, now)
+    inertia = each(np.where(t.static[:, None], 1.0, t.inertia))
+    tensor = torch.from_numpy
+    start = tensor(orientation)
+    free, free_angular = torque_free(start, tensor(angular), torch.diag_embed(tensor(inertia)), t.dt)
+    turned = to_rotvec(multiply(tensor(rows(t.quat_xyzw, then)), conjugate(start))) / t.dt
+    extent = np.array([np.ptp(shapes[str(n)].sdf.bounds, axis=0).max() for n in t.shape]) * t.scale
+    return {
+        "bodies": np.full(len(used), bodies),
+        "edges": count[used],
+        "orientation": orientation,
+        "velocity": rows(t.velocity, now),
+        "angular": angular,
+        "free_angular": free_angular.numpy(),
+        "mean_angular": (to_rotvec(multiply(free, conjugate(start))) / t.dt).numpy(),
+        "end_velocity": rows(t.velocity, then),
+        "end_angular": rows(t.angular_velocity, then),
+        "moved": (rows(t.position, then) - rows(t.position, now)) / t.dt,
+        "turned": turned.numpy(),
+        "mass": each(np.where(t.static, 0.0, t.mass)),
+        "inertia": inertia,
+        "friction": each(t.friction),
+        "restitution": each(t.restitution),
+        "size": each(extent),
+    } | {k: edges[k] for k in ("first", "second", "arm", "other", "normal", "gap")}
+
+
+def _concatenate(parts: list[dict[str, np.ndarray]], like: Trajectory, reach: float) -> ContactFrames:
+    joined = {k: np.concatenate([p[k] for p in parts]) for k in parts[0]}
+    starts = {
+        "body_start": np.concatenate([[0], np.cumsum(joined.pop("bodies"))]),
+        "edge_start": np.concatenate([[0], np.cumsum(joined.pop("edges"))]),
+    }
+    small = {k: v.astype(np.int16 if k in ("first", "second") else np.float32) for k, v in joined.items()}
+    return ContactFrames(**starts, **small, dt=like.dt, gravity=like.gravity, reach=reach)

@@ -1,0 +1,104 @@
+"""Many trajectories as one set of bodies: contacts and rollouts of all of them in the same few calls."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from sdfsim.dynamics.bodies import Bodies, State, Units, from_scene
+from sdfsim.dynamics.contacts import find_contacts
+from sdfsim.learning.dataset import FLOOR, Trajectory
+from sdfsim.scene.types import Body, Scene
+from sdfsim.shape.asset import Shape, analytic_shape
+
+
+def merged(
+    trajectories: list[Trajectory], frames: list[int], shapes: dict[str, Shape], units: Units, device: torch.device
+) -> tuple[Bodies, State]:
+    """Bodies of all trajectories, each at its frame, then one floor they share; worlds do not touch each other.
+
+    Args:
+        trajectories: W of them.
+        frames: [W] the frame each is taken at.
+        shapes: Shape of every name in use. The dataset's body frames sit at the centre of mass, so do these.
+        units: model units.
+        device: of the tensors.
+    """
+    names = sorted({str(n) for t in trajectories for n in t.shape})
+    centred = [replace(shapes[n], com=np.zeros(3)) for n in names]
+    bodies, world = [], []
+    for w, (t, frame) in enumerate(zip(trajectories, frames, strict=True)):
+        for i, name in enumerate(t.shape):
+            bodies.append(_body(t, frame, i, names.index(str(name)), f"{w}/{i}"))
+            world.append(w)
+    bodies.append(_floor(len(names)))
+    scene = Scene(
+        shapes=(*centred, analytic_shape("plane")),
+        bodies=tuple(bodies),
+        gravity=trajectories[0].gravity,
+        duration=1.0,
+    )
+    tensors, state = from_scene(scene, units, device)
+    place = torch.tensor([*world, -1], device=device)
+    same = (place[:, None] == place[None]) | (place[:, None] == -1) | (place[None] == -1)
+    return replace(tensors, may_touch=same), state
+
+
+def find_edges(trajectory: Trajectory, shapes: dict[str, Shape], reach: float) -> dict[str, np.ndarray]:
+    """Contact edges of every frame but the last, SI units, sorted by frame.
+
+    Returns:
+        frame, first, second (-1 = floor) [E]; arm, other, normal [E, 3]; gap [E].
+    """
+    steps = len(trajectory.position) - 1
+    bodies, state = merged([trajectory] * steps, list(range(steps)), shapes, Units(1.0, 1.0, 1.0), torch.device("cpu"))
+    gravity = torch.from_numpy(np.asarray(trajectory.gravity, dtype=np.float64))
+    contacts = find_contacts(bodies, state, gravity, reach, trajectory.dt)
+    per_world = trajectory.position.shape[1]
+    floor = len(bodies) - 1
+    order = torch.argsort(contacts.owner // per_world, stable=True)
+    owner, other = contacts.owner[order], contacts.body[order]
+    return {
+        "frame": (owner // per_world).numpy(),
+        "first": (owner % per_world).numpy(),
+        "second": torch.where(other == floor, -1, other % per_world).numpy(),
+        "arm": contacts.arm[order].numpy(),
+        "other": (state.position[owner] - state.position[other]).numpy(),
+        "normal": contacts.normal[order].numpy(),
+        "gap": contacts.distance[order].numpy(),
+    }
+
+
+def _body(t: Trajectory, frame: int, i: int, shape: int, name: str) -> Body:
+    return Body(
+        name=name,
+        shape=shape,
+        motion="static" if t.static[i] else "dynamic",
+        scale=float(t.scale[i]),
+        position=t.position[frame, i],
+        quat_xyzw=t.quat_xyzw[frame, i],
+        velocity=t.velocity[frame, i],
+        angular_velocity=t.angular_velocity[frame, i],
+        mass=float(t.mass[i]),
+        inertia=np.diag(t.inertia[i]),
+        friction=float(t.friction[i]),
+        restitution=float(t.restitution[i]),
+    )
+
+
+def _floor(shape: int) -> Body:
+    return Body(
+        name="floor",
+        shape=shape,
+        motion="static",
+        scale=1.0,
+        position=np.zeros(3),
+        quat_xyzw=np.array([0.0, 0.0, 0.0, 1.0]),
+        velocity=np.zeros(3),
+        angular_velocity=np.zeros(3),
+        mass=0.0,
+        friction=FLOOR[0],
+        restitution=FLOOR[1],
+    )

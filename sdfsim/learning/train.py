@@ -1,0 +1,294 @@
+"""Training: one loop for both networks, resumable to the step, needing only torch and numpy once frames are cached."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from sdfsim.errors import SdfsimError
+from sdfsim.learning.dataset import read_info
+
+CHECKPOINT_SECONDS = 60.0
+LOG_STEPS = 100
+EMA_DECAY = 0.999
+CLIP = 1.0
+BAD_BATCHES = 20  # consecutive batches without a finite gradient before training gives up
+
+Progress = Callable[[float, str], None]
+
+
+@dataclass(frozen=True)
+class Preset:
+    """One way to train one network.
+
+    Attributes:
+        kind: "impulse" or "paper".
+        config: sizes of the network.
+        steps: of the optimiser.
+        batch: contact frames (impulse) or recorded steps (paper) a step.
+        rate: peak learning rate; it falls to a hundredth along a cosine.
+        reach: m, contact radius D.
+        noise: standard deviation of pose noise (*paper*: m, as published), or None for the network's default.
+    """
+
+    kind: str
+    config: dict[str, int]
+    steps: int
+    batch: int
+    rate: float
+    reach: float = 0.1
+    noise: float | None = None
+
+
+PRESETS = {
+    "small": Preset("impulse", {"width": 64, "rounds": 6}, steps=40_000, batch=32, rate=2e-3),
+    "base": Preset("impulse", {"width": 128, "rounds": 8}, steps=200_000, batch=64, rate=1e-3),
+    "paper": Preset("paper", {"width": 128, "steps": 10}, steps=1_000_000, batch=8, rate=1e-3, noise=0.003),
+}
+
+
+class Task(Protocol):
+    """What a network is trained on: batches and their loss."""
+
+    def draw(self, rng: np.random.Generator, count: int) -> Any: ...
+
+    def loss(self, network: Any, batch: Any, *, mirrored: bool = False) -> Tensor: ...
+
+
+def train(
+    data: Path,
+    out: Path,
+    *,
+    preset: str = "small",
+    resume: bool = False,
+    steps: int | None = None,
+    seed: int = 0,
+    device: str = "cpu",
+    on_progress: Progress | None = None,
+) -> dict:
+    """Train a preset on a dataset; write `model.safetensors`, `log.jsonl` and a checkpoint under `out`.
+
+    Args:
+        data: dataset folder with train/ and validation/.
+        out: training folder.
+        preset: name in `PRESETS`.
+        resume: go on from the checkpoint in `out`; the result equals an uninterrupted run's.
+        steps: of the optimiser, instead of the preset's.
+        seed: of initial weights and batches.
+        device: "cpu", "cuda" or "auto".
+        on_progress: called with the fraction done and a message.
+
+    Returns:
+        A report: paths, losses, seconds.
+
+    Raises:
+        SdfsimError: unknown preset, unusable data, a checkpoint in `out` without `resume`, diverged training.
+    """
+    from sdfsim.dynamics.simulator import pick_device
+
+    if preset not in PRESETS:
+        raise SdfsimError(f"unknown preset {preset!r}", f"known: {', '.join(PRESETS)}")
+    plan = PRESETS[preset]
+    total = steps or plan.steps
+    checkpoint = out / "checkpoint.npz"
+    if checkpoint.exists() and not resume:
+        raise SdfsimError(f"{checkpoint} exists", "continue with --resume, or choose another -o")
+    out.mkdir(parents=True, exist_ok=True)
+    tell = on_progress or (lambda fraction, message: None)
+    place = pick_device(device)
+    task, held_out = _tasks(plan, data, place, lambda f, m: tell(0.0, m))
+    run = Run(plan, task, total, seed, place)
+    if checkpoint.exists():
+        run.load(checkpoint)
+    _loop(run, held_out, out, tell)
+    model = run.export(name=preset, info=read_info(data), ranges=task.ranges())
+    model.save(out / "model.safetensors")
+    return {
+        "model": str(out / "model.safetensors"),
+        "steps": run.step,
+        "seconds": run.seconds,
+        "loss": run.loss,
+        "held_out_loss": held_out_loss(run, held_out),
+    }
+
+
+def _tasks(plan: Preset, data: Path, device: torch.device, tell: Progress):
+    """Training and held-out tasks of a preset."""
+    if plan.kind == "impulse":
+        from sdfsim.learning.frames import contact_frames
+        from sdfsim.learning.impulse_task import ImpulseTask, Noise
+
+        sets = {s: contact_frames(data, s, plan.reach, on_progress=tell) for s in ("train", "validation")}
+        return ImpulseTask(sets["train"], device, Noise()), ImpulseTask(sets["validation"], device, None)
+    from sdfsim.learning.paper_task import PaperTask
+
+    return (
+        PaperTask(data, "train", plan.reach, device, plan.noise),
+        PaperTask(data, "validation", plan.reach, device, None),
+    )
+
+
+class Run:
+    """Everything that changes while training, and how to save it.
+
+    Args:
+        plan: preset.
+        task: gives batches and losses.
+        total: optimiser steps of the whole run (the learning rate depends on it).
+        seed: of weights and batches.
+        device: of weights and batches.
+    """
+
+    def __init__(self, plan: Preset, task: Any, total: int, seed: int, device: torch.device) -> None:
+        from sdfsim.dynamics.model import new_network
+
+        torch.manual_seed(seed)
+        self.plan, self.task, self.total, self.seed, self.device = plan, task, total, seed, device
+        self.network: nn.Module = new_network(plan.kind, plan.config).to(device)
+        if hasattr(task, "prepare"):
+            task.prepare(self.network, np.random.default_rng([seed, 1]))
+        self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
+        self.optimiser = torch.optim.Adam(self.network.parameters(), lr=plan.rate)
+        self.step, self.seconds, self.loss, self.skipped = 0, 0.0, math.nan, 0
+
+    def advance(self) -> None:
+        """One optimiser step on a batch that depends on (seed, step) alone."""
+        rng = np.random.default_rng([self.seed, 0, self.step])
+        batch = self.task.draw(rng, self.plan.batch)
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.rate()
+        loss = self.task.loss(self.network, batch, mirrored=bool(rng.integers(2)))
+        self.optimiser.zero_grad()
+        loss.backward()
+        norm = nn.utils.clip_grad_norm_(self.network.parameters(), CLIP)
+        if bool(norm.isfinite()):
+            self.optimiser.step()
+            self.skipped = 0
+        else:
+            self.skipped += 1
+            if self.skipped >= BAD_BATCHES:
+                raise SdfsimError(f"training diverged at step {self.step}: no finite gradient in {BAD_BATCHES} batches")
+        self.step += 1
+        value = float(loss.detach())
+        self.loss = value if math.isnan(self.loss) else 0.99 * self.loss + 0.01 * value
+        decay = min(EMA_DECAY, (1.0 + self.step) / (10.0 + self.step))
+        with torch.no_grad():
+            for name, weight in self.network.state_dict().items():
+                if weight.dtype.is_floating_point and self.average[name].shape:
+                    self.average[name].lerp_(weight, 1.0 - decay)
+                else:
+                    self.average[name].copy_(weight)
+
+    def rate(self) -> float:
+        """Learning rate: 500 steps of warm-up, then a cosine to a hundredth."""
+        warm = min(1.0, (self.step + 1) / 500)
+        fall = 0.5 * (1.0 + math.cos(math.pi * min(1.0, self.step / self.total)))
+        return self.plan.rate * warm * (0.01 + 0.99 * fall)
+
+    def averaged(self) -> nn.Module:
+        """The network with its averaged weights."""
+        from sdfsim.dynamics.model import new_network
+
+        network = new_network(self.plan.kind, self.plan.config).to(self.device)
+        network.load_state_dict(self.average)
+        return network.eval().requires_grad_(False)
+
+    def save(self, path: Path) -> None:
+        """Write everything to a temporary name, then rename. Arrays only: nothing is pickled."""
+        arrays: dict[str, np.ndarray] = {}
+        for name, weight in self.network.state_dict().items():
+            arrays[f"network/{name}"] = weight.cpu().numpy()
+            arrays[f"average/{name}"] = self.average[name].cpu().numpy()
+        for index, slot in self.optimiser.state_dict()["state"].items():
+            for name, value in slot.items():
+                arrays[f"adam/{index}/{name}"] = value.cpu().numpy()
+        progress = {"step": self.step, "seconds": self.seconds, "loss": self.loss, "total": self.total}
+        arrays["run"] = np.array(json.dumps({"plan": asdict(self.plan), "seed": self.seed, **progress}))
+        temporary = path.with_name(path.name + ".part")
+        with open(temporary, "wb") as handle:
+            np.savez(handle, **arrays)  # type: ignore[arg-type]
+        os.replace(temporary, path)
+
+    def load(self, path: Path) -> None:
+        """Take up a saved run. Raises SdfsimError when it is another preset's or seed's, or unreadable."""
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                arrays = {k: data[k] for k in data.files}
+        except (OSError, ValueError, EOFError) as error:
+            raise SdfsimError(f"{path}: unreadable checkpoint: {error}", "delete it to start anew") from error
+        info = json.loads(str(arrays["run"]))
+        if info["plan"] != asdict(self.plan) or info["seed"] != self.seed or info["total"] != self.total:
+            raise SdfsimError(f"{path} belongs to another preset, seed or number of steps", "choose another -o")
+        tensors = {k: torch.from_numpy(v).to(self.device) for k, v in arrays.items() if k != "run"}
+        self.network.load_state_dict({k[8:]: v for k, v in tensors.items() if k.startswith("network/")})
+        self.average = {k[8:]: v for k, v in tensors.items() if k.startswith("average/")}
+        state: dict[int, dict[str, Tensor]] = {}
+        for key, value in tensors.items():
+            if key.startswith("adam/"):
+                _, index, name = key.split("/", 2)
+                state.setdefault(int(index), {})[name] = value.cpu() if name == "step" else value
+        self.optimiser.load_state_dict({"state": state, "param_groups": self.optimiser.state_dict()["param_groups"]})
+        self.step, self.seconds, self.loss = info["step"], info["seconds"], info["loss"]
+
+    def export(self, *, name: str, info: dict, ranges: dict[str, list[float]]):
+        """The averaged weights as a `Model`."""
+        from sdfsim.dynamics.model import Model
+
+        card = {
+            "data": {k: info.get(k) for k in ("recipe", "seed", "engine", "engine_version")},
+            "optimiser_steps": self.step,
+            "seconds": round(self.seconds),
+            "threads": torch.get_num_threads(),
+            "device": str(self.device),
+            "preset": asdict(self.plan),
+        }
+        return Model(
+            name=name,
+            kind=self.plan.kind,
+            network=self.averaged(),
+            dt=self.task.dt,
+            gravity=self.task.gravity,
+            length=float(np.mean(ranges["size"])),
+            reach=self.plan.reach,
+            ranges=ranges,
+            card=card,
+        )
+
+
+def held_out_loss(run: Run, task: Task, batches: int = 8) -> float:
+    """Loss of the averaged weights on a fixed set of held-out batches."""
+    network, rng = run.averaged(), np.random.default_rng(12345)
+    with torch.no_grad():
+        losses = [float(task.loss(network, task.draw(rng, 64))) for _ in range(batches)]
+    return float(np.mean(losses))
+
+
+def _loop(run: Run, held_out: Task, out: Path, tell: Progress) -> None:
+    saved = time.monotonic()
+    try:
+        while run.step < run.total:
+            started = time.monotonic()
+            run.advance()
+            run.seconds += time.monotonic() - started
+            if run.step % LOG_STEPS == 0:
+                tell(run.step / run.total, f"step {run.step}, loss {run.loss:.4f}")
+            if run.step % 1000 == 0 or run.step == run.total:
+                entry = {"step": run.step, "seconds": round(run.seconds, 1), "loss": run.loss, "rate": run.rate()}
+                with open(out / "log.jsonl", "a") as log:
+                    log.write(json.dumps(entry | {"held_out_loss": held_out_loss(run, held_out)}) + "\n")
+            if time.monotonic() - saved > CHECKPOINT_SECONDS:
+                run.save(out / "checkpoint.npz")
+                saved = time.monotonic()
+    finally:
+        # Also on Ctrl-C: what has been learned is kept.
+        run.save(out / "checkpoint.npz")
