@@ -119,9 +119,7 @@ def edge_frames(graph: ContactGraph, *, mirrored: bool = False) -> EdgeFrames:
     share = torch.cat(
         [push_first * mass[:, :1], push_second * mass[:, :1], twist_first[:, 0, 0, None] * mass[:, :1]], -1
     )
-    count = torch.zeros(g.pairs, dtype=g.gap.dtype, device=g.gap.device).index_add_(
-        0, g.pair, torch.ones_like(g.gap)
-    )
+    count = torch.zeros(g.pairs, dtype=g.gap.dtype, device=g.gap.device).index_add_(0, g.pair, torch.ones_like(g.gap))
     in_frame = axes @ torch.stack([slip, lift, _centripetal(g)], -1)  # [E, axis, quantity]
     scaled = (in_frame / speed[..., None]).flatten(1)
     gap = g.gap[:, None] / (speed * g.dt)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from torch import nn
 from sdfsim.dynamics.impulse import ImpulseConfig, ImpulseNetwork
 from sdfsim.dynamics.paper import PaperConfig, PaperNetwork
 from sdfsim.errors import SdfsimError
+from sdfsim.files import replacing
 
 BUNDLED = Path(__file__).resolve().parent.parent / "models"
 DEFAULT_MODEL = "small"
@@ -60,10 +60,9 @@ class Model:
             "config": asdict(self.network.config),  # type: ignore[call-overload]
             **{k: getattr(self, k) for k in ("dt", "gravity", "length", "reach", "ranges", "card")},
         }
-        temporary = path.with_name(path.name + ".part")
         weights = {k: v.detach().cpu().contiguous() for k, v in self.network.state_dict().items()}
-        save_file(weights, temporary, metadata={"sdfsim_model": json.dumps(info)})
-        os.replace(temporary, path)
+        with replacing(path) as partial:
+            save_file(weights, partial, metadata={"sdfsim_model": json.dumps(info)})
 
 
 def new_network(kind: str, config: dict[str, Any]) -> nn.Module:

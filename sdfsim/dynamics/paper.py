@@ -7,7 +7,9 @@ every surface node an acceleration; shape matching turns those of a body into it
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -79,6 +81,10 @@ class EdgeUpdate(nn.Module):
 class Step(nn.Module):
     """One step of message passing: all four kinds of edges, then both kinds of nodes; residual latents."""
 
+    edges: nn.ModuleDict
+    node: nn.Module
+    body: nn.Module
+
     def __init__(self, width: int) -> None:
         super().__init__()
         self.edges = nn.ModuleDict({kind: EdgeUpdate(width) for kind in KINDS})
@@ -87,7 +93,7 @@ class Step(nn.Module):
 
 
 class PaperNetwork(nn.Module):
-    """Encode, `steps` of message passing, decode; inputs and targets are normalised by running statistics.
+    """Encode, `steps` of message passing, decode; inputs and targets are normalised by statistics of the training data.
 
     Args:
         config: sizes.
@@ -102,7 +108,7 @@ class PaperNetwork(nn.Module):
         self.target = Normaliser(3)
         self.encode = nn.ModuleDict({name: mlp(sizes[name], width, width) for name in ("body", "node")})
         self.encode_edge = nn.ModuleDict({kind: mlp(sizes[kind.split("_")[0]], width, width) for kind in KINDS})
-        self.steps = nn.ModuleList(Step(width) for _ in range(config.steps))
+        self.steps = nn.ModuleList([Step(width) for _ in range(config.steps)])
         self.decode = mlp(width, width, 3, normalised=False)
 
     def forward(self, graph: SurfaceGraph) -> Tensor:
@@ -119,7 +125,7 @@ class PaperNetwork(nn.Module):
             "contact_up": (g.contact_node, g.contact_body),
             "contact_down": (g.contact_body, g.contact_node),
         }
-        for step in self.steps:
+        for step in cast("Iterable[Step]", self.steps):
             heard = {}
             for kind in KINDS:
                 sender, receiver = (node, body) if kind.endswith("up") else (body, node)
@@ -133,7 +139,11 @@ class PaperNetwork(nn.Module):
 
 
 class Normaliser(nn.Module):
-    """Standardises features by mean and deviation that are accumulated during training and kept with the weights."""
+    """Standardises features by mean and deviation that are gathered before training and kept with the weights."""
+
+    total: Tensor
+    sum: Tensor
+    squares: Tensor
 
     def __init__(self, size: int) -> None:
         super().__init__()

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
 
 from sdfsim.errors import SdfsimError
+from sdfsim.files import read_arrays, write_arrays
 
 
 @dataclass(frozen=True)
@@ -61,31 +61,16 @@ class Rollout:
         )
 
     def save(self, path: Path | str) -> None:
-        """Write `rollout.npz`: to a temporary name first, then renamed."""
-        path = Path(path)
+        """Write `rollout.npz`."""
         arrays = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("counters", "names", "meta")}
         arrays |= {f"counter_{k}": v for k, v in self.counters.items()}
-        temporary = path.with_name(path.name + ".part")
-        try:
-            with open(temporary, "wb") as handle:
-                np.savez_compressed(
-                    handle,
-                    **arrays,
-                    names=np.array(self.names, dtype=str),
-                    meta=np.array(json.dumps(self.meta)),
-                )
-            os.replace(temporary, path)
-        except OSError as error:
-            raise SdfsimError(f"{path}: cannot be written: {error.strerror}", "free some space or choose another -o") from error
+        arrays |= {"names": np.array(self.names, dtype=str), "meta": np.array(json.dumps(self.meta))}
+        write_arrays(Path(path), arrays)
 
     @classmethod
     def load(cls, path: Path | str) -> Rollout:
         """Read a `rollout.npz`. Raises SdfsimError when it is missing or not one of ours."""
-        try:
-            with np.load(path, allow_pickle=False) as data:
-                arrays = {k: data[k] for k in data.files}
-        except (OSError, ValueError, EOFError) as error:
-            raise SdfsimError(f"{path}: cannot be read as a rollout: {error}") from error
+        arrays = read_arrays(Path(path), "a rollout")
         try:
             counters = {k.removeprefix("counter_"): arrays.pop(k) for k in list(arrays) if k.startswith("counter_")}
             names = tuple(str(n) for n in arrays.pop("names"))

@@ -35,7 +35,9 @@ class SimulationError(SdfsimError):
     """
 
     def __init__(self, message: str, rollout: Rollout) -> None:
-        super().__init__(message, "try another model, or look for bodies that overlap at the start", exit_code=EXIT_QUALITY)
+        super().__init__(
+            message, "try another model, or look for bodies that overlap at the start", exit_code=EXIT_QUALITY
+        )
         self.rollout = rollout
 
 

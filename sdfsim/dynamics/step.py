@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State
-from sdfsim.dynamics.contacts import Contacts, find_contacts
+from sdfsim.dynamics.contacts import Contacts, find_contacts, thin_contacts
 from sdfsim.dynamics.freeflight import ballistic, torque_free
 from sdfsim.dynamics.graph import ContactGraph, number_pairs
 from sdfsim.dynamics.impulse import Velocities
@@ -56,6 +56,7 @@ def step(model: Model, bodies: Bodies, state: State, rules: Rules) -> tuple[Stat
         return _paper_step(model, bodies, state, free, contacts, rules), contacts
     if len(contacts) == 0:
         return free, contacts
+    contacts = thin_contacts(bodies, contacts)
     active, graph = contact_graph(bodies, state, free, contacts, rules)
     predicted = model.network(graph, friction=rules.friction)
     return _move(bodies, state, free, active, predicted, rules), contacts
@@ -121,9 +122,7 @@ def contact_graph(
     )
 
 
-def _move(
-    bodies: Bodies, state: State, free: State, active: Tensor, predicted: Velocities, rules: Rules
-) -> State:
+def _move(bodies: Bodies, state: State, free: State, active: Tensor, predicted: Velocities, rules: Rules) -> State:
     """Bodies in contact move by the predicted mean velocities and leave with the predicted end velocities."""
     active, chosen = active[bodies.moves[active]], bodies.moves[active]
     now = {k: getattr(free, k).clone() for k in ("position", "orientation", "velocity", "angular_velocity")}
@@ -136,9 +135,7 @@ def _move(
     return replace(free, **now)
 
 
-def _paper_step(
-    model: Model, bodies: Bodies, state: State, free: State, contacts: Contacts, rules: Rules
-) -> State:
+def _paper_step(model: Model, bodies: Bodies, state: State, free: State, contacts: Contacts, rules: Rules) -> State:
     """The published step; with exact free flight only bodies with a contact edge follow the network."""
     if rules.free_flight == "exact" and len(contacts) == 0:
         return free

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-import json
-import os
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sdfsim.errors import SdfsimError
+from sdfsim.files import read_arrays, read_json, write_arrays, write_json
 
 if TYPE_CHECKING:
     from sdfsim.shape.asset import Shape
 
 
 FLOOR = (0.3, 0.5)  # friction and restitution of the recipes' floor, the plane z = 0
+
+
+def product_range(values: np.ndarray, floor: float) -> list[float]:
+    """[low, high] of the products of two bodies' coefficients, or of a body's and the floor's."""
+    low, high = float(values.min()), float(values.max())
+    return [low * min(low, floor), high * max(high, floor)]
 
 
 @dataclass(frozen=True)
@@ -54,20 +59,13 @@ class Trajectory:
     gravity: np.ndarray
 
     def save(self, path: Path) -> None:
-        """Write to a temporary name, then rename."""
-        temporary = path.with_name(path.name + ".part")
-        with open(temporary, "wb") as handle:
-            np.savez_compressed(handle, **{f.name: np.asarray(getattr(self, f.name)) for f in fields(self)})
-        os.replace(temporary, path)
+        """Write the file."""
+        write_arrays(path, {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)})
 
     @classmethod
     def load(cls, path: Path) -> Trajectory:
         """Read and check one file. Raises SdfsimError naming the file and the field that is wrong."""
-        try:
-            with np.load(path, allow_pickle=False) as data:
-                arrays = {k: data[k] for k in data.files}
-        except (OSError, ValueError, EOFError) as error:
-            raise SdfsimError(f"{path}: cannot be read as a trajectory: {error}") from error
+        arrays: dict[str, Any] = read_arrays(path, "a trajectory")
         missing = [f.name for f in fields(cls) if f.name not in arrays]
         if missing:
             raise SdfsimError(f"{path}: missing field(s) {', '.join(missing)}")
@@ -103,18 +101,12 @@ def _check(path: Path, arrays: dict) -> None:
 
 def write_info(folder: Path, info: dict) -> None:
     """Write `dataset.json` (recipe, seed, engine with version and settings)."""
-    temporary = folder / "dataset.json.part"
-    temporary.write_text(json.dumps(info, indent=2) + "\n")
-    os.replace(temporary, folder / "dataset.json")
+    write_json(folder / "dataset.json", info)
 
 
 def read_info(folder: Path) -> dict:
     """`dataset.json` of a dataset folder. Raises SdfsimError when it is absent or not JSON."""
-    path = folder / "dataset.json"
-    try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise SdfsimError(f"{path}: cannot be read: {error}", "a dataset folder is what `sdfsim dataset` writes") from error
+    return read_json(folder / "dataset.json", "a dataset folder is what `sdfsim dataset` writes")
 
 
 def trajectory_files(folder: Path, split: str | None = None) -> list[Path]:

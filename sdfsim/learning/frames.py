@@ -6,10 +6,14 @@ component of the relative displacement, to first order.
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, fields
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,6 +21,7 @@ import torch
 from sdfsim.dynamics.freeflight import torque_free
 from sdfsim.dynamics.pose import conjugate, multiply, to_rotvec
 from sdfsim.errors import SdfsimError
+from sdfsim.files import read_arrays, write_arrays
 from sdfsim.learning.dataset import Trajectory, load_shapes, trajectory_files
 
 
@@ -71,21 +76,20 @@ class ContactFrames:
         return len(self.edge_start) - 1
 
     def save(self, path: Path) -> None:
-        """Write to a temporary name, then rename."""
-        temporary = path.with_name(path.name + ".part")
-        with open(temporary, "wb") as handle:
-            np.savez(handle, **{f.name: np.asarray(getattr(self, f.name)) for f in fields(self)})
-        os.replace(temporary, path)
+        """Write the cache file."""
+        write_arrays(path, {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}, compressed=False)
 
     @classmethod
     def load(cls, path: Path) -> ContactFrames:
         """Read a cache file. Raises SdfsimError when it is not one."""
-        try:
-            with np.load(path, allow_pickle=False) as data:
-                arrays = {f.name: data[f.name] for f in fields(cls)}
-        except (OSError, ValueError, KeyError, EOFError) as error:
-            raise SdfsimError(f"{path}: not readable as contact frames: {error}", "delete it to have it made") from error
-        return cls(**arrays | {"dt": float(arrays["dt"]), "reach": float(arrays["reach"])})
+        arrays = read_arrays(path, "contact frames", "delete it to have it made again")
+        if missing := [f.name for f in fields(cls) if f.name not in arrays]:
+            raise SdfsimError(f"{path}: no {missing[0]} in it", "delete it to have it made again")
+        return cls(**_typed(arrays))
+
+
+def _typed(arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+    return {k: float(v) if k in ("dt", "reach") else v for k, v in arrays.items()}
 
 
 def contact_frames(
@@ -97,21 +101,33 @@ def contact_frames(
         SdfsimError: no trajectories, or unreadable ones.
     """
     files = trajectory_files(data, split)
-    cache = data / f"frames-{split}-{reach:g}-{len(files)}.npz"
-    if cache.exists():
-        return ContactFrames.load(cache)
+    cached = data / f"frames-{split}-{reach:g}-{len(files)}.npz"
+    if cached.exists():
+        return ContactFrames.load(cached)
+    spawn = multiprocessing.get_context("spawn")  # torch's thread pool does not survive a fork
+    parts = []
+    with ProcessPoolExecutor(max_workers=os.cpu_count(), mp_context=spawn) as pool:
+        for k, part in enumerate(pool.map(_of_file, files, [reach] * len(files), chunksize=8)):
+            parts.append(part)
+            if on_progress:
+                on_progress((k + 1) / len(files), f"contacts of {split} trajectory {k + 1} of {len(files)}")
+    frames = _concatenate(parts, Trajectory.load(files[0]), reach)
+    frames.save(cached)
+    return frames
+
+
+@cache
+def _shape(folder: Path, name: str):
+    return load_shapes(folder, {name})[name]
+
+
+def _of_file(path: Path, reach: float) -> dict[str, np.ndarray]:
     from sdfsim.learning.merge import find_edges  # needs the SDFs, hence more than torch and numpy
 
-    trajectories = [Trajectory.load(f) for f in files]
-    shapes = load_shapes(data, {str(n) for t in trajectories for n in t.shape})
-    parts = []
-    for k, trajectory in enumerate(trajectories):
-        parts.append(_of_trajectory(trajectory, find_edges(trajectory, shapes, reach), shapes))
-        if on_progress:
-            on_progress((k + 1) / len(files), f"contacts of {split} trajectory {k + 1} of {len(files)}")
-    frames = _concatenate(parts, trajectories[0], reach)
-    frames.save(cache)
-    return frames
+    torch.set_num_threads(1)
+    trajectory = Trajectory.load(path)
+    shapes = {str(n): _shape(path.parent, str(n)) for n in trajectory.shape}
+    return _of_trajectory(trajectory, find_edges(trajectory, shapes, reach), shapes)
 
 
 def _of_trajectory(t: Trajectory, edges: dict[str, np.ndarray], shapes) -> dict[str, np.ndarray]:

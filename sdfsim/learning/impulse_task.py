@@ -11,7 +11,7 @@ from torch import Tensor
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.graph import ContactGraph, number_pairs
 from sdfsim.dynamics.impulse import ImpulseNetwork, Velocities
-from sdfsim.learning.dataset import FLOOR
+from sdfsim.learning.dataset import FLOOR, product_range
 from sdfsim.learning.frames import ContactFrames
 
 HUBER = 0.05  # m/s: below it errors count squared, above it by their size
@@ -78,13 +78,12 @@ class ImpulseTask:
         f = self.frames
         moving = f.mass > 0
         speed = np.linalg.norm(f.velocity[moving], axis=-1)
-        pair = [(min(c) * min(c[0], k), max(c) * max(c[1], k)) for c, k in ((_span(f.friction), FLOOR[0]), (_span(f.restitution), FLOOR[1]))]
         return {
             "size": _span(f.size[moving]),
             "speed": [0.0, float(np.percentile(speed, 99.9))],
             "mass_ratio": [1.0, float(f.mass[moving].max() / f.mass[moving].min())],
-            "friction": list(pair[0]),
-            "restitution": list(pair[1]),
+            "friction": product_range(f.friction, FLOOR[0]),
+            "restitution": product_range(f.restitution, FLOOR[1]),
         }
 
     def draw(self, rng: np.random.Generator, count: int) -> Batch:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from sdfsim.dynamics.bodies import Bodies, State, Units, from_scene
-from sdfsim.dynamics.contacts import find_contacts
+from sdfsim.dynamics.contacts import find_contacts, thin_contacts
 from sdfsim.learning.dataset import FLOOR, Trajectory
 from sdfsim.scene.types import Body, Scene
 from sdfsim.shape.asset import Shape, analytic_shape
@@ -55,7 +55,7 @@ def find_edges(trajectory: Trajectory, shapes: dict[str, Shape], reach: float) -
     steps = len(trajectory.position) - 1
     bodies, state = merged([trajectory] * steps, list(range(steps)), shapes, Units(1.0, 1.0, 1.0), torch.device("cpu"))
     gravity = torch.from_numpy(np.asarray(trajectory.gravity, dtype=np.float64))
-    contacts = find_contacts(bodies, state, gravity, reach, trajectory.dt)
+    contacts = thin_contacts(bodies, find_contacts(bodies, state, gravity, reach, trajectory.dt))
     per_world = trajectory.position.shape[1]
     floor = len(bodies) - 1
     order = torch.argsort(contacts.owner // per_world, stable=True)

@@ -202,11 +202,10 @@ def _spawn(teacher: Teacher, rng: np.random.Generator, sources: list[ShapeSource
 def _place(teacher: Teacher, rng: np.random.Generator, source: ShapeSource, body: TeacherBody) -> np.ndarray | None:
     index = teacher.add(body, np.array([0.0, 0.0, -100.0]), np.array([0.0, 0.0, 0.0, 1.0]))
     for _ in range(TRIES):
-        rotation = Rotation.random(random_state=rng)
+        rotation = Rotation.random(rng=rng)
         vertices = body.scale * rotation.apply(source.vertices)
         position = rng.uniform(REGION[0] - vertices.min(0), REGION[1] - vertices.max(0))
         teacher.place(index, position, rotation.as_quat())
         if not teacher.overlaps(index):
             return position
     return None
-

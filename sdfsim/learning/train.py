@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -16,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from sdfsim.errors import SdfsimError
+from sdfsim.files import read_arrays, write_arrays
 from sdfsim.learning.dataset import read_info
 
 CHECKPOINT_SECONDS = 60.0
@@ -51,7 +51,7 @@ class Preset:
 
 
 PRESETS = {
-    "small": Preset("impulse", {"width": 64, "rounds": 6}, steps=40_000, batch=32, rate=2e-3),
+    "small": Preset("impulse", {"width": 64, "rounds": 6}, steps=30_000, batch=32, rate=2e-3),
     "base": Preset("impulse", {"width": 128, "rounds": 8}, steps=200_000, batch=64, rate=1e-3),
     "paper": Preset("paper", {"width": 128, "steps": 10}, steps=1_000_000, batch=8, rate=1e-3, noise=0.003),
 }
@@ -157,8 +157,10 @@ class Run:
         self.network: nn.Module = new_network(plan.kind, plan.config).to(device)
         if hasattr(task, "prepare"):
             task.prepare(self.network, np.random.default_rng([seed, 1]))
+        # Averaged are the trained weights; feature statistics are fixed before the first step.
+        self.weights = dict(self.network.named_parameters())
         self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
-        self.optimiser = torch.optim.Adam(self.network.parameters(), lr=plan.rate)
+        self.optimiser = torch.optim.Adam(self.network.parameters(), lr=plan.rate, fused=True)
         self.step, self.seconds, self.loss, self.skipped = 0, 0.0, math.nan, 0
 
     def advance(self) -> None:
@@ -183,11 +185,8 @@ class Run:
         self.loss = value if math.isnan(self.loss) else 0.99 * self.loss + 0.01 * value
         decay = min(EMA_DECAY, (1.0 + self.step) / (10.0 + self.step))
         with torch.no_grad():
-            for name, weight in self.network.state_dict().items():
-                if weight.dtype.is_floating_point and self.average[name].shape:
-                    self.average[name].lerp_(weight, 1.0 - decay)
-                else:
-                    self.average[name].copy_(weight)
+            for name, weight in self.weights.items():
+                self.average[name].lerp_(weight, 1.0 - decay)
 
     def rate(self) -> float:
         """Learning rate: 500 steps of warm-up, then a cosine to a hundredth."""
@@ -204,7 +203,7 @@ class Run:
         return network.eval().requires_grad_(False)
 
     def save(self, path: Path) -> None:
-        """Write everything to a temporary name, then rename. Arrays only: nothing is pickled."""
+        """Write everything. Arrays only: nothing is pickled."""
         arrays: dict[str, np.ndarray] = {}
         for name, weight in self.network.state_dict().items():
             arrays[f"network/{name}"] = weight.cpu().numpy()
@@ -214,18 +213,11 @@ class Run:
                 arrays[f"adam/{index}/{name}"] = value.cpu().numpy()
         progress = {"step": self.step, "seconds": self.seconds, "loss": self.loss, "total": self.total}
         arrays["run"] = np.array(json.dumps({"plan": asdict(self.plan), "seed": self.seed, **progress}))
-        temporary = path.with_name(path.name + ".part")
-        with open(temporary, "wb") as handle:
-            np.savez(handle, **arrays)  # type: ignore[arg-type]
-        os.replace(temporary, path)
+        write_arrays(path, arrays, compressed=False)
 
     def load(self, path: Path) -> None:
         """Take up a saved run. Raises SdfsimError when it is another preset's or seed's, or unreadable."""
-        try:
-            with np.load(path, allow_pickle=False) as data:
-                arrays = {k: data[k] for k in data.files}
-        except (OSError, ValueError, EOFError) as error:
-            raise SdfsimError(f"{path}: unreadable checkpoint: {error}", "delete it to start anew") from error
+        arrays = read_arrays(path, "a checkpoint", "delete it to start anew")
         info = json.loads(str(arrays["run"]))
         if info["plan"] != asdict(self.plan) or info["seed"] != self.seed or info["total"] != self.total:
             raise SdfsimError(f"{path} belongs to another preset, seed or number of steps", "choose another -o")

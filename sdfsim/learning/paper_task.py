@@ -1,0 +1,145 @@
+"""What training the *paper* network means: recorded steps of whole scenes, and a loss on node accelerations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sdfsim.dynamics import pose
+from sdfsim.dynamics.bodies import Bodies, State, Units
+from sdfsim.dynamics.contacts import find_contacts
+from sdfsim.dynamics.paper import PaperNetwork, SurfaceGraph
+from sdfsim.dynamics.surfaces import node_owner, surface_graph, target_acceleration
+from sdfsim.learning.dataset import FLOOR, Trajectory, load_shapes, product_range, trajectory_files
+from sdfsim.learning.merge import merged
+
+NODES = 64  # surface nodes a body: the first of each shape's, which are its corners and then the most spread
+WARM_BATCHES = 20  # batches that set the feature statistics before the first step
+
+
+@dataclass(frozen=True)
+class Batch:
+    """A graph, the accelerations [M, 3] that were recorded, and which nodes move [M]."""
+
+    graph: SurfaceGraph
+    target: Tensor
+    moves: Tensor
+
+
+class PaperTask:
+    """Draws recorded steps of random trajectories, turned by a random yaw, with rigid pose noise.
+
+    Args:
+        data: dataset folder.
+        split: "train" or "validation".
+        reach: m, contact radius D.
+        device: where batches are made.
+        noise: m, standard deviation of the noise on the earlier poses (paper: 0.003), None for exact inputs.
+    """
+
+    def __init__(self, data: Path, split: str, reach: float, device: torch.device, noise: float | None) -> None:
+        self.trajectories = [Trajectory.load(f) for f in trajectory_files(data, split)]
+        names = {str(n) for t in self.trajectories for n in t.shape}
+        self.shapes = {k: replace(s, nodes=s.nodes[:NODES]) for k, s in load_shapes(data, names).items()}
+        self.reach, self.device, self.noise = reach, device, noise
+        self.dt = self.trajectories[0].dt
+        self.gravity = float(np.linalg.norm(self.trajectories[0].gravity))
+
+    def prepare(self, network: PaperNetwork, rng: np.random.Generator) -> None:
+        """Set the network's feature statistics from a few batches."""
+        for _ in range(WARM_BATCHES):
+            batch = self.draw(rng, 4)
+            for name in ("body", "node", "intra", "contact"):
+                network.scale[name].observe(getattr(batch.graph, name))  # type: ignore[operator]
+            network.target.observe(batch.target[batch.moves])
+
+    def draw(self, rng: np.random.Generator, count: int) -> Batch:
+        """`count` recorded steps as one graph."""
+        picked = [self.trajectories[i] for i in rng.integers(len(self.trajectories), size=count)]
+        frames = [int(rng.integers(2, len(t.position) - 1)) for t in picked]
+        units = Units(1.0, 1.0, 1.0)
+        bodies, state = merged(picked, frames, self.shapes, units, self.device)
+        yaw = pose.from_rotvec(torch.tensor([0.0, 0.0, rng.uniform(0, 2 * np.pi)], dtype=torch.float64))
+        poses = [self._poses(picked, frames, offset, yaw) for offset in (-2, -1, 0, 1)]
+        noisy = self._disturbed(poses, bodies, rng) if self.noise else poses
+        state = State(
+            position=noisy[2][0],
+            orientation=noisy[2][1],
+            velocity=(noisy[2][0] - noisy[1][0]) / self.dt,
+            angular_velocity=pose.to_rotvec(pose.multiply(noisy[2][1], pose.conjugate(noisy[1][1]))) / self.dt,
+            earlier_position=torch.stack([noisy[0][0], noisy[1][0]]),
+            earlier_orientation=torch.stack([noisy[0][1], noisy[1][1]]),
+        )
+        gravity = torch.tensor(picked[0].gravity, dtype=torch.float64, device=self.device)
+        contacts = find_contacts(bodies, state, gravity, self.reach, self.dt)
+        # The target leads from the disturbed poses to the recorded one, so that errors are learnt to be undone.
+        target = target_acceleration(bodies, state, *poses[3])
+        return Batch(surface_graph(bodies, state, contacts), target.float(), bodies.moves[node_owner(bodies)])
+
+    def loss(self, network: PaperNetwork, batch: Batch, *, mirrored: bool = False) -> Tensor:
+        """Mean squared error of the standardised accelerations; a mirror image reverses the y axis of the world."""
+        if mirrored:
+            batch = _mirror(batch)
+        error = network(batch.graph) - network.target(batch.target)
+        return error[batch.moves].square().mean()
+
+    def ranges(self) -> dict[str, list[float]]:
+        """[low, high] of what the trajectories hold, SI units, coefficients as products with the floor's."""
+        extent = {name: float(np.ptp(shape.sdf.bounds, axis=0).max()) for name, shape in self.shapes.items()}
+        size = [extent[str(n)] * s for t in self.trajectories for n, s in zip(t.shape, t.scale, strict=True)]
+        mass = np.concatenate([t.mass for t in self.trajectories])
+        friction = np.concatenate([t.friction for t in self.trajectories])
+        restitution = np.concatenate([t.restitution for t in self.trajectories])
+        speed = np.concatenate([np.linalg.norm(t.velocity, axis=-1).ravel() for t in self.trajectories])
+        return {
+            "size": [float(min(size)), float(max(size))],
+            "speed": [0.0, float(np.percentile(speed, 99.9))],
+            "mass_ratio": [1.0, float(mass.max() / mass.min())],
+            "friction": product_range(friction, FLOOR[0]),
+            "restitution": product_range(restitution, FLOOR[1]),
+        }
+
+    def _poses(self, picked: list[Trajectory], frames: list[int], offset: int, yaw: Tensor) -> tuple[Tensor, Tensor]:
+        """Positions [N, 3] and orientations [N, 4] of all bodies at frame + offset, then the floor's."""
+        each = [(t.position[f + offset], t.quat_xyzw[f + offset]) for t, f in zip(picked, frames, strict=True)]
+        each.append((np.zeros((1, 3)), np.array([[0.0, 0.0, 0.0, 1.0]])))
+        position, quat = (np.concatenate(part) for part in zip(*each, strict=True))
+        place, turn = torch.from_numpy(position), torch.from_numpy(quat)
+        return pose.rotate(yaw, place).to(self.device), pose.multiply(yaw.expand_as(turn), turn).to(self.device)
+
+    def _disturbed(self, poses, bodies: Bodies, rng: np.random.Generator):
+        """A random walk of rigid displacements over the three input poses, each step of size `noise` at the last."""
+        assert self.noise is not None
+        moves = bodies.moves[:, None]
+        lever = torch.where(bodies.moves, 2.0 / bodies.size, torch.zeros_like(bodies.size))[:, None]
+        shift = turn = torch.zeros_like(poses[0][0])
+        result = []
+        for position, quat in poses[:3]:
+            step = rng.normal(scale=self.noise / np.sqrt(3), size=(2, len(bodies), 3))
+            draw = torch.from_numpy(step).to(self.device) * moves
+            shift, turn = shift + draw[0], turn + draw[1] * lever
+            result.append((position + shift, pose.multiply(pose.from_rotvec(turn), quat)))
+        return [*result, poses[3]]
+
+
+def _mirror(batch: Batch) -> Batch:
+    """Reverse y of every vector feature; body-frame reference offsets stay (a mirrored body has its own frame)."""
+    g = batch.graph
+
+    def flip(values: Tensor, columns: tuple[int, ...]) -> Tensor:
+        sign = torch.ones(values.shape[-1], dtype=values.dtype, device=values.device)
+        sign[list(columns)] = -1.0
+        return values * sign
+
+    graph = replace(
+        g,
+        body=flip(g.body, (1, 4, 7)),
+        node=flip(g.node, (1, 4, 7)),
+        intra=flip(g.intra, (1, 5)),
+        contact=flip(g.contact, (1, 4, 7, 10)),
+    )
+    return replace(batch, graph=graph, target=flip(batch.target, (1,)))

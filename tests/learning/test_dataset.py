@@ -1,0 +1,69 @@
+"""The trajectory format: what is written comes back, and every fault is named."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sdfsim.errors import SdfsimError
+from sdfsim.learning.dataset import Trajectory, read_info, trajectory_files
+
+
+def trajectory(frames: int = 4, bodies: int = 2) -> Trajectory:
+    rng = np.random.default_rng(0)
+    quat = rng.normal(size=(frames, bodies, 4))
+    return Trajectory(
+        position=rng.normal(size=(frames, bodies, 3)),
+        quat_xyzw=quat / np.linalg.norm(quat, axis=-1, keepdims=True),
+        velocity=rng.normal(size=(frames, bodies, 3)),
+        angular_velocity=rng.normal(size=(frames, bodies, 3)),
+        shape=np.array(["cube", "spot"]),
+        scale=np.array([1.0, 0.5]),
+        mass=np.array([2.0, 1.0]),
+        inertia=np.ones((bodies, 3)),
+        friction=np.array([0.4, 0.8]),
+        restitution=np.array([0.3, 0.7]),
+        static=np.zeros(bodies, dtype=bool),
+        dt=0.02,
+        gravity=np.array([0.0, 0.0, -10.0]),
+    )
+
+
+def test_round_trip(tmp_path):
+    one = trajectory()
+    one.save(tmp_path / "a.npz")
+    two = Trajectory.load(tmp_path / "a.npz")
+    assert two.dt == one.dt and list(two.shape) == ["cube", "spot"]
+    np.testing.assert_array_equal(two.position, one.position)
+    assert trajectory_files(tmp_path) == [tmp_path / "a.npz"]
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"mass": np.array([-1.0, 1.0])}, "mass: must be > 0"),
+        ({"velocity": np.full((4, 2, 3), np.nan)}, "velocity: has values that are not finite"),
+        ({"quat_xyzw": np.zeros((4, 2, 3))}, "quat_xyzw: must be [4, 2, 4]"),
+        ({"dt": 0.0}, "scale and dt must be > 0"),
+    ],
+)
+def test_faults_are_named(tmp_path, change, complaint):
+    replace(trajectory(), **change).save(tmp_path / "a.npz")
+    with pytest.raises(SdfsimError) as error:
+        Trajectory.load(tmp_path / "a.npz")
+    assert complaint in error.value.message and "a.npz" in error.value.message
+
+
+def test_missing_fields_truncation_and_empty_folders(tmp_path):
+    np.savez(tmp_path / "part.npz", position=np.zeros((2, 1, 3)))
+    with pytest.raises(SdfsimError, match="missing field"):
+        Trajectory.load(tmp_path / "part.npz")
+    trajectory().save(tmp_path / "whole.npz")
+    (tmp_path / "torn.npz").write_bytes((tmp_path / "whole.npz").read_bytes()[:200])
+    with pytest.raises(SdfsimError, match=r"torn\.npz: cannot be read"):
+        Trajectory.load(tmp_path / "torn.npz")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(SdfsimError, match="no trajectories"):
+        trajectory_files(tmp_path / "empty")
+    with pytest.raises(SdfsimError, match=r"dataset\.json"):
+        read_info(tmp_path / "empty")
