@@ -2,12 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+import torch
 
-from sdfsim.shape.mesh import Mesh
+from sdfsim.errors import SdfsimError
+from sdfsim.shape.analytic import BoxSdf, PlaneSdf, SphereSdf
+from sdfsim.shape.mesh import Frame, Mesh, load_mesh
+from sdfsim.shape.mlp import MlpSdf
 from sdfsim.shape.sdf import Sdf
+from sdfsim.shape.storage import FORMAT_VERSION, read_mesh, read_record, sdf_from_file, sdf_to_file, write, write_ply
+
+if TYPE_CHECKING:
+    from sdfsim.shape.fit import Recipe
+
+WEIGHTS_FILE, MESH_FILE, RECORD_FILE = "shape.safetensors", "mesh.ply", "shape.json"
 
 
 @dataclass(frozen=True)
@@ -35,3 +52,274 @@ class Shape:
     inertia: np.ndarray
     certificate: dict = field(default_factory=dict)
     source: dict = field(default_factory=dict)
+
+    def save(self, folder: str | Path) -> Path:
+        """Write the shape folder: shape.safetensors, mesh.ply and, last, shape.json.
+
+        Each file appears complete or not at all, and shape.json only beside the files it describes.
+
+        Returns:
+            the folder.
+
+        Raises:
+            SdfsimError: the folder cannot be written, or the SDF is of a kind that has no file format.
+        """
+        folder = Path(folder)
+        tensors, description = sdf_to_file(self.sdf)
+        tensors["nodes"] = torch.from_numpy(np.ascontiguousarray(self.nodes, dtype=np.float64))
+        tensors["bounds"] = torch.from_numpy(np.ascontiguousarray(self.sdf.bounds, dtype=np.float64))
+        record = {
+            "version": FORMAT_VERSION,
+            "name": self.name,
+            "units": "m",
+            "scale": description.get("scale", 1.0),
+            "sdf": description,
+            "volume": self.volume,
+            "com": self.com.tolist(),
+            "inertia": self.inertia.tolist(),
+            "certificate": self.certificate,
+            "source": self.source,
+        }
+        from safetensors.torch import save as to_bytes
+
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / RECORD_FILE).unlink(missing_ok=True)
+            write(folder / WEIGHTS_FILE, to_bytes(tensors))
+            write(folder / MESH_FILE, write_ply(self.mesh))
+            write(folder / RECORD_FILE, (json.dumps(record, indent=1) + "\n").encode())
+        except OSError as error:
+            raise SdfsimError(f"{folder}: cannot write the shape ({error.strerror or error})") from error
+        return folder
+
+
+def load_shape(folder: str | Path) -> Shape:
+    """Read a folder written by `Shape.save` (or by `fit` or `reconstruct`).
+
+    Raises:
+        SdfsimError: a file is missing, cut short, of another version, or holds what it should not.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise SdfsimError(f"{folder}: no such shape folder")
+    for name in (RECORD_FILE, WEIGHTS_FILE, MESH_FILE):
+        if not (folder / name).is_file():
+            raise SdfsimError(f"{folder}: {name} is missing, so this is no complete shape folder")
+    record = read_record(folder / RECORD_FILE)
+    from safetensors import SafetensorError
+    from safetensors.torch import load as from_bytes
+
+    try:
+        tensors = from_bytes((folder / WEIGHTS_FILE).read_bytes())
+    except (SafetensorError, OSError) as error:
+        raise SdfsimError(f"{folder / WEIGHTS_FILE}: damaged or cut short ({error})") from error
+    for name, tensor in tensors.items():
+        if name != "bounds" and not torch.isfinite(tensor).all():
+            raise SdfsimError(f"{folder / WEIGHTS_FILE}: {name} is not finite")
+    mesh = read_mesh(folder / MESH_FILE)
+    try:
+        return Shape(
+            name=str(record["name"]),
+            mesh=mesh,
+            sdf=sdf_from_file(record["sdf"], tensors),
+            nodes=tensors["nodes"].numpy().reshape(-1, 3),
+            volume=float(record["volume"]),
+            com=np.array(record["com"], dtype=np.float64).reshape(3),
+            inertia=np.array(record["inertia"], dtype=np.float64).reshape(3, 3),
+            certificate=dict(record["certificate"]),
+            source=dict(record["source"]),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+        raise SdfsimError(f"{folder}: not a valid shape folder ({reason})") from error
+
+
+def shape_from_mesh(
+    path: str | Path,
+    cache_dir: str | Path | None = None,
+    *,
+    name: str | None = None,
+    units: float = 1.0,
+    recipe: Recipe = "default",
+    on_progress: Callable[[float, str], None] | None = None,
+) -> Shape:
+    """The shape of a mesh file: fitted on first use, then taken from a cache keyed by content.
+
+    Args:
+        path: a mesh file.
+        cache_dir: where fitted shapes are kept; by default `sdfsim/shapes` in the user's cache folder.
+        name: by default the file's.
+        units: metres per unit of the file.
+        recipe: of the fit; part of the key.
+        on_progress: called with (fraction done, message) while fitting.
+
+    Raises:
+        SdfsimError: the mesh cannot be used, or the cache cannot be written.
+    """
+    path = Path(path)
+    mesh = load_mesh(path)
+    key = hashlib.sha256(path.read_bytes()).hexdigest()
+    shape = _cached(mesh, key, path.stem, cache_dir, recipe, on_progress)
+    shape = replace(shape, name=name or path.stem, source={**shape.source, "file": path.name, "sha256": key})
+    return scaled(shape, units)
+
+
+def shape_from_primitive(
+    kind: str,
+    size: float = 1.0,
+    cache_dir: str | Path | None = None,
+    *,
+    name: str | None = None,
+    on_progress: Callable[[float, str], None] | None = None,
+) -> Shape:
+    """The shape of a procedural mesh of `primitives.PRIMITIVES`, fitted on first use and cached.
+
+    Args:
+        kind: name in `PRIMITIVES`.
+        size: its largest extent, m.
+        cache_dir, name, on_progress: as for `shape_from_mesh`.
+
+    Raises:
+        SdfsimError: no such primitive.
+    """
+    from sdfsim.shape.primitives import PRIMITIVES
+
+    if kind not in PRIMITIVES:
+        raise SdfsimError(f"no primitive called {kind!r}", "there are " + ", ".join(PRIMITIVES))
+    mesh = PRIMITIVES[kind]()
+    unit = Mesh(mesh.vertices / float(np.ptp(mesh.vertices, axis=0).max()), mesh.faces)
+    key = hashlib.sha256(unit.vertices.round(9).tobytes() + unit.faces.tobytes()).hexdigest()
+    shape = _cached(unit, key, kind, cache_dir, "default", on_progress)
+    return scaled(replace(shape, name=name or kind, source={**shape.source, "primitive": kind}), size)
+
+
+def _cached(
+    mesh: Mesh,
+    key: str,
+    label: str,
+    cache_dir: str | Path | None,
+    recipe: Recipe,
+    on_progress: Callable[[float, str], None] | None,
+) -> Shape:
+    # Only here is anything fitted: reading a shape folder needs no open3d and no optimiser.
+    from sdfsim.shape.fit import FIT_VERSION, fit_mesh
+
+    if cache_dir is None:
+        cache_dir = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sdfsim" / "shapes"
+    folder = Path(cache_dir) / f"{key[:24]}-{recipe}-{FIT_VERSION}.{FORMAT_VERSION}"
+    if folder.is_dir():
+        try:
+            return load_shape(folder)
+        except SdfsimError:
+            shutil.rmtree(folder, ignore_errors=True)  # a damaged entry is only a cache miss
+    shape = fit_mesh(mesh, name=label, recipe=recipe, on_progress=on_progress)
+    # A folder of its own first, so that processes fitting the same mesh never see each other's half.
+    partial = folder.with_name(f"{folder.name}.{os.getpid()}.partial")
+    shape.save(partial)
+    try:
+        partial.rename(folder)
+    except OSError:
+        shutil.rmtree(partial, ignore_errors=True)  # another process was first: its entry is as good
+    return shape
+
+
+def scaled(shape: Shape, factor: float) -> Shape:
+    """The same shape `factor` times as large, about its own origin.
+
+    Raises:
+        SdfsimError: the factor is not a positive finite number.
+    """
+    if not (np.isfinite(factor) and factor > 0):
+        raise SdfsimError(f"{shape.name}: scale must be > 0 (got {factor})")
+    if factor == 1.0:
+        return shape
+    sdf = shape.sdf
+    if isinstance(sdf, MlpSdf):
+        frame = Frame(sdf.frame.centre * factor, sdf.frame.scale * factor)
+        sdf = replace(sdf, frame=frame, bounds=sdf.bounds * factor)
+    elif isinstance(sdf, SphereSdf):
+        sdf = SphereSdf(sdf.radius * factor)
+    elif isinstance(sdf, BoxSdf):
+        x, y, z = sdf.half
+        sdf = BoxSdf((x * factor, y * factor, z * factor))
+    elif not isinstance(sdf, PlaneSdf):
+        raise SdfsimError(f"{shape.name}: an SDF of type {type(sdf).__name__} cannot be scaled")
+    return replace(
+        shape,
+        mesh=replace(shape.mesh, vertices=shape.mesh.vertices * factor),
+        sdf=sdf,
+        nodes=shape.nodes * factor,
+        volume=shape.volume * factor**3,
+        com=shape.com * factor,
+        inertia=shape.inertia * factor**5,
+    )
+
+
+def analytic_shape(
+    kind: Literal["plane", "sphere", "box"],
+    *,
+    radius: float | None = None,
+    size: Sequence[float] | np.ndarray | None = None,
+    name: str | None = None,
+) -> Shape:
+    """A shape with an exact SDF, about the origin.
+
+    Args:
+        kind: "plane" (z = 0, +z outside, infinite), "sphere" or "box".
+        radius: of the sphere, m.
+        size: (x, y, z) full extents of the box, m.
+        name: by default the kind.
+
+    Returns:
+        Shape with exact mass properties (per unit density; those of the plane are 0), a mesh for display (of the
+        plane: a 20 m square) and nodes: sphere 128 spread as a Fibonacci spiral, box 8 corners and points
+        along edges and on faces, plane none.
+
+    Raises:
+        SdfsimError: unknown kind, or a size that is missing or not positive.
+    """
+    from sdfsim.shape import primitives
+
+    source = {"kind": kind}
+    if kind == "plane":
+        square = np.array([[-10, -10, 0], [10, -10, 0], [10, 10, 0], [-10, 10, 0]], dtype=np.float64)
+        mesh = Mesh(square, np.array([[0, 1, 2], [0, 2, 3]]))
+        return Shape(
+            name or kind, mesh, PlaneSdf(), np.zeros((0, 3)), 0.0, np.zeros(3), np.zeros((3, 3)), source=source
+        )
+    if kind == "sphere":
+        if radius is None:
+            raise SdfsimError("a sphere needs a radius")
+        sdf = SphereSdf(float(radius))
+        volume = 4.0 / 3.0 * np.pi * sdf.radius**3
+        inertia = 0.4 * volume * sdf.radius**2 * np.eye(3)
+        mesh, nodes = primitives.sphere(sdf.radius), _sphere_nodes(sdf.radius, 128)
+    elif kind == "box":
+        if size is None or len(size) != 3:
+            raise SdfsimError("a box needs its size along x, y and z")
+        x, y, z = (0.5 * float(value) for value in size)
+        sdf = BoxSdf((x, y, z))
+        volume = 8.0 * x * y * z
+        inertia = volume / 3.0 * np.diag([y * y + z * z, z * z + x * x, x * x + y * y])
+        mesh, nodes = primitives.box((2 * x, 2 * y, 2 * z)), _box_nodes(np.array([x, y, z]))
+    else:
+        raise SdfsimError(f"unknown analytic shape {kind!r}", "use plane, sphere or box")
+    return Shape(name or kind, mesh, sdf, nodes, float(volume), np.zeros(3), inertia, source=source)
+
+
+def _sphere_nodes(radius: float, count: int) -> np.ndarray:
+    """Fibonacci spiral on the sphere: [count, 3] m."""
+    number = np.arange(count) + 0.5
+    height = 1.0 - 2.0 * number / count
+    turn = np.pi * (1.0 + 5.0**0.5) * number
+    ring = np.sqrt(1.0 - height**2)
+    return radius * np.stack([ring * np.cos(turn), ring * np.sin(turn), height], axis=1)
+
+
+def _box_nodes(half: np.ndarray) -> np.ndarray:
+    """Corners, edges and faces of a 5 x 5 x 5 lattice on the box: [98, 3] m, the corners first."""
+    axis = np.linspace(-1.0, 1.0, 5)
+    lattice = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    sides = (np.abs(lattice) == 1.0).sum(1)
+    order = np.argsort(-sides, kind="stable")
+    return (lattice * half)[order[sides[order] > 0]]

@@ -3,8 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+
+from sdfsim.errors import SdfsimError
+from sdfsim.shape.sdf import Sdf
+
+MESH_SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
 
 
 @dataclass(frozen=True)
@@ -20,3 +27,264 @@ class Mesh:
     vertices: np.ndarray
     faces: np.ndarray
     colors: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The normalised frame of a shape: `normalised = (metres - centre) / scale`, the solid within [-0.5, 0.5].
+
+    Attributes:
+        centre: [3] float64 m, centre of the bounding box.
+        scale: m, its largest extent.
+    """
+
+    centre: np.ndarray
+    scale: float
+
+    def inward(self, points: np.ndarray) -> np.ndarray:
+        """Metres -> normalised, [P, 3]."""
+        return (points - self.centre) / self.scale
+
+    def outward(self, points: np.ndarray) -> np.ndarray:
+        """Normalised -> metres, [P, 3]."""
+        return points * self.scale + self.centre
+
+
+def normal_frame(bounds: np.ndarray) -> Frame:
+    """The frame in which a box `bounds` [2, 3] m becomes [-0.5, 0.5] along its largest extent.
+
+    Raises:
+        SdfsimError: the box has no extent, or is not finite.
+    """
+    extent = float((bounds[1] - bounds[0]).max())
+    if not np.isfinite(extent) or extent <= 0:
+        raise SdfsimError("the shape has no extent", "all of its vertices are at one point")
+    return Frame(centre=bounds.mean(0), scale=extent)
+
+
+def load_mesh(path: str | Path) -> Mesh:
+    """Read a triangle mesh (obj, ply, glb, gltf, stl, off), cleaned by `clean`.
+
+    Raises:
+        SdfsimError: missing file, not a mesh, no faces, vertices that are not finite, or indices out of range.
+    """
+    import trimesh
+
+    path = Path(path)
+    if not path.is_file():
+        raise SdfsimError(f"{path}: no such mesh file")
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise SdfsimError(f"{path}: not a mesh file ({path.suffix or 'no suffix'})", "use " + " ".join(MESH_SUFFIXES))
+    try:
+        loaded: Any = trimesh.load(path, force="mesh", process=False)
+        vertices = np.array(loaded.vertices, dtype=np.float64).reshape(-1, 3)
+        faces = np.array(getattr(loaded, "faces", []), dtype=np.int64).reshape(-1, 3)
+        colors = _vertex_colors(loaded, len(vertices))
+    except Exception as error:  # the readers raise whatever their format made them stumble over
+        reason = str(error).strip().splitlines()
+        raise SdfsimError(f"{path}: not a readable mesh ({reason[0] if reason else type(error).__name__})") from error
+    return clean(Mesh(vertices, faces, colors), name=str(path))
+
+
+def _vertex_colors(loaded: Any, count: int) -> np.ndarray | None:
+    """[V, 3] uint8 when the file carries colours; a texture is looked up at each vertex."""
+    visual: Any = getattr(loaded, "visual", None)
+    kind = getattr(visual, "kind", None)
+    if kind == "texture":
+        material = getattr(visual, "material", None)
+        image = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
+        if image is None or getattr(visual, "uv", None) is None:
+            return None
+        visual = visual.to_color()
+    elif kind not in ("vertex", "face"):
+        return None
+    colors = np.asarray(visual.vertex_colors)
+    return colors[:, :3].astype(np.uint8) if colors.shape[:1] == (count,) else None
+
+
+def clean(mesh: Mesh, *, name: str = "mesh") -> Mesh:
+    """Merge equal vertices, drop degenerate and duplicate faces and unused vertices, turn a closed mesh right side out.
+
+    Args:
+        mesh: metres.
+        name: how messages call it.
+
+    Raises:
+        SdfsimError: no faces (before or after), vertices that are not finite, or indices out of range.
+    """
+    vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
+    if len(faces) == 0:
+        raise SdfsimError(f"{name}: mesh has no faces", "a point cloud is not enough: export triangles")
+    if not np.isfinite(vertices).all():
+        bad = int((~np.isfinite(vertices)).any(1).sum())
+        raise SdfsimError(f"{name}: {bad} of {len(vertices)} vertices are not finite")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise SdfsimError(f"{name}: face indices out of range (0 to {len(vertices) - 1} allowed)")
+
+    extent = float(np.ptp(vertices[np.unique(faces)], axis=0).max())
+    # Files round to about seven digits: what agrees to a millionth of the size is one vertex.
+    keys = np.round((vertices - vertices.min(0)) / max(1e-6 * extent, 1e-300)).astype(np.int64)
+    _, first, label = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    faces = label.reshape(-1)[faces]
+    vertices = vertices[first]
+    colors = None if mesh.colors is None else mesh.colors[first]
+
+    distinct = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    faces = faces[distinct]
+    if len(faces):
+        _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+        faces = faces[np.sort(first)]
+    if len(faces) == 0:
+        raise SdfsimError(f"{name}: mesh has no faces with an area")
+    used, label = np.unique(faces, return_inverse=True)
+    result = Mesh(vertices[used], label.reshape(-1, 3), None if colors is None else colors[used])
+    if is_closed(result) and signed_volume(result) < 0:
+        result = Mesh(result.vertices, result.faces[:, ::-1].copy(), result.colors)
+    return result
+
+
+def is_closed(mesh: Mesh) -> bool:
+    """Whether every directed edge has exactly one opposite: watertight, with one consistent winding."""
+    edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
+    forward = edges[:, 0] * len(mesh.vertices) + edges[:, 1]
+    backward = edges[:, 1] * len(mesh.vertices) + edges[:, 0]
+    forward.sort()
+    backward.sort()
+    return bool(np.array_equal(forward, backward))
+
+
+def signed_volume(mesh: Mesh) -> float:
+    """Volume enclosed, m^3; negative when the faces are wound inwards. Meaningful for closed meshes only."""
+    corners = mesh.vertices[mesh.faces] - mesh.vertices.mean(0)
+    return float(np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6.0)
+
+
+def mass_properties(mesh: Mesh) -> tuple[float, np.ndarray, np.ndarray]:
+    """Exact volume integrals of a closed mesh, as a sum over signed tetrahedra.
+
+    Returns:
+        volume m^3, centre of mass [3] m, and inertia [3, 3] m^5 (per unit density) about the centre of mass.
+
+    Raises:
+        SdfsimError: the volume cannot be trusted: the mesh is open, or encloses nothing.
+            `mass_properties_of_sdf` serves those.
+    """
+    if not is_closed(mesh):
+        raise SdfsimError("mesh is not closed, so it has no exact volume")
+    # Moments about the vertices' mean: far from the origin the products of large coordinates would cancel.
+    shift = mesh.vertices.mean(0)
+    corners = mesh.vertices[mesh.faces] - shift
+    six = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+    volume = float(six.sum() / 6.0)
+    extent = float(np.ptp(corners.reshape(-1, 3), axis=0).max())
+    if volume <= 1e-9 * extent**3:
+        raise SdfsimError("mesh encloses no volume")
+    total = corners.sum(1)
+    com = np.einsum("f,fi->i", six, total) / (24.0 * volume)
+    # Integral of x x^T over a tetrahedron with one corner at the origin.
+    second = np.einsum("f,fi,fj->ij", six, total, total) + np.einsum("f,fki,fkj->ij", six, corners, corners)
+    second = second / 120.0 - volume * np.outer(com, com)
+    return volume, com + shift, np.trace(second) * np.eye(3) - second
+
+
+def mass_properties_of_sdf(sdf: Sdf, *, cells: int = 64) -> tuple[float, np.ndarray, np.ndarray]:
+    """The integrals of `mass_properties`, taken on a grid over the inside of any bounded SDF.
+
+    A cell at distance f from the surface counts with the fraction 0.5 - f / cell (clamped), so the error is of
+    second order in the cell.
+
+    Args:
+        sdf: bounded; metres.
+        cells: along the longest side of its bounds.
+
+    Raises:
+        SdfsimError: the SDF is unbounded, or negative nowhere.
+    """
+    low, high = np.asarray(sdf.bounds, dtype=np.float64)
+    if not np.isfinite([low, high]).all():
+        raise SdfsimError("an unbounded shape has no mass properties")
+    cell = float((high - low).max()) / cells
+    counts = np.ceil((high - low) / cell).astype(int) + 2
+    start = 0.5 * (low + high) - 0.5 * cell * (counts - 1)
+    axes = [start[axis] + cell * np.arange(counts[axis]) for axis in range(3)]
+    volume, first, second = 0.0, np.zeros(3), np.zeros((3, 3))
+    for x in axes[0]:
+        points = np.stack(np.meshgrid([x], axes[1], axes[2], indexing="ij"), axis=-1).reshape(-1, 3)
+        distance = np.asarray(sdf(points)[0])
+        weight = np.clip(0.5 - distance / cell, 0.0, 1.0) * cell**3
+        offset = points - start
+        volume += float(weight.sum())
+        first += weight @ offset
+        second += np.einsum("p,pi,pj->ij", weight, offset, offset)
+    if volume <= 0:
+        raise SdfsimError("the shape encloses no volume")
+    com = first / volume
+    # A filled cell is a small cube, not a point: its own second moment.
+    second += np.eye(3) * volume * cell**2 / 12.0 - volume * np.outer(com, com)
+    return volume, com + start, np.trace(second) * np.eye(3) - second
+
+
+def load_pieces(path: str | Path) -> list[Mesh]:
+    """The convex pieces of a collision geometry in Wavefront OBJ: the convex hull of each `o` group's vertices.
+
+    Raises:
+        SdfsimError: missing or unreadable file, no pieces, or a piece that is flat.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise SdfsimError(f"{path}: no such mesh file")
+    groups: list[list[list[float]]] = [[]]
+    try:
+        for line in path.read_text(encoding="utf-8").splitlines():
+            key, _, rest = line.strip().partition(" ")
+            if key == "o":
+                groups.append([])
+            elif key == "v":
+                groups[-1].append([float(number) for number in rest.split()[:3]])
+    except (UnicodeDecodeError, ValueError) as error:
+        raise SdfsimError(f"{path}: not a readable OBJ file ({error})") from error
+    pieces = []
+    for number, group in enumerate(group for group in groups if group):
+        try:
+            pieces.append(convex_hull(np.array(group)))
+        except (SdfsimError, ValueError) as error:
+            raise SdfsimError(f"{path}: piece {number}: {error}") from error
+    if not pieces:
+        raise SdfsimError(f"{path}: no vertices, so no convex pieces")
+    return pieces
+
+
+def convex_hull(points: np.ndarray) -> Mesh:
+    """Convex hull of `points` [P, 3] m, outward faces.
+
+    Raises:
+        SdfsimError: fewer than four points, not finite, or all in one plane.
+    """
+    from scipy.spatial import ConvexHull, QhullError
+
+    if len(points) < 4 or not np.isfinite(points).all():
+        raise SdfsimError("a convex piece needs four finite points")
+    try:
+        hull = ConvexHull(points)
+    except QhullError as error:
+        raise SdfsimError("a convex piece is flat") from error
+    faces = hull.simplices.astype(np.int64)
+    corners = points[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    inward = np.einsum("fi,fi->f", normal, hull.equations[:, :3]) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    used, label = np.unique(faces, return_inverse=True)
+    return Mesh(np.asarray(points, dtype=np.float64)[used], label.reshape(-1, 3))
+
+
+def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Points spread evenly by area: [P, 3] m, with the unit normals [P, 3] of their faces."""
+    corners = mesh.vertices[mesh.faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(normal, axis=1)
+    face = rng.choice(len(area), size=count, p=area / area.sum())
+    u, v = rng.random((2, count, 1))
+    flip = u + v > 1
+    u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
+    first, second, third = corners[face, 0], corners[face, 1], corners[face, 2]
+    return first + u * (second - first) + v * (third - first), normal[face] / area[face, None]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -16,12 +18,39 @@ class Sdf(Protocol):
         bounds: [2, 3] float64 m, the axis-aligned box that holds the solid (infinite for a plane).
     """
 
-    bounds: np.ndarray
+    @property
+    def bounds(self) -> np.ndarray: ...
 
-    def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def __call__(self, points: Any, /) -> tuple[Any, Any]:
         """Distance [P] m and gradient [P, 3] (unit length where the SDF is exact) at `points` [P, 3] m.
 
         The result has the dtype and device of `points`. Never NaN: where the gradient is undefined
-        (medial axis, an edge) any valid one-sided gradient is returned.
+        (medial axis, an edge) any valid one-sided gradient is returned. The implementations of this
+        package also take a NumPy array and then return NumPy arrays.
         """
         ...
+
+
+def accepts_numpy(call: Callable[..., tuple[torch.Tensor, torch.Tensor]]) -> Callable[..., tuple[Any, Any]]:
+    """Let an Sdf's `__call__` also take a NumPy array [P, 3], and then answer in NumPy of the same dtype.
+
+    An object with a `device` attribute is evaluated there; the answer comes back to the host.
+
+    Raises:
+        ValueError: (from the wrapped call) `points` is not [P, 3].
+    """
+
+    @wraps(call)
+    def wrapper(self: Any, points: Any) -> tuple[Any, Any]:
+        if len(points.shape) != 2 or points.shape[1] != 3:
+            raise ValueError(f"points must be [P, 3], got {list(points.shape)}")
+        if isinstance(points, torch.Tensor):
+            return call(self, points)
+        array = np.asarray(points)
+        if not np.issubdtype(array.dtype, np.floating):
+            array = array.astype(np.float64)
+        tensor = torch.from_numpy(np.ascontiguousarray(array)).to(getattr(self, "device", "cpu"))
+        distance, gradient = call(self, tensor)
+        return distance.cpu().numpy(), gradient.cpu().numpy()
+
+    return wrapper

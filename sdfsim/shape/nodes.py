@@ -1,0 +1,116 @@
+"""Surface nodes: the points of a body that carry contact, sampled from its SDF alone."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sdfsim.errors import SdfsimError
+from sdfsim.shape.mesh import normal_frame
+from sdfsim.shape.sdf import Sdf
+
+# The paper's sampling (section 3 and appendix): a grid over this half extent of the normalised frame, projected onto
+# the surface, points that did not reach it dropped, one point kept per voxel.
+GRID_HALF = 0.7
+VOXEL = 0.025
+REACHED = 0.005
+PROJECTIONS = 3
+DEFAULT_GRID = 24
+DEFAULT_COUNT = 128
+
+
+def sample_nodes(sdf: Sdf, *, grid: int = DEFAULT_GRID, voxel: float = VOXEL) -> np.ndarray:
+    """Nodes on the zero level of an SDF, as in the paper: grid, project, filter, voxel downsample. Deterministic.
+
+    Lengths are relative to the largest extent of `sdf.bounds` (the frame in which the solid is within [-0.5, 0.5]).
+
+    Args:
+        sdf: bounded.
+        grid: points along each side of the sampling cube [-0.7, 0.7]^3.
+        voxel: edge of the downsampling voxels, normalised; the point nearest a voxel's middle stays.
+
+    Returns:
+        [K, 3] float64 m.
+
+    Raises:
+        SdfsimError: the SDF is unbounded, or no point reached its surface.
+    """
+    frame = normal_frame(sdf.bounds)
+    axis = np.linspace(-GRID_HALF, GRID_HALF, grid)
+    points = frame.outward(np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3))
+    points = project(sdf, points)
+    distance = np.asarray(sdf(points)[0])
+    reached = np.abs(distance) <= REACHED * frame.scale
+    # A network may have a stray zero level in the corners of its box: nothing outside the solid's bounds is surface.
+    margin = REACHED * frame.scale
+    reached &= ((points >= sdf.bounds[0] - margin) & (points <= sdf.bounds[1] + margin)).all(1)
+    points = points[reached]
+    if len(points) == 0:
+        raise SdfsimError("no surface nodes: the SDF has no zero level within its bounds")
+    return frame.outward(_one_per_voxel(frame.inward(points), voxel))
+
+
+def project(sdf: Sdf, points: np.ndarray) -> np.ndarray:
+    """Move points [P, 3] m to the zero level by a few steps x - f grad f / |grad f|^2."""
+    for _ in range(PROJECTIONS):
+        distance, gradient = sdf(points)
+        # A step never gets longer than twice the distance: slopes below 0.7 are errors of a fit, not geometry.
+        squared = np.maximum(np.square(gradient).sum(1), 0.5)
+        points = points - (np.asarray(distance) / squared)[:, None] * np.asarray(gradient)
+    return points
+
+
+def _one_per_voxel(points: np.ndarray, voxel: float) -> np.ndarray:
+    """The point nearest the middle of each occupied voxel; an average would leave the surface where it bends."""
+    # Voxels centred on the origin: the faces of a normalised box at 0.5 then run through their middles.
+    cell = np.round(points / voxel).astype(np.int64)
+    off_centre = np.square(points - cell * voxel).sum(1)
+    order = np.lexsort((off_centre, cell[:, 2], cell[:, 1], cell[:, 0]))
+    ordered = cell[order]
+    first = np.ones(len(order), dtype=bool)
+    first[1:] = (ordered[1:] != ordered[:-1]).any(1)
+    return points[order[first]]
+
+
+def thin(points: np.ndarray, count: int, *, keep: np.ndarray | None = None) -> np.ndarray:
+    """At most `count` points: all of `keep`, then the farthest remaining point again and again.
+
+    Args:
+        points: [P, 3] candidates.
+        count: how many points to return at most.
+        keep: [Q, 3] points that come first; when they alone exceed `count` they are thinned themselves.
+
+    Returns:
+        [min(count, P + Q), 3], `keep` first. Deterministic: it starts (without `keep`) at the point farthest
+        from the centroid.
+    """
+    if keep is not None and len(keep) >= count:
+        return thin(keep, count) if len(keep) > count else keep.copy()
+    chosen: list[np.ndarray] = [] if keep is None else list(keep)
+    nearest = np.full(len(points), np.inf)
+    for point in chosen:
+        np.minimum(nearest, np.square(points - point).sum(1), out=nearest)
+    if not chosen and len(points):
+        nearest = np.square(points - points.mean(0)).sum(1)
+        first = points[int(nearest.argmax())]
+        chosen.append(first)
+        nearest = np.square(points - first).sum(1)
+    while len(chosen) < count and len(points):
+        far = int(nearest.argmax())
+        if nearest[far] <= 0:
+            break
+        chosen.append(points[far])
+        np.minimum(nearest, np.square(points - points[far]).sum(1), out=nearest)
+    return np.array(chosen).reshape(-1, 3)
+
+
+def hull_nodes(vertices: np.ndarray, count: int) -> np.ndarray:
+    """At most `count` of a polyhedral body's own vertices [V, 3] m.
+
+    The vertices of the convex hull of all come first, for only they can touch a flat floor; the others follow
+    farthest first.
+    """
+    from scipy.spatial import ConvexHull
+
+    outer = np.sort(ConvexHull(vertices).vertices)
+    rest = np.delete(vertices, outer, axis=0)
+    return thin(rest, count, keep=vertices[outer])

@@ -1,0 +1,305 @@
+"""Procedural watertight meshes, metres, centred on their own origin, and the convex pieces of those that have them.
+
+Every function has defaults that give a largest extent near 1 m; faces are counter-clockwise seen from outside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from sdfsim.errors import SdfsimError
+from sdfsim.shape.mesh import Mesh, clean, convex_hull
+
+
+def box(size: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Mesh:
+    """A box with full extents `size` m: 8 vertices, 12 faces."""
+    corners = np.stack(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5], indexing="ij"), axis=-1).reshape(-1, 3)
+    quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    return clean(Mesh(corners * _positive(*size), _quads(quads)), name="box")
+
+
+def sphere(radius: float = 0.5, subdivisions: int = 3) -> Mesh:
+    """An icosphere: 20 * 4^subdivisions faces, vertices on the sphere of `radius` m."""
+    _positive(radius)
+    golden = (1.0 + 5.0**0.5) / 2.0
+    vertices = np.array([[0, a, b * golden] for a in (-1, 1) for b in (-1, 1)], dtype=np.float64)
+    solid = convex_hull(np.concatenate([np.roll(vertices, turn, axis=1) for turn in range(3)]))
+    corners = solid.vertices[solid.faces]
+    for _ in range(subdivisions):
+        a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+        ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+        parts = ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
+        corners = np.concatenate([np.stack(part, axis=1) for part in parts])
+        corners /= np.linalg.norm(corners, axis=2, keepdims=True)
+    corners *= radius / np.linalg.norm(corners, axis=2, keepdims=True)
+    return clean(Mesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3)), name="sphere")
+
+
+def cylinder(radius: float = 0.5, height: float = 1.0, segments: int = 64) -> Mesh:
+    """A cylinder along z, its middle at the origin."""
+    _positive(radius, height)
+    profile = np.array([[0, -height / 2], [radius, -height / 2], [radius, height / 2], [0, height / 2]])
+    return _revolve(profile, segments, "cylinder")
+
+
+def cone(radius: float = 0.5, height: float = 1.0, segments: int = 64) -> Mesh:
+    """A cone along z, apex up, the middle of its height at the origin."""
+    _positive(radius, height)
+    return _revolve(np.array([[0, -height / 2], [radius, -height / 2], [0, height / 2]]), segments, "cone")
+
+
+def torus(major: float = 0.35, minor: float = 0.15, segments: int = 64, sides: int = 32) -> Mesh:
+    """A ring about z: circles of radius `minor` m around a circle of radius `major` m."""
+    return _tube(_torus_rings(major, minor, segments, sides), "torus")
+
+
+def gear(radius: float = 0.5, tooth: float = 0.1, thickness: float = 0.2, bore: float = 0.12, teeth: int = 12) -> Mesh:
+    """A spur gear about z.
+
+    Args:
+        radius: to the tips, m.
+        tooth: height of a tooth, m.
+        thickness: along z, m.
+        bore: radius of the hole, m.
+        teeth: how many.
+    """
+    outer, inner = _gear_outline(radius, tooth, bore, teeth)
+    count = len(outer)
+    layers = [np.column_stack([outline, np.full(count, z)]) for z in _faces_at(thickness) for outline in (outer, inner)]
+    this, following = np.arange(count), (np.arange(count) + 1) % count
+    low_out, low_in, high_out, high_in = (count * layer for layer in range(4))
+    quads = [
+        np.stack([a + this, a + following, b + following, b + this], axis=1)
+        for a, b in ((low_out, high_out), (high_out, high_in), (high_in, low_in), (low_in, low_out))
+    ]
+    return clean(Mesh(np.concatenate(layers), _quads(np.concatenate(quads))), name="gear")
+
+
+def torus_knot(
+    major: float = 0.3, wrap: float = 0.13, tube: float = 0.06, turns: tuple[int, int] = (2, 3), segments: int = 192
+) -> Mesh:
+    """A tube along a torus knot.
+
+    Args:
+        major: radius of the torus the curve lies on, m.
+        wrap: radius of that torus' section, m.
+        tube: radius of the tube, m.
+        turns: around the axis, and around the section; without common divisor.
+        segments: along the curve.
+    """
+    return _tube(_knot_rings(major, wrap, tube, turns, segments, 24), "torus_knot")
+
+
+def sponge(size: float = 1.0, holes: int = 2) -> Mesh:
+    """A cube with `holes` x `holes` square channels through it along each axis, as wide as the walls between them."""
+    solid = _sponge_cells(holes)
+    _positive(size)
+    cells = len(solid)
+    padded = np.pad(solid, 1)
+    corners = []
+    for axis in range(3):
+        for step in (-1, 1):
+            bare = padded & ~np.roll(padded, -step, axis=axis)
+            base = (np.argwhere(bare) - 1).astype(np.float64)
+            first, second = np.eye(3)[(axis + 1) % 3], np.eye(3)[(axis + 2) % 3]
+            base += np.eye(3)[axis] * (step > 0)
+            quad = [base, base + first, base + first + second, base + second]
+            corners.append(np.stack(quad if step > 0 else quad[::-1], axis=1))
+    vertices = np.concatenate(corners).reshape(-1, 3) / cells - 0.5
+    return clean(Mesh(vertices * size, _quads(np.arange(len(vertices)).reshape(-1, 4))), name="sponge")
+
+
+def bowl(radius: float = 0.5, wall: float = 0.06, segments: int = 64, bands: int = 16) -> Mesh:
+    """Half of a thick spherical shell, open at the top (+z); the centre of the sphere is the origin.
+
+    Args:
+        radius: outer, m.
+        wall: thickness, m, less than the radius.
+        segments: around.
+        bands: from the bottom to the rim.
+    """
+    outer, inner = _bowl_profiles(radius, wall, bands)
+    return _revolve(np.concatenate([outer, inner[::-1]]), segments, "bowl")
+
+
+def shoe(length: float = 1.0, cells: int = 72) -> Mesh:
+    """A clog: a long rounded body with a flat sole and a deep opening over the heel, toe along +x.
+
+    Args:
+        length: m.
+        cells: of the grid it is cut from, along the length.
+    """
+    from skimage.measure import marching_cubes
+
+    _positive(length)
+    axis = np.linspace(-0.58, 0.58, cells)
+    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
+    # The body thins towards the toe, so do its cavity and its height.
+    reach = np.clip((x + 0.3) / 0.6, 0.0, 1.0)
+    thickness = 0.2 - 0.07 * reach
+    along = np.maximum(np.abs(x) - 0.3, 0.0)
+    body = np.sqrt(along**2 + y**2 + (1.15 * z) ** 2) - thickness
+    body = np.maximum(body, -0.12 - z)
+    cavity = np.sqrt(np.maximum(np.abs(x + 0.02) - 0.26, 0.0) ** 2 + y**2 + (1.15 * (z - 0.02)) ** 2) - thickness + 0.06
+    cavity = np.maximum(cavity, -0.06 - z)
+    opening = np.sqrt(np.maximum(np.abs(x + 0.22) - 0.08, 0.0) ** 2 + y**2) - 0.12
+    opening = np.maximum(opening, -z)
+    field = np.maximum(body, -np.minimum(cavity, opening))
+    vertices, faces, _, _ = marching_cubes(field, 0.0, spacing=(axis[1] - axis[0],) * 3)
+    vertices = vertices.astype(np.float64) + axis[0]
+    return clean(Mesh(vertices * (length / np.ptp(vertices[:, 0])), faces.astype(np.int64)), name="shoe")
+
+
+PRIMITIVES: dict[str, Callable[..., Mesh]] = {
+    "box": box,
+    "sphere": sphere,
+    "cylinder": cylinder,
+    "cone": cone,
+    "torus": torus,
+    "gear": gear,
+    "torus_knot": torus_knot,
+    "sponge": sponge,
+    "bowl": bowl,
+    "shoe": shoe,
+}
+
+
+def convex_pieces(kind: str) -> list[Mesh]:
+    """Convex pieces whose union is (close to) the default mesh of a primitive, for engines that need them.
+
+    Args:
+        kind: a name in `PRIMITIVES` other than "shoe".
+
+    Raises:
+        SdfsimError: there is no such primitive, or no simple decomposition of it.
+    """
+    if kind in ("box", "sphere", "cylinder", "cone"):
+        return [convex_hull(PRIMITIVES[kind]().vertices)]
+    if kind == "torus":
+        return _ring_hulls(_torus_rings(0.35, 0.15, 32, 16))
+    if kind == "torus_knot":
+        return _ring_hulls(_knot_rings(0.3, 0.13, 0.06, (2, 3), 64, 12))
+    if kind == "gear":
+        outer, inner = _gear_outline(0.5, 0.1, 0.12, 12)
+        outline = np.stack([outer, np.roll(outer, -1, axis=0), np.roll(inner, -1, axis=0), inner], axis=1)
+        return [
+            convex_hull(np.concatenate([np.column_stack([sector, np.full(4, z)]) for z in _faces_at(0.2)]))
+            for sector in outline
+        ]
+    if kind == "sponge":
+        solid = _sponge_cells(2)
+        cells = len(solid)
+        cube = box((1.0 / cells, 1.0 / cells, 1.0 / cells))
+        return [Mesh(cube.vertices + (cell + 0.5) / cells - 0.5, cube.faces) for cell in np.argwhere(solid)]
+    if kind == "bowl":
+        outer, inner = _bowl_profiles(0.5, 0.06, 6)
+        turns = 2 * np.pi * np.arange(25) / 24
+        pieces = []
+        for low in range(len(outer) - 1):
+            wall = np.concatenate([outer[low : low + 2], inner[low : low + 2]])
+            rings = [_spin(wall, turn) for turn in turns]
+            pieces += [convex_hull(np.concatenate(rings[k : k + 2])) for k in range(24)]
+        return pieces
+    raise SdfsimError(f"no convex pieces for {kind!r}", "decompose its mesh with another program")
+
+
+def _positive(*sizes: float) -> np.ndarray:
+    if not all(np.isfinite(size) and size > 0 for size in sizes):
+        raise SdfsimError(f"the sizes of a primitive must be > 0 (got {', '.join(f'{size:g}' for size in sizes)})")
+    return np.array(sizes, dtype=np.float64)
+
+
+def _quads(quads: np.ndarray) -> np.ndarray:
+    """Two triangles for each of [Q, 4]."""
+    return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+
+
+def _spin(profile: np.ndarray, turn: float) -> np.ndarray:
+    """(radius, z) points [K, 2] at the angle `turn` about z: [K, 3]."""
+    return np.stack([profile[:, 0] * np.cos(turn), profile[:, 0] * np.sin(turn), profile[:, 1]], axis=1)
+
+
+def _revolve(profile: np.ndarray, segments: int, name: str) -> Mesh:
+    """The solid of a profile [K, 2] of (radius, z), both ends on the axis, turned about z."""
+    rings = np.stack([_spin(profile, turn) for turn in 2 * np.pi * np.arange(segments) / segments])
+    count = len(profile)
+    this, following = np.arange(segments)[:, None], ((np.arange(segments) + 1) % segments)[:, None]
+    low, high = np.arange(count - 1)[None], np.arange(1, count)[None]
+    corners = (this * count + low, following * count + low, following * count + high, this * count + high)
+    # On the axis all turns of a point are one vertex and half of each quad vanishes: `clean` sees to both.
+    return clean(Mesh(rings.reshape(-1, 3), _quads(np.stack(corners, axis=-1).reshape(-1, 4))), name=name)
+
+
+def _tube(rings: np.ndarray, name: str) -> Mesh:
+    """The closed tube through rings [R, K, 3], the last joined to the first."""
+    turns, sides = rings.shape[:2]
+    this, following = np.arange(turns)[:, None], ((np.arange(turns) + 1) % turns)[:, None]
+    left, right = np.arange(sides)[None], (np.arange(sides) + 1)[None] % sides
+    corners = (this * sides + left, following * sides + left, following * sides + right, this * sides + right)
+    return clean(Mesh(rings.reshape(-1, 3), _quads(np.stack(corners, axis=-1).reshape(-1, 4))), name=name)
+
+
+def _ring_hulls(rings: np.ndarray) -> list[Mesh]:
+    return [convex_hull(np.concatenate(pair)) for pair in zip(rings, np.roll(rings, -1, axis=0), strict=True)]
+
+
+def _torus_rings(major: float, minor: float, segments: int, sides: int) -> np.ndarray:
+    _positive(major, minor)
+    around = 2 * np.pi * np.arange(sides) / sides
+    profile = np.stack([major + minor * np.cos(around), minor * np.sin(around)], axis=1)
+    return np.stack([_spin(profile, turn) for turn in 2 * np.pi * np.arange(segments) / segments])
+
+
+def _knot_rings(
+    major: float, wrap: float, tube: float, turns: tuple[int, int], segments: int, sides: int
+) -> np.ndarray:
+    _positive(major, wrap, tube)
+    t = 2 * np.pi * np.arange(segments) / segments
+    p, q = turns
+    radius = major + wrap * np.cos(q * t)
+    curve = np.stack([radius * np.cos(p * t), radius * np.sin(p * t), wrap * np.sin(q * t)], axis=1)
+    tangent = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    # Away from the middle of the torus' own tube: a direction that turns with the curve and closes on itself.
+    middle = major * np.stack([np.cos(p * t), np.sin(p * t), np.zeros_like(t)], axis=1)
+    first = curve - middle
+    first -= (first * tangent).sum(1, keepdims=True) * tangent
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second = np.cross(tangent, first)
+    around = 2 * np.pi * np.arange(sides) / sides
+    offset = np.cos(around)[None, :, None] * first[:, None] + np.sin(around)[None, :, None] * second[:, None]
+    return curve[:, None] + tube * offset
+
+
+def _gear_outline(radius: float, tooth: float, bore: float, teeth: int) -> tuple[np.ndarray, np.ndarray]:
+    """Outer and bore outlines [4 * teeth, 2], counter-clockwise: root, rise, tip, fall of each tooth."""
+    _positive(radius, tooth, bore, radius - tooth - bore)
+    fraction = np.array([0.0, 0.3, 0.4, 0.9])
+    turn = (2 * np.pi / teeth * (np.arange(teeth)[:, None] + fraction)).reshape(-1)
+    reach = np.tile([radius - tooth, radius - tooth, radius, radius], teeth)
+    circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    return circle * reach[:, None], circle * bore
+
+
+def _faces_at(thickness: float) -> tuple[float, float]:
+    _positive(thickness)
+    return -thickness / 2, thickness / 2
+
+
+def _sponge_cells(holes: int) -> np.ndarray:
+    """[C, C, C] bool with C = 2 * holes + 1: solid unless two or more of the three indices are odd."""
+    if holes < 1:
+        raise SdfsimError(f"a sponge needs at least one hole a side (got {holes})")
+    odd = np.arange(2 * holes + 1) % 2
+    return odd[:, None, None] + odd[None, :, None] + odd[None, None, :] < 2
+
+
+def _bowl_profiles(radius: float, wall: float, bands: int) -> tuple[np.ndarray, np.ndarray]:
+    """Outer and inner quarter circles [bands + 1, 2] of (radius, z), from the bottom to the rim."""
+    _positive(radius, wall, radius - wall)
+    angle = np.pi / 2 * np.arange(bands + 1) / bands
+    quarter = np.stack([np.sin(angle), -np.cos(angle)], axis=1)
+    quarter[0, 0] = 0.0
+    return radius * quarter, (radius - wall) * quarter

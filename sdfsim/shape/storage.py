@@ -1,0 +1,148 @@
+"""The files of a shape folder: SDF parameters as tensors, the mesh as PLY, the record as JSON."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from sdfsim.errors import SdfsimError
+from sdfsim.shape.analytic import BoxSdf, PlaneSdf, SphereSdf
+from sdfsim.shape.mesh import Frame, Mesh
+from sdfsim.shape.mlp import MlpSdf
+from sdfsim.shape.sdf import Sdf
+
+FORMAT_VERSION = 1
+
+
+def sdf_to_file(sdf: Sdf) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    """Tensors and a description (for JSON) of an SDF.
+
+    Raises:
+        SdfsimError: an SDF of a kind that has no file format.
+    """
+    if isinstance(sdf, MlpSdf):
+        tensors = {}
+        for layer, (weight, bias) in enumerate(zip(sdf.weights, sdf.biases, strict=True)):
+            tensors[f"layer{layer}.weight"] = weight.cpu().contiguous()
+            tensors[f"layer{layer}.bias"] = bias.cpu().contiguous()
+        return tensors, {
+            "kind": "mlp",
+            "activation": sdf.activation,
+            "layers": len(sdf.weights),
+            "centre": np.asarray(sdf.frame.centre).tolist(),
+            "scale": float(sdf.frame.scale),
+        }
+    if isinstance(sdf, SphereSdf):
+        return {}, {"kind": "sphere", "radius": sdf.radius}
+    if isinstance(sdf, BoxSdf):
+        return {}, {"kind": "box", "half": list(sdf.half)}
+    if isinstance(sdf, PlaneSdf):
+        return {}, {"kind": "plane"}
+    raise SdfsimError(f"an SDF of type {type(sdf).__name__} cannot be saved", "fit it first")
+
+
+def sdf_from_file(description: dict[str, Any], tensors: dict[str, torch.Tensor]) -> Sdf:
+    """The SDF that `sdf_to_file` described.
+
+    Raises:
+        KeyError, TypeError, ValueError: the description or the tensors are not what it writes.
+    """
+    kind = description["kind"]
+    if kind == "mlp":
+        layers = range(int(description["layers"]))
+        if description["activation"] not in ("sine", "relu"):
+            raise ValueError(f"unknown activation {description['activation']!r}")
+        weights = tuple(tensors[f"layer{layer}.weight"] for layer in layers)
+        sizes = [3, *(weight.shape[0] for weight in weights)]
+        if sizes[-1] != 1 or any(weight.shape[1] != size for weight, size in zip(weights, sizes, strict=False)):
+            raise ValueError("the layers do not fit together")
+        return MlpSdf(
+            weights,
+            tuple(tensors[f"layer{layer}.bias"] for layer in layers),
+            description["activation"],
+            Frame(np.array(description["centre"], dtype=np.float64).reshape(3), float(description["scale"])),
+            tensors["bounds"].numpy().reshape(2, 3),
+        )
+    if kind == "sphere":
+        return SphereSdf(float(description["radius"]))
+    if kind == "box":
+        x, y, z = description["half"]
+        return BoxSdf((float(x), float(y), float(z)))
+    if kind == "plane":
+        return PlaneSdf()
+    raise ValueError(f"unknown SDF kind {kind!r}")
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """The content of a shape.json.
+
+    Raises:
+        SdfsimError: not readable, or of another format version.
+    """
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise SdfsimError(f"{path}: not readable ({error})") from error
+    if not isinstance(record, dict) or record.get("version") != FORMAT_VERSION:
+        found = record.get("version") if isinstance(record, dict) else None
+        raise SdfsimError(
+            f"{path}: shape format version {found!r}, this program reads {FORMAT_VERSION}", "fit the mesh again"
+        )
+    return record
+
+
+def write(path: Path, content: bytes) -> None:
+    """Put `content` at `path` in one step: what was there before, or all of it, even when interrupted."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        partial.write_bytes(content)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def write_ply(mesh: Mesh) -> bytes:
+    """A mesh as binary PLY, vertices in double precision."""
+    columns: list[tuple[str, str]] = [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(mesh.vertices)}"]
+    header += [f"property double {axis}" for axis in "xyz"]
+    if mesh.colors is not None:
+        columns += [(channel, "u1") for channel in ("red", "green", "blue")]
+        header += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
+    header += [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices", "end_header", ""]
+    vertices = np.empty(len(mesh.vertices), dtype=columns)
+    for column, axis in enumerate("xyz"):
+        vertices[axis] = mesh.vertices[:, column]
+    if mesh.colors is not None:
+        for column, channel in enumerate(("red", "green", "blue")):
+            vertices[channel] = mesh.colors[:, column]
+    faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("corner", "<i4", 3)])
+    faces["count"], faces["corner"] = 3, mesh.faces
+    return "\n".join(header).encode() + vertices.tobytes() + faces.tobytes()
+
+
+def read_mesh(path: Path) -> Mesh:
+    """The mesh of a shape folder as it was written: not cleaned, not reordered.
+
+    Raises:
+        SdfsimError: not readable.
+    """
+    import trimesh
+
+    try:
+        loaded: Any = trimesh.load(path, force="mesh", process=False)
+        vertices = np.array(loaded.vertices, dtype=np.float64)
+        faces = np.array(loaded.faces, dtype=np.int64).reshape(-1, 3)
+        colors = None
+        if loaded.visual.kind == "vertex":
+            colors = np.array(loaded.visual.vertex_colors)[:, :3].astype(np.uint8)
+        if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
+            raise ValueError("face indices out of range")
+    except Exception as error:  # the readers raise whatever their format made them stumble over
+        raise SdfsimError(f"{path}: damaged or cut short ({error})") from error
+    return Mesh(vertices, faces, colors)

@@ -1,0 +1,18 @@
+"""What the tests share: where the data that is not part of the project lies."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """The folder with `kubasic` and `meshes`: $SDFSIM_DATA, or `../shared/data` beside the checkout."""
+    default = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
+    folder = Path(os.environ.get("SDFSIM_DATA") or default)
+    if not (folder / "kubasic").is_dir():
+        pytest.skip(f"no test data at {folder} (set SDFSIM_DATA to a folder that holds kubasic/)")
+    return folder

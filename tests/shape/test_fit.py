@@ -1,0 +1,221 @@
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from sdfsim.errors import SdfsimError
+from sdfsim.shape import primitives, training
+from sdfsim.shape.analytic import BoxSdf, SphereSdf
+from sdfsim.shape.asset import Shape
+from sdfsim.shape.certificate import LIMITS, certify, verdict
+from sdfsim.shape.distance import MeshDistance, PiecesDistance
+from sdfsim.shape.fit import fit_mesh, fit_pieces
+from sdfsim.shape.mesh import Mesh, load_mesh, load_pieces, mass_properties, mass_properties_of_sdf
+from sdfsim.shape.mlp import MlpSdf
+
+
+@pytest.fixture
+def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = replace(training.PLANS["default"], width=16, layers=4, steps=600, batch=256, pool=5000, goal=None, decay=0.5)
+    monkeypatch.setitem(training.PLANS, "default", plan)
+
+
+def weights(shape: Shape) -> list[torch.Tensor]:
+    assert isinstance(shape.sdf, MlpSdf)
+    return [*shape.sdf.weights, *shape.sdf.biases]
+
+
+def test_a_torus_in_a_few_hundred_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = replace(training.PLANS["default"], steps=450, batch=1024, pool=60_000, goal=None)
+    monkeypatch.setitem(training.PLANS, "default", plan)
+    mesh = primitives.torus(0.35, 0.15)
+    shape = fit_mesh(Mesh(mesh.vertices * 0.2 + [5.0, 0.0, -3.0], mesh.faces), name="ring")
+    got = shape.certificate
+    assert got["passed"], got["reason"]
+    assert got["error_within_0.01"] < 8e-4
+    assert got["error_within_0.1"] < 1e-3
+    assert got["error_in_box"] < 4e-3
+    assert got["gradient_within_0.1"] < 4e-3
+    assert got["projected_from_0.01"] < 1e-3
+    assert got["sign_errors"] < 2e-3
+    # The certificate is about held-out points of the mesh; this is the closed form.
+    local = np.random.default_rng(3).uniform(-0.6, 0.6, (4000, 3))
+    truth = np.hypot(np.hypot(local[:, 0], local[:, 1]) - 0.35, local[:, 2]) - 0.15
+    distance, gradient = shape.sdf(local * 0.2 + [5.0, 0.0, -3.0])
+    assert np.abs(distance / 0.2 - truth).mean() < 3e-3
+    norm = np.linalg.norm(gradient, axis=1)[np.abs(truth) < 0.1]
+    assert 0.9 < np.quantile(norm, 0.02) < np.quantile(norm, 0.98) < 1.1
+    # The hole is open; at its middle, a cusp of the distance, the network rounds off.
+    assert 0.03 < shape.sdf(np.array([[5.0, 0.0, -3.0]]))[0][0] < 0.041
+    # Far outside the fitted box it still is a distance; a full fit is within a few percent.
+    far = np.random.default_rng(4).normal(size=(500, 3))
+    far *= np.random.default_rng(5).uniform(1.3, 20.0, (500, 1)) / np.linalg.norm(far, axis=1, keepdims=True)
+    truth = np.hypot(np.hypot(far[:, 0], far[:, 1]) - 0.35, far[:, 2]) - 0.15
+    ratio = shape.sdf(far * 0.2 + [5.0, 0.0, -3.0])[0] / 0.2 / truth
+    assert 0.85 < ratio.min()
+    assert ratio.max() < 1.12
+    assert shape.nodes.shape == (128, 3)
+    on = (shape.nodes - [5.0, 0.0, -3.0]) / 0.2
+    assert np.abs(np.hypot(np.hypot(on[:, 0], on[:, 1]) - 0.35, on[:, 2]) - 0.15).max() < 3e-3
+    assert shape.volume == pytest.approx(mass_properties(mesh)[0] * 0.2**3)
+    np.testing.assert_allclose(shape.com, [5.0, 0.0, -3.0], atol=1e-6)
+
+
+def test_the_same_seed_gives_the_same_weights(tiny: None) -> None:
+    mesh = primitives.cone(segments=16)
+    first, second, other = (fit_mesh(mesh, name="cone", seed=seed) for seed in (0, 0, 1))
+    assert all(torch.equal(a, b) for a, b in zip(weights(first), weights(second), strict=True))
+    assert not torch.equal(weights(first)[0], weights(other)[0])
+    np.testing.assert_array_equal(first.nodes, second.nodes)
+
+
+def test_an_interrupted_fit_resumes_to_the_same_result(tiny: None, tmp_path: Path) -> None:
+    mesh, path = primitives.cone(segments=16), tmp_path / "fit.checkpoint"
+    whole = fit_mesh(mesh, name="cone")
+    messages: list[str] = []
+
+    def interrupt(fraction: float, message: str) -> None:
+        if message.startswith("step 300"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit_mesh(mesh, name="cone", checkpoint=path, on_progress=interrupt)
+    assert path.is_file()
+    resumed = fit_mesh(mesh, name="cone", checkpoint=path, on_progress=lambda _, message: messages.append(message))
+    assert not any(message.startswith("step 100 ") for message in messages)
+    assert any(message.startswith("step 600 ") for message in messages)
+    assert all(torch.equal(a, b) for a, b in zip(weights(whole), weights(resumed), strict=True))
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("spoil", ["other", "cut"])
+def test_a_checkpoint_of_something_else_is_not_used(tiny: None, tmp_path: Path, spoil: str) -> None:
+    path = tmp_path / "fit.checkpoint"
+
+    def interrupt(fraction: float, message: str) -> None:
+        if message.startswith("step 300"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit_mesh(primitives.cone(), name="cone", checkpoint=path, on_progress=interrupt)
+    mesh = primitives.cone() if spoil == "cut" else primitives.box()
+    if spoil == "cut":
+        path.write_bytes(path.read_bytes()[:200])
+    messages: list[str] = []
+    fit_mesh(mesh, name="box", checkpoint=path, on_progress=lambda _, message: messages.append(message))
+    assert any(message.startswith("step 100 ") for message in messages)
+
+
+def test_a_budget_is_kept_and_still_ends_in_a_decay(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = replace(training.PLANS["default"], width=16, layers=4, batch=256, pool=5000, goal=None, steps=10**6)
+    monkeypatch.setitem(training.PLANS, "default", plan)
+    started = time.monotonic()
+    shape = fit_mesh(primitives.box(), name="box", budget=2.0)
+    assert time.monotonic() - started < 6.0
+    assert shape.certificate["steps"] < 10**5
+    with pytest.raises(SdfsimError, match="budget"):
+        fit_mesh(primitives.box(), name="box", budget=0.0)
+
+
+def test_a_goal_that_is_met_ends_the_fit_early(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = replace(
+        training.PLANS["default"], width=16, layers=4, batch=256, pool=5000, goal=(1.0, 1.0), settle=100, steps=5000
+    )
+    monkeypatch.setitem(training.PLANS, "default", plan)
+    assert fit_mesh(primitives.box(), name="box").certificate["steps"] == 200
+
+
+def test_an_update_that_is_not_finite_is_survived(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = replace(training.PLANS["default"], width=16, layers=4, batch=64, pool=2000, goal=None, steps=300, lr=1e38)
+    monkeypatch.setitem(training.PLANS, "default", plan)
+    shape = fit_mesh(primitives.box(), name="box")
+    for part in shape.sdf(np.random.default_rng(0).normal(size=(50, 3))):
+        assert np.isfinite(part).all()
+
+
+def test_paper_recipe_learns(monkeypatch: pytest.MonkeyPatch) -> None:
+    paper = training.PLANS["paper"]
+    assert (paper.activation, paper.width, paper.layers, paper.lr, paper.steps) == ("relu", 128, 8, 1e-5, 400_000)
+    plan = replace(paper, steps=150, batch=512, pool=4096, lr=1e-3)
+    monkeypatch.setitem(training.PLANS, "paper", plan)
+    shape = fit_mesh(primitives.sphere(), name="ball", recipe="paper")
+    assert isinstance(shape.sdf, MlpSdf)
+    assert [tuple(w.shape) for w in shape.sdf.weights] == [(128, 3), *[(128, 128)] * 6, (1, 128)]
+    assert shape.certificate["error_in_box"] < 0.05
+    assert not shape.certificate["passed"] or shape.certificate["error_within_0.01"] < 1.5e-3
+
+
+def test_pieces_keep_their_own_vertices_as_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = replace(training.PLANS["default"], width=32, layers=5, steps=500, batch=512, pool=30_000, goal=None)
+    monkeypatch.setitem(training.PLANS, "default", plan)
+    half = primitives.box((0.5, 1.0, 1.0))
+    shifts = [np.array([-0.25, 0, 0]), np.array([0.25, 0, 0])]
+    buried = primitives.box((0.2, 0.2, 0.2))
+    pieces = [
+        *(Mesh(half.vertices + shift, half.faces) for shift in shifts),
+        Mesh(buried.vertices - 0.25, buried.faces),
+    ]
+    display = primitives.box()
+    shape = fit_pieces(pieces, name="block", display=display, nodes=40)
+    assert shape.mesh is display
+    assert shape.nodes.shape == (40, 3)
+    corners = {tuple(corner) for corner in primitives.box().vertices}
+    assert {tuple(node) for node in shape.nodes[:8]} == corners
+    # None of the buried cube's, and no repetition of the shared corners.
+    assert np.abs(np.abs(shape.nodes).max(1) - 0.5).max() < 0.02
+    assert len(np.unique(shape.nodes.round(6), axis=0)) == 40
+    assert shape.volume == pytest.approx(1.0, rel=0.02)
+    np.testing.assert_allclose(shape.inertia, np.eye(3) / 6, rtol=0.03, atol=1e-3)
+
+
+def test_one_piece_has_exact_mass_properties(tiny: None) -> None:
+    assert fit_pieces([primitives.box()], name="one").volume == pytest.approx(1.0, rel=1e-12)
+
+
+def test_an_open_mesh_gets_its_mass_from_the_sdf(tiny: None) -> None:
+    cube = primitives.box()
+    shape = fit_mesh(Mesh(cube.vertices, cube.faces[1:]), name="open")
+    assert shape.volume == pytest.approx(1.0, rel=0.3)
+
+
+def test_the_certificate_of_the_truth_is_clean_and_of_a_lie_is_not() -> None:
+    oracle = MeshDistance(primitives.box())
+    got = certify(BoxSdf((0.5, 0.5, 0.5)), oracle, points=2000)
+    assert got["passed"]
+    assert max(got[key] for key, _, _ in LIMITS) < 1e-5
+    got = certify(SphereSdf(0.5), oracle, points=2000)
+    assert not got["passed"]
+    assert "allowed" in got["reason"]
+    assert got["sign_errors"] > 0.1
+    assert certify(BoxSdf((0.5, 0.5, 0.5)), PiecesDistance([primitives.box()]), points=500)["passed"]
+    assert not verdict({key: float("nan") for key, _, _ in LIMITS})["passed"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "near", "within"), [("suzanne", 5e-4, 1.5e-3), ("sponge", 1.3e-3, 2.5e-3), ("cube", 5e-4, 1.5e-3)]
+)
+def test_real_shapes_within_the_default_recipe(data_dir: Path, name: str, near: float, within: float) -> None:
+    got = fit_mesh(load_mesh(data_dir / "kubasic" / name / "visual_geometry.obj"), name=name).certificate
+    assert got["passed"], got["reason"]
+    assert got["error_within_0.01"] < near
+    assert got["error_within_0.1"] < within
+
+
+@pytest.mark.slow
+def test_convex_pieces_of_a_real_shape(data_dir: Path) -> None:
+    pieces = load_pieces(data_dir / "kubasic" / "torus" / "collision_geometry.obj")
+    shape = fit_pieces(pieces, name="torus")
+    assert shape.certificate["error_within_0.01"] < 8e-4
+    assert mass_properties_of_sdf(shape.sdf)[0] == pytest.approx(shape.volume, rel=0.01)
+
+
+def test_shared_meshes_are_read_whole(data_dir: Path) -> None:
+    volume, com, _ = mass_properties(load_mesh(data_dir / "kubasic" / "suzanne" / "visual_geometry.obj"))
+    assert volume == pytest.approx(0.3113, abs=1e-4)
+    np.testing.assert_allclose(com, 0, atol=1e-3)
