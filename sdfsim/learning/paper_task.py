@@ -109,7 +109,8 @@ class PaperTask:
         each.append((np.zeros((1, 3)), np.array([[0.0, 0.0, 0.0, 1.0]])))
         position, quat = (np.concatenate(part) for part in zip(*each, strict=True))
         place, turn = torch.from_numpy(position), torch.from_numpy(quat)
-        return pose.rotate(yaw, place).to(self.device), pose.multiply(yaw.expand_as(turn), turn).to(self.device)
+        yaw = yaw.expand_as(turn)
+        return pose.rotate(yaw, place).to(self.device), pose.multiply(yaw, turn).to(self.device)
 
     def _disturbed(self, poses, bodies: Bodies, rng: np.random.Generator):
         """A random walk of rigid displacements over the three input poses, each step of size `noise` at the last."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
 import time
@@ -189,8 +190,8 @@ class Run:
                 self.average[name].lerp_(weight, 1.0 - decay)
 
     def rate(self) -> float:
-        """Learning rate: 500 steps of warm-up, then a cosine to a hundredth."""
-        warm = min(1.0, (self.step + 1) / 500)
+        """Learning rate: a warm-up over the first 2 %, then a cosine to a hundredth."""
+        warm = min(1.0, (self.step + 1) / max(1.0, 0.02 * self.total))
         fall = 0.5 * (1.0 + math.cos(math.pi * min(1.0, self.step / self.total)))
         return self.plan.rate * warm * (0.01 + 0.99 * fall)
 
@@ -284,3 +285,31 @@ def _loop(run: Run, held_out: Task, out: Path, tell: Progress) -> None:
     finally:
         # Also on Ctrl-C: what has been learned is kept.
         run.save(out / "checkpoint.npz")
+
+
+def main() -> None:
+    """Command line of this module, for machines that have only torch and numpy."""
+    parser = argparse.ArgumentParser(description="Train on a dataset whose contact frames are cached.")
+    parser.add_argument("data", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--preset", default="small", choices=list(PRESETS))
+    parser.add_argument("--steps", type=int)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--device", default="auto", choices=["auto", "cpu", "cuda"])
+    parser.add_argument("--resume", action="store_true")
+    args = parser.parse_args()
+    report = train(
+        args.data,
+        args.out,
+        preset=args.preset,
+        resume=args.resume,
+        steps=args.steps,
+        seed=args.seed,
+        device=args.device,
+        on_progress=lambda fraction, message: print(f"{100 * fraction:5.1f} %  {message}", flush=True),
+    )
+    print(json.dumps(report))
+
+
+if __name__ == "__main__":
+    main()
