@@ -1,0 +1,167 @@
+"""Trains the field on posed photos, measures it on held-out ones, and keeps it in a folder."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from pipeline.cameras import Sparse, View
+from pipeline.field import FieldSize, GridField, render
+from pipeline.normalise import Normalisation, find_normalisation
+from pipeline.photos import BACKDROP
+from pipeline.rays import held_out, load_rays
+from pipeline.recipe import Recipe, beta_at
+from pipeline.threads import choose_threads
+from pipeline.trainer import Trainer, find_landmarks
+from sdfsim.errors import SdfsimError
+
+Progress = Callable[[float, str], None]
+
+
+@dataclass
+class Trained:
+    """A trained field and where its space lies in the world of the poses."""
+
+    field: GridField
+    beta: float
+    normalisation: Normalisation
+    report: dict
+
+
+def train(
+    views: list[View], sparse: Sparse, photos_folder: Path, out: Path, *, recipe: Recipe, budget: float | None = None,
+    seed: int = 0, device: str = "cpu", threads: int | None = None, checkpoint_every: float = 20.0,
+    on_progress: Progress | None = None,
+) -> Trained:  # fmt: skip
+    """Trains a field and writes `field.safetensors` and `field.json` to `out`; resumes from `checkpoint.safetensors`.
+
+    Args:
+        views: posed cameras in the world of the poses.
+        sparse: points in the same world.
+        photos_folder: of the photos stage.
+        out: existing folder.
+        recipe: see `PRESETS`.
+        budget: s of training; the number of steps is cut to what fits, measured after the first steps.
+        seed: of everything random.
+        device: where to compute.
+        threads: of the CPU; None takes what is fastest now (a second thread only slows things down where another
+            program uses the core).
+        checkpoint_every: s.
+        on_progress: called with (fraction, message).
+
+    Raises:
+        SdfsimError: the loss is no longer finite.
+    """
+    out = Path(out)
+    masked = all((Path(photos_folder) / "masks" / f"{v.name}.png").exists() for v in views)
+    normalisation = find_normalisation(views, sparse, masked=masked)
+    local = normalisation.views(views)
+    test = held_out(len(views))
+    rays = load_rays([v for i, v in enumerate(local) if i not in test], photos_folder, recipe.long_side, masks=masked)
+    landmarks = find_landmarks(sparse, local, normalisation)
+    trainer = Trainer(recipe, rays, landmarks, seed, device)
+    checkpoint = out / "checkpoint.safetensors"
+    resumed = trainer.load(checkpoint)
+    per_step = calibrate(Trainer(recipe, trainer.rays, landmarks, seed, device), threads)
+    if budget is not None and not resumed:
+        trainer.iterations = min(recipe.iterations, max(100, int(budget / per_step)))
+    saved = started = time.monotonic()
+    before = trainer.seconds
+    smooth: dict[str, float] = {}
+    while trainer.iteration < trainer.iterations:
+        losses = trainer.step()
+        smooth = {k: 0.95 * smooth.get(k, v) + 0.05 * v for k, v in losses.items()}
+        if not all(math.isfinite(v) for v in losses.values()):
+            raise SdfsimError("distill: the loss is no longer finite", "try another --seed; the poses may be wrong")
+        now = time.monotonic()
+        trainer.seconds = before + now - started
+        if now - saved > checkpoint_every:
+            trainer.save(checkpoint)
+            saved = now
+        if on_progress and trainer.iteration % 10 == 0:
+            on_progress(0.92 * trainer.fraction, f"step {trainer.iteration} of {trainer.iterations}, "
+                        f"colour error {smooth['color']:.4f}")  # fmt: skip
+    trainer.save(checkpoint)
+    trainer.refresh()
+    beta = beta_at(recipe, 1.0)
+    scores = {}
+    if test:
+        scores = score([local[i] for i in test], photos_folder, trainer, beta, masked, on_progress)
+    report = {
+        "iterations": trainer.iterations, "rays": len(rays), "train_seconds": round(trainer.seconds, 1),
+        "seconds_before": round(before, 1), "resumed": resumed, "masked": masked, "beta": beta,
+        "threads": torch.get_num_threads(), "losses": {k: round(v, 5) for k, v in smooth.items()},
+        "held_out_photos": [views[i].source for i in test], **scores,
+    }  # fmt: skip
+    save_field(trainer.field, beta, normalisation, report, out)
+    checkpoint.unlink(missing_ok=True)
+    return Trained(trainer.field.cpu(), beta, normalisation, report)
+
+
+def calibrate(probe: Trainer, threads: int | None) -> float:
+    """Seconds a step, late in training; sets the number of threads to `threads`, or to the fastest."""
+    probe.iteration, probe.iterations = 9701, 10_000  # Late in training all levels are active.
+    probe.refresh()
+    return choose_threads(probe.step, threads if probe.device == "cpu" else torch.get_num_threads())
+
+
+@torch.no_grad()
+def score(views: list[View], photos_folder: Path, trainer: Trainer, beta: float, masked: bool,
+          on_progress: Progress | None) -> dict:  # fmt: skip
+    """PSNR of held-out views at a third of the training resolution, over pixels whose ray meets the sphere."""
+    assert trainer.cache is not None
+    values, samples = [], trainer.recipe.samples
+    rays = load_rays(views, photos_folder, max(100, trainer.recipe.long_side // 3), masks=masked).to(trainer.device)
+    backdrop = torch.full((3,), BACKDROP, device=trainer.device) if masked else None
+    for number in range(len(views)):
+        index = torch.nonzero(rays.view == number)[:, 0]
+        errors = []
+        for part in index.split(4096):
+            origins, directions = rays.at(part)
+            out = render(
+                trainer.field, trainer.cache, origins, directions, beta, samples=samples, backdrop=backdrop
+            )
+            errors.append(((out["rgb"] - rays.rgb[part].float() / 255) ** 2).mean(1))
+        values.append(-10 * math.log10(max(float(torch.cat(errors).mean()), 1e-10)))
+        if on_progress:
+            on_progress(0.92 + 0.08 * (number + 1) / len(views), f"held-out view {number + 1} of {len(views)}")
+    return {"psnr": round(float(np.mean(values)), 2), "psnr_each": [round(v, 2) for v in values]}
+
+
+def save_field(field: GridField, beta: float, normalisation: Normalisation, report: dict, folder: Path) -> None:
+    """Writes `field.safetensors`, then `field.json`."""
+    tensors = {k: v.detach().cpu().contiguous() for k, v in field.state_dict().items()}
+    save_file(tensors, str(folder / "field.safetensors"))
+    about = {
+        "version": 1, "size": asdict(field.size), "start_radius": field.start_radius, "beta": beta,
+        "center": normalisation.center.tolist(), "radius": normalisation.radius, "report": report,
+    }  # fmt: skip
+    (folder / "field.json").write_text(json.dumps(about, indent=1), encoding="utf-8")
+
+
+def load_field(folder: Path) -> Trained:
+    """Reads what `train` wrote.
+
+    Raises:
+        SdfsimError: no readable field in `folder`.
+    """
+    try:
+        about = json.loads((Path(folder) / "field.json").read_text(encoding="utf-8"))
+        size = about["size"]
+        size = replace(FieldSize(**size), levels=tuple(size["levels"]), channels=tuple(size["channels"]))
+        field = GridField(size, start_radius=float(about["start_radius"]))
+        with safe_open(str(Path(folder) / "field.safetensors"), "pt") as file:
+            field.load_state_dict({key: file.get_tensor(key) for key in file.keys()})
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise SdfsimError(f"{folder}: no trained field", "run the distill stage first") from error
+    place = Normalisation(np.array(about["center"]), float(about["radius"]))
+    return Trained(field, float(about["beta"]), place, about["report"])

@@ -1,0 +1,125 @@
+"""Normalised space -> metres with z up: which way gravity points, how large the scene is, where its floor lies."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from pipeline.cameras import View
+from pipeline.normalise import camera_up, plane_up
+from pipeline.surface import face_normals
+from sdfsim.shape.mesh import Mesh
+
+
+@dataclass(frozen=True)
+class Placement:
+    """x -> scale * R x + t.
+
+    Attributes:
+        scale: metres a normalised unit.
+        rotation: [3, 3]; its last row is up in normalised space.
+        translation: [3] m.
+        up_from: "plane" or "cameras".
+        size_from: where the scale comes from, in words.
+        floor: z of the plane that things rest on when they leave the scene, m.
+    """
+
+    scale: float
+    rotation: np.ndarray
+    translation: np.ndarray
+    up_from: str
+    size_from: str
+    floor: float = 0.0
+
+    def points(self, points: np.ndarray) -> np.ndarray:
+        """Normalised points [P, 3] -> metres."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+    def mesh(self, mesh: Mesh) -> Mesh:
+        """A mesh moved to metres."""
+        return Mesh(self.points(mesh.vertices), mesh.faces, mesh.colors)
+
+    def view(self, view: View) -> View:
+        """A camera moved to metres."""
+        return view.transformed(self.scale, self.rotation, self.translation)
+
+    def to_dict(self) -> dict:
+        """Plain values for JSON."""
+        return {**asdict(self), "rotation": self.rotation.tolist(), "translation": self.translation.tolist()}
+
+    @staticmethod
+    def from_dict(data: dict) -> Placement:
+        """The inverse of `to_dict`."""
+        return Placement(
+            **{**data, "rotation": np.array(data["rotation"]), "translation": np.array(data["translation"])}
+        )
+
+
+def find_up(shown: Mesh, views: list[View]) -> tuple[np.ndarray, str]:
+    """Up [3] in normalised space and where it comes from: the largest nearly level plane, else the cameras."""
+    guess = camera_up(views)
+    normals, areas = face_normals(shown)
+    centers = shown.vertices[shown.faces].mean(1)
+    plane = plane_up(centers, normals, areas, guess, tolerance=0.02)
+    return (guess, "cameras") if plane is None else (plane[0], "plane")
+
+
+def resting_height(mesh: Mesh, *, level: float = 0.95, share: float = 0.05) -> float:
+    """Height of the lowest level surface with at least `share` of the mesh's area; without one, the mesh's lowest part.
+
+    Args:
+        mesh: z up.
+        level: least z of a normal that counts as level.
+        share: of all the area.
+    """
+    normals, areas = face_normals(mesh)
+    height = mesh.vertices[mesh.faces][:, :, 2].mean(1)
+    flat = normals[:, 2] > level
+    size = float(np.ptp(mesh.vertices, axis=0).max())
+    width = 0.01 * size
+    if flat.any():
+        low = height[flat].min()
+        bins = ((height[flat] - low) / width).astype(int)
+        area = np.bincount(bins, areas[flat])
+        # A plane that lies across the border of two bins must not be missed.
+        pair = area + np.append(area[1:], 0)
+        enough = np.flatnonzero(pair > share * areas.sum())
+        if len(enough):
+            chosen = (bins == enough[0]) | (bins == enough[0] + 1)
+            order = np.argsort(height[flat][chosen])
+            total = np.cumsum(areas[flat][chosen][order])
+            return float(height[flat][chosen][order][np.searchsorted(total, total[-1] / 2)])
+    return float(np.quantile(mesh.vertices[:, 2], 0.002))
+
+
+def place(shown: Mesh, views: list[View], size: float | None) -> Placement:
+    """Chooses up, scale and origin.
+
+    The widest side of the box around the visible surface becomes `size`; the front (towards the mean camera) is -y;
+    the floor is z = 0 and the surface's middle is over the origin.
+
+    Args:
+        shown: visible surface in normalised space.
+        views: cameras in normalised space.
+        size: m; None means 1 m, and says so in `size_from`.
+    """
+    up, up_from = find_up(shown, views)
+    center = (shown.vertices.min(0) + shown.vertices.max(0)) / 2
+    front = np.mean([v.center for v in views], axis=0) - center
+    front -= up * (front @ up)
+    if np.linalg.norm(front) < 0.2:  # Cameras all around have no front: take the first photo's side.
+        front = views[0].center - center
+        front -= up * (front @ up)
+    if np.linalg.norm(front) < 1e-6:
+        front = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    y = -front / np.linalg.norm(front)
+    rotation = np.stack([np.cross(y, up), y, up])
+    turned = shown.vertices @ rotation.T
+    widest = float(np.ptp(turned, axis=0).max())
+    scale = (1.0 if size is None else size) / widest
+    in_metres = Mesh(scale * turned, shown.faces)
+    low, high = in_metres.vertices.min(0), in_metres.vertices.max(0)
+    translation = -np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, resting_height(in_metres)])
+    source = "assumed: widest side = 1 m" if size is None else f"given: widest side = {size:g} m"
+    return Placement(scale, rotation, translation, up_from, source)

@@ -1,0 +1,189 @@
+"""The child process of the poses stage: COLMAP through pycolmap. Run as `python -m pipeline.poses_worker JOB.json`.
+
+A process of its own, because a native abort or an endless loop in here must not take the user's session down.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+import time
+import zlib  # noqa: F401  pycolmap exports its own zlib symbols: the real one has to be there first.
+from pathlib import Path
+
+import numpy as np
+
+
+def say(message: str) -> None:
+    """One line for the parent, at once."""
+    print(message, flush=True)
+
+
+def watch_parent() -> None:
+    """Ends this process when its parent is gone (killed), so that no orphan keeps computing."""
+    parent = os.getppid()
+
+    def loop() -> None:
+        while os.getppid() == parent:
+            time.sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=loop, daemon=True).start()
+
+
+def features(pycolmap, job: dict, database: Path) -> None:
+    """Extracts features, one camera per group of photos of the same size and lens."""
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.use_gpu = False
+    extraction.sift.max_num_features = job["max_features"]
+    extraction.sift.peak_threshold = job["peak_threshold"]
+    for group in job["groups"]:
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = "SIMPLE_RADIAL"
+        if job["masks"]:
+            reader.mask_path = job["masks"]
+        if group["focal"]:
+            reader.camera_params = f"{group['focal']},{group['width'] / 2},{group['height'] / 2},0"
+        pycolmap.extract_features(
+            database,
+            job["images"],
+            image_names=group["names"],
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            reader_options=reader,
+            extraction_options=extraction,
+            device=pycolmap.Device.cpu,
+        )
+
+
+def matches(pycolmap, job: dict, database: Path) -> None:
+    """Matches every pair, or neighbours in name order where there are too many pairs."""
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.use_gpu = False
+    matching.guided_matching = job["guided"]
+    matching.sift.max_ratio = job["max_ratio"]
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.min_num_inliers = job["min_inliers"]
+    verification.ransac.random_seed = job["seed"]
+    # Pairs that do not overlap would otherwise use up all 10,000 trials each, most of the time of this stage.
+    verification.ransac.min_inlier_ratio = job["min_inlier_ratio"]
+    common = {"matching_options": matching, "verification_options": verification, "device": pycolmap.Device.cpu}
+    if job["count"] <= job["exhaustive_up_to"]:
+        pairing = pycolmap.ExhaustivePairingOptions()
+        pairing.block_size = 10  # Small blocks only so that progress shows in the database.
+        pycolmap.match_exhaustive(database, pairing_options=pairing, **common)
+    else:
+        pairing = pycolmap.SequentialPairingOptions()
+        pairing.overlap = 20
+        pairing.quadratic_overlap = True
+        pycolmap.match_sequential(database, pairing_options=pairing, **common)
+
+
+def mapping(pycolmap, job: dict, database: Path, out: Path):
+    """Incremental mapping: the reconstruction with the most registered photos (or None), and how many were found."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.min_model_size = 3
+    options.max_num_models = 4
+    options.random_seed = job["seed"]
+    options.min_num_matches = job["min_inliers"]
+    options.mapper.random_seed = job["seed"]
+    options.triangulation.random_seed = job["seed"]
+    options.mapper.init_min_num_inliers = min(100, job["init_inliers"])
+    options.mapper.init_min_tri_angle = job["init_angle"]
+    options.mapper.abs_pose_min_num_inliers = job["pose_inliers"]
+    if job["one_thread"]:
+        options.num_threads = 1
+    done = 0
+
+    def count() -> None:
+        nonlocal done
+        done += 1
+        say(f"placed {done}")
+
+    (out / "colmap").mkdir(exist_ok=True)
+    found = pycolmap.incremental_mapping(
+        database, job["images"], out / "colmap", options=options, next_image_callback=count
+    )
+    return max(found.values(), key=lambda r: (r.num_reg_images(), r.num_points3D()), default=None), len(found)
+
+
+def counts(pycolmap, database: Path) -> dict[str, dict]:
+    """Features of each photo, and the best and total number of verified matches with other photos."""
+    with pycolmap.Database.open(database) as opened:
+        images = {image.image_id: image.name for image in opened.read_all_images()}
+        result = {
+            name: {"features": int(opened.num_keypoints_for_image(key)), "best_matches": 0, "partners": 0}
+            for key, name in images.items()
+        }
+        pairs, geometries = opened.read_two_view_geometries()
+        for pair, geometry in zip(pairs, geometries, strict=True):
+            inliers = len(geometry.inlier_matches)
+            for key in pycolmap.pair_id_to_image_pair(pair):
+                entry = result[images[key]]
+                entry["best_matches"] = max(entry["best_matches"], inliers)
+                entry["partners"] += inliers > 0
+    return result
+
+
+def collect(reconstruction, out: Path) -> list[dict]:
+    """Writes `sparse.npz` and returns the posed views as plain values."""
+    views, index_of = [], {}
+    registered = sorted((i for i in reconstruction.images.values() if i.has_pose), key=lambda i: i.name)
+    for image in registered:
+        camera = reconstruction.cameras[image.camera_id]
+        focal, cx, cy, k = (float(value) for value in camera.params)
+        pose = image.cam_from_world()
+        index_of[image.image_id] = len(views)
+        views.append(
+            {
+                "name": image.name, "width": camera.width, "height": camera.height,
+                "focal": focal, "cx": cx, "cy": cy, "k": k, "camera": int(image.camera_id),
+                "rotation": pose.rotation.matrix().tolist(), "translation": list(map(float, pose.translation)),
+            }
+        )  # fmt: skip
+    points = [reconstruction.points3D[key] for key in sorted(reconstruction.points3D)]
+    seen = [
+        (p, index_of[e.image_id]) for p, point in enumerate(points) for e in point.track.elements
+        if e.image_id in index_of
+    ]  # fmt: skip
+    observations = np.array(seen, np.int32).reshape(-1, 2)
+    np.savez(
+        out / "sparse.npz",
+        xyz=np.array([p.xyz for p in points], np.float64).reshape(-1, 3),
+        rgb=np.array([p.color for p in points], np.uint8).reshape(-1, 3),
+        error=np.array([p.error for p in points], np.float32),
+        point_of=observations[:, 0],
+        view_of=observations[:, 1],
+    )
+    return views
+
+
+def main(job_path: str) -> None:
+    """Runs one job file and writes `result.json` and `sparse.npz` beside it."""
+    import pycolmap
+
+    watch_parent()
+    job = json.loads(Path(job_path).read_text(encoding="utf-8"))
+    out = Path(job_path).parent
+    database = out / "database.db"
+    database.unlink(missing_ok=True)
+    pycolmap.set_random_seed(job["seed"])
+    say("phase features")
+    features(pycolmap, job, database)
+    say("phase matches")
+    matches(pycolmap, job, database)
+    say("phase mapping")
+    best, models = mapping(pycolmap, job, database, out)
+    result = {"models": models, "counts": counts(pycolmap, database), "views": []}
+    if best is not None:
+        result["views"] = collect(best, out)
+        result["mean_error"] = float(best.compute_mean_reprojection_error())
+        result["points"] = int(best.num_points3D())
+        result["track_length"] = float(best.compute_mean_track_length())
+    (out / "result.json").write_text(json.dumps(result), encoding="utf-8")
+    say("phase done")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,356 @@
+"""The stages from photos to a scene: each in its own folder, skipped when nothing changed, resumed when killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from pipeline import record
+from sdfsim.errors import SdfsimError
+
+Progress = Callable[[str, float, str], None]
+
+STAGES = ("photos", "poses", "distill", "mesh", "fit", "scene")
+PRESETS = ("quick", "standard", "fine")
+LONG_SIDE = {"quick": 800, "standard": 1200, "fine": 1600}  # px of the prepared photos
+# Share of an overall time budget that fitting may take, and what the other stages need after training, s.
+FIT_SHARE, AFTER_TRAINING = 0.15, 40.0
+
+# Whose source code makes a stage's result; a change there makes the result old.
+CODE = {
+    "photos": ("photos",),
+    "poses": ("photos", "cameras", "poses", "poses_worker", "normalise"),
+    "distill": ("cameras", "normalise", "rays", "field", "recipe", "trainer", "distill"),
+    "mesh": ("cameras", "normalise", "field", "surface", "placement"),
+    "fit": (),
+    "scene": ("asset", "placement"),
+}
+
+
+@dataclass
+class Options:
+    """Every option of a reconstruction, as written to config.yaml.
+
+    Attributes:
+        photos: the user's folder.
+        preset: quick, standard or fine.
+        size: widest side of the scene, m; None: assumed to be 1 m.
+        budget: s for everything; None: what the preset takes.
+        seed: of everything random.
+        device: auto, cpu or cuda.
+        recipe: of the fit.
+    """
+
+    photos: str = ""
+    preset: str = "standard"
+    size: float | None = None
+    budget: float | None = None
+    seed: int = 0
+    device: str = "auto"
+    recipe: str = "default"
+
+    def check(self) -> None:
+        """Raises SdfsimError where a value makes no sense."""
+        if self.preset not in PRESETS:
+            raise SdfsimError(f"preset: {self.preset!r} is not one of {', '.join(PRESETS)}")
+        if self.size is not None and not 1e-4 <= self.size <= 1e5:
+            raise SdfsimError(f"size: must be between 0.0001 and 100000 m (got {self.size:g})")
+        if self.budget is not None and not self.budget > 0:
+            raise SdfsimError(f"budget: must be > 0 s (got {self.budget:g})")
+
+    def of_stage(self, stage: str) -> dict[str, Any]:
+        """The options that a stage's result depends on."""
+        common = {"preset": self.preset, "seed": self.seed}
+        if stage == "photos":
+            return {"long_side": LONG_SIDE[self.preset]}
+        if stage == "poses":
+            return {"seed": self.seed}
+        if stage == "distill":
+            return {**common, "budget": self.budget}
+        if stage == "mesh":
+            return {"preset": self.preset, "size": self.size}
+        if stage == "fit":
+            return {"seed": self.seed, "budget": self.budget, "recipe": self.recipe}
+        return {"seed": self.seed}
+
+
+@dataclass
+class Run:
+    """One call: where it works and what it has done so far."""
+
+    folder: Path
+    options: Options
+    progress: Progress | None = None
+    started: float = field(default_factory=time.monotonic)
+
+    def tell(self, stage: str) -> Callable[[float, str], None]:
+        """The progress callback of one stage."""
+        return lambda fraction, message: self.progress(stage, fraction, message) if self.progress else None
+
+    def place(self, stage: str) -> Path:
+        """Where a stage's result lies."""
+        return self.folder / ("assets/scene" if stage == "fit" else stage)
+
+
+def reconstruct(
+    photos: str | Path, out: str | Path, *, preset: str = "standard", size: float | None = None,
+    budget: float | None = None, seed: int = 0, device: str = "auto", from_stage: str | None = None,
+    until_stage: str | None = None, progress: Progress | None = None,
+) -> dict:  # fmt: skip
+    """Photos -> a scene that can be simulated.
+
+    Writes one folder a stage, `assets/scene/` (a Shape folder), `scene.yaml`, `config.yaml` and `report.json` to `out`.
+    A stage whose inputs, options and code are those of its last run is skipped; a run that was killed goes on.
+
+    Args:
+        photos: folder of photos; never written to.
+        out: folder to write; made where missing.
+        preset: quick, standard or fine.
+        size: widest side of the scene, m; None: 1 m is assumed, and the report says so.
+        budget: s for everything.
+        seed: of everything random.
+        device: auto, cpu or cuda.
+        from_stage: do this stage and all after it again.
+        until_stage: stop after this stage.
+        progress: called with (stage, fraction, message).
+
+    Returns:
+        The report, as in report.json.
+
+    Raises:
+        SdfsimError: bad photos or options (exit code 1), poses or surface not good enough (exit code 3).
+    """
+    options = Options(str(photos), preset, size, budget, seed, device)
+    options.check()
+    for name in (from_stage, until_stage):
+        if name is not None and name not in STAGES:
+            raise SdfsimError(f"no such stage: {name!r}", "stages: " + ", ".join(STAGES))
+    first = STAGES.index(from_stage) if from_stage else len(STAGES)
+    last = STAGES.index(until_stage) if until_stage else len(STAGES) - 1
+    run = Run(Path(out), options, progress)
+    with record.writing(run.folder):
+        if "photos" in STAGES[: last + 1]:
+            from pipeline.photos import find_photos
+
+            find_photos(Path(photos))  # Before anything is written.
+        run.folder.mkdir(parents=True, exist_ok=True)
+        write_config(run)
+        for number, stage in enumerate(STAGES[: last + 1]):
+            run_one(run, stage, again=number >= first)
+            write_report(run)
+        return write_report(run)
+
+
+def run_stage(name: str, folder: str | Path, *, progress: Progress | None = None, again: bool = False,
+              **changes: Any) -> dict:  # fmt: skip
+    """Runs one stage in a folder that the stages before it have written.
+
+    Args:
+        name: one of `STAGES`.
+        folder: of an earlier `reconstruct`.
+        progress: called with (stage, fraction, message).
+        again: also when nothing changed.
+        **changes: options that differ from those in the folder's config.yaml (see `Options`); None changes nothing.
+
+    Returns:
+        The report, as in report.json.
+
+    Raises:
+        SdfsimError: a stage before has not run; else as `reconstruct`.
+    """
+    if name not in STAGES:
+        raise SdfsimError(f"no such stage: {name!r}", "stages: " + ", ".join(STAGES))
+    run = Run(Path(folder), read_config(Path(folder)), progress)
+    known = {key: value for key, value in changes.items() if value is not None}
+    unknown = set(known) - set(asdict(run.options))
+    if unknown:
+        raise SdfsimError(f"no such option: {', '.join(sorted(unknown))}")
+    run.options = replace(run.options, **known)
+    run.options.check()
+    with record.writing(run.folder):
+        for before in STAGES[: STAGES.index(name)]:
+            if record.read(run.place(before)) is None:
+                raise SdfsimError(f"{folder}: the {before} stage has not run", f"run `sdfsim {before}` first")
+        write_config(run)
+        run_one(run, name, again=again)
+        return write_report(run)
+
+
+def run_one(run: Run, stage: str, *, again: bool) -> None:
+    """Runs one stage, or skips it where its fingerprint is that of its last run."""
+    number = STAGES.index(stage)
+    before = record.read(run.place(STAGES[number - 1])) if number else None
+    inputs = before["fingerprint"] if before else record.content_of_photos(Path(run.options.photos))
+    extra = {}
+    if stage == "fit":
+        from sdfsim.shape.fit import FIT_VERSION
+
+        extra["version"] = FIT_VERSION
+    wanted = record.fingerprint(stage, inputs, {**run.options.of_stage(stage), **extra}, CODE[stage])
+    known = record.read(run.place(stage))
+    complete = stage != "scene" or (run.folder / "scene.yaml").exists()
+    if not again and known and known["fingerprint"] == wanted and complete:
+        run.tell(stage)(1.0, "unchanged")
+        return
+    work = record.begin(run.folder / f".{stage}.part", wanted, fresh=again)
+    started = time.monotonic()
+    report = ACTIONS[stage](run, work)
+    # Training that a killed run had already done counts as well.
+    seconds = time.monotonic() - started + report.get("seconds_before", 0.0)
+    record.finish(work, run.place(stage), wanted, report, seconds)
+    run.tell(stage)(1.0, f"done in {seconds:.0f} s")
+
+
+def do_photos(run: Run, work: Path) -> dict:
+    """Photos stage."""
+    from pipeline.photos import prepare_photos
+
+    photos, notes = prepare_photos(
+        Path(run.options.photos), work, long_side=LONG_SIDE[run.options.preset], on_progress=run.tell("photos")
+    )
+    return {"count": len(photos), "notes": notes, "masks": sum(p.mask for p in photos)}
+
+
+def do_poses(run: Run, work: Path) -> dict:
+    """Poses stage."""
+    from pipeline.photos import load_photos
+    from pipeline.poses import solve
+
+    photos = run.place("photos")
+    return solve(load_photos(photos), photos, work, seed=run.options.seed, on_progress=run.tell("poses"))
+
+
+def do_distill(run: Run, work: Path) -> dict:
+    """Distill stage."""
+    from pipeline.cameras import load_sparse, load_views
+    from pipeline.distill import train
+    from pipeline.recipe import PRESETS as RECIPES
+
+    budget = run.options.budget
+    if budget is not None:
+        spent = time.monotonic() - run.started
+        budget = max(20.0, budget * (1 - FIT_SHARE) - spent - AFTER_TRAINING)
+    poses = run.place("poses")
+    trained = train(
+        load_views(poses), load_sparse(poses), run.place("photos"), work, recipe=RECIPES[run.options.preset],
+        budget=budget, seed=run.options.seed, device=pick_device(run.options.device), on_progress=run.tell("distill"),
+    )  # fmt: skip
+    return trained.report
+
+
+def do_mesh(run: Run, work: Path) -> dict:
+    """Mesh stage."""
+    from pipeline.asset import write_mesh
+    from pipeline.cameras import load_sparse, load_views
+    from pipeline.distill import load_field
+    from pipeline.placement import place
+    from pipeline.surface import PRESET_RESOLUTION, extract
+
+    trained = load_field(run.place("distill"))
+    views = trained.normalisation.views(load_views(run.place("poses")))
+    points = trained.normalisation.apply(load_sparse(run.place("poses")).xyz)
+    surface = extract(
+        trained.field, views, points, run.place("photos"), resolution=PRESET_RESOLUTION[run.options.preset],
+        on_progress=run.tell("mesh"),
+    )  # fmt: skip
+    placement = place(surface.shown, views, run.options.size)
+    shown = placement.mesh(surface.shown)
+    write_mesh(shown, work / "mesh.ply")
+    write_mesh(placement.mesh(surface.solid), work / "solid.ply")
+    (work / "placement.json").write_text(json.dumps(placement.to_dict(), indent=1), encoding="utf-8")
+    extent = (shown.vertices.max(0) - shown.vertices.min(0)).round(4).tolist()
+    return {**surface.report, "extent_m": extent, "up_from": placement.up_from, "size": placement.size_from}
+
+
+def do_fit(run: Run, work: Path) -> dict:
+    """Fit stage."""
+    from pipeline.asset import fit_scenery
+    from pipeline.threads import choose_threads, network_work
+
+    choose_threads(network_work, repeat=10)
+    budget = None if run.options.budget is None else max(10.0, FIT_SHARE * run.options.budget)
+    return fit_scenery(
+        run.place("mesh"), work, budget=budget, recipe=run.options.recipe, seed=run.options.seed,
+        on_progress=run.tell("fit"),
+    )  # fmt: skip
+
+
+def do_scene(run: Run, work: Path) -> dict:
+    """Scene stage."""
+    from pipeline.asset import write_scene
+
+    return write_scene(run.place("mesh"), run.folder / "scene.yaml", seed=run.options.seed)
+
+
+ACTIONS: dict[str, Callable[[Run, Path], dict]] = {
+    "photos": do_photos, "poses": do_poses, "distill": do_distill, "mesh": do_mesh, "fit": do_fit, "scene": do_scene,
+}  # fmt: skip
+
+
+def pick_device(name: str) -> str:
+    """The torch device for auto, cpu or cuda.
+
+    Raises:
+        SdfsimError: cuda was asked for and is not there.
+    """
+    import torch
+
+    if name == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if name == "cuda" and not torch.cuda.is_available():
+        raise SdfsimError("device: no CUDA device here", "use --device cpu")
+    return name
+
+
+def write_config(run: Run) -> None:
+    """Writes config.yaml: every option as resolved."""
+    text = yaml.safe_dump({"version": 1, **asdict(run.options)}, sort_keys=False, allow_unicode=True)
+    temporary = run.folder / "config.yaml.part"
+    temporary.write_text(text, encoding="utf-8")
+    os.replace(temporary, run.folder / "config.yaml")
+
+
+def read_config(folder: Path) -> Options:
+    """Reads config.yaml.
+
+    Raises:
+        SdfsimError: it is missing or not one of ours.
+    """
+    try:
+        data = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
+        data.pop("version", None)
+        return Options(**data)
+    except (OSError, yaml.YAMLError, TypeError, AttributeError) as error:
+        raise SdfsimError(f"{folder}: not the folder of a reconstruction", "run `sdfsim reconstruct` first") from error
+
+
+def write_report(run: Run) -> dict:
+    """Writes report.json from the stages' own records; returns it."""
+    stages, seconds = {}, {}
+    for stage in STAGES:
+        known = record.read(run.place(stage))
+        if known:
+            stages[stage], seconds[stage] = known["report"], round(known["seconds"], 1)
+    distill = stages.get("distill", {})
+    paths = {"scene": "scene.yaml", "shape": "assets/scene", "mesh": "mesh/mesh.ply", "cameras": "poses/cameras.json"}
+    failed = []
+    fit = stages.get("fit", {})
+    if fit and fit.get("passed") is False:
+        failed.append(f"fit: {fit.get('reason', 'certificate missed')}")
+    report = {
+        "version": 1, "options": asdict(run.options),
+        "seconds": seconds, "seconds_total": round(sum(seconds.values()), 1),
+        "psnr": distill.get("psnr"), "stages": stages, "failed_checks": failed,
+        "paths": {key: str(run.folder / path) for key, path in paths.items() if (run.folder / path).exists()},
+    }  # fmt: skip
+    temporary = run.folder / "report.json.part"
+    temporary.write_text(json.dumps(report, indent=1), encoding="utf-8")
+    os.replace(temporary, run.folder / "report.json")
+    return report

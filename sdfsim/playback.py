@@ -1,0 +1,277 @@
+"""Rollout -> rerun. A live run and a file go through the same calls: a live step is a chunk of one frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sdfsim.dynamics.rollout import Rollout
+from sdfsim.files import replacing
+from sdfsim.scene.types import Body, Scene
+from sdfsim.shading import distinct_colors, sheet, with_normals
+from sdfsim.shape.mesh import Mesh
+
+if TYPE_CHECKING:
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+WORLD = "world"
+CONTACTS = "world/contacts"
+PLOTS = {
+    "kinetic_energy": "kinetic energy (J)",
+    "contacts": "contacts",
+    "worst_penetration": "worst penetration (m)",
+    "step_ms": "step (ms)",
+}
+_STATIC_COLOR = (150, 150, 155)
+_NODE_COLOR = (20, 20, 20)
+_CONTACT_COLOR = (255, 40, 40)
+_MOST_CORNER_PAIRS = (
+    1_000_000  # beyond, a mesh of about 10,000 vertices, it counts as smooth: splitting triples its size
+)
+_PHOTO_PIXELS = 320
+
+
+class Playback:
+    """One recording of one scene, to be written to a file, or streamed to a viewer.
+
+    Args:
+        scene: what moves.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        import rerun as rr
+
+        self._rr = rr
+        self._scene = scene
+        self._step = 0
+        self._com = [b.scale * scene.shapes[b.shape].com for b in scene.bodies]
+        self._paths = body_paths(scene)
+        self.stream = rr.RecordingStream("sdfsim")
+
+    def blueprint(self) -> rrb.Blueprint:
+        """The layout: the scene on the left, one plot a counter on the right; nodes and contact points hidden."""
+        import rerun.blueprint as rrb
+
+        hidden = [CONTACTS, *(f"{path}/nodes" for path in self._paths)]
+        centre, radius = _extent(self._scene)
+        view = rrb.Spatial3DView(
+            origin=WORLD,
+            name="scene",
+            overrides={path: rrb.EntityBehavior(visible=False) for path in hidden},
+            eye_controls=_eye(centre, radius, -self._scene.gravity),
+            line_grid=False,
+        )
+        plots = [rrb.TimeSeriesView(origin=f"plots/{key}", name=name) for key, name in PLOTS.items()]
+        return rrb.Blueprint(
+            rrb.Horizontal(view, rrb.Vertical(*plots), column_shares=[3, 1]),
+            rrb.TimePanel(timeline="time", state="collapsed"),
+            rrb.BlueprintPanel(state="collapsed"),
+            rrb.SelectionPanel(state="collapsed"),
+            auto_views=False,
+        )
+
+    def log_static(self) -> None:
+        """Everything that does not change: meshes, surface nodes, and the names of the plots."""
+        rr, scene = self._rr, self._scene
+        self.stream.send_blueprint(self.blueprint())
+        self.stream.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        size = _extent(scene)[1]
+        hues = distinct_colors(sum(b.motion == "dynamic" for b in scene.bodies))
+        for body, path, com in zip(scene.bodies, self._paths, self._com, strict=True):
+            shape = scene.shapes[body.shape]
+            infinite = not np.all(np.isfinite(shape.sdf.bounds))
+            color = _STATIC_COLOR if body.motion == "static" else next(hues)
+            mesh = sheet(6 * size) if infinite else shape.mesh
+            placed = Mesh(mesh.vertices * body.scale - com, mesh.faces, mesh.colors)
+            self.stream.log(f"{path}/mesh", _shaded(rr, placed, color), static=True)
+            if len(shape.nodes):
+                nodes = rr.Points3D(shape.nodes * body.scale - com, colors=_NODE_COLOR, radii=rr.Radius.ui_points(2))
+                self.stream.log(f"{path}/nodes", nodes, static=True)
+            self._log_pose(path, body, com)
+        style = rr.Points3D.from_fields(colors=_CONTACT_COLOR, radii=rr.Radius.ui_points(4))
+        self.stream.log(CONTACTS, style, static=True)
+        for key, name in PLOTS.items():
+            self.stream.log(f"plots/{key}", rr.SeriesLines(names=name), static=True)
+
+    def _log_pose(self, path: str, body: Body, com: np.ndarray) -> None:
+        """Static bodies have one pose for good."""
+        if body.motion == "static":
+            from scipy.spatial.transform import Rotation
+
+            centre = body.position + Rotation.from_quat(body.quat_xyzw).apply(com)
+            pose = self._rr.Transform3D(translation=centre, quaternion=self._rr.Quaternion(xyzw=body.quat_xyzw))
+            self.stream.log(path, pose, static=True)
+
+    def log_steps(self, chunk: Rollout) -> None:
+        """Poses, contact points and counters of the frames of `chunk`, which follow the frames logged before."""
+        rr, frames = self._rr, len(chunk.time)
+        steps = np.arange(self._step, self._step + frames)
+        self._step += frames
+        times = [rr.TimeColumn("time", duration=chunk.time), rr.TimeColumn("step", sequence=steps)]
+        for i, (body, path) in enumerate(zip(self._scene.bodies, self._paths, strict=True)):
+            if body.motion == "dynamic":
+                poses = rr.Transform3D.columns(translation=chunk.position[:, i], quaternion=chunk.orientation[:, i])
+                self.stream.send_columns(path, times, poses)
+        points = rr.Points3D.columns(positions=chunk.contact_point).partition(chunk.contact_count)
+        self.stream.send_columns(CONTACTS, times, points)
+        for key in PLOTS:
+            if key in chunk.counters:
+                values = np.asarray(chunk.counters[key], dtype=np.float64)
+                self.stream.send_columns(f"plots/{key}", times, rr.Scalars.columns(scalars=values))
+
+
+def save_rollout(scene: Scene, rollout: Rollout, path: Path) -> None:
+    """Write `rollout` as a rerun recording: to a temporary name first, then renamed.
+
+    Raises:
+        SdfsimError: the file cannot be written.
+    """
+    playback = Playback(scene)
+    encoded = playback.stream.binary_stream()
+    playback.log_static()
+    playback.log_steps(rollout)
+    _write(path, encoded)
+
+
+def body_paths(scene: Scene) -> list[str]:
+    """Entity path of every body, in order."""
+    import rerun as rr
+
+    return [f"{WORLD}/{rr.escape_entity_path_part(body.name)}" for body in scene.bodies]
+
+
+@dataclass(frozen=True)
+class PosedPhoto:
+    """One camera of a reconstruction.
+
+    Attributes:
+        name: what the viewer calls it.
+        image: photo file, or None to show the camera alone.
+        focal: px.
+        principal: (cx, cy) px.
+        size: (width, height) px.
+        rotation: [3, 3] world to camera (x right, y down, z forward).
+        translation: [3] m, world to camera.
+    """
+
+    name: str
+    image: Path | None
+    focal: float
+    principal: tuple[float, float]
+    size: tuple[int, int]
+    rotation: np.ndarray
+    translation: np.ndarray
+
+
+def save_reconstruction(
+    path: Path, photos: list[PosedPhoto], points: np.ndarray, colors: np.ndarray | None, mesh: Mesh | None
+) -> None:
+    """Write cameras with their photos, sparse points and the surface as one rerun recording.
+
+    Args:
+        path: .rrd to write.
+        photos: posed cameras.
+        points: [P, 3] m, sparse points.
+        colors: [P, 3] uint8 RGB, or None.
+        mesh: the reconstructed surface, if it is there already.
+
+    Raises:
+        SdfsimError: the file cannot be written.
+    """
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    stream = rr.RecordingStream("sdfsim-reconstruct")
+    encoded = stream.binary_stream()
+    rotations = [np.asarray(photo.rotation) for photo in photos]
+    centres = [-turn.T @ photo.translation for turn, photo in zip(rotations, photos, strict=True)]
+    # Cameras surround what matters; sparse points also lie on whatever is behind it.
+    shown = np.concatenate([np.reshape(centres, (-1, 3)), points[:0] if mesh is None else mesh.vertices])
+    low, high = (shown.min(0), shown.max(0)) if len(shown) else (-np.ones(3), np.ones(3))
+    centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2 or 1.0
+    # Before there is a surface, z need not be up: photographers mostly hold the camera level.
+    up = -np.sum([turn[1] for turn in rotations], axis=0) if mesh is None and photos else np.array([0.0, 0.0, 1.0])
+    view = rrb.Spatial3DView(
+        origin=WORLD, name="reconstruction", eye_controls=_eye(centre, radius, up), line_grid=False
+    )
+    stream.send_blueprint(rrb.Blueprint(view, collapse_panels=True, auto_views=False))
+    stream.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    stream.log(f"{WORLD}/points", rr.Points3D(points, colors=colors, radii=rr.Radius.ui_points(1.5)), static=True)
+    if mesh is not None:
+        stream.log(f"{WORLD}/surface", _shaded(rr, mesh, (200, 190, 175)), static=True)
+    for photo, turn, centre_of in zip(photos, rotations, centres, strict=True):
+        entity = f"{WORLD}/cameras/{rr.escape_entity_path_part(photo.name)}"
+        pose = rr.Transform3D(translation=centre_of, mat3x3=turn.T)
+        stream.log(entity, pose, static=True)
+        shrink = min(1.0, _PHOTO_PIXELS / max(photo.size))
+        size = [max(1, round(s * shrink)) for s in photo.size]
+        pinhole = rr.Pinhole(
+            focal_length=photo.focal * shrink,
+            principal_point=np.array(photo.principal) * shrink,
+            resolution=size,
+            image_plane_distance=0.1 * radius,
+        )
+        stream.log(entity, pinhole, static=True)
+        if photo.image is not None and photo.image.exists():
+            stream.log(entity, rr.Image(_thumbnail(photo.image, size)).compress(jpeg_quality=80), static=True)
+    _write(path, encoded)
+
+
+def _thumbnail(path: Path, size: list[int]) -> np.ndarray:
+    from PIL import Image
+
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB").resize((size[0], size[1]), Image.Resampling.BILINEAR))
+
+
+def _write(path: Path, encoded: Any) -> None:
+    """All bytes of a rerun binary stream into `path`. We write them, since rerun's own sink only logs a full disk."""
+    with replacing(path) as partial:
+        partial.write_bytes(encoded.read() or b"")
+
+
+def _eye(centre: np.ndarray, radius: float, up: np.ndarray) -> rrb.EyeControls3D:
+    import rerun.blueprint as rrb
+
+    length = np.linalg.norm(up)
+    up = up / length if length > 0 else np.array([0.0, 0.0, 1.0])
+    side = np.cross(up, [0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0])
+    side /= np.linalg.norm(side)
+    away = 1.6 * np.cross(up, side) + 1.1 * side + 0.9 * up
+    return rrb.EyeControls3D(
+        kind=rrb.Eye3DKind.Orbital, position=centre + radius * 1.3 * away, look_target=centre, eye_up=up
+    )
+
+
+def _extent(scene: Scene) -> tuple[np.ndarray, float]:
+    """Centre [3] m and radius m of the bodies at the start, planes left out."""
+    from scipy.spatial.transform import Rotation
+
+    corners = []
+    for body in scene.bodies:
+        shape = scene.shapes[body.shape]
+        if np.all(np.isfinite(shape.sdf.bounds)) and len(shape.mesh.vertices):
+            box = np.stack([shape.mesh.vertices.min(0), shape.mesh.vertices.max(0)]) * body.scale
+            turn = Rotation.from_quat(body.quat_xyzw)
+            corners.append(body.position + turn.apply(np.stack(np.meshgrid(*box.T), -1).reshape(-1, 3)))
+    if not corners:
+        return np.zeros(3), 1.0
+    every = np.concatenate(corners)
+    low, high = every.min(0), every.max(0)
+    return (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
+
+
+def _shaded(rr: Any, mesh: Mesh, color: tuple[int, ...]) -> rr.Mesh3D:
+    """With its own colours, or `color` where it has none."""
+    mesh, normals = with_normals(mesh)
+    return rr.Mesh3D(
+        vertex_positions=mesh.vertices,
+        triangle_indices=mesh.faces,
+        vertex_normals=normals,
+        vertex_colors=mesh.colors,
+        albedo_factor=color if mesh.colors is None else None,
+    )

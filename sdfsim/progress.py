@@ -1,0 +1,210 @@
+"""What a command says: progress and errors on stderr, its report on stdout, and its exit code."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import sys
+import time
+import traceback
+from types import TracebackType
+from typing import Any
+
+from sdfsim.errors import EXIT_ERROR, EXIT_INTERRUPTED, SceneError, SdfsimError
+
+_PLAIN_SECONDS = 5.0  # between two plain lines of one stage
+
+
+class Session:
+    """One command from start to exit code; a context manager around its work.
+
+    Errors inside become one line and a hint on stderr, and the `SystemExit` of DESIGN's exit codes. With `as_json`
+    stdout carries exactly one JSON object (also for an error), and what libraries print there goes to stderr.
+
+    Args:
+        as_json: report as JSON.
+        verbose: show tracebacks.
+    """
+
+    def __init__(self, *, as_json: bool = False, verbose: bool = False) -> None:
+        self.as_json = as_json
+        self.verbose = verbose
+        self.exit_code = 0
+        self._result: dict[str, Any] | None = None
+        self._clean_up = contextlib.ExitStack()
+        self._bar = _Bar()
+
+    def __enter__(self) -> Session:
+        if self.as_json:
+            sys.stdout.flush()
+            real = os.dup(1)  # native libraries write to the descriptor, past sys.stdout
+            os.dup2(2, 1)
+            self._clean_up.callback(os.close, real)
+            self._clean_up.callback(os.dup2, real, 1)
+            self._clean_up.enter_context(contextlib.redirect_stdout(sys.stderr))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.close()
+        code = self._explain(error) if error is not None else self.exit_code
+        with contextlib.suppress(BrokenPipeError):
+            sys.stdout.flush()
+        self._clean_up.close()
+        if self.as_json and self._result is not None:
+            print(json.dumps(_plain(self._result)))
+        if code is not None:
+            raise SystemExit(code) from None
+
+    def _explain(self, error: BaseException) -> int | None:
+        """Tell the error; None lets it through (it is not ours to handle)."""
+        if isinstance(error, KeyboardInterrupt):
+            return self._fail("interrupted; what was finished is kept", "", EXIT_INTERRUPTED)
+        if isinstance(error, SceneError):
+            return self._fail(error.message, error.hint, error.exit_code, problems=error.problems)
+        if isinstance(error, SdfsimError):
+            return self._fail(error.message, error.hint, error.exit_code)
+        if isinstance(error, BrokenPipeError):  # whoever read our report, such as `head`, has seen enough
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+            return EXIT_ERROR
+        if isinstance(error, OSError):
+            where = f"{error.filename}: " if error.filename else ""
+            return self._fail(f"{where}{error.strerror or error}", "", EXIT_ERROR)
+        if isinstance(error, Exception):
+            hint = "" if self.verbose else "this is a fault of sdfsim; -v shows where"
+            return self._fail(f"internal error: {type(error).__name__}: {error}", hint, EXIT_ERROR)
+        return None
+
+    def _fail(self, message: str, hint: str, code: int, **more: Any) -> int:
+        if self.verbose:
+            traceback.print_exc(file=sys.stderr)
+        self.say("\n".join(f"error: {line}" for line in message.splitlines()))
+        if hint:
+            self.say(f"hint: {hint}")
+        self._result = {**(self._result or {}), "error": message, "hint": hint, "exit_code": code, **more}
+        return code
+
+    def say(self, text: str) -> None:
+        """A line on stderr."""
+        self._bar.say(text)
+
+    def report(self, result: dict[str, Any], lines: list[str] | None = None) -> None:
+        """The outcome: `result` for --json, `lines` (or the entries of `result`) for people."""
+        self._result = result
+        if not self.as_json:
+            self._bar.close()
+            print("\n".join(lines if lines is not None else _as_lines(result)))
+
+    def hold(self, why: str) -> None:
+        """Wait for Ctrl-C, if a person is there to press it."""
+        if self.as_json or not sys.stdin.isatty():
+            return
+        self.say(why)
+        with contextlib.suppress(KeyboardInterrupt):
+            while True:
+                time.sleep(1.0)
+
+    def progress(self, fraction: float, message: str) -> None:
+        """`fraction` (0 to 1) of the work is done."""
+        self._bar.update("", fraction, message)
+
+    def stage_progress(self, stage: str, fraction: float, message: str) -> None:
+        """The same for one stage of several; each has its own bar and ETA."""
+        self._bar.update(stage, fraction, message)
+
+
+class _Bar:
+    """A bar with an ETA on a terminal; elsewhere a line now and then."""
+
+    def __init__(self) -> None:
+        self._on_terminal = sys.stderr.isatty()
+        self._progress: Any = None
+        self._task: Any = None
+        self._stage: str | None = None
+        self._started = self._told = 0.0
+        self._ended = False
+
+    def update(self, stage: str, fraction: float, message: str) -> None:
+        fraction = min(max(fraction, 0.0), 1.0)
+        title = f"{stage}: {message}" if stage and message else stage or message
+        fresh = stage != self._stage
+        if fresh:
+            self._stage, self._started, self._ended = stage, time.monotonic(), False
+        if self._on_terminal:
+            self._draw(fresh, fraction, title)
+        else:
+            self._tell(fresh, fraction, title)
+
+    def _draw(self, fresh: bool, fraction: float, title: str) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+        from rich.progress import TimeRemainingColumn as Eta
+
+        if self._progress is None:
+            texts = TextColumn("{task.description}", markup=False)
+            columns = (BarColumn(24), TaskProgressColumn(), TimeElapsedColumn(), "left:", Eta(), texts)
+            self._progress = Progress(*columns, console=Console(stderr=True))
+            self._progress.start()
+        if fresh:
+            self._task = self._progress.add_task(title, total=1.0)
+        self._progress.update(self._task, completed=fraction, description=title)
+
+    def _tell(self, fresh: bool, fraction: float, title: str) -> None:
+        now = time.monotonic()
+        end = fraction >= 1 and not self._ended
+        if not (fresh or end or (fraction < 1 and now - self._told >= _PLAIN_SECONDS)):
+            return
+        self._told, self._ended = now, fraction >= 1
+        elapsed = now - self._started
+        left = f", about {duration(elapsed * (1 - fraction) / fraction)} left" if 0.01 < fraction < 1 else ""
+        print(f"[{fraction:4.0%}] {title} ({duration(elapsed)}{left})", file=sys.stderr, flush=True)
+
+    def say(self, text: str) -> None:
+        if self._progress is not None:
+            self._progress.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        else:
+            print(text, file=sys.stderr, flush=True)
+
+    def close(self) -> None:
+        """Leave what is drawn and go to the next line."""
+        if self._progress is not None:
+            self._progress.stop()
+        self._progress, self._stage = None, None
+
+
+def duration(seconds: float) -> str:
+    """`42 s`, `3 min 20 s`, `1 h 5 min`."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60} s"
+    return f"{whole // 3600} h {whole % 3600 // 60} min"
+
+
+def _plain(value: Any) -> Any:
+    """What JSON can hold: numpy numbers and arrays and paths become plain, numbers that are not finite null."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if value is None or isinstance(value, bool | int | str) else str(value)
+
+
+def _as_lines(result: dict[str, Any], indent: str = "") -> list[str]:
+    lines = []
+    for key, value in result.items():
+        if isinstance(value, dict):
+            lines += [f"{indent}{key}:", *_as_lines(value, indent + "  ")]
+        elif isinstance(value, float):
+            lines.append(f"{indent}{key}: {value:.6g}")
+        else:
+            lines.append(f"{indent}{key}: {value}")
+    return lines

@@ -1,0 +1,226 @@
+"""What the commands simulate, plan and info do: a scene file becomes a run folder, or a description."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import yaml
+
+from sdfsim.dynamics.rollout import Rollout
+from sdfsim.dynamics.simulator import SimulationError, Simulator, join
+from sdfsim.errors import SdfsimError
+from sdfsim.files import write_json, write_text
+from sdfsim.playback import Playback, save_rollout
+from sdfsim.scene.effects import EFFECTS, plan
+from sdfsim.scene.load import load_scene
+
+Viewer = Literal["none", "file", "native", "web"]
+_TRIAL_STEPS = 5
+_PACKAGES = (
+    "torch",
+    "numpy",
+    "scipy",
+    "open3d",
+    "trimesh",
+    "pycolmap",
+    "opencv-python-headless",
+    "rerun-sdk",
+    "pybullet",
+)
+_RESULTS = ("report.json", "rollout.npz", "rollout.rrd")
+
+
+def simulate(
+    scene_file: Path,
+    out: Path,
+    *,
+    model: str | None,
+    seconds: float | None,
+    seed: int | None,
+    viewer: Viewer,
+    device: str,
+    on_progress: Callable[[float, str], None],
+    on_address: Callable[[str], None],
+) -> dict[str, Any]:
+    """Simulate a scene and write config.yaml, report.json, rollout.npz and (unless `viewer` is none) rollout.rrd.
+
+    Args:
+        scene_file: scene.yaml.
+        out: run folder; made if missing, an earlier run in it is replaced.
+        model: bundled name or path (None: what the scene says).
+        seconds: simulated time in s (None: the scene's duration).
+        seed: None: the scene's.
+        viewer: where to watch: not at all, later from the file, or live in a window or a page.
+        device: cpu, cuda or auto.
+        on_progress: called with (fraction, message).
+        on_address: called with the address of the page that `viewer` web serves.
+
+    Returns:
+        The content of report.json.
+
+    Raises:
+        SdfsimError: bad input, or an output that cannot be written.
+        SimulationError: the state broke; what was computed before is in the folder.
+        KeyboardInterrupt: likewise.
+    """
+    scene = load_scene(scene_file, on_progress=on_progress)
+    simulator = Simulator(scene, model=model, device=device, seed=seed)
+    length = scene.duration if seconds is None else seconds
+    config = {
+        "command": "simulate",
+        "scene": str(scene_file.resolve()),
+        "model": simulator.model.name,
+        "seconds": float(length),
+        "seed": int(simulator.seed),
+        "viewer": viewer,
+        "device": str(simulator.device),
+    }
+    out.mkdir(parents=True, exist_ok=True)
+    for name in _RESULTS:
+        (out / name).unlink(missing_ok=True)
+    write_text(out / "config.yaml", yaml.safe_dump(config, sort_keys=False))
+
+    frames = [simulator.initial_rollout()]
+    live = _live(scene, viewer, frames[0], on_address)
+
+    def on_step(frame: Rollout) -> None:
+        frames.append(frame)
+        if live:
+            live.log_steps(frame)
+        on_progress(float(frame.time[-1]) / length, f"{frame.time[-1]:.2f} of {length:g} s simulated")
+
+    started, broken = time.monotonic(), None
+    try:
+        rollout = simulator.run(seconds=length, on_step=on_step)
+    except (SimulationError, KeyboardInterrupt) as error:
+        broken = error
+        rollout = error.rollout if isinstance(error, SimulationError) else join(frames)
+    on_progress(1.0, f"{len(rollout)} steps" + (" (stopped early)" if broken else ""))
+
+    report = summary(rollout, time.monotonic() - started)
+    report["status"] = "done" if broken is None else "failed" if isinstance(broken, SdfsimError) else "interrupted"
+    report["folder"] = str(out)
+    if isinstance(broken, SdfsimError):
+        report["error"] = broken.message
+    rollout.save(out / "rollout.npz")
+    if viewer != "none":
+        save_rollout(scene, rollout, out / "rollout.rrd")
+        report["recording"] = str(out / "rollout.rrd")
+    write_json(out / "report.json", report)
+    if isinstance(broken, SimulationError):
+        broken.hint = f"what was computed is in {out}; {broken.hint}"
+    if broken is not None:
+        raise broken
+    return report
+
+
+def _live(scene: Any, viewer: Viewer, first: Rollout, on_address: Callable[[str], None]) -> Playback | None:
+    if viewer not in ("native", "web"):
+        return None
+    from sdfsim.viewer import stream_to_viewer
+
+    live = Playback(scene)
+    if address := stream_to_viewer(live, viewer):
+        on_address(address)
+    live.log_static()
+    live.log_steps(first)
+    return live
+
+
+def summary(rollout: Rollout, wall: float) -> dict[str, Any]:
+    """The numbers of a run that a person looks at first; None for one that is not finite."""
+    counters, heights = rollout.counters, rollout.position[..., 2]
+    energy = counters["kinetic_energy"]
+    taken = counters["step_ms"][1:]
+    return {
+        "model": rollout.meta.get("model"),
+        "steps": len(rollout),
+        "dt_s": _number(rollout.meta["dt"]),
+        "simulated_s": _number(rollout.time[-1]),
+        "wall_s": round(wall, 3),
+        "step_ms_median": _number(np.median(taken)) if len(taken) else None,
+        "contacts_mean": _number(counters["contacts"].mean()),
+        "worst_penetration_m": _number(counters["worst_penetration"].max()),
+        "kinetic_energy_J": [_number(energy[0]), _number(energy[-1])],
+        "lowest_m": _number(heights.min()) if heights.size else None,
+        "finite": bool(np.isfinite(rollout.position).all() and np.isfinite(rollout.orientation).all()),
+        "meta": rollout.meta,
+    }
+
+
+def _number(value: Any) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def describe(
+    scene_file: Path, *, model: str | None, device: str, on_progress: Callable[[float, str], None]
+) -> dict[str, Any]:
+    """The plan of a scene with the units and the cost of a step, measured over a few steps.
+
+    Raises:
+        SdfsimError: bad input.
+    """
+    scene = load_scene(scene_file, on_progress=on_progress)
+    decided = plan(scene)
+    simulator = Simulator(scene, model=model, device=device)
+    units = simulator.units
+    trial = simulator.run(steps=_TRIAL_STEPS)
+    return {
+        "scene": str(scene_file),
+        "effects": {name: decided.to_dict()[name] for name in EFFECTS},
+        "static": list(decided.static),
+        "dynamic": list(decided.dynamic),
+        "masses_kg": {b.name: b.mass for b in scene.bodies if b.motion == "dynamic"},
+        "pairs": decided.pairs,
+        "nodes": decided.nodes,
+        "model": simulator.model.name,
+        "device": str(simulator.device),
+        "duration_s": scene.duration,
+        "dt_s": simulator.dt,
+        "steps": max(1, round(scene.duration / simulator.dt)),
+        "step_ms": float(np.median(trial.counters["step_ms"][1:])),
+        "units": {"length_m": units.length, "time_s": units.time, "mass_kg": units.mass},
+    }
+
+
+def plan_lines(report: dict[str, Any]) -> list[str]:
+    """`describe`'s report for people."""
+    units = report["units"]
+    moving, still = len(report["dynamic"]), len(report["static"])
+    return [
+        *(f"{name:<12}{'on' if e['on'] else 'off':<5}{e['why']}" for name, e in report["effects"].items()),
+        f"{moving} dynamic and {still} static bodies, {report['pairs']} pairs, {report['nodes']} surface nodes",
+        f"model {report['model']} on {report['device']}: {report['steps']} steps of {report['dt_s']:.4g} s, "
+        f"about {report['step_ms']:.1f} ms each (measured over the first {_TRIAL_STEPS})",
+        f"Froude scaling: the model's metre is {units['length_m']:.4g} m, its second {units['time_s']:.4g} s, "
+        f"its kilogram {units['mass_kg']:.4g} kg",
+    ]
+
+
+def environment() -> dict[str, Any]:
+    """Versions, devices and bundled models."""
+    import platform
+    from importlib.metadata import PackageNotFoundError, version
+
+    import torch
+
+    import sdfsim
+    from sdfsim.dynamics.model import bundled_models
+
+    versions = {"sdfsim": sdfsim.__version__, "python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            versions[name] = version(name)
+        except PackageNotFoundError:
+            versions[name] = "missing"
+    gpus = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
+    return {
+        "versions": versions,
+        "devices": ["cpu", *(f"cuda:{i} {name}" for i, name in enumerate(gpus))],
+        "cpu_threads": torch.get_num_threads(),
+        "models": bundled_models(),
+    }

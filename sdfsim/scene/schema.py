@@ -1,0 +1,158 @@
+"""The keys of `scene.yaml`: a checked document becomes plain specifications, nothing loaded yet."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sdfsim.scene.bodies import BodySpec, read_bodies
+from sdfsim.scene.document import Problems, Value, nearest, read_document
+from sdfsim.scene.types import Effects
+
+VERSION = 1
+DEFAULT_DURATION = 4.0  # s
+DEFAULT_GRAVITY = (0.0, 0.0, -9.81)  # m/s^2
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+
+_TOP = ("version", "model", "duration", "seed", "gravity", "effects", "shapes", "bodies")
+_SHAPE_KINDS = ("asset", "mesh", "primitive", "sphere", "box", "plane")
+_PLANE_ADVICE = " (a plane shape takes none: tilt it by the body's pose, or give the body its own `plane:`)"
+
+
+@dataclass
+class ShapeSpec:
+    """One entry of `shapes`, or the plane of a body.
+
+    Attributes:
+        name: its key.
+        kind: asset, mesh, primitive, sphere, box or plane.
+        place: where faults of it are reported.
+        path: of an asset or mesh, resolved against the scene's folder.
+        units: metres per unit of the mesh file.
+        options: radius, size, or what a primitive takes.
+    """
+
+    name: str
+    kind: str
+    place: Value
+    path: Path | None = None
+    units: float = 1.0
+    options: dict = field(default_factory=dict)
+
+
+@dataclass
+class SceneSpec:
+    """Everything a scene file says."""
+
+    problems: Problems
+    model: str | None
+    duration: float
+    seed: int
+    gravity: np.ndarray
+    effects: Effects
+    shapes: dict[str, ShapeSpec | None]
+    bodies: list[BodySpec]
+
+
+def read_scene(path: Path) -> SceneSpec:
+    """Read and check a scene file; faults are collected in `problems`, which the caller checks.
+
+    Raises:
+        SceneError: at once only when the file is missing or is not YAML.
+    """
+    root = read_document(path)
+    top = root.section(_TOP)
+    version = top.get("version")
+    if version is None:
+        top.missing("version", f"is required (must be {VERSION})")
+    elif version.integer(least=1, default=VERSION) != VERSION:
+        version.wrong(f"must be {VERSION} (got {version.shown()})")
+    model, seed = top.get("model"), top.get("seed")
+    shapes = _shapes(top.get("shapes"), path.parent)
+    bodies = top.required("bodies")
+    return SceneSpec(
+        problems=root.problems,
+        model=model.text() if model and not model.is_null() else None,
+        duration=top.number("duration", "s", above=0, default=DEFAULT_DURATION),
+        seed=seed.integer(least=0, default=0) if seed else 0,
+        gravity=top.vector("gravity", "m/s^2", DEFAULT_GRAVITY),
+        effects=_effects(top.get("effects")),
+        shapes=shapes,
+        bodies=read_bodies(bodies, {name: s.kind if s else None for name, s in shapes.items()}) if bodies else [],
+    )
+
+
+def _effects(value: Value | None) -> Effects:
+    if value is None or value.is_null():
+        return Effects()
+    choices: dict[str, tuple[str, ...]] = {
+        name: ("auto", "on", "off") for name in ("contact", "friction", "restitution", "rotation")
+    }
+    choices["sleep"] = ("on", "off")
+    chosen: dict[str, Any] = {key: item.choice(choices[key], choices[key][0]) for key, item in value.section(choices)}
+    return Effects(**chosen)
+
+
+def _shapes(value: Value | None, folder: Path) -> dict[str, ShapeSpec | None]:
+    """Every shape by name; None for one that is faulty, so that references to it are not faults as well."""
+    shapes: dict[str, ShapeSpec | None] = {}
+    if value is None or value.is_null():
+        return shapes
+    for name, item in value.section():
+        before = len(item.problems)
+        spec = _shape(name, item, folder)
+        shapes[name] = spec if len(item.problems) == before else None
+    return shapes
+
+
+def _shape(name: str, item: Value, folder: Path) -> ShapeSpec | None:
+    section = item.section((*_SHAPE_KINDS, "units"))
+    kind = section.one_of(_SHAPE_KINDS, required=True)
+    if kind is None:
+        return None
+    spec = ShapeSpec(name, kind.path.rsplit(".", 1)[-1], kind)
+    if "units" in section:
+        spec.units = UNITS[section["units"].choice(UNITS, "m")]
+        if spec.kind != "mesh":
+            section["units"].wrong(f"goes with mesh only (a shape given by {spec.kind} is in metres)")
+    if spec.kind in ("asset", "mesh"):
+        spec.path = folder / kind.text("?")
+        if spec.kind == "asset" and not spec.path.is_dir():
+            kind.wrong(f"no such folder: {spec.path}")
+        if spec.kind == "mesh" and not spec.path.is_file():
+            kind.wrong(f"no such file: {spec.path}")
+    elif spec.kind == "primitive":
+        spec.options = _primitive(kind)
+    elif spec.kind == "sphere":
+        sphere = kind.section(["radius"])
+        sphere.required("radius")
+        spec.options = {"radius": sphere.number("radius", "m", above=0, default=1.0)}
+    elif spec.kind == "box":
+        size = kind.section(["size"]).required("size")
+        spec.options = {"size": _positive(size) if size else np.ones(3)}
+    elif not kind.is_null():
+        kind.section((), advice=_PLANE_ADVICE)
+    return spec
+
+
+def _primitive(value: Value) -> dict:
+    """`{name: torus, size: 0.2}`: a procedural shape with its largest extent in metres."""
+    from sdfsim.shape.primitives import PRIMITIVES
+
+    section = value.section(("name", "size"))
+    name = section.required("name")
+    chosen = name.text() if name else ""
+    if name and chosen not in PRIMITIVES:
+        name.wrong(f"no such primitive: {chosen!r}{nearest(chosen, PRIMITIVES)}; there are {', '.join(PRIMITIVES)}")
+    return {"name": chosen, "size": section.number("size", "m", above=0, default=1.0)}
+
+
+def _positive(value: Value) -> np.ndarray:
+    size = value.vector(3, "m", default=(1, 1, 1))
+    for item, number in zip(value.items() if value.is_list() else [], size, strict=False):
+        if number <= 0:
+            item.wrong(f"must be > 0 (got {number:g} m)")
+    return size

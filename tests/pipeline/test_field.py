@@ -1,0 +1,215 @@
+"""The field's formulas against closed forms, and the trainer's determinism."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.cameras import Sparse, View
+from pipeline.distill import train
+from pipeline.field import (
+    FieldSize,
+    GridField,
+    choose_samples,
+    contract,
+    differences,
+    laplace_density,
+    render_weights,
+    sdf_cache,
+    sphere_interval,
+    stencil,
+)
+from pipeline.normalise import Normalisation
+from pipeline.rays import Rays, camera_rays, load_rays
+from pipeline.recipe import PRESETS
+from pipeline.trainer import Trainer, find_landmarks
+
+SMALL = FieldSize((8, 16), (2, 2), 16, 8)
+
+
+def test_laplace_density_is_the_distribution_function():
+    beta, s = 0.1, torch.linspace(-1, 1, 201, dtype=torch.float64)
+    density, x = laplace_density(s, beta), s.numpy()
+    expected = np.where(x > 0, 0.5 * np.exp(-x / beta), 1 - 0.5 * np.exp(x / beta)) / beta
+    np.testing.assert_allclose(density.numpy(), expected, rtol=1e-12)
+    assert laplace_density(torch.zeros(1), beta).item() == pytest.approx(0.5 / beta)
+
+
+def test_transmittance_in_front_of_a_plane_matches_the_integral():
+    # Ray towards the plane s = 1 - t; integral of the density up to t < 1 is 0.5 exp((t - 1) / beta) (from -inf).
+    beta, t = 0.05, torch.linspace(0, 1, 4001, dtype=torch.float64)
+    middle, delta = (t[1:] + t[:-1]) / 2, (t[1:] - t[:-1])
+    weights, left = render_weights(laplace_density(1 - middle, beta)[None], delta[None])
+    optical = 0.5 * (np.exp(0.0) - np.exp(-1 / beta))
+    assert left.item() == pytest.approx(np.exp(-optical), rel=1e-6)
+    assert weights.sum().item() + left.item() == pytest.approx(1.0, rel=1e-12)
+
+
+def test_weights_peak_at_the_plane():
+    beta, t = 0.01, torch.linspace(0, 2, 4001, dtype=torch.float64)
+    middle = (t[1:] + t[:-1]) / 2
+    weights, _ = render_weights(laplace_density(1 - middle, beta)[None], (t[1:] - t[:-1])[None])
+    depth = (weights[0] * middle).sum().item() / weights.sum().item()
+    assert abs(depth - 1) < 2 * beta
+
+
+def test_sphere_interval_closed_form():
+    origin = torch.tensor([[0.0, 0, -3], [0, 0, 0], [5, 5, -3]])
+    direction = torch.tensor([[0.0, 0, 1]] * 3)
+    enter, leave = sphere_interval(origin, direction)
+    assert enter.tolist()[:2] == pytest.approx([2, 0.02]) and leave.tolist()[:2] == pytest.approx([4, 1])
+    assert enter[2] == leave[2]
+
+
+def test_contraction_keeps_the_sphere_and_maps_infinity_to_one():
+    p = torch.tensor([[0.0, 0, 1], [0, 0, 2], [0, 0, 1e9]])
+    assert contract(p)[:, 2].tolist() == pytest.approx([0.5, 0.75, 1.0])
+
+
+def test_differences_on_a_quadratic():
+    p = torch.randn(20, 3, dtype=torch.float64)
+    values = (stencil(p, 0.01) ** 2).sum(-1)
+    gradient, laplacian = differences(values, 0.01)
+    assert torch.allclose(gradient, 2 * p) and torch.allclose(laplacian, torch.full_like(laplacian, 6.0), atol=1e-8)
+
+
+def test_fresh_field_is_a_ball():
+    field = GridField(FieldSize(), seed=0, start_radius=0.3)
+    p = torch.randn(500, 3)
+    p = p / p.norm(dim=1, keepdim=True) * torch.rand(500, 1)
+    with torch.no_grad():
+        assert (field.sdf(p) - (p.norm(dim=1) - 0.3)).abs().max() < 0.15
+
+
+def test_samples_gather_at_the_surface():
+    line = torch.linspace(-1, 1, 64)
+    z, y, x = torch.meshgrid(line, line, line, indexing="ij")
+    cache = (torch.stack([x, y, z]).norm(dim=0) - 0.5)[None, None]
+    origin, direction = torch.tensor([[0.0, 0, -3]]), torch.tensor([[0.0, 0, 1]])
+    found = choose_samples(cache, origin, direction, 0.01, torch.full((1, 32), 0.5))
+    assert (found.distance.diff() >= 0).all()
+    assert found.delta.sum().item() == pytest.approx(2.0, rel=1e-5)
+    assert (found.points[found.near_surface].norm(dim=1) - 0.5).abs().median() < 0.05
+
+
+def test_camera_rays_match_the_slow_twin_and_projection():
+    rng = np.random.default_rng(0)
+    q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    q *= np.sign(np.linalg.det(q))
+    view = View("a", "a", 100, 80, 90.0, 51.0, 39.0, 0.05, q, rng.normal(size=3))
+    uv = rng.uniform([0, 0], [100, 80], (50, 2))
+    slow = view.rays(uv[:, 0], uv[:, 1])
+    tables = [torch.tensor(np.repeat(np.asarray(a)[None], 50, 0), dtype=torch.float64)
+              for a in ([view.focal, view.cx, view.cy, view.k], view.rotation, view.center)]  # fmt: skip
+    _, fast = camera_rays(*tables, torch.tensor(uv))
+    np.testing.assert_allclose(fast.numpy(), slow, atol=1e-7)
+    back, depth = view.project(view.center + 2.5 * slow)
+    np.testing.assert_allclose(back, uv, atol=1e-4)
+    assert (depth > 0).all()
+
+
+def toy_rays(count: int = 2000) -> Rays:
+    """A red ball in front of grey, seen from two sides."""
+    rng = np.random.default_rng(0)
+    pixel = rng.integers(0, 40, (count, 2))
+    view = rng.integers(0, 2, count)
+    inside = ((pixel - 19.5) ** 2).sum(1) < 100
+    rgb = np.where(inside[:, None], [200, 30, 30], [128, 128, 128]).astype(np.uint8)
+    turn = np.diag([-1.0, 1, -1])
+    return Rays(
+        torch.tensor(rgb), None, torch.tensor(view.astype(np.int16)), torch.tensor(pixel.astype(np.int16)),
+        torch.tensor([[60.0, 20, 20, 0]] * 2), torch.tensor(np.stack([np.eye(3), turn]), dtype=torch.float32),
+        torch.tensor([[0.0, 0, -3], [0, 0, 3]]), torch.tensor([[40, 40]] * 2),
+    )  # fmt: skip
+
+
+def trainer(seed: int = 0) -> Trainer:
+    from dataclasses import replace
+
+    recipe = replace(PRESETS["quick"], size=SMALL, rays=64, iterations=20, surface_points=32)
+    sparse = Sparse(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), np.zeros(0, int), np.zeros(0, int))
+    return Trainer(recipe, toy_rays(), find_landmarks(sparse, [], Normalisation(np.zeros(3), 1.0)), seed)
+
+
+def test_batches_depend_on_seed_and_iteration_only():
+    rays = toy_rays()
+    assert torch.equal(rays.batch(16, 1, 5), rays.batch(16, 1, 5))
+    assert not torch.equal(rays.batch(16, 1, 5), rays.batch(16, 1, 6))
+    assert not torch.equal(rays.batch(16, 1, 5), rays.batch(16, 2, 5))
+
+
+@pytest.fixture
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def test_a_resumed_run_ends_as_an_undisturbed_one(tmp_path, one_thread):
+    whole, first, second = trainer(), trainer(), trainer(seed=0)
+    for _ in range(8):
+        whole.step()
+    for _ in range(4):
+        first.step()
+    first.save(tmp_path / "c.safetensors")
+    assert second.load(tmp_path / "c.safetensors")
+    for _ in range(4):
+        second.step()
+    for a, b in zip(whole.parameters(), second.parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_a_broken_checkpoint_is_ignored(tmp_path):
+    path = tmp_path / "c.safetensors"
+    path.write_bytes(b"not a checkpoint")
+    assert not trainer().load(path)
+    assert not trainer().load(tmp_path / "none")
+
+
+def test_training_lowers_the_colour_error():
+    run = trainer()
+    losses = [run.step()["color"] for _ in range(20)]
+    assert np.mean(losses[-4:]) < np.mean(losses[:4])
+    assert torch.isfinite(sdf_cache(run.field, 8)).all()
+
+
+def test_masks_make_what_they_exclude_transparent():
+    from dataclasses import replace
+
+    rays = toy_rays()
+    masked = replace(rays, mask=((rays.rgb[:, 0] == 200) * 255).to(torch.uint8))
+    sparse = Sparse(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), np.zeros(0, int), np.zeros(0, int))
+    recipe = replace(PRESETS["quick"], size=SMALL, rays=128, iterations=40, surface_points=32)
+    run = Trainer(recipe, masked, find_landmarks(sparse, [], Normalisation(np.zeros(3), 1.0)), 0)
+    losses = [run.step()["mask"] for _ in range(40)]
+    assert np.mean(losses[-5:]) < 0.7 * np.mean(losses[:5])
+
+
+def test_train_writes_and_reads_back(tmp_path):
+    from dataclasses import replace
+
+    from PIL import Image
+
+    from pipeline.distill import load_field
+
+    (tmp_path / "images").mkdir()
+    rng = np.random.default_rng(0)
+    views = []
+    for k in range(4):
+        Image.fromarray(rng.integers(0, 255, (40, 40, 3), dtype=np.uint8)).save(tmp_path / "images" / f"{k}.jpg")
+        a = k * np.pi / 2
+        turn = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+        views.append(View(f"{k}.jpg", f"{k}.jpg", 40, 40, 50.0, 20.0, 20.0, 0.0, turn, np.array([0.0, 0, 3])))
+    points = rng.normal(size=(50, 3)) * 0.3
+    point_of, view_of = np.repeat(np.arange(50), 4), np.tile(np.arange(4), 50)
+    sparse = Sparse(points, np.zeros((50, 3), np.uint8), np.full(50, 0.5), point_of, view_of)
+    recipe = replace(PRESETS["quick"], size=SMALL, rays=32, iterations=6, surface_points=16)
+    trained = train(views, sparse, tmp_path, tmp_path, recipe=recipe, threads=1)
+    again = load_field(tmp_path)
+    p = torch.randn(10, 3) * 0.4
+    with torch.no_grad():
+        assert torch.equal(trained.field.sdf(p), again.field.sdf(p))
+    assert not (tmp_path / "checkpoint.safetensors").exists()
+    assert len(load_rays(trained.normalisation.views(views), tmp_path, 40, masks=False)) > 0

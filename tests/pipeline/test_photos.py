@@ -1,0 +1,134 @@
+"""Reading photos: what is accepted, and one clear line for each thing that is not."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipeline.photos import load_photos, prepare_photos
+from sdfsim.errors import EXIT_ERROR, SdfsimError
+
+
+def picture(width: int = 120, height: int = 80, seed: int = 0) -> Image.Image:
+    return Image.fromarray(np.random.default_rng(seed).integers(0, 255, (height, width, 3), dtype=np.uint8))
+
+
+def fill(folder: Path, count: int = 3, **keywords) -> None:
+    folder.mkdir(exist_ok=True)
+    for k in range(count):
+        picture(seed=k, **keywords).save(folder / f"{k}.jpg")
+
+
+def failure(folder: Path, out: Path) -> SdfsimError:
+    with pytest.raises(SdfsimError) as caught:
+        prepare_photos(folder, out, long_side=100)
+    assert "\n" not in caught.value.message
+    assert caught.value.exit_code == EXIT_ERROR
+    return caught.value
+
+
+def test_missing_folder(tmp_path):
+    assert "no such folder" in failure(tmp_path / "none", tmp_path).message
+
+
+def test_empty_folder(tmp_path):
+    (tmp_path / "empty").mkdir()
+    message = failure(tmp_path / "empty", tmp_path).message
+    assert "no photos" in message and "at least 3" in message
+
+
+def test_two_photos(tmp_path):
+    fill(tmp_path / "two", 2)
+    assert "2 photos found, at least 3 are needed" in failure(tmp_path / "two", tmp_path).message
+
+
+def test_text_named_jpg(tmp_path):
+    fill(tmp_path / "in")
+    (tmp_path / "in" / "9.jpg").write_text("hello")
+    message = failure(tmp_path / "in", tmp_path).message
+    assert "9.jpg: not an image" in message
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png"])
+def test_truncated_photo_is_named(tmp_path, suffix):
+    fill(tmp_path / "in")
+    data = io.BytesIO()
+    picture(400, 300).save(data, "JPEG" if suffix == "jpg" else "PNG")
+    (tmp_path / "in" / f"cut.{suffix}").write_bytes(data.getvalue()[: len(data.getvalue()) // 2])
+    message = failure(tmp_path / "in", tmp_path).message
+    assert f"cut.{suffix}: " in message and "truncated" in message
+
+
+def test_absurdly_large_photo_is_refused_before_decoding(tmp_path):
+    import struct
+    import zlib
+
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    fill(tmp_path / "in")
+    header = struct.pack(">IIBBBBB", 100_000, 100_000, 8, 2, 0, 0, 0)
+    (tmp_path / "in" / "bomb.png").write_bytes(
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0")) + chunk(b"IEND", b"")
+    )
+    assert "bomb.png: too large (100000 x 100000" in failure(tmp_path / "in", tmp_path).message
+
+
+def test_tiny_photo_is_refused(tmp_path):
+    fill(tmp_path / "in")
+    picture(20, 20).save(tmp_path / "in" / "x.png")
+    assert "too small" in failure(tmp_path / "in", tmp_path).message
+
+
+def test_other_files_are_noted_and_sizes_may_differ(tmp_path):
+    fill(tmp_path / "in")
+    picture(60, 90).resize((80, 120)).save(tmp_path / "in" / "portrait.png")
+    (tmp_path / "in" / "notes.txt").write_text("hello")
+    photos, notes = prepare_photos(tmp_path / "in", tmp_path, long_side=100)
+    assert {(p.width, p.height) for p in photos} == {(100, 67), (67, 100)}
+    assert any("notes.txt" in note for note in notes) and any("several sizes" in note for note in notes)
+    assert load_photos(tmp_path) == photos
+
+
+def test_exif_orientation_and_focal_length(tmp_path):
+    fill(tmp_path / "in", 2)
+    pixels = np.zeros((80, 120, 3), np.uint8)
+    pixels[:, :30] = 255  # The left edge; orientation 6 turns it to the top.
+    image = Image.fromarray(pixels)
+    exif = image.getexif()
+    exif[0x0112] = 6
+    exif.get_ifd(0x8769)[0xA405] = 36  # 35 mm equivalent
+    image.save(tmp_path / "in" / "turned.jpg", exif=exif, quality=95)
+    photos, _ = prepare_photos(tmp_path / "in", tmp_path, long_side=120)
+    turned = next(p for p in photos if p.source == "turned.jpg")
+    assert (turned.width, turned.height) == (80, 120)
+    assert turned.focal == pytest.approx(120.0)  # 36 mm on a 36 mm frame: as long as the longer side.
+    written = np.asarray(Image.open(tmp_path / "images" / turned.name))
+    assert written[:25].mean() > 250 and written[40:].mean() < 5
+
+
+def test_alpha_becomes_a_mask(tmp_path):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for k in range(3):
+        pixels = np.full((80, 80, 4), 200, np.uint8)
+        pixels[:40, :, 3] = 0
+        Image.fromarray(pixels).save(folder / f"{k}.png")
+    photos, _ = prepare_photos(folder, tmp_path, long_side=80)
+    assert all(p.mask for p in photos)
+    mask = np.asarray(Image.open(tmp_path / "masks" / (photos[0].name + ".png")))
+    assert mask[:38].max() == 0 and mask[42:].min() == 200
+    rgb = np.asarray(Image.open(tmp_path / "images" / photos[0].name)).astype(int)
+    assert np.abs(rgb[:38] - 128).max() < 6
+
+
+def test_sixteen_bit_grey_is_scaled_not_clipped(tmp_path):
+    fill(tmp_path / "in", 2)
+    Image.fromarray(np.full((80, 80), 128 << 8, np.uint16)).save(tmp_path / "in" / "deep.png")
+    photos, _ = prepare_photos(tmp_path / "in", tmp_path, long_side=80)
+    deep = next(p for p in photos if p.source == "deep.png")
+    assert abs(int(np.asarray(Image.open(tmp_path / "images" / deep.name))[40, 40, 0]) - 128) <= 1

@@ -1,0 +1,172 @@
+"""Stages: skipped when nothing changed, done again when something did, resumed when killed, never half-written."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipeline import record, stages
+from sdfsim.errors import SdfsimError
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+
+
+@pytest.fixture
+def photos(tmp_path) -> Path:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for k in range(3):
+        pixels = np.random.default_rng(k).integers(0, 255, (80, 80, 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(folder / f"{k}.png")
+    return folder
+
+
+@pytest.fixture
+def calls(monkeypatch) -> list[str]:
+    """Replaces what stages do by a note of their names and one file each."""
+    done: list[str] = []
+
+    def action(name: str):
+        def act(run: stages.Run, work: Path) -> dict:
+            done.append(name)
+            (work / "result").write_text(name)
+            if name == "scene":
+                (run.folder / "scene.yaml").write_text("version: 1\n")
+            return {"name": name}
+
+        return act
+
+    monkeypatch.setattr(stages, "ACTIONS", {name: action(name) for name in stages.STAGES})
+    return done
+
+
+def test_unchanged_stages_are_skipped(photos, tmp_path, calls):
+    stages.reconstruct(photos, tmp_path / "out", preset="quick")
+    assert calls == list(stages.STAGES)
+    calls.clear()
+    report = stages.reconstruct(photos, tmp_path / "out", preset="quick")
+    assert calls == []
+    assert set(report["stages"]) == set(stages.STAGES)
+    assert json.loads((tmp_path / "out" / "report.json").read_text()) == report
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"size": 2.0}, ["mesh", "fit", "scene"]),
+        ({"from_stage": "fit"}, ["fit", "scene"]),
+        ({"preset": "standard"}, list(stages.STAGES)),
+        ({"until_stage": "poses", "seed": 3}, ["poses"]),
+    ],
+)
+def test_what_changed_is_done_again(photos, tmp_path, calls, changes, expected):
+    stages.reconstruct(photos, tmp_path / "out", preset="quick")
+    calls.clear()
+    stages.reconstruct(photos, tmp_path / "out", **{"preset": "quick", **changes})
+    assert calls == expected
+
+
+def test_another_photo_changes_everything(photos, tmp_path, calls):
+    stages.reconstruct(photos, tmp_path / "out", preset="quick")
+    calls.clear()
+    Image.new("RGB", (80, 80)).save(photos / "9.png")
+    stages.reconstruct(photos, tmp_path / "out", preset="quick")
+    assert calls == list(stages.STAGES)
+
+
+def test_a_killed_stage_goes_on_in_its_own_folder(photos, tmp_path, calls, monkeypatch):
+    def killed(run: stages.Run, work: Path) -> dict:
+        (work / "checkpoint").write_text("half")
+        raise KeyboardInterrupt
+
+    ordinary = stages.ACTIONS["distill"]
+    monkeypatch.setitem(stages.ACTIONS, "distill", killed)
+    with pytest.raises(KeyboardInterrupt):
+        stages.reconstruct(photos, tmp_path / "out", preset="quick")
+    assert not (tmp_path / "out" / "distill").exists()
+    found = []
+    monkeypatch.setitem(
+        stages.ACTIONS, "distill", lambda run, work: found.append((work / "checkpoint").exists()) or ordinary(run, work)
+    )
+    calls.clear()
+    stages.reconstruct(photos, tmp_path / "out", preset="quick")
+    assert found == [True] and calls == ["distill", "mesh", "fit", "scene"]
+
+
+def test_leftovers_of_other_options_are_not_used(tmp_path):
+    work = record.begin(tmp_path / "w", "a", fresh=False)
+    (work / "x").write_text("")
+    assert (record.begin(work, "a", fresh=False) / "x").exists()
+    assert not (record.begin(work, "b", fresh=False) / "x").exists()
+    (work / "x").write_text("")
+    assert not (record.begin(work, "b", fresh=True) / "x").exists()
+
+
+def test_run_stage_needs_the_stages_before(photos, tmp_path, calls):
+    with pytest.raises(SdfsimError, match="not the folder of a reconstruction"):
+        stages.run_stage("distill", tmp_path / "out")
+    stages.reconstruct(photos, tmp_path / "out", preset="quick", until_stage="photos")
+    with pytest.raises(SdfsimError, match="the poses stage has not run"):
+        stages.run_stage("distill", tmp_path / "out")
+    stages.run_stage("poses", tmp_path / "out")
+    calls.clear()
+    report = stages.run_stage("distill", tmp_path / "out", budget=5.0, preset=None)
+    assert calls == ["distill"] and report["options"]["preset"] == "quick" and report["options"]["budget"] == 5.0
+
+
+@pytest.mark.parametrize(
+    ("keywords", "words"),
+    [
+        ({"preset": "slow"}, "preset"),
+        ({"size": -1.0}, "size"),
+        ({"budget": 0.0}, "budget"),
+        ({"until_stage": "x"}, "stage"),
+    ],
+)
+def test_bad_options_are_one_line_and_write_nothing(photos, tmp_path, keywords, words):
+    with pytest.raises(SdfsimError, match=words) as caught:
+        stages.reconstruct(photos, tmp_path / "out", **keywords)
+    assert "\n" not in caught.value.message
+    assert not (tmp_path / "out").exists()
+
+
+def test_bad_photos_write_nothing(tmp_path):
+    with pytest.raises(SdfsimError, match="no such folder"):
+        stages.reconstruct(tmp_path / "none", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_unwritable_output_is_one_clear_line(photos, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SdfsimError, match="cannot be written"):
+        stages.reconstruct(photos, tmp_path / "file" / "out")
+
+
+def test_full_disk_is_one_clear_line(photos, tmp_path, calls, monkeypatch):
+    def full(run: stages.Run, work: Path) -> dict:
+        raise OSError(28, "No space left on device", str(work))
+
+    monkeypatch.setitem(stages.ACTIONS, "mesh", full)
+    with pytest.raises(SdfsimError, match="the disk is full"):
+        stages.reconstruct(photos, tmp_path / "out", preset="quick")
+
+
+@pytest.mark.slow
+def test_the_whole_chain_on_the_rendered_set(tmp_path):
+    sys.path.insert(0, str(ROOT))
+    from benchmarks.reconstruct import evaluate
+
+    source = ROOT / "samples" / "photos" / "table_vase"
+    report = stages.reconstruct(source, tmp_path, preset="quick")
+    truth = evaluate(tmp_path, source)
+    assert truth["poses"]["center_error_worst_percent"] < 0.5
+    surface = truth["surface_percent_of_table_width"]["surface"]
+    assert surface["median"] <= 1.0
+    assert surface["p90"] <= 4.0
+    assert report["psnr"] > 20
+    assert (tmp_path / "scene.yaml").exists()

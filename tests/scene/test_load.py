@@ -1,0 +1,277 @@
+"""Scene files: good ones become SI data, bad ones are told about line by line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from sdfsim import SceneError, load_scene
+from sdfsim.scene.types import Scene
+
+HEAD = "version: 1\nshapes:\n  ball: {sphere: {radius: 0.5}}\nbodies:\n"  # bodies[0] is on line 5
+
+
+@pytest.fixture
+def load(tmp_path: Path):
+    def from_text(text: str) -> Scene:
+        file = tmp_path / "scene.yaml"
+        file.write_text(text, encoding="utf-8")
+        return load_scene(file)
+
+    return from_text
+
+
+def problems_of(load, text: str) -> list[str]:
+    """The faults of a scene, without the folder in front of the file's name."""
+    with pytest.raises(SceneError) as caught:
+        load(text)
+    return ["scene.yaml:" + line.split("scene.yaml:", 1)[1] for line in caught.value.problems]
+
+
+BODY = [
+    ("mass: -0.3", "bodies[0].mass: must be > 0 (got -0.3 kg)"),
+    ("mass: .nan", "bodies[0].mass: must be finite (got .nan)"),
+    ("mass: 1e999", "bodies[0].mass: must be finite (got 1e999)"),
+    ("mass: heavy", "bodies[0].mass: must be a number in kg (got 'heavy')"),
+    ("mass: '1'", "bodies[0].mass: must be a number in kg (got '1')"),
+    ("mass: [1]", "bodies[0].mass: must be a number in kg (got a list)"),
+    ("mass:", "bodies[0].mass: must be a number in kg (got nothing)"),
+    ("mass: 1, density: 2", "bodies[0].density: give only one of mass, density (got mass and density)"),
+    ("scale: 0", "bodies[0].scale: must be > 0 (got 0)"),
+    ("restitution: 1.5", "bodies[0].restitution: must be <= 1 (got 1.5)"),
+    ("friction: -1", "bodies[0].friction: must be >= 0 (got -1)"),
+    ("positon: [0, 0, 0]", "bodies[0].positon: unknown key (did you mean 'position'?)"),
+    ("position: [0, 0]", "bodies[0].position: must be a list of 3 numbers in m (got 2 values)"),
+    ("position: [0, inf, 0]", "bodies[0].position[1]: must be finite (got inf)"),
+    ("velocity: 3", "bodies[0].velocity: must be a list of 3 numbers in m/s (got '3')"),
+    ("motion: kinematic", "bodies[0].motion: must be one of static, dynamic (got 'kinematic')"),
+    ("quat_xyzw: [0, 0, 0, 0]", "bodies[0].quat_xyzw: must not be zero: a quaternion has length 1"),
+    (
+        "quat_xyzw: [0, 0, 0, 1], euler_xyz_deg: [0, 0, 0]",
+        "bodies[0].euler_xyz_deg: give only one of quat_xyzw, quat_wxyz, euler_xyz_deg "
+        "(got quat_xyzw and euler_xyz_deg)",
+    ),
+    ("collides_with: [flor]", "bodies[0].collides_with[0]: no body is called 'flor' (did you mean 'floor'?)"),
+    ("collides_with: none", "bodies[0].collides_with: must be one of all (got 'none')"),
+    ("count: 0", "bodies[0].count: must be >= 1 (got 0)"),
+    ("count: 2.5", "bodies[0].count: must be a whole number (got '2.5')"),
+    ("count: 3", "bodies[0].count: needs arrange: {grid: [nx, ny, nz], spacing: metres} (got 3 at one place)"),
+    (
+        "count: 9, arrange: {grid: [2, 2, 2], spacing: 1}",
+        "bodies[0].count: must be <= 8, the places of the grid (got 9)",
+    ),
+    ("arrange: {grid: [2, 2, 2]}", "bodies[0].arrange.spacing: is required"),
+    ("mass: !!python/object/apply:os.getcwd []", None),
+]
+
+
+@pytest.mark.parametrize(("fields", "fault"), BODY)
+def test_a_wrong_body_is_told_with_its_line(load, fields, fault):
+    text = f"{HEAD}  - {{name: a, shape: ball, {fields}}}\n  - {{name: floor, motion: static, plane: {{}}}}\n"
+    found = problems_of(load, text)
+    if fault is not None:
+        assert found == [f"scene.yaml:5: {fault}"]
+
+
+FILES = [
+    ("", ["scene.yaml:1: the file is empty"]),
+    ("- 1\n", ["scene.yaml:1: must be a mapping (got a list)"]),
+    ("version: 1\nbodies: []\n", ["scene.yaml:2: bodies: must hold at least one body (got 0)"]),
+    ("bodies: [{name: a, plane: {}}]\n", ["scene.yaml:1: version: is required (must be 1)"]),
+    ("version: 1\n", ["scene.yaml:1: bodies: is required"]),
+    ("version: 1\nversion: 1\nbodies: []\n", ["scene.yaml:2: version: the key appears twice (first on line 1)"]),
+    ("version: 1\nbodies: [\n", ["scene.yaml:3: not valid YAML: "]),
+    ("version: 1\nbodies:\n\t- {}\n", ["scene.yaml:3: not valid YAML: "]),
+    ("a: &a [*a]\n", ["scene.yaml:1: a: unknown key"]),
+]
+
+
+@pytest.mark.parametrize(("text", "faults"), FILES)
+def test_a_wrong_file_is_told_with_its_line(load, text, faults):
+    found = problems_of(load, text)
+    for fault in faults:
+        assert any(line.startswith(fault) for line in found), found
+
+
+TOP = [
+    ("version: 2", "version: must be 1 (got '2')"),
+    ("duration: 0", "duration: must be > 0 (got 0 s)"),
+    ("gravity: [0, 0, nan]", "gravity[2]: must be finite (got nan)"),
+    ("seed: -1", "seed: must be >= 0 (got -1)"),
+    ("effects: {frictoin: off}", "effects.frictoin: unknown key (did you mean 'friction'?)"),
+    ("effects: {sleep: auto}", "effects.sleep: must be one of on, off (got 'auto')"),
+    ("shapes: {cup: {asset: nowhere}}", "shapes.cup.asset: no such folder: FOLDER/nowhere"),
+    ("shapes: {cup: {mesh: cup.obj}}", "shapes.cup.mesh: no such file: FOLDER/cup.obj"),
+    ("shapes: {cup: {sphere: {radius: 0}}}", "shapes.cup.sphere.radius: must be > 0 (got 0 m)"),
+    ("shapes: {cup: {sphere: {}}}", "shapes.cup.sphere.radius: is required"),
+    ("shapes: {cup: {box: {size: [1, -1, 1]}}}", "shapes.cup.box.size[1]: must be > 0 (got -1 m)"),
+    ("shapes: {cup: {}}", "shapes.cup: one of asset, mesh, primitive, sphere, box, plane is required"),
+    ("shapes: {cup: {shpere: {}}}", "shapes.cup.shpere: unknown key (did you mean 'sphere'?)"),
+    ("shapes: {cup: {sphere: {radius: 1}, units: cm}}", "shapes.cup.units: goes with mesh only"),
+    ("shapes: {cup: {primitive: {name: tours}}}", "shapes.cup.primitive.name: no such primitive: 'tours'"),
+]
+
+
+@pytest.mark.parametrize(("line", "fault"), TOP)
+def test_a_wrong_top_level_is_told_with_its_line(load, tmp_path, line, fault):
+    version = "" if line.startswith("version") else "version: 1\n"
+    found = problems_of(load, f"# comment\n{version}{line}\nbodies:\n  - {{name: floor, plane: {{}}}}\n")
+    where = "scene.yaml:2: " if not version else "scene.yaml:3: "
+    assert any(f.startswith(where + fault.replace("FOLDER", str(tmp_path))) for f in found), found
+
+
+def test_every_fault_is_told_at_once_in_file_order(load):
+    found = problems_of(
+        load,
+        "version: 3\nduration: -1\nshapes:\n  ball: {sphere: {radius: 0.1}}\nbodies:\n"
+        "  - {name: a, shape: bal, mass: 0}\n  - name: a\n    shape: ball\n    velocity: [1, 2]\n",
+    )
+    assert found == [
+        "scene.yaml:1: version: must be 1 (got '3')",
+        "scene.yaml:2: duration: must be > 0 (got -1 s)",
+        "scene.yaml:6: bodies[0].shape: no shape is called 'bal' (did you mean 'ball'?)",
+        "scene.yaml:6: bodies[0].mass: must be > 0 (got 0 kg)",
+        "scene.yaml:7: bodies[1].name: two bodies are called 'a' (the first on line 6)",
+        "scene.yaml:9: bodies[1].velocity: must be a list of 3 numbers in m/s (got 2 values)",
+    ]
+
+
+def test_missing_files(tmp_path):
+    with pytest.raises(SceneError, match="no such file"):
+        load_scene(tmp_path / "scene.yaml")
+    with pytest.raises(SceneError, match="cannot be read"):
+        load_scene(tmp_path)
+    (tmp_path / "scene.yaml").write_bytes(b"version: 1\n\xff\xfe")
+    with pytest.raises(SceneError, match=r"scene\.yaml:2: not a text"):
+        load_scene(tmp_path / "scene.yaml")
+    (tmp_path / "scene.yaml").write_text("[" * 100_000)
+    with pytest.raises(SceneError, match="not valid YAML"):
+        load_scene(tmp_path / "scene.yaml")
+
+
+def test_a_broken_asset_is_told_at_its_line(load, tmp_path):
+    (tmp_path / "cup").mkdir()
+    found = problems_of(load, "version: 1\nshapes:\n  c: {asset: cup}\nbodies:\n  - {name: a, shape: c, mass: 1}\n")
+    assert len(found) == 1 and found[0].startswith("scene.yaml:3: shapes.c.asset: ")
+
+
+def test_a_mesh_without_faces_is_told_at_its_line(load, tmp_path):
+    (tmp_path / "cup.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
+    found = problems_of(load, "version: 1\nshapes:\n  c: {mesh: cup.obj}\nbodies:\n  - {name: a, shape: c, mass: 1}\n")
+    assert len(found) == 1 and found[0].startswith("scene.yaml:3: shapes.c.mesh: ")
+
+
+def test_defaults_and_units(load):
+    scene = load(HEAD + "  - {name: a, shape: ball, scale: 2}\n")
+    body = scene.bodies[0]
+    assert scene.duration == 4.0 and scene.seed == 0 and scene.model is None
+    np.testing.assert_array_equal(scene.gravity, [0, 0, -9.81])
+    assert body.motion == "dynamic" and body.friction == 0.5 and body.restitution == 0.5
+    assert body.mass == pytest.approx(1000 * np.pi / 6 * 8, rel=0.01)  # 1000 kg/m^3 unless the file says otherwise
+    assert body.collides_with is None
+
+
+def test_numbers_are_read_from_their_text(load):
+    scene = load(HEAD + "  - {name: a, shape: ball, mass: 1e-3, velocity: [+1, .5, 2.]}\n")
+    assert scene.bodies[0].mass == 1e-3
+    np.testing.assert_array_equal(scene.bodies[0].velocity, [1, 0.5, 2])
+
+
+def test_the_three_ways_to_turn_a_body_agree(load):
+    turn = Rotation.from_euler("xyz", [30, -40, 70], degrees=True)
+    x, y, z, w = turn.as_quat()
+    bodies = [f"quat_xyzw: [{x}, {y}, {z}, {w}]", f"quat_wxyz: [{2 * w}, {2 * x}, {2 * y}, {2 * z}]"]
+    bodies.append("euler_xyz_deg: [30, -40, 70]")
+    scene = load(HEAD + "".join(f"  - {{name: b{i}, shape: ball, {b}}}\n" for i, b in enumerate(bodies)))
+    for body in scene.bodies:
+        np.testing.assert_allclose(Rotation.from_quat(body.quat_xyzw).as_matrix(), turn.as_matrix(), atol=1e-12)
+
+
+@pytest.mark.parametrize("normal", [[0, 0, 1], [0, 0, -2], [1, 2, -3], [0, 1e-3, 0]])
+def test_a_plane_has_its_pose_from_normal_and_offset(load, normal):
+    scene = load(f"version: 1\nbodies:\n  - {{name: wall, plane: {{normal: {normal}, offset: 0.7}}}}\n")
+    body, unit = scene.bodies[0], np.array(normal) / np.linalg.norm(normal)
+    np.testing.assert_allclose(Rotation.from_quat(body.quat_xyzw).apply([0, 0, 1]), unit, atol=1e-12)
+    assert body.position @ unit == pytest.approx(0.7)
+    assert body.motion == "static" and body.mass == 0.0
+    assert np.isinf(scene.shapes[body.shape].sdf.bounds).any()
+
+
+def test_a_plane_does_not_move(load):
+    bodies = "  - {name: a, plane: {}, motion: dynamic}\n  - {name: b, plane: {}, mass: 1}\n"
+    first, second = problems_of(load, "version: 1\nbodies:\n" + bodies)
+    assert first == "scene.yaml:3: bodies[0].motion: a plane must be static"
+    assert second.startswith("scene.yaml:4: bodies[1].mass: does not go with plane")
+
+
+def test_copies_fill_a_grid_from_the_bottom(load):
+    scene = load(
+        HEAD + "  - {name: b, shape: ball, count: 5, arrange: {grid: [2, 2, 2], spacing: 3}, position: [1, 0, 2]}\n"
+        "  - {name: c, shape: ball, collides_with: [b]}\n"
+    )
+    assert [b.name for b in scene.bodies] == ["b[0]", "b[1]", "b[2]", "b[3]", "b[4]", "c"]
+    np.testing.assert_allclose(scene.bodies[0].position, [-0.5, -1.5, 2])
+    np.testing.assert_allclose(scene.bodies[1].position, [2.5, -1.5, 2])
+    np.testing.assert_allclose(scene.bodies[4].position, [-0.5, -1.5, 5])
+    assert scene.bodies[5].collides_with == ("b[0]", "b[1]", "b[2]", "b[3]", "b[4]")
+    assert len(scene.shapes) == 1
+
+
+@pytest.mark.parametrize("sample", ["tower", "spheres_in_bowl", "pile"])
+def test_the_samples_are_right(sample):
+    from sdfsim.scene.schema import read_scene
+
+    spec = read_scene(Path(__file__).parents[2] / "samples" / f"{sample}.yaml")
+    spec.problems.check()
+    assert sum(len(b.names()) for b in spec.bodies) >= 5
+
+
+VOCABULARY = """version 1 bodies shapes ball name a shape mass -1 .nan 1e400 plane normal offset count arrange grid
+spacing position [0,0,1] collides_with all effects contact off sphere radius 0 &x *x {} [] ~ ! | > ' " - : ,"""
+WORDS = st.sampled_from([*VOCABULARY.split(), "\n", "\n  "])
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(WORDS, max_size=40))
+def test_whatever_is_written_ends_in_a_scene_or_a_scene_error(load, words):
+    try:
+        load(" ".join(words))
+    except SceneError as error:
+        assert error.problems and all("scene.yaml" in line for line in error.problems)
+
+
+VALUES = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(),
+    st.floats(),
+    st.text(max_size=6),
+    st.lists(st.floats() | st.integers(-3, 3), max_size=4),
+    st.sampled_from([{}, {"grid": [1, 2, 3], "spacing": 0.1}, {"normal": [0, 0, 1]}, ["a"], "all", "ball", "static"]),
+)
+KEYS = st.sampled_from(
+    "name shape plane motion scale position quat_xyzw quat_wxyz euler_xyz_deg velocity angular_velocity mass density "
+    "friction restitution collides_with count arrange other".split()
+)
+
+
+@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.dictionaries(KEYS, VALUES, max_size=5))
+def test_any_body_is_a_body_or_a_fault(load, fields):
+    import yaml
+
+    body = {"name": "a", "shape": "ball", **fields}
+    text = yaml.safe_dump({"version": 1, "shapes": {"ball": {"sphere": {"radius": 1}}}, "bodies": [body]})
+    try:
+        scene = load(text)
+    except SceneError as error:
+        assert error.problems
+        return
+    for b in scene.bodies:
+        assert np.isfinite(b.position).all() and np.isfinite(b.mass) and b.scale > 0
+        assert np.linalg.norm(b.quat_xyzw) == pytest.approx(1)

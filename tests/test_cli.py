@@ -1,0 +1,262 @@
+"""The command line from outside: exit codes, one line an error, one JSON object, run folders."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from typer.testing import CliRunner
+
+import cli
+from sdfsim import Rollout, SdfsimError
+from sdfsim.dynamics.model import Model, new_network
+from sdfsim.dynamics.simulator import SimulationError, Simulator
+
+ROOT = Path(__file__).resolve().parents[1]
+SCENE = """
+version: 1
+duration: 0.2
+shapes:
+  ball: {sphere: {radius: 0.5}}
+bodies:
+  - {name: floor, plane: {}}
+  - {name: ball, shape: ball, position: [0, 0, 5]}
+"""
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory) -> str:
+    """Untrained weights: what the commands do around the network does not depend on them."""
+    path = tmp_path_factory.mktemp("model") / "untrained.safetensors"
+    torch.manual_seed(0)
+    Model("untrained", "impulse", new_network("impulse", {"width": 8, "rounds": 1}), 0.02, 10.0, 1.0, 0.1).save(path)
+    return str(path)
+
+
+@pytest.fixture
+def scene(tmp_path) -> str:
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    return str(tmp_path / "scene.yaml")
+
+
+def run(*arguments: object):
+    return CliRunner().invoke(cli.app, [str(a) for a in arguments])
+
+
+def test_simulate_leaves_a_run_folder_and_says_how_to_watch_it(scene, model, tmp_path):
+    out = tmp_path / "run"
+    done = run("simulate", scene, "-o", out, "--model", model, "--seconds", 0.1, "--seed", 3)
+    assert done.exit_code == 0, done.stderr
+    assert sorted(p.name for p in out.iterdir()) == ["config.yaml", "report.json", "rollout.npz", "rollout.rrd"]
+    config = yaml.safe_load((out / "config.yaml").read_text())
+    assert config["seconds"] == 0.1 and config["seed"] == 3 and config["model"] == "untrained"
+    assert f"sdfsim view {out / 'rollout.rrd'}" in done.stdout
+    rollout, report = Rollout.load(out / "rollout.npz"), json.loads((out / "report.json").read_text())
+    assert len(rollout) == report["steps"] and report["status"] == "done" and report["finite"]
+    fallen = 5 - 0.5 * 9.81 * rollout.time**2
+    np.testing.assert_allclose(rollout.position[:, 1, 2], fallen, atol=1e-9)
+
+
+def test_a_second_run_replaces_the_first(scene, model, tmp_path):
+    assert run("simulate", scene, "-o", tmp_path / "run", "--model", model, "--seconds", 0.1).exit_code == 0
+    done = run("simulate", scene, "-o", tmp_path / "run", "--model", model, "--seconds", 0.1, "--viewer", "none")
+    assert done.exit_code == 0
+    assert not (tmp_path / "run" / "rollout.rrd").exists()
+
+
+def test_json_is_one_object_and_nothing_else(scene, model, tmp_path):
+    for arguments in (
+        ("simulate", scene, "-o", tmp_path / "run", "--model", model, "--seconds", 0.1),
+        ("plan", scene, "--model", model),
+        ("info",),
+        ("plan", tmp_path / "missing.yaml"),
+    ):
+        done = run(*arguments, "--json")
+        assert isinstance(json.loads(done.stdout), dict), done.stdout
+        assert done.stdout.count("\n") == 1
+
+
+def test_json_keeps_native_output_off_stdout(scene, model, tmp_path):
+    code = (
+        "import os, sys, cli, sdfsim.run as r\n"
+        "real = r.simulate\n"
+        "def noisy(*a, **k):\n    os.write(1, b'from C\\n'); print('from Python'); return real(*a, **k)\n"
+        "r.simulate = noisy\n"
+        "cli.app()\n"
+    )
+    arguments = ["simulate", scene, "-o", str(tmp_path / "run"), "--model", model, "--json"]
+    done = subprocess.run([sys.executable, "-c", code, *arguments], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["steps"] > 0
+    assert "from C" in done.stderr and "from Python" in done.stderr
+
+
+def test_plan_says_what_is_in_play(scene, model):
+    done = run("plan", scene, "--model", model)
+    assert done.exit_code == 0 and "gravity     on   9.81 m/s^2" in done.stdout
+    report = json.loads(run("plan", scene, "--model", model, "--json").stdout)
+    assert report["effects"]["contact"]["on"] and report["dynamic"] == ["ball"] and report["step_ms"] > 0
+
+
+BAD_SCENES = [
+    ("mass: -0.3", "bodies[1].mass: must be > 0 (got -0.3 kg)"),
+    ("mas: 1", "bodies[1].mas: unknown key (did you mean 'mass'?)"),
+    ("mass: .nan", "bodies[1].mass: must be finite (got .nan)"),
+]
+
+
+@pytest.mark.parametrize(("field", "fault"), BAD_SCENES)
+@pytest.mark.parametrize("command", ["simulate", "plan"])
+def test_a_bad_scene_is_one_line_and_code_1(tmp_path, command, field, fault):
+    file = tmp_path / "scene.yaml"
+    file.write_text(SCENE.rstrip().removesuffix("}") + f", {field}}}\n")
+    done = run(command, file, *(["-o", tmp_path / "run"] if command == "simulate" else []))
+    assert done.exit_code == 1
+    assert done.stderr == f"error: {file}:8: {fault}\n" and done.stdout == ""
+    assert not (tmp_path / "run").exists()
+    answer = json.loads(run("plan", file, "--json").stdout)
+    assert answer["exit_code"] == 1 and answer["problems"] == [f"{file}:8: {fault}"]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("simulate",),
+        ("simulate", "scene.yaml"),
+        ("simulate", "scene.yaml", "-o", "run", "--seconds", "-1"),
+        ("simulate", "scene.yaml", "-o", "run", "--viewer", "paper"),
+        ("simulate", "scene.yaml", "-o", "run", "--device", "tpu"),
+        ("reconstruct", "photos", "-o", "out", "--budget", "soon"),
+        ("reconstruct", "photos", "-o", "out", "--from", "dessert"),
+        ("dataset", "movi-z", "-o", "out", "--shapes", "meshes", "--trajectories", "1"),
+        ("view", "run.rrd", "--at", "1"),
+        ("fit", "mesh.obj"),
+        ("nonsense",),
+    ],
+)
+def test_wrong_usage_is_code_2(arguments):
+    done = run(*arguments)
+    assert done.exit_code == 2 and "Error" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("simulate", "{scene}", "-o", "{run}", "--model", "gigantic"), "'gigantic'"),
+        (("simulate", "{scene}", "-o", "{scene}/run", "--model", "{model}"), "{scene}"),
+        (("simulate", "{run}", "-o", "{run}"), "no such file"),
+        (("reconstruct", "{run}", "-o", "{run}/out"), "{run}"),
+        (("distill", "{run}"), "{run}"),
+        (("fit", "{run}.obj", "-o", "{run}"), "no such mesh file"),
+        (("view", "{scene}"), "not a rerun recording"),
+        (("view", "{run}.rrd"), "no such recording"),
+        (("evaluate", "{run}", "--model", "{model}"), "{run}"),
+        (("train", "--data", "{run}", "-o", "{run}/out"), "{run}"),
+    ],
+)
+def test_bad_input_is_one_line_and_code_1(scene, model, tmp_path, arguments, told):
+    names = {"scene": scene, "model": model, "run": str(tmp_path / "run")}
+    done = run(*(a.format(**names) for a in arguments))
+    lines = done.stderr.splitlines()
+    errors = [line for line in lines if line.startswith("error: ")]
+    assert done.exit_code == 1 and len(errors) == 1, done.stderr
+    assert told.format(**names) in errors[0] and "Traceback" not in done.stderr
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_disk_is_one_line(scene, model, tmp_path):
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / f".rollout.npz.{os.getpid()}.part").symlink_to("/dev/full")
+    done = run("simulate", scene, "-o", out, "--model", model)
+    assert done.exit_code == 1 and "No space left" in done.stderr and "Traceback" not in done.stderr
+    assert not (out / "rollout.npz").exists()
+
+
+def stop_after(steps: int, how):
+    """A `Simulator.run` that breaks after some steps, as `how(rollout)` says."""
+    real = Simulator.run
+
+    def broken(self, seconds=None, **options):
+        raise how(real(self, steps=steps, **options))
+
+    return broken
+
+
+def test_a_broken_state_is_code_3_with_what_was_computed(scene, model, tmp_path, monkeypatch):
+    monkeypatch.setattr(Simulator, "run", stop_after(3, lambda r: SimulationError("step 4: not finite", r)))
+    out = tmp_path / "run"
+    done = run("simulate", scene, "-o", out, "--model", model, "--json")
+    assert done.exit_code == 3 and "error: step 4: not finite" in done.stderr
+    assert json.loads(done.stdout)["exit_code"] == 3
+    assert len(Rollout.load(out / "rollout.npz")) == 3 and (out / "rollout.rrd").exists()
+    assert json.loads((out / "report.json").read_text())["status"] == "failed"
+
+
+def test_an_interrupt_is_code_130_with_what_was_computed(scene, model, tmp_path, monkeypatch):
+    monkeypatch.setattr(Simulator, "run", stop_after(3, lambda r: KeyboardInterrupt()))
+    out = tmp_path / "run"
+    done = run("simulate", scene, "-o", out, "--model", model)
+    assert done.exit_code == 130 and "interrupted" in done.stderr
+    assert len(Rollout.load(out / "rollout.npz")) == 3
+    assert json.loads((out / "report.json").read_text())["status"] == "interrupted"
+
+
+def test_tracebacks_only_with_v(scene, monkeypatch):
+    def fail(*arguments, **options):
+        raise ZeroDivisionError("a fault of ours")
+
+    monkeypatch.setattr("sdfsim.run.describe", fail)
+    plain, verbose = run("plan", scene), run("plan", scene, "-v")
+    assert plain.exit_code == verbose.exit_code == 1
+    assert "internal error: ZeroDivisionError" in plain.stderr and "Traceback" not in plain.stderr
+    assert "Traceback" in verbose.stderr
+
+
+def test_a_hint_follows_the_error(scene, monkeypatch):
+    def fail(*arguments, **options):
+        raise SdfsimError("what is wrong", "what to try")
+
+    monkeypatch.setattr("sdfsim.run.describe", fail)
+    assert run("plan", scene).stderr == "error: what is wrong\nhint: what to try\n"
+
+
+@pytest.mark.parametrize("option", ["--json", "--device", "--verbose"])
+def test_every_command_takes_the_common_options(option):
+    commands = [c.name or c.callback.__name__ for c in cli.app.registered_commands if c.callback]
+    assert len(commands) == 12
+    for command in commands:
+        assert option in run(command, "--help").stdout, command
+
+
+@pytest.mark.parametrize(("text", "seconds"), [("90s", 90), ("10m", 600), ("1h", 3600), ("45", 45), ("1.5m", 90)])
+def test_budgets(text, seconds):
+    assert cli._seconds(text) == seconds
+
+
+@pytest.mark.slow
+def test_the_wheel_holds_everything(tmp_path):
+    import shutil
+    import zipfile
+
+    source = tmp_path / "source"
+    ignore = shutil.ignore_patterns(".*", "runs", "tests", "samples", "__pycache__", "*.egg-info", "build")
+    shutil.copytree(ROOT, source, ignore=ignore)
+    command = [sys.executable, "-m", "pip", "wheel", ".", "-q", "--no-deps", "-w", str(tmp_path)]
+    subprocess.run(command, cwd=source, check=True, capture_output=True)
+    with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as wheel:
+        names = set(wheel.namelist())
+        entry = wheel.read(next(n for n in names if n.endswith("entry_points.txt"))).decode()
+    ours = {str(p.relative_to(ROOT)) for room in ("sdfsim", "pipeline") for p in (ROOT / room).rglob("*.py")}
+    ours |= {str(p.relative_to(ROOT)) for p in (ROOT / "sdfsim" / "models").glob("*.safetensors")}
+    assert ours | {"cli.py"} <= names
+    assert "sdfsim = cli:app" in entry
+    assert any(n.endswith("LICENSE") for n in names)
+    assert not any(n.startswith(("tests", "samples")) for n in names)
