@@ -238,7 +238,7 @@ def view(
 
 @app.command()
 def dataset(
-    recipe: Annotated[Literal["movi-b", "movi-c", "bowl", "pile"], typer.Argument(show_default=False)],
+    recipe: Annotated[Literal["movi-b"], typer.Argument(show_default=False)],
     out: Out,
     shapes: Annotated[Path, typer.Option(help="Folder of meshes.", show_default=False)],
     trajectories: Annotated[int, typer.Option(help="How many.", min=1, show_default=False)],

@@ -105,6 +105,7 @@ class Simulator:
             dt=self.model.dt,
             contact=effects.contact.on,
             friction=effects.friction.on,
+            restitution=effects.restitution.on,
             rotation=effects.rotation.on,
             free_flight=free_flight,
         )

@@ -29,6 +29,7 @@ class Rules:
         dt: the step.
         contact: False leaves every body in free flight.
         friction: False computes no tangential impulse.
+        restitution: False makes every contact one of restitution 0.
         rotation: False lets bodies translate only.
         free_flight: "exact", or "learned" where the *paper* network predicts all of every body's motion.
     """
@@ -37,6 +38,7 @@ class Rules:
     dt: float
     contact: bool = True
     friction: bool = True
+    restitution: bool = True
     rotation: bool = True
     free_flight: FreeFlight = "exact"
 
@@ -97,6 +99,7 @@ def contact_graph(
     point = contacts.arm - 0.5 * contacts.distance[:, None] * contacts.normal
     between = state.position[contacts.owner] - state.position[contacts.body]
     turn = pose.to_rotvec(pose.multiply(free.orientation[active], pose.conjugate(state.orientation[active])))
+    bounce = bodies.restitution if rules.restitution else torch.zeros_like(bodies.restitution)
     # Masses enter as ratios only; relative to the heaviest they stay within single precision.
     heaviest = bodies.mass[active].max()
     return active, ContactGraph(
@@ -117,7 +120,7 @@ def contact_graph(
         arm_second=(point + between).float(),
         gap=contacts.distance.float(),
         friction=(bodies.friction[contacts.owner] * bodies.friction[contacts.body]).float(),
-        restitution=(bodies.restitution[contacts.owner] * bodies.restitution[contacts.body]).float(),
+        restitution=(bounce[contacts.owner] * bounce[contacts.body]).float(),
         dt=rules.dt,
     )
 

@@ -165,7 +165,7 @@ def train(
     )
     if saved is not None and soap is not None:
         step, turn, stop = saved.load(parameters, average, soap, generator) or (step, turn, stop)
-    before = step
+    before, looping = step, time.monotonic()
 
     while step < stop:
         if plan.resample and step and step % plan.resample == 0:
@@ -196,7 +196,9 @@ def train(
             turn, stop = step, min(stop, step + plan.settle)
         elapsed = time.monotonic() - started
         if budget is not None:
-            turn, stop = _shorten(budget, elapsed, step, before, turn, stop, plan)
+            pace = (time.monotonic() - looping) / (step - before)
+            possible = step + int((0.9 * budget - elapsed) / pace)  # a tenth is left for the certificate
+            turn, stop = _fitted(possible, step, turn, stop, plan)
         tell(0.97 * step / max(stop, 1), f"step {step} of {stop}, error {near:.2g} near, {far:.2g} in the box")
         if saved is not None and soap is not None and step % (2 * CHECK) == 0:
             saved.save(parameters, average, soap, generator, (step, turn, stop))
@@ -213,16 +215,16 @@ def train(
     ), step
 
 
-def _shorten(
-    budget: float, elapsed: float, step: int, before: int, turn: int, stop: int, plan: Plan
-) -> tuple[int, int]:
-    """Where decay and end must lie so that the steps left fit into the seconds left."""
-    # A tenth is left for the certificate.
-    possible = step + int((0.9 * budget - elapsed) / max(elapsed, 1e-6) * (step - before))
-    if possible >= stop:
-        return turn, stop
-    stop = max(possible, step)
-    return min(turn, max(step, int(stop * (1.0 - plan.decay)))), stop
+def _fitted(possible: int, step: int, turn: int, stop: int, plan: Plan) -> tuple[int, int]:
+    """Where decay and end must lie when `possible` steps can be made in all.
+
+    Until the decay has begun the end moves both ways, since the first steps of a busy machine tell little; after
+    that it only comes nearer.
+    """
+    if step >= turn:
+        return turn, max(min(stop, possible), step)
+    stop = max(min(plan.steps, possible), step)
+    return max(step, int(stop * (1.0 - plan.decay))), stop
 
 
 def _sample(oracle: DistanceOracle, frame: Frame, plan: Plan, rng: np.random.Generator) -> _Pool:
