@@ -141,13 +141,11 @@ def _score(
     position, orientation = _roll(model, bodies, state, rules, steps)
     position = position * units.length
     results, at = [], 0
-    for k, t in enumerate(group):
+    for t in group:
         mine = slice(at, at + t.position.shape[1])
         at = mine.stop
         moving = ~t.static.astype(bool)
         p, q = position[:, mine][:, moving], orientation[:, mine][:, moving]
-        if not (np.isfinite(p).all() and np.isfinite(q).all()):
-            raise SdfsimError(f"trajectory {k}: the rollout is not finite", exit_code=EXIT_QUALITY)
         truth_p, truth_q = t.position[1 : steps + 1][:, moving], t.quat_xyzw[1 : steps + 1][:, moving]
         horizons = _horizons(steps)
         results.append(
@@ -176,6 +174,11 @@ def _roll(model: Model, bodies: Bodies, state: State, rules: Rules, steps: int) 
     positions, orientations = [], []
     for _ in range(steps):
         state, _ = step(model, bodies, state, rules)
+        broken = ~(state.position.isfinite().all(-1) & state.orientation.isfinite().all(-1))
+        if broken.any():
+            raise SdfsimError(
+                f"step {len(positions) + 1}: {int(broken.sum())} bodies are not finite", exit_code=EXIT_QUALITY
+            )
         positions.append(state.position.cpu().numpy())
         orientations.append(state.orientation.cpu().numpy())
     return np.stack(positions), np.stack(orientations)

@@ -25,14 +25,14 @@ def make_body(name: str, shape: int, position, **fields) -> Body:
     return Body(name=name, shape=shape, position=np.asarray(position, dtype=float), **(defaults | fields))
 
 
-def random_model(kind: str, seed: int = 0, **config: int) -> Model:
-    """An untrained model whose predictions are far from zero."""
+def random_model(kind: str, seed: int = 0, push: float = 0.5, **config: int) -> Model:
+    """An untrained model whose predictions are far from zero (by `push`)."""
     torch.manual_seed(seed)
     network = new_network(kind, config or {"width": 16, "rounds": 2} if kind == "impulse" else config)
     if kind == "impulse":
         for layer in network.rounds:  # type: ignore[union-attr]
-            torch.nn.init.normal_(layer.normal_impulse.weight, std=0.5)
-            torch.nn.init.normal_(layer.tangent_impulse.weight, std=0.5)
+            torch.nn.init.normal_(layer.normal_impulse.weight, std=push)
+            torch.nn.init.normal_(layer.tangent_impulse.weight, std=push)
     network.eval().requires_grad_(False)
     return Model("random", kind, network, dt=0.02, gravity=10.0, length=1.0, reach=0.1)
 
