@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from sdfsim.dynamics import pose
+from sdfsim.errors import SdfsimError
 from sdfsim.scene.types import Scene
 from sdfsim.shape.mlp import SdfBank
 
@@ -102,9 +103,24 @@ class State:
     earlier_orientation: Tensor | None = None
 
 
-def from_scene(scene: Scene, units: Units, device: torch.device) -> tuple[Bodies, State]:
-    """Bodies and initial state of a scene, in model units on `device`."""
+def from_scene(
+    scene: Scene, units: Units, device: torch.device, nodes_a_body: int | None = None
+) -> tuple[Bodies, State]:
+    """Bodies and initial state of a scene, in model units on `device`.
+
+    Args:
+        scene: what is to be simulated.
+        units: model units.
+        device: of the tensors.
+        nodes_a_body: use only the first that many surface nodes of each body.
+
+    Raises:
+        SdfsimError: a body that moves has no mass or no surface nodes.
+    """
     shapes = [scene.shapes[b.shape] for b in scene.bodies]
+    for body, shape in zip(scene.bodies, shapes, strict=True):
+        if body.motion == "dynamic" and (not body.mass > 0 or len(shape.nodes) == 0 or not shape.volume > 0):
+            raise SdfsimError(f"body {body.name!r} moves: it needs a mass, a volume and surface nodes")
     scale = np.array([b.scale for b in scene.bodies]) / units.length
     moves = np.array([b.motion == "dynamic" for b in scene.bodies])
     mass = np.array([b.mass if m else 0.0 for b, m in zip(scene.bodies, moves, strict=True)]) / units.mass
@@ -112,7 +128,7 @@ def from_scene(scene: Scene, units: Units, device: torch.device) -> tuple[Bodies
     inertia[moves] /= units.mass * units.length**2
     com = np.stack([s.com for s in shapes]) * scale[:, None]
     bounds = np.stack([(s.sdf.bounds - s.com) * k for s, k in zip(shapes, scale, strict=True)])
-    nodes = [(s.nodes - s.com) * k for s, k in zip(shapes, scale, strict=True)]
+    nodes = [(s.nodes[:nodes_a_body] - s.com) * k for s, k in zip(shapes, scale, strict=True)]
 
     def tensor(array, dtype=torch.float64) -> Tensor:
         return torch.as_tensor(np.asarray(array), dtype=dtype, device=device)

@@ -46,10 +46,6 @@ class Contacts:
     def __len__(self) -> int:
         return len(self.owner)
 
-    def node_position(self, state: State) -> Tensor:
-        """[E, 3] world positions of the nodes."""
-        return state.position[self.owner] + self.arm
-
 
 def find_contacts(bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float) -> Contacts:
     """All contact edges of a state.

@@ -30,8 +30,9 @@ class Model:
         network: in evaluation mode.
         dt: s, the step of the training data.
         gravity: m/s^2, its magnitude in the training data.
-        length: m, mean largest extent of the training bodies; scenes of other sizes are rescaled to it.
+        length: m, the middle of the range of training bodies' largest extents; other scenes are rescaled to it.
         reach: m, contact radius D.
+        nodes: surface nodes a body it was trained with, the first of each shape's; None for all.
         ranges: name -> [low, high] of what training saw (friction, restitution, mass_ratio, speed, size).
         card: training record (data, steps, seconds, errors).
     """
@@ -43,6 +44,7 @@ class Model:
     gravity: float
     length: float
     reach: float
+    nodes: int | None = None
     ranges: dict[str, list[float]] = field(default_factory=dict)
     card: dict[str, Any] = field(default_factory=dict)
 
@@ -53,16 +55,17 @@ class Model:
 
     def save(self, path: Path) -> None:
         """Write a `.safetensors` file whose metadata holds all that is not weights (temporary name, then renamed)."""
-        from safetensors.torch import save_file
+        from safetensors.torch import save
 
         info = {
             "kind": self.kind,
             "config": asdict(self.network.config),  # type: ignore[call-overload]
-            **{k: getattr(self, k) for k in ("dt", "gravity", "length", "reach", "ranges", "card")},
+            **{k: getattr(self, k) for k in ("dt", "gravity", "length", "reach", "nodes", "ranges", "card")},
         }
         weights = {k: v.detach().cpu().contiguous() for k, v in self.network.state_dict().items()}
         with replacing(path) as partial:
-            save_file(weights, partial, metadata={"sdfsim_model": json.dumps(info)})
+            # Bytes, not the library's own file: a full disk is then an OSError like any other.
+            partial.write_bytes(save(weights, metadata={"sdfsim_model": json.dumps(info)}))
 
 
 def new_network(kind: str, config: dict[str, Any]) -> nn.Module:

@@ -17,7 +17,7 @@ from sdfsim.dynamics.bodies import Bodies, State, Units, from_scene
 from sdfsim.dynamics.contacts import Contacts
 from sdfsim.dynamics.model import Model, load_model
 from sdfsim.dynamics.rollout import Rollout
-from sdfsim.dynamics.step import FreeFlight, Rules, step
+from sdfsim.dynamics.step import FreeFlight, Rules, fly, step
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.scene.effects import plan
 from sdfsim.scene.types import Scene
@@ -94,7 +94,7 @@ class Simulator:
         model = model if model is not None else scene.model
         self.model = (model if isinstance(model, Model) else load_model(model)).to(self.device)
         if free_flight == "learned" and self.model.kind != "paper":
-            raise SdfsimError("free_flight 'learned' exists for the paper network only", "use --model paper")
+            raise SdfsimError("free_flight 'learned' exists for the paper network only", "give a model of that kind")
         self.seed = scene.seed if seed is None else seed
         self.units = scene_units(scene, self.model, dt)
         self.dt = self.model.dt * self.units.time
@@ -109,7 +109,7 @@ class Simulator:
             rotation=effects.rotation.on,
             free_flight=free_flight,
         )
-        self.bodies, self.state = from_scene(scene, self.units, self.device)
+        self.bodies, self.state = from_scene(scene, self.units, self.device, self.model.nodes)
         if self.model.kind == "paper":
             self.state = with_history(self.state, self.bodies, self.rules)
         self.contacts: Contacts | None = None
@@ -248,8 +248,6 @@ class Simulator:
 
 def with_history(state: State, bodies: Bodies, rules: Rules) -> State:
     """The same state with the two poses it would have come from in free flight (the *paper* network's input)."""
-    from sdfsim.dynamics.step import fly
-
     back = replace(rules, dt=-rules.dt)
     one = fly(bodies, state, back)
     two = fly(bodies, one, back)

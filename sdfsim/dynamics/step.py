@@ -51,8 +51,12 @@ def step(model: Model, bodies: Bodies, state: State, rules: Rules) -> tuple[Stat
         The next state, and the contact edges that acted (None with contact off).
     """
     free = fly(bodies, state, rules)
-    if not rules.contact:
+    if not rules.contact and rules.free_flight == "exact":
         return free, None
+    if not rules.contact:
+        bodies = replace(
+            bodies, may_touch=torch.zeros(len(bodies), len(bodies), dtype=torch.bool, device=bodies.device)
+        )
     contacts = find_contacts(bodies, state, rules.gravity, model.reach, rules.dt)
     if model.kind == "paper":
         return _paper_step(model, bodies, state, free, contacts, rules), contacts
@@ -142,7 +146,14 @@ def _paper_step(model: Model, bodies: Bodies, state: State, free: State, contact
     """The published step; with exact free flight only bodies with a contact edge follow the network."""
     if rules.free_flight == "exact" and len(contacts) == 0:
         return free
+    if not rules.friction:
+        bodies = replace(bodies, friction=torch.zeros_like(bodies.friction))
+    if not rules.restitution:
+        bodies = replace(bodies, restitution=torch.zeros_like(bodies.restitution))
     predicted = predict(model.network, bodies, state, contacts, rules.dt)  # type: ignore[arg-type]
+    if not rules.rotation:
+        still = torch.zeros_like(state.angular_velocity)
+        predicted = replace(predicted, orientation=state.orientation, angular_velocity=still)
     if rules.free_flight == "learned":
         follows = bodies.moves.clone()
     else:

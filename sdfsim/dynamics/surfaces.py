@@ -22,7 +22,7 @@ def surface_graph(bodies: Bodies, state: State, contacts: Contacts) -> SurfaceGr
     """The published graph for a state that carries its two earlier poses.
 
     Node features: displacement over each of the last two steps, displacement of the body's centre over the last,
-    inverse mass relative to the mean, friction, restitution, and whether the body is static. Displacements are
+    inverse mass, friction, restitution, and whether the body is static. Displacements are
     differences of poses in float64, never of large float32 positions.
     """
     earlier_position, earlier_orientation = _history(state)
@@ -37,7 +37,7 @@ def surface_graph(bodies: Bodies, state: State, contacts: Contacts) -> SurfaceGr
     travel = [places[1] - places[0], places[2] - places[1]]
     material = torch.stack(
         [
-            bodies.inverse_mass / bodies.inverse_mass[bodies.moves].mean().clamp_min(1e-30),
+            bodies.inverse_mass,
             bodies.friction,
             bodies.restitution,
             (~bodies.moves).to(bodies.friction.dtype),

@@ -1,4 +1,4 @@
-"""Replace a bundled model: `python -m sdfsim.learning.bundle MODEL DATA --name small` evaluates it and writes its card."""
+"""Replace a bundled model: `python -m sdfsim.learning.bundle MODEL DATA --name NAME` evaluates it, writes its card."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from pathlib import Path
 from sdfsim.dynamics.model import BUNDLED, Model, load_model
 from sdfsim.errors import SdfsimError
 from sdfsim.files import write_text
+from sdfsim.learning.dataset import SPLITS, trajectory_files
 from sdfsim.learning.evaluate import evaluate
 
 
@@ -28,6 +29,7 @@ def bundle(path: Path, data: Path, name: str, folder: Path = BUNDLED) -> dict:
     """
     model = load_model(path)
     report = evaluate(data, model=model)
+    report["made_from"] = {split: len(trajectory_files(data, split)) for split in SPLITS}
     learned = evaluate(data, model=model, free_flight="learned") if model.kind == "paper" else None
     errors = {who: report[who] for who in ("model", "ballistic")}
     model = replace(model, name=name, card=model.card | {"errors": errors, "test_trajectories": report["trajectories"]})
@@ -59,10 +61,12 @@ def card_text(model: Model, report: dict, learned: dict | None) -> str:
         "",
         "Repeat with:",
         "",
-        "    sdfsim dataset movi-b -o DATA --shapes MOVI_B_SHAPES --trajectories 1500 --split train",
-        "    sdfsim dataset movi-b -o DATA --shapes MOVI_B_SHAPES --trajectories 100 --split validation",
-        "    sdfsim dataset movi-b -o DATA --shapes MOVI_B_SHAPES --trajectories 100 --split test",
-        f"    sdfsim train --data DATA -o RUN --preset {model.card.get('preset_name', model.name)}",
+        *(
+            f"    sdfsim dataset {card['data']['recipe']} -o DATA --shapes SHAPES --trajectories {count}"
+            f" --seed {card['data']['seed']} --split {split}"
+            for split, count in report["made_from"].items()
+        ),
+        f"    sdfsim train --data DATA -o RUN --preset {card['preset_name']}",
         f"    python -m sdfsim.learning.bundle RUN/model.safetensors DATA --name {model.name}",
         "",
         "## Ranges it has seen",
@@ -75,8 +79,8 @@ def card_text(model: Model, report: dict, learned: dict | None) -> str:
         "",
         "## Errors",
         "",
-        f"{report['trajectories']} test trajectories ({report['bodies']} bodies) of the same recipe, all rolled out from",
-        "their first frame; 95 % intervals over trajectories.",
+        f"{report['trajectories']} test trajectories ({report['bodies']} bodies) of the same recipe, all rolled out",
+        "from their first frame; 95 % intervals over trajectories.",
         "",
         "| | steps | translation RMSE, m | rotation, degrees |",
         "| --- | --- | --- | --- |",

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from sdfsim.shape.asset import Shape
 
 
+SPLITS = ("train", "validation", "test")
 FLOOR = (0.3, 0.5)  # friction and restitution of the recipes' floor, the plane z = 0
 
 
@@ -95,6 +96,10 @@ def _check(path: Path, arrays: dict) -> None:
     for name in ("mass", "inertia"):
         if not (arrays[name][moving] > 0).all():
             raise SdfsimError(f"{path}: {name}: must be > 0 for bodies that move")
+    if frames < 2:
+        raise SdfsimError(f"{path}: position: needs at least two frames (got {frames})")
+    if np.abs(np.linalg.norm(arrays["quat_xyzw"], axis=-1) - 1.0).max(initial=0.0) > 1e-3:
+        raise SdfsimError(f"{path}: quat_xyzw: must be unit quaternions")
     if not (arrays["scale"] > 0).all() or not arrays["dt"] > 0:
         raise SdfsimError(f"{path}: scale and dt must be > 0")
 
@@ -106,16 +111,22 @@ def write_info(folder: Path, info: dict) -> None:
 
 def read_info(folder: Path) -> dict:
     """`dataset.json` of a dataset folder. Raises SdfsimError when it is absent or not JSON."""
-    return read_json(folder / "dataset.json", "a dataset folder is what `sdfsim dataset` writes")
+    info = read_json(folder / "dataset.json", "a dataset folder is what `sdfsim dataset` writes")
+    if not isinstance(info, dict):
+        raise SdfsimError(f"{folder / 'dataset.json'}: must be a JSON object")
+    return info
 
 
 def trajectory_files(folder: Path, split: str | None = None) -> list[Path]:
-    """Trajectory files of a dataset in name order: of `folder/split/` where that exists, else of `folder`.
+    """Trajectory files of a dataset in name order: of `folder/split/`, or of `folder` where nothing is split.
 
     Raises:
-        SdfsimError: when there are none.
+        SdfsimError: when there are none, or the dataset has other splits but not this one.
     """
-    home = folder / split if split and (folder / split).is_dir() else folder
+    split_up = [name for name in SPLITS if (folder / name).is_dir()]
+    if split_up and split and split not in split_up:
+        raise SdfsimError(f"{folder}: no {split} split here, only {', '.join(split_up)}")
+    home = folder / split if split and split_up else folder
     files = sorted(p for p in home.glob("*.npz") if not p.name.startswith("."))
     if not files:
         raise SdfsimError(f"{home}: no trajectories (*.npz) here", "make some with `sdfsim dataset movi-b`")

@@ -72,9 +72,10 @@ def evaluate(
     place = pick_device(device)
     used = (model if isinstance(model, Model) else load_model(model)).to(place)
     if free_flight == "learned" and used.kind != "paper":
-        raise SdfsimError("free_flight 'learned' exists for the paper network only", "use --model paper")
+        raise SdfsimError("free_flight 'learned' exists for the paper network only", "give a model of that kind")
     trajectories = [Trajectory.load(f) for f in trajectory_files(data, split)]
     shapes = load_shapes(data, {str(n) for t in trajectories for n in t.shape})
+    shapes = {name: replace(shape, nodes=shape.nodes[: used.nodes]) for name, shape in shapes.items()}
     longest = min(steps, *(len(t.position) - 1 for t in trajectories))
     substep = _substep(data)
     scores: dict[str, list[Score]] = {"model": [], "ballistic": []}
@@ -104,7 +105,9 @@ def _substep(data: Path) -> float:
     """The engine's inner step in s, where the dataset tells it (0 elsewhere)."""
     for folder in (data, data.parent):
         if (folder / "dataset.json").exists():
-            return float(read_info(folder).get("engine_settings", {}).get("timeStep", 0.0))
+            settings = read_info(folder).get("engine_settings")
+            step = settings.get("timeStep") if isinstance(settings, dict) else None
+            return float(step) if isinstance(step, int | float) else 0.0
     return 0.0
 
 
@@ -166,7 +169,7 @@ def _units(model: Model, like: Trajectory) -> Units:
     """Model units in which the recorded step is the model's own."""
     strength = float(np.linalg.norm(like.gravity)) or model.gravity
     length = (like.dt / model.dt) ** 2 * strength / model.gravity
-    return Units(length=length, time=like.dt / model.dt, mass=float(like.mass[like.mass > 0].mean()))
+    return Units(length=length, time=like.dt / model.dt, mass=length**3)  # the recipe's densities are the model's
 
 
 def _roll(model: Model, bodies: Bodies, state: State, rules: Rules, steps: int) -> tuple[np.ndarray, np.ndarray]:

@@ -6,10 +6,8 @@ component of the relative displacement, to first order.
 
 from __future__ import annotations
 
-import multiprocessing
-import os
+import hashlib
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
@@ -23,6 +21,9 @@ from sdfsim.dynamics.pose import conjugate, multiply, to_rotvec
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_arrays, write_arrays
 from sdfsim.learning.dataset import Trajectory, load_shapes, trajectory_files
+from sdfsim.learning.parallel import parallel
+
+FRAMES_VERSION = 1  # counts up whenever contacts are found or thinned differently
 
 
 @dataclass(frozen=True)
@@ -100,20 +101,36 @@ def contact_frames(
     Raises:
         SdfsimError: no trajectories, or unreadable ones.
     """
+    folder = data / "frames"
+    if not (data / split).is_dir():
+        # A machine that only trains may have been given nothing but the cache.
+        made = list(folder.glob(f"{split}-{reach:g}-*.npz"))
+        if len(made) == 1:
+            return ContactFrames.load(made[0])
     files = trajectory_files(data, split)
-    cached = data / f"frames-{split}-{reach:g}-{len(files)}.npz"
+    cached = folder / f"{split}-{reach:g}-{_fingerprint(data, files)}.npz"
     if cached.exists():
         return ContactFrames.load(cached)
-    spawn = multiprocessing.get_context("spawn")  # torch's thread pool does not survive a fork
-    parts = []
-    with ProcessPoolExecutor(max_workers=os.cpu_count(), mp_context=spawn) as pool:
-        for k, part in enumerate(pool.map(_of_file, files, [reach] * len(files), chunksize=8)):
-            parts.append(part)
-            if on_progress:
-                on_progress((k + 1) / len(files), f"contacts of {split} trajectory {k + 1} of {len(files)}")
+    parts: list[dict[str, np.ndarray]] = [{}] * len(files)
+    for done, (index, part) in enumerate(parallel(_of_file, [(f, reach) for f in files]), start=1):
+        parts[index] = part
+        if on_progress:
+            on_progress(done / len(files), f"contacts of {split} trajectory {done} of {len(files)}")
     frames = _concatenate(parts, Trajectory.load(files[0]), reach)
+    folder.mkdir(exist_ok=True)
+    for old in folder.glob(f"{split}-{reach:g}-*.npz"):
+        old.unlink()
     frames.save(cached)
     return frames
+
+
+def _fingerprint(data: Path, files: list[Path]) -> str:
+    """Changes with the trajectories (names and sizes), the recipe, the shapes, and the way contacts are found."""
+    digest = hashlib.sha256(f"{FRAMES_VERSION} {[(f.name, f.stat().st_size) for f in files]}".encode())
+    for record in (data / "dataset.json", *sorted((data / "shapes").glob("*/shape.json"))):
+        if record.exists():
+            digest.update(record.read_bytes())
+    return digest.hexdigest()[:12]
 
 
 @cache
@@ -124,7 +141,6 @@ def _shape(folder: Path, name: str):
 def _of_file(path: Path, reach: float) -> dict[str, np.ndarray]:
     from sdfsim.learning.merge import find_edges  # needs the SDFs, hence more than torch and numpy
 
-    torch.set_num_threads(1)
     trajectory = Trajectory.load(path)
     shapes = {str(n): _shape(path.parent, str(n)) for n in trajectory.shape}
     return _of_trajectory(trajectory, find_edges(trajectory, shapes, reach), shapes)

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +10,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sdfsim.errors import SdfsimError
-from sdfsim.learning.dataset import FLOOR, Trajectory, write_info
+from sdfsim.learning.dataset import FLOOR, SPLITS, Trajectory, read_info, write_info
+from sdfsim.learning.parallel import parallel
 from sdfsim.learning.teacher import DT, ENGINE_SETTINGS, SUBSTEP, Teacher, TeacherBody, import_pybullet, write_urdf
 from sdfsim.shape.fit import fit_pieces
 from sdfsim.shape.mesh import load_mesh, load_pieces, mass_properties
@@ -25,7 +23,6 @@ MATERIALS = {"metal": (2.7, 0.4, 0.3), "rubber": (1.1, 0.8, 0.7)}  # density, fr
 STEPS = 100
 NODES = 320  # surface nodes a shape: the pieces' own vertices first, since the engine touches the floor with those
 TRIES = 100  # spawns of one body before the scene is drawn again
-SPLITS = {"train": 0, "validation": 1, "test": 2}
 RECIPES = ("movi-b",)
 
 Progress = Callable[[float, str], None]
@@ -70,7 +67,7 @@ def make_dataset(
         A report: paths, counts.
 
     Raises:
-        SdfsimError: unknown recipe or split, no usable shapes, PyBullet absent.
+        SdfsimError: unknown recipe or split, no usable shapes, PyBullet absent, another dataset in `out`.
     """
     if recipe not in RECIPES:
         raise SdfsimError(f"unknown recipe {recipe!r}", f"known: {', '.join(RECIPES)}")
@@ -83,26 +80,23 @@ def make_dataset(
     folder = out / split
     folder.mkdir(parents=True, exist_ok=True)
     sources = find_shapes(shapes, out / "shapes" / "engine")
+    info = {
+        "recipe": recipe,
+        "seed": seed,
+        "engine": "pybullet",
+        "engine_version": str(engine.getAPIVersion()),
+        "engine_settings": ENGINE_SETTINGS | {"timeStep": SUBSTEP},
+        "floor": {"friction": FLOOR[0], "restitution": FLOOR[1]},
+        "shapes": [s.name for s in sources],
+    }
+    if (out / "dataset.json").exists() and read_info(out) != info:
+        raise SdfsimError(f"{out} holds a dataset of another seed, engine or set of shapes", "choose another -o")
     fit_dataset_shapes(shapes, out / "shapes", [s.name for s in sources], lambda f, m: tell(0.5 * f, m))
-    write_info(
-        out,
-        {
-            "recipe": recipe,
-            "seed": seed,
-            "engine": "pybullet",
-            "engine_version": str(engine.getAPIVersion()),
-            "engine_settings": ENGINE_SETTINGS | {"timeStep": SUBSTEP},
-            "floor": {"friction": FLOOR[0], "restitution": FLOOR[1]},
-            "shapes": [s.name for s in sources],
-        },
-    )
+    write_info(out, info)
     todo = [k for k in range(trajectories) if not (folder / f"{k:05d}.npz").exists()]
-    spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(max_workers=os.cpu_count(), mp_context=spawn) as pool:
-        jobs = {pool.submit(_make_one, k, seed, split, sources, folder / f"{k:05d}.npz"): k for k in todo}
-        for done, job in enumerate(as_completed(jobs), start=1):
-            job.result()
-            tell(0.5 + 0.5 * done / len(todo), f"trajectory {done} of {len(todo)}")
+    jobs = [(k, seed, split, sources, folder / f"{k:05d}.npz") for k in todo]
+    for done, _ in enumerate(parallel(_make_one, jobs), start=1):
+        tell(0.5 + 0.5 * done / len(todo), f"trajectory {done} of {len(todo)}")
     return {"dataset": str(out), "split": split, "trajectories": trajectories, "made_now": len(todo)}
 
 
@@ -134,18 +128,11 @@ def fit_dataset_shapes(shapes: Path, out: Path, names: list[str], on_progress: P
     The surface is that of the convex pieces, since that is what the teacher collides.
     """
     todo = [name for name in names if not (out / name / "shape.json").exists()]
-    spawn = multiprocessing.get_context("spawn")  # torch's thread pool does not survive a fork
-    with ProcessPoolExecutor(max_workers=os.cpu_count(), mp_context=spawn) as pool:
-        jobs = {pool.submit(_fit_one, shapes / name, out / name): name for name in todo}
-        for done, job in enumerate(as_completed(jobs), start=1):
-            job.result()
-            on_progress(done / len(todo), f"shape {jobs[job]} fitted, {done} of {len(todo)}")
+    for done, (index, _) in enumerate(parallel(_fit_one, [(shapes / n, out / n) for n in todo]), start=1):
+        on_progress(done / len(todo), f"shape {todo[index]} fitted, {done} of {len(todo)}")
 
 
 def _fit_one(source: Path, out: Path) -> None:
-    import torch
-
-    torch.set_num_threads(1)
     pieces = load_pieces(source / "collision_geometry.obj")
     fit_pieces(pieces, name=source.name, display=load_mesh(_visual(source)), nodes=NODES).save(out)
 
@@ -155,7 +142,7 @@ def _visual(folder: Path) -> Path:
 
 
 def _make_one(index: int, seed: int, split: str, sources: list[ShapeSource], path: Path) -> None:
-    movi_b_trajectory(np.random.default_rng([seed, SPLITS[split], index]), sources).save(path)
+    movi_b_trajectory(np.random.default_rng([seed, SPLITS.index(split), index]), sources).save(path)
 
 
 def movi_b_trajectory(rng: np.random.Generator, sources: list[ShapeSource]) -> Trajectory:

@@ -45,7 +45,7 @@ class PaperTask:
         self.trajectories = [Trajectory.load(f) for f in trajectory_files(data, split)]
         names = {str(n) for t in self.trajectories for n in t.shape}
         self.shapes = {k: replace(s, nodes=s.nodes[:NODES]) for k, s in load_shapes(data, names).items()}
-        self.reach, self.device, self.noise = reach, device, noise
+        self.reach, self.device, self.noise, self.nodes = reach, device, noise, NODES
         self.dt = self.trajectories[0].dt
         self.gravity = float(np.linalg.norm(self.trajectories[0].gravity))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -113,9 +114,14 @@ def train(
         run.load(checkpoint)
     _loop(run, held_out, out, tell)
     model = run.export(name=preset, info=read_info(data), ranges=task.ranges())
-    model.save(out / "model.safetensors")
+    target: Path | None = out / "model.safetensors"
+    try:
+        model.save(target)
+    except ImportError:
+        # Nothing is lost: with the checkpoint, --resume writes the model where safetensors is installed.
+        target = None
     return {
-        "model": str(out / "model.safetensors"),
+        "model": str(target) if target else None,
         "steps": run.step,
         "seconds": run.seconds,
         "loss": run.loss,
@@ -219,7 +225,7 @@ class Run:
     def load(self, path: Path) -> None:
         """Take up a saved run. Raises SdfsimError when it is another preset's or seed's, or unreadable."""
         arrays = read_arrays(path, "a checkpoint", "delete it to start anew")
-        info = json.loads(str(arrays["run"]))
+        info: dict[str, Any] = json.loads(str(arrays["run"])) if "run" in arrays else {"plan": None}
         if info["plan"] != asdict(self.plan) or info["seed"] != self.seed or info["total"] != self.total:
             raise SdfsimError(f"{path} belongs to another preset, seed or number of steps", "choose another -o")
         tensors = {k: torch.from_numpy(v).to(self.device) for k, v in arrays.items() if k != "run"}
@@ -243,6 +249,7 @@ class Run:
             "seconds": round(self.seconds),
             "threads": torch.get_num_threads(),
             "device": str(self.device),
+            "preset_name": name,
             "preset": asdict(self.plan),
         }
         return Model(
@@ -253,6 +260,7 @@ class Run:
             gravity=self.task.gravity,
             length=float(np.mean(ranges["size"])),
             reach=self.plan.reach,
+            nodes=getattr(self.task, "nodes", None),
             ranges=ranges,
             card=card,
         )
@@ -298,16 +306,11 @@ def main() -> None:
     parser.add_argument("--device", default="auto", choices=["auto", "cpu", "cuda"])
     parser.add_argument("--resume", action="store_true")
     args = parser.parse_args()
-    report = train(
-        args.data,
-        args.out,
-        preset=args.preset,
-        resume=args.resume,
-        steps=args.steps,
-        seed=args.seed,
-        device=args.device,
-        on_progress=lambda fraction, message: print(f"{100 * fraction:5.1f} %  {message}", flush=True),
-    )
+    options = {name: getattr(args, name) for name in ("preset", "resume", "steps", "seed", "device")}
+    try:
+        report = train(args.data, args.out, **options, on_progress=lambda f, m: print(f"{f:6.1%}  {m}", flush=True))
+    except SdfsimError as error:
+        sys.exit(f"error: {error}\n{error.hint}")
     print(json.dumps(report))
 
 

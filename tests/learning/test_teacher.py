@@ -15,10 +15,10 @@ from sdfsim.learning.teacher import DT, Teacher, TeacherBody
 from sdfsim.shape.asset import analytic_shape
 from tests.dynamics.conftest import random_model
 
-CUBE = "".join(f"v {x} {y} {z}\n" for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)) + "\n".join(
-    f"f {a} {b} {c}"
-    for a, b, c in [(1, 2, 4), (1, 4, 3), (5, 7, 8), (5, 8, 6), (1, 5, 6), (1, 6, 2)]
-    + [(3, 4, 8), (3, 8, 7), (1, 3, 7), (1, 7, 5), (2, 6, 8), (2, 8, 4)]
+CORNERS = [(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]
+SIDES = [(1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4)]
+CUBE = "".join(f"v {x} {y} {z}\n" for x, y, z in CORNERS) + "".join(
+    f"f {a} {b} {c}\nf {a} {c} {d}\n" for a, b, c, d in SIDES
 )
 
 

@@ -1,0 +1,78 @@
+"""The paper network's step: what is off is off, free flight exact or learned, and its history is a rigid motion."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from sdfsim.dynamics import pose
+from sdfsim.dynamics.simulator import Simulator
+from sdfsim.dynamics.surfaces import advance, node_owner
+from sdfsim.scene.types import Effects
+from tests.dynamics.conftest import random_model
+
+
+def paper_model(push: float = 1e-3):
+    """Untrained, its accelerations of the size of `push`."""
+    model = random_model("paper", width=16, steps=2)
+    model.network.target.total.fill_(1.0)
+    model.network.target.squares.fill_(push**2)
+    return model
+
+
+def test_without_acceleration_every_body_goes_on_as_it_came(dropped):
+    """Zero acceleration of every node is uniform motion: translation exactly, rotation to the order of the step."""
+    sim = Simulator(dropped, paper_model())
+    zero = torch.zeros(len(sim.bodies.node), 3, dtype=torch.float64)
+    after = advance(sim.bodies, sim.state, zero, sim.rules.dt)
+    moves = sim.bodies.moves
+    before = sim.state.earlier_position[1]
+    torch.testing.assert_close(
+        after.position[moves], (2 * sim.state.position - before)[moves], rtol=0, atol=2e-3 * sim.rules.dt
+    )
+    assert torch.equal(after.position[~moves], sim.state.position[~moves])
+
+
+def test_a_common_acceleration_moves_the_centre_by_it(free_pair):
+    sim = Simulator(free_pair, paper_model())
+    push = torch.tensor([[0.01, -0.02, 0.03], [0.0, 0.05, 0.0]], dtype=torch.float64)
+    owner = node_owner(sim.bodies)
+    with_push = advance(sim.bodies, sim.state, push[owner], sim.rules.dt)
+    without = advance(sim.bodies, sim.state, torch.zeros_like(push[owner]), sim.rules.dt)
+    torch.testing.assert_close(with_push.position - without.position, push, rtol=0, atol=1e-9)
+    assert float(pose.angle_between(with_push.orientation, without.orientation).max()) < 1e-6
+
+
+def test_exact_free_flight_leaves_the_high_body_to_gravity_and_learned_does_not(dropped):
+    exact = Simulator(dropped, paper_model()).run(steps=5)
+    learned = Simulator(dropped, paper_model(), free_flight="learned").run(steps=5)
+    high = dropped.bodies[3]
+    t = exact.time[:, None]
+    fall = high.position + 0.5 * dropped.gravity * t**2
+    np.testing.assert_allclose(exact.position[:, 3], fall, atol=1e-9)
+    assert np.abs(learned.position[:, 3] - fall).max() > 1e-4
+
+
+def test_learned_free_flight_reaches_the_network_without_any_contact(dropped):
+    alone = replace(dropped, bodies=(dropped.bodies[3],))
+    learned = Simulator(alone, paper_model(), free_flight="learned").run(steps=3)
+    fall = alone.bodies[0].position + 0.5 * alone.gravity * learned.time[:, None] ** 2
+    assert np.abs(learned.position[:, 0] - fall).max() > 1e-4
+
+
+def test_rotation_off_keeps_every_orientation(dropped):
+    for model in (paper_model(), random_model("impulse", push=0.05)):
+        scene = replace(dropped, effects=Effects(rotation="off"))
+        rollout = Simulator(scene, model).run(steps=8)
+        assert rollout.contact_count.sum() > 0
+        np.testing.assert_array_equal(rollout.orientation, np.broadcast_to(rollout.orientation[0], (9, 4, 4)))
+        assert (rollout.angular_velocity[1:] == 0).all()
+
+
+def test_friction_and_restitution_off_equal_bodies_without_them(dropped):
+    model = paper_model()
+    off = Simulator(replace(dropped, effects=Effects(friction="off", restitution="off")), model).run(steps=6)
+    bare = tuple(replace(b, friction=0.0, restitution=0.0) for b in dropped.bodies)
+    none = Simulator(replace(dropped, bodies=bare), model).run(steps=6)
+    np.testing.assert_array_equal(off.position, none.position)
+    assert np.abs(off.position - Simulator(dropped, model).run(steps=6).position).max() > 1e-6
