@@ -7,26 +7,7 @@ import pytest
 
 from sdfsim.errors import SdfsimError
 from sdfsim.learning.dataset import Trajectory, read_info, trajectory_files
-
-
-def trajectory(frames: int = 4, bodies: int = 2) -> Trajectory:
-    rng = np.random.default_rng(0)
-    quat = rng.normal(size=(frames, bodies, 4))
-    return Trajectory(
-        position=rng.normal(size=(frames, bodies, 3)),
-        quat_xyzw=quat / np.linalg.norm(quat, axis=-1, keepdims=True),
-        velocity=rng.normal(size=(frames, bodies, 3)),
-        angular_velocity=rng.normal(size=(frames, bodies, 3)),
-        shape=np.array(["cube", "spot"]),
-        scale=np.array([1.0, 0.5]),
-        mass=np.array([2.0, 1.0]),
-        inertia=np.ones((bodies, 3)),
-        friction=np.array([0.4, 0.8]),
-        restitution=np.array([0.3, 0.7]),
-        static=np.zeros(bodies, dtype=bool),
-        dt=0.02,
-        gravity=np.array([0.0, 0.0, -10.0]),
-    )
+from tests.learning.conftest import trajectory
 
 
 def test_round_trip(tmp_path):

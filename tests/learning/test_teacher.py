@@ -12,36 +12,11 @@ from sdfsim.learning.dataset import Trajectory, trajectory_files
 from sdfsim.learning.evaluate import evaluate
 from sdfsim.learning.movi import MATERIALS, REGION, SIZES, find_shapes, make_dataset, movi_b_trajectory
 from sdfsim.learning.teacher import DT, Teacher, TeacherBody
-from sdfsim.shape.asset import analytic_shape
 from tests.dynamics.conftest import random_model
 
-CORNERS = [(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]
-SIDES = [(1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4)]
-CUBE = "".join(f"v {x} {y} {z}\n" for x, y, z in CORNERS) + "".join(
-    f"f {a} {b} {c}\nf {a} {c} {d}\n" for a, b, c, d in SIDES
-)
 
-
-@pytest.fixture(scope="module")
-def meshes(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("meshes")
-    (folder / "cube").mkdir()
-    (folder / "cube" / "visual_geometry.obj").write_text(CUBE)
-    (folder / "cube" / "collision_geometry.obj").write_text("o piece\n" + CUBE)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def data(meshes, tmp_path_factory):
-    """A dataset of three trajectories; the cube's SDF is the exact one, so that nothing has to be fitted."""
-    out = tmp_path_factory.mktemp("data")
-    analytic_shape("box", size=(1.0, 1.0, 1.0), name="cube").save(out / "shapes" / "cube")
-    make_dataset("movi-b", out, shapes=meshes, trajectories=3, seed=1, split="test")
-    return out
-
-
-def test_free_fall_is_symplectic_euler_and_rest_is_at_half_the_size(meshes, tmp_path):
-    source = find_shapes(meshes, tmp_path)[0]
+def test_free_fall_is_symplectic_euler_and_rest_is_at_half_the_size(cube_meshes, tmp_path):
+    source = find_shapes(cube_meshes, tmp_path)[0]
     assert source.volume == pytest.approx(1.0)
     with Teacher(np.array([0.0, 0.0, -10.0])) as teacher:
         teacher.add(TeacherBody(source.urdf, 1.0, 2.0, 0.5, 0.0), np.array([0.0, 0.0, 2.0]), np.array([0, 0, 0, 1.0]))
@@ -52,8 +27,8 @@ def test_free_fall_is_symplectic_euler_and_rest_is_at_half_the_size(meshes, tmp_
     assert np.abs(motion["velocity"][100]).max() < 0.02
 
 
-def test_the_recipe_keeps_to_its_ranges(meshes, tmp_path):
-    sources = find_shapes(meshes, tmp_path)
+def test_the_recipe_keeps_to_its_ranges(cube_meshes, tmp_path):
+    sources = find_shapes(cube_meshes, tmp_path)
     t = movi_b_trajectory(np.random.default_rng(0), sources)
     assert len(t.position) == 101 and 3 <= t.position.shape[1] <= 10 and t.dt == pytest.approx(0.02)
     assert ((t.scale >= SIZES[0]) & (t.scale <= SIZES[1])).all()
@@ -69,32 +44,32 @@ def test_the_recipe_keeps_to_its_ranges(meshes, tmp_path):
     assert (t.angular_velocity[0] == 0).all()
 
 
-def test_a_dataset_repeats_and_goes_on_where_it_was(data, meshes):
-    files = trajectory_files(data, "test")
+def test_a_dataset_repeats_and_goes_on_where_it_was(cube_data, cube_meshes):
+    files = trajectory_files(cube_data, "test")
     before = [Trajectory.load(f).position for f in files]
     files[1].unlink()
-    report = make_dataset("movi-b", data, shapes=meshes, trajectories=3, seed=1, split="test")
+    report = make_dataset("movi-b", cube_data, shapes=cube_meshes, trajectories=3, seed=1, split="test")
     assert report["made_now"] == 1
     for f, position in zip(files, before, strict=True):
         np.testing.assert_array_equal(Trajectory.load(f).position, position)
     with pytest.raises(SdfsimError, match="no shapes found"):
-        find_shapes(data / "test", data)
+        find_shapes(cube_data / "test", cube_data)
 
 
-def test_flying_on_equals_the_teacher_until_something_touches(data, meshes, tmp_path):
+def test_flying_on_equals_the_teacher_until_something_touches(cube_data, cube_meshes, tmp_path):
     """The baseline's error in free fall is rounding: the engine's staggered start velocity is understood."""
-    source = find_shapes(meshes, tmp_path)[0]
+    source = find_shapes(cube_meshes, tmp_path)[0]
     with Teacher(np.array([0.0, 0.0, -10.0])) as teacher:
         teacher.add(TeacherBody(source.urdf, 1.0, 2.0, 0.5, 0.0), np.array([0.0, 0.0, 50.0]), np.array([0, 0, 0, 1.0]))
         teacher.push(0, np.array([3.0, -1.0, 2.0]), np.array([1.0, 2.0, 3.0]))
         motion = teacher.run(100)
-    whole = Trajectory.load(trajectory_files(data, "test")[0])
+    whole = Trajectory.load(trajectory_files(cube_data, "test")[0])
     of_bodies = ("shape", "scale", "mass", "inertia", "friction", "restitution", "static")
     one = replace(whole, **motion, **{name: getattr(whole, name)[:1] for name in of_bodies})
     one = replace(one, inertia=np.full((1, 3), 1 / 3))
     (tmp_path / "test").mkdir()
-    (tmp_path / "shapes").symlink_to(data / "shapes")
-    (tmp_path / "dataset.json").write_text((data / "dataset.json").read_text())
+    (tmp_path / "shapes").symlink_to(cube_data / "shapes")
+    (tmp_path / "dataset.json").write_text((cube_data / "dataset.json").read_text())
     one.save(tmp_path / "test" / "0.npz")
     report = evaluate(tmp_path, model=random_model("impulse"))
     assert report["ballistic"]["100"]["translation_rmse"] < 1e-6
@@ -102,16 +77,16 @@ def test_flying_on_equals_the_teacher_until_something_touches(data, meshes, tmp_
     assert report["model"] == report["ballistic"]
 
 
-def test_side_by_side_equals_one_by_one(data, tmp_path):
+def test_side_by_side_equals_one_by_one(cube_data, tmp_path):
     """Trajectories that are evaluated in one batch do not feel each other."""
     model = random_model("impulse", push=0.05)
-    together = evaluate(data, model=model, steps=40)
+    together = evaluate(cube_data, model=model, steps=40)
     alone = []
-    for k, f in enumerate(trajectory_files(data, "test")):
+    for k, f in enumerate(trajectory_files(cube_data, "test")):
         place = tmp_path / str(k)
         place.mkdir()
-        (place / "shapes").symlink_to(data / "shapes")
-        (place / "dataset.json").write_text((data / "dataset.json").read_text())
+        (place / "shapes").symlink_to(cube_data / "shapes")
+        (place / "dataset.json").write_text((cube_data / "dataset.json").read_text())
         (place / f.name).write_bytes(f.read_bytes())
         one = evaluate(place, model=model, steps=40)
         alone.append((one["bodies"], one["model"]["40"]["translation_rmse"]))

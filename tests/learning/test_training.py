@@ -19,69 +19,19 @@ from sdfsim.learning.frames import contact_frames
 from sdfsim.learning.impulse_task import ImpulseTask, Noise
 from sdfsim.learning.merge import merged
 from sdfsim.learning.paper_task import PaperTask
-from sdfsim.learning.train import Preset, Run, train
-from sdfsim.shape.asset import analytic_shape
-from tests.learning.test_dataset import trajectory
+from sdfsim.learning.train import Run, train
 
 CPU = torch.device("cpu")
 
 
-def bouncing(seed: int):
-    """Two balls thrown at the floor and at each other; bounces are elastic and frictionless by hand."""
-    rng = np.random.default_rng(seed)
-    dt, frames, radius = 0.02, 40, 0.5
-    position = np.zeros((frames, 2, 3))
-    velocity = np.zeros((frames, 2, 3))
-    position[0] = [[-1.5, 0.0, 0.55 + rng.uniform(0, 0.2)], [1.5, 0.0, 0.6 + rng.uniform(0, 0.2)]]
-    velocity[0] = rng.uniform([-1, -1, -3], [1, 1, -1], size=(2, 3))
-    for t in range(1, frames):
-        velocity[t] = velocity[t - 1] + [0, 0, -10 * dt]
-        position[t] = position[t - 1] + velocity[t] * dt
-        hit = (position[t, :, 2] < radius) & (velocity[t, :, 2] < 0)
-        velocity[t, hit, 2] *= -0.5
-        position[t, hit, 2] = radius
-    return replace(
-        trajectory(),
-        position=position,
-        velocity=velocity,
-        quat_xyzw=np.tile([0.0, 0.0, 0.0, 1.0], (frames, 2, 1)),
-        angular_velocity=np.zeros((frames, 2, 3)),
-        shape=np.array(["ball", "ball"]),
-        scale=np.ones(2),
-        inertia=np.full((2, 3), 0.1),
-    )
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    """A dataset folder with two splits of thrown balls."""
-    folder = tmp_path_factory.mktemp("balls")
-    analytic_shape("sphere", radius=0.5, name="ball").save(folder / "shapes" / "ball")
-    for split, count in (("train", 6), ("validation", 2)):
-        (folder / split).mkdir()
-        for k in range(count):
-            bouncing(k + 100 * (split == "validation")).save(folder / split / f"{k}.npz")
-    (folder / "dataset.json").write_text('{"recipe": "balls", "seed": 0}')
-    return folder
-
-
-@pytest.fixture(scope="module")
-def presets(data):
-    """Tiny presets under names of their own."""
-    train_module.PRESETS["tiny"] = Preset("impulse", {"width": 16, "rounds": 2}, steps=150, batch=16, rate=3e-3)
-    train_module.PRESETS["tiny-paper"] = Preset("paper", {"width": 16, "steps": 2}, 60, 2, 3e-3, noise=0.003)
-    yield
-    del train_module.PRESETS["tiny"], train_module.PRESETS["tiny-paper"]
-
-
-def test_cached_frames_equal_the_simulators_own_graph(data):
+def test_cached_frames_equal_the_simulators_own_graph(ball_data):
     """A batch drawn from the cache is the graph that a step would build from the recorded state."""
     from sdfsim.dynamics.contacts import thin_contacts
     from sdfsim.learning.dataset import Trajectory, load_shapes
 
-    cached = contact_frames(data, "train", 0.1)
-    first = Trajectory.load(data / "train" / "0.npz")
-    shapes = load_shapes(data, {"ball"})
+    cached = contact_frames(ball_data, "train", 0.1)
+    first = Trajectory.load(ball_data / "train" / "0.npz")
+    shapes = load_shapes(ball_data, {"ball"})
     bodies, _ = merged([first], [0], shapes, Units(1.0, 1.0, 1.0), CPU)
     rules = Rules(gravity=torch.tensor(first.gravity), dt=first.dt)
     found = []
@@ -101,8 +51,8 @@ def test_cached_frames_equal_the_simulators_own_graph(data):
         )
 
 
-def test_perfect_predictions_have_no_loss_and_free_flight_has(data):
-    task = ImpulseTask(contact_frames(data, "validation", 0.1), CPU, None)
+def test_perfect_predictions_have_no_loss_and_free_flight_has(ball_data):
+    task = ImpulseTask(contact_frames(ball_data, "validation", 0.1), CPU, None)
     batch = task.draw(np.random.default_rng(0), 8)
     assert float(task.loss(lambda graph, mirrored: batch.truth, batch)) == 0.0
 
@@ -112,9 +62,9 @@ def test_perfect_predictions_have_no_loss_and_free_flight_has(data):
     assert float(task.loss(flying, batch)) > 0.1 * REST_SPEED
 
 
-def test_noise_moves_gaps_by_the_normal_displacement_and_corrects_the_target(data):
+def test_noise_moves_gaps_by_the_normal_displacement_and_corrects_the_target(ball_data):
     """The recorded end pose is reached from the disturbed pose: shift + mean velocity * dt is what it was."""
-    frames = contact_frames(data, "train", 0.1)
+    frames = contact_frames(ball_data, "train", 0.1)
     exact, noisy = (ImpulseTask(frames, CPU, n) for n in (None, Noise(shift=1e-3, speed=0.0)))
     picked = np.arange(6)
     a, b = exact.batch(picked), noisy.batch(picked, np.random.default_rng(0))
@@ -128,12 +78,12 @@ def test_noise_moves_gaps_by_the_normal_displacement_and_corrects_the_target(dat
 
 
 @pytest.mark.parametrize("preset", ["tiny", "tiny-paper"])
-def test_it_learns_and_the_model_file_gives_the_same_network(data, presets, preset, tmp_path):
+def test_it_learns_and_the_model_file_gives_the_same_network(ball_data, presets, preset, tmp_path):
     place = tmp_path / "run"
     plan = train_module.PRESETS[preset]
-    task, held_out = train_module._tasks(plan, data, CPU, lambda f, m: None)
+    task, held_out = train_module._tasks(plan, ball_data, CPU, lambda f, m: None)
     before = train_module.held_out_loss(Run(plan, task, plan.steps, 0, CPU), held_out, batches=2)
-    report = train(data, place, preset=preset)
+    report = train(ball_data, place, preset=preset)
     assert report["held_out_loss"] < 0.7 * before
     model = load_model(place / "model.safetensors")
     assert model.kind == plan.kind and model.dt == pytest.approx(0.02) and model.gravity == pytest.approx(10.0)
@@ -141,8 +91,8 @@ def test_it_learns_and_the_model_file_gives_the_same_network(data, presets, pres
     assert not list(place.glob("*.part")) and (place / "log.jsonl").exists()
 
 
-def test_an_interrupted_run_resumes_to_the_bit(data, presets, tmp_path, monkeypatch):
-    train(data, tmp_path / "whole", preset="tiny", steps=60)
+def test_an_interrupted_run_resumes_to_the_bit(ball_data, presets, tmp_path, monkeypatch):
+    train(ball_data, tmp_path / "whole", preset="tiny", steps=60)
 
     def interrupted(self):
         if self.step == 30:
@@ -152,31 +102,31 @@ def test_an_interrupted_run_resumes_to_the_bit(data, presets, tmp_path, monkeypa
     original = Run.advance
     monkeypatch.setattr(Run, "advance", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        train(data, tmp_path / "halves", preset="tiny", steps=60)
+        train(ball_data, tmp_path / "halves", preset="tiny", steps=60)
     monkeypatch.setattr(Run, "advance", original)
     with pytest.raises(SdfsimError, match="exists"):
-        train(data, tmp_path / "halves", preset="tiny", steps=60)
-    train(data, tmp_path / "halves", preset="tiny", steps=60, resume=True)
+        train(ball_data, tmp_path / "halves", preset="tiny", steps=60)
+    train(ball_data, tmp_path / "halves", preset="tiny", steps=60, resume=True)
     one, other = (load_model(tmp_path / k / "model.safetensors").network.state_dict() for k in ("whole", "halves"))
     assert all(torch.equal(one[k], other[k]) for k in one)
 
 
-def test_a_checkpoint_of_another_run_is_refused(data, presets, tmp_path):
-    train(data, tmp_path, preset="tiny", steps=5)
+def test_a_checkpoint_of_another_run_is_refused(ball_data, presets, tmp_path):
+    train(ball_data, tmp_path, preset="tiny", steps=5)
     with pytest.raises(SdfsimError, match="another preset, seed or number of steps"):
-        train(data, tmp_path, preset="tiny", steps=6, resume=True)
+        train(ball_data, tmp_path, preset="tiny", steps=6, resume=True)
 
 
-def test_paper_targets_lead_exactly_to_the_recorded_pose(data):
+def test_paper_targets_lead_exactly_to_the_recorded_pose(ball_data):
     """Advancing by the target acceleration lands on the next recorded frame, noise or not."""
     from sdfsim.dynamics.surfaces import advance, target_acceleration
     from sdfsim.learning.dataset import Trajectory, load_shapes
 
-    t = Trajectory.load(data / "train" / "0.npz")
-    bodies, state = merged([t], [5], load_shapes(data, {"ball"}), Units(1.0, 1.0, 1.0), CPU)
+    t = Trajectory.load(ball_data / "train" / "0.npz")
+    bodies, state = merged([t], [5], load_shapes(ball_data, {"ball"}), Units(1.0, 1.0, 1.0), CPU)
 
     def pose_at(k):
-        _, s = merged([t], [k], load_shapes(data, {"ball"}), Units(1.0, 1.0, 1.0), CPU)
+        _, s = merged([t], [k], load_shapes(ball_data, {"ball"}), Units(1.0, 1.0, 1.0), CPU)
         return s.position, s.orientation
 
     before, after = [pose_at(k) for k in (3, 4)], pose_at(6)
@@ -188,14 +138,14 @@ def test_paper_targets_lead_exactly_to_the_recorded_pose(data):
     )
     landed = advance(bodies, state, target_acceleration(bodies, state, *after), t.dt)
     torch.testing.assert_close(landed.position, after[0], rtol=0, atol=1e-12)
-    assert PaperTask(data, "train", 0.1, CPU, 0.003).dt == t.dt
+    assert PaperTask(ball_data, "train", 0.1, CPU, 0.003).dt == t.dt
 
 
-def test_an_unreadable_frame_cache_is_named(data):
-    contact_frames(data, "validation", 0.1)
-    cached = next((data / "frames").glob("validation-*.npz"))
+def test_an_unreadable_frame_cache_is_named(ball_data):
+    contact_frames(ball_data, "validation", 0.1)
+    cached = next((ball_data / "frames").glob("validation-*.npz"))
     content = cached.read_bytes()
     cached.write_bytes(content[:100])
     with pytest.raises(SdfsimError, match="contact frames"):
-        frames_module.contact_frames(data, "validation", 0.1)
+        frames_module.contact_frames(ball_data, "validation", 0.1)
     cached.write_bytes(content)
