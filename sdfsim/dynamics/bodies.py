@@ -11,6 +11,7 @@ from torch import Tensor
 from sdfsim.dynamics import pose
 from sdfsim.errors import SdfsimError
 from sdfsim.scene.types import Scene
+from sdfsim.shape.asset import Shape
 from sdfsim.shape.mlp import SdfBank
 
 
@@ -159,6 +160,11 @@ def from_scene(
         angular_velocity=tensor([b.angular_velocity for b in scene.bodies]) * units.time,
     )
     return bodies, state
+
+
+def largest_extent(shape: Shape) -> float:
+    """Longest side in m of the box around a shape at scale 1."""
+    return float(np.ptp(shape.sdf.bounds, axis=0).max())
 
 
 def _inertia(body, shape, moves: bool) -> np.ndarray:

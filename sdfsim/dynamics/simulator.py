@@ -13,9 +13,10 @@ import torch
 
 import sdfsim
 from sdfsim.dynamics import pose
-from sdfsim.dynamics.bodies import Bodies, State, Units, from_scene
+from sdfsim.dynamics.bodies import Bodies, State, Units, from_scene, largest_extent
 from sdfsim.dynamics.contacts import Contacts
 from sdfsim.dynamics.model import Model, load_model
+from sdfsim.dynamics.ranges import outside_training
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.step import FreeFlight, Rules, fly, step
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
@@ -51,7 +52,7 @@ def scene_units(scene: Scene, model: Model, dt: float | None = None) -> Units:
     """
     strength = float(np.linalg.norm(scene.gravity)) or EARTH
     moving = [b for b in scene.bodies if b.motion == "dynamic"]
-    sizes = [float(np.ptp(scene.shapes[b.shape].sdf.bounds, axis=0).max()) * b.scale for b in moving]
+    sizes = [largest_extent(scene.shapes[b.shape]) * b.scale for b in moving]
     if dt is not None:
         length = (dt / model.dt) ** 2 * strength / model.gravity
     else:
@@ -74,6 +75,7 @@ class Simulator:
     Attributes:
         dt: s, the step in the scene's units.
         units: metres, seconds and kilograms per model unit.
+        outside_training: what of the scene the model has not seen in training, one line each.
 
     Raises:
         SdfsimError: no such model or device, a body that moves without nodes or mass.
@@ -98,6 +100,7 @@ class Simulator:
         self.seed = scene.seed if seed is None else seed
         self.units = scene_units(scene, self.model, dt)
         self.dt = self.model.dt * self.units.time
+        self.outside_training = outside_training(scene, self.model, self.units)
         effects = plan(scene)
         gravity = torch.tensor(scene.gravity / self.units.acceleration, dtype=torch.float64, device=self.device)
         self.rules = Rules(
@@ -222,6 +225,7 @@ class Simulator:
                 "seed": self.seed,
                 "dt": self.dt,
                 "device": str(self.device),
+                "outside_training": self.outside_training,
                 "free_flight": self.rules.free_flight,
                 "sdfsim": sdfsim.__version__,
                 "torch": torch.__version__,

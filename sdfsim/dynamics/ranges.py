@@ -1,0 +1,52 @@
+"""Where a scene leaves what a model has seen in training: its predictions are then extrapolation, and are flagged."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sdfsim.dynamics.bodies import Units, largest_extent
+from sdfsim.dynamics.model import Model
+from sdfsim.scene.types import Scene
+
+SLACK = 0.05  # relative: rounding, and fits that end a little beyond the solid
+
+
+def outside_training(scene: Scene, model: Model, units: Units) -> list[str]:
+    """One line for every quantity of `scene` that lies outside the ranges of `model`; empty when it knows them all.
+
+    Sizes and speeds are compared in model units, so that a small or slow scene is not by itself unknown. Scenery is
+    not compared in size: what matters of it is the surface near a contact.
+    """
+    moving = [b for b in scene.bodies if b.motion == "dynamic"]
+    if not moving or not model.ranges:
+        return []
+    pairs = [(a, b) for k, a in enumerate(scene.bodies) for b in scene.bodies[k + 1 :]]
+    pairs = [(a, b) for a, b in pairs if "dynamic" in (a.motion, b.motion)]
+    seen = {
+        "size": [largest_extent(scene.shapes[b.shape]) * b.scale / units.length for b in moving],
+        "speed": [float(np.linalg.norm(b.velocity)) / units.velocity for b in moving],
+        "mass_ratio": [max(b.mass for b in moving) / min(b.mass for b in moving)],
+        "friction": [a.friction * b.friction for a, b in pairs],
+        "restitution": [a.restitution * b.restitution for a, b in pairs],
+    }
+    si = {"size": units.length, "speed": units.velocity}
+    labels = {
+        "size": "largest side of a body, m",
+        "speed": "speed at the start, m/s",
+        "mass_ratio": "heaviest to lightest body",
+        "friction": "friction of two bodies, multiplied",
+        "restitution": "restitution of two bodies, multiplied",
+    }
+    lines = []
+    for name, values in seen.items():
+        if not values or name not in model.ranges:
+            continue
+        low, high = model.ranges[name]
+        slack = SLACK * (high - low)
+        if min(values) < low - slack or max(values) > high + slack:
+            unit = si.get(name, 1.0)
+            lines.append(
+                f"{labels[name]}: {min(values) * unit:.3g} to {max(values) * unit:.3g} here, "
+                f"{model.name} was trained on {low * unit:.3g} to {high * unit:.3g}"
+            )
+    return lines
