@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from pipeline.cameras import View, load_views
 from pipeline.distill import load_field
-from pipeline.placement import Placement
+from pipeline.placement import load_placement
 
 
 def similarity(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
@@ -73,7 +73,7 @@ def surface_errors(folder: Path, photos: Path, move: tuple[float, np.ndarray, np
 
     _, about = true_cameras(photos)
     width = about["table_width"]
-    place = Placement.from_dict(json.loads((folder / "mesh" / "placement.json").read_text()))
+    place = load_placement(folder / "mesh")
     normal = load_field(folder / "distill").normalisation
     mesh = o3d.io.read_triangle_mesh(str(folder / "mesh" / "mesh.ply"))
     points = (np.asarray(mesh.vertices) - place.translation) @ place.rotation / place.scale

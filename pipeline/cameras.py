@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
 from sdfsim.errors import SdfsimError
+from sdfsim.files import read_arrays, read_json, write_json
 
 
 @dataclass(frozen=True)
@@ -99,9 +98,7 @@ def save_views(views: list[View], path: Path) -> None:
         for v in views
     ]
     data = {"version": 1, "convention": "world to camera; x right, y down, z forward", "views": entries}
-    temporary = Path(path).with_suffix(".part")
-    temporary.write_text(json.dumps(data, indent=1), encoding="utf-8")
-    os.replace(temporary, path)
+    write_json(path, data)
 
 
 def load_views(folder: Path) -> list[View]:
@@ -110,14 +107,15 @@ def load_views(folder: Path) -> list[View]:
     Raises:
         SdfsimError: no readable `cameras.json`.
     """
+    path = Path(folder) / "cameras.json"
+    data = read_json(path, "run the poses stage first")
     try:
-        data = json.loads((Path(folder) / "cameras.json").read_text(encoding="utf-8"))
         return [
             View(**{**v, "rotation": np.array(v["rotation"], float), "translation": np.array(v["translation"], float)})
             for v in data["views"]
         ]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise SdfsimError(f"{folder}: no camera poses", "run the poses stage first") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise SdfsimError(f"{path}: damaged", "run the poses stage again") from error
 
 
 def load_sparse(folder: Path) -> Sparse:
@@ -126,8 +124,9 @@ def load_sparse(folder: Path) -> Sparse:
     Raises:
         SdfsimError: no readable `sparse.npz`.
     """
+    path = Path(folder) / "sparse.npz"
+    data = read_arrays(path, "sparse points", "run the poses stage again")
     try:
-        with np.load(Path(folder) / "sparse.npz") as data:
-            return Sparse(**{key: data[key] for key in ("xyz", "rgb", "error", "point_of", "view_of")})
-    except (OSError, ValueError, KeyError) as error:
-        raise SdfsimError(f"{folder}: no sparse points", "run the poses stage first") from error
+        return Sparse(**{key: data[key] for key in ("xyz", "rgb", "error", "point_of", "view_of")})
+    except KeyError as error:
+        raise SdfsimError(f"{path}: damaged: no {error}", "run the poses stage again") from error

@@ -10,19 +10,21 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import safetensors.torch
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 
 from pipeline.cameras import Sparse, View
-from pipeline.field import FieldSize, GridField, render
+from pipeline.field import FieldSize, GridField
 from pipeline.normalise import Normalisation, find_normalisation
 from pipeline.photos import BACKDROP
 from pipeline.rays import held_out, load_rays
 from pipeline.recipe import Recipe, beta_at
+from pipeline.render import render
 from pipeline.threads import choose_threads
 from pipeline.trainer import Trainer, find_landmarks
 from sdfsim.errors import SdfsimError
+from sdfsim.files import replacing, write_json
 
 Progress = Callable[[float, str], None]
 
@@ -81,7 +83,10 @@ def train(
         losses = trainer.step()
         smooth = {k: 0.95 * smooth.get(k, v) + 0.05 * v for k, v in losses.items()}
         if not all(math.isfinite(v) for v in losses.values()):
-            raise SdfsimError("distill: the loss is no longer finite", "try another --seed; the poses may be wrong")
+            raise SdfsimError(
+                "distill: the loss is no longer finite",
+                "the poses may be wrong: look at the recording of the poses stage, or take more photos",
+            )
         now = time.monotonic()
         trainer.seconds = before + now - started
         if now - saved > checkpoint_every:
@@ -127,9 +132,7 @@ def score(views: list[View], photos_folder: Path, trainer: Trainer, beta: float,
         errors = []
         for part in index.split(4096):
             origins, directions = rays.at(part)
-            out = render(
-                trainer.field, trainer.cache, origins, directions, beta, samples=samples, backdrop=backdrop
-            )
+            out = render(trainer.field, trainer.cache, origins, directions, beta, samples=samples, backdrop=backdrop)
             errors.append(((out["rgb"] - rays.rgb[part].float() / 255) ** 2).mean(1))
         values.append(-10 * math.log10(max(float(torch.cat(errors).mean()), 1e-10)))
         if on_progress:
@@ -140,12 +143,13 @@ def score(views: list[View], photos_folder: Path, trainer: Trainer, beta: float,
 def save_field(field: GridField, beta: float, normalisation: Normalisation, report: dict, folder: Path) -> None:
     """Writes `field.safetensors`, then `field.json`."""
     tensors = {k: v.detach().cpu().contiguous() for k, v in field.state_dict().items()}
-    save_file(tensors, str(folder / "field.safetensors"))
+    with replacing(folder / "field.safetensors") as partial:
+        partial.write_bytes(safetensors.torch.save(tensors))
     about = {
         "version": 1, "size": asdict(field.size), "start_radius": field.start_radius, "beta": beta,
         "center": normalisation.center.tolist(), "radius": normalisation.radius, "report": report,
     }  # fmt: skip
-    (folder / "field.json").write_text(json.dumps(about, indent=1), encoding="utf-8")
+    write_json(folder / "field.json", about)
 
 
 def load_field(folder: Path) -> Trained:

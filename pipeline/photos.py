@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,6 +10,7 @@ import numpy as np
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from sdfsim.errors import SdfsimError
+from sdfsim.files import read_json, write_json
 
 MIN_PHOTOS = 3
 MIN_SIDE = 64
@@ -213,7 +212,9 @@ def prepare_photos(
             on_progress((index + 1) / len(paths), f"{index + 1} of {len(paths)} photos")
     masked = sum(p.mask for p in photos)
     if 0 < masked < len(photos):
-        notes.append(f"{masked} of {len(photos)} photos have an alpha mask: masks are used where they exist")
+        notes.append(
+            f"{masked} of {len(photos)} photos have an alpha mask: ignored, as masks count only where all have one"
+        )
     sizes = sorted({(p.width, p.height) for p in photos})
     if len(sizes) > 1:
         notes.append("photos of several sizes: " + ", ".join(f"{w} x {h}" for w, h in sizes) + "; one camera for each")
@@ -227,10 +228,7 @@ def prepare_photos(
 
 def save_photos(photos: list[Photo], folder: Path) -> None:
     """Writes `photos.json`."""
-    text = json.dumps({"version": 1, "photos": [asdict(p) for p in photos]}, indent=1)
-    temporary = Path(folder) / "photos.json.part"
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, Path(folder) / "photos.json")
+    write_json(Path(folder) / "photos.json", {"version": 1, "photos": [asdict(p) for p in photos]})
 
 
 def load_photos(folder: Path) -> list[Photo]:
@@ -239,8 +237,9 @@ def load_photos(folder: Path) -> list[Photo]:
     Raises:
         SdfsimError: the folder was not written by the photos stage.
     """
+    path = Path(folder) / "photos.json"
+    data = read_json(path, "run the photos stage first")
     try:
-        data = json.loads((Path(folder) / "photos.json").read_text(encoding="utf-8"))
         return [Photo(**entry) for entry in data["photos"]]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise SdfsimError(f"{folder}: no prepared photos", "run the photos stage first") from error
+    except (KeyError, TypeError) as error:
+        raise SdfsimError(f"{path}: damaged", "run the photos stage again") from error

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import numpy as np
 
 from pipeline.cameras import View
+from pipeline.cleaning import face_normals
 from pipeline.normalise import camera_up, plane_up
-from pipeline.surface import face_normals
+from sdfsim.errors import SdfsimError
+from sdfsim.files import read_json
 from sdfsim.shape.mesh import Mesh
 
 
@@ -123,3 +126,17 @@ def place(shown: Mesh, views: list[View], size: float | None) -> Placement:
     translation = -np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, resting_height(in_metres)])
     source = "assumed: widest side = 1 m" if size is None else f"given: widest side = {size:g} m"
     return Placement(scale, rotation, translation, up_from, source)
+
+
+def load_placement(mesh_folder: Path) -> Placement:
+    """Reads `placement.json`.
+
+    Raises:
+        SdfsimError: the mesh stage has not run.
+    """
+    path = Path(mesh_folder) / "placement.json"
+    content = read_json(path, "run the mesh stage first")
+    try:
+        return Placement.from_dict(content)
+    except (ValueError, KeyError, TypeError) as error:
+        raise SdfsimError(f"{path}: damaged", "run the mesh stage again") from error

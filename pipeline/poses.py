@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import signal
@@ -18,6 +17,7 @@ import numpy as np
 from pipeline.cameras import View, save_views
 from pipeline.photos import Photo
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
+from sdfsim.files import read_json, write_json
 
 Progress = Callable[[float, str], None]
 
@@ -88,7 +88,14 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
             if on_progress:
                 on_progress(fraction if number == 0 else 0.5 + fraction / 2, ("retry: " if number else "") + message)
 
-        result = run_worker({**job, **settings}, folder, timeout, report)
+        try:
+            result = run_worker({**job, **settings}, folder, timeout, report)
+        except SdfsimError as error:
+            if not tries:
+                raise
+            # What the first try found out says more than that the second one broke.
+            tries[0][0]["warnings"].append(f"the second try failed: {error.message}")
+            break
         verdict = judge(result, photos)
         verdict["settings"] = "ordinary" if number == 0 else "more features, looser thresholds"
         tries.append((verdict, folder, result))
@@ -97,8 +104,7 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
     # Best: plausible first, then the most photos.
     verdict, folder, result = max(tries, key=lambda t: (not t[0]["failures"], t[0]["posed"]))
     verdict["tries"] = len(tries)
-    text = json.dumps(verdict, indent=1)
-    (out / "verdict.json").write_text(text, encoding="utf-8")
+    write_json(out / "verdict.json", verdict)
     if verdict["failures"]:
         raise SdfsimError(failure_message(verdict), failure_hint(verdict), exit_code=EXIT_QUALITY)
     save_views(views_of(result, photos), out / "cameras.json")
@@ -120,7 +126,7 @@ def run_worker(job: dict, folder: Path, timeout: float, on_progress: Progress) -
     """
     log = folder / "colmap.log"
     (folder / "result.json").unlink(missing_ok=True)
-    (folder / "job.json").write_text(json.dumps(job), encoding="utf-8")
+    write_json(folder / "job.json", job)
     environment = dict(os.environ)
     root = str(Path(__file__).resolve().parent.parent)
     environment["PYTHONPATH"] = os.pathsep.join(filter(None, [root, environment.get("PYTHONPATH", "")]))
@@ -149,7 +155,7 @@ def run_worker(job: dict, folder: Path, timeout: float, on_progress: Progress) -
     if child.returncode != 0 or not (folder / "result.json").exists():
         reason = crash_reason(child.returncode, log)
         raise SdfsimError(f"camera poses: COLMAP {reason} (log: {log})", "run again; if it stays, try fewer photos")
-    return json.loads((folder / "result.json").read_text(encoding="utf-8"))
+    return read_json(folder / "result.json")
 
 
 def crash_reason(code: int, log: Path) -> str:

@@ -15,6 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
+from sdfsim.files import write_arrays, write_json
+
 
 def say(message: str) -> None:
     """One line for the parent, at once."""
@@ -148,14 +150,14 @@ def collect(reconstruction, out: Path) -> list[dict]:
         if e.image_id in index_of
     ]  # fmt: skip
     observations = np.array(seen, np.int32).reshape(-1, 2)
-    np.savez(
-        out / "sparse.npz",
-        xyz=np.array([p.xyz for p in points], np.float64).reshape(-1, 3),
-        rgb=np.array([p.color for p in points], np.uint8).reshape(-1, 3),
-        error=np.array([p.error for p in points], np.float32),
-        point_of=observations[:, 0],
-        view_of=observations[:, 1],
-    )
+    arrays = {
+        "xyz": np.array([p.xyz for p in points], np.float64).reshape(-1, 3),
+        "rgb": np.array([p.color for p in points], np.uint8).reshape(-1, 3),
+        "error": np.array([p.error for p in points], np.float32),
+        "point_of": observations[:, 0],
+        "view_of": observations[:, 1],
+    }
+    write_arrays(out / "sparse.npz", arrays, compressed=False)
     return views
 
 
@@ -181,7 +183,7 @@ def main(job_path: str) -> None:
         result["mean_error"] = float(best.compute_mean_reprojection_error())
         result["points"] = int(best.num_points3D())
         result["track_length"] = float(best.compute_mean_track_length())
-    (out / "result.json").write_text(json.dumps(result), encoding="utf-8")
+    write_json(out / "result.json", result)
     say("phase done")
 
 

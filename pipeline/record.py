@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import hashlib
 import json
 import os
@@ -12,9 +13,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from sdfsim.errors import SdfsimError
+from sdfsim.files import write_json
 
 RECORD = "stage.json"
 UNFINISHED = "unfinished.json"
+LOCK = ".lock"
 
 
 def fingerprint(stage: str, inputs: str, options: dict, modules: tuple[str, ...]) -> str:
@@ -48,11 +51,11 @@ def content_of_photos(folder: Path) -> str:
 
 
 def read(folder: Path) -> dict | None:
-    """The record of a finished stage: fingerprint, report, seconds; None where it has not finished."""
+    """The record of a finished stage: fingerprint, inputs, report, seconds; None where it has not finished."""
     try:
         known = json.loads((folder / RECORD).read_text(encoding="utf-8"))
-        return known if {"fingerprint", "report", "seconds"} <= set(known) else None
-    except (OSError, ValueError):
+        return known if {"fingerprint", "inputs", "report", "seconds"} <= set(known) else None
+    except (OSError, ValueError, TypeError):
         return None
 
 
@@ -72,15 +75,26 @@ def begin(work: Path, wanted: str, *, fresh: bool) -> Path:
         if work.exists():
             shutil.rmtree(work)
         work.mkdir(parents=True)
-        (work / UNFINISHED).write_text(json.dumps({"fingerprint": wanted}), encoding="utf-8")
+        write_json(work / UNFINISHED, {"fingerprint": wanted})
     return work
 
 
-def finish(work: Path, place: Path, wanted: str, report: dict, seconds: float) -> None:
-    """Writes the record and moves the finished folder to its place."""
-    (work / UNFINISHED).unlink(missing_ok=True)
-    text = json.dumps({"version": 1, "fingerprint": wanted, "seconds": seconds, "report": report}, indent=1)
-    (work / RECORD).write_text(text, encoding="utf-8")
+def finish(work: Path, place: Path, wanted: str, inputs: str, report: dict, seconds: float) -> None:
+    """Writes the record and moves the finished folder to its place.
+
+    Args:
+        work: the folder that `begin` gave.
+        place: where the result belongs.
+        wanted: fingerprint of the stage.
+        inputs: fingerprint of what it read.
+        report: of the stage.
+        seconds: that it took.
+    """
+    # The mark of unfinished work goes last: where the record cannot be written, the next run goes on from here.
+    write_json(
+        work / RECORD,
+        {"version": 1, "fingerprint": wanted, "inputs": inputs, "seconds": seconds, "report": report},
+    )
     place.parent.mkdir(parents=True, exist_ok=True)
     old = place.with_name(f".{place.name}.old")
     shutil.rmtree(old, ignore_errors=True)
@@ -88,6 +102,7 @@ def finish(work: Path, place: Path, wanted: str, report: dict, seconds: float) -
     if place.exists():
         os.rename(place, old)
     os.rename(work, place)
+    (place / UNFINISHED).unlink(missing_ok=True)
     shutil.rmtree(old, ignore_errors=True)
 
 
@@ -105,3 +120,20 @@ def writing(folder: Path) -> Iterator[None]:
         hint = "free some space and run again: finished stages are kept" if error.errno in reasons else ""
         reason = reasons.get(error.errno or 0, error.strerror or str(error))
         raise SdfsimError(f"{error.filename or folder}: cannot be written ({reason})", hint) from error
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Keeps other runs out of a folder; the system lifts the lock when this process ends, however it ends.
+
+    Raises:
+        SdfsimError: another run is in there.
+    """
+    with open(folder / LOCK, "a") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise SdfsimError(
+                f"{folder}: another run is writing to this folder", "wait until it ends, or choose another folder"
+            ) from error
+        yield

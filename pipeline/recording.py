@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 from pipeline.cameras import load_sparse, load_views
-from sdfsim.errors import SdfsimError
+from pipeline.report import current
 from sdfsim.playback import PosedPhoto, save_reconstruction
 from sdfsim.shape.mesh import load_mesh
 
@@ -24,20 +23,18 @@ def record(folder: Path) -> Path | None:
     Raises:
         SdfsimError: a stage's folder is damaged, or the file cannot be written.
     """
-    poses, mesh_folder = folder / "poses", folder / "mesh"
-    if not (poses / "cameras.json").exists():
+    done = current(folder)
+    if "poses" not in done:
         return None
+    poses, mesh_folder = folder / "poses", folder / "mesh"
     views, sparse = load_views(poses), load_sparse(poses)
     points, mesh = sparse.xyz, None
-    if (mesh_folder / "placement.json").exists():
+    if "mesh" in done:
         from pipeline.distill import load_field
-        from pipeline.placement import Placement
+        from pipeline.placement import load_placement
 
         normalisation = load_field(folder / "distill").normalisation
-        try:
-            placement = Placement.from_dict(json.loads((mesh_folder / "placement.json").read_text(encoding="utf-8")))
-        except (OSError, ValueError, TypeError, KeyError) as error:
-            raise SdfsimError(f"{mesh_folder}: damaged placement.json", "run `sdfsim mesh` again") from error
+        placement = load_placement(mesh_folder)
         views = [placement.view(v) for v in normalisation.views(views)]
         points = placement.points(normalisation.apply(points))
         mesh = load_mesh(mesh_folder / "mesh.ply")

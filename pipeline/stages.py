@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import json
-import os
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from pipeline import record
+from pipeline.options import LONG_SIDE, Options, read_config, write_config
+from pipeline.report import STAGES, current, place_of, write_report
 from sdfsim.errors import SdfsimError
+from sdfsim.files import replacing, write_json
 
 Progress = Callable[[str, float, str], None]
 
-STAGES = ("photos", "poses", "distill", "mesh", "fit", "scene")
-PRESETS = ("quick", "standard", "fine")
-LONG_SIDE = {"quick": 800, "standard": 1200, "fine": 1600}  # px of the prepared photos
 # Share of an overall time budget that fitting may take, and what the other stages need after training, s.
 FIT_SHARE, AFTER_TRAINING = 0.15, 40.0
 
@@ -27,58 +23,11 @@ FIT_SHARE, AFTER_TRAINING = 0.15, 40.0
 CODE = {
     "photos": ("photos",),
     "poses": ("photos", "cameras", "poses", "poses_worker", "normalise"),
-    "distill": ("cameras", "normalise", "rays", "field", "recipe", "trainer", "distill"),
-    "mesh": ("cameras", "normalise", "field", "surface", "placement"),
-    "fit": (),
-    "scene": ("asset", "placement"),
+    "distill": ("photos", "cameras", "normalise", "rays", "field", "render", "recipe", "trainer", "distill"),
+    "mesh": ("cameras", "normalise", "field", "distill", "surface", "cleaning", "placement"),
+    "fit": ("asset",),
+    "scene": ("scene_file", "drop", "placement"),
 }
-
-
-@dataclass
-class Options:
-    """Every option of a reconstruction, as written to config.yaml.
-
-    Attributes:
-        photos: the user's folder.
-        preset: quick, standard or fine.
-        size: widest side of the scene, m; None: assumed to be 1 m.
-        budget: s for everything; None: what the preset takes.
-        seed: of everything random.
-        device: auto, cpu or cuda.
-        recipe: of the fit.
-    """
-
-    photos: str = ""
-    preset: str = "standard"
-    size: float | None = None
-    budget: float | None = None
-    seed: int = 0
-    device: str = "auto"
-    recipe: str = "default"
-
-    def check(self) -> None:
-        """Raises SdfsimError where a value makes no sense."""
-        if self.preset not in PRESETS:
-            raise SdfsimError(f"preset: {self.preset!r} is not one of {', '.join(PRESETS)}")
-        if self.size is not None and not 1e-4 <= self.size <= 1e5:
-            raise SdfsimError(f"size: must be between 0.0001 and 100000 m (got {self.size:g})")
-        if self.budget is not None and not self.budget > 0:
-            raise SdfsimError(f"budget: must be > 0 s (got {self.budget:g})")
-
-    def of_stage(self, stage: str) -> dict[str, Any]:
-        """The options that a stage's result depends on."""
-        common = {"preset": self.preset, "seed": self.seed}
-        if stage == "photos":
-            return {"long_side": LONG_SIDE[self.preset]}
-        if stage == "poses":
-            return {"seed": self.seed}
-        if stage == "distill":
-            return {**common, "budget": self.budget}
-        if stage == "mesh":
-            return {"preset": self.preset, "size": self.size}
-        if stage == "fit":
-            return {"seed": self.seed, "budget": self.budget, "recipe": self.recipe}
-        return {"seed": self.seed}
 
 
 @dataclass
@@ -96,7 +45,7 @@ class Run:
 
     def place(self, stage: str) -> Path:
         """Where a stage's result lies."""
-        return self.folder / ("assets/scene" if stage == "fit" else stage)
+        return place_of(self.folder, stage)
 
 
 def reconstruct(
@@ -135,17 +84,17 @@ def reconstruct(
     first = STAGES.index(from_stage) if from_stage else len(STAGES)
     last = STAGES.index(until_stage) if until_stage else len(STAGES) - 1
     run = Run(Path(out), options, progress)
-    with record.writing(run.folder):
-        if "photos" in STAGES[: last + 1]:
-            from pipeline.photos import find_photos
+    from pipeline.photos import find_photos
 
-            find_photos(Path(photos))  # Before anything is written.
+    find_photos(Path(photos))  # Before anything is written.
+    with record.writing(run.folder):
         run.folder.mkdir(parents=True, exist_ok=True)
-        write_config(run)
-        for number, stage in enumerate(STAGES[: last + 1]):
-            run_one(run, stage, again=number >= first)
-            write_report(run)
-        return write_report(run)
+        with record.locked(run.folder):
+            write_config(options, run.folder)
+            for number, stage in enumerate(STAGES[: last + 1]):
+                run_one(run, stage, again=number >= first)
+                write_report(run.folder, options)
+            return write_report(run.folder, options)
 
 
 def run_stage(name: str, folder: str | Path, *, progress: Progress | None = None, again: bool = False,
@@ -174,13 +123,16 @@ def run_stage(name: str, folder: str | Path, *, progress: Progress | None = None
         raise SdfsimError(f"no such option: {', '.join(sorted(unknown))}")
     run.options = replace(run.options, **known)
     run.options.check()
-    with record.writing(run.folder):
+    with record.writing(run.folder), record.locked(run.folder):
+        done = current(run.folder)
         for before in STAGES[: STAGES.index(name)]:
-            if record.read(run.place(before)) is None:
-                raise SdfsimError(f"{folder}: the {before} stage has not run", f"run `sdfsim {before}` first")
-        write_config(run)
+            if before not in done:
+                why = "is older than what it reads" if record.read(run.place(before)) else "has not run"
+                command = "poses" if before == "photos" else before  # No command does the photos alone.
+                raise SdfsimError(f"{folder}: the {before} stage {why}", f"run `sdfsim {command}` first")
+        write_config(run.options, run.folder)
         run_one(run, name, again=again)
-        return write_report(run)
+        return write_report(run.folder, run.options)
 
 
 def run_one(run: Run, stage: str, *, again: bool) -> None:
@@ -204,7 +156,7 @@ def run_one(run: Run, stage: str, *, again: bool) -> None:
     report = ACTIONS[stage](run, work)
     # Training that a killed run had already done counts as well.
     seconds = time.monotonic() - started + report.get("seconds_before", 0.0)
-    record.finish(work, run.place(stage), wanted, report, seconds)
+    record.finish(work, run.place(stage), wanted, inputs, report, seconds)
     run.tell(stage)(1.0, f"done in {seconds:.0f} s")
 
 
@@ -247,11 +199,11 @@ def do_distill(run: Run, work: Path) -> dict:
 
 def do_mesh(run: Run, work: Path) -> dict:
     """Mesh stage."""
-    from pipeline.asset import write_mesh
     from pipeline.cameras import load_sparse, load_views
     from pipeline.distill import load_field
     from pipeline.placement import place
     from pipeline.surface import PRESET_RESOLUTION, extract
+    from sdfsim.shape.storage import write_ply
 
     trained = load_field(run.place("distill"))
     views = trained.normalisation.views(load_views(run.place("poses")))
@@ -262,9 +214,10 @@ def do_mesh(run: Run, work: Path) -> dict:
     )  # fmt: skip
     placement = place(surface.shown, views, run.options.size)
     shown = placement.mesh(surface.shown)
-    write_mesh(shown, work / "mesh.ply")
-    write_mesh(placement.mesh(surface.solid), work / "solid.ply")
-    (work / "placement.json").write_text(json.dumps(placement.to_dict(), indent=1), encoding="utf-8")
+    for name, mesh in (("mesh.ply", shown), ("solid.ply", placement.mesh(surface.solid))):
+        with replacing(work / name) as partial:
+            partial.write_bytes(write_ply(mesh))
+    write_json(work / "placement.json", placement.to_dict())
     extent = (shown.vertices.max(0) - shown.vertices.min(0)).round(4).tolist()
     return {**surface.report, "extent_m": extent, "up_from": placement.up_from, "size": placement.size_from}
 
@@ -284,9 +237,11 @@ def do_fit(run: Run, work: Path) -> dict:
 
 def do_scene(run: Run, work: Path) -> dict:
     """Scene stage."""
-    from pipeline.asset import write_scene
+    from pipeline.scene_file import write_scene
 
-    return write_scene(run.place("mesh"), run.folder / "scene.yaml", seed=run.options.seed)
+    before = record.read(run.place("scene"))
+    written = before["report"].get("scene_sha256") if before else None
+    return write_scene(run.place("mesh"), run.folder / "scene.yaml", written=written, seed=run.options.seed)
 
 
 ACTIONS: dict[str, Callable[[Run, Path], dict]] = {
@@ -307,50 +262,3 @@ def pick_device(name: str) -> str:
     if name == "cuda" and not torch.cuda.is_available():
         raise SdfsimError("device: no CUDA device here", "use --device cpu")
     return name
-
-
-def write_config(run: Run) -> None:
-    """Writes config.yaml: every option as resolved."""
-    text = yaml.safe_dump({"version": 1, **asdict(run.options)}, sort_keys=False, allow_unicode=True)
-    temporary = run.folder / "config.yaml.part"
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, run.folder / "config.yaml")
-
-
-def read_config(folder: Path) -> Options:
-    """Reads config.yaml.
-
-    Raises:
-        SdfsimError: it is missing or not one of ours.
-    """
-    try:
-        data = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
-        data.pop("version", None)
-        return Options(**data)
-    except (OSError, yaml.YAMLError, TypeError, AttributeError) as error:
-        raise SdfsimError(f"{folder}: not the folder of a reconstruction", "run `sdfsim reconstruct` first") from error
-
-
-def write_report(run: Run) -> dict:
-    """Writes report.json from the stages' own records; returns it."""
-    stages, seconds = {}, {}
-    for stage in STAGES:
-        known = record.read(run.place(stage))
-        if known:
-            stages[stage], seconds[stage] = known["report"], round(known["seconds"], 1)
-    distill = stages.get("distill", {})
-    paths = {"scene": "scene.yaml", "shape": "assets/scene", "mesh": "mesh/mesh.ply", "cameras": "poses/cameras.json"}
-    failed = []
-    fit = stages.get("fit", {})
-    if fit and fit.get("passed") is False:
-        failed.append(f"fit: {fit.get('reason', 'certificate missed')}")
-    report = {
-        "version": 1, "options": asdict(run.options),
-        "seconds": seconds, "seconds_total": round(sum(seconds.values()), 1),
-        "psnr": distill.get("psnr"), "stages": stages, "failed_checks": failed,
-        "paths": {key: str(run.folder / path) for key, path in paths.items() if (run.folder / path).exists()},
-    }  # fmt: skip
-    temporary = run.folder / "report.json.part"
-    temporary.write_text(json.dumps(report, indent=1), encoding="utf-8")
-    os.replace(temporary, run.folder / "report.json")
-    return report

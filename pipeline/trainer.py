@@ -3,32 +3,29 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import safetensors.torch
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
 from pipeline.cameras import Sparse, View
 from pipeline.field import (
     BACKGROUND_SAMPLES,
     GridField,
-    Samples,
-    choose_samples,
-    composite,
     differences,
     level_step,
-    sdf_cache,
     stencil,
 )
 from pipeline.normalise import Normalisation, point_weights
 from pipeline.photos import BACKDROP
 from pipeline.rays import Rays
 from pipeline.recipe import Recipe, active_levels, beta_at, rate_at, view_dependence_at
+from pipeline.render import Samples, choose_samples, composite, sdf_cache
+from sdfsim.files import replacing
 
 
 @dataclass(frozen=True)
@@ -83,9 +80,7 @@ class Trainer:
         device: where to compute.
     """
 
-    def __init__(
-        self, recipe: Recipe, rays: Rays, landmarks: Landmarks, seed: int, device: str = "cpu"
-    ) -> None:
+    def __init__(self, recipe: Recipe, rays: Rays, landmarks: Landmarks, seed: int, device: str = "cpu") -> None:
         self.recipe, self.rays, self.seed, self.device = recipe, rays.to(device), seed, device
         self.points, self.point_weights, self.sight = (
             torch.tensor(values, dtype=torch.float32, device=device)
@@ -202,9 +197,9 @@ class Trainer:
             "active": self.field.active, "view_dependence": self.field.view_dependence,
             "size": self.recipe.size.to_dict(),
         }  # fmt: skip
-        temporary = path.with_suffix(".part")
-        save_file(tensors, str(temporary), metadata={"about": json.dumps(about)})
-        os.replace(temporary, path)
+        # As bytes: safetensors' own writer does not raise OSError where the disk is full.
+        with replacing(path) as partial:
+            partial.write_bytes(safetensors.torch.save(tensors, metadata={"about": json.dumps(about)}))
 
     def load(self, path: Path) -> bool:
         """Goes on from a checkpoint; False where there is none that fits."""

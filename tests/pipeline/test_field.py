@@ -7,23 +7,22 @@ import pytest
 import torch
 
 from pipeline.cameras import Sparse, View
-from pipeline.distill import train
+from pipeline.distill import save_field, train
 from pipeline.field import (
     FieldSize,
     GridField,
-    choose_samples,
     contract,
     differences,
     laplace_density,
     render_weights,
-    sdf_cache,
-    sphere_interval,
     stencil,
 )
 from pipeline.normalise import Normalisation
 from pipeline.rays import Rays, camera_rays, load_rays
 from pipeline.recipe import PRESETS
+from pipeline.render import choose_samples, sdf_cache, sphere_interval
 from pipeline.trainer import Trainer, find_landmarks
+from sdfsim.errors import SdfsimError
 
 SMALL = FieldSize((8, 16), (2, 2), 16, 8)
 
@@ -213,3 +212,17 @@ def test_train_writes_and_reads_back(tmp_path):
         assert torch.equal(trained.field.sdf(p), again.field.sdf(p))
     assert not (tmp_path / "checkpoint.safetensors").exists()
     assert len(load_rays(trained.normalisation.views(views), tmp_path, 40, masks=False)) > 0
+
+
+def test_a_full_disk_is_one_clear_line(tmp_path):
+    import resource
+
+    field, place = GridField(SMALL), Normalisation(np.zeros(3), 1.0)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))  # Writing fails as it does on a full disk.
+    try:
+        with pytest.raises(SdfsimError, match=r"field\.safetensors: cannot be written"):
+            save_field(field, 0.01, place, {}, tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert list(tmp_path.iterdir()) == []

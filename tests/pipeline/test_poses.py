@@ -8,9 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline import poses
+from pipeline.cameras import load_sparse
 from pipeline.photos import Photo, prepare_photos
 from pipeline.poses import FIRST_TRY, failure_hint, failure_message, judge, run_worker, size_groups, solve
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
+from sdfsim.files import write_arrays
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 
@@ -91,6 +94,25 @@ def test_photos_without_anything_in_common_fail_with_reasons(tmp_path):
         solve(photos, tmp_path, tmp_path, timeout=120)
     assert caught.value.exit_code == EXIT_QUALITY
     assert "only 0 of 3" in caught.value.message and "flat0.jpg: too few features" in caught.value.message
+
+
+def test_a_second_try_that_breaks_leaves_the_verdict_of_the_first(tmp_path, monkeypatch):
+    def run(job, folder, timeout, report):
+        if folder.name == "try2":
+            raise SdfsimError("camera poses: stopped after 5 s")
+        return result(10, 4)
+
+    monkeypatch.setattr(poses, "run_worker", run)
+    with pytest.raises(SdfsimError, match=r"only 4 of 10 photos.*IMG_4\.JPG") as caught:
+        solve([photo(k) for k in range(10)], tmp_path, tmp_path)
+    assert caught.value.exit_code == EXIT_QUALITY
+
+
+def test_a_cut_file_of_points_is_one_clear_line(tmp_path):
+    write_arrays(tmp_path / "sparse.npz", {"xyz": np.zeros((500, 3))})
+    (tmp_path / "sparse.npz").write_bytes((tmp_path / "sparse.npz").read_bytes()[:60])
+    with pytest.raises(SdfsimError, match=r"sparse\.npz: cannot be read"):
+        load_sparse(tmp_path)
 
 
 @pytest.mark.slow

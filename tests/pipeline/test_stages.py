@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from pipeline import record, stages
+from pipeline.report import notes
 from sdfsim.errors import SdfsimError
 
 ROOT = Path(__file__).resolve().parent.parent.parent
@@ -154,6 +155,70 @@ def test_full_disk_is_one_clear_line(photos, tmp_path, calls, monkeypatch):
     monkeypatch.setitem(stages.ACTIONS, "mesh", full)
     with pytest.raises(SdfsimError, match="the disk is full"):
         stages.reconstruct(photos, tmp_path / "out", preset="quick")
+
+
+def test_stages_made_from_an_older_result_are_not_reported(photos, tmp_path, calls, monkeypatch):
+    ordinary = stages.ACTIONS["fit"]
+    failing = {"passed": False, "reason": "too coarse"}
+    monkeypatch.setitem(stages.ACTIONS, "fit", lambda run, work: {**ordinary(run, work), **failing})
+    out = tmp_path / "out"
+    report = stages.reconstruct(photos, out, preset="quick")
+    assert report["failed_checks"] == ["fit: too coarse"] and "scene" in report["paths"]
+    report = stages.run_stage("mesh", out, size=5.0)
+    assert list(report["stages"]) == ["photos", "poses", "distill", "mesh"]
+    assert report["failed_checks"] == [] and "scene" not in report["paths"]
+    with pytest.raises(SdfsimError, match="the fit stage is older than what it reads") as caught:
+        stages.run_stage("scene", out)
+    assert "sdfsim fit" in caught.value.hint
+    stages.run_stage("fit", out)
+    assert set(stages.run_stage("scene", out)["stages"]) == set(stages.STAGES)
+
+
+def test_the_hint_names_a_command_that_exists(photos, tmp_path, calls):
+    out = tmp_path / "out"
+    stages.reconstruct(photos, out, until_stage="photos")
+    (out / "photos" / record.RECORD).unlink()
+    with pytest.raises(SdfsimError) as caught:
+        stages.run_stage("distill", out)
+    assert caught.value.hint == "run `sdfsim poses` first"
+
+
+def test_a_second_run_into_the_same_folder_is_refused(photos, tmp_path, calls):
+    out = tmp_path / "out"
+    stages.reconstruct(photos, out, until_stage="photos")
+    with record.locked(out):
+        for again in (lambda: stages.reconstruct(photos, out), lambda: stages.run_stage("poses", out)):
+            with pytest.raises(SdfsimError, match="another run is writing") as caught:
+                again()
+            assert caught.value.exit_code == 1
+    stages.run_stage("poses", out)
+
+
+def test_a_record_that_cannot_be_written_keeps_the_work(tmp_path, monkeypatch):
+    work = record.begin(tmp_path / "w", "a", fresh=False)
+    (work / "result").write_text("")
+
+    def full(path: Path, content: dict) -> None:
+        raise SdfsimError(f"{path}: cannot be written: No space left on device")
+
+    monkeypatch.setattr(record, "write_json", full)
+    with pytest.raises(SdfsimError, match="No space left"):
+        record.finish(work, tmp_path / "place", "a", "before", {}, 1.0)
+    assert (record.begin(work, "a", fresh=False) / "result").exists()
+
+
+def test_notes_name_what_was_passed_over_assumed_or_is_vague():
+    found = notes({
+        "photos": {"notes": ["photos of several sizes"]},
+        "poses": {"warnings": ["12 left out"], "left_out": [{"photo": f"{k}.jpg", "why": "dark"} for k in range(12)]},
+        "mesh": {"up_from": "cameras", "size": "assumed: widest side = 1 m"},
+    })  # fmt: skip
+    assert found[:3] == ["photos of several sizes", "12 left out", "left out: 0.jpg: dark"]
+    assert found[-3:-1] == [
+        "left out: 2 more",
+        "no level plane found: up is taken from the cameras and may be off by some degrees",
+    ]
+    assert found[-1] == "size assumed: widest side = 1 m (give --size)"
 
 
 @pytest.mark.slow

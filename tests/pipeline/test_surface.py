@@ -5,19 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.asset import choose_drop, heights_from_above, scene_text
 from pipeline.cameras import Sparse, View
+from pipeline.cleaning import components, drop_small, vertex_normals
 from pipeline.normalise import camera_up, find_normalisation, nearest_to_axes, plane_up
 from pipeline.placement import Placement, place, resting_height
 from pipeline.surface import (
     bilinear,
-    components,
-    drop_small,
-    face_normals,
     marching_cubes,
     sample_volume,
     trusted_vertices,
-    vertex_normals,
 )
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.shape.mesh import Mesh, is_closed, signed_volume
@@ -183,39 +179,3 @@ def test_placement_turns_gravity_down_and_sets_the_size():
     again = Placement.from_dict(found.to_dict())
     np.testing.assert_allclose(again.points(turned.vertices), placed.vertices)
     assert "assumed" in place(turned, views, None).size_from
-
-
-def test_drop_lands_on_the_block():
-    mesh = scenery()
-    drop = choose_drop(mesh, mesh)
-    x, y, z = drop.position
-    assert abs(x - 0.1) < 0.3 - 0.5 * drop.side and abs(y) < 0.3 - 0.5 * drop.side
-    assert drop.support == pytest.approx(0.4, abs=1e-3) and drop.slope < 1
-    assert z - 0.5 * drop.side > drop.support
-    assert drop.side == pytest.approx(0.18, rel=0.01)
-    assert np.isnan(heights_from_above(mesh, np.array([[5.0, 5]]))).all()
-
-
-def test_a_ball_rests_in_a_hollow():
-    from pipeline.asset import resting_map
-
-    line = np.linspace(-1, 1, 81)
-    x, y = np.meshgrid(line, line, indexing="ij")
-    bowl = np.minimum(x**2 + y**2, 0.36)
-    lowest, slope, depth = resting_map(bowl, line[1] - line[0], 0.1)
-    assert np.unravel_index(lowest.argmin(), lowest.shape) == (40, 40)
-    assert depth[40, 40] == pytest.approx(0.36, abs=0.01) and slope[40, 40] < 1
-    # Inside the bowl the slope is that of a sphere's path: steeper away from the middle.
-    assert slope[52, 40] > 20 and depth[0, 0] == 0
-
-
-def test_scene_text_is_valid_yaml_with_gravity_down():
-    import yaml
-
-    mesh = scenery()
-    placement = Placement(1.0, np.eye(3), np.zeros(3), "plane", "assumed: widest side = 1 m")
-    text = scene_text(placement, choose_drop(mesh, mesh))
-    data = yaml.safe_load(text)
-    assert data["gravity"] == [0, 0, -9.81] and data["shapes"]["scene"] == {"asset": "assets/scene"}
-    assert "assumed: widest side = 1 m" in text
-    assert face_normals(mesh)[1].min() > 0
