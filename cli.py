@@ -123,35 +123,31 @@ def mesh(
 def fit(
     source: Annotated[Path, typer.Argument(help="A mesh file, or a folder that mesh has written.", show_default=False)],
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Shape folder to write (for a mesh file).")] = None,
-    recipe: Annotated[Literal["default", "paper"], typer.Option(help="How the network is fitted.")] = "default",
+    recipe: Annotated[
+        Literal["default", "paper"] | None, typer.Option(help="How the network is fitted (a folder: as before).")
+    ] = None,
     budget: Budget = None,
     as_json: Json = False,
     device: Device = "auto",
     verbose: Verbose = False,
 ) -> None:
-    """Mesh -> compact SDF network, its errors certified."""
+    """Mesh -> compact SDF network, its errors certified; in a reconstruction's folder also its scene.yaml.
+
+    A fit runs on the CPU, whatever --device says.
+    """
     if source.is_dir():
-        _stage("fit", source, as_json, verbose, budget=budget, device=device)
+        if out is not None:
+            raise typer.BadParameter("-o goes with a mesh file; a folder keeps its shape in itself")
+        _stage("fit", source, as_json, verbose, then="scene", budget=budget, recipe=recipe, device=device)
         return
     if out is None:
         raise typer.BadParameter("a mesh file needs -o SHAPE_DIR")
     with Session(as_json=as_json, verbose=verbose) as session:
-        from sdfsim.shape.fit import fit_mesh
-        from sdfsim.shape.mesh import load_mesh
+        from sdfsim import run
 
-        shape = fit_mesh(
-            load_mesh(source),
-            name=out.name,
-            recipe=recipe,
-            budget=budget,
-            on_progress=session.progress,
-        )
-        shape.save(out)
-        passed = bool(shape.certificate.get("passed", True))
-        if not passed:
-            session.exit_code = EXIT_QUALITY
-            session.say("the fit missed its certificate: the shape is usable, but less exact than it should be")
-        session.report({"folder": str(out), "volume_m3": shape.volume, "nodes": len(shape.nodes)} | shape.certificate)
+        report = run.fit(source, out, recipe=recipe or "default", budget=budget, on_progress=session.progress)
+        _tell_failed(session, report)
+        session.report(report)
 
 
 @app.command()
@@ -180,7 +176,7 @@ def simulate(
             seed=seed,
             viewer=viewer,
             device=device,
-            on_progress=session.progress,
+            on_progress=session.stage_progress,
             on_address=lambda address: session.say(f"watch it at {address}"),
         )
         lines = [
@@ -188,7 +184,9 @@ def simulate(
             f" (median {report['step_ms_median']:.1f} ms a step)",
             f"mean contacts {report['contacts_mean']:.1f}, worst penetration {report['worst_penetration_m']:.2g} m",
             f"wrote {out}",
+            *(f"outside the model's training: {line}" for line in report["outside_training"]),
         ]
+        _tell_failed(session, report)
         if viewer != "none":
             lines.append(f"watch it: sdfsim view {report['recording']}   (or: rerun {report['recording']})")
         session.report(report, lines)
@@ -208,7 +206,9 @@ def plan(
     with Session(as_json=as_json, verbose=verbose) as session:
         from sdfsim import run
 
-        report = run.describe(scene, model=model, device=device, on_progress=session.progress)
+        report = run.describe(scene, model=model, device=device, on_progress=session.stage_progress)
+        for check in report["failed_checks"]:  # told, but a plan is as good with a shape that is less exact
+            session.say(f"failed check: {check}")
         session.report(report, run.plan_lines(report))
 
 
@@ -289,15 +289,22 @@ def evaluate(
     data: Annotated[Path, typer.Argument(help="Dataset folder, or one split of it.", show_default=False)],
     model: Model = None,
     steps: Annotated[int, typer.Option(help="Length of each rollout.", min=1)] = 50,
+    free_flight: Annotated[
+        Literal["exact", "learned"], typer.Option(help="Bodies without contact (learned: paper networks only).")
+    ] = "exact",
     as_json: Json = False,
     device: Device = "auto",
     verbose: Verbose = False,
 ) -> None:
     """Errors of a model's rollouts on recorded trajectories."""
     with Session(as_json=as_json, verbose=verbose) as session:
+        from sdfsim import run
         from sdfsim.learning.evaluate import evaluate as run_evaluation
 
-        session.report(run_evaluation(data, model=model, steps=steps, device=device, on_progress=session.progress))
+        report = run_evaluation(
+            data, model=model, steps=steps, device=device, free_flight=free_flight, on_progress=session.progress
+        )
+        session.report(report, run.evaluation_lines(report))
 
 
 @app.command()
@@ -309,11 +316,14 @@ def info(as_json: Json = False, device: Device = "auto", verbose: Verbose = Fals
         session.report(run.environment())
 
 
-def _stage(name: str, folder: Path, as_json: bool, verbose: bool, **options: Any) -> None:
+def _stage(name: str, folder: Path, as_json: bool, verbose: bool, *, then: Stage | None = None, **options: Any) -> None:
+    """Run one stage, and `then` another that costs next to nothing."""
     with Session(as_json=as_json, verbose=verbose) as session:
         from pipeline import stages
 
         report = stages.run_stage(name, folder, progress=session.stage_progress, **options)
+        if then is not None:
+            report = stages.run_stage(then, folder, progress=session.stage_progress)
         _report_stages(session, report, folder)
 
 
@@ -328,7 +338,13 @@ def _report_stages(session: Session, report: dict, folder: Path) -> None:
         lines.append(f"look at it: sdfsim view {report['paths']['recording']}")
     if "scene" in report["paths"]:
         lines.append(f"next: sdfsim simulate {report['paths']['scene']} -o RUN")
+    for note in report.get("notes", []):
+        session.say(note)
+    _tell_failed(session, report)
+    session.report(report, lines)
+
+
+def _tell_failed(session: Session, report: dict) -> None:
     for check in report["failed_checks"]:
         session.exit_code = EXIT_QUALITY
         session.say(f"failed check: {check}")
-    session.report(report, lines)

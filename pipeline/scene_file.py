@@ -33,14 +33,14 @@ shapes:
   box: {{box: {{size: [{side}, {side}, {thickness}]}}}}
 bodies:
   - {{name: floor, motion: static, plane: {{normal: [0, 0, 1], offset: {placement.floor:g}}}}}
-  - {{name: scene, shape: scene, motion: static, friction: 0.8, restitution: 0.2}}
+  - {{name: scene, shape: scene, motion: static, friction: 0.8, restitution: 0.4}}
   - name: box
     shape: box
     position: [{x}, {y}, {z}]     # m
     quat_xyzw: [{quat}]  # level with the surface below
     density: {BODY_DENSITY:g}                 # kg/m^3
     friction: 0.8
-    restitution: 0.2
+    restitution: 0.4
 """
 
 

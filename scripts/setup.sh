@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Makes .venv with the project in it, ready to run. Usage: bash scripts/setup.sh [EXTRA ...]   (extras: data, test)
-# Run again it does nothing, unless pyproject.toml or the wanted extras have changed.
+# Run again it does nothing, unless pyproject.toml has changed or an extra is wanted that is not there yet.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -67,9 +67,15 @@ if [ "${#wanted[@]}" -gt 0 ]; then
     fi
 fi
 
-extras="$(IFS=,; printf '%s' "$*")"
-mark="$({ cat pyproject.toml; pwd; printf '%s' "$extras"; } | sha256sum | cut -d' ' -f1)"
-if [ -x .venv/bin/sdfsim ] && [ "$(cat .venv/.set-up 2>/dev/null)" = "$mark" ]; then
+# The mark of a finished set-up: what it was made from, then the extras that are in. Those stay in.
+made_from="$({ cat pyproject.toml; pwd; } | sha256sum | cut -d' ' -f1)"
+known=() marked=''
+if [ -x .venv/bin/sdfsim ] && [ -f .venv/.set-up ]; then
+    read -r marked <.venv/.set-up || true
+    read -ra known < <(tail -n +2 .venv/.set-up) || true
+fi
+extras="$(printf '%s\n' "${known[@]}" "$@" | sed '/^$/d' | sort -u | paste -sd, -)"
+if [ "$marked" = "$made_from" ] && [ "$extras" = "$(IFS=,; printf '%s' "${known[*]}")" ]; then
     exit 0
 fi
 
@@ -92,5 +98,5 @@ fi
 say "installing Python packages (a few minutes the first time)"
 rm -f .venv/.set-up
 .venv/bin/python -m pip install -qq --disable-pip-version-check "${index[@]}" --editable ".${extras:+[$extras]}"
-printf '%s' "$mark" >.venv/.set-up
+printf '%s\n%s\n' "$made_from" "${extras//,/ }" >.venv/.set-up
 say "done: $(.venv/bin/python --version), $PWD/.venv"

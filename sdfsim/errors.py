@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 EXIT_ERROR = 1
-EXIT_USAGE = 2
 EXIT_QUALITY = 3
 EXIT_INTERRUPTED = 130
 

@@ -29,9 +29,6 @@ PLOTS = {
 _STATIC_COLOR = (150, 150, 155)
 _NODE_COLOR = (20, 20, 20)
 _CONTACT_COLOR = (255, 40, 40)
-_MOST_CORNER_PAIRS = (
-    1_000_000  # beyond, a mesh of about 10,000 vertices, it counts as smooth: splitting triples its size
-)
 _PHOTO_PIXELS = 320
 
 
@@ -243,7 +240,7 @@ def _eye(centre: np.ndarray, radius: float, up: np.ndarray) -> rrb.EyeControls3D
     side /= np.linalg.norm(side)
     away = 1.6 * np.cross(up, side) + 1.1 * side + 0.9 * up
     return rrb.EyeControls3D(
-        kind=rrb.Eye3DKind.Orbital, position=centre + radius * 1.3 * away, look_target=centre, eye_up=up
+        kind=rrb.Eye3DKind.Orbital, position=centre + radius * away, look_target=centre, eye_up=up
     )
 
 

@@ -51,11 +51,14 @@ class Session:
     ) -> None:
         self._bar.close()
         code = self._explain(error) if error is not None else self.exit_code
-        with contextlib.suppress(BrokenPipeError):
-            sys.stdout.flush()
-        self._clean_up.close()
-        if self.as_json and self._result is not None:
-            print(json.dumps(_plain(self._result)))
+        try:
+            with self._clean_up:
+                sys.stdout.flush()
+            if self.as_json and self._result is not None:
+                print(json.dumps(_plain(self._result)), flush=True)
+        except OSError as unwritten:
+            lost = self._lost_output(unwritten)
+            code = code or lost
         if code is not None:
             raise SystemExit(code) from None
 
@@ -67,9 +70,8 @@ class Session:
             return self._fail(error.message, error.hint, error.exit_code, problems=error.problems)
         if isinstance(error, SdfsimError):
             return self._fail(error.message, error.hint, error.exit_code)
-        if isinstance(error, BrokenPipeError):  # whoever read our report, such as `head`, has seen enough
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-            return EXIT_ERROR
+        if isinstance(error, BrokenPipeError):
+            return self._lost_output(error)
         if isinstance(error, OSError):
             where = f"{error.filename}: " if error.filename else ""
             return self._fail(f"{where}{error.strerror or error}", "", EXIT_ERROR)
@@ -77,6 +79,13 @@ class Session:
             hint = "" if self.verbose else "this is a fault of sdfsim; -v shows where"
             return self._fail(f"internal error: {type(error).__name__}: {error}", hint, EXIT_ERROR)
         return None
+
+    def _lost_output(self, error: OSError) -> int:
+        """The report cannot be written. Whoever read it and closed the pipe, such as `head`, has seen enough."""
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # else Python tries again at its end, and fails loudly
+        if not isinstance(error, BrokenPipeError):
+            self.say(f"error: the report cannot be written: {error.strerror or error}")
+        return EXIT_ERROR
 
     def _fail(self, message: str, hint: str, code: int, **more: Any) -> int:
         if self.verbose:
@@ -96,7 +105,10 @@ class Session:
         self._result = result
         if not self.as_json:
             self._bar.close()
-            print("\n".join(lines if lines is not None else _as_lines(result)))
+            try:
+                print("\n".join(lines if lines is not None else _as_lines(result)), flush=True)
+            except OSError as error:
+                self.exit_code = self._lost_output(error)
 
     def hold(self, why: str) -> None:
         """Wait for Ctrl-C, if a person is there to press it."""

@@ -1,7 +1,8 @@
-"""What the commands simulate, plan and info do: a scene file becomes a run folder, or a description."""
+"""What the commands fit, simulate, plan and info do: a mesh becomes a shape folder, a scene file a run folder."""
 
 from __future__ import annotations
 
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -10,15 +11,18 @@ from typing import Any, Literal
 import numpy as np
 import yaml
 
+from sdfsim.dynamics.model import Model, load_model
 from sdfsim.dynamics.rollout import Rollout
-from sdfsim.dynamics.simulator import SimulationError, Simulator, join
+from sdfsim.dynamics.simulator import SimulationError, Simulator, join, pick_device
 from sdfsim.errors import SdfsimError
 from sdfsim.files import write_json, write_text
 from sdfsim.playback import Playback, save_rollout
 from sdfsim.scene.effects import EFFECTS, plan
 from sdfsim.scene.load import load_scene
+from sdfsim.scene.types import Scene
 
 Viewer = Literal["none", "file", "native", "web"]
+Progress = Callable[[str, float, str], None]  # stage, fraction of it that is done, message
 _TRIAL_STEPS = 5
 _PACKAGES = (
     "torch",
@@ -34,6 +38,48 @@ _PACKAGES = (
 _RESULTS = ("report.json", "rollout.npz", "rollout.rrd")
 
 
+def fit(
+    mesh_file: Path,
+    out: Path,
+    *,
+    recipe: Literal["default", "paper"],
+    budget: float | None,
+    on_progress: Callable[[float, str], None],
+) -> dict[str, Any]:
+    """Fit a mesh file and write the shape folder `out`; a fit that was cut off goes on where it was.
+
+    Args:
+        mesh_file: to be fitted, in metres.
+        out: shape folder.
+        recipe: of the fit.
+        budget: seconds of fitting at most, or None.
+        on_progress: called with (fraction, message).
+
+    Returns:
+        Folder, volume, number of nodes, the certificate, and in `failed_checks` whether it was missed.
+
+    Raises:
+        SdfsimError: the mesh cannot be used, or the folder cannot be written.
+    """
+    from sdfsim.shape.fit import fit_mesh
+    from sdfsim.shape.mesh import load_mesh
+
+    mesh = load_mesh(mesh_file)
+    _check_writable(out)
+    shape = fit_mesh(
+        mesh,
+        name=out.resolve().name,
+        recipe=recipe,
+        budget=budget,
+        on_progress=on_progress,
+        checkpoint=out / "fit.checkpoint",
+    )
+    shape.save(out)
+    missed = [] if shape.certificate["passed"] else [f"fit: {shape.certificate['reason']}"]
+    found = {"folder": str(out), "volume_m3": shape.volume, "nodes": len(shape.nodes)}
+    return found | shape.certificate | {"failed_checks": missed}
+
+
 def simulate(
     scene_file: Path,
     out: Path,
@@ -43,7 +89,7 @@ def simulate(
     seed: int | None,
     viewer: Viewer,
     device: str,
-    on_progress: Callable[[float, str], None],
+    on_progress: Progress,
     on_address: Callable[[str], None],
 ) -> dict[str, Any]:
     """Simulate a scene and write config.yaml, report.json, rollout.npz and (unless `viewer` is none) rollout.rrd.
@@ -56,24 +102,35 @@ def simulate(
         seed: None: the scene's.
         viewer: where to watch: not at all, later from the file, or live in a window or a page.
         device: cpu, cuda or auto.
-        on_progress: called with (fraction, message).
+        on_progress: called with (stage, fraction, message).
         on_address: called with the address of the page that `viewer` web serves.
 
     Returns:
-        The content of report.json.
+        The content of report.json; `failed_checks` names the shapes that were fitted for this scene and missed their
+        certificate.
 
     Raises:
         SdfsimError: bad input, or an output that cannot be written.
         SimulationError: the state broke; what was computed before is in the folder.
         KeyboardInterrupt: likewise.
     """
-    scene = load_scene(scene_file, on_progress=on_progress)
-    simulator = Simulator(scene, model=model, device=device, seed=seed)
+    # Everything that can be wrong from the start, before shapes are fitted for minutes or earlier results are deleted.
+    pick_device(device)
+    chosen = load_model(model) if model else None
+    _check_writable(out)
+    if viewer in ("native", "web"):
+        from sdfsim.viewer import check_screen
+
+        check_screen(viewer)
+    scene = _load(scene_file, on_progress)
+    simulator = Simulator(scene, model=chosen, device=device, seed=seed)
+    frames = [simulator.initial_rollout()]
+    live = _live(scene, viewer, frames[0], on_address)
     length = scene.duration if seconds is None else seconds
     config = {
         "command": "simulate",
         "scene": str(scene_file.resolve()),
-        "model": simulator.model.name,
+        "model": _repeatable(model or scene.model, simulator.model),
         "seconds": float(length),
         "seed": int(simulator.seed),
         "viewer": viewer,
@@ -84,14 +141,11 @@ def simulate(
         (out / name).unlink(missing_ok=True)
     write_text(out / "config.yaml", yaml.safe_dump(config, sort_keys=False))
 
-    frames = [simulator.initial_rollout()]
-    live = _live(scene, viewer, frames[0], on_address)
-
     def on_step(frame: Rollout) -> None:
         frames.append(frame)
         if live:
             live.log_steps(frame)
-        on_progress(float(frame.time[-1]) / length, f"{frame.time[-1]:.2f} of {length:g} s simulated")
+        on_progress("simulate", float(frame.time[-1]) / length, f"{frame.time[-1]:.2f} of {length:g} s simulated")
 
     started, broken = time.monotonic(), None
     try:
@@ -99,11 +153,12 @@ def simulate(
     except (SimulationError, KeyboardInterrupt) as error:
         broken = error
         rollout = error.rollout if isinstance(error, SimulationError) else join(frames)
-    on_progress(1.0, f"{len(rollout)} steps" + (" (stopped early)" if broken else ""))
+    on_progress("simulate", 1.0, f"{len(rollout)} steps" + (" (stopped early)" if broken else ""))
 
     report = summary(rollout, time.monotonic() - started)
     report["status"] = "done" if broken is None else "failed" if isinstance(broken, SdfsimError) else "interrupted"
     report["folder"] = str(out)
+    report["failed_checks"] = _missed(scene)
     if isinstance(broken, SdfsimError):
         report["error"] = broken.message
     rollout.save(out / "rollout.npz")
@@ -116,6 +171,29 @@ def simulate(
     if broken is not None:
         raise broken
     return report
+
+
+def _load(scene_file: Path, on_progress: Progress) -> Scene:
+    return load_scene(scene_file, on_progress=lambda fraction, message: on_progress("shapes", fraction, message))
+
+
+def _missed(scene: Scene) -> list[str]:
+    return [f"fit of shape {told}" for told in scene.missed]
+
+
+def _repeatable(asked: str | None, model: Model) -> str:
+    """The model as it can be asked for again, from whatever folder."""
+    return str(Path(asked).resolve()) if asked and asked.endswith(".safetensors") else model.name
+
+
+def _check_writable(folder: Path) -> None:
+    """That a folder can be made and written to, without making it. Raises SdfsimError otherwise."""
+    there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    try:
+        with tempfile.TemporaryFile(dir=there):
+            pass
+    except OSError as error:
+        raise SdfsimError(f"{folder}: cannot be written: {error.strerror}", "choose another -o") from error
 
 
 def _live(scene: Any, viewer: Viewer, first: Rollout, on_address: Callable[[str], None]) -> Playback | None:
@@ -147,6 +225,7 @@ def summary(rollout: Rollout, wall: float) -> dict[str, Any]:
         "worst_penetration_m": _number(counters["worst_penetration"].max()),
         "kinetic_energy_J": [_number(energy[0]), _number(energy[-1])],
         "lowest_m": _number(heights.min()) if heights.size else None,
+        "outside_training": rollout.meta.get("outside_training", []),
         "finite": bool(np.isfinite(rollout.position).all() and np.isfinite(rollout.orientation).all()),
         "meta": rollout.meta,
     }
@@ -156,17 +235,17 @@ def _number(value: Any) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def describe(
-    scene_file: Path, *, model: str | None, device: str, on_progress: Callable[[float, str], None]
-) -> dict[str, Any]:
+def describe(scene_file: Path, *, model: str | None, device: str, on_progress: Progress) -> dict[str, Any]:
     """The plan of a scene with the units and the cost of a step, measured over a few steps.
 
     Raises:
         SdfsimError: bad input.
     """
-    scene = load_scene(scene_file, on_progress=on_progress)
+    pick_device(device)
+    chosen = load_model(model) if model else None
+    scene = _load(scene_file, on_progress)
     decided = plan(scene)
-    simulator = Simulator(scene, model=model, device=device)
+    simulator = Simulator(scene, model=chosen, device=device)
     units = simulator.units
     trial = simulator.run(steps=_TRIAL_STEPS)
     return {
@@ -184,6 +263,8 @@ def describe(
         "steps": max(1, round(scene.duration / simulator.dt)),
         "step_ms": float(np.median(trial.counters["step_ms"][1:])),
         "units": {"length_m": units.length, "time_s": units.time, "mass_kg": units.mass},
+        "outside_training": simulator.outside_training,
+        "failed_checks": _missed(scene),
     }
 
 
@@ -198,6 +279,30 @@ def plan_lines(report: dict[str, Any]) -> list[str]:
         f"about {report['step_ms']:.1f} ms each (measured over the first {_TRIAL_STEPS})",
         f"Froude scaling: the model's metre is {units['length_m']:.4g} m, its second {units['time_s']:.4g} s, "
         f"its kilogram {units['mass_kg']:.4g} kg",
+        *(f"outside the model's training: {line}" for line in report["outside_training"]),
+    ]
+
+
+def evaluation_lines(report: dict[str, Any]) -> list[str]:
+    """`evaluate`'s report for people: a row for the model and one for the baseline at every horizon."""
+    rows = [("", "steps", "seconds", "translation RMSE, m (95 %)", "rotation error, degrees (95 %)")]
+    for who, name in (("model", report["model_name"]), ("ballistic", "ballistic")):
+        for horizon, errors in report[who].items():
+            distance, angle = errors["translation_rmse_95"], errors["rotation_error_95"]
+            rows.append(
+                (
+                    name,
+                    horizon,
+                    f"{int(horizon) * report['dt']:g}",
+                    f"{errors['translation_rmse']:.3f} ({distance[0]:.3f} to {distance[1]:.3f})",
+                    f"{errors['rotation_error']:.1f} ({angle[0]:.1f} to {angle[1]:.1f})",
+                )
+            )
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    return [
+        *("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows),
+        f"{report['trajectories']} trajectories, {report['bodies']} bodies, "
+        f"{report['ms_per_step_per_trajectory']:.2f} ms per step and trajectory",
     ]
 
 

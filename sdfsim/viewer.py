@@ -40,19 +40,27 @@ def stream_to_viewer(playback: Playback, kind: Literal["native", "web"]) -> str:
     """
     import rerun as rr
 
-    has_screen = bool(sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    check_screen(kind)
     try:
         if kind == "native":
-            if not has_screen:
-                raise SdfsimError("--viewer native: there is no screen here", "use --viewer web, or --viewer file")
             playback.stream.spawn(port=_free_port(_GRPC_PORT), hide_welcome_screen=True)
             return ""
         source = playback.stream.serve_grpc(grpc_port=_free_port(_GRPC_PORT))
         port = _free_port(_WEB_PORT)
-        rr.serve_web_viewer(web_port=port, open_browser=has_screen, connect_to=source)
+        rr.serve_web_viewer(web_port=port, open_browser=_has_screen(), connect_to=source)
     except RuntimeError as error:
         raise SdfsimError(f"the rerun viewer does not start: {error}", "use --viewer file") from error
     return f"http://localhost:{port}?url={quote(source, safe=':/')}"
+
+
+def check_screen(kind: Literal["native", "web"]) -> None:
+    """Raises SdfsimError when a window is wanted where there is no screen."""
+    if kind == "native" and not _has_screen():
+        raise SdfsimError("--viewer native: there is no screen here", "use --viewer web, or --viewer file")
+
+
+def _has_screen() -> bool:
+    return bool(sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def show(recording: Path, *, web: bool = False) -> None:

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,13 @@ import yaml
 from typer.testing import CliRunner
 
 import cli
-from sdfsim import Rollout, SdfsimError
+from sdfsim import Rollout, SdfsimError, load_scene
 from sdfsim.dynamics.model import Model, new_network
 from sdfsim.dynamics.simulator import SimulationError, Simulator
+from sdfsim.shape import primitives, training
+from sdfsim.shape.asset import load_shape
+from sdfsim.shape.checkpoint import Checkpoint
+from sdfsim.shape.storage import write_ply
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENE = """
@@ -56,7 +61,7 @@ def test_simulate_leaves_a_run_folder_and_says_how_to_watch_it(scene, model, tmp
     assert done.exit_code == 0, done.stderr
     assert sorted(p.name for p in out.iterdir()) == ["config.yaml", "report.json", "rollout.npz", "rollout.rrd"]
     config = yaml.safe_load((out / "config.yaml").read_text())
-    assert config["seconds"] == 0.1 and config["seed"] == 3 and config["model"] == "untrained"
+    assert config["seconds"] == 0.1 and config["seed"] == 3 and config["model"] == model
     assert f"sdfsim view {out / 'rollout.rrd'}" in done.stdout
     rollout, report = Rollout.load(out / "rollout.npz"), json.loads((out / "report.json").read_text())
     assert len(rollout) == report["steps"] and report["status"] == "done" and report["finite"]
@@ -138,6 +143,8 @@ def test_a_bad_scene_is_one_line_and_code_1(tmp_path, command, field, fault):
         ("dataset", "movi-z", "-o", "out", "--shapes", "meshes", "--trajectories", "1"),
         ("view", "run.rrd", "--at", "1"),
         ("fit", "mesh.obj"),
+        ("fit", ".", "-o", "shape"),
+        ("evaluate", "data", "--free-flight", "high"),
         ("nonsense",),
     ],
 )
@@ -155,6 +162,7 @@ def test_wrong_usage_is_code_2(arguments):
         (("reconstruct", "{run}", "-o", "{run}/out"), "{run}"),
         (("distill", "{run}"), "{run}"),
         (("fit", "{run}.obj", "-o", "{run}"), "no such mesh file"),
+        (("fit", "{mesh}", "-o", "{scene}/shape"), "{scene}/shape: cannot be written"),
         (("view", "{scene}"), "not a rerun recording"),
         (("view", "{run}.rrd"), "no such recording"),
         (("evaluate", "{run}", "--model", "{model}"), "{run}"),
@@ -162,7 +170,8 @@ def test_wrong_usage_is_code_2(arguments):
     ],
 )
 def test_bad_input_is_one_line_and_code_1(scene, model, tmp_path, arguments, told):
-    names = {"scene": scene, "model": model, "run": str(tmp_path / "run")}
+    (tmp_path / "mesh.ply").write_bytes(write_ply(primitives.box()))
+    names = {"scene": scene, "model": model, "run": str(tmp_path / "run"), "mesh": str(tmp_path / "mesh.ply")}
     done = run(*(a.format(**names) for a in arguments))
     lines = done.stderr.splitlines()
     errors = [line for line in lines if line.startswith("error: ")]
@@ -178,6 +187,110 @@ def test_a_full_disk_is_one_line(scene, model, tmp_path):
     done = run("simulate", scene, "-o", out, "--model", model)
     assert done.exit_code == 1 and "No space left" in done.stderr and "Traceback" not in done.stderr
     assert not (out / "rollout.npz").exists()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+@pytest.mark.parametrize("options", [["--json"], []])
+def test_a_report_that_cannot_be_written_is_one_line(options):
+    command = [sys.executable, "-c", "import cli; cli.app()", "info", *options]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(command, cwd=ROOT, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == 1
+    assert done.stderr == "error: the report cannot be written: No space left on device\n"
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [("--model", "gigantic"), ("--device", "cuda"), ("--viewer", "native")],
+    ids=lambda option: option[0],
+)
+def test_what_is_wrong_from_the_start_is_told_before_work_and_deletes_nothing(
+    scene, model, tmp_path, monkeypatch, wrong
+):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr("sdfsim.run.load_scene", lambda *a, **k: pytest.fail("worked first"))
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "report.json").write_text("{}")
+    done = run("simulate", scene, "-o", tmp_path / "run", "--model", model, *wrong)
+    assert done.exit_code == 1 and done.stderr.startswith("error: "), done.stderr
+    assert (tmp_path / "run" / "report.json").read_text() == "{}"
+
+
+def test_a_fit_that_missed_its_certificate_is_code_3_and_the_run_still_whole(scene, model, tmp_path, monkeypatch):
+    real = load_scene
+    monkeypatch.setattr("sdfsim.run.load_scene", lambda *a, **k: replace(real(*a, **k), missed=("ball: thin walls",)))
+    done = run("simulate", scene, "-o", tmp_path / "run", "--model", model)
+    assert done.exit_code == 3 and "failed check: fit of shape ball: thin walls" in done.stderr
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert report["status"] == "done" and report["failed_checks"] == ["fit of shape ball: thin walls"]
+    done = run("plan", scene, "--model", model)
+    assert done.exit_code == 0 and "failed check: fit of shape ball: thin walls" in done.stderr
+
+
+def test_the_run_of_a_model_beside_the_scene_can_be_repeated(scene, model, tmp_path):
+    (tmp_path / "mine.safetensors").write_bytes(Path(model).read_bytes())
+    Path(scene).write_text(SCENE + "model: mine.safetensors\n")
+    assert run("simulate", scene, "-o", tmp_path / "run", "--viewer", "none").exit_code == 0
+    config = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
+    assert config["model"] == str(tmp_path / "mine.safetensors")
+
+
+def test_fitting_a_mesh_goes_on_where_it_was_interrupted(tmp_path, monkeypatch):
+    plan = replace(training.PLANS["default"], width=16, layers=4, steps=400, batch=256, pool=4000, goal=None)
+    monkeypatch.setitem(training.PLANS, "default", plan)
+    (tmp_path / "box.ply").write_bytes(write_ply(primitives.box()))
+    save, calls = Checkpoint.save, []
+
+    def interrupted(self, *state):
+        save(self, *state)
+        calls.append(state[-1][0])
+        if len(calls) == 1:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Checkpoint, "save", interrupted)
+    assert run("fit", tmp_path / "box.ply", "-o", tmp_path / "box").exit_code == 130
+    done = run("fit", tmp_path / "box.ply", "-o", tmp_path / "box", "--json")
+    report = json.loads(done.stdout)
+    assert calls == [200, 400] and done.exit_code == (0 if report["passed"] else 3)
+    assert load_shape(tmp_path / "box").volume == pytest.approx(1.0)
+    assert sorted(p.name for p in (tmp_path / "box").iterdir()) == ["mesh.ply", "shape.json", "shape.safetensors"]
+
+
+def test_fitting_a_folder_ends_with_its_scene(tmp_path, monkeypatch):
+    calls = []
+
+    def run_stage(name, folder, *, progress, **options):
+        calls.append((name, {key: value for key, value in options.items() if value is not None}))
+        return {"seconds": {name: 1.0}, "paths": {}, "failed_checks": [], "notes": ["a metre is a guess"]}
+
+    monkeypatch.setattr("pipeline.stages.run_stage", run_stage)
+    done = run("fit", tmp_path, "--recipe", "paper")
+    assert done.exit_code == 0 and done.stderr == "a metre is a guess\n"
+    assert calls == [("fit", {"recipe": "paper", "device": "auto"}), ("scene", {})]
+
+
+def test_an_evaluation_is_a_table(tmp_path, monkeypatch, model):
+    errors = {
+        "translation_rmse": 0.1714,
+        "translation_rmse_95": [0.15, 0.19],
+        "rotation_error": 12.04,
+        "rotation_error_95": [11.0, 13.0],
+    }
+    report = {"model_name": "small", "trajectories": 60, "bodies": 400, "dt": 0.02, "ms_per_step_per_trajectory": 1.5}
+    asked = {}
+
+    def evaluate(data, **options):
+        asked.update(options)
+        return report | {"model": {"50": errors}, "ballistic": {"50": errors}}
+
+    monkeypatch.setattr("sdfsim.learning.evaluate.evaluate", evaluate)
+    lines = run("evaluate", tmp_path, "--free-flight", "learned").stdout.splitlines()
+    assert asked["steps"] == 50 and asked["free_flight"] == "learned"
+    assert [line.split()[:3] for line in lines[1:3]] == [["small", "50", "1"], ["ballistic", "50", "1"]]
+    assert "0.171 (0.150 to 0.190)" in lines[1] and "12.0 (11.0 to 13.0)" in lines[1]
+    assert len({line.index("12.0") for line in lines[1:3]}) == 1
 
 
 def stop_after(steps: int, how):
@@ -255,7 +368,11 @@ def test_the_wheel_holds_everything(tmp_path):
         names = set(wheel.namelist())
         entry = wheel.read(next(n for n in names if n.endswith("entry_points.txt"))).decode()
     ours = {str(p.relative_to(ROOT)) for room in ("sdfsim", "pipeline") for p in (ROOT / room).rglob("*.py")}
-    ours |= {str(p.relative_to(ROOT)) for p in (ROOT / "sdfsim" / "models").glob("*.safetensors")}
+    models = {
+        str(p.relative_to(ROOT)) for p in (ROOT / "sdfsim" / "models").iterdir() if p.suffix in (".safetensors", ".md")
+    }
+    assert {Path(name).suffix for name in models} == {".safetensors", ".md"}
+    ours |= models
     assert ours | {"cli.py"} <= names
     assert "sdfsim = cli:app" in entry
     assert any(n.endswith("LICENSE") for n in names)

@@ -1,4 +1,4 @@
-"""Every bundled sample with the bundled model: 200 steps, all finite, rotations orthonormal, nothing under the floor."""
+"""Every bundled sample with the bundled model: 200 steps, finite, rotations orthonormal, nothing under the floor."""
 
 from pathlib import Path
 

@@ -196,8 +196,8 @@ class Run:
                 self.average[name].lerp_(weight, 1.0 - decay)
 
     def rate(self) -> float:
-        """Learning rate: a warm-up over the first 2 %, then a cosine to a hundredth."""
-        warm = min(1.0, (self.step + 1) / max(1.0, 0.02 * self.total))
+        """Learning rate: a warm-up over the first 2 % (at most 1000 steps), then a cosine to a hundredth."""
+        warm = min(1.0, (self.step + 1) / max(1.0, min(1000.0, 0.02 * self.total)))
         fall = 0.5 * (1.0 + math.cos(math.pi * min(1.0, self.step / self.total)))
         return self.plan.rate * warm * (0.01 + 0.99 * fall)
 
@@ -283,7 +283,7 @@ def _loop(run: Run, held_out: Task, out: Path, tell: Progress) -> None:
             run.seconds += time.monotonic() - started
             if run.step % LOG_STEPS == 0:
                 tell(run.step / run.total, f"step {run.step}, loss {run.loss:.4f}")
-            if run.step % 1000 == 0 or run.step == run.total:
+            if run.step % min(1000, max(1, run.total // 10)) == 0 or run.step == run.total:
                 entry = {"step": run.step, "seconds": round(run.seconds, 1), "loss": run.loss, "rate": run.rate()}
                 with open(out / "log.jsonl", "a") as log:
                     log.write(json.dumps(entry | {"held_out_loss": held_out_loss(run, held_out)}) + "\n")

@@ -104,6 +104,10 @@ def _body(item: Value, shapes: dict[str, str | None]) -> BodySpec:
     chosen = motion.choice(("static", "dynamic"), "dynamic") if motion else "static" if flat else "dynamic"
     if motion and flat and chosen == "dynamic":
         motion.wrong("a plane must be static")
+    velocity, spin = section.vector("velocity", "m/s"), section.vector("angular_velocity", "rad/s")
+    for key, value in (("velocity", velocity), ("angular_velocity", spin)):
+        if chosen == "static" and not plane and value.any():
+            section[key].wrong("must be zero: a static body does not move")
     offsets, grouped = (np.zeros((1, 3)), False) if plane else _offsets(section)
     return BodySpec(
         name=name.text() if name else "",
@@ -113,8 +117,8 @@ def _body(item: Value, shapes: dict[str, str | None]) -> BodySpec:
         scale=section.number("scale", above=0, default=1.0),
         position=position,
         quat_xyzw=quat,
-        velocity=section.vector("velocity", "m/s"),
-        angular_velocity=section.vector("angular_velocity", "rad/s"),
+        velocity=velocity,
+        angular_velocity=spin,
         mass=section.number("mass", "kg", above=0, default=1.0) if "mass" in section else None,
         density=section.number("density", "kg/m^3", above=0, default=DEFAULT_DENSITY),
         friction=section.number("friction", least=0, default=DEFAULT_FRICTION),

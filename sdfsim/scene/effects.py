@@ -74,14 +74,13 @@ def plan(scene: Scene) -> Plan:
         turning = Effect(True, f"{spinning} bodies start with spin")
     else:
         turning = Effect(False, "nothing turns without contact or spin")
-    asleep = scene.effects.sleep == "on"
     return Plan(
         gravity=gravity,
         contact=contact,
         friction=friction,
         restitution=restitution,
         rotation=_asked(scene.effects.rotation, turning),
-        sleep=Effect(asleep, "asked for" if asleep else "off unless asked for"),
+        sleep=Effect(False, "not available yet"),
         static=tuple(b.name for b in scene.bodies if b.motion == "static"),
         dynamic=tuple(b.name for b in dynamic),
         pairs=pairs,

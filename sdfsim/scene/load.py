@@ -12,10 +12,12 @@ from sdfsim.errors import SdfsimError
 from sdfsim.scene.bodies import BodySpec
 from sdfsim.scene.schema import SceneSpec, ShapeSpec, read_scene
 from sdfsim.scene.types import Body, Scene
-from sdfsim.shape.asset import Shape, analytic_shape, load_shape, shape_from_mesh, shape_from_primitive
+from sdfsim.shape.asset import Shape, analytic_shape, load_shape
+from sdfsim.shape.cache import shape_from_mesh, shape_from_primitive
 
 Progress = Callable[[float, str], None]
 
+_FITTED = ("mesh", "primitive")  # kinds of shapes that are fitted on first use
 _PLANE = ""  # the key of the one plane shape that all bodies with a `plane:` of their own share
 
 
@@ -37,6 +39,7 @@ def load_scene(path: Path | str, on_progress: Progress | None = None) -> Scene:
     shapes = _load_shapes(spec, on_progress or (lambda fraction, message: None))
     order = {key: i for i, key in enumerate(shapes)}
     groups = {body.name: body.names() for body in spec.bodies}
+    fitted = [shapes[key] for key, of in spec.shapes.items() if key in shapes and of and of.kind in _FITTED]
     bodies = []
     for body in spec.bodies:
         key = body.shape or _PLANE
@@ -51,6 +54,7 @@ def load_scene(path: Path | str, on_progress: Progress | None = None) -> Scene:
         model=spec.model,
         effects=spec.effects,
         path=path,
+        missed=tuple(f"{s.name}: {s.certificate['reason']}" for s in fitted if not s.certificate.get("passed", True)),
     )
 
 
@@ -64,13 +68,12 @@ def _load_shapes(spec: SceneSpec, on_progress: Progress) -> dict[str, Shape]:
     for slow in (False, True):
         if slow:
             spec.problems.check()
-        for i, key in enumerate(used):
-            shape = None if key == _PLANE else spec.shapes.get(key)
-            if shape is None or (shape.kind in ("mesh", "primitive")) is not slow:
-                continue
+        given = {key: spec.shapes.get(key) for key in used if key != _PLANE}
+        todo = {key: shape for key, shape in given.items() if shape and (shape.kind in _FITTED) is slow}
+        for i, (key, shape) in enumerate(todo.items()):
 
-            def report(fraction: float, message: str, i: int = i) -> None:
-                on_progress((i + fraction) / len(used), message)
+            def report(fraction: float, message: str, i: int = i, count: int = len(todo)) -> None:
+                on_progress((i + fraction) / count, message)
 
             try:
                 shapes[key] = _load_shape(shape, report)
@@ -96,9 +99,13 @@ def _expand(body: BodySpec, index: int, shape: Shape, groups: dict[str, list[str
     if body.motion == "dynamic":
         volume = shape.volume * body.scale**3
         mass = body.density * volume if body.mass is None else body.mass
-        if not (np.isfinite(mass) and mass > 0):
+        if not (np.isfinite(volume) and volume > 0):
+            body.place.wrong(f"cannot move: its shape has a volume of {volume:g} m^3; close it, or make it static")
+        elif not (np.isfinite(mass) and mass > 0):
             told = f"density {body.density:g} kg/m^3 times a volume of {volume:g} m^3"
-            body.place.wrong(f"has no usable mass: {told}; give mass in kg, or a closed mesh")
+            body.place.wrong(f"has no usable mass: {told}; give mass in kg")
+        elif not len(shape.nodes):
+            body.place.wrong("cannot move: its shape has no surface nodes to touch others with; make it static")
     partners = None
     if body.collides_with is not None:
         partners = tuple(n for place in body.collides_with for n in groups.get(place.text(), [place.text()]))

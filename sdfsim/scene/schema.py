@@ -75,7 +75,7 @@ def read_scene(path: Path) -> SceneSpec:
     bodies = top.required("bodies")
     return SceneSpec(
         problems=root.problems,
-        model=model.text() if model and not model.is_null() else None,
+        model=_model(model, path.parent) if model and not model.is_null() else None,
         duration=top.number("duration", "s", above=0, default=DEFAULT_DURATION),
         seed=seed.integer(least=0, default=0) if seed else 0,
         gravity=top.vector("gravity", "m/s^2", DEFAULT_GRAVITY),
@@ -85,14 +85,24 @@ def read_scene(path: Path) -> SceneSpec:
     )
 
 
+def _model(value: Value, folder: Path) -> str:
+    """A bundled model's name, or the path of a file, taken from the scene's folder."""
+    text = value.text()
+    return str(folder / text) if text.endswith(".safetensors") else text
+
+
 def _effects(value: Value | None) -> Effects:
     if value is None or value.is_null():
         return Effects()
     choices: dict[str, tuple[str, ...]] = {
         name: ("auto", "on", "off") for name in ("contact", "friction", "restitution", "rotation")
     }
-    choices["sleep"] = ("on", "off")
-    chosen: dict[str, Any] = {key: item.choice(choices[key], choices[key][0]) for key, item in value.section(choices)}
+    chosen: dict[str, Any] = {}
+    for key, item in value.section((*choices, "sleep")):
+        if key != "sleep":
+            chosen[key] = item.choice(choices[key], choices[key][0])
+        elif item.shown() != "'off'":
+            item.wrong(f"must be off: sleep is not available yet (got {item.shown()})")
     return Effects(**chosen)
 
 

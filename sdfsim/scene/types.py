@@ -21,7 +21,6 @@ class Effects:
     friction: Literal["auto", "on", "off"] = "auto"
     restitution: Literal["auto", "on", "off"] = "auto"
     rotation: Literal["auto", "on", "off"] = "auto"
-    sleep: Literal["on", "off"] = "off"
 
 
 @dataclass(frozen=True)
@@ -72,6 +71,7 @@ class Scene:
         model: bundled model name or path, None for the default.
         effects: what the file asked for.
         path: the file it came from, if any.
+        missed: shapes fitted for this scene whose certificate was not met, with the reason, one line each.
     """
 
     shapes: tuple[Shape, ...]
@@ -82,3 +82,4 @@ class Scene:
     model: str | None = None
     effects: Effects = Effects()
     path: Path | None = None
+    missed: tuple[str, ...] = ()

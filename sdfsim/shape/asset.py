@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-import os
-import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import torch
 
 from sdfsim.errors import SdfsimError
+from sdfsim.files import write_json
 from sdfsim.shape.analytic import BoxSdf, PlaneSdf, SphereSdf
-from sdfsim.shape.mesh import Frame, Mesh, load_mesh
+from sdfsim.shape.mesh import Frame, Mesh
 from sdfsim.shape.mlp import MlpSdf
 from sdfsim.shape.sdf import Sdf
 from sdfsim.shape.storage import FORMAT_VERSION, read_mesh, read_record, sdf_from_file, sdf_to_file, write, write_ply
-
-if TYPE_CHECKING:
-    from sdfsim.shape.fit import Recipe
 
 WEIGHTS_FILE, MESH_FILE, RECORD_FILE = "shape.safetensors", "mesh.ply", "shape.json"
 
@@ -87,7 +81,7 @@ class Shape:
             (folder / RECORD_FILE).unlink(missing_ok=True)
             write(folder / WEIGHTS_FILE, to_bytes(tensors))
             write(folder / MESH_FILE, write_ply(self.mesh))
-            write(folder / RECORD_FILE, (json.dumps(record, indent=1) + "\n").encode())
+            write_json(folder / RECORD_FILE, record)
         except OSError as error:
             raise SdfsimError(f"{folder}: cannot write the shape ({error.strerror or error})") from error
         return folder
@@ -132,95 +126,6 @@ def load_shape(folder: str | Path) -> Shape:
     except (KeyError, TypeError, ValueError) as error:
         reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
         raise SdfsimError(f"{folder}: not a valid shape folder ({reason})") from error
-
-
-def shape_from_mesh(
-    path: str | Path,
-    cache_dir: str | Path | None = None,
-    *,
-    name: str | None = None,
-    units: float = 1.0,
-    recipe: Recipe = "default",
-    on_progress: Callable[[float, str], None] | None = None,
-) -> Shape:
-    """The shape of a mesh file: fitted on first use, then taken from a cache keyed by content.
-
-    Args:
-        path: a mesh file.
-        cache_dir: where fitted shapes are kept; by default `sdfsim/shapes` in the user's cache folder.
-        name: by default the file's.
-        units: metres per unit of the file.
-        recipe: of the fit; part of the key.
-        on_progress: called with (fraction done, message) while fitting.
-
-    Raises:
-        SdfsimError: the mesh cannot be used, or the cache cannot be written.
-    """
-    path = Path(path)
-    mesh = load_mesh(path)
-    key = hashlib.sha256(path.read_bytes()).hexdigest()
-    shape = _cached(mesh, key, path.stem, cache_dir, recipe, on_progress)
-    shape = replace(shape, name=name or path.stem, source={**shape.source, "file": path.name, "sha256": key})
-    return scaled(shape, units)
-
-
-def shape_from_primitive(
-    kind: str,
-    size: float = 1.0,
-    cache_dir: str | Path | None = None,
-    *,
-    name: str | None = None,
-    on_progress: Callable[[float, str], None] | None = None,
-) -> Shape:
-    """The shape of a procedural mesh of `primitives.PRIMITIVES`, fitted on first use and cached.
-
-    Args:
-        kind: name in `PRIMITIVES`.
-        size: its largest extent, m.
-        cache_dir, name, on_progress: as for `shape_from_mesh`.
-
-    Raises:
-        SdfsimError: no such primitive.
-    """
-    from sdfsim.shape.primitives import PRIMITIVES
-
-    if kind not in PRIMITIVES:
-        raise SdfsimError(f"no primitive called {kind!r}", "there are " + ", ".join(PRIMITIVES))
-    mesh = PRIMITIVES[kind]()
-    unit = Mesh(mesh.vertices / float(np.ptp(mesh.vertices, axis=0).max()), mesh.faces)
-    key = hashlib.sha256(unit.vertices.round(9).tobytes() + unit.faces.tobytes()).hexdigest()
-    shape = _cached(unit, key, kind, cache_dir, "default", on_progress)
-    return scaled(replace(shape, name=name or kind, source={**shape.source, "primitive": kind}), size)
-
-
-def _cached(
-    mesh: Mesh,
-    key: str,
-    label: str,
-    cache_dir: str | Path | None,
-    recipe: Recipe,
-    on_progress: Callable[[float, str], None] | None,
-) -> Shape:
-    # Only here is anything fitted: reading a shape folder needs no open3d and no optimiser.
-    from sdfsim.shape.fit import FIT_VERSION, fit_mesh
-
-    if cache_dir is None:
-        cache_dir = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sdfsim" / "shapes"
-    folder = Path(cache_dir) / f"{key[:24]}-{recipe}-{FIT_VERSION}.{FORMAT_VERSION}"
-    if folder.is_dir():
-        try:
-            return load_shape(folder)
-        except SdfsimError:
-            shutil.rmtree(folder, ignore_errors=True)  # a damaged entry is only a cache miss
-    shape = fit_mesh(mesh, name=label, recipe=recipe, on_progress=on_progress)
-    # A folder of its own first, so that processes fitting the same mesh never see each other's half.
-    partial = folder.with_name(f"{folder.name}.{os.getpid()}.partial")
-    shape.save(partial)
-    try:
-        partial.rename(folder)
-    except OSError:
-        shutil.rmtree(partial, ignore_errors=True)  # another process was first: its entry is as good
-    return shape
 
 
 def scaled(shape: Shape, factor: float) -> Shape:

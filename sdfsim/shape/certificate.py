@@ -33,10 +33,10 @@ def certify(sdf: Sdf, oracle: DistanceOracle, *, points: int = 10_000, seed: int
         seed: of the points.
 
     Returns:
-        JSON-ready dict, lengths relative to the largest extent: mean absolute errors `error_within_0.01`,
-        `error_within_0.1` and `error_in_box`; `gradient_within_0.1`, the median cosine distance (1 - cosine) of
-        the gradient from the true direction; `projected_from_0.01` and `projected_from_0.1`, mean distance
-        from the surface of x - f grad f / |grad f|^2; `sign_errors`, the fraction of points farther than 0.002
+        JSON-ready dict (None: could not be measured), lengths relative to the largest extent: mean absolute errors
+        `error_within_0.01`, `error_within_0.1` and `error_in_box`; `gradient_within_0.1`, the median cosine distance
+        (1 - cosine) of the gradient from the true direction; `projected_from_0.01` and `projected_from_0.1`, mean
+        distance from the surface of x - f grad f / |grad f|^2; `sign_errors`, the fraction of points farther than 0.002
         whose sign is wrong; `passed`, and a `reason` when not.
     """
     # A stream of its own, so that no seed of the fit draws these points.
@@ -72,7 +72,9 @@ def certify(sdf: Sdf, oracle: DistanceOracle, *, points: int = 10_000, seed: int
             result["gradient_within_0.1"] = float(np.median(1.0 - cosine))
     result["sign_errors"] = wrong / max(signed, 1)
     result.update(verdict(result))
-    return result
+    # None for what could not be measured: JSON has no NaN.
+    unknown = [key for key, value in result.items() if isinstance(value, float) and not math.isfinite(value)]
+    return result | dict.fromkeys(unknown)
 
 
 def verdict(errors: dict) -> dict:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from sdfsim.shape.mesh import Mesh
-from sdfsim.shape.soap import Soap
+from sdfsim.shape.soap import Adam, Soap
 from sdfsim.shape.storage import write
+
+VERSION = 2  # of the file's tensors
 
 
 class Checkpoint:
@@ -24,16 +25,13 @@ class Checkpoint:
 
     def __init__(self, path: Path, settings: str, surface: Mesh) -> None:
         self.path = path
-        digest = hashlib.sha256(settings.encode())
-        digest.update(np.ascontiguousarray(surface.vertices).tobytes())
-        digest.update(np.ascontiguousarray(surface.faces).tobytes())
-        self.fingerprint = digest.hexdigest()
+        self.fingerprint = hashlib.sha256(f"{VERSION}|{settings}|{surface.digest()}".encode()).hexdigest()
 
     def save(
         self,
         parameters: list[torch.Tensor],
         average: list[torch.Tensor],
-        soap: Soap,
+        optimiser: Soap | Adam,
         generator: torch.Generator,
         progress: tuple[int, int, int],
     ) -> None:
@@ -42,14 +40,18 @@ class Checkpoint:
 
         tensors = {f"parameter{i}": p.detach() for i, p in enumerate(parameters)}
         tensors |= {f"average{i}": p for i, p in enumerate(average)}
-        tensors |= {f"soap{i}.{key}": value.contiguous() for i, s in enumerate(soap.state) for key, value in s.items()}
+        tensors |= {f"optimiser.{key}": value.contiguous() for key, value in optimiser.tensors().items()}
         tensors["generator"] = generator.get_state()
-        tensors["progress"] = torch.tensor([*progress, soap.count])
+        tensors["progress"] = torch.tensor(progress)
         self.path.parent.mkdir(parents=True, exist_ok=True)
         write(self.path, save(tensors, {"fingerprint": self.fingerprint}))
 
     def load(
-        self, parameters: list[torch.Tensor], average: list[torch.Tensor], soap: Soap, generator: torch.Generator
+        self,
+        parameters: list[torch.Tensor],
+        average: list[torch.Tensor],
+        optimiser: Soap | Adam,
+        generator: torch.Generator,
     ) -> tuple[int, int, int] | None:
         """Put a saved state in place; None (and nothing changed) when there is none for this fit."""
         from safetensors import SafetensorError, safe_open
@@ -67,11 +69,10 @@ class Checkpoint:
             for i, parameter in enumerate(parameters):
                 parameter.copy_(tensors[f"parameter{i}"])
                 average[i].copy_(tensors[f"average{i}"])
-        for i, state in enumerate(soap.state):
-            for key in state:
-                state[key] = tensors[f"soap{i}.{key}"]
+        own = "optimiser."
+        optimiser.restore({key.removeprefix(own): value for key, value in tensors.items() if key.startswith(own)})
         generator.set_state(tensors["generator"])
-        step, turn, stop, soap.count = (int(value) for value in tensors["progress"])
+        step, turn, stop = (int(value) for value in tensors["progress"])
         return step, turn, stop
 
     def remove(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,14 @@ class Mesh:
     vertices: np.ndarray
     faces: np.ndarray
     colors: np.ndarray | None = None
+
+    def digest(self) -> str:
+        """SHA-256 of vertices, faces and colours, in hexadecimal."""
+        digest = hashlib.sha256()
+        for array in (self.vertices, self.faces, self.colors):
+            if array is not None:
+                digest.update(f"{array.dtype}{array.shape}".encode() + np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
 
 
 @dataclass(frozen=True)

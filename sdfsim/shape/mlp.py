@@ -167,11 +167,13 @@ class SdfBank:
 
     Args:
         sdfs: the shapes; `index` refers to them in this order.
+        device: where to compute; by default where the first network is, or on the CPU.
     """
 
-    def __init__(self, sdfs: Sequence[Sdf]) -> None:
+    def __init__(self, sdfs: Sequence[Sdf], device: torch.device | str | None = None) -> None:
         self.sdfs = tuple(sdfs)
-        self.device = next((sdf.device for sdf in self.sdfs if isinstance(sdf, MlpSdf)), torch.device("cpu"))
+        networks = [sdf.device for sdf in self.sdfs if isinstance(sdf, MlpSdf)]
+        self.device = torch.device(device if device is not None else networks[0] if networks else "cpu")
         kinds: dict[object, list[int]] = {}
         for number, sdf in enumerate(self.sdfs):
             if isinstance(sdf, MlpSdf):
@@ -191,7 +193,7 @@ class SdfBank:
 
     def to(self, device: torch.device | str) -> SdfBank:
         """The same bank on `device`."""
-        return SdfBank([sdf.to(device) if isinstance(sdf, MlpSdf) else sdf for sdf in self.sdfs])
+        return SdfBank(self.sdfs, device)
 
     def __call__(self, index: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Distance and gradient of shape `index[p]` at `points[p]`.

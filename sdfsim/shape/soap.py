@@ -1,4 +1,4 @@
-"""The optimiser of the fast fit: Adam in the eigenbasis of Shampoo's preconditioner."""
+"""The optimisers of the fits: Adam in the eigenbasis of Shampoo's preconditioner for the fast one, and Adam."""
 
 from __future__ import annotations
 
@@ -67,6 +67,52 @@ class Soap:
                     average.lerp_(product, 1 - self.PRECONDITIONER)
                     if self.count % self.REFRESH == 0:
                         state[f"{side}_basis"] = torch.linalg.qr(average @ state[f"{side}_basis"])[0]
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """Everything that the next step depends on, beside the parameters."""
+        kept = {f"{i}.{key}": value for i, state in enumerate(self.state) for key, value in state.items()}
+        return {**kept, "count": torch.tensor(self.count), "lr": torch.tensor(self.lr, dtype=torch.float64)}
+
+    def restore(self, tensors: dict[str, torch.Tensor]) -> None:
+        """Go on from what `tensors` gave."""
+        for i, state in enumerate(self.state):
+            for key in state:
+                state[key] = tensors[f"{i}.{key}"]
+        self.count, self.lr = int(tensors["count"]), float(tensors["lr"])
+
+
+class Adam:
+    """torch's Adam at a constant rate, in the shape of `Soap`.
+
+    Args:
+        parameters: what it updates.
+        lr: step size.
+    """
+
+    def __init__(self, parameters: list[torch.Tensor], lr: float) -> None:
+        self.lr = lr
+        self._adam = torch.optim.Adam(parameters, lr=lr)
+
+    def step(self, factor: float) -> None:
+        """Apply the gradients; the paper's recipe has no schedule, so `factor` does not count."""
+        self._adam.step()
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """As `Soap.tensors`."""
+        state = self._adam.state_dict()["state"]
+        kept = {f"{i}.{key}": value for i, entry in state.items() for key, value in entry.items()}
+        return {**kept, "lr": torch.tensor(self.lr, dtype=torch.float64)}
+
+    def restore(self, tensors: dict[str, torch.Tensor]) -> None:
+        """As `Soap.restore`."""
+        state: dict[int, dict[str, torch.Tensor]] = {}
+        for name, value in tensors.items():
+            if name != "lr":
+                number, key = name.split(".")
+                state.setdefault(int(number), {})[key] = value
+        self.lr = float(tensors["lr"])
+        groups = [{**group, "lr": self.lr} for group in self._adam.state_dict()["param_groups"]]
+        self._adam.load_state_dict({"state": state, "param_groups": groups})
 
 
 def _rotate(matrix: torch.Tensor, state: dict[str, torch.Tensor]) -> torch.Tensor:

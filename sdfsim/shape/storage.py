@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +9,7 @@ import numpy as np
 import torch
 
 from sdfsim.errors import SdfsimError
+from sdfsim.files import read_json, replacing
 from sdfsim.shape.analytic import BoxSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.mesh import Frame, Mesh
 from sdfsim.shape.mlp import MlpSdf
@@ -84,10 +83,7 @@ def read_record(path: Path) -> dict[str, Any]:
     Raises:
         SdfsimError: not readable, or of another format version.
     """
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise SdfsimError(f"{path}: not readable ({error})") from error
+    record = read_json(path, "fit the mesh again")
     if not isinstance(record, dict) or record.get("version") != FORMAT_VERSION:
         found = record.get("version") if isinstance(record, dict) else None
         raise SdfsimError(
@@ -97,13 +93,13 @@ def read_record(path: Path) -> dict[str, Any]:
 
 
 def write(path: Path, content: bytes) -> None:
-    """Put `content` at `path` in one step: what was there before, or all of it, even when interrupted."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
+    """Put `content` at `path` in one step: what was there before, or all of it, even when interrupted.
+
+    Raises:
+        SdfsimError: the file cannot be written.
+    """
+    with replacing(path) as partial:
         partial.write_bytes(content)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def write_ply(mesh: Mesh) -> bytes:

@@ -16,7 +16,7 @@ from sdfsim.shape.checkpoint import Checkpoint
 from sdfsim.shape.distance import DistanceOracle
 from sdfsim.shape.mesh import Frame, normal_frame, sample_surface
 from sdfsim.shape.mlp import BOX, Activation, MlpSdf, value_and_gradient
-from sdfsim.shape.soap import Soap
+from sdfsim.shape.soap import Adam, Soap
 
 
 @dataclass(frozen=True)
@@ -153,18 +153,13 @@ def train(
     generator = torch.Generator().manual_seed(seed)
     parameters = _initial(plan, generator)
     average = [parameter.detach().clone() for parameter in parameters]
-    soap = Soap(parameters, plan.lr) if plan.optimiser == "soap" else None
-    adam = torch.optim.Adam(parameters, lr=plan.lr) if soap is None else None
+    optimiser = (Soap if plan.optimiser == "soap" else Adam)(parameters, plan.lr)
     # Where the decay begins; an early stop or a short budget moves it forward.
     turn, step = int(plan.steps * (1.0 - plan.decay)), 0
     stop = plan.steps
-    saved = (
-        Checkpoint(checkpoint, f"{asdict(plan)}|{seed}", oracle.surface)
-        if checkpoint is not None and soap is not None
-        else None
-    )
-    if saved is not None and soap is not None:
-        step, turn, stop = saved.load(parameters, average, soap, generator) or (step, turn, stop)
+    saved = Checkpoint(checkpoint, f"{asdict(plan)}|{seed}", oracle.surface) if checkpoint is not None else None
+    if saved is not None:
+        step, turn, stop = saved.load(parameters, average, optimiser, generator) or (step, turn, stop)
     before, looping = step, time.monotonic()
 
     while step < stop:
@@ -177,10 +172,7 @@ def train(
         factor = min(1.0, (step + 1) / WARMUP)
         if plan.decay and step >= turn:
             factor *= 0.5 * (1.0 + math.cos(math.pi * (step - turn) / max(stop - turn, 1)))
-        if soap is not None:
-            soap.step(factor)
-        elif adam is not None:
-            adam.step()
+        optimiser.step(factor)
         step += 1
         with torch.no_grad():
             for mean, parameter in zip(average, parameters, strict=True):
@@ -189,8 +181,10 @@ def train(
             continue
 
         if not math.isfinite(loss.item()) or not all(bool(p.isfinite().all()) for p in parameters):
-            parameters, average, soap = _restart(average, plan, soap)
-            adam = torch.optim.Adam(parameters, lr=plan.lr / 4) if soap is None else None
+            # A fresh start from new weights with a quarter of the step size.
+            parameters = _initial(plan, torch.Generator().manual_seed(1))
+            average = [parameter.detach().clone() for parameter in parameters]
+            optimiser = type(optimiser)(parameters, optimiser.lr / 4)
         near, far = _errors(average, plan, check)
         if plan.goal is not None and step < turn and near <= plan.goal[0] and far <= plan.goal[1]:
             turn, stop = step, min(stop, step + plan.settle)
@@ -200,8 +194,8 @@ def train(
             possible = step + int((0.9 * budget - elapsed) / pace)  # a tenth is left for the certificate
             turn, stop = _fitted(possible, step, turn, stop, plan)
         tell(0.97 * step / max(stop, 1), f"step {step} of {stop}, error {near:.2g} near, {far:.2g} in the box")
-        if saved is not None and soap is not None and step % (2 * CHECK) == 0:
-            saved.save(parameters, average, soap, generator, (step, turn, stop))
+        if saved is not None and step % (2 * CHECK) == 0:
+            saved.save(parameters, average, optimiser, generator, (step, turn, stop))
 
     if saved is not None:
         saved.remove()
@@ -299,12 +293,3 @@ def _errors(parameters: list[torch.Tensor], plan: Plan, check: _Pool) -> tuple[f
     error = torch.where(check.signed, value[0] - check.distance, value[0].abs() - check.distance.abs()).abs()
     half = len(error) // 2
     return float(error[:half].mean()), float(error[half:].mean())
-
-
-def _restart(
-    average: list[torch.Tensor], plan: Plan, soap: Soap | None
-) -> tuple[list[torch.Tensor], list[torch.Tensor], Soap | None]:
-    """After an update that was not finite: a fresh start from new weights with a quarter of the step size."""
-    parameters = _initial(plan, torch.Generator().manual_seed(1))
-    average = [parameter.detach().clone() for parameter in parameters]
-    return parameters, average, None if soap is None else Soap(parameters, soap.lr / 4)

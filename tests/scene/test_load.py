@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim import SceneError, load_scene
 from sdfsim.scene.types import Scene
+from sdfsim.shape.asset import analytic_shape
 
 HEAD = "version: 1\nshapes:\n  ball: {sphere: {radius: 0.5}}\nbodies:\n"  # bodies[0] is on line 5
 
@@ -49,6 +51,11 @@ BODY = [
     ("position: [0, 0]", "bodies[0].position: must be a list of 3 numbers in m (got 2 values)"),
     ("position: [0, inf, 0]", "bodies[0].position[1]: must be finite (got inf)"),
     ("velocity: 3", "bodies[0].velocity: must be a list of 3 numbers in m/s (got '3')"),
+    ("motion: static, velocity: [0, 0, 1]", "bodies[0].velocity: must be zero: a static body does not move"),
+    (
+        "motion: static, angular_velocity: [1, 0, 0]",
+        "bodies[0].angular_velocity: must be zero: a static body does not move",
+    ),
     ("motion: kinematic", "bodies[0].motion: must be one of static, dynamic (got 'kinematic')"),
     ("quat_xyzw: [0, 0, 0, 0]", "bodies[0].quat_xyzw: must not be zero: a quaternion has length 1"),
     (
@@ -104,7 +111,8 @@ TOP = [
     ("gravity: [0, 0, nan]", "gravity[2]: must be finite (got nan)"),
     ("seed: -1", "seed: must be >= 0 (got -1)"),
     ("effects: {frictoin: off}", "effects.frictoin: unknown key (did you mean 'friction'?)"),
-    ("effects: {sleep: auto}", "effects.sleep: must be one of on, off (got 'auto')"),
+    ("effects: {sleep: on}", "effects.sleep: must be off: sleep is not available yet (got 'on')"),
+    ("effects: {friction: [], sleep: on}", "effects.friction: must be one of auto, on, off (got a list)"),
     ("shapes: {cup: {asset: nowhere}}", "shapes.cup.asset: no such folder: FOLDER/nowhere"),
     ("shapes: {cup: {mesh: cup.obj}}", "shapes.cup.mesh: no such file: FOLDER/cup.obj"),
     ("shapes: {cup: {sphere: {radius: 0}}}", "shapes.cup.sphere.radius: must be > 0 (got 0 m)"),
@@ -164,6 +172,37 @@ def test_a_mesh_without_faces_is_told_at_its_line(load, tmp_path):
     (tmp_path / "cup.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
     found = problems_of(load, "version: 1\nshapes:\n  c: {mesh: cup.obj}\nbodies:\n  - {name: a, shape: c, mass: 1}\n")
     assert len(found) == 1 and found[0].startswith("scene.yaml:3: shapes.c.mesh: ")
+
+
+@pytest.mark.parametrize("change", [{"volume": 0.0}, {"volume": -1.0}, {"nodes": np.zeros((0, 3))}])
+def test_a_shape_that_cannot_move_is_told_where_it_should(load, tmp_path, change):
+    replace(analytic_shape("box", size=(1, 1, 1)), **change).save(tmp_path / "cup")
+    text = "version: 1\nshapes:\n  c: {asset: cup}\nbodies:\n  - {name: a, shape: c, mass: 1MOTION}\n"
+    found = problems_of(load, text.replace("MOTION", ""))
+    assert len(found) == 1 and found[0].startswith("scene.yaml:5: bodies[0].name: cannot move: its shape has ")
+    assert load(text.replace("MOTION", ", motion: static")).bodies[0].motion == "static"
+
+
+def test_a_model_file_is_taken_from_the_scenes_folder(load, tmp_path):
+    body = "bodies:\n  - {name: floor, plane: {}}\n"
+    for said, meant in (
+        ("model: models/mine.safetensors", str(tmp_path / "models/mine.safetensors")),
+        ("model: /models/mine.safetensors", "/models/mine.safetensors"),
+        ("model: small", "small"),
+        ("effects: {sleep: off}", None),
+    ):
+        assert load(f"version: 1\n{said}\n{body}").model == meant
+
+
+def test_a_shape_that_missed_its_certificate_is_named(load, monkeypatch):
+    text = "version: 1\nshapes:\n  b: {primitive: {name: box}}\nbodies:\n  - {name: a, shape: b}\n"
+    for certificate, missed in (
+        ({"passed": True, "reason": ""}, ()),
+        ({"passed": False, "reason": "thin walls"}, ("b: thin walls",)),
+    ):
+        shape = replace(analytic_shape("box", size=(1, 1, 1), name="b"), certificate=certificate)
+        monkeypatch.setattr("sdfsim.scene.load.shape_from_primitive", lambda *a, shape=shape, **k: shape)
+        assert load(text).missed == missed
 
 
 def test_defaults_and_units(load):

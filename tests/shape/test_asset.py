@@ -16,9 +16,8 @@ from sdfsim.shape.asset import (
     analytic_shape,
     load_shape,
     scaled,
-    shape_from_mesh,
-    shape_from_primitive,
 )
+from sdfsim.shape.cache import shape_from_mesh, shape_from_primitive
 from sdfsim.shape.mesh import Frame, Mesh, mass_properties_of_sdf
 from sdfsim.shape.mlp import MlpSdf
 from sdfsim.shape.storage import write_ply
@@ -123,7 +122,7 @@ def edit(folder: Path, **changes: object) -> None:
             lambda f: (f / "shape.safetensors").write_bytes((f / "shape.safetensors").read_bytes()[:-50]),
             "shape.safetensors: damaged or cut short",
         ),
-        (lambda f: (f / "shape.json").write_text("{"), "shape.json: not readable"),
+        (lambda f: (f / "shape.json").write_text("{"), "shape.json: cannot be read"),
         (lambda f: edit(f, version=99), "version 99"),
         (lambda f: edit(f, sdf={"kind": "magic"}), "unknown SDF kind"),
         (lambda f: edit(f, sdf={"kind": "mlp"}), "is missing"),
@@ -254,6 +253,40 @@ def test_a_damaged_cache_entry_is_fitted_again(tmp_path: Path, quick: None) -> N
     assert load_shape(entry).name == "box"
     with pytest.raises(SdfsimError, match="teapot"):
         shape_from_primitive("teapot", 0.5, tmp_path)
+
+
+def test_what_the_cache_knows_a_mesh_by_is_all_that_it_describes(tmp_path: Path, quick: None) -> None:
+    """A glTF keeps its vertices in a file beside it: its own bytes say little."""
+    import trimesh
+
+    path = tmp_path / "cup.gltf"
+    for size in (1.0, 2.0):
+        mesh = primitives.box((size, 1.0, 1.0))
+        scene = trimesh.Trimesh(mesh.vertices, mesh.faces).scene()
+        for name, content in trimesh.exchange.gltf.export_gltf(scene).items():
+            (path if name.endswith(".gltf") else tmp_path / name).write_bytes(content)
+        shape = shape_from_mesh(path, tmp_path / "cache")
+        assert np.ptp(shape.mesh.vertices, axis=0).max() == pytest.approx(size)
+    cube = primitives.box()
+    colors = np.zeros((len(cube.vertices), 3), dtype=np.uint8)
+    digests = {cube.digest(), replace(cube, colors=colors).digest(), replace(cube, colors=colors + 1).digest()}
+    assert len(digests) == 3
+
+
+def test_a_cache_that_cannot_be_written_does_not_lose_the_fit(
+    tmp_path: Path, quick: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "file").write_text("")
+    assert shape_from_primitive("box", 0.5, tmp_path / "file" / "cache").name == "box"
+    assert "not kept" in caplog.text and len(caplog.records) == 1
+
+    def full(path: Path, content: bytes) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(asset, "write", full)
+    assert shape_from_primitive("box", 0.5, tmp_path / "cache").name == "box"
+    assert "No space left" in caplog.text
+    assert list((tmp_path / "cache").iterdir()) == []
 
 
 def test_recorded_volume_matches_the_sdf(tmp_path: Path) -> None:

@@ -93,6 +93,27 @@ def test_an_interrupted_fit_resumes_to_the_same_result(tiny: None, tmp_path: Pat
     assert not path.exists()
 
 
+def test_the_paper_recipe_resumes_too(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    plan = replace(training.PLANS["paper"], width=16, layers=4, steps=400, batch=64, pool=2000, lr=1e-3)
+    monkeypatch.setitem(training.PLANS, "paper", plan)
+    mesh, path = primitives.cone(segments=16), tmp_path / "fit.checkpoint"
+    whole = fit_mesh(mesh, name="cone", recipe="paper")
+
+    def interrupt(fraction: float, message: str) -> None:
+        if message.startswith("step 300"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit_mesh(mesh, name="cone", recipe="paper", checkpoint=path, on_progress=interrupt)
+    messages: list[str] = []
+    resumed = fit_mesh(
+        mesh, name="cone", recipe="paper", checkpoint=path, on_progress=lambda _, message: messages.append(message)
+    )
+    assert not any(message.startswith("step 200 ") for message in messages)
+    assert all(torch.equal(a, b) for a, b in zip(weights(whole), weights(resumed), strict=True))
+    assert not path.exists()
+
+
 @pytest.mark.parametrize("spoil", ["other", "cut"])
 def test_a_checkpoint_of_something_else_is_not_used(tiny: None, tmp_path: Path, spoil: str) -> None:
     path = tmp_path / "fit.checkpoint"

@@ -170,6 +170,8 @@ def test_the_bank_takes_strangers_and_devices(mixed: list[Sdf]) -> None:
     points = torch.rand(20, 3)
     distance, _ = bank(torch.full((20,), len(mixed)), points)
     torch.testing.assert_close(distance, points[:, 0] - 1)
+    # "meta" stands in for a GPU: every index the bank looks up must have moved.
+    assert SdfBank([SphereSdf(0.3), PlaneSdf()]).to("meta")._slot_of.device.type == "meta"
 
 
 def test_order_of_questions_does_not_matter() -> None:
@@ -186,3 +188,17 @@ def test_cuda_gives_what_the_cpu_gives(mixed: list[Sdf]) -> None:
     here = SdfBank(mixed)(index, points)
     there = SdfBank(mixed).to("cuda")(index.cuda(), points.cuda())
     torch.testing.assert_close(here[0], there[0].cpu(), rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize(
+    "sdfs", [[SphereSdf(0.3)], [PlaneSdf(), SphereSdf(0.3), BoxSdf((0.2, 0.3, 0.4))]], ids=["one", "several"]
+)
+def test_a_bank_without_networks_goes_to_cuda_too(sdfs: list[Sdf]) -> None:
+    index, points = torch.randint(len(sdfs), (5000,)), torch.rand(5000, 3)
+    here = SdfBank(sdfs)(index, points)
+    bank = SdfBank(sdfs).to("cuda")
+    assert bank.device.type == "cuda"
+    there = bank(index.cuda(), points.cuda())
+    assert there[0].is_cuda and there[1].is_cuda
+    torch.testing.assert_close(here[0], there[0].cpu(), rtol=1e-5, atol=1e-5)
