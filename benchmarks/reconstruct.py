@@ -1,6 +1,6 @@
 """Question: how far from the truth is a reconstruction of the rendered photo set?
 
-    python benchmarks/reconstruct.py -o /tmp/table [--preset quick]
+    python benchmarks/reconstruct.py -o runs/table [--preset quick]
 
 Runs the whole chain on samples/photos/table_vase (or takes what is already in the folder), moves the result onto the
 true cameras by a similarity, and prints pose errors, surface errors and times. A folder of photos without

@@ -239,9 +239,7 @@ def _eye(centre: np.ndarray, radius: float, up: np.ndarray) -> rrb.EyeControls3D
     side = np.cross(up, [0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0])
     side /= np.linalg.norm(side)
     away = 1.6 * np.cross(up, side) + 1.1 * side + 0.9 * up
-    return rrb.EyeControls3D(
-        kind=rrb.Eye3DKind.Orbital, position=centre + radius * away, look_target=centre, eye_up=up
-    )
+    return rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=centre + radius * away, look_target=centre, eye_up=up)
 
 
 def _extent(scene: Scene) -> tuple[np.ndarray, float]:
