@@ -109,10 +109,6 @@ class Teacher:
         self.bodies.append(handle)
         return len(self.bodies) - 1
 
-    def remove_last(self) -> None:
-        """Take the most recently added body out again (a spawn that overlapped)."""
-        self._call("removeBody", self.bodies.pop())
-
     def overlaps(self, index: int) -> bool:
         """Whether body `index` touches or penetrates anything."""
         self._call("performCollisionDetection")
