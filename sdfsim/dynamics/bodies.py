@@ -12,7 +12,7 @@ from sdfsim.dynamics import pose
 from sdfsim.errors import SdfsimError
 from sdfsim.scene.types import Scene
 from sdfsim.shape.asset import Shape
-from sdfsim.shape.mlp import SdfBank
+from sdfsim.shape.bank import SdfBank
 
 
 @dataclass(frozen=True)

@@ -12,12 +12,12 @@ from sdfsim.errors import SdfsimError
 from sdfsim.scene.bodies import BodySpec
 from sdfsim.scene.schema import SceneSpec, ShapeSpec, read_scene
 from sdfsim.scene.types import Body, Scene
-from sdfsim.shape.asset import Shape, analytic_shape, load_shape
+from sdfsim.shape.asset import SdfKind, Shape, analytic_shape, load_shape, with_sdf
 from sdfsim.shape.cache import shape_from_mesh, shape_from_primitive
 
 Progress = Callable[[float, str], None]
 
-_FITTED = ("mesh", "primitive")  # kinds of shapes that are fitted on first use
+_FITTED = ("mesh", "primitive")  # kinds of shapes that are fitted (or sampled) on first use
 _PLANE = ""  # the key of the one plane shape that all bodies with a `plane:` of their own share
 
 
@@ -61,7 +61,7 @@ def load_scene(path: Path | str, on_progress: Progress | None = None) -> Scene:
 def _load_shapes(spec: SceneSpec, on_progress: Progress) -> dict[str, Shape]:
     """Every shape in use, in the order of first use.
 
-    What must be fitted waits until the rest of the file is known to be right: a fit takes a minute.
+    What must be fitted or sampled waits until the rest of the file is known to be right: a fit takes a minute.
     """
     used = list(dict.fromkeys(body.shape or _PLANE for body in spec.bodies))
     shapes = {_PLANE: analytic_shape("plane", name="plane")}
@@ -69,7 +69,7 @@ def _load_shapes(spec: SceneSpec, on_progress: Progress) -> dict[str, Shape]:
         if slow:
             spec.problems.check()
         given = {key: spec.shapes.get(key) for key in used if key != _PLANE}
-        todo = {key: shape for key, shape in given.items() if shape and (shape.kind in _FITTED) is slow}
+        todo = {key: shape for key, shape in given.items() if shape and _is_slow(shape) is slow}
         for i, (key, shape) in enumerate(todo.items()):
 
             def report(fraction: float, message: str, i: int = i, count: int = len(todo)) -> None:
@@ -83,13 +83,20 @@ def _load_shapes(spec: SceneSpec, on_progress: Progress) -> dict[str, Shape]:
     return {key: shapes[key] for key in used}
 
 
+def _is_slow(spec: ShapeSpec) -> bool:
+    return spec.kind in _FITTED or spec.sdf == "grid"
+
+
 def _load_shape(spec: ShapeSpec, on_progress: Progress) -> Shape:
+    kind = cast(SdfKind | None, spec.sdf)
     if spec.kind == "asset" and spec.path:
-        return load_shape(spec.path)
+        shape = load_shape(spec.path)
+        return with_sdf(shape, kind, resolution=spec.resolution) if kind else shape
+    made: Any = {"name": spec.name, "sdf": kind or "mlp", "resolution": spec.resolution, "on_progress": on_progress}
     if spec.kind == "mesh" and spec.path:
-        return shape_from_mesh(spec.path, name=spec.name, units=spec.units, on_progress=on_progress)
+        return shape_from_mesh(spec.path, units=spec.units, **made)
     if spec.kind == "primitive":
-        return shape_from_primitive(spec.options["name"], spec.options["size"], name=spec.name, on_progress=on_progress)
+        return shape_from_primitive(spec.options["name"], spec.options["size"], **made)
     return analytic_shape(cast(Any, spec.kind), name=spec.name, **spec.options)
 
 

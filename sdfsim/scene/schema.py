@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from sdfsim.scene.bodies import BodySpec, read_bodies
-from sdfsim.scene.document import Problems, Value, nearest, read_document
+from sdfsim.scene.document import Problems, Section, Value, nearest, read_document
 from sdfsim.scene.types import Effects
+from sdfsim.shape.asset import DEFAULT_RESOLUTION
 
 VERSION = 1
 DEFAULT_DURATION = 4.0  # s
@@ -19,6 +20,9 @@ UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 
 _TOP = ("version", "model", "duration", "seed", "gravity", "effects", "shapes", "bodies")
 _SHAPE_KINDS = ("asset", "mesh", "primitive", "sphere", "box", "plane")
+_SDF_KINDS = ("mlp", "grid", "mesh")
+_WITH_SDF = ("asset", "mesh", "primitive")  # the others have an exact SDF of their own
+FEWEST_SAMPLES, MOST_SAMPLES = 8, 512  # along each side of a grid
 _PLANE_ADVICE = " (a plane shape takes none: tilt it by the body's pose, or give the body its own `plane:`)"
 
 
@@ -32,6 +36,8 @@ class ShapeSpec:
         place: where faults of it are reported.
         path: of an asset or mesh, resolved against the scene's folder.
         units: metres per unit of the mesh file.
+        sdf: mlp, grid or mesh; None where the file does not say (an asset then keeps its own, others are fitted).
+        resolution: of a grid, samples along each side.
         options: radius, size, or what a primitive takes.
     """
 
@@ -40,6 +46,8 @@ class ShapeSpec:
     place: Value
     path: Path | None = None
     units: float = 1.0
+    sdf: str | None = None
+    resolution: int = DEFAULT_RESOLUTION
     options: dict = field(default_factory=dict)
 
 
@@ -119,7 +127,7 @@ def _shapes(value: Value | None, folder: Path) -> dict[str, ShapeSpec | None]:
 
 
 def _shape(name: str, item: Value, folder: Path) -> ShapeSpec | None:
-    section = item.section((*_SHAPE_KINDS, "units"))
+    section = item.section((*_SHAPE_KINDS, "units", "sdf", "resolution"))
     kind = section.one_of(_SHAPE_KINDS, required=True)
     if kind is None:
         return None
@@ -128,6 +136,7 @@ def _shape(name: str, item: Value, folder: Path) -> ShapeSpec | None:
         spec.units = UNITS[section["units"].choice(UNITS, "m")]
         if spec.kind != "mesh":
             section["units"].wrong(f"goes with mesh only (a shape given by {spec.kind} is in metres)")
+    _sdf(section, spec)
     if spec.kind in ("asset", "mesh"):
         spec.path = folder / kind.text("?")
         if spec.kind == "asset" and not spec.path.is_dir():
@@ -146,6 +155,22 @@ def _shape(name: str, item: Value, folder: Path) -> ShapeSpec | None:
     elif not kind.is_null():
         kind.section((), advice=_PLANE_ADVICE)
     return spec
+
+
+def _sdf(section: Section, spec: ShapeSpec) -> None:
+    """`sdf: grid` and `resolution: 64`: where the distances of a mesh come from."""
+    if "sdf" in section:
+        # A word that is no kind is a fault already; as a grid it makes none of its resolution.
+        spec.sdf = section["sdf"].choice(_SDF_KINDS, "grid")
+        if spec.kind not in _WITH_SDF:
+            section["sdf"].wrong(f"goes with {', '.join(_WITH_SDF)} only (a {spec.kind} has its exact SDF)")
+    if "resolution" in section:
+        value = section["resolution"]
+        spec.resolution = value.integer(least=FEWEST_SAMPLES, default=DEFAULT_RESOLUTION)
+        if spec.resolution > MOST_SAMPLES:
+            value.wrong(f"must be <= {MOST_SAMPLES} (got {spec.resolution})")
+        if spec.sdf != "grid":
+            value.wrong("goes with sdf: grid only")
 
 
 def _primitive(value: Value) -> dict:

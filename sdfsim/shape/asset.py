@@ -1,8 +1,8 @@
-"""A `Shape`: geometry, learned SDF, surface nodes and mass properties; and the folder it lives in."""
+"""A `Shape`: geometry, SDF (learned, sampled or exact), surface nodes, mass properties; and the folder it lives in."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -13,11 +13,18 @@ import torch
 from sdfsim.errors import SdfsimError
 from sdfsim.files import write_json
 from sdfsim.shape.analytic import BoxSdf, PlaneSdf, SphereSdf
+from sdfsim.shape.distance import MeshDistance
+from sdfsim.shape.exact import MeshSdf
+from sdfsim.shape.grid import GridSdf, sample_grid
 from sdfsim.shape.mesh import Frame, Mesh
 from sdfsim.shape.mlp import MlpSdf
 from sdfsim.shape.sdf import Sdf
 from sdfsim.shape.storage import FORMAT_VERSION, read_mesh, read_record, sdf_from_file, sdf_to_file, write, write_ply
 
+SdfKind = Literal["mlp", "grid", "mesh"]
+
+# Samples along each side of a grid: its cells are then 0.022 of the solid's largest extent.
+DEFAULT_RESOLUTION = 64
 WEIGHTS_FILE, MESH_FILE, RECORD_FILE = "shape.safetensors", "mesh.ply", "shape.json"
 
 
@@ -27,13 +34,13 @@ class Shape:
 
     Attributes:
         name: what messages and the viewer call it.
-        mesh: what is shown (and what the SDF was fitted to).
+        mesh: what is shown, and what the SDF was made from (of convex pieces, the SDF is that of their union).
         sdf: signed distance in the same frame.
         nodes: [K, 3] float64 m, surface nodes that carry contact (empty for a plane).
         volume: m^3.
         com: [3] float64 m, centre of mass.
         inertia: [3, 3] float64 kg m^2 per unit density, about `com`, shape axes.
-        certificate: fit errors measured on held-out points (empty for analytic shapes).
+        certificate: fit errors measured on held-out points (empty where nothing was fitted).
         source: where it came from and a content hash (for caching and for the record).
     """
 
@@ -56,10 +63,11 @@ class Shape:
             the folder.
 
         Raises:
-            SdfsimError: the folder cannot be written, or the SDF is of a kind that has no file format.
+            SdfsimError: the folder cannot be written, or the SDF has no file format: its kind has none, or it is exact
+                and not of this shape's mesh.
         """
         folder = Path(folder)
-        tensors, description = sdf_to_file(self.sdf)
+        tensors, description = sdf_to_file(self.sdf, self.mesh)
         tensors["nodes"] = torch.from_numpy(np.ascontiguousarray(self.nodes, dtype=np.float64))
         tensors["bounds"] = torch.from_numpy(np.ascontiguousarray(self.sdf.bounds, dtype=np.float64))
         record = {
@@ -115,7 +123,7 @@ def load_shape(folder: str | Path) -> Shape:
         return Shape(
             name=str(record["name"]),
             mesh=mesh,
-            sdf=sdf_from_file(record["sdf"], tensors),
+            sdf=sdf_from_file(record["sdf"], tensors, mesh),
             nodes=tensors["nodes"].numpy().reshape(-1, 3),
             volume=float(record["volume"]),
             com=np.array(record["com"], dtype=np.float64).reshape(3),
@@ -139,7 +147,7 @@ def scaled(shape: Shape, factor: float) -> Shape:
     if factor == 1.0:
         return shape
     sdf = shape.sdf
-    if isinstance(sdf, MlpSdf):
+    if isinstance(sdf, MlpSdf | GridSdf):
         frame = Frame(sdf.frame.centre * factor, sdf.frame.scale * factor)
         sdf = replace(sdf, frame=frame, bounds=sdf.bounds * factor)
     elif isinstance(sdf, SphereSdf):
@@ -147,6 +155,8 @@ def scaled(shape: Shape, factor: float) -> Shape:
     elif isinstance(sdf, BoxSdf):
         x, y, z = sdf.half
         sdf = BoxSdf((x * factor, y * factor, z * factor))
+    elif isinstance(sdf, MeshSdf):
+        sdf = MeshSdf(replace(sdf.mesh, vertices=sdf.mesh.vertices * factor))
     elif not isinstance(sdf, PlaneSdf):
         raise SdfsimError(f"{shape.name}: an SDF of type {type(sdf).__name__} cannot be scaled")
     return replace(
@@ -158,6 +168,48 @@ def scaled(shape: Shape, factor: float) -> Shape:
         com=shape.com * factor,
         inertia=shape.inertia * factor**5,
     )
+
+
+def with_sdf(shape: Shape, kind: SdfKind, *, resolution: int = DEFAULT_RESOLUTION) -> Shape:
+    """The same shape with its distances taken from another source; mesh, nodes and mass properties stay.
+
+    Args:
+        shape: any but a plane; "grid" and "mesh" are made from its mesh, whatever its SDF was.
+        kind: "mlp" (the shape as it is, which must have a network), "grid" (samples of the exact distance to the
+            mesh, see `sample_grid`) or "mesh" (that distance itself).
+        resolution: of a grid, samples along each side.
+
+    Returns:
+        Shape without a certificate, since nothing was fitted; its `source` notes the kind as `sdf`.
+
+    Raises:
+        SdfsimError: there is no network, the shape is a plane, or the grid has fewer than two samples a side.
+    """
+    if kind == "mlp":
+        if not isinstance(shape.sdf, MlpSdf):
+            raise SdfsimError(f"{shape.name}: the shape has no SDF network", "fit its mesh")
+        return shape
+    if isinstance(shape.sdf, PlaneSdf):
+        raise SdfsimError(f"{shape.name}: a plane has no end, so no grid or mesh holds it")
+    sdf, note = sdf_of_mesh(shape.mesh, kind, resolution)
+    return replace(shape, sdf=sdf, certificate={}, source=shape.source | note)
+
+
+def sdf_of_mesh(
+    mesh: Mesh,
+    kind: Literal["grid", "mesh"],
+    resolution: int,
+    on_progress: Callable[[float, str], None] | None = None,
+) -> tuple[Sdf, dict]:
+    """A mesh's exact SDF or a grid of it, and what a shape's `source` says about it.
+
+    Raises:
+        SdfsimError: the mesh has no faces or no extent, or the grid fewer than two samples a side.
+    """
+    if kind == "mesh":
+        return MeshSdf(mesh), {"sdf": "mesh"}
+    oracle = MeshDistance(mesh)
+    return sample_grid(oracle, oracle.bounds, resolution, on_progress), {"sdf": "grid", "resolution": resolution}
 
 
 def analytic_shape(

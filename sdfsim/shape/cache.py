@@ -1,4 +1,4 @@
-"""Shapes fitted on first use, then taken from a cache keyed by content."""
+"""Shapes of meshes: fitted (or sampled) on first use, then taken from a cache keyed by content."""
 
 from __future__ import annotations
 
@@ -8,13 +8,17 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from sdfsim.errors import SdfsimError
-from sdfsim.shape.asset import Shape, load_shape, scaled
-from sdfsim.shape.mesh import Mesh, load_mesh
+from sdfsim.shape.asset import DEFAULT_RESOLUTION, SdfKind, Shape, load_shape, scaled, sdf_of_mesh
+from sdfsim.shape.mesh import Mesh, clean, is_closed, load_mesh, mass_properties, mass_properties_of_sdf
+from sdfsim.shape.nodes import DEFAULT_COUNT, sample_nodes, thin
 from sdfsim.shape.storage import FORMAT_VERSION
+
+Progress = Callable[[float, str], None]
 
 _log = logging.getLogger(__name__)
 
@@ -25,16 +29,20 @@ def shape_from_mesh(
     *,
     name: str | None = None,
     units: float = 1.0,
-    on_progress: Callable[[float, str], None] | None = None,
+    sdf: SdfKind = "mlp",
+    resolution: int = DEFAULT_RESOLUTION,
+    on_progress: Progress | None = None,
 ) -> Shape:
-    """The shape of a mesh file: fitted on first use, then taken from a cache keyed by what the file describes.
+    """The shape of a mesh file: made on first use, then taken from a cache keyed by what the file describes.
 
     Args:
         path: a mesh file.
-        cache_dir: where fitted shapes are kept; by default `sdfsim/shapes` in the user's cache folder.
+        cache_dir: where shapes are kept; by default `sdfsim/shapes` in the user's cache folder.
         name: by default the file's.
         units: metres per unit of the file.
-        on_progress: called with (fraction done, message) while fitting.
+        sdf: "mlp" fits the network; "grid" and "mesh" fit nothing (see `mesh_shape`).
+        resolution: of a grid, samples along each side.
+        on_progress: called with (fraction done, message) while fitting or sampling.
 
     Raises:
         SdfsimError: the mesh cannot be used.
@@ -43,7 +51,7 @@ def shape_from_mesh(
     mesh = load_mesh(path)
     # Not of the file's bytes: a glTF keeps its vertices, and an OBJ its colours, in files beside it.
     key = mesh.digest()
-    shape = _cached(mesh, key, path.stem, cache_dir, on_progress)
+    shape = _cached(mesh, key, path.stem, sdf, resolution, cache_dir, on_progress)
     shape = replace(shape, name=name or path.stem, source={**shape.source, "file": path.name, "sha256": key})
     return scaled(shape, units)
 
@@ -54,14 +62,16 @@ def shape_from_primitive(
     cache_dir: str | Path | None = None,
     *,
     name: str | None = None,
-    on_progress: Callable[[float, str], None] | None = None,
+    sdf: SdfKind = "mlp",
+    resolution: int = DEFAULT_RESOLUTION,
+    on_progress: Progress | None = None,
 ) -> Shape:
-    """The shape of a procedural mesh of `primitives.PRIMITIVES`, fitted on first use and cached.
+    """The shape of a procedural mesh of `primitives.PRIMITIVES`, made on first use and cached.
 
     Args:
         kind: name in `PRIMITIVES`.
         size: its largest extent, m.
-        cache_dir, name, on_progress: as for `shape_from_mesh`.
+        cache_dir, name, sdf, resolution, on_progress: as for `shape_from_mesh`.
 
     Raises:
         SdfsimError: no such primitive.
@@ -74,29 +84,67 @@ def shape_from_primitive(
     unit = Mesh(mesh.vertices / float(np.ptp(mesh.vertices, axis=0).max()), mesh.faces)
     # Rounded, since sines and cosines differ in their last digit from machine to machine.
     key = Mesh(unit.vertices.round(9), unit.faces).digest()
-    shape = _cached(unit, key, kind, cache_dir, on_progress)
+    shape = _cached(unit, key, kind, sdf, resolution, cache_dir, on_progress)
     return scaled(replace(shape, name=name or kind, source={**shape.source, "primitive": kind}), size)
+
+
+def mesh_shape(
+    mesh: Mesh,
+    *,
+    name: str,
+    kind: Literal["grid", "mesh"],
+    resolution: int = DEFAULT_RESOLUTION,
+    on_progress: Progress | None = None,
+) -> Shape:
+    """The shape of a mesh without any fit: its exact SDF or a grid of it, nodes and mass properties as a fit has them.
+
+    Args:
+        mesh: metres.
+        name: of the shape.
+        kind: "mesh" (the exact distance) or "grid" (samples of it).
+        resolution: of a grid, samples along each side.
+        on_progress: called with (fraction done, message) while a grid is sampled.
+
+    Raises:
+        SdfsimError: the mesh cannot be used.
+    """
+    from sdfsim.shape.fit import _outer
+
+    solid = clean(mesh, name=name)
+    sdf, note = sdf_of_mesh(solid, kind, resolution, on_progress)
+    corners = thin(solid.vertices[_outer(solid.vertices)], DEFAULT_COUNT // 3)
+    nodes = thin(sample_nodes(sdf), DEFAULT_COUNT, keep=corners)
+    volume, com, inertia = mass_properties(solid) if is_closed(solid) else mass_properties_of_sdf(sdf)
+    return Shape(name, solid, sdf, nodes, volume, com, inertia, source={"kind": "mesh"} | note)
 
 
 def _cached(
     mesh: Mesh,
     key: str,
     label: str,
+    kind: SdfKind,
+    resolution: int,
     cache_dir: str | Path | None,
-    on_progress: Callable[[float, str], None] | None,
+    on_progress: Progress | None,
 ) -> Shape:
+    if kind == "mesh":  # made as fast as it is read
+        return mesh_shape(mesh, name=label, kind=kind)
     # Only here is anything fitted: reading a shape folder needs no open3d and no optimiser.
     from sdfsim.shape.fit import FIT_VERSION, fit_mesh
 
     if cache_dir is None:
         cache_dir = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sdfsim" / "shapes"
-    folder = Path(cache_dir) / f"{key[:24]}-{FIT_VERSION}.{FORMAT_VERSION}"
+    variant = f"-grid{resolution}" if kind == "grid" else ""
+    folder = Path(cache_dir) / f"{key[:24]}{variant}-{FIT_VERSION}.{FORMAT_VERSION}"
     if folder.is_dir():
         try:
             return load_shape(folder)
         except SdfsimError:
             shutil.rmtree(folder, ignore_errors=True)  # a damaged entry is only a cache miss
-    shape = fit_mesh(mesh, name=label, on_progress=on_progress)
+    if kind == "grid":
+        shape = mesh_shape(mesh, name=label, kind=kind, resolution=resolution, on_progress=on_progress)
+    else:
+        shape = fit_mesh(mesh, name=label, on_progress=on_progress)
     # A folder of its own first, so that processes fitting the same mesh never see each other's half.
     partial = folder.with_name(f"{folder.name}.{os.getpid()}.partial")
     try:
@@ -104,7 +152,7 @@ def _cached(
         if not folder.is_dir():  # else another process was first: its entry is as good
             partial.rename(folder)
     except (SdfsimError, OSError) as error:
-        _log.warning("the fitted shape %s is not kept for the next time: %s", label, error)
+        _log.warning("the shape %s is not kept for the next time: %s", label, error)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return shape

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from sdfsim.errors import SdfsimError
+from sdfsim.shape.repair import without_doubles
 from sdfsim.shape.sdf import Sdf
 
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
@@ -112,7 +113,9 @@ def _vertex_colors(loaded: Any, count: int) -> np.ndarray | None:
 
 
 def clean(mesh: Mesh, *, name: str = "mesh") -> Mesh:
-    """Merge equal vertices, drop degenerate and duplicate faces and unused vertices, turn a closed mesh right side out.
+    """Merge equal vertices, drop degenerate and doubled faces and unused vertices, turn a closed mesh right side out.
+
+    Of two faces back to back none stays where the rest is closed without them (a wall between touching cells).
 
     Args:
         mesh: metres.
@@ -141,8 +144,7 @@ def clean(mesh: Mesh, *, name: str = "mesh") -> Mesh:
     distinct = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     faces = faces[distinct]
     if len(faces):
-        _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
-        faces = faces[np.sort(first)]
+        faces = without_doubles(faces)
     if len(faces) == 0:
         raise SdfsimError(f"{name}: mesh has no faces with an area")
     used, label = np.unique(faces, return_inverse=True)
@@ -180,10 +182,23 @@ def mass_properties(mesh: Mesh) -> tuple[float, np.ndarray, np.ndarray]:
     """
     if not is_closed(mesh):
         raise SdfsimError("mesh is not closed, so it has no exact volume")
+    return integrals(mesh)
+
+
+def integrals(mesh: Mesh, weights: np.ndarray | float = 1.0) -> tuple[float, np.ndarray, np.ndarray]:
+    """`mass_properties` of a surface that is closed but for cracks: edges need not match, as after cutting its faces.
+
+    Args:
+        mesh: metres.
+        weights: of its faces, [F]; 1 / n where n of them lie on each other.
+
+    Raises:
+        SdfsimError: the mesh encloses nothing.
+    """
     # Moments about the vertices' mean: far from the origin the products of large coordinates would cancel.
     shift = mesh.vertices.mean(0)
     corners = mesh.vertices[mesh.faces] - shift
-    six = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+    six = weights * np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
     volume = float(six.sum() / 6.0)
     extent = float(np.ptp(corners.reshape(-1, 3), axis=0).max())
     if volume <= 1e-9 * extent**3:

@@ -49,9 +49,9 @@ def sample_nodes(sdf: Sdf, *, grid: int = DEFAULT_GRID, voxel: float = VOXEL) ->
     return frame.outward(_one_per_voxel(frame.inward(points), voxel))
 
 
-def project(sdf: Sdf, points: np.ndarray) -> np.ndarray:
+def project(sdf: Sdf, points: np.ndarray, *, steps: int = PROJECTIONS) -> np.ndarray:
     """Move points [P, 3] m to the zero level by a few steps x - f grad f / |grad f|^2."""
-    for _ in range(PROJECTIONS):
+    for _ in range(steps):
         distance, gradient = sdf(points)
         # A step never gets longer than twice the distance: slopes below 0.7 are errors of a fit, not geometry.
         squared = np.maximum(np.square(gradient).sum(1), 0.5)

@@ -14,6 +14,9 @@ import torch
 class Sdf(Protocol):
     """A signed distance with its gradient: positive outside, negative inside, metres, the shape's own frame.
 
+    Its members: `MlpSdf` (a fitted network), the closed forms `PlaneSdf`, `SphereSdf` and `BoxSdf`, `GridSdf` (samples)
+    and `MeshSdf` (the exact mesh); `SdfBank` asks many of them at once.
+
     Attributes:
         bounds: [2, 3] float64 m, the axis-aligned box that holds the solid (infinite for a plane).
     """

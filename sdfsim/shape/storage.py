@@ -11,6 +11,8 @@ import torch
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, replacing
 from sdfsim.shape.analytic import BoxSdf, PlaneSdf, SphereSdf
+from sdfsim.shape.exact import MeshSdf
+from sdfsim.shape.grid import GridSdf
 from sdfsim.shape.mesh import Frame, Mesh
 from sdfsim.shape.mlp import MlpSdf
 from sdfsim.shape.sdf import Sdf
@@ -18,11 +20,15 @@ from sdfsim.shape.sdf import Sdf
 FORMAT_VERSION = 1
 
 
-def sdf_to_file(sdf: Sdf) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+def sdf_to_file(sdf: Sdf, mesh: Mesh) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     """Tensors and a description (for JSON) of an SDF.
 
+    Args:
+        sdf: what is to be written.
+        mesh: what the folder's mesh.ply will hold; an exact SDF is that mesh and has nothing of its own to write.
+
     Raises:
-        SdfsimError: an SDF of a kind that has no file format.
+        SdfsimError: an SDF of a kind that has no file format, or the exact SDF of another mesh.
     """
     if isinstance(sdf, MlpSdf):
         tensors = {}
@@ -36,6 +42,17 @@ def sdf_to_file(sdf: Sdf) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
             "centre": np.asarray(sdf.frame.centre).tolist(),
             "scale": float(sdf.frame.scale),
         }
+    if isinstance(sdf, GridSdf):
+        return {"grid": sdf.values.cpu().contiguous()}, {
+            "kind": "grid",
+            "resolution": sdf.resolution,
+            "centre": np.asarray(sdf.frame.centre).tolist(),
+            "scale": float(sdf.frame.scale),
+        }
+    if isinstance(sdf, MeshSdf):
+        if not all(np.array_equal(getattr(sdf.mesh, key), getattr(mesh, key)) for key in ("vertices", "faces")):
+            raise SdfsimError("an exact SDF of another mesh than the shape's own cannot be saved")
+        return {}, {"kind": "mesh"}
     if isinstance(sdf, SphereSdf):
         return {}, {"kind": "sphere", "radius": sdf.radius}
     if isinstance(sdf, BoxSdf):
@@ -45,8 +62,8 @@ def sdf_to_file(sdf: Sdf) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     raise SdfsimError(f"an SDF of type {type(sdf).__name__} cannot be saved", "fit it first")
 
 
-def sdf_from_file(description: dict[str, Any], tensors: dict[str, torch.Tensor]) -> Sdf:
-    """The SDF that `sdf_to_file` described.
+def sdf_from_file(description: dict[str, Any], tensors: dict[str, torch.Tensor], mesh: Mesh) -> Sdf:
+    """The SDF that `sdf_to_file` described, beside the folder's `mesh`.
 
     Raises:
         KeyError, TypeError, ValueError: the description or the tensors are not what it writes.
@@ -64,9 +81,13 @@ def sdf_from_file(description: dict[str, Any], tensors: dict[str, torch.Tensor])
             weights,
             tuple(tensors[f"layer{layer}.bias"] for layer in layers),
             description["activation"],
-            Frame(np.array(description["centre"], dtype=np.float64).reshape(3), float(description["scale"])),
+            _frame(description),
             tensors["bounds"].numpy().reshape(2, 3),
         )
+    if kind == "grid":
+        return GridSdf(tensors["grid"].float(), _frame(description), tensors["bounds"].numpy().reshape(2, 3))
+    if kind == "mesh":
+        return MeshSdf(mesh)
     if kind == "sphere":
         return SphereSdf(float(description["radius"]))
     if kind == "box":
@@ -75,6 +96,10 @@ def sdf_from_file(description: dict[str, Any], tensors: dict[str, torch.Tensor])
     if kind == "plane":
         return PlaneSdf()
     raise ValueError(f"unknown SDF kind {kind!r}")
+
+
+def _frame(description: dict[str, Any]) -> Frame:
+    return Frame(np.array(description["centre"], dtype=np.float64).reshape(3), float(description["scale"]))
 
 
 def read_record(path: Path) -> dict[str, Any]:
@@ -103,7 +128,7 @@ def write(path: Path, content: bytes) -> None:
 
 
 def write_ply(mesh: Mesh) -> bytes:
-    """A mesh as binary PLY, vertices in double precision."""
+    """A mesh as binary PLY, vertices in double precision: what is read back is what was written, to the last bit."""
     columns: list[tuple[str, str]] = [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(mesh.vertices)}"]
     header += [f"property double {axis}" for axis in "xyz"]

@@ -92,6 +92,18 @@ def test_cleaning_merges_drops_and_turns_right_side_out() -> None:
     assert signed_volume(result) == pytest.approx(6.0)
 
 
+def test_of_faces_back_to_back_a_wall_goes_and_a_double_sided_one_stays_once() -> None:
+    half = primitives.box((0.5, 1.0, 1.0))
+    halves = [Mesh(half.vertices + np.array([x, 0, 0]), half.faces) for x in (-0.25, 0.25)]
+    cells = np.concatenate([mesh.vertices for mesh in halves])
+    doubled = half.vertices + np.array([3.0, 0, 0])
+    faces = [half.faces, half.faces + 8, half.faces + 16, half.faces[:, ::-1] + 16]
+    result = clean(Mesh(np.concatenate([cells, doubled]), np.concatenate(faces)))
+    assert is_closed(result)
+    assert len(result.faces) == 20 + 12
+    assert signed_volume(result) == pytest.approx(1.5)
+
+
 def test_cleaning_keeps_colours_with_their_vertices() -> None:
     solid = primitives.box()
     colors = np.arange(24, dtype=np.uint8).reshape(8, 3)

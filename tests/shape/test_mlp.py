@@ -7,10 +7,8 @@ import pytest
 import torch
 
 from sdfsim.shape import mlp
-from sdfsim.shape.analytic import BoxSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.mesh import Frame
-from sdfsim.shape.mlp import BOX, MlpSdf, SdfBank, value_and_gradient
-from sdfsim.shape.sdf import Sdf
+from sdfsim.shape.mlp import BOX, MlpSdf, value_and_gradient
 
 
 def network(seed: int, activation: mlp.Activation, width: int = 64, layers: int = 8) -> MlpSdf:
@@ -125,80 +123,3 @@ def test_empty_chunked_and_numpy_questions(monkeypatch: pytest.MonkeyPatch) -> N
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)
     array, _ = sdf(points.double().numpy())
     assert array.dtype == np.float64
-
-
-@pytest.fixture
-def mixed() -> list[Sdf]:
-    return [
-        network(1, "sine"),
-        SphereSdf(0.3),
-        network(2, "relu"),
-        PlaneSdf(),
-        network(3, "sine"),
-        BoxSdf((0.2, 0.3, 0.4)),
-        SphereSdf(0.7),
-        network(4, "sine"),
-        network(5, "sine", width=16),
-        BoxSdf((1.0, 0.1, 0.4)),
-    ]
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("count", [0, 1, 7, 500, 5000])
-def test_the_bank_is_each_one_alone(mixed: list[Sdf], count: int, dtype: torch.dtype) -> None:
-    generator = torch.Generator().manual_seed(count)
-    # Uneven shares, and some shapes not asked at all.
-    index = (torch.rand(count, generator=generator) ** 2 * (len(mixed) - 1)).long()
-    points = (torch.rand(count, 3, generator=generator, dtype=dtype) - 0.5) * 3
-    distance, gradient = SdfBank(mixed)(index, points)
-    assert distance.dtype == gradient.dtype == dtype
-    assert gradient.shape == (count, 3)
-    for number, sdf in enumerate(mixed):
-        alone = sdf(points[index == number])
-        torch.testing.assert_close(distance[index == number], alone[0], rtol=1e-4, atol=1e-5)
-        torch.testing.assert_close(gradient[index == number], alone[1], rtol=1e-3, atol=1e-4)
-
-
-def test_the_bank_takes_strangers_and_devices(mixed: list[Sdf]) -> None:
-    class Slab:
-        bounds = np.array([[-1.0] * 3, [1.0] * 3])
-
-        def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-            return points[:, 0] - 1, torch.tensor([1.0, 0, 0]).expand_as(points)
-
-    bank = SdfBank([*mixed, Slab()]).to("cpu")
-    points = torch.rand(20, 3)
-    distance, _ = bank(torch.full((20,), len(mixed)), points)
-    torch.testing.assert_close(distance, points[:, 0] - 1)
-    # "meta" stands in for a GPU: every index the bank looks up must have moved.
-    assert SdfBank([SphereSdf(0.3), PlaneSdf()]).to("meta")._slot_of.device.type == "meta"
-
-
-def test_order_of_questions_does_not_matter() -> None:
-    bank = SdfBank([network(seed, "sine") for seed in range(1, 6)])
-    index, points = torch.randint(5, (3000,)), torch.rand(3000, 3)
-    turn = torch.randperm(3000)
-    straight, turned = bank(index, points), bank(index[turn], points[turn])
-    torch.testing.assert_close(straight[0][turn], turned[0], rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.gpu
-def test_cuda_gives_what_the_cpu_gives(mixed: list[Sdf]) -> None:
-    index, points = torch.randint(len(mixed), (5000,)), torch.rand(5000, 3)
-    here = SdfBank(mixed)(index, points)
-    there = SdfBank(mixed).to("cuda")(index.cuda(), points.cuda())
-    torch.testing.assert_close(here[0], there[0].cpu(), rtol=1e-3, atol=1e-3)
-
-
-@pytest.mark.gpu
-@pytest.mark.parametrize(
-    "sdfs", [[SphereSdf(0.3)], [PlaneSdf(), SphereSdf(0.3), BoxSdf((0.2, 0.3, 0.4))]], ids=["one", "several"]
-)
-def test_a_bank_without_networks_goes_to_cuda_too(sdfs: list[Sdf]) -> None:
-    index, points = torch.randint(len(sdfs), (5000,)), torch.rand(5000, 3)
-    here = SdfBank(sdfs)(index, points)
-    bank = SdfBank(sdfs).to("cuda")
-    assert bank.device.type == "cuda"
-    there = bank(index.cuda(), points.cuda())
-    assert there[0].is_cuda and there[1].is_cuda
-    torch.testing.assert_close(here[0], there[0].cpu(), rtol=1e-5, atol=1e-5)

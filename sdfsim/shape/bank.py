@@ -1,0 +1,175 @@
+"""Many SDFs asked at once, grouped by kind so that shapes of one kind share their arithmetic."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from sdfsim.shape import grid, mlp
+from sdfsim.shape.analytic import BoxSdf, PlaneSdf, SphereSdf, box_distance, plane_distance, sphere_distance
+from sdfsim.shape.grid import GridSdf, trilinear
+from sdfsim.shape.mlp import BOX, Activation, MlpSdf, complete, half_extents, value_and_gradient
+from sdfsim.shape.sdf import Sdf
+
+
+class SdfBank:
+    """Many SDFs asked at once: each point of its own shape.
+
+    Networks of one architecture share batched matrix products, grids of one resolution a gather; spheres, boxes and
+    planes are evaluated by kind. Anything else that speaks the protocol (an exact mesh) is called once per shape.
+
+    Args:
+        sdfs: the shapes; `index` refers to them in this order.
+        device: where to compute; by default where the first network or grid is, or on the CPU.
+    """
+
+    def __init__(self, sdfs: Sequence[Sdf], device: torch.device | str | None = None) -> None:
+        self.sdfs = tuple(sdfs)
+        devices = [sdf.device for sdf in self.sdfs if isinstance(sdf, MlpSdf | GridSdf)]
+        self.device = torch.device(device if device is not None else devices[0] if devices else "cpu")
+        kinds: dict[object, list[int]] = {}
+        for number, sdf in enumerate(self.sdfs):
+            if isinstance(sdf, MlpSdf):
+                key: object = sdf.architecture
+            elif isinstance(sdf, GridSdf):
+                key = (GridSdf, sdf.resolution)
+            elif isinstance(sdf, PlaneSdf | SphereSdf | BoxSdf):
+                key = type(sdf)
+            else:
+                key = number
+            kinds.setdefault(key, []).append(number)
+        self._groups = [_group([self.sdfs[number] for number in members], self.device) for members in kinds.values()]
+        group_of, slot_of = [0] * len(self.sdfs), [0] * len(self.sdfs)
+        for group, members in enumerate(kinds.values()):
+            for slot, number in enumerate(members):
+                group_of[number], slot_of[number] = group, slot
+        self._group_of = torch.tensor(group_of, dtype=torch.int64, device=self.device)
+        self._slot_of = torch.tensor(slot_of, dtype=torch.int64, device=self.device)
+
+    def to(self, device: torch.device | str) -> SdfBank:
+        """The same bank on `device`."""
+        return SdfBank(self.sdfs, device)
+
+    def __call__(self, index: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Distance and gradient of shape `index[p]` at `points[p]`.
+
+        Args:
+            index: [P] int64 into the sequence given at construction.
+            points: [P, 3] m, each in its own shape's frame.
+
+        Returns:
+            distance [P] m and gradient [P, 3], in the dtype of `points`: what each SDF alone would give.
+        """
+        slot = self._slot_of[index]
+        if len(self._groups) == 1:
+            return self._groups[0](slot, points)
+        group_of = self._group_of[index]
+        distance, gradient = torch.empty_like(points[:, 0]), torch.empty_like(points)
+        for number, group in enumerate(self._groups):
+            chosen = (group_of == number).nonzero()[:, 0]
+            if len(chosen):
+                distance[chosen], gradient[chosen] = group(slot[chosen], points[chosen])
+        return distance, gradient
+
+
+def _group(sdfs: list[Sdf], device: torch.device):
+    """One callable (slot [P], points [P, 3]) -> (distance, gradient) for SDFs of one kind."""
+    first = sdfs[0]
+    if isinstance(first, MlpSdf):
+        return _MlpGroup([sdf for sdf in sdfs if isinstance(sdf, MlpSdf)], device)
+    if isinstance(first, GridSdf):
+        return _GridGroup([sdf for sdf in sdfs if isinstance(sdf, GridSdf)], device)
+    if isinstance(first, PlaneSdf):
+        return lambda slot, points: plane_distance(points)
+    if isinstance(first, SphereSdf):
+        radius = torch.tensor(
+            [sdf.radius for sdf in sdfs if isinstance(sdf, SphereSdf)], dtype=torch.float64, device=device
+        )
+        return lambda slot, points: sphere_distance(points, radius[slot].to(points.dtype))
+    if isinstance(first, BoxSdf):
+        half = torch.tensor([sdf.half for sdf in sdfs if isinstance(sdf, BoxSdf)], dtype=torch.float64, device=device)
+        return lambda slot, points: box_distance(points, half[slot].to(points.dtype))
+    return lambda slot, points: first(points)
+
+
+class _FramedGroup:
+    """SDFs that are fitted or sampled on the box of their normalised frame; `_evaluate` asks them there."""
+
+    def __init__(self, sdfs: Sequence[MlpSdf | GridSdf], device: torch.device, chunk: int) -> None:
+        self._centre = torch.tensor(np.stack([sdf.frame.centre for sdf in sdfs]), device=device)
+        self._scale = torch.tensor([sdf.frame.scale for sdf in sdfs], dtype=torch.float64, device=device)
+        self._half = torch.stack([half_extents(sdf.frame, sdf.bounds) for sdf in sdfs]).to(device)
+        self._chunk = chunk
+        self._count = len(sdfs)
+
+    def __call__(self, slot: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        distance, gradient = [], []
+        parts = zip(slot.split(self._chunk), points.split(self._chunk), strict=True) if len(slot) else ((slot, points),)
+        for some, part in parts:
+            scale = self._scale.index_select(0, some).to(points.dtype)
+            centre, half = self._centre.index_select(0, some), self._half.index_select(0, some)
+            local = ((part - centre.to(points.dtype)) / scale[:, None]).float()
+            clamped = local.clamp(-BOX, BOX)
+            value, slope = complete(*self._evaluate(some, clamped), clamped, local, half)
+            distance.append(value.to(points.dtype) * scale)
+            gradient.append(slope.to(points.dtype))
+        return torch.cat(distance), torch.cat(gradient)
+
+    def _evaluate(self, slot: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Normalised distance [P] and gradient [P, 3] of SDF `slot[p]` at `points[p]`, within the box."""
+        raise NotImplementedError
+
+
+class _GridGroup(_FramedGroup):
+    """Grids of one resolution."""
+
+    def __init__(self, sdfs: list[GridSdf], device: torch.device) -> None:
+        super().__init__(sdfs, device, grid.CHUNK)
+        # One grid alone is not copied: at 512 samples a side it is half a gigabyte.
+        alone = len(sdfs) == 1
+        self._values = sdfs[0].values.to(device)[None] if alone else torch.stack([s.values.to(device) for s in sdfs])
+
+    def _evaluate(self, slot: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return trilinear(self._values, slot if self._count > 1 else None, points)
+
+
+class _MlpGroup(_FramedGroup):
+    """Networks of one architecture. Points are sorted by network and cut into tiles of one network each."""
+
+    TILES = (8, 16, 32, 64, 128, 256, 512, 1024)
+
+    def __init__(self, sdfs: list[MlpSdf], device: torch.device) -> None:
+        super().__init__(sdfs, device, mlp.CHUNK)
+        layers = range(len(sdfs[0].weights))
+        self._weights = [torch.stack([sdf.weights[layer] for sdf in sdfs]).to(device) for layer in layers]
+        self._biases = [torch.stack([sdf.biases[layer] for sdf in sdfs]).to(device) for layer in layers]
+        self._activation: Activation = sdfs[0].activation
+
+    def _evaluate(self, slot: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Network `slot[p]` at `points[p]`: [P], [P, 3]."""
+        if self._count == 1 or len(slot) == 0:
+            value, gradient = value_and_gradient(self._weights, self._biases, self._activation, points[None])
+            return value[0], gradient[0]
+        counts = torch.bincount(slot, minlength=self._count)
+        order = slot.argsort(stable=True)
+        known = counts.tolist()
+        # A tile costs its padding and a copy of its network, which is worth about 24 points.
+        tile = min(self.TILES, key=lambda size: sum(-(-count // size) for count in known) * (size + 24))
+        tiles = (counts + tile - 1).div(tile, rounding_mode="floor")
+        first_tile, first_point = tiles.cumsum(0) - tiles, counts.cumsum(0) - counts
+        owner = slot[order]
+        place = first_tile[owner] * tile + torch.arange(len(slot), device=slot.device) - first_point[owner]
+        network = torch.repeat_interleave(torch.arange(self._count, device=slot.device), tiles)
+        padded = points.new_zeros(len(network) * tile, 3)
+        padded[place] = points[order]
+        value, gradient = value_and_gradient(
+            [weight[network] for weight in self._weights],
+            [bias[network] for bias in self._biases],
+            self._activation,
+            padded.view(len(network), tile, 3),
+        )
+        back = torch.empty_like(place)
+        back[order] = place
+        return value.reshape(-1)[back], gradient.reshape(-1, 3)[back]
