@@ -10,8 +10,9 @@ import torch
 from sdfsim.shape import grid, mlp
 from sdfsim.shape.analytic import BoxSdf, PlaneSdf, SphereSdf, box_distance, plane_distance, sphere_distance
 from sdfsim.shape.grid import GridSdf, trilinear
-from sdfsim.shape.mlp import BOX, Activation, MlpSdf, complete, half_extents, value_and_gradient
+from sdfsim.shape.mlp import BOX, MlpSdf, complete, half_extents, sides
 from sdfsim.shape.sdf import Sdf
+from sdfsim.shape.sweep import Activation, value_and_gradient
 
 
 class SdfBank:
@@ -146,8 +147,14 @@ class _MlpGroup(_FramedGroup):
         self._weights = [torch.stack([sdf.weights[layer] for sdf in sdfs]).to(device) for layer in layers]
         self._biases = [torch.stack([sdf.biases[layer] for sdf in sdfs]).to(device) for layer in layers]
         self._activation: Activation = sdfs[0].activation
+        self._mirrors = torch.tensor([sdf.mirrors for sdf in sdfs], device=device)
 
     def _evaluate(self, slot: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        side = sides(points, self._mirrors.index_select(0, slot))
+        value, gradient = self._network(slot, points * side)
+        return value, gradient * side
+
+    def _network(self, slot: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Network `slot[p]` at `points[p]`: [P], [P, 3]."""
         if self._count == 1 or len(slot) == 0:
             value, gradient = value_and_gradient(self._weights, self._biases, self._activation, points[None])

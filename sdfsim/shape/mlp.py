@@ -1,65 +1,32 @@
-"""The compact SDF network: value and gradient in one call, by a hand-written reverse sweep."""
+"""The compact SDF network: a shape's signed distance, sane everywhere."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 import torch
 
 from sdfsim.shape.mesh import Frame
 from sdfsim.shape.sdf import accepts_numpy
-
-Activation = Literal["sine", "relu"]
+from sdfsim.shape.sweep import Activation, value_and_gradient
 
 # Half extent of the box, in the normalised frame, on which the network is fitted (the paper's sampling box).
 BOX = 0.7
-# Points evaluated at once: 7 layers x 64 wide x 2 arrays x 4 bytes x this many is about 120 MB.
-CHUNK = 32_768
-
-
-def value_and_gradient(
-    weights: list[torch.Tensor], biases: list[torch.Tensor], activation: Activation, points: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Evaluate a stack of networks of one architecture, each on its own points; no autograd graph is built.
-
-    A layer is `act(W x + b)`, the last one is linear with one output. The forward sweep keeps each activation's
-    derivative; one reverse sweep multiplies them back to the input, which costs as much as the forward one.
-
-    Args:
-        weights: per layer [S, out, in].
-        biases: per layer [S, out].
-        activation: of the hidden layers.
-        points: [S, T, 3], in the networks' own (normalised) coordinates.
-
-    Returns:
-        value [S, T] and its gradient [S, T, 3], in the dtype of the weights.
-    """
-    with torch.no_grad():
-        slopes = []
-        hidden = points
-        for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
-            before = torch.baddbmm(bias[:, None, :], hidden, weight.transpose(1, 2))
-            if activation == "sine":
-                slopes.append(before.cos())
-                hidden = before.sin_()
-            else:
-                slopes.append((before > 0).to(before.dtype))
-                hidden = before.relu_()
-        value = torch.baddbmm(biases[-1][:, None, :], hidden, weights[-1].transpose(1, 2))[..., 0]
-        # The last layer is one row, so its product with the slope broadcasts.
-        flow = slopes[-1].mul_(weights[-1])
-        for weight, slope in zip(weights[-2:0:-1], slopes[-2::-1], strict=True):
-            flow = torch.bmm(flow, weight).mul_(slope)
-        return value, torch.bmm(flow, weights[0])
+# Points prepared and finished at once, a few hundred bytes each.
+CHUNK = 131_072
+# Gradients are returned no shorter and no longer than this. A network's slope is within it almost everywhere near the
+# surface, but rounds off the ridge in the middle of a thin wall, where x - f grad f / |grad f|^2 would fly off.
+SLOPE = (0.9, 1.1)
 
 
 def complete(
     value: torch.Tensor, gradient: torch.Tensor, clamped: torch.Tensor, points: torch.Tensor, half: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Make a fitted SDF sane away from where it was fitted.
+    """Make a fitted SDF sane where a fit is not: on ridges, and away from where it was fitted.
+
+    The length of the gradient is kept within `SLOPE`; where it vanishes, it points away from the centre.
 
     Beyond the fitted box: from the clamped point q with value f and gradient g the nearest surface is near
     c = q - f g / |g|, so the distance is |x - c| and its gradient points from c to x. It meets the inner value
@@ -78,9 +45,12 @@ def complete(
         value [P] and gradient [P, 3] at `points`.
     """
     outside = (points != clamped).any(-1)
+    norm = gradient.norm(dim=-1, keepdim=True)
+    away = clamped + clamped.new_tensor([0.0, 0.0, 1e-6])
+    unit = torch.where(norm > 1e-6, gradient / norm.clamp_min(1e-6), away / away.norm(dim=-1, keepdim=True))
+    gradient = unit * norm.clamp(*SLOPE)
     # So far out the direction of a fitted gradient is better than its length, which is known to be 1.
-    step = value.clamp_min(0) / gradient.norm(dim=-1).clamp_min(1e-6)
-    ray = points - clamped + step[:, None] * gradient
+    ray = points - clamped + value.clamp_min(0)[:, None] * unit
     length = ray.norm(dim=-1)
     value = torch.where(outside, length, value)
     gradient = torch.where(outside[:, None], ray / length.clamp_min(1e-6)[:, None], gradient)
@@ -98,9 +68,11 @@ class MlpSdf:
     Attributes:
         weights: per layer [out, in] float32.
         biases: per layer [out] float32.
-        activation: of the hidden layers ("sine": sin(W x + b), the frequency is part of W).
+        activation: of the hidden layers (the frequency of the periodic ones is part of the weights).
         frame: metres <-> normalised.
         bounds: [2, 3] float64 m, the box that holds the solid.
+        mirrors: across which of the frame's planes x = 0, y = 0, z = 0 the solid is its own mirror image; the network
+            knows the positive side only.
     """
 
     weights: tuple[torch.Tensor, ...]
@@ -108,6 +80,7 @@ class MlpSdf:
     activation: Activation
     frame: Frame
     bounds: np.ndarray
+    mirrors: tuple[bool, bool, bool] = (False, False, False)
 
     @property
     def device(self) -> torch.device:
@@ -130,26 +103,34 @@ class MlpSdf:
             self.activation,
             self.frame,
             self.bounds,
+            self.mirrors,
         )
 
     @accepts_numpy
     def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Distance [P] m and gradient [P, 3] at `points` [P, 3] m; evaluated in float32, cast back.
 
-        Near the solid the gradient is the network's own; see `complete` for what is far.
+        Near the solid the gradient is the network's own; see `complete` for what is not.
         """
         centre = torch.as_tensor(self.frame.centre, dtype=points.dtype, device=points.device)
         half = half_extents(self.frame, self.bounds).to(points.device)
+        mirrors = torch.tensor(self.mirrors, device=points.device)
         distance, gradient = [], []
         for part in points.split(CHUNK) if len(points) else (points,):
             # The centre leaves in the precision of the points, before the cast.
             local = ((part - centre) / self.frame.scale).float()
             clamped = local.clamp(-BOX, BOX)
-            value, slope = value_and_gradient(*self._stack, self.activation, clamped[None])
-            value, slope = complete(value[0], slope[0], clamped, local, half)
+            side = sides(clamped, mirrors)
+            value, slope = value_and_gradient(*self._stack, self.activation, (clamped * side)[None])
+            value, slope = complete(value[0], slope[0] * side, clamped, local, half)
             distance.append(value.to(points.dtype) * self.frame.scale)
             gradient.append(slope.to(points.dtype))
         return torch.cat(distance), torch.cat(gradient)
+
+
+def sides(points: torch.Tensor, mirrors: torch.Tensor) -> torch.Tensor:
+    """-1 where a coordinate of `points` [P, 3] is on the negative side of one of `mirrors` [3] or [P, 3], else 1."""
+    return 1.0 - 2.0 * (mirrors & (points < 0)).to(points.dtype)
 
 
 def half_extents(frame: Frame, bounds: np.ndarray) -> torch.Tensor:

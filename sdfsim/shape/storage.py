@@ -16,6 +16,7 @@ from sdfsim.shape.grid import GridSdf
 from sdfsim.shape.mesh import Frame, Mesh
 from sdfsim.shape.mlp import MlpSdf
 from sdfsim.shape.sdf import Sdf
+from sdfsim.shape.sweep import ACTIVATIONS
 
 FORMAT_VERSION = 1
 
@@ -38,6 +39,7 @@ def sdf_to_file(sdf: Sdf, mesh: Mesh) -> tuple[dict[str, torch.Tensor], dict[str
         return tensors, {
             "kind": "mlp",
             "activation": sdf.activation,
+            "mirrors": list(sdf.mirrors),
             "layers": len(sdf.weights),
             "centre": np.asarray(sdf.frame.centre).tolist(),
             "scale": float(sdf.frame.scale),
@@ -71,18 +73,20 @@ def sdf_from_file(description: dict[str, Any], tensors: dict[str, torch.Tensor],
     kind = description["kind"]
     if kind == "mlp":
         layers = range(int(description["layers"]))
-        if description["activation"] not in ("sine", "relu"):
+        if description["activation"] not in ACTIVATIONS:
             raise ValueError(f"unknown activation {description['activation']!r}")
         weights = tuple(tensors[f"layer{layer}.weight"] for layer in layers)
         sizes = [3, *(weight.shape[0] for weight in weights)]
         if sizes[-1] != 1 or any(weight.shape[1] != size for weight, size in zip(weights, sizes, strict=False)):
             raise ValueError("the layers do not fit together")
+        x, y, z = (bool(mirror) for mirror in description.get("mirrors", (False, False, False)))
         return MlpSdf(
             weights,
             tuple(tensors[f"layer{layer}.bias"] for layer in layers),
             description["activation"],
             _frame(description),
             tensors["bounds"].numpy().reshape(2, 3),
+            (x, y, z),
         )
     if kind == "grid":
         return GridSdf(tensors["grid"].float(), _frame(description), tensors["bounds"].numpy().reshape(2, 3))
