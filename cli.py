@@ -127,6 +127,10 @@ def fit(
         Literal["default", "paper"] | None, typer.Option(help="How the network is fitted (a folder: as before).")
     ] = None,
     budget: Budget = None,
+    cap: Annotated[bool, typer.Option("--cap", help="Close openings of any size (for a mesh file).")] = False,
+    thicken: Annotated[
+        float | None, typer.Option(help="Thickness to give an open sheet, metres (for a mesh file).", min=0.0)
+    ] = None,
     as_json: Json = False,
     device: Device = "auto",
     verbose: Verbose = False,
@@ -138,6 +142,8 @@ def fit(
     if source.is_dir():
         if out is not None:
             raise typer.BadParameter("-o goes with a mesh file; a folder keeps its shape in itself")
+        if cap or thicken is not None:
+            raise typer.BadParameter("--cap and --thicken go with a mesh file")
         _stage("fit", source, as_json, verbose, then="scene", budget=budget, recipe=recipe, device=device)
         return
     if out is None:
@@ -145,9 +151,17 @@ def fit(
     with Session(as_json=as_json, verbose=verbose) as session:
         from sdfsim import run
 
-        report = run.fit(source, out, recipe=recipe or "default", budget=budget, on_progress=session.progress)
+        report = run.fit(
+            source,
+            out,
+            recipe=recipe or "default",
+            budget=budget,
+            cap=cap,
+            thicken=thicken,
+            on_progress=session.progress,
+        )
         _tell_failed(session, report)
-        session.report(report)
+        session.report(report, run.fit_lines(report))
 
 
 @app.command()

@@ -37,7 +37,7 @@ def fit_scenery(mesh_folder: Path, out: Path, *, budget: float | None, recipe: s
     solid = load_mesh(Path(mesh_folder) / "solid.ply")
     shown = load_mesh(Path(mesh_folder) / "mesh.ply")
     shape = fit_mesh(
-        solid, name="scene", recipe=recipe, budget=budget, seed=seed,  # type: ignore[arg-type]
+        solid, name="scene", recipe=recipe, budget=budget, seed=seed, cap=True,  # type: ignore[arg-type]
         on_progress=on_progress, checkpoint=Path(out) / "fit.checkpoint",
     )  # fmt: skip
     shape = replace(shape, mesh=shown)

@@ -17,6 +17,7 @@ from sdfsim.dynamics.simulator import SimulationError, Simulator, join, pick_dev
 from sdfsim.errors import SdfsimError
 from sdfsim.files import write_json, write_text
 from sdfsim.playback import Playback, save_rollout
+from sdfsim.progress import duration
 from sdfsim.scene.effects import EFFECTS, plan
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.types import Scene
@@ -44,6 +45,8 @@ def fit(
     *,
     recipe: Literal["default", "paper"],
     budget: float | None,
+    cap: bool,
+    thicken: float | None,
     on_progress: Callable[[float, str], None],
 ) -> dict[str, Any]:
     """Fit a mesh file and write the shape folder `out`; a fit that was cut off goes on where it was.
@@ -53,10 +56,13 @@ def fit(
         out: shape folder.
         recipe: of the fit.
         budget: seconds of fitting at most, or None.
+        cap: close openings of any size.
+        thicken: m; a thickness for an open sheet, or None.
         on_progress: called with (fraction, message).
 
     Returns:
-        Folder, volume, number of nodes, the certificate, and in `failed_checks` whether it was missed.
+        Folder, volume, number of nodes, what was done to the mesh, the certificate, and in `failed_checks` whether it
+        was missed.
 
     Raises:
         SdfsimError: the mesh cannot be used, or the folder cannot be written.
@@ -71,13 +77,28 @@ def fit(
         name=out.resolve().name,
         recipe=recipe,
         budget=budget,
+        cap=cap,
+        thicken=thicken,
         on_progress=on_progress,
         checkpoint=out / "fit.checkpoint",
     )
     shape.save(out)
     missed = [] if shape.certificate["passed"] else [f"fit: {shape.certificate['reason']}"]
     found = {"folder": str(out), "volume_m3": shape.volume, "nodes": len(shape.nodes)}
+    found["notes"] = shape.source.get("notes", [])
     return found | shape.certificate | {"failed_checks": missed}
+
+
+def fit_lines(report: dict[str, Any]) -> list[str]:
+    """What a person reads of a `fit` report."""
+    keys = ("error_within_0.01", "error_within_0.1", "error_in_box", "projected_from_0.01", "hausdorff", "sign_errors")
+    errors = ", ".join(f"{key.replace('_', ' ')} {report[key]:.2g}" for key in keys if report.get(key) is not None)
+    return [
+        *report["notes"],
+        f"errors relative to the size: {errors}",
+        f"{report['nodes']} nodes, volume {report['volume_m3']:.4g} m^3, {duration(report['seconds'])}",
+        f"wrote {report['folder']}",
+    ]
 
 
 def simulate(

@@ -14,8 +14,8 @@ import numpy as np
 
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.asset import DEFAULT_RESOLUTION, SdfKind, Shape, load_shape, scaled, sdf_of_mesh
-from sdfsim.shape.mesh import Mesh, clean, is_closed, load_mesh, mass_properties, mass_properties_of_sdf
-from sdfsim.shape.nodes import DEFAULT_COUNT, sample_nodes, thin
+from sdfsim.shape.mesh import Mesh, load_mesh
+from sdfsim.shape.nodes import DEFAULT_COUNT
 from sdfsim.shape.storage import FORMAT_VERSION
 
 Progress = Callable[[float, str], None]
@@ -108,14 +108,13 @@ def mesh_shape(
     Raises:
         SdfsimError: the mesh cannot be used.
     """
-    from sdfsim.shape.fit import _outer
+    from sdfsim.shape.fit import surface_nodes
+    from sdfsim.shape.solid import solidify
 
-    solid = clean(mesh, name=name)
-    sdf, note = sdf_of_mesh(solid, kind, resolution, on_progress)
-    corners = thin(solid.vertices[_outer(solid.vertices)], DEFAULT_COUNT // 3)
-    nodes = thin(sample_nodes(sdf), DEFAULT_COUNT, keep=corners)
-    volume, com, inertia = mass_properties(solid) if is_closed(solid) else mass_properties_of_sdf(sdf)
-    return Shape(name, solid, sdf, nodes, volume, com, inertia, source={"kind": "mesh"} | note)
+    solid = solidify(mesh, name=name)
+    sdf, note = sdf_of_mesh(solid.surface, kind, resolution, on_progress)
+    nodes = surface_nodes(sdf, solid.surface, DEFAULT_COUNT)
+    return Shape(name, solid.surface, sdf, nodes, *solid.mass_properties(), source={"kind": "mesh"} | note)
 
 
 def _cached(

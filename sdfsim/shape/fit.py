@@ -20,13 +20,14 @@ from sdfsim.shape.distance import DistanceOracle, MeshDistance, PiecesDistance
 from sdfsim.shape.mesh import Mesh, clean, is_closed, mass_properties, mass_properties_of_sdf
 from sdfsim.shape.mlp import MlpSdf
 from sdfsim.shape.nodes import DEFAULT_COUNT, hull_nodes, sample_nodes, thin
-from sdfsim.shape.sdf import accepts_numpy
+from sdfsim.shape.sdf import Sdf, accepts_numpy
+from sdfsim.shape.solid import solidify
 
 Recipe = Literal["default", "paper"]
 Progress = Callable[[float, str], None]
 
 # Changes whenever the same mesh would come out differently; part of every cache key.
-FIT_VERSION = 2
+FIT_VERSION = 3
 
 
 def fit_mesh(
@@ -37,10 +38,12 @@ def fit_mesh(
     budget: float | None = None,
     seed: int = 0,
     nodes: int = DEFAULT_COUNT,
+    cap: bool = False,
+    thicken: float | None = None,
     on_progress: Progress | None = None,
     checkpoint: str | Path | None = None,
 ) -> Shape:
-    """Fit the compact SDF network to a triangle mesh.
+    """Fit the compact SDF network to the solid that a triangle mesh bounds (see `solidify`).
 
     The result depends on the mesh, the recipe and the seed only, unless the budget cuts the training short.
 
@@ -51,23 +54,34 @@ def fit_mesh(
         budget: seconds of training at most; the default recipe then shortens its schedule to fit.
         seed: of sampling and initialisation.
         nodes: surface nodes at most.
+        cap: close openings of any size.
+        thicken: m; the solid is all within half of this distance from the mesh instead.
         on_progress: called with (fraction done, message).
         checkpoint: a file to resume from when it exists and belongs to the same fit, and to write on the way.
 
     Returns:
-        Shape whose `certificate` tells the errors and whether they are within the limits (`passed`).
+        Shape whose `certificate` tells the errors and whether they are within the limits (`passed`); what was done to
+        the mesh is in `source["notes"]`.
 
     Raises:
-        SdfsimError: the mesh cannot be used.
+        SdfsimError: the mesh cannot be used, or bounds no solid.
     """
-    oracle = mesh if isinstance(mesh, MeshDistance) else MeshDistance(clean(mesh, name=name))
-    solid = oracle.surface
-    sdf, certificate = _train(oracle, recipe, budget, seed, on_progress, checkpoint)
-    corners = thin(solid.vertices[_outer(solid.vertices)], nodes // 3)
-    surface = thin(sample_nodes(sdf), nodes, keep=corners)
-    # An open mesh encloses a volume only by what the fit makes of its holes.
-    volume, com, inertia = mass_properties(solid) if is_closed(solid) else mass_properties_of_sdf(sdf)
-    return Shape(name, solid, sdf, surface, volume, com, inertia, certificate, _source("mesh", recipe, [solid]))
+    if isinstance(mesh, Mesh):
+        mesh = MeshDistance(solidify(mesh, name=name, cap=cap, thicken=thicken))
+    solid = mesh.solid
+
+    def pick(sdf: Sdf) -> np.ndarray:
+        return surface_nodes(sdf, solid.surface, nodes)
+
+    sdf, points, certificate = _train(mesh, recipe, budget, seed, pick, on_progress, checkpoint)
+    source = _source("mesh", recipe, [solid.surface]) | ({"notes": list(solid.notes)} if solid.notes else {})
+    return Shape(name, solid.surface, sdf, points, *solid.mass_properties(), certificate, source)
+
+
+def surface_nodes(sdf: Sdf, surface: Mesh, count: int) -> np.ndarray:
+    """Nodes for contact, at most `count` [K, 3] m: first corners of the convex hull, then points all over `sdf`."""
+    corners = thin(surface.vertices[_outer(surface.vertices)], count // 3)
+    return thin(sample_nodes(sdf), count, keep=corners)
 
 
 def fit_pieces(
@@ -99,17 +113,21 @@ def fit_pieces(
         SdfsimError: no pieces.
     """
     oracle = PiecesDistance(pieces)
-    sdf, certificate = _train(oracle, recipe, budget, seed, on_progress, checkpoint)
     size = float(np.ptp(oracle.bounds, axis=0).max())
     vertices = np.concatenate([piece.vertices for piece in pieces])
     _, first = np.unique(np.round(vertices / (1e-4 * size)), axis=0, return_index=True)
     vertices = vertices[np.sort(first)]
-    vertices = vertices[~oracle.inside(vertices, margin=1e-3 * size)]
-    surface = thin(sample_nodes(sdf), nodes, keep=hull_nodes(vertices, nodes))
+    # Measured from the boundary of the union: a vertex on the seam of two pieces is deep in neither.
+    vertices = vertices[oracle(vertices).distance >= -1e-3 * size]
+
+    def pick(sdf: Sdf) -> np.ndarray:
+        return thin(sample_nodes(sdf), nodes, keep=hull_nodes(vertices, nodes))
+
+    sdf, points, certificate = _train(oracle, recipe, budget, seed, pick, on_progress, checkpoint)
     single = len(pieces) == 1 and is_closed(pieces[0])
     volume, com, inertia = mass_properties(pieces[0]) if single else mass_properties_of_sdf(_OracleSdf(oracle))
     mesh = display if display is not None else clean(oracle.surface, name=name)
-    return Shape(name, mesh, sdf, surface, volume, com, inertia, certificate, _source("pieces", recipe, pieces))
+    return Shape(name, mesh, sdf, points, volume, com, inertia, certificate, _source("pieces", recipe, pieces))
 
 
 def _train(
@@ -117,9 +135,11 @@ def _train(
     recipe: Recipe,
     budget: float | None,
     seed: int,
+    pick: Callable[[Sdf], np.ndarray],
     on_progress: Progress | None,
     checkpoint: str | Path | None,
-) -> tuple[MlpSdf, dict]:
+) -> tuple[MlpSdf, np.ndarray, dict]:
+    """Network, nodes [K, 3] m as `pick` takes them from it, and certificate."""
     if budget is not None and not budget > 0:
         raise SdfsimError(f"the budget of a fit must be > 0 seconds (got {budget})")
     started = time.monotonic()
@@ -129,10 +149,11 @@ def _train(
         oracle, plan, budget=budget, seed=seed, tell=tell, checkpoint=Path(checkpoint) if checkpoint else None
     )
     tell(0.98, "measuring")
-    certificate = certify(sdf, oracle)
+    nodes = pick(sdf)
+    certificate = certify(sdf, oracle, nodes=nodes)
     certificate.update(recipe=recipe, seed=seed, steps=steps, seconds=round(time.monotonic() - started, 2))
     tell(1.0, "fitted" if certificate["passed"] else f"fitted, but {certificate['reason']}")
-    return sdf, certificate
+    return sdf, nodes, certificate
 
 
 def _outer(vertices: np.ndarray) -> np.ndarray:

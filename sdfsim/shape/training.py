@@ -308,9 +308,7 @@ def _split(parts: list[torch.Tensor]) -> tuple[list[torch.Tensor], list[torch.Te
     return [first, *hidden.split(1), last], [*biases[..., 0].split(1), end[..., 0]]
 
 
-def _differentiate(
-    tape: Tape, parameters: list[torch.Tensor], plan: Plan, pool: _Pool, chosen: torch.Tensor
-) -> float:
+def _differentiate(tape: Tape, parameters: list[torch.Tensor], plan: Plan, pool: _Pool, chosen: torch.Tensor) -> float:
     """Weighted L1 of the signed distance, and of the unsigned one where the sign is not known; fills the gradients."""
     weights, biases = _layers(parameters, plan.activation)
     points = pool.points[chosen][None]

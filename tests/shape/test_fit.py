@@ -195,10 +195,29 @@ def test_one_piece_has_exact_mass_properties(tiny: None) -> None:
     assert fit_pieces([primitives.box()], name="one").volume == pytest.approx(1.0, rel=1e-12)
 
 
-def test_an_open_mesh_gets_its_mass_from_the_sdf(tiny: None) -> None:
+def test_what_bounds_no_solid_is_refused_capped_or_thickened(tiny: None) -> None:
     cube = primitives.box()
-    shape = fit_mesh(Mesh(cube.vertices, cube.faces[1:]), name="open")
-    assert shape.volume == pytest.approx(1.0, rel=0.3)
+    holed = Mesh(cube.vertices, cube.faces[1:])
+    with pytest.raises(SdfsimError, match="open") as refused:
+        fit_mesh(holed, name="holed")
+    assert "--cap" in str(refused.value.hint)
+    shape = fit_mesh(holed, name="holed", cap=True)
+    assert shape.volume == pytest.approx(1.0, rel=1e-9)
+    assert "closed" in shape.source["notes"][0]
+    sheet = Mesh(np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float), np.array([[0, 1, 2], [0, 2, 3]]))
+    slab = fit_mesh(sheet, name="sheet", thicken=0.1)
+    # A slab with rounded rim: area times thickness, half a cylinder along each side, a ball for the four corners.
+    assert slab.volume == pytest.approx(0.1 + 4 * np.pi * 0.05**2 / 2 + 4 / 3 * np.pi * 0.05**3, rel=0.01)
+
+
+def test_a_shape_with_mirror_planes_is_fitted_on_one_side(tiny: None) -> None:
+    mesh = primitives.shoe()
+    shape = fit_mesh(mesh, name="shoe")
+    assert isinstance(shape.sdf, MlpSdf)
+    # A shoe's left is its right; toe and heel, top and sole are not alike.
+    assert sum(shape.sdf.mirrors) == 1
+    assert isinstance((ball := fit_mesh(primitives.box(), name="box").sdf), MlpSdf)
+    assert ball.mirrors == (True, True, True)
 
 
 @pytest.mark.slow
