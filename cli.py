@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from sdfsim.errors import EXIT_QUALITY
+from sdfsim.errors import EXIT_ERROR, EXIT_QUALITY
 from sdfsim.progress import Session, duration
 
 app = typer.Typer(
@@ -40,6 +40,9 @@ Stage = Literal["photos", "poses", "distill", "mesh", "fit", "scene"]
 Size = Annotated[float | None, typer.Option(help="Widest side of the scene, metres.", min=0.0)]
 Budget = Annotated[
     float | None, typer.Option(parser=_seconds, metavar="TIME", help="Longest time to take, such as 90s, 10m or 1h.")
+]
+Cluster = Annotated[
+    str | None, typer.Option(metavar="ADDRESS", help="Scheduler of a Dask cluster to work on, tcp://HOST:8786.")
 ]
 
 
@@ -121,47 +124,58 @@ def mesh(
 
 @app.command()
 def fit(
-    source: Annotated[Path, typer.Argument(help="A mesh file, or a folder that mesh has written.", show_default=False)],
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="Shape folder to write (for a mesh file).")] = None,
+    sources: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SOURCE...", help="Mesh files, folders of them, or a folder of mesh.", show_default=False
+        ),
+    ],
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Shape folder of one mesh file; of several, a folder of them.")
+    ] = None,
     recipe: Annotated[
-        Literal["default", "paper"] | None, typer.Option(help="How the network is fitted (a folder: as before).")
+        Literal["default", "paper"] | None,
+        typer.Option(help="How networks are fitted (a reconstruction: as before).", show_default=False),
     ] = None,
     budget: Budget = None,
-    cap: Annotated[bool, typer.Option("--cap", help="Close openings of any size (for a mesh file).")] = False,
+    cap: Annotated[bool, typer.Option("--cap", help="Close openings of any size (with -o).")] = False,
     thicken: Annotated[
-        float | None, typer.Option(help="Thickness to give an open sheet, metres (for a mesh file).", min=0.0)
+        float | None, typer.Option(help="Thickness to give an open sheet, metres (with -o).", min=0.0)
     ] = None,
+    cluster: Cluster = None,
     as_json: Json = False,
     device: Device = "auto",
     verbose: Verbose = False,
 ) -> None:
-    """Mesh -> compact SDF network, its errors certified; in a reconstruction's folder also its scene.yaml.
+    """Mesh -> compact SDF network, its errors certified.
 
-    A fit runs on the CPU, whatever --device says.
+    Several meshes, or a folder, with -o DIR: a shape folder DIR/NAME each; what is there already is kept. A folder
+    that `mesh` has written, without -o: its shape and scene.yaml.
     """
-    if source.is_dir():
-        if out is not None:
-            raise typer.BadParameter("-o goes with a mesh file; a folder keeps its shape in itself")
-        if cap or thicken is not None:
-            raise typer.BadParameter("--cap and --thicken go with a mesh file")
-        _stage("fit", source, as_json, verbose, then="scene", budget=budget, recipe=recipe, device=device)
-        return
     if out is None:
-        raise typer.BadParameter("a mesh file needs -o SHAPE_DIR")
+        if len(sources) > 1 or not sources[0].is_dir():
+            raise typer.BadParameter("a mesh file needs -o SHAPE_DIR")
+        if cap or thicken is not None or cluster is not None:
+            raise typer.BadParameter("--cap, --thicken and --cluster go with -o")
+        _stage("fit", sources[0], as_json, verbose, then="scene", budget=budget, recipe=recipe, device=device)
+        return
     with Session(as_json=as_json, verbose=verbose) as session:
-        from sdfsim import run
+        from sdfsim import fitting
+        from sdfsim.parallel import cluster as working_on
 
-        report = run.fit(
-            source,
-            out,
-            recipe=recipe or "default",
-            budget=budget,
-            cap=cap,
-            thicken=thicken,
-            on_progress=session.progress,
-        )
+        options = fitting.Options(recipe or "default", budget, cap, thicken)
+        if len(sources) == 1 and not sources[0].is_dir():
+            report = fitting.fit(sources[0], out, options, device=device, on_progress=session.progress)
+            lines = fitting.fit_lines(report)
+        else:
+            meshes = fitting.named_meshes(sources)
+            with working_on(cluster):
+                report = fitting.fit_many(meshes, out, options, device=device, on_progress=session.progress)
+            lines = fitting.batch_lines(report)
         _tell_failed(session, report)
-        session.report(report, run.fit_lines(report))
+        if any("error" in shape for shape in report.get("shapes", {}).values()):
+            session.exit_code = EXIT_ERROR
+        session.report(report, lines)
 
 
 @app.command()
@@ -258,6 +272,7 @@ def dataset(
     trajectories: Annotated[int, typer.Option(help="How many.", min=1, show_default=False)],
     seed: Annotated[int, typer.Option(min=0)] = 0,
     split: Literal["train", "validation", "test"] = "train",
+    cluster: Cluster = None,
     as_json: Json = False,
     device: Device = "auto",
     verbose: Verbose = False,
@@ -265,9 +280,10 @@ def dataset(
     """Trajectories of the teacher (PyBullet) to learn from."""
     with Session(as_json=as_json, verbose=verbose) as session:
         from sdfsim.learning.movi import make_dataset
+        from sdfsim.parallel import cluster as working_on
 
-        session.report(
-            make_dataset(
+        with working_on(cluster):
+            report = make_dataset(
                 recipe,
                 out,
                 shapes=shapes,
@@ -276,7 +292,7 @@ def dataset(
                 split=split,
                 on_progress=session.progress,
             )
-        )
+        session.report(report)
 
 
 @app.command()

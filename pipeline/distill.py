@@ -21,10 +21,10 @@ from pipeline.photos import BACKDROP
 from pipeline.rays import held_out, load_rays
 from pipeline.recipe import Recipe, beta_at
 from pipeline.render import render
-from pipeline.threads import choose_threads
 from pipeline.trainer import Trainer, find_landmarks
 from sdfsim.errors import SdfsimError
 from sdfsim.files import replacing, write_json
+from sdfsim.threads import choose_threads
 
 Progress = Callable[[float, str], None]
 

@@ -225,7 +225,7 @@ def do_mesh(run: Run, work: Path) -> dict:
 def do_fit(run: Run, work: Path) -> dict:
     """Fit stage."""
     from pipeline.asset import fit_scenery
-    from pipeline.threads import choose_threads, network_work
+    from sdfsim.threads import choose_threads, network_work
 
     choose_threads(network_work, repeat=10)
     budget = None if run.options.budget is None else max(10.0, FIT_SHARE * run.options.budget)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import tempfile
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -70,3 +71,13 @@ def read_arrays(path: Path, what: str, hint: str = "") -> dict[str, np.ndarray]:
             return {name: data[name] for name in data.files}
     except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
         raise SdfsimError(f"{path}: cannot be read as {what}: {error}", hint) from error
+
+
+def check_writable(folder: Path) -> None:
+    """That a folder can be made and written to, without making it. Raises SdfsimError otherwise."""
+    there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    try:
+        with tempfile.TemporaryFile(dir=there):
+            pass
+    except OSError as error:
+        raise SdfsimError(f"{folder}: cannot be written: {error.strerror}", "choose another -o") from error

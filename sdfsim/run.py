@@ -1,8 +1,7 @@
-"""What the commands fit, simulate, plan and info do: a mesh becomes a shape folder, a scene file a run folder."""
+"""What the commands simulate, plan and info do: a scene file becomes a run folder."""
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,9 +14,9 @@ from sdfsim.dynamics.model import Model, load_model
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.simulator import SimulationError, Simulator, join, pick_device
 from sdfsim.errors import SdfsimError
-from sdfsim.files import write_json, write_text
+from sdfsim.files import check_writable, write_json, write_text
 from sdfsim.playback import Playback, save_rollout
-from sdfsim.progress import duration
+from sdfsim.progress import columns
 from sdfsim.scene.effects import EFFECTS, plan
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.types import Scene
@@ -37,68 +36,6 @@ _PACKAGES = (
     "pybullet",
 )
 _RESULTS = ("report.json", "rollout.npz", "rollout.rrd")
-
-
-def fit(
-    mesh_file: Path,
-    out: Path,
-    *,
-    recipe: Literal["default", "paper"],
-    budget: float | None,
-    cap: bool,
-    thicken: float | None,
-    on_progress: Callable[[float, str], None],
-) -> dict[str, Any]:
-    """Fit a mesh file and write the shape folder `out`; a fit that was cut off goes on where it was.
-
-    Args:
-        mesh_file: to be fitted, in metres.
-        out: shape folder.
-        recipe: of the fit.
-        budget: seconds of fitting at most, or None.
-        cap: close openings of any size.
-        thicken: m; a thickness for an open sheet, or None.
-        on_progress: called with (fraction, message).
-
-    Returns:
-        Folder, volume, number of nodes, what was done to the mesh, the certificate, and in `failed_checks` whether it
-        was missed.
-
-    Raises:
-        SdfsimError: the mesh cannot be used, or the folder cannot be written.
-    """
-    from sdfsim.shape.fit import fit_mesh
-    from sdfsim.shape.mesh import load_mesh
-
-    mesh = load_mesh(mesh_file)
-    _check_writable(out)
-    shape = fit_mesh(
-        mesh,
-        name=out.resolve().name,
-        recipe=recipe,
-        budget=budget,
-        cap=cap,
-        thicken=thicken,
-        on_progress=on_progress,
-        checkpoint=out / "fit.checkpoint",
-    )
-    shape.save(out)
-    missed = [] if shape.certificate["passed"] else [f"fit: {shape.certificate['reason']}"]
-    found = {"folder": str(out), "volume_m3": shape.volume, "nodes": len(shape.nodes)}
-    found["notes"] = shape.source.get("notes", [])
-    return found | shape.certificate | {"failed_checks": missed}
-
-
-def fit_lines(report: dict[str, Any]) -> list[str]:
-    """What a person reads of a `fit` report."""
-    keys = ("error_within_0.01", "error_within_0.1", "error_in_box", "projected_from_0.01", "hausdorff", "sign_errors")
-    errors = ", ".join(f"{key.replace('_', ' ')} {report[key]:.2g}" for key in keys if report.get(key) is not None)
-    return [
-        *report["notes"],
-        f"errors relative to the size: {errors}",
-        f"{report['nodes']} nodes, volume {report['volume_m3']:.4g} m^3, {duration(report['seconds'])}",
-        f"wrote {report['folder']}",
-    ]
 
 
 def simulate(
@@ -138,7 +75,7 @@ def simulate(
     # Everything that can be wrong from the start, before shapes are fitted for minutes or earlier results are deleted.
     pick_device(device)
     chosen = load_model(model) if model else None
-    _check_writable(out)
+    check_writable(out)
     if viewer in ("native", "web"):
         from sdfsim.viewer import check_screen
 
@@ -205,16 +142,6 @@ def _missed(scene: Scene) -> list[str]:
 def _repeatable(asked: str | None, model: Model) -> str:
     """The model as it can be asked for again, from whatever folder."""
     return str(Path(asked).resolve()) if asked and asked.endswith(".safetensors") else model.name
-
-
-def _check_writable(folder: Path) -> None:
-    """That a folder can be made and written to, without making it. Raises SdfsimError otherwise."""
-    there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
-    try:
-        with tempfile.TemporaryFile(dir=there):
-            pass
-    except OSError as error:
-        raise SdfsimError(f"{folder}: cannot be written: {error.strerror}", "choose another -o") from error
 
 
 def _live(scene: Any, viewer: Viewer, first: Rollout, on_address: Callable[[str], None]) -> Playback | None:
@@ -319,9 +246,8 @@ def evaluation_lines(report: dict[str, Any]) -> list[str]:
                     f"{errors['rotation_error']:.1f} ({angle[0]:.1f} to {angle[1]:.1f})",
                 )
             )
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     return [
-        *("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows),
+        *columns(rows),
         f"{report['trajectories']} trajectories, {report['bodies']} bodies, "
         f"{report['ms_per_step_per_trajectory']:.2f} ms per step and trajectory",
     ]

@@ -19,7 +19,7 @@ import cli
 from sdfsim import Rollout, SdfsimError, load_scene
 from sdfsim.dynamics.model import Model, new_network
 from sdfsim.dynamics.simulator import SimulationError, Simulator
-from sdfsim.shape import primitives, training
+from sdfsim.shape import plans, primitives
 from sdfsim.shape.asset import load_shape
 from sdfsim.shape.checkpoint import Checkpoint
 from sdfsim.shape.storage import write_ply
@@ -238,8 +238,8 @@ def test_the_run_of_a_model_beside_the_scene_can_be_repeated(scene, model, tmp_p
 
 
 def test_fitting_a_mesh_goes_on_where_it_was_interrupted(tmp_path, monkeypatch):
-    plan = replace(training.PLANS["default"], width=16, layers=4, steps=400, batch=256, pool=4000, goal=None)
-    monkeypatch.setitem(training.PLANS, "default", plan)
+    plan = replace(plans.PLANS["default"], width=16, layers=4, steps=400, batch=256, pool=4000, goal=None)
+    monkeypatch.setitem(plans.PLANS, "default", plan)
     (tmp_path / "box.ply").write_bytes(write_ply(primitives.box()))
     save, calls = Checkpoint.save, []
 

@@ -27,7 +27,18 @@ HEAVY = (
 
 # A room may import itself and rooms further down. Rooms of one level may not import each other,
 # but the rooms of the top level share what they have to (a run plays back, a viewer shows a playback).
-LEVELS = {"errors": 0, "files": 1, "shape": 2, "scene": 3, "dynamics": 4, "learning": 5, "baselines": 5, "studies": 6}
+LEVELS = {
+    "errors": 0,
+    "files": 1,
+    "threads": 1,
+    "parallel": 1,
+    "shape": 2,
+    "scene": 3,
+    "dynamics": 4,
+    "learning": 5,
+    "baselines": 5,
+    "studies": 6,
+}
 TOP = 7  # playback and the other modules directly in sdfsim
 
 

@@ -21,7 +21,7 @@ from sdfsim.dynamics.pose import conjugate, multiply, to_rotvec
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_arrays, write_arrays
 from sdfsim.learning.dataset import Trajectory, load_shapes, trajectory_files
-from sdfsim.learning.parallel import parallel
+from sdfsim.parallel import parallel
 
 FRAMES_VERSION = 1  # counts up whenever contacts are found or thinned differently
 

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim.errors import SdfsimError
 from sdfsim.learning.dataset import FLOOR, SPLITS, Trajectory, read_info, write_info
-from sdfsim.learning.parallel import parallel
 from sdfsim.learning.teacher import DT, ENGINE_SETTINGS, SUBSTEP, Teacher, TeacherBody, import_pybullet, write_urdf
+from sdfsim.parallel import parallel
 from sdfsim.shape.fit import fit_pieces
 from sdfsim.shape.mesh import load_mesh, load_pieces, mass_properties
 

@@ -9,8 +9,9 @@ import torch
 
 from sdfsim.shape import grid, mlp
 from sdfsim.shape.analytic import BoxSdf, PlaneSdf, SphereSdf, box_distance, plane_distance, sphere_distance
+from sdfsim.shape.boxed import everywhere, half_extents
 from sdfsim.shape.grid import GridSdf, trilinear
-from sdfsim.shape.mlp import BOX, MlpSdf, complete, half_extents, sides
+from sdfsim.shape.mlp import MlpSdf, sides
 from sdfsim.shape.sdf import Sdf
 from sdfsim.shape.sweep import Activation, value_and_gradient
 
@@ -112,8 +113,13 @@ class _FramedGroup:
             scale = self._scale.index_select(0, some).to(points.dtype)
             centre, half = self._centre.index_select(0, some), self._half.index_select(0, some)
             local = ((part - centre.to(points.dtype)) / scale[:, None]).float()
-            clamped = local.clamp(-BOX, BOX)
-            value, slope = complete(*self._evaluate(some, clamped), clamped, local, half)
+
+            def inner(
+                rows: torch.Tensor | None, local: torch.Tensor, some: torch.Tensor = some
+            ) -> tuple[torch.Tensor, torch.Tensor]:
+                return self._evaluate(some if rows is None else some[rows], local)
+
+            value, slope = everywhere(inner, local, half)
             distance.append(value.to(points.dtype) * scale)
             gradient.append(slope.to(points.dtype))
         return torch.cat(distance), torch.cat(gradient)

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sdfsim.shape.boxed import BOX
 from sdfsim.shape.coverage import coverage, hausdorff, outward_samples
 from sdfsim.shape.distance import DistanceOracle
 from sdfsim.shape.mesh import Frame, normal_frame, sample_surface
-from sdfsim.shape.mlp import BOX
 from sdfsim.shape.sdf import Sdf
 
 # Worst allowed errors; lengths as a fraction of the shape's largest extent.

@@ -8,10 +8,10 @@ from pathlib import Path
 import torch
 
 from sdfsim.shape.mesh import Mesh
-from sdfsim.shape.soap import Adam, Soap
+from sdfsim.shape.soap import Adam
 from sdfsim.shape.storage import write
 
-VERSION = 2  # of the file's tensors
+VERSION = 3  # of the file's tensors
 
 
 class Checkpoint:
@@ -31,18 +31,18 @@ class Checkpoint:
         self,
         parameters: list[torch.Tensor],
         average: list[torch.Tensor],
-        optimiser: Soap | Adam,
+        optimiser: Adam,
         generator: torch.Generator,
-        progress: tuple[int, int, int],
+        progress: tuple[float, ...],
     ) -> None:
-        """Write everything that the next step depends on; `progress` is (step, turn, stop)."""
+        """Write everything that the next step depends on; `progress` comes back from `load`."""
         from safetensors.torch import save
 
         tensors = {f"parameter{i}": p.detach() for i, p in enumerate(parameters)}
         tensors |= {f"average{i}": p for i, p in enumerate(average)}
         tensors |= {f"optimiser.{key}": value.contiguous() for key, value in optimiser.tensors().items()}
         tensors["generator"] = generator.get_state()
-        tensors["progress"] = torch.tensor(progress)
+        tensors["progress"] = torch.tensor(progress, dtype=torch.float64)
         self.path.parent.mkdir(parents=True, exist_ok=True)
         write(self.path, save(tensors, {"fingerprint": self.fingerprint}))
 
@@ -50,9 +50,9 @@ class Checkpoint:
         self,
         parameters: list[torch.Tensor],
         average: list[torch.Tensor],
-        optimiser: Soap | Adam,
+        optimiser: Adam,
         generator: torch.Generator,
-    ) -> tuple[int, int, int] | None:
+    ) -> tuple[float, ...] | None:
         """Put a saved state in place; None (and nothing changed) when there is none for this fit."""
         from safetensors import SafetensorError, safe_open
 
@@ -72,8 +72,7 @@ class Checkpoint:
         own = "optimiser."
         optimiser.restore({key.removeprefix(own): value for key, value in tensors.items() if key.startswith(own)})
         generator.set_state(tensors["generator"])
-        step, turn, stop = (int(value) for value in tensors["progress"])
-        return step, turn, stop
+        return tuple(tensors["progress"].tolist())
 
     def remove(self) -> None:
         """The fit is done."""

@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
+from sdfsim.shape.boxed import BOX
 from sdfsim.shape.bvh import ClosestPoint
 from sdfsim.shape.distance import DistanceOracle, MeshDistance
 from sdfsim.shape.mesh import Frame, Mesh, normal_frame, sample_surface, signed_volume
-from sdfsim.shape.mlp import BOX
 from sdfsim.shape.nodes import project
 from sdfsim.shape.sdf import Sdf
 

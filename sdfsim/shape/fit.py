@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 import torch
@@ -20,14 +20,16 @@ from sdfsim.shape.distance import DistanceOracle, MeshDistance, PiecesDistance
 from sdfsim.shape.mesh import Mesh, clean, is_closed, mass_properties, mass_properties_of_sdf
 from sdfsim.shape.mlp import MlpSdf
 from sdfsim.shape.nodes import DEFAULT_COUNT, hull_nodes, sample_nodes, thin
+from sdfsim.shape.plans import PLANS
 from sdfsim.shape.sdf import Sdf, accepts_numpy
 from sdfsim.shape.solid import solidify
 
 Recipe = Literal["default", "paper"]
 Progress = Callable[[float, str], None]
+Oracle = TypeVar("Oracle", bound=DistanceOracle)
 
 # Changes whenever the same mesh would come out differently; part of every cache key.
-FIT_VERSION = 3
+FIT_VERSION = 4
 
 
 def fit_mesh(
@@ -42,22 +44,26 @@ def fit_mesh(
     thicken: float | None = None,
     on_progress: Progress | None = None,
     checkpoint: str | Path | None = None,
+    device: torch.device | str = "cpu",
 ) -> Shape:
     """Fit the compact SDF network to the solid that a triangle mesh bounds (see `solidify`).
 
-    The result depends on the mesh, the recipe and the seed only, unless the budget cuts the training short.
+    The result depends on the mesh, the recipe and the seed only (up to rounding, which the number of threads and the
+    device change), unless the budget cuts the training short.
 
     Args:
         mesh: metres; or its distance oracle, when there is one already.
         name: of the shape.
-        recipe: "default" (sine, 64 wide, SOAP, seconds) or "paper" (ReLU, 128 wide, Adam 1e-5, 400k steps).
+        recipe: "default" (waves, 64 wide, SOAP, seconds) or "paper" (ReLU, 128 wide, Adam 1e-5, 400k steps).
         budget: seconds of training at most; the default recipe then shortens its schedule to fit.
         seed: of sampling and initialisation.
         nodes: surface nodes at most.
         cap: close openings of any size.
         thicken: m; the solid is all within half of this distance from the mesh instead.
         on_progress: called with (fraction done, message).
-        checkpoint: a file to resume from when it exists and belongs to the same fit, and to write on the way.
+        checkpoint: a file to resume from when it exists and belongs to the same fit, and to write on the way; to be
+            removed by the caller once the shape is safe.
+        device: to train on.
 
     Returns:
         Shape whose `certificate` tells the errors and whether they are within the limits (`passed`); what was done to
@@ -68,14 +74,51 @@ def fit_mesh(
     """
     if isinstance(mesh, Mesh):
         mesh = MeshDistance(solidify(mesh, name=name, cap=cap, thicken=thicken))
-    solid = mesh.solid
+    return fit_solids(
+        {name: mesh},
+        recipe=recipe,
+        budget=budget,
+        seed=seed,
+        nodes=nodes,
+        on_progress=on_progress,
+        checkpoint=checkpoint,
+        device=device,
+    )[0]
 
-    def pick(sdf: Sdf) -> np.ndarray:
-        return surface_nodes(sdf, solid.surface, nodes)
 
-    sdf, points, certificate = _train(mesh, recipe, budget, seed, pick, on_progress, checkpoint)
-    source = _source("mesh", recipe, [solid.surface]) | ({"notes": list(solid.notes)} if solid.notes else {})
-    return Shape(name, solid.surface, sdf, points, *solid.mass_properties(), certificate, source)
+def fit_solids(
+    solids: dict[str, MeshDistance],
+    *,
+    recipe: Recipe = "default",
+    budget: float | None = None,
+    seed: int = 0,
+    nodes: int = DEFAULT_COUNT,
+    on_progress: Progress | None = None,
+    checkpoint: str | Path | None = None,
+    device: torch.device | str = "cpu",
+) -> list[Shape]:
+    """Fit several solids side by side in one batched optimiser, which is what a GPU is good at.
+
+    Args:
+        solids: by name, from `MeshDistance(solidify(mesh))`.
+        budget: seconds of training for all of them.
+        recipe, seed, nodes, on_progress, checkpoint, device: as for `fit_mesh`; the checkpoint for a single solid only.
+
+    Returns:
+        Shapes in the order of `solids`, as `fit_mesh` gives them.
+    """
+
+    def pick(sdf: Sdf, oracle: MeshDistance) -> np.ndarray:
+        return surface_nodes(sdf, oracle.surface, nodes)
+
+    oracles = list(solids.values())
+    shapes = []
+    fitted = _train(oracles, recipe, budget, seed, pick, on_progress, checkpoint, device)
+    for (name, oracle), (sdf, points, certificate) in zip(solids.items(), fitted, strict=True):
+        solid = oracle.solid
+        source = _source("mesh", recipe, [solid.surface]) | ({"notes": list(solid.notes)} if solid.notes else {})
+        shapes.append(Shape(name, solid.surface, sdf, points, *solid.mass_properties(), certificate, source))
+    return shapes
 
 
 def surface_nodes(sdf: Sdf, surface: Mesh, count: int) -> np.ndarray:
@@ -120,10 +163,10 @@ def fit_pieces(
     # Measured from the boundary of the union: a vertex on the seam of two pieces is deep in neither.
     vertices = vertices[oracle(vertices).distance >= -1e-3 * size]
 
-    def pick(sdf: Sdf) -> np.ndarray:
+    def pick(sdf: Sdf, oracle: PiecesDistance) -> np.ndarray:
         return thin(sample_nodes(sdf), nodes, keep=hull_nodes(vertices, nodes))
 
-    sdf, points, certificate = _train(oracle, recipe, budget, seed, pick, on_progress, checkpoint)
+    sdf, points, certificate = _train([oracle], recipe, budget, seed, pick, on_progress, checkpoint, "cpu")[0]
     single = len(pieces) == 1 and is_closed(pieces[0])
     volume, com, inertia = mass_properties(pieces[0]) if single else mass_properties_of_sdf(_OracleSdf(oracle))
     mesh = display if display is not None else clean(oracle.surface, name=name)
@@ -131,29 +174,42 @@ def fit_pieces(
 
 
 def _train(
-    oracle: DistanceOracle,
+    oracles: Sequence[Oracle],
     recipe: Recipe,
     budget: float | None,
     seed: int,
-    pick: Callable[[Sdf], np.ndarray],
+    pick: Callable[[Sdf, Oracle], np.ndarray],
     on_progress: Progress | None,
     checkpoint: str | Path | None,
-) -> tuple[MlpSdf, np.ndarray, dict]:
-    """Network, nodes [K, 3] m as `pick` takes them from it, and certificate."""
+    device: torch.device | str,
+) -> list[tuple[MlpSdf, np.ndarray, dict]]:
+    """Per oracle the network, nodes [K, 3] m as `pick` takes them from it, and the certificate."""
     if budget is not None and not budget > 0:
         raise SdfsimError(f"the budget of a fit must be > 0 seconds (got {budget})")
     started = time.monotonic()
     tell = on_progress or (lambda fraction, message: None)
-    plan = training.PLANS[recipe]
-    sdf, steps = training.train(
-        oracle, plan, budget=budget, seed=seed, tell=tell, checkpoint=Path(checkpoint) if checkpoint else None
+    fitted = training.train(
+        oracles,
+        PLANS[recipe],
+        budget=budget,
+        seed=seed,
+        tell=tell,
+        checkpoint=Path(checkpoint) if checkpoint else None,
+        device=torch.device(device),
     )
-    tell(0.98, "measuring")
-    nodes = pick(sdf)
-    certificate = certify(sdf, oracle, nodes=nodes)
-    certificate.update(recipe=recipe, seed=seed, steps=steps, seconds=round(time.monotonic() - started, 2))
-    tell(1.0, "fitted" if certificate["passed"] else f"fitted, but {certificate['reason']}")
-    return sdf, nodes, certificate
+    trained = time.monotonic() - started
+    results = []
+    for oracle, (sdf, steps) in zip(oracles, fitted, strict=True):
+        tell(0.98, "measuring")
+        measuring = time.monotonic()
+        nodes = pick(sdf, oracle)
+        certificate = certify(sdf, oracle, nodes=nodes)
+        # Its share of the training that it had with others, and its own measuring.
+        seconds = trained / len(oracles) + time.monotonic() - measuring
+        certificate.update(recipe=recipe, seed=seed, steps=steps, seconds=round(seconds, 2))
+        tell(1.0, "fitted" if certificate["passed"] else f"fitted, but {certificate['reason']}")
+        results.append((sdf, nodes, certificate))
+    return results
 
 
 def _outer(vertices: np.ndarray) -> np.ndarray:

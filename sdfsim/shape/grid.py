@@ -10,8 +10,8 @@ import numpy as np
 import torch
 
 from sdfsim.errors import SdfsimError
+from sdfsim.shape.boxed import BOX, everywhere, half_extents
 from sdfsim.shape.mesh import Frame, normal_frame
-from sdfsim.shape.mlp import BOX, complete, half_extents
 from sdfsim.shape.sdf import accepts_numpy
 
 # Points evaluated at once: eight indices and corners with what is made of them, about 250 bytes a point, is 65 MB.
@@ -101,7 +101,7 @@ class GridSdf:
     def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Distance [P] m and gradient [P, 3] at `points` [P, 3] m; interpolated in float32, cast back.
 
-        Near the solid the gradient is the interpolant's own (see `trilinear`); see `complete` for what is far.
+        Near the solid the gradient is the interpolant's own (see `trilinear`); see `everywhere` for what is far.
         """
         centre = torch.as_tensor(self.frame.centre, dtype=points.dtype, device=points.device)
         half = half_extents(self.frame, self.bounds).to(points.device)
@@ -109,8 +109,7 @@ class GridSdf:
         for part in points.split(CHUNK) if len(points) else (points,):
             # The centre leaves in the precision of the points, before the cast.
             local = ((part - centre) / self.frame.scale).float()
-            clamped = local.clamp(-BOX, BOX)
-            value, slope = complete(*trilinear(self.values, None, clamped), clamped, local, half)
+            value, slope = everywhere(lambda rows, inside: trilinear(self.values, None, inside), local, half)
             distance.append(value.to(points.dtype) * self.frame.scale)
             gradient.append(slope.to(points.dtype))
         return torch.cat(distance), torch.cat(gradient)

@@ -1,286 +1,274 @@
-"""The training loop behind `fit`: sampling, loss, schedule, early stop, resume."""
+"""The training loop behind `fit`: many small networks side by side, each with its own schedule and early stop."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
 
 from sdfsim.shape.checkpoint import Checkpoint
 from sdfsim.shape.distance import DistanceOracle
-from sdfsim.shape.mesh import Frame, normal_frame, sample_surface
-from sdfsim.shape.mlp import BOX, MlpSdf
+from sdfsim.shape.mlp import MlpSdf
+from sdfsim.shape.plans import Plan
+from sdfsim.shape.sampling import CHECKED, Subject, stack
 from sdfsim.shape.soap import Adam, Soap
 from sdfsim.shape.sweep import Activation, Tape, value_and_gradient
+from sdfsim.threads import choose_threads
 
-
-@dataclass(frozen=True)
-class Plan:
-    """One recipe. Lengths are relative to the shape's largest extent.
-
-    Attributes:
-        activation: of the hidden layers ("wave" or "relu").
-        width: of the hidden layers.
-        layers: linear layers, the last one included.
-        first: first-layer weights are uniform in +-first (periodic; it sets the finest scale the fit starts with).
-        optimiser: "soap" or "adam".
-        lr: step size.
-        decay: the part of the steps over which it falls to zero, at the end (0: constant).
-        steps: updates.
-        batch: points an update.
-        sigmas: points lie this far from the surface (standard deviation, log-uniform between the two).
-        near: fraction of points near the surface; the others are uniform in the box.
-        resample: updates between fresh pools of points (0: one pool).
-        pool: points in a pool.
-        soften: errors count with soften / (|distance| + soften); None counts all alike.
-        sign_everywhere: use the parity sign everywhere on closed surfaces, not only where the paper's rule trusts it.
-        goal: mean errors (within 0.01, in the box) of the averaged weights at which the decay begins early; a decay
-            halves them. None never stops early.
-        settle: steps of an early decay.
-        fold: fit a solid that is its own mirror image on one side only.
-    """
-
-    activation: Activation
-    width: int
-    layers: int
-    first: float
-    optimiser: Literal["soap", "adam"]
-    lr: float
-    decay: float
-    steps: int
-    batch: int
-    sigmas: tuple[float, float]
-    near: float
-    resample: int
-    pool: int
-    soften: float | None
-    sign_everywhere: bool
-    goal: tuple[float, float] | None
-    settle: int
-    fold: bool
-
-
-PLANS = {
-    # Chosen by measurement on scanned and thin-walled shapes. The box gets its share of points and the loss stays soft
-    # up to some hundredths of the size, without which the far field is off by as much.
-    "default": Plan(
-        activation="wave",
-        width=64,
-        layers=8,
-        first=8.0,
-        optimiser="soap",
-        lr=1e-2,
-        decay=0.5,
-        steps=5000,
-        batch=4096,
-        sigmas=(0.002, 0.15),
-        near=0.8,
-        resample=0,
-        pool=400_000,
-        soften=0.04,
-        sign_everywhere=True,
-        goal=(8e-4, 4e-3),
-        settle=700,
-        fold=True,
-    ),
-    # Rubanova et al. 2024, section 3.1 and appendix: 400k updates at 1e-5, noise 0.1 drawn again every 100 updates.
-    "paper": Plan(
-        activation="relu",
-        width=128,
-        layers=8,
-        first=0.0,
-        optimiser="adam",
-        lr=1e-5,
-        decay=0.0,
-        steps=400_000,
-        batch=4096,
-        sigmas=(0.1, 0.1),
-        near=1.0,
-        resample=100,
-        pool=65_536,
-        soften=None,
-        sign_everywhere=False,
-        goal=None,
-        settle=0,
-        fold=False,
-    ),
-}
 WARMUP = 50
-# Points are drawn from a little beyond the box that is used: at the very edge of its data a network's slope is poor.
-MARGIN = 1.15
 CHECK = 100
 # Seconds that the certificate takes of a budget, beside a tenth.
 RESERVE = 2.0
-# A solid whose distances agree with their mirror images' to this, relative to its size, is fitted on one side only.
-SAME = 1e-4
+CPU = torch.device("cpu")
 
-
-@dataclass(frozen=True)
-class _Pool:
-    """Points [P, 3] with their distance [P] (normalised) and whether its sign counts [P]."""
-
-    points: torch.Tensor
-    distance: torch.Tensor
-    signed: torch.Tensor
+# Weights and biases per layer, [S, out, in] and [S, out].
+Layers = tuple[list[torch.Tensor], list[torch.Tensor]]
 
 
 def train(
-    oracle: DistanceOracle,
+    oracles: Sequence[DistanceOracle],
     plan: Plan,
     *,
     budget: float | None,
     seed: int,
     tell: Callable[[float, str], None],
-    checkpoint: Path | None,
-) -> tuple[MlpSdf, int]:
-    """Run a plan.
+    checkpoint: Path | None = None,
+    device: torch.device = CPU,
+) -> list[tuple[MlpSdf, int]]:
+    """Run a plan for several solids in one batched optimiser; each comes out as it would alone, up to rounding.
 
     Args:
-        oracle: true distances, metres.
+        oracles: true distances to each solid, metres.
         plan: the recipe.
-        budget: seconds at most; the decay begins early enough to end within them.
+        budget: seconds for all at most; the decay begins early enough to end within them.
         seed: of points and weights.
         tell: called with (fraction done, message).
-        checkpoint: resumed from when it belongs to this very fit; removed at the end.
+        checkpoint: of a single solid; resumed from when it belongs to this very fit. The caller removes it once what
+            came of the fit is safe.
+        device: to train on.
 
     Returns:
-        the network and the number of updates made.
+        per solid its network, on the CPU, and the number of updates made.
     """
     started = time.monotonic()
-    frame = normal_frame(oracle.bounds)
-    tell(0.0, "sampling distances")
-    mirrors = _mirrors(oracle, frame) if plan.fold else (False, False, False)
-    pool = _sample(oracle, frame, plan, mirrors, np.random.default_rng([seed, 0]))
-    checked = replace(plan, pool=8000, near=0.5, sigmas=(0.006, 0.006))
-    check = _sample(oracle, frame, checked, mirrors, np.random.default_rng([seed, 1]))
-    generator = torch.Generator().manual_seed(seed)
-    parameters = _initial(plan, generator)
-    average = [parameter.detach().clone() for parameter in parameters]
-    optimiser = (Soap if plan.optimiser == "soap" else Adam)(parameters, plan.lr)
-    # Where the decay begins; an early stop or a short budget moves it forward.
-    turn, step = int(plan.steps * (1.0 - plan.decay)), 0
-    stop = plan.steps
-    saved = Checkpoint(checkpoint, f"{asdict(plan)}|{seed}", oracle.surface) if checkpoint is not None else None
+    run = _Run(oracles, plan, seed, tell, device)
+    if checkpoint is not None and len(oracles) > 1:
+        raise ValueError("a checkpoint belongs to a single solid")
+    saved = Checkpoint(checkpoint, f"{asdict(plan)}|{seed}", oracles[0].surface) if checkpoint is not None else None
     if saved is not None:
-        step, turn, stop = saved.load(parameters, average, optimiser, generator) or (step, turn, stop)
-    tape = Tape(plan.activation, plan.width, plan.layers, parameters[0])
-    before, looping = step, time.monotonic()
+        run.restore(saved)
+    if device.type == "cpu":
+        choose_threads(partial(run.differentiate, torch.arange(plan.batch) % plan.pool))
+    before, looping = run.step, time.monotonic()
 
-    while step < stop:
-        if plan.resample and step and step % plan.resample == 0:
-            pool = _sample(oracle, frame, plan, mirrors, np.random.default_rng([seed, 0, step]))
-        chosen = torch.randint(len(pool.points), (plan.batch,), generator=generator)
-        loss = _differentiate(tape, parameters, plan, pool, chosen)
-        factor = min(1.0, (step + 1) / WARMUP)
-        if plan.decay and step >= turn:
-            factor *= 0.5 * (1.0 + math.cos(math.pi * (step - turn) / max(stop - turn, 1)))
-        optimiser.step(factor)
-        step += 1
-        with torch.no_grad():
-            for mean, parameter in zip(average, parameters, strict=True):
-                mean.lerp_(parameter, 0.02)
-        if step % CHECK:
+    while run.step < run.stop.max():
+        run.update()
+        if run.step % CHECK:
             continue
-
-        if not math.isfinite(loss) or not all(bool(p.isfinite().all()) for p in parameters):
-            # A fresh start from new weights with a quarter of the step size.
-            parameters = _initial(plan, torch.Generator().manual_seed(1))
-            average = [parameter.detach().clone() for parameter in parameters]
-            optimiser = type(optimiser)(parameters, optimiser.lr / 4)
-        near, far = _errors(average, plan, check)
-        if plan.goal is not None and step < turn and near <= plan.goal[0] and far <= plan.goal[1]:
-            turn, stop = step, min(stop, step + plan.settle)
-        elapsed = time.monotonic() - started
+        run.repair()
+        near, far = run.judge()
         if budget is not None:
-            pace = (time.monotonic() - looping) / (step - before)
+            pace = (time.monotonic() - looping) / (run.step - before)
             kept = min(0.1 * budget + RESERVE, 0.5 * budget)
-            possible = step + int((budget - kept - elapsed) / pace)
-            turn, stop = _fitted(possible, step, turn, stop, plan)
-        tell(0.97 * step / max(stop, 1), f"step {step} of {stop}, error {near:.2g} near, {far:.2g} in the box")
-        if saved is not None and step % (2 * CHECK) == 0:
-            saved.save(parameters, average, optimiser, generator, (step, turn, stop))
-
-    if saved is not None:
-        saved.remove()
-    weights, biases = _layers(parameters, plan.activation)
-    return MlpSdf(
-        tuple(weight[0].clone() for weight in weights),
-        tuple(bias[0].clone() for bias in biases),
-        plan.activation,
-        frame,
-        oracle.bounds.copy(),
-        mirrors,
-    ), step
+            run.hurry(run.step + int((budget - kept - (time.monotonic() - started)) / pace))
+        run.retire()
+        last = max(int(run.stop.max()), 1)
+        errors = f"error {near:.2g} near, {far:.2g} in the box"
+        tell(0.97 * run.step / last, f"step {run.step} of {last}, {errors}")
+        if saved is not None and run.step % (2 * CHECK) == 0:
+            run.save(saved)
+    return run.results()
 
 
-def _fitted(possible: int, step: int, turn: int, stop: int, plan: Plan) -> tuple[int, int]:
-    """Where decay and end must lie when `possible` steps can be made in all.
+class _Run:
+    """S networks in training; those that are done leave the stack.
 
-    Until the decay has begun the end moves both ways, since the first steps of a busy machine tell little; after
-    that it only comes nearer.
+    Attributes:
+        step: updates made.
+        turn: [S] the update at which each one's decay begins; an early stop or a short budget moves it forward.
+        stop: [S] the update at which each one ends.
     """
-    if step >= turn:
-        return turn, max(min(stop, possible), step)
-    stop = max(min(plan.steps, possible), step)
-    return max(step, int(stop * (1.0 - plan.decay))), stop
+
+    def __init__(
+        self,
+        oracles: Sequence[DistanceOracle],
+        plan: Plan,
+        seed: int,
+        tell: Callable[[float, str], None],
+        device: torch.device,
+    ) -> None:
+        self.plan, self.device = plan, device
+        self.subjects, pools, checks = [], [], []
+        for done, oracle in enumerate(oracles):
+            tell(0.0, "sampling distances" + (f" of {done + 1} of {len(oracles)}" if len(oracles) > 1 else ""))
+            subject = Subject(oracle, plan, seed)
+            self.subjects.append(subject)
+            pools.append(subject.pool())
+            checks.append(subject.check())
+        self.pool, self.check = stack(pools).to(device), stack(checks).to(device)
+        # Drawn on the CPU, so that points and first weights do not depend on the device.
+        self.generator = torch.Generator().manual_seed(seed)
+        self._take([p.to(device) for p in _initial(plan, len(oracles), self.generator)])
+        self.average = [parameter.clone() for parameter in self.parameters]
+        self.optimiser = (Soap if plan.optimiser == "soap" else Adam)(self.parameters, plan.lr)
+        self.step = 0
+        self.turn = np.full(len(oracles), int(plan.steps * (1.0 - plan.decay)))
+        self.stop = np.full(len(oracles), plan.steps)
+        self.rate = np.ones(len(oracles))  # of the step size, lower after a fresh start
+        self.places = np.arange(len(oracles))  # in the results
+        self.done: dict[int, tuple[MlpSdf, int]] = {}
+        self._tape = Tape(plan.activation, plan.width, plan.layers, self.parameters[0])
+
+    def _take(self, parameters: list[torch.Tensor]) -> None:
+        self.parameters = parameters
+        for parameter in parameters:
+            parameter.grad = torch.zeros_like(parameter)
+
+    def update(self) -> None:
+        """One step of the optimiser for all that are not done."""
+        plan = self.plan
+        if plan.resample and self.step and self.step % plan.resample == 0:
+            self.pool = stack([subject.pool(self.step) for subject in self.subjects]).to(self.device)
+        self.differentiate(torch.randint(plan.pool, (plan.batch,), generator=self.generator))
+        factor = min(1.0, (self.step + 1) / WARMUP) * self.rate
+        if plan.decay:
+            late = np.clip((self.step - self.turn) / np.maximum(self.stop - self.turn, 1), 0.0, 1.0)
+            factor = factor * 0.5 * (1.0 + np.cos(math.pi * late))
+        factor = np.where(self.step < self.stop, factor, 0.0)
+        self.optimiser.step(torch.from_numpy(factor).to(self.parameters[0]))
+        self.step += 1
+        for mean, parameter in zip(self.average, self.parameters, strict=True):
+            mean.lerp_(parameter, 0.02)
+
+    def differentiate(self, chosen: torch.Tensor) -> None:
+        """Weighted L1 of the signed distance, and of the unsigned one where the sign is not known; fills the gradients.
+
+        Args:
+            chosen: [T] points of each pool.
+        """
+        chosen = chosen.to(self.device)
+        points, distance, signed = (
+            self.pool.points[:, chosen],
+            self.pool.distance[:, chosen],
+            self.pool.signed[:, chosen],
+        )
+        weights, biases = _layers(self.parameters, self.plan.activation)
+        value = self._tape.forward(weights, biases, points)
+        error = torch.where(signed, value - distance, value.abs() - distance.abs())
+        slope = error.sign() * torch.where(signed, 1.0, value.sign()) / len(chosen)
+        if self.plan.soften is not None:
+            slope = slope * (self.plan.soften / (distance.abs() + self.plan.soften))
+        gradients = [parameter.grad for parameter in self.parameters if parameter.grad is not None]
+        self._tape.parameter_gradients(weights, points, slope, *_split(gradients))
+        for gradient, scale in zip(gradients, _SCALES[self.plan.activation], strict=True):
+            gradient.mul_(scale)
+
+    def repair(self) -> None:
+        """A fresh start, from new weights and with a quarter of the step size, for what is not finite."""
+        finite = torch.stack([p.isfinite().all(-1).all(-1).all(0) for p in self.parameters]).all(0)
+        if bool(finite.all()):
+            return
+        broken = ~finite
+        fresh = _initial(self.plan, len(finite), torch.Generator().manual_seed(1))
+        for mean, parameter, start in zip(self.average, self.parameters, fresh, strict=True):
+            parameter[:, broken] = start.to(self.device)[:, broken]
+            mean[:, broken] = parameter[:, broken]
+        self.optimiser.forget(broken)
+        self.rate[broken.cpu().numpy()] /= 4
+
+    def judge(self) -> tuple[float, float]:
+        """Begin the decay of those that meet the goal. Returns mean errors near the surface and in the box, of all."""
+        layers = _layers(self.average, self.plan.activation)
+        value, gradient = value_and_gradient(*layers, self.plan.activation, self.check.points)
+        distance, signed = self.check.distance, self.check.signed
+        error = torch.where(signed, value - distance, value.abs() - distance.abs()).abs()
+        near, far = error[:, :CHECKED].mean(1), error[:, 2 * CHECKED :].mean(1)
+        if self.plan.goal is not None:
+            cosine = torch.nn.functional.cosine_similarity(gradient, self.check.direction, dim=-1)
+            turned = 1.0 - cosine[:, CHECKED : 2 * CHECKED].median(1).values
+            met = (near <= self.plan.goal[0]) & (far <= self.plan.goal[1]) & (turned <= self.plan.goal[2])
+            early = met.cpu().numpy() & (self.step < self.turn)
+            self.turn = np.where(early, self.step, self.turn)
+            self.stop = np.where(early, np.minimum(self.stop, self.step + self.plan.settle), self.stop)
+        return float(near.mean()), float(far.mean())
+
+    def hurry(self, possible: int) -> None:
+        """Place decay and end so that `possible` updates in all suffice.
+
+        Until the decay has begun the end moves both ways, since the first steps of a busy machine tell little; after
+        that it only comes nearer.
+        """
+        possible = max(possible, self.step)
+        begun = self.step >= self.turn
+        self.stop = np.minimum(np.where(begun, self.stop, self.plan.steps), possible)
+        open_ended = np.maximum(self.step, (self.stop * (1.0 - self.plan.decay)).astype(int))
+        self.turn = np.where(begun, self.turn, open_ended)
+
+    def retire(self) -> None:
+        """Put aside the networks that are done, once they are half of the stack."""
+        going = self.step < self.stop
+        if 2 * going.sum() > len(going) or not going.any():
+            return
+        self._finish(~going)
+        kept = torch.from_numpy(np.flatnonzero(going)).to(self.device)
+        self._take([parameter[:, kept] for parameter in self.parameters])
+        self.average = [mean[:, kept] for mean in self.average]
+        self.optimiser.keep(kept, self.parameters)
+        self.pool, self.check = self.pool.rows(kept), self.check.rows(kept)
+        self.subjects = [subject for subject, stays in zip(self.subjects, going, strict=True) if stays]
+        self.turn, self.stop, self.rate = self.turn[going], self.stop[going], self.rate[going]
+        self.places = self.places[going]
+
+    def _finish(self, chosen: np.ndarray) -> None:
+        weights, biases = _layers(self.parameters, self.plan.activation)
+        for row in np.flatnonzero(chosen):
+            subject = self.subjects[row]
+            sdf = MlpSdf(
+                tuple(weight[row].cpu().clone() for weight in weights),
+                tuple(bias[row].cpu().clone() for bias in biases),
+                self.plan.activation,
+                subject.frame,
+                subject.oracle.bounds.copy(),
+                subject.mirrors,
+            )
+            self.done[int(self.places[row])] = sdf, int(min(self.step, self.stop[row]))
+
+    def results(self) -> list[tuple[MlpSdf, int]]:
+        """Every network and its updates, in the order of the solids."""
+        self._finish(np.ones(len(self.subjects), dtype=bool))
+        return [self.done[place] for place in sorted(self.done)]
+
+    def save(self, saved: Checkpoint) -> None:
+        """Write the state of a single network's training."""
+        progress = (self.step, int(self.turn[0]), int(self.stop[0]), float(self.rate[0]))
+        saved.save(self.parameters, self.average, self.optimiser, self.generator, progress)
+
+    def restore(self, saved: Checkpoint) -> None:
+        """Go on from what `save` wrote, if it is there."""
+        progress = saved.load(self.parameters, self.average, self.optimiser, self.generator)
+        if progress is not None:
+            self.step = int(progress[0])
+            self.turn, self.stop = np.array([int(progress[1])]), np.array([int(progress[2])])
+            self.rate = np.array([progress[3]])
 
 
-def _mirrors(oracle: DistanceOracle, frame: Frame) -> tuple[bool, bool, bool]:
-    """Across which planes of its frame the solid is its own mirror image, as far as sampled distances tell."""
-    rng = np.random.default_rng(0)
-    local = frame.inward(sample_surface(oracle.surface, 2000, rng)[0])
-    local = np.concatenate([local, local + rng.normal(0.0, 0.05, local.shape)])
-    truth = oracle(frame.outward(local)).distance
-    same = []
-    for axis in range(3):
-        image = local.copy()
-        image[:, axis] *= -1.0
-        same.append(bool(np.abs(oracle(frame.outward(image)).distance - truth).max() < SAME * frame.scale))
-    return same[0], same[1], same[2]
+def _initial(plan: Plan, count: int, generator: torch.Generator) -> list[torch.Tensor]:
+    """First [1, S, W, 3], hidden [L - 2, S, W, W] and last [1, S, 1, W] weights; biases [L - 1, S, W, 1], [1, S, 1, 1].
 
-
-def _sample(
-    oracle: DistanceOracle, frame: Frame, plan: Plan, mirrors: tuple[bool, bool, bool], rng: np.random.Generator
-) -> _Pool:
-    near = int(plan.pool * plan.near)
-    local = frame.inward(sample_surface(oracle.surface, near, rng)[0])
-    low, high = np.log(plan.sigmas)
-    sigma = np.exp(rng.uniform(low, high, (near, 1)))
-    local = np.concatenate(
-        [
-            local + sigma * rng.standard_normal((near, 3)),
-            rng.uniform(-MARGIN * BOX, MARGIN * BOX, (plan.pool - near, 3)),
-        ]
-    )
-    local = np.clip(local, -MARGIN * BOX, MARGIN * BOX)
-    truth = oracle(frame.outward(local))
-    signed = truth.trusted | (oracle.closed and plan.sign_everywhere)
-    local = np.where(mirrors, np.abs(local), local)
-    return _Pool(
-        torch.from_numpy(local).float(),
-        torch.from_numpy(truth.distance / frame.scale).float(),
-        torch.from_numpy(signed),
-    )
-
-
-def _initial(plan: Plan, generator: torch.Generator) -> list[torch.Tensor]:
-    """First [1, W, 3], hidden [L - 2, W, W] and last [1, 1, W] weights, then the biases [L - 1, W, 1] and [1, 1, 1].
-
-    Equal layers are stacked for the optimiser. Periodic layers start with phases all around and the spread of inputs
-    that sine layers have (Sitzmann et al. 2020); ReLU layers with He's variance.
+    All `count` networks start alike. Equal layers are stacked for the optimiser. Periodic layers start with phases all
+    around and the spread of inputs that sine layers have (Sitzmann et al. 2020); ReLU layers with He's variance.
     """
     width, hidden = plan.width, plan.layers - 2
 
-    def uniform(bound: float, *shape: int) -> torch.Tensor:
-        parameter = (2.0 * torch.rand(shape, generator=generator) - 1.0) * bound
-        parameter.grad = torch.zeros_like(parameter)
-        return parameter
+    def uniform(bound: float, layers: int, *shape: int) -> torch.Tensor:
+        one = (2.0 * torch.rand((layers, 1, *shape), generator=generator) - 1.0) * bound
+        return one.repeat(1, count, 1, 1)
 
     periodic = plan.activation == "wave"
     return [
@@ -297,38 +285,11 @@ def _initial(plan: Plan, generator: torch.Generator) -> list[torch.Tensor]:
 _SCALES = {"wave": (0.5 / math.pi, 4.0 / math.pi, 8.0, 0.5 / math.pi, 1.0), "relu": (1.0,) * 5}
 
 
-def _layers(parameters: list[torch.Tensor], activation: Activation) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
-    """What the network computes with, per layer: weights [1, out, in] and biases [1, out]."""
-    used = [parameter * scale for parameter, scale in zip(parameters, _SCALES[activation], strict=True)]
-    return _split(used)
+def _layers(parameters: list[torch.Tensor], activation: Activation) -> Layers:
+    """What the networks compute with."""
+    return _split([parameter * scale for parameter, scale in zip(parameters, _SCALES[activation], strict=True)])
 
 
-def _split(parts: list[torch.Tensor]) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+def _split(parts: list[torch.Tensor]) -> Layers:
     first, hidden, last, biases, end = parts
-    return [first, *hidden.split(1), last], [*biases[..., 0].split(1), end[..., 0]]
-
-
-def _differentiate(tape: Tape, parameters: list[torch.Tensor], plan: Plan, pool: _Pool, chosen: torch.Tensor) -> float:
-    """Weighted L1 of the signed distance, and of the unsigned one where the sign is not known; fills the gradients."""
-    weights, biases = _layers(parameters, plan.activation)
-    points = pool.points[chosen][None]
-    value = tape.forward(weights, biases, points)[0]
-    distance, signed = pool.distance[chosen], pool.signed[chosen]
-    error = torch.where(signed, value - distance, value.abs() - distance.abs())
-    slope = error.sign() * torch.where(signed, 1.0, value.sign()) / len(chosen)
-    if plan.soften is not None:
-        weight = plan.soften / (distance.abs() + plan.soften)
-        error, slope = error * weight, slope * weight
-    gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
-    tape.parameter_gradients(weights, points, slope[None], *_split(gradients))
-    for gradient, scale in zip(gradients, _SCALES[plan.activation], strict=True):
-        gradient.mul_(scale)
-    return float(error.abs().mean())
-
-
-def _errors(parameters: list[torch.Tensor], plan: Plan, check: _Pool) -> tuple[float, float]:
-    """Mean absolute error near the surface (first half of the pool) and in the box (second half)."""
-    value, _ = value_and_gradient(*_layers(parameters, plan.activation), plan.activation, check.points[None])
-    error = torch.where(check.signed, value[0] - check.distance, value[0].abs() - check.distance.abs()).abs()
-    half = len(error) // 2
-    return float(error[:half].mean()), float(error[half:].mean())
+    return [first[0], *hidden.unbind(), last[0]], [*biases[..., 0].unbind(), end[0, ..., 0]]

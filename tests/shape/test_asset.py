@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from sdfsim.errors import SdfsimError
-from sdfsim.shape import asset, primitives, training
+from sdfsim.shape import asset, plans, primitives
 from sdfsim.shape.analytic import BoxSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.asset import (
     Shape,
@@ -29,8 +29,8 @@ from sdfsim.shape.storage import write_ply
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """A recipe of a second, for tests of what is around the fit."""
-    plan = replace(training.PLANS["default"], width=16, layers=4, steps=100, batch=256, pool=4000)
-    monkeypatch.setitem(training.PLANS, "default", plan)
+    plan = replace(plans.PLANS["default"], width=16, layers=4, steps=100, batch=256, pool=4000)
+    monkeypatch.setitem(plans.PLANS, "default", plan)
 
 
 def fitted() -> Shape:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from sdfsim.errors import SdfsimError
-from sdfsim.shape import primitives, training
+from sdfsim.shape import plans, primitives
 from sdfsim.shape.asset import Shape
 from sdfsim.shape.fit import fit_mesh, fit_pieces
 from sdfsim.shape.mesh import Mesh, load_mesh, load_pieces, mass_properties, mass_properties_of_sdf
@@ -18,8 +18,8 @@ from sdfsim.shape.mlp import MlpSdf
 
 @pytest.fixture
 def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
-    plan = replace(training.PLANS["default"], width=16, layers=4, steps=600, batch=256, pool=5000, goal=None, decay=0.5)
-    monkeypatch.setitem(training.PLANS, "default", plan)
+    plan = replace(plans.PLANS["default"], width=16, layers=4, steps=600, batch=256, pool=5000, goal=None, decay=0.5)
+    monkeypatch.setitem(plans.PLANS, "default", plan)
 
 
 def weights(shape: Shape) -> list[torch.Tensor]:
@@ -28,8 +28,8 @@ def weights(shape: Shape) -> list[torch.Tensor]:
 
 
 def test_a_torus_in_a_few_hundred_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    plan = replace(training.PLANS["default"], steps=450, batch=1024, pool=60_000, goal=None)
-    monkeypatch.setitem(training.PLANS, "default", plan)
+    plan = replace(plans.PLANS["default"], steps=450, batch=1024, pool=60_000, goal=None)
+    monkeypatch.setitem(plans.PLANS, "default", plan)
     mesh = primitives.torus(0.35, 0.15)
     shape = fit_mesh(Mesh(mesh.vertices * 0.2 + [5.0, 0.0, -3.0], mesh.faces), name="ring")
     got = shape.certificate
@@ -91,8 +91,8 @@ def test_an_interrupted_fit_resumes_to_the_same_result(tiny: None, tmp_path: Pat
 
 
 def test_the_paper_recipe_resumes_too(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    plan = replace(training.PLANS["paper"], width=16, layers=4, steps=400, batch=64, pool=2000, lr=1e-3)
-    monkeypatch.setitem(training.PLANS, "paper", plan)
+    plan = replace(plans.PLANS["paper"], width=16, layers=4, steps=400, batch=64, pool=2000, lr=1e-3)
+    monkeypatch.setitem(plans.PLANS, "paper", plan)
     mesh, path = primitives.cone(segments=16), tmp_path / "fit.checkpoint"
     whole = fit_mesh(mesh, name="cone", recipe="paper")
 
@@ -130,8 +130,8 @@ def test_a_checkpoint_of_something_else_is_not_used(tiny: None, tmp_path: Path, 
 
 
 def test_a_budget_is_kept_and_still_ends_in_a_decay(monkeypatch: pytest.MonkeyPatch) -> None:
-    plan = replace(training.PLANS["default"], width=16, layers=4, batch=256, pool=5000, goal=None, steps=10**6)
-    monkeypatch.setitem(training.PLANS, "default", plan)
+    plan = replace(plans.PLANS["default"], width=16, layers=4, batch=256, pool=5000, goal=None, steps=10**6)
+    monkeypatch.setitem(plans.PLANS, "default", plan)
     started = time.monotonic()
     shape = fit_mesh(primitives.box(), name="box", budget=2.0)
     assert time.monotonic() - started < 6.0
@@ -142,25 +142,25 @@ def test_a_budget_is_kept_and_still_ends_in_a_decay(monkeypatch: pytest.MonkeyPa
 
 def test_a_goal_that_is_met_ends_the_fit_early(monkeypatch: pytest.MonkeyPatch) -> None:
     plan = replace(
-        training.PLANS["default"], width=16, layers=4, batch=256, pool=5000, goal=(1.0, 1.0), settle=100, steps=5000
+        plans.PLANS["default"], width=16, layers=4, batch=256, pool=5000, goal=(1.0, 1.0), settle=100, steps=5000
     )
-    monkeypatch.setitem(training.PLANS, "default", plan)
+    monkeypatch.setitem(plans.PLANS, "default", plan)
     assert fit_mesh(primitives.box(), name="box").certificate["steps"] == 200
 
 
 def test_an_update_that_is_not_finite_is_survived(monkeypatch: pytest.MonkeyPatch) -> None:
-    plan = replace(training.PLANS["default"], width=16, layers=4, batch=64, pool=2000, goal=None, steps=300, lr=1e38)
-    monkeypatch.setitem(training.PLANS, "default", plan)
+    plan = replace(plans.PLANS["default"], width=16, layers=4, batch=64, pool=2000, goal=None, steps=300, lr=1e38)
+    monkeypatch.setitem(plans.PLANS, "default", plan)
     shape = fit_mesh(primitives.box(), name="box")
     for part in shape.sdf(np.random.default_rng(0).normal(size=(50, 3))):
         assert np.isfinite(part).all()
 
 
 def test_paper_recipe_learns(monkeypatch: pytest.MonkeyPatch) -> None:
-    paper = training.PLANS["paper"]
+    paper = plans.PLANS["paper"]
     assert (paper.activation, paper.width, paper.layers, paper.lr, paper.steps) == ("relu", 128, 8, 1e-5, 400_000)
     plan = replace(paper, steps=150, batch=512, pool=4096, lr=1e-3)
-    monkeypatch.setitem(training.PLANS, "paper", plan)
+    monkeypatch.setitem(plans.PLANS, "paper", plan)
     shape = fit_mesh(primitives.sphere(), name="ball", recipe="paper")
     assert isinstance(shape.sdf, MlpSdf)
     assert [tuple(w.shape) for w in shape.sdf.weights] == [(128, 3), *[(128, 128)] * 6, (1, 128)]
@@ -169,8 +169,8 @@ def test_paper_recipe_learns(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_pieces_keep_their_own_vertices_as_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    plan = replace(training.PLANS["default"], width=32, layers=5, steps=500, batch=512, pool=30_000, goal=None)
-    monkeypatch.setitem(training.PLANS, "default", plan)
+    plan = replace(plans.PLANS["default"], width=32, layers=5, steps=500, batch=512, pool=30_000, goal=None)
+    monkeypatch.setitem(plans.PLANS, "default", plan)
     half = primitives.box((0.5, 1.0, 1.0))
     shifts = [np.array([-0.25, 0, 0]), np.array([0.25, 0, 0])]
     buried = primitives.box((0.2, 0.2, 0.2))

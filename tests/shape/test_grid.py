@@ -7,10 +7,10 @@ import torch
 from sdfsim.errors import SdfsimError
 from sdfsim.shape import grid
 from sdfsim.shape.analytic import BoxSdf, SphereSdf
+from sdfsim.shape.boxed import BOX
 from sdfsim.shape.distance import MeshDistance
 from sdfsim.shape.grid import GridSdf, sample_grid, trilinear
 from sdfsim.shape.mesh import Frame, Mesh
-from sdfsim.shape.mlp import BOX
 from sdfsim.shape.nodes import project
 from sdfsim.shape.primitives import box
 from sdfsim.shape.sdf import Sdf

@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from sdfsim.shape import mlp, sweep
+from sdfsim.shape.boxed import BOX
 from sdfsim.shape.mesh import Frame
-from sdfsim.shape.mlp import BOX, MlpSdf
+from sdfsim.shape.mlp import MlpSdf
 from sdfsim.shape.sweep import Activation, Tape, value_and_gradient
 
 

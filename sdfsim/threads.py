@@ -7,7 +7,14 @@ from collections.abc import Callable
 
 import torch
 
-MOST = torch.get_num_threads()  # Before anything here has changed it.
+_most = torch.get_num_threads()  # Before anything here has changed it.
+
+
+def limit_threads(count: int) -> None:
+    """Use no more than `count` threads in this process from now on."""
+    global _most
+    _most = count
+    torch.set_num_threads(count)
 
 
 def choose_threads(work: Callable[[], object], threads: int | None = None, *, repeat: int = 3) -> float:
@@ -22,7 +29,7 @@ def choose_threads(work: Callable[[], object], threads: int | None = None, *, re
         Seconds one call takes with the number chosen.
     """
     took = {}
-    for count in sorted({threads} if threads else {1, MOST}):
+    for count in sorted({threads} if threads else {1, _most}):
         torch.set_num_threads(count)
         work()
         began = time.monotonic()

@@ -1,0 +1,239 @@
+"""What the fit command does: mesh files become shape folders, one or many."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from sdfsim.dynamics.simulator import pick_device
+from sdfsim.errors import SdfsimError
+from sdfsim.files import check_writable, read_json
+from sdfsim.parallel import parallel
+from sdfsim.progress import columns, duration
+from sdfsim.shape.asset import RECORD_FILE, Shape
+from sdfsim.shape.distance import MeshDistance
+from sdfsim.shape.fit import FIT_VERSION, fit_mesh, fit_solids
+from sdfsim.shape.mesh import MESH_SUFFIXES, load_mesh
+from sdfsim.shape.solid import solidify
+
+Progress = Callable[[float, str], None]
+
+# Shapes that one GPU trains side by side: some 40 MB each.
+STACK = 256
+ERRORS = ("error_within_0.01", "error_within_0.1", "error_in_box", "projected_from_0.01", "hausdorff", "sign_errors")
+
+
+@dataclass(frozen=True)
+class Options:
+    """How meshes are fitted; see `fit_mesh`."""
+
+    recipe: Literal["default", "paper"] = "default"
+    budget: float | None = None
+    cap: bool = False
+    thicken: float | None = None
+
+
+def fit(mesh_file: Path, out: Path, options: Options, *, device: str, on_progress: Progress) -> dict[str, Any]:
+    """Fit a mesh file and write the shape folder `out`; a fit that was cut off goes on where it was.
+
+    Args:
+        mesh_file: to be fitted, in metres.
+        out: shape folder.
+        options: of the fit.
+        device: cpu, cuda or auto.
+        on_progress: called with (fraction, message).
+
+    Returns:
+        Folder, volume, number of nodes, what was done to the mesh, the certificate, and in `failed_checks` whether it
+        was missed.
+
+    Raises:
+        SdfsimError: the mesh cannot be used, or the folder cannot be written.
+    """
+    mesh = load_mesh(mesh_file)
+    check_writable(out)
+    checkpoint = out / "fit.checkpoint"
+    shape = fit_mesh(
+        mesh,
+        name=out.resolve().name,
+        recipe=options.recipe,
+        budget=options.budget,
+        cap=options.cap,
+        thicken=options.thicken,
+        on_progress=on_progress,
+        checkpoint=checkpoint,
+        device=pick_device(device),
+    )
+    report = _save(shape, mesh_file, out, options)
+    checkpoint.unlink(missing_ok=True)
+    missed = [] if shape.certificate["passed"] else [f"fit: {shape.certificate['reason']}"]
+    return report | {"failed_checks": missed}
+
+
+def fit_lines(report: dict[str, Any]) -> list[str]:
+    """What a person reads of a `fit` report."""
+    errors = ", ".join(f"{key.replace('_', ' ')} {report[key]:.2g}" for key in ERRORS if report.get(key) is not None)
+    return [
+        *report["notes"],
+        f"errors relative to the size: {errors}",
+        f"{report['nodes']} nodes, volume {report['volume_m3']:.4g} m^3, {duration(report['seconds'])}",
+        f"wrote {report['folder']}",
+    ]
+
+
+def named_meshes(sources: list[Path]) -> dict[str, Path]:
+    """Mesh files by the names their shapes get.
+
+    Args:
+        sources: mesh files, and folders of which every mesh file is taken.
+
+    Returns:
+        The file's own name without suffix; where several files share it, the name of the folder they lie in.
+
+    Raises:
+        SdfsimError: no meshes, or two of one name.
+    """
+    files: list[Path] = []
+    for source in sources:
+        if source.is_dir():
+            inside = sorted(p for p in source.iterdir() if p.suffix.lower() in MESH_SUFFIXES)
+            if not inside:
+                raise SdfsimError(f"{source}: no mesh files in this folder", "it takes " + " ".join(MESH_SUFFIXES))
+            files += inside
+        else:
+            files.append(source)
+    files = list(dict.fromkeys(files))
+    stems = [file.stem for file in files]
+    named: dict[str, Path] = {}
+    for file in files:
+        name = file.stem if stems.count(file.stem) == 1 else file.resolve().parent.name
+        if name in named:
+            raise SdfsimError(f"{named[name]} and {file} would both become {name}", "fit them into different folders")
+        named[name] = file
+    return named
+
+
+def fit_many(
+    meshes: dict[str, Path], out: Path, options: Options, *, device: str, on_progress: Progress
+) -> dict[str, Any]:
+    """Fit many mesh files into the shape folders `out`/NAME: in processes on CPUs, side by side on a GPU.
+
+    What an earlier call has fitted in the same way is kept, so that a call that was cut off is finished by the next.
+
+    Args:
+        meshes: files by name.
+        out: folder of shape folders.
+        options: of each fit.
+        device: cpu, cuda or auto.
+        on_progress: called with (fraction, message).
+
+    Returns:
+        `shapes`, a report by name: that of `fit`, or the `error` that kept a mesh from being fitted; and in
+        `failed_checks` what missed its certificate.
+
+    Raises:
+        SdfsimError: the folder cannot be written.
+    """
+    where = pick_device(device)
+    check_writable(out)
+    reports: dict[str, dict[str, Any]] = {}
+    for name, file in meshes.items():
+        if (kept := _kept(file, out / name, options)) is not None:
+            reports[name] = kept
+    todo = [(name, file) for name, file in meshes.items() if name not in reports]
+    on_progress(0.0, f"{len(todo)} meshes to fit" + (f", {len(reports)} fitted before" if reports else ""))
+    if where.type == "cuda" and options.recipe == "default":
+        made = _stacked(todo, out, options, str(where), on_progress)
+    else:
+        made = ((todo[i][0], found) for i, found in parallel(_fit_one, [(f, out / n, options) for n, f in todo]))
+    for done, (name, report) in enumerate(made, start=1):
+        reports[name] = report
+        on_progress(done / len(todo), f"{name}: {_verdict(report)}, {done} of {len(todo)}")
+    missed = [f"{name}: {reports[name]['reason']}" for name in meshes if reports[name].get("passed") is False]
+    return {"folder": str(out), "shapes": {name: reports[name] for name in meshes}, "failed_checks": missed}
+
+
+def batch_lines(report: dict[str, Any]) -> list[str]:
+    """`fit_many`'s report for people: a row a mesh."""
+    heads = ("within 0.01", "within 0.1", "in box", "projected", "hausdorff", "signs")
+    rows: list[tuple[str, ...]] = [("", "", "seconds", "steps", *heads)]
+    for name, found in report["shapes"].items():
+        if "error" in found:
+            rows.append((name, "failed", *[""] * (len(heads) + 2)))
+        else:
+            errors = ("-" if found.get(key) is None else f"{found[key]:.2g}" for key in ERRORS)
+            rows.append((name, _verdict(found), f"{found['seconds']:.1f}", str(found["steps"]), *errors))
+    problems = [f"{name}: {found['error']}" for name, found in report["shapes"].items() if "error" in found]
+    return [*columns(rows), *problems, f"wrote {report['folder']}"]
+
+
+def _verdict(report: dict[str, Any]) -> str:
+    if "error" in report:
+        return "failed"
+    return "fitted" if report["passed"] else "missed"
+
+
+def _fit_one(file: Path, folder: Path, options: Options) -> dict[str, Any]:
+    """In a worker: a report, or the error; whatever happens to one mesh must not stop the others."""
+    try:
+        return fit(file, folder, options, device="cpu", on_progress=lambda fraction, message: None)
+    except SdfsimError as error:
+        return {"error": error.message, "hint": error.hint}
+    except Exception as error:
+        return {"error": f"internal error: {type(error).__name__}: {error}", "hint": ""}
+
+
+def _stacked(todo: list[tuple[str, Path]], out: Path, options: Options, device: str, on_progress: Progress):
+    """Yield (name, report) of meshes that are trained side by side."""
+    for before in range(0, len(todo), STACK):
+        group = todo[before : before + STACK]
+        solids: dict[str, MeshDistance] = {}
+        for name, file in group:
+            try:
+                solid = solidify(load_mesh(file), name=name, cap=options.cap, thicken=options.thicken)
+                solids[name] = MeshDistance(solid)
+            except SdfsimError as error:
+                yield name, {"error": error.message, "hint": error.hint}
+
+        def tell(fraction: float, message: str, before: int = before, count: int = len(group)) -> None:
+            on_progress((before + 0.99 * fraction * count) / len(todo), message)
+
+        if solids:
+            budget = None if options.budget is None else options.budget * len(solids)
+            shapes = fit_solids(solids, recipe=options.recipe, budget=budget, device=device, on_progress=tell)
+            files = dict(group)
+            for shape in shapes:
+                yield shape.name, _save(shape, files[shape.name], out / shape.name, options)
+
+
+def _save(shape: Shape, file: Path, folder: Path, options: Options) -> dict[str, Any]:
+    """Write a shape with a note of what it was made from, and report on it."""
+    shape = replace(shape, source=shape.source | {"request": _request(file, options)})
+    shape.save(folder)
+    return _report(shape.certificate, shape.volume, len(shape.nodes), shape.source, folder)
+
+
+def _report(certificate: dict, volume: float, nodes: int, source: dict, folder: Path) -> dict[str, Any]:
+    known = {"folder": str(folder), "volume_m3": volume, "nodes": nodes, "notes": source.get("notes", [])}
+    return known | certificate
+
+
+def _request(file: Path, options: Options) -> str:
+    """Changes with everything that a fit depends on."""
+    return hashlib.sha256(file.read_bytes() + f"|{options}|{FIT_VERSION}".encode()).hexdigest()
+
+
+def _kept(file: Path, folder: Path, options: Options) -> dict[str, Any] | None:
+    """The report of a shape folder that holds just what this fit would make, or None."""
+    from sdfsim.shape.asset import load_shape
+
+    try:
+        if read_json(folder / RECORD_FILE)["source"].get("request") != _request(file, options):
+            return None
+        shape = load_shape(folder)
+    except (SdfsimError, OSError, KeyError, TypeError, AttributeError):
+        return None
+    return _report(shape.certificate, shape.volume, len(shape.nodes), shape.source, folder)
