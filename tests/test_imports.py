@@ -31,7 +31,7 @@ LEVELS = {
     "errors": 0,
     "files": 1,
     "threads": 1,
-    "parallel": 1,
+    "parallel": 2,
     "shape": 2,
     "scene": 3,
     "dynamics": 4,
@@ -39,7 +39,7 @@ LEVELS = {
     "baselines": 5,
     "studies": 6,
 }
-TOP = 7  # playback and the other modules directly in sdfsim
+TOP = 8  # playback and the other modules directly in sdfsim
 
 
 def room(module: str) -> tuple[str, int]:

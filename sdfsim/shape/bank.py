@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import numpy as np
@@ -96,7 +97,7 @@ def _group(sdfs: list[Sdf], device: torch.device):
     return lambda slot, points: first(points)
 
 
-class _FramedGroup:
+class _FramedGroup(ABC):
     """SDFs that are fitted or sampled on the box of their normalised frame; `_evaluate` asks them there."""
 
     def __init__(self, sdfs: Sequence[MlpSdf | GridSdf], device: torch.device, chunk: int) -> None:
@@ -124,9 +125,9 @@ class _FramedGroup:
             gradient.append(slope.to(points.dtype))
         return torch.cat(distance), torch.cat(gradient)
 
+    @abstractmethod
     def _evaluate(self, slot: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Normalised distance [P] and gradient [P, 3] of SDF `slot[p]` at `points[p]`, within the box."""
-        raise NotImplementedError
 
 
 class _GridGroup(_FramedGroup):

@@ -199,15 +199,16 @@ def _train(
     )
     trained = time.monotonic() - started
     results = []
-    for oracle, (sdf, steps) in zip(oracles, fitted, strict=True):
-        tell(0.98, "measuring")
+    for done, (oracle, (sdf, steps)) in enumerate(zip(oracles, fitted, strict=True), start=1):
+        tell(0.98 + 0.02 * (done - 1) / len(oracles), "measuring")
         measuring = time.monotonic()
         nodes = pick(sdf, oracle)
         certificate = certify(sdf, oracle, nodes=nodes)
         # Its share of the training that it had with others, and its own measuring.
         seconds = trained / len(oracles) + time.monotonic() - measuring
         certificate.update(recipe=recipe, seed=seed, steps=steps, seconds=round(seconds, 2))
-        tell(1.0, "fitted" if certificate["passed"] else f"fitted, but {certificate['reason']}")
+        told = "fitted" if certificate["passed"] else f"fitted, but {certificate['reason']}"
+        tell(0.98 + 0.02 * done / len(oracles), told)
         results.append((sdf, nodes, certificate))
     return results
 

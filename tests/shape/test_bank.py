@@ -94,7 +94,10 @@ def test_grids_of_one_resolution_share_a_gather_of_bounded_size(monkeypatch: pyt
     monkeypatch.setattr("sdfsim.shape.bank.trilinear", counted)
     monkeypatch.setattr(grid, "CHUNK", chunk)
     sdfs = [voxels(seed, 8) for seed in range(4)]
-    index, points = torch.randint(4, (1000,)), torch.rand(1000, 3, dtype=torch.float64) * 4 - 2
+    index = torch.randint(4, (1000,))
+    local = torch.rand(1000, 3, dtype=torch.float64) * 1.38 - 0.69
+    frames = [sdfs[i].frame for i in index]
+    points = torch.stack([torch.from_numpy(f.outward(x[None].numpy())[0]) for f, x in zip(frames, local, strict=True)])
     distance, gradient = SdfBank(sdfs)(index, points)
     assert max(seen) <= chunk and sum(seen) == 1000 and len(seen) == -(-1000 // chunk)
     for number, sdf in enumerate(sdfs):

@@ -9,11 +9,13 @@ import pytest
 import torch
 
 from sdfsim.errors import SdfsimError
-from sdfsim.shape import plans, primitives
+from sdfsim.shape import plans, primitives, training
 from sdfsim.shape.asset import Shape
-from sdfsim.shape.fit import fit_mesh, fit_pieces
+from sdfsim.shape.distance import MeshDistance
+from sdfsim.shape.fit import fit_mesh, fit_pieces, fit_solids
 from sdfsim.shape.mesh import Mesh, load_mesh, load_pieces, mass_properties, mass_properties_of_sdf
 from sdfsim.shape.mlp import MlpSdf
+from sdfsim.shape.solid import solidify
 
 
 @pytest.fixture
@@ -87,7 +89,6 @@ def test_an_interrupted_fit_resumes_to_the_same_result(tiny: None, tmp_path: Pat
     assert not any(message.startswith("step 100 ") for message in messages)
     assert any(message.startswith("step 600 ") for message in messages)
     assert all(torch.equal(a, b) for a, b in zip(weights(whole), weights(resumed), strict=True))
-    assert not path.exists()
 
 
 def test_the_paper_recipe_resumes_too(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -108,7 +109,6 @@ def test_the_paper_recipe_resumes_too(monkeypatch: pytest.MonkeyPatch, tmp_path:
     )
     assert not any(message.startswith("step 200 ") for message in messages)
     assert all(torch.equal(a, b) for a, b in zip(weights(whole), weights(resumed), strict=True))
-    assert not path.exists()
 
 
 @pytest.mark.parametrize("spoil", ["other", "cut"])
@@ -142,7 +142,7 @@ def test_a_budget_is_kept_and_still_ends_in_a_decay(monkeypatch: pytest.MonkeyPa
 
 def test_a_goal_that_is_met_ends_the_fit_early(monkeypatch: pytest.MonkeyPatch) -> None:
     plan = replace(
-        plans.PLANS["default"], width=16, layers=4, batch=256, pool=5000, goal=(1.0, 1.0), settle=100, steps=5000
+        plans.PLANS["default"], width=16, layers=4, batch=256, pool=5000, goal=(1.0, 1.0, 1.0), settle=100, steps=5000
     )
     monkeypatch.setitem(plans.PLANS, "default", plan)
     assert fit_mesh(primitives.box(), name="box").certificate["steps"] == 200
@@ -219,15 +219,61 @@ def test_a_shape_with_mirror_planes_is_fitted_on_one_side(tiny: None) -> None:
     assert shoe.mirrors == (False, False, False)
 
 
+def test_side_by_side_is_each_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    # The goals are met at different updates, so that some leave the stack before the others.
+    plan = replace(
+        plans.PLANS["default"], width=16, layers=4, batch=256, pool=5000, goal=(8e-3, 1.0, 1.0), settle=200, steps=1200
+    )
+    monkeypatch.setitem(plans.PLANS, "default", plan)
+    meshes = {
+        "cone": primitives.cone(),
+        "box": primitives.box(),
+        "shoe": primitives.shoe(),
+        "torus": primitives.torus(),
+    }
+    solids = {name: MeshDistance(solidify(mesh, name=name)) for name, mesh in meshes.items()}
+    together = fit_solids(solids)
+    assert [shape.name for shape in together] == list(meshes)
+    assert len({shape.certificate["steps"] for shape in together}) >= 2
+    points = torch.rand(500, 3, dtype=torch.float64) - 0.5
+    for name, shape in zip(meshes, together, strict=True):
+        alone = fit_mesh(meshes[name], name=name)
+        assert shape.certificate["steps"] == alone.certificate["steps"]
+        assert shape.volume == alone.volume
+        # Rounding differs with the size of the stack, and grows through hundreds of updates.
+        torch.testing.assert_close(shape.sdf(points)[0], alone.sdf(points)[0], rtol=0, atol=2e-3)
+
+
+def test_one_that_breaks_does_not_spoil_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = replace(plans.PLANS["default"], width=16, layers=4, batch=64, pool=2000, goal=None, steps=200)
+    oracles = [MeshDistance(solidify(mesh, name="it")) for mesh in (primitives.box(), primitives.cone())]
+    real = training._Run.differentiate
+
+    def poisoned(self, chosen: torch.Tensor) -> None:
+        real(self, chosen)
+        if self.step == 50:
+            self.parameters[1].grad[:, 0] = torch.nan
+
+    options = {"budget": None, "seed": 0, "tell": lambda fraction, message: None}
+    good = training.train(oracles, plan, **options)
+    monkeypatch.setattr(training._Run, "differentiate", poisoned)
+    bad = training.train(oracles, plan, **options)
+    for one, other in zip(good[1][0].weights, bad[1][0].weights, strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-5)
+    assert all(weight.isfinite().all() for weight in bad[0][0].weights)
+    assert not torch.equal(bad[0][0].weights[1], good[0][0].weights[1])
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "near", "within"), [("suzanne", 5e-4, 1.5e-3), ("sponge", 1.3e-3, 2.5e-3), ("cube", 5e-4, 1.5e-3)]
-)
-def test_real_shapes_within_the_default_recipe(data_dir: Path, name: str, near: float, within: float) -> None:
+@pytest.mark.parametrize("name", ["suzanne", "sponge", "cube", "spot"])
+def test_real_shapes_within_the_default_recipe(data_dir: Path, name: str) -> None:
+    started = time.monotonic()
     got = fit_mesh(load_mesh(data_dir / "kubasic" / name / "visual_geometry.obj"), name=name).certificate
+    assert time.monotonic() - started < 120
     assert got["passed"], got["reason"]
-    assert got["error_within_0.01"] < near
-    assert got["error_within_0.1"] < within
+    assert got["error_within_0.01"] < (1e-3 if name == "sponge" else 5e-4)
+    assert got["projected_from_0.01"] < 5e-4
+    assert got["hausdorff"] < 0.01
 
 
 @pytest.mark.slow

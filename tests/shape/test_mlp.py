@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from sdfsim.shape import mlp, sweep
+from sdfsim.shape import boxed, mlp, sweep
 from sdfsim.shape.boxed import BOX
 from sdfsim.shape.mesh import Frame
 from sdfsim.shape.mlp import MlpSdf
@@ -113,8 +113,8 @@ def test_gradients_keep_their_length_within_bounds() -> None:
     net = network(2, "wave")
     _, gradient = net(net.frame.outward(np.random.default_rng(0).uniform(-3, 3, (3000, 3))))
     norm = np.linalg.norm(gradient, axis=1)
-    assert norm.min() > mlp.SLOPE[0] - 1e-4
-    assert norm.max() < mlp.SLOPE[1] + 1e-4
+    assert norm.min() > boxed.SLOPE[0] - 1e-4
+    assert norm.max() < boxed.SLOPE[1] + 1e-4
 
 
 def test_where_the_slope_vanishes_a_gradient_still_points_somewhere() -> None:
@@ -126,7 +126,7 @@ def test_where_the_slope_vanishes_a_gradient_still_points_somewhere() -> None:
         np.array([[-0.5] * 3, [0.5] * 3]),
     )
     _, gradient = flat(np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]))
-    np.testing.assert_allclose(gradient, [[0, 0, mlp.SLOPE[0]], [mlp.SLOPE[0], 0, 0]], atol=1e-4)
+    np.testing.assert_allclose(gradient, [[0, 0, boxed.SLOPE[0]], [boxed.SLOPE[0], 0, 0]], atol=1e-4)
 
 
 def test_metres_and_normalised_frame() -> None:
@@ -139,7 +139,7 @@ def test_metres_and_normalised_frame() -> None:
     assert distance.dtype == torch.float64
     torch.testing.assert_close(distance.float(), value[0] * net.frame.scale, rtol=1e-4, atol=1e-4)
     norm = gradient[0].norm(dim=1, keepdim=True)
-    torch.testing.assert_close(slope.float(), gradient[0] / norm * norm.clamp(*mlp.SLOPE), rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(slope.float(), gradient[0] / norm * norm.clamp(*boxed.SLOPE), rtol=1e-3, atol=1e-3)
 
 
 def test_large_coordinates_leave_before_the_cast() -> None:
@@ -147,25 +147,6 @@ def test_large_coordinates_leave_before_the_cast() -> None:
     far = MlpSdf(net.weights, net.biases, "wave", Frame(net.frame.centre + 1e6, net.frame.scale), net.bounds + 1e6)
     points = net.frame.outward(np.random.default_rng(0).uniform(-0.6, 0.6, (100, 3)))
     np.testing.assert_allclose(far(points + 1e6)[0], net(points)[0], atol=1e-6)
-
-
-def test_beyond_the_box_the_distance_goes_on() -> None:
-    sdf = ball()
-    direction = torch.nn.functional.normalize(torch.randn(200, 3, dtype=torch.float64), dim=1)
-    on_box = direction * (BOX / direction.abs().amax(1, keepdim=True))
-    inner, outer = sdf(on_box * (1 - 1e-6)), sdf(on_box * (1 + 1e-6))
-    torch.testing.assert_close(inner[0], outer[0], rtol=0, atol=1e-5)
-    torch.testing.assert_close(inner[1], outer[1], rtol=0, atol=1e-4)
-    points = on_box * (1.0 + 30.0 * torch.rand(200, 1, dtype=torch.float64))
-    distance, gradient = sdf(points)
-    assert torch.isfinite(distance).all()
-    torch.testing.assert_close(gradient.norm(dim=1), torch.ones(200, dtype=torch.float64), atol=1e-5, rtol=0)
-    # At least the way to the box, at most the way to the centre of it.
-    assert (distance >= (points.abs() - BOX).clamp_min(0).norm(dim=1) - 1e-6).all()
-    assert (distance <= points.norm(dim=1)).all()
-    step = 1e-3
-    slope = (sdf(points + step * gradient)[0] - sdf(points - step * gradient)[0]) / (2 * step)
-    assert (slope - 1).abs().max() < 0.2
 
 
 def test_a_bad_network_cannot_undercut_the_bounding_box() -> None:

@@ -1,0 +1,126 @@
+"""Many meshes at once: in processes, on a cluster, in one stack."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+import cli
+from sdfsim import fitting
+from sdfsim.errors import SdfsimError
+from sdfsim.fitting import Options, fit_many, named_meshes
+from sdfsim.parallel import cluster, parallel
+from sdfsim.shape import primitives
+from sdfsim.shape.asset import load_shape
+from sdfsim.shape.mesh import Mesh
+from sdfsim.shape.storage import write_ply
+
+QUICK = Options(budget=1.0)
+
+
+@pytest.fixture
+def meshes(tmp_path: Path) -> Path:
+    folder = tmp_path / "meshes"
+    folder.mkdir()
+    box = primitives.box()
+    for name, mesh in (("ball", primitives.sphere()), ("box", box), ("holed", Mesh(box.vertices, box.faces[1:]))):
+        (folder / f"{name}.ply").write_bytes(write_ply(mesh))
+    (folder / "notes.txt").write_text("not a mesh")
+    (folder / "torn.obj").write_text("v 0 0")
+    return folder
+
+
+def test_a_folder_of_meshes_becomes_a_folder_of_shapes(meshes: Path, tmp_path: Path) -> None:
+    out = tmp_path / "shapes"
+    arguments = ["fit", str(meshes), "-o", str(out), "--budget", "1s", "--device", "cpu"]
+    done = CliRunner().invoke(cli.app, arguments)
+    assert done.exit_code == 1
+    lines = {line.split()[0]: line for line in done.stdout.splitlines() if line.strip()}
+    assert "failed" in lines["holed"] and "failed" in lines["torn"]
+    assert "failed" not in lines["box"] + lines["ball"]
+    assert "holed: " in done.stdout and "open" in done.stdout
+    assert load_shape(out / "box").volume == pytest.approx(1.0)
+    assert not (out / "holed").exists() and not list(out.rglob("*.checkpoint"))
+
+    # Again: what is there is kept, the others are tried once more; with what was missing they succeed.
+    (meshes / "torn.obj").unlink()
+    written = (out / "box" / "shape.json").stat().st_mtime_ns
+    found = CliRunner().invoke(cli.app, [*arguments, "--json"])
+    report = json.loads(found.stdout)
+    assert list(report["shapes"]) == ["ball", "box", "holed"]
+    assert (out / "box" / "shape.json").stat().st_mtime_ns == written
+    assert report["shapes"]["box"]["error_in_box"] == load_shape(out / "box").certificate["error_in_box"]
+    # Other options are another fit.
+    options = Options(cap=True, budget=1.0)
+    assert fitting._kept(meshes / "box.ply", out / "box", Options(budget=1.0)) is not None
+    assert fitting._kept(meshes / "box.ply", out / "box", options) is None
+
+
+def test_one_stack_gives_the_same_shapes_as_processes(
+    meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fitting, "STACK", 2)
+    files = named_meshes([meshes])
+    told: list[float] = []
+    made = dict(fitting._stacked(list(files.items()), tmp_path / "s", QUICK, "cpu", lambda f, m: told.append(f)))
+    assert {name for name, report in made.items() if "error" in report} == {"holed", "torn"}
+    assert told == sorted(told) and told[-1] <= 1
+    assert load_shape(tmp_path / "s" / "ball").name == "ball"
+    # What the stack has made, processes do not make again.
+    report = fit_many(files, tmp_path / "s", QUICK, device="cpu", on_progress=lambda f, m: None)
+    assert report["shapes"]["box"]["steps"] == made["box"]["steps"]
+
+
+def test_names(meshes: Path, tmp_path: Path) -> None:
+    assert list(named_meshes([meshes])) == ["ball", "box", "holed", "torn"]
+    twins = []
+    for name in ("cow", "cat"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "visual.obj").write_text("")
+        twins.append(tmp_path / name / "visual.obj")
+    assert list(named_meshes([*twins, *twins, meshes / "box.ply"])) == ["cow", "cat", "box"]
+    (tmp_path / "cow" / "visual.ply").write_text("")
+    with pytest.raises(SdfsimError, match="both become cow"):
+        named_meshes([tmp_path / "cow" / "visual.ply", *twins])
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(SdfsimError, match="no mesh files"):
+        named_meshes([tmp_path / "empty"])
+
+
+def where(number: int) -> tuple[int, int, int]:
+    import os
+
+    if number == 13:
+        raise ValueError("unlucky")
+    return number * number, os.getpid(), torch.get_num_threads()
+
+
+def test_work_is_spread_over_processes_of_one_thread() -> None:
+    import os
+
+    found = dict(parallel(where, [(n,) for n in range(6)]))
+    assert [found[n][0] for n in range(6)] == [n * n for n in range(6)]
+    assert all(pid != os.getpid() and threads == 1 for _, pid, threads in found.values())
+    assert list(parallel(where, [])) == []
+    with pytest.raises(ValueError, match="unlucky"):
+        list(parallel(where, [(n,) for n in range(10, 20)]))
+
+
+def test_the_same_call_works_on_a_cluster(meshes: Path, tmp_path: Path) -> None:
+    from distributed import LocalCluster
+
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as engine:
+        with cluster(engine.scheduler_address):
+            found = dict(parallel(where, [(n,) for n in range(8)]))
+            files = {"box": meshes / "box.ply"}
+            report = fit_many(files, tmp_path / "shapes", QUICK, device="cpu", on_progress=lambda f, m: None)
+        workers = {worker.pid for worker in engine.workers.values()}
+    assert len(found) == 8 and {pid for _, pid, _ in found.values()} <= workers
+    assert all("error" not in shape for shape in report["shapes"].values())
+    assert load_shape(tmp_path / "shapes" / "box").name == "box"
+    with pytest.raises(SdfsimError, match="no scheduler"), cluster("tcp://127.0.0.1:1"):
+        pass
