@@ -78,7 +78,7 @@ def _load_shapes(spec: SceneSpec, on_progress: Progress) -> dict[str, Shape]:
             try:
                 shapes[key] = _load_shape(shape, report)
             except SdfsimError as error:
-                shape.place.wrong(error.message)
+                shape.place.wrong(error.message + (f" ({error.hint})" if error.hint else ""))
     spec.problems.check()
     return {key: shapes[key] for key in used}
 
@@ -94,7 +94,7 @@ def _load_shape(spec: ShapeSpec, on_progress: Progress) -> Shape:
         return with_sdf(shape, kind, resolution=spec.resolution) if kind else shape
     made: Any = {"name": spec.name, "sdf": kind or "mlp", "resolution": spec.resolution, "on_progress": on_progress}
     if spec.kind == "mesh" and spec.path:
-        return shape_from_mesh(spec.path, units=spec.units, **made)
+        return shape_from_mesh(spec.path, units=spec.units, cap=spec.cap, thicken=spec.thicken, **made)
     if spec.kind == "primitive":
         return shape_from_primitive(spec.options["name"], spec.options["size"], **made)
     return analytic_shape(cast(Any, spec.kind), name=spec.name, **spec.options)

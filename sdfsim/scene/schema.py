@@ -36,6 +36,8 @@ class ShapeSpec:
         place: where faults of it are reported.
         path: of an asset or mesh, resolved against the scene's folder.
         units: metres per unit of the mesh file.
+        cap: whether openings of the mesh are closed.
+        thicken: m, the thickness that an open sheet gets, or None.
         sdf: mlp, grid or mesh; None where the file does not say (an asset then keeps its own, others are fitted).
         resolution: of a grid, samples along each side.
         options: radius, size, or what a primitive takes.
@@ -46,6 +48,8 @@ class ShapeSpec:
     place: Value
     path: Path | None = None
     units: float = 1.0
+    cap: bool = False
+    thicken: float | None = None
     sdf: str | None = None
     resolution: int = DEFAULT_RESOLUTION
     options: dict = field(default_factory=dict)
@@ -127,7 +131,7 @@ def _shapes(value: Value | None, folder: Path) -> dict[str, ShapeSpec | None]:
 
 
 def _shape(name: str, item: Value, folder: Path) -> ShapeSpec | None:
-    section = item.section((*_SHAPE_KINDS, "units", "sdf", "resolution"))
+    section = item.section((*_SHAPE_KINDS, "units", "cap", "thicken", "sdf", "resolution"))
     kind = section.one_of(_SHAPE_KINDS, required=True)
     if kind is None:
         return None
@@ -136,6 +140,13 @@ def _shape(name: str, item: Value, folder: Path) -> ShapeSpec | None:
         spec.units = UNITS[section["units"].choice(UNITS, "m")]
         if spec.kind != "mesh":
             section["units"].wrong(f"goes with mesh only (a shape given by {spec.kind} is in metres)")
+    if "cap" in section:
+        spec.cap = section["cap"].choice(("on", "off"), "off") == "on"
+    if "thicken" in section:
+        spec.thicken = section.number("thicken", "m", above=0, default=1.0)
+    for key in ("cap", "thicken"):
+        if key in section and spec.kind != "mesh":
+            section[key].wrong(f"goes with mesh only (a {spec.kind} is closed)")
     _sdf(section, spec)
     if spec.kind in ("asset", "mesh"):
         spec.path = folder / kind.text("?")

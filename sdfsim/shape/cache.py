@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -23,12 +23,29 @@ Progress = Callable[[float, str], None]
 _log = logging.getLogger(__name__)
 
 
+class Closing(NamedTuple):
+    """What is done to a mesh that is open, as in `solidify`: openings closed, or a thickness in the mesh's units."""
+
+    cap: bool = False
+    thicken: float | None = None
+
+    @property
+    def variant(self) -> str:
+        """For a cache key."""
+        return ("-cap" if self.cap else "") + (f"-thick{self.thicken:g}" if self.thicken is not None else "")
+
+
+AS_IT_IS = Closing()
+
+
 def shape_from_mesh(
     path: str | Path,
     cache_dir: str | Path | None = None,
     *,
     name: str | None = None,
     units: float = 1.0,
+    cap: bool = False,
+    thicken: float | None = None,
     sdf: SdfKind = "mlp",
     resolution: int = DEFAULT_RESOLUTION,
     on_progress: Progress | None = None,
@@ -40,6 +57,8 @@ def shape_from_mesh(
         cache_dir: where shapes are kept; by default `sdfsim/shapes` in the user's cache folder.
         name: by default the file's.
         units: metres per unit of the file.
+        cap: close openings of any size.
+        thicken: m; a thickness for an open sheet.
         sdf: "mlp" fits the network; "grid" and "mesh" fit nothing (see `mesh_shape`).
         resolution: of a grid, samples along each side.
         on_progress: called with (fraction done, message) while fitting or sampling.
@@ -51,7 +70,8 @@ def shape_from_mesh(
     mesh = load_mesh(path)
     # Not of the file's bytes: a glTF keeps its vertices, and an OBJ its colours, in files beside it.
     key = mesh.digest()
-    shape = _cached(mesh, key, path.stem, sdf, resolution, cache_dir, on_progress)
+    closing = Closing(cap, None if thicken is None else thicken / units)
+    shape = _cached(mesh, key, path.stem, closing, sdf, resolution, cache_dir, on_progress)
     shape = replace(shape, name=name or path.stem, source={**shape.source, "file": path.name, "sha256": key})
     return scaled(shape, units)
 
@@ -84,7 +104,7 @@ def shape_from_primitive(
     unit = Mesh(mesh.vertices / float(np.ptp(mesh.vertices, axis=0).max()), mesh.faces)
     # Rounded, since sines and cosines differ in their last digit from machine to machine.
     key = Mesh(unit.vertices.round(9), unit.faces).digest()
-    shape = _cached(unit, key, kind, sdf, resolution, cache_dir, on_progress)
+    shape = _cached(unit, key, kind, AS_IT_IS, sdf, resolution, cache_dir, on_progress)
     return scaled(replace(shape, name=name or kind, source={**shape.source, "primitive": kind}), size)
 
 
@@ -93,6 +113,7 @@ def mesh_shape(
     *,
     name: str,
     kind: Literal["grid", "mesh"],
+    closing: Closing = AS_IT_IS,
     resolution: int = DEFAULT_RESOLUTION,
     on_progress: Progress | None = None,
 ) -> Shape:
@@ -102,6 +123,7 @@ def mesh_shape(
         mesh: metres.
         name: of the shape.
         kind: "mesh" (the exact distance) or "grid" (samples of it).
+        closing: of an open mesh.
         resolution: of a grid, samples along each side.
         on_progress: called with (fraction done, message) while a grid is sampled.
 
@@ -111,7 +133,7 @@ def mesh_shape(
     from sdfsim.shape.fit import surface_nodes
     from sdfsim.shape.solid import solidify
 
-    solid = solidify(mesh, name=name)
+    solid = solidify(mesh, name=name, cap=closing.cap, thicken=closing.thicken)
     sdf, note = sdf_of_mesh(solid.surface, kind, resolution, on_progress)
     nodes = surface_nodes(sdf, solid.surface, DEFAULT_COUNT)
     return Shape(name, solid.surface, sdf, nodes, *solid.mass_properties(), source={"kind": "mesh"} | note)
@@ -121,19 +143,20 @@ def _cached(
     mesh: Mesh,
     key: str,
     label: str,
+    closing: Closing,
     kind: SdfKind,
     resolution: int,
     cache_dir: str | Path | None,
     on_progress: Progress | None,
 ) -> Shape:
     if kind == "mesh":  # made as fast as it is read
-        return mesh_shape(mesh, name=label, kind=kind)
+        return mesh_shape(mesh, name=label, kind=kind, closing=closing)
     # Only here is anything fitted: reading a shape folder needs no open3d and no optimiser.
     from sdfsim.shape.fit import FIT_VERSION, fit_mesh
 
     if cache_dir is None:
         cache_dir = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sdfsim" / "shapes"
-    variant = f"-grid{resolution}" if kind == "grid" else ""
+    variant = closing.variant + (f"-grid{resolution}" if kind == "grid" else "")
     folder = Path(cache_dir) / f"{key[:24]}{variant}-{FIT_VERSION}.{FORMAT_VERSION}"
     if folder.is_dir():
         try:
@@ -141,9 +164,9 @@ def _cached(
         except SdfsimError:
             shutil.rmtree(folder, ignore_errors=True)  # a damaged entry is only a cache miss
     if kind == "grid":
-        shape = mesh_shape(mesh, name=label, kind=kind, resolution=resolution, on_progress=on_progress)
+        shape = mesh_shape(mesh, name=label, kind=kind, closing=closing, resolution=resolution, on_progress=on_progress)
     else:
-        shape = fit_mesh(mesh, name=label, on_progress=on_progress)
+        shape = fit_mesh(mesh, name=label, cap=closing.cap, thicken=closing.thicken, on_progress=on_progress)
     # A folder of its own first, so that processes fitting the same mesh never see each other's half.
     partial = folder.with_name(f"{folder.name}.{os.getpid()}.partial")
     try:

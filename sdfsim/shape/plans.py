@@ -60,7 +60,7 @@ PLANS = {
     "default": Plan(
         activation="wave",
         width=64,
-        layers=8,
+        layers=6,
         first=8.0,
         optimiser="soap",
         lr=1e-2,
@@ -73,8 +73,8 @@ PLANS = {
         pool=400_000,
         soften=0.04,
         sign_everywhere=True,
-        goal=(8e-4, 6e-3, 4e-3),
-        settle=700,
+        goal=(7.5e-4, 6e-3, 4e-3),
+        settle=1000,
         fold=True,
     ),
     # Rubanova et al. 2024, section 3.1 and appendix: 400k updates at 1e-5, noise 0.1 drawn again every 100 updates.

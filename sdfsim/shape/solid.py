@@ -25,7 +25,7 @@ STEP = 1e-4
 TRIFLE = 1e-3
 # A sheet thinner than this is below what a fit resolves (mean errors of 0.0015 near the surface are allowed).
 THINNEST = 0.01
-HINT = "--cap closes openings of any size; --thicken METRES gives a sheet a thickness"
+HINT = "--cap (cap: on) closes openings of any size, --thicken METRES (thicken: METRES) gives a sheet a thickness"
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,8 @@ from sdfsim.shape.analytic import BoxSdf
 from sdfsim.shape.asset import analytic_shape, with_sdf
 from sdfsim.shape.exact import MeshSdf
 from sdfsim.shape.grid import GridSdf
+from sdfsim.shape.mesh import Mesh
+from sdfsim.shape.primitives import box
 from sdfsim.shape.storage import write_ply
 
 HEAD = "version: 1\nshapes:\n  ball: {sphere: {radius: 0.5}}\nbodies:\n"  # bodies[0] is on line 5
@@ -128,6 +130,10 @@ TOP = [
     ("shapes: {cup: {}}", "shapes.cup: one of asset, mesh, primitive, sphere, box, plane is required"),
     ("shapes: {cup: {shpere: {}}}", "shapes.cup.shpere: unknown key (did you mean 'sphere'?)"),
     ("shapes: {cup: {sphere: {radius: 1}, units: cm}}", "shapes.cup.units: goes with mesh only"),
+    ("shapes: {cup: {sphere: {radius: 1}, cap: on}}", "shapes.cup.cap: goes with mesh only"),
+    ("shapes: {cup: {box: {size: [1, 1, 1]}, thicken: 0.1}}", "shapes.cup.thicken: goes with mesh only"),
+    ("shapes: {cup: {mesh: leaf.obj, thicken: 0}}", "shapes.cup.thicken: must be > 0"),
+    ("shapes: {cup: {mesh: leaf.obj, cap: maybe}}", "shapes.cup.cap: must be one of on, off"),
     ("shapes: {cup: {sphere: {radius: 1}, sdf: grid}}", "shapes.cup.sdf: goes with asset, mesh, primitive only"),
     (
         "shapes: {cup: {primitive: {name: box}, sdf: gird}}",
@@ -239,6 +245,19 @@ def test_a_wrong_kind_of_sdf_is_one_fault_not_two(load):
     assert len(problems_of(load, f"version: 1\nshapes:\n  b: {shape}\nbodies:\n  - {{name: a, shape: b}}\n")) == 1
 
 
+def test_open_meshes_are_closed_as_the_file_says(load, tmp_path):
+    cube = box((10.0, 20.0, 30.0))
+    (tmp_path / "open.ply").write_bytes(write_ply(Mesh(cube.vertices, cube.faces[2:])))
+    text = "version: 1\nshapes:\n  b: {mesh: open.ply, units: cm, sdf: mesh%s}\nbodies:\n  - {name: a, shape: b}\n"
+    (problem,) = problems_of(load, text % "")
+    assert "shapes.b" in problem and "open" in problem and "cap: on" in problem
+    assert load(text % ", cap: on").shapes[0].volume == pytest.approx(0.1 * 0.2 * 0.3)
+    # Two centimetres around the five sheets that are left: their outlines grow by one on either side.
+    shell = load(text % ", thicken: 0.02").shapes[0]
+    np.testing.assert_allclose(np.ptp(shell.sdf.bounds, axis=0), [0.12, 0.22, 0.32], atol=2e-3)
+    assert 0.02 * 2 * (0.02 + 0.03 + 0.06) > shell.volume > 0.02 * (0.02 + 0.03 + 0.06)
+
+
 CRATE = {
     "box": "{box: {size: [0.4, 0.4, 0.4]}}",
     "grid": "{primitive: {name: box, size: 0.4}, sdf: grid, resolution: 64}",
@@ -315,7 +334,7 @@ def test_an_asset_keeps_its_own_sdf_unless_told_and_cannot_grow_a_network(load, 
     with_sdf(analytic_shape("box", size=(0.4, 0.4, 0.4)), "mesh").save(tmp_path / "crate")
     assert isinstance(load(falling_ball("{asset: crate}")).shapes[1].sdf, MeshSdf)
     (fault,) = problems_of(load, falling_ball("{asset: crate, sdf: mlp}"))
-    assert fault == "scene.yaml:3: shapes.crate.asset: box: the shape has no SDF network"
+    assert fault == "scene.yaml:3: shapes.crate.asset: box: the shape has no SDF network (fit its mesh)"
 
 
 def test_defaults_and_units(load):
