@@ -21,7 +21,7 @@ REGION = ((-5.0, -5.0, 1.0), (5.0, 5.0, 5.0))  # m, holds every body's bounds at
 SIZES = (0.7, 1.4)
 MATERIALS = {"metal": (2.7, 0.4, 0.3), "rubber": (1.1, 0.8, 0.7)}  # density, friction, restitution
 STEPS = 100
-NODES = 320  # surface nodes a shape: the pieces' own vertices first, since the engine touches the floor with those
+NODES = 512  # surface nodes a shape: the vertices and edges of the pieces first, since those are what really touches
 TRIES = 100  # spawns of one body before the scene is drawn again
 RECIPES = ("movi-b",)
 

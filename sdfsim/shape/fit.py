@@ -19,7 +19,7 @@ from sdfsim.shape.certificate import certify
 from sdfsim.shape.distance import DistanceOracle, MeshDistance, PiecesDistance
 from sdfsim.shape.mesh import Mesh, clean, is_closed, mass_properties, mass_properties_of_sdf
 from sdfsim.shape.mlp import MlpSdf
-from sdfsim.shape.nodes import DEFAULT_COUNT, hull_nodes, sample_nodes, thin
+from sdfsim.shape.nodes import DEFAULT_COUNT, edge_nodes, hull_nodes, sample_nodes, thin
 from sdfsim.shape.plans import PLANS
 from sdfsim.shape.sdf import Sdf, accepts_numpy
 from sdfsim.shape.solid import solidify
@@ -27,6 +27,11 @@ from sdfsim.shape.solid import solidify
 Recipe = Literal["default", "paper"]
 Progress = Callable[[float, str], None]
 Oracle = TypeVar("Oracle", bound=DistanceOracle)
+
+# Of the nodes of convex pieces: the pieces' vertices are at most this part, with points on their edges at most that.
+OWN_SHARE, EDGE_SHARE = 0.6, 0.85
+# Between points on the edges of convex pieces, relative to the size of the whole.
+EDGE_SPACING = 0.06
 
 # Changes whenever the same mesh would come out differently; part of every cache key.
 FIT_VERSION = 4
@@ -142,7 +147,7 @@ def fit_pieces(
     """Fit the compact SDF network to the union of convex pieces: the body that a rigid-body engine collides.
 
     Nodes are the pieces' own vertices first (without repetitions and those inside another piece), because contact
-    between polyhedra is exact only there; where they are fewer than `nodes`, sampled ones follow.
+    with a flat floor is exact only there; then points along their sharp edges, then points all over the surface.
 
     Args:
         pieces: convex closed meshes, metres (see `load_pieces`).
@@ -158,13 +163,19 @@ def fit_pieces(
     oracle = PiecesDistance(pieces)
     size = float(np.ptp(oracle.bounds, axis=0).max())
     vertices = np.concatenate([piece.vertices for piece in pieces])
-    _, first = np.unique(np.round(vertices / (1e-4 * size)), axis=0, return_index=True)
-    vertices = vertices[np.sort(first)]
-    # Measured from the boundary of the union: a vertex on the seam of two pieces is deep in neither.
-    vertices = vertices[oracle(vertices).distance >= -1e-3 * size]
+    edges = np.concatenate([edge_nodes(piece.vertices, EDGE_SPACING * size) for piece in pieces])
+
+    def bare(points: np.ndarray) -> np.ndarray:
+        _, first = np.unique(np.round(points / (1e-4 * size)), axis=0, return_index=True)
+        points = points[np.sort(first)]
+        # Measured from the boundary of the union: a point on the seam of two pieces is deep in neither.
+        return points[oracle(points).distance >= -1e-3 * size]
+
+    vertices, edges = bare(vertices), bare(edges)
 
     def pick(sdf: Sdf, oracle: PiecesDistance) -> np.ndarray:
-        return thin(sample_nodes(sdf), nodes, keep=hull_nodes(vertices, nodes))
+        own = hull_nodes(vertices, round(OWN_SHARE * nodes))
+        return thin(sample_nodes(sdf), nodes, keep=thin(edges, round(EDGE_SHARE * nodes), keep=own))
 
     sdf, points, certificate = _train([oracle], recipe, budget, seed, pick, on_progress, checkpoint, "cpu")[0]
     single = len(pieces) == 1 and is_closed(pieces[0])

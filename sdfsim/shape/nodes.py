@@ -16,6 +16,8 @@ REACHED = 0.005
 PROJECTIONS = 3
 DEFAULT_GRID = 24
 DEFAULT_COUNT = 128
+# Faces that meet at less than this cosine (20 degrees) make an edge worth nodes of its own.
+SHARP = 0.94
 
 
 def sample_nodes(sdf: Sdf, *, grid: int = DEFAULT_GRID, voxel: float = VOXEL) -> np.ndarray:
@@ -114,3 +116,32 @@ def hull_nodes(vertices: np.ndarray, count: int) -> np.ndarray:
     outer = np.sort(ConvexHull(vertices).vertices)
     rest = np.delete(vertices, outer, axis=0)
     return thin(rest, count, keep=vertices[outer])
+
+
+def edge_nodes(piece: np.ndarray, spacing: float, sharp: float = SHARP) -> np.ndarray:
+    """Points along the sharp edges of a convex polyhedron, its corners left out.
+
+    Two polyhedra often touch edge against edge, which their corners alone do not see.
+
+    Args:
+        piece: [V, 3] m, its corners.
+        spacing: m, between points at most; edges shorter than this get none.
+        sharp: cosine of the angle between the normals of the two faces, above which an edge counts as flat.
+
+    Returns:
+        [K, 3] m.
+    """
+    from scipy.spatial import ConvexHull
+
+    hull = ConvexHull(piece)
+    normals = hull.equations[:, :3]
+    face, corner = np.nonzero(np.arange(len(hull.simplices))[:, None] < hull.neighbors)
+    other = hull.neighbors[face, corner]
+    bent = (normals[face] * normals[other]).sum(1) < sharp
+    # The neighbour k of a face lies across the edge opposite to its corner k.
+    points = [np.empty((0, 3))]
+    for f, c in zip(face[bent], corner[bent], strict=True):
+        start, end = piece[np.delete(hull.simplices[f], c)]
+        parts = int(np.ceil(np.linalg.norm(end - start) / spacing))
+        points.append(start + np.arange(1, parts)[:, None] / parts * (end - start))
+    return np.concatenate(points)

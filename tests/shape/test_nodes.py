@@ -8,7 +8,7 @@ from sdfsim.errors import SdfsimError
 from sdfsim.shape import primitives
 from sdfsim.shape.analytic import BoxSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.mesh import sample_surface
-from sdfsim.shape.nodes import hull_nodes, sample_nodes, thin
+from sdfsim.shape.nodes import edge_nodes, hull_nodes, sample_nodes, thin
 
 
 @pytest.mark.parametrize("scale", [0.01, 1.0, 300.0])
@@ -83,3 +83,14 @@ def test_hull_vertices_come_before_those_in_hollows() -> None:
     nodes = hull_nodes(np.concatenate([hollow, corners]), 10)
     assert len(nodes) == 10
     assert {tuple(p) for p in nodes[:8]} == {tuple(p) for p in corners}
+
+
+def test_edges_of_a_box_and_none_of_its_flat_diagonals() -> None:
+    corners = primitives.box((1.0, 2.0, 3.0)).vertices
+    points = edge_nodes(corners, 0.25)
+    half = np.array([0.5, 1.0, 1.5])
+    on = np.isclose(np.abs(points), half).sum(1)
+    assert (on == 2).all()
+    assert len(points) == 4 * (3 + 7 + 11)
+    assert len(edge_nodes(corners, 5.0)) == 0
+    assert len(edge_nodes(primitives.sphere().vertices, 0.01)) == 0
