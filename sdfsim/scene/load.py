@@ -12,7 +12,7 @@ from sdfsim.errors import SdfsimError
 from sdfsim.scene.bodies import BodySpec
 from sdfsim.scene.schema import SceneSpec, ShapeSpec, read_scene
 from sdfsim.scene.types import Body, Scene
-from sdfsim.shape.asset import SdfKind, Shape, analytic_shape, load_shape, with_sdf
+from sdfsim.shape.asset import SdfKind, Shape, analytic_shape, load_shape, with_nodes, with_sdf
 from sdfsim.shape.cache import shape_from_mesh, shape_from_primitive
 
 Progress = Callable[[float, str], None]
@@ -76,7 +76,8 @@ def _load_shapes(spec: SceneSpec, on_progress: Progress) -> dict[str, Shape]:
                 on_progress((i + fraction) / count, message)
 
             try:
-                shapes[key] = _load_shape(shape, report)
+                made = _load_shape(shape, report)
+                shapes[key] = with_nodes(made, shape.nodes) if shape.nodes else made
             except SdfsimError as error:
                 shape.place.wrong(error.message + (f" ({error.hint})" if error.hint else ""))
     spec.problems.check()

@@ -21,6 +21,7 @@ UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 _TOP = ("version", "model", "duration", "seed", "gravity", "effects", "shapes", "bodies")
 _SHAPE_KINDS = ("asset", "mesh", "primitive", "sphere", "box", "plane")
 _SDF_KINDS = ("mlp", "grid", "mesh")
+FEWEST_NODES, MOST_NODES = 3, 128  # along each side of the sampling grid
 _WITH_SDF = ("asset", "mesh", "primitive")  # the others have an exact SDF of their own
 FEWEST_SAMPLES, MOST_SAMPLES = 8, 512  # along each side of a grid
 _PLANE_ADVICE = " (a plane shape takes none: tilt it by the body's pose, or give the body its own `plane:`)"
@@ -40,6 +41,7 @@ class ShapeSpec:
         thicken: m, the thickness that an open sheet gets, or None.
         sdf: mlp, grid or mesh; None where the file does not say (an asset then keeps its own, others are fitted).
         resolution: of a grid, samples along each side.
+        nodes: N of the N^3 grid whose points become surface nodes; None keeps the shape's own nodes.
         options: radius, size, or what a primitive takes.
     """
 
@@ -52,6 +54,7 @@ class ShapeSpec:
     thicken: float | None = None
     sdf: str | None = None
     resolution: int = DEFAULT_RESOLUTION
+    nodes: int | None = None
     options: dict = field(default_factory=dict)
 
 
@@ -131,7 +134,7 @@ def _shapes(value: Value | None, folder: Path) -> dict[str, ShapeSpec | None]:
 
 
 def _shape(name: str, item: Value, folder: Path) -> ShapeSpec | None:
-    section = item.section((*_SHAPE_KINDS, "units", "cap", "thicken", "sdf", "resolution"))
+    section = item.section((*_SHAPE_KINDS, "units", "cap", "thicken", "sdf", "resolution", "nodes"))
     kind = section.one_of(_SHAPE_KINDS, required=True)
     if kind is None:
         return None
@@ -148,6 +151,12 @@ def _shape(name: str, item: Value, folder: Path) -> ShapeSpec | None:
         if key in section and spec.kind != "mesh":
             section[key].wrong(f"goes with mesh only (a {spec.kind} is closed)")
     _sdf(section, spec)
+    if "nodes" in section:
+        spec.nodes = section["nodes"].integer(least=FEWEST_NODES, default=FEWEST_NODES)
+        if spec.nodes > MOST_NODES:
+            section["nodes"].wrong(f"must be <= {MOST_NODES} (got {spec.nodes})")
+        if spec.kind == "plane":
+            section["nodes"].wrong("goes with bodies only (a plane has no nodes)")
     if spec.kind in ("asset", "mesh"):
         spec.path = folder / kind.text("?")
         if spec.kind == "asset" and not spec.path.is_dir():

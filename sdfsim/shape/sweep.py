@@ -12,7 +12,7 @@ from typing import Literal
 
 import torch
 
-Activation = Literal["wave", "sine", "relu"]
+Activation = Literal["wave", "relu"]
 
 # Points in one sweep of a stack. 64 wide and 8 layers are 4 kB a point: 33 MB on the CPU, of which the two layers at
 # work stay in the cache; a GPU wants more at a time.
@@ -43,13 +43,7 @@ def relu(before: torch.Tensor, slope: torch.Tensor, spare: torch.Tensor) -> None
     before.mul_(slope)
 
 
-def sine(before: torch.Tensor, slope: torch.Tensor, spare: torch.Tensor) -> None:
-    """The same for sin(x), which shapes fitted earlier use."""
-    torch.cos(before, out=slope)
-    before.sin_()
-
-
-ACTIVATIONS = {"wave": wave, "sine": sine, "relu": relu}
+ACTIVATIONS = {"wave": wave, "relu": relu}
 
 
 class Tape:

@@ -134,6 +134,9 @@ TOP = [
     ("shapes: {cup: {box: {size: [1, 1, 1]}, thicken: 0.1}}", "shapes.cup.thicken: goes with mesh only"),
     ("shapes: {cup: {mesh: leaf.obj, thicken: 0}}", "shapes.cup.thicken: must be > 0"),
     ("shapes: {cup: {mesh: leaf.obj, cap: maybe}}", "shapes.cup.cap: must be one of on, off"),
+    ("shapes: {cup: {sphere: {radius: 1}, nodes: 2}}", "shapes.cup.nodes: must be >= 3"),
+    ("shapes: {cup: {sphere: {radius: 1}, nodes: 500}}", "shapes.cup.nodes: must be <= 128"),
+    ("shapes: {cup: {plane: {}, nodes: 7}}", "shapes.cup.nodes: goes with bodies only"),
     ("shapes: {cup: {sphere: {radius: 1}, sdf: grid}}", "shapes.cup.sdf: goes with asset, mesh, primitive only"),
     (
         "shapes: {cup: {primitive: {name: box}, sdf: gird}}",
@@ -256,6 +259,14 @@ def test_open_meshes_are_closed_as_the_file_says(load, tmp_path):
     shell = load(text % ", thicken: 0.02").shapes[0]
     np.testing.assert_allclose(np.ptp(shell.sdf.bounds, axis=0), [0.12, 0.22, 0.32], atol=2e-3)
     assert 0.02 * 2 * (0.02 + 0.03 + 0.06) > shell.volume > 0.02 * (0.02 + 0.03 + 0.06)
+
+
+def test_nodes_can_be_sampled_anew(load):
+    text = "version: 1\nshapes:\n  b: {sphere: {radius: 0.2}%s}\nbodies:\n  - {name: a, shape: b}\n"
+    counts = [len(load(text % key).shapes[0].nodes) for key in ("", ", nodes: 5", ", nodes: 7", ", nodes: 12")]
+    assert counts[1] < counts[2] < counts[3] and counts[1] != counts[0]
+    nodes = load(text % ", nodes: 7").shapes[0].nodes
+    np.testing.assert_allclose(np.linalg.norm(nodes, axis=1), 0.2, rtol=1e-6)
 
 
 CRATE = {

@@ -25,15 +25,15 @@ def voxels(seed: int, resolution: int) -> GridSdf:
 @pytest.fixture
 def mixed() -> list[Sdf]:
     return [
-        network(1, "sine"),
+        network(1, "wave"),
         SphereSdf(0.3),
         network(2, "relu"),
         PlaneSdf(),
-        network(3, "sine"),
+        network(3, "wave"),
         BoxSdf((0.2, 0.3, 0.4)),
         SphereSdf(0.7),
-        network(4, "sine"),
-        network(5, "sine", width=16),
+        network(4, "wave"),
+        network(5, "wave", width=16),
         BoxSdf((1.0, 0.1, 0.4)),
         voxels(1, 9),
         voxels(2, 12),
@@ -74,7 +74,7 @@ def test_the_bank_takes_strangers_and_devices(mixed: list[Sdf]) -> None:
 
 
 def test_order_of_questions_does_not_matter() -> None:
-    bank = SdfBank([network(seed, "sine") for seed in range(1, 6)])
+    bank = SdfBank([network(seed, "wave") for seed in range(1, 6)])
     index, points = torch.randint(5, (3000,)), torch.rand(3000, 3)
     turn = torch.randperm(3000)
     straight, turned = bank(index, points), bank(index[turn], points[turn])
