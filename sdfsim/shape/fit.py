@@ -34,7 +34,7 @@ OWN_SHARE, EDGE_SHARE = 0.6, 0.85
 EDGE_SPACING = 0.06
 
 # Changes whenever the same mesh would come out differently; part of every cache key.
-FIT_VERSION = 4
+FIT_VERSION = 5
 
 
 def fit_mesh(

@@ -25,6 +25,7 @@ WARMUP = 50
 CHECK = 100
 # Seconds that the certificate takes of a budget, beside a tenth.
 RESERVE = 2.0
+SIGN_FROM = 0.002  # nearer to the surface a wrong sign is no more than an error of the distance
 CPU = torch.device("cpu")
 
 # Weights and biases per layer, [S, out, in] and [S, out].
@@ -192,7 +193,10 @@ class _Run:
         if self.plan.goal is not None:
             cosine = torch.nn.functional.cosine_similarity(gradient, self.check.direction, dim=-1)
             turned = 1.0 - cosine[:, CHECKED : 2 * CHECKED].median(1).values
-            met = (near <= self.plan.goal[0]) & (far <= self.plan.goal[1]) & (turned <= self.plan.goal[2])
+            clear = signed & (distance.abs() > SIGN_FROM)
+            wrong = (clear & (value * distance <= 0)).sum(1) / clear.sum(1).clamp_min(1)
+            errors = torch.stack([near, far, turned, wrong], -1)
+            met = (errors <= errors.new_tensor(self.plan.goal)).all(-1)
             early = met.cpu().numpy() & (self.step < self.turn)
             self.turn = np.where(early, self.step, self.turn)
             self.stop = np.where(early, np.minimum(self.stop, self.step + self.plan.settle), self.stop)
