@@ -211,6 +211,7 @@ def simulate(
             f"{report['steps']} steps of {report['dt_s']:.4g} s in {duration(report['wall_s'])}"
             f" (median {report['step_ms_median']:.1f} ms a step)",
             f"mean contacts {report['contacts_mean']:.1f}, worst penetration {report['worst_penetration_m']:.2g} m",
+            *run.cost_lines(report),
             f"wrote {out}",
             *(f"outside the model's training: {line}" for line in report["outside_training"]),
         ]
@@ -232,12 +233,12 @@ def plan(
 ) -> None:
     """Which effects are in play, why, and what a step costs."""
     with Session(as_json=as_json, verbose=verbose) as session:
-        from sdfsim import run
+        from sdfsim import planning
 
-        report = run.describe(scene, model=model, device=device, on_progress=session.stage_progress)
+        report = planning.describe(scene, model=model, device=device, on_progress=session.stage_progress)
         for check in report["failed_checks"]:  # told, but a plan is as good with a shape that is less exact
             session.say(f"failed check: {check}")
-        session.report(report, run.plan_lines(report))
+        session.report(report, planning.plan_lines(report))
 
 
 @app.command()
@@ -266,10 +267,17 @@ def view(
 
 @app.command()
 def dataset(
-    recipe: Annotated[Literal["movi-b"], typer.Argument(show_default=False)],
+    recipe: Annotated[Literal["movi-b", "movi-c", "bowl", "pile", "varied"], typer.Argument(show_default=False)],
     out: Out,
-    shapes: Annotated[Path, typer.Option(help="Folder of meshes.", show_default=False)],
     trajectories: Annotated[int, typer.Option(help="How many.", min=1, show_default=False)],
+    shapes: Annotated[
+        Path | None,
+        typer.Option(help="Folder of meshes (bowl has its own; movi-b: NAME/ folders with convex pieces only)."),
+    ] = None,
+    random_solids: Annotated[
+        int, typer.Option(help="So many of PyBullet's random solids beside them (not movi-b).", min=0, max=1000)
+    ] = 0,
+    bodies: Annotated[int | None, typer.Option(help="How many move (bowl, pile).", min=1, max=512)] = None,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     split: Literal["train", "validation", "test"] = "train",
     cluster: Cluster = None,
@@ -279,20 +287,22 @@ def dataset(
 ) -> None:
     """Trajectories of the teacher (PyBullet) to learn from."""
     with Session(as_json=as_json, verbose=verbose) as session:
-        from sdfsim.learning.movi import make_dataset
+        from sdfsim.learning.generate import make_dataset, report_lines
         from sdfsim.parallel import cluster as working_on
 
         with working_on(cluster):
             report = make_dataset(
                 recipe,
                 out,
-                shapes=shapes,
                 trajectories=trajectories,
+                shapes=shapes,
+                random_solids=random_solids,
+                bodies=bodies,
                 seed=seed,
                 split=split,
                 on_progress=session.progress,
             )
-        session.report(report)
+        session.report(report, report_lines(report))
 
 
 @app.command()
@@ -322,17 +332,27 @@ def evaluate(
     free_flight: Annotated[
         Literal["exact", "learned"], typer.Option(help="Bodies without contact (learned: paper networks only).")
     ] = "exact",
+    chaos_floor: Annotated[
+        bool,
+        typer.Option("--chaos-floor", help="Also the teacher again from starts slightly off (needs PyBullet)."),
+    ] = False,
     as_json: Json = False,
     device: Device = "auto",
     verbose: Verbose = False,
 ) -> None:
-    """Errors of a model's rollouts on recorded trajectories."""
+    """Errors of a model's rollouts on recorded trajectories, and the quality of its motion."""
     with Session(as_json=as_json, verbose=verbose) as session:
         from sdfsim import run
         from sdfsim.learning.evaluate import evaluate as run_evaluation
 
         report = run_evaluation(
-            data, model=model, steps=steps, device=device, free_flight=free_flight, on_progress=session.progress
+            data,
+            model=model,
+            steps=steps,
+            device=device,
+            free_flight=free_flight,
+            chaos_floor=chaos_floor,
+            on_progress=session.progress,
         )
         session.report(report, run.evaluation_lines(report))
 

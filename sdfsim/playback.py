@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sdfsim.dynamics.memory import PHASES
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.files import replacing
 from sdfsim.scene.types import Body, Scene
@@ -22,9 +23,27 @@ WORLD = "world"
 CONTACTS = "world/contacts"
 PLOTS = {
     "kinetic_energy": "kinetic energy (J)",
-    "contacts": "contacts",
     "worst_penetration": "worst penetration (m)",
-    "step_ms": "step (ms)",
+    "contacts": "contacts",
+    "pairs": "near pairs of bodies",
+    "free": "free",
+    "active": "active",
+    "asleep": "asleep",
+    "sdf_queries": "asked",
+    "sdf_waiting": "waiting",
+    "nodes": "nodes",
+    "edges": "edges",
+    "step_ms": "step",
+    **PHASES,
+}
+VIEWS = {
+    "kinetic energy (J)": ("kinetic_energy",),
+    "worst penetration (m)": ("worst_penetration",),
+    "contacts": ("contacts", "pairs"),
+    "bodies": ("free", "active", "asleep"),
+    "signed distances": ("sdf_queries", "sdf_waiting"),
+    "network": ("nodes", "edges"),
+    "milliseconds": ("step_ms", *PHASES),
 }
 _STATIC_COLOR = (150, 150, 155)
 _NODE_COLOR = (20, 20, 20)
@@ -50,7 +69,7 @@ class Playback:
         self.stream = rr.RecordingStream("sdfsim")
 
     def blueprint(self) -> rrb.Blueprint:
-        """The layout: the scene on the left, one plot a counter on the right; nodes and contact points hidden."""
+        """The layout: the scene on the left, plots of the counters on the right; nodes and contact points hidden."""
         import rerun.blueprint as rrb
 
         hidden = [CONTACTS, *(f"{path}/nodes" for path in self._paths)]
@@ -62,7 +81,10 @@ class Playback:
             eye_controls=_eye(centre, radius, -self._scene.gravity),
             line_grid=False,
         )
-        plots = [rrb.TimeSeriesView(origin=f"plots/{key}", name=name) for key, name in PLOTS.items()]
+        plots = [
+            rrb.TimeSeriesView(origin="plots", contents=[f"plots/{key}" for key in keys], name=name)
+            for name, keys in VIEWS.items()
+        ]
         return rrb.Blueprint(
             rrb.Horizontal(view, rrb.Vertical(*plots), column_shares=[3, 1]),
             rrb.TimePanel(timeline="time", state="collapsed"),
@@ -77,7 +99,7 @@ class Playback:
         self.stream.send_blueprint(self.blueprint())
         self.stream.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         size = _extent(scene)[1]
-        hues = distinct_colors(sum(b.motion == "dynamic" for b in scene.bodies))
+        hues = distinct_colors(sum(b.motion != "static" for b in scene.bodies))
         for body, path, com in zip(scene.bodies, self._paths, self._com, strict=True):
             shape = scene.shapes[body.shape]
             infinite = not np.all(np.isfinite(shape.sdf.bounds))
@@ -110,7 +132,7 @@ class Playback:
         self._step += frames
         times = [rr.TimeColumn("time", duration=chunk.time), rr.TimeColumn("step", sequence=steps)]
         for i, (body, path) in enumerate(zip(self._scene.bodies, self._paths, strict=True)):
-            if body.motion == "dynamic":
+            if body.motion != "static":
                 poses = rr.Transform3D.columns(translation=chunk.position[:, i], quaternion=chunk.orientation[:, i])
                 self.stream.send_columns(path, times, poses)
         points = rr.Points3D.columns(positions=chunk.contact_point).partition(chunk.contact_count)

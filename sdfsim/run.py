@@ -1,4 +1,4 @@
-"""What the commands simulate, plan and info do: a scene file becomes a run folder."""
+"""What the commands simulate, evaluate and info do or tell: a scene file becomes a run folder."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from typing import Any, Literal
 import numpy as np
 import yaml
 
+from sdfsim.dynamics.memory import COUNTS, PHASES
 from sdfsim.dynamics.model import Model, load_model
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.simulator import SimulationError, Simulator, join, pick_device
 from sdfsim.errors import SdfsimError
 from sdfsim.files import check_writable, write_json, write_text
+from sdfsim.learning import tables
 from sdfsim.playback import Playback, save_rollout
 from sdfsim.progress import columns
-from sdfsim.scene.effects import EFFECTS, plan
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.types import Scene
 
 Viewer = Literal["none", "file", "native", "web"]
 Progress = Callable[[str, float, str], None]  # stage, fraction of it that is done, message
-_TRIAL_STEPS = 5
 _PACKAGES = (
     "torch",
     "numpy",
@@ -74,14 +74,15 @@ def simulate(
     """
     # Everything that can be wrong from the start, before shapes are fitted for minutes or earlier results are deleted.
     pick_device(device)
-    chosen = load_model(model) if model else None
+    if model:
+        load_model(model, weights=False)
     check_writable(out)
     if viewer in ("native", "web"):
         from sdfsim.viewer import check_screen
 
         check_screen(viewer)
     scene = _load(scene_file, on_progress)
-    simulator = Simulator(scene, model=chosen, device=device, seed=seed)
+    simulator = Simulator(scene, model=model, device=device, seed=seed)
     frames = [simulator.initial_rollout()]
     live = _live(scene, viewer, frames[0], on_address)
     length = scene.duration if seconds is None else seconds
@@ -174,80 +175,46 @@ def summary(rollout: Rollout, wall: float) -> dict[str, Any]:
         "kinetic_energy_J": [_number(energy[0]), _number(energy[-1])],
         "lowest_m": _number(heights.min()) if heights.size else None,
         "outside_training": rollout.meta.get("outside_training", []),
+        "cost": cost(rollout),
         "finite": bool(np.isfinite(rollout.position).all() and np.isfinite(rollout.orientation).all()),
         "meta": rollout.meta,
     }
+
+
+def cost(rollout: Rollout) -> dict[str, dict[str, Any]]:
+    """Sum and largest value over the steps of everything that was counted or timed."""
+    counted = {name: rollout.counters[name][1:] for name in (*COUNTS, *PHASES, "step_ms") if name in rollout.counters}
+    return {
+        name: {"sum": _number(v.sum()), "mean": _number(v.mean()), "most": _number(v.max())}
+        for name, v in counted.items()
+        if len(v)
+    }
+
+
+def cost_lines(report: dict[str, Any]) -> list[str]:
+    """What a run has cost, as one table: a row for each counter and each phase of the step."""
+    told = {**COUNTS, **{name: f"{what}, ms" for name, what in PHASES.items()}, "step_ms": "whole step, ms"}
+    rows = [("", "a step", "most", "together")]
+    for name, values in report["cost"].items():
+        mean, most, total = (f"{values[k]:,.1f}" for k in ("mean", "most", "sum"))
+        rows.append((told[name], mean, most, total))
+    return columns(rows)
 
 
 def _number(value: Any) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def describe(scene_file: Path, *, model: str | None, device: str, on_progress: Progress) -> dict[str, Any]:
-    """The plan of a scene with the units and the cost of a step, measured over a few steps.
-
-    Raises:
-        SdfsimError: bad input.
-    """
-    pick_device(device)
-    chosen = load_model(model) if model else None
-    scene = _load(scene_file, on_progress)
-    decided = plan(scene)
-    simulator = Simulator(scene, model=chosen, device=device)
-    units = simulator.units
-    trial = simulator.run(steps=_TRIAL_STEPS)
-    return {
-        "scene": str(scene_file),
-        "effects": {name: decided.to_dict()[name] for name in EFFECTS},
-        "static": list(decided.static),
-        "dynamic": list(decided.dynamic),
-        "masses_kg": {b.name: b.mass for b in scene.bodies if b.motion == "dynamic"},
-        "pairs": decided.pairs,
-        "nodes": decided.nodes,
-        "model": simulator.model.name,
-        "device": str(simulator.device),
-        "duration_s": scene.duration,
-        "dt_s": simulator.dt,
-        "steps": max(1, round(scene.duration / simulator.dt)),
-        "step_ms": float(np.median(trial.counters["step_ms"][1:])),
-        "units": {"length_m": units.length, "time_s": units.time, "mass_kg": units.mass},
-        "outside_training": simulator.outside_training,
-        "failed_checks": _missed(scene),
-    }
-
-
-def plan_lines(report: dict[str, Any]) -> list[str]:
-    """`describe`'s report for people."""
-    units = report["units"]
-    moving, still = len(report["dynamic"]), len(report["static"])
-    return [
-        *(f"{name:<12}{'on' if e['on'] else 'off':<5}{e['why']}" for name, e in report["effects"].items()),
-        f"{moving} dynamic and {still} static bodies, {report['pairs']} pairs, {report['nodes']} surface nodes",
-        f"model {report['model']} on {report['device']}: {report['steps']} steps of {report['dt_s']:.4g} s, "
-        f"about {report['step_ms']:.1f} ms each (measured over the first {_TRIAL_STEPS})",
-        f"Froude scaling: the model's metre is {units['length_m']:.4g} m, its second {units['time_s']:.4g} s, "
-        f"its kilogram {units['mass_kg']:.4g} kg",
-        *(f"outside the model's training: {line}" for line in report["outside_training"]),
-    ]
-
-
 def evaluation_lines(report: dict[str, Any]) -> list[str]:
-    """`evaluate`'s report for people: a row for the model and one for the baseline at every horizon."""
-    rows = [("", "steps", "seconds", "translation RMSE, m (95 %)", "rotation error, degrees (95 %)")]
-    for who, name in (("model", report["model_name"]), ("ballistic", "ballistic")):
-        for horizon, errors in report[who].items():
-            distance, angle = errors["translation_rmse_95"], errors["rotation_error_95"]
-            rows.append(
-                (
-                    name,
-                    horizon,
-                    f"{int(horizon) * report['dt']:g}",
-                    f"{errors['translation_rmse']:.3f} ({distance[0]:.3f} to {distance[1]:.3f})",
-                    f"{errors['rotation_error']:.1f} ({angle[0]:.1f} to {angle[1]:.1f})",
-                )
-            )
+    """`evaluate`'s report for people: errors at every horizon, then the quality of the motion."""
+    names = {"name": report["model_name"], "ballistic": "ballistic"}
     return [
-        *columns(rows),
+        "Translation RMSE and mean rotation error up to each horizon (95 % intervals over trajectories)",
+        *columns(tables.error_rows(report, **names)),
+        "",
+        *columns(tables.quality_rows(report, **names)),
+        "",
+        *tables.notes(report),
         f"{report['trajectories']} trajectories, {report['bodies']} bodies, "
         f"{report['ms_per_step_per_trajectory']:.2f} ms per step and trajectory",
     ]

@@ -221,7 +221,9 @@ def test_what_is_wrong_from_the_start_is_told_before_work_and_deletes_nothing(
 
 def test_a_fit_that_missed_its_certificate_is_code_3_and_the_run_still_whole(scene, model, tmp_path, monkeypatch):
     real = load_scene
-    monkeypatch.setattr("sdfsim.run.load_scene", lambda *a, **k: replace(real(*a, **k), missed=("ball: thin walls",)))
+    missed = ("ball: thin walls",)
+    for module in ("run", "planning"):
+        monkeypatch.setattr(f"sdfsim.{module}.load_scene", lambda *a, **k: replace(real(*a, **k), missed=missed))
     done = run("simulate", scene, "-o", tmp_path / "run", "--model", model)
     assert done.exit_code == 3 and "failed check: fit of shape ball: thin walls" in done.stderr
     report = json.loads((tmp_path / "run" / "report.json").read_text())
@@ -272,26 +274,47 @@ def test_fitting_a_folder_ends_with_its_scene(tmp_path, monkeypatch):
     assert calls == [("fit", {"recipe": "paper", "device": "auto"}), ("scene", {})]
 
 
-def test_an_evaluation_is_a_table(tmp_path, monkeypatch, model):
+def test_an_evaluation_is_two_tables(tmp_path, monkeypatch, model):
     errors = {
-        "translation_rmse": 0.1714,
-        "translation_rmse_95": [0.15, 0.19],
-        "rotation_error": 12.04,
-        "rotation_error_95": [11.0, 13.0],
+        "50": {
+            "seconds": 1.0,
+            "translation_rmse": 0.1714,
+            "translation_rmse_95": [0.15, 0.19],
+            "rotation_error": 12.04,
+            "rotation_error_95": [11.0, 13.0],
+        }
     }
-    report = {"model_name": "small", "trajectories": 60, "bodies": 400, "dt": 0.02, "ms_per_step_per_trajectory": 1.5}
+    who = ("model", "ballistic", "teacher 0", "teacher 1e-6")
+    depth = {"percentile_95": 0.0123, "worst": 0.2, "steps_with_contact": 7}
+    report = {
+        "model_name": "small",
+        "trajectories": 60,
+        "bodies": 400,
+        "ms_per_step_per_trajectory": 1.5,
+        "chaos_floor": {"perturbations": {"0": errors, "1e-6": errors}, "median_farthest_unperturbed_m": 0.00053},
+        "median_survival_s": {name: {"0.25": None if "1e" in name else 0.74} for name in who},
+        "penetration": {"model": depth, "teacher": depth, "geometry": {"cube": "pieces"}, "every": 10},
+        "energy_gain": {name: {"mean": 0.01, "worst": 0.5} for name in ("model", "teacher")},
+        "resting_speed": {"model": None, "teacher": None, "bodies": 0},
+    }
     asked = {}
 
     def evaluate(data, **options):
         asked.update(options)
-        return report | {"model": {"50": errors}, "ballistic": {"50": errors}}
+        return report | {"model": errors, "ballistic": errors}
 
     monkeypatch.setattr("sdfsim.learning.evaluate.evaluate", evaluate)
-    lines = run("evaluate", tmp_path, "--free-flight", "learned").stdout.splitlines()
-    assert asked["steps"] == 50 and asked["free_flight"] == "learned"
-    assert [line.split()[:3] for line in lines[1:3]] == [["small", "50", "1"], ["ballistic", "50", "1"]]
-    assert "0.171 (0.150 to 0.190)" in lines[1] and "12.0 (11.0 to 13.0)" in lines[1]
-    assert len({line.index("12.0") for line in lines[1:3]}) == 1
+    lines = run("evaluate", tmp_path, "--free-flight", "learned", "--chaos-floor").stdout.splitlines()
+    assert asked["steps"] == 50 and asked["free_flight"] == "learned" and asked["chaos_floor"]
+    assert "50 steps = 1 s" in lines[1]
+    assert [line.split("  ")[0] for line in lines[2:5]] == ["small", "teacher, 1e-6 m/s off", "ballistic"]
+    assert all("0.171 (0.150 to 0.190)" in line and "12.0 (11.0 to 13.0)" in line for line in lines[2:5])
+    assert len({line.index("12.0") for line in lines[2:5]}) == 1
+    small, recorded, again, ballistic = (line.split() for line in lines[7:11])
+    assert small == "small 0.0123 m 0.2000 m 1.00 % 50.00 % - 0.74 s".split()
+    assert recorded[-1] == "-" and again[-3:] == [">", "1", "s"] and ballistic[-2:] == ["0.74", "s"]
+    assert any("0.0005 m (median" in line for line in lines[11:])
+    assert max(map(len, lines)) <= 120
 
 
 def stop_after(steps: int, how):
@@ -327,7 +350,7 @@ def test_tracebacks_only_with_v(scene, monkeypatch):
     def fail(*arguments, **options):
         raise ZeroDivisionError("a fault of ours")
 
-    monkeypatch.setattr("sdfsim.run.describe", fail)
+    monkeypatch.setattr("sdfsim.planning.describe", fail)
     plain, verbose = run("plan", scene), run("plan", scene, "-v")
     assert plain.exit_code == verbose.exit_code == 1
     assert "internal error: ZeroDivisionError" in plain.stderr and "Traceback" not in plain.stderr
@@ -338,7 +361,7 @@ def test_a_hint_follows_the_error(scene, monkeypatch):
     def fail(*arguments, **options):
         raise SdfsimError("what is wrong", "what to try")
 
-    monkeypatch.setattr("sdfsim.run.describe", fail)
+    monkeypatch.setattr("sdfsim.planning.describe", fail)
     assert run("plan", scene).stderr == "error: what is wrong\nhint: what to try\n"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,9 @@ import torch
 from torch import Tensor
 
 from sdfsim.dynamics import pose
+from sdfsim.dynamics.tracks import Tracks, from_paths
 from sdfsim.errors import SdfsimError
+from sdfsim.scene.pairs import contact_groups
 from sdfsim.scene.types import Scene
 from sdfsim.shape.asset import Shape
 from sdfsim.shape.bank import SdfBank
@@ -43,20 +46,25 @@ class Bodies:
     """N bodies with M surface nodes; lengths, times and masses in model units.
 
     Attributes:
-        shape: [N] int64 index into the SDF bank.
+        shape: [N] int64 index into the SDF bank, -1 for a body that nothing may touch.
         scale: [N] float64, shape metres -> model lengths.
         com: [N, 3] float64, centre of mass from the shape's origin (shape axes, scaled).
-        mass: [N] float64 (0 for static).
-        inverse_mass: [N] float64, 0 for static bodies.
-        inertia: [N, 3, 3] float64 about the centre of mass, shape axes (identity for static bodies).
+        mass: [N] float64 (0 unless dynamic).
+        inverse_mass: [N] float64, 0 unless dynamic.
+        inertia: [N, 3, 3] float64 about the centre of mass, shape axes (identity unless dynamic).
         friction, restitution: [N] float64.
-        moves: [N] bool, False for static bodies.
+        moves: [N] bool, True for dynamic bodies: they fly, and contacts push them.
         bounds: [N, 2, 3] float64, box of the solid about the centre of mass, shape axes, scaled.
         size: [N] float64, largest side of `bounds` (infinite for a plane).
+        disc: [N] float64, see the function of this name.
+        radius: [N] float64, how far `bounds` reach from the centre of mass (infinite for a plane).
         node: [M, 3] float64, surface nodes about the centre of mass, shape axes, scaled.
         node_start: [N + 1] int64, body k owns nodes node_start[k] : node_start[k + 1].
-        may_touch: [N, N] bool, or None when every pair with a body that moves may.
-        bank: signed distances of all shapes.
+        group: [N] int64, what `collides_with` makes of a body.
+        allowed: [G, G] bool, whether bodies of two groups may touch.
+        world: [N] int64: bodies of two worlds never meet; -1 is in all of them.
+        bank: signed distances of the shapes that may be touched.
+        tracks: the paths of kinematic bodies, None where there are none.
     """
 
     shape: Tensor
@@ -70,10 +78,15 @@ class Bodies:
     moves: Tensor
     bounds: Tensor
     size: Tensor
+    disc: Tensor
+    radius: Tensor
     node: Tensor
     node_start: Tensor
-    may_touch: Tensor | None
+    group: Tensor
+    allowed: Tensor
+    world: Tensor
     bank: SdfBank
+    tracks: Tracks | None = None
 
     def __len__(self) -> int:
         return len(self.shape)
@@ -81,6 +94,33 @@ class Bodies:
     @property
     def device(self) -> torch.device:
         return self.shape.device
+
+    def may_meet(self, a: Tensor, b: Tensor) -> Tensor:
+        """[P] bool: whether bodies `a` [P] and `b` [P] may touch; at least one of a pair is dynamic."""
+        one, other = self.world[a], self.world[b]
+        together = (one == other) | (one < 0) | (other < 0)
+        return together & (self.moves[a] | self.moves[b]) & self.allowed[self.group[a], self.group[b]]
+
+
+@dataclass(frozen=True)
+class Sleep:
+    """Which of N bodies are frozen, see `sdfsim.dynamics.sleep`.
+
+    Attributes:
+        quiet: [N] int64, for how many steps a body in contact has stayed near its anchor.
+        anchor: [N, 7] float64, position and orientation that it has stayed near.
+        island: [N] int64, a number shared by the bodies that fell asleep together; -1 for all that are awake.
+        link: [L, 2] int64, a sleeper and a body it rests on that is not dynamic.
+        held: [N, 13] float64, position, orientation and velocities of all bodies when the last of them fell asleep.
+        gravity: [3], what they fell asleep under.
+    """
+
+    quiet: Tensor
+    anchor: Tensor
+    island: Tensor
+    link: Tensor
+    held: Tensor
+    gravity: Tensor
 
 
 @dataclass(frozen=True)
@@ -94,6 +134,8 @@ class State:
         angular_velocity: [N, 3] float64, world frame.
         earlier_position, earlier_orientation: [2, N, 3] and [2, N, 4], the two poses before (oldest first),
             for the *paper* network; None where nobody needs them.
+        sleep: who is frozen; None where sleep is off.
+        time: since the start.
     """
 
     position: Tensor
@@ -102,6 +144,27 @@ class State:
     angular_velocity: Tensor
     earlier_position: Tensor | None = None
     earlier_orientation: Tensor | None = None
+    sleep: Sleep | None = None
+    time: float = 0.0
+
+
+def awake(bodies: Bodies, state: State) -> Tensor:
+    """[A] int64, the dynamic bodies that are not asleep."""
+    moves = bodies.moves if state.sleep is None else bodies.moves & (state.sleep.island < 0)
+    return moves.nonzero()[:, 0]
+
+
+def disc(bounds: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
+    """[N] radius of bodies with `bounds` [N, 2, 3] about their centres of mass; infinite for a plane.
+
+    Half the diagonal of the box, and how far its middle is off: with this measure the engine of the training data
+    scales the distance at which it begins to act on a contact.
+    """
+    bounds = np.asarray(bounds)
+    finite = np.asarray(np.isfinite(bounds).all((1, 2)))
+    box = np.where(finite[:, None, None], bounds, 0.0)
+    radius = np.linalg.norm(box.mean(1), axis=-1) + 0.5 * np.linalg.norm(box[:, 1] - box[:, 0], axis=-1)
+    return np.where(finite, radius, np.inf)
 
 
 def from_scene(
@@ -134,8 +197,12 @@ def from_scene(
     def tensor(array, dtype=torch.float64) -> Tensor:
         return torch.as_tensor(np.asarray(array), dtype=dtype, device=device)
 
+    group, allowed = contact_groups(scene.bodies)
+    touched = sorted({b.shape for b, g in zip(scene.bodies, group, strict=True) if allowed[g].any()})
+    slot = {shape: k for k, shape in enumerate(touched)}
+    paths = [(k, b.path) for k, b in enumerate(scene.bodies) if b.path is not None]
     bodies = Bodies(
-        shape=tensor([b.shape for b in scene.bodies], torch.int64),
+        shape=tensor([slot.get(b.shape, -1) for b in scene.bodies], torch.int64),
         scale=tensor(scale),
         com=tensor(com),
         mass=tensor(mass),
@@ -146,10 +213,15 @@ def from_scene(
         moves=tensor(moves, torch.bool),
         bounds=tensor(bounds),
         size=tensor((bounds[:, 1] - bounds[:, 0]).max(-1)),
+        radius=tensor(np.linalg.norm(np.abs(bounds).max(1), axis=-1)),
+        disc=tensor(disc(bounds)),
         node=tensor(np.concatenate(nodes).reshape(-1, 3)),
         node_start=tensor(np.concatenate([[0], np.cumsum([len(n) for n in nodes])]), torch.int64),
-        may_touch=_may_touch(scene, device),
-        bank=SdfBank([s.sdf for s in scene.shapes]).to(device),
+        group=tensor(group, torch.int64),
+        allowed=tensor(allowed, torch.bool),
+        world=torch.zeros(len(scene.bodies), dtype=torch.int64, device=device),
+        bank=SdfBank([scene.shapes[k].sdf for k in touched], device),
+        tracks=from_paths(paths, com, length=units.length, time=units.time, device=device),
     )
     orientation = tensor([b.quat_xyzw for b in scene.bodies])
     origin = tensor([b.position for b in scene.bodies]) / units.length
@@ -175,18 +247,3 @@ def _inertia(body, shape, moves: bool) -> np.ndarray:
         return np.asarray(body.inertia, dtype=np.float64)
     density = body.mass / (shape.volume * body.scale**3)
     return density * shape.inertia * body.scale**5
-
-
-def _may_touch(scene: Scene, device: torch.device) -> Tensor | None:
-    if all(b.collides_with is None for b in scene.bodies):
-        return None
-    index = {b.name: k for k, b in enumerate(scene.bodies)}
-    allowed = torch.ones(len(scene.bodies), len(scene.bodies), dtype=torch.bool, device=device)
-    for k, body in enumerate(scene.bodies):
-        if body.collides_with is not None:
-            row = torch.zeros(len(scene.bodies), dtype=torch.bool, device=device)
-            row[[index[name] for name in body.collides_with]] = True
-            # A pair touches only when both sides agree.
-            allowed[k] &= row
-            allowed[:, k] &= row
-    return allowed

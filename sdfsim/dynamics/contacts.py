@@ -9,6 +9,9 @@ from torch import Tensor
 
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State
+from sdfsim.dynamics.broad import expand, near_pairs, turning
+from sdfsim.dynamics.graph import number_pairs
+from sdfsim.dynamics.memory import Memory, Waits
 
 DEPTH_PULL = 5.0  # how much farther out (in lengths) a node must be to be kept for each length it is higher
 _GOLDEN = (1.0 + 5.0**0.5) / 2.0
@@ -17,6 +20,8 @@ _ICOSAHEDRON = [
     for i in range(3)
     for axis in ((0.0, a, b * _GOLDEN) for a in (-1.0, 1.0) for b in (-1.0, 1.0))
 ]
+
+ARRAYS = ("owner", "node", "body", "arm", "distance", "normal", "ahead")
 
 
 @dataclass(frozen=True)
@@ -32,6 +37,7 @@ class Contacts:
         normal: [E, 3] float64, unit outward normal of `body` at the closest point.
         ahead: [E] float64, the distance there will be after the step if the node keeps closing in.
         queries: how many signed distances were evaluated to find them.
+        waiting: how many were not, because an earlier answer says that there can be no edge yet.
     """
 
     owner: Tensor
@@ -42,12 +48,21 @@ class Contacts:
     normal: Tensor
     ahead: Tensor
     queries: int = 0
+    waiting: int = 0
 
     def __len__(self) -> int:
         return len(self.owner)
 
 
-def find_contacts(bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float) -> Contacts:
+def find_contacts(
+    bodies: Bodies,
+    state: State,
+    gravity: Tensor,
+    reach: float,
+    dt: float,
+    memory: Memory | None = None,
+    rows: int | None = None,
+) -> Contacts:
     """All contact edges of a state.
 
     An edge exists where d + min(0, closing velocity * dt) <= reach: a fixed threshold would let a fast body bounce
@@ -59,28 +74,64 @@ def find_contacts(bodies: Bodies, state: State, gravity: Tensor, reach: float, d
         gravity: [3], model units.
         reach: contact radius D, model length.
         dt: the step, model time.
+        memory: of the run; it saves work and counts it.
+        rows: look at no more than that many nodes at once (but at all of a body's), None for all.
     """
-    first, second = _near_pairs(bodies, state, gravity, reach, dt)
-    pair, node = _expand(bodies.node_start[first], bodies.node_start[first + 1])
-    owner, other = first[pair], second[pair]
+    memory = memory or Memory()
+    with memory.timed("pairs_ms"):
+        going, still = memory.surroundings(bodies, state, gravity, reach, dt)
+        first, second = near_pairs(bodies, state, gravity, reach, dt, going, still)
+    if not len(first):
+        memory.waits.turn()
+        return no_contacts(bodies)
+    with memory.timed("distances_ms"):
+        approach = _approach(bodies, state, gravity, first, second, dt)
+        cuts = _cuts(bodies, first, rows)
+        pairs = zip(first.split(cuts), second.split(cuts), approach.split(cuts), strict=True)
+        parts = [_edges(bodies, state, gravity, reach, dt, *part, memory.waits) for part in pairs]
+        memory.waits.turn()
+        found = _joined(parts)
+    near = number_pairs(first, second, len(bodies))[1]
+    memory.count(pairs=near, sdf_queries=found.queries, sdf_waiting=found.waiting)
+    return found
+
+
+def _edges(
+    bodies: Bodies,
+    state: State,
+    gravity: Tensor,
+    reach: float,
+    dt: float,
+    first: Tensor,
+    second: Tensor,
+    approach: Tensor,
+    waits: Waits,
+) -> Contacts:
+    """The edges from nodes of bodies `first` to bodies `second` [P], which approach by at most `approach` [P]."""
+    pair, node = expand(bodies.node_start[first], bodies.node_start[first + 1])
+    owner, other, approach = first[pair], second[pair], approach[pair]
     arm = pose.rotate(state.orientation[owner], bodies.node[node])
     # Differences are taken in float64 before anything is cast, so that a far origin costs no precision.
     offset = state.position[owner] - state.position[other] + arm
     local = pose.rotate(pose.conjugate(state.orientation[other]), offset)
-    approach = _approach(bodies, state, gravity, owner, other, dt)
     box = bodies.bounds[other]
     margin = (reach + approach)[:, None]
-    near = ((local >= box[:, 0] - margin) & (local <= box[:, 1] + margin)).all(-1)
-    owner, other, node, arm, local = owner[near], other[near], node[near], arm[near], local[near]
+    near = ((local >= box[:, 0] - margin) & (local <= box[:, 1] + margin)).all(-1).nonzero()[:, 0]
+    owner, other, node, local, approach = owner[near], other[near], node[near], local[near], approach[near]
 
-    scale = bodies.scale[other]
-    query = (local + bodies.com[other]) / scale[:, None]
-    distance, gradient = bodies.bank(bodies.shape[other], query)
-    distance = distance * scale
+    key = (owner * len(bodies) + other) * len(bodies.node) + node
+    trust = bodies.bank.trust[bodies.shape[other]]
+    wait, place, known = waits.may_wait(key, local, trust, reach + approach)
+    asked = (~wait).nonzero()[:, 0]
+    distance, gradient = _distances(bodies, other[asked], local[asked])
+    place, known = place.index_copy(0, asked, local[asked]), known.index_copy(0, asked, distance)
+    waits.note(key, place, known, trust * known > reach)
+
+    owner, other, node, local = owner[asked], other[asked], node[asked], local[asked]
+    arm, offset = arm[near[asked]], offset[near[asked]]
     normal = pose.rotate(state.orientation[other], _unit(gradient, local))
-
     velocity = node_velocity(state, owner, arm) + gravity * dt * bodies.moves[owner, None]
-    arm_other = offset[near] - distance[:, None] * normal
+    arm_other = offset - distance[:, None] * normal
     velocity = velocity - node_velocity(state, other, arm_other) - gravity * dt * bodies.moves[other, None]
     closing = (velocity * normal).sum(-1).clamp_max(0.0)
     ahead = distance + closing * dt
@@ -93,8 +144,46 @@ def find_contacts(bodies: Bodies, state: State, gravity: Tensor, reach: float, d
         distance=distance[touching],
         normal=normal[touching],
         ahead=ahead[touching],
-        queries=len(query),
+        queries=len(asked),
+        waiting=len(wait) - len(asked),
     )
+
+
+def _distances(bodies: Bodies, other: Tensor, local: Tensor) -> tuple[Tensor, Tensor]:
+    """Distance [Q] and gradient [Q, 3] of bodies `other` [Q] at `local` [Q, 3] about their centres of mass."""
+    if not len(other):
+        return local[:, 0], local
+    scale = bodies.scale[other]
+    distance, gradient = bodies.bank(bodies.shape[other], (local + bodies.com[other]) / scale[:, None])
+    return distance * scale, gradient
+
+
+def no_contacts(bodies: Bodies) -> Contacts:
+    """None at all."""
+    index = torch.zeros(0, dtype=torch.int64, device=bodies.device)
+    number = torch.zeros(0, dtype=torch.float64, device=bodies.device)
+    return Contacts(index, index, index, number[:, None].expand(0, 3), number, number[:, None].expand(0, 3), number)
+
+
+def _cuts(bodies: Bodies, first: Tensor, rows: int | None) -> list[int]:
+    """How many pairs to look at together: their owners have at most `rows` nodes, or it is one pair."""
+    if rows is None:
+        return [len(first)]
+    sizes, total = [0], 0
+    for nodes in (bodies.node_start[first + 1] - bodies.node_start[first]).tolist():
+        if sizes[-1] and total + nodes > rows:
+            sizes.append(0)
+            total = 0
+        sizes[-1] += 1
+        total += nodes
+    return sizes
+
+
+def _joined(parts: list[Contacts]) -> Contacts:
+    if len(parts) == 1:
+        return parts[0]
+    arrays = {k: torch.cat([getattr(part, k) for part in parts]) for k in ARRAYS}
+    return Contacts(**arrays, queries=sum(p.queries for p in parts), waiting=sum(p.waiting for p in parts))
 
 
 def thin_contacts(bodies: Bodies, contacts: Contacts) -> Contacts:
@@ -119,7 +208,7 @@ def thin_contacts(bodies: Bodies, contacts: Contacts) -> Contacts:
     number = torch.where(score >= best[pair], number, edges)
     winner = torch.full((pairs, score.shape[1]), edges, device=score.device).scatter_reduce(0, group, number, "amin")
     kept = torch.unique(winner)
-    arrays = {k: getattr(contacts, k)[kept] for k in ("owner", "node", "body", "arm", "distance", "normal", "ahead")}
+    arrays = {k: getattr(contacts, k)[kept] for k in ARRAYS}
     return replace(contacts, **arrays)
 
 
@@ -128,49 +217,11 @@ def node_velocity(state: State, body: Tensor, arm: Tensor) -> Tensor:
     return state.velocity[body] + torch.linalg.cross(state.angular_velocity[body], arm)
 
 
-def _near_pairs(bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float) -> tuple[Tensor, Tensor]:
-    """Ordered pairs (owner of nodes, other) whose swept, grown boxes overlap: [P], [P]."""
-    low, high = _world_boxes(bodies, state)
-    sweep = (state.velocity * dt).abs() + (gravity * dt * dt).abs() * bodies.moves[:, None]
-    # Turning moves a corner by at most |w| dt times its distance from the centre.
-    radius = bodies.bounds.abs().amax(1).norm(dim=-1)
-    turn = torch.where(bodies.moves, state.angular_velocity.norm(dim=-1) * dt * radius, torch.zeros_like(radius))
-    grow = sweep + turn[:, None] + 0.5 * reach
-    low, high = low - grow, high + grow
-    overlap = (low[:, None] <= high[None]).all(-1) & (high[:, None] >= low[None]).all(-1)
-    overlap &= bodies.moves[:, None] | bodies.moves[None]
-    overlap &= (bodies.node_start[1:] > bodies.node_start[:-1])[:, None]
-    overlap.fill_diagonal_(False)
-    if bodies.may_touch is not None:
-        overlap &= bodies.may_touch
-    first, second = overlap.nonzero(as_tuple=True)
-    return first, second
-
-
-def _world_boxes(bodies: Bodies, state: State) -> tuple[Tensor, Tensor]:
-    """Axis-aligned boxes [N, 3], [N, 3] of the turned bounds."""
-    finite = bodies.bounds.isfinite().all(-1).all(-1)
-    box = torch.where(finite[:, None, None], bodies.bounds, torch.zeros_like(bodies.bounds))
-    centre = state.position + pose.rotate(state.orientation, box.mean(1))
-    half = (pose.to_matrix(state.orientation).abs() @ (0.5 * (box[:, 1] - box[:, 0]))[..., None])[..., 0]
-    half = torch.where(finite[:, None], half, torch.full_like(half, torch.inf))
-    return centre - half, centre + half
-
-
 def _approach(bodies: Bodies, state: State, gravity: Tensor, owner: Tensor, other: Tensor, dt: float) -> Tensor:
-    """Upper bound [Q] on how far a node of `owner` and the surface of `other` approach in one step."""
-    radius = bodies.bounds.abs().amax(1).norm(dim=-1)
-    turn = torch.where(bodies.moves, state.angular_velocity.norm(dim=-1) * radius, torch.zeros_like(radius))
+    """Upper bound [P] on how far a node of `owner` and the surface of `other` approach in one step."""
     relative = (state.velocity[owner] - state.velocity[other]).norm(dim=-1)
-    return (relative + turn[owner] + turn[other]) * dt + gravity.norm() * dt * dt
-
-
-def _expand(start: Tensor, stop: Tensor) -> tuple[Tensor, Tensor]:
-    """For ranges start[k]:stop[k], the range index and the value of every element, in order."""
-    count = stop - start
-    which = torch.repeat_interleave(torch.arange(len(count), device=count.device), count)
-    first = torch.repeat_interleave(count.cumsum(0) - count, count)
-    return which, start[which] + torch.arange(len(which), device=count.device) - first
+    turn = turning(bodies, state, owner) + turning(bodies, state, other)
+    return (relative + turn) * dt + gravity.norm() * dt * dt
 
 
 def _unit(gradient: Tensor, fallback: Tensor) -> Tensor:

@@ -33,6 +33,12 @@ def torque_free(orientation: Tensor, angular_velocity: Tensor, inertia: Tensor, 
     Returns:
         Orientation [N, 4] and angular velocity [N, 3] rad/s after `dt`.
     """
+    turning = (angular_velocity != 0).any(-1).nonzero()[:, 0]
+    if len(turning) < len(orientation):  # what does not turn stays as it is
+        some = orientation[turning], angular_velocity[turning]
+        if len(turning):
+            some = torque_free(*some, inertia[turning], dt)
+        return orientation.index_copy(0, turning, some[0]), angular_velocity.index_copy(0, turning, some[1])
     if len(orientation) == 0:
         return orientation, angular_velocity
     inverse = torch.linalg.inv(inertia)

@@ -7,6 +7,7 @@ step turns with the scene, whatever the weights are.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -50,6 +51,13 @@ def mlp(inputs: int, width: int, outputs: int) -> nn.Sequential:
     )
 
 
+def by_rows(function: Callable[..., Tensor], rows: int | None, *inputs: Tensor) -> Tensor:
+    """`function` of inputs [E, ...] that treats every row alone, on at most `rows` of them at once."""
+    if rows is None or len(inputs[0]) <= rows:
+        return function(*inputs)
+    return torch.cat([function(*part) for part in zip(*(v.split(rows) for v in inputs), strict=True)])
+
+
 class Round(nn.Module):
     """One round: edges read both bodies and the current relative velocities, then push and inform them."""
 
@@ -81,36 +89,42 @@ class ImpulseNetwork(nn.Module):
         self.encode = mlp(EDGE_FEATURES, config.width, config.width)
         self.rounds = nn.ModuleList(Round(config.width) for _ in range(config.rounds))
 
-    def forward(self, graph: ContactGraph, *, friction: bool = True, mirrored: bool = False) -> Velocities:
+    def forward(
+        self, graph: ContactGraph, *, friction: bool = True, mirrored: bool = False, rows: int | None = None
+    ) -> Velocities:
         """Velocities after the contacts have acted.
 
         Args:
             graph: bodies and edges.
             friction: False computes no tangential impulse at all.
             mirrored: see `edge_frames`.
+            rows: update no more than that many edges at once; None for all.
         """
         frames = edge_frames(graph, mirrored=mirrored)
-        edge = self.encode(frames.start)
+        edge = by_rows(self.encode, rows, frames.start)
         body = edge.new_zeros(len(graph.inverse_mass), self.config.width)
         now = Velocities(graph.free_velocity, graph.free_angular, graph.mean_velocity, graph.mean_angular)
         for layer in self.rounds:
-            edge, body, now = self._round(layer, graph, frames, edge, body, now, friction)
+            edge, body, now = self._round(layer, graph, frames, edge, body, now, friction, rows)
         return now
 
-    def _round(self, layer, graph: ContactGraph, frames: EdgeFrames, edge, body, now: Velocities, friction: bool):
+    def _round(self, layer, graph: ContactGraph, frames: EdgeFrames, edge, body, now: Velocities, friction, rows):
         end = _in_frame(graph, frames, now.velocity, now.angular)
         mean = _in_frame(graph, frames, now.mean_velocity, now.mean_angular)
         first, second = graph.first, graph.second
-        hidden = layer.edge(torch.cat([layer.normalise(edge), body[first], body[second], end, mean], -1))
+
+        def read(edge: Tensor, first: Tensor, second: Tensor, end: Tensor, mean: Tensor) -> Tensor:
+            return layer.edge(torch.cat([layer.normalise(edge), body[first], body[second], end, mean], -1))
+
+        hidden = by_rows(read, rows, edge, first, second, end, mean)
         edge = edge + layer.latent(hidden)
         weight = _share_of_pair(layer.attention(hidden)[:, 0], graph)[:, None]
 
-        normal = layer.normal_impulse(hidden)
-        change = hidden.new_zeros(len(hidden), 2, 3)  # [E, end | mean, axis] velocity change, units of `speed`
-        change[:, :, 0] = normal
+        # [E, end | mean, axis] velocity change, units of `speed`; without friction the normal is the only axis.
+        change = layer.normal_impulse(hidden)[..., None]
         if friction:
-            change[:, :, 1:] = layer.tangent_impulse(hidden).reshape(-1, 2, 2)
-        impulse = change * (weight * frames.speed)[..., None] * frames.mass[:, None]
+            change = torch.cat([change, layer.tangent_impulse(hidden).reshape(-1, 2, 2)], -1)
+        impulse = change * (weight * frames.speed)[..., None] * frames.mass[:, None, : change.shape[-1]]
         now = Velocities(
             *_push(graph, frames, impulse[:, 0], now.velocity, now.angular),
             *_push(graph, frames, impulse[:, 1], now.mean_velocity, now.mean_angular),
@@ -138,10 +152,17 @@ def _share_of_pair(logit: Tensor, graph: ContactGraph) -> Tensor:
 
 
 def _push(graph: ContactGraph, frames: EdgeFrames, impulse: Tensor, velocity: Tensor, angular: Tensor):
-    """Apply impulses [E, 3] (edge frames) to both bodies: new velocities [N, 3] and angular velocities [N, 3]."""
-    world = (impulse[:, None] @ frames.axes)[:, 0]
+    """Apply impulses [E, 3] (edge frames; [E, 1] along the normal) to both: new velocities, linear and angular."""
+    world = _along(impulse, frames.axes)
     velocity = velocity.index_add(0, graph.first, world * frames.push_first)
     velocity = velocity.index_add(0, graph.second, -world * frames.push_second)
-    angular = angular.index_add(0, graph.first, (impulse[:, None] @ frames.turn_first)[:, 0])
-    angular = angular.index_add(0, graph.second, -(impulse[:, None] @ frames.turn_second)[:, 0])
+    angular = angular.index_add(0, graph.first, _along(impulse, frames.turn_first))
+    angular = angular.index_add(0, graph.second, -_along(impulse, frames.turn_second))
     return velocity, angular
+
+
+def _along(impulse: Tensor, vectors: Tensor) -> Tensor:
+    """[E, 3]: vectors [E, 3, 3] of the axes, each times the impulse [E, 3] along it; [E, 1]: of the first axis alone."""
+    if impulse.shape[-1] == 1:
+        return impulse * vectors[:, 0]
+    return (impulse[:, None] @ vectors)[:, 0]

@@ -79,11 +79,20 @@ def bundled_models() -> list[str]:
     return sorted(p.stem for p in BUNDLED.glob("*.safetensors"))
 
 
-def load_model(name: str | Path | None = None) -> Model:
+class Unread(nn.Module):
+    """Stands for weights that nothing will ask."""
+
+    def forward(self, *_: Any, **__: Any) -> None:
+        """Never to be called."""
+        raise RuntimeError("the weights of this model were not read")
+
+
+def load_model(name: str | Path | None = None, *, weights: bool = True) -> Model:
     """A bundled model by name, or any model file by path.
 
     Args:
         name: None for the default model.
+        weights: False reads only what the model says of itself; its network is then `Unread`.
 
     Raises:
         SdfsimError: unknown name, unreadable or foreign file.
@@ -99,9 +108,9 @@ def load_model(name: str | Path | None = None) -> Model:
     try:
         with safe_open(path, framework="pt") as file:
             info = json.loads((file.metadata() or {})["sdfsim_model"])
-            weights = {k: file.get_tensor(k) for k in file.keys()}
-        network = new_network(info["kind"], info.pop("config"))
-        network.load_state_dict(weights)
+            config = info.pop("config")
+            network = Unread() if not weights else new_network(info["kind"], config)
+            network.load_state_dict({k: file.get_tensor(k) for k in file.keys()} if weights else {})
     except (OSError, SafetensorError, KeyError, ValueError, TypeError, RuntimeError) as error:
         raise SdfsimError(f"{path}: not a model of this version of sdfsim: {error}") from error
     network.eval().requires_grad_(False)

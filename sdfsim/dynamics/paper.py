@@ -9,10 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 from typing import cast
 
 import torch
 from torch import Tensor, nn
+
+from sdfsim.dynamics.impulse import by_rows
 
 NODE_FEATURES = 13  # of surface nodes and of body nodes
 INTRA_FEATURES = 8
@@ -73,9 +76,13 @@ class EdgeUpdate(nn.Module):
             nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, width), nn.LayerNorm(width)
         )
 
-    def forward(self, edge: Tensor, sender: Tensor, receiver: Tensor, source: Tensor, target: Tensor) -> Tensor:
-        """[E, width] updates of edges from node `source` [E] (of `sender`) to `target` [E] (of `receiver`)."""
-        return self.rest(self.edge(edge) + self.sender(sender)[source] + self.receiver(receiver)[target])
+    def project(self, sender: Tensor, receiver: Tensor) -> tuple[Tensor, Tensor]:
+        """The nodes' parts of the first layer."""
+        return self.sender(sender), self.receiver(receiver)
+
+    def forward(self, sent: Tensor, received: Tensor, edge: Tensor, source: Tensor, target: Tensor) -> Tensor:
+        """[E, width] updates of edges from node `source` [E] (`sent` is projected) to `target` [E] (`received`)."""
+        return self.rest(self.edge(edge) + sent[source] + received[target])
 
 
 class Step(nn.Module):
@@ -111,8 +118,13 @@ class PaperNetwork(nn.Module):
         self.steps = nn.ModuleList([Step(width) for _ in range(config.steps)])
         self.decode = mlp(width, width, 3, normalised=False)
 
-    def forward(self, graph: SurfaceGraph) -> Tensor:
-        """Standardised accelerations (change of displacement a step) of the surface nodes, [M, 3]."""
+    def forward(self, graph: SurfaceGraph, *, rows: int | None = None) -> Tensor:
+        """Standardised accelerations (change of displacement a step) of the surface nodes, [M, 3].
+
+        Args:
+            graph: nodes and edges.
+            rows: update no more than that many edges at once; None for all.
+        """
         g = graph
         node = self.encode["node"](self.scale["node"](g.node))
         body = self.encode["body"](self.scale["body"](g.body))
@@ -129,7 +141,9 @@ class PaperNetwork(nn.Module):
             heard = {}
             for kind in KINDS:
                 sender, receiver = (node, body) if kind.endswith("up") else (body, node)
-                edges[kind] = edges[kind] + step.edges[kind](edges[kind], sender, receiver, *ends[kind])
+                update = step.edges[kind]
+                project = update.project(sender, receiver)  # type: ignore[operator]
+                edges[kind] = edges[kind] + by_rows(partial(update, *project), rows, edges[kind], *ends[kind])
                 heard[kind] = torch.zeros_like(receiver).index_add_(0, ends[kind][1], edges[kind])
             node, body = (
                 node + step.node(torch.cat([node, heard["intra_down"], heard["contact_down"]], -1)),

@@ -20,14 +20,12 @@ def outside_training(scene: Scene, model: Model, units: Units) -> list[str]:
     moving = [b for b in scene.bodies if b.motion == "dynamic"]
     if not moving or not model.ranges:
         return []
-    pairs = [(a, b) for k, a in enumerate(scene.bodies) for b in scene.bodies[k + 1 :]]
-    pairs = [(a, b) for a, b in pairs if "dynamic" in (a.motion, b.motion)]
     seen = {
         "size": [largest_extent(scene.shapes[b.shape]) * b.scale / units.length for b in moving],
         "speed": [float(np.linalg.norm(b.velocity)) / units.velocity for b in moving],
         "mass_ratio": [max(b.mass for b in moving) / min(b.mass for b in moving)],
-        "friction": [a.friction * b.friction for a, b in pairs],
-        "restitution": [a.restitution * b.restitution for a, b in pairs],
+        "friction": _products(scene, "friction"),
+        "restitution": _products(scene, "restitution"),
     }
     si = {"size": units.length, "speed": units.velocity}
     labels = {
@@ -38,6 +36,8 @@ def outside_training(scene: Scene, model: Model, units: Units) -> list[str]:
         "restitution": "restitution of two bodies, multiplied",
     }
     lines = []
+    if any(b.motion == "kinematic" for b in scene.bodies):
+        lines.append(f"bodies on a path: {model.name} has seen none in training")
     for name, values in seen.items():
         if not values or name not in model.ranges:
             continue
@@ -50,3 +50,23 @@ def outside_training(scene: Scene, model: Model, units: Units) -> list[str]:
                 f"{model.name} was trained on {low * unit:.3g} to {high * unit:.3g}"
             )
     return lines
+
+
+def constant_in_training(model: Model) -> list[str]:
+    """The quantities that never varied in training: the model cannot know what they change."""
+    return [name for name, (low, high) in model.ranges.items() if high - low <= 1e-9]
+
+
+def _products(scene: Scene, name: str) -> list[float]:
+    """The products of a coefficient over all pairs with a dynamic body, each value once."""
+    count: dict[tuple[float, bool], int] = {}
+    for body in scene.bodies:
+        key = (getattr(body, name), body.motion == "dynamic")
+        count[key] = count.get(key, 0) + 1
+    listed = list(count.items())
+    return [
+        one * other
+        for k, ((one, moves), many) in enumerate(listed)
+        for (other, goes), _ in listed[k if many > 1 else k + 1 :]
+        if moves or goes
+    ]

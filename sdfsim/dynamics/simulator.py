@@ -13,11 +13,13 @@ import torch
 
 import sdfsim
 from sdfsim.dynamics import pose
-from sdfsim.dynamics.bodies import Bodies, State, Units, from_scene, largest_extent
+from sdfsim.dynamics.bodies import Bodies, State, Units, awake, from_scene, largest_extent
 from sdfsim.dynamics.contacts import Contacts
+from sdfsim.dynamics.memory import Memory, row_limit
 from sdfsim.dynamics.model import Model, load_model
 from sdfsim.dynamics.ranges import outside_training
 from sdfsim.dynamics.rollout import Rollout
+from sdfsim.dynamics.sleep import nobody_asleep
 from sdfsim.dynamics.step import FreeFlight, Rules, fly, step
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.scene.effects import plan
@@ -73,6 +75,8 @@ class Simulator:
         free_flight: "exact", or "learned" for the *paper* network's own formulation.
 
     Attributes:
+        state: bodies and how they move, model units. Give it another one to start from there, or to change a body:
+            `simulator.state = replace(simulator.state, velocity=...)`; its tensors are not to be written into.
         dt: s, the step in the scene's units.
         units: metres, seconds and kilograms per model unit.
         outside_training: what of the scene the model has not seen in training, one line each.
@@ -93,28 +97,36 @@ class Simulator:
     ) -> None:
         self.scene = scene
         self.device = pick_device(device)
+        effects = plan(scene)
         model = model if model is not None else scene.model
-        self.model = (model if isinstance(model, Model) else load_model(model)).to(self.device)
+        asked = effects.contact.on or free_flight == "learned"
+        self.model = (model if isinstance(model, Model) else load_model(model, weights=asked)).to(self.device)
         if free_flight == "learned" and self.model.kind != "paper":
             raise SdfsimError("free_flight 'learned' exists for the paper network only", "give a model of that kind")
         self.seed = scene.seed if seed is None else seed
         self.units = scene_units(scene, self.model, dt)
         self.dt = self.model.dt * self.units.time
         self.outside_training = outside_training(scene, self.model, self.units)
-        effects = plan(scene)
         gravity = torch.tensor(scene.gravity / self.units.acceleration, dtype=torch.float64, device=self.device)
         self.rules = Rules(
             gravity=gravity,
             dt=self.model.dt,
+            falls=effects.gravity.on,
             contact=effects.contact.on,
             friction=effects.friction.on,
             restitution=effects.restitution.on,
             rotation=effects.rotation.on,
             free_flight=free_flight,
+            rows=row_limit(scene.limits),
         )
         self.bodies, self.state = from_scene(scene, self.units, self.device, self.model.nodes)
         if self.model.kind == "paper":
             self.state = with_history(self.state, self.bodies, self.rules)
+        if effects.sleep.on:
+            self.state = replace(self.state, sleep=nobody_asleep(self.bodies, gravity))
+        self.memory = Memory()
+        self._dynamic = self.bodies.moves.nonzero()[:, 0]
+        self._names = tuple(b.name for b in scene.bodies)
         self.contacts: Contacts | None = None
         self.steps_done = 0
 
@@ -170,27 +182,29 @@ class Simulator:
             orientation=s.orientation.cpu(),
             velocity=(s.velocity * u.velocity).cpu(),
             angular_velocity=(s.angular_velocity / u.time).cpu(),
+            time=s.time * u.time,
         )
 
     def _step(self) -> None:
-        after, contacts = step(self.model, self.bodies, self.state, self.rules)
+        after, contacts = step(self.model, self.bodies, self.state, self.rules, self.memory)
         self._check(after)
         self.state, self.contacts = after, contacts
         self.steps_done += 1
 
     def _check(self, state: State) -> None:
+        rows = awake(self.bodies, state)
         for name in ("position", "orientation", "velocity", "angular_velocity"):
-            bad = ~getattr(state, name).isfinite().all(-1)
+            bad = ~getattr(state, name)[rows].isfinite().all(-1)
             if bad.any():
-                self._broke(f"{name} is not finite", bad)
-        rotation = pose.to_matrix(state.orientation)
+                self._broke(f"{name} is not finite", rows[bad])
+        rotation = pose.to_matrix(state.orientation[rows])
         eye = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
         bad = (rotation.mT @ rotation - eye).abs().amax((-2, -1)) > SPIN_LIMIT
         if bad.any():
-            self._broke("orientation is no rotation", bad)
+            self._broke("orientation is no rotation", rows[bad])
 
     def _broke(self, what: str, bad: torch.Tensor) -> None:
-        name = self.scene.bodies[int(bad.nonzero()[0])].name
+        name = self.scene.bodies[int(bad[0])].name
         raise SimulationError(f"step {self.steps_done + 1}: body {name!r}: {what}", self.initial_rollout())
 
     def _frame(self, milliseconds: float) -> Rollout:
@@ -203,10 +217,10 @@ class Simulator:
             pairs = torch.stack([c.owner, c.body], -1).cpu().numpy()
         depth = float((-c.distance).clamp_min(0.0).max()) * u.length if c is not None and count else 0.0
         counters = {
-            **self._energies(state),
+            **self._energies(),
             "contacts": float(count),
             "worst_penetration": depth,
-            "sdf_queries": float(c.queries) if c is not None else 0.0,
+            **self.memory.counts,
             "step_ms": milliseconds,
         }
         return Rollout(
@@ -219,7 +233,7 @@ class Simulator:
             contact_point=points,
             contact_body=pairs,
             counters={k: np.array([v]) for k, v in counters.items()},
-            names=tuple(b.name for b in self.scene.bodies),
+            names=self._names,
             meta={
                 "model": self.model.name,
                 "seed": self.seed,
@@ -238,14 +252,14 @@ class Simulator:
         turned = pose.rotate(self.state.orientation[contacts.owner], self.bodies.node[contacts.node])
         return self.state.position[contacts.owner] + turned
 
-    def _energies(self, state: State) -> dict[str, float]:
-        """Kinetic and potential energy in joules of all bodies that move."""
-        u, b = self.units, self.bodies
-        rotation = pose.to_matrix(self.state.orientation)
-        spin = (rotation.mT @ self.state.angular_velocity[..., None])[..., 0]
-        turning = (spin * (b.inertia @ spin[..., None])[..., 0]).sum(-1) * b.moves
-        kinetic = 0.5 * (b.mass * self.state.velocity.square().sum(-1) + turning).sum()
-        potential = -(b.mass * (self.state.position @ self.rules.gravity)).sum()
+    def _energies(self) -> dict[str, float]:
+        """Kinetic and potential energy in joules of all dynamic bodies."""
+        u, b, s, rows = self.units, self.bodies, self.state, self._dynamic
+        rotation, mass = pose.to_matrix(s.orientation[rows]), b.mass[rows]
+        spin = (rotation.mT @ s.angular_velocity[rows][..., None])[..., 0]
+        turning = (spin * (b.inertia[rows] @ spin[..., None])[..., 0]).sum(-1)
+        kinetic = 0.5 * (mass * s.velocity[rows].square().sum(-1) + turning).sum()
+        potential = -(mass * (s.position[rows] @ self.rules.gravity)).sum()
         joule = u.mass * u.velocity**2
         return {"kinetic_energy": float(kinetic) * joule, "potential_energy": float(potential) * joule}
 
@@ -253,7 +267,7 @@ class Simulator:
 def with_history(state: State, bodies: Bodies, rules: Rules) -> State:
     """The same state with the two poses it would have come from in free flight (the *paper* network's input)."""
     back = replace(rules, dt=-rules.dt)
-    one = fly(bodies, state, back)
+    one = fly(bodies, replace(state, sleep=None), back)
     two = fly(bodies, one, back)
     return replace(
         state,

@@ -1,4 +1,8 @@
-"""One step of simulation, top to bottom as in the paper: fly, find contacts, let the network act, move."""
+"""One step of simulation, top to bottom as in the paper: find contacts, fly, let the network act, move.
+
+Each stage sees only what is in play: an effect that is off is not computed, a body without contact is not in the
+network's graph, and what sleeps is not looked at until something moves beside it.
+"""
 
 from __future__ import annotations
 
@@ -9,15 +13,18 @@ import torch
 from torch import Tensor
 
 from sdfsim.dynamics import pose
-from sdfsim.dynamics.bodies import Bodies, State
-from sdfsim.dynamics.contacts import Contacts, find_contacts, thin_contacts
+from sdfsim.dynamics.bodies import Bodies, State, awake
+from sdfsim.dynamics.contacts import Contacts, find_contacts, no_contacts, thin_contacts
 from sdfsim.dynamics.freeflight import ballistic, torque_free
-from sdfsim.dynamics.graph import ContactGraph, number_pairs
+from sdfsim.dynamics.graph import SHELL, ContactGraph, number_pairs
 from sdfsim.dynamics.impulse import Velocities
+from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.model import Model
-from sdfsim.dynamics.surfaces import predict
+from sdfsim.dynamics.sleep import settle, stir, touched, wake
+from sdfsim.dynamics.surfaces import compact, predict
 
 FreeFlight = Literal["exact", "learned"]
+_POSE = ("position", "orientation", "velocity", "angular_velocity")
 
 
 @dataclass(frozen=True)
@@ -27,66 +34,131 @@ class Rules:
     Attributes:
         gravity: [3] float64.
         dt: the step.
+        falls: False where gravity is zero: free flight without acceleration.
         contact: False leaves every body in free flight.
         friction: False computes no tangential impulse.
         restitution: False makes every contact one of restitution 0.
         rotation: False lets bodies translate only.
         free_flight: "exact", or "learned" where the *paper* network predicts all of every body's motion.
+        rows: how many nodes or edges to work on at once; None for all.
     """
 
     gravity: Tensor
     dt: float
+    falls: bool = True
     contact: bool = True
     friction: bool = True
     restitution: bool = True
     rotation: bool = True
     free_flight: FreeFlight = "exact"
+    rows: int | None = None
 
 
 @torch.no_grad()
-def step(model: Model, bodies: Bodies, state: State, rules: Rules) -> tuple[State, Contacts | None]:
+def step(
+    model: Model, bodies: Bodies, state: State, rules: Rules, memory: Memory | None = None
+) -> tuple[State, Contacts | None]:
     """Advance `state` by one step.
+
+    Args:
+        model: what predicts contact.
+        bodies: N bodies.
+        state: theirs.
+        rules: what is in play.
+        memory: of the run; without one every step starts from nothing, with the same result.
 
     Returns:
         The next state, and the contact edges that acted (None with contact off).
     """
-    free = fly(bodies, state, rules)
-    if not rules.contact and rules.free_flight == "exact":
-        return free, None
-    if not rules.contact:
-        bodies = replace(
-            bodies, may_touch=torch.zeros(len(bodies), len(bodies), dtype=torch.bool, device=bodies.device)
-        )
-    contacts = find_contacts(bodies, state, rules.gravity, model.reach, rules.dt)
-    if model.kind == "paper":
-        return _paper_step(model, bodies, state, free, contacts, rules), contacts
-    if len(contacts) == 0:
-        return free, contacts
-    contacts = thin_contacts(bodies, contacts)
-    active, graph = contact_graph(bodies, state, free, contacts, rules)
-    predicted = model.network(graph, friction=rules.friction)
-    return _move(bodies, state, free, active, predicted, rules), contacts
+    memory = memory or Memory()
+    edited = memory.begin(bodies, state)
+    state = stir(bodies, drive(bodies, state, rules), rules.gravity, edited=edited)
+    contacts = None
+    if rules.contact:
+        state, contacts = meet(model, bodies, state, rules, memory)
+    with memory.timed("flight_ms"):
+        after = fly(bodies, state, rules)
+    if contacts is not None or rules.free_flight == "learned":
+        with memory.timed("network_ms"):
+            after, contacts = respond(model, bodies, state, after, contacts, rules, memory)
+    if contacts is not None and after.sleep is not None:
+        with memory.timed("sleep_ms"):
+            after = settle(bodies, after, contacts, rules.gravity)
+    memory.end(bodies, after)
+    return after, contacts
+
+
+def drive(bodies: Bodies, state: State, rules: Rules) -> State:
+    """Scripted bodies take the velocities that lead them along their paths in the coming step."""
+    if bodies.tracks is None:
+        return state
+    velocity, angular = bodies.tracks.velocity(state.time, rules.dt)
+    rows = bodies.tracks.body
+    return replace(
+        state,
+        velocity=state.velocity.index_copy(0, rows, velocity),
+        angular_velocity=state.angular_velocity.index_copy(0, rows, angular),
+    )
+
+
+def meet(model: Model, bodies: Bodies, state: State, rules: Rules, memory: Memory) -> tuple[State, Contacts]:
+    """Contact edges; what sleeps beside something that moves wakes, and is looked at in turn."""
+    while True:
+        contacts = find_contacts(bodies, state, rules.gravity, model.reach, rules.dt, memory, rules.rows)
+        islands = touched(state, contacts)
+        if not len(islands):
+            return state, contacts
+        state = wake(state, islands)
 
 
 def fly(bodies: Bodies, state: State, rules: Rules) -> State:
-    """Free flight of every body that moves: exact, whatever the step."""
-    position, velocity = ballistic(state.position, state.velocity, rules.gravity, rules.dt)
-    moves = bodies.moves
-    orientation, angular = state.orientation.clone(), state.angular_velocity.clone()
-    if rules.rotation:
-        turned = torque_free(orientation[moves], angular[moves], bodies.inertia[moves], rules.dt)
-        orientation[moves], angular[moves] = turned
-    else:
-        angular = torch.zeros_like(angular)
+    """Free flight of every body that moves: exact, whatever the step. Scripted bodies go on along their paths."""
+    rows = awake(bodies, state)
+    now = {name: getattr(state, name) for name in _POSE}
+    if len(rows):
+        place, velocity = state.position[rows], state.velocity[rows]
+        if rules.falls:
+            place, velocity = ballistic(place, velocity, rules.gravity, rules.dt)
+        else:
+            place = place + velocity * rules.dt
+        if rules.rotation:
+            turned = torque_free(state.orientation[rows], state.angular_velocity[rows], bodies.inertia[rows], rules.dt)
+        else:
+            turned = (state.orientation[rows], torch.zeros_like(velocity))
+        now = _put(now, rows, (place, turned[0], velocity, turned[1]))
+    if bodies.tracks is not None:
+        place, orientation = bodies.tracks.at(state.time + rules.dt)
+        at = bodies.tracks.body
+        now = _put(now, at, (place, orientation, state.velocity[at], state.angular_velocity[at]))
     return replace(
         state,
-        position=torch.where(moves[:, None], position, state.position),
-        orientation=orientation,
-        velocity=torch.where(moves[:, None], velocity, state.velocity),
-        angular_velocity=angular,
+        **now,
         earlier_position=_shift(state.earlier_position, state.position),
         earlier_orientation=_shift(state.earlier_orientation, state.orientation),
+        time=state.time + rules.dt,
     )
+
+
+def respond(
+    model: Model, bodies: Bodies, state: State, free: State, contacts: Contacts | None, rules: Rules, memory: Memory
+) -> tuple[State, Contacts]:
+    """What contacts make of free flight; only bodies with a contact edge are in the network's graph."""
+    contacts = no_contacts(bodies) if contacts is None else contacts
+    active = torch.cat([contacts.owner, contacts.body])
+    if rules.free_flight == "learned":
+        active = torch.cat([active, awake(bodies, state)])
+    active = torch.unique(active)
+    moved = int(bodies.moves[active].sum())
+    memory.count(active=moved)
+    if not moved:
+        return free, contacts
+    if model.kind == "paper":
+        return _paper_step(model, bodies, state, free, contacts, active, rules, memory), contacts
+    contacts = thin_contacts(bodies, contacts)
+    graph = contact_graph(bodies, state, free, contacts, rules)[1]
+    memory.count(nodes=len(active), edges=len(contacts))
+    predicted = model.network(graph, friction=rules.friction, rows=rules.rows)
+    return _move(bodies, state, free, active, predicted, rules), contacts
 
 
 def contact_graph(
@@ -103,7 +175,7 @@ def contact_graph(
     point = contacts.arm - 0.5 * contacts.distance[:, None] * contacts.normal
     between = state.position[contacts.owner] - state.position[contacts.body]
     turn = pose.to_rotvec(pose.multiply(free.orientation[active], pose.conjugate(state.orientation[active])))
-    bounce = bodies.restitution if rules.restitution else torch.zeros_like(bodies.restitution)
+    nothing = torch.zeros_like(contacts.distance)
     # Masses enter as ratios only; relative to the heaviest they stay within single precision.
     heaviest = bodies.mass[active].max()
     return active, ContactGraph(
@@ -123,45 +195,63 @@ def contact_graph(
         arm_first=point.float(),
         arm_second=(point + between).float(),
         gap=contacts.distance.float(),
-        friction=(bodies.friction[contacts.owner] * bodies.friction[contacts.body]).float(),
-        restitution=(bounce[contacts.owner] * bounce[contacts.body]).float(),
+        shell=(SHELL * torch.minimum(bodies.disc[contacts.owner], bodies.disc[contacts.body])).float(),
+        friction=(_product(bodies.friction, contacts) if rules.friction else nothing).float(),
+        restitution=(_product(bodies.restitution, contacts) if rules.restitution else nothing).float(),
         dt=rules.dt,
     )
 
 
 def _move(bodies: Bodies, state: State, free: State, active: Tensor, predicted: Velocities, rules: Rules) -> State:
     """Bodies in contact move by the predicted mean velocities and leave with the predicted end velocities."""
-    active, chosen = active[bodies.moves[active]], bodies.moves[active]
-    now = {k: getattr(free, k).clone() for k in ("position", "orientation", "velocity", "angular_velocity")}
-    now["velocity"][active] = predicted.velocity[chosen].double()
-    now["position"][active] = state.position[active] + predicted.mean_velocity[chosen].double() * rules.dt
+    chosen = bodies.moves[active]
+    rows = active[chosen]
+    place = state.position[rows] + predicted.mean_velocity[chosen].double() * rules.dt
+    orientation, angular = state.orientation[rows], free.angular_velocity[rows]
     if rules.rotation:
         turn = pose.from_rotvec(predicted.mean_angular[chosen].double() * rules.dt)
-        now["angular_velocity"][active] = predicted.angular[chosen].double()
-        now["orientation"][active] = pose.normalise(pose.multiply(turn, state.orientation[active]))
-    return replace(free, **now)
+        orientation = pose.normalise(pose.multiply(turn, orientation))
+        angular = predicted.angular[chosen].double()
+    now = {name: getattr(free, name) for name in _POSE}
+    return replace(free, **_put(now, rows, (place, orientation, predicted.velocity[chosen].double(), angular)))
 
 
-def _paper_step(model: Model, bodies: Bodies, state: State, free: State, contacts: Contacts, rules: Rules) -> State:
-    """The published step; with exact free flight only bodies with a contact edge follow the network."""
-    if rules.free_flight == "exact" and len(contacts) == 0:
-        return free
+def _paper_step(
+    model: Model,
+    bodies: Bodies,
+    state: State,
+    free: State,
+    contacts: Contacts,
+    active: Tensor,
+    rules: Rules,
+    memory: Memory,
+) -> State:
+    """The published step of the bodies `active` [A] alone."""
     if not rules.friction:
         bodies = replace(bodies, friction=torch.zeros_like(bodies.friction))
     if not rules.restitution:
         bodies = replace(bodies, restitution=torch.zeros_like(bodies.restitution))
-    predicted = predict(model.network, bodies, state, contacts, rules.dt)  # type: ignore[arg-type]
+    some = compact(bodies, state, contacts, active)
+    memory.count(nodes=len(active) + len(some[0].node), edges=2 * (len(some[0].node) + len(contacts)))
+    predicted = predict(model.network, *some, rules.dt, rules.rows)  # type: ignore[arg-type]
+    chosen = bodies.moves[active]
+    rows = active[chosen]
+    orientation, angular = predicted.orientation[chosen], predicted.angular_velocity[chosen]
     if not rules.rotation:
-        still = torch.zeros_like(state.angular_velocity)
-        predicted = replace(predicted, orientation=state.orientation, angular_velocity=still)
-    if rules.free_flight == "learned":
-        follows = bodies.moves.clone()
-    else:
-        follows = torch.zeros_like(bodies.moves)
-        follows[contacts.owner] = follows[contacts.body] = True
-    names = ("position", "orientation", "velocity", "angular_velocity")
-    chosen = {k: torch.where(follows[:, None], getattr(predicted, k), getattr(free, k)) for k in names}
-    return replace(free, **chosen)
+        orientation, angular = state.orientation[rows], torch.zeros_like(angular)
+    now = {name: getattr(free, name) for name in _POSE}
+    return replace(
+        free, **_put(now, rows, (predicted.position[chosen], orientation, predicted.velocity[chosen], angular))
+    )
+
+
+def _put(now: dict[str, Tensor], rows: Tensor, values: tuple[Tensor, ...]) -> dict[str, Tensor]:
+    """The tensors of `now` with the given rows replaced."""
+    return {name: now[name].index_copy(0, rows, value) for name, value in zip(_POSE, values, strict=True)}
+
+
+def _product(coefficient: Tensor, contacts: Contacts) -> Tensor:
+    return coefficient[contacts.owner] * coefficient[contacts.body]
 
 
 def _shift(earlier: Tensor | None, now: Tensor) -> Tensor | None:

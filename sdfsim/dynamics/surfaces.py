@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State
+from sdfsim.dynamics.broad import expand
 from sdfsim.dynamics.contacts import Contacts
 from sdfsim.dynamics.matching import match_shapes
 from sdfsim.dynamics.paper import PaperNetwork, SurfaceGraph
@@ -16,6 +19,31 @@ def node_owner(bodies: Bodies) -> Tensor:
     """[M] int64, the body of every surface node."""
     count = bodies.node_start[1:] - bodies.node_start[:-1]
     return torch.repeat_interleave(torch.arange(len(bodies), device=bodies.device), count)
+
+
+def compact(bodies: Bodies, state: State, contacts: Contacts, rows: Tensor) -> tuple[Bodies, State, Contacts]:
+    """The bodies `rows` [A] alone, in ascending order, with their states and all the contacts, which are among them."""
+    if len(rows) == len(bodies):
+        return bodies, state, contacts
+    owner, node = expand(bodies.node_start[rows], bodies.node_start[rows + 1])
+    number = torch.full((len(bodies),), -1, dtype=torch.int64, device=bodies.device)
+    number[rows] = torch.arange(len(rows), device=bodies.device)
+    ends = torch.bincount(owner, minlength=len(rows)).cumsum(0)
+    start = torch.cat([ends.new_zeros(1), ends])
+    per_body = ("shape", "scale", "com", "mass", "inverse_mass", "inertia", "friction", "restitution", "moves")
+    per_body += ("bounds", "size", "radius", "group", "world")
+    some = replace(
+        bodies, **{k: getattr(bodies, k)[rows] for k in per_body}, node=bodies.node[node], node_start=start, tracks=None
+    )
+    earlier_position, earlier_orientation = _history(state)
+    moved = State(
+        *(v[rows] for v in (state.position, state.orientation, state.velocity, state.angular_velocity)),
+        earlier_position=earlier_position[:, rows],
+        earlier_orientation=earlier_orientation[:, rows],
+    )
+    mine = number[contacts.owner]
+    place = contacts.node - bodies.node_start[contacts.owner] + start[mine]
+    return some, moved, replace(contacts, owner=mine, body=number[contacts.body], node=place)
 
 
 def surface_graph(bodies: Bodies, state: State, contacts: Contacts) -> SurfaceGraph:
@@ -93,10 +121,12 @@ def advance(bodies: Bodies, state: State, acceleration: Tensor, dt: float) -> St
     )
 
 
-def predict(network: PaperNetwork, bodies: Bodies, state: State, contacts: Contacts, dt: float) -> State:
-    """One step of the published simulator."""
+def predict(
+    network: PaperNetwork, bodies: Bodies, state: State, contacts: Contacts, dt: float, rows: int | None = None
+) -> State:
+    """One step of the published simulator, its network working on at most `rows` edges at once."""
     graph = surface_graph(bodies, state, contacts)
-    return advance(bodies, state, network.target.undo(network(graph)).double(), dt)
+    return advance(bodies, state, network.target.undo(network(graph, rows=rows)).double(), dt)
 
 
 def target_acceleration(bodies: Bodies, state: State, position: Tensor, orientation: Tensor) -> Tensor:

@@ -5,17 +5,21 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+
+import torch
 
 from sdfsim.dynamics.model import BUNDLED, Model, load_model
 from sdfsim.errors import SdfsimError
 from sdfsim.files import write_text
+from sdfsim.learning import tables
 from sdfsim.learning.dataset import SPLITS, trajectory_files
 from sdfsim.learning.evaluate import evaluate
 
 
-def bundle(path: Path, data: Path, name: str, folder: Path = BUNDLED) -> dict:
+def bundle(path: Path, data: Path, name: str, folder: Path = BUNDLED, seeds: Sequence[Path] = ()) -> dict:
     """Evaluate a trained model on the test split of `data`, then write `NAME.safetensors` and its card `NAME.md`.
 
     Args:
@@ -23,29 +27,52 @@ def bundle(path: Path, data: Path, name: str, folder: Path = BUNDLED) -> dict:
         data: dataset folder with test/.
         name: the bundled model's name.
         folder: of the bundled models.
+        seeds: models of the same preset trained from other seeds; the range of their errors goes into the card.
 
     Returns:
-        The evaluation's report.
+        The evaluation's report; `other_seeds` holds the errors of `seeds`.
+
+    Raises:
+        SdfsimError: a model of `seeds` is of another preset, or the same again.
     """
     model = load_model(path)
-    report = evaluate(data, model=model)
+    others = [_other_seed(model, path, other) for other in seeds]
+    report = evaluate(data, model=model, chaos_floor=True)
     report["made_from"] = {split: len(trajectory_files(data, split)) for split in SPLITS}
-    learned = evaluate(data, model=model, free_flight="learned") if model.kind == "paper" else None
-    errors = {who: report[who] for who in ("model", "ballistic")}
-    model = replace(model, name=name, card=model.card | {"errors": errors, "test_trajectories": report["trajectories"]})
+    report["other_seeds"] = [evaluate(data, model=other, errors_only=True)["model"] for other in others]
+    learned = evaluate(data, model=model, free_flight="learned", errors_only=True) if model.kind == "paper" else None
+    kept = ("model", "ballistic", "other_seeds", "chaos_floor", "median_survival_s")
+    kept += ("penetration", "energy_gain", "resting_speed")
+    results = {"errors": {what: report[what] for what in kept}, "test_trajectories": report["trajectories"]}
+    model = replace(model, name=name, card=model.card | results)
     folder.mkdir(parents=True, exist_ok=True)
     model.save(folder / f"{name}.safetensors")
     write_text(folder / f"{name}.md", card_text(model, report, learned))
     return report
 
 
+def _other_seed(model: Model, path: Path, other: Path) -> Model:
+    """A further model, checked to be what the card will say it is: trained likewise, with another outcome."""
+    found = load_model(other)
+    for what in ("preset_name", "preset", "optimiser_steps", "data"):
+        if found.card.get(what) != model.card.get(what):
+            raise SdfsimError(f"{other}: trained with another {what.replace('_', ' ')} than {path}")
+    ours, theirs = model.network.state_dict(), found.network.state_dict()
+    if all(torch.equal(weights, theirs[key]) for key, weights in ours.items()):
+        raise SdfsimError(f"{other}: the same weights as {path}", "train with another --seed")
+    return found
+
+
 def card_text(model: Model, report: dict, learned: dict | None) -> str:
     """The model card as Markdown."""
     parameters = sum(p.numel() for p in model.network.parameters())
     card, preset = model.card, model.card["preset"]
-    rows = [("this model", report["model"]), ("flying on without contact", report["ballistic"])]
+    names = {"name": "this model", "ballistic": "flying on without contact"}
+    extra = []
     if learned:
-        rows.insert(1, ("this model, free flight learned too (as published)", learned["model"]))
+        extra.append(("this model, free flight learned too (as published)", *tables.error_cells(learned["model"])))
+    if others := report.get("other_seeds"):
+        extra.append((f"other training seeds ({len(others)}): low - high", *tables.range_cells(others)))
     lines = [
         f"# {model.name}",
         "",
@@ -56,8 +83,8 @@ def card_text(model: Model, report: dict, learned: dict | None) -> str:
         "",
         f"Data: {card['data']['recipe']} (seed {card['data']['seed']}), made with {card['data']['engine']}.",
         "Surfaces and nodes are those of the convex pieces that the engine collides.",
-        f"{card['optimiser_steps']:,} optimiser steps of {preset['batch']}, {card['seconds']:,} s on {card['device']}",
-        f"with {card['threads']} thread(s).",
+        "",
+        *_markdown(_training_rows(card, parameters)),
         "",
         "Repeat with:",
         "",
@@ -67,7 +94,8 @@ def card_text(model: Model, report: dict, learned: dict | None) -> str:
             for split, count in report["made_from"].items()
         ),
         f"    sdfsim train --data DATA -o RUN --preset {card['preset_name']}",
-        f"    python -m sdfsim.learning.bundle RUN/model.safetensors DATA --name {model.name}",
+        f"    python -m sdfsim.learning.bundle RUN/model.safetensors DATA --name {model.name}"
+        f"{' --seeds OTHERS' if others else ''}",
         "",
         "## Ranges it has seen",
         "",
@@ -80,20 +108,36 @@ def card_text(model: Model, report: dict, learned: dict | None) -> str:
         "## Errors",
         "",
         f"{report['trajectories']} test trajectories ({report['bodies']} bodies) of the same recipe, all rolled out",
-        "from their first frame; 95 % intervals over trajectories.",
+        "from their first frame: translation RMSE and mean rotation error; 95 % intervals over trajectories.",
         "",
-        "| | steps | translation RMSE, m | rotation, degrees |",
-        "| --- | --- | --- | --- |",
+        *_markdown(tables.error_rows(report, **names, extra=extra)),
+        "",
+        "## Quality of the motion",
+        "",
+        *_markdown(tables.quality_rows(report, **names)),
+        "",
+        *(f"- {line}" for line in tables.notes(report)),
     ]
-    for who, table in rows:
-        for steps, e in table.items():
-            low, high = e["translation_rmse_95"]
-            turn_low, turn_high = e["rotation_error_95"]
-            lines.append(
-                f"| {who} | {steps} | {e['translation_rmse']:.3f} ({low:.3f}-{high:.3f}) "
-                f"| {e['rotation_error']:.1f} ({turn_low:.1f}-{turn_high:.1f}) |"
-            )
     return "\n".join(lines) + "\n"
+
+
+def _training_rows(card: dict, parameters: int) -> tables.Rows:
+    """What the training cost."""
+    return [
+        ("parameters", "optimiser steps", "batch", "time", "where"),
+        (
+            f"{parameters:,}",
+            f"{card['optimiser_steps']:,}",
+            str(card["preset"]["batch"]),
+            f"{card['seconds']:,} s = {card['seconds'] / 3600:.2f} h",
+            f"{card['device']}, {card['threads']} thread(s)",
+        ),
+    ]
+
+
+def _markdown(rows: tables.Rows) -> list[str]:
+    lines = ["| " + " | ".join(row) + " |" for row in rows]
+    return [lines[0], "|" + " --- |" * len(rows[0]), *lines[1:]]
 
 
 def main() -> None:
@@ -102,12 +146,13 @@ def main() -> None:
     parser.add_argument("model", type=Path)
     parser.add_argument("data", type=Path)
     parser.add_argument("--name", required=True)
+    parser.add_argument("--seeds", type=Path, nargs="+", default=[], help="models of the same preset, other seeds")
     args = parser.parse_args()
     try:
-        report = bundle(args.model, args.data, args.name)
+        report = bundle(args.model, args.data, args.name, seeds=args.seeds)
     except SdfsimError as error:
         sys.exit(f"error: {error}\n{error.hint}")
-    print(json.dumps({k: report[k] for k in ("model", "ballistic")}, indent=2))
+    print(json.dumps({k: report[k] for k in ("model", "ballistic", "other_seeds")}, indent=2))
 
 
 if __name__ == "__main__":

@@ -138,5 +138,10 @@ def load_shapes(folder: Path, names: set[str]) -> dict[str, Shape]:
     # Here and not above: training from cached contact frames runs where only torch and numpy are installed.
     from sdfsim.shape.asset import load_shape
 
-    home = folder / "shapes" if (folder / "shapes").is_dir() else folder.parent / "shapes"
+    home = shapes_folder(folder)
     return {name: load_shape(home / name) for name in sorted(names)}
+
+
+def shapes_folder(folder: Path) -> Path:
+    """Where the Shape folders of a dataset are: its own `shapes/`, or its parent's for a split folder."""
+    return folder / "shapes" if (folder / "shapes").is_dir() else folder.parent / "shapes"

@@ -1,4 +1,4 @@
-"""Rollouts against a recorded dataset: the table that models are compared by."""
+"""Rollouts against a recorded dataset: the numbers that models are compared by."""
 
 from __future__ import annotations
 
@@ -8,21 +8,23 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
-from sdfsim.dynamics.bodies import Bodies, State, Units
 from sdfsim.dynamics.model import Model, load_model
-from sdfsim.dynamics.simulator import pick_device, with_history
-from sdfsim.dynamics.step import FreeFlight, Rules, step
-from sdfsim.errors import EXIT_QUALITY, SdfsimError
-from sdfsim.learning.dataset import Trajectory, load_shapes, read_info, trajectory_files
-from sdfsim.learning.merge import merged
-from sdfsim.learning.metrics import interval, rotation_error, translation_rmse
+from sdfsim.dynamics.simulator import pick_device
+from sdfsim.dynamics.step import FreeFlight
+from sdfsim.errors import SdfsimError
+from sdfsim.learning import floor, metrics
+from sdfsim.learning.dataset import Trajectory, load_shapes, trajectory_files
+from sdfsim.learning.penetration import EVERY, Solid, exact_solids, penetration
+from sdfsim.learning.rollouts import at_instants, batches, engine_substep, first_frames, roll_out
+from sdfsim.shape.asset import Shape
 
 HORIZONS = (50, 100)  # steps, as the paper reports
-BATCH = 50  # trajectories simulated side by side
+LIMITS = (0.1, 0.25, 0.5)  # m, translation errors that a body survives
+CURVE_EVERY = 5  # steps between two stored points of a survival curve
 
 Progress = Callable[[float, str], None]
+Motions = list[Trajectory]
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,8 @@ def evaluate(
     split: str = "test",
     device: str = "cpu",
     free_flight: FreeFlight = "exact",
+    chaos_floor: bool = False,
+    errors_only: bool = False,
     on_progress: Progress | None = None,
 ) -> dict:
     """Roll a model out from the first frame of every trajectory and compare, beside the ballistic baseline.
@@ -59,132 +63,123 @@ def evaluate(
         split: which part of the dataset.
         device: "cpu", "cuda" or "auto".
         free_flight: "exact" or (paper network) "learned".
+        chaos_floor: also run the teacher again from starts that differ slightly (see `floor.PERTURBATIONS`).
+        errors_only: leave out penetration, energy and rest.
         on_progress: called with the fraction done and a message.
 
     Returns:
-        {"model", "ballistic"} -> horizon -> translation_rmse m and rotation_error degrees over all bodies and
-        steps, with 95 % intervals over trajectories; counts; milliseconds a step.
+        A report; its errors are tables horizon -> seconds, translation_rmse m and rotation_error degrees over all
+        bodies and steps, with 95 % intervals over trajectories:
+        "model", "ballistic": errors.
+        "chaos_floor": "perturbations" -> name -> errors; or "left_out", why.
+        "survival", "median_survival_s": of all of them, by limit in m.
+        "penetration" m, "energy_gain" (a fraction), "resting_speed" m/s: of the model and of the teacher's recording.
+        Further counts, and milliseconds a step.
 
     Raises:
         SdfsimError: no or unreadable trajectories or shapes; exit code 3 when a rollout is not finite.
     """
     tell = on_progress or (lambda fraction, message: None)
-    place = pick_device(device)
-    used = (model if isinstance(model, Model) else load_model(model)).to(place)
+    used = (model if isinstance(model, Model) else load_model(model)).to(pick_device(device))
     if free_flight == "learned" and used.kind != "paper":
         raise SdfsimError("free_flight 'learned' exists for the paper network only", "give a model of that kind")
-    trajectories = [Trajectory.load(f) for f in trajectory_files(data, split)]
-    shapes = load_shapes(data, {str(n) for t in trajectories for n in t.shape})
-    shapes = {name: replace(shape, nodes=shape.nodes[: used.nodes]) for name, shape in shapes.items()}
-    longest = min(steps, *(len(t.position) - 1 for t in trajectories))
-    substep = _substep(data)
-    scores: dict[str, list[Score]] = {"model": [], "ballistic": []}
-    seconds = 0.0
-    groups = _alike(trajectories)
-    for k, group in enumerate(groups):
-        tell(k / len(groups), f"{used.name}: batch {k + 1} of {len(groups)}, {longest} steps")
-        started = time.perf_counter()
-        scores["model"] += _score(used, group, shapes, longest, substep, place, free_flight, contact=True)
-        seconds += time.perf_counter() - started
-        scores["ballistic"] += _score(used, group, shapes, longest, substep, place, "exact", contact=False)
-    tell(1.0, "done")
-    return {
+    recorded, shapes = _load(data, split)
+    longest = min(steps, *(len(t.position) - 1 for t in recorded))
+    recorded = [first_frames(t, longest + 1) for t in recorded]
+    substep = engine_substep(data)
+    contenders, seconds = _simulate(used, recorded, shapes, substep, device, free_flight, tell)
+    again, floor_report = {}, {}
+    if chaos_floor:
+        tell(0.8, "teacher, from starts that differ slightly")
+        again, floor_report = _teacher_again(data, recorded)
+    report = {
         "data": str(data),
         "split": split,
         "model_name": used.name,
         "free_flight": free_flight,
-        "trajectories": len(trajectories),
-        "bodies": int(sum(t.position.shape[1] for t in trajectories)),
-        "dt": trajectories[0].dt,
-        "ms_per_step_per_trajectory": 1e3 * seconds / longest / len(trajectories),
-        **{who: {str(h): _summary(rows, h) for h in _horizons(longest)} for who, rows in scores.items()},
+        "trajectories": len(recorded),
+        "bodies": int(sum(t.position.shape[1] for t in recorded)),
+        "dt": recorded[0].dt,
+        "ms_per_step_per_trajectory": 1e3 * seconds / longest / len(recorded),
+        **{who: _errors(motions, recorded) for who, motions in contenders.items()},
+        **floor_report,
+        **_survival(contenders | again, recorded),
     }
+    if not errors_only:
+        tell(0.9, "penetration, energy and rest")
+        solids = exact_solids(data, shapes)
+        # Energies compare at the instants of the positions; rest and penetration are told by positions alone.
+        report |= _quality(contenders["model"], [at_instants(t, substep) for t in recorded], solids)
+    tell(1.0, "done")
+    return report
 
 
-def _substep(data: Path) -> float:
-    """The engine's inner step in s, where the dataset tells it (0 elsewhere)."""
-    for folder in (data, data.parent):
-        if (folder / "dataset.json").exists():
-            settings = read_info(folder).get("engine_settings")
-            step = settings.get("timeStep") if isinstance(settings, dict) else None
-            return float(step) if isinstance(step, int | float) else 0.0
-    return 0.0
+def _load(data: Path, split: str) -> tuple[Motions, dict[str, Shape]]:
+    """Trajectories in which something moves, those that can run together side by side, and their shapes."""
+    recorded = [Trajectory.load(f) for f in trajectory_files(data, split)]
+    recorded = [t for group in batches(recorded) for t in group if not t.static.all()]
+    if not recorded:
+        raise SdfsimError(f"{data}: nothing moves in any trajectory")
+    return recorded, load_shapes(data, {str(n) for t in recorded for n in t.shape})
 
 
-def _alike(trajectories: list[Trajectory]) -> list[list[Trajectory]]:
-    """Batches of trajectories that share step and gravity, so that they run as one."""
-    groups: dict[tuple, list[Trajectory]] = {}
-    for t in trajectories:
-        groups.setdefault((t.dt, *t.gravity), []).append(t)
-    return [g[i : i + BATCH] for g in groups.values() for i in range(0, len(g), BATCH)]
-
-
-def _score(
+def _simulate(
     model: Model,
-    group: list[Trajectory],
-    shapes: dict,
-    steps: int,
+    recorded: Motions,
+    shapes: dict[str, Shape],
     substep: float,
-    device: torch.device,
+    device: str,
     free_flight: FreeFlight,
-    *,
-    contact: bool,
-) -> list[Score]:
-    """Roll one batch out; the errors of every trajectory."""
-    units = _units(model, group[0])
-    bodies, state = merged(group, [0] * len(group), shapes, units, device)
-    gravity = torch.tensor(group[0].gravity / units.acceleration, dtype=torch.float64, device=device)
-    # The recording engine's first position step already uses the new velocity (symplectic Euler): an exact parabola,
-    # but of a body that started half an inner step of gravity faster. All start in free flight.
-    nudge = 0.5 * (substep / units.time) * gravity * bodies.moves[:, None]
-    state = replace(state, velocity=state.velocity + nudge)
-    rules = Rules(gravity=gravity, dt=model.dt, contact=contact, free_flight=free_flight)
-    if model.kind == "paper":
-        state = with_history(state, bodies, rules)
-    position, orientation = _roll(model, bodies, state, rules, steps)
-    position = position * units.length
-    results, at = [], 0
-    for t in group:
-        mine = slice(at, at + t.position.shape[1])
-        at = mine.stop
-        moving = ~t.static.astype(bool)
-        p, q = position[:, mine][:, moving], orientation[:, mine][:, moving]
-        truth_p, truth_q = t.position[1 : steps + 1][:, moving], t.quat_xyzw[1 : steps + 1][:, moving]
-        horizons = _horizons(steps)
-        results.append(
-            Score(
-                bodies=int(moving.sum()),
-                squared={h: translation_rmse(p[:h], truth_p[:h]) ** 2 for h in horizons},
-                angle={h: rotation_error(q[:h], truth_q[:h]) for h in horizons},
-            )
-        )
-    return results
+    tell: Progress,
+) -> tuple[dict[str, Motions], float]:
+    """The model's and the ballistic motions from the recorded starts, and the seconds that the model took."""
+    known = {name: replace(shape, nodes=shape.nodes[: model.nodes]) for name, shape in shapes.items()}
+    place, longest = pick_device(device), len(recorded[0].position) - 1
+    motions: dict[str, Motions] = {"model": [], "ballistic": []}
+    seconds = 0.0
+    groups = batches([at_instants(t, substep) for t in recorded])
+    for k, group in enumerate(groups):
+        tell(0.8 * k / len(groups), f"{model.name}: batch {k + 1} of {len(groups)}, {longest} steps")
+        started = time.perf_counter()
+        motions["model"] += roll_out(model, group, known, longest, place, free_flight)
+        seconds += time.perf_counter() - started
+        motions["ballistic"] += roll_out(model, group, known, longest, place, contact=False)
+    return motions, seconds
 
 
-def _horizons(steps: int) -> list[int]:
-    return sorted({h for h in HORIZONS if h <= steps} | {steps})
+def _teacher_again(data: Path, recorded: Motions) -> tuple[dict[str, Motions], dict]:
+    """The teacher's motions from perturbed starts by "teacher NAME", and what the report says of them."""
+    try:
+        again = floor.chaos_floor(data, recorded, len(recorded[0].position) - 1)
+    except SdfsimError as error:
+        why = f"{error.message} ({error.hint})" if error.hint else error.message
+        return {}, {"chaos_floor": {"left_out": why}}
+    farthest = [float(_distance(one, truth).max()) for one, truth in zip(again["0"], recorded, strict=True)]
+    report = {
+        "perturbations": {name: _errors(motions, recorded) for name, motions in again.items()},
+        "median_farthest_unperturbed_m": float(np.median(farthest)),
+    }
+    return {f"teacher {name}": motions for name, motions in again.items()}, {"chaos_floor": report}
 
 
-def _units(model: Model, like: Trajectory) -> Units:
-    """Model units in which the recorded step is the model's own."""
-    strength = float(np.linalg.norm(like.gravity)) or model.gravity
-    length = (like.dt / model.dt) ** 2 * strength / model.gravity
-    return Units(length=length, time=like.dt / model.dt, mass=length**3)  # the recipe's densities are the model's
+def _errors(motions: Motions, recorded: Motions) -> dict[str, dict]:
+    """Horizon in steps -> errors of all `motions` up to there."""
+    longest = len(recorded[0].position) - 1
+    horizons = sorted({h for h in HORIZONS if h <= longest} | {longest})
+    scores = [score(motion, truth, horizons) for motion, truth in zip(motions, recorded, strict=True)]
+    return {str(h): {"seconds": h * recorded[0].dt} | _summary(scores, h) for h in horizons}
 
 
-def _roll(model: Model, bodies: Bodies, state: State, rules: Rules, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [steps, N, 3] (model units) and orientations [steps, N, 4]."""
-    positions, orientations = [], []
-    for _ in range(steps):
-        state, _ = step(model, bodies, state, rules)
-        broken = ~(state.position.isfinite().all(-1) & state.orientation.isfinite().all(-1))
-        if broken.any():
-            raise SdfsimError(
-                f"step {len(positions) + 1}: {int(broken.sum())} bodies are not finite", exit_code=EXIT_QUALITY
-            )
-        positions.append(state.position.cpu().numpy())
-        orientations.append(state.orientation.cpu().numpy())
-    return np.stack(positions), np.stack(orientations)
+def score(motion: Trajectory, truth: Trajectory, horizons: list[int]) -> Score:
+    """Errors of a motion over the steps up to each horizon, of the bodies that move."""
+    moving = ~truth.static.astype(bool)
+    p, q = motion.position[1:, moving], motion.quat_xyzw[1:, moving]
+    truth_p, truth_q = truth.position[1:, moving], truth.quat_xyzw[1:, moving]
+    return Score(
+        bodies=int(moving.sum()),
+        squared={h: metrics.translation_rmse(p[:h], truth_p[:h]) ** 2 for h in horizons},
+        angle={h: metrics.rotation_error(q[:h], truth_q[:h]) for h in horizons},
+    )
 
 
 def _summary(scores: list[Score], horizon: int) -> dict:
@@ -195,7 +190,50 @@ def _summary(scores: list[Score], horizon: int) -> dict:
     angle = np.array([s.angle[horizon] for s in scores]) * share
     return {
         "translation_rmse": float(np.sqrt(squared.mean())),
-        "translation_rmse_95": [float(np.sqrt(v)) for v in interval(squared)],
+        "translation_rmse_95": [float(np.sqrt(v)) for v in metrics.interval(squared)],
         "rotation_error": float(angle.mean()),
-        "rotation_error_95": interval(angle),
+        "rotation_error_95": metrics.interval(angle),
     }
+
+
+def _survival(contenders: dict[str, Motions], recorded: Motions) -> dict:
+    """Shares of all bodies that stay near the recording, and the seconds until half of them have left it."""
+    curves: dict[str, dict] = {}
+    medians: dict[str, dict] = {}
+    for who, motions in contenders.items():
+        error = np.concatenate([_distance(m, t) for m, t in zip(motions, recorded, strict=True)], axis=1)
+        shares = {str(limit): metrics.survival(error, limit) for limit in LIMITS}
+        curves[who] = {limit: share[::CURVE_EVERY].tolist() for limit, share in shares.items()}
+        medians[who] = {limit: metrics.median_survival(share, recorded[0].dt) for limit, share in shares.items()}
+    steps = list(range(0, len(recorded[0].position), CURVE_EVERY))
+    return {"survival": {"steps": steps, **curves}, "median_survival_s": medians}
+
+
+def _distance(motion: Trajectory, truth: Trajectory) -> np.ndarray:
+    """[T, N] m: translation errors of the bodies that move, the first frame included."""
+    moving = ~truth.static.astype(bool)
+    return np.linalg.norm(motion.position[:, moving] - truth.position[:, moving], axis=-1)
+
+
+def _quality(predicted: Motions, recorded: Motions, solids: dict[str, Solid]) -> dict:
+    """Penetration, energy gain and resting speed of the model and of the teacher."""
+    rest = [metrics.resting(t) for t in recorded]
+    sides = {"model": predicted, "teacher": recorded}
+    return {
+        "penetration": {who: penetration(motions, solids) for who, motions in sides.items()}
+        | {"geometry": {name: solid.kind for name, solid in solids.items()}, "every": EVERY},
+        "energy_gain": {who: _gain(motions) for who, motions in sides.items()},
+        "resting_speed": {who: _resting(motions, rest) for who, motions in sides.items()}
+        | {"bodies": int(sum(r.sum() for r in rest))},
+    }
+
+
+def _gain(motions: Motions) -> dict[str, float | None]:
+    gains = [gain for motion in motions if (gain := metrics.energy_gain(motion)) is not None]
+    return {"mean": float(np.mean(gains)) if gains else None, "worst": max(gains) if gains else None}
+
+
+def _resting(motions: Motions, rest: list[np.ndarray]) -> float | None:
+    """Median speed m/s in the last steps of the bodies [N] that rest in the recording; None without any."""
+    found = [metrics.speeds(motion)[:, r].ravel() for motion, r in zip(motions, rest, strict=True)]
+    return float(np.median(np.concatenate(found))) if any(len(f) for f in found) else None

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from sdfsim.dynamics.bodies import disc
 from sdfsim.dynamics.freeflight import torque_free
 from sdfsim.dynamics.pose import conjugate, multiply, to_rotvec
 from sdfsim.errors import SdfsimError
@@ -23,7 +24,7 @@ from sdfsim.files import read_arrays, write_arrays
 from sdfsim.learning.dataset import Trajectory, load_shapes, trajectory_files
 from sdfsim.parallel import parallel
 
-FRAMES_VERSION = 1  # counts up whenever contacts are found or thinned differently
+FRAMES_VERSION = 2  # counts up whenever contacts are found or thinned differently
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,8 @@ class ContactFrames:
         free_angular, mean_angular: [B, 3] rad/s in free flight, at the end of the step and as its mean.
         end_velocity, end_angular, moved, turned: [B, 3] recorded: velocities at the end of the step, and mean
             linear and angular velocity over it.
-        mass: [B] kg, 0 for static bodies; inertia: [B, 3]; friction, restitution, size: [B].
+        mass: [B] kg, 0 for static bodies; inertia: [B, 3]; friction, restitution, size: [B];
+            disc: [B] m, radius about the centre of mass (`bodies.disc`).
         first, second: [E] int16, bodies within the frame.
         arm: [E, 3] m, from the first body's centre of mass to its node.
         other: [E, 3] m, first body's centre of mass from the second's (from the floor's origin below it).
@@ -63,6 +65,7 @@ class ContactFrames:
     friction: np.ndarray
     restitution: np.ndarray
     size: np.ndarray
+    disc: np.ndarray
     first: np.ndarray
     second: np.ndarray
     arm: np.ndarray
@@ -183,6 +186,7 @@ def _of_trajectory(t: Trajectory, edges: dict[str, np.ndarray], shapes) -> dict[
         "friction": each(t.friction),
         "restitution": each(t.restitution),
         "size": each(extent),
+        "disc": each(disc([shapes[str(n)].sdf.bounds for n in t.shape]) * t.scale),
     } | {k: edges[k] for k in ("first", "second", "arm", "other", "normal", "gap")}
 
 

@@ -13,6 +13,8 @@ from sdfsim.learning.dataset import FLOOR, Trajectory
 from sdfsim.scene.types import Body, Scene
 from sdfsim.shape.asset import Shape, analytic_shape
 
+TOGETHER = 4000  # bodies whose contacts are found in one call
+
 
 def merged(
     trajectories: list[Trajectory], frames: list[int], shapes: dict[str, Shape], units: Units, device: torch.device
@@ -42,8 +44,7 @@ def merged(
     )
     tensors, state = from_scene(scene, units, device)
     place = torch.tensor([*world, -1], device=device)
-    same = (place[:, None] == place[None]) | (place[:, None] == -1) | (place[None] == -1)
-    return replace(tensors, may_touch=same), state
+    return replace(tensors, world=place), state
 
 
 def find_edges(trajectory: Trajectory, shapes: dict[str, Shape], reach: float) -> dict[str, np.ndarray]:
@@ -53,15 +54,25 @@ def find_edges(trajectory: Trajectory, shapes: dict[str, Shape], reach: float) -
         frame, first, second (-1 = floor) [E]; arm, other, normal [E, 3]; gap [E].
     """
     steps = len(trajectory.position) - 1
-    bodies, state = merged([trajectory] * steps, list(range(steps)), shapes, Units(1.0, 1.0, 1.0), torch.device("cpu"))
-    gravity = torch.from_numpy(np.asarray(trajectory.gravity, dtype=np.float64))
-    contacts = thin_contacts(bodies, find_contacts(bodies, state, gravity, reach, trajectory.dt))
-    per_world = trajectory.position.shape[1]
+    # Every pair of bodies of all frames is looked at, at first.
+    together = max(1, TOGETHER // trajectory.position.shape[1])
+    parts = [
+        _edges(trajectory, list(range(start, min(start + together, steps))), shapes, reach)
+        for start in range(0, steps, together)
+    ]
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _edges(t: Trajectory, frames: list[int], shapes: dict[str, Shape], reach: float) -> dict[str, np.ndarray]:
+    bodies, state = merged([t] * len(frames), frames, shapes, Units(1.0, 1.0, 1.0), torch.device("cpu"))
+    gravity = torch.from_numpy(np.asarray(t.gravity, dtype=np.float64))
+    contacts = thin_contacts(bodies, find_contacts(bodies, state, gravity, reach, t.dt))
+    per_world = t.position.shape[1]
     floor = len(bodies) - 1
     order = torch.argsort(contacts.owner // per_world, stable=True)
     owner, other = contacts.owner[order], contacts.body[order]
     return {
-        "frame": (owner // per_world).numpy(),
+        "frame": frames[0] + (owner // per_world).numpy(),
         "first": (owner % per_world).numpy(),
         "second": torch.where(other == floor, -1, other % per_world).numpy(),
         "arm": contacts.arm[order].numpy(),

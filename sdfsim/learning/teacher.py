@@ -20,6 +20,7 @@ ENGINE_SETTINGS = {
     "enableConeFriction": False,
     "deterministicOverlappingPairs": True,
 }
+FAR = (0.0, 0.0, -100.0)  # m, where bodies wait to be placed
 URDF_TEMPLATE = """<robot name="body"><link name="base">
 <inertial><origin xyz="0 0 0"/><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
 <collision><origin xyz="{x} {y} {z}"/><geometry><mesh filename="{mesh}"/></geometry></collision>
@@ -85,8 +86,13 @@ class Teacher:
     def _call(self, name: str, *args, **kwargs):
         return getattr(self.pb, name)(*args, **kwargs, physicsClientId=self.client)
 
-    def add(self, body: TeacherBody, position: np.ndarray, quat: np.ndarray) -> int:
-        """Place a body with its centre of mass at `position` [3] m, orientation `quat` [4] xyzw; returns its index."""
+    def add(
+        self,
+        body: TeacherBody,
+        position: np.ndarray | tuple[float, ...] = FAR,
+        quat: np.ndarray | tuple[float, ...] = (0.0, 0.0, 0.0, 1.0),
+    ) -> int:
+        """Add a body with its centre of mass at `position` [3] m, orientation `quat` [4] xyzw; returns its index."""
         handle = self._call(
             "loadURDF",
             str(body.urdf),
@@ -113,6 +119,11 @@ class Teacher:
         """Whether body `index` touches or penetrates anything."""
         self._call("performCollisionDetection")
         return bool(self._call("getContactPoints", self.bodies[index]))
+
+    def penetrates(self, index: int) -> bool:
+        """Whether body `index` is inside anything; to touch is allowed."""
+        self._call("performCollisionDetection")
+        return any(contact[8] < 0.0 for contact in self._call("getContactPoints", self.bodies[index]))
 
     def inertia(self, index: int) -> np.ndarray:
         """[3] kg m^2: the diagonal that the engine uses, body axes."""

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sdfsim.scene.document import Section, Value, nearest
-from sdfsim.scene.types import Motion
+from sdfsim.scene.types import Motion, Waypoints
 
 DEFAULT_DENSITY = 1000.0  # kg/m^3, of a dynamic body that gives neither mass nor density
 DEFAULT_FRICTION = 0.5
@@ -21,7 +21,8 @@ _NOT_WITH_PLANE = (
     *("shape", "scale", "position", *_ROTATIONS, "velocity", "angular_velocity", "mass", "density"),
     *("count", "arrange"),
 )
-_KEYS = ("name", "plane", "motion", *_NOT_WITH_PLANE, "friction", "restitution", "collides_with")
+_NOT_WITH_PATH = ("position", *_ROTATIONS, "velocity", "angular_velocity", "mass", "density")
+_KEYS = ("name", "plane", "motion", "path", *_NOT_WITH_PLANE, "friction", "restitution", "collides_with")
 
 
 @dataclass
@@ -37,6 +38,7 @@ class BodySpec:
         offsets: [C, 3] m, added to the position, one row a copy.
         grouped: there is a `count` or `arrange`, so that copies are numbered.
         collides_with: names of bodies or groups, or None for all.
+        path: of a kinematic body.
     """
 
     name: str
@@ -55,6 +57,7 @@ class BodySpec:
     offsets: np.ndarray
     grouped: bool
     collides_with: list[Value] | None
+    path: Waypoints | None
 
     def names(self) -> list[str]:
         """The names of its copies: `balls[0]`, `balls[1]` ..., or its own name when it is one."""
@@ -101,9 +104,12 @@ def _body(item: Value, shapes: dict[str, str | None]) -> BodySpec:
         section.one_of(("mass", "density"), required=False)
     flat = plane is not None or (shape is not None and shapes.get(shape) == "plane")
     motion = section.get("motion")
-    chosen = motion.choice(("static", "dynamic"), "dynamic") if motion else "static" if flat else "dynamic"
-    if motion and flat and chosen == "dynamic":
+    chosen = motion.choice(("static", "dynamic", "kinematic"), "dynamic") if motion else "static" if flat else "dynamic"
+    if motion and flat and chosen != "static":
         motion.wrong("a plane must be static")
+    path = _path(section, chosen)
+    if path is not None:
+        position, quat = path.position[0], path.quat_xyzw[0]
     velocity, spin = section.vector("velocity", "m/s"), section.vector("angular_velocity", "rad/s")
     for key, value in (("velocity", velocity), ("angular_velocity", spin)):
         if chosen == "static" and not plane and value.any():
@@ -126,7 +132,39 @@ def _body(item: Value, shapes: dict[str, str | None]) -> BodySpec:
         offsets=offsets,
         grouped=grouped,
         collides_with=_partners(section.get("collides_with")),
+        path=path,
     )
+
+
+def _path(section: Section, motion: str) -> Waypoints | None:
+    """The timed poses of a kinematic body."""
+    value = section.get("path")
+    if motion != "kinematic":
+        if value:
+            value.wrong("goes with motion: kinematic only")
+        return None
+    for key in _NOT_WITH_PATH:
+        if key in section:
+            section[key].wrong("does not go with motion: kinematic: its path says where it is")
+    if value is None:
+        section.missing("path", "is required: a kinematic body follows timed poses")
+        return None
+    times, places, turns = [], [], []
+    for item in value.items():
+        pose = item.section(("time", "position", *_ROTATIONS))
+        pose.required("time")
+        pose.required("position")
+        time = pose.number("time", "s", least=0, default=times[-1] + 1.0 if times else 0.0)
+        if times and time <= times[-1]:
+            item.wrong(f"must be later than the pose before it (got {time:g} s after {times[-1]:g} s)")
+        times.append(time)
+        places.append(pose.vector("position", "m"))
+        turns.append(_rotation(pose))
+    if not times:
+        if value.is_list():
+            value.wrong("must hold at least one pose (got 0)")
+        return None
+    return Waypoints(np.array(times), np.stack(places), np.stack(turns))
 
 
 def _shape_of(section: Section, shapes: dict[str, str | None]) -> str | None:

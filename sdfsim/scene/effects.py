@@ -6,15 +6,23 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from sdfsim.scene.types import Body, Scene
+from sdfsim.scene.pairs import Pairs, count_pairs
+from sdfsim.scene.types import Scene
 
 
 @dataclass(frozen=True)
 class Effect:
-    """One decision: `on`, and the reason in a few words."""
+    """One decision.
+
+    Attributes:
+        on: whether it is in play.
+        why: the reason in a few words.
+        field: what to edit in the scene file to change it.
+    """
 
     on: bool
     why: str
+    field: str
 
 
 @dataclass(frozen=True)
@@ -22,111 +30,112 @@ class Plan:
     """What the simulator has to do for one scene.
 
     Attributes:
-        gravity, contact, friction, restitution, rotation, sleep: the decisions.
-        static: names of the bodies that never move.
-        dynamic: names of the others.
-        pairs: pairs of bodies that may touch (at least one of them dynamic).
+        gravity, free_flight, contact, scenery, kinematic, rotation, friction, restitution, sleep: the decisions.
+        static, dynamic, kinematic_bodies: names of the bodies by how they move.
+        pairs: which pairs of bodies may touch.
         nodes: surface nodes of all bodies, the infinite planes having none.
     """
 
     gravity: Effect
+    free_flight: Effect
     contact: Effect
+    scenery: Effect
+    kinematic: Effect
+    rotation: Effect
     friction: Effect
     restitution: Effect
-    rotation: Effect
     sleep: Effect
     static: tuple[str, ...]
     dynamic: tuple[str, ...]
-    pairs: int
+    kinematic_bodies: tuple[str, ...]
+    pairs: Pairs
     nodes: int
+
+    def effects(self) -> dict[str, Effect]:
+        """Every decision by its name."""
+        return {name: getattr(self, name) for name in EFFECTS}
 
     def to_dict(self) -> dict:
         """Plain data for --json."""
         return asdict(self)
 
 
-EFFECTS = ("gravity", "contact", "friction", "restitution", "rotation", "sleep")
+EFFECTS = (
+    *("gravity", "free_flight", "contact", "scenery", "kinematic"),
+    *("rotation", "friction", "restitution", "sleep"),
+)
 
 
 def plan(scene: Scene) -> Plan:
     """Decide every effect of a scene. `on` and `off` in the file win; `auto` is on where it can change the motion."""
-    dynamic = [b for b in scene.bodies if b.motion == "dynamic"]
-    pairs, frictional, bouncy = _pairs(scene.bodies)
+    names = {m: tuple(b.name for b in scene.bodies if b.motion == m) for m in ("static", "dynamic", "kinematic")}
+    pairs = count_pairs(scene.bodies)
     size = float(np.linalg.norm(scene.gravity))
-    gravity = Effect(size > 0, f"{size:g} m/s^2" if size else "the file sets it to zero")
-
-    if not dynamic:
-        contact = Effect(False, "no body moves")
-    elif not pairs:
-        contact = Effect(False, "no two bodies may touch")
-    else:
-        contact = _asked(scene.effects.contact, Effect(True, f"{pairs} pairs of bodies may touch"))
-    touching = contact.on
-    friction = _asked(scene.effects.friction, _of_pairs(touching, frictional, "friction above zero"))
-    restitution = _asked(scene.effects.restitution, _of_pairs(touching, bouncy, "restitution above zero"))
-    if not touching:  # asked for or not, there is nothing for them to act on
-        friction = restitution = Effect(False, "contact is off")
-
-    spinning = sum(bool(np.any(b.angular_velocity)) for b in dynamic)
-    if touching:
-        turning = Effect(True, "contacts turn bodies")
-    elif spinning:
-        turning = Effect(True, f"{spinning} bodies start with spin")
-    else:
-        turning = Effect(False, "nothing turns without contact or spin")
+    moving = len(names["dynamic"])
+    contact = _contact(scene.effects.contact, pairs, moving)
     return Plan(
-        gravity=gravity,
+        gravity=Effect(size > 0, f"{size:g} m/s^2" if size else "the file sets it to zero", "gravity"),
+        free_flight=Effect(
+            moving > 0,
+            f"{moving} dynamic bodies, in closed form while they touch nothing" if moving else "no body is dynamic",
+            "bodies[].motion",
+        ),
         contact=contact,
-        friction=friction,
-        restitution=restitution,
-        rotation=_asked(scene.effects.rotation, turning),
-        sleep=Effect(False, "not available yet"),
-        static=tuple(b.name for b in scene.bodies if b.motion == "static"),
-        dynamic=tuple(b.name for b in dynamic),
+        scenery=_of_kind(len(names["static"]), "static", "encoded once, never moved"),
+        kinematic=_of_kind(len(names["kinematic"]), "kinematic", "on their paths, never decoded"),
+        rotation=_rotation(scene.effects.rotation),
+        friction=_of_pairs(scene.effects.friction, contact.on, pairs.frictional, "friction"),
+        restitution=_of_pairs(
+            scene.effects.restitution,
+            contact.on,
+            pairs.bouncy,
+            "restitution",
+            "; an input of the network: off saves nothing",
+        ),
+        sleep=_sleep(scene.effects.sleep, contact.on),
+        static=names["static"],
+        dynamic=names["dynamic"],
+        kinematic_bodies=names["kinematic"],
         pairs=pairs,
         nodes=sum(len(scene.shapes[b.shape].nodes) for b in scene.bodies),
     )
 
 
-def may_touch(a: Body, b: Body) -> bool:
-    """True when both bodies list each other (or all), and at least one of them moves."""
-    if a.motion == "static" and b.motion == "static":
-        return False
-    return (a.collides_with is None or b.name in a.collides_with) and (
-        b.collides_with is None or a.name in b.collides_with
-    )
+def _contact(choice: str, pairs: Pairs, moving: int) -> Effect:
+    field = "effects.contact, bodies[].collides_with, bodies[].motion"
+    if not moving:
+        return Effect(False, "no body is dynamic", field)
+    if not pairs.possible:
+        return Effect(False, "no two bodies may touch", field)
+    if choice == "off":
+        return Effect(False, "the file says off", field)
+    return Effect(True, f"{pairs.possible} pairs of bodies may touch", field)
 
 
-def _asked(choice: str, automatic: Effect) -> Effect:
-    return automatic if choice == "auto" else Effect(choice == "on", f"the file says {choice}")
+def _of_kind(count: int, kind: str, what: str) -> Effect:
+    return Effect(count > 0, f"{count} {kind} bodies, {what}" if count else f"no body is {kind}", "bodies[].motion")
 
 
-def _of_pairs(touching: bool, count: int, what: str) -> Effect:
+def _rotation(choice: str) -> Effect:
+    why = "the file says off: bodies translate only" if choice == "off" else "only the file can say off"
+    return Effect(choice != "off", why, "effects.rotation")
+
+
+def _of_pairs(choice: str, touching: bool, count: int, name: str, note: str = "") -> Effect:
+    """Friction or restitution: asked for or not, without contact there is nothing for them to act on."""
+    field = f"effects.{name}, bodies[].{name}"
     if not touching:
-        return Effect(False, "contact is off")
-    return Effect(count > 0, f"{count} pairs have {what}" if count else f"no pair has {what}")
+        return Effect(False, "contact is off", field)
+    if choice != "auto":
+        return Effect(choice == "on", f"the file says {choice}{note}", field)
+    told = f"{count} pairs have {name} above zero" if count else f"no pair has {name} above zero"
+    return Effect(count > 0, told + note, field)
 
 
-def _pairs(bodies: tuple[Body, ...]) -> tuple[int, int, int]:
-    """Pairs that may touch; of these, with a friction product above zero, and with a restitution product above zero.
-
-    Bodies of one kind are counted together: a scene of thousands of balls has millions of pairs.
-    """
-    kinds: dict[tuple, list[Body]] = {}
-    for body in bodies:
-        kinds.setdefault((body.motion, body.friction > 0, body.restitution > 0, body.collides_with), []).append(body)
-    found = list(kinds.values())
-    total = frictional = bouncy = 0
-    for i, first in enumerate(found):
-        for j, second in enumerate(found[i:], i):
-            a, b = first[0], second[0]
-            if a.collides_with is None and b.collides_with is None:
-                pairs = len(first) * (len(first) - 1) // 2 if i == j else len(first) * len(second)
-                count = 0 if a.motion == b.motion == "static" else pairs
-            else:
-                both = [(x, y) for m, x in enumerate(first) for y in (first[m + 1 :] if i == j else second)]
-                count = sum(may_touch(x, y) for x, y in both)
-            total += count
-            frictional += count * (a.friction > 0 and b.friction > 0)
-            bouncy += count * (a.restitution > 0 and b.restitution > 0)
-    return total, frictional, bouncy
+def _sleep(choice: str, touching: bool) -> Effect:
+    if not touching:
+        return Effect(False, "contact is off: nothing can come to rest", "effects.sleep")
+    why = (
+        "the file says on: resting islands freeze until disturbed" if choice == "on" else "the file does not ask for it"
+    )
+    return Effect(choice == "on", why, "effects.sleep")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -53,6 +54,7 @@ def load_scene(path: Path | str, on_progress: Progress | None = None) -> Scene:
         seed=spec.seed,
         model=spec.model,
         effects=spec.effects,
+        limits=spec.limits,
         path=path,
         missed=tuple(f"{s.name}: {s.certificate['reason']}" for s in fitted if not s.certificate.get("passed", True)),
     )
@@ -131,6 +133,7 @@ def _expand(body: BodySpec, index: int, shape: Shape, groups: dict[str, list[str
             friction=body.friction,
             restitution=body.restitution,
             collides_with=partners,
+            path=body.path and replace(body.path, position=body.path.position + offset),
         )
         for name, offset in zip(body.names(), body.offsets, strict=True)
     ]

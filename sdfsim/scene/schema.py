@@ -10,7 +10,7 @@ import numpy as np
 
 from sdfsim.scene.bodies import BodySpec, read_bodies
 from sdfsim.scene.document import Problems, Section, Value, nearest, read_document
-from sdfsim.scene.types import Effects
+from sdfsim.scene.types import Effects, Limits
 from sdfsim.shape.asset import DEFAULT_RESOLUTION
 
 VERSION = 1
@@ -18,7 +18,7 @@ DEFAULT_DURATION = 4.0  # s
 DEFAULT_GRAVITY = (0.0, 0.0, -9.81)  # m/s^2
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 
-_TOP = ("version", "model", "duration", "seed", "gravity", "effects", "shapes", "bodies")
+_TOP = ("version", "model", "duration", "seed", "gravity", "effects", "limits", "shapes", "bodies")
 _SHAPE_KINDS = ("asset", "mesh", "primitive", "sphere", "box", "plane")
 _SDF_KINDS = ("mlp", "grid", "mesh")
 FEWEST_NODES, MOST_NODES = 3, 128  # along each side of the sampling grid
@@ -68,6 +68,7 @@ class SceneSpec:
     seed: int
     gravity: np.ndarray
     effects: Effects
+    limits: Limits
     shapes: dict[str, ShapeSpec | None]
     bodies: list[BodySpec]
 
@@ -95,6 +96,7 @@ def read_scene(path: Path) -> SceneSpec:
         seed=seed.integer(least=0, default=0) if seed else 0,
         gravity=top.vector("gravity", "m/s^2", DEFAULT_GRAVITY),
         effects=_effects(top.get("effects")),
+        limits=_limits(top.get("limits")),
         shapes=shapes,
         bodies=read_bodies(bodies, {name: s.kind if s else None for name, s in shapes.items()}) if bodies else [],
     )
@@ -112,13 +114,16 @@ def _effects(value: Value | None) -> Effects:
     choices: dict[str, tuple[str, ...]] = {
         name: ("auto", "on", "off") for name in ("contact", "friction", "restitution", "rotation")
     }
-    chosen: dict[str, Any] = {}
-    for key, item in value.section((*choices, "sleep")):
-        if key != "sleep":
-            chosen[key] = item.choice(choices[key], choices[key][0])
-        elif item.shown() != "'off'":
-            item.wrong(f"must be off: sleep is not available yet (got {item.shown()})")
+    choices["sleep"] = ("off", "on")
+    chosen: dict[str, Any] = {key: item.choice(choices[key], choices[key][0]) for key, item in value.section(choices)}
     return Effects(**chosen)
+
+
+def _limits(value: Value | None) -> Limits:
+    if value is None or value.is_null():
+        return Limits()
+    section = value.section(("memory_gib",))
+    return Limits(section.number("memory_gib", "GiB", above=0, default=1.0) if "memory_gib" in section else None)
 
 
 def _shapes(value: Value | None, folder: Path) -> dict[str, ShapeSpec | None]:

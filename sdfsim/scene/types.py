@@ -10,7 +10,7 @@ import numpy as np
 
 from sdfsim.shape.asset import Shape
 
-Motion = Literal["static", "dynamic"]
+Motion = Literal["static", "dynamic", "kinematic"]
 
 
 @dataclass(frozen=True)
@@ -21,6 +21,33 @@ class Effects:
     friction: Literal["auto", "on", "off"] = "auto"
     restitution: Literal["auto", "on", "off"] = "auto"
     rotation: Literal["auto", "on", "off"] = "auto"
+    sleep: Literal["on", "off"] = "off"
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a run must keep to.
+
+    Attributes:
+        memory_gib: GiB that one step may take for distances and edges; None for no limit.
+    """
+
+    memory_gib: float | None = None
+
+
+@dataclass(frozen=True)
+class Waypoints:
+    """The poses that a kinematic body passes through: straight and at an even turn in between, at rest outside.
+
+    Attributes:
+        time: [K] s, increasing.
+        position: [K, 3] m, of the shape's own origin.
+        quat_xyzw: [K, 4] unit quaternions.
+    """
+
+    time: np.ndarray
+    position: np.ndarray
+    quat_xyzw: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -30,17 +57,18 @@ class Body:
     Attributes:
         name: unique in the scene.
         shape: index into `Scene.shapes`.
-        motion: "static" or "dynamic".
+        motion: "static", "dynamic", or "kinematic": on its `path`, whatever it meets.
         scale: uniform factor on the shape.
         position: [3] float64 m, of the shape's own origin (not its centre of mass).
         quat_xyzw: [4] float64 unit quaternion, shape frame -> world.
         velocity: [3] m/s, of the centre of mass.
         angular_velocity: [3] rad/s, world frame.
-        mass: kg (already resolved from a density; static bodies have 0).
+        mass: kg (already resolved from a density; bodies that are not dynamic have 0).
         inertia: [3, 3] kg m^2 about the centre of mass, shape axes; None means mass / volume times the shape's own.
         friction: Coulomb coefficient (the product of the two bodies' counts).
         restitution: likewise.
         collides_with: names of the bodies it may touch, or None for all.
+        path: of a kinematic body.
     """
 
     name: str
@@ -56,6 +84,7 @@ class Body:
     restitution: float
     inertia: np.ndarray | None = None
     collides_with: tuple[str, ...] | None = None
+    path: Waypoints | None = None
 
 
 @dataclass(frozen=True)
@@ -70,6 +99,7 @@ class Scene:
         seed: random seed of the run.
         model: bundled model name or path, None for the default.
         effects: what the file asked for.
+        limits: what a run must keep to.
         path: the file it came from, if any.
         missed: shapes fitted for this scene whose certificate was not met, with the reason, one line each.
     """
@@ -81,5 +111,6 @@ class Scene:
     seed: int = 0
     model: str | None = None
     effects: Effects = Effects()
+    limits: Limits = Limits()
     path: Path | None = None
     missed: tuple[str, ...] = ()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -16,6 +16,8 @@ from sdfsim.shape.mlp import MlpSdf, sides
 from sdfsim.shape.sdf import Sdf
 from sdfsim.shape.sweep import Activation, value_and_gradient
 
+FITTED_TRUST = 0.8  # of a fitted or sampled distance: its errors are far smaller, and grow with the distance
+
 
 class SdfBank:
     """Many SDFs asked at once: each point of its own shape.
@@ -23,9 +25,15 @@ class SdfBank:
     Networks of one architecture share batched matrix products, grids of one resolution a gather; spheres, boxes and
     planes are evaluated by kind. Anything else that speaks the protocol (an exact mesh) is called once per shape.
 
+    What a kind needs is brought to the device when one of its shapes is first asked for.
+
     Args:
         sdfs: the shapes; `index` refers to them in this order.
         device: where to compute; by default where the first network or grid is, or on the CPU.
+
+    Attributes:
+        trust: [S] float64: going a way w from where the distance was d, it stays above `trust` d - w / `trust`. 1 for
+            an exact distance, which no way shortens by more than its length.
     """
 
     def __init__(self, sdfs: Sequence[Sdf], device: torch.device | str | None = None) -> None:
@@ -43,7 +51,11 @@ class SdfBank:
             else:
                 key = number
             kinds.setdefault(key, []).append(number)
-        self._groups = [_group([self.sdfs[number] for number in members], self.device) for members in kinds.values()]
+        fitted = [isinstance(sdf, MlpSdf | GridSdf) for sdf in self.sdfs]
+        trust = [FITTED_TRUST if each else 1.0 for each in fitted]
+        self.trust = torch.tensor(trust, dtype=torch.float64, device=self.device)
+        self._members = list(kinds.values())
+        self._groups: dict[int, Callable[[torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]]] = {}
         group_of, slot_of = [0] * len(self.sdfs), [0] * len(self.sdfs)
         for group, members in enumerate(kinds.values()):
             for slot, number in enumerate(members):
@@ -66,15 +78,20 @@ class SdfBank:
             distance [P] m and gradient [P, 3], in the dtype of `points`: what each SDF alone would give.
         """
         slot = self._slot_of[index]
-        if len(self._groups) == 1:
-            return self._groups[0](slot, points)
+        if len(self._members) == 1 and len(index):
+            return self._group(0)(slot, points)
         group_of = self._group_of[index]
         distance, gradient = torch.empty_like(points[:, 0]), torch.empty_like(points)
-        for number, group in enumerate(self._groups):
+        for number in range(len(self._members)):
             chosen = (group_of == number).nonzero()[:, 0]
             if len(chosen):
-                distance[chosen], gradient[chosen] = group(slot[chosen], points[chosen])
+                distance[chosen], gradient[chosen] = self._group(number)(slot[chosen], points[chosen])
         return distance, gradient
+
+    def _group(self, number: int):
+        if number not in self._groups:
+            self._groups[number] = _group([self.sdfs[member] for member in self._members[number]], self.device)
+        return self._groups[number]
 
 
 def _group(sdfs: list[Sdf], device: torch.device):

@@ -37,6 +37,28 @@ def trajectory(frames: int = 4, bodies: int = 2) -> Trajectory:
     )
 
 
+def balls(position, **fields) -> Trajectory:
+    """Unturned balls of radius 0.5 m, 1 kg and 0.1 kg m^2 that follow `position` [T, N, 3]; no velocities."""
+    position = np.asarray(position, dtype=float)
+    frames, bodies = position.shape[:2]
+    defaults = {
+        "position": position,
+        "quat_xyzw": np.tile([0.0, 0.0, 0.0, 1.0], (frames, bodies, 1)),
+        "velocity": np.zeros((frames, bodies, 3)),
+        "angular_velocity": np.zeros((frames, bodies, 3)),
+        "shape": np.array(["ball"] * bodies),
+        "scale": np.ones(bodies),
+        "mass": np.ones(bodies),
+        "inertia": np.full((bodies, 3), 0.1),
+        "friction": np.full(bodies, 0.5),
+        "restitution": np.full(bodies, 0.5),
+        "static": np.zeros(bodies, dtype=bool),
+        "dt": 0.02,
+        "gravity": np.array([0.0, 0.0, -10.0]),
+    }
+    return Trajectory(**(defaults | fields))
+
+
 def bouncing(seed: int):
     """Two balls thrown at the floor and at each other; bounces are elastic and frictionless by hand."""
     rng = np.random.default_rng(seed)
@@ -78,7 +100,7 @@ def cube_data(cube_meshes, tmp_path_factory):
     out = tmp_path_factory.mktemp("data")
     analytic_shape("box", size=(1.0, 1.0, 1.0), name="cube").save(out / "shapes" / "cube")
     pytest.importorskip("pybullet")
-    from sdfsim.learning.movi import make_dataset
+    from sdfsim.learning.generate import make_dataset
 
     make_dataset("movi-b", out, shapes=cube_meshes, trajectories=3, seed=1, split="test")
     return out

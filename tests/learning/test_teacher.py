@@ -10,7 +10,9 @@ pytest.importorskip("pybullet")
 from sdfsim.errors import SdfsimError
 from sdfsim.learning.dataset import Trajectory, trajectory_files
 from sdfsim.learning.evaluate import evaluate
-from sdfsim.learning.movi import MATERIALS, REGION, SIZES, find_shapes, make_dataset, movi_b_trajectory
+from sdfsim.learning.generate import make_dataset, make_trajectory
+from sdfsim.learning.recipes import MATERIALS, REGION, SIZES, Cast
+from sdfsim.learning.shapes import find_shapes
 from sdfsim.learning.teacher import DT, Teacher, TeacherBody
 from tests.dynamics.conftest import random_model
 
@@ -29,7 +31,7 @@ def test_free_fall_is_symplectic_euler_and_rest_is_at_half_the_size(cube_meshes,
 
 def test_the_recipe_keeps_to_its_ranges(cube_meshes, tmp_path):
     sources = find_shapes(cube_meshes, tmp_path)
-    t = movi_b_trajectory(np.random.default_rng(0), sources)
+    t = make_trajectory("movi-b", np.random.default_rng(0), Cast(sources))
     assert len(t.position) == 101 and 3 <= t.position.shape[1] <= 10 and t.dt == pytest.approx(0.02)
     assert ((t.scale >= SIZES[0]) & (t.scale <= SIZES[1])).all()
     materials = {(friction, restitution): density for density, friction, restitution in MATERIALS.values()}

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
-from sdfsim import load_scene
-from sdfsim.scene.effects import may_touch, plan
-from sdfsim.scene.types import Effects
+from sdfsim import SceneError, load_scene
+from sdfsim.scene.effects import EFFECTS, plan
+from sdfsim.scene.pairs import contact_groups, count_pairs, may_touch
+from sdfsim.scene.types import Effects, Limits
 
 TEXT = """
 version: 1
@@ -42,9 +45,38 @@ def test_pairs_need_both_sides(scene):
     bodies = {b.name: b for b in scene().bodies}
     assert may_touch(bodies["b"], bodies["c"])
     assert not may_touch(bodies["a"], bodies["b"])
-    assert plan(scene()).pairs == 3  # a-floor, b-c, c-floor
+    pairs = plan(scene()).pairs
+    assert (pairs.total, pairs.unmoved, pairs.excluded, pairs.possible) == (6, 0, 3, 3)  # a-floor, b-c, c-floor
     expected = sum(may_touch(x, y) for i, x in enumerate(scene().bodies) for y in scene().bodies[i + 1 :])
     assert expected == 3
+
+
+def test_groups_and_counts_say_what_every_single_pair_says(scene):
+    bodies = list(scene().bodies)
+    rng = np.random.default_rng(0)
+    lists = [None, None, ("a", "floor"), ("b", "x3", "x7"), ()]
+    for k in range(12):
+        changes = {
+            "name": f"x{k}",
+            "motion": str(rng.choice(["static", "dynamic"])),
+            "collides_with": lists[rng.integers(len(lists))],
+            "friction": float(rng.integers(2)),
+            "restitution": float(rng.integers(2)),
+        }
+        bodies.append(replace(bodies[1], **changes))
+    group, allowed = contact_groups(bodies)
+    found = {"possible": 0, "frictional": 0, "bouncy": 0, "unmoved": 0}
+    for i, x in enumerate(bodies):
+        for j, y in enumerate(bodies[i + 1 :], i + 1):
+            moves, touch = "dynamic" in (x.motion, y.motion), may_touch(x, y)
+            assert touch == (moves and bool(allowed[group[i], group[j]]))
+            found["possible"] += touch
+            found["unmoved"] += not moves
+            found["frictional"] += touch and x.friction * y.friction > 0
+            found["bouncy"] += touch and x.restitution * y.restitution > 0
+    counted = vars(count_pairs(bodies))
+    assert found == {name: counted[name] for name in found} and found["possible"] > found["frictional"] > 0
+    assert counted["total"] == counted["possible"] + counted["unmoved"] + counted["excluded"]
 
 
 def test_what_the_file_says_wins(scene):
@@ -55,9 +87,55 @@ def test_what_the_file_says_wins(scene):
     assert frictionless.contact.on and not frictionless.friction.on and frictionless.friction.why == "the file says off"
 
 
-def test_without_contact_only_spin_turns(scene):
-    assert not plan(scene(effects=Effects(contact="off"))).rotation.on
-    assert plan(scene("angular_velocity: [0, 0, 1]", effects=Effects(contact="off"))).rotation.on
+def test_only_the_file_turns_rotation_off(scene):
+    assert plan(scene(effects=Effects(contact="off"))).rotation.on
+    assert not plan(scene(effects=Effects(rotation="off"))).rotation.on
+
+
+def test_every_effect_says_why_and_what_would_change_it(scene):
+    for made in (scene(), scene(effects=Effects(contact="off", sleep="on")), scene(gravity=np.zeros(3))):
+        effects = plan(made).effects()
+        assert tuple(effects) == EFFECTS and all(e.why and e.field for e in effects.values())
+    assert "off saves nothing" in plan(scene()).restitution.why
+    assert plan(scene(effects=Effects(sleep="on"))).sleep.on
+    assert not plan(scene(gravity=np.zeros(3))).gravity.on
+
+
+PATH = "motion: kinematic, path: [{time: 0, position: [0, 0, 1]}, {time: 2, position: [1, 0, 1]}]"
+
+
+def test_bodies_by_how_they_move(scene):
+    decided = plan(scene(PATH))
+    assert (decided.static, decided.dynamic, decided.kinematic_bodies) == (("floor",), ("b", "c"), ("a",))
+    assert decided.kinematic.on and not plan(scene()).kinematic.on
+    assert decided.pairs.unmoved == 1  # the floor and what moves along a path do not meet
+    body = scene(PATH).bodies[1]
+    assert body.mass == 0 and body.position.tolist() == [0, 0, 1] and body.path.time.tolist() == [0, 2]
+
+
+@pytest.mark.parametrize(
+    ("fields", "told"),
+    [
+        ("motion: kinematic", "bodies[1].path: is required"),
+        ("path: []", "bodies[1].path: goes with motion: kinematic only"),
+        ("motion: kinematic, path: []", "bodies[1].path: must hold at least one pose (got 0)"),
+        (PATH + ", mass: 1", "bodies[1].mass: does not go with motion: kinematic"),
+        (PATH.replace("time: 2", "time: 0"), "bodies[1].path[1]: must be later than the pose before it"),
+        (PATH.replace("time: 2, ", ""), "bodies[1].path[1].time: is required"),
+    ],
+)
+def test_faulty_paths_are_told(scene, fields, told):
+    with pytest.raises(SceneError, match=re.escape(told)):
+        scene(fields)
+
+
+def test_memory_limits_are_read(scene, tmp_path):
+    assert scene().limits == Limits()
+    (tmp_path / "scene.yaml").write_text(TEXT.replace("FIELDS", "mass: 1") + "limits: {memory_gib: 0.5}\n")
+    assert load_scene(tmp_path / "scene.yaml").limits.memory_gib == 0.5
+    (tmp_path / "scene.yaml").write_text(TEXT.replace("FIELDS", "mass: 1") + "limits: {memory_gib: 0}\n")
+    with pytest.raises(SceneError, match=r"limits\.memory_gib: must be > 0"):
+        load_scene(tmp_path / "scene.yaml")
 
 
 def test_smooth_bodies_have_no_friction_to_compute(scene):
@@ -69,4 +147,5 @@ def test_smooth_bodies_have_no_friction_to_compute(scene):
 def test_nothing_to_do(scene):
     made = scene()
     still = plan(replace(made, bodies=made.bodies[:1]))
-    assert not still.contact.on and still.pairs == 0 and still.dynamic == ()
+    assert not still.contact.on and still.pairs.possible == 0 and still.dynamic == ()
+    assert not still.free_flight.on and still.scenery.on

@@ -65,7 +65,7 @@ BODY = [
         "motion: static, angular_velocity: [1, 0, 0]",
         "bodies[0].angular_velocity: must be zero: a static body does not move",
     ),
-    ("motion: kinematic", "bodies[0].motion: must be one of static, dynamic (got 'kinematic')"),
+    ("motion: driven", "bodies[0].motion: must be one of static, dynamic, kinematic (got 'driven')"),
     ("quat_xyzw: [0, 0, 0, 0]", "bodies[0].quat_xyzw: must not be zero: a quaternion has length 1"),
     (
         "quat_xyzw: [0, 0, 0, 1], euler_xyz_deg: [0, 0, 0]",
@@ -120,7 +120,7 @@ TOP = [
     ("gravity: [0, 0, nan]", "gravity[2]: must be finite (got nan)"),
     ("seed: -1", "seed: must be >= 0 (got -1)"),
     ("effects: {frictoin: off}", "effects.frictoin: unknown key (did you mean 'friction'?)"),
-    ("effects: {sleep: on}", "effects.sleep: must be off: sleep is not available yet (got 'on')"),
+    ("effects: {sleep: auto}", "effects.sleep: must be one of off, on (got 'auto')"),
     ("effects: {friction: [], sleep: on}", "effects.friction: must be one of auto, on, off (got a list)"),
     ("shapes: {cup: {asset: nowhere}}", "shapes.cup.asset: no such folder: FOLDER/nowhere"),
     ("shapes: {cup: {mesh: cup.obj}}", "shapes.cup.mesh: no such file: FOLDER/cup.obj"),

@@ -108,7 +108,10 @@ def test_grids_of_one_resolution_share_a_gather_of_bounded_size(monkeypatch: pyt
 
 def test_a_grid_alone_is_not_copied() -> None:
     sdf = sample_grid(SphereSdf(0.5), SphereSdf(0.5).bounds, 8)
-    (group,) = SdfBank([sdf])._groups
+    bank = SdfBank([sdf])
+    assert not bank._groups  # nothing is loaded before it is asked for
+    bank(torch.zeros(1, dtype=torch.int64), torch.zeros(1, 3))
+    (group,) = bank._groups.values()
     assert isinstance(group, _GridGroup)
     assert group._values.data_ptr() == sdf.values.data_ptr()
 

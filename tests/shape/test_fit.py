@@ -142,7 +142,7 @@ def test_a_budget_is_kept_and_still_ends_in_a_decay(monkeypatch: pytest.MonkeyPa
 
 def test_a_goal_that_is_met_ends_the_fit_early(monkeypatch: pytest.MonkeyPatch) -> None:
     plan = replace(
-        plans.PLANS["default"], width=16, layers=4, batch=256, pool=5000, goal=(1.0, 1.0, 1.0, 1.0), settle=100, steps=5000
+        plans.PLANS["default"], width=16, layers=4, batch=256, pool=5000, goal=(1.0,) * 4, settle=100, steps=5000
     )
     monkeypatch.setitem(plans.PLANS, "default", plan)
     assert fit_mesh(primitives.box(), name="box").certificate["steps"] == 200
@@ -222,7 +222,7 @@ def test_a_shape_with_mirror_planes_is_fitted_on_one_side(tiny: None) -> None:
 def test_side_by_side_is_each_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     # The goals are met at different updates, so that some leave the stack before the others.
     plan = replace(
-        plans.PLANS["default"], width=16, layers=4, batch=256, pool=5000, goal=(8e-3, 1.0, 1.0, 1.0), settle=200, steps=1200
+        plans.PLANS["default"], width=16, layers=4, batch=256, pool=5000, goal=(8e-3, 1, 1, 1), settle=200, steps=1200
     )
     monkeypatch.setitem(plans.PLANS, "default", plan)
     meshes = {

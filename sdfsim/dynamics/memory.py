@@ -1,0 +1,138 @@
+"""What a run keeps from step to step to compute less, and what it counts. Nothing here changes a result."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor
+
+from sdfsim.dynamics.bodies import Bodies, State
+from sdfsim.dynamics.broad import Still, moving, swept_boxes
+from sdfsim.scene.types import Limits
+
+COUNTS = {
+    "pairs": "pairs of bodies that the broad phase let through",
+    "sdf_queries": "signed distances asked for",
+    "sdf_waiting": "nodes near a surface that cannot reach it yet, by an earlier answer",
+    "nodes": "nodes of the graph that the network saw",
+    "edges": "edges of that graph",
+    "free": "dynamic bodies in free flight",
+    "active": "dynamic bodies that the network moved",
+    "asleep": "dynamic bodies asleep",
+}
+PHASES = {
+    "pairs_ms": "broad phase",
+    "distances_ms": "signed distances",
+    "flight_ms": "free flight",
+    "network_ms": "network",
+    "sleep_ms": "sleep",
+}
+_SLACK = 1e-9  # model lengths, for the rounding of distances
+BYTES_A_ROW = 4096  # what a node near a surface, or an edge of the network, takes while it is worked on
+
+
+def row_limit(limits: Limits) -> int | None:
+    """How many nodes or edges may be worked on at once, so that a step keeps to its memory; None for all."""
+    return None if limits.memory_gib is None else max(1, int(limits.memory_gib * 2**30 / BYTES_A_ROW))
+
+
+class Waits:
+    """Signed distances from earlier steps: a node at distance d has to move by d - D before it is within reach.
+
+    What was asked is kept in the other body's frame, where the way from there to here is all that the distance can have
+    shrunk by, whatever has moved.
+    """
+
+    def __init__(self) -> None:
+        self._rows: tuple[Tensor, Tensor, Tensor] | None = None
+        self._noted: list[tuple[Tensor, Tensor, Tensor]] = []
+
+    def may_wait(self, key: Tensor, place: Tensor, trust: Tensor, most: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Which of Q nodes near a surface cannot have come within `most` of it.
+
+        Args:
+            key: [Q] int64, ascending, of the node and the other body.
+            place: [Q, 3] the node in the other body's frame.
+            trust: [Q] how exact that body's distances are, see `SdfBank.trust`.
+            most: [Q] a smaller distance may make an edge.
+
+        Returns:
+            [Q] bool; and where [Q, 3] and what [Q] the last answer was, for those that wait.
+        """
+        if self._rows is None or not len(self._rows[0]):
+            return torch.zeros_like(key, dtype=torch.bool), place, torch.zeros_like(most)
+        keys, places, distances = self._rows
+        at = torch.searchsorted(keys, key).clamp_max(len(keys) - 1)
+        before, distance = places[at], distances[at]
+        least = trust * distance - (place - before).norm(dim=-1) / trust
+        return (keys[at] == key) & (least > most + _SLACK), before, distance
+
+    def note(self, key: Tensor, place: Tensor, distance: Tensor, worth: Tensor) -> None:
+        """Keep the answers that are `worth` it for the next step; keys come in ascending order."""
+        self._noted.append((key[worth], place[worth], distance[worth]))
+
+    def turn(self) -> None:
+        """What was noted since the last call replaces what was known."""
+        keys, places, distances = zip(*self._noted, strict=True) if self._noted else ((), (), ())
+        self._rows = (torch.cat(keys), torch.cat(places), torch.cat(distances)) if keys else None
+        self._noted = []
+
+
+class Memory:
+    """Of one run: caches, counters and timers.
+
+    Attributes:
+        waits: earlier distances.
+        counts: what the present step has counted so far, by the names of `COUNTS` and `PHASES` (ms).
+    """
+
+    def __init__(self) -> None:
+        self.waits = Waits()
+        self.counts = dict.fromkeys((*COUNTS, *PHASES), 0.0)
+        self._last: State | None = None
+        self._still: tuple[Tensor, Still] | None = None
+        self._cuda = False
+
+    def begin(self, bodies: Bodies, state: State) -> bool:
+        """Start counting a step. Returns whether `state` comes from elsewhere than the step before."""
+        self.counts = dict.fromkeys(self.counts, 0.0)
+        self._cuda = bodies.device.type == "cuda"
+        edited = state is not self._last
+        if edited:
+            self._still = None
+        return edited
+
+    def end(self, bodies: Bodies, state: State) -> None:
+        """The step led to `state`."""
+        self._last = state
+        asleep = 0 if state.sleep is None else int((state.sleep.island >= 0).sum())
+        self.count(asleep=asleep, free=int(bodies.moves.sum()) - asleep - self.counts["active"])
+
+    def count(self, **more: float) -> None:
+        """Add to counters."""
+        for name, value in more.items():
+            self.counts[name] += value
+
+    @contextmanager
+    def timed(self, phase: str) -> Iterator[None]:
+        """Add the time that a block takes to a phase."""
+        started = time.perf_counter()
+        yield
+        if self._cuda:
+            torch.cuda.synchronize()
+        self.counts[phase] += 1e3 * (time.perf_counter() - started)
+
+    def surroundings(
+        self, bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float
+    ) -> tuple[Tensor, Still]:
+        """The bodies that move, and the others, sorted again only when it is not the same bodies as before."""
+        going = moving(bodies, state)
+        if self._still is None or not torch.equal(self._still[0], going):
+            stays = torch.ones(len(bodies), dtype=torch.bool, device=bodies.device)
+            stays[going] = False
+            boxes = swept_boxes(bodies, state, gravity, reach, dt, stays.nonzero()[:, 0])
+            self._still = (going, Still(boxes))
+        return going, self._still[1]

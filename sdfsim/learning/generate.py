@@ -1,0 +1,193 @@
+"""Datasets made by the teacher: shapes, then trajectories on all cores."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from sdfsim.errors import SdfsimError
+from sdfsim.learning.dataset import FLOOR, SPLITS, Trajectory, read_info, write_info
+from sdfsim.learning.recipes import RECIPES, Cast, Recipe
+from sdfsim.learning.shapes import Origin, ShapeSource, find_shapes, fit_shapes, origins, prepare, split_of
+from sdfsim.learning.statistics import statistics, statistics_lines
+from sdfsim.learning.teacher import DT, ENGINE_SETTINGS, SUBSTEP, Teacher, import_pybullet
+from sdfsim.parallel import parallel
+
+GRAVITY = (0.0, 0.0, -10.0)  # m/s^2
+STEPS = 100
+MOST_BODIES = 512
+
+Progress = Callable[[float, str], None]
+
+
+def make_dataset(
+    recipe: str,
+    out: Path,
+    *,
+    trajectories: int,
+    shapes: Path | None = None,
+    random_solids: int = 0,
+    bodies: int | None = None,
+    seed: int = 0,
+    split: str = "train",
+    on_progress: Progress | None = None,
+) -> dict:
+    """Write `trajectories` files under `out/SPLIT/` and the Shape folders under `out/shapes/`.
+
+    Files that exist are kept, so that an interrupted run goes on where it was. With the same shapes, trajectory k of
+    a split depends on (seed, split, k) alone. Every recipe but movi-b draws a split's bodies from that split's shapes
+    (see `split_of`), so that those of validation and test are never trained on.
+
+    Args:
+        recipe: a name in `RECIPES`.
+        out: dataset folder.
+        trajectories: how many.
+        shapes: folder of NAME/ folders, each with `visual_geometry.obj` and `collision_geometry.obj` (one convex
+            piece a group); all recipes but movi-b also take mesh files, which are cut into pieces by V-HACD.
+        random_solids: how many of PyBullet's random solids there are beside them.
+        bodies: how many move, instead of the recipe's range (bowl and pile).
+        seed: of the dataset.
+        split: "train", "validation" or "test".
+        on_progress: called with the fraction done and a message.
+
+    Returns:
+        A report: paths, counts, and `statistics` of the split.
+
+    Raises:
+        SdfsimError: unknown recipe or split, an option that the recipe has no use for, no usable shapes, PyBullet
+            absent, another dataset in `out`.
+    """
+    plan = _checked(recipe, split, trajectories, shapes, random_solids, bodies)
+    tell = on_progress or (lambda fraction, message: None)
+    engine = import_pybullet()
+    cast, found = _cast(plan, shapes, random_solids, out / "shapes" / "engine", lambda f, m: tell(0.1 * f, m))
+    info = {
+        "recipe": recipe,
+        "seed": seed,
+        "engine": "pybullet",
+        "engine_version": str(engine.getAPIVersion()),
+        "engine_settings": ENGINE_SETTINGS | {"timeStep": SUBSTEP},
+        "floor": {"friction": FLOOR[0], "restitution": FLOOR[1]},
+        **found,
+    }
+    if plan.counted:
+        info["bodies"] = bodies
+    if (out / "dataset.json").exists() and read_info(out) != info:
+        raise SdfsimError(
+            f"{out} holds a dataset of another recipe, seed, engine, count or set of shapes", "choose another -o"
+        )
+    if not plan.kubasic:
+        cast = replace(cast, shapes=[s for s in cast.shapes if split_of(s.name) == split])
+    if plan.given and not cast.shapes:
+        raise SdfsimError(f"none of the {len(info['shapes'])} shapes belongs to the {split} split", "give more shapes")
+    folder = out / split
+    folder.mkdir(parents=True, exist_ok=True)
+    fit_shapes([*cast.shapes, *cast.scenery.values()], out / "shapes", lambda f, m: tell(0.1 + 0.4 * f, m))
+    write_info(out, info)
+    cast = replace(cast, bodies=bodies)
+    todo = [k for k in range(trajectories) if not (folder / f"{k:05d}.npz").exists()]
+    jobs = [(recipe, k, seed, split, cast, folder / f"{k:05d}.npz") for k in todo]
+    for done, _ in enumerate(parallel(_make_one, jobs), start=1):
+        tell(0.5 + 0.5 * done / len(todo), f"trajectory {done} of {len(todo)}")
+    return {
+        "dataset": str(out),
+        "split": split,
+        "trajectories": trajectories,
+        "made_now": len(todo),
+        "shapes": len(cast.shapes),
+        "left_out": info.get("left_out", {}),
+        "statistics": statistics(out, split),
+    }
+
+
+def report_lines(report: dict) -> list[str]:
+    """The report of `make_dataset` for people."""
+    lines = [
+        f"{report['dataset']}: {report['trajectories']} {report['split']} trajectories, {report['made_now']} made now; "
+        f"{report['shapes']} shapes to draw from",
+        *(f"left out: {name}: {why}" for name, why in report["left_out"].items()),
+    ]
+    return lines + statistics_lines(report["statistics"])
+
+
+def make_trajectory(recipe: str, rng: np.random.Generator, cast: Cast) -> Trajectory:
+    """One trajectory of `STEPS` steps.
+
+    Args:
+        recipe: a name in `RECIPES`.
+        rng: what the scene is drawn from.
+        cast: shapes and scenery.
+    """
+    while True:
+        with Teacher(np.array(GRAVITY), FLOOR) as teacher:
+            placed = RECIPES[recipe].spawn(teacher, rng, cast)
+            if placed is None:
+                continue
+            motion = teacher.run(STEPS)
+            inertia = np.array([teacher.inertia(i) for i in range(len(placed))])
+        specs = [body for _, body in placed]
+        mass = np.array([b.mass for b in specs])
+        return Trajectory(
+            **motion,
+            shape=np.array([source.name for source, _ in placed]),
+            scale=np.array([b.scale for b in specs]),
+            mass=mass,
+            inertia=inertia,
+            friction=np.array([b.friction for b in specs]),
+            restitution=np.array([b.restitution for b in specs]),
+            static=mass == 0,
+            dt=DT,
+            gravity=np.array(GRAVITY),
+        )
+
+
+def _make_one(recipe: str, index: int, seed: int, split: str, cast: Cast, path: Path) -> None:
+    make_trajectory(recipe, np.random.default_rng([seed, SPLITS.index(split), index]), cast).save(path)
+
+
+def _checked(
+    recipe: str, split: str, trajectories: int, shapes: Path | None, random_solids: int, bodies: int | None
+) -> Recipe:
+    """The recipe, when everything goes with it."""
+    if recipe not in RECIPES:
+        raise SdfsimError(f"unknown recipe {recipe!r}", f"known: {', '.join(RECIPES)}")
+    if split not in SPLITS:
+        raise SdfsimError(f"unknown split {split!r}", f"known: {', '.join(SPLITS)}")
+    if trajectories < 1:
+        raise SdfsimError("--trajectories must be at least 1")
+    plan = RECIPES[recipe]
+    if bodies is not None and not (plan.counted and 1 <= bodies <= MOST_BODIES):
+        counted = " and ".join(name for name, r in RECIPES.items() if r.counted)
+        raise SdfsimError(f"--bodies goes with {counted}, and is 1 to {MOST_BODIES} (got {bodies} for {recipe})")
+    if plan.given and shapes is None and (plan.kubasic or not random_solids):
+        also = "" if plan.kubasic else " or --random-solids N"
+        raise SdfsimError(f"{recipe} needs shapes", f"give --shapes FOLDER{also}")
+    if (plan.kubasic or not plan.given) and random_solids:
+        raise SdfsimError(f"{recipe} has no use for --random-solids")
+    if not plan.given and shapes is not None:
+        raise SdfsimError(f"{recipe} brings its own shapes", "leave out --shapes")
+    return plan
+
+
+def _cast(
+    plan: Recipe, shapes: Path | None, random_solids: int, engine: Path, on_progress: Progress
+) -> tuple[Cast, dict]:
+    """All shapes of a recipe, and what `dataset.json` says of them."""
+    if plan.kubasic:
+        assert shapes is not None
+        sources = find_shapes(shapes, engine)
+        return Cast(sources), {"shapes": [s.name for s in sources]}
+    given = origins(shapes, random_solids) if plan.given else []
+    own = [Origin(name, primitive=kind) for name, kind in plan.scenery.items()]
+    if taken := {o.name for o in given} & set(plan.scenery):
+        raise SdfsimError(f"{shapes}: the recipe has a shape {min(taken)!r} of its own", "rename yours")
+    found, info = prepare(given + own, engine, on_progress)
+    return _sorted_out(found, plan), info
+
+
+def _sorted_out(found: list[ShapeSource], plan: Recipe) -> Cast:
+    scenery = {s.name: s for s in found if s.name in plan.scenery}
+    return Cast([s for s in found if s.name not in plan.scenery], scenery)

@@ -1,0 +1,122 @@
+"""Recorded trajectories simulated again by a model, many side by side."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from sdfsim.dynamics.bodies import Units
+from sdfsim.dynamics.model import Model
+from sdfsim.dynamics.simulator import with_history
+from sdfsim.dynamics.step import FreeFlight, Rules, step
+from sdfsim.errors import EXIT_QUALITY, SdfsimError
+from sdfsim.learning.dataset import Trajectory, read_info
+from sdfsim.learning.merge import merged
+from sdfsim.shape.asset import Shape
+
+BATCH = 50  # trajectories simulated side by side
+
+
+def roll_out(
+    model: Model,
+    group: list[Trajectory],
+    shapes: dict[str, Shape],
+    steps: int,
+    device: torch.device,
+    free_flight: FreeFlight = "exact",
+    *,
+    contact: bool = True,
+) -> list[Trajectory]:
+    """Simulate one batch from its first frames.
+
+    Args:
+        model: what simulates.
+        group: trajectories of one step and one gravity; only their first frames are used. Their velocities are those
+            at the instant of the positions (see `at_instants`).
+        shapes: of every name in use, with the nodes that the model is to have.
+        steps: how many.
+        device: where to compute.
+        free_flight: "exact", or "learned" for the *paper* network.
+        contact: False leaves every body in free flight.
+
+    Returns:
+        For each of the group, the same bodies in the predicted motion: steps + 1 frames.
+
+    Raises:
+        SdfsimError: a state that is not finite (exit code 3).
+    """
+    units = _units(model, group[0])
+    bodies, state = merged(group, [0] * len(group), shapes, units, device)
+    gravity = torch.tensor(group[0].gravity / units.acceleration, dtype=torch.float64, device=device)
+    rules = Rules(gravity=gravity, dt=model.dt, contact=contact, free_flight=free_flight)
+    if model.kind == "paper":
+        state = with_history(state, bodies, rules)
+    states = [state]
+    for k in range(steps):
+        state, _ = step(model, bodies, state, rules)
+        broken = ~(state.position.isfinite().all(-1) & state.orientation.isfinite().all(-1))
+        if broken.any():
+            raise SdfsimError(f"step {k + 1}: {int(broken.sum())} bodies are not finite", exit_code=EXIT_QUALITY)
+        states.append(state)
+    position, quat, velocity, angular = (
+        np.stack([getattr(s, name).cpu().numpy() for s in states])
+        for name in ("position", "orientation", "velocity", "angular_velocity")
+    )
+    motions, at = [], 0
+    for t in group:
+        mine = slice(at, at + t.position.shape[1])
+        at = mine.stop
+        motions.append(
+            replace(
+                t,
+                position=position[:, mine] * units.length,
+                quat_xyzw=quat[:, mine],
+                velocity=velocity[:, mine] * units.velocity,
+                angular_velocity=angular[:, mine] / units.time,
+            )
+        )
+    return motions
+
+
+def batches(trajectories: list[Trajectory]) -> list[list[Trajectory]]:
+    """Batches of trajectories that share step and gravity, so that they run as one."""
+    groups: dict[tuple, list[Trajectory]] = {}
+    for t in trajectories:
+        groups.setdefault((t.dt, *t.gravity), []).append(t)
+    return [g[i : i + BATCH] for g in groups.values() for i in range(0, len(g), BATCH)]
+
+
+def engine_substep(data: Path) -> float:
+    """The engine's inner step in s, where the dataset tells it (0 elsewhere)."""
+    for folder in (data, data.parent):
+        if (folder / "dataset.json").exists():
+            settings = read_info(folder).get("engine_settings")
+            found = settings.get("timeStep") if isinstance(settings, dict) else None
+            return float(found) if isinstance(found, int | float) else 0.0
+    return 0.0
+
+
+def at_instants(trajectory: Trajectory, substep: float) -> Trajectory:
+    """The trajectory with velocities at the instants of its positions.
+
+    The recording engine's position step already uses the new velocity (symplectic Euler): its flights are exact
+    parabolas, but of bodies that are half an inner step `substep` s of gravity faster than recorded.
+    """
+    moving = ~trajectory.static.astype(bool)
+    return replace(trajectory, velocity=trajectory.velocity + 0.5 * substep * trajectory.gravity * moving[:, None])
+
+
+def first_frames(trajectory: Trajectory, count: int) -> Trajectory:
+    """The first `count` frames."""
+    names = ("position", "quat_xyzw", "velocity", "angular_velocity")
+    return replace(trajectory, **{name: getattr(trajectory, name)[:count] for name in names})
+
+
+def _units(model: Model, like: Trajectory) -> Units:
+    """Model units in which the recorded step is the model's own."""
+    strength = float(np.linalg.norm(like.gravity)) or model.gravity
+    length = (like.dt / model.dt) ** 2 * strength / model.gravity
+    return Units(length=length, time=like.dt / model.dt, mass=length**3)  # the recipe's densities are the model's

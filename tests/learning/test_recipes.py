@@ -1,0 +1,188 @@
+"""The recipes on cubes and balls: ranges, rest, scenery that stays, repeatability, statistics."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("pybullet")
+
+from sdfsim.errors import SdfsimError
+from sdfsim.learning import merge
+from sdfsim.learning.dataset import SPLITS, Trajectory, load_shapes, trajectory_files
+from sdfsim.learning.frames import contact_frames
+from sdfsim.learning.generate import GRAVITY, make_dataset, make_trajectory
+from sdfsim.learning.impulse_task import ImpulseTask
+from sdfsim.learning.recipes import BALL, MASS_RATIO, OBSTACLES, RECIPES, WALL, Cast
+from sdfsim.learning.resting import DROP, NUDGE, STARTS, at_rest, steady_faces
+from sdfsim.learning.shapes import Origin, prepare
+from sdfsim.learning.statistics import statistics, statistics_lines
+from sdfsim.learning.teacher import Teacher, TeacherBody
+from sdfsim.shape import primitives
+from sdfsim.shape.asset import Shape, analytic_shape, sdf_of_mesh
+from sdfsim.shape.mesh import mass_properties
+
+
+@pytest.fixture(scope="module")
+def cast(tmp_path_factory):
+    """Cubes to draw from, and the scenery of all recipes."""
+    scenery = {name: kind for recipe in RECIPES.values() for name, kind in recipe.scenery.items()}
+    found = [Origin(name, primitive=kind) for name, kind in {"cube": "box", **scenery}.items()]
+    sources, _ = prepare(found, tmp_path_factory.mktemp("engine"), lambda fraction, message: None)
+    return Cast(sources[:1], {s.name: s for s in sources[1:]})
+
+
+def spawned(recipe: str, seed: int, cast: Cast):
+    """The start of a scene that found room: bodies and the engine's state of them."""
+    rng = np.random.default_rng(seed)
+    while True:
+        with Teacher(np.array(GRAVITY)) as teacher:
+            placed = RECIPES[recipe].spawn(teacher, rng, cast)
+            if placed is not None:
+                return placed, teacher.run(0), [teacher.penetrates(i) for i in range(len(placed))]
+
+
+def test_movi_c_keeps_to_its_ranges(cast):
+    t = make_trajectory("movi-c", np.random.default_rng(0), cast)
+    assert 3 <= len(t.shape) <= 10 and len(t.position) == 101
+    assert ((t.scale >= 0.75) & (t.scale <= 3.0)).all()
+    assert (t.friction == 0.5).all() and (t.restitution == 0.5).all() and not t.static.any()
+    assert t.mass == pytest.approx(1.1 * t.scale**3)
+    aim = t.velocity[0] + t.position[0] * [1, 1, 0]
+    assert (np.abs(aim[:, :2]) <= 4.0).all() and (t.velocity[0][:, 2] == 0).all()
+
+
+@pytest.mark.parametrize("count", [1, 24])
+def test_balls_start_apart_and_stay_in_a_bowl_that_never_moves(cast, count):
+    t = make_trajectory("bowl", np.random.default_rng(count), replace(cast, bodies=count))
+    assert list(t.static) == [True] + [False] * count and t.mass[0] == 0
+    assert np.ptp(t.position[:, 0], axis=0).max() == 0 and not t.velocity[:, 0].any()
+    start, end = t.position[0, 1:], t.position[-1, 1:]
+    apart = np.linalg.norm(start[:, None] - start[None], axis=-1) + BALL * np.eye(count)
+    assert apart.min() >= BALL - 1e-9 and (t.scale[1:] == BALL).all()
+    inner = 0.5 * t.scale[0] * (1 - WALL)
+    rim = 0.5 * t.scale[0]
+    # Nothing is in the wall: a ball's farthest point is within the inner sphere, but for a contact margin.
+    assert np.linalg.norm(end - [0, 0, rim], axis=1).max() <= inner - 0.5 * BALL + 0.01
+    assert (start[:, 2] > rim - 0.1 * BALL).all() and (end[:, 2] < start[:, 2]).all()
+
+
+def test_a_pile_starts_apart_at_rest_and_falls_onto_the_floor(cast):
+    placed, start, inside = spawned("pile", 0, replace(cast, bodies=20))
+    assert len(placed) == 20 and not any(inside) and not start["velocity"].any()
+    t = make_trajectory("pile", np.random.default_rng(0), replace(cast, bodies=20))
+    np.testing.assert_array_equal(t.position[0], start["position"][0])
+    assert (t.position[-1, :, 2] > 0.4 * t.scale).all()
+    assert t.position[-1, :, 2].mean() < 0.7 * t.position[0, :, 2].mean()
+    counts = {len(spawned("pile", seed, cast)[0]) for seed in range(12)}
+    assert min(counts) >= 5 and max(counts) <= 30 and len(counts) > 5
+
+
+def test_varied_scenes_keep_to_their_ranges_and_start_clear_of_each_other(cast):
+    resting = obstacles = 0
+    for seed in range(40):
+        placed, start, inside = spawned("varied", seed, cast)
+        moving = [body for _, body in placed if body.mass > 0]
+        masses = [body.mass for body in moving]
+        assert max(masses) / min(masses) <= MASS_RATIO * (1 + 1e-9) and 3 <= len(moving) <= 10
+        assert all(0 <= b.friction <= 1 and 0 <= b.restitution <= 0.9 for _, b in placed)
+        assert not any(inside)
+        assert {s.name for s, b in placed if b.mass == 0} <= set(OBSTACLES)
+        resting += bool((np.abs(start["velocity"]) <= NUDGE).all())
+        obstacles += len(placed) - len(moving)
+    assert 6 <= resting <= 21 and 5 <= obstacles <= 20
+
+
+@pytest.mark.parametrize("start", STARTS)
+def test_resting_starts_are_low_and_slow_and_still_cubes_stay(cast, start):
+    (cube,) = cast.shapes
+    with Teacher(np.array(GRAVITY)) as teacher:
+        bodies = [(cube, TeacherBody(cube.urdf, 0.8 + 0.05 * k, 1.0, 0.5, 0.2)) for k in range(6)]
+        # Smaller ones on top: a cube that hangs over may fall.
+        assert at_rest(teacher, np.random.default_rng(1), bodies[::-1], start, 100)
+        motion = teacher.run(50)
+    lowest = motion["position"][0, :, 2] - 0.5 * np.array([b.scale for _, b in bodies[::-1]])
+    assert lowest.min() > 0 and lowest.min() <= DROP
+    assert np.abs(motion["velocity"][0]).max() <= NUDGE
+    moved = np.linalg.norm(motion["position"] - motion["position"][0], axis=-1).max()
+    assert moved < 0.005 if start == "still" else moved > 0.005
+
+
+def test_a_body_stands_on_the_faces_that_its_centre_is_above(cast):
+    corners = primitives.box((1.0, 1.0, 1.0)).vertices
+    assert sorted(map(tuple, steady_faces(corners).round(6) + 0.0)) == sorted(
+        map(tuple, np.concatenate([np.eye(3), -np.eye(3)]))
+    )
+    # A frustum whose centre of mass is beside its small end: only the other five faces are steady.
+    low, high = corners[corners[:, 2] < 0], corners[corners[:, 2] > 0] * [0.1, 0.1, 1.0] + [0.3, 0.0, 0.0]
+    faces = steady_faces(np.concatenate([low, high]))
+    assert not (faces[:, 2] > 0.99).any() and (faces[:, 2] < -0.99).sum() == 1
+
+
+@pytest.mark.parametrize("recipe", ["movi-c", "bowl", "pile", "varied"])
+def test_a_trajectory_depends_on_seed_split_and_number_alone(cast, recipe):
+    few = replace(cast, bodies=4) if RECIPES[recipe].counted else cast
+
+    def made(seed: int, split: str, index: int) -> Trajectory:
+        return make_trajectory(recipe, np.random.default_rng([seed, SPLITS.index(split), index]), few)
+
+    one = made(0, "train", 3)
+    np.testing.assert_array_equal(made(0, "train", 3).position, one.position)
+    for other in (made(1, "train", 3), made(0, "test", 3), made(0, "train", 2)):
+        assert other.position.shape != one.position.shape or not np.array_equal(other.position, one.position)
+
+
+def test_a_dataset_goes_on_where_it_was_and_refuses_another(cube_meshes, tmp_path):
+    analytic_shape("box", size=(1.0, 1.0, 1.0), name="cube").save(tmp_path / "shapes" / "cube")
+    report = make_dataset("pile", tmp_path, trajectories=2, shapes=cube_meshes, bodies=4)
+    files = trajectory_files(tmp_path, "train")
+    before = [Trajectory.load(file).position for file in files]
+    files[1].unlink()
+    again = make_dataset("pile", tmp_path, trajectories=2, shapes=cube_meshes, bodies=4)
+    assert report["made_now"] == 2 and again["made_now"] == 1 and again["statistics"] == report["statistics"]
+    np.testing.assert_array_equal(Trajectory.load(files[1]).position, before[1])
+    with pytest.raises(SdfsimError, match="another recipe, seed, engine, count"):
+        make_dataset("pile", tmp_path, trajectories=2, shapes=cube_meshes, bodies=5)
+    found = report["statistics"]
+    assert found["bodies"] == [4, 4, 4] and found["static_bodies"] == 0 and found["resting_at_start"] == 1.0
+    assert 0.5 <= found["extent_m"][0] <= found["extent_m"][2] <= 1.5
+    assert "  bodies: 4 to 4, mean 4" in statistics_lines(found)
+
+
+def bowl_shapes(folder):
+    """Shape folders of the bowl recipe without a fit: a coarse grid, and a sphere."""
+    mesh = primitives.bowl()
+    volume, com, inertia = mass_properties(mesh)
+    mesh = replace(mesh, vertices=mesh.vertices - com)
+    sdf, _ = sdf_of_mesh(mesh, "grid", 24)
+    Shape("bowl", mesh, sdf, mesh.vertices[::8], volume, com, inertia).save(folder / "bowl")
+    analytic_shape("sphere", radius=0.5, name="ball").save(folder / "ball")
+
+
+def test_static_scenery_takes_part_in_contacts_but_never_in_what_is_learnt(cast, tmp_path, monkeypatch):
+    bowl_shapes(tmp_path / "shapes")
+    (tmp_path / "train").mkdir()
+    t = make_trajectory("bowl", np.random.default_rng(0), replace(cast, bodies=5))
+    t.save(tmp_path / "train" / "00000.npz")
+    frames = contact_frames(tmp_path, "train", 0.1)
+    assert (frames.mass.reshape(-1, 6)[:, 0] == 0).all() and (frames.mass.reshape(-1, 6)[:, 1:] > 0).all()
+    assert (frames.first == 0).any() and (frames.second == 0).any()  # the bowl's nodes count, and so does its surface
+    task = ImpulseTask(frames, torch.device("cpu"), None)
+    batch = task.batch(np.arange(len(frames)))
+    fixed = torch.arange(len(batch.counts)) % 6 == 0
+    assert not batch.counts[fixed].any() and not batch.graph.inverse_mass[fixed].any()
+    assert not batch.graph.inverse_inertia[fixed].any() and batch.graph.gap.isfinite().all()
+    assert task.ranges()["mass_ratio"] == [1.0, 1.0] and np.isfinite(task.weight).all()
+    shapes = load_shapes(tmp_path, {"bowl", "ball"})
+    whole = merge.find_edges(t, shapes, 0.1)
+    monkeypatch.setattr(merge, "TOGETHER", 50)
+    for name, values in merge.find_edges(t, shapes, 0.1).items():
+        np.testing.assert_allclose(values, whole[name], atol=1e-9)
+
+
+def test_statistics_of_balls_are_those_of_their_closed_forms(ball_data):
+    found = statistics(ball_data, "train")
+    assert found["bodies"] == [2, 2, 2] and found["volume_m3"] == pytest.approx([4 / 3 * np.pi / 8] * 3)
+    assert found["mass_ratio"] == pytest.approx([2.0] * 3) and found["nodes_per_scene"] == 256
+    assert 0 < found["contacts_per_step"] < 256 and "published" not in found

@@ -1,0 +1,118 @@
+"""`plan` explains a scene; `simulate` tells what it has cost."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+import cli
+from sdfsim import Simulator, load_scene
+from sdfsim.dynamics.memory import COUNTS, PHASES
+from sdfsim.dynamics.model import Model, load_model, new_network
+from sdfsim.dynamics.rollout import Rollout
+from sdfsim.planning import describe, plan_lines
+from sdfsim.playback import PLOTS, VIEWS
+from sdfsim.run import cost_lines
+from sdfsim.scene.effects import EFFECTS
+
+SCENE = """
+version: 1
+duration: 0.2
+effects: {restitution: off}
+limits: {memory_gib: 0.5}
+shapes:
+  ball: {sphere: {radius: 0.5}}
+bodies:
+  - {name: floor, plane: {}}
+  - {name: ball, shape: ball, position: [0, 0, 0.5]}
+  - {name: ghost, shape: ball, position: [2, 0, 0.5], collides_with: [floor]}
+  - {name: far, shape: ball, position: [0, 0, 50], restitution: 0.1}
+  - {name: lift, shape: ball, motion: kinematic, path: [{time: 0, position: [9, 0, 0]}]}
+"""
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory) -> str:
+    path = tmp_path_factory.mktemp("model") / "untrained.safetensors"
+    torch.manual_seed(0)
+    ranges = {"friction": [0.2, 0.3], "restitution": [0.25, 0.25]}
+    network = new_network("impulse", {"width": 8, "rounds": 1})
+    Model("untrained", "impulse", network, 0.02, 10.0, 1.0, 0.1, ranges=ranges).save(path)
+    return str(path)
+
+
+@pytest.fixture
+def scene(tmp_path) -> Path:
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    return tmp_path / "scene.yaml"
+
+
+def told(scene: Path, model: str) -> dict:
+    return describe(scene, model=model, device="cpu", on_progress=lambda *_: None)
+
+
+def test_plan_tells_all_there_is_to_know(scene, model):
+    report = told(scene, model)
+    assert tuple(report["effects"]) == EFFECTS
+    assert {name: e["on"] for name, e in report["effects"].items() if not e["on"]} == {
+        "restitution": False,
+        "sleep": False,
+    }
+    assert (report["static"], report["kinematic"]) == (["floor"], ["lift"]) and len(report["dynamic"]) == 3
+    # 10 pairs: floor-lift is not driven, ghost meets the floor alone, and only two lie on the floor at the start.
+    pairs = {name: report["pairs"][name] for name in ("total", "unmoved", "excluded", "possible", "near", "apart")}
+    assert pairs == {"total": 10, "unmoved": 1, "excluded": 3, "possible": 6, "near": 2, "apart": 4}
+    assert report["step"]["nodes"] == 3 and report["step"]["edges"] > 0 and report["step"]["sdf_queries"] > 0
+    assert report["step"]["memory_mib"] > 0 and report["step_ms"] > 0 and report["units"]["length_m"] == 1.0
+    assert report["constant_in_training"] == ["restitution"]
+    assert any("path" in line for line in report["outside_training"])
+    assert any(line.startswith("friction") for line in report["outside_training"]) is False  # 0.25 is in its range
+    assert set(report["not_default"]) == {"effects.restitution", "limits.memory_gib", "model", "duration"}
+    lines = "\n".join(plan_lines(report))
+    for word in ("off saves nothing", "[effects.sleep]", "kept apart by collides_with", "so not learned: restitution"):
+        assert word in lines
+
+
+def test_plan_reads_no_weights_where_the_run_would_not(scene, model, monkeypatch):
+    scene.write_text(SCENE.replace("restitution: off", "contact: off"))
+    monkeypatch.setattr("sdfsim.dynamics.model.new_network", lambda *_: pytest.fail("weights were read"))
+    report = told(scene, model)
+    assert not report["effects"]["contact"]["on"] and report["effects"]["friction"]["why"] == "contact is off"
+    assert report["step"]["edges"] == report["step"]["sdf_queries"] == 0
+    with pytest.raises(RuntimeError, match="not read"):
+        load_model(model, weights=False).network(None)
+
+
+def test_a_run_ends_with_what_it_has_cost(scene, model, tmp_path):
+    run = ["simulate", str(scene), "-o", str(tmp_path / "run"), "--model", model, "--viewer", "none"]
+    done = CliRunner().invoke(cli.app, run)
+    assert done.exit_code == 0, done.stderr
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    rollout = Rollout.load(tmp_path / "run" / "rollout.npz")
+    assert list(report["cost"]) == [*COUNTS, *PHASES, "step_ms"]
+    for name, values in report["cost"].items():
+        assert values["sum"] == pytest.approx(rollout.counters[name][1:].sum())
+    assert report["cost"]["sdf_queries"]["sum"] > 0
+    for line in cost_lines(report):
+        assert line in done.stdout
+
+
+def test_every_counter_is_plotted_once():
+    assert {*COUNTS, *PHASES, "step_ms"} <= set(PLOTS)
+    assert sorted(key for keys in VIEWS.values() for key in keys) == sorted(PLOTS)
+
+
+def test_the_trial_of_a_plan_counts_what_the_run_counts(scene, model):
+    made = load_scene(scene)
+    first = Simulator(made, model).run(steps=5).counters
+    report = told(scene, model)
+    assert report["step"]["sdf_queries"] == first["sdf_queries"].max()
+    backwards = replace(made, bodies=made.bodies[::-1])
+    other = Simulator(backwards, model).run(steps=5).counters
+    np.testing.assert_array_equal(first["sdf_queries"], other["sdf_queries"])
