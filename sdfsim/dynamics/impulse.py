@@ -15,6 +15,13 @@ from torch import Tensor, nn
 
 from sdfsim.dynamics.graph import EDGE_FEATURES, ContactGraph, EdgeFrames, edge_frames, relative_velocity
 
+# Relative velocities that a round sees are no larger than this, in units of the fastest motion before the step (1.7 in
+# training). Larger ones are a prediction that runs away, which the rounds after it must not feed on.
+FASTEST = 3.0
+# Longest latent vector of a body (5 in training). One among many more neighbours than there were hears so much that the
+# next rounds would amplify it without end.
+LOUDEST = 6.0
+
 
 @dataclass(frozen=True)
 class ImpulseConfig:
@@ -132,6 +139,7 @@ class ImpulseNetwork(nn.Module):
         to_first, to_second = (layer.message(hidden) * weight).chunk(2, -1)
         heard = torch.zeros_like(body).index_add_(0, first, to_first).index_add_(0, second, to_second)
         body = body + layer.body(torch.cat([body, heard], -1))
+        body = body * (LOUDEST / body.norm(dim=-1, keepdim=True).clamp_min(LOUDEST))
         # Scenery carries no message from one body to another.
         return edge, body * (graph.inverse_mass > 0)[:, None], now
 
@@ -139,7 +147,7 @@ class ImpulseNetwork(nn.Module):
 def _in_frame(graph: ContactGraph, frames: EdgeFrames, velocity: Tensor, angular: Tensor) -> Tensor:
     """[E, 3] dimensionless relative velocity in the edge's frame."""
     v = relative_velocity(graph, velocity, angular)
-    return (frames.axes @ v[..., None])[..., 0] / frames.speed
+    return ((frames.axes @ v[..., None])[..., 0] / frames.speed).clamp(-FASTEST, FASTEST)
 
 
 def _share_of_pair(logit: Tensor, graph: ContactGraph) -> Tensor:
@@ -162,7 +170,7 @@ def _push(graph: ContactGraph, frames: EdgeFrames, impulse: Tensor, velocity: Te
 
 
 def _along(impulse: Tensor, vectors: Tensor) -> Tensor:
-    """[E, 3]: vectors [E, 3, 3] of the axes, each times the impulse [E, 3] along it; [E, 1]: of the first axis alone."""
+    """[E, 3]: vectors [E, 3, 3] of the axes, each times the impulse [E, 3] along it; [E, 1]: of the first alone."""
     if impulse.shape[-1] == 1:
         return impulse * vectors[:, 0]
     return (impulse[:, None] @ vectors)[:, 0]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import torch
 from torch import Tensor
@@ -13,6 +13,8 @@ from sdfsim.dynamics.broad import expand
 from sdfsim.dynamics.contacts import Contacts
 from sdfsim.dynamics.matching import match_shapes
 from sdfsim.dynamics.paper import PaperNetwork, SurfaceGraph
+
+_NOT_PER_BODY = ("node", "node_start", "allowed", "bank", "tracks")
 
 
 def node_owner(bodies: Bodies) -> Tensor:
@@ -30,8 +32,7 @@ def compact(bodies: Bodies, state: State, contacts: Contacts, rows: Tensor) -> t
     number[rows] = torch.arange(len(rows), device=bodies.device)
     ends = torch.bincount(owner, minlength=len(rows)).cumsum(0)
     start = torch.cat([ends.new_zeros(1), ends])
-    per_body = ("shape", "scale", "com", "mass", "inverse_mass", "inertia", "friction", "restitution", "moves")
-    per_body += ("bounds", "size", "radius", "group", "world")
+    per_body = [f.name for f in fields(bodies) if f.name not in _NOT_PER_BODY]
     some = replace(
         bodies, **{k: getattr(bodies, k)[rows] for k in per_body}, node=bodies.node[node], node_start=start, tracks=None
     )

@@ -50,11 +50,13 @@ def test_contact_off_looks_for_nothing_and_equals_bodies_that_may_not_touch(drop
     assert Simulator(alone, model).bodies.shape.tolist() == [-1] * 4  # there is no SDF to ask
 
 
-def test_no_weights_are_read_that_nothing_asks(dropped):
-    off = Simulator(replace(dropped, effects=Effects(contact="off")))
+def test_no_weights_are_read_that_nothing_asks(dropped, tmp_path):
+    file = tmp_path / "random.safetensors"
+    random_model("impulse").save(file)
+    off = Simulator(replace(dropped, effects=Effects(contact="off")), file)
     assert isinstance(off.model.network, Unread) and off.dt > 0
     off.run(steps=2)
-    assert not isinstance(Simulator(dropped).model.network, Unread)
+    assert not isinstance(Simulator(dropped, file).model.network, Unread)
 
 
 def test_no_sdf_is_loaded_before_a_pair_is_near(dropped, forbid):

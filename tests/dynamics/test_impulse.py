@@ -10,7 +10,9 @@ from scipy.spatial.transform import Rotation
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.dynamics.step import contact_graph, find_contacts, fly
-from tests.dynamics.conftest import random_model
+from sdfsim.scene.types import Scene
+from sdfsim.shape.asset import analytic_shape
+from tests.dynamics.conftest import make_body, random_model
 
 
 def linear_momentum(sim: Simulator) -> torch.Tensor:
@@ -163,3 +165,14 @@ def test_mirrored_frames_mirror_the_network_output(dropped):
     straight, seen = sim.model.network(graph), sim.model.network(image, mirrored=True)
     torch.testing.assert_close(mirror(straight.velocity), seen.velocity, rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(-mirror(straight.angular), seen.angular, rtol=1e-4, atol=1e-5)
+
+
+def test_a_crowd_denser_than_any_in_training_does_not_run_away():
+    # Cubes 5 cm apart on a floor, two high: every one has up to eleven neighbours within reach.
+    cube, plane = analytic_shape("box", size=(1.0, 1.0, 1.0)), analytic_shape("plane")
+    places = [(1.05 * i, 1.05 * j, 0.5 + k) for i in range(10) for j in range(10) for k in range(2)]
+    bodies = [make_body("floor", 1, [0, 0, 0], motion="static", mass=0.0)]
+    bodies += [make_body(f"cube{n}", 0, place) for n, place in enumerate(places)]
+    scene = Scene((cube, plane), tuple(bodies), gravity=np.array([0.0, 0.0, -9.81]), duration=2.0)
+    rollout = Simulator(scene, model="small").run(steps=66)
+    assert np.linalg.norm(rollout.velocity, axis=-1).max() < 2.0
