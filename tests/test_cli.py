@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 
 import cli
 from sdfsim import Rollout, SdfsimError, load_scene
+from sdfsim.commands.arguments import seconds_of
 from sdfsim.dynamics.model import Model, new_network
 from sdfsim.dynamics.simulator import SimulationError, Simulator
 from sdfsim.shape import plans, primitives
@@ -375,7 +376,7 @@ def test_every_command_takes_the_common_options(option):
 
 @pytest.mark.parametrize(("text", "seconds"), [("90s", 90), ("10m", 600), ("1h", 3600), ("45", 45), ("1.5m", 90)])
 def test_budgets(text, seconds):
-    assert cli._seconds(text) == seconds
+    assert seconds_of(text) == seconds
 
 
 @pytest.mark.slow

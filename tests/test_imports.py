@@ -38,6 +38,7 @@ LEVELS = {
     "learning": 5,
     "baselines": 5,
     "studies": 6,
+    "commands": 9,
 }
 TOP = 8  # playback and the other modules directly in sdfsim
 

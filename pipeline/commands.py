@@ -1,0 +1,172 @@
+"""From photos and meshes to shapes: reconstruct, its stages, and fit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+
+from sdfsim.commands.arguments import Budget, Cluster, Device, Json, Out, Verbose, tell_failed
+from sdfsim.errors import EXIT_ERROR
+from sdfsim.progress import Session, duration
+
+Preset = Annotated[Literal["quick", "standard", "fine"], typer.Option(help="How much time to spend.")]
+KeptPreset = Annotated[Literal["quick", "standard", "fine"] | None, typer.Option(help="Default: as before.")]
+Stage = Literal["photos", "poses", "distill", "mesh", "fit", "scene"]
+Size = Annotated[float | None, typer.Option(help="Widest side of the scene, metres.", min=0.0)]
+
+
+def reconstruct(
+    photos: Annotated[Path, typer.Argument(help="Folder of photos.", show_default=False)],
+    out: Out,
+    preset: Preset = "standard",
+    first: Annotated[Stage | None, typer.Option("--from", help="Do this stage and those after it again.")] = None,
+    last: Annotated[Stage | None, typer.Option("--until", help="Stop after this stage.")] = None,
+    size: Size = None,
+    budget: Budget = None,
+    as_json: Json = False,
+    device: Device = "auto",
+    verbose: Verbose = False,
+) -> None:
+    """Photos -> a scene that can be simulated, by all stages."""
+    with Session(as_json=as_json, verbose=verbose) as session:
+        from pipeline import stages
+
+        report = stages.reconstruct(
+            photos,
+            out,
+            preset=preset,
+            size=size,
+            budget=budget,
+            from_stage=first,
+            until_stage=last,
+            device=device,
+            progress=session.stage_progress,
+        )
+        _report_stages(session, report, out)
+
+
+def poses(
+    photos: Annotated[Path, typer.Argument(help="Folder of photos.", show_default=False)],
+    out: Out,
+    preset: Preset = "standard",
+    as_json: Json = False,
+    device: Device = "auto",
+    verbose: Verbose = False,
+) -> None:
+    """Photos -> camera poses and sparse points."""
+    with Session(as_json=as_json, verbose=verbose) as session:
+        from pipeline import stages
+
+        report = stages.reconstruct(
+            photos, out, preset=preset, until_stage="poses", device=device, progress=session.stage_progress
+        )
+        _report_stages(session, report, out)
+
+
+def distill(
+    folder: Annotated[Path, typer.Argument(help="Folder that poses has written.", show_default=False)],
+    preset: KeptPreset = None,
+    budget: Budget = None,
+    as_json: Json = False,
+    device: Device = "auto",
+    verbose: Verbose = False,
+) -> None:
+    """Posed photos -> a signed-distance and colour field."""
+    _stage("distill", folder, as_json, verbose, preset=preset, budget=budget, device=device)
+
+
+def mesh(
+    folder: Annotated[Path, typer.Argument(help="Folder that distill has written.", show_default=False)],
+    preset: KeptPreset = None,
+    size: Size = None,
+    as_json: Json = False,
+    device: Device = "auto",
+    verbose: Verbose = False,
+) -> None:
+    """Field -> cleaned, upright mesh."""
+    _stage("mesh", folder, as_json, verbose, preset=preset, size=size, device=device)
+
+
+def fit(
+    sources: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SOURCE...", help="Mesh files, folders of them, or a folder of mesh.", show_default=False
+        ),
+    ],
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Shape folder of one mesh file; of several, a folder of them.")
+    ] = None,
+    recipe: Annotated[
+        Literal["default", "paper"] | None,
+        typer.Option(help="How networks are fitted (a reconstruction: as before).", show_default=False),
+    ] = None,
+    budget: Budget = None,
+    cap: Annotated[bool, typer.Option("--cap", help="Close openings of any size (with -o).")] = False,
+    thicken: Annotated[
+        float | None, typer.Option(help="Thickness to give an open sheet, metres (with -o).", min=0.0)
+    ] = None,
+    cluster: Cluster = None,
+    as_json: Json = False,
+    device: Device = "auto",
+    verbose: Verbose = False,
+) -> None:
+    """Mesh -> compact SDF network, its errors certified.
+
+    Several meshes, or a folder, with -o DIR: a shape folder DIR/NAME each; what is there already is kept. A folder
+    that `mesh` has written, without -o: its shape and scene.yaml.
+    """
+    if out is None:
+        if len(sources) > 1 or not sources[0].is_dir():
+            raise typer.BadParameter("a mesh file needs -o SHAPE_DIR")
+        if cap or thicken is not None or cluster is not None:
+            raise typer.BadParameter("--cap, --thicken and --cluster go with -o")
+        _stage("fit", sources[0], as_json, verbose, then="scene", budget=budget, recipe=recipe, device=device)
+        return
+    with Session(as_json=as_json, verbose=verbose) as session:
+        from sdfsim import fitting
+        from sdfsim.parallel import cluster as working_on
+
+        options = fitting.Options(recipe or "default", budget, cap, thicken)
+        if len(sources) == 1 and not sources[0].is_dir():
+            report = fitting.fit(sources[0], out, options, device=device, on_progress=session.progress)
+            lines = fitting.fit_lines(report)
+        else:
+            meshes = fitting.named_meshes(sources)
+            with working_on(cluster):
+                report = fitting.fit_many(meshes, out, options, device=device, on_progress=session.progress)
+            lines = fitting.batch_lines(report)
+        tell_failed(session, report)
+        if any("error" in shape for shape in report.get("shapes", {}).values()):
+            session.exit_code = EXIT_ERROR
+        session.report(report, lines)
+
+
+def _stage(name: str, folder: Path, as_json: bool, verbose: bool, *, then: Stage | None = None, **options: Any) -> None:
+    """Run one stage, and `then` another that costs next to nothing."""
+    with Session(as_json=as_json, verbose=verbose) as session:
+        from pipeline import stages
+
+        report = stages.run_stage(name, folder, progress=session.stage_progress, **options)
+        if then is not None:
+            report = stages.run_stage(then, folder, progress=session.stage_progress)
+        _report_stages(session, report, folder)
+
+
+def _report_stages(session: Session, report: dict, folder: Path) -> None:
+    from pipeline import recording
+
+    if made := recording.record(folder):
+        report["paths"]["recording"] = str(made)
+    lines = [f"{stage:<8} {duration(seconds)}" for stage, seconds in report["seconds"].items()]
+    lines += [f"{what}: {path}" for what, path in report["paths"].items()]
+    if "recording" in report["paths"]:
+        lines.append(f"look at it: sdfsim view {report['paths']['recording']}")
+    if "scene" in report["paths"]:
+        lines.append(f"next: sdfsim simulate {report['paths']['scene']} -o RUN")
+    for note in report.get("notes", []):
+        session.say(note)
+    tell_failed(session, report)
+    session.report(report, lines)

@@ -1,0 +1,1 @@
+"""The commands: arguments -> one call -> report. Heavy imports happen inside them."""

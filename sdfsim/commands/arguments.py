@@ -1,0 +1,40 @@
+"""Arguments that several commands take, and what they all do with a report."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from sdfsim.errors import EXIT_QUALITY
+from sdfsim.progress import Session
+
+
+def seconds_of(text: str) -> float:
+    """`90s`, `10m`, `1h` or plain seconds."""
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)([smh]?)", text.strip())
+    if not match or float(match[1]) == 0:
+        raise typer.BadParameter(f"{text!r} is not a length of time: write it as 90s, 10m or 1h")
+    return float(match[1]) * {"": 1, "s": 1, "m": 60, "h": 3600}[match[2]]
+
+
+Json = Annotated[bool, typer.Option("--json", help="One JSON object on stdout, everything else on stderr.")]
+Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Tracebacks with errors.")]
+Device = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Where to compute.")]
+Out = Annotated[Path, typer.Option("-o", "--out", help="Folder to write.", show_default=False)]
+Model = Annotated[str | None, typer.Option(help="Bundled model or path (default: the scene's, else the best one).")]
+Budget = Annotated[
+    float | None, typer.Option(parser=seconds_of, metavar="TIME", help="Longest time to take, such as 90s, 10m or 1h.")
+]
+Cluster = Annotated[
+    str | None, typer.Option(metavar="ADDRESS", help="Scheduler of a Dask cluster to work on, tcp://HOST:8786.")
+]
+
+
+def tell_failed(session: Session, report: dict) -> None:
+    """Say every failed check; there being one is the exit code."""
+    for check in report["failed_checks"]:
+        session.exit_code = EXIT_QUALITY
+        session.say(f"failed check: {check}")

@@ -1,0 +1,100 @@
+"""From trajectories to models: dataset, train, evaluate."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from sdfsim.commands.arguments import Cluster, Device, Json, Model, Out, Verbose
+from sdfsim.progress import Session
+
+
+def dataset(
+    recipe: Annotated[Literal["movi-b", "movi-c", "bowl", "pile", "varied"], typer.Argument(show_default=False)],
+    out: Out,
+    trajectories: Annotated[int, typer.Option(help="How many.", min=1, show_default=False)],
+    shapes: Annotated[
+        Path | None,
+        typer.Option(help="Folder of meshes (bowl has its own; movi-b: NAME/ folders with convex pieces only)."),
+    ] = None,
+    random_solids: Annotated[
+        int, typer.Option(help="So many of PyBullet's random solids beside them (not movi-b).", min=0, max=1000)
+    ] = 0,
+    bodies: Annotated[int | None, typer.Option(help="How many move (bowl, pile).", min=1, max=512)] = None,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    split: Literal["train", "validation", "test"] = "train",
+    cluster: Cluster = None,
+    as_json: Json = False,
+    device: Device = "auto",
+    verbose: Verbose = False,
+) -> None:
+    """Trajectories of the teacher (PyBullet) to learn from."""
+    with Session(as_json=as_json, verbose=verbose) as session:
+        from sdfsim.learning.generate import make_dataset, report_lines
+        from sdfsim.parallel import cluster as working_on
+
+        with working_on(cluster):
+            report = make_dataset(
+                recipe,
+                out,
+                trajectories=trajectories,
+                shapes=shapes,
+                random_solids=random_solids,
+                bodies=bodies,
+                seed=seed,
+                split=split,
+                on_progress=session.progress,
+            )
+        session.report(report, report_lines(report))
+
+
+def train(
+    data: Annotated[Path, typer.Option(help="Dataset folder.", show_default=False)],
+    out: Out,
+    preset: Annotated[Literal["small", "base", "paper"], typer.Option(help="Kind and size of the model.")] = "small",
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in the folder.")] = False,
+    as_json: Json = False,
+    device: Device = "auto",
+    verbose: Verbose = False,
+) -> None:
+    """Train a model on a dataset."""
+    with Session(as_json=as_json, verbose=verbose) as session:
+        from sdfsim.learning.train import train as run_training
+
+        session.report(
+            run_training(data, out, preset=preset, resume=resume, device=device, on_progress=session.progress)
+        )
+
+
+def evaluate(
+    data: Annotated[Path, typer.Argument(help="Dataset folder, or one split of it.", show_default=False)],
+    model: Model = None,
+    steps: Annotated[int, typer.Option(help="Length of each rollout.", min=1)] = 50,
+    free_flight: Annotated[
+        Literal["exact", "learned"], typer.Option(help="Bodies without contact (learned: paper networks only).")
+    ] = "exact",
+    chaos_floor: Annotated[
+        bool,
+        typer.Option("--chaos-floor", help="Also the teacher again from starts slightly off (needs PyBullet)."),
+    ] = False,
+    as_json: Json = False,
+    device: Device = "auto",
+    verbose: Verbose = False,
+) -> None:
+    """Errors of a model's rollouts on recorded trajectories, and the quality of its motion."""
+    with Session(as_json=as_json, verbose=verbose) as session:
+        from sdfsim import run
+        from sdfsim.learning.evaluate import evaluate as run_evaluation
+
+        report = run_evaluation(
+            data,
+            model=model,
+            steps=steps,
+            device=device,
+            free_flight=free_flight,
+            chaos_floor=chaos_floor,
+            on_progress=session.progress,
+        )
+        session.report(report, run.evaluation_lines(report))

@@ -1,0 +1,103 @@
+"""From scenes to motion: simulate, plan, view, info."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from sdfsim.commands.arguments import Device, Json, Model, Out, Verbose, tell_failed
+from sdfsim.progress import Session, duration
+
+
+def simulate(
+    scene: Annotated[Path, typer.Argument(help="scene.yaml", show_default=False)],
+    out: Out,
+    model: Model = None,
+    seconds: Annotated[float | None, typer.Option(help="Simulated time (default: the scene's).")] = None,
+    seed: Annotated[int | None, typer.Option(help="Default: the scene's.", min=0)] = None,
+    viewer: Annotated[Literal["none", "file", "native", "web"], typer.Option(help="Where to watch.")] = "file",
+    as_json: Json = False,
+    device: Device = "auto",
+    verbose: Verbose = False,
+) -> None:
+    """Scene -> motion, in a run folder."""
+    if seconds is not None and not (0 < seconds < float("inf")):
+        raise typer.BadParameter("--seconds must be > 0")
+    with Session(as_json=as_json, verbose=verbose) as session:
+        from sdfsim import run
+
+        report = run.simulate(
+            scene,
+            out,
+            model=model,
+            seconds=seconds,
+            seed=seed,
+            viewer=viewer,
+            device=device,
+            on_progress=session.stage_progress,
+            on_address=lambda address: session.say(f"watch it at {address}"),
+        )
+        lines = [
+            f"{report['steps']} steps of {report['dt_s']:.4g} s in {duration(report['wall_s'])}"
+            f" (median {report['step_ms_median']:.1f} ms a step)",
+            f"mean contacts {report['contacts_mean']:.1f}, worst penetration {report['worst_penetration_m']:.2g} m",
+            *run.cost_lines(report),
+            f"wrote {out}",
+            *(f"outside the model's training: {line}" for line in report["outside_training"]),
+        ]
+        tell_failed(session, report)
+        if viewer != "none":
+            lines.append(f"watch it: sdfsim view {report['recording']}   (or: rerun {report['recording']})")
+        session.report(report, lines)
+        if viewer == "web":
+            session.hold("the page stays up until Ctrl-C")
+
+
+def plan(
+    scene: Annotated[Path, typer.Argument(help="scene.yaml", show_default=False)],
+    model: Model = None,
+    as_json: Json = False,
+    device: Device = "auto",
+    verbose: Verbose = False,
+) -> None:
+    """Which effects are in play, why, and what a step costs."""
+    with Session(as_json=as_json, verbose=verbose) as session:
+        from sdfsim import planning
+
+        report = planning.describe(scene, model=model, device=device, on_progress=session.stage_progress)
+        for check in report["failed_checks"]:  # told, but a plan is as good with a shape that is less exact
+            session.say(f"failed check: {check}")
+        session.report(report, planning.plan_lines(report))
+
+
+def view(
+    recording: Annotated[Path, typer.Argument(help="rollout.rrd", show_default=False)],
+    web: Annotated[bool, typer.Option("--web", help="In the browser.")] = False,
+    picture: Annotated[Path | None, typer.Option("--screenshot", help="Write a PNG instead; needs no screen.")] = None,
+    at: Annotated[float | None, typer.Option(help="Time of the screenshot, s (default: the end).")] = None,
+    as_json: Json = False,
+    device: Device = "auto",
+    verbose: Verbose = False,
+) -> None:
+    """Watch a recording, or take a picture of it."""
+    if at is not None and picture is None:
+        raise typer.BadParameter("--at goes with --screenshot")
+    with Session(as_json=as_json, verbose=verbose) as session:
+        from sdfsim import viewer
+
+        if picture is not None:
+            viewer.screenshot(recording, picture, at=at)
+            session.report({"screenshot": str(picture)})
+        else:
+            viewer.show(recording, web=web)
+            session.report({"recording": str(recording)})
+
+
+def info(as_json: Json = False, device: Device = "auto", verbose: Verbose = False) -> None:
+    """Versions, devices and bundled models."""
+    with Session(as_json=as_json, verbose=verbose) as session:
+        from sdfsim import run
+
+        session.report(run.environment())
