@@ -51,7 +51,9 @@ def dataset(
 
 
 def train(
-    data: Annotated[Path, typer.Option(help="Dataset folder.", show_default=False)],
+    data: Annotated[
+        list[Path], typer.Option(help="Dataset folder; several are trained on together.", show_default=False)
+    ],
     out: Out,
     preset: Annotated[Literal["small", "base", "paper"], typer.Option(help="Kind and size of the model.")] = "small",
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in the folder.")] = False,
@@ -59,7 +61,7 @@ def train(
     device: Device = "auto",
     verbose: Verbose = False,
 ) -> None:
-    """Train a model on a dataset."""
+    """Train a model on datasets."""
     with Session(as_json=as_json, verbose=verbose) as session:
         from sdfsim.learning.train import train as run_training
 
@@ -75,6 +77,9 @@ def evaluate(
     free_flight: Annotated[
         Literal["exact", "learned"], typer.Option(help="Bodies without contact (learned: paper networks only).")
     ] = "exact",
+    guard: Annotated[
+        Literal["none", "energy"], typer.Option(help="energy: hold back contact that makes energy.")
+    ] = "none",
     chaos_floor: Annotated[
         bool,
         typer.Option("--chaos-floor", help="Also the teacher again from starts slightly off (needs PyBullet)."),
@@ -94,6 +99,7 @@ def evaluate(
             steps=steps,
             device=device,
             free_flight=free_flight,
+            guard=guard,
             chaos_floor=chaos_floor,
             on_progress=session.progress,
         )

@@ -15,7 +15,6 @@ from sdfsim.dynamics.model import BUNDLED, Model, load_model
 from sdfsim.errors import SdfsimError
 from sdfsim.files import write_text
 from sdfsim.learning import tables
-from sdfsim.learning.dataset import SPLITS, trajectory_files
 from sdfsim.learning.evaluate import evaluate
 
 
@@ -38,7 +37,6 @@ def bundle(path: Path, data: Path, name: str, folder: Path = BUNDLED, seeds: Seq
     model = load_model(path)
     others = [_other_seed(model, path, other) for other in seeds]
     report = evaluate(data, model=model, chaos_floor=True)
-    report["made_from"] = {split: len(trajectory_files(data, split)) for split in SPLITS}
     report["other_seeds"] = [evaluate(data, model=other, errors_only=True)["model"] for other in others]
     learned = evaluate(data, model=model, free_flight="learned", errors_only=True) if model.kind == "paper" else None
     kept = ("model", "ballistic", "other_seeds", "chaos_floor", "median_survival_s")
@@ -81,20 +79,19 @@ def card_text(model: Model, report: dict, learned: dict | None) -> str:
         "",
         "## Training",
         "",
-        f"Data: {card['data']['recipe']} (seed {card['data']['seed']}), made with {card['data']['engine']}.",
+        *(
+            f"Data: {d['recipe']} (seed {d['seed']}, {d['shapes']} shapes), made with {d['engine']};"
+            f" {d['trajectories']['train']:,} trajectories."
+            for d in card["data"]
+        ),
         "Surfaces and nodes are those of the convex pieces that the engine collides.",
         "",
         *_markdown(_training_rows(card, parameters)),
         "",
         "Repeat with:",
         "",
-        *(
-            f"    sdfsim dataset {card['data']['recipe']} -o DATA --shapes SHAPES --trajectories {count}"
-            f" --seed {card['data']['seed']} --split {split}"
-            for split, count in report["made_from"].items()
-        ),
-        f"    sdfsim train --data DATA -o RUN --preset {card['preset_name']}",
-        f"    python -m sdfsim.learning.bundle RUN/model.safetensors DATA --name {model.name}"
+        *(f"    {line}" for line in _commands(card)),
+        f"    python -m sdfsim.learning.bundle RUN/model.safetensors {_folder(card['data'][0])} --name {model.name}"
         f"{' --seeds OTHERS' if others else ''}",
         "",
         "## Ranges it has seen",
@@ -119,6 +116,22 @@ def card_text(model: Model, report: dict, learned: dict | None) -> str:
         *(f"- {line}" for line in tables.notes(report)),
     ]
     return "\n".join(lines) + "\n"
+
+
+def _commands(card: dict) -> list[str]:
+    """What makes the data and trains on them."""
+    lines = [
+        f"sdfsim dataset {made['recipe']} -o {_folder(made)} --shapes SHAPES --trajectories {count}"
+        f" --seed {made['seed']} --split {split}"
+        for made in card["data"]
+        for split, count in made["trajectories"].items()
+    ]
+    folders = " ".join(f"--data {_folder(made)}" for made in card["data"])
+    return [*lines, f"sdfsim train {folders} -o RUN --preset {card['preset_name']}"]
+
+
+def _folder(made: dict) -> str:
+    return made["recipe"].upper()
 
 
 def _training_rows(card: dict, parameters: int) -> tables.Rows:

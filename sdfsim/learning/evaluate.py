@@ -9,14 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
+from sdfsim.dynamics.energy import Guard
 from sdfsim.dynamics.model import Model, load_model
 from sdfsim.dynamics.simulator import pick_device
 from sdfsim.dynamics.step import FreeFlight
 from sdfsim.errors import SdfsimError
 from sdfsim.learning import floor, metrics
 from sdfsim.learning.dataset import Trajectory, load_shapes, trajectory_files
+from sdfsim.learning.instants import at_instants, engine_substep
 from sdfsim.learning.penetration import EVERY, Solid, exact_solids, penetration
-from sdfsim.learning.rollouts import at_instants, batches, engine_substep, first_frames, roll_out
+from sdfsim.learning.rollouts import batches, first_frames, roll_out
 from sdfsim.shape.asset import Shape
 
 HORIZONS = (50, 100)  # steps, as the paper reports
@@ -50,6 +52,7 @@ def evaluate(
     split: str = "test",
     device: str = "cpu",
     free_flight: FreeFlight = "exact",
+    guard: Guard = "none",
     chaos_floor: bool = False,
     errors_only: bool = False,
     on_progress: Progress | None = None,
@@ -63,6 +66,7 @@ def evaluate(
         split: which part of the dataset.
         device: "cpu", "cuda" or "auto".
         free_flight: "exact" or (paper network) "learned".
+        guard: "energy" holds back contact that makes energy.
         chaos_floor: also run the teacher again from starts that differ slightly (see `floor.PERTURBATIONS`).
         errors_only: leave out penetration, energy and rest.
         on_progress: called with the fraction done and a message.
@@ -87,7 +91,7 @@ def evaluate(
     longest = min(steps, *(len(t.position) - 1 for t in recorded))
     recorded = [first_frames(t, longest + 1) for t in recorded]
     substep = engine_substep(data)
-    contenders, seconds = _simulate(used, recorded, shapes, substep, device, free_flight, tell)
+    contenders, seconds = _simulate(used, recorded, shapes, substep, device, free_flight, guard, tell)
     again, floor_report = {}, {}
     if chaos_floor:
         tell(0.8, "teacher, from starts that differ slightly")
@@ -97,6 +101,7 @@ def evaluate(
         "split": split,
         "model_name": used.name,
         "free_flight": free_flight,
+        "guard": guard,
         "trajectories": len(recorded),
         "bodies": int(sum(t.position.shape[1] for t in recorded)),
         "dt": recorded[0].dt,
@@ -130,6 +135,7 @@ def _simulate(
     substep: float,
     device: str,
     free_flight: FreeFlight,
+    guard: Guard,
     tell: Progress,
 ) -> tuple[dict[str, Motions], float]:
     """The model's and the ballistic motions from the recorded starts, and the seconds that the model took."""
@@ -141,7 +147,7 @@ def _simulate(
     for k, group in enumerate(groups):
         tell(0.8 * k / len(groups), f"{model.name}: batch {k + 1} of {len(groups)}, {longest} steps")
         started = time.perf_counter()
-        motions["model"] += roll_out(model, group, known, longest, place, free_flight)
+        motions["model"] += roll_out(model, group, known, longest, place, free_flight, guard=guard)
         seconds += time.perf_counter() - started
         motions["ballistic"] += roll_out(model, group, known, longest, place, contact=False)
     return motions, seconds

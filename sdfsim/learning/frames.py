@@ -22,9 +22,10 @@ from sdfsim.dynamics.pose import conjugate, multiply, to_rotvec
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_arrays, write_arrays
 from sdfsim.learning.dataset import Trajectory, load_shapes, trajectory_files
+from sdfsim.learning.instants import at_instants, engine_substep
 from sdfsim.parallel import parallel
 
-FRAMES_VERSION = 2  # counts up whenever contacts are found or thinned differently
+FRAMES_VERSION = 3  # counts up whenever frames of the same recordings come out differently
 
 
 @dataclass(frozen=True)
@@ -127,6 +128,28 @@ def contact_frames(
     return frames
 
 
+def join_frames(sets: list[ContactFrames]) -> ContactFrames:
+    """Several sets of frames as one.
+
+    Raises:
+        SdfsimError: they differ in step, gravity or contact radius.
+    """
+    one = sets[0]
+    for other in sets[1:]:
+        if (one.dt, one.reach) != (other.dt, other.reach) or not np.allclose(one.gravity, other.gravity):
+            raise SdfsimError("datasets that are trained on together must share step and gravity")
+    whole: dict[str, Any] = {"dt": one.dt, "gravity": one.gravity, "reach": one.reach}
+    for field in fields(ContactFrames):
+        if field.name in whole:
+            continue
+        arrays = [getattr(s, field.name) for s in sets]
+        if field.name.endswith("_start"):
+            ends = np.cumsum([0] + [a[-1] for a in arrays[:-1]])
+            arrays = [arrays[0][:1], *(a[1:] + end for a, end in zip(arrays, ends, strict=True))]
+        whole[field.name] = np.concatenate(arrays)
+    return ContactFrames(**whole)
+
+
 def _fingerprint(data: Path, files: list[Path]) -> str:
     """Changes with the trajectories (names and sizes), the recipe, the shapes, and the way contacts are found."""
     digest = hashlib.sha256(f"{FRAMES_VERSION} {[(f.name, f.stat().st_size) for f in files]}".encode())
@@ -144,7 +167,7 @@ def _shape(folder: Path, name: str):
 def _of_file(path: Path, reach: float) -> dict[str, np.ndarray]:
     from sdfsim.learning.merge import find_edges  # needs the SDFs, hence more than torch and numpy
 
-    trajectory = Trajectory.load(path)
+    trajectory = at_instants(Trajectory.load(path), engine_substep(path.parent))
     shapes = {str(n): _shape(path.parent, str(n)) for n in trajectory.shape}
     return _of_trajectory(trajectory, find_edges(trajectory, shapes, reach), shapes)
 

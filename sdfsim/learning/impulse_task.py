@@ -27,8 +27,8 @@ class Noise:
         speed: m/s, of its velocity, and of its surface by spinning.
     """
 
-    shift: float = 0.0015
-    speed: float = 0.015
+    shift: float = 0.0003
+    speed: float = 0.003
 
 
 @dataclass(frozen=True)

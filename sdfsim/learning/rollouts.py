@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
 
 from sdfsim.dynamics.bodies import Units
+from sdfsim.dynamics.energy import Guard
+from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.model import Model
 from sdfsim.dynamics.simulator import with_history
+from sdfsim.dynamics.sleep import nobody_asleep
 from sdfsim.dynamics.step import FreeFlight, Rules, step
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
-from sdfsim.learning.dataset import Trajectory, read_info
+from sdfsim.learning.dataset import FLOOR, Trajectory
 from sdfsim.learning.merge import merged
 from sdfsim.shape.asset import Shape
 
@@ -29,6 +31,9 @@ def roll_out(
     free_flight: FreeFlight = "exact",
     *,
     contact: bool = True,
+    sleep: bool = False,
+    guard: Guard = "none",
+    floor: tuple[float, float] = FLOOR,
 ) -> list[Trajectory]:
     """Simulate one batch from its first frames.
 
@@ -41,6 +46,9 @@ def roll_out(
         device: where to compute.
         free_flight: "exact", or "learned" for the *paper* network.
         contact: False leaves every body in free flight.
+        sleep: freeze what has come to rest.
+        guard: "energy" holds back contact that makes energy.
+        floor: its friction and restitution.
 
     Returns:
         For each of the group, the same bodies in the predicted motion: steps + 1 frames.
@@ -49,14 +57,16 @@ def roll_out(
         SdfsimError: a state that is not finite (exit code 3).
     """
     units = _units(model, group[0])
-    bodies, state = merged(group, [0] * len(group), shapes, units, device)
+    bodies, state = merged(group, [0] * len(group), shapes, units, device, floor)
     gravity = torch.tensor(group[0].gravity / units.acceleration, dtype=torch.float64, device=device)
-    rules = Rules(gravity=gravity, dt=model.dt, contact=contact, free_flight=free_flight)
+    rules = Rules(gravity=gravity, dt=model.dt, contact=contact, free_flight=free_flight, guard=guard)
     if model.kind == "paper":
         state = with_history(state, bodies, rules)
-    states = [state]
+    if sleep:
+        state = replace(state, sleep=nobody_asleep(bodies, gravity))
+    states, memory = [state], Memory()
     for k in range(steps):
-        state, _ = step(model, bodies, state, rules)
+        state, _ = step(model, bodies, state, rules, memory)
         broken = ~(state.position.isfinite().all(-1) & state.orientation.isfinite().all(-1))
         if broken.any():
             raise SdfsimError(f"step {k + 1}: {int(broken.sum())} bodies are not finite", exit_code=EXIT_QUALITY)
@@ -87,26 +97,6 @@ def batches(trajectories: list[Trajectory]) -> list[list[Trajectory]]:
     for t in trajectories:
         groups.setdefault((t.dt, *t.gravity), []).append(t)
     return [g[i : i + BATCH] for g in groups.values() for i in range(0, len(g), BATCH)]
-
-
-def engine_substep(data: Path) -> float:
-    """The engine's inner step in s, where the dataset tells it (0 elsewhere)."""
-    for folder in (data, data.parent):
-        if (folder / "dataset.json").exists():
-            settings = read_info(folder).get("engine_settings")
-            found = settings.get("timeStep") if isinstance(settings, dict) else None
-            return float(found) if isinstance(found, int | float) else 0.0
-    return 0.0
-
-
-def at_instants(trajectory: Trajectory, substep: float) -> Trajectory:
-    """The trajectory with velocities at the instants of its positions.
-
-    The recording engine's position step already uses the new velocity (symplectic Euler): its flights are exact
-    parabolas, but of bodies that are half an inner step `substep` s of gravity faster than recorded.
-    """
-    moving = ~trajectory.static.astype(bool)
-    return replace(trajectory, velocity=trajectory.velocity + 0.5 * substep * trajectory.gravity * moving[:, None])
 
 
 def first_frames(trajectory: Trajectory, count: int) -> Trajectory:

@@ -7,8 +7,8 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -17,8 +17,10 @@ import torch
 from torch import Tensor, nn
 
 from sdfsim.errors import SdfsimError
-from sdfsim.files import read_arrays, write_arrays
-from sdfsim.learning.dataset import read_info
+from sdfsim.files import locked, read_arrays, write_arrays, write_text
+from sdfsim.learning.dataset import SPLITS, read_info
+from sdfsim.learning.optimiser import Optimiser
+from sdfsim.learning.presets import PRESETS, Preset
 
 CHECKPOINT_SECONDS = 60.0
 LOG_STEPS = 100
@@ -27,36 +29,6 @@ CLIP = 1.0
 BAD_BATCHES = 20  # consecutive batches without a finite gradient before training gives up
 
 Progress = Callable[[float, str], None]
-
-
-@dataclass(frozen=True)
-class Preset:
-    """One way to train one network.
-
-    Attributes:
-        kind: "impulse" or "paper".
-        config: sizes of the network.
-        steps: of the optimiser.
-        batch: contact frames (impulse) or recorded steps (paper) a step.
-        rate: peak learning rate; it falls to a hundredth along a cosine.
-        reach: m, contact radius D.
-        noise: standard deviation of pose noise (*paper*: m, as published), or None for the network's default.
-    """
-
-    kind: str
-    config: dict[str, int]
-    steps: int
-    batch: int
-    rate: float
-    reach: float = 0.1
-    noise: float | None = None
-
-
-PRESETS = {
-    "small": Preset("impulse", {"width": 64, "rounds": 6}, steps=50_000, batch=32, rate=2e-3),
-    "base": Preset("impulse", {"width": 128, "rounds": 8}, steps=200_000, batch=64, rate=1e-3),
-    "paper": Preset("paper", {"width": 128, "steps": 10}, steps=1_000_000, batch=8, rate=1e-3, noise=0.003),
-}
 
 
 class Task(Protocol):
@@ -68,7 +40,7 @@ class Task(Protocol):
 
 
 def train(
-    data: Path,
+    data: Path | Sequence[Path],
     out: Path,
     *,
     preset: str = "small",
@@ -78,10 +50,10 @@ def train(
     device: str = "cpu",
     on_progress: Progress | None = None,
 ) -> dict:
-    """Train a preset on a dataset; write `model.safetensors`, `log.jsonl` and a checkpoint under `out`.
+    """Train a preset on one dataset or several; write `model.safetensors`, `log.jsonl` and a checkpoint under `out`.
 
     Args:
-        data: dataset folder with train/ and validation/.
+        data: dataset folders with train/ and validation/; several (impulse only) are drawn from as if they were one.
         out: training folder.
         preset: name in `PRESETS`.
         resume: go on from the checkpoint in `out`; the result equals an uninterrupted run's.
@@ -94,51 +66,68 @@ def train(
         A report: paths, losses, seconds.
 
     Raises:
-        SdfsimError: unknown preset, unusable data, a checkpoint in `out` without `resume`, diverged training.
+        SdfsimError: unknown preset, unusable data, a checkpoint in `out` without `resume`, another run writing
+            to it, diverged training.
     """
     from sdfsim.dynamics.simulator import pick_device
 
     if preset not in PRESETS:
         raise SdfsimError(f"unknown preset {preset!r}", f"known: {', '.join(PRESETS)}")
     plan = PRESETS[preset]
+    folders = [data] if isinstance(data, Path) else list(data)
     total = steps or plan.steps
     checkpoint = out / "checkpoint.npz"
     if checkpoint.exists() and not resume:
         raise SdfsimError(f"{checkpoint} exists", "continue with --resume, or choose another -o")
-    out.mkdir(parents=True, exist_ok=True)
     tell = on_progress or (lambda fraction, message: None)
-    place = pick_device(device)
-    task, held_out = _tasks(plan, data, place, lambda f, m: tell(0.0, m))
-    run = Run(plan, task, total, seed, place)
-    if checkpoint.exists():
-        run.load(checkpoint)
-    _loop(run, held_out, out, tell)
-    model = run.export(name=preset, info=read_info(data), ranges=task.ranges())
-    target: Path | None = out / "model.safetensors"
-    try:
-        model.save(target)
-    except ImportError:
-        # Nothing is lost: with the checkpoint, --resume writes the model where safetensors is installed.
-        target = None
-    return {
-        "model": str(target) if target else None,
-        "steps": run.step,
-        "seconds": run.seconds,
-        "loss": run.loss,
-        "held_out_loss": held_out_loss(run, held_out),
-    }
+    with locked(out):
+        place = pick_device(device)
+        task, held_out = _tasks(plan, folders, place, lambda f, m: tell(0.0, m))
+        run = Run(plan, task, total, seed, place)
+        if checkpoint.exists():
+            run.load(checkpoint)
+        _shorten(out / "log.jsonl", run.step)
+        _loop(run, held_out, out, tell)
+        model = run.export(name=preset, data=[_made(folder) for folder in folders], ranges=task.ranges())
+        target: Path | None = out / "model.safetensors"
+        try:
+            model.save(target)
+        except ImportError:
+            # Nothing is lost: with the checkpoint, --resume writes the model where safetensors is installed.
+            target = None
+        return {
+            "model": str(target) if target else None,
+            "steps": run.step,
+            "seconds": run.seconds,
+            "loss": run.loss,
+            "held_out_loss": held_out_loss(run, held_out),
+        }
 
 
-def _tasks(plan: Preset, data: Path, device: torch.device, tell: Progress):
+def _made(data: Path) -> dict[str, Any]:
+    """What a model's card tells of a dataset."""
+    info = read_info(data)
+    counts = {split: len(list((data / split).glob("*.npz"))) for split in SPLITS if (data / split).is_dir()}
+    known = {k: info.get(k) for k in ("recipe", "seed", "engine", "engine_version")}
+    return known | {"shapes": len(info.get("shapes", [])), "trajectories": counts}
+
+
+def _tasks(plan: Preset, folders: Sequence[Path], device: torch.device, tell: Progress):
     """Training and held-out tasks of a preset."""
     if plan.kind == "impulse":
-        from sdfsim.learning.frames import contact_frames
+        from sdfsim.learning.frames import contact_frames, join_frames
         from sdfsim.learning.impulse_task import ImpulseTask, Noise
 
-        sets = {s: contact_frames(data, s, plan.reach, on_progress=tell) for s in ("train", "validation")}
+        sets = {
+            split: join_frames([contact_frames(folder, split, plan.reach, on_progress=tell) for folder in folders])
+            for split in ("train", "validation")
+        }
         return ImpulseTask(sets["train"], device, Noise()), ImpulseTask(sets["validation"], device, None)
     from sdfsim.learning.paper_task import PaperTask
 
+    if len(folders) > 1:
+        raise SdfsimError("the paper network trains on one dataset", "give a single --data")
+    data = folders[0]
     return (
         PaperTask(data, "train", plan.reach, device, plan.noise),
         PaperTask(data, "validation", plan.reach, device, None),
@@ -167,21 +156,19 @@ class Run:
         # Averaged are the trained weights; feature statistics are fixed before the first step.
         self.weights = dict(self.network.named_parameters())
         self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
-        self.optimiser = torch.optim.Adam(self.network.parameters(), lr=plan.rate, fused=True)
+        self.optimiser = Optimiser(self.network, plan)
         self.step, self.seconds, self.loss, self.skipped = 0, 0.0, math.nan, 0
 
     def advance(self) -> None:
         """One optimiser step on a batch that depends on (seed, step) alone."""
         rng = np.random.default_rng([self.seed, 0, self.step])
         batch = self.task.draw(rng, self.plan.batch)
-        for group in self.optimiser.param_groups:
-            group["lr"] = self.rate()
         loss = self.task.loss(self.network, batch, mirrored=bool(rng.integers(2)))
         self.optimiser.zero_grad()
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), CLIP)
         if bool(norm.isfinite()):
-            self.optimiser.step()
+            self.optimiser.step(self.share())
             self.skipped = 0
         else:
             self.skipped += 1
@@ -195,11 +182,11 @@ class Run:
             for name, weight in self.weights.items():
                 self.average[name].lerp_(weight, 1.0 - decay)
 
-    def rate(self) -> float:
-        """Learning rate: a warm-up over the first 2 % (at most 1000 steps), then a cosine to a hundredth."""
+    def share(self) -> float:
+        """Of the peak learning rates: a warm-up over 2 % of all steps, 1000 at most, then a cosine to a hundredth."""
         warm = min(1.0, (self.step + 1) / max(1.0, min(1000.0, 0.02 * self.total)))
         fall = 0.5 * (1.0 + math.cos(math.pi * min(1.0, self.step / self.total)))
-        return self.plan.rate * warm * (0.01 + 0.99 * fall)
+        return warm * (0.01 + 0.99 * fall)
 
     def averaged(self) -> nn.Module:
         """The network with its averaged weights."""
@@ -215,9 +202,8 @@ class Run:
         for name, weight in self.network.state_dict().items():
             arrays[f"network/{name}"] = weight.cpu().numpy()
             arrays[f"average/{name}"] = self.average[name].cpu().numpy()
-        for index, slot in self.optimiser.state_dict()["state"].items():
-            for name, value in slot.items():
-                arrays[f"adam/{index}/{name}"] = value.cpu().numpy()
+        for name, value in self.optimiser.state().items():
+            arrays[f"optimiser/{name}"] = value.cpu().numpy()
         progress = {"step": self.step, "seconds": self.seconds, "loss": self.loss, "total": self.total}
         arrays["run"] = np.array(json.dumps({"plan": asdict(self.plan), "seed": self.seed, **progress}))
         write_arrays(path, arrays, compressed=False)
@@ -231,20 +217,15 @@ class Run:
         tensors = {k: torch.from_numpy(v).to(self.device) for k, v in arrays.items() if k != "run"}
         self.network.load_state_dict({k[8:]: v for k, v in tensors.items() if k.startswith("network/")})
         self.average = {k[8:]: v for k, v in tensors.items() if k.startswith("average/")}
-        state: dict[int, dict[str, Tensor]] = {}
-        for key, value in tensors.items():
-            if key.startswith("adam/"):
-                _, index, name = key.split("/", 2)
-                state.setdefault(int(index), {})[name] = value.cpu() if name == "step" else value
-        self.optimiser.load_state_dict({"state": state, "param_groups": self.optimiser.state_dict()["param_groups"]})
+        self.optimiser.load({k[10:]: v for k, v in tensors.items() if k.startswith("optimiser/")})
         self.step, self.seconds, self.loss = info["step"], info["seconds"], info["loss"]
 
-    def export(self, *, name: str, info: dict, ranges: dict[str, list[float]]):
+    def export(self, *, name: str, data: list[dict[str, Any]], ranges: dict[str, list[float]]):
         """The averaged weights as a `Model`."""
         from sdfsim.dynamics.model import Model
 
         card = {
-            "data": {k: info.get(k) for k in ("recipe", "seed", "engine", "engine_version")},
+            "data": data,
             "optimiser_steps": self.step,
             "seconds": round(self.seconds),
             "threads": torch.get_num_threads(),
@@ -284,7 +265,8 @@ def _loop(run: Run, held_out: Task, out: Path, tell: Progress) -> None:
             if run.step % LOG_STEPS == 0:
                 tell(run.step / run.total, f"step {run.step}, loss {run.loss:.4f}")
             if run.step % min(1000, max(1, run.total // 10)) == 0 or run.step == run.total:
-                entry = {"step": run.step, "seconds": round(run.seconds, 1), "loss": run.loss, "rate": run.rate()}
+                rate = run.plan.rate * run.share()
+                entry = {"step": run.step, "seconds": round(run.seconds, 1), "loss": run.loss, "rate": rate}
                 with open(out / "log.jsonl", "a") as log:
                     log.write(json.dumps(entry | {"held_out_loss": held_out_loss(run, held_out)}) + "\n")
             if time.monotonic() - saved > CHECKPOINT_SECONDS:
@@ -295,10 +277,26 @@ def _loop(run: Run, held_out: Task, out: Path, tell: Progress) -> None:
         run.save(out / "checkpoint.npz")
 
 
+def _shorten(log: Path, step: int) -> None:
+    """Leave of a log what was written up to a step, in whole lines: the rest will be done, and logged, again."""
+    if not log.exists():
+        return
+    kept = []
+    for line in log.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True):
+        try:
+            entry = json.loads(line)
+        except ValueError:
+            break  # a kill has cut it short
+        if entry["step"] > step:
+            break
+        kept.append(line)
+    write_text(log, "".join(kept))
+
+
 def main() -> None:
     """Command line of this module, for machines that have only torch and numpy."""
     parser = argparse.ArgumentParser(description="Train on a dataset whose contact frames are cached.")
-    parser.add_argument("data", type=Path)
+    parser.add_argument("data", type=Path, nargs="+")
     parser.add_argument("out", type=Path)
     parser.add_argument("--preset", default="small", choices=list(PRESETS))
     parser.add_argument("--steps", type=int)

@@ -7,7 +7,7 @@ import pytest
 
 from sdfsim.learning import train as train_module
 from sdfsim.learning.dataset import Trajectory
-from sdfsim.learning.train import Preset
+from sdfsim.learning.presets import Preset
 from sdfsim.shape.asset import analytic_shape
 
 CORNERS = [(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]

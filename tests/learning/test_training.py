@@ -81,7 +81,7 @@ def test_noise_moves_gaps_by_the_normal_displacement_and_corrects_the_target(bal
 def test_it_learns_and_the_model_file_gives_the_same_network(ball_data, presets, preset, tmp_path):
     place = tmp_path / "run"
     plan = train_module.PRESETS[preset]
-    task, held_out = train_module._tasks(plan, ball_data, CPU, lambda f, m: None)
+    task, held_out = train_module._tasks(plan, [ball_data], CPU, lambda f, m: None)
     before = train_module.held_out_loss(Run(plan, task, plan.steps, 0, CPU), held_out, batches=2)
     report = train(ball_data, place, preset=preset)
     assert report["held_out_loss"] < 0.7 * before

@@ -1,0 +1,39 @@
+"""Velocities at the instants of positions: what a recording engine's own velocities lack of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from sdfsim.learning.dataset import Trajectory, read_info
+
+EXACTLY = 1e-3  # part of what gravity adds in a step, by which a free flight may miss it
+
+
+def engine_substep(data: Path) -> float:
+    """The engine's inner step in s, where the dataset (a folder or one of its splits) tells it; 0 elsewhere."""
+    for folder in (data, data.parent):
+        if (folder / "dataset.json").exists():
+            settings = read_info(folder).get("engine_settings")
+            found = settings.get("timeStep") if isinstance(settings, dict) else None
+            return float(found) if isinstance(found, int | float) else 0.0
+    return 0.0
+
+
+def at_instants(trajectory: Trajectory, substep: float) -> Trajectory:
+    """The trajectory with velocities at the instants of its positions.
+
+    The recording engine's position step already uses the new velocity (symplectic Euler): its flights are exact
+    parabolas, but of bodies that are half an inner step `substep` s of gravity faster than recorded. Bodies that fly
+    before or after an instant get the velocity of their parabola; those that lie or slide keep the recorded one.
+    """
+    added = np.diff(trajectory.velocity, axis=0) - trajectory.gravity * trajectory.dt
+    flies = np.linalg.norm(added, axis=-1) < EXACTLY * np.linalg.norm(trajectory.gravity) * trajectory.dt
+    airborne = np.zeros(trajectory.velocity.shape[:2], dtype=bool)
+    airborne[:-1] |= flies
+    airborne[1:] |= flies
+    airborne &= ~trajectory.static.astype(bool)
+    lead = 0.5 * substep * trajectory.gravity * airborne[..., None]
+    return replace(trajectory, velocity=trajectory.velocity + lead)

@@ -1,0 +1,37 @@
+"""Presets: which network is trained, how large it is and for how long."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Preset:
+    """One way to train one network.
+
+    Attributes:
+        kind: "impulse" or "paper".
+        config: sizes of the network.
+        steps: of the optimiser.
+        batch: contact frames (impulse) or recorded steps (paper) a step.
+        rate: peak learning rate of Adam; it falls to a hundredth along a cosine.
+        matrix_rate: the same of Muon, which then trains the hidden matrices; None leaves all to Adam, as published.
+        reach: m, contact radius D.
+        noise: standard deviation of pose noise (*paper*: m, as published), or None for the network's default.
+    """
+
+    kind: str
+    config: dict[str, int]
+    steps: int
+    batch: int
+    rate: float
+    reach: float = 0.1
+    noise: float | None = None
+    matrix_rate: float | None = None
+
+
+PRESETS = {
+    "small": Preset("impulse", {"width": 64, "rounds": 6}, steps=40_000, batch=32, rate=2e-3, matrix_rate=0.01),
+    "base": Preset("impulse", {"width": 128, "rounds": 8}, steps=100_000, batch=64, rate=1e-3, matrix_rate=0.01),
+    "paper": Preset("paper", {"width": 128, "steps": 10}, steps=1_000_000, batch=8, rate=1e-3, noise=0.003),
+}
