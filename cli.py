@@ -7,6 +7,7 @@ import typer
 from pipeline.commands import distill, fit, mesh, poses, reconstruct
 from sdfsim.commands.learning import dataset, evaluate, train
 from sdfsim.commands.simulating import info, plan, simulate, view
+from sdfsim.commands.studying import stress, tradeoff
 
 app = typer.Typer(
     name="sdfsim",
@@ -16,5 +17,20 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for command in (reconstruct, poses, distill, mesh, fit, simulate, plan, view, dataset, train, evaluate, info):
+for command in (
+    reconstruct,
+    poses,
+    distill,
+    mesh,
+    fit,
+    simulate,
+    plan,
+    view,
+    dataset,
+    train,
+    evaluate,
+    tradeoff,
+    stress,
+    info,
+):
     app.command()(command)

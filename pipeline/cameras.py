@@ -47,6 +47,11 @@ class View:
         """[3] camera centre in the world."""
         return -self.rotation.T @ self.translation
 
+    @property
+    def fov(self) -> float:
+        """Field of view of the longer side, degrees."""
+        return float(2 * np.degrees(np.arctan(0.5 * max(self.width, self.height) / self.focal)))
+
     def rays(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Unit directions [P, 3] in world axes through pixels u, v [P]."""
         xd, yd = (u - self.cx) / self.focal, (v - self.cy) / self.focal
@@ -107,7 +112,15 @@ def load_views(folder: Path) -> list[View]:
     Raises:
         SdfsimError: no readable `cameras.json`.
     """
-    path = Path(folder) / "cameras.json"
+    return load_view_file(Path(folder) / "cameras.json")
+
+
+def load_view_file(path: Path) -> list[View]:
+    """Reads the views that `save_views` wrote to a file.
+
+    Raises:
+        SdfsimError: it is absent or damaged.
+    """
     data = read_json(path, "run the poses stage first")
     try:
         return [

@@ -11,19 +11,53 @@ from sdfsim.commands.arguments import Budget, Cluster, Device, Json, Out, Verbos
 from sdfsim.errors import EXIT_ERROR
 from sdfsim.progress import Session, duration
 
-Preset = Annotated[Literal["quick", "standard", "fine"], typer.Option(help="How much time to spend.")]
-KeptPreset = Annotated[Literal["quick", "standard", "fine"] | None, typer.Option(help="Default: as before.")]
+Preset = Annotated[
+    Literal["quick", "standard", "fine", "paper"],
+    typer.Option(help="How much time to spend; paper is the network of the VolSDF paper, for a GPU."),
+]
+KeptPreset = Annotated[Literal["quick", "standard", "fine", "paper"] | None, typer.Option(help="Default: as before.")]
 Stage = Literal["photos", "poses", "distill", "mesh", "fit", "scene"]
 Size = Annotated[float | None, typer.Option(help="Widest side of the scene, metres.", min=0.0)]
+Distance = Annotated[
+    tuple[str, str, float] | None,
+    typer.Option(
+        metavar="PLACE PLACE METRES",
+        help="A distance that you know. A place is PHOTO:X,Y, what that pixel shows, or PHOTO, the camera itself.",
+        show_default=False,
+    ),
+]
+Crop = Annotated[
+    tuple[str, str] | None,
+    typer.Option(
+        metavar="X,Y,Z X,Y,Z", help="Corners of the box to keep, metres, the lower one first.", show_default=False
+    ),
+]
+Keep = Annotated[
+    list[str] | None,
+    typer.Option(metavar="NAME", help="Keep a piece that would be left out; all keeps every one.", show_default=False),
+]
+Static = Annotated[
+    list[str] | None,
+    typer.Option(metavar="NAME", help="This body stays where it is (mesh/objects.png has names).", show_default=False),
+]
+DropShape = Annotated[Literal["box", "ball", "none"], typer.Option("--drop", help="What falls onto the scene.")]
 
 
 def reconstruct(
-    photos: Annotated[Path, typer.Argument(help="Folder of photos.", show_default=False)],
+    photos: Annotated[
+        Path,
+        typer.Argument(help="Folder of photos, a video, a transforms.json, or a COLMAP model.", show_default=False),
+    ],
     out: Out,
     preset: Preset = "standard",
     first: Annotated[Stage | None, typer.Option("--from", help="Do this stage and those after it again.")] = None,
     last: Annotated[Stage | None, typer.Option("--until", help="Stop after this stage.")] = None,
     size: Size = None,
+    distance: Distance = None,
+    crop: Crop = None,
+    keep: Keep = None,
+    static: Static = None,
+    drop: DropShape = "box",
     budget: Budget = None,
     as_json: Json = False,
     device: Device = "auto",
@@ -38,6 +72,11 @@ def reconstruct(
             out,
             preset=preset,
             size=size,
+            distance=list(distance) if distance else None,
+            crop=_corners(crop),
+            keep=keep or [],
+            static=static or [],
+            drop=drop,
             budget=budget,
             from_stage=first,
             until_stage=last,
@@ -48,7 +87,10 @@ def reconstruct(
 
 
 def poses(
-    photos: Annotated[Path, typer.Argument(help="Folder of photos.", show_default=False)],
+    photos: Annotated[
+        Path,
+        typer.Argument(help="Folder of photos, a video, a transforms.json, or a COLMAP model.", show_default=False),
+    ],
     out: Out,
     preset: Preset = "standard",
     as_json: Json = False,
@@ -81,12 +123,32 @@ def mesh(
     folder: Annotated[Path, typer.Argument(help="Folder that distill has written.", show_default=False)],
     preset: KeptPreset = None,
     size: Size = None,
+    distance: Distance = None,
+    crop: Crop = None,
+    keep: Keep = None,
     as_json: Json = False,
     device: Device = "auto",
     verbose: Verbose = False,
 ) -> None:
-    """Field -> cleaned, upright mesh."""
-    _stage("mesh", folder, as_json, verbose, preset=preset, size=size, device=device)
+    """Field -> upright meshes of the scenery and of the bodies that stand on it."""
+    known = list(distance) if distance else None
+    _stage(
+        "mesh", folder, as_json, verbose, preset=preset, size=size, distance=known, crop=_corners(crop), keep=keep,
+        device=device,
+    )  # fmt: skip
+
+
+def _corners(crop: tuple[str, str] | None) -> list[float] | None:
+    """Six numbers from two corners x,y,z."""
+    if crop is None:
+        return None
+    try:
+        corners = [[float(part) for part in corner.split(",")] for corner in crop]
+    except ValueError:
+        corners = []
+    if [len(corner) for corner in corners] != [3, 3]:
+        raise typer.BadParameter(f"--crop takes two corners X,Y,Z in metres (got {' '.join(crop)})")
+    return corners[0] + corners[1]
 
 
 def fit(

@@ -6,7 +6,7 @@ import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,25 +15,31 @@ import torch
 from safetensors import SafetensorError, safe_open
 
 from pipeline.cameras import Sparse, View
-from pipeline.field import FieldSize, GridField
+from pipeline.field import Field, FieldSize, GridField
+from pipeline.held_out import HeldOut, score
+from pipeline.landmarks import find_landmarks
+from pipeline.mlp_field import MlpField, MlpSize
+from pipeline.mlp_trainer import trainer_for
 from pipeline.normalise import Normalisation, find_normalisation
-from pipeline.photos import BACKDROP
 from pipeline.rays import held_out, load_rays
-from pipeline.recipe import Recipe, beta_at
-from pipeline.render import render
-from pipeline.trainer import Trainer, find_landmarks
+from pipeline.recipe import Recipe
+from pipeline.snapshots import Snapshots
+from pipeline.trainer import Trainer
 from sdfsim.errors import SdfsimError
 from sdfsim.files import replacing, write_json
 from sdfsim.threads import choose_threads
 
 Progress = Callable[[float, str], None]
 
+FEWEST_STEPS = 100  # with however small a budget
+PACE = 25  # steps between looks at the clock
+
 
 @dataclass
 class Trained:
     """A trained field and where its space lies in the world of the poses."""
 
-    field: GridField
+    field: Field
     beta: float
     normalisation: Normalisation
     report: dict
@@ -70,13 +76,16 @@ def train(
     test = held_out(len(views))
     rays = load_rays([v for i, v in enumerate(local) if i not in test], photos_folder, recipe.long_side, masks=masked)
     landmarks = find_landmarks(sparse, local, normalisation)
-    trainer = Trainer(recipe, rays, landmarks, seed, device)
+    make = trainer_for(recipe.size)
+    trainer = make(recipe, rays, landmarks, seed, device)
     checkpoint = out / "checkpoint.safetensors"
     resumed = trainer.load(checkpoint)
-    per_step = calibrate(Trainer(recipe, trainer.rays, landmarks, seed, device), threads)
+    per_step = calibrate(make(recipe, trainer.rays, landmarks, seed, device), threads)
     if budget is not None and not resumed:
-        trainer.iterations = min(recipe.iterations, max(100, int(budget / per_step)))
-    saved = started = time.monotonic()
+        trainer.iterations = min(recipe.iterations, max(FEWEST_STEPS, int(budget / per_step)))
+    held = HeldOut([local[i] for i in test], photos_folder, trainer, masked=masked) if test else None
+    snapshots = Snapshots(out, trainer, held)
+    saved, started, first = time.monotonic(), time.monotonic(), trainer.iteration
     before = trainer.seconds
     smooth: dict[str, float] = {}
     while trainer.iteration < trainer.iterations:
@@ -87,8 +96,11 @@ def train(
                 "distill: the loss is no longer finite",
                 "the poses may be wrong: look at the recording of the poses stage, or take more photos",
             )
+        snapshots.take(smooth)
         now = time.monotonic()
         trainer.seconds = before + now - started
+        if budget is not None and trainer.iteration % PACE == 0:
+            trainer.iterations = paced(trainer, recipe, budget, now - started, trainer.iteration - first)
         if now - saved > checkpoint_every:
             trainer.save(checkpoint)
             saved = now
@@ -97,15 +109,15 @@ def train(
                         f"colour error {smooth['color']:.4f}")  # fmt: skip
     trainer.save(checkpoint)
     trainer.refresh()
-    beta = beta_at(recipe, 1.0)
+    beta = trainer.beta
     scores = {}
-    if test:
-        scores = score([local[i] for i in test], photos_folder, trainer, beta, masked, on_progress)
+    if held:
+        scores = score(held, out, lambda part, text: on_progress(0.92 + 0.08 * part, text) if on_progress else None)
     report = {
         "iterations": trainer.iterations, "rays": len(rays), "train_seconds": round(trainer.seconds, 1),
         "seconds_before": round(before, 1), "resumed": resumed, "masked": masked, "beta": beta,
         "threads": torch.get_num_threads(), "losses": {k: round(v, 5) for k, v in smooth.items()},
-        "held_out_photos": [views[i].source for i in test], **scores,
+        "held_out_photos": [views[i].source for i in test], "snapshots": snapshots.curve, **scores,
     }  # fmt: skip
     save_field(trainer.field, beta, normalisation, report, out)
     checkpoint.unlink(missing_ok=True)
@@ -119,34 +131,30 @@ def calibrate(probe: Trainer, threads: int | None) -> float:
     return choose_threads(probe.step, threads if probe.device == "cpu" else torch.get_num_threads())
 
 
-@torch.no_grad()
-def score(views: list[View], photos_folder: Path, trainer: Trainer, beta: float, masked: bool,
-          on_progress: Progress | None) -> dict:  # fmt: skip
-    """PSNR of held-out views at a third of the training resolution, over pixels whose ray meets the sphere."""
-    assert trainer.cache is not None
-    values, samples = [], trainer.recipe.samples
-    rays = load_rays(views, photos_folder, max(100, trainer.recipe.long_side // 3), masks=masked).to(trainer.device)
-    backdrop = torch.full((3,), BACKDROP, device=trainer.device) if masked else None
-    for number in range(len(views)):
-        index = torch.nonzero(rays.view == number)[:, 0]
-        errors = []
-        for part in index.split(4096):
-            origins, directions = rays.at(part)
-            out = render(trainer.field, trainer.cache, origins, directions, beta, samples=samples, backdrop=backdrop)
-            errors.append(((out["rgb"] - rays.rgb[part].float() / 255) ** 2).mean(1))
-        values.append(-10 * math.log10(max(float(torch.cat(errors).mean()), 1e-10)))
-        if on_progress:
-            on_progress(0.92 + 0.08 * (number + 1) / len(views), f"held-out view {number + 1} of {len(views)}")
-    return {"psnr": round(float(np.mean(values)), 2), "psnr_each": [round(v, 2) for v in values]}
+def paced(trainer: Trainer, recipe: Recipe, budget: float, elapsed: float, done: int) -> int:
+    """Steps that fit into the time: the measured pace may be another than before training, when other work goes on.
+
+    Args:
+        trainer: in training.
+        recipe: whose number of steps is never exceeded.
+        budget: s, for the steps of this run.
+        elapsed: s since it began.
+        done: steps since it began.
+    """
+    left = int((budget - elapsed) / (elapsed / done))
+    # Schedules follow the share that is done: they must not jump, nor run backwards by much.
+    wanted = min(recipe.iterations, max(FEWEST_STEPS, trainer.iteration + max(left, 0)))
+    low, high = int(0.9 * trainer.iterations), int(1.1 * trainer.iterations)
+    return max(trainer.iteration, min(max(wanted, low), high) if left > 0 else trainer.iteration)
 
 
-def save_field(field: GridField, beta: float, normalisation: Normalisation, report: dict, folder: Path) -> None:
+def save_field(field: Field, beta: float, normalisation: Normalisation, report: dict, folder: Path) -> None:
     """Writes `field.safetensors`, then `field.json`."""
     tensors = {k: v.detach().cpu().contiguous() for k, v in field.state_dict().items()}
     with replacing(folder / "field.safetensors") as partial:
         partial.write_bytes(safetensors.torch.save(tensors))
     about = {
-        "version": 1, "size": asdict(field.size), "start_radius": field.start_radius, "beta": beta,
+        "version": 1, "size": field.size.to_dict(), "start_radius": field.start_radius, "beta": beta,
         "center": normalisation.center.tolist(), "radius": normalisation.radius, "report": report,
     }  # fmt: skip
     write_json(folder / "field.json", about)
@@ -160,9 +168,12 @@ def load_field(folder: Path) -> Trained:
     """
     try:
         about = json.loads((Path(folder) / "field.json").read_text(encoding="utf-8"))
-        size = about["size"]
-        size = replace(FieldSize(**size), levels=tuple(size["levels"]), channels=tuple(size["channels"]))
-        field = GridField(size, start_radius=float(about["start_radius"]))
+        size, radius = about["size"], float(about["start_radius"])
+        if "levels" in size:
+            size = replace(FieldSize(**size), levels=tuple(size["levels"]), channels=tuple(size["channels"]))
+            field: Field = GridField(size, start_radius=radius)
+        else:
+            field = MlpField(MlpSize(**size), start_radius=radius)
         with safe_open(str(Path(folder) / "field.safetensors"), "pt") as file:
             field.load_state_dict({key: file.get_tensor(key) for key in file.keys()})
     except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from pipeline.visibility import Caster
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.shape.mesh import Mesh
 
@@ -65,20 +65,14 @@ class Above:
     """Heights of a mesh's topmost surface."""
 
     def __init__(self, mesh: Mesh) -> None:
-        import open3d as o3d
-
-        self.tensor: Any = o3d.core.Tensor
-        self.scene = o3d.t.geometry.RaycastingScene()
-        self.scene.add_triangles(
-            self.tensor(mesh.vertices.astype(np.float32)), self.tensor(mesh.faces.astype(np.uint32))
-        )
+        self.caster = Caster(mesh)
         self.top = float(mesh.vertices[:, 2].max()) + 1.0
 
     def heights(self, at: np.ndarray) -> np.ndarray:
         """Heights [...] m over the points `at` [..., 2] m; NaN where there is no surface."""
-        ray = np.zeros((at.size // 2, 6), np.float32)
-        ray[:, :2], ray[:, 2], ray[:, 5] = at.reshape(-1, 2), self.top, -1
-        distance = self.scene.cast_rays(self.tensor(ray))["t_hit"].numpy()
+        origin = np.full((at.size // 2, 3), self.top)
+        origin[:, :2] = at.reshape(-1, 2)
+        distance, _ = self.caster.hits(origin, np.tile([0.0, 0.0, -1.0], (len(origin), 1)))
         return np.where(np.isfinite(distance), self.top - distance, np.nan).reshape(at.shape[:-1])
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -81,7 +82,64 @@ def sample_grid(grid: Tensor, points: Tensor) -> Tensor:
     return found.view(grid.shape[1], -1).t()
 
 
-class GridField(nn.Module):
+class Field(nn.Module):
+    """SDF and colour in the unit sphere, and a background outside; what both encodings have in common.
+
+    Attributes:
+        background: [1, 4, n, n, n], channel 0 density before softplus, channels 1 to 3 colour before sigmoid.
+        size: of the encoding, with `to_dict`.
+        start_radius: radius of the sphere that the SDF starts from.
+        active: how many levels of detail are in use.
+        view_dependence: how much colour changes with direction, 0 to 1.
+    """
+
+    background: nn.Parameter
+    size: Any
+    start_radius: float
+    active: int = 0
+    view_dependence: float = 1.0
+
+    @property
+    def finest(self) -> float:
+        """Size of the smallest detail, normalised units."""
+        raise NotImplementedError
+
+    def geometry_at(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """SDF [P] and two kinds of features [P, F] for `color_of` at points [P, 3] of normalised space."""
+        raise NotImplementedError
+
+    def color_of(self, geometry: Tensor, features: Tensor, directions: Tensor) -> Tensor:
+        """RGB [P, 3] in 0..1 seen along unit directions [P, 3]."""
+        raise NotImplementedError
+
+    def sdf(self, points: Tensor) -> Tensor:
+        """Signed distance [P] in normalised units at points [P, 3]."""
+        return self.geometry_at(points)[0]
+
+    def background_along(self, origins: Tensor, directions: Tensor, jitter: Tensor) -> Tensor:
+        """RGB [R, 3] of what lies behind the unit sphere, by rendering its grid.
+
+        Args:
+            origins: [R, 3].
+            directions: [R, 3] unit.
+            jitter: [R, S] in 0..1, place of each sample within its step of inverse radius.
+        """
+        count = jitter.shape[1]
+        inverse = 1 - (torch.arange(count, device=jitter.device) + jitter) / count * 0.995
+        radius = 1 / inverse
+        along = -(origins * directions).sum(1, keepdim=True)
+        closest = (origins * origins).sum(1, keepdim=True) - along**2
+        distance = along + torch.sqrt((radius**2 - closest).clamp_min(1e-6))
+        points = origins[:, None] + distance[..., None] * directions[:, None]
+        values = sample_grid(self.background, contract(points).view(-1, 3)).view(*jitter.shape, 4)
+        # Optical depth per step of inverse radius, so that far steps are not heavier than near ones.
+        depth = functional.softplus(values[..., 0] * 10 - 1.0)
+        depth = torch.cat([depth[:, :-1], torch.full_like(depth[:, -1:], 20.0)], 1)
+        weights, _ = render_weights(depth, torch.ones_like(depth))
+        return (weights[..., None] * torch.sigmoid(values[..., 1:] * 10)).sum(1)
+
+
+class GridField(Field):
     """SDF and colour in the unit sphere, and a background outside.
 
     Args:
@@ -119,9 +177,13 @@ class GridField(nn.Module):
         self.color = nn.Sequential(
             layer(GEOMETRY + 8 + sum(size.channels), width), nn.ReLU(), layer(width, 3, gain=0.3)
         )
-        # Channel 0 is density before softplus, channels 1 to 3 colour before sigmoid.
         n = size.background
         self.background = uniform(1, 4, n, n, n, bound=1e-2)
+
+    @property
+    def finest(self) -> float:
+        """Width of a cell of the finest level, normalised units."""
+        return level_step(self.size.levels, len(self.size.levels))
 
     def features(self, points: Tensor) -> Tensor:
         """Grid features [P, F] at points [P, 3]; zeros for levels that are not active yet."""
@@ -138,36 +200,10 @@ class GridField(nn.Module):
         base = points.norm(dim=1) - self.start_radius
         return base + hidden[:, 0], hidden[:, 1:], features
 
-    def sdf(self, points: Tensor) -> Tensor:
-        """Signed distance [P] in normalised units at points [P, 3]."""
-        return self.geometry_at(points)[0]
-
     def color_of(self, geometry: Tensor, features: Tensor, directions: Tensor) -> Tensor:
         """RGB [P, 3] in 0..1 seen along unit directions [P, 3]."""
         seen_along = self.view_dependence * direction_features(directions)
         return torch.sigmoid(self.color(torch.cat([geometry, features, seen_along], 1)))
-
-    def background_along(self, origins: Tensor, directions: Tensor, jitter: Tensor) -> Tensor:
-        """RGB [R, 3] of what lies behind the unit sphere, by rendering its grid.
-
-        Args:
-            origins: [R, 3].
-            directions: [R, 3] unit.
-            jitter: [R, S] in 0..1, place of each sample within its step of inverse radius.
-        """
-        count = jitter.shape[1]
-        inverse = 1 - (torch.arange(count, device=jitter.device) + jitter) / count * 0.995
-        radius = 1 / inverse
-        along = -(origins * directions).sum(1, keepdim=True)
-        closest = (origins * origins).sum(1, keepdim=True) - along**2
-        distance = along + torch.sqrt((radius**2 - closest).clamp_min(1e-6))
-        points = origins[:, None] + distance[..., None] * directions[:, None]
-        values = sample_grid(self.background, contract(points).view(-1, 3)).view(*jitter.shape, 4)
-        # Optical depth per step of inverse radius, so that far steps are not heavier than near ones.
-        depth = functional.softplus(values[..., 0] * 10 - 1.0)
-        depth = torch.cat([depth[:, :-1], torch.full_like(depth[:, -1:], 20.0)], 1)
-        weights, _ = render_weights(depth, torch.ones_like(depth))
-        return (weights[..., None] * torch.sigmoid(values[..., 1:] * 10)).sum(1)
 
 
 def stencil(points: Tensor, step: float) -> Tensor:

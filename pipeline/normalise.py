@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -92,8 +93,19 @@ def find_normalisation(views: list[View], sparse: Sparse, *, masked: bool = Fals
     return Normalisation(center, max(radius, 1e-9))
 
 
-def camera_up(views: list[View]) -> np.ndarray:
-    """Up [3] (unit) from the cameras alone: people hold cameras level, so their right axes are horizontal.
+class CameraUp(NamedTuple):
+    """Up from the cameras alone: the unit vector [3], and degrees within which it can be trusted."""
+
+    normal: np.ndarray
+    within: float
+
+
+# People hold cameras level to about this; where photos are turned, or all from one place, next to nothing is known.
+CAREFUL, UNKNOWN = 2.0, 30.0  # degrees
+
+
+def camera_up(views: list[View]) -> CameraUp:
+    """Up from the cameras alone: people hold cameras level, so their right axes are horizontal.
 
     The direction with the least spread of the right axes, with the sign of the mean image up. Where the right axes
     span no plane (a single viewpoint, or photos turned by 90 degrees) the mean image up itself.
@@ -104,15 +116,24 @@ def camera_up(views: list[View]) -> np.ndarray:
     values, vectors = np.linalg.eigh(right.T @ right / len(right))
     up = vectors[:, 0] * np.sign(vectors[:, 0] @ mean or 1.0)
     if values[1] < 0.05 or values[0] > 0.3 * values[1] or up @ mean < 0.5:
-        return mean
-    return up
+        return CameraUp(mean, UNKNOWN)
+    # Where the right axes fan out little, a roll of each camera tilts the whole the more.
+    return CameraUp(up, float(np.hypot(CAREFUL, np.degrees(np.sqrt(max(values[0], 0) / values[1])))))
+
+
+class Plane(NamedTuple):
+    """A plane: unit normal [3], its share of all the area, and the slope in degrees that its unevenness amounts to."""
+
+    normal: np.ndarray
+    share: float
+    slope: float
 
 
 def plane_up(
     points: np.ndarray, normals: np.ndarray, weights: np.ndarray, guess: np.ndarray, tolerance: float, *,
     max_angle: float = 25.0, min_share: float = 0.08, seed: int = 0,
-) -> tuple[np.ndarray, float] | None:  # fmt: skip
-    """Normal of the largest plane among surface samples whose normal is near a guess (RANSAC).
+) -> Plane | None:  # fmt: skip
+    """The largest plane among surface samples whose normal is near a guess (RANSAC).
 
     Args:
         points: [P, 3].
@@ -125,7 +146,7 @@ def plane_up(
         seed: of the random choice of samples.
 
     Returns:
-        The unit normal and the share of area of its plane, or None where no plane is large enough.
+        The plane, or None where none is large enough.
     """
     near = normals @ guess > np.cos(np.radians(max_angle))
     if near.sum() < 10:
@@ -139,14 +160,16 @@ def plane_up(
             best, inside = float(w[member].sum()), member
     if inside is None or best < min_share * weights.sum():
         return None
+    spread = np.ones(3)
     for _ in range(3):
         center = np.average(p[inside], axis=0, weights=w[inside])
         offset = p[inside] - center
-        normal = np.linalg.eigh((offset * w[inside, None]).T @ offset)[1][:, 0]
-        normal *= np.sign(normal @ guess)
+        spread, axes = np.linalg.eigh((offset * w[inside, None]).T @ offset)
+        normal = axes[:, 0] * np.sign(axes[:, 0] @ guess)
         inside = (np.abs((p - center) @ normal) < tolerance) & (n @ normal > 0.9)
         if inside.sum() < 10:
             return None
     if normal @ guess < np.cos(np.radians(max_angle)):
         return None
-    return normal, float(w[inside].sum() / weights.sum())
+    slope = float(np.degrees(np.arctan(np.sqrt(max(spread[0], 0) / max(spread[1], 1e-30)))))
+    return Plane(normal, float(w[inside].sum() / weights.sum()), slope)

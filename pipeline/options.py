@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
+from pipeline.wishes import Known, Wishes
 from sdfsim.errors import SdfsimError
 from sdfsim.files import write_text
 
-PRESETS = ("quick", "standard", "fine")
-LONG_SIDE = {"quick": 800, "standard": 1200, "fine": 1600}  # px of the prepared photos
+PRESETS = ("quick", "standard", "fine", "paper")
+DROPS = ("box", "ball", "none")
 
 
 @dataclass
@@ -20,13 +22,18 @@ class Options:
     """Every option of a reconstruction, as written to config.yaml.
 
     Attributes:
-        photos: the user's folder.
-        preset: quick, standard or fine.
+        photos: what the user gave.
+        preset: quick, standard, fine, or paper.
         size: widest side of the scene, m; None: assumed to be 1 m.
         budget: s for everything; None: what the preset takes.
         seed: of everything random.
         device: auto, cpu or cuda.
         recipe: of the fit.
+        distance: two places and the metres between them, see `Known`; None: size counts.
+        crop: m, corners x, y, z, x, y, z of the box that is kept; None: everything.
+        keep: pieces to keep that would be left out, by name; "all" for every one.
+        static: bodies that are to stay where they are, by name.
+        drop: what is dropped onto the scene: box, ball or none.
     """
 
     photos: str = ""
@@ -36,6 +43,11 @@ class Options:
     seed: int = 0
     device: str = "auto"
     recipe: str = "default"
+    distance: list | None = None
+    crop: list[float] | None = None
+    keep: list[str] = field(default_factory=list)
+    static: list[str] = field(default_factory=list)
+    drop: str = "box"
 
     def check(self) -> None:
         """Raises SdfsimError where a value makes no sense."""
@@ -45,21 +57,50 @@ class Options:
             raise SdfsimError(f"size: must be between 0.0001 and 100000 m (got {self.size:g})")
         if self.budget is not None and not self.budget > 0:
             raise SdfsimError(f"budget: must be > 0 s (got {self.budget:g})")
+        if self.size is not None and self.distance is not None:
+            raise SdfsimError("size and distance: both set the scale", "give one of them")
+        if self.drop not in DROPS:
+            raise SdfsimError(f"drop: {self.drop!r} is not one of {', '.join(DROPS)}")
+        if self.crop is not None and not np.less(self.crop[:3], self.crop[3:]).all():
+            raise SdfsimError(
+                f"crop: the second corner must lie beyond the first in x, y and z (got {self.crop})",
+                "corners are x,y,z in metres, the lower one first",
+            )
+        self.wishes()
+
+    def changed(self, changes: dict[str, Any]) -> Options:
+        """With other values; a new size takes the place of a known distance, and the other way round."""
+        instead = {"size": "distance", "distance": "size"}
+        return replace(self, **({instead[key]: None for key in changes if key in instead} | changes))
+
+    def wishes(self) -> Wishes:
+        """What a person asks of the meshes.
+
+        Raises:
+            SdfsimError: the distance makes no sense.
+        """
+        known = None
+        if self.distance is not None:
+            known = Known(str(self.distance[0]), str(self.distance[1]), float(self.distance[2]))
+            known.check()
+        crop = None if self.crop is None else np.reshape(self.crop, (2, 3))
+        return Wishes(self.size, known, crop, tuple(self.keep))
 
     def of_stage(self, stage: str) -> dict[str, Any]:
         """The options that a stage's result depends on."""
         common = {"preset": self.preset, "seed": self.seed}
         if stage == "photos":
-            return {"long_side": LONG_SIDE[self.preset]}
+            return {}
         if stage == "poses":
             return {"seed": self.seed}
         if stage == "distill":
             return {**common, "budget": self.budget}
         if stage == "mesh":
-            return {"preset": self.preset, "size": self.size}
+            keys = ("preset", "size", "distance", "crop", "keep")
+            return {key: getattr(self, key) for key in keys}
         if stage == "fit":
             return {"seed": self.seed, "budget": self.budget, "recipe": self.recipe}
-        return {"seed": self.seed}
+        return {"seed": self.seed, "drop": self.drop, "static": self.static}
 
 
 def write_config(options: Options, folder: Path) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from pipeline.cameras import View
 from pipeline.cleaning import face_normals
 from pipeline.normalise import camera_up, plane_up
+from pipeline.scale import Scale
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json
 from sdfsim.shape.mesh import Mesh
@@ -26,6 +27,7 @@ class Placement:
         up_from: "plane" or "cameras".
         size_from: where the scale comes from, in words.
         floor: z of the plane that things rest on when they leave the scene, m.
+        up_within: degrees within which up can be trusted.
     """
 
     scale: float
@@ -34,6 +36,12 @@ class Placement:
     up_from: str
     size_from: str
     floor: float = 0.0
+    up_within: float = 0.0
+
+    @property
+    def up_confidence(self) -> str:
+        """high, medium or low: whether a ball would roll off a level table for a wrong gravity alone."""
+        return next((word for word, most in CONFIDENT.items() if self.up_within <= most), "low")
 
     def points(self, points: np.ndarray) -> np.ndarray:
         """Normalised points [P, 3] -> metres."""
@@ -59,13 +67,37 @@ class Placement:
         )
 
 
-def find_up(shown: Mesh, views: list[View]) -> tuple[np.ndarray, str]:
-    """Up [3] in normalised space and where it comes from: the largest nearly level plane, else the cameras."""
-    guess = camera_up(views)
+@dataclass(frozen=True)
+class Up:
+    """Which way is up, in normalised space.
+
+    Attributes:
+        direction: [3] unit.
+        source: "plane" or "cameras".
+        within: degrees within which it can be trusted.
+    """
+
+    direction: np.ndarray
+    source: str
+    within: float
+
+
+# Degrees up to which gravity is known well, or well enough to look right.
+CONFIDENT = {"high": 2.0, "medium": 6.0}
+FLOORS = 0.5  # degrees within which floors and tables are level
+
+
+def find_up(shown: Mesh, views: list[View]) -> Up:
+    """Up from the largest nearly level plane, else from the cameras; how far they disagree counts as doubt."""
+    cameras = camera_up(views)
     normals, areas = face_normals(shown)
     centers = shown.vertices[shown.faces].mean(1)
-    plane = plane_up(centers, normals, areas, guess, tolerance=0.02)
-    return (guess, "cameras") if plane is None else (plane[0], "plane")
+    plane = plane_up(centers, normals, areas, cameras.normal, tolerance=0.02)
+    if plane is None:
+        return Up(cameras.normal, "cameras", cameras.within)
+    within = float(np.hypot(FLOORS, plane.slope))
+    apart = float(np.degrees(np.arccos(np.clip(plane.normal @ cameras.normal, -1, 1))))
+    return Up(plane.normal, "plane", within if apart < 3 * cameras.within else max(within, apart))
 
 
 def resting_height(mesh: Mesh, *, level: float = 0.95, share: float = 0.05) -> float:
@@ -96,18 +128,8 @@ def resting_height(mesh: Mesh, *, level: float = 0.95, share: float = 0.05) -> f
     return float(np.quantile(mesh.vertices[:, 2], 0.002))
 
 
-def place(shown: Mesh, views: list[View], size: float | None) -> Placement:
-    """Chooses up, scale and origin.
-
-    The widest side of the box around the visible surface becomes `size`; the front (towards the mean camera) is -y;
-    the floor is z = 0 and the surface's middle is over the origin.
-
-    Args:
-        shown: visible surface in normalised space.
-        views: cameras in normalised space.
-        size: m; None means 1 m, and says so in `size_from`.
-    """
-    up, up_from = find_up(shown, views)
+def level(shown: Mesh, views: list[View], up: np.ndarray) -> np.ndarray:
+    """The rotation [3, 3] that turns up [3] to z and the front, which is towards the mean camera, to -y."""
     center = (shown.vertices.min(0) + shown.vertices.max(0)) / 2
     front = np.mean([v.center for v in views], axis=0) - center
     front -= up * (front @ up)
@@ -117,15 +139,32 @@ def place(shown: Mesh, views: list[View], size: float | None) -> Placement:
     if np.linalg.norm(front) < 1e-6:
         front = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     y = -front / np.linalg.norm(front)
-    rotation = np.stack([np.cross(y, up), y, up])
+    return np.stack([np.cross(y, up), y, up])
+
+
+def place(shown: Mesh, views: list[View], scale: Scale | None = None, *, size: float | None = None,
+          alone: bool = False) -> Placement:  # fmt: skip
+    """Chooses up, scale and origin: the floor is z = 0 and the middle of the visible surface is over the origin.
+
+    Args:
+        shown: visible surface in normalised space.
+        views: cameras in normalised space.
+        scale: where it is known; else `size` sets it.
+        size: widest side of the box around the visible surface, m; None means 1 m, and says so in `size_from`.
+        alone: there is no scenery: the floor is where the lowest point is.
+    """
+    up = find_up(shown, views)
+    rotation = level(shown, views, up.direction)
     turned = shown.vertices @ rotation.T
-    widest = float(np.ptp(turned, axis=0).max())
-    scale = (1.0 if size is None else size) / widest
-    in_metres = Mesh(scale * turned, shown.faces)
+    if scale is None:
+        metres = (1.0 if size is None else size) / float(np.ptp(turned, axis=0).max())
+        source = "assumed: widest side = 1 m" if size is None else f"given: widest side = {size:g} m"
+        scale = Scale(metres, source)
+    in_metres = Mesh(scale.metres * turned, shown.faces)
     low, high = in_metres.vertices.min(0), in_metres.vertices.max(0)
-    translation = -np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, resting_height(in_metres)])
-    source = "assumed: widest side = 1 m" if size is None else f"given: widest side = {size:g} m"
-    return Placement(scale, rotation, translation, up_from, source)
+    floor = low[2] if alone else resting_height(in_metres)
+    translation = -np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, floor])
+    return Placement(scale.metres, rotation, translation, up.source, scale.source, up_within=up.within)
 
 
 def load_placement(mesh_folder: Path) -> Placement:

@@ -1,4 +1,4 @@
-"""Photos -> camera poses and sparse points, with a verdict on whether they can be trusted."""
+"""Photos -> camera poses and sparse points, by a ladder of attempts, with a verdict on whether they can be trusted."""
 
 from __future__ import annotations
 
@@ -10,32 +10,69 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from pipeline.cameras import View, save_views
-from pipeline.photos import Photo
+from pipeline.cameras import load_view_file, save_views
+from pipeline.photos import GIVEN, Photo
+from pipeline.verdict import failure_hint, failure_message, judge, views_of
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.files import read_json, write_json
 
 Progress = Callable[[float, str], None]
 
-# Field of view of the longer side, degrees: from a short telephoto to a wide angle lens.
-FOV_RANGE = (18.0, 110.0)
-MAX_MEAN_ERROR = 2.0
-MIN_TRIANGULATION = 1.5
-FEW_FEATURES = 150
-FEW_MATCHES = 30
+ORDINARY: dict[str, Any] = {
+    "pixels": 1000, "max_features": 3000, "peak_threshold": 0.0066667, "affine": False, "max_ratio": 0.8,
+    "guided": False, "moving_only": False, "min_inliers": 15, "min_inlier_ratio": 0.35, "mapper": "incremental",
+    "init_inliers": 100, "init_angle": 16.0, "pose_inliers": 30, "hold_focal": False,
+}  # fmt: skip
+MORE = {
+    **ORDINARY, "pixels": 1600, "max_features": 12000, "peak_threshold": 0.003, "max_ratio": 0.88, "guided": True,
+    "min_inliers": 12, "min_inlier_ratio": 0.25, "init_inliers": 40, "init_angle": 6.0, "pose_inliers": 15,
+}  # fmt: skip
 
-FIRST_TRY = {
-    "max_features": 3000, "peak_threshold": 0.0066667, "max_ratio": 0.8, "guided": False, "min_inliers": 15,
-    "init_inliers": 100, "init_angle": 16.0, "pose_inliers": 30, "min_inlier_ratio": 0.35,
-}  # fmt: skip
-SECOND_TRY = {
-    "max_features": 12000, "peak_threshold": 0.003, "max_ratio": 0.88, "guided": True, "min_inliers": 12,
-    "init_inliers": 40, "init_angle": 6.0, "pose_inliers": 15, "min_inlier_ratio": 0.25,
-}  # fmt: skip
+
+@dataclass(frozen=True)
+class Rung:
+    """One way to find poses.
+
+    Attributes:
+        name: what it does, for the report.
+        settings: of the worker.
+        when: whether it is worth trying after these verdicts, none of them good.
+        matches_of: name of an earlier rung whose matches it takes, or nothing.
+    """
+
+    name: str
+    settings: dict[str, Any]
+    when: Callable[[list[dict]], bool]
+    matches_of: str = ""
+
+
+def _about_focal(verdicts: list[dict]) -> bool:
+    return any("EXIF" in failure for failure in verdicts[0]["failures"])
+
+
+def _hopeful(verdicts: list[dict]) -> bool:
+    """More of the same cannot mend photos from one spot, or of nothing."""
+    last = verdicts[-1]
+    return last["turn_only_pairs"] <= 0.5 and last["components"][0] >= last["needed"]
+
+
+LADDER = (
+    Rung("ordinary", ORDINARY, lambda verdicts: True),
+    Rung("without what stands still in the picture", {**ORDINARY, "moving_only": True},
+         lambda verdicts: verdicts[0]["still_pairs"] > 0.5),
+    Rung("focal length of EXIF held", {**ORDINARY, "hold_focal": True}, _about_focal, "ordinary"),
+    Rung("more pixels and features, looser thresholds", MORE, lambda verdicts: True),
+    Rung("global mapping", {**MORE, "mapper": "global"}, _hopeful, "more pixels and features, looser thresholds"),
+    Rung("affine features", {**MORE, "max_features": 6000, "affine": True},
+         lambda verdicts: _hopeful(verdicts) and "repeats" not in " ".join(verdicts[-1]["failures"])),
+)  # fmt: skip
+KNOWN = (Rung("known cameras", ORDINARY, lambda verdicts: True),)
 
 
 def size_groups(photos: list[Photo]) -> list[dict]:
@@ -50,64 +87,73 @@ def size_groups(photos: list[Photo]) -> list[dict]:
 
 
 def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0, timeout: float = 1800.0,
-          exhaustive_up_to: int = 150, one_thread: bool = False,
-          on_progress: Progress | None = None) -> dict:  # fmt: skip
+          exhaustive_up_to: int = 150, on_progress: Progress | None = None) -> dict:  # fmt: skip
     """Finds the poses of `photos` and writes `cameras.json`, `sparse.npz`, `verdict.json` to `out`.
 
-    Tries once with ordinary settings and once more with more features and looser thresholds where the first try
-    leaves too many photos out or is not plausible.
+    Climbs `LADDER` until poses can be trusted; each rung has a folder of its own, in which a killed run goes on. Where
+    the photos came with cameras these are kept, checked against the photos, and given sparse points.
 
     Args:
         photos: what the photos stage prepared, in `photos_folder`.
-        photos_folder: holds `images/` (and `masks/`).
+        photos_folder: holds `images/` (and `masks/`, `given.json`).
         out: existing folder.
         seed: of every random choice in matching and mapping.
-        timeout: s for each try.
+        timeout: s for each rung.
         exhaustive_up_to: with more photos than this only neighbours in name order are matched.
-        one_thread: bundle adjustment on one thread: the same result on every machine, but slower.
         on_progress: called with (fraction, message).
 
     Returns:
-        The verdict (also in verdict.json): posed, left_out with reasons, mean_error px, focal checks, warnings.
+        The verdict (also in verdict.json): posed, left_out with reasons, mean_error px, focal checks, warnings, and
+        the rungs that were tried.
 
     Raises:
         SdfsimError: (exit code 3) too few photos could be posed, or the result is not plausible.
     """
     out, photos_folder = Path(out), Path(photos_folder)
+    given = photos_folder / GIVEN
     job = {
         "images": str(photos_folder / "images"), "count": len(photos), "groups": size_groups(photos), "seed": seed,
         "masks": str(photos_folder / "masks") if all(p.mask for p in photos) else "",
-        "exhaustive_up_to": exhaustive_up_to, "one_thread": one_thread,
+        "given": str(given) if given.exists() else "", "exhaustive_up_to": exhaustive_up_to,
     }  # fmt: skip
-    tries = []
-    for number, settings in enumerate((FIRST_TRY, SECOND_TRY)):
-        folder = out / f"try{number + 1}"
-        folder.mkdir(parents=True, exist_ok=True)
+    tries: list[tuple[dict, Path, dict]] = []
+    told: list[dict] = []
+    rungs = KNOWN if job["given"] else LADDER
+    for number, rung in enumerate(rungs):
+        made = rung.matches_of in {"", *(one["name"] for one in told if "seconds" in one)}
+        if not made or not rung.when([verdict for verdict, _, _ in tries]):
+            continue
 
-        def report(fraction: float, message: str, number: int = number) -> None:
+        def report(fraction: float, message: str, number: int = number, rung: Rung = rung) -> None:
             if on_progress:
-                on_progress(fraction if number == 0 else 0.5 + fraction / 2, ("retry: " if number else "") + message)
+                on_progress(fraction, (f"again, {rung.name}: " if number else "") + message)
 
+        folder, started = out / folder_of(rung), time.monotonic()
+        matches = str(out / folder_of(_named(rung.matches_of)) / "database.db") if rung.matches_of else ""
         try:
-            result = run_worker({**job, **settings}, folder, timeout, report)
+            result = run_worker({**job, **rung.settings, "matches_of": matches}, folder, timeout, report)
         except SdfsimError as error:
             if not tries:
                 raise
-            # What the first try found out says more than that the second one broke.
-            tries[0][0]["warnings"].append(f"the second try failed: {error.message}")
-            break
+            # What the rungs before found out says more than that this one broke.
+            told.append({"name": rung.name, "posed": 0, "failures": [error.message]})
+            continue
         verdict = judge(result, photos)
-        verdict["settings"] = "ordinary" if number == 0 else "more features, looser thresholds"
         tries.append((verdict, folder, result))
+        told.append({"name": rung.name, "posed": verdict["posed"], "failures": verdict["failures"],
+                     "seconds": round(time.monotonic() - started, 1)})  # fmt: skip
         if not verdict["failures"]:
             break
-    # Best: plausible first, then the most photos.
-    verdict, folder, result = max(tries, key=lambda t: (not t[0]["failures"], t[0]["posed"]))
-    verdict["tries"] = len(tries)
+    # Best: plausible first, then the most photos and points.
+    verdict, folder, result = max(tries, key=lambda t: (not t[0]["failures"], t[0]["posed"], t[0]["points"]))
+    verdict["attempts"], verdict["known_cameras"] = told, bool(job["given"])
+    if verdict["known_cameras"] and verdict["failures"]:
+        verdict["failures"] = [f"the known cameras do not fit the photos: {'; '.join(verdict['failures'])}"]
     write_json(out / "verdict.json", verdict)
     if verdict["failures"]:
         raise SdfsimError(failure_message(verdict), failure_hint(verdict), exit_code=EXIT_QUALITY)
-    save_views(views_of(result, photos), out / "cameras.json")
+    views = load_view_file(given) if job["given"] else views_of(result, photos)
+    save_views(views, out / "cameras.json")
     os.replace(folder / "sparse.npz", out / "sparse.npz")
     for _, used, _ in tries:  # Tens of megabytes that nothing reads any more; the logs stay.
         (used / "database.db").unlink(missing_ok=True)
@@ -115,8 +161,25 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
     return verdict
 
 
+def _named(name: str) -> Rung:
+    return next(rung for rung in LADDER if rung.name == name)
+
+
+def folder_of(rung: Rung) -> str:
+    """A rung's folder in that of the stage."""
+    return "try_" + rung.name.split(",")[0].replace(" ", "_")
+
+
+def read_if_there(path: Path) -> Any:
+    """The content of a JSON file, or None where it is absent or was cut short."""
+    try:
+        return read_json(path)
+    except SdfsimError:
+        return None
+
+
 def run_worker(job: dict, folder: Path, timeout: float, on_progress: Progress) -> dict:
-    """Runs the COLMAP child process on one job.
+    """Runs the COLMAP child process on one job, unless the folder holds the result of the same job already.
 
     Returns:
         What it wrote to `result.json`.
@@ -124,8 +187,12 @@ def run_worker(job: dict, folder: Path, timeout: float, on_progress: Progress) -
     Raises:
         SdfsimError: it crashed or ran out of time; the message names its log.
     """
+    if read_if_there(folder / "job.json") != job:
+        shutil.rmtree(folder, ignore_errors=True)  # Of other photos or settings.
+    elif (done := read_if_there(folder / "result.json")) is not None:
+        return done
+    folder.mkdir(parents=True, exist_ok=True)
     log = folder / "colmap.log"
-    (folder / "result.json").unlink(missing_ok=True)
     write_json(folder / "job.json", job)
     environment = dict(os.environ)
     root = str(Path(__file__).resolve().parent.parent)
@@ -189,110 +256,3 @@ def estimate(folder: Path, lines: Path, count: int, exhaustive_up_to: int) -> tu
     if phase == "features":
         return 0.2 * part, f"finding features, {rows} of {count} photos"
     return 0.2 + 0.55 * part, f"matching, {rows} of {int(total)} pairs"
-
-
-def views_of(result: dict, photos: list[Photo]) -> list[View]:
-    """The posed views of a worker's result, in photo order."""
-    source = {p.name: p.source for p in photos}
-    return [
-        View(**{**{k: x for k, x in v.items() if k != "camera"}, "source": source[v["name"]],
-                "rotation": np.array(v["rotation"]), "translation": np.array(v["translation"])})
-        for v in result["views"]
-    ]  # fmt: skip
-
-
-def judge(result: dict, photos: list[Photo]) -> dict:
-    """Decides whether a reconstruction can be trusted.
-
-    "All registered" is not "right": repeating textures give complete but wrong reconstructions, which show in the
-    focal length, the reprojection error or the spread of points.
-
-    Args:
-        result: of the worker.
-        photos: all photos.
-
-    Returns:
-        A dict for the report; `failures` is empty when the poses may be used, `warnings` are for the reader.
-    """
-    posed = {view["name"] for view in result["views"]}
-    needed = max(3, int(np.ceil(len(photos) / 2)))
-    left_out = [
-        {"photo": p.source, "why": left_out_reason(result["counts"].get(p.name, {}))}
-        for p in photos
-        if p.name not in posed
-    ]
-    failures, warnings = [], []
-    if len(posed) < needed:
-        failures.append(f"only {len(posed)} of {len(photos)} photos could be posed ({needed} are needed)")
-    elif left_out:
-        warnings.append(f"{len(left_out)} of {len(photos)} photos were left out")
-    focal = []
-    views = views_of(result, photos)
-    prior = {p.name: p.focal for p in photos}
-    for view in views:
-        fov = 2 * np.degrees(np.arctan(0.5 * max(view.width, view.height) / view.focal))
-        focal.append({"focal": round(view.focal, 2), "fov": round(float(fov), 2), "exif": prior[view.name]})
-    fovs = sorted({entry["fov"] for entry in focal})
-    off = [f for f in fovs if not FOV_RANGE[0] <= f <= FOV_RANGE[1]]
-    if off and len(posed) >= needed:
-        failures.append(f"implausible field of view of {off[0]:.0f} degrees: the poses are probably wrong")
-    ratios = [entry["focal"] / entry["exif"] for entry in focal if entry["exif"]]
-    if ratios and not 0.67 < float(np.median(ratios)) < 1.5:
-        warnings.append(f"focal length is {np.median(ratios):.2f} times what EXIF says (cropped photos?)")
-    error = result.get("mean_error", 0.0)
-    if error > MAX_MEAN_ERROR:
-        failures.append(f"mean reprojection error of {error:.1f} px (at most {MAX_MEAN_ERROR})")
-    angle = 0.0
-    if len(posed) >= needed and result.get("points", 0) < 30:
-        failures.append(f"only {result.get('points', 0)} points in common")
-    elif views:
-        angle = spread_angle(views, result)
-        if angle < MIN_TRIANGULATION:
-            failures.append(f"the cameras stand too close together ({angle:.1f} degrees apart as seen from the scene)")
-    return {
-        "photos": len(photos), "posed": len(posed), "needed": needed, "left_out": left_out,
-        "mean_error": round(error, 4), "points": result.get("points", 0),
-        "track_length": round(result.get("track_length", 0.0), 2), "models": result["models"],
-        "field_of_view": fovs, "focal": sorted({entry["focal"] for entry in focal}),
-        "spread_angle": round(angle, 2), "failures": failures, "warnings": warnings,
-    }  # fmt: skip
-
-
-def spread_angle(views: list[View], result: dict) -> float:
-    """Largest angle (degrees) between viewing rays to the centre of what the cameras look at."""
-    centers = np.array([v.center for v in views])
-    axes = np.array([v.rotation[2] for v in views])
-    from pipeline.normalise import nearest_to_axes
-
-    focus = nearest_to_axes(centers, axes)
-    rays = focus - centers
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True) + 1e-12
-    return float(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1, 1))))
-
-
-def left_out_reason(entry: dict) -> str:
-    """Why a photo has no pose, from its feature and match counts."""
-    found, best = entry.get("features", 0), entry.get("best_matches", 0)
-    if found < FEW_FEATURES:
-        return f"too few features ({found}): blurred, dark or without texture"
-    if best < FEW_MATCHES:
-        return f"too few matches with other photos (best pair: {best}): not enough overlap"
-    return f"its {best} matches do not agree with the rest of the reconstruction"
-
-
-def failure_message(verdict: dict) -> str:
-    """The verdict's failures and the photos left out, in one line."""
-    message = "camera poses: " + "; ".join(verdict["failures"])
-    left = verdict["left_out"]
-    if left:
-        named = [f"{entry['photo']}: {entry['why']}" for entry in left[:4]]
-        message += ". Left out: " + "; ".join(named) + (f"; and {len(left) - 4} more" if len(left) > 4 else "")
-    return message
-
-
-def failure_hint(verdict: dict) -> str:
-    """What to try, from the commonest reason."""
-    reasons = " ".join(entry["why"] for entry in verdict["left_out"])
-    if reasons.count("features") > reasons.count("overlap"):
-        return "take sharper photos in better light, or put something textured under the object"
-    return "take 20 to 60 photos in small steps around the object, each overlapping the one before by two thirds"

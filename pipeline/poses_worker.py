@@ -1,20 +1,24 @@
 """The child process of the poses stage: COLMAP through pycolmap. Run as `python -m pipeline.poses_worker JOB.json`.
 
-A process of its own, because a native abort or an endless loop in here must not take the user's session down.
+A process of its own, because a native abort or an endless loop in here must not take the user's session down. Killed
+and started again with the same job, it goes on with the features and matches that its database holds.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import shutil
 import sys
 import threading
 import time
 import zlib  # noqa: F401  pycolmap exports its own zlib symbols: the real one has to be there first.
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from pipeline.pair_checks import contradictions, counts, focal_of_pairs
 from sdfsim.files import write_arrays, write_json
 
 
@@ -39,8 +43,11 @@ def features(pycolmap, job: dict, database: Path) -> None:
     """Extracts features, one camera per group of photos of the same size and lens."""
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.use_gpu = False
+    extraction.max_image_size = job["pixels"]
     extraction.sift.max_num_features = job["max_features"]
     extraction.sift.peak_threshold = job["peak_threshold"]
+    extraction.sift.estimate_affine_shape = job["affine"]
+    pycolmap.Database.open(database).close()  # makes it
     for group in job["groups"]:
         reader = pycolmap.ImageReaderOptions()
         reader.camera_model = "SIMPLE_RADIAL"
@@ -48,15 +55,19 @@ def features(pycolmap, job: dict, database: Path) -> None:
             reader.mask_path = job["masks"]
         if group["focal"]:
             reader.camera_params = f"{group['focal']},{group['width'] / 2},{group['height'] / 2},0"
+        common = {"image_names": group["names"], "camera_mode": pycolmap.CameraMode.SINGLE}
+        if not all(_known(pycolmap, database, name) for name in group["names"]):
+            # Before extraction, whose threads would number photos in the order in which they happen to end.
+            pycolmap.import_images(database, job["images"], options=reader, **common)
         pycolmap.extract_features(
-            database,
-            job["images"],
-            image_names=group["names"],
-            camera_mode=pycolmap.CameraMode.SINGLE,
-            reader_options=reader,
-            extraction_options=extraction,
-            device=pycolmap.Device.cpu,
-        )
+            database, job["images"], reader_options=reader, extraction_options=extraction,
+            device=pycolmap.Device.cpu, **common,
+        )  # fmt: skip
+
+
+def _known(pycolmap, database: Path, name: str) -> bool:
+    with pycolmap.Database.open(database) as opened:
+        return opened.read_image_with_name(name) is not None
 
 
 def matches(pycolmap, job: dict, database: Path) -> None:
@@ -67,6 +78,7 @@ def matches(pycolmap, job: dict, database: Path) -> None:
     matching.sift.max_ratio = job["max_ratio"]
     verification = pycolmap.TwoViewGeometryOptions()
     verification.min_num_inliers = job["min_inliers"]
+    verification.filter_stationary_matches = job["moving_only"]
     verification.ransac.random_seed = job["seed"]
     # Pairs that do not overlap would otherwise use up all 10,000 trials each, most of the time of this stage.
     verification.ransac.min_inlier_ratio = job["min_inlier_ratio"]
@@ -83,19 +95,19 @@ def matches(pycolmap, job: dict, database: Path) -> None:
 
 
 def mapping(pycolmap, job: dict, database: Path, out: Path):
-    """Incremental mapping: the reconstruction with the most registered photos (or None), and how many were found."""
-    options = pycolmap.IncrementalPipelineOptions()
-    options.min_model_size = 3
-    options.max_num_models = 4
-    options.random_seed = job["seed"]
-    options.min_num_matches = job["min_inliers"]
-    options.mapper.random_seed = job["seed"]
-    options.triangulation.random_seed = job["seed"]
-    options.mapper.init_min_num_inliers = min(100, job["init_inliers"])
-    options.mapper.init_min_tri_angle = job["init_angle"]
-    options.mapper.abs_pose_min_num_inliers = job["pose_inliers"]
-    if job["one_thread"]:
-        options.num_threads = 1
+    """Reconstructions [..] from the matches: incremental or global mapping, or triangulation from known cameras."""
+    shutil.rmtree(out / "colmap", ignore_errors=True)
+    (out / "colmap").mkdir()
+    options = incremental_options(pycolmap, job)
+    if job["given"]:
+        known = given_cameras(pycolmap, job, database)
+        return [pycolmap.triangulate_points(known, database, job["images"], out / "colmap", options=options)]
+    if job["mapper"] == "global":
+        settings = pycolmap.GlobalPipelineOptions()
+        settings.num_threads, settings.random_seed = 1, job["seed"]
+        settings.min_num_matches = job["min_inliers"]
+        pycolmap.calibrate_view_graph(database, pycolmap.ViewGraphCalibrationOptions(random_seed=job["seed"]))
+        return list(pycolmap.global_mapping(database, job["images"], out / "colmap", options=settings).values())
     done = 0
 
     def count() -> None:
@@ -103,29 +115,53 @@ def mapping(pycolmap, job: dict, database: Path, out: Path):
         done += 1
         say(f"placed {done}")
 
-    (out / "colmap").mkdir(exist_ok=True)
     found = pycolmap.incremental_mapping(
         database, job["images"], out / "colmap", options=options, next_image_callback=count
     )
-    return max(found.values(), key=lambda r: (r.num_reg_images(), r.num_points3D()), default=None), len(found)
+    return list(found.values())
 
 
-def counts(pycolmap, database: Path) -> dict[str, dict]:
-    """Features of each photo, and the best and total number of verified matches with other photos."""
+def incremental_options(pycolmap, job: dict):
+    """Settings of incremental mapping: on one thread, as several add up in an order that differs from run to run."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.min_model_size = 3
+    options.max_num_models = 4
+    options.num_threads = options.mapper.num_threads = 1
+    options.random_seed = job["seed"]
+    options.min_num_matches = job["min_inliers"]
+    options.mapper.random_seed = job["seed"]
+    options.triangulation.random_seed = job["seed"]
+    options.mapper.init_min_num_inliers = min(100, job["init_inliers"])
+    options.mapper.init_min_tri_angle = job["init_angle"]
+    options.mapper.abs_pose_min_num_inliers = job["pose_inliers"]
+    options.ba_refine_focal_length = not job["hold_focal"]
+    options.mapper.abs_pose_refine_focal_length = not job["hold_focal"]
+    return options
+
+
+def given_cameras(pycolmap, job: dict, database: Path):
+    """A reconstruction without points, of the known cameras of the job."""
+    views = json.loads(Path(job["given"]).read_text(encoding="utf-8"))["views"]
+    model = pycolmap.Reconstruction()
     with pycolmap.Database.open(database) as opened:
-        images = {image.image_id: image.name for image in opened.read_all_images()}
-        result = {
-            name: {"features": int(opened.num_keypoints_for_image(key)), "best_matches": 0, "partners": 0}
-            for key, name in images.items()
-        }
-        pairs, geometries = opened.read_two_view_geometries()
-        for pair, geometry in zip(pairs, geometries, strict=True):
-            inliers = len(geometry.inlier_matches)
-            for key in pycolmap.pair_id_to_image_pair(pair):
-                entry = result[images[key]]
-                entry["best_matches"] = max(entry["best_matches"], inliers)
-                entry["partners"] += inliers > 0
-    return result
+        images = {image.name: image for image in opened.read_all_images()}
+        cameras = {}
+        for view in views:
+            lens = (view["width"], view["height"], view["focal"], view["cx"], view["cy"])
+            image = images[view["name"]]
+            if lens not in cameras:
+                cameras[lens] = pycolmap.Camera(
+                    camera_id=len(cameras) + 1, model="SIMPLE_RADIAL", width=view["width"], height=view["height"],
+                    params=[view["focal"], view["cx"], view["cy"], 0.0],
+                )  # fmt: skip
+                model.add_camera_with_trivial_rig(cameras[lens])
+            pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array(view["rotation"])), np.array(view["translation"]))
+            keypoints = opened.read_keypoints(image.image_id)[:, :2].astype(np.float64)
+            entry = pycolmap.Image(
+                name=view["name"], keypoints=keypoints, camera_id=cameras[lens].camera_id, image_id=image.image_id
+            )
+            model.add_image_with_trivial_frame(entry, pose)
+    return model
 
 
 def collect(reconstruction, out: Path) -> list[dict]:
@@ -169,17 +205,25 @@ def main(job_path: str) -> None:
     job = json.loads(Path(job_path).read_text(encoding="utf-8"))
     out = Path(job_path).parent
     database = out / "database.db"
-    database.unlink(missing_ok=True)
     pycolmap.set_random_seed(job["seed"])
-    say("phase features")
-    features(pycolmap, job, database)
-    say("phase matches")
-    matches(pycolmap, job, database)
+    if job["matches_of"]:
+        shutil.copyfile(job["matches_of"], database)
+    else:
+        say("phase features")
+        features(pycolmap, job, database)
+        say("phase matches")
+        matches(pycolmap, job, database)
     say("phase mapping")
-    best, models = mapping(pycolmap, job, database, out)
-    result = {"models": models, "counts": counts(pycolmap, database), "views": []}
-    if best is not None:
+    result: dict[str, Any] = {"views": [], "models": []}
+    result["counts"], result["pairs"], result["turn_only"] = counts(pycolmap, job, database)
+    result["focal_of_pairs"] = {} if job["given"] else focal_of_pairs(pycolmap, job, database, out)
+    models = sorted(mapping(pycolmap, job, database, out), key=lambda r: (-r.num_reg_images(), -r.num_points3D()))
+    for model in models:
+        result["models"].append(sorted(image.name for image in model.images.values() if image.has_pose))
+    if models:
+        best = models[0]
         result["views"] = collect(best, out)
+        result["contradictions"] = contradictions(pycolmap, database, result["views"])
         result["mean_error"] = float(best.compute_mean_reprojection_error())
         result["points"] = int(best.num_points3D())
         result["track_length"] = float(best.compute_mean_track_length())

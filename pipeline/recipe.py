@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 from pipeline.field import FieldSize
+from pipeline.mlp_field import MlpSize
 
 
 @dataclass(frozen=True)
@@ -13,7 +14,7 @@ class Recipe:
     """How a field is trained. Lengths are in normalised units (the scene is the unit sphere).
 
     Attributes:
-        size: resolutions of the field.
+        size: resolutions of the grids, or of the MLP of the VolSDF paper.
         start_radius: radius of the ball that training starts from. Small, because what is solid at first has to be
             carved away, and shadowed parts hardly are.
         iterations: steps of Adam.
@@ -30,7 +31,7 @@ class Recipe:
         surface_points: points of the eikonal loss.
     """
 
-    size: FieldSize = FieldSize()  # noqa: RUF009  frozen
+    size: FieldSize | MlpSize = FieldSize()  # noqa: RUF009  frozen
     start_radius: float = 0.25
     iterations: int = 1800
     rays: int = 512
@@ -41,7 +42,7 @@ class Recipe:
     eikonal: float = 0.1
     curvature: float = 0.01
     sparse: float = 0.3
-    free: float = 0.5
+    free: float = 1.0
     mask: float = 0.3
     surface_points: int = 512
 
@@ -52,6 +53,12 @@ PRESETS = {
     "fine": Recipe(
         size=FieldSize((16, 32, 64, 128, 224), (4, 4, 4, 4, 2), 64, 96),
         iterations=20000, rays=1024, samples=48, long_side=1280, beta=(0.1, 0.0015),
+    ),
+    # The paper's (section 4, appendix B): L1 colour, eikonal 0.1, Adam 5e-4, 1024 rays of 64 samples. Its beta is
+    # learned; sparse points, which the paper did without, get little weight.
+    "paper": Recipe(
+        size=MlpSize(), iterations=100_000, rays=1024, samples=64, long_side=1600, rate=5e-4, eikonal=0.1,
+        curvature=0.0, sparse=0.1, free=0.0, surface_points=2048,
     ),
 }  # fmt: skip
 
@@ -64,6 +71,7 @@ def beta_at(recipe: Recipe, fraction: float) -> float:
 
 def active_levels(recipe: Recipe, fraction: float) -> int:
     """Grid levels in use: two at first, the others one after the other until 45 % of training."""
+    assert isinstance(recipe.size, FieldSize)
     extra = len(recipe.size.levels) - 2
     return 2 + min(extra, int(extra * fraction / 0.45 + 0.4)) if extra > 0 else len(recipe.size.levels)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import hashlib
 import json
 import os
@@ -17,7 +16,6 @@ from sdfsim.files import write_json
 
 RECORD = "stage.json"
 UNFINISHED = "unfinished.json"
-LOCK = ".lock"
 
 
 def fingerprint(stage: str, inputs: str, options: dict, modules: tuple[str, ...]) -> str:
@@ -35,12 +33,12 @@ def fingerprint(stage: str, inputs: str, options: dict, modules: tuple[str, ...]
     return digest.hexdigest()
 
 
-def content_of_photos(folder: Path) -> str:
-    """Hash of the names and contents of the photos of a folder."""
-    from pipeline.photos import find_photos
+def content_of_photos(given: Path) -> str:
+    """Hash of the names and contents of the photos (or the video), their masks and cameras."""
+    from pipeline.sources import find_source
 
     digest = hashlib.sha256()
-    for path in find_photos(folder)[0]:
+    for path in find_source(given).files():
         digest.update(path.name.encode("utf-8", "surrogateescape") + b"\0")
         try:
             with open(path, "rb") as file:
@@ -120,20 +118,3 @@ def writing(folder: Path) -> Iterator[None]:
         hint = "free some space and run again: finished stages are kept" if error.errno in reasons else ""
         reason = reasons.get(error.errno or 0, error.strerror or str(error))
         raise SdfsimError(f"{error.filename or folder}: cannot be written ({reason})", hint) from error
-
-
-@contextlib.contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Keeps other runs out of a folder; the system lifts the lock when this process ends, however it ends.
-
-    Raises:
-        SdfsimError: another run is in there.
-    """
-    with open(folder / LOCK, "a") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise SdfsimError(
-                f"{folder}: another run is writing to this folder", "wait until it ends, or choose another folder"
-            ) from error
-        yield

@@ -6,18 +6,42 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
-from pipeline.field import BACKGROUND_SAMPLES, GridField, laplace_density, render_weights, sample_grid
+from pipeline.field import BACKGROUND_SAMPLES, Field, laplace_density, render_weights, sample_grid
 
 
 @torch.no_grad()
-def sdf_cache(field: GridField, resolution: int) -> Tensor:
-    """The SDF on a grid [1, 1, n, n, n] over [-1, 1]^3 (z, y, x order), from which samples along rays are chosen."""
-    line = torch.linspace(-1, 1, resolution, device=field.background.device)
-    z, y, x = torch.meshgrid(line, line, line, indexing="ij")
-    points = torch.stack([x, y, z], -1).view(-1, 3)
-    values = torch.cat([field.sdf(part) for part in points.split(1 << 16)])
-    return values.view(1, 1, resolution, resolution, resolution)
+def sdf_cache(field: Field, resolution: int, coarse: int = 4) -> Tensor:
+    """The SDF on a grid [1, 1, n, n, n] over [-1, 1]^3 (z, y, x order), from which samples along rays are chosen.
+
+    Every `coarse`-th value is the field's, the others only in blocks that the surface may cross; elsewhere, in empty
+    space and deep inside, they are interpolated.
+
+    Args:
+        field: the field.
+        resolution: n, a multiple of `coarse` plus 1.
+        coarse: see above.
+    """
+    device = field.background.device
+    line = torch.linspace(-1, 1, resolution, device=device)
+
+    def values(points: Tensor) -> Tensor:
+        return torch.cat([field.sdf(part) for part in points.split(1 << 16)])
+
+    knots = torch.stack(torch.meshgrid(*[line[::coarse]] * 3, indexing="ij"), -1)
+    rough = values(knots.view(-1, 3).flip(1)).view(1, 1, *knots.shape[:3])
+    cache = functional.interpolate(rough, size=(resolution,) * 3, mode="trilinear", align_corners=True)
+    low, high = -functional.max_pool3d(-rough, 2, 1), functional.max_pool3d(rough, 2, 1)
+    reach = 3**0.5 * coarse * float(line[1] - line[0])
+    block = torch.nonzero((low < reach) & (high > -reach))[:, 2:] * coarse
+    step = torch.stack(torch.meshgrid(*[torch.arange(coarse + 1, device=device)] * 3, indexing="ij"), -1).view(-1, 3)
+    near = torch.zeros_like(cache, dtype=torch.bool)
+    index = (block[:, None] + step).reshape(-1, 3)
+    near[0, 0, index[:, 0], index[:, 1], index[:, 2]] = True
+    index = torch.nonzero(near)[:, 2:]
+    cache[0, 0, index[:, 0], index[:, 1], index[:, 2]] = values(line[index].flip(1))
+    return cache
 
 
 def sphere_interval(origins: Tensor, directions: Tensor, near: float = 0.02) -> tuple[Tensor, Tensor]:
@@ -50,7 +74,7 @@ class Samples:
 
 @torch.no_grad()
 def choose_samples(
-    cache: Tensor, origins: Tensor, directions: Tensor, beta: float, uniforms: Tensor, *, bins: int = 64, plain: int = 8
+    cache: Tensor, origins: Tensor, directions: Tensor, beta: float, uniforms: Tensor, *, bins: int = 96, plain: int = 8
 ) -> Samples:
     """Distances of the samples along each ray: some evenly spread, most where the cached SDF has its surface.
 
@@ -90,7 +114,7 @@ def choose_samples(
 
 
 def composite(
-    field: GridField, samples: Samples, geometry: tuple[Tensor, Tensor, Tensor], beta: float, behind: Tensor
+    field: Field, samples: Samples, geometry: tuple[Tensor, Tensor, Tensor], beta: float | Tensor, behind: Tensor
 ) -> dict[str, Tensor]:
     """Renders rays from the field's values at their samples.
 
@@ -123,7 +147,7 @@ def composite(
 
 @torch.no_grad()
 def render(
-    field: GridField, cache: Tensor, origins: Tensor, directions: Tensor, beta: float, *,
+    field: Field, cache: Tensor, origins: Tensor, directions: Tensor, beta: float, *,
     samples: int = 32, backdrop: Tensor | None = None,
 ) -> dict[str, Tensor]:  # fmt: skip
     """Renders rays for looking at, without gradients and the same every time.

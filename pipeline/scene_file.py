@@ -1,50 +1,99 @@
-"""The scene.yaml of a reconstruction: the scenery, a floor below it, and a body dropped onto it."""
+"""The scene.yaml of a reconstruction: a floor, the scenery, the bodies found on it, and one dropped onto it."""
 
 from __future__ import annotations
 
 import hashlib
 import itertools
 import os
-from dataclasses import asdict
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import numpy as np
+
+from pipeline.asset import origin_of
+from pipeline.cleaning import joined
 from pipeline.drop import LEVEL, Drop, choose_drop
+from pipeline.meshing import read_parts
 from pipeline.placement import Placement, load_placement
+from sdfsim.errors import SdfsimError
 from sdfsim.files import write_text
 from sdfsim.shape.mesh import load_mesh
 
-BODY_DENSITY = 400.0  # kg/m^3, wood
+DENSITY = 400.0  # kg/m^3, wood: no photo tells what a thing is made of
+SURFACE = "friction: 0.8, restitution: 0.4"
 
 
-def scene_text(placement: Placement, drop: Drop, *, asset: str = "assets/scene", seed: int = 0) -> str:
-    """The text of scene.yaml: the scenery, a floor below it, and a flat box above it."""
-    side, thickness = f"{drop.side:.4f}", f"{drop.thickness:.4f}"
-    x, y, z = (f"{value:.4f}" for value in drop.position)
-    quat = ", ".join(f"{value:.5f}" for value in drop.quat_xyzw)
-    return f"""\
-# Reconstructed from photos. Up from the {"dominant plane" if placement.up_from == "plane" else "cameras"}.
-# Size {placement.size_from}{" (give --size for true metres)" if placement.size_from.startswith("assumed") else ""}.
-version: 1
-duration: 4.0                    # s
-seed: {seed}
-gravity: [0, 0, -9.81]           # m/s^2
-shapes:
-  scene: {{asset: {asset}}}
-  box: {{box: {{size: [{side}, {side}, {thickness}]}}}}
-bodies:
-  - {{name: floor, motion: static, plane: {{normal: [0, 0, 1], offset: {placement.floor:g}}}}}
-  - {{name: scene, shape: scene, motion: static, friction: 0.8, restitution: 0.4}}
-  - name: box
-    shape: box
-    position: [{x}, {y}, {z}]     # m
-    quat_xyzw: [{quat}]  # level with the surface below
-    density: {BODY_DENSITY:g}                 # kg/m^3
-    friction: 0.8
-    restitution: 0.4
-"""
+@dataclass(frozen=True)
+class Found:
+    """A body as the scene file needs it.
+
+    Attributes:
+        name: also of its asset.
+        origin: [3] m, where its shape's origin is.
+        static: a person wants it to stay.
+    """
+
+    name: str
+    origin: np.ndarray
+    static: bool = False
 
 
-def write_scene(mesh_folder: Path, scene_file: Path, *, written: str | None = None, seed: int = 0) -> dict:
+def scene_text(placement: Placement, drop: Drop | None, *, scenery: bool = True, found: Sequence[Found] = (),
+               shape: str = "box", seed: int = 0) -> str:  # fmt: skip
+    """The text of scene.yaml: a floor, the scenery, bodies that were found, and one dropped from above.
+
+    Args:
+        placement: of the meshes.
+        drop: where the last one starts; None leaves it out.
+        scenery: whether there is any.
+        found: bodies, with assets that go by their names.
+        shape: of what is dropped, box or ball.
+        seed: of the scene.
+    """
+    source = "the dominant plane" if placement.up_from == "plane" else "the cameras"
+    assumed = " (give --size or --distance for true metres)" if placement.size_from.startswith("assumed") else ""
+    lines = [
+        f"# Reconstructed from photos. Up from {source}, within {placement.up_within:.1f} degrees "
+        f"(confidence: {placement.up_confidence}).",
+        f"# Size {placement.size_from}{assumed}.",
+        "version: 1",
+        "duration: 4.0                    # s",
+        f"seed: {seed}",
+        "gravity: [0, 0, -9.81]           # m/s^2",
+        "shapes:",
+    ]
+    bodies = [f"  - {{name: floor, motion: static, plane: {{normal: [0, 0, 1], offset: {placement.floor:g}}}}}"]
+    if scenery:
+        lines.append("  scene: {asset: assets/scene}")
+        bodies.append(f"  - {{name: scene, shape: scene, motion: static, {SURFACE}}}")
+    for body in found:
+        lines.append(f"  {body.name}: {{asset: assets/{body.name}}}")
+        moves = "motion: static" if body.static else f"density: {DENSITY:g}"
+        bodies.append(
+            f"  - {{name: {body.name}, shape: {body.name}, position: {_numbers(body.origin)}, {moves}, {SURFACE}}}"
+        )
+    if drop is not None:
+        size = _numbers((drop.side, drop.side, drop.thickness))
+        lines.append(f"  {shape}: " + (f"{{box: {{size: {size}}}}}" if shape == "box" else
+                                       f"{{sphere: {{radius: {drop.thickness / 2:.4f}}}}}"))  # fmt: skip
+        bodies += [
+            f"  - name: {shape}",
+            f"    shape: {shape}",
+            f"    position: {_numbers(drop.position)}     # m",
+            f"    quat_xyzw: {_numbers(drop.quat_xyzw, 5)}  # level with the surface below",
+            f"    density: {DENSITY:g}                 # kg/m^3",
+            *(f"    {part}" for part in SURFACE.split(", ")),
+        ]
+    return "\n".join([*lines, "bodies:", *bodies, ""])
+
+
+def _numbers(values: Iterable[float], digits: int = 4) -> str:
+    return "[" + ", ".join(f"{value:.{digits}f}" for value in values) + "]"
+
+
+def write_scene(mesh_folder: Path, scene_file: Path, *, shape: str = "box", static: Sequence[str] = (),
+                written: str | None = None, seed: int = 0) -> dict:  # fmt: skip
     """Writes scene.yaml for the meshes of a mesh folder; returns where the body is dropped.
 
     A scene file that the user has changed is kept beside it as `scene.yaml.bak`.
@@ -52,27 +101,40 @@ def write_scene(mesh_folder: Path, scene_file: Path, *, written: str | None = No
     Args:
         mesh_folder: of the mesh stage.
         scene_file: to write.
+        shape: of what is dropped: box, ball or none.
+        static: bodies that are to stay where they are, by name.
         written: hash of the scene file as this function last wrote it; None where it never did.
         seed: of the scene.
 
     Raises:
-        SdfsimError: the mesh stage has not run.
+        SdfsimError: the mesh stage has not run, or no body has a name in `static`.
     """
-    shown, solid = load_mesh(Path(mesh_folder) / "mesh.ply"), load_mesh(Path(mesh_folder) / "solid.ply")
-    placement = load_placement(mesh_folder)
-    drop = choose_drop(shown, solid)
-    text = scene_text(placement, drop, seed=seed)
-    notes = []
+    mesh_folder = Path(mesh_folder)
+    parts, placement = read_parts(mesh_folder), load_placement(mesh_folder)
+    names = [entry["name"] for entry in parts["objects"]]
+    wrong = sorted(set(static) - set(names))
+    if wrong:
+        there = f"found: {', '.join(names)} (see mesh/objects.png)" if names else "no separate bodies were found"
+        raise SdfsimError(f"static: no body is called {', '.join(wrong)}", there)
+    solids = [load_mesh(mesh_folder / "objects" / f"{name}.ply") for name in names]
+    found = [Found(name, origin_of(mesh), name in static) for name, mesh in zip(names, solids, strict=True)]
+    notes: list[str] = []
+    drop = None
+    if shape != "none":
+        scenery = [load_mesh(mesh_folder / "solid.ply")] if parts["scenery"] else []
+        shown = load_mesh(mesh_folder / "shown.ply") if parts["scenery"] else joined(solids)
+        drop = choose_drop(shown, joined([*scenery, *solids]))
+        if drop.slope > LEVEL:
+            notes.append(f"no level place to drop a body onto: the flattest slopes by {drop.slope:.0f} degrees")
+    text = scene_text(placement, drop, scenery=parts["scenery"], found=found, shape=shape, seed=seed)
     if scene_file.exists() and content_hash(scene_file.read_bytes()) not in (written, content_hash(text.encode())):
         kept = free_name(scene_file)
         os.replace(scene_file, kept)
         notes.append(f"{scene_file.name} had been changed by hand: kept as {kept.name}")
     write_text(scene_file, text)
-    body = f"box of {drop.side:.3g} x {drop.side:.3g} x {drop.thickness:.3g} m"
-    if drop.slope > LEVEL:
-        notes.append(f"no level place to drop a body onto: the flattest slopes by {drop.slope:.0f} degrees")
     return {
-        "drop": asdict(drop), "body": body, "size": placement.size_from, "notes": notes,
+        "objects": names, "static": sorted(static), "density_assumed": DENSITY, "size": placement.size_from,
+        "drop": {"shape": shape, **(asdict(drop) if drop else {})}, "notes": notes,
         "scene_sha256": content_hash(text.encode()),
     }  # fmt: skip
 

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from pipeline import record
-from pipeline.options import LONG_SIDE, Options, read_config, write_config
+from pipeline.options import Options, read_config, write_config
 from pipeline.report import STAGES, current, place_of, write_report
 from sdfsim.errors import SdfsimError
-from sdfsim.files import replacing, write_json
+from sdfsim.files import locked
 
 Progress = Callable[[str, float, str], None]
 
@@ -20,14 +20,22 @@ Progress = Callable[[str, float, str], None]
 FIT_SHARE, AFTER_TRAINING = 0.15, 40.0
 
 # Whose source code makes a stage's result; a change there makes the result old.
+# fmt: off
 CODE = {
-    "photos": ("photos",),
-    "poses": ("photos", "cameras", "poses", "poses_worker", "normalise"),
-    "distill": ("photos", "cameras", "normalise", "rays", "field", "render", "recipe", "trainer", "distill"),
-    "mesh": ("cameras", "normalise", "field", "distill", "surface", "cleaning", "placement"),
+    "photos": ("sources", "given", "video", "rectify", "quality", "photo_file", "photos", "cameras"),
+    "poses": ("photos", "cameras", "poses", "poses_worker", "pair_checks", "verdict", "normalise"),
+    "distill": (
+        "photo_file", "cameras", "normalise", "rays", "field", "landmarks", "render", "recipe", "trainer", "distill",
+        "held_out", "mlp_field", "mlp_trainer", "error_bound",
+    ),
+    "mesh": (
+        "cameras", "normalise", "field", "distill", "volume", "visibility", "cleaning", "surface", "objects", "parts",
+        "placement", "scale", "picture", "meshing",
+    ),
     "fit": ("asset",),
-    "scene": ("scene_file", "drop", "placement"),
+    "scene": ("scene_file", "drop", "placement", "asset", "meshing"),
 }
+# fmt: on
 
 
 @dataclass
@@ -51,17 +59,18 @@ class Run:
 def reconstruct(
     photos: str | Path, out: str | Path, *, preset: str = "standard", size: float | None = None,
     budget: float | None = None, seed: int = 0, device: str = "auto", from_stage: str | None = None,
-    until_stage: str | None = None, progress: Progress | None = None,
+    until_stage: str | None = None, progress: Progress | None = None, **more: Any,
 ) -> dict:  # fmt: skip
     """Photos -> a scene that can be simulated.
 
-    Writes one folder a stage, `assets/scene/` (a Shape folder), `scene.yaml`, `config.yaml` and `report.json` to `out`.
+    Writes one folder a stage, Shape folders in `assets/`, `scene.yaml`, `config.yaml`, `report.json` and
+    `report.html` to `out`.
     A stage whose inputs, options and code are those of its last run is skipped; a run that was killed goes on.
 
     Args:
-        photos: folder of photos; never written to.
+        photos: folder of photos, video, transforms.json or COLMAP model; never written to.
         out: folder to write; made where missing.
-        preset: quick, standard or fine.
+        preset: quick, standard or fine; paper is the network of the VolSDF paper, for a GPU.
         size: widest side of the scene, m; None: 1 m is assumed, and the report says so.
         budget: s for everything.
         seed: of everything random.
@@ -69,6 +78,7 @@ def reconstruct(
         from_stage: do this stage and all after it again.
         until_stage: stop after this stage.
         progress: called with (stage, fraction, message).
+        **more: distance, crop, keep, static, drop: see `Options`.
 
     Returns:
         The report, as in report.json.
@@ -76,7 +86,7 @@ def reconstruct(
     Raises:
         SdfsimError: bad photos or options (exit code 1), poses or surface not good enough (exit code 3).
     """
-    options = Options(str(photos), preset, size, budget, seed, device)
+    options = Options(str(photos), preset, size, budget, seed, device, **more)
     options.check()
     for name in (from_stage, until_stage):
         if name is not None and name not in STAGES:
@@ -84,17 +94,16 @@ def reconstruct(
     first = STAGES.index(from_stage) if from_stage else len(STAGES)
     last = STAGES.index(until_stage) if until_stage else len(STAGES) - 1
     run = Run(Path(out), options, progress)
-    from pipeline.photos import find_photos
+    from pipeline.sources import find_source
 
-    find_photos(Path(photos))  # Before anything is written.
+    find_source(Path(photos))  # Before anything is written.
     with record.writing(run.folder):
         run.folder.mkdir(parents=True, exist_ok=True)
-        with record.locked(run.folder):
+        with locked(run.folder):
             write_config(options, run.folder)
             for number, stage in enumerate(STAGES[: last + 1]):
-                run_one(run, stage, again=number >= first)
-                write_report(run.folder, options)
-            return write_report(run.folder, options)
+                run_reported(run, stage, again=number >= first)
+            return write_reports(run)
 
 
 def run_stage(name: str, folder: str | Path, *, progress: Progress | None = None, again: bool = False,
@@ -121,9 +130,9 @@ def run_stage(name: str, folder: str | Path, *, progress: Progress | None = None
     unknown = set(known) - set(asdict(run.options))
     if unknown:
         raise SdfsimError(f"no such option: {', '.join(sorted(unknown))}")
-    run.options = replace(run.options, **known)
+    run.options = run.options.changed(known)
     run.options.check()
-    with record.writing(run.folder), record.locked(run.folder):
+    with record.writing(run.folder), locked(run.folder):
         done = current(run.folder)
         for before in STAGES[: STAGES.index(name)]:
             if before not in done:
@@ -131,8 +140,27 @@ def run_stage(name: str, folder: str | Path, *, progress: Progress | None = None
                 command = "poses" if before == "photos" else before  # No command does the photos alone.
                 raise SdfsimError(f"{folder}: the {before} stage {why}", f"run `sdfsim {command}` first")
         write_config(run.options, run.folder)
-        run_one(run, name, again=again)
-        return write_report(run.folder, run.options)
+        run_reported(run, name, again=again)
+        return write_reports(run)
+
+
+def run_reported(run: Run, stage: str, *, again: bool) -> None:
+    """Runs one stage; the report tells what came of it, also where that is an error."""
+    try:
+        run_one(run, stage, again=again)
+    except SdfsimError as error:
+        write_reports(run, (stage, error))
+        raise
+    write_report(run.folder, run.options)
+
+
+def write_reports(run: Run, failed: tuple[str, SdfsimError] | None = None) -> dict:
+    """Writes report.json and report.html; returns the former."""
+    from pipeline.report_page import write_page
+
+    report = write_report(run.folder, run.options, failed)
+    write_page(run.folder, report)
+    return write_report(run.folder, run.options, failed)  # Now its paths name the page as well.
 
 
 def run_one(run: Run, stage: str, *, again: bool) -> None:
@@ -164,9 +192,7 @@ def do_photos(run: Run, work: Path) -> dict:
     """Photos stage."""
     from pipeline.photos import prepare_photos
 
-    photos, notes = prepare_photos(
-        Path(run.options.photos), work, long_side=LONG_SIDE[run.options.preset], on_progress=run.tell("photos")
-    )
+    photos, notes = prepare_photos(Path(run.options.photos), work, on_progress=run.tell("photos"))
     return {"count": len(photos), "notes": notes, "masks": sum(p.mask for p in photos)}
 
 
@@ -199,37 +225,24 @@ def do_distill(run: Run, work: Path) -> dict:
 
 def do_mesh(run: Run, work: Path) -> dict:
     """Mesh stage."""
-    from pipeline.cameras import load_sparse, load_views
-    from pipeline.distill import load_field
-    from pipeline.placement import place
-    from pipeline.surface import PRESET_RESOLUTION, extract
-    from sdfsim.shape.storage import write_ply
+    from pipeline.meshing import make_meshes
+    from pipeline.sources import find_source
 
-    trained = load_field(run.place("distill"))
-    views = trained.normalisation.views(load_views(run.place("poses")))
-    points = trained.normalisation.apply(load_sparse(run.place("poses")).xyz)
-    surface = extract(
-        trained.field, views, points, run.place("photos"), resolution=PRESET_RESOLUTION[run.options.preset],
-        on_progress=run.tell("mesh"),
+    named = find_source(Path(run.options.photos)).folder
+    return make_meshes(
+        run.place("distill"), run.place("poses"), run.place("photos"), named, work,
+        preset=run.options.preset, wishes=run.options.wishes(), on_progress=run.tell("mesh"),
     )  # fmt: skip
-    placement = place(surface.shown, views, run.options.size)
-    shown = placement.mesh(surface.shown)
-    for name, mesh in (("mesh.ply", shown), ("solid.ply", placement.mesh(surface.solid))):
-        with replacing(work / name) as partial:
-            partial.write_bytes(write_ply(mesh))
-    write_json(work / "placement.json", placement.to_dict())
-    extent = (shown.vertices.max(0) - shown.vertices.min(0)).round(4).tolist()
-    return {**surface.report, "extent_m": extent, "up_from": placement.up_from, "size": placement.size_from}
 
 
 def do_fit(run: Run, work: Path) -> dict:
     """Fit stage."""
-    from pipeline.asset import fit_scenery
+    from pipeline.asset import fit_parts
     from sdfsim.threads import choose_threads, network_work
 
     choose_threads(network_work, repeat=10)
     budget = None if run.options.budget is None else max(10.0, FIT_SHARE * run.options.budget)
-    return fit_scenery(
+    return fit_parts(
         run.place("mesh"), work, budget=budget, recipe=run.options.recipe, seed=run.options.seed,
         on_progress=run.tell("fit"),
     )  # fmt: skip
@@ -241,7 +254,10 @@ def do_scene(run: Run, work: Path) -> dict:
 
     before = record.read(run.place("scene"))
     written = before["report"].get("scene_sha256") if before else None
-    return write_scene(run.place("mesh"), run.folder / "scene.yaml", written=written, seed=run.options.seed)
+    return write_scene(
+        run.place("mesh"), run.folder / "scene.yaml", shape=run.options.drop, static=run.options.static,
+        written=written, seed=run.options.seed,
+    )  # fmt: skip
 
 
 ACTIONS: dict[str, Callable[[Run, Path], dict]] = {

@@ -3,70 +3,33 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import safetensors.torch
 import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from pipeline.cameras import Sparse, View
 from pipeline.field import (
     BACKGROUND_SAMPLES,
+    Field,
+    FieldSize,
     GridField,
     differences,
     level_step,
     stencil,
 )
-from pipeline.normalise import Normalisation, point_weights
-from pipeline.photos import BACKDROP
+from pipeline.landmarks import FreeSpace, Landmarks
+from pipeline.photo_file import BACKDROP
 from pipeline.rays import Rays
 from pipeline.recipe import Recipe, active_levels, beta_at, rate_at, view_dependence_at
 from pipeline.render import Samples, choose_samples, composite, sdf_cache
 from sdfsim.files import replacing
 
-
-@dataclass(frozen=True)
-class Landmarks:
-    """What structure-from-motion knows about the scene, in normalised space.
-
-    Attributes:
-        points: [P, 3] surface points in the unit sphere.
-        weights: [P] how far each is trusted, mean 1.
-        sight: [L, 6] starts and ends of stretches of free space.
-    """
-
-    points: np.ndarray
-    weights: np.ndarray
-    sight: np.ndarray
-
-
-def find_landmarks(sparse: Sparse, views: list[View], normalisation: Normalisation) -> Landmarks:
-    """Sparse points seen by three views or more with a small error, and their lines of sight within the sphere.
-
-    Args:
-        sparse: in the world of the poses.
-        views: in normalised space.
-        normalisation: from one to the other.
-    """
-    points = normalisation.apply(sparse.xyz)
-    seen = np.bincount(sparse.point_of, minlength=len(points))
-    good = (seen >= 3) & (sparse.error < 1.5)
-    inside = good & (np.linalg.norm(points, axis=1) < 1.0)
-    weights = point_weights(sparse, len(points))[inside]
-    use = good[sparse.point_of]
-    end, start = points[sparse.point_of[use]], np.array([v.center for v in views]).reshape(-1, 3)[sparse.view_of[use]]
-    length = np.linalg.norm(end - start, axis=1)
-    direction = (end - start) / np.maximum(length, 1e-9)[:, None]
-    along = -(start * direction).sum(1)
-    half = np.sqrt(np.maximum(1 - ((start**2).sum(1) - along**2), 0))
-    # Not all the way: a point is uncertain by a little, and so is the surface there.
-    low, high = np.maximum(along - half, 0), np.minimum(along + half, length - 0.04)
-    crosses = (half > 0) & (high > low + 0.02)
-    sight = np.concatenate([start + low[:, None] * direction, start + high[:, None] * direction], 1)[crosses]
-    return Landmarks(points[inside], weights / max(float(weights.mean()), 1e-9) if len(weights) else weights, sight)
+# Steps between updates of the cached SDF, fewer at first; a multiple, so that both fall on the same steps.
+EARLY, EARLY_PERIOD, PERIOD = 288, 16, 48
+CACHE = 129  # samples a side of the cached SDF; what is thinner than its cells is found by luck only
+HOLLOWS = 0.25  # of the training is done before filled free space is looked for
 
 
 class Trainer:
@@ -82,45 +45,70 @@ class Trainer:
 
     def __init__(self, recipe: Recipe, rays: Rays, landmarks: Landmarks, seed: int, device: str = "cpu") -> None:
         self.recipe, self.rays, self.seed, self.device = recipe, rays.to(device), seed, device
-        self.points, self.point_weights, self.sight = (
-            torch.tensor(values, dtype=torch.float32, device=device)
-            for values in (landmarks.points, landmarks.weights, landmarks.sight)
+        self.points, self.point_weights = (
+            torch.tensor(values, dtype=torch.float32, device=device) for values in (landmarks.points, landmarks.weights)
         )
-        self.field = GridField(recipe.size, seed, recipe.start_radius).to(device)
-        grids = [*self.field.grids, self.field.background]
-        networks = [p for name, p in self.field.named_parameters() if not name.startswith(("grids", "background"))]
-        self.optimizer = torch.optim.Adam(
-            [
-                {"params": grids, "lr": recipe.rate, "base": recipe.rate},
-                {"params": networks, "lr": recipe.rate / 4, "base": recipe.rate / 4},
-            ],
-            betas=(0.9, 0.99), eps=1e-12, fused=True,
-        )  # fmt: skip
+        self.free = FreeSpace(landmarks.sight, device)
+        self.field, self.optimizer = self.fresh()
         self.iteration = 0
         self.iterations = recipe.iterations
         self.seconds = 0.0
         self.cache: Tensor | None = None
+
+    def fresh(self) -> tuple[Field, torch.optim.Adam]:
+        """A field that nothing was learned by yet, and its optimiser."""
+        recipe = self.recipe
+        assert isinstance(recipe.size, FieldSize)
+        field = GridField(recipe.size, self.seed, recipe.start_radius).to(self.device)
+        grids = [*field.grids, field.background]
+        networks = [p for name, p in field.named_parameters() if not name.startswith(("grids", "background"))]
+        groups = [
+            {"params": grids, "lr": recipe.rate, "base": recipe.rate},
+            {"params": networks, "lr": recipe.rate / 4, "base": recipe.rate / 4},
+        ]
+        return field, torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12, fused=True)
+
+    @property
+    def beta(self) -> float:
+        """Scale of the density now, normalised units."""
+        return beta_at(self.recipe, self.fraction)
 
     @property
     def fraction(self) -> float:
         """Share of the training that is done."""
         return self.iteration / self.iterations
 
+    @property
+    def period(self) -> int:
+        """Steps between updates of the cache; of the iteration alone, so that a resumed run does the same."""
+        return EARLY_PERIOD if self.iteration < EARLY else PERIOD
+
     def refresh(self) -> None:
         """Brings the cached SDF and the active levels up to date."""
         self.field.active = active_levels(self.recipe, self.fraction)
         self.field.view_dependence = view_dependence_at(self.fraction)
-        self.cache = sdf_cache(self.field, 64)
+        self.cache = sdf_cache(self.field, CACHE)
+        self.look()
+
+    def show(self) -> None:
+        """Makes the cached SDF good enough for pictures, without a change to the training."""
+        if self.cache is None:
+            self.refresh()
+
+    def look(self) -> None:
+        """Finds free space that the cached SDF fills, once the field is fine enough to have room for a hollow."""
+        # A function of the step at which the cache was made, so that a resumed run finds the same.
+        made = self.iteration - self.iteration % self.period
+        if self.cache is not None and made > HOLLOWS * self.iterations and len(self.free):
+            self.free.look(self.cache, torch.Generator().manual_seed((self.seed + 11) * 1_000_003 + made))
 
     def step(self) -> dict[str, float]:
         """One step of Adam; returns the losses."""
         recipe, field = self.recipe, self.field
-        # A function of the iteration alone, so that a resumed run equals an undisturbed one.
-        period = 16 if self.iteration < 256 else 48
-        if self.cache is None or self.iteration % period == 0:
+        if self.cache is None or self.iteration % self.period == 0:
             self.refresh()
         assert self.cache is not None
-        beta = beta_at(recipe, self.fraction)
+        beta = self.beta
         rng = torch.Generator().manual_seed((self.seed + 7) * 1_000_003 + self.iteration)
         index = self.rays.batch(recipe.rays, self.seed, self.iteration)
         origins, directions = self.rays.at(index)
@@ -131,11 +119,13 @@ class Trainer:
         behind = torch.full((3,), BACKDROP, device=self.device)
         if not masked:
             behind = field.background_along(origins, directions, uniforms[:, recipe.samples :])
+        assert isinstance(recipe.size, FieldSize)
         width = level_step(recipe.size.levels, field.active)
         around = stencil(self.regularised(samples, rng), width)
         pick = torch.randint(max(1, len(self.points)), (min(256, len(self.points)),), generator=rng).to(self.device)
         # One query for all: each would otherwise fill a gradient buffer as large as the grids.
-        parts = [samples.points.view(-1, 3), around.view(-1, 3), self.points[pick], self.free_points(rng)]
+        empty, clearance = self.free.pick(512, rng)
+        parts = [samples.points.view(-1, 3), around.view(-1, 3), self.points[pick], empty]
         sdf, features, grid = field.geometry_at(torch.cat(parts))
         rendered, stencils = len(parts[0]), len(parts[0]) + len(parts[1])
         pinned = stencils + len(pick)
@@ -153,25 +143,19 @@ class Trainer:
             # Robust: a wrong point must not pull a surface out of nothing.
             pull = self.point_weights[pick] * sdf[stencils:pinned].abs().clamp_max(0.1)
             losses["sparse"] = pull.mean() * recipe.sparse
-        if len(self.sight):
-            losses["free"] = torch.relu(0.02 - sdf[pinned:]).mean() * recipe.free
-        total = torch.stack(list(losses.values())).sum()
+        if len(empty):
+            losses["free"] = torch.relu(clearance - sdf[pinned:]).mean() * recipe.free
+        return self.update(losses, rate_at(self.fraction))
+
+    def update(self, losses: dict[str, Tensor], factor: float) -> dict[str, float]:
+        """One step of Adam down the sum of the losses, at `factor` of the full rates; returns the losses."""
         self.optimizer.zero_grad(set_to_none=True)
-        total.backward()
-        factor = rate_at(self.fraction)
+        torch.stack(list(losses.values())).sum().backward()
         for group in self.optimizer.param_groups:
             group["lr"] = group["base"] * factor
         self.optimizer.step()
         self.iteration += 1
         return {name: float(value.detach()) for name, value in losses.items()}
-
-    def free_points(self, rng: torch.Generator) -> Tensor:
-        """Points [P, 3] between cameras and sparse points that they see: free space, whatever the colours say."""
-        count = min(256, len(self.sight))
-        pick = torch.randint(max(1, len(self.sight)), (count,), generator=rng).to(self.device)
-        along = torch.rand(count, 1, generator=rng).to(self.device)
-        start, end = self.sight[pick, :3], self.sight[pick, 3:]
-        return start + along * (end - start)
 
     def regularised(self, samples: Samples, rng: torch.Generator) -> Tensor:
         """Points [P, 3] of the sphere for the eikonal and curvature losses, half of them near the surface."""
@@ -220,6 +204,7 @@ class Trainer:
         self.seconds, self.field.active = about["seconds"], about["active"]
         self.field.view_dependence = about["view_dependence"]
         self.cache = tensors.get("cache")
+        self.look()
         return True
 
     def parameters(self) -> list[torch.nn.Parameter]:

@@ -7,6 +7,11 @@ EXIT_QUALITY = 3
 EXIT_INTERRUPTED = 130
 
 
+def printable(text: str) -> str:
+    """`text` with escapes for what is not printable: file names and keys of strangers may hold terminal codes."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
 class SdfsimError(Exception):
     """Something a user can act on.
 
@@ -17,6 +22,7 @@ class SdfsimError(Exception):
     """
 
     def __init__(self, message: str, hint: str = "", *, exit_code: int = EXIT_ERROR) -> None:
+        message = "\n".join(map(printable, message.split("\n")))
         super().__init__(message)
         self.message = message
         self.hint = hint
@@ -34,5 +40,5 @@ class SceneError(SdfsimError):
     """
 
     def __init__(self, problems: list[str], hint: str = "") -> None:
-        super().__init__("\n".join(problems), hint)
-        self.problems = problems
+        self.problems = [printable(problem) for problem in problems]
+        super().__init__("\n".join(self.problems), hint)

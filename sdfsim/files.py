@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
+import math
 import os
 import tempfile
 import zipfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sdfsim.errors import SdfsimError
+
+LOCK = ".lock"
+# What an archive may unpack to: so many bytes, or so many times its own size.
+FREELY, MOST_GROWTH = 2**30, 100
 
 
 @contextmanager
@@ -50,7 +56,7 @@ def read_json(path: Path, hint: str = "") -> Any:
     """The content of a JSON file. Raises SdfsimError when it is absent or not JSON."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise SdfsimError(f"{path}: cannot be read: {error}", hint) from error
 
 
@@ -64,13 +70,67 @@ def read_arrays(path: Path, what: str, hint: str = "") -> dict[str, np.ndarray]:
     """All arrays of an `.npz` file; `what` says in the message what it should have been.
 
     Raises:
-        SdfsimError: absent, cut short, or not such a file.
+        SdfsimError: absent, cut short, not such a file, or one that claims an absurd size.
     """
     try:
+        _check_sizes(path)
         with np.load(path, allow_pickle=False) as data:
             return {name: data[name] for name in data.files}
-    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+    except Exception as error:  # the readers raise whatever a damaged file made them stumble over
         raise SdfsimError(f"{path}: cannot be read as {what}: {error}", hint) from error
+
+
+def _check_sizes(path: Path) -> None:
+    """Raise ValueError where an `.npz` would take far more memory than what is in it."""
+    with zipfile.ZipFile(path) as archive:
+        unpacked = sum(member.file_size for member in archive.infolist())
+        if unpacked > max(FREELY, MOST_GROWTH * path.stat().st_size):
+            raise ValueError(f"it would unpack to {unpacked / 2**30:.1f} GiB")
+        for member in archive.infolist():
+            with archive.open(member) as file:
+                major, _ = np.lib.format.read_magic(file)
+                read = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
+                shape, _, dtype = read(file)
+                if dtype.itemsize * math.prod(shape) > member.file_size:
+                    raise ValueError(f"{member.filename} claims more values than it holds")
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Make a folder, keep other runs out of it inside the block, and clear away what a killed one left half-written.
+
+    The system lifts the lock when this process ends, however it ends. A folder made here goes again if nothing came
+    into it.
+
+    Raises:
+        SdfsimError: another run is in there, or the folder cannot be written.
+    """
+    path, made = folder / LOCK, not folder.exists()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = open(path, "a")
+    except OSError as error:
+        raise SdfsimError(f"{folder}: cannot be written: {error.strerror}", "choose another folder") from error
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            alone = os.path.samestat(os.fstat(file.fileno()), path.stat())
+        except (BlockingIOError, FileNotFoundError):  # the latter: another run has just ended and removed its lock
+            alone = False
+        if not alone:
+            raise SdfsimError(
+                f"{folder}: another run is writing to this folder", "wait until it ends, or choose another folder"
+            )
+        for left in folder.glob(".*.part"):
+            if left.is_file():
+                left.unlink(missing_ok=True)
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
+            if made:
+                with suppress(OSError):  # not empty: something came of it
+                    folder.rmdir()
 
 
 def check_writable(folder: Path) -> None:

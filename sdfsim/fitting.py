@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from sdfsim.dynamics.simulator import pick_device
 from sdfsim.errors import SdfsimError
-from sdfsim.files import check_writable, read_json
+from sdfsim.files import check_writable, locked, read_json
 from sdfsim.parallel import parallel
 from sdfsim.progress import columns, duration
 from sdfsim.shape.asset import RECORD_FILE, Shape
@@ -51,24 +51,25 @@ def fit(mesh_file: Path, out: Path, options: Options, *, device: str, on_progres
         was missed.
 
     Raises:
-        SdfsimError: the mesh cannot be used, or the folder cannot be written.
+        SdfsimError: the mesh cannot be used, the folder cannot be written, or another run is writing to it.
     """
     mesh = load_mesh(mesh_file)
     check_writable(out)
-    checkpoint = out / "fit.checkpoint"
-    shape = fit_mesh(
-        mesh,
-        name=out.resolve().name,
-        recipe=options.recipe,
-        budget=options.budget,
-        cap=options.cap,
-        thicken=options.thicken,
-        on_progress=on_progress,
-        checkpoint=checkpoint,
-        device=pick_device(device),
-    )
-    report = _save(shape, mesh_file, out, options)
-    checkpoint.unlink(missing_ok=True)
+    with locked(out):
+        checkpoint = out / "fit.checkpoint"
+        shape = fit_mesh(
+            mesh,
+            name=out.resolve().name,
+            recipe=options.recipe,
+            budget=options.budget,
+            cap=options.cap,
+            thicken=options.thicken,
+            on_progress=on_progress,
+            checkpoint=checkpoint,
+            device=pick_device(device),
+        )
+        report = _save(shape, mesh_file, out, options)
+        checkpoint.unlink(missing_ok=True)
     missed = [] if shape.certificate["passed"] else [f"fit: {shape.certificate['reason']}"]
     return report | {"failed_checks": missed}
 

@@ -9,20 +9,30 @@ from typing import Any
 
 import numpy as np
 
-from sdfsim.dynamics.memory import BYTES_A_ROW
+from sdfsim.dynamics.memory import peak_bytes
 from sdfsim.dynamics.model import load_model
 from sdfsim.dynamics.ranges import constant_in_training
 from sdfsim.dynamics.simulator import Simulator, pick_device
+from sdfsim.progress import duration
 from sdfsim.scene.effects import Plan, plan
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.schema import DEFAULT_DURATION, DEFAULT_GRAVITY
+from sdfsim.scene.thin import may_pass_through
 from sdfsim.scene.types import Effects, Scene
+from sdfsim.shape.mlp import MlpSdf
+from sdfsim.studies.tradeoff_cost import stored_cost
+from sdfsim.studies.tradeoff_estimate import estimate, landings
 
 TRIAL_STEPS = 5
 
 
 def describe(
-    scene_file: Path, *, model: str | None, device: str, on_progress: Callable[[str, float, str], None]
+    scene_file: Path,
+    *,
+    model: str | None,
+    device: str,
+    on_progress: Callable[[str, float, str], None],
+    allow_outside: bool = False,
 ) -> dict[str, Any]:
     """The plan of a scene with its units and the cost of a step, measured over the first few.
 
@@ -31,6 +41,7 @@ def describe(
         model: bundled name or path (None: what the scene says).
         device: cpu, cuda or auto.
         on_progress: called with (stage, fraction, message).
+        allow_outside: whether the scene may name files outside of its own folder.
 
     Raises:
         SdfsimError: bad input.
@@ -38,10 +49,14 @@ def describe(
     pick_device(device)
     if model:
         load_model(model, weights=False)
-    scene = load_scene(scene_file, on_progress=lambda fraction, message: on_progress("shapes", fraction, message))
+
+    def tell(fraction: float, message: str) -> None:
+        on_progress("shapes", fraction, message)
+
+    scene = load_scene(scene_file, tell, allow_outside=allow_outside)
     decided = plan(scene)
     simulator = Simulator(scene, model=model, device=device)
-    units = simulator.units
+    units, steps = simulator.units, max(1, round(scene.duration / simulator.dt))
     return {
         "scene": str(scene_file),
         "effects": {name: asdict(effect) for name, effect in decided.effects().items()},
@@ -50,35 +65,43 @@ def describe(
         "kinematic": list(decided.kinematic_bodies),
         "masses_kg": {b.name: b.mass for b in scene.bodies if b.motion == "dynamic"},
         "nodes": decided.nodes,
-        **_costs(simulator, decided),
+        **_costs(simulator, decided, steps),
         "model": simulator.model.name,
         "device": str(simulator.device),
         "duration_s": scene.duration,
         "dt_s": simulator.dt,
-        "steps": max(1, round(scene.duration / simulator.dt)),
+        "steps": steps,
         "units": {"length_m": units.length, "time_s": units.time, "mass_kg": units.mass},
         "outside_training": simulator.outside_training,
         "constant_in_training": constant_in_training(simulator.model),
+        "may_pass_through": may_pass_through(scene, simulator.dt),
         "not_default": _not_default(scene, model),
         "failed_checks": [f"fit of shape {told}" for told in scene.missed],
     }
 
 
-def _costs(simulator: Simulator, decided: Plan) -> dict[str, Any]:
-    """Pairs by what filters them, and nodes, edges, memory and time of a step."""
+def _costs(simulator: Simulator, decided: Plan, steps: int) -> dict[str, Any]:
+    """Pairs by what filters them; nodes, edges, memory and time of a step; time of the run, where costs are known."""
+    cost = stored_cost(simulator.model)
+    landed = None if cost is None else landings(simulator, steps)
     counters = simulator.run(steps=TRIAL_STEPS).counters
     near = int(counters["pairs"][1])
-    worked_on = max(counters["sdf_queries"].max(), counters["edges"].max(), counters["nodes"].max())
-    if simulator.rules.rows is not None:
-        worked_on = min(worked_on, simulator.rules.rows)
-    held = sum(v.nelement() * v.element_size() for v in vars(simulator.bodies).values() if hasattr(v, "element_size"))
+    run = None if cost is None or landed is None else estimate(cost, simulator, counters, landed, steps)
+    memory = peak_bytes(
+        nodes=len(simulator.bodies.node),
+        edges=max(float(counters["edges"].max()), 0.0 if run is None else run["edges"]),
+        points=float((counters["sdf_queries"] + counters["sdf_waiting"]).max()),
+        fitted=any(isinstance(sdf, MlpSdf) for sdf in simulator.bodies.bank.sdfs),
+        rows=simulator.rules.rows,
+    )
     return {
         "pairs": {**asdict(decided.pairs), "apart": decided.pairs.possible - near, "near": near},
         "step": {
             **{k: float(counters[k][1:].max()) for k in ("nodes", "edges", "sdf_queries")},
-            "memory_mib": float(held + worked_on * BYTES_A_ROW) / 2**20,
+            "memory_mib": memory / 2**20,
         },
         "step_ms": float(np.median(counters["step_ms"][1:])),
+        "run": run,
     }
 
 
@@ -116,10 +139,21 @@ def plan_lines(report: dict[str, Any]) -> list[str]:
         f"{pairs['near']} left",
         f"model {report['model']} on {report['device']}: {report['steps']} steps of {report['dt_s']:.4g} s",
         f"a step (over the first {TRIAL_STEPS}): {report['step_ms']:.1f} ms, {step['sdf_queries']:.0f} distances, "
-        f"{step['nodes']:.0f} nodes and {step['edges']:.0f} edges in the network, {step['memory_mib']:.1f} MiB",
+        f"{step['nodes']:.0f} nodes and {step['edges']:.0f} edges in the network, {step['memory_mib']:.0f} MiB",
+        *_run_lines(report["run"]),
         f"Froude scaling: the model's metre is {units['length_m']:.4g} m, its second {units['time_s']:.4g} s, "
         f"its kilogram {units['mass_kg']:.4g} kg",
         *(f"outside the model's training: {line}" for line in report["outside_training"]),
         *(f"constant in the model's training, so not learned: {name}" for name in report["constant_in_training"]),
+        *(f"may pass through: {line}" for line in report["may_pass_through"]),
         *(f"not the default: {name}: {said}" for name, said in report["not_default"].items()),
+    ]
+
+
+def _run_lines(run: dict[str, float] | None) -> list[str]:
+    if run is None:
+        return []
+    return [
+        f"the whole run: about {duration(run['seconds'])}, {run['step_ms']:.1f} ms a step with {run['in_contact']:.1f} "
+        f"bodies in contact and {run['edges']:.0f} edges in the mean"
     ]

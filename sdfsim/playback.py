@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sdfsim.crowds import crowds
 from sdfsim.dynamics.memory import PHASES
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.files import replacing
@@ -23,12 +24,14 @@ WORLD = "world"
 CONTACTS = "world/contacts"
 PLOTS = {
     "kinetic_energy": "kinetic energy (J)",
+    "energy_gain": "energy from nothing (J)",
     "worst_penetration": "worst penetration (m)",
     "contacts": "contacts",
     "pairs": "near pairs of bodies",
     "free": "free",
     "active": "active",
     "asleep": "asleep",
+    "held_back": "held back",
     "sdf_queries": "asked",
     "sdf_waiting": "waiting",
     "nodes": "nodes",
@@ -38,9 +41,10 @@ PLOTS = {
 }
 VIEWS = {
     "kinetic energy (J)": ("kinetic_energy",),
+    "energy from nothing (J)": ("energy_gain",),
     "worst penetration (m)": ("worst_penetration",),
     "contacts": ("contacts", "pairs"),
-    "bodies": ("free", "active", "asleep"),
+    "bodies": ("free", "active", "asleep", "held_back"),
     "signed distances": ("sdf_queries", "sdf_waiting"),
     "network": ("nodes", "edges"),
     "milliseconds": ("step_ms", *PHASES),
@@ -65,14 +69,16 @@ class Playback:
         self._scene = scene
         self._step = 0
         self._com = [b.scale * scene.shapes[b.shape].com for b in scene.bodies]
-        self._paths = body_paths(scene)
+        self._crowds = crowds(scene, WORLD)
+        crowded = {int(k) for crowd in self._crowds for k in crowd.bodies}
+        self._alone = [(k, path) for k, path in enumerate(body_paths(scene)) if k not in crowded]
         self.stream = rr.RecordingStream("sdfsim")
 
     def blueprint(self) -> rrb.Blueprint:
         """The layout: the scene on the left, plots of the counters on the right; nodes and contact points hidden."""
         import rerun.blueprint as rrb
 
-        hidden = [CONTACTS, *(f"{path}/nodes" for path in self._paths)]
+        hidden = [CONTACTS, *(f"{path}/nodes" for _, path in self._alone)]
         centre, radius = _extent(self._scene)
         view = rrb.Spatial3DView(
             origin=WORLD,
@@ -99,8 +105,14 @@ class Playback:
         self.stream.send_blueprint(self.blueprint())
         self.stream.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         size = _extent(scene)[1]
-        hues = distinct_colors(sum(b.motion != "static" for b in scene.bodies))
-        for body, path, com in zip(scene.bodies, self._paths, self._com, strict=True):
+        hues = distinct_colors(len(self._alone) + len(self._crowds))
+        for crowd in self._crowds:
+            shape = scene.shapes[crowd.shape]
+            mesh = Mesh(shape.mesh.vertices - shape.com, shape.mesh.faces, shape.mesh.colors)
+            self.stream.log(crowd.path, _shaded(rr, mesh, next(hues)), static=True)
+            crowd.log_scale(self.stream, rr)
+        for k, path in self._alone:
+            body, com = scene.bodies[k], self._com[k]
             shape = scene.shapes[body.shape]
             infinite = not np.all(np.isfinite(shape.sdf.bounds))
             color = _STATIC_COLOR if body.motion == "static" else next(hues)
@@ -131,8 +143,10 @@ class Playback:
         steps = np.arange(self._step, self._step + frames)
         self._step += frames
         times = [rr.TimeColumn("time", duration=chunk.time), rr.TimeColumn("step", sequence=steps)]
-        for i, (body, path) in enumerate(zip(self._scene.bodies, self._paths, strict=True)):
-            if body.motion != "static":
+        for crowd in self._crowds:
+            crowd.log_steps(self.stream, rr, times, chunk)
+        for i, path in self._alone:
+            if self._scene.bodies[i].motion != "static":
                 poses = rr.Transform3D.columns(translation=chunk.position[:, i], quaternion=chunk.orientation[:, i])
                 self.stream.send_columns(path, times, poses)
         points = rr.Points3D.columns(positions=chunk.contact_point).partition(chunk.contact_count)

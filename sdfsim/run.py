@@ -10,17 +10,21 @@ from typing import Any, Literal
 import numpy as np
 import yaml
 
+from sdfsim.dynamics.energy import Guard
 from sdfsim.dynamics.memory import COUNTS, PHASES
 from sdfsim.dynamics.model import Model, load_model
-from sdfsim.dynamics.rollout import Rollout
+from sdfsim.dynamics.rollout import Rollout, energy_from_nothing
 from sdfsim.dynamics.simulator import SimulationError, Simulator, join, pick_device
+from sdfsim.dynamics.sleep import Rest
 from sdfsim.errors import SdfsimError
-from sdfsim.files import check_writable, write_json, write_text
+from sdfsim.files import check_writable, locked, write_json, write_text
 from sdfsim.learning import tables
 from sdfsim.playback import Playback, save_rollout
 from sdfsim.progress import columns
+from sdfsim.resuming import Checkpoint
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.types import Scene
+from sdfsim.studies.tradeoff_quality import at_quality, quality_note, quality_setting
 
 Viewer = Literal["none", "file", "native", "web"]
 Progress = Callable[[str, float, str], None]  # stage, fraction of it that is done, message
@@ -49,12 +53,18 @@ def simulate(
     device: str,
     on_progress: Progress,
     on_address: Callable[[str], None],
+    bind: str = "127.0.0.1",
+    allow_outside: bool = False,
+    until_settled: bool = False,
+    resume: bool = False,
+    guard: Guard = "none",
+    quality: str | None = None,
 ) -> dict[str, Any]:
     """Simulate a scene and write config.yaml, report.json, rollout.npz and (unless `viewer` is none) rollout.rrd.
 
     Args:
         scene_file: scene.yaml.
-        out: run folder; made if missing, an earlier run in it is replaced.
+        out: run folder; made if missing, an earlier run in it is replaced, unless it is to `resume`.
         model: bundled name or path (None: what the scene says).
         seconds: simulated time in s (None: the scene's duration).
         seed: None: the scene's.
@@ -62,13 +72,19 @@ def simulate(
         device: cpu, cuda or auto.
         on_progress: called with (stage, fraction, message).
         on_address: called with the address of the page that `viewer` web serves.
+        bind: address of this machine that a live viewer listens on.
+        allow_outside: whether the scene may name files outside of its own folder.
+        until_settled: end as soon as everything has come to rest.
+        resume: go on with the run in `out` that was interrupted; from the start where there is none.
+        quality: draft, standard or fine: measured settings of the simulator (None: shapes and model as they are).
+        guard: "energy" holds back contact that makes energy.
 
     Returns:
         The content of report.json; `failed_checks` names the shapes that were fitted for this scene and missed their
         certificate.
 
     Raises:
-        SdfsimError: bad input, or an output that cannot be written.
+        SdfsimError: bad input, an output that cannot be written, or another run that writes to the same folder.
         SimulationError: the state broke; what was computed before is in the folder.
         KeyboardInterrupt: likewise.
     """
@@ -76,15 +92,16 @@ def simulate(
     pick_device(device)
     if model:
         load_model(model, weights=False)
+    if quality:
+        quality_setting(quality)
     check_writable(out)
     if viewer in ("native", "web"):
         from sdfsim.viewer import check_screen
 
         check_screen(viewer)
-    scene = _load(scene_file, on_progress)
-    simulator = Simulator(scene, model=model, device=device, seed=seed)
-    frames = [simulator.initial_rollout()]
-    live = _live(scene, viewer, frames[0], on_address)
+    scene = _load(scene_file, on_progress, allow_outside)
+    scene, used = at_quality(quality, scene, model) if quality else (scene, model)
+    simulator = Simulator(scene, model=used, device=device, seed=seed, guard=guard)
     length = scene.duration if seconds is None else seconds
     config = {
         "command": "simulate",
@@ -92,48 +109,76 @@ def simulate(
         "model": _repeatable(model or scene.model, simulator.model),
         "seconds": float(length),
         "seed": int(simulator.seed),
+        "quality": quality,
         "viewer": viewer,
+        "allow_outside": allow_outside,
+        "until_settled": until_settled,
+        "guard": guard,
         "device": str(simulator.device),
     }
+    rest, settled = Rest(simulator.bodies), False
     out.mkdir(parents=True, exist_ok=True)
-    for name in _RESULTS:
-        (out / name).unlink(missing_ok=True)
-    write_text(out / "config.yaml", yaml.safe_dump(config, sort_keys=False))
+    with locked(out):
+        kept = Checkpoint(out, simulator)
+        frames = kept.restore() if resume else []
+        for name in _RESULTS:
+            (out / name).unlink(missing_ok=True)
+        if not frames:
+            kept.clear()
+            frames = [simulator.initial_rollout()]
+            kept.add(frames[0])
+        write_text(out / "config.yaml", yaml.safe_dump(config, sort_keys=False))
+        live = _live(scene, viewer, join(frames), on_address, bind)
 
-    def on_step(frame: Rollout) -> None:
-        frames.append(frame)
-        if live:
-            live.log_steps(frame)
-        on_progress("simulate", float(frame.time[-1]) / length, f"{frame.time[-1]:.2f} of {length:g} s simulated")
+        def on_step(frame: Rollout) -> bool:
+            nonlocal settled
+            frames.append(frame)
+            kept.add(frame)
+            if live:
+                live.log_steps(frame)
+            on_progress("simulate", float(frame.time[-1]) / length, f"{frame.time[-1]:.2f} of {length:g} s simulated")
+            settled = until_settled and rest.settled(simulator.state)
+            return settled
 
-    started, broken = time.monotonic(), None
-    try:
-        rollout = simulator.run(seconds=length, on_step=on_step)
-    except (SimulationError, KeyboardInterrupt) as error:
-        broken = error
-        rollout = error.rollout if isinstance(error, SimulationError) else join(frames)
-    on_progress("simulate", 1.0, f"{len(rollout)} steps" + (" (stopped early)" if broken else ""))
+        started, broken = time.monotonic(), None
+        left = max(1, round(length / simulator.dt)) - simulator.steps_done
+        try:
+            if left > 0:
+                simulator.run(steps=left, on_step=on_step)
+        except (SimulationError, KeyboardInterrupt) as error:
+            broken = error
+            kept.save()
+        rollout = join(frames)
+        on_progress("simulate", 1.0, f"{len(rollout)} steps" + (" (stopped early)" if broken else ""))
 
-    report = summary(rollout, time.monotonic() - started)
-    report["status"] = "done" if broken is None else "failed" if isinstance(broken, SdfsimError) else "interrupted"
-    report["folder"] = str(out)
-    report["failed_checks"] = _missed(scene)
-    if isinstance(broken, SdfsimError):
-        report["error"] = broken.message
-    rollout.save(out / "rollout.npz")
-    if viewer != "none":
-        save_rollout(scene, rollout, out / "rollout.rrd")
-        report["recording"] = str(out / "rollout.rrd")
-    write_json(out / "report.json", report)
-    if isinstance(broken, SimulationError):
-        broken.hint = f"what was computed is in {out}; {broken.hint}"
-    if broken is not None:
-        raise broken
-    return report
+        report = summary(rollout, time.monotonic() - started)
+        report["status"] = "done" if broken is None else "failed" if isinstance(broken, SdfsimError) else "interrupted"
+        report["folder"] = str(out)
+        report["quality"] = quality_note(quality) if quality else None
+        report["failed_checks"] = _missed(scene)
+        if until_settled:
+            report["settled"] = settled
+        if isinstance(broken, SdfsimError):
+            report["error"] = broken.message
+        rollout.save(out / "rollout.npz")
+        if viewer != "none":
+            save_rollout(scene, rollout, out / "rollout.rrd")
+            report["recording"] = str(out / "rollout.rrd")
+        write_json(out / "report.json", report)
+        if not isinstance(broken, KeyboardInterrupt):
+            kept.clear()
+        if isinstance(broken, SimulationError):
+            broken.hint = f"what was computed is in {out}; {broken.hint}"
+        if broken is not None:
+            raise broken
+        return report
 
 
-def _load(scene_file: Path, on_progress: Progress) -> Scene:
-    return load_scene(scene_file, on_progress=lambda fraction, message: on_progress("shapes", fraction, message))
+def _load(scene_file: Path, on_progress: Progress, allow_outside: bool) -> Scene:
+    def tell(fraction: float, message: str) -> None:
+        on_progress("shapes", fraction, message)
+
+    return load_scene(scene_file, tell, allow_outside=allow_outside)
 
 
 def _missed(scene: Scene) -> list[str]:
@@ -145,13 +190,13 @@ def _repeatable(asked: str | None, model: Model) -> str:
     return str(Path(asked).resolve()) if asked and asked.endswith(".safetensors") else model.name
 
 
-def _live(scene: Any, viewer: Viewer, first: Rollout, on_address: Callable[[str], None]) -> Playback | None:
+def _live(scene: Any, viewer: Viewer, first: Rollout, on_address: Callable[[str], None], bind: str) -> Playback | None:
     if viewer not in ("native", "web"):
         return None
     from sdfsim.viewer import stream_to_viewer
 
     live = Playback(scene)
-    if address := stream_to_viewer(live, viewer):
+    if address := stream_to_viewer(live, viewer, bind=bind):
         on_address(address)
     live.log_static()
     live.log_steps(first)
@@ -173,6 +218,7 @@ def summary(rollout: Rollout, wall: float) -> dict[str, Any]:
         "contacts_mean": _number(counters["contacts"].mean()),
         "worst_penetration_m": _number(counters["worst_penetration"].max()),
         "kinetic_energy_J": [_number(energy[0]), _number(energy[-1])],
+        "energy_from_nothing": energy_from_nothing(rollout),
         "lowest_m": _number(heights.min()) if heights.size else None,
         "outside_training": rollout.meta.get("outside_training", []),
         "cost": cost(rollout),
@@ -189,6 +235,21 @@ def cost(rollout: Rollout) -> dict[str, dict[str, Any]]:
         for name, v in counted.items()
         if len(v)
     }
+
+
+def energy_lines(report: dict[str, Any]) -> list[str]:
+    """What contact has made from nothing, and who was held back."""
+    made = report["energy_from_nothing"]
+    lines = [
+        f"energy from nothing: {made['sum_J']:.3g} J; {100 * made['steps_above_1_percent']:.1f} % of the steps made "
+        f"more than 1 % of what was in play, the worst {100 * made['worst']:.2g} %"
+    ]
+    if made["steps_held_back"]:
+        lines.append(
+            f"held back: velocities in {made['steps_held_back']} steps, {made['bodies_held_back']} bodies in all "
+            f"(see docs/stability.md)"
+        )
+    return lines
 
 
 def cost_lines(report: dict[str, Any]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import socket
@@ -10,6 +11,8 @@ import sys
 import sysconfig
 import tempfile
 import time
+import webbrowser
+from ipaddress import ip_address
 from pathlib import Path
 from shutil import which
 from typing import Literal
@@ -19,18 +22,20 @@ from sdfsim.errors import SdfsimError
 from sdfsim.playback import Playback
 
 WINDOW = "1600x900"
+LOOPBACK = "127.0.0.1"
 _GRPC_PORT, _WEB_PORT = 9876, 9090
 _START_SECONDS = 60.0
 _TOAST_SECONDS = 10.0  # the notices of the start cover the plots until they fade
 _NO_GRAPHICS = "pictures need a Vulkan driver: apt-get install mesa-vulkan-drivers"
 
 
-def stream_to_viewer(playback: Playback, kind: Literal["native", "web"]) -> str:
+def stream_to_viewer(playback: Playback, kind: Literal["native", "web"], *, bind: str = LOOPBACK) -> str:
     """Send everything that `playback` logs from now on to a viewer.
 
     Args:
         playback: nothing logged yet.
-        kind: a window, or a page served by this process for as long as it runs.
+        kind: a window, or a page that is there for as long as this process runs.
+        bind: address of this machine that the viewer listens on.
 
     Returns:
         The address of the page, or an empty string for a window.
@@ -38,19 +43,60 @@ def stream_to_viewer(playback: Playback, kind: Literal["native", "web"]) -> str:
     Raises:
         SdfsimError: no screen, or the viewer does not start.
     """
-    import rerun as rr
-
     check_screen(kind)
-    try:
-        if kind == "native":
-            playback.stream.spawn(port=_free_port(_GRPC_PORT), hide_welcome_screen=True)
-            return ""
-        source = playback.stream.serve_grpc(grpc_port=_free_port(_GRPC_PORT))
-        port = _free_port(_WEB_PORT)
-        rr.serve_web_viewer(web_port=port, open_browser=_has_screen(), connect_to=source)
-    except RuntimeError as error:
-        raise SdfsimError(f"the rerun viewer does not start: {error}", "use --viewer file") from error
-    return f"http://localhost:{port}?url={quote(source, safe=':/')}"
+    serving = _Serving(bind)
+    if kind == "native":
+        viewer = _start([*serving.options, "--expect-data-soon", "--hide-welcome-screen"], serving)
+    else:
+        viewer = _start([*serving.options, *serving.page_options, "--serve-web"], serving)
+        atexit.register(_end, viewer)
+    playback.stream.connect_grpc(f"rerun+http://{serving.near}:{serving.port}/proxy")
+    if kind == "native":
+        return ""
+    if _has_screen():
+        webbrowser.open(serving.page)
+    return serving.page
+
+
+class _Serving:
+    """Ports for a viewer, and how they are told to it. Its own default would let the whole network in.
+
+    Args:
+        bind: address to listen on; 0.0.0.0 is every address of this machine.
+
+    Raises:
+        SdfsimError: not an address.
+    """
+
+    def __init__(self, bind: str) -> None:
+        try:
+            address = ip_address(bind)
+        except ValueError as error:
+            raise SdfsimError(f"--bind {bind}: not an address", f"such as {LOOPBACK}, or 0.0.0.0 for all") from error
+        self.port, self.page_port = _free_port(_GRPC_PORT), _free_port(_WEB_PORT)
+        self.near = LOOPBACK if address.is_unspecified or address.is_loopback else bind
+        host = "localhost" if address.is_loopback else socket.gethostname() if address.is_unspecified else bind
+        self.page = f"http://{host}:{self.page_port}?url={quote(f'rerun+http://{host}:{self.port}/proxy', safe=':/')}"
+        self.options = ["--bind", bind, "--port", str(self.port)]
+        self.page_options = ["--web-viewer-port", str(self.page_port)]
+        if not address.is_loopback:
+            self.page_options += ["--cors-allow-origin", f"http://{host}:{self.page_port}"]
+
+
+def _start(options: list[str], serving: _Serving) -> subprocess.Popen:
+    """A viewer in a group of its own: `rerun` is a script that starts the real one, and both have to go together."""
+    viewer = subprocess.Popen(
+        [_executable(), *options], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    )
+    started = time.monotonic()
+    while time.monotonic() - started < _START_SECONDS and viewer.poll() is None:
+        try:
+            socket.create_connection((serving.near, serving.port), timeout=1.0).close()
+            return viewer
+        except OSError:
+            time.sleep(0.1)
+    _end(viewer)
+    raise SdfsimError("the rerun viewer does not start", "use --viewer file")
 
 
 def check_screen(kind: Literal["native", "web"]) -> None:
@@ -63,21 +109,21 @@ def _has_screen() -> bool:
     return bool(sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-def show(recording: Path, *, web: bool = False) -> None:
+def show(recording: Path, *, web: bool = False, bind: str = LOOPBACK) -> None:
     """Open a recording, and wait until the viewer is closed.
+
+    Args:
+        recording: .rrd.
+        web: as a page instead of a window.
+        bind: address of this machine that the viewer listens on.
 
     Raises:
         SdfsimError: no such recording, or the viewer fails.
     """
-    command = [_executable(), str(_existing(recording))]
+    serving = _Serving(bind)
+    command = [_executable(), str(_existing(recording)), *serving.options]
     if web:
-        command += [
-            "--web-viewer",
-            "--web-viewer-port",
-            str(_free_port(_WEB_PORT)),
-            "--port",
-            str(_free_port(_GRPC_PORT)),
-        ]
+        command += ["--web-viewer", *serving.page_options]
     code = subprocess.run(command, check=False).returncode
     if code not in (0, -signal.SIGINT, 130):
         raise SdfsimError(f"the rerun viewer ended with code {code}", "without a screen: sdfsim view --web")
@@ -98,12 +144,13 @@ def screenshot(recording: Path, picture: Path, *, at: float | None = None) -> No
     if not picture.parent.is_dir() or not os.access(picture.parent, os.W_OK):
         raise SdfsimError(f"{picture}: the folder is missing or not writable")
     port = _free_port(0)
-    command = [_executable(), "--headless", "--window-size", WINDOW, "--port", str(port), str(recording.resolve())]
+    command = [_executable(), "--headless", "--window-size", WINDOW, "--bind", LOOPBACK, "--port", str(port)]
+    command.append(str(recording.resolve()))
     with tempfile.TemporaryFile() as log:
         # A group of its own: `rerun` is a script that starts the real viewer, and both have to go.
         viewer = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
         try:
-            _picture(viewer, f"rerun+http://127.0.0.1:{port}/proxy", picture, at)
+            _picture(viewer, f"rerun+http://{LOOPBACK}:{port}/proxy", picture, at)
         except ConnectionError as error:
             log.seek(0)
             told = log.read().decode(errors="replace")
@@ -173,7 +220,7 @@ def _free_port(wanted: int) -> int:
     for port in (wanted, 0):
         with socket.socket() as probe:
             try:
-                probe.bind(("127.0.0.1", port))
+                probe.bind((LOOPBACK, port))
                 return probe.getsockname()[1]
             except OSError:
                 continue

@@ -23,6 +23,10 @@ def seconds_of(text: str) -> float:
 Json = Annotated[bool, typer.Option("--json", help="One JSON object on stdout, everything else on stderr.")]
 Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Tracebacks with errors.")]
 Device = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Where to compute.")]
+Outside = Annotated[
+    bool, typer.Option("--allow-outside", help="Let the scene name files that are not in its own folder.")
+]
+Bind = Annotated[str, typer.Option(metavar="ADDRESS", help="Where viewers listen; 0.0.0.0 lets the network in.")]
 Out = Annotated[Path, typer.Option("-o", "--out", help="Folder to write.", show_default=False)]
 Model = Annotated[str | None, typer.Option(help="Bundled model or path (default: the scene's, else the best one).")]
 Budget = Annotated[

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from sdfsim.commands.arguments import Device, Json, Model, Out, Verbose, tell_failed
+from sdfsim.commands.arguments import Bind, Device, Json, Model, Out, Outside, Verbose, tell_failed
 from sdfsim.progress import Session, duration
 
 
@@ -17,7 +17,20 @@ def simulate(
     model: Model = None,
     seconds: Annotated[float | None, typer.Option(help="Simulated time (default: the scene's).")] = None,
     seed: Annotated[int | None, typer.Option(help="Default: the scene's.", min=0)] = None,
+    quality: Annotated[
+        Literal["draft", "standard", "fine"] | None,
+        typer.Option(help="A measured compromise of error and time (default: shapes and model as they are)."),
+    ] = None,
     viewer: Annotated[Literal["none", "file", "native", "web"], typer.Option(help="Where to watch.")] = "file",
+    until_settled: Annotated[
+        bool, typer.Option("--until-settled", help="End as soon as everything rests (--seconds at the latest).")
+    ] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the interrupted run in the folder.")] = False,
+    guard: Annotated[
+        Literal["none", "energy"], typer.Option(help="energy: hold back contact that makes energy.")
+    ] = "none",
+    bind: Bind = "127.0.0.1",
+    allow_outside: Outside = False,
     as_json: Json = False,
     device: Device = "auto",
     verbose: Verbose = False,
@@ -34,7 +47,13 @@ def simulate(
             model=model,
             seconds=seconds,
             seed=seed,
+            quality=quality,
             viewer=viewer,
+            bind=bind,
+            allow_outside=allow_outside,
+            until_settled=until_settled,
+            resume=resume,
+            guard=guard,
             device=device,
             on_progress=session.stage_progress,
             on_address=lambda address: session.say(f"watch it at {address}"),
@@ -42,7 +61,10 @@ def simulate(
         lines = [
             f"{report['steps']} steps of {report['dt_s']:.4g} s in {duration(report['wall_s'])}"
             f" (median {report['step_ms_median']:.1f} ms a step)",
+            *([report["quality"]] if report["quality"] else []),
             f"mean contacts {report['contacts_mean']:.1f}, worst penetration {report['worst_penetration_m']:.2g} m",
+            *run.energy_lines(report),
+            *([] if report.get("settled", True) else ["not settled: give it more --seconds"]),
             *run.cost_lines(report),
             f"wrote {out}",
             *(f"outside the model's training: {line}" for line in report["outside_training"]),
@@ -58,6 +80,7 @@ def simulate(
 def plan(
     scene: Annotated[Path, typer.Argument(help="scene.yaml", show_default=False)],
     model: Model = None,
+    allow_outside: Outside = False,
     as_json: Json = False,
     device: Device = "auto",
     verbose: Verbose = False,
@@ -66,7 +89,9 @@ def plan(
     with Session(as_json=as_json, verbose=verbose) as session:
         from sdfsim import planning
 
-        report = planning.describe(scene, model=model, device=device, on_progress=session.stage_progress)
+        report = planning.describe(
+            scene, model=model, device=device, allow_outside=allow_outside, on_progress=session.stage_progress
+        )
         for check in report["failed_checks"]:  # told, but a plan is as good with a shape that is less exact
             session.say(f"failed check: {check}")
         session.report(report, planning.plan_lines(report))
@@ -77,6 +102,7 @@ def view(
     web: Annotated[bool, typer.Option("--web", help="In the browser.")] = False,
     picture: Annotated[Path | None, typer.Option("--screenshot", help="Write a PNG instead; needs no screen.")] = None,
     at: Annotated[float | None, typer.Option(help="Time of the screenshot, s (default: the end).")] = None,
+    bind: Bind = "127.0.0.1",
     as_json: Json = False,
     device: Device = "auto",
     verbose: Verbose = False,
@@ -91,7 +117,7 @@ def view(
             viewer.screenshot(recording, picture, at=at)
             session.report({"screenshot": str(picture)})
         else:
-            viewer.show(recording, web=web)
+            viewer.show(recording, web=web, bind=bind)
             session.report({"recording": str(recording)})
 
 

@@ -40,6 +40,11 @@ class Units:
         """m/s^2 in one model unit of acceleration."""
         return self.length / self.time**2
 
+    @property
+    def energy(self) -> float:
+        """J in one model unit of energy."""
+        return self.mass * self.velocity**2
+
 
 @dataclass(frozen=True)
 class Bodies:

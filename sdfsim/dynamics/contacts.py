@@ -10,8 +10,9 @@ from torch import Tensor
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State
 from sdfsim.dynamics.broad import expand, near_pairs, turning
+from sdfsim.dynamics.clusters import Layer
 from sdfsim.dynamics.graph import number_pairs
-from sdfsim.dynamics.memory import Memory, Waits
+from sdfsim.dynamics.memory import PIECE, Memory, Waits, least
 
 DEPTH_PULL = 5.0  # how much farther out (in lengths) a node must be to be kept for each length it is higher
 _GOLDEN = (1.0 + 5.0**0.5) / 2.0
@@ -62,8 +63,10 @@ def find_contacts(
     dt: float,
     memory: Memory | None = None,
     rows: int | None = None,
+    *,
+    thin: bool = False,
 ) -> Contacts:
-    """All contact edges of a state.
+    """All contact edges of a state, or those of them that `thin_contacts` keeps.
 
     An edge exists where d + min(0, closing velocity * dt) <= reach: a fixed threshold would let a fast body bounce
     inside one step without ever having had an edge.
@@ -75,81 +78,106 @@ def find_contacts(
         reach: contact radius D, model length.
         dt: the step, model time.
         memory: of the run; it saves work and counts it.
-        rows: look at no more than that many nodes at once (but at all of a body's), None for all.
+        rows: look at no more than that many nodes at once (but at all of a body's), None for `PIECE`.
+        thin: keep few edges a pair. They are chosen piece by piece, so that all are never there at once.
     """
     memory = memory or Memory()
     with memory.timed("pairs_ms"):
         going, still = memory.surroundings(bodies, state, gravity, reach, dt)
         first, second = near_pairs(bodies, state, gravity, reach, dt, going, still)
     if not len(first):
-        memory.waits.turn()
+        memory.turn()
         return no_contacts(bodies)
     with memory.timed("distances_ms"):
         approach = _approach(bodies, state, gravity, first, second, dt)
-        cuts = _cuts(bodies, first, rows)
-        pairs = zip(first.split(cuts), second.split(cuts), approach.split(cuts), strict=True)
-        parts = [_edges(bodies, state, gravity, reach, dt, *part, memory.waits) for part in pairs]
-        memory.waits.turn()
+        cuts = _cuts(bodies, first, min(rows or PIECE, PIECE))
+        parts = []
+        for pairs in zip(first.split(cuts), second.split(cuts), approach.split(cuts), strict=True):
+            part = _edges(bodies, state, gravity, reach, dt, Pairs(bodies, state, *pairs), memory)
+            parts.append(thin_contacts(bodies, part) if thin else part)
+        memory.turn()
         found = _joined(parts)
     near = number_pairs(first, second, len(bodies))[1]
     memory.count(pairs=near, sdf_queries=found.queries, sdf_waiting=found.waiting)
     return found
 
 
+class Pairs:
+    """P pairs of bodies, and how the frame of the first lies in that of the second.
+
+    Args:
+        bodies: N bodies.
+        state: theirs.
+        first, second: [P] int64, owner of nodes and the body they may meet.
+        approach: [P] how far they may approach in the step.
+    """
+
+    def __init__(self, bodies: Bodies, state: State, first: Tensor, second: Tensor, approach: Tensor) -> None:
+        self.first, self.second, self.approach = first, second, approach
+        back = pose.conjugate(state.orientation[second])
+        self.turn = pose.to_matrix(pose.multiply(back, state.orientation[first]))
+        # Differences are taken in float64 before anything is cast, so that a far origin costs no precision.
+        self.shift = pose.rotate(back, state.position[first] - state.position[second])
+        self.number = first * len(bodies) + second
+        self.box = bodies.bounds[second]
+        self.trust = bodies.bank.trust[bodies.shape[second]]
+
+
 def _edges(
-    bodies: Bodies,
-    state: State,
-    gravity: Tensor,
-    reach: float,
-    dt: float,
-    first: Tensor,
-    second: Tensor,
-    approach: Tensor,
-    waits: Waits,
+    bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, pairs: Pairs, memory: Memory
 ) -> Contacts:
-    """The edges from nodes of bodies `first` to bodies `second` [P], which approach by at most `approach` [P]."""
-    pair, node = expand(bodies.node_start[first], bodies.node_start[first + 1])
-    owner, other, approach = first[pair], second[pair], approach[pair]
+    """The edges from nodes of the first bodies of `pairs` to the second: balls of nodes first, then what is near."""
+    pair, parent = torch.arange(len(pairs.first), device=bodies.device), pairs.first
+    queries = waiting = 0
+    tree = memory.tree(bodies)
+    for layer, waits in zip(tree, memory.waits, strict=True):
+        pair, item, local, distance, gradient, waited = _sift(bodies, layer, reach, pairs, pair, parent, waits)
+        queries, waiting = queries + len(pair), waiting + waited
+        if layer is not tree[-1]:
+            trust, most = pairs.trust[pair], reach + pairs.approach[pair]
+            close = (least(trust, distance, layer.radius[item]) <= most).nonzero()[:, 0]
+            pair, parent = pair[close], item[close]
+    owner, other, node = pairs.first[pair], pairs.second[pair], tree[-1].node[item]
     arm = pose.rotate(state.orientation[owner], bodies.node[node])
-    # Differences are taken in float64 before anything is cast, so that a far origin costs no precision.
     offset = state.position[owner] - state.position[other] + arm
-    local = pose.rotate(pose.conjugate(state.orientation[other]), offset)
-    box = bodies.bounds[other]
-    margin = (reach + approach)[:, None]
-    near = ((local >= box[:, 0] - margin) & (local <= box[:, 1] + margin)).all(-1).nonzero()[:, 0]
-    owner, other, node, local, approach = owner[near], other[near], node[near], local[near], approach[near]
-
-    key = (owner * len(bodies) + other) * len(bodies.node) + node
-    trust = bodies.bank.trust[bodies.shape[other]]
-    wait, place, known = waits.may_wait(key, local, trust, reach + approach)
-    asked = (~wait).nonzero()[:, 0]
-    distance, gradient = _distances(bodies, other[asked], local[asked])
-    place, known = place.index_copy(0, asked, local[asked]), known.index_copy(0, asked, distance)
-    waits.note(key, place, known, trust * known > reach)
-
-    owner, other, node, local = owner[asked], other[asked], node[asked], local[asked]
-    arm, offset = arm[near[asked]], offset[near[asked]]
     normal = pose.rotate(state.orientation[other], _unit(gradient, local))
     velocity = node_velocity(state, owner, arm) + gravity * dt * bodies.moves[owner, None]
     arm_other = offset - distance[:, None] * normal
     velocity = velocity - node_velocity(state, other, arm_other) - gravity * dt * bodies.moves[other, None]
     closing = (velocity * normal).sum(-1).clamp_max(0.0)
     ahead = distance + closing * dt
-    touching = ahead <= reach
-    return Contacts(
-        owner=owner[touching],
-        node=node[touching],
-        body=other[touching],
-        arm=arm[touching],
-        distance=distance[touching],
-        normal=normal[touching],
-        ahead=ahead[touching],
-        queries=len(asked),
-        waiting=len(wait) - len(asked),
-    )
+    touching = (ahead <= reach).nonzero()[:, 0]
+    found = dict(zip(ARRAYS, (owner, node, other, arm, distance, normal, ahead), strict=True))
+    return Contacts(**{k: v[touching] for k, v in found.items()}, queries=queries, waiting=waiting)
 
 
-def _distances(bodies: Bodies, other: Tensor, local: Tensor) -> tuple[Tensor, Tensor]:
+def _sift(
+    bodies: Bodies, layer: Layer, reach: float, pairs: Pairs, pair: Tensor, parent: Tensor, waits: Waits
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, int]:
+    """The balls of `layer` under `parent` [B] of `pair` [B] that are near, asked for their distances.
+
+    Returns:
+        For each of the Q asked its pair, its number in the layer, its place [Q, 3] in the other's frame, distance and
+        gradient [Q, 3]; and how many were not asked, since they cannot be near yet.
+    """
+    row, item = expand(layer.start[parent], layer.start[parent + 1])
+    pair = pair[row]
+    local = (pairs.turn[pair] * layer.centre[item, None]).sum(-1) + pairs.shift[pair]
+    radius, most = layer.radius[item], reach + pairs.approach[pair]
+    margin, box = (most + radius)[:, None], pairs.box[pair]
+    near = ((local >= box[:, 0] - margin) & (local <= box[:, 1] + margin)).all(-1).nonzero()[:, 0]
+    pair, item, local, radius, most = pair[near], item[near], local[near], radius[near], most[near]
+
+    key, trust = pairs.number[pair] * len(layer) + item, pairs.trust[pair]
+    wait, place, known = waits.may_wait(key, local, radius, trust, most)
+    asked = (~wait).nonzero()[:, 0]
+    distance, gradient = distances(bodies, pairs.second[pair[asked]], local[asked])
+    place, known = place.index_copy(0, asked, local[asked]), known.index_copy(0, asked, distance)
+    waits.note(key, place, known, least(trust, known, radius) > reach)
+    return pair[asked], item[asked], local[asked], distance, gradient, len(wait) - len(asked)
+
+
+def distances(bodies: Bodies, other: Tensor, local: Tensor) -> tuple[Tensor, Tensor]:
     """Distance [Q] and gradient [Q, 3] of bodies `other` [Q] at `local` [Q, 3] about their centres of mass."""
     if not len(other):
         return local[:, 0], local
@@ -165,18 +193,12 @@ def no_contacts(bodies: Bodies) -> Contacts:
     return Contacts(index, index, index, number[:, None].expand(0, 3), number, number[:, None].expand(0, 3), number)
 
 
-def _cuts(bodies: Bodies, first: Tensor, rows: int | None) -> list[int]:
+def _cuts(bodies: Bodies, first: Tensor, rows: int) -> list[int]:
     """How many pairs to look at together: their owners have at most `rows` nodes, or it is one pair."""
-    if rows is None:
-        return [len(first)]
-    sizes, total = [0], 0
-    for nodes in (bodies.node_start[first + 1] - bodies.node_start[first]).tolist():
-        if sizes[-1] and total + nodes > rows:
-            sizes.append(0)
-            total = 0
-        sizes[-1] += 1
-        total += nodes
-    return sizes
+    nodes = bodies.node_start[first + 1] - bodies.node_start[first]
+    # Pairs whose nodes end in the same stretch go together; what the first of them has before it is one body's at most.
+    stretch = max(1, rows - int(nodes.max()))
+    return torch.unique_consecutive(nodes.cumsum(0) // stretch, return_counts=True)[1].tolist()
 
 
 def _joined(parts: list[Contacts]) -> Contacts:

@@ -11,6 +11,7 @@ from torch import Tensor
 from sdfsim.dynamics.pose import from_rotvec, multiply, normalise, to_matrix
 
 MAX_TURN = 0.1  # rad of rotation per inner step of the torque-free rotation
+MOST_TURN = 100.0  # rad of rotation that a step can follow
 
 
 def ballistic(position: Tensor, velocity: Tensor, gravity: Tensor, dt: float) -> tuple[Tensor, Tensor]:
@@ -22,7 +23,8 @@ def torque_free(orientation: Tensor, angular_velocity: Tensor, inertia: Tensor, 
     """Rotation of bodies on which no torque acts.
 
     The world angular momentum is held exactly; the orientation follows dR/dt = [R I^-1 R^T L] R by a
-    Runge-Kutta-Munthe-Kaas method of order 4, each inner step turning at most `MAX_TURN`.
+    Runge-Kutta-Munthe-Kaas method of order 4, each inner step turning at most `MAX_TURN`. Beyond `MOST_TURN` in all it
+    is no longer exact.
 
     Args:
         orientation: [N, 4] xyzw, body -> world.
@@ -45,7 +47,7 @@ def torque_free(orientation: Tensor, angular_velocity: Tensor, inertia: Tensor, 
     rotation = to_matrix(orientation)
     momentum = _apply(rotation @ inertia @ rotation.mT, angular_velocity)
     fastest = float(angular_velocity.norm(dim=-1).max())
-    steps = max(1, min(1000, math.ceil(fastest * abs(dt) / MAX_TURN)))
+    steps = max(1, math.ceil(min(MOST_TURN, fastest * abs(dt)) / MAX_TURN))
     h = dt / steps
 
     def spin(q: Tensor) -> Tensor:

@@ -11,17 +11,19 @@ from torch import Tensor
 
 from sdfsim.dynamics.bodies import Bodies, State
 from sdfsim.dynamics.broad import Still, moving, swept_boxes
+from sdfsim.dynamics.clusters import Layer, layers
 from sdfsim.scene.types import Limits
 
 COUNTS = {
     "pairs": "pairs of bodies that the broad phase let through",
     "sdf_queries": "signed distances asked for",
-    "sdf_waiting": "nodes near a surface that cannot reach it yet, by an earlier answer",
+    "sdf_waiting": "nodes, or balls of them, near a surface that cannot reach it yet, by an earlier answer",
     "nodes": "nodes of the graph that the network saw",
     "edges": "edges of that graph",
     "free": "dynamic bodies in free flight",
     "active": "dynamic bodies that the network moved",
     "asleep": "dynamic bodies asleep",
+    "held_back": "dynamic bodies whose velocities were held back",
 }
 PHASES = {
     "pairs_ms": "broad phase",
@@ -30,8 +32,12 @@ PHASES = {
     "network_ms": "network",
     "sleep_ms": "sleep",
 }
+PIECE = 2**18  # nodes looked at together at most: more at once is slower, and takes memory
 _SLACK = 1e-9  # model lengths, for the rounding of distances
-BYTES_A_ROW = 4096  # what a node near a surface, or an edge of the network, takes while it is worked on
+BYTES_A_ROW = 4096  # what an edge of the network takes; a node near a surface takes no more while it is worked on
+# What a run takes beside its scene, by benchmarks/scale.py: torch's own at the first step, the working memory of fitted
+# distances, a surface node with its place among the balls, and a point of a search while it is looked at.
+BYTES_AT_LEAST, BYTES_FITTED, BYTES_A_NODE, BYTES_A_POINT = 28 * 2**20, 33 * 2**20, 235, 400
 
 
 def row_limit(limits: Limits) -> int | None:
@@ -39,23 +45,46 @@ def row_limit(limits: Limits) -> int | None:
     return None if limits.memory_gib is None else max(1, int(limits.memory_gib * 2**30 / BYTES_A_ROW))
 
 
+def peak_bytes(*, nodes: int, edges: float, points: float, fitted: bool, rows: int | None) -> float:
+    """What a run will take at its largest step, beside the loaded scene and the rollout that it keeps.
+
+    Args:
+        nodes: surface nodes of all bodies.
+        edges: of the impulse network.
+        points: nodes and balls near a surface, asked or waiting.
+        fitted: whether some of the distances are networks.
+        rows: see `row_limit`.
+    """
+    at_once = min(points, PIECE, rows or PIECE)
+    standing = BYTES_AT_LEAST + BYTES_FITTED * fitted + BYTES_A_NODE * nodes
+    return standing + BYTES_A_ROW * edges + BYTES_A_POINT * at_once
+
+
+def least(trust: Tensor, distance: Tensor, way: Tensor) -> Tensor:
+    """[Q] what a signed distance [Q] has left at least after a `way` [Q], see `SdfBank.trust`."""
+    return trust * distance - way / trust - _SLACK
+
+
 class Waits:
     """Signed distances from earlier steps: a node at distance d has to move by d - D before it is within reach.
 
     What was asked is kept in the other body's frame, where the way from there to here is all that the distance can have
-    shrunk by, whatever has moved.
+    shrunk by, whatever has moved. A ball of nodes reaches as much farther as its radius.
     """
 
     def __init__(self) -> None:
         self._rows: tuple[Tensor, Tensor, Tensor] | None = None
         self._noted: list[tuple[Tensor, Tensor, Tensor]] = []
 
-    def may_wait(self, key: Tensor, place: Tensor, trust: Tensor, most: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Which of Q nodes near a surface cannot have come within `most` of it.
+    def may_wait(
+        self, key: Tensor, place: Tensor, radius: Tensor, trust: Tensor, most: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Which of Q balls near a surface cannot have come within `most` of it.
 
         Args:
-            key: [Q] int64, ascending, of the node and the other body.
-            place: [Q, 3] the node in the other body's frame.
+            key: [Q] int64, ascending, of the ball and the other body.
+            place: [Q, 3] its middle in the other body's frame.
+            radius: [Q] of it; 0 for a node.
             trust: [Q] how exact that body's distances are, see `SdfBank.trust`.
             most: [Q] a smaller distance may make an edge.
 
@@ -67,8 +96,8 @@ class Waits:
         keys, places, distances = self._rows
         at = torch.searchsorted(keys, key).clamp_max(len(keys) - 1)
         before, distance = places[at], distances[at]
-        least = trust * distance - (place - before).norm(dim=-1) / trust
-        return (keys[at] == key) & (least > most + _SLACK), before, distance
+        left = least(trust, distance, (place - before).norm(dim=-1) + radius)
+        return (keys[at] == key) & (left > most), before, distance
 
     def note(self, key: Tensor, place: Tensor, distance: Tensor, worth: Tensor) -> None:
         """Keep the answers that are `worth` it for the next step; keys come in ascending order."""
@@ -85,16 +114,29 @@ class Memory:
     """Of one run: caches, counters and timers.
 
     Attributes:
-        waits: earlier distances.
-        counts: what the present step has counted so far, by the names of `COUNTS` and `PHASES` (ms).
+        waits: earlier distances, of each of the layers of `tree`.
+        counts: what the present step has counted so far, by the names of `COUNTS` and `PHASES` (ms), and the
+            `energy_gain` (model units) of contact.
     """
 
     def __init__(self) -> None:
-        self.waits = Waits()
-        self.counts = dict.fromkeys((*COUNTS, *PHASES), 0.0)
+        self.waits = (Waits(), Waits(), Waits())
+        self.counts = dict.fromkeys((*COUNTS, *PHASES, "energy_gain"), 0.0)
+        self._tree: tuple[Tensor, tuple[Layer, Layer, Layer]] | None = None
         self._last: State | None = None
         self._still: tuple[Tensor, Still] | None = None
         self._cuda = False
+
+    def tree(self, bodies: Bodies) -> tuple[Layer, Layer, Layer]:
+        """The bodies' nodes in balls, sorted out once."""
+        if self._tree is None or self._tree[0] is not bodies.node:
+            self._tree = (bodies.node, layers(bodies))
+        return self._tree[1]
+
+    def turn(self) -> None:
+        """A search is over: what it noted replaces what was known."""
+        for waits in self.waits:
+            waits.turn()
 
     def begin(self, bodies: Bodies, state: State) -> bool:
         """Start counting a step. Returns whether `state` comes from elsewhere than the step before."""

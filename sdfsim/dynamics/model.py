@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from sdfsim.files import replacing
 
 BUNDLED = Path(__file__).resolve().parent.parent / "models"
 DEFAULT_MODEL = "small"
+MOST = 4096  # of any size of a network
 NETWORKS = {"impulse": (ImpulseConfig, ImpulseNetwork), "paper": (PaperConfig, PaperNetwork)}
 
 
@@ -109,9 +111,25 @@ def load_model(name: str | Path | None = None, *, weights: bool = True) -> Model
         with safe_open(path, framework="pt") as file:
             info = json.loads((file.metadata() or {})["sdfsim_model"])
             config = info.pop("config")
+            _check_size(info["kind"], config, {k: file.get_slice(k).get_shape() for k in file.keys()})
             network = Unread() if not weights else new_network(info["kind"], config)
             network.load_state_dict({k: file.get_tensor(k) for k in file.keys()} if weights else {})
-    except (OSError, SafetensorError, KeyError, ValueError, TypeError, RuntimeError) as error:
+        model = Model(name=path.stem, network=network, **info)
+        for key in ("dt", "gravity", "length", "reach"):
+            if not 0 < float(getattr(model, key)) < math.inf:
+                raise ValueError(f"{key} must be > 0")
+    except (OSError, SafetensorError, LookupError, ValueError, TypeError, RuntimeError, AttributeError) as error:
         raise SdfsimError(f"{path}: not a model of this version of sdfsim: {error}") from error
     network.eval().requires_grad_(False)
-    return Model(name=path.stem, network=network, **info)
+    return model
+
+
+def _check_size(kind: str, config: dict[str, Any], found: dict[str, list[int]]) -> None:
+    """Raise ValueError where the weights of a file are not those of its network: before memory is taken for it."""
+    if any(isinstance(value, int) and not 0 <= value <= MOST for value in config.values()):
+        raise ValueError(f"sizes of its network must be 0 to {MOST} (got {config})")
+    with torch.device("meta"):
+        wanted = {name: list(weight.shape) for name, weight in new_network(kind, config).state_dict().items()}
+    if wanted != found:
+        odd = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name))
+        raise ValueError(f"the weights are not those of its network: {odd[0]} and {len(odd) - 1} others")

@@ -14,11 +14,13 @@ import torch
 import sdfsim
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State, Units, awake, from_scene, largest_extent
+from sdfsim.dynamics.check import check_nodes, fault
 from sdfsim.dynamics.contacts import Contacts
+from sdfsim.dynamics.energy import Guard, kinetic
 from sdfsim.dynamics.memory import Memory, row_limit
 from sdfsim.dynamics.model import Model, load_model
 from sdfsim.dynamics.ranges import outside_training
-from sdfsim.dynamics.rollout import Rollout
+from sdfsim.dynamics.rollout import Rollout, join
 from sdfsim.dynamics.sleep import nobody_asleep
 from sdfsim.dynamics.step import FreeFlight, Rules, fly, step
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
@@ -26,7 +28,6 @@ from sdfsim.scene.effects import plan
 from sdfsim.scene.types import Scene
 
 EARTH = 9.81  # m/s^2, sets the time scale of scenes without gravity
-SPIN_LIMIT = 1e-5  # how far R'R may be from the identity
 
 
 class SimulationError(SdfsimError):
@@ -73,6 +74,7 @@ class Simulator:
         seed: of torch's generator (nothing in a step draws from it today; it is recorded).
         dt: s, the step; None lets the size of the bodies decide (the model owns the step in its own units).
         free_flight: "exact", or "learned" for the *paper* network's own formulation.
+        guard: "energy" holds back contact that makes energy, see `sdfsim.dynamics.energy`.
 
     Attributes:
         state: bodies and how they move, model units. Give it another one to start from there, or to change a body:
@@ -82,7 +84,8 @@ class Simulator:
         outside_training: what of the scene the model has not seen in training, one line each.
 
     Raises:
-        SdfsimError: no such model or device, a body that moves without nodes or mass.
+        SdfsimError: no such model or device, a body that moves without mass or without nodes that tell how it turns,
+            one that is too far away or too fast.
     """
 
     def __init__(
@@ -94,6 +97,7 @@ class Simulator:
         *,
         dt: float | None = None,
         free_flight: FreeFlight = "exact",
+        guard: Guard = "none",
     ) -> None:
         self.scene = scene
         self.device = pick_device(device)
@@ -118,7 +122,9 @@ class Simulator:
             rotation=effects.rotation.on,
             free_flight=free_flight,
             rows=row_limit(scene.limits),
+            guard=guard,
         )
+        check_nodes(scene, self.model.nodes)
         self.bodies, self.state = from_scene(scene, self.units, self.device, self.model.nodes)
         if self.model.kind == "paper":
             self.state = with_history(self.state, self.bodies, self.rules)
@@ -127,14 +133,19 @@ class Simulator:
         self.memory = Memory()
         self._dynamic = self.bodies.moves.nonzero()[:, 0]
         self._names = tuple(b.name for b in scene.bodies)
+        weight = self.bodies.mass[self._dynamic] * self.rules.gravity.norm()
+        self._lift = float((weight * self.bodies.size[self._dynamic]).sum()) * self.units.energy
         self.contacts: Contacts | None = None
         self.steps_done = 0
+        if broken := self._fault(self.state, everybody(self.bodies)):
+            raise SdfsimError(broken)
+        self._good = self.state
 
     def steps(self, count: int) -> Iterator[State]:
         """Advance by `count` steps, yielding the state after each (SI units).
 
         Raises:
-            SimulationError: a state that is not finite or not a rotation (its `rollout` is one frame here).
+            SimulationError: a state that cannot be; its `rollout` is one frame here, the last good state.
         """
         for _ in range(count):
             self._step()
@@ -144,20 +155,21 @@ class Simulator:
         self,
         seconds: float | None = None,
         steps: int | None = None,
-        on_step: Callable[[Rollout], None] | None = None,
+        on_step: Callable[[Rollout], bool | None] | None = None,
     ) -> Rollout:
         """Simulate and keep everything.
 
         Args:
             seconds: how long (default: the scene's duration).
             steps: how many steps instead.
-            on_step: called after each step with its one frame.
+            on_step: called after each step with its one frame; the run ends early when it returns True.
 
         Raises:
             SimulationError: the state broke; what was computed is in its `rollout`.
         """
         if steps is None:
             steps = max(1, round((self.scene.duration if seconds is None else seconds) / self.dt))
+        self._accept()
         frames = [self.initial_rollout()]
         for _ in range(steps):
             started = time.perf_counter()
@@ -166,8 +178,8 @@ class Simulator:
             except SimulationError as error:
                 raise SimulationError(error.message, join(frames)) from None
             frames.append(self._frame(1e3 * (time.perf_counter() - started)))
-            if on_step:
-                on_step(frames[-1])
+            if on_step and on_step(frames[-1]):
+                break
         return join(frames)
 
     def initial_rollout(self) -> Rollout:
@@ -186,26 +198,30 @@ class Simulator:
         )
 
     def _step(self) -> None:
+        self._accept()
         after, contacts = step(self.model, self.bodies, self.state, self.rules, self.memory)
-        self._check(after)
+        if broken := self._fault(after, awake(self.bodies, after), self.state):
+            raise self._broke(broken)
         self.state, self.contacts = after, contacts
+        self._good = after
         self.steps_done += 1
 
-    def _check(self, state: State) -> None:
-        rows = awake(self.bodies, state)
-        for name in ("position", "orientation", "velocity", "angular_velocity"):
-            bad = ~getattr(state, name)[rows].isfinite().all(-1)
-            if bad.any():
-                self._broke(f"{name} is not finite", rows[bad])
-        rotation = pose.to_matrix(state.orientation[rows])
-        eye = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
-        bad = (rotation.mT @ rotation - eye).abs().amax((-2, -1)) > SPIN_LIMIT
-        if bad.any():
-            self._broke("orientation is no rotation", rows[bad])
+    def _accept(self) -> None:
+        """A state that came from outside is looked at before anything is computed from it."""
+        if self.state is self._good:
+            return
+        if broken := self._fault(self.state, everybody(self.bodies)):
+            self.state = self._good
+            raise self._broke(broken)
+        self._good = self.state
 
-    def _broke(self, what: str, bad: torch.Tensor) -> None:
-        name = self.scene.bodies[int(bad[0])].name
-        raise SimulationError(f"step {self.steps_done + 1}: body {name!r}: {what}", self.initial_rollout())
+    def _fault(self, state: State, rows: torch.Tensor, before: State | None = None) -> str | None:
+        found = fault(state, rows, self.rules.dt, self.units, before)
+        return None if found is None else f"body {self._names[found[0]]!r}: {found[1]}"
+
+    def _broke(self, what: str) -> SimulationError:
+        last = f"the last good state is that of step {self.steps_done}, t = {self.steps_done * self.dt:.4g} s"
+        return SimulationError(f"step {self.steps_done + 1}: {what}; {last}", self.initial_rollout())
 
     def _frame(self, milliseconds: float) -> Rollout:
         state, c, u = self.si_state(), self.contacts, self.units
@@ -221,6 +237,7 @@ class Simulator:
             "contacts": float(count),
             "worst_penetration": depth,
             **self.memory.counts,
+            "energy_gain": self.memory.counts["energy_gain"] * self.units.energy,
             "step_ms": milliseconds,
         }
         return Rollout(
@@ -241,6 +258,8 @@ class Simulator:
                 "device": str(self.device),
                 "outside_training": self.outside_training,
                 "free_flight": self.rules.free_flight,
+                "guard": self.rules.guard,
+                "lift_energy": self._lift,
                 "sdfsim": sdfsim.__version__,
                 "torch": torch.__version__,
                 "python": platform.python_version(),
@@ -254,14 +273,17 @@ class Simulator:
 
     def _energies(self) -> dict[str, float]:
         """Kinetic and potential energy in joules of all dynamic bodies."""
-        u, b, s, rows = self.units, self.bodies, self.state, self._dynamic
-        rotation, mass = pose.to_matrix(s.orientation[rows]), b.mass[rows]
-        spin = (rotation.mT @ s.angular_velocity[rows][..., None])[..., 0]
-        turning = (spin * (b.inertia[rows] @ spin[..., None])[..., 0]).sum(-1)
-        kinetic = 0.5 * (mass * s.velocity[rows].square().sum(-1) + turning).sum()
-        potential = -(mass * (s.position[rows] @ self.rules.gravity)).sum()
-        joule = u.mass * u.velocity**2
-        return {"kinetic_energy": float(kinetic) * joule, "potential_energy": float(potential) * joule}
+        rows = self._dynamic
+        s = self.state
+        moving = kinetic(self.bodies, rows, s.orientation, (s.velocity[rows], s.angular_velocity[rows])).sum()
+        potential = -(self.bodies.mass[rows] * (s.position[rows] @ self.rules.gravity)).sum()
+        joule = self.units.energy
+        return {"kinetic_energy": float(moving) * joule, "potential_energy": float(potential) * joule}
+
+
+def everybody(bodies: Bodies) -> torch.Tensor:
+    """[N] int64, all of them."""
+    return torch.arange(len(bodies), device=bodies.device)
 
 
 def with_history(state: State, bodies: Bodies, rules: Rules) -> State:
@@ -283,14 +305,3 @@ def pick_device(name: str) -> torch.device:
     if name == "cuda" and not torch.cuda.is_available():
         raise SdfsimError("--device cuda: no CUDA device here", "use --device cpu")
     return torch.device(name)
-
-
-def join(frames: list[Rollout]) -> Rollout:
-    """One rollout out of consecutive pieces."""
-    arrays = ("time", "position", "orientation", "velocity", "angular_velocity")
-    arrays += ("contact_count", "contact_point", "contact_body")
-    return replace(
-        frames[0],
-        **{name: np.concatenate([getattr(f, name) for f in frames]) for name in arrays},
-        counters={k: np.concatenate([f.counters[k] for f in frames]) for k in frames[0].counters},
-    )

@@ -87,7 +87,7 @@ def settle(bodies: Bodies, state: State, contacts: Contacts, gravity: Tensor) ->
     state = replace(state, sleep=replace(sleep, quiet=quiet, anchor=anchor))
     if not bool((quiet >= STEPS).any()):
         return state
-    label = _islands(bodies, contacts)
+    label = islands(bodies, contacts)
     busy = bodies.moves & (quiet < STEPS)
     scripted = bodies.tracks.body if bodies.tracks is not None else rows[:0]
     pushed = _beside(contacts, scripted[(state.velocity[scripted] != 0).any(-1)], len(bodies))
@@ -144,7 +144,7 @@ def _beside(contacts: Contacts, bodies: Tensor, count: int) -> Tensor:
     return beside
 
 
-def _islands(bodies: Bodies, contacts: Contacts) -> Tensor:
+def islands(bodies: Bodies, contacts: Contacts) -> Tensor:
     """[N] int64, the same number for dynamic bodies that contact edges join."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -154,3 +154,26 @@ def _islands(bodies: Bodies, contacts: Contacts) -> Tensor:
     graph = coo_array(([True] * len(owner), (owner, body)), shape=(len(bodies), len(bodies)))
     _, label = connected_components(graph, directed=False)
     return torch.as_tensor(label, dtype=torch.int64, device=bodies.device)
+
+
+class Rest:
+    """Watches whether everything has come to rest: for `STEPS` steps no point of a dynamic body goes beyond `STRAY`.
+
+    Args:
+        bodies: N bodies.
+    """
+
+    def __init__(self, bodies: Bodies) -> None:
+        self._radius = bodies.radius[bodies.moves]
+        self._rows = bodies.moves
+        self._anchor: Tensor | None = None
+        self._quiet = 0
+
+    def settled(self, state: State) -> bool:
+        """Whether they rest in `state`, which follows that of the call before."""
+        pose = torch.cat([state.position[self._rows], state.orientation[self._rows]], -1)
+        if self._anchor is None or bool((_strayed(self._anchor, pose, self._radius) >= STRAY).any()):
+            self._anchor, self._quiet = pose, 0
+        else:
+            self._quiet += 1
+        return self._quiet >= STEPS

@@ -14,12 +14,14 @@ from torch import Tensor
 
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State, awake
-from sdfsim.dynamics.contacts import Contacts, find_contacts, no_contacts, thin_contacts
+from sdfsim.dynamics.contacts import Contacts, find_contacts, no_contacts
+from sdfsim.dynamics.energy import Guard, hold_back
 from sdfsim.dynamics.freeflight import ballistic, torque_free
 from sdfsim.dynamics.graph import SHELL, ContactGraph, number_pairs
 from sdfsim.dynamics.impulse import Velocities
 from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.model import Model
+from sdfsim.dynamics.overlap import parting
 from sdfsim.dynamics.sleep import settle, stir, touched, wake
 from sdfsim.dynamics.surfaces import compact, predict
 
@@ -41,6 +43,7 @@ class Rules:
         rotation: False lets bodies translate only.
         free_flight: "exact", or "learned" where the *paper* network predicts all of every body's motion.
         rows: how many nodes or edges to work on at once; None for all.
+        guard: "energy" holds back contact that makes energy.
     """
 
     gravity: Tensor
@@ -52,6 +55,7 @@ class Rules:
     rotation: bool = True
     free_flight: FreeFlight = "exact"
     rows: int | None = None
+    guard: Guard = "none"
 
 
 @torch.no_grad()
@@ -77,10 +81,11 @@ def step(
     if rules.contact:
         state, contacts = meet(model, bodies, state, rules, memory)
     with memory.timed("flight_ms"):
-        after = fly(bodies, state, rules)
+        after = flown = fly(bodies, state, rules)
     if contacts is not None or rules.free_flight == "learned":
         with memory.timed("network_ms"):
-            after, contacts = respond(model, bodies, state, after, contacts, rules, memory)
+            after, contacts = respond(model, bodies, state, flown, contacts, rules, memory)
+            after = hold_back(bodies, state, flown, after, contacts, rules.gravity, rules.dt, rules.guard, memory)
     if contacts is not None and after.sleep is not None:
         with memory.timed("sleep_ms"):
             after = settle(bodies, after, contacts, rules.gravity)
@@ -104,10 +109,11 @@ def drive(bodies: Bodies, state: State, rules: Rules) -> State:
 def meet(model: Model, bodies: Bodies, state: State, rules: Rules, memory: Memory) -> tuple[State, Contacts]:
     """Contact edges; what sleeps beside something that moves wakes, and is looked at in turn."""
     while True:
-        contacts = find_contacts(bodies, state, rules.gravity, model.reach, rules.dt, memory, rules.rows)
+        thin = model.kind == "impulse"
+        contacts = find_contacts(bodies, state, rules.gravity, model.reach, rules.dt, memory, rules.rows, thin=thin)
         islands = touched(state, contacts)
         if not len(islands):
-            return state, contacts
+            return state, parting(bodies, state, contacts, memory)
         state = wake(state, islands)
 
 
@@ -154,7 +160,6 @@ def respond(
         return free, contacts
     if model.kind == "paper":
         return _paper_step(model, bodies, state, free, contacts, active, rules, memory), contacts
-    contacts = thin_contacts(bodies, contacts)
     graph = contact_graph(bodies, state, free, contacts, rules)[1]
     memory.count(nodes=len(active), edges=len(contacts))
     predicted = model.network(graph, friction=rules.friction, rows=rules.rows)

@@ -109,7 +109,7 @@ def advance(bodies: Bodies, state: State, acceleration: Tensor, dt: float) -> St
     # Relative to each body's own centre, so that a far origin costs no precision.
     step = (state.position - earlier_position[1])[owner] + _apply((now - before)[owner], bodies.node)
     moved = _apply(now[owner], bodies.node) + step + acceleration
-    offset, orientation = match_shapes(bodies.node, moved, owner, len(bodies))
+    offset, orientation = match_shapes(bodies.node, moved, owner, state.orientation)
     still = ~bodies.moves[:, None]
     offset = torch.where(still, torch.zeros_like(offset), offset)
     orientation = torch.where(still, state.orientation, orientation)

@@ -16,6 +16,7 @@ from sdfsim.errors import SdfsimError
 from sdfsim.files import write_text
 from sdfsim.learning import tables
 from sdfsim.learning.evaluate import evaluate
+from sdfsim.learning.recipes import RECIPES
 
 
 def bundle(path: Path, data: Path, name: str, folder: Path = BUNDLED, seeds: Sequence[Path] = ()) -> dict:
@@ -121,13 +122,20 @@ def card_text(model: Model, report: dict, learned: dict | None) -> str:
 def _commands(card: dict) -> list[str]:
     """What makes the data and trains on them."""
     lines = [
-        f"sdfsim dataset {made['recipe']} -o {_folder(made)} --shapes SHAPES --trajectories {count}"
+        f"sdfsim dataset {made['recipe']} -o {_folder(made)}{_shapes(made)} --trajectories {count}"
         f" --seed {made['seed']} --split {split}"
         for made in card["data"]
         for split, count in made["trajectories"].items()
     ]
     folders = " ".join(f"--data {_folder(made)}" for made in card["data"])
     return [*lines, f"sdfsim train {folders} -o RUN --preset {card['preset_name']}"]
+
+
+def _shapes(made: dict) -> str:
+    """The options that say which shapes a recipe draws from."""
+    recipe = RECIPES.get(made["recipe"])
+    given = " --shapes SHAPES" if recipe is None or recipe.given else ""
+    return given + (f" --random-solids {made['random_solids']}" if made.get("random_solids") else "")
 
 
 def _folder(made: dict) -> str:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 
 SPLITS = ("train", "validation", "test")
+SOLID = "solid_"  # how the names of PyBullet's random solids begin
 FLOOR = (0.3, 0.5)  # friction and restitution of the recipes' floor, the plane z = 0
 
 

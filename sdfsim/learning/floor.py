@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +12,7 @@ import numpy as np
 
 from sdfsim.errors import SdfsimError
 from sdfsim.learning.dataset import FLOOR, Trajectory, read_info, shapes_folder
-from sdfsim.learning.teacher import DT, ENGINE_SETTINGS, SUBSTEP, Teacher, TeacherBody, import_pybullet
+from sdfsim.learning.teacher import DT, ENGINE_SETTINGS, SUBSTEP, SUBSTEPS, Teacher, TeacherBody, import_pybullet
 from sdfsim.parallel import parallel
 
 # m/s; 0 tells what the recording alone does not bring back: an engine's state is more than its recorded frames.
@@ -42,7 +44,7 @@ def chaos_floor(data: Path, trajectories: list[Trajectory], steps: int, seed: in
     floor = info.get("floor") or {"friction": FLOOR[0], "restitution": FLOOR[1]}
     surface = (float(floor["friction"]), float(floor["restitution"]))
     jobs = [
-        (_perturbed(t, size, [seed, k]), urdfs, surface, steps)
+        (perturbed(t, size, [seed, k]), urdfs, surface, steps)
         for size in PERTURBATIONS.values()
         for k, t in enumerate(trajectories)
     ]
@@ -57,7 +59,16 @@ def run_again(start: Trajectory, urdfs: dict[str, Path], floor: tuple[float, flo
     Raises:
         SdfsimError: the engine takes another inertia than the recorded one.
     """
-    with Teacher(start.gravity, floor) as teacher:
+    with started(start, urdfs, floor) as teacher:
+        return replace(start, **teacher.run(steps))
+
+
+@contextmanager
+def started(
+    start: Trajectory, urdfs: dict[str, Path], floor: tuple[float, float], substeps: int = SUBSTEPS
+) -> Iterator[Teacher]:
+    """The teacher at the first frame of `start`. Raises as `run_again` does."""
+    with Teacher(start.gravity, floor, substeps) as teacher:
         for i, name in enumerate(start.shape):
             mass = 0.0 if start.static[i] else float(start.mass[i])
             body = TeacherBody(
@@ -70,7 +81,7 @@ def run_again(start: Trajectory, urdfs: dict[str, Path], floor: tuple[float, flo
                 teacher.push(i, start.velocity[0, i], start.angular_velocity[0, i])
                 if not np.allclose(teacher.inertia(i), start.inertia[i], rtol=SAME_INERTIA):
                     raise SdfsimError(f"{urdfs[str(name)]}: the engine's inertia is not the recorded one")
-        return replace(start, **teacher.run(steps))
+        yield teacher
 
 
 def engine_file(data: Path, shape: str) -> Path:
@@ -105,7 +116,7 @@ def collision_mesh(urdf: Path) -> tuple[Path, np.ndarray]:
     return urdf.parent / mesh.attrib["filename"], offset
 
 
-def _perturbed(t: Trajectory, size: float, seed: list[int]) -> Trajectory:
+def perturbed(t: Trajectory, size: float, seed: list[int]) -> Trajectory:
     """The trajectory with velocities of its moving bodies changed by `size` m/s in random directions."""
     direction = np.random.default_rng(seed).normal(size=t.velocity[0].shape)
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sdfsim.errors import SdfsimError
+from sdfsim.files import locked
 from sdfsim.learning.dataset import FLOOR, SPLITS, Trajectory, read_info, write_info
 from sdfsim.learning.recipes import RECIPES, Cast, Recipe
 from sdfsim.learning.shapes import Origin, ShapeSource, find_shapes, fit_shapes, origins, prepare, split_of
@@ -58,7 +59,7 @@ def make_dataset(
 
     Raises:
         SdfsimError: unknown recipe or split, an option that the recipe has no use for, no usable shapes, PyBullet
-            absent, another dataset in `out`.
+            absent, another dataset in `out`, or another run writing to it.
     """
     plan = _checked(recipe, split, trajectories, shapes, random_solids, bodies)
     tell = on_progress or (lambda fraction, message: None)
@@ -83,24 +84,25 @@ def make_dataset(
         cast = replace(cast, shapes=[s for s in cast.shapes if split_of(s.name) == split])
     if plan.given and not cast.shapes:
         raise SdfsimError(f"none of the {len(info['shapes'])} shapes belongs to the {split} split", "give more shapes")
-    folder = out / split
-    folder.mkdir(parents=True, exist_ok=True)
-    fit_shapes([*cast.shapes, *cast.scenery.values()], out / "shapes", lambda f, m: tell(0.1 + 0.4 * f, m))
-    write_info(out, info)
-    cast = replace(cast, bodies=bodies)
-    todo = [k for k in range(trajectories) if not (folder / f"{k:05d}.npz").exists()]
-    jobs = [(recipe, k, seed, split, cast, folder / f"{k:05d}.npz") for k in todo]
-    for done, _ in enumerate(parallel(_make_one, jobs), start=1):
-        tell(0.5 + 0.5 * done / len(todo), f"trajectory {done} of {len(todo)}")
-    return {
-        "dataset": str(out),
-        "split": split,
-        "trajectories": trajectories,
-        "made_now": len(todo),
-        "shapes": len(cast.shapes),
-        "left_out": info.get("left_out", {}),
-        "statistics": statistics(out, split),
-    }
+    with locked(out):
+        folder = out / split
+        folder.mkdir(parents=True, exist_ok=True)
+        fit_shapes([*cast.shapes, *cast.scenery.values()], out / "shapes", lambda f, m: tell(0.1 + 0.4 * f, m))
+        write_info(out, info)
+        cast = replace(cast, bodies=bodies)
+        todo = [k for k in range(trajectories) if not (folder / f"{k:05d}.npz").exists()]
+        jobs = [(recipe, k, seed, split, cast, folder / f"{k:05d}.npz") for k in todo]
+        for done, _ in enumerate(parallel(_make_one, jobs), start=1):
+            tell(0.5 + 0.5 * done / len(todo), f"trajectory {done} of {len(todo)}")
+        return {
+            "dataset": str(out),
+            "split": split,
+            "trajectories": trajectories,
+            "made_now": len(todo),
+            "shapes": len(cast.shapes),
+            "left_out": info.get("left_out", {}),
+            "statistics": statistics(out, split),
+        }
 
 
 def report_lines(report: dict) -> list[str]:

@@ -13,6 +13,7 @@ from sdfsim.dynamics.graph import SHELL, ContactGraph, number_pairs
 from sdfsim.dynamics.impulse import ImpulseNetwork, Velocities
 from sdfsim.learning.dataset import FLOOR, product_range
 from sdfsim.learning.frames import ContactFrames
+from sdfsim.learning.team import ALONE, Team
 
 HUBER = 0.05  # m/s: below it errors count squared, above it by their size
 CALM_SHARE = 0.2  # how often frames in which nothing is hit are drawn, against those with the hardest hits
@@ -29,6 +30,17 @@ class Noise:
 
     shift: float = 0.0003
     speed: float = 0.003
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """Draws of the noise for B bodies, [B, 3] each: displacements in m, those by turning at the bodies' surfaces, then
+    velocities in m/s likewise."""
+
+    shift: Tensor
+    turn: Tensor
+    push: Tensor
+    spin: Tensor
 
 
 @dataclass(frozen=True)
@@ -86,13 +98,13 @@ class ImpulseTask:
             "restitution": product_range(f.restitution, FLOOR[1]),
         }
 
-    def draw(self, rng: np.random.Generator, count: int) -> Batch:
-        """A batch of `count` frames."""
-        picked = rng.choice(len(self.frames), size=count, p=self.weight)
-        return self.batch(np.sort(picked), rng)
+    def draw(self, rng: np.random.Generator, count: int, team: Team = ALONE) -> Batch:
+        """A batch of `count` frames, or the part of it that falls to one of a team."""
+        picked = np.sort(rng.choice(len(self.frames), size=count, p=self.weight))
+        return self.batch(picked[team.share(count)], self._noise(picked, rng, team))
 
-    def batch(self, picked: np.ndarray, rng: np.random.Generator | None = None) -> Batch:
-        """The frames `picked` [K] as one graph whose last body is the floor; disturbed when `rng` is given."""
+    def batch(self, picked: np.ndarray, noise: Disturbance | None = None) -> Batch:
+        """The frames `picked` [K] as one graph whose last body is the floor; disturbed when `noise` is given."""
         f = self.frames
         rows, body_of = _ranges(f.body_start, picked)
         edges, edge_of = _ranges(f.edge_start, picked)
@@ -144,7 +156,7 @@ class ImpulseTask:
         counts = torch.zeros_like(moves)
         counts[index.flatten()] = True
         batch = Batch(graph, truth, body(f.size, 1.0), counts & moves)
-        return self._disturbed(batch, rng) if rng is not None and self.noise is not None else batch
+        return batch if noise is None else _disturbed(batch, noise)
 
     def loss(self, network: ImpulseNetwork, batch: Batch, *, mirrored: bool = False) -> Tensor:
         """Mean pseudo-Huber error of end and mean velocities, angular ones times half the body's size."""
@@ -156,38 +168,53 @@ class ImpulseTask:
             _huber((predicted.angular - batch.truth.angular) * lever),
             _huber((predicted.mean_angular - batch.truth.mean_angular) * lever),
         ]
-        return torch.stack(terms).mean(0)[batch.counts].mean()
+        return torch.stack(terms).mean(0)[batch.counts].sum() / max(1, self.weight_of(batch))
 
-    def _disturbed(self, batch: Batch, rng: np.random.Generator) -> Batch:
-        """Shift, turn and push bodies a little; mean velocities still lead to the recorded pose."""
-        assert self.noise is not None
-        g, moves = batch.graph, (batch.graph.inverse_mass > 0)[:, None]
+    def weight_of(self, batch: Batch) -> int:
+        """Over how many bodies a batch's loss is the mean."""
+        return int(batch.counts.sum())
+
+    def _noise(self, picked: np.ndarray, rng: np.random.Generator, team: Team) -> Disturbance | None:
+        """Noise of the whole batch, so that it does not depend on the team's size; then this one's part of it."""
+        if self.noise is None:
+            return None
+        counts = np.diff(self.frames.body_start)[picked]
+        mine = np.zeros(len(picked), dtype=bool)
+        mine[team.share(len(picked))] = True
+        rows = np.repeat(mine, counts)
 
         def normal(scale: float) -> Tensor:
-            draw = rng.standard_normal((len(moves), 3), dtype=np.float32) * scale
-            return torch.from_numpy(draw).to(self.device) * moves
+            draw = rng.standard_normal((len(rows), 3), dtype=np.float32)[rows] * scale
+            return torch.from_numpy(np.concatenate([draw, np.zeros((1, 3), dtype=np.float32)])).to(self.device)
 
-        lever = 2.0 / batch.size[:, None]
-        shift, turn = normal(self.noise.shift), normal(self.noise.shift) * lever
-        push, spin = normal(self.noise.speed), normal(self.noise.speed) * lever
-        one = shift[g.first] + torch.linalg.cross(turn[g.first], g.arm_first)
-        two = shift[g.second] + torch.linalg.cross(turn[g.second], g.arm_second)
-        graph = replace(
-            g,
-            gap=g.gap + ((one - two) * g.normal).sum(-1),
-            velocity=g.velocity + push,
-            free_velocity=g.free_velocity + push,
-            mean_velocity=g.mean_velocity + push,
-            angular=g.angular + spin,
-            free_angular=g.free_angular + spin,
-            mean_angular=g.mean_angular + spin,
-        )
-        truth = replace(
-            batch.truth,
-            mean_velocity=batch.truth.mean_velocity - shift / g.dt,
-            mean_angular=batch.truth.mean_angular - turn / g.dt,
-        )
-        return replace(batch, graph=graph, truth=truth)
+        shift, speed = self.noise.shift, self.noise.speed
+        return Disturbance(normal(shift), normal(shift), normal(speed), normal(speed))
+
+
+def _disturbed(batch: Batch, noise: Disturbance) -> Batch:
+    """Shift, turn and push bodies a little; mean velocities still lead to the recorded pose."""
+    g = batch.graph
+    moves, lever = (g.inverse_mass > 0)[:, None], 2.0 / batch.size[:, None]
+    shift, push = noise.shift * moves, noise.push * moves
+    turn, spin = noise.turn * moves * lever, noise.spin * moves * lever
+    one = shift[g.first] + torch.linalg.cross(turn[g.first], g.arm_first)
+    two = shift[g.second] + torch.linalg.cross(turn[g.second], g.arm_second)
+    graph = replace(
+        g,
+        gap=g.gap + ((one - two) * g.normal).sum(-1),
+        velocity=g.velocity + push,
+        free_velocity=g.free_velocity + push,
+        mean_velocity=g.mean_velocity + push,
+        angular=g.angular + spin,
+        free_angular=g.free_angular + spin,
+        mean_angular=g.mean_angular + spin,
+    )
+    truth = replace(
+        batch.truth,
+        mean_velocity=batch.truth.mean_velocity - shift / g.dt,
+        mean_angular=batch.truth.mean_angular - turn / g.dt,
+    )
+    return replace(batch, graph=graph, truth=truth)
 
 
 def _span(values: np.ndarray) -> list[float]:

@@ -17,7 +17,12 @@ TOGETHER = 4000  # bodies whose contacts are found in one call
 
 
 def merged(
-    trajectories: list[Trajectory], frames: list[int], shapes: dict[str, Shape], units: Units, device: torch.device
+    trajectories: list[Trajectory],
+    frames: list[int],
+    shapes: dict[str, Shape],
+    units: Units,
+    device: torch.device,
+    floor: tuple[float, float] = FLOOR,
 ) -> tuple[Bodies, State]:
     """Bodies of all trajectories, each at its frame, then one floor they share; worlds do not touch each other.
 
@@ -27,7 +32,17 @@ def merged(
         shapes: Shape of every name in use. The dataset's body frames sit at the centre of mass, so do these.
         units: model units.
         device: of the tensors.
+        floor: its friction and restitution.
     """
+    scene, world = scene_of(trajectories, frames, shapes, floor)
+    tensors, state = from_scene(scene, units, device)
+    return replace(tensors, world=torch.tensor(world, device=device)), state
+
+
+def scene_of(
+    trajectories: list[Trajectory], frames: list[int], shapes: dict[str, Shape], floor: tuple[float, float] = FLOOR
+) -> tuple[Scene, list[int]]:
+    """The scene that `merged` makes tensors of, and the world of each of its bodies (-1: the floor's, in all)."""
     names = sorted({str(n) for t in trajectories for n in t.shape})
     centred = [replace(shapes[n], com=np.zeros(3)) for n in names]
     bodies, world = [], []
@@ -35,16 +50,14 @@ def merged(
         for i, name in enumerate(t.shape):
             bodies.append(_body(t, frame, i, names.index(str(name)), f"{w}/{i}"))
             world.append(w)
-    bodies.append(_floor(len(names)))
+    bodies.append(_floor(len(names), floor))
     scene = Scene(
         shapes=(*centred, analytic_shape("plane")),
         bodies=tuple(bodies),
         gravity=trajectories[0].gravity,
         duration=1.0,
     )
-    tensors, state = from_scene(scene, units, device)
-    place = torch.tensor([*world, -1], device=device)
-    return replace(tensors, world=place), state
+    return scene, [*world, -1]
 
 
 def find_edges(trajectory: Trajectory, shapes: dict[str, Shape], reach: float) -> dict[str, np.ndarray]:
@@ -99,7 +112,7 @@ def _body(t: Trajectory, frame: int, i: int, shape: int, name: str) -> Body:
     )
 
 
-def _floor(shape: int) -> Body:
+def _floor(shape: int, surface: tuple[float, float]) -> Body:
     return Body(
         name="floor",
         shape=shape,
@@ -110,6 +123,6 @@ def _floor(shape: int) -> Body:
         velocity=np.zeros(3),
         angular_velocity=np.zeros(3),
         mass=0.0,
-        friction=FLOOR[0],
-        restitution=FLOOR[1],
+        friction=surface[0],
+        restitution=surface[1],
     )

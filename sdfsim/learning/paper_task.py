@@ -16,6 +16,7 @@ from sdfsim.dynamics.paper import PaperNetwork, SurfaceGraph
 from sdfsim.dynamics.surfaces import node_owner, surface_graph, target_acceleration
 from sdfsim.learning.dataset import FLOOR, Trajectory, load_shapes, product_range, trajectory_files
 from sdfsim.learning.merge import merged
+from sdfsim.learning.team import ALONE, Team
 
 NODES = 64  # surface nodes a body: the first of each shape's, which are its corners and then the most spread
 WARM_BATCHES = 20  # batches that set the feature statistics before the first step
@@ -57,10 +58,11 @@ class PaperTask:
                 network.scale[name].observe(getattr(batch.graph, name))  # type: ignore[operator]
             network.target.observe(batch.target[batch.moves])
 
-    def draw(self, rng: np.random.Generator, count: int) -> Batch:
-        """`count` recorded steps as one graph."""
+    def draw(self, rng: np.random.Generator, count: int, team: Team = ALONE) -> Batch:
+        """`count` recorded steps as one graph, or the part of them that falls to one of a team."""
         picked = [self.trajectories[i] for i in rng.integers(len(self.trajectories), size=count)]
         frames = [int(rng.integers(2, len(t.position) - 1)) for t in picked]
+        picked, frames = picked[team.share(count)], frames[team.share(count)]
         units = Units(1.0, 1.0, 1.0)
         bodies, state = merged(picked, frames, self.shapes, units, self.device)
         yaw = pose.from_rotvec(torch.tensor([0.0, 0.0, rng.uniform(0, 2 * np.pi)], dtype=torch.float64))
@@ -87,11 +89,15 @@ class PaperTask:
         error = network(batch.graph) - network.target(batch.target)
         return error[batch.moves].square().mean()
 
+    def weight_of(self, batch: Batch) -> int:
+        """Over how many nodes a batch's loss is the mean."""
+        return int(batch.moves.sum())
+
     def ranges(self) -> dict[str, list[float]]:
         """[low, high] of what the trajectories hold, SI units, coefficients as products with the floor's."""
         extent = {name: float(np.ptp(shape.sdf.bounds, axis=0).max()) for name, shape in self.shapes.items()}
         size = [extent[str(n)] * s for t in self.trajectories for n, s in zip(t.shape, t.scale, strict=True)]
-        mass = np.concatenate([t.mass for t in self.trajectories])
+        mass = np.concatenate([t.mass[~t.static] for t in self.trajectories])
         friction = np.concatenate([t.friction for t in self.trajectories])
         restitution = np.concatenate([t.restitution for t in self.trajectories])
         speed = np.concatenate([np.linalg.norm(t.velocity, axis=-1).ravel() for t in self.trajectories])

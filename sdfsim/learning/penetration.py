@@ -125,7 +125,7 @@ def _solid(data: Path, name: str, shape: Shape) -> Solid:
         return _of_sdf(shape, "mesh" if isinstance(shape.sdf, MeshSdf) else "closed form")
     if shape.source.get("kind") != "pieces":
         return _of_sdf(with_sdf(shape, "mesh"), "mesh")
-    if not (pieces := _engine_pieces(data, name)):
+    if not (pieces := engine_pieces(data, name)):
         return _of_sdf(with_sdf(shape, "mesh"), "shown mesh")
     oracle = PiecesDistance(pieces)
     return Solid(shape.nodes, oracle.bounds, lambda points: oracle(points).distance, "pieces")
@@ -136,7 +136,7 @@ def _of_sdf(shape: Shape, kind: str) -> Solid:
     return Solid(shape.nodes, np.asarray(sdf.bounds), lambda points: np.asarray(sdf(points)[0]), kind)
 
 
-def _engine_pieces(data: Path, name: str) -> list[Mesh]:
+def engine_pieces(data: Path, name: str) -> list[Mesh]:
     """The convex pieces that the engine collides, in the body's frame; none where the dataset does not lead to them."""
     try:
         path, offset = collision_mesh(engine_file(data, name))

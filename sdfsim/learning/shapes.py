@@ -12,6 +12,7 @@ import numpy as np
 
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, write_json, write_text
+from sdfsim.learning.dataset import SOLID
 from sdfsim.learning.decompose import VHACD, decompose, wavefront
 from sdfsim.learning.teacher import write_urdf
 from sdfsim.parallel import parallel
@@ -129,7 +130,7 @@ def origins(shapes: Path | None, random_solids: int = 0) -> list[Origin]:
         import pybullet_data
 
         home = Path(pybullet_data.getDataPath()) / "random_urdfs"
-        found += [Origin(f"solid_{k:03d}", pieces=home / f"{k:03d}" / f"{k:03d}.obj") for k in range(random_solids)]
+        found += [Origin(f"{SOLID}{k:03d}", pieces=home / f"{k:03d}" / f"{k:03d}.obj") for k in range(random_solids)]
     names = [origin.name for origin in found]
     if twice := {name for name in names if names.count(name) > 1}:
         raise SdfsimError(f"{shapes}: two shapes are called {min(twice)!r}", "rename one")

@@ -68,15 +68,19 @@ class Teacher:
     Args:
         gravity: [3] m/s^2.
         floor: (friction, restitution) of the floor, or None for no floor.
+        substeps: of the engine in one recorded step; the recordings have `SUBSTEPS`.
     """
 
-    def __init__(self, gravity: np.ndarray, floor: tuple[float, float] | None = (0.3, 0.5)) -> None:
+    def __init__(
+        self, gravity: np.ndarray, floor: tuple[float, float] | None = (0.3, 0.5), substeps: int = SUBSTEPS
+    ) -> None:
         self.pb = import_pybullet()
+        self.substeps = substeps
         self.client = self.pb.connect(self.pb.DIRECT)
         self.bodies: list[int] = []
         self._call("setPhysicsEngineParameter", **ENGINE_SETTINGS)
         self._call("setGravity", *gravity)
-        self._call("setTimeStep", SUBSTEP)
+        self._call("setTimeStep", DT / substeps)
         if floor is not None:
             # A very large box, as in Kubric: its upper face is z = 0.
             shape = self._call("createCollisionShape", self.pb.GEOM_BOX, halfExtents=[100.0, 100.0, 1.0])
@@ -146,7 +150,7 @@ class Teacher:
         """
         frames = [self._state()]
         for _ in range(steps):
-            for _ in range(SUBSTEPS):
+            for _ in range(self.substeps):
                 self._call("stepSimulation")
             frames.append(self._state())
         position, quat, velocity, angular = (np.array(a) for a in zip(*frames, strict=True))

@@ -15,6 +15,7 @@ DEFAULT_DENSITY = 1000.0  # kg/m^3, of a dynamic body that gives neither mass no
 DEFAULT_FRICTION = 0.5
 DEFAULT_RESTITUTION = 0.5
 MOST_COPIES = 100_000
+MOST_NAMED = 20  # in one message
 
 _ROTATIONS = ("quat_xyzw", "quat_wxyz", "euler_xyz_deg")
 _NOT_WITH_PLANE = (
@@ -74,7 +75,13 @@ def read_bodies(value: Value, shapes: dict[str, str | None]) -> list[BodySpec]:
     items = value.items()
     if value.is_list() and not items:
         value.wrong("must hold at least one body (got 0)")
-    bodies = [_body(item, shapes) for item in items]
+    bodies, copies = [], 0
+    for item in items:
+        bodies.append(_body(item, shapes))
+        copies += len(bodies[-1].offsets)
+        if copies > MOST_COPIES:
+            item.wrong(f"one too many: a scene has at most {MOST_COPIES} bodies, copies included")
+            return bodies
     seen: dict[str, int] = {}
     for body in bodies:
         for name in sorted({body.name, *body.names()} - {""}):
@@ -173,7 +180,8 @@ def _shape_of(section: Section, shapes: dict[str, str | None]) -> str | None:
         return None
     name = value.text()
     if name and name not in shapes:
-        there = f"; shapes are {', '.join(shapes)}" if shapes else "; the file has no shapes"
+        few = [*list(shapes)[:MOST_NAMED], *(["..."] if len(shapes) > MOST_NAMED else [])]
+        there = f"; shapes are {', '.join(few)}" if shapes else "; the file has no shapes"
         value.wrong(f"no shape is called {name!r}{nearest(name, shapes) or there}")
     return name
 

@@ -10,7 +10,6 @@ import difflib
 import math
 import re
 from collections.abc import Iterable
-from pathlib import Path
 
 import numpy as np
 import yaml
@@ -21,6 +20,8 @@ _NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?")
 _NOT_FINITE = re.compile(r"[-+]?\.?(nan|inf|infinity)", re.IGNORECASE)
 _NULL = ("", "~", "null", "Null", "NULL")
 _SHOWN = 40
+MOST_LETTERS = 1000  # of a key or a text
+_ALIKE = 100  # names longer than this, or more of them than ten times as many, are not searched for similar ones
 _PLAIN_TAGS = {f"tag:yaml.org,2002:{t}" for t in ("str int float bool null map seq timestamp merge value".split())}
 
 
@@ -29,16 +30,15 @@ class Problems:
 
     def __init__(self, file: str) -> None:
         self.file = file
-        self._found: list[tuple[int, str]] = []
+        self._found: dict[tuple[int, str], None] = {}  # in the order of the finding, and quick to look up
 
     def __len__(self) -> int:
         return len(self._found)
 
     def add(self, line: int, path: str, text: str) -> None:
         """Note a fault; `line` counts from 1, `path` is such as `bodies[2].mass` (may be empty)."""
-        entry = (line, f"{self.file}:{line}: {path}: {text}" if path else f"{self.file}:{line}: {text}")
-        if entry not in self._found:  # an anchor used twice is one fault
-            self._found.append(entry)
+        # An anchor used twice is one fault.
+        self._found[line, f"{self.file}:{line}: {path}: {text}" if path else f"{self.file}:{line}: {text}"] = None
 
     def check(self) -> None:
         """Raise SceneError with every fault, in file order, if there is any."""
@@ -138,6 +138,9 @@ class Value:
         if not isinstance(self.node, yaml.ScalarNode) or self.is_null() or not self.node.value.strip():
             self.wrong(f"must be a text (got {self.shown()})")
             return default
+        if len(self.node.value) > MOST_LETTERS:
+            self.wrong(f"must be a text of at most {MOST_LETTERS} letters (got {len(self.node.value)})")
+            return default
         return self.node.value
 
     def choice(self, allowed: Iterable[str], default: str) -> str:
@@ -174,10 +177,13 @@ class Section:
         first: dict[str, int] = {}
         for key_node, child in value.node.value:
             line = key_node.start_mark.line + 1
-            if not isinstance(key_node, yaml.ScalarNode):
-                value.problems.add(line, value.path, "a key must be a text")
+            if not isinstance(key_node, yaml.ScalarNode) or key_node.tag not in _PLAIN_TAGS:
+                value.problems.add(line, value.path, "a key must be a text without tags")
                 continue
             key = key_node.value
+            if len(key) > MOST_LETTERS:
+                value.problems.add(line, value.path, f"a key of {len(key)} letters (at most {MOST_LETTERS})")
+                continue
             path = f"{value.path}.{key}" if value.path else key
             if key in first:
                 value.problems.add(line, path, f"the key appears twice (first on line {first[key]})")
@@ -235,35 +241,8 @@ class Section:
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """` (did you mean 'x'?)` with the nearest known name, or an empty string."""
-    match = difflib.get_close_matches(name, list(known), n=1, cutoff=0.55)
+    known = [other for other in known if len(other) <= _ALIKE]
+    if len(name) > _ALIKE or len(known) > 10 * _ALIKE:
+        return ""
+    match = difflib.get_close_matches(name, known, n=1, cutoff=0.55)
     return f" (did you mean '{match[0]}'?)" if match else ""
-
-
-def read_document(path: Path) -> Value:
-    """Parse one YAML file into its root value.
-
-    Raises:
-        SceneError: when it is missing, not UTF-8, not YAML (with the line), or empty.
-    """
-    try:
-        text = path.read_bytes().decode("utf-8")
-    except FileNotFoundError as error:
-        raise SceneError([f"{path}: no such file"], "give the path of a scene.yaml") from error
-    except OSError as error:
-        raise SceneError([f"{path}: cannot be read: {error.strerror}"], "give the path of a scene.yaml") from error
-    except UnicodeDecodeError as error:
-        line = error.object[: error.start].count(b"\n") + 1
-        raise SceneError([f"{path}:{line}: not a text in UTF-8"], "a scene is a YAML text file") from error
-    try:
-        root = yaml.compose(text, Loader=yaml.SafeLoader)
-    except yaml.MarkedYAMLError as error:
-        line = error.problem_mark.line + 1 if error.problem_mark else 1
-        raise SceneError([f"{path}:{line}: not valid YAML: {error.problem or error.context}"]) from error
-    except yaml.reader.ReaderError as error:
-        line = text[: error.position].count("\n") + 1
-        raise SceneError([f"{path}:{line}: not valid YAML: {error.reason}"]) from error
-    except (yaml.YAMLError, RecursionError) as error:
-        raise SceneError([f"{path}:1: not valid YAML: {type(error).__name__}"]) from error
-    if root is None:
-        raise SceneError([f"{path}:1: the file is empty"], "a scene needs at least version and bodies")
-    return Value(root, "", Problems(str(path)))

@@ -22,12 +22,13 @@ _FITTED = ("mesh", "primitive")  # kinds of shapes that are fitted (or sampled) 
 _PLANE = ""  # the key of the one plane shape that all bodies with a `plane:` of their own share
 
 
-def load_scene(path: Path | str, on_progress: Progress | None = None) -> Scene:
+def load_scene(path: Path | str, on_progress: Progress | None = None, *, allow_outside: bool = False) -> Scene:
     """Read a scene file, and load or fit the shapes that its bodies use.
 
     Args:
         path: of the scene.yaml; paths inside it are taken from its folder.
         on_progress: called with (fraction, message) while shapes are fitted. A mesh is fitted on first use only.
+        allow_outside: whether meshes, shape folders and models that the file names may lie outside of its folder.
 
     Returns:
         The scene in SI units.
@@ -36,7 +37,7 @@ def load_scene(path: Path | str, on_progress: Progress | None = None) -> Scene:
         SceneError: with one line `FILE:LINE: FIELD: what is wrong` for every fault found.
     """
     path = Path(path)
-    spec = read_scene(path)
+    spec = read_scene(path, allow_outside=allow_outside)
     shapes = _load_shapes(spec, on_progress or (lambda fraction, message: None))
     order = {key: i for i, key in enumerate(shapes)}
     groups = {body.name: body.names() for body in spec.bodies}

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from sdfsim.scene.bodies import BodySpec, read_bodies
-from sdfsim.scene.document import Problems, Section, Value, nearest, read_document
+from sdfsim.scene.document import Problems, Section, Value, nearest
+from sdfsim.scene.source import read_document
 from sdfsim.scene.types import Effects, Limits
-from sdfsim.shape.asset import DEFAULT_RESOLUTION
+from sdfsim.shape.asset import DEFAULT_RESOLUTION, MESH_FILE, RECORD_FILE, WEIGHTS_FILE
 
 VERSION = 1
 DEFAULT_DURATION = 4.0  # s
@@ -24,6 +25,7 @@ _SDF_KINDS = ("mlp", "grid", "mesh")
 FEWEST_NODES, MOST_NODES = 3, 128  # along each side of the sampling grid
 _WITH_SDF = ("asset", "mesh", "primitive")  # the others have an exact SDF of their own
 FEWEST_SAMPLES, MOST_SAMPLES = 8, 512  # along each side of a grid
+_OUTSIDE_ADVICE = "copy it there, or allow it with --allow-outside, in Python allow_outside=True"
 _PLANE_ADVICE = " (a plane shape takes none: tilt it by the body's pose, or give the body its own `plane:`)"
 
 
@@ -73,8 +75,46 @@ class SceneSpec:
     bodies: list[BodySpec]
 
 
-def read_scene(path: Path) -> SceneSpec:
+@dataclass(frozen=True)
+class Home:
+    """Where the paths of a scene file start.
+
+    Attributes:
+        folder: the file's own.
+        allow_outside: whether a path may lead out of it, by `..`, from the root or through a link.
+    """
+
+    folder: Path
+    allow_outside: bool = False
+
+    def find(self, value: Value) -> Path | None:
+        """The place that a value names; None after reporting that it is none, or lies outside."""
+        place = self.folder / value.text("?")
+        try:
+            if not self.allow_outside and not all(p.is_relative_to(self.folder.resolve()) for p in _ends(place)):
+                value.wrong(f"leads out of the scene's folder: {place} ({_OUTSIDE_ADVICE})")
+                return None
+            place.stat()
+        except (FileNotFoundError, NotADirectoryError):
+            pass  # told in the words of whoever wants it
+        except (OSError, RuntimeError, ValueError) as error:  # a loop of links, too long a name, a zero byte
+            value.wrong(f"cannot be looked up: {place} ({getattr(error, 'strerror', None) or error})")
+            return None
+        return place
+
+
+def _ends(place: Path) -> list[Path]:
+    """Where a path leads when every link is followed; of a folder, also where the files of a shape lead."""
+    inside = (WEIGHTS_FILE, MESH_FILE, RECORD_FILE) if place.is_dir() else ()
+    return [place.resolve(), *((place / name).resolve() for name in inside)]
+
+
+def read_scene(path: Path, *, allow_outside: bool = False) -> SceneSpec:
     """Read and check a scene file; faults are collected in `problems`, which the caller checks.
+
+    Args:
+        path: of the file.
+        allow_outside: whether paths in it may lead out of its folder.
 
     Raises:
         SceneError: at once only when the file is missing or is not YAML.
@@ -87,11 +127,12 @@ def read_scene(path: Path) -> SceneSpec:
     elif version.integer(least=1, default=VERSION) != VERSION:
         version.wrong(f"must be {VERSION} (got {version.shown()})")
     model, seed = top.get("model"), top.get("seed")
-    shapes = _shapes(top.get("shapes"), path.parent)
+    home = Home(path.parent, allow_outside)
+    shapes = _shapes(top.get("shapes"), home)
     bodies = top.required("bodies")
     return SceneSpec(
         problems=root.problems,
-        model=_model(model, path.parent) if model and not model.is_null() else None,
+        model=_model(model, home) if model and not model.is_null() else None,
         duration=top.number("duration", "s", above=0, default=DEFAULT_DURATION),
         seed=seed.integer(least=0, default=0) if seed else 0,
         gravity=top.vector("gravity", "m/s^2", DEFAULT_GRAVITY),
@@ -102,10 +143,10 @@ def read_scene(path: Path) -> SceneSpec:
     )
 
 
-def _model(value: Value, folder: Path) -> str:
+def _model(value: Value, home: Home) -> str:
     """A bundled model's name, or the path of a file, taken from the scene's folder."""
     text = value.text()
-    return str(folder / text) if text.endswith(".safetensors") else text
+    return str(home.find(value)) if text.endswith(".safetensors") else text
 
 
 def _effects(value: Value | None) -> Effects:
@@ -126,19 +167,19 @@ def _limits(value: Value | None) -> Limits:
     return Limits(section.number("memory_gib", "GiB", above=0, default=1.0) if "memory_gib" in section else None)
 
 
-def _shapes(value: Value | None, folder: Path) -> dict[str, ShapeSpec | None]:
+def _shapes(value: Value | None, home: Home) -> dict[str, ShapeSpec | None]:
     """Every shape by name; None for one that is faulty, so that references to it are not faults as well."""
     shapes: dict[str, ShapeSpec | None] = {}
     if value is None or value.is_null():
         return shapes
     for name, item in value.section():
         before = len(item.problems)
-        spec = _shape(name, item, folder)
+        spec = _shape(name, item, home)
         shapes[name] = spec if len(item.problems) == before else None
     return shapes
 
 
-def _shape(name: str, item: Value, folder: Path) -> ShapeSpec | None:
+def _shape(name: str, item: Value, home: Home) -> ShapeSpec | None:
     section = item.section((*_SHAPE_KINDS, "units", "cap", "thicken", "sdf", "resolution", "nodes"))
     kind = section.one_of(_SHAPE_KINDS, required=True)
     if kind is None:
@@ -163,10 +204,10 @@ def _shape(name: str, item: Value, folder: Path) -> ShapeSpec | None:
         if spec.kind == "plane":
             section["nodes"].wrong("goes with bodies only (a plane has no nodes)")
     if spec.kind in ("asset", "mesh"):
-        spec.path = folder / kind.text("?")
-        if spec.kind == "asset" and not spec.path.is_dir():
+        spec.path = home.find(kind)
+        if spec.path and spec.kind == "asset" and not spec.path.is_dir():
             kind.wrong(f"no such folder: {spec.path}")
-        if spec.kind == "mesh" and not spec.path.is_file():
+        if spec.path and spec.kind == "mesh" and not spec.path.is_file():
             kind.wrong(f"no such file: {spec.path}")
     elif spec.kind == "primitive":
         spec.options = _primitive(kind)

@@ -19,7 +19,16 @@ from sdfsim.shape.grid import GridSdf, sample_grid
 from sdfsim.shape.mesh import Frame, Mesh
 from sdfsim.shape.mlp import MlpSdf
 from sdfsim.shape.sdf import Sdf
-from sdfsim.shape.storage import FORMAT_VERSION, read_mesh, read_record, sdf_from_file, sdf_to_file, write, write_ply
+from sdfsim.shape.storage import (
+    FORMAT_VERSION,
+    finite,
+    read_mesh,
+    read_record,
+    sdf_from_file,
+    sdf_to_file,
+    write,
+    write_ply,
+)
 
 SdfKind = Literal["mlp", "grid", "mesh"]
 
@@ -125,13 +134,13 @@ def load_shape(folder: str | Path) -> Shape:
             mesh=mesh,
             sdf=sdf_from_file(record["sdf"], tensors, mesh),
             nodes=tensors["nodes"].numpy().reshape(-1, 3),
-            volume=float(record["volume"]),
-            com=np.array(record["com"], dtype=np.float64).reshape(3),
-            inertia=np.array(record["inertia"], dtype=np.float64).reshape(3, 3),
+            volume=float(finite(record["volume"], "volume")),
+            com=finite(record["com"], "com", 3),
+            inertia=finite(record["inertia"], "inertia", 3, 3),
             certificate=dict(record["certificate"]),
             source=dict(record["source"]),
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
         reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
         raise SdfsimError(f"{folder}: not a valid shape folder ({reason})") from error
 

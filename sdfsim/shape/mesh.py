@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,10 +11,17 @@ from typing import Any
 import numpy as np
 
 from sdfsim.errors import SdfsimError
+from sdfsim.shape.gltf import check_gltf
 from sdfsim.shape.repair import without_doubles
 from sdfsim.shape.sdf import Sdf
 
+# Its readers log what they pass over, some with tracebacks; who wants to see that can still listen.
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
+
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
+MOST_BYTES = 2 * 2**30  # of a file
+FARTHEST = 1e12  # from the origin: beyond, not even double precision tells the vertices of a room-sized mesh apart
+TEXTURES = ("JPEG", "PNG", "WEBP", "BMP", "TIFF")  # others would start programs that draw them
 
 
 @dataclass(frozen=True)
@@ -76,7 +84,8 @@ def load_mesh(path: str | Path) -> Mesh:
     """Read a triangle mesh (obj, ply, glb, gltf, stl, off), cleaned by `clean`.
 
     Raises:
-        SdfsimError: missing file, not a mesh, no faces, vertices that are not finite, or indices out of range.
+        SdfsimError: missing file, not a mesh, no faces, vertices that are not finite, indices out of range, or an
+            absurd size.
     """
     import trimesh
 
@@ -85,6 +94,11 @@ def load_mesh(path: str | Path) -> Mesh:
         raise SdfsimError(f"{path}: no such mesh file")
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise SdfsimError(f"{path}: not a mesh file ({path.suffix or 'no suffix'})", "use " + " ".join(MESH_SUFFIXES))
+    if (size := path.stat().st_size) > MOST_BYTES:
+        told = f"{size / 2**30:.1f} GiB, at most {MOST_BYTES // 2**30}"
+        raise SdfsimError(f"{path}: too large ({told})", "export it with fewer faces")
+    if path.suffix.lower() in (".glb", ".gltf"):
+        check_gltf(path)
     try:
         loaded: Any = trimesh.load(path, force="mesh", process=False)
         vertices = np.array(loaded.vertices, dtype=np.float64).reshape(-1, 3)
@@ -103,7 +117,7 @@ def _vertex_colors(loaded: Any, count: int) -> np.ndarray | None:
     if kind == "texture":
         material = getattr(visual, "material", None)
         image = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
-        if image is None or getattr(visual, "uv", None) is None:
+        if image is None or image.format not in TEXTURES or getattr(visual, "uv", None) is None:
             return None
         visual = visual.to_color()
     elif kind not in ("vertex", "face"):
@@ -122,7 +136,7 @@ def clean(mesh: Mesh, *, name: str = "mesh") -> Mesh:
         name: how messages call it.
 
     Raises:
-        SdfsimError: no faces (before or after), vertices that are not finite, or indices out of range.
+        SdfsimError: no faces (before or after), vertices that are not finite or absurdly far, or indices out of range.
     """
     vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
     if len(faces) == 0:
@@ -132,6 +146,9 @@ def clean(mesh: Mesh, *, name: str = "mesh") -> Mesh:
         raise SdfsimError(f"{name}: {bad} of {len(vertices)} vertices are not finite")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise SdfsimError(f"{name}: face indices out of range (0 to {len(vertices) - 1} allowed)")
+
+    if (farthest := float(np.abs(vertices).max())) > FARTHEST:
+        raise SdfsimError(f"{name}: a coordinate of {farthest:.3g} is too large (at most {FARTHEST:g})")
 
     extent = float(np.ptp(vertices[np.unique(faces)], axis=0).max())
     # Files round to about seven digits: what agrees to a millionth of the size is one vertex.

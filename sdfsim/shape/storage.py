@@ -71,39 +71,61 @@ def sdf_from_file(description: dict[str, Any], tensors: dict[str, torch.Tensor],
         KeyError, TypeError, ValueError: the description or the tensors are not what it writes.
     """
     kind = description["kind"]
+    if kind in ("mlp", "grid") and not all(tensor.is_floating_point() for tensor in tensors.values()):
+        raise ValueError("weights that are not floating-point numbers")
     if kind == "mlp":
         layers = range(int(description["layers"]))
         if description["activation"] not in ACTIVATIONS:
             raise ValueError(f"unknown activation {description['activation']!r}")
-        weights = tuple(tensors[f"layer{layer}.weight"] for layer in layers)
+        weights = tuple(tensors[f"layer{layer}.weight"].float() for layer in layers)
         sizes = [3, *(weight.shape[0] for weight in weights)]
         if sizes[-1] != 1 or any(weight.shape[1] != size for weight, size in zip(weights, sizes, strict=False)):
+            raise ValueError("the layers do not fit together")
+        if any(tuple(tensors[f"layer{layer}.bias"].shape) != (sizes[layer + 1],) for layer in layers):
             raise ValueError("the layers do not fit together")
         x, y, z = (bool(mirror) for mirror in description.get("mirrors", (False, False, False)))
         return MlpSdf(
             weights,
-            tuple(tensors[f"layer{layer}.bias"] for layer in layers),
+            tuple(tensors[f"layer{layer}.bias"].float() for layer in layers),
             description["activation"],
             _frame(description),
-            tensors["bounds"].numpy().reshape(2, 3),
+            finite(tensors["bounds"].numpy(), "bounds", 2, 3),
             (x, y, z),
         )
     if kind == "grid":
-        return GridSdf(tensors["grid"].float(), _frame(description), tensors["bounds"].numpy().reshape(2, 3))
+        if tensors["grid"].ndim != 3 or len(set(tensors["grid"].shape)) != 1 or len(tensors["grid"]) < 2:
+            raise ValueError(f"a grid of {list(tensors['grid'].shape)} samples")
+        return GridSdf(tensors["grid"].float(), _frame(description), finite(tensors["bounds"].numpy(), "bounds", 2, 3))
     if kind == "mesh":
         return MeshSdf(mesh)
     if kind == "sphere":
-        return SphereSdf(float(description["radius"]))
+        return SphereSdf(positive(description["radius"], "radius"))
     if kind == "box":
         x, y, z = description["half"]
-        return BoxSdf((float(x), float(y), float(z)))
+        return BoxSdf((positive(x, "half"), positive(y, "half"), positive(z, "half")))
     if kind == "plane":
         return PlaneSdf()
     raise ValueError(f"unknown SDF kind {kind!r}")
 
 
 def _frame(description: dict[str, Any]) -> Frame:
-    return Frame(np.array(description["centre"], dtype=np.float64).reshape(3), float(description["scale"]))
+    return Frame(finite(description["centre"], "centre", 3), positive(description["scale"], "scale"))
+
+
+def finite(value: Any, what: str, *shape: int) -> np.ndarray:
+    """Finite numbers [*shape] out of JSON. Raises TypeError or ValueError otherwise."""
+    numbers = np.array(value, dtype=np.float64).reshape(shape)
+    if not np.isfinite(numbers).all():
+        raise ValueError(f"{what} is not finite")
+    return numbers
+
+
+def positive(value: Any, what: str) -> float:
+    """A finite number above 0 out of JSON. Raises TypeError or ValueError otherwise."""
+    number = float(finite(value, what))
+    if number <= 0:
+        raise ValueError(f"{what} must be > 0 (got {number:g})")
+    return number
 
 
 def read_record(path: Path) -> dict[str, Any]:
@@ -168,6 +190,8 @@ def read_mesh(path: Path) -> Mesh:
             colors = np.array(loaded.visual.vertex_colors)[:, :3].astype(np.uint8)
         if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
             raise ValueError("face indices out of range")
+        if not np.isfinite(vertices).all():
+            raise ValueError("vertices that are not finite")
     except Exception as error:  # the readers raise whatever their format made them stumble over
         raise SdfsimError(f"{path}: damaged or cut short ({error})") from error
     return Mesh(vertices, faces, colors)

@@ -41,7 +41,7 @@ def forbid(monkeypatch):
 
 def test_contact_off_looks_for_nothing_and_equals_bodies_that_may_not_touch(dropped, forbid):
     alone = replace(dropped, bodies=tuple(replace(b, collides_with=()) for b in dropped.bodies))
-    forbid(step_module, "find_contacts", "thin_contacts", "contact_graph", "settle")
+    forbid(step_module, "find_contacts", "contact_graph", "settle")
     forbid(bank, "_group")
     model = random_model("impulse")
     forbid(model.network, "forward")

@@ -107,7 +107,7 @@ def test_a_body_has_to_stay_and_be_in_contact_for_a_while():
         {"velocity": [0.0, 0.0, 0.3]},
         {"angular_velocity": [0.0, 0.1, 0.0]},
         {"position": [10.0, 0.0, 1.021]},
-        {"orientation": [0.0, 0.0, 0.1, 0.995]},
+        {"orientation": [0.0, 0.0, 0.6, 0.8]},
     ],
 )
 def test_a_poke_wakes_exactly_its_island(poke):

@@ -1,5 +1,6 @@
 """Training on a handful of recorded steps: it learns, it resumes to the bit, it leaves no pickle."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -15,11 +16,14 @@ from sdfsim.dynamics.step import Rules, contact_graph, fly
 from sdfsim.errors import SdfsimError
 from sdfsim.learning import frames as frames_module
 from sdfsim.learning import train as train_module
-from sdfsim.learning.frames import contact_frames
+from sdfsim.learning import watch
+from sdfsim.learning.frames import contact_frames, join_frames
 from sdfsim.learning.impulse_task import ImpulseTask, Noise
 from sdfsim.learning.merge import merged
 from sdfsim.learning.paper_task import PaperTask
-from sdfsim.learning.train import Run, train
+from sdfsim.learning.team import ALONE
+from sdfsim.learning.train import train
+from sdfsim.learning.training_run import Run, held_out_loss
 
 CPU = torch.device("cpu")
 
@@ -67,7 +71,7 @@ def test_noise_moves_gaps_by_the_normal_displacement_and_corrects_the_target(bal
     frames = contact_frames(ball_data, "train", 0.1)
     exact, noisy = (ImpulseTask(frames, CPU, n) for n in (None, Noise(shift=1e-3, speed=0.0)))
     picked = np.arange(6)
-    a, b = exact.batch(picked), noisy.batch(picked, np.random.default_rng(0))
+    a, b = exact.batch(picked), noisy.batch(picked, noisy._noise(picked, np.random.default_rng(0), ALONE))
     shift = (a.truth.mean_velocity - b.truth.mean_velocity) * a.graph.dt
     turn = (a.truth.mean_angular - b.truth.mean_angular) * a.graph.dt
     moved = shift[a.graph.first] + torch.linalg.cross(turn[a.graph.first], a.graph.arm_first)
@@ -82,7 +86,7 @@ def test_it_learns_and_the_model_file_gives_the_same_network(ball_data, presets,
     place = tmp_path / "run"
     plan = train_module.PRESETS[preset]
     task, held_out = train_module._tasks(plan, [ball_data], CPU, lambda f, m: None)
-    before = train_module.held_out_loss(Run(plan, task, plan.steps, 0, CPU), held_out, batches=2)
+    before = held_out_loss(Run(plan, task, plan.steps, 0, CPU), held_out, batches=2)
     report = train(ball_data, place, preset=preset)
     assert report["held_out_loss"] < 0.7 * before
     model = load_model(place / "model.safetensors")
@@ -149,3 +153,29 @@ def test_an_unreadable_frame_cache_is_named(ball_data):
     with pytest.raises(SdfsimError, match="contact frames"):
         frames_module.contact_frames(ball_data, "validation", 0.1)
     cached.write_bytes(content)
+
+
+def test_joined_frames_are_the_frames_of_both(ball_data):
+    one, two = (contact_frames(ball_data, split, 0.1) for split in ("train", "validation"))
+    joined = join_frames([one, two])
+    assert len(joined) == len(one) + len(two)
+    task, alone = ImpulseTask(joined, CPU, None), ImpulseTask(two, CPU, None)
+    for k in (0, len(two) - 1):
+        ours, theirs = task.batch(np.array([len(one) + k])), alone.batch(np.array([k]))
+        for name in ("velocity", "gap", "arm_second", "first"):
+            torch.testing.assert_close(getattr(ours.graph, name), getattr(theirs.graph, name), rtol=0, atol=0)
+
+
+def test_frames_of_another_step_cannot_be_joined(ball_data):
+    frames = contact_frames(ball_data, "train", 0.1)
+    with pytest.raises(SdfsimError, match="share step and gravity"):
+        join_frames([frames, replace(frames, dt=0.01)])
+
+
+def test_the_log_tells_rollouts_and_is_drawn(ball_data, presets, tmp_path):
+    pytest.importorskip("matplotlib")
+    train(ball_data, tmp_path / "run", preset="tiny", steps=20)
+    entries = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert all(0 < e["rollout_m"] < 100 and 0 <= e["rollout_degrees"] <= 180 for e in entries)
+    watch.draw(tmp_path / "run", tmp_path / "curves.png")
+    assert (tmp_path / "curves.png").read_bytes()[:4] == b"\x89PNG"

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import yaml
 
+from pipeline.asset import fit_parts
 from pipeline.drop import LEVEL, Above, choose_drop, plate_on
 from pipeline.placement import Placement
-from pipeline.scene_file import scene_text, write_scene
+from pipeline.scene_file import DENSITY, Found, scene_text, write_scene
+from sdfsim.errors import SdfsimError
 from sdfsim.files import write_json
+from sdfsim.shape.asset import Shape, analytic_shape
 from sdfsim.shape.mesh import Mesh
 from sdfsim.shape.storage import write_ply
-from tests.pipeline.test_surface import scenery
+from tests.pipeline.test_surface import cube, scenery
 
 PLACEMENT = Placement(1.0, np.eye(3), np.zeros(3), "plane", "assumed: widest side = 1 m")
 
@@ -83,19 +88,70 @@ def test_scene_text_is_valid_yaml_with_gravity_down():
     text = scene_text(PLACEMENT, choose_drop(mesh, mesh))
     data = yaml.safe_load(text)
     assert data["gravity"] == [0, 0, -9.81] and data["shapes"]["scene"] == {"asset": "assets/scene"}
-    assert "assumed: widest side = 1 m" in text
+    assert "assumed: widest side = 1 m" in text and "confidence: high" in text
+    assert [body["name"] for body in data["bodies"]] == ["floor", "scene", "box"]
 
 
-def test_a_scene_file_changed_by_hand_is_kept(tmp_path):
-    for name in ("mesh.ply", "solid.ply"):
+def test_bodies_found_are_dynamic_unless_they_are_to_stay():
+    mesh = scenery()
+    found = [Found("object1", np.array([0.1, 0.2, 0.4])), Found("object2", np.zeros(3), static=True)]
+    data = yaml.safe_load(scene_text(PLACEMENT, choose_drop(mesh, mesh), found=found, shape="ball"))
+    by_name = {body["name"]: body for body in data["bodies"]}
+    assert by_name["object1"]["position"] == [0.1, 0.2, 0.4] and by_name["object1"]["density"] == DENSITY
+    assert "motion" not in by_name["object1"] and by_name["object2"]["motion"] == "static"
+    assert data["shapes"]["object2"] == {"asset": "assets/object2"} and "sphere" in data["shapes"]["ball"]
+    alone = yaml.safe_load(scene_text(PLACEMENT, None, scenery=False, found=found[:1]))
+    assert [body["name"] for body in alone["bodies"]] == ["floor", "object1"]
+
+
+@pytest.fixture
+def meshes(tmp_path):
+    """A mesh folder: a floor with a block of 0.6 m, and a cube that was found on the floor."""
+    parts = {"scenery": True, "objects": [{"name": "object1"}], "left_out": [], "smallest_m": 0.05}
+    (tmp_path / "objects").mkdir()
+    for name in ("solid.ply", "shown.ply"):
         (tmp_path / name).write_bytes(write_ply(scenery()))
+    (tmp_path / "objects" / "object1.ply").write_bytes(write_ply(cube(0.2, (-0.6, 0.5, 0.1))))
     write_json(tmp_path / "placement.json", PLACEMENT.to_dict())
-    scene = tmp_path / "scene.yaml"
-    first = write_scene(tmp_path, scene)
-    again = write_scene(tmp_path, scene, written=first["scene_sha256"], seed=3)
-    assert again["notes"] == [] and not (tmp_path / "scene.yaml.bak").exists()
+    write_json(tmp_path / "parts.json", {"version": 1, **parts})
+    return tmp_path
+
+
+def test_a_scene_file_changed_by_hand_is_kept(meshes):
+    scene = meshes / "scene.yaml"
+    first = write_scene(meshes, scene)
+    again = write_scene(meshes, scene, written=first["scene_sha256"], seed=3)
+    assert again["notes"] == [] and not (meshes / "scene.yaml.bak").exists()
     for kept in ("scene.yaml.bak", "scene.yaml.bak2"):
         scene.write_text("mine\n")
-        report = write_scene(tmp_path, scene, written=again["scene_sha256"])
-        assert (tmp_path / kept).read_text() == "mine\n" and kept in report["notes"][0]
+        report = write_scene(meshes, scene, written=again["scene_sha256"])
+        assert (meshes / kept).read_text() == "mine\n" and kept in report["notes"][0]
         assert yaml.safe_load(scene.read_text())["version"] == 1
+
+
+def test_bodies_stand_where_they_were_found_and_stay_where_asked(meshes):
+    report = write_scene(meshes, meshes / "scene.yaml", shape="none", static=["object1"])
+    body = yaml.safe_load((meshes / "scene.yaml").read_text())["bodies"][-1]
+    np.testing.assert_allclose(body["position"], [-0.6, 0.5, 0.0], atol=1e-4)
+    assert body["motion"] == "static" and report["static"] == ["object1"]
+    with pytest.raises(SdfsimError, match="static: no body is called vase") as caught:
+        write_scene(meshes, meshes / "scene.yaml", static=["vase"])
+    assert "object1" in caught.value.hint
+
+
+def test_every_part_is_fitted_in_its_own_frame_and_kept_when_killed(meshes, tmp_path, monkeypatch):
+    fits = []
+
+    def fit_mesh(solid: Mesh, *, name: str, **options) -> Shape:
+        fits.append((name, solid, options["budget"]))
+        certificate = {"passed": name != "object1", "reason": "too thin"}
+        return replace(analytic_shape("box", size=(0.2, 0.2, 0.2), name=name), mesh=solid, certificate=certificate)
+
+    monkeypatch.setattr("sdfsim.shape.fit.fit_mesh", fit_mesh)
+    out = tmp_path / "assets"
+    out.mkdir()
+    report = fit_parts(meshes, out, budget=30.0)
+    assert [(name, budget) for name, _, budget in fits] == [("scene", 20.0), ("object1", 10.0)]
+    np.testing.assert_allclose(fits[1][1].vertices.min(0), [-0.1, -0.1, 0.0], atol=1e-6)
+    assert report["passed"] is False and report["reason"] == "object1: too thin"
+    assert fit_parts(meshes, out, budget=30.0) == report and len(fits) == 2

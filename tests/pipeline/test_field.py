@@ -17,11 +17,12 @@ from pipeline.field import (
     render_weights,
     stencil,
 )
+from pipeline.landmarks import find_landmarks
 from pipeline.normalise import Normalisation
 from pipeline.rays import Rays, camera_rays, load_rays
 from pipeline.recipe import PRESETS
 from pipeline.render import choose_samples, sdf_cache, sphere_interval
-from pipeline.trainer import Trainer, find_landmarks
+from pipeline.trainer import Trainer
 from sdfsim.errors import SdfsimError
 
 SMALL = FieldSize((8, 16), (2, 2), 16, 8)
@@ -171,7 +172,7 @@ def test_training_lowers_the_colour_error():
     run = trainer()
     losses = [run.step()["color"] for _ in range(20)]
     assert np.mean(losses[-4:]) < np.mean(losses[:4])
-    assert torch.isfinite(sdf_cache(run.field, 8)).all()
+    assert torch.isfinite(sdf_cache(run.field, 9)).all()
 
 
 def test_masks_make_what_they_exclude_transparent():

@@ -1,4 +1,4 @@
-"""The verdict on poses, and the child process."""
+"""The ladder of attempts, the child process, and what a killed run leaves."""
 
 from __future__ import annotations
 
@@ -10,55 +10,13 @@ import pytest
 
 from pipeline import poses
 from pipeline.cameras import load_sparse
-from pipeline.photos import Photo, prepare_photos
-from pipeline.poses import FIRST_TRY, failure_hint, failure_message, judge, run_worker, size_groups, solve
+from pipeline.photos import prepare_photos
+from pipeline.poses import LADDER, ORDINARY, run_worker, size_groups, solve
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
-from sdfsim.files import write_arrays
+from sdfsim.files import write_arrays, write_json
+from tests.pipeline.test_verdict import photo, result
 
 ROOT = Path(__file__).resolve().parent.parent.parent
-
-
-def photo(index: int, width: int = 640, height: int = 480, focal: float | None = None) -> Photo:
-    return Photo(f"{index:04d}.jpg", f"IMG_{index}.JPG", width, height, focal, "", False, 0.01)
-
-
-def result(count: int, posed: int, *, focal: float = 600.0, error: float = 0.5, features: int = 2000) -> dict:
-    views = []
-    for k in range(posed):
-        a = 2 * np.pi * k / max(posed, 1)
-        turn = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
-        views.append({"name": f"{k:04d}.jpg", "width": 640, "height": 480, "focal": focal, "cx": 320, "cy": 240,
-                      "k": 0, "camera": 1, "rotation": turn.tolist(), "translation": [0, 0, 3]})  # fmt: skip
-    counts = {f"{k:04d}.jpg": {"features": features, "best_matches": 10, "partners": 1} for k in range(count)}
-    return {"views": views, "counts": counts, "mean_error": error, "points": 900, "track_length": 4.0, "models": 1}
-
-
-def test_good_poses_pass():
-    verdict = judge(result(10, 9), [photo(k) for k in range(10)])
-    assert verdict["failures"] == [] and verdict["posed"] == 9
-    assert verdict["left_out"][0]["photo"] == "IMG_9.JPG"
-    assert "too few matches" in verdict["left_out"][0]["why"]
-
-
-def test_too_few_posed_names_photos_reasons_and_what_to_try():
-    verdict = judge(result(10, 4, features=20), [photo(k) for k in range(10)])
-    message = failure_message(verdict)
-    assert "only 4 of 10 photos" in message and "IMG_4.JPG: too few features (20)" in message and "\n" not in message
-    assert "textured" in failure_hint(verdict)
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [({"focal": 5000.0}, "field of view"), ({"focal": 100.0}, "field of view"), ({"error": 3.0}, "reprojection error")],
-)
-def test_all_registered_is_not_right(changes, words):
-    verdict = judge(result(10, 10, **changes), [photo(k) for k in range(10)])
-    assert any(words in failure for failure in verdict["failures"])
-
-
-def test_focal_far_from_exif_is_a_warning():
-    verdict = judge(result(6, 6), [photo(k, focal=1500.0) for k in range(6)])
-    assert verdict["failures"] == [] and "EXIF" in verdict["warnings"][0]
 
 
 def test_one_camera_for_each_size_and_zoom():
@@ -67,7 +25,7 @@ def test_one_camera_for_each_size_and_zoom():
 
 
 def test_a_crash_of_the_child_is_one_clear_line(tmp_path):
-    job = {**FIRST_TRY, "count": 3, "exhaustive_up_to": 100}  # Lacks what the child needs.
+    job = {**ORDINARY, "count": 3, "exhaustive_up_to": 100}  # Lacks what the child needs.
     with pytest.raises(SdfsimError) as caught:
         run_worker(job, tmp_path, 60, lambda fraction, message: None)
     assert "COLMAP failed" in caught.value.message and "colmap.log" in caught.value.message
@@ -79,7 +37,7 @@ def test_a_child_that_hangs_is_ended(tmp_path, monkeypatch):
     script.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(script))
     with pytest.raises(SdfsimError, match="stopped after 1 s"):
-        run_worker({"count": 3, "exhaustive_up_to": 100}, tmp_path, 1.0, lambda fraction, message: None)
+        run_worker({"count": 3, "exhaustive_up_to": 100}, tmp_path / "work", 1.0, lambda fraction, message: None)
 
 
 def test_photos_without_anything_in_common_fail_with_reasons(tmp_path):
@@ -94,18 +52,124 @@ def test_photos_without_anything_in_common_fail_with_reasons(tmp_path):
         solve(photos, tmp_path, tmp_path, timeout=120)
     assert caught.value.exit_code == EXIT_QUALITY
     assert "only 0 of 3" in caught.value.message and "flat0.jpg: too few features" in caught.value.message
+    assert "there is too little to see" in caught.value.message
 
 
-def test_a_second_try_that_breaks_leaves_the_verdict_of_the_first(tmp_path, monkeypatch):
+def climb(monkeypatch, tmp_path, results: dict, photos: int = 10) -> tuple[list[str], dict]:
+    """Runs the ladder on made-up results by rung; returns the rungs that were tried, and the verdict."""
+    tried = []
+
     def run(job, folder, timeout, report):
-        if folder.name == "try2":
-            raise SdfsimError("camera poses: stopped after 5 s")
-        return result(10, 4)
+        name = folder.name.removeprefix("try_").replace("_", " ")
+        tried.append(name)
+        folder.mkdir(parents=True)
+        write_arrays(folder / "sparse.npz", {"xyz": np.zeros((0, 3))})
+        found = results.get(name, result(photos, 0))
+        if isinstance(found, SdfsimError):
+            raise found
+        return found
 
     monkeypatch.setattr(poses, "run_worker", run)
-    with pytest.raises(SdfsimError, match=r"only 4 of 10 photos.*IMG_4\.JPG") as caught:
-        solve([photo(k) for k in range(10)], tmp_path, tmp_path)
-    assert caught.value.exit_code == EXIT_QUALITY
+    try:
+        verdict = solve([photo(k) for k in range(photos)], tmp_path, tmp_path)
+    except SdfsimError as error:
+        assert error.exit_code == EXIT_QUALITY
+        verdict = {"error": error.message}
+    return tried, verdict
+
+
+def test_the_first_good_rung_is_the_last(monkeypatch, tmp_path):
+    tried, verdict = climb(monkeypatch, tmp_path, {"more pixels and features": result(10, 10)})
+    assert tried == ["ordinary", "more pixels and features"]
+    assert [(one["name"], one["posed"]) for one in verdict["attempts"]] == [
+        ("ordinary", 0), ("more pixels and features, looser thresholds", 10),
+    ]  # fmt: skip
+    assert (tmp_path / "cameras.json").exists()
+
+
+def test_the_ladder_ends_with_the_best_rung_not_the_last(monkeypatch, tmp_path):
+    tried, verdict = climb(monkeypatch, tmp_path, {"ordinary": result(10, 4), "global mapping": result(10, 3)})
+    assert tried == ["ordinary", "more pixels and features", "global mapping", "affine features"]
+    assert "only 4 of 10 photos" in verdict["error"]
+
+
+def test_what_stands_still_gets_a_rung_of_its_own(monkeypatch, tmp_path):
+    still = result(10, 0, still=0.9)
+    tried, verdict = climb(
+        monkeypatch, tmp_path, {"ordinary": still, "without what stands still in the picture": result(10, 10)}
+    )
+    assert tried == ["ordinary", "without what stands still in the picture"] and verdict["posed"] == 10
+
+
+def test_photos_from_one_spot_are_not_tried_for_long(monkeypatch, tmp_path):
+    turning = {**result(10, 0), "turn_only": 0.9}
+    tried, verdict = climb(monkeypatch, tmp_path, {"ordinary": turning, "more pixels and features": turning})
+    assert tried == ["ordinary", "more pixels and features"]
+    assert "taken from one spot" in verdict["error"]
+
+
+def test_a_rung_that_breaks_leaves_the_verdict_of_the_others(monkeypatch, tmp_path):
+    broken = {"more pixels and features": SdfsimError("camera poses: stopped after 5 s"), "ordinary": result(10, 4)}
+    tried, verdict = climb(monkeypatch, tmp_path, broken)
+    assert "only 4 of 10 photos" in verdict["error"] and "IMG_4.JPG" in verdict["error"]
+    assert "global mapping" not in tried  # it would take matches that the broken rung has not made
+
+
+def test_rungs_that_share_matches_come_after_their_source():
+    names = [rung.name for rung in LADDER]
+    assert all(names.index(rung.matches_of) < k for k, rung in enumerate(LADDER) if rung.matches_of)
+    assert len({poses.folder_of(rung) for rung in LADDER}) == len(LADDER)
+
+
+def test_a_finished_rung_is_not_run_again(tmp_path, monkeypatch):
+    job = {"count": 3, "exhaustive_up_to": 100}
+    (tmp_path / "try").mkdir()
+    write_json(tmp_path / "try" / "job.json", job)
+    write_json(tmp_path / "try" / "result.json", {"views": []})
+    monkeypatch.setattr(poses.subprocess, "Popen", lambda *a, **k: pytest.fail("started"))
+    assert run_worker(job, tmp_path / "try", 1.0, lambda fraction, message: None) == {"views": []}
+
+
+def test_the_leavings_of_another_job_go(tmp_path, monkeypatch):
+    write_json(tmp_path / "job.json", {"count": 4})
+    (tmp_path / "database.db").write_text("old")
+    monkeypatch.setattr(sys, "executable", "/bin/false")
+    with pytest.raises(SdfsimError):
+        run_worker({"count": 3, "exhaustive_up_to": 100}, tmp_path, 5.0, lambda fraction, message: None)
+    assert not (tmp_path / "database.db").exists()
+
+
+def test_epipolar_errors_are_those_of_projected_points():
+    """Matches of points that two cameras see have no error; moved off their lines by 3 px they have 3 / sqrt(2)."""
+    from pipeline.pair_checks import epipolar_errors
+
+    views = result(10, 10)["views"]
+    for view in views[:2]:
+        view["k"] = 0.05
+    a, b = poses.views_of({"views": views[:2]}, [photo(0), photo(1)])
+    points = np.random.default_rng(0).normal(size=(200, 3)) * 0.5
+    first, second = a.project(points)[0], b.project(points)[0]
+    assert epipolar_errors(views[0], views[1], first, second).max() < 1e-3
+    moved = second + np.array([0, 3.0])  # The cameras turn about y, so all lines are nearly level.
+    assert np.median(epipolar_errors(views[0], views[1], first, moved)) == pytest.approx(3 / 2**0.5, rel=0.2)
+
+
+def test_turning_on_the_spot_is_told_from_walking():
+    from pipeline.pair_checks import turn_only
+
+    rng = np.random.default_rng(0)
+    size = {"width": 640, "height": 480}
+    directions = rng.uniform([-0.4, -0.3, 1], [0.4, 0.3, 1], (300, 3))
+    turn = np.array([[np.cos(0.2), 0, np.sin(0.2)], [0, 1, 0], [-np.sin(0.2), 0, np.cos(0.2)]])
+
+    def seen(points: np.ndarray) -> np.ndarray:
+        return 600 * points[:, :2] / points[:, 2:] + [320, 240]
+
+    turned = (size, seen(directions), seen(directions @ turn.T) + rng.normal(0, 0.5, (300, 2)))
+    deep = directions * rng.uniform(1, 4, (300, 1))
+    walked = (size, seen(deep), seen(deep + np.array([0.4, 0, 0])))
+    assert turn_only([turned, turned, walked]) == pytest.approx(2 / 3)
+    assert turn_only([walked]) == 0.0
 
 
 def test_a_cut_file_of_points_is_one_clear_line(tmp_path):

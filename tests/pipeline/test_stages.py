@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline import record, stages
+from pipeline import record, report_page, stages
 from pipeline.report import notes
 from sdfsim.errors import SdfsimError
+from sdfsim.files import locked
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 
@@ -43,6 +44,7 @@ def calls(monkeypatch) -> list[str]:
         return act
 
     monkeypatch.setattr(stages, "ACTIONS", {name: action(name) for name in stages.STAGES})
+    monkeypatch.setattr(report_page, "write_page", lambda folder, report: None)  # There is nothing to show.
     return done
 
 
@@ -61,7 +63,7 @@ def test_unchanged_stages_are_skipped(photos, tmp_path, calls):
     [
         ({"size": 2.0}, ["mesh", "fit", "scene"]),
         ({"from_stage": "fit"}, ["fit", "scene"]),
-        ({"preset": "standard"}, list(stages.STAGES)),
+        ({"preset": "standard"}, ["distill", "mesh", "fit", "scene"]),
         ({"until_stage": "poses", "seed": 3}, ["poses"]),
     ],
 )
@@ -186,7 +188,7 @@ def test_the_hint_names_a_command_that_exists(photos, tmp_path, calls):
 def test_a_second_run_into_the_same_folder_is_refused(photos, tmp_path, calls):
     out = tmp_path / "out"
     stages.reconstruct(photos, out, until_stage="photos")
-    with record.locked(out):
+    with locked(out):
         for again in (lambda: stages.reconstruct(photos, out), lambda: stages.run_stage("poses", out)):
             with pytest.raises(SdfsimError, match="another run is writing") as caught:
                 again()
@@ -218,7 +220,7 @@ def test_notes_name_what_was_passed_over_assumed_or_is_vague():
         "left out: 2 more",
         "no level plane found: up is taken from the cameras and may be off by some degrees",
     ]
-    assert found[-1] == "size assumed: widest side = 1 m (give --size)"
+    assert found[-1] == "size assumed: widest side = 1 m (give --size or --distance)"
 
 
 @pytest.mark.slow

@@ -221,7 +221,8 @@ def test_a_shape_that_cannot_move_is_told_where_it_should(load, tmp_path, change
     assert load(text.replace("MOTION", ", motion: static")).bodies[0].motion == "static"
 
 
-def test_a_model_file_is_taken_from_the_scenes_folder(load, tmp_path):
+def test_a_model_file_is_taken_from_the_scenes_folder(tmp_path):
+    file = tmp_path / "scene.yaml"
     body = "bodies:\n  - {name: floor, plane: {}}\n"
     for said, meant in (
         ("model: models/mine.safetensors", str(tmp_path / "models/mine.safetensors")),
@@ -229,7 +230,8 @@ def test_a_model_file_is_taken_from_the_scenes_folder(load, tmp_path):
         ("model: small", "small"),
         ("effects: {sleep: off}", None),
     ):
-        assert load(f"version: 1\n{said}\n{body}").model == meant
+        file.write_text(f"version: 1\n{said}\n{body}")
+        assert load_scene(file, allow_outside=True).model == meant
 
 
 def test_a_shape_that_missed_its_certificate_is_named(load, monkeypatch):

@@ -1,0 +1,261 @@
+"""What stands on a level plane becomes a body of its own; the scenery is closed where the body stood.
+
+Everything here is in normalised space; heights are measured along a plane's normal.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import ndimage
+
+from pipeline.cleaning import components, face_normals, keep_faces
+from pipeline.surface import RIM, Surface
+from pipeline.volume import Distance, Volume, sample, sample_box
+from sdfsim.shape.mesh import Mesh
+
+# A level plane smaller than this share of the largest one carries nothing: the lid of a box is no table.
+LEVEL_SHARE = 0.1
+LEVEL_NORMAL = 0.95  # least cosine between up and the normal of a face of a level plane
+# A body covers less of what it stands on than this; what covers more is relief.
+LARGEST_FOOT = 0.5
+# A body needs photos of this share of its surface.
+SEEN_SHARE = 0.2
+# Least share of a body's lowest layer that has the solid of the plane right below it.
+STANDS = 0.3
+# How far sideways, in contact layers, what is around a body's foot is taken away together with it.
+FILLET = 3.0
+
+
+@dataclass(frozen=True)
+class Level:
+    """A level plane.
+
+    Attributes:
+        normal: [3] unit, upwards.
+        height: of the plane along it.
+        area: that photos show.
+    """
+
+    normal: np.ndarray
+    height: float
+    area: float
+
+    def above(self, points: np.ndarray) -> np.ndarray:
+        """Height [...] of points [..., 3] above the plane."""
+        return points @ self.normal - self.height
+
+
+@dataclass(frozen=True)
+class Body:
+    """A body that stands on a level plane.
+
+    Attributes:
+        name: object1, object2 ... from the largest down.
+        level: what it stands on.
+        size: the longest side of its bounding box.
+        own: [X, Y, Z] bool on a part of the samples: those nearest to this body, of all that stands on the plane.
+        low: [3] position of the first of these samples.
+        cell: between them.
+        layer: thickness of the contact layer, in which the field cannot tell body and plane apart.
+    """
+
+    name: str
+    level: Level
+    size: float
+    own: np.ndarray
+    low: np.ndarray
+    cell: float
+    layer: float
+
+    def lifted(self, points: np.ndarray) -> np.ndarray:
+        """Points [P, 3], those below the top of the contact layer raised to it."""
+        return points + np.maximum(self.layer - self.level.above(points), 0)[:, None] * self.level.normal
+
+    def owns(self, points: np.ndarray) -> np.ndarray:
+        """Whether points [P, 3] are nearer to this body than to anything else on the plane."""
+        index = np.round((points - self.low) / self.cell).astype(int)
+        inside = ((index >= 0) & (index < self.own.shape)).all(1)
+        result = np.zeros(len(points), bool)
+        result[inside] = self.own[tuple(index[inside].T)]
+        return result
+
+    def distance(self, field: Distance) -> Distance:
+        """Its signed distance, from the field's: the cross-section above the contact layer goes down to the plane."""
+
+        def value(points: np.ndarray) -> np.ndarray:
+            lifted = self.lifted(points)
+            found = np.where(self.owns(lifted), field(lifted), self.cell)
+            return np.maximum(found, -self.level.above(points))
+
+        return value
+
+
+def find_levels(shown: Mesh, up: np.ndarray, width: float) -> list[Level]:
+    """Level planes of a surface, largest first.
+
+    Args:
+        shown: what photos show.
+        up: [3] unit.
+        width: within which faces belong to one plane.
+    """
+    normals, areas = face_normals(shown)
+    centers = shown.vertices[shown.faces].mean(1)
+    flat = normals @ up > LEVEL_NORMAL
+    normals, areas, centers = normals[flat], areas[flat], centers[flat]
+    levels: list[Level] = []
+    while len(areas):
+        height = centers @ up
+        bins = ((height - height.min()) / width).astype(int)
+        total = np.bincount(bins, areas)
+        # A plane that lies across the border of two bins must not be missed.
+        fullest = int(np.argmax(total + np.append(total[1:], 0)))
+        member = (bins == fullest) | (bins == fullest + 1)
+        if levels and areas[member].sum() < LEVEL_SHARE * levels[0].area:
+            break
+        middle = np.average(centers[member], axis=0, weights=areas[member])
+        offset = centers[member] - middle
+        normal = np.linalg.eigh((offset * areas[member, None]).T @ offset)[1][:, 0]
+        normal = normal * np.sign(normal @ up) if abs(normal @ up) > LEVEL_NORMAL else up
+        levels.append(Level(normal, float(middle @ normal), float(areas[member].sum())))
+        rest = (np.abs(levels[-1].above(centers)) > 2 * width) & ~member
+        normals, areas, centers = normals[rest], areas[rest], centers[rest]
+    return levels
+
+
+def find_bodies(surface: Surface, levels: list[Level], layer: float, smallest: float) -> list[Body]:
+    """Bodies that stand on level planes, each alone and wholly within the trained space.
+
+    What carries a level plane itself, as a table does, is scenery, and so is what reaches the end of the trained space.
+
+    Args:
+        surface: extracted.
+        levels: of its visible part.
+        layer: thickness of the contact layer.
+        smallest: what is shorter than this stays part of what it stands on.
+    """
+    volume = surface.volume
+    solid = volume.values < 0
+    vertices = surface.raw.vertices[np.unique(surface.raw.faces[surface.kept])]
+    seen = surface.raw.vertices[surface.seen]
+    x, y, z = np.ix_(*volume.axes())
+    at_rim = np.sqrt(x**2 + y**2 + z**2) > RIM - 2 * volume.cell
+    taken = np.zeros(solid.shape, bool)
+    found: list[Body] = []
+    # From the top down: what stands on a table has been taken when the table itself is looked at.
+    for level in sorted(levels, key=lambda level: -level.height):
+        height = volume.along(level.normal).astype(np.float32) - level.height
+        label, count = ndimage.label(solid & (height > layer))
+        others = [other for other in levels if other is not level and level.above(other.height * other.normal) > layer]
+        for number, box in enumerate(ndimage.find_objects(label, count), start=1):
+            mine = label[box] == number
+            if (at_rim[box] & mine).any() or (taken[box] & mine).any() or mine.sum() < 8:
+                continue
+            low = volume.low + volume.cell * np.array([part.start for part in box])
+            sides = volume.cell * np.array(mine.shape)
+            own_height = height[box][mine]
+            if sides.max() < smallest or own_height.max() < 2 * layer:
+                continue
+            place = Volume(mine.astype(np.float32), low, volume.cell)
+            if any(_carries(place, other, volume.cell) for other in others):
+                continue
+            if not _stands(volume, place, mine & (height[box] < layer + 1.5 * volume.cell), level, layer):
+                continue
+            if _share_seen(place, vertices, seen) < SEEN_SHARE:
+                continue
+            taken[box] |= mine
+            found.append(_body(volume, solid & (height > layer), box, mine, level, layer, float(sides.max())))
+    found.sort(key=lambda body: -body.size)
+    return [replace(body, name=f"object{number}") for number, body in enumerate(found, start=1)]
+
+
+def _carries(place: Volume, other: Level, cell: float) -> bool:
+    """Whether the samples right below a level plane are for a good part those of one component."""
+    below = -other.above(place.points())
+    return float((place.values * ((below > 0) & (below <= cell))).sum()) * cell**2 > 0.3 * other.area
+
+
+def _stands(volume: Volume, place: Volume, lowest: np.ndarray, level: Level, layer: float) -> bool:
+    """Whether a component's lowest samples have the plane's solid below them, and cover only a part of the plane."""
+    points = place.points()[lowest]
+    if not len(points) or len(points) * volume.cell**2 / 1.5 > LARGEST_FOOT * level.area:
+        return False
+    down = level.above(points) + 0.5 * layer
+    return float((volume.at(points - down[:, None] * level.normal) < 0).mean()) > STANDS
+
+
+def _share_seen(place: Volume, vertices: np.ndarray, seen: np.ndarray) -> float:
+    """Share of the surface vertices at a component that photos show."""
+
+    def here(points: np.ndarray) -> int:
+        inside = (points > place.low - place.cell) & (points < place.low + place.cell * np.array(place.values.shape))
+        near = points[inside.all(1)]
+        grown = replace(place, values=ndimage.binary_dilation(place.values > 0).astype(np.float32))
+        return int((grown.at(near) > 0.5).sum()) if len(near) else 0
+
+    return here(seen) / max(here(vertices), 1)
+
+
+def _body(volume: Volume, standing: np.ndarray, box: tuple[slice, ...], mine: np.ndarray, level: Level, layer: float,
+          size: float) -> Body:  # fmt: skip
+    """The body of one component: all samples around it that are nearer to it than to what else is on the plane."""
+    margin = int(np.ceil((FILLET + 1) * layer / volume.cell)) + 1
+    start = [max(part.start - margin, 0) for part in box]
+    wide = tuple(slice(low, part.stop + margin) for low, part in zip(start, box, strict=True))
+    label = standing[wide].astype(np.int8)
+    inner = tuple(slice(part.start - low, part.stop - low) for low, part in zip(start, box, strict=True))
+    label[inner][mine] = 2
+    away, nearest = ndimage.distance_transform_edt(label == 0, return_indices=True)
+    own = (label[tuple(nearest)] == 2) & (away * volume.cell <= FILLET * layer)
+    return Body("", level, size, own, volume.low + volume.cell * np.array(start), volume.cell, layer)
+
+
+def body_mesh(body: Body, field: Distance, cell: float) -> Mesh:
+    """The closed mesh of a body, sampled `cell` apart along its plane; crumbs are left out."""
+    frame = _frame(body.level.normal)
+    points = body.low + body.cell * np.argwhere(body.own)
+    turned = points @ frame.T
+    low, high = turned.min(0), turned.max(0)
+    low[2] = body.level.height - 2 * cell
+    distance = body.distance(field)
+    volume = sample_box(lambda p: distance(p @ frame), low - 2 * cell, high + 2 * cell, cell)
+    mesh = volume.mesh()
+    mesh = Mesh(mesh.vertices @ frame, mesh.faces)
+    label = components(mesh)
+    area = np.bincount(label, face_normals(mesh)[1])
+    return keep_faces(mesh, (area > 0.02 * area.max())[label])
+
+
+def _frame(normal: np.ndarray) -> np.ndarray:
+    """A right-handed rotation [3, 3] whose last row is a normal."""
+    side = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    side /= np.linalg.norm(side)
+    return np.stack([side, np.cross(normal, side), normal])
+
+
+def without_bodies(volume: Volume, bodies: list[Body], field: Distance) -> Volume:
+    """The scenery alone: what bodies leave behind is empty, and their plane goes on below them.
+
+    Args:
+        volume: of everything.
+        bodies: that stand on it.
+        field: the signed distance that `volume` holds samples of.
+    """
+    values = volume.values.copy()
+    for body in bodies:
+        start = np.round((body.low - volume.low) / volume.cell).astype(int)
+        part = tuple(slice(low, low + count) for low, count in zip(start, body.own.shape, strict=True))
+        shape = values[part].shape
+        points = (body.low + volume.cell * np.indices(shape).reshape(3, -1).T).astype(np.float64)
+        height, lifted = body.level.above(points), body.lifted(points)
+        own = body.owns(lifted)
+        inside = values[part].reshape(-1).copy()
+        over = own & (height > 0)
+        inside[over] = np.maximum(inside[over], height[over])
+        # Below its foot the field never saw anything: there the plane's solid goes on, and holes in it are closed.
+        under = np.flatnonzero(own & (height <= 0) & (height > -2 * body.layer))
+        foot = under[sample(field, lifted[under]) < 0.5 * body.layer] if len(under) else under
+        inside[foot] = np.minimum(inside[foot], height[foot])
+        values[part] = inside.reshape(shape)
+    return replace(volume, values=values)

@@ -1,0 +1,164 @@
+"""One photo file -> upright pixels, its mask, and what EXIF says about the lens."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
+
+from sdfsim.errors import SdfsimError
+
+MIN_SIDE = 64
+MAX_PIXELS = 200_000_000
+# As PIL calls them. It knows others as well, and starts a program for some of them, whatever the file's name says.
+FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP")
+# Photos with a mask are shown on this grey; it has no texture, so it adds no features.
+BACKDROP = 0.5
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A photo as it was read.
+
+    Attributes:
+        pixels: RGB [H, W, 3] uint8.
+        mask: [H, W] uint8 (255 = object), or None.
+        focal: prior from EXIF, px of `pixels`, or None.
+        camera: make and model, empty where unknown.
+    """
+
+    pixels: np.ndarray
+    mask: np.ndarray | None = None
+    focal: float | None = None
+    camera: str = ""
+
+
+def exif_focal(image: Image.Image) -> tuple[float | None, str]:
+    """Focal length in units of the image's longer side, and the camera's name, from EXIF.
+
+    Uses the 35 mm equivalent (a 36 mm wide frame) or the focal length with the focal plane resolution. A photo whose
+    shape is not the one that the camera wrote down was cropped, and its focal length is not known.
+    """
+    try:
+        exif = image.getexif()
+        detail = exif.get_ifd(ExifTags.IFD.Exif)
+        camera = " ".join(str(exif.get(tag, "")).strip("\0 ") for tag in (ExifTags.Base.Make, ExifTags.Base.Model))
+        written = [float(detail.get(tag) or 0) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
+        if min(written) > 0:
+            shape, now = max(written) / min(written), max(image.size) / min(image.size)
+            if abs(shape / now - 1) > 0.02:
+                return None, camera.strip()
+        equivalent = float(detail.get(ExifTags.Base.FocalLengthIn35mmFilm) or 0)
+        if equivalent > 0:
+            return equivalent / 36.0, camera.strip()
+        focal = float(detail.get(ExifTags.Base.FocalLength) or 0)
+        density = float(detail.get(ExifTags.Base.FocalPlaneXResolution) or 0)
+        unit = {2: 25.4, 3: 10.0, 4: 1.0}.get(int(detail.get(ExifTags.Base.FocalPlaneResolutionUnit) or 2), 25.4)
+        if focal > 0 and density > 0:
+            # The density is that of the photo as written: a copy at half the size has half of it.
+            ratio = focal / unit * density / (max(written) or max(image.size))
+            if 0.3 < ratio < 20:
+                return ratio, camera.strip()
+        return None, camera.strip()
+    except (ValueError, TypeError, ZeroDivisionError, OSError, SyntaxError):
+        return None, ""  # Broken EXIF is common and never worth failing for.
+
+
+def read_photo(path: Path, long_side: int, mask: Path | None = None, shape: float | None = None) -> Picture:
+    """Reads one photo upright and no larger than `long_side`.
+
+    Args:
+        path: the file.
+        long_side: limit of the longer side, px; smaller photos stay as they are.
+        mask: file of its mask, which goes before an alpha channel; white is the object.
+        shape: width over height that a known camera has: the photo is turned upright only where it then fits that.
+
+    Raises:
+        SdfsimError: not an image, truncated, too small or too large; the message names the file.
+    """
+    image, focal, camera = _open(path, long_side)
+    turn = ImageOps.exif_transpose(image)
+    if shape is not None and abs(turn.width / turn.height / shape - 1) > abs(image.width / image.height / shape - 1):
+        turn = image
+    upright = _eight_bits(turn)
+    has_alpha = upright.mode in ("RGBA", "LA", "PA") or "transparency" in upright.info
+    upright = upright.convert("RGBA" if has_alpha else "RGB")
+    scale = min(1.0, long_side / max(upright.size))
+    if scale < 1.0:
+        size = (max(1, round(upright.width * scale)), max(1, round(upright.height * scale)))
+        upright = upright.resize(size, Image.Resampling.LANCZOS)
+    pixels, inside = np.asarray(upright), None
+    if mask is not None:
+        inside = read_mask(mask, upright.size, turned=turn is not image)
+    elif has_alpha and pixels[..., 3].min() < 128:
+        inside = pixels[..., 3]
+    if inside is not None:
+        share = inside[..., None].astype(np.float32) / 255
+        pixels = (255 * (pixels[..., :3] / 255.0 * share + BACKDROP * (1 - share)) + 0.5).astype(np.uint8)
+    return Picture(
+        np.ascontiguousarray(pixels[..., :3]), inside, focal * max(pixels.shape[:2]) if focal else None, camera
+    )
+
+
+def read_mask(path: Path, size: tuple[int, int], *, turned: bool) -> np.ndarray:
+    """A mask [H, W] uint8 at the size (width, height) of its photo.
+
+    Args:
+        path: grey or with alpha; white is the object.
+        size: px.
+        turned: the photo was turned by its EXIF orientation: a mask that only fits unturned is turned likewise.
+
+    Raises:
+        SdfsimError: it cannot be read, or is not shaped like the photo.
+    """
+    image, _, _ = _open(path, max(size))
+    for form in (ImageOps.exif_transpose(image), *([image.transpose(Image.Transpose.ROTATE_270)] if turned else [])):
+        if abs(form.width * size[1] / (form.height * size[0]) - 1) < 0.02:
+            grey = form.getchannel("A") if form.mode == "RGBA" else form.convert("L")
+            return np.asarray(grey.resize(size, Image.Resampling.BOX))
+    raise SdfsimError(
+        f"{path}: a mask of {image.width} x {image.height} does not fit its photo, shaped {size[0]} x {size[1]}",
+        "masks have to be as large as their photos",
+    )
+
+
+def _open(path: Path, long_side: int) -> tuple[Image.Image, float | None, str]:
+    """A decoded image, its focal length in longer sides, and its camera."""
+    limit = Image.MAX_IMAGE_PIXELS
+    Image.MAX_IMAGE_PIXELS = None  # Our own limit below, before anything is decoded.
+    try:
+        with Image.open(path, formats=FORMATS) as image:
+            width, height = image.size
+            if width * height > MAX_PIXELS:
+                raise SdfsimError(
+                    f"{path}: too large ({width} x {height}, at most {MAX_PIXELS // 1_000_000} megapixels)",
+                    "scale it down first",
+                )
+            if min(width, height) < MIN_SIDE:
+                raise SdfsimError(f"{path}: too small ({width} x {height}, at least {MIN_SIDE} px a side)")
+            focal, camera = exif_focal(image)
+            if image.format == "JPEG":
+                # The decoder may skip to a smaller size, but no smaller than twice what is wanted.
+                image.draft("RGB", (2 * long_side, 2 * long_side))
+            image.load()
+            return image, focal, camera
+    except SdfsimError:
+        raise
+    except UnidentifiedImageError as error:
+        raise SdfsimError(f"{path}: not an image, in spite of its name", "remove it or replace it") from error
+    except (OSError, SyntaxError, ValueError, EOFError) as error:
+        what = "truncated" if "truncated" in str(error) else f"cannot be decoded ({error})"
+        raise SdfsimError(f"{path}: {what}", "copy it again from the camera, or remove it") from error
+    except Image.DecompressionBombError as error:
+        raise SdfsimError(f"{path}: too large", "scale it down first") from error
+    finally:
+        Image.MAX_IMAGE_PIXELS = limit
+
+
+def _eight_bits(image: Image.Image) -> Image.Image:
+    """16 bits a pixel scaled to 8; PIL would clip instead."""
+    if image.mode.startswith("I"):
+        return Image.fromarray((np.asarray(image).astype(np.uint32) >> 8).astype(np.uint8))
+    return image

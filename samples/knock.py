@@ -1,0 +1,87 @@
+"""Throws a ball at a body of a reconstruction, towards the nearest edge of what it stands on.
+
+    sdfsim reconstruct samples/photos/table_vase -o table --preset quick --distance 041.jpg:68,364 041.jpg:574,341 1.2
+    python samples/knock.py table object1           # writes table/knock.yaml
+    sdfsim simulate table/knock.yaml -o run
+
+What was dropped onto the scene is left out; everything else stays as it is in scene.yaml.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from pipeline.drop import Above
+from sdfsim.files import write_text
+from sdfsim.shape.asset import Shape, load_shape
+
+GRAVITY = 9.81  # m/s^2
+HEAVIER = 2.0  # the ball's mass over the body's
+SPARE = 1.4  # speed over what sliding to the edge takes
+SLOWEST = 1.5  # m/s
+
+
+def edge(above: Above, at: np.ndarray, base: float, size: float) -> tuple[np.ndarray, float]:
+    """The direction [2] in which the support ends first, and how far away that is, m."""
+    angles = np.arange(32) * 2 * np.pi / 32
+    directions = np.stack([np.cos(angles), np.sin(angles)], 1)
+    away = np.arange(0.5, 20, 0.1) * size
+    heights = above.heights(at + away[:, None, None] * directions)
+    gone = ~(heights > base - 0.3 * size)
+    first = np.where(gone.any(0), away[gone.argmax(0)], np.inf)
+    best = int(first.argmin())
+    return directions[best], float(min(first[best], away[-1]))
+
+
+def throw(body: dict, shape: Shape, above: Above) -> tuple[float, dict]:
+    """Radius m of the ball, and its entry among the bodies."""
+    low, high = np.stack([shape.mesh.vertices.min(0), shape.mesh.vertices.max(0)])
+    height, wide = float(high[2] - low[2]), float(max(high[:2] - low[:2]))
+    base = np.array(body["position"])
+    direction, away = edge(above, base[:2], float(base[2]), max(height, wide))
+    radius = 0.15 * height
+    friction, bounce = float(body["friction"]) ** 2, float(body["restitution"]) ** 2
+    sliding = SPARE * np.sqrt(2 * friction * GRAVITY * away)
+    speed = max(SLOWEST, sliding * (1 + HEAVIER) / (HEAVIER * (1 + bounce)))
+    flight = wide / 2 + 3 * radius
+    start = np.array([*(base[:2] - (flight + radius) * direction), base[2] + 0.55 * height])
+    # As fast upwards as gravity takes away on half the way: it hits at the height that it starts from.
+    velocity = [*(speed * direction), 0.5 * GRAVITY * flight / speed]
+    return radius, {
+        "name": "thrown", "shape": "thrown", "position": start.round(4).tolist(),
+        "velocity": np.round(velocity, 3).tolist(), "mass": round(HEAVIER * float(body["density"]) * shape.volume, 4),
+        "friction": body["friction"], "restitution": body["restitution"],
+    }  # fmt: skip
+
+
+def main() -> None:
+    """Writes knock.yaml beside scene.yaml."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="of a reconstruction")
+    parser.add_argument("body", help="its name in scene.yaml (mesh/objects.png shows the names)")
+    arguments = parser.parse_args()
+    scene = yaml.safe_load((arguments.folder / "scene.yaml").read_text(encoding="utf-8"))
+    assets = {name: shape["asset"] for name, shape in scene["shapes"].items() if "asset" in shape}
+    bodies = [body for body in scene["bodies"] if "plane" in body or body["shape"] in assets]
+    target = next((body for body in bodies if body["name"] == arguments.body and "density" in body), None)
+    if target is None:
+        names = [body["name"] for body in bodies if "density" in body]
+        parser.error(f"{arguments.folder}/scene.yaml has no body {arguments.body!r} that can move (it has {names})")
+    shapes = {name: load_shape(arguments.folder / asset) for name, asset in assets.items()}
+    radius, ball = throw(target, shapes[target["shape"]], Above(shapes["scene"].mesh))
+    scene["shapes"] = {name: {"asset": asset} for name, asset in assets.items()}
+    scene["shapes"]["thrown"] = {"sphere": {"radius": round(radius, 4)}}
+    scene["bodies"] = [*bodies, ball]
+    write_text(arguments.folder / "knock.yaml", yaml.safe_dump(scene, sort_keys=False))
+    print(f"wrote {arguments.folder / 'knock.yaml'}")
+
+
+if __name__ == "__main__":
+    main()

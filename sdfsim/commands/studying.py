@@ -1,0 +1,83 @@
+"""Studies of the simulator: tradeoff, stress."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sdfsim.commands.arguments import Device, Json, Out, Verbose, tell_failed
+from sdfsim.progress import Session, columns
+
+
+def tradeoff(
+    out: Out,
+    source: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[DATA|SCENE|MESHES]",
+            help="Dataset or scene.yaml: error against time. Meshes: the same of fits. Nothing: growth with size.",
+            show_default=False,
+        ),
+    ] = None,
+    model: Annotated[
+        list[str] | None, typer.Option(help="Bundled models or paths, the one to turn knobs on first (default: all).")
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="A few settings, in minutes.")] = False,
+    as_json: Json = False,
+    device: Device = "auto",
+    verbose: Verbose = False,
+) -> None:
+    """What accuracy costs in time: knobs, models and engines on the same scenes; what is measured is kept in -o."""
+    with Session(as_json=as_json, verbose=verbose) as session:
+        from sdfsim.playback import save_rollout
+        from sdfsim.studies import tradeoff as study
+        from sdfsim.studies.hard_cases_plots import check_matplotlib
+
+        check_matplotlib()
+        report, rows, notes = study.run(
+            source,
+            out,
+            models=model or [],
+            quick=quick,
+            device=device,
+            on_progress=session.stage_progress,
+            record=save_rollout,
+        )
+        session.report(report, [*columns(rows), *notes])
+
+
+def stress(
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder to write; finished cases in it are kept.")] = Path(
+        "stress"
+    ),
+    model: Annotated[
+        list[str] | None, typer.Option(help="Bundled model or path; may be given again (default: all bundled ones).")
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer and shorter cases, in minutes.")] = False,
+    shapes: Annotated[Path | None, typer.Option(help="Folder of meshes that are to rest on the floor too.")] = None,
+    as_json: Json = False,
+    device: Device = "auto",
+    verbose: Verbose = False,
+) -> None:
+    """The hard cases, with every model and the teacher: a table, a page, and recordings of what went wrong."""
+    with Session(as_json=as_json, verbose=verbose) as session:
+        from sdfsim.playback import save_rollout
+        from sdfsim.studies import hard_cases_run
+        from sdfsim.studies.hard_cases_page import report_notes, report_table, write_report
+        from sdfsim.studies.hard_cases_plots import check_matplotlib
+
+        check_matplotlib()
+        study = hard_cases_run.stress(
+            out,
+            models=model or [],
+            quick=quick,
+            shapes=shapes,
+            device=device,
+            record=save_rollout,
+            on_progress=session.progress,
+        )
+        report = write_report(study, out)
+        tell_failed(session, report)
+        session.report(report, [*columns(report_table(study)), *report_notes(report)])

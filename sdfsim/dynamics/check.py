@@ -1,0 +1,80 @@
+"""What a state and a scene must be for their motion to mean anything."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from sdfsim.dynamics.bodies import State, Units
+from sdfsim.dynamics.freeflight import MOST_TURN
+from sdfsim.errors import SdfsimError
+from sdfsim.scene.types import Scene
+
+# Of |q|^2 - 1. The matrix R of a quaternion that keeps to it has |R'R - I| below 1e-5, and a positive determinant.
+UNIT = 2e-6
+# Model lengths from the origin. Double precision places a body to a ten millionth of its size up to here.
+FARTHEST = 1e9
+# Model units. Faster, a body passes ten thousand of its own lengths in a step.
+FASTEST = 1e6
+# Of the nodes' largest extent: with a second one smaller than this they are a line.
+LINE = 1e-5
+
+
+def fault(
+    state: State, rows: torch.Tensor, dt: float, units: Units, before: State | None = None
+) -> tuple[int, str] | None:
+    """The first of bodies `rows` [R] int64 whose state cannot be, and what is wrong with it; None when all are sound.
+
+    Args:
+        state: N bodies, model units.
+        rows: which of them to look at.
+        dt: the step, model units.
+        units: what messages are told in.
+        before: the state a step earlier, if there is one.
+    """
+    for name in ("position", "orientation", "velocity", "angular_velocity"):
+        bad = ~getattr(state, name)[rows].isfinite().all(-1)
+        if bool(bad.any()):
+            return int(rows[bad][0]), f"{name} is not finite"
+    bad = (state.orientation[rows].square().sum(-1) - 1.0).abs() > UNIT
+    if bool(bad.any()):
+        return int(rows[bad][0]), "orientation is no rotation"
+    limits = [
+        (state.position, FARTHEST, units.length, "m from the origin, too far to be placed exactly"),
+        (state.velocity, FASTEST, units.velocity, "m/s, too fast for any contact"),
+        (state.angular_velocity, MOST_TURN / dt, 1.0 / units.time, "rad/s, too fast to be followed"),
+    ]
+    if before is not None:
+        way = (state.position - before.position) / dt
+        limits.append((way, FASTEST, units.velocity, "m/s on its way through the step, too fast for any contact"))
+    for values, most, unit, what in limits:
+        size = values[rows].norm(dim=-1)
+        bad = size > most
+        if bool(bad.any()):
+            return int(rows[bad][0]), f"{float(size[bad][0]) * unit:.3g} {what} (at most {most * unit:.3g})"
+    return None
+
+
+def check_nodes(scene: Scene, nodes_a_body: int | None) -> None:
+    """That every dynamic body has nodes that tell how it is turned.
+
+    Args:
+        scene: what is to be simulated.
+        nodes_a_body: the simulator uses only the first that many of each; None for all.
+
+    Raises:
+        SdfsimError: its nodes are one place or one line.
+    """
+    told = set()
+    for body in scene.bodies:
+        if body.motion != "dynamic" or body.shape in told:
+            continue
+        told.add(body.shape)
+        nodes = scene.shapes[body.shape].nodes[:nodes_a_body]
+        extents = np.linalg.svd(nodes - nodes.mean(0), compute_uv=False) if len(nodes) > 1 else np.zeros(2)
+        if extents[0] == 0 or len(extents) < 2 or extents[1] <= LINE * extents[0]:
+            where = "in one place" if extents[0] == 0 else "on one line"
+            raise SdfsimError(
+                f"body {body.name!r} moves: its {len(nodes)} surface nodes are {where}, which tells no turn",
+                "sample nodes anew: nodes: 7 at its shape in the scene file",
+            )

@@ -1,0 +1,57 @@
+"""Bodies so deep inside each other that the nearest surface is the wrong way out.
+
+A node leaves a solid where its surface is nearest. Of a body whose centre is inside another one that is, for the nodes
+beyond that one's middle, the far side: such pairs would be drawn together. They part along one direction instead, the
+way out for the centre, which an SDF's gradient tells everywhere, on the medial axis too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from sdfsim.dynamics import pose
+from sdfsim.dynamics.bodies import Bodies, State
+from sdfsim.dynamics.contacts import Contacts, distances
+from sdfsim.dynamics.graph import number_pairs
+from sdfsim.dynamics.memory import Memory
+
+
+def parting(bodies: Bodies, state: State, contacts: Contacts, memory: Memory) -> Contacts:
+    """The edges, those of pairs that are swallowed with normals along which the two part.
+
+    Swallowed is a pair of which one body's centre of mass is inside both solids (that of a ring on a peg is not inside
+    the ring). Both bodies' edges then have the same direction, opposite ways: the normal of the other one where that
+    centre is; of two centres that are inside, the one of the first body counts.
+    """
+    if not len(contacts):
+        return contacts
+    owner, body = contacts.owner, contacts.body
+    pair, pairs = number_pairs(owner, body, len(bodies))
+    first = torch.zeros(pairs, dtype=torch.int64, device=bodies.device).index_copy_(0, pair, torch.minimum(owner, body))
+    second = torch.zeros_like(first).index_copy_(0, pair, torch.maximum(owner, body))
+    way = torch.zeros(pairs, 3, dtype=torch.float64, device=bodies.device)
+    for one, other, sign in ((second, first, -1.0), (first, second, 1.0)):
+        rows, out = _inside(bodies, state, one, other, memory)
+        way = way.index_copy(0, rows, sign * out)
+    towards = torch.where(owner == first[pair], 1.0, -1.0)[:, None] * way[pair]
+    swallowed = (towards != 0).any(-1, keepdim=True)
+    return replace(contacts, normal=torch.where(swallowed, towards, contacts.normal))
+
+
+def _inside(bodies: Bodies, state: State, one: Tensor, other: Tensor, memory: Memory) -> tuple[Tensor, Tensor]:
+    """The rows of pairs [P] in which the centre of `one` is inside both solids, and unit ways [K, 3] out of `other`."""
+    back = pose.conjugate(state.orientation[other])
+    local = pose.rotate(back, state.position[one] - state.position[other])
+    box = bodies.bounds[other]
+    near = bodies.moves[one] & ((local > box[:, 0]) & (local < box[:, 1])).all(-1)
+    rows = near.nonzero()[:, 0]
+    distance, gradient = distances(bodies, other[rows], local[rows])
+    own, _ = distances(bodies, one[rows], torch.zeros_like(local[rows]))
+    memory.count(sdf_queries=2 * len(rows))
+    deep = (distance < 0) & (own < 0)
+    rows, gradient = rows[deep], gradient[deep]
+    out = pose.rotate(state.orientation[other[rows]], gradient)
+    return rows, out / out.norm(dim=-1, keepdim=True)

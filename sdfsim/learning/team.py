@@ -1,0 +1,82 @@
+"""Several processes or GPUs that train one network, as `torchrun` starts them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+
+@dataclass(frozen=True)
+class Team:
+    """One of `size` processes that share every batch: each works on its part, gradients are added up.
+
+    Attributes:
+        rank: 0 ... size - 1; the first writes all files.
+        size: how many there are.
+    """
+
+    rank: int = 0
+    size: int = 1
+
+    @property
+    def leads(self) -> bool:
+        """Whether this is the one that writes files."""
+        return self.rank == 0
+
+    @contextmanager
+    def in_turn(self) -> Iterator[None]:
+        """The first goes first, the others together after it."""
+        if not self.leads:
+            self.wait()
+        yield
+        if self.leads:
+            self.wait()
+
+    def share(self, count: int) -> slice:
+        """This one's part of a batch of `count`."""
+        return slice(self.rank * count // self.size, (self.rank + 1) * count // self.size)
+
+    def total(self, value: float, device: torch.device) -> float:
+        """The sum of everybody's `value`."""
+        if self.size == 1:
+            return value
+        whole = torch.tensor([value], dtype=torch.float64, device=device)
+        torch.distributed.all_reduce(whole)
+        return float(whole)
+
+    def add_gradients(self, parameters: Iterable[nn.Parameter]) -> None:
+        """Replace everybody's gradients by their sum."""
+        if self.size == 1:
+            return
+        gradients: list[Tensor] = [p.grad if p.grad is not None else torch.zeros_like(p) for p in parameters]
+        flat = torch.cat([g.flatten() for g in gradients])
+        torch.distributed.all_reduce(flat)
+        for gradient, part in zip(gradients, flat.split([g.numel() for g in gradients]), strict=True):
+            gradient.copy_(part.reshape(gradient.shape))
+
+    def wait(self) -> None:
+        """Until everybody has got here."""
+        if self.size > 1:
+            torch.distributed.barrier()
+
+
+ALONE = Team()
+
+
+def gather_team(device: str) -> tuple[Team, str]:
+    """The team that `torchrun` has started this process for, and its own device; alone where there is none."""
+    size = int(os.environ.get("WORLD_SIZE", "1"))
+    if size == 1:
+        return ALONE, device
+    cuda = device != "cpu" and torch.cuda.is_available()
+    if not torch.distributed.is_initialized():
+        torch.distributed.init_process_group("nccl" if cuda else "gloo")
+    team = Team(torch.distributed.get_rank(), size)
+    if cuda:
+        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
+    return team, "cuda" if cuda else "cpu"

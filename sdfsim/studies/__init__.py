@@ -1,0 +1,1 @@
+"""Studies: what the simulator costs, and where it fails."""

@@ -1,0 +1,174 @@
+"""The recorded scenes that settings are compared on, and what they have in common."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from sdfsim.errors import SdfsimError
+from sdfsim.learning.dataset import FLOOR, Trajectory, load_shapes, read_info, trajectory_files
+from sdfsim.learning.floor import engine_file
+from sdfsim.learning.instants import at_instants, engine_substep
+from sdfsim.learning.merge import scene_of
+from sdfsim.learning.penetration import Solid, engine_pieces, exact_solids
+from sdfsim.learning.rollouts import first_frames
+from sdfsim.scene.types import Scene
+from sdfsim.shape.asset import Shape, load_shape
+from sdfsim.shape.distance import PiecesDistance
+from sdfsim.shape.grid import sample_grid
+from sdfsim.shape.mesh import Mesh
+from sdfsim.shape.sdf import accepts_numpy
+
+MOST, MOST_QUICK = 20, 8  # trajectories
+STEPS, TIMED_STEPS = 100, 40
+
+
+@dataclass(frozen=True)
+class Cases:
+    """What every contender simulates.
+
+    Attributes:
+        data: dataset folder.
+        scratch: folder for what is made once and used again.
+        recorded: as the teacher moved them, from their first frames on.
+        starts: the same with velocities at the instants of the positions: what ours start from.
+        shapes: of every name in use, their origins at the centres of mass.
+        urdfs: the engine's files, by name; none where they are not at hand.
+        pieces: the convex pieces that the engine collides, by name; none where they are not at hand.
+        solids: the exact geometry, by name.
+        floor: its friction and restitution.
+        timed: which of the trajectories are timed.
+        timed_steps: how many steps of them.
+        length, time: m and s of the scene in one of these; recordings are 1.
+    """
+
+    data: Path
+    scratch: Path
+    recorded: list[Trajectory]
+    starts: list[Trajectory]
+    shapes: dict[str, Shape]
+    urdfs: dict[str, Path]
+    pieces: dict[str, list[Mesh]]
+    solids: dict[str, Solid]
+    floor: tuple[float, float]
+    timed: list[int]
+    timed_steps: int
+    length: float = 1.0
+    time: float = 1.0
+
+    @property
+    def steps(self) -> int:
+        """How far all are simulated."""
+        return len(self.recorded[0].position) - 1
+
+    @property
+    def bodies(self) -> int:
+        """How many bodies move in all."""
+        return int(sum((~t.static.astype(bool)).sum() for t in self.recorded))
+
+    def scene(self, index: int, shapes: dict[str, Shape]) -> Scene:
+        """One of the trajectories as a scene of its own."""
+        return scene_of([self.starts[index]], [0], shapes, self.floor)[0]
+
+    def digest(self) -> str:
+        """Changes with all that a measurement depends on but the contender itself."""
+        told = hashlib.sha256(f"{self.steps} {self.timed} {self.timed_steps} {self.floor}".encode())
+        for t in self.recorded:
+            told.update(np.ascontiguousarray(t.position).tobytes())
+        for name, shape in sorted(self.shapes.items()):
+            told.update(name.encode() + np.ascontiguousarray(shape.nodes).tobytes())
+        return told.hexdigest()[:16]
+
+
+@dataclass(frozen=True, eq=False)
+class PiecesSdf:
+    """The exact signed distance to a union of convex pieces, as an Sdf; by bounding-volume hierarchy, on the CPU."""
+
+    oracle: PiecesDistance
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """[2, 3] m."""
+        return self.oracle.bounds
+
+    @accepts_numpy
+    def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Distance [P] m and gradient [P, 3] (0 on the surface itself)."""
+        asked = points.detach().cpu().numpy().astype(np.float64)
+        truth = self.oracle(asked)
+        away = np.where(truth.distance == 0, 1.0, truth.distance)[:, None]
+        return torch.from_numpy(truth.distance).to(points), torch.from_numpy((asked - truth.closest) / away).to(points)
+
+
+def sampled(shape: Shape, resolution: int, scratch: Path) -> Shape:
+    """A shape whose network's distances are sampled on a grid, once, and kept; `source` says how long it took."""
+    folder = scratch / f"grid-{resolution}" / shape.name
+    if folder.exists():
+        return load_shape(folder)
+    began = time.process_time()
+    grid = sample_grid(shape.sdf, shape.sdf.bounds, resolution)
+    note = {"sdf": "grid", "resolution": resolution, "sampled_s": time.process_time() - began}
+    made = replace(shape, sdf=grid, certificate={}, source=shape.source | note)
+    made.save(folder)
+    return made
+
+
+def load_cases(data: Path, scratch: Path, *, quick: bool) -> Cases:
+    """The trajectories of a dataset's test split, at most `MOST`; a quick study takes fewer and shorter ones.
+
+    Args:
+        data: dataset folder.
+        scratch: see `Cases`.
+        quick: a quick study.
+
+    Raises:
+        SdfsimError: no or unreadable trajectories or shapes, or recordings of different steps or gravities.
+    """
+    files = trajectory_files(data, "test")[: MOST_QUICK if quick else MOST]
+    recorded = [t for t in map(Trajectory.load, files) if not t.static.all()]
+    if not recorded:
+        raise SdfsimError(f"{data}: nothing moves in any trajectory")
+    if len({(t.dt, *t.gravity) for t in recorded}) > 1:
+        raise SdfsimError(f"{data}: its trajectories differ in step or gravity", "give a dataset of one recipe")
+    longest = min(50 if quick else STEPS, *(len(t.position) - 1 for t in recorded))
+    recorded = [first_frames(t, longest + 1) for t in recorded]
+    substep = engine_substep(data)
+    shapes = load_shapes(data, {str(n) for t in recorded for n in t.shape})
+    order = np.argsort([t.position.shape[1] for t in recorded], kind="stable")
+    places = (2,) if quick else (1, 3)  # quarters of the scenes by their bodies
+    timed = sorted({int(order[k * (len(order) - 1) // 4]) for k in places})
+    return Cases(
+        data=data,
+        scratch=scratch,
+        recorded=recorded,
+        starts=[at_instants(t, substep) for t in recorded],
+        shapes={name: replace(shape, com=np.zeros(3)) for name, shape in shapes.items()},
+        urdfs=_engine_files(data, shapes),
+        pieces={name: engine_pieces(data, name) for name in shapes},
+        solids=exact_solids(data, shapes),
+        floor=_floor(data),
+        timed=timed,
+        timed_steps=min(30 if quick else TIMED_STEPS, longest),
+    )
+
+
+def _engine_files(data: Path, names: Iterable[str]) -> dict[str, Path]:
+    """The engine's files that are at hand; without them the engine is left out, and says so."""
+    found = {}
+    for name in names:
+        with suppress(SdfsimError):
+            found[name] = engine_file(data, name)
+    return found
+
+
+def _floor(data: Path) -> tuple[float, float]:
+    home = data if (data / "dataset.json").exists() else data.parent
+    said = read_info(home).get("floor") if (home / "dataset.json").exists() else None
+    return (float(said["friction"]), float(said["restitution"])) if isinstance(said, dict) else FLOOR

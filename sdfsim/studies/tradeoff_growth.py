@@ -1,0 +1,260 @@
+"""How time and memory of a step grow with bodies and with nodes, on piles and bowls; the cost model comes from here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sdfsim.dynamics.model import load_model
+from sdfsim.dynamics.simulator import Simulator
+from sdfsim.errors import SdfsimError
+from sdfsim.files import read_json, replacing, write_json
+from sdfsim.scene.types import Body, Scene
+from sdfsim.shape.asset import analytic_shape, with_nodes
+from sdfsim.shape.cache import shape_from_primitive
+from sdfsim.studies.tradeoff_contenders import peak_memory, time_simulator, weights_digest
+from sdfsim.studies.tradeoff_cost import Load, fit_cost, relative_errors
+
+VERSION = 1
+STEPS = 9  # of which the first is not timed
+BALL, BOX = 0.7, 0.6  # m: radius, side
+GAP = 0.02  # m between neighbours at the start: they are within reach of each other
+WALL = 0.12  # of the bowl primitive, relative to its outer radius
+GRID = 48  # samples along each side of the bowl's distances
+HIGH, APART = 100.0, 5.0  # m above the floor, and times as far from each other: where nothing touches
+WITHIN = 0.3  # what a cost model may be off by on scenes that it was not fitted to
+NAMES = {"pile": "boxes in columns on a floor", "bowl": "balls in a bowl"}
+
+
+@dataclass(frozen=True)
+class Growing:
+    """One scene of the study.
+
+    Attributes:
+        kind: of `NAMES`.
+        bodies: how many move.
+        nodes: N of the N^3 grid that a body's nodes are sampled from; None for its own (98 or 128).
+        flying: high above what it would touch.
+    """
+
+    kind: str
+    bodies: int
+    nodes: int | None = None
+    flying: bool = False
+
+    @property
+    def key(self) -> str:
+        """A file name."""
+        tail = "" if self.nodes is None else f"__nodes-{self.nodes}"
+        return f"{self.kind}__{self.bodies}{tail}{'__flying' if self.flying else ''}"
+
+
+def scenes(*, quick: bool) -> list[Growing]:
+    """The scenes of a study: by bodies, by nodes of 16 bodies, and without contact."""
+    counts = (1, 4, 16, 64) if quick else (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
+    grids = (3, 6, 12, 24) if quick else (3, 4, 6, 8, 12, 16, 24, 48, 96)
+    found = [Growing(kind, count) for kind in NAMES for count in counts]
+    found += [Growing(kind, 16, grid) for kind in NAMES for grid in grids]
+    return found + [Growing("pile", count, flying=True) for count in counts[::2]]
+
+
+def build(one: Growing) -> Scene:
+    """The scene, in metres, at 9.81 m/s^2."""
+    shapes, held = [analytic_shape("plane")], [_body("floor", 0, np.zeros(3), 0.0)]
+    if one.kind == "pile":
+        shape, places = analytic_shape("box", size=(BOX, BOX, BOX)), _columns(one.bodies)
+    else:
+        shape, (places, outer) = analytic_shape("sphere", radius=BALL), _in_bowl(one.bodies)
+        shapes.append(shape_from_primitive("bowl", 2 * outer, sdf="grid", resolution=GRID))
+        held.append(_body("bowl", 1, np.array([0.0, 0.0, outer]), 0.0))
+    shapes.append(shape if one.nodes is None else with_nodes(shape, one.nodes))
+    if one.flying:
+        places = APART * places + np.array([0.0, 0.0, HIGH])
+    moving = [_body(f"body{k}", len(shapes) - 1, place, 1.0) for k, place in enumerate(places)]
+    return Scene(tuple(shapes), (*held, *moving), np.array([0.0, 0.0, -9.81]), duration=1.0)
+
+
+def _columns(count: int) -> np.ndarray:
+    """[count, 3] m: boxes in columns of four, the lowest on the floor."""
+    column, level = np.divmod(np.arange(count), 4)
+    side = int(np.ceil((count / 4) ** 0.5))
+    return np.stack([*np.divmod(column, side), level], 1) * (BOX + GAP) + np.array([0.0, 0.0, 0.5 * BOX])
+
+
+def _in_bowl(count: int) -> tuple[np.ndarray, float]:
+    """[count, 3] m: balls in the lowest layers of a bowl that stands on the floor; and its outer radius m."""
+    step, inner = 2 * BALL + GAP, 2.0 * BALL
+    while True:
+        reach = int(inner / step) + 1
+        axis = np.arange(-reach, reach + 1) * step
+        lattice = np.stack(np.meshgrid(axis, axis, axis - 0.5 * step, indexing="ij"), -1).reshape(-1, 3)
+        inside = lattice[(np.linalg.norm(lattice, axis=1) <= inner - BALL) & (lattice[:, 2] <= 0)]
+        if len(inside) >= count:
+            order = np.lexsort((np.hypot(inside[:, 0], inside[:, 1]).round(6), inside[:, 2].round(6)))
+            outer = inner / (1 - WALL)
+            return inside[order[:count]] + np.array([0.0, 0.0, outer]), outer
+        inner *= 1.1
+
+
+def _body(name: str, shape: int, position: np.ndarray, mass: float) -> Body:
+    return Body(
+        name=name,
+        shape=shape,
+        motion="dynamic" if mass else "static",
+        scale=1.0,
+        position=np.asarray(position, dtype=float),
+        quat_xyzw=np.array([0.0, 0.0, 0.0, 1.0]),
+        velocity=np.zeros(3),
+        angular_velocity=np.zeros(3),
+        mass=mass,
+        friction=0.5,
+        restitution=0.3,
+    )
+
+
+def growth(
+    out: Path, *, model: str | None, quick: bool, device: str, on_progress: Callable[[str, float, str], None]
+) -> dict[str, Any]:
+    """Time the scenes, fit the cost model to two of three and check it on the others; growth.png and growth.json.
+
+    Args:
+        out: folder to write; scenes that it holds already are not run again.
+        model: bundled name or path.
+        quick: fewer and smaller scenes.
+        device: "cpu", "cuda" or "auto".
+        on_progress: called with (stage, fraction, message).
+
+    Returns:
+        The content of growth.json: points, slopes, the cost model and its errors on scenes that it has not seen.
+    """
+    used = load_model(model)
+    # What a process takes only once, the first thing it simulates must not be charged with.
+    time_simulator(Simulator(build(Growing("pile", 2)), used, device), STEPS)
+    points, chosen = [], scenes(quick=quick)
+    for k, one in enumerate(chosen):
+        on_progress("growth", k / len(chosen), f"{one.kind}, {one.bodies} bodies")
+        points.append(_measured(one, out / "points" / "growth", model or used.name, device))
+    on_progress("growth", 1.0, "measured")
+    good = [p for p in points if not p["failed"]]
+    loads, ms = [Load(**p["load"]) for p in good], [p["ms"] for p in good]
+    held = [k for k in range(len(good)) if k % 3 == 1]
+    kept = [k for k in range(len(good)) if k % 3 != 1]
+    cost = fit_cost([loads[k] for k in kept], [ms[k] for k in kept])
+    off = relative_errors(cost, [loads[k] for k in held], [ms[k] for k in held])
+    report = {
+        "model": used.name,
+        "kind": used.kind,
+        "quick": quick,
+        "points": points,
+        "slopes": slopes(good),
+        "cost": cost.to_json(),
+        "held_out": {good[k]["key"]: float(e) for k, e in zip(held, off, strict=True)},
+        "held_out_median": float(np.median(np.abs(off))),
+        "held_out_within": float((np.abs(off) <= WITHIN).mean()),
+        "folder": str(out),
+    }
+    write_json(out / "growth.json", report)
+    draw(good, out / "growth.png")
+    return report
+
+
+def _measured(one: Growing, folder: Path, model: str, device: str) -> dict[str, Any]:
+    path = folder / f"{one.key}.json"
+    mark = {"version": VERSION, "model": weights_digest(model), "device": device, **asdict(one)}
+    if path.exists() and (point := read_json(path)).get("fingerprint") == mark:
+        return point
+    point = {"key": one.key, **asdict(one), "fingerprint": mark, "failed": ""}
+    try:
+        scene = build(one)
+        with peak_memory() as memory:
+            repeats = [time_simulator(Simulator(scene, model, device), STEPS) for _ in range(3)]
+        counts = repeats[0].scenes[0]
+        own = counts["nodes"] / max(1.0, counts["bodies"])
+        point |= {
+            # The least of three: what others do on the machine only adds.
+            "ms": min(r.scenes[0]["ms"] for r in repeats),
+            "mib": memory["mib"],
+            "all_nodes": counts["nodes"],
+            "load": asdict(Load(counts["bodies"], float(counts["edges"] > 0), own * counts["active"], counts["edges"])),
+        }
+    except (SdfsimError, RuntimeError, MemoryError) as error:
+        point["failed"] = str(error).splitlines()[0]
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(path, point)
+    return point
+
+
+def slopes(points: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """Exponents of time and memory against bodies and against nodes, of the last three points of each curve."""
+    found = {}
+    for name, axis, some in curves(points):
+        last = some[-3:]
+        if len(last) < 2:
+            continue
+        x = np.log([p[axis] for p in last])
+        found[name] = {"time": float(np.polyfit(x, np.log([p["ms"] for p in last]), 1)[0])}
+        if all(p["mib"] for p in last):
+            found[name]["memory"] = float(np.polyfit(x, np.log([p["mib"] for p in last]), 1)[0])
+    return found
+
+
+def curves(points: Sequence[dict[str, Any]]) -> list[tuple[str, str, list[dict[str, Any]]]]:
+    """(name, axis, points in order) of every curve."""
+    found = []
+    for kind in NAMES:
+        some = [p for p in points if p["kind"] == kind and not p["flying"]]
+        by_bodies = sorted((p for p in some if p["nodes"] is None), key=lambda p: p["bodies"])
+        by_nodes = sorted((p for p in some if p["nodes"] is not None), key=lambda p: p["all_nodes"])
+        found += [(f"{kind}, bodies", "bodies", by_bodies), (f"{kind}, nodes", "all_nodes", by_nodes)]
+    return [curve for curve in found if curve[2]]
+
+
+def draw(points: Sequence[dict[str, Any]], path: Path) -> None:
+    """Time and memory of a step against bodies and nodes, logarithmic."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(2, 2, figsize=(10, 7), layout="constrained")
+    found = slopes(points)
+    for name, axis, some in curves(points):
+        column = 0 if axis == "bodies" else 1
+        for row, what in enumerate(("ms", "mib")):
+            slope = found.get(name, {}).get("time" if what == "ms" else "memory")
+            told = name.split(",")[0] + ("" if slope is None else f", slope at the end {slope:.2f}")
+            shown = [p for p in some if p[what]]
+            axes[row, column].loglog([p[axis] for p in shown], [p[what] for p in shown], "o-", ms=4, label=told)
+    for column, what in enumerate(("bodies that move (98 or 128 nodes each)", "surface nodes of 16 bodies")):
+        for row, measured in enumerate(("milliseconds a step", "memory of a run above the program's, MiB")):
+            axes[row, column].set(xlabel=what, ylabel=measured)
+            axes[row, column].grid(True, which="both", lw=0.3)
+            axes[row, column].legend(fontsize=8)
+    with replacing(path) as partial:
+        figure.savefig(partial, dpi=110, format="png")
+    pyplot.close(figure)
+
+
+def told(report: dict[str, Any]) -> tuple[list[tuple[str, ...]], list[str]]:
+    """The report of `growth` for people: a row a scene, then slopes and the cost model."""
+    rows: list[tuple[str, ...]] = [("scene", "bodies", "nodes", "edges", "ms a step", "MiB")]
+    for p in report["points"]:
+        if p["failed"]:
+            rows.append((f"{p['key']}: {p['failed']}", *[""] * 5))
+        else:
+            load, mib = p["load"], "-" if p["mib"] is None else f"{p['mib']:.1f}"
+            numbers = (load["bodies"], p["all_nodes"], load["edges"])
+            rows.append((p["key"], *(f"{v:.0f}" for v in numbers), f"{p['ms']:.2f}", mib))
+    found = [f"{name}: " + ", ".join(f"{k} ~ x^{v:.2f}" for k, v in s.items()) for name, s in report["slopes"].items()]
+    cost = ", ".join(f"{name} {value:.3g}" for name, value in report["cost"].items())
+    return rows, [
+        *found,
+        f"cost model, ms: {cost}",
+        f"on scenes that it was not fitted to: off by {report['held_out_median']:.0%} in the median, "
+        f"{report['held_out_within']:.0%} of them within {WITHIN:.0%}",
+        f"wrote {report['folder']}",
+    ]

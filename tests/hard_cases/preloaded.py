@@ -1,0 +1,10 @@
+"""What every command needs, imported once in the server that the children of `crashing` are forked from."""
+
+import cli
+import pipeline.stages
+import sdfsim.fitting
+import sdfsim.learning.train
+import sdfsim.run
+import sdfsim.shape.fit
+
+__all__ = ["cli", "pipeline", "sdfsim"]

@@ -1,0 +1,114 @@
+"""Rows 16 (flag), 18, 19 and 21: many bodies, long runs, and a single mover among much scenery."""
+
+from __future__ import annotations
+
+import gc
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sdfsim
+from sdfsim.dynamics.simulator import Simulator
+from sdfsim.scene.types import Effects
+from tests.dynamics.conftest import make_body
+from tests.hard_cases import gates
+
+
+def total(rollout) -> np.ndarray:
+    return rollout.counters["kinetic_energy"] + rollout.counters["potential_energy"]
+
+
+def assert_falls_into_the_bowl(model, count: int, seconds: float) -> None:
+    scene = gates.in_bowl(count)
+    rollout = Simulator(scene, model).run(seconds=seconds)
+    gates.assert_sound(rollout)
+    assert rollout.contact_count.sum() > count
+    potential, kinetic = rollout.counters["potential_energy"], rollout.counters["kinetic_energy"]
+    fallen = potential[0] - potential.min()
+    # Motion comes out of height alone, at every moment.
+    assert fallen > 0 and (kinetic <= potential[0] - potential + 0.01 * fallen).all()
+    assert (total(rollout) <= total(rollout)[0] + 0.01 * fallen).all()
+    below = rollout.position[:, gates.moving(scene), 2].min()
+    assert below > -0.01  # nobody through the bowl and the floor
+
+
+def test_twenty_seven_balls_into_a_bowl(model):
+    assert_falls_into_the_bowl(model, 27, 0.5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("count", "seconds"), [(64, 4.0), (512, 2.0)])
+def test_many_balls_into_a_bowl(model, count, seconds):
+    assert_falls_into_the_bowl(model, count, seconds)
+
+
+def resident() -> float:
+    """MiB of memory that the process holds."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * 4096 / 2**20
+
+
+def assert_runs_on(model, settle: int, steps: int, sleep: str) -> None:
+    """The sample pile, settled, for many steps more."""
+    scene = sdfsim.load_scene(gates.SAMPLES / "pile.yaml")
+    sim = Simulator(replace(scene, effects=Effects(sleep=sleep)), model)
+    start = total(sim.initial_rollout())[0]
+    for _ in sim.steps(settle):
+        pass
+    settled = total(sim.initial_rollout())[0]
+    fallen = start - settled
+    objects, memory, worst = None, None, 0.0
+    for k, _ in enumerate(sim.steps(steps)):
+        if k % max(1, steps // 50) == 0:
+            frame = sim.initial_rollout()
+            gates.assert_sound(frame)
+            worst = max(worst, total(frame)[0] - settled)
+        if k in (steps // 4, steps - 1):
+            gc.collect()
+            if memory is None:
+                objects, memory = len(gc.get_objects()), resident()
+    assert fallen > 0 and worst < 0.01 * fallen
+    assert len(gc.get_objects()) < objects + steps // 2  # one object a step would be more
+    assert resident() < memory + 32.0
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="reads /proc to see the memory of a process")
+@pytest.mark.parametrize("sleep", ["off"])
+def test_hundreds_of_steps_of_a_pile(model, sleep):
+    assert_runs_on(model, 150, 150, sleep)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="reads /proc to see the memory of a process")
+@pytest.mark.parametrize("sleep", ["on", "off"])
+def test_ten_thousand_steps_of_a_settled_pile(model, sleep):
+    assert_runs_on(model, 400, 10_000, sleep)
+
+
+def test_ten_thousand_static_bodies_cost_one_mover_what_ten_do(model):
+    """Counted, not timed: pairs, distances, nodes and edges of every step; benchmarks/effects.py has the times."""
+
+    def run(count: int):
+        scene = gates.mixed()
+        far = tuple(
+            make_body(f"far{k}", 0, [30 + 2 * (k % 100), 2 * (k // 100), 1], motion="static", mass=0.0)
+            for k in range(count)
+        )
+        sim = Simulator(replace(scene, bodies=(*scene.bodies, *far)), model)
+        return sim.run(steps=12)
+
+    few, many = run(10), run(10_000)
+    for name in ("pairs", "sdf_queries", "nodes", "edges", "active", "free"):
+        np.testing.assert_array_equal(few.counters[name], many.counters[name], err_msg=name)
+    assert few.counters["sdf_queries"].sum() > 0
+    np.testing.assert_array_equal(few.position[:, :4], many.position[:, :4])
+
+
+def test_masses_beyond_training_are_flagged(model):
+    """`simulate` and `plan` print these lines, see tests/test_planning.py."""
+    lines = Simulator(gates.unequal(), model).outside_training
+    assert [line for line in lines if line.startswith("heaviest to lightest body: 1e+03 to 1e+03 here")]
+    scene = gates.placed(gates.CUBE, [(0, 0, 0.5), (0.1, 0, 1.55)], floor=True)
+    assert not [line for line in Simulator(scene, model).outside_training if "heaviest" in line]

@@ -1,0 +1,140 @@
+"""Rows 1 to 5, 7 and 8: what every run of every bundled model keeps to, whatever it has learned.
+
+Of untrained networks the same is tested in tests/dynamics (test_freeflight.py, test_impulse.py).
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sdfsim.dynamics.simulator import Simulator
+from sdfsim.shape.asset import analytic_shape
+from tests.hard_cases import gates
+
+ROOT = Path(__file__).resolve().parents[2]
+NAMES = ("position", "orientation", "velocity", "angular_velocity")
+
+
+@pytest.mark.parametrize("case", gates.CASES)
+def test_every_case_stays_sound(model, device, case):
+    scene = gates.CASES[case]()
+    rollout = Simulator(scene, model, device).run(steps=40)
+    gates.assert_sound(rollout)
+    assert rollout.contact_count.sum() > 0
+    assert np.abs(rollout.position).max() < 40.0 and np.abs(rollout.velocity).max() < 60.0
+
+
+@pytest.mark.parametrize("size", [1.0, 100.0])
+def test_ten_seconds_of_projectile(model, device, size):
+    velocity, spin = np.array([3.0, -2.0, 8.0]), np.array([0.3, 0.2, 0.1])
+    scene = gates.placed(
+        gates.CUBE, [(1.0, 2.0, 3.0)], gravity=gates.EARTH, scale=size, velocity=velocity, angular_velocity=spin
+    )
+    rollout = Simulator(scene, model, device).run(seconds=10.0)
+    t = rollout.time[:, None]
+    expected = scene.bodies[0].position + velocity * t + 0.5 * gates.EARTH * t**2
+    far = np.linalg.norm(expected, axis=-1).max()
+    assert np.abs(rollout.position[:, 0] - expected).max() <= 1e-5 * far
+    assert np.abs(rollout.velocity[:, 0] - (velocity + gates.EARTH * t)).max() <= 1e-5 * 100
+    # A cube's inertia has no axes of its own: it turns evenly.
+    turned = Rotation.from_rotvec(rollout.time[:, None] * spin)
+    assert (Rotation.from_quat(rollout.orientation[:, 0]) * turned.inv()).magnitude().max() < 1e-5
+
+
+def test_twenty_seconds_about_the_middle_axis_flip_and_conserve(model, device):
+    box = analytic_shape("box", size=(1.0, 0.8, 0.6))
+    spin = np.array([0.02, 5.0, 0.02])
+    rollout = Simulator(gates.placed(box, [(0, 0, 0)], angular_velocity=spin), model, device).run(seconds=20.0)
+    turn = Rotation.from_quat(rollout.orientation[:, 0])
+    local = turn.inv().apply(rollout.angular_velocity[:, 0])
+    inertia = np.diag(box.inertia) / box.volume  # of 1 kg
+    energy, momentum = 0.5 * (inertia * local**2).sum(-1), turn.apply(inertia * local)
+    assert np.abs(energy / energy[0] - 1).max() <= 1e-3
+    assert np.linalg.norm(momentum - momentum[0], axis=-1).max() <= 1e-3 * np.linalg.norm(momentum[0])
+    about = local[:, 1]
+    assert (np.diff(np.sign(about[np.abs(about) > 1.0])) != 0).sum() >= 2
+
+
+def apart(model, one, other, steps: int, back=lambda p: p, device: str = "cpu") -> float:
+    """Largest distance of two scenes' bodies over some steps, the second one's positions brought back."""
+    near, far = (Simulator(s, model, device).run(steps=steps) for s in (one, other))
+    assert near.contact_count.sum() > 10
+    rows = gates.moving(one)
+    return float(np.abs(back(far.position)[:, rows] - near.position[:, rows]).max())
+
+
+@pytest.mark.parametrize("distance", [1.7, 1e3, 1e4, 1e6])
+def test_where_it_happens_does_not_matter(model, device, distance):
+    shift = distance * np.array([1.0, -1.0, 0.5])
+    scene = gates.mixed()
+    far = replace(scene, bodies=tuple(replace(b, position=b.position + shift) for b in scene.bodies))
+    assert apart(model, scene, far, 25, lambda p: p - shift, device) <= 1e-4
+
+
+def test_the_order_of_bodies_does_not_matter(model):
+    scene = gates.mixed()
+    order = [2, 0, 3, 1]
+    mixed_up = replace(scene, bodies=tuple(scene.bodies[k] for k in order))
+    assert apart(model, scene, mixed_up, 25, lambda p: p[:, np.argsort(order)]) <= 1e-4
+
+
+def test_the_order_of_nodes_does_not_matter(model):
+    """Networks that look at the first so many nodes have others then, which is another body."""
+    if model.nodes is not None:
+        pytest.skip(f"{model.name} looks at the first {model.nodes} nodes of a shape")
+    scene, rng = gates.mixed(), np.random.default_rng(0)
+    shapes = tuple(replace(s, nodes=s.nodes[rng.permutation(len(s.nodes))]) for s in scene.shapes)
+    assert apart(model, scene, replace(scene, shapes=shapes), 25) <= 1e-4
+
+
+@pytest.mark.parametrize(("size", "strength"), [(0.01, 9.81), (100.0, 9.81), (1.0, 1.62)])
+def test_units_do_not_matter(model, size, strength):
+    scene = gates.mixed()
+    time = np.sqrt(size * 9.81 / strength)
+
+    def body(b):
+        return replace(
+            b,
+            position=b.position * size,
+            scale=b.scale * size,
+            mass=b.mass * size**3,
+            velocity=b.velocity * size / time,
+            angular_velocity=b.angular_velocity / time,
+        )
+
+    scaled = replace(scene, gravity=np.array([0.0, 0.0, -strength]), bodies=tuple(body(b) for b in scene.bodies))
+    assert apart(model, scene, scaled, 25, lambda p: p / size) <= 1e-4
+
+
+SCRIPT = """
+import sys, numpy as np, torch
+from sdfsim.dynamics.simulator import Simulator
+from tests.hard_cases import gates
+torch.set_num_threads(int(sys.argv[1]))
+r = Simulator(gates.mixed(), sys.argv[2], seed=3).run(steps=25)
+np.savez(sys.argv[3], **{k: getattr(r, k) for k in ("position", "orientation", "velocity", "angular_velocity")})
+"""
+
+
+def test_the_same_run_in_a_fresh_process(model, tmp_path):
+    """Bit for bit with as many threads, and to a millionth of a size a step with others."""
+    for name, threads in (("one", 1), ("again", 1), ("two", 2)):
+        subprocess.run(
+            [sys.executable, "-c", SCRIPT, str(threads), model.name, str(tmp_path / f"{name}.npz")],
+            cwd=ROOT,
+            env=os.environ | {"OMP_NUM_THREADS": str(threads)},
+            check=True,
+        )
+    one, again, two = (np.load(tmp_path / f"{name}.npz") for name in ("one", "again", "two"))
+    for name in NAMES:
+        assert one[name].tobytes() == again[name].tobytes(), name
+    steps = np.arange(len(one["position"]))[:, None, None]
+    assert (np.abs(one["position"] - two["position"]) <= 1e-6 * steps).all()

@@ -1,0 +1,192 @@
+"""What cannot be is an error that names step, body and last good state, and what was computed stays readable."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from typer.testing import CliRunner
+
+import cli
+from sdfsim import Rollout, SdfsimError
+from sdfsim.dynamics import check
+from sdfsim.dynamics.impulse import ImpulseNetwork, Velocities
+from sdfsim.dynamics.simulator import SimulationError, Simulator
+from sdfsim.dynamics.step import Rules
+from tests.dynamics.conftest import make_body, random_model
+from tests.dynamics.test_paper import paper_model
+from tests.hard_cases import gates
+
+NAMES = ("position", "orientation", "velocity", "angular_velocity")
+BROKEN = {
+    "nan": ("velocity", torch.nan),
+    "inf": ("position", torch.inf),
+    "nan turn": ("orientation", torch.nan),
+    "far": ("position", 1e12),
+    "fast": ("velocity", 1e9),
+    "fast turn": ("angular_velocity", 1e9),
+    "long quaternion": ("orientation", 1.0),
+    "no quaternion": ("orientation", 0.0),
+}
+
+
+def spoil(state, name: str, value: float):
+    """The state with one number (the whole quaternion where 0 is asked for) of body 1 replaced."""
+    tensor = getattr(state, name).clone()
+    tensor[1, slice(None) if value == 0.0 else 0] = value
+    return replace(state, **{name: tensor})
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_state_that_cannot_be_is_named_and_the_last_good_one_kept(kind, seed):
+    steps = int(np.random.default_rng(seed).integers(1, 12))
+    sim = Simulator(gates.mixed(), random_model("impulse", push=0.1))
+    frames = []
+
+    def inject(frame: Rollout) -> None:
+        frames.append(frame)
+        if len(frames) == steps:
+            sim.state = spoil(sim.state, *BROKEN[kind])
+
+    with pytest.raises(SimulationError) as caught:
+        sim.run(steps=20, on_step=inject)
+    told = caught.value.message
+    assert told.startswith(f"step {steps + 1}: body 'box': ") and "\n" not in told
+    assert f"the last good state is that of step {steps}, t = {steps * sim.dt:.4g} s" in told
+    assert caught.value.exit_code == 3 and len(caught.value.rollout) == steps
+    gates.assert_sound(caught.value.rollout)
+    np.testing.assert_array_equal(sim.si_state().position.numpy(), frames[-1].position[0])
+    sim.run(steps=1)  # from the last good state it goes on
+
+
+def test_a_state_of_one_frame_comes_with_the_error_of_steps():
+    sim = Simulator(gates.mixed(), random_model("impulse", push=0.1))
+    walk = sim.steps(9)
+    for _ in range(4):
+        last = next(walk)
+    sim.state = spoil(sim.state, "velocity", torch.nan)
+    with pytest.raises(SimulationError, match="step 5: body 'box': velocity is not finite") as caught:
+        next(walk)
+    np.testing.assert_array_equal(caught.value.rollout.position[0], last.position.numpy())
+
+
+def test_rounding_is_no_fault_and_the_threshold_is_that_of_the_matrix():
+    """Just below `UNIT` the matrix keeps to 1e-5; a rotation in single precision is one."""
+    sim = Simulator(gates.mixed(), random_model("impulse", push=0.1))
+    long = sim.state.orientation * (1.0 + check.UNIT) ** 0.5
+    turn = gates.pose.to_matrix(long)
+    assert (turn.mT @ turn - torch.eye(3, dtype=torch.float64)).abs().max() <= 1e-5
+    sim.state = replace(sim.state, orientation=sim.state.orientation.float().double())
+    sim.run(steps=2)
+
+
+def breaking(network, at_call: int, spoiled):
+    """`network` gives `spoiled(answer)` at its `at_call`th call."""
+    real, calls = network.forward, []
+
+    def forward(*arguments, **options):
+        calls.append(1)
+        answer = real(*arguments, **options)
+        return spoiled(answer) if len(calls) == at_call else answer
+
+    network.forward = forward
+
+
+def in_velocities(name: str, value: float):
+    def spoiled(answer: Velocities) -> Velocities:
+        tensor = getattr(answer, name).clone()
+        tensor[-1, 0] = value
+        return replace(answer, **{name: tensor})
+
+    return spoiled
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("-inf"), 1e30], ids=str)
+@pytest.mark.parametrize("name", ["velocity", "angular", "mean_velocity", "mean_angular"])
+def test_an_answer_of_the_impulse_network_that_cannot_be(name, value):
+    if (name, value) == ("mean_angular", 1e30):
+        pytest.skip("a turn is a turn, however often it goes round")
+    model = random_model("impulse", push=0.1)
+    breaking(model.network, 3, in_velocities(name, value))
+    sim = Simulator(gates.mixed(), model)
+    with pytest.raises(SimulationError, match=r"step \d+: body '(box|ball|ring)': .*; the last good state") as caught:
+        sim.run(steps=30)
+    gates.assert_sound(caught.value.rollout)
+    assert len(caught.value.rollout) == sim.steps_done >= 2
+
+
+@pytest.mark.parametrize("value", [float("nan"), 1e30], ids=str)
+def test_an_answer_of_the_paper_network_that_cannot_be(value):
+    model = paper_model()
+
+    def spoiled(answer):
+        answer = answer.clone()
+        answer[0, 0] = value
+        return answer
+
+    breaking(model.network, 3, spoiled)
+    sim = Simulator(gates.placed(gates.CUBE, [(0, 0, 0.51), (0, 0, 1.53)], floor=True), model)
+    with pytest.raises(SimulationError, match=r"step 3: body 'b0': .*; the last good state is that of step 2,"):
+        sim.run(steps=9)
+
+
+def test_a_run_on_disk_is_readable_up_to_the_last_good_step(tmp_path, monkeypatch):
+    scene, out = tmp_path / "scene.yaml", tmp_path / "run"
+    scene.write_text(
+        "version: 1\nduration: 1\nshapes: {ball: {sphere: {radius: 0.5}}}\n"
+        "bodies:\n  - {name: floor, plane: {}}\n  - {name: ball, shape: ball, position: [0, 0, 0.52]}\n"
+    )
+    real, calls = ImpulseNetwork.forward, []
+    at = int(np.random.default_rng(7).integers(3, 20))
+
+    def forward(self, *arguments, **options):
+        calls.append(1)
+        answer = real(self, *arguments, **options)
+        return replace(answer, velocity=answer.velocity * torch.nan) if len(calls) == at else answer
+
+    monkeypatch.setattr(ImpulseNetwork, "forward", forward)
+    done = CliRunner().invoke(cli.app, ["simulate", str(scene), "-o", str(out), "--json"])
+    assert done.exit_code == 3
+    rollout, report = Rollout.load(out / "rollout.npz"), json.loads((out / "report.json").read_text())
+    assert len(rollout) == at - 1 == report["steps"] and report["status"] == "failed"
+    gates.assert_sound(rollout)
+    assert report["error"].startswith(f"step {at}: body 'ball': ") and report["error"] in done.stderr
+    assert f"the last good state is that of step {at - 1}" in report["error"]
+    assert (out / "rollout.rrd").stat().st_size > 0 and yaml.safe_load((out / "config.yaml").read_text())
+
+
+@pytest.mark.parametrize(
+    ("fields", "told"),
+    [
+        ({"position": np.array([0.0, np.nan, 1.0])}, "body 'b0': position is not finite"),
+        ({"velocity": np.array([0.0, 0.0, 1e9])}, "too fast for any contact"),
+        ({"angular_velocity": np.array([0.0, 0.0, 1e9])}, "too fast to be followed"),
+        ({"position": np.array([1e15, 0.0, 1.0])}, "too far to be placed exactly"),
+        ({"quat_xyzw": np.array([0.0, 0.0, 0.0, 2.0])}, "orientation is no rotation"),
+    ],
+)
+def test_a_start_that_cannot_be_is_told_before_any_step(fields, told):
+    scene = gates.placed(gates.CUBE, [(0, 0, 1)])
+    broken = replace(scene, bodies=(replace(scene.bodies[0], **fields),))
+    with pytest.raises(SdfsimError, match=told) as caught:
+        Simulator(broken, random_model("impulse"))
+    assert caught.value.exit_code == 1
+
+
+def test_thousands_of_steps_of_turning_leave_a_rotation_that_nothing_pulled_on():
+    """Normalising removes the drift of rounding and nothing else: an even turn ends where the closed form does."""
+    spin = torch.tensor([[0.7, -0.4, 0.2]], dtype=torch.float64)
+    body = make_body("b", 0, [0, 0, 0], angular_velocity=spin[0].numpy())
+    sim = Simulator(gates.Scene((gates.CUBE,), (body,), np.zeros(3), 1.0), random_model("impulse"))
+    assert isinstance(sim.rules, Rules)
+    for _ in range(1_000):
+        sim._step()
+    worst = abs(float(sim.state.orientation.norm(dim=-1)) - 1.0)
+    expected = gates.pose.from_rotvec(spin * 1_000 * sim.dt)
+    assert worst < 1e-14
+    assert float(gates.pose.angle_between(sim.state.orientation, expected)) < 1e-9

@@ -1,0 +1,129 @@
+"""The mesh stage as a whole, on a field that is drawn by hand: a table with a cup on it, and a speck in the air."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from pipeline import meshing
+from pipeline.cameras import Sparse, View, save_views
+from pipeline.distill import Trained
+from pipeline.field import FieldSize
+from pipeline.meshing import make_meshes, read_parts
+from pipeline.normalise import Normalisation
+from pipeline.placement import load_placement
+from pipeline.wishes import Known, Wishes
+from sdfsim.errors import SdfsimError
+from sdfsim.shape.mesh import is_closed, load_mesh, signed_volume
+from tests.pipeline.test_objects import TABLE, TOP, both, box
+from tests.pipeline.test_surface import look_at
+
+WIDTH = 2 * TABLE[0]
+SPECK = (-0.3, 0.2, 0.5)
+
+
+class Drawn:
+    """A field that is known exactly, and red where it is high."""
+
+    size = FieldSize((16, 64), (2, 2), 8, 8)
+
+    def sdf(self, points: torch.Tensor) -> torch.Tensor:
+        p = points.double().numpy()
+        return torch.from_numpy(np.minimum(both(p), box(p, SPECK, (0.03, 0.03, 0.03)))).float()
+
+    def geometry_at(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        return self.sdf(points), points, points
+
+    def color_of(self, geometry: torch.Tensor, features: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
+        return torch.zeros_like(geometry)
+
+
+def cameras() -> list[View]:
+    """Two rings, so that the cup's inside and the table's sides are both seen."""
+    angles = np.arange(8) * np.pi / 4
+    eyes = [np.array([2.2 * np.cos(a), 2.2 * np.sin(a), z]) for z in (0.4, 2.4) for a in angles]
+    views = [look_at(eye) for eye in eyes]
+    return [replace(view, name=f"{k:04d}.jpg", source=f"{k}.jpg") for k, view in enumerate(views)]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """Folders as the stages before leave them."""
+    folder = tmp_path_factory.mktemp("run")
+    for name in ("poses", "photos/images", "source"):
+        (folder / name).mkdir(parents=True)
+    views = cameras()
+    save_views(views, folder / "poses" / "cameras.json")
+    rng = np.random.default_rng(0)
+    xyz = rng.uniform([-0.6, -0.6, -0.5], [0.6, 0.6, 0.5], (4000, 3))
+    xyz = xyz[np.abs(both(xyz)) < 0.05]
+    count = len(xyz)
+    sparse = Sparse(xyz, np.zeros((count, 3), np.uint8), np.full(count, 0.3), np.arange(count), np.zeros(count, int))
+    np.savez(folder / "poses" / "sparse.npz", **vars(sparse))
+    for view in views:
+        for path in (folder / "photos" / "images" / view.name, folder / "source" / view.source):
+            Image.new("RGB", (view.width, view.height), (180, 90, 40)).save(path)
+    return folder
+
+
+@pytest.fixture
+def mesh(run: Path, tmp_path: Path, monkeypatch):
+    """Runs the mesh stage with some wishes; gives its report and its folder."""
+    trained = Trained(Drawn(), 0.01, Normalisation(np.zeros(3), 1.0), {"masked": False})  # type: ignore[arg-type]
+    monkeypatch.setattr(meshing, "load_field", lambda folder: trained)
+    monkeypatch.setitem(meshing.PRESET_RESOLUTION, "quick", 97)
+
+    def make(**wishes) -> tuple[dict, Path]:
+        places = run / "distill", run / "poses", run / "photos", run / "source"
+        return make_meshes(*places, tmp_path, preset="quick", wishes=Wishes(**wishes)), tmp_path
+
+    return make
+
+
+def test_a_cup_on_a_table_becomes_meshes_in_metres_with_names(mesh):
+    corners = [np.array([x, 0.34, TOP]) for x in (-0.49, 0.49)]
+    view = cameras()[10]
+    places = [f"{view.source}:{u:.3f},{v:.3f}" for u, v in view.project(np.array(corners))[0]]
+    report, folder = mesh(distance=Known(*places, 1.2 * 0.98))
+    scale = load_placement(folder).scale
+    assert scale == pytest.approx(1.2 / WIDTH, rel=0.02)
+    assert report["objects"] == ["object1"] and report["up_confidence"] == "high"
+    assert report["size"].startswith(f"given: {places[0]} to {places[1]}")
+    cup, solid = load_mesh(folder / "objects" / "object1.ply"), load_mesh(folder / "solid.ply")
+    assert is_closed(cup) and is_closed(solid)
+    assert np.ptp(cup.vertices[:, 2]) == pytest.approx(0.3 * scale, rel=0.05)
+    assert cup.vertices[:, 2].min() == pytest.approx((TOP + 0.5) * scale, abs=0.01 * scale)  # The floor is z = 0.
+    assert cup.colors is not None
+    assert np.abs(np.median(cup.colors, axis=0) - [180, 90, 40]).max() < 4  # As in the photos.
+    picture = np.asarray(Image.open(folder / "objects.png"), float)
+    assert (np.abs(picture - [180, 90, 40]).max(-1) > 40).mean() > 0.005  # The cup is tinted.
+
+
+def test_what_is_left_out_is_named_and_can_be_kept(mesh):
+    report, folder = mesh()
+    assert [piece["name"] for piece in report["left_out"]] == ["piece1"]
+    assert report["size"] == "assumed: widest side = 1 m"
+    before = signed_volume(load_mesh(folder / "solid.ply"))
+    kept, folder = mesh(keep=("piece1",))
+    assert kept["left_out"] == [] and read_parts(folder)["left_out"][0]["kept"]
+    more = signed_volume(load_mesh(folder / "solid.ply")) - before
+    assert more == pytest.approx(0.06**3 * load_placement(folder).scale ** 3, rel=0.4)  # Its corners are cut.
+
+
+def test_cropping_leaves_the_frame_and_what_is_within(mesh):
+    _, folder = mesh(size=2.0)
+    whole = load_placement(folder)
+    corners = np.sort(whole.points(np.array([[-0.55, -0.4, 0.0], [0.55, 0.4, 0.45]])), axis=0)
+    # Without the floor nothing reaches the end of the trained space: the table is what is left to move.
+    report, folder = mesh(size=2.0, crop=corners)
+    assert load_placement(folder).to_dict() == whole.to_dict()
+    assert not read_parts(folder)["scenery"] and report["objects"] == ["object1"]
+    vertices = load_mesh(folder / "objects" / "object1.ply").vertices
+    assert (vertices > corners[0] - 0.02).all() and (vertices < corners[1] + 0.02).all()
+    with pytest.raises(SdfsimError, match="crop: the box holds nothing"):
+        mesh(crop=np.array([[5.0, 5, 5], [6, 6, 6]]))

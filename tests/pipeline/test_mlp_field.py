@@ -1,0 +1,126 @@
+"""The paper's field: starts as a sphere, learns, resumes, and is read back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.cameras import Sparse
+from pipeline.distill import load_field, save_field
+from pipeline.landmarks import find_landmarks
+from pipeline.mlp_field import MlpField, MlpSize, encoded
+from pipeline.mlp_trainer import MlpTrainer, trainer_for
+from pipeline.normalise import Normalisation
+from pipeline.recipe import PRESETS
+from pipeline.render import sdf_cache
+from pipeline.trainer import Trainer
+from tests.pipeline.test_field import one_thread, toy_rays  # noqa: F401  a fixture
+
+TINY = MlpSize(depth=4, width=32, frequencies=3, color_depth=2, view_frequencies=2, background=8)
+PAPER = PRESETS["paper"]
+
+
+def points(count: int = 2000) -> torch.Tensor:
+    rng = torch.Generator().manual_seed(1)
+    directions = torch.randn(count, 3, generator=rng)
+    return directions / directions.norm(dim=1, keepdim=True) * torch.rand(count, 1, generator=rng)
+
+
+@pytest.mark.parametrize("radius", [0.25, 0.6])
+def test_the_papers_network_starts_as_a_sphere(radius):
+    field = MlpField(MlpSize(), seed=3, start_radius=radius)
+    p = points()
+    sdf, _, more = field.geometry_at(p)
+    outer = p.norm(dim=1) > 0.3
+    with torch.no_grad():
+        assert (sdf - (p.norm(dim=1) - radius)).abs().mean() < 0.07
+        assert (sdf - (p.norm(dim=1) - radius)).mean().abs() < 0.01
+        assert (more[outer, 3:].norm(dim=1) - 1).abs().mean() < 0.15
+        cosine = torch.nn.functional.cosine_similarity(more[outer, 3:], p[outer])
+        assert cosine.mean() > 0.95
+
+
+def test_encoding_is_the_papers():
+    p = torch.tensor([[0.3, -0.2, 0.7]], dtype=torch.float64)
+    found = encoded(p, 2)[0]
+    expected = [*p[0], *torch.sin(p[0]), *torch.cos(p[0]), *torch.sin(2 * p[0]), *torch.cos(2 * p[0])]
+    assert found.tolist() == pytest.approx([float(v) for v in expected])
+
+
+def test_gradients_are_those_of_differences():
+    field = MlpField(TINY, seed=0).double()
+    p = points(20).double()
+    gradient = field.geometry_at(p)[2][:, 3:]
+    step = 1e-5 * torch.eye(3, dtype=torch.float64)
+    with torch.no_grad():
+        slow = torch.stack([(field.sdf(p + s) - field.sdf(p - s)) / 2e-5 for s in step], 1)
+    assert torch.allclose(gradient, slow, atol=1e-6)
+
+
+def test_without_gradients_nothing_is_kept():
+    with torch.no_grad():
+        sdf, features, more = MlpField(TINY).geometry_at(points(10))
+    assert not (sdf.requires_grad or features.requires_grad or more.requires_grad)
+
+
+def trainer(**changes) -> Trainer:
+    recipe = replace(
+        PAPER, size=TINY, **{"rays": 32, "samples": 16, "surface_points": 64, "iterations": 40, "rate": 2e-3, **changes}
+    )
+    nothing = np.zeros((0, 3))
+    sparse = Sparse(nothing, nothing.astype(np.uint8), np.zeros(0), np.zeros(0, int), np.zeros(0, int))
+    landmarks = find_landmarks(sparse, [], Normalisation(np.zeros(3), 1.0))
+    return trainer_for(recipe.size)(recipe, toy_rays(), landmarks, 0)
+
+
+def test_training_lowers_the_loss_and_keeps_a_distance():
+    run = trainer()
+    assert isinstance(run, MlpTrainer)
+    losses = [run.step() for _ in range(40)]
+    assert np.mean([one["color"] for one in losses[-8:]]) < 0.75 * np.mean([one["color"] for one in losses[:8]])
+    assert losses[-1]["eikonal"] < 0.02
+    assert run.converged > 0.5
+    assert torch.isfinite(sdf_cache(run.field, 9)).all()
+
+
+def test_beta_is_learned():
+    run = trainer()
+    before = run.beta
+    for _ in range(5):
+        run.step()
+    assert run.beta != before and run.beta > 0
+
+
+def test_a_resumed_run_ends_as_an_undisturbed_one(tmp_path, one_thread):  # noqa: F811
+    whole, first, second = trainer(), trainer(), trainer()
+    for _ in range(6):
+        whole.step()
+    for _ in range(3):
+        first.step()
+    first.save(tmp_path / "c.safetensors")
+    assert second.load(tmp_path / "c.safetensors")
+    for _ in range(3):
+        second.step()
+    for a, b in zip(whole.parameters(), second.parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_the_field_is_read_back(tmp_path):
+    field = MlpField(TINY, seed=5)
+    save_field(field, 0.01, Normalisation(np.zeros(3), 2.0), {}, tmp_path)
+    again = load_field(tmp_path)
+    assert isinstance(again.field, MlpField) and again.field.finest == field.finest
+    with torch.no_grad():
+        assert torch.equal(field.sdf(points(50)), again.field.sdf(points(50)))
+
+
+@pytest.mark.slow
+def test_the_papers_preset_learns_on_the_cpu():
+    """The full 8 x 256 network, some hundred steps of few rays: the colours come nearer and it stays a distance."""
+    run = trainer(size=MlpSize(), rays=64, samples=32, iterations=300, surface_points=128)
+    losses = [run.step() for _ in range(300)]
+    assert np.mean([one["color"] for one in losses[-30:]]) < 0.5 * np.mean([one["color"] for one in losses[:30]])
+    assert np.mean([one["eikonal"] for one in losses[-30:]]) < 0.02

@@ -1,0 +1,155 @@
+"""Bodies on level planes against scenes whose signed distance is known exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.objects import find_levels
+from pipeline.parts import Parts, split
+from pipeline.surface import EXTENT, Surface, ball
+from pipeline.volume import sample_volume
+from sdfsim.shape.bvh import Winding
+from sdfsim.shape.mesh import Mesh, is_closed, mass_properties, signed_volume
+
+FINEST = 0.02
+TABLE = (0.5, 0.35, 0.05)  # half sides of the top and half its thickness
+TOP = 0.1  # height of the table's upper side
+WALL = 0.035
+
+
+def box(points: np.ndarray, center, half) -> np.ndarray:
+    q = np.abs(points - np.asarray(center)) - np.asarray(half)
+    return np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(1), 0)
+
+
+def cup(points: np.ndarray, at=(0.1, -0.05), radius: float = 0.12, height: float = 0.3) -> np.ndarray:
+    """An open vessel that stands on the table, its inside as deep as its wall allows."""
+    p = points - [*at, TOP]
+    r = np.hypot(p[:, 0], p[:, 1])
+
+    def cylinder(low: float, high: float, outer: float) -> np.ndarray:
+        return np.maximum(r - outer, np.maximum(low - p[:, 2], p[:, 2] - high))
+
+    return np.maximum(cylinder(0, height, radius), -cylinder(WALL, height + 1, radius - WALL))
+
+
+def table(points: np.ndarray) -> np.ndarray:
+    top = box(points, (0, 0, TOP - TABLE[2]), TABLE)
+    legs = [box(points, (x, y, -0.25), (0.05, 0.05, 0.3)) for x in (-0.4, 0.4) for y in (-0.25, 0.25)]
+    return np.minimum.reduce([top, *legs, points[:, 2] + 0.5])
+
+
+def surface_of(distance: Callable, seen: Callable | None = None, turn: np.ndarray | None = None) -> Surface:
+    """A surface of which photos show all that lies above the floor, but for what `seen` [V] excludes."""
+    turn = np.eye(3) if turn is None else turn
+    volume = sample_volume(lambda p: np.maximum(distance(p @ turn), ball(p)).astype(np.float32), 81, extent=EXTENT)
+    raw = volume.mesh()
+    raw = Mesh(raw.vertices, raw.faces, np.full((len(raw.vertices), 3), 128, np.uint8))
+    there = raw.vertices @ turn
+    shown = (ball(raw.vertices) < -0.03) & (np.ones(len(there), bool) if seen is None else seen(there))
+    faces = shown[raw.faces].all(1)
+    return Surface(volume, raw, shown, np.ones(len(raw.faces), bool), faces, (), {})
+
+
+def parts_of(distance: Callable, turn: np.ndarray | None = None, seen: Callable | None = None) -> Parts:
+    turn = np.eye(3) if turn is None else turn
+    up = turn @ np.array([0.0, 0, 1])
+    field = lambda p: distance(p @ turn).astype(np.float32)  # noqa: E731
+    return split(surface_of(distance, seen, turn), field, FINEST, [], Path(), up, alone=False)
+
+
+def some_rotation(seed: int) -> np.ndarray:
+    q, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    return q * np.sign(np.linalg.det(q))
+
+
+def both(points: np.ndarray) -> np.ndarray:
+    return np.minimum(table(points), cup(points))
+
+
+@pytest.mark.parametrize("turn", [np.eye(3), some_rotation(3)], ids=["upright", "turned"])
+def test_a_cup_on_a_table_is_a_body_of_its_own_and_hollow(turn):
+    parts = parts_of(both, turn)
+    assert list(parts.bodies) == ["object1"]
+    mesh = parts.bodies["object1"]
+    assert is_closed(mesh) and signed_volume(mesh) > 0
+    true = np.pi * (0.12**2 * 0.3 - (0.12 - WALL) ** 2 * (0.3 - WALL))
+    volume, com, _ = mass_properties(mesh)
+    assert volume == pytest.approx(true, rel=0.05)
+    there = mesh.vertices @ turn
+    assert there[:, 2].min() == pytest.approx(TOP, abs=0.1 * FINEST)
+    assert there[:, 2].max() == pytest.approx(TOP + 0.3, abs=0.3 * FINEST)
+    np.testing.assert_allclose((com @ turn)[:2], [0.1, -0.05], atol=0.3 * FINEST)
+    around = Winding(mesh)(np.array([[0.1, -0.05, TOP + 0.1], [0.1, -0.05, TOP + 0.02]]) @ turn.T)
+    np.testing.assert_allclose(around, [0, 1], atol=0.01)
+
+
+def test_where_the_cup_stood_the_table_is_whole():
+    parts = parts_of(both)
+    assert parts.solid is not None and parts.shown is not None and is_closed(parts.solid)
+    alone = surface_of(table).solid
+    assert signed_volume(parts.solid) == pytest.approx(signed_volume(alone), rel=1e-3)
+    for mesh in (parts.solid, parts.shown):
+        near = mesh.vertices[(np.hypot(mesh.vertices[:, 0] - 0.1, mesh.vertices[:, 1] + 0.05) < 0.2)]
+        near = near[near[:, 2] > TOP - TABLE[2]]
+        assert len(near) > 50 and np.abs(near[:, 2] - TOP).max() < 0.2 * FINEST
+
+
+def test_several_bodies_are_named_from_the_largest_down():
+    def scene(p: np.ndarray) -> np.ndarray:
+        things = cup(p), cup(p, (-0.25, 0.1), 0.1, 0.2), box(p, (-0.3, 0.0, -0.4), (0.08, 0.08, 0.1))
+        return np.minimum.reduce([table(p), *things])
+
+    parts = parts_of(scene)
+    heights = [np.ptp(mesh.vertices[:, 2]) for mesh in parts.bodies.values()]
+    assert list(parts.bodies) == ["object1", "object2", "object3"]
+    np.testing.assert_allclose(heights, [0.3, 0.2, 0.2], atol=0.3 * FINEST)
+    # The third stands on the floor, below the table.
+    assert parts.bodies["object3"].vertices[:, 2].min() == pytest.approx(-0.5, abs=0.1 * FINEST)
+
+
+def hidden(points: np.ndarray) -> np.ndarray:
+    return (np.hypot(points[:, 0] - 0.1, points[:, 1] + 0.05) > 0.15) | (points[:, 2] < TOP + 0.02)
+
+
+@pytest.mark.parametrize(
+    ("scene", "seen", "why"),
+    [
+        (table, None, "a table carries a plane of its own"),
+        (
+            lambda p: np.minimum(table(p), box(p, (0, 0, 0.15), (0.45, 0.3, 0.05))),
+            None,
+            "a slab that covers it is relief",
+        ),
+        (lambda p: np.minimum(table(p), box(p, (0.2, 0, 0.12), (0.03, 0.03, 0.03))), None, "a crumb is too small"),
+        (lambda p: np.minimum(table(p), box(p, (0.3, 0, 0.6), (0.1, 0.1, 0.6))), None, "a post goes on outside"),
+        (lambda p: np.minimum(table(p), box(p, (0.3, 0, 0.3), (0.1, 0.1, 0.06))), None, "what hovers does not stand"),
+        (both, hidden, "no photo shows it"),
+    ],
+    ids=lambda value: value.replace(" ", "-") if isinstance(value, str) else "",
+)
+def test_what_is_no_body_stays_scenery(scene, seen, why):
+    parts = parts_of(scene, seen=seen)
+    assert parts.bodies == {}, why
+    assert parts.solid is not None and signed_volume(parts.solid) == pytest.approx(
+        signed_volume(surface_of(scene).solid)
+    )
+
+
+def test_without_scenery_every_component_is_a_body():
+    pair = lambda p: np.minimum(box(p, (0.3, 0, 0), (0.1, 0.2, 0.1)), box(p, (-0.4, 0, 0), (0.3, 0.2, 0.2)))  # noqa: E731
+    surface = surface_of(pair)
+    parts = split(surface, pair, FINEST, [], Path(), np.array([0.0, 0, 1]), alone=True)
+    assert parts.solid is None and parts.shown is None
+    volumes = [signed_volume(mesh) for mesh in parts.bodies.values()]
+    np.testing.assert_allclose(volumes, [0.6 * 0.4 * 0.4, 0.2 * 0.4 * 0.2], rtol=0.05)
+
+
+def test_level_planes_are_found_at_their_heights():
+    levels = find_levels(surface_of(both).visible, np.array([0.0, 0, 1]), FINEST)
+    np.testing.assert_allclose([level.height for level in levels], [-0.5, TOP], atol=0.1 * FINEST)
+    assert levels[1].area == pytest.approx(4 * TABLE[0] * TABLE[1] - np.pi * 0.12**2, rel=0.08)

@@ -1,0 +1,61 @@
+"""Sharpness and exposure: what a blur does, and what must not matter."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from PIL import Image, ImageFilter
+
+from pipeline.photos import prepare_photos
+from pipeline.quality import fault, sharpness
+from tests.pipeline.photo_sets import TABLE_VASE
+
+
+@pytest.fixture(scope="module")
+def photo() -> Image.Image:
+    return Image.open(TABLE_VASE / "images" / "000.jpg").convert("RGB")
+
+
+def test_a_blur_shows_whatever_the_contrast_and_the_noise(photo):
+    rng = np.random.default_rng(0)
+    for contrast in (1.0, 0.3):
+        pixels = 128 + contrast * (np.asarray(photo, float) - 128) + rng.normal(0, 2, (*photo.size[::-1], 3))
+        sharp = Image.fromarray(pixels.clip(0, 255).astype(np.uint8))
+        blurred = sharp.filter(ImageFilter.GaussianBlur(2))
+        assert sharpness(np.asarray(sharp)) > 0.3
+        assert sharpness(np.asarray(blurred)) < 0.1
+
+
+def test_an_object_in_focus_before_a_soft_background_is_sharp(photo):
+    soft = photo.filter(ImageFilter.GaussianBlur(5))
+    soft.paste(photo.crop((240, 120, 420, 320)), (240, 120))
+    assert sharpness(np.asarray(soft)) > 0.3
+
+
+def test_a_plain_photo_has_no_sharpness():
+    assert sharpness(np.full((80, 80, 3), 90, np.uint8)) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [((0.5, 0.1, 0.1), ""), ((0.5, 0.8, 0.0), "too dark"), ((0.5, 0.0, 0.9), "burnt out"),
+     ((0.05, 0.0, 0.0), "blurred"), ((0.12, 0.0, 0.0), "blurred")],
+)  # fmt: skip
+def test_faults(values, expected):
+    assert fault(*values, typical=0.5, masked=False) == expected
+
+
+def test_what_a_mask_hides_is_not_dark():
+    assert fault(0.5, 0.9, 0.0, typical=0.5, masked=True) == ""
+
+
+def test_faulty_photos_are_named(tmp_path, photo):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for k in range(4):
+        photo.save(folder / f"good{k}.png")
+    photo.filter(ImageFilter.GaussianBlur(3)).save(folder / "soft.png")
+    Image.fromarray((np.asarray(photo) * 0.05).astype(np.uint8)).save(folder / "night.png")
+    photos, notes = prepare_photos(folder, tmp_path)
+    assert {p.source: p.fault for p in photos if p.fault} == {"soft.png": "blurred", "night.png": "too dark"}
+    assert "1 of 6 photos are blurred: soft.png" in notes and "1 of 6 photos are too dark: night.png" in notes

@@ -1,0 +1,147 @@
+"""Metric scale from distances that a person knows and from what cameras write into their photos."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import ExifTags, Image
+
+from pipeline.cameras import View
+from pipeline.cleaning import joined
+from pipeline.scale import GPS_ERROR, measured, of_exif, source_size
+from pipeline.visibility import Caster
+from pipeline.wishes import Known
+from sdfsim.errors import SdfsimError
+from tests.pipeline.test_surface import cube, ring
+
+METRES = 3.0  # a unit of normalised space in the world that the photos were taken in
+UP = np.array([0.0, 0, 1])
+
+
+def named(views: list[View]) -> list[View]:
+    return [replace(view, name=f"{k:04d}.jpg", source=f"photo{k}.jpg") for k, view in enumerate(views)]
+
+
+@pytest.fixture
+def views() -> list[View]:
+    return named(ring(8))
+
+
+@pytest.fixture
+def photos(tmp_path: Path, views: list[View]) -> Path:
+    """Files twice as large as the prepared photos."""
+    for view in views:
+        Image.new("RGB", (2 * view.width, 2 * view.height)).save(tmp_path / view.source)
+    return tmp_path
+
+
+def place(view: View, point: np.ndarray, scale: float = 2.0) -> str:
+    x, y = scale * view.project(point[None])[0][0]
+    return f"{view.source}:{x:.4f},{y:.4f}"
+
+
+def test_two_pixels_with_a_known_distance_set_the_scale(views, photos):
+    surface = Caster(cube(1.0))
+    # Corners of the top (just inside its edges, which a ray may miss), each in a photo of its own.
+    a, b = np.array([0.499, 0.499, 0.5]), np.array([-0.499, 0.499, 0.5])
+    known = Known(place(views[1], a), place(views[3], b), 0.998 * METRES)
+    scale = measured(known, views, photos, surface)
+    assert scale.metres == pytest.approx(METRES, rel=1e-3)
+    assert scale.source == f"given: {known.start} to {known.end} = {known.metres:g} m"
+
+
+def test_a_pixel_just_beside_a_corner_means_the_corner(views, photos):
+    wall = cube(30.0, (0.0, 0, -15.6))  # Far below and behind the cube: most rays that miss it end there.
+    surface = Caster(joined([cube(1.0), wall]))
+    corners = np.array([0.5, 0.5, 0.5]), np.array([-0.5, 0.5, 0.5])
+    beside = [corner * [1.01, 1.01, 1.01] for corner in corners]
+    known = Known(place(views[1], beside[0]), place(views[3], beside[1]), METRES)
+    assert measured(known, views, photos, surface).metres == pytest.approx(METRES, rel=0.03)
+
+
+def test_a_photo_without_a_pixel_is_its_camera(views, photos):
+    apart = float(np.linalg.norm(views[0].center - views[2].center))
+    scale = measured(Known("photo0.jpg", "photo2.jpg", METRES * apart), views, photos, Caster(cube(1.0)))
+    assert scale.metres == pytest.approx(METRES)
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "says"),
+    [
+        ("photo9.jpg:1,1", "photo1.jpg:3,3", "no posed photo is called 'photo9.jpg'"),
+        ("photo0.jpg:2000,1", "photo1.jpg:3,3", r"photo0.jpg:2000,1 lies outside the photo \(1280 x 960 px\)"),
+        ("photo0.jpg:1,1", "photo1.jpg:640,480", "photo0.jpg:1,1 shows nothing of the surface"),
+        ("photo1.jpg:640,480", "photo1.jpg:640.0,480", "are in the same place"),
+    ],
+)
+def test_places_that_are_none_are_named(views, photos, start, end, says):
+    with pytest.raises(SdfsimError, match=says):
+        measured(Known(start, end, 1.0), views, photos, Caster(cube(1.0)))
+
+
+@pytest.mark.parametrize("known", [Known("a:1,1", "b:1,1", 0.0), Known("a:1,1", "a:1,1", 1.0)])
+def test_distances_that_make_no_sense_are_refused(known):
+    with pytest.raises(SdfsimError):
+        known.check()
+
+
+def test_pixels_are_those_of_the_upright_photo(tmp_path):
+    image = Image.new("RGB", (60, 40))
+    exif = image.getexif()
+    exif[ExifTags.Base.Orientation] = 6
+    image.save(tmp_path / "turned.jpg", exif=exif)
+    assert source_size(tmp_path / "turned.jpg", (1, 1)) == (40, 60)
+    assert source_size(tmp_path / "missing.jpg", (7, 8)) == (7, 8)
+
+
+def write_exif(photos: Path, views: list[View], metres: float, noise: float, subject: bool) -> None:
+    """Photos with the positions of their cameras on the map, or the distances of their subjects."""
+    rng = np.random.default_rng(0)
+    turn = np.array([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]])
+    for view in views:
+        image = Image.new("RGB", (64, 48))
+        exif = image.getexif()
+        if subject:
+            away = metres * (np.linalg.norm(view.center) - 0.6) * (1 + noise * rng.normal())
+            exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.SubjectDistance] = away
+        else:
+            east, north = turn @ view.center[:2] * metres + noise * rng.normal(size=2)
+            degrees = np.array([48.0, 11.0]) + np.degrees([north, east / np.cos(np.radians(48))]) / 6_371_000.0
+            gps = exif.get_ifd(ExifTags.IFD.GPSInfo)
+            for key, value, letter in zip((2, 4), degrees, "NE", strict=True):
+                minutes = value % 1 * 60
+                gps[key] = (float(int(value)), float(int(minutes)), minutes % 1 * 60)
+                gps[key - 1] = letter
+        image.save(photos / view.source, exif=exif)
+
+
+def test_positions_on_the_map_set_the_scale_of_large_scenes(tmp_path, views):
+    write_exif(tmp_path, views, 20.0, 0.5, subject=False)
+    found = of_exif(views, tmp_path, Caster(cube(1.0)), UP)
+    assert found is not None and found.metres == pytest.approx(20.0, rel=0.02)
+    assert "EXIF positions of 8 photos" in found.source
+
+
+@pytest.mark.parametrize(("metres", "noise"), [(GPS_ERROR / 3, 0.5), (30.0, 40.0)], ids=["too close", "contradicting"])
+def test_positions_that_tell_nothing_are_not_used(tmp_path, views, metres, noise):
+    write_exif(tmp_path, views, metres, noise, subject=False)
+    assert of_exif(views, tmp_path, Caster(cube(1.0)), UP) is None
+
+
+def test_subject_distances_set_the_scale_where_they_agree(tmp_path, views):
+    surface = Caster(cube(1.2))
+    middle = np.array([320.0]), np.array([240.0])
+    truth = np.median([surface.hits(view.center, view.rays(*middle))[0][0] for view in views])
+    write_exif(tmp_path, views, METRES, 0.02, subject=True)
+    found = of_exif(views, tmp_path, surface, UP)
+    nominal = METRES * (np.linalg.norm(views[0].center) - 0.6)
+    assert found is not None and found.metres == pytest.approx(nominal / truth, rel=0.05)
+    write_exif(tmp_path, views, METRES, 0.8, subject=True)
+    assert of_exif(views, tmp_path, surface, UP) is None
+
+
+def test_photos_without_exif_set_no_scale(photos, views):
+    assert of_exif(views, photos, Caster(cube(1.0)), UP) is None

@@ -1,0 +1,215 @@
+"""What can be given: folders, masks, transforms.json, COLMAP models; against cameras that we know."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipeline.cameras import load_view_file
+from pipeline.given import read_given
+from pipeline.photos import GIVEN, prepare_photos
+from pipeline.sources import find_source
+from sdfsim.errors import SdfsimError
+
+SIZE = (120, 90)
+SIMPLE = [100.0, 60.0, 45.0]
+
+
+def turned(angle: float) -> np.ndarray:
+    """World to camera: about the y axis."""
+    return np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+
+
+def photos(folder: Path, names: list[str]) -> None:
+    for k, name in enumerate(names):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        pixels = np.random.default_rng(k).integers(0, 255, (SIZE[1], SIZE[0], 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(folder / name)
+
+
+def fresh(folder: Path) -> Path:
+    folder.mkdir()
+    return folder
+
+
+NAMES = ["a.jpg", "b.jpg", "c.jpg"]
+
+
+def write_transforms(folder: Path, names: list[str] = NAMES, **more) -> Path:
+    frames = []
+    for k, name in enumerate(names):
+        pose = np.eye(4)
+        pose[:3, :3] = turned(0.3 * k).T @ np.diag([1.0, -1, -1])
+        pose[:3, 3] = [k, 2 * k, 3]
+        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
+    path = folder / "transforms.json"
+    path.write_text(json.dumps({"fl_x": 100.0, "w": 120, "h": 90, "frames": frames, **more}))
+    return path
+
+
+def write_text_model(folder: Path, camera: str = "1 SIMPLE_PINHOLE 120 90 100 60 45") -> None:
+    from scipy.spatial.transform import Rotation
+
+    folder.mkdir(parents=True)
+    (folder / "cameras.txt").write_text(f"# Camera list\n{camera}\n")
+    lines = []
+    for k, name in enumerate(NAMES):
+        x, y, z, w = Rotation.from_matrix(turned(0.3 * k)).as_quat()
+        shift = -turned(0.3 * k) @ [k, 2 * k, 3]
+        lines += [f"{k + 1} {w} {x} {y} {z} {shift[0]} {shift[1]} {shift[2]} 1 {name}", "1.0 2.0 -1"]
+    (folder / "images.txt").write_text("# Image list\n" + "\n".join(lines) + "\n")
+
+
+def write_binary_model(folder: Path) -> None:
+    from scipy.spatial.transform import Rotation
+
+    folder.mkdir(parents=True)
+    (folder / "cameras.bin").write_bytes(struct.pack("<QIiQQ3d", 1, 7, 0, 120, 90, *SIMPLE))
+    data = struct.pack("<Q", 3)
+    for k, name in enumerate(NAMES):
+        x, y, z, w = Rotation.from_matrix(turned(0.3 * k)).as_quat()
+        shift = -turned(0.3 * k) @ [k, 2 * k, 3]
+        data += struct.pack("<I7dI", k + 1, w, x, y, z, *shift, 7) + name.encode() + b"\0"
+        data += struct.pack("<Q", 2) + struct.pack("<ddq", 1.0, 2.0, -1) * 2
+    (folder / "images.bin").write_bytes(data)
+
+
+@pytest.mark.parametrize("kind", ["transforms", "text", "binary"])
+def test_the_same_cameras_come_out_of_every_format(tmp_path, kind):
+    photos(tmp_path / "images", NAMES)
+    given = tmp_path / "sparse" / "0"
+    if kind == "transforms":
+        given = write_transforms(tmp_path, [f"images/{name}" for name in NAMES])
+    else:
+        (write_text_model if kind == "text" else write_binary_model)(given)
+    prepared, _ = prepare_photos(given, fresh(tmp_path / "out"))
+    views = load_view_file(tmp_path / "out" / GIVEN)
+    assert [p.source for p in prepared] == [v.source for v in views] == NAMES
+    for k, view in enumerate(views):
+        np.testing.assert_allclose(view.rotation, turned(0.3 * k), atol=1e-9)
+        np.testing.assert_allclose(view.center, [k, 2 * k, 3], atol=1e-9)
+        assert (view.focal, view.cx, view.cy, view.k) == pytest.approx((100, 60, 45, 0))
+
+
+def test_intrinsics_of_another_size_are_scaled_and_numbers_may_be_padded(tmp_path):
+    photos(tmp_path / "images", ["r_000.png", "r_001.png", "r_010.png"])
+    about = json.loads(write_transforms(tmp_path, ["./train/r_0", "./train/r_1", "./train/r_10"]).read_text())
+    for key in ("w", "h", "fl_x"):
+        del about[key]
+    (tmp_path / "transforms.json").write_text(json.dumps({**about, "camera_angle_x": 2 * np.arctan(0.5 * 120 / 100)}))
+    prepare_photos(tmp_path / "transforms.json", tmp_path, long_side=100)
+    view = load_view_file(tmp_path / GIVEN)[2]
+    assert view.source == "r_010.png" and view.focal == pytest.approx(100 * 100 / 120) and view.cx == 50
+
+
+def test_a_lens_is_straightened(tmp_path):
+    """Where the camera's own formula puts a ray's point before, the pinhole's has it afterwards."""
+    k1, k2, p1, p2 = 0.15, -0.05, 0.002, -0.001
+    fx, fy, cx, cy = 110.0, 104.0, 62.0, 43.0
+    row, column = np.mgrid[0 : SIZE[1], 0 : SIZE[0]] + 0.5
+    x, y = (column - cx) / fx, (row - cy) / fy
+    # A photo that shows the undistorted position of each of its pixels, found by fixed-point iteration.
+    u, v = x.copy(), y.copy()
+    for _ in range(50):
+        r = u * u + v * v
+        radial = 1 + k1 * r + k2 * r * r
+        u = (x - 2 * p1 * u * v - p2 * (r + 2 * u * u)) / radial
+        v = (y - p1 * (r + 2 * v * v) - 2 * p2 * u * v) / radial
+    shown = np.stack([128 + 150 * u, 128 + 150 * v, np.zeros_like(u)], -1)
+    for name in NAMES:
+        (tmp_path / "images").mkdir(exist_ok=True)
+        Image.fromarray((shown + 0.5).astype(np.uint8)).save(tmp_path / "images" / name.replace("jpg", "png"))
+    given = write_transforms(tmp_path, [f"images/{n.replace('jpg', 'png')}" for n in NAMES], fl_x=fx, fl_y=fy, cx=cx,
+                             cy=cy, k1=k1, k2=k2, p1=p1, p2=p2)  # fmt: skip
+    prepare_photos(given, fresh(tmp_path / "out"))
+    view = load_view_file(tmp_path / "out" / GIVEN)[0]
+    pixels = np.asarray(Image.open(tmp_path / "out" / "images" / view.name)).astype(float)
+    found = (pixels[..., :2] - 128) / 150
+    expected = np.stack([(column - view.cx) / view.focal, (row - view.cy) / view.focal], -1)
+    inside = np.s_[4:-4, 4:-4]
+    assert np.abs(found - expected)[inside].max() < 0.02  # two grey values are 0.013
+    assert np.abs(found - np.stack([x, y], -1))[inside].max() > 0.03  # it was bent before
+
+
+@pytest.mark.parametrize("name", ["a.jpg.png", "a.png", "a.jpg"])
+def test_masks_in_a_folder_go_by_the_photos_names(tmp_path, name):
+    photos(tmp_path / "images", NAMES)
+    (tmp_path / "masks").mkdir()
+    shade = np.zeros((SIZE[1], SIZE[0]), np.uint8)
+    shade[:, 60:] = 255
+    for other in NAMES:
+        Image.fromarray(shade).save(tmp_path / "masks" / name.replace("a", other[0], 1))
+    prepared, _ = prepare_photos(tmp_path, fresh(tmp_path / "out"))
+    assert all(photo.mask for photo in prepared)
+    found = np.asarray(Image.open(tmp_path / "out" / "masks" / "0000.jpg.png"))
+    assert found[:, :57].max() < 10 and found[:, 63:].min() > 245
+    assert abs(np.asarray(Image.open(tmp_path / "out" / "images" / "0000.jpg"))[:, :50].mean() - 128) < 2
+
+
+def test_a_mask_of_another_shape_is_named(tmp_path):
+    photos(tmp_path / "images", NAMES)
+    (tmp_path / "masks").mkdir()
+    Image.new("L", (90, 90)).save(tmp_path / "masks" / "b.png")
+    with pytest.raises(SdfsimError, match=r"b\.png: a mask of 90 x 90 does not fit"):
+        prepare_photos(tmp_path, tmp_path)
+
+
+def test_cameras_beside_the_photos_are_mentioned_not_used(tmp_path):
+    photos(tmp_path, NAMES)
+    write_transforms(tmp_path)
+    source = find_source(tmp_path)
+    assert source.cameras is None and "transforms.json were not used" in source.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [("{", "cannot be read as cameras"), ('{"frames": []}', "0 cameras, at least 3"),
+     ('{"camera_model": "PANO", "frames": []}', "camera_model: 'PANO' is not read")],
+)  # fmt: skip
+def test_bad_transforms_are_one_line(tmp_path, content, words):
+    (tmp_path / "transforms.json").write_text(content)
+    with pytest.raises(SdfsimError, match=words) as caught:
+        find_source(tmp_path / "transforms.json")
+    assert "\n" not in caught.value.message
+
+
+def test_cameras_without_photos_are_named(tmp_path):
+    with pytest.raises(SdfsimError, match=r"the photos of 3 of 3 cameras were not found \(first: a\.jpg\)"):
+        find_source(write_transforms(tmp_path))
+
+
+def test_a_lens_that_is_not_known_is_named(tmp_path):
+    write_text_model(tmp_path / "model", "1 FOV 120 90 100 100 60 45 0.9")
+    with pytest.raises(SdfsimError, match="the camera model FOV is not read"):
+        read_given(tmp_path / "model")
+
+
+def test_a_model_that_was_cut_is_one_line(tmp_path):
+    write_binary_model(tmp_path / "model")
+    path = tmp_path / "model" / "images.bin"
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(SdfsimError, match="cannot be read as cameras"):
+        read_given(tmp_path / "model")
+
+
+def test_colmap_reads_the_model_as_we_do(tmp_path):
+    """COLMAP's own reader, in a process of its own, on the same text model written as binary by it."""
+    import subprocess
+    import sys
+
+    write_text_model(tmp_path / "text")
+    (tmp_path / "text" / "points3D.txt").write_text("")
+    (tmp_path / "binary").mkdir()
+    code = "import zlib, pycolmap, sys\nm = pycolmap.Reconstruction()\nm.read_text(sys.argv[1])\n"
+    code += "m.write_binary(sys.argv[2])"
+    subprocess.run([sys.executable, "-c", code, tmp_path / "text", tmp_path / "binary"], check=True)
+    for one, other in zip(read_given(tmp_path / "text"), read_given(tmp_path / "binary"), strict=True):
+        assert one.name == other.name and one.distortion == other.distortion
+        np.testing.assert_allclose(one.matrix, other.matrix)
+        np.testing.assert_allclose(one.rotation, other.rotation, atol=1e-12)
+        np.testing.assert_allclose(one.translation, other.translation, atol=1e-12)
