@@ -1,6 +1,9 @@
 """What every effect costs, and what is saved where it is off: prints the table and the claims of docs/effects.md.
 
-    python benchmarks/effects.py [--only samples|claims] [--steps 50]
+    python benchmarks/effects.py [--only samples|claims|always-on] [--steps 50] [--data DATA] [--paper MODEL]
+
+DATA is a dataset folder: the default model's error on its held-out frames then stands beside what friction leaves out.
+MODEL is a *paper* network: the samples then also run with every body in it in every step, as published.
 
 Times are medians of whole steps on one thread; the two sides of a comparison take turns, so that a busy machine
 slows both.
@@ -18,14 +21,18 @@ import torch
 
 from sdfsim import Simulator, load_scene
 from sdfsim.dynamics.contacts import find_contacts, thin_contacts
+from sdfsim.dynamics.model import load_model
 from sdfsim.dynamics.simulator import SimulationError
 from sdfsim.dynamics.sleep import STEPS as SLEEP_STEPS
 from sdfsim.dynamics.step import contact_graph, fly
+from sdfsim.learning.frames import contact_frames
+from sdfsim.learning.impulse_task import ImpulseTask
 from sdfsim.progress import columns
 from sdfsim.scene.types import Body, Effects, Limits, Scene
 from sdfsim.shape.asset import analytic_shape
 
 SAMPLES = Path(__file__).resolve().parents[1] / "samples"
+HELD_OUT = 20  # batches of frames
 SETTLE = 300  # steps after which what is not asleep is not waited for
 EARTH = np.array([0.0, 0.0, -9.81])
 VARIANTS: dict[str, Callable[[Scene], Scene]] = {
@@ -102,7 +109,7 @@ def samples(steps: int) -> None:
     print("\n".join(columns(rows)))
 
 
-def claims(steps: int) -> None:
+def claims(steps: int, data: Path | None) -> None:
     """What must hold, with what was measured."""
     rows = [("claim", "measured", "wanted")]
     few, many = Simulator(far_scenery(10)), Simulator(far_scenery(10_000))
@@ -119,6 +126,8 @@ def claims(steps: int) -> None:
     rows += sleeping(scene_of(pile(200, layers=4, spacing=1.5)), "fifty towers of four", steps)
     rows += sleeping(scene_of(pile(200)), "a packed pile", steps)
     rows += frictionless(steps)
+    if data:
+        rows += test_error(data)
     print("\n".join(columns(rows)))
 
 
@@ -168,17 +177,47 @@ def frictionless(steps: int) -> list[tuple[str, str, str]]:
     ]
 
 
+def test_error(data: Path) -> list[tuple[str, str, str]]:
+    """The default model's error of one step on held-out frames: what a difference of its answers compares with."""
+    model = load_model()
+    task = ImpulseTask(contact_frames(data, "validation", model.reach), torch.device("cpu"), None)
+    rng, errors = np.random.default_rng(0), []
+    with torch.no_grad():
+        for _ in range(HELD_OUT):
+            batch = task.batch(rng.choice(len(task.frames), size=64))
+            error = (model.network(batch.graph).velocity - batch.truth.velocity).norm(dim=-1)
+            errors.append(error[batch.counts])
+    told = f"{float(torch.cat(errors).mean()):.4f} m/s"
+    return [("error of a step's velocity on held-out frames, bodies in contact", told, "the scale of the above")]
+
+
+def always_on(paper: Path, steps: int) -> None:
+    """Each sample with every body in the network in every step, as published, against as planned."""
+    rows = [("scene", "published, ms a step", "only in contact", "ratio", "impulse network", "ratio")]
+    for file in sorted(SAMPLES.glob("*.yaml")):
+        scene = load_scene(file)
+        published = Simulator(scene, paper, free_flight="learned")
+        ms = timed([published, Simulator(scene, paper), Simulator(scene)], max(5, steps))
+        rows.append((file.stem, f"{ms[0]:.1f}", f"{ms[1]:.1f}", f"{ms[0] / ms[1]:.2f}", f"{ms[2]:.2f}"))
+        rows[-1] += (f"{ms[0] / ms[2]:.1f}",)
+    print("\n".join(columns(rows)))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", choices=("samples", "claims"))
+    parser.add_argument("--only", choices=("samples", "claims", "always-on"))
     parser.add_argument("--steps", type=int, default=50)
+    parser.add_argument("--data", type=Path)
+    parser.add_argument("--paper", type=Path)
     chosen = parser.parse_args()
     torch.set_num_threads(1)
-    if chosen.only != "claims":
+    if chosen.only in (None, "samples"):
         samples(chosen.steps)
         print()
-    if chosen.only != "samples":
-        claims(chosen.steps)
+    if chosen.only in (None, "claims"):
+        claims(chosen.steps, chosen.data)
+    if chosen.only in (None, "always-on") and chosen.paper:
+        always_on(chosen.paper, chosen.steps)
 
 
 if __name__ == "__main__":

@@ -18,30 +18,50 @@ from sdfsim.progress import Session
 from sdfsim.studies.hard_cases_page import write_report
 from sdfsim.studies.hard_cases_plots import group_picture
 from sdfsim.studies.hard_cases_ratchet import accepted
-from sdfsim.studies.hard_cases_run import Study, stress
+from sdfsim.studies.hard_cases_results import Study
+from sdfsim.studies.hard_cases_run import stress
 from sdfsim.studies.hard_cases_tables import LEGEND, losses, markdown
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENT = ROOT / "docs" / "stability.md"
 RATCHET = Path(__file__).with_name("hard_cases_ratchet.json")
 BEGIN, END = "<!-- written by benchmarks/hard_cases.py -->", "<!-- end -->"
-PICTURES = {"stack": "stability_stacks.png", "bounce": "stability_bounces.png", "slope": "stability_slopes.png"}
+PICTURES = {
+    "stack": ("Stacks", "stability_stacks.png"),
+    "bounce": ("Balls dropped", "stability_bounces.png"),
+    "slope": ("Boxes on slopes", "stability_slopes.png"),
+}
 DPI = 70
 
 
 def section(study: Study) -> str:
     """What stands between the two marks of the document."""
-    form = "short form: `sdfsim stress --quick`" if study.quick else "`sdfsim stress`"
+    form = "Short form, `sdfsim stress --quick`:" if study.quick else "Long form, `sdfsim stress`:"
     told = [f"{who}: {', '.join(f'{n} {what}' for what, n in found.items())}" for who, found in losses(study).items()]
     legend = [f"- {line}" for line in LEGEND]
-    return "\n".join([BEGIN, f"({form})", "", *(f"- {line}" for line in told), *legend, "", *markdown(study), END])
+    pictures = [f"![{what}](images/{name})" for what, name in PICTURES.values()]
+    parts = [
+        BEGIN,
+        "",
+        form,
+        "",
+        *(f"- {line}" for line in told),
+        *legend,
+        "",
+        *pictures,
+        "",
+        *markdown(study),
+        "",
+        END,
+    ]
+    return "\n".join(parts)
 
 
 def write_document(study: Study) -> None:
     """Replace the table of the document and its pictures."""
     before, rest = DOCUMENT.read_text(encoding="utf-8").split(BEGIN)
     write_text(DOCUMENT, before + section(study) + rest.split(END)[1])
-    for group, name in PICTURES.items():
+    for group, (_, name) in PICTURES.items():
         picture = group_picture(study, group, dpi=DPI)
         assert picture is not None
         with replacing(ROOT / "docs" / "images" / name) as partial:

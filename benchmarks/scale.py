@@ -97,8 +97,8 @@ class Study:
     def selection(self) -> list[Case]:
         """What choosing edges changes."""
         return [
-            (f"selection_{name}_{nodes}", ours.selection, (self.scene(name, 64, nodes), 100), {})
-            for name, nodes in (("bowl", 64), ("bowl", 512), ("knots", 1422))
+            (f"selection_{name}_{nodes}", ours.selection, (self.scene(name, 64, nodes), steps), {})
+            for name, nodes, steps in (("bowl", 64, 100), ("bowl", 512, 100), ("knots", 1422, 60))
         ]
 
     def accuracy(self) -> list[Case]:

@@ -142,10 +142,13 @@ def paced(trainer: Trainer, recipe: Recipe, budget: float, elapsed: float, done:
         done: steps since it began.
     """
     left = int((budget - elapsed) / (elapsed / done))
-    # Schedules follow the share that is done: they must not jump, nor run backwards by much.
-    wanted = min(recipe.iterations, max(FEWEST_STEPS, trainer.iteration + max(left, 0)))
+    least = max(trainer.iteration, min(FEWEST_STEPS, recipe.iterations))
+    if left <= 0:
+        return least
+    # Schedules follow the share that is done: they must not jump.
+    wanted = min(recipe.iterations, trainer.iteration + left)
     low, high = int(0.9 * trainer.iterations), int(1.1 * trainer.iterations)
-    return max(trainer.iteration, min(max(wanted, low), high) if left > 0 else trainer.iteration)
+    return max(least, min(max(wanted, low), high))
 
 
 def save_field(field: Field, beta: float, normalisation: Normalisation, report: dict, folder: Path) -> None:

@@ -122,8 +122,7 @@ def bounded_samples(
         use = torch.where(good[:, None], beta, _smallest_beta(distance, sdf, beta, safe))
         done = good | last
         if done.any():
-            bound_, before = opacity_bound(distance[done], sdf[done], use[done])
-            del bound_
+            before = opacity_bound(distance[done], sdf[done], use[done])[1]
             delta = distance[done, 1:] - distance[done, :-1]
             weights = torch.exp(-before) * -torch.expm1(-laplace_density(sdf[done, :-1], use[done]) * delta)
             chosen[active[done]] = draw(distance[done], weights, uniforms[active[done]])

@@ -17,7 +17,7 @@ GAP = 0.015
 # Clearance that free space asks for: at most, and as a share of the way to the point, which may be on a grazed plane.
 CLEARANCE, SLOPE = 0.02, 0.1
 # Free space counts as filled where the field is below this; between, it may be its coarseness.
-FILLED = -0.004
+FILLED, JUST_EMPTY = -0.004, 0.002
 TRIES = 16  # places along each line at which filled free space is looked for
 
 
@@ -105,7 +105,11 @@ class FreeSpace:
         line = torch.randint(max(1, len(self)), (count,), generator=rng).to(device)
         along = torch.rand(count, generator=rng).to(device)
         again = torch.randint(max(1, len(self.filled)), (count // 2,), generator=rng).to(device)
-        if len(self.filled):
-            line[: count // 2] = self.filled[again, 0].long()
-            along[: count // 2] = self.filled[again, 1]
-        return self.at(line, along)
+        if not len(self.filled):
+            return self.at(line, along)
+        line[: count // 2] = self.filled[again, 0].long()
+        along[: count // 2] = self.filled[again, 1]
+        points, clearance = self.at(line, along)
+        # Emptied, but no more: right beside may be a surface, and this loss comes back to the same places.
+        clearance[: count // 2].clamp_(max=JUST_EMPTY)
+        return points, clearance

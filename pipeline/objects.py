@@ -59,6 +59,8 @@ class Body:
         low: [3] position of the first of these samples.
         cell: between them.
         layer: thickness of the contact layer, in which the field cannot tell body and plane apart.
+        hollow: [A, B] bool on the plane: places that the body goes around at the top of the contact layer.
+        corner: [2] of the first of these, in the axes of `frame_of` the plane.
     """
 
     name: str
@@ -68,6 +70,8 @@ class Body:
     low: np.ndarray
     cell: float
     layer: float
+    hollow: np.ndarray
+    corner: np.ndarray
 
     def lifted(self, points: np.ndarray) -> np.ndarray:
         """Points [P, 3], those below the top of the contact layer raised to it."""
@@ -81,13 +85,23 @@ class Body:
         result[inside] = self.own[tuple(index[inside].T)]
         return result
 
+    def holds(self, points: np.ndarray) -> np.ndarray:
+        """Whether points [P, 3] are in the contact layer and the body goes around them, as a cup around its floor."""
+        index = np.round((points @ frame_of(self.level.normal)[:2].T - self.corner) / (0.5 * self.cell)).astype(int)
+        inside = ((index >= 0) & (index < self.hollow.shape)).all(1) & (self.level.above(points) < self.layer)
+        inside[inside] = self.hollow[tuple(index[inside].T)]
+        return inside
+
     def distance(self, field: Distance) -> Distance:
-        """Its signed distance, from the field's: the cross-section above the contact layer goes down to the plane."""
+        """Its signed distance, from the field's: the cross-section above the contact layer goes down to the plane.
+
+        What it goes around there is as the field has it: the floor of a cup, or nothing.
+        """
 
         def value(points: np.ndarray) -> np.ndarray:
-            lifted = self.lifted(points)
-            found = np.where(self.owns(lifted), field(lifted), self.cell)
-            return np.maximum(found, -self.level.above(points))
+            lifted, holds = self.lifted(points), self.holds(points)
+            found = field(np.where(holds[:, None], points, lifted))
+            return np.maximum(np.where(self.owns(lifted) | holds, found, self.cell), -self.level.above(points))
 
         return value
 
@@ -133,7 +147,7 @@ def find_bodies(surface: Surface, levels: list[Level], layer: float, smallest: f
         surface: extracted.
         levels: of its visible part.
         layer: thickness of the contact layer.
-        smallest: what is shorter than this stays part of what it stands on.
+        smallest: what rises less than this above its plane stays part of it.
     """
     volume = surface.volume
     solid = volume.values < 0
@@ -146,7 +160,8 @@ def find_bodies(surface: Surface, levels: list[Level], layer: float, smallest: f
     # From the top down: what stands on a table has been taken when the table itself is looked at.
     for level in sorted(levels, key=lambda level: -level.height):
         height = volume.along(level.normal).astype(np.float32) - level.height
-        label, count = ndimage.label(solid & (height > layer))
+        label = np.empty(solid.shape, np.int32)
+        count = int(ndimage.label(solid & (height > layer), output=label))  # type: ignore[arg-type]
         others = [other for other in levels if other is not level and level.above(other.height * other.normal) > layer]
         for number, box in enumerate(ndimage.find_objects(label, count), start=1):
             mine = label[box] == number
@@ -154,8 +169,7 @@ def find_bodies(surface: Surface, levels: list[Level], layer: float, smallest: f
                 continue
             low = volume.low + volume.cell * np.array([part.start for part in box])
             sides = volume.cell * np.array(mine.shape)
-            own_height = height[box][mine]
-            if sides.max() < smallest or own_height.max() < 2 * layer:
+            if height[box][mine].max() < smallest:
                 continue
             place = Volume(mine.astype(np.float32), low, volume.cell)
             if any(_carries(place, other, volume.cell) for other in others):
@@ -206,14 +220,23 @@ def _body(volume: Volume, standing: np.ndarray, box: tuple[slice, ...], mine: np
     label = standing[wide].astype(np.int8)
     inner = tuple(slice(part.start - low, part.stop - low) for low, part in zip(start, box, strict=True))
     label[inner][mine] = 2
-    away, nearest = ndimage.distance_transform_edt(label == 0, return_indices=True)
+    away, nearest = np.empty(label.shape), np.empty((3, *label.shape), np.int32)
+    ndimage.distance_transform_edt(label == 0, return_indices=True, distances=away, indices=nearest)
     own = (label[tuple(nearest)] == 2) & (away * volume.cell <= FILLET * layer)
-    return Body("", level, size, own, volume.low + volume.cell * np.array(start), volume.cell, layer)
+    corner = volume.low + volume.cell * np.array(start)
+    body = Body("", level, size, own, corner, volume.cell, layer, np.zeros((0, 0), bool), np.zeros(2))
+    frame = frame_of(level.normal)
+    flat = (corner + volume.cell * np.argwhere(own)) @ frame[:2].T
+    a, b = (np.arange(low, high, 0.5 * volume.cell) for low, high in zip(flat.min(0), flat.max(0), strict=True))
+    points = np.stack(np.meshgrid(a, b, indexing="ij"), -1).reshape(-1, 2) @ frame[:2]
+    points += (level.height + layer) * level.normal
+    cut = ((volume.at(points) < 0) & body.owns(points)).reshape(len(a), len(b))
+    return replace(body, hollow=ndimage.binary_fill_holes(cut) & ~cut, corner=flat.min(0))
 
 
 def body_mesh(body: Body, field: Distance, cell: float) -> Mesh:
     """The closed mesh of a body, sampled `cell` apart along its plane; crumbs are left out."""
-    frame = _frame(body.level.normal)
+    frame = frame_of(body.level.normal)
     points = body.low + body.cell * np.argwhere(body.own)
     turned = points @ frame.T
     low, high = turned.min(0), turned.max(0)
@@ -227,7 +250,7 @@ def body_mesh(body: Body, field: Distance, cell: float) -> Mesh:
     return keep_faces(mesh, (area > 0.02 * area.max())[label])
 
 
-def _frame(normal: np.ndarray) -> np.ndarray:
+def frame_of(normal: np.ndarray) -> np.ndarray:
     """A right-handed rotation [3, 3] whose last row is a normal."""
     side = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
     side /= np.linalg.norm(side)
@@ -248,14 +271,14 @@ def without_bodies(volume: Volume, bodies: list[Body], field: Distance) -> Volum
         part = tuple(slice(low, low + count) for low, count in zip(start, body.own.shape, strict=True))
         shape = values[part].shape
         points = (body.low + volume.cell * np.indices(shape).reshape(3, -1).T).astype(np.float64)
-        height, lifted = body.level.above(points), body.lifted(points)
-        own = body.owns(lifted)
+        height, lifted, holds = body.level.above(points), body.lifted(points), body.holds(points)
+        own = body.owns(lifted) | holds
         inside = values[part].reshape(-1).copy()
         over = own & (height > 0)
         inside[over] = np.maximum(inside[over], height[over])
         # Below its foot the field never saw anything: there the plane's solid goes on, and holes in it are closed.
         under = np.flatnonzero(own & (height <= 0) & (height > -2 * body.layer))
-        foot = under[sample(field, lifted[under]) < 0.5 * body.layer] if len(under) else under
+        foot = under[holds[under] | (sample(field, lifted[under]) < 0.5 * body.layer)] if len(under) else under
         inside[foot] = np.minimum(inside[foot], height[foot])
         values[part] = inside.reshape(shape)
     return replace(volume, values=values)

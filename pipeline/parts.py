@@ -16,8 +16,8 @@ from pipeline.volume import Distance
 from sdfsim.shape.mesh import Mesh
 
 # Thickness of the layer in which a field cannot tell a body from what it stands on, in cells of its finest grid.
-LAYER = 1.0
-# Shorter than this (normalised units, or this many cells of the finest grid) a thing stays part of what it stands on.
+LAYER = 1.5
+# What rises less than this (normalised units, or this many cells of the finest grid) stays part of what it stands on.
 SMALLEST, SMALLEST_CELLS = 0.04, 4.0
 # Samples of a body are so much closer than the cells of the field's finest grid.
 FINER = 3.0
@@ -31,7 +31,7 @@ class Parts:
         solid: closed mesh of the scenery; None where there are bodies alone.
         shown: what is displayed of it: its visible surface, and the places where bodies stood; None like `solid`.
         bodies: closed mesh of each body by name, with colours; the largest first.
-        smallest: what is shorter than this stayed part of the scenery.
+        smallest: what rises less than this above its plane stayed part of the scenery.
         levels: the level planes, largest first.
     """
 

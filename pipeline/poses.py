@@ -147,11 +147,16 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
     # Best: plausible first, then the most photos and points.
     verdict, folder, result = max(tries, key=lambda t: (not t[0]["failures"], t[0]["posed"], t[0]["points"]))
     verdict["attempts"], verdict["known_cameras"] = told, bool(job["given"])
+    hint = failure_hint(verdict)
     if verdict["known_cameras"] and verdict["failures"]:
         verdict["failures"] = [f"the known cameras do not fit the photos: {'; '.join(verdict['failures'])}"]
+        verdict["causes"] = []
+        hint = (
+            "check which photo belongs to which camera, and its axes; or give the folder of photos to find poses anew"
+        )
     write_json(out / "verdict.json", verdict)
     if verdict["failures"]:
-        raise SdfsimError(failure_message(verdict), failure_hint(verdict), exit_code=EXIT_QUALITY)
+        raise SdfsimError(failure_message(verdict), hint, exit_code=EXIT_QUALITY)
     views = load_view_file(given) if job["given"] else views_of(result, photos)
     save_views(views, out / "cameras.json")
     os.replace(folder / "sparse.npz", out / "sparse.npz")

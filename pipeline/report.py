@@ -64,6 +64,11 @@ def write_report(folder: Path, options: Options, failed: tuple[str, SdfsimError]
     if failed:
         stage, error = failed
         report["error"] = {"stage": stage, "message": error.message, "hint": error.hint}
+    if options.budget is not None and report["seconds_total"] > 1.1 * options.budget:
+        report["notes"].append(
+            f"it took {report['seconds_total']:.0f} s, more than the budget of {options.budget:.0f} s: poses, mesh and "
+            "the shortest of fits take their time"
+        )
     report["improve"] = improvements(report)
     write_json(folder / "report.json", report)
     return report
@@ -143,7 +148,7 @@ def notes(stages: dict[str, dict]) -> list[str]:
     if mesh.get("objects"):
         lines.append(f"bodies of their own: {', '.join(mesh['objects'])} (mesh/objects.png shows which is which)")
     if "smallest_object_m" in mesh:
-        lines.append(f"what is shorter than {mesh['smallest_object_m']:.2g} m stays part of what it stands on")
+        lines.append(f"what rises less than {mesh['smallest_object_m']:.2g} m stays part of what it stands on")
     pieces = mesh.get("left_out", [])
     for piece in pieces[:NAMED]:
         name = piece["name"]

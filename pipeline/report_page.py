@@ -118,8 +118,8 @@ def _held_out(folder: Path, report: dict) -> str:
         render = folder / "distill" / "held_out" / file
         if file and render.exists():
             pictures.append(
-                _picture(plots.image_uri(folder / "photos" / "images" / file, 360), f"{name}: the photo")
-                + _picture(plots.image_uri(render, 360), f"rendered from the field, {psnr:.1f} dB")
+                _picture(plots.image_uri(folder / "photos" / "images" / file, 360), f"{name}: the photo", 360)
+                + _picture(plots.image_uri(render, 360), f"rendered from the field, {psnr:.1f} dB", 360)
             )
     return _section("Photos that were not trained on", "<br>".join(pictures))
 

@@ -20,7 +20,7 @@ from sdfsim.errors import SdfsimError
 GPS_ERROR, GPS_SPREAD = 5.0, 4.0  # m, times
 # Subject distances in EXIF may scatter by this share of their median.
 SUBJECT_SCATTER = 0.2
-# A pixel may miss what it is meant to show by these shares of the photo's width; farther off by the factor is behind it.
+# A pixel may miss what it is meant to show by these shares of the width; farther off by the factor is behind it.
 NEARBY, BEHIND = (0.0, 0.008, 0.016, 0.024), 1.1
 FEWEST = 3  # photos with EXIF distances or positions
 EARTH = 6_371_000.0  # m

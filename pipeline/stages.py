@@ -150,7 +150,10 @@ def run_reported(run: Run, stage: str, *, again: bool) -> None:
         run_one(run, stage, again=again)
     except SdfsimError as error:
         write_reports(run, (stage, error))
-        raise
+        more = f"{run.folder / 'report.html'} shows what was found"
+        raise SdfsimError(
+            error.message, f"{error.hint}; {more}" if error.hint else more, exit_code=error.exit_code
+        ) from error
     write_report(run.folder, run.options)
 
 

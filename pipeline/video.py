@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.quality import sharpness
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 
-SMALL = 256  # px, longer side of the frames that motion is measured on
+SMALL, MIDDLE = 256, 960  # px, longer side of the frames that motion and sharpness are measured on
 STEP = 0.07  # of the picture's width: motion from one chosen frame to the next
 FEWEST, MOST = 24, 100
 LEAST_MOTION = 0.5  # picture widths in all: less is no walk around anything
@@ -75,6 +75,15 @@ def _quiet() -> Iterator[None]:
         os.close(null)
 
 
+def reduced(frame: np.ndarray, longest: int) -> np.ndarray:
+    """A frame no larger than `longest` px."""
+    import cv2
+
+    scale = min(1.0, longest / max(frame.shape[:2]))
+    size = (round(frame.shape[1] * scale), round(frame.shape[0] * scale))
+    return cv2.resize(frame, size, interpolation=cv2.INTER_AREA)
+
+
 def follow(path: Path) -> Track:
     """First pass: motion and sharpness of every frame.
 
@@ -86,10 +95,9 @@ def follow(path: Path) -> Track:
     frames, rate = frames_of(path)
     before, moved, sharp = None, [], []
     for frame in frames:
-        scale = SMALL / max(frame.shape[:2])
-        size = (round(frame.shape[1] * scale), round(frame.shape[0] * scale))
-        grey = cv2.cvtColor(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
+        frame = reduced(frame, MIDDLE)
         sharp.append(sharpness(frame))
+        grey = cv2.cvtColor(reduced(frame, SMALL), cv2.COLOR_RGB2GRAY)
         step = 0.0
         if before is not None:
             corners = cv2.goodFeaturesToTrack(before, 200, 0.01, 6)
@@ -97,7 +105,7 @@ def follow(path: Path) -> Track:
                 found, status, _ = cv2.calcOpticalFlowPyrLK(before, grey, corners, np.empty_like(corners))
                 kept = status.ravel() == 1
                 shift = np.linalg.norm((found - corners).reshape(-1, 2)[kept], axis=1)
-                step = float(np.median(shift)) / size[0] if kept.mean() > 0.4 else STEP
+                step = float(np.median(shift)) / grey.shape[1] if kept.mean() > 0.4 else STEP
         moved.append((moved[-1] if moved else 0.0) + step)
         before = grey
     return Track(np.array(moved), np.array(sharp), rate)

@@ -6,7 +6,9 @@ bash scripts/setup.sh
 sdfsim=.venv/bin/sdfsim
 
 echo "1/2  reconstructing samples/photos/table_vase (the table is 1.2 m wide)"
-"$sdfsim" reconstruct samples/photos/table_vase -o runs/demo/scene --preset quick --size 1.2
+# Two corners of the table, as one of the photos shows them.
+"$sdfsim" reconstruct samples/photos/table_vase -o runs/demo/scene --preset quick \
+    --distance 041.jpg:68,364 041.jpg:574,341 1.2
 
 echo "2/2  dropping a body onto it"
 "$sdfsim" simulate runs/demo/scene/scene.yaml -o runs/demo/rollout

@@ -88,6 +88,7 @@ def _costs(simulator: Simulator, decided: Plan, steps: int) -> dict[str, Any]:
     near = int(counters["pairs"][1])
     run = None if cost is None or landed is None else estimate(cost, simulator, counters, landed, steps)
     memory = peak_bytes(
+        bodies=len(simulator.bodies),
         nodes=len(simulator.bodies.node),
         edges=max(float(counters["edges"].max()), 0.0 if run is None else run["edges"]),
         points=float((counters["sdf_queries"] + counters["sdf_waiting"]).max()),

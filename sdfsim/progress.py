@@ -137,7 +137,7 @@ class _Bar:
         self._progress: Any = None
         self._task: Any = None
         self._stage: str | None = None
-        self._started = self._told = 0.0
+        self._started = self._told = self._from = 0.0
         self._ended = False
 
     def update(self, stage: str, fraction: float, message: str) -> None:
@@ -146,6 +146,7 @@ class _Bar:
         fresh = stage != self._stage
         if fresh:
             self._stage, self._started, self._ended = stage, time.monotonic(), False
+            self._from = fraction  # work that is gone on with begins in the middle
         if self._on_terminal:
             self._draw(fresh, fraction, title)
         else:
@@ -172,7 +173,8 @@ class _Bar:
             return
         self._told, self._ended = now, fraction >= 1
         elapsed = now - self._started
-        left = f", about {duration(elapsed * (1 - fraction) / fraction)} left" if 0.01 < fraction < 1 else ""
+        done = fraction - self._from
+        left = f", about {duration(elapsed * (1 - fraction) / done)} left" if done > 0.01 and fraction < 1 else ""
         print(f"[{fraction:4.0%}] {title} ({duration(elapsed)}{left})", file=sys.stderr, flush=True)
 
     def say(self, text: str) -> None:

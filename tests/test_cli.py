@@ -322,8 +322,8 @@ def stop_after(steps: int, how):
     """A `Simulator.run` that breaks after some steps, as `how(rollout)` says."""
     real = Simulator.run
 
-    def broken(self, seconds=None, **options):
-        raise how(real(self, steps=steps, **options))
+    def broken(self, **options):
+        raise how(real(self, **(options | {"steps": steps})))
 
     return broken
 

@@ -60,3 +60,26 @@ def test_slopes_and_series():
     assert page.slope(x, [3 * v**1.5 for v in x]) == pytest.approx(1.5)
     found = page.series({"growth_64_8": {"a": 1}, "growth_64_16": {"a": 2}, "growth_512_8": {}}, "growth_64")
     assert found == [(8, {"a": 1}), (16, {"a": 2})]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fitted", [False, True])
+def test_memory_is_what_is_foreseen(tmp_path, fitted):
+    """In a process of its own, its peak over the loaded scene within a fifth."""
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
+    from benchmarks.scale_parts import ours
+    from sdfsim.dynamics.memory import peak_bytes
+
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        if fitted:
+            scene = large.write_scene("bowl", tmp_path, 512, 64)
+            got = pool.submit(ours.run, str(scene), 10).result()
+        else:
+            got = pool.submit(ours.run_apart, 2000, 5).result()
+    points = got["counts"]["sdf_queries"] + got["counts"]["sdf_waiting"]
+    edges = got["counts"]["edges"]
+    counts = {"bodies": got["bodies"], "nodes": got["nodes"], "edges": edges, "points": points}
+    foreseen = peak_bytes(**counts, fitted=fitted, rows=None)
+    assert foreseen / 2**20 == pytest.approx(got["peak_mib"], rel=0.2)

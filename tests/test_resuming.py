@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sdfsim import SdfsimError, resuming, run
+from sdfsim import SdfsimError, progress, resuming, run
 from sdfsim.dynamics.rollout import Rollout
 
 TOWER = Path(__file__).resolve().parents[1] / "samples" / "tower.yaml"
@@ -70,3 +70,13 @@ def test_a_run_ends_when_everything_rests(tmp_path):
     assert report["settled"] and report["simulated_s"] < 1.0
     falling = simulate(TOWER, tmp_path / "short", seconds=0.05, until_settled=True)
     assert falling["settled"] is False and falling["status"] == "done"
+
+
+def test_the_time_left_counts_from_where_the_work_was_taken_up(monkeypatch, capsys):
+    now = [100.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    session = progress.Session()
+    session.stage_progress("simulate", 0.5, "half of it was there")
+    now[0] += 20.0
+    session.stage_progress("simulate", 0.75, "a quarter more")
+    assert "about 20 s left" in capsys.readouterr().err

@@ -64,7 +64,7 @@ def _growth(results: Results) -> str:
             )
     if not rows:
         return ""
-    head = ["spheres", "nodes each", "nodes", "contacts", "ms a step", "MiB", "penetration 95 %", "lost", ""]
+    head = ["spheres", "nodes each", "nodes", "contacts", "ms a step", "MiB", "deepest node 95 %", "lost", ""]
     return "### Growth\n\n" + _table(head, rows) + "\n\n" + "\n\n".join(notes)
 
 

@@ -16,7 +16,7 @@ def tradeoff(
     source: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[DATA|SCENE|MESHES]",
+            metavar="DATA|SCENE|MESHES",
             help="Dataset or scene.yaml: error against time. Meshes: the same of fits. Nothing: growth with size.",
             show_default=False,
         ),

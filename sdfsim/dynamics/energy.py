@@ -43,6 +43,7 @@ class Balance:
         flown: [K] kinetic energy at the end of the step in free flight.
         allowed: [K] the most kinetic energy there may be: that, less what lifting took, and the work of paths.
         reached: [K] kinetic energy there is.
+        jumped: whether a body may have gone farther in the step than is allowed.
     """
 
     rows: Tensor
@@ -51,6 +52,7 @@ class Balance:
     flown: Tensor
     allowed: Tensor
     reached: Tensor
+    jumped: bool
 
     @property
     def gain(self) -> Tensor:
@@ -87,52 +89,63 @@ def hold_back(
         guard: "energy" allows no gain at all; "none" only stops what runs away (`ESCAPE`).
         memory: counts.
     """
-    found = balance(bodies, state, flown, after, contacts, gravity)
-    if not len(found.rows):
+    found = balance(bodies, state, flown, after, contacts, gravity, dt)
+    if found is None:
         return after
     rows, most = found.rows, found.allowed.clamp_min(0.0)
-
-    def beyond(speed: float) -> Tensor:
-        return 0.5 * ((2.0 * most).sqrt() + found.mass.sqrt() * speed).square()
-
-    escape = 0.0 if guard == "energy" else ESCAPE
-    end = _share(bodies, found, after, _end(flown, rows), _end(after, rows), beyond(escape))
-    way = _share(bodies, found, after, _way(state, flown, rows, dt), _way(state, after, rows, dt), beyond(LEAVE))
+    root, mass = (2.0 * most).sqrt(), found.mass.sqrt()
+    fast, far = (0.5 * (root + mass * v).square() for v in (0.0 if guard == "energy" else ESCAPE, LEAVE))
+    end = _share(bodies, found, after, _end(flown, rows), _end(after, rows), fast)
+    way = torch.ones_like(end)
+    if found.jumped:
+        way = _share(bodies, found, after, _way(state, flown, rows, dt), _way(state, after, rows, dt), far)
     if state.earlier_position is not None:
         way = torch.minimum(way, end)  # the paper network takes its velocities from the poses
     held = (torch.minimum(end, way) < 1.0)[found.island]
     if bool(held.any()):
         after = _blend(flown, after, rows, end[found.island, None], way[found.island, None])
         memory.count(held_back=int(held.sum()))
-        found = balance(bodies, state, flown, after, contacts, gravity)
-    memory.count(energy_gain=float(found.gain.sum()))
+        found = balance(bodies, state, flown, after, contacts, gravity, dt)
+    memory.count(energy_gain=0.0 if found is None else float(found.gain.sum()))
     return after
 
 
-def balance(bodies: Bodies, state: State, flown: State, after: State, contacts: Contacts, gravity: Tensor) -> Balance:
-    """Energies of the islands that contact has changed."""
-    rows = awake(bodies, state)
+def balance(
+    bodies: Bodies, state: State, flown: State, after: State, contacts: Contacts, gravity: Tensor, dt: float
+) -> Balance | None:
+    """Energies of the islands that contact has changed; None where no body of any has gained, or jumped."""
     changed = (after.velocity != flown.velocity) | (after.angular_velocity != flown.angular_velocity)
+    rows = awake(bodies, state)
     rows = rows[changed[rows].any(-1)]
-    label = islands(bodies, contacts) if len(rows) else bodies.shape
-    numbers, island = torch.unique(label[rows], return_inverse=True)
-    none = bodies.mass.new_zeros(len(numbers))
-    found = Balance(rows, island, none, none, none, none)
-    mass = found.total(bodies.mass[rows])
-    flying = found.total(kinetic(bodies, rows, flown.orientation, _end(flown, rows)))
-    reached = found.total(kinetic(bodies, rows, after.orientation, _end(after, rows)))
+    (one, spin), (other, turn) = _end(flown, rows), _end(after, rows)
+    mass, both = bodies.mass[rows], torch.cat([rows, rows])
+    orientation = torch.cat([flown.orientation[rows], after.orientation[rows]])
+    before, reached = kinetic(bodies, both, orientation, (torch.cat([one, other]), torch.cat([spin, turn]))).chunk(2)
     # Differences of positions, so that a far origin costs no precision.
-    lifted = found.total(-bodies.mass[rows] * ((after.position - flown.position)[rows] @ gravity))
+    lifted = -mass * ((after.position - flown.position)[rows] @ gravity)
+    # Cheap, and enough: an island can only have gained, or be over a limit, when one of its bodies is.
+    jump = (after.position - state.position)[rows].norm(dim=-1)
+    jump = jump + 2.0 * (after.orientation - state.orientation)[rows].norm(dim=-1) * bodies.radius[rows]
+    wild = 0.5 * mass * ((jump / dt).square() - LEAVE**2)
+    jumped = bool((wild + lifted > before).any())
+    if not jumped and not bool((reached + lifted > before).any()):
+        return None
+    label = islands(bodies, contacts)
+    numbers, island = torch.unique(label[rows], return_inverse=True)
+    none = mass.new_zeros(len(numbers))
+    found = Balance(rows, island, none, none, none, none, jumped)
     speed = _path_speed(bodies, state, contacts, label)[numbers]
+    masses, flying = found.total(mass), found.total(before)
     # A wall of speed V adds 2 V to the speed of what bounces off it.
-    driven = 0.5 * ((2.0 * flying).sqrt() + 2.0 * mass.sqrt() * speed).square()
-    return replace(found, mass=mass, flown=flying, allowed=driven - lifted, reached=reached)
+    driven = 0.5 * ((2.0 * flying).sqrt() + 2.0 * masses.sqrt() * speed).square()
+    allowed = driven - found.total(lifted)
+    return replace(found, mass=masses, flown=flying, allowed=allowed, reached=found.total(reached))
 
 
 def kinetic(bodies: Bodies, rows: Tensor, orientation: Tensor, motion: Motion) -> Tensor:
-    """[R] kinetic energy of bodies `rows` [R] at `orientation` [N, 4] (of all) with the `motion` of those."""
+    """[R] kinetic energy of bodies `rows` [R] at `orientation` [R, 4] with the `motion` of each."""
     velocity, angular = motion
-    spin = pose.rotate(pose.conjugate(orientation[rows]), angular)
+    spin = pose.rotate(pose.conjugate(orientation), angular)
     turning = (spin * (bodies.inertia[rows] @ spin[..., None])[..., 0]).sum(-1)
     return 0.5 * (bodies.mass[rows] * velocity.square().sum(-1) + turning)
 
@@ -145,7 +158,7 @@ def _share(bodies: Bodies, found: Balance, after: State, start: Motion, stop: Mo
     """
 
     def energy(motion: Motion) -> Tensor:
-        return found.total(kinetic(bodies, found.rows, after.orientation, motion))
+        return found.total(kinetic(bodies, found.rows, after.orientation[found.rows], motion))
 
     reached = energy(stop)
     over = (reached - most > ROUNDING * (found.flown + reached)) & (reached < 0.5 * found.mass * FASTEST**2)

@@ -35,9 +35,10 @@ PHASES = {
 PIECE = 2**18  # nodes looked at together at most: more at once is slower, and takes memory
 _SLACK = 1e-9  # model lengths, for the rounding of distances
 BYTES_A_ROW = 4096  # what an edge of the network takes; a node near a surface takes no more while it is worked on
-# What a run takes beside its scene, by benchmarks/scale.py: torch's own at the first step, the working memory of fitted
-# distances, a surface node with its place among the balls, and a point of a search while it is looked at.
-BYTES_AT_LEAST, BYTES_FITTED, BYTES_A_NODE, BYTES_A_POINT = 28 * 2**20, 33 * 2**20, 235, 400
+# What a run takes beside its scene, as measured on scenes of docs/scale.md: torch's own at the first step, the working
+# memory of fitted distances, a body, a surface node with its place among the balls, a point while it is looked at.
+BYTES_AT_LEAST, BYTES_FITTED = 71 * 2**20, 16 * 2**20
+BYTES_A_BODY, BYTES_A_NODE, BYTES_A_POINT = 22_000, 110, 200
 
 
 def row_limit(limits: Limits) -> int | None:
@@ -45,10 +46,11 @@ def row_limit(limits: Limits) -> int | None:
     return None if limits.memory_gib is None else max(1, int(limits.memory_gib * 2**30 / BYTES_A_ROW))
 
 
-def peak_bytes(*, nodes: int, edges: float, points: float, fitted: bool, rows: int | None) -> float:
+def peak_bytes(*, bodies: int, nodes: int, edges: float, points: float, fitted: bool, rows: int | None) -> float:
     """What a run will take at its largest step, beside the loaded scene and the rollout that it keeps.
 
     Args:
+        bodies: of the scene.
         nodes: surface nodes of all bodies.
         edges: of the impulse network.
         points: nodes and balls near a surface, asked or waiting.
@@ -56,7 +58,7 @@ def peak_bytes(*, nodes: int, edges: float, points: float, fitted: bool, rows: i
         rows: see `row_limit`.
     """
     at_once = min(points, PIECE, rows or PIECE)
-    standing = BYTES_AT_LEAST + BYTES_FITTED * fitted + BYTES_A_NODE * nodes
+    standing = BYTES_AT_LEAST + BYTES_FITTED * fitted + BYTES_A_BODY * bodies + BYTES_A_NODE * nodes
     return standing + BYTES_A_ROW * edges + BYTES_A_POINT * at_once
 
 

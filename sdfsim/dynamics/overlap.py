@@ -29,6 +29,12 @@ def parting(bodies: Bodies, state: State, contacts: Contacts, memory: Memory) ->
     if not len(contacts):
         return contacts
     owner, body = contacts.owner, contacts.body
+    # A plane has one way out for all of a body.
+    near = (state.position[owner] - state.position[body]).norm(dim=-1) < torch.maximum(
+        _reach(bodies, owner), _reach(bodies, body)
+    )
+    if not bool(near.any()):
+        return contacts
     pair, pairs = number_pairs(owner, body, len(bodies))
     first = torch.zeros(pairs, dtype=torch.int64, device=bodies.device).index_copy_(0, pair, torch.minimum(owner, body))
     second = torch.zeros_like(first).index_copy_(0, pair, torch.maximum(owner, body))
@@ -47,6 +53,7 @@ def _inside(bodies: Bodies, state: State, one: Tensor, other: Tensor, memory: Me
     local = pose.rotate(back, state.position[one] - state.position[other])
     box = bodies.bounds[other]
     near = bodies.moves[one] & ((local > box[:, 0]) & (local < box[:, 1])).all(-1)
+    near &= bodies.radius[other].isfinite()
     rows = near.nonzero()[:, 0]
     distance, gradient = distances(bodies, other[rows], local[rows])
     own, _ = distances(bodies, one[rows], torch.zeros_like(local[rows]))
@@ -55,3 +62,9 @@ def _inside(bodies: Bodies, state: State, one: Tensor, other: Tensor, memory: Me
     rows, gradient = rows[deep], gradient[deep]
     out = pose.rotate(state.orientation[other[rows]], gradient)
     return rows, out / out.norm(dim=-1, keepdim=True)
+
+
+def _reach(bodies: Bodies, rows: Tensor) -> Tensor:
+    """[R] how far the solids of bodies `rows` [R] reach from their centres; nothing for a plane."""
+    radius = bodies.radius[rows]
+    return torch.where(radius.isfinite(), radius, 0.0)

@@ -275,7 +275,7 @@ class Simulator:
         """Kinetic and potential energy in joules of all dynamic bodies."""
         rows = self._dynamic
         s = self.state
-        moving = kinetic(self.bodies, rows, s.orientation, (s.velocity[rows], s.angular_velocity[rows])).sum()
+        moving = kinetic(self.bodies, rows, s.orientation[rows], (s.velocity[rows], s.angular_velocity[rows])).sum()
         potential = -(self.bodies.mass[rows] * (s.position[rows] @ self.rules.gravity)).sum()
         joule = self.units.energy
         return {"kinetic_energy": float(moving) * joule, "potential_energy": float(potential) * joule}

@@ -13,6 +13,7 @@ import numpy as np
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.gltf import check_gltf
 from sdfsim.shape.repair import without_doubles
+from sdfsim.shape.rows import check_rows
 from sdfsim.shape.sdf import Sdf
 
 # Its readers log what they pass over, some with tracebacks; who wants to see that can still listen.
@@ -99,6 +100,8 @@ def load_mesh(path: str | Path) -> Mesh:
         raise SdfsimError(f"{path}: too large ({told})", "export it with fewer faces")
     if path.suffix.lower() in (".glb", ".gltf"):
         check_gltf(path)
+    if path.suffix.lower() in (".off", ".ply"):
+        check_rows(path)
     try:
         loaded: Any = trimesh.load(path, force="mesh", process=False)
         vertices = np.array(loaded.vertices, dtype=np.float64).reshape(-1, 3)

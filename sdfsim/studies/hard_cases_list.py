@@ -62,7 +62,7 @@ def _yaw(quick: bool) -> list[Case]:
         return [scenes.yawed(base, yaw) for base in bases for yaw in yaws]
 
     back = partial(measure.turned_back, degrees=yaws)
-    figures = (Figure("deviation", "% of size", 3, largest=True),)
+    figures = (Figure("deviation", "% of size", 5, largest=True),)
     return [Case("yaw", "yaw", "random scenes, 50 steps", turned, back, figures, steps=50)]
 
 

@@ -12,7 +12,7 @@ import sdfsim
 from sdfsim.files import write_text
 from sdfsim.studies.hard_cases import GROUPS, group_order
 from sdfsim.studies.hard_cases_plots import group_picture
-from sdfsim.studies.hard_cases_run import TEACHER, Study
+from sdfsim.studies.hard_cases_results import TEACHER, Study
 from sdfsim.studies.hard_cases_tables import LEGEND, Cell, Row, columns, losses, rows
 
 PAGE = "index.html"

@@ -10,7 +10,7 @@ import numpy as np
 
 from sdfsim.errors import SdfsimError
 from sdfsim.studies.hard_cases import GROUPS, Case
-from sdfsim.studies.hard_cases_run import TEACHER, Study
+from sdfsim.studies.hard_cases_results import TEACHER, Study
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,7 +8,7 @@ from typing import Any
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json
 from sdfsim.studies.hard_cases import Figure
-from sdfsim.studies.hard_cases_run import TEACHER, Study
+from sdfsim.studies.hard_cases_results import TEACHER, Study
 
 SPREADS = 3.0  # so many standard deviations are noise
 SHARE = 0.05  # of a figure: what another machine's rounding may change where repetitions agree

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -23,15 +22,14 @@ from sdfsim.learning.teacher import DT, ENGINE_SETTINGS, SUBSTEP, import_pybulle
 from sdfsim.parallel import parallel
 from sdfsim.scene.types import Scene
 from sdfsim.shape.analytic import PlaneSdf
-from sdfsim.studies.hard_cases import GROUPS, Case, Figure
+from sdfsim.studies.hard_cases import GROUPS, Case
 from sdfsim.studies.hard_cases_list import cases
 from sdfsim.studies.hard_cases_measures import Run
 from sdfsim.studies.hard_cases_motion import simulated, taught
+from sdfsim.studies.hard_cases_results import NO_CUDA, TEACHER, Part, Result, Study
 from sdfsim.studies.hard_cases_teacher import engine_file
 
 VERSION = 1  # counts up when what is measured changes, so that kept results are measured again
-TEACHER = "teacher"
-NO_CUDA = "no CUDA device here"
 WATCHED = 10.0  # s of a recording
 
 Progress = Callable[[float, str], None]
@@ -39,103 +37,13 @@ Record = Callable[[Scene, Rollout, Path], None]
 
 
 @dataclass(frozen=True)
-class Part:
-    """What one repetition of a case gave with one model, or with the teacher.
-
-    Attributes:
-        fingerprint: of everything that it depends on.
-        figures: name -> value.
-        broke: what went wrong, a line for each motion that ended early or ran away.
-        outside: in what the scenes lie outside the model's training.
-        curve: [2, K], what is drawn.
-        recording: file of the motion to watch, relative to the folder; None where there is none.
-    """
-
-    fingerprint: str
-    figures: dict[str, float]
-    broke: list[str]
-    outside: list[str]
-    curve: list[list[float]]
-    recording: str | None
-
-
-@dataclass(frozen=True)
-class Result:
-    """What all repetitions of a case gave with one model, or with the teacher.
-
-    Attributes:
-        case, who: names.
-        parts: in order; none where the case was not run.
-        skipped: why it was not, else empty.
-    """
-
-    case: str
-    who: str
-    parts: tuple[Part, ...]
-    skipped: str = ""
-
-    @property
-    def broke(self) -> list[str]:
-        """Every motion that ended early or ran away."""
-        return [line for part in self.parts for line in part.broke]
-
-    @property
-    def outside(self) -> list[str]:
-        """In what the case lies outside the model's training."""
-        return list(dict.fromkeys(line for part in self.parts for line in part.outside))
-
-    @property
-    def recording(self) -> str | None:
-        """The motion to watch: one that broke, if any did."""
-        found = sorted(self.parts, key=lambda part: not part.broke)
-        return next((part.recording for part in found if part.recording), None)
-
-    def value(self, figure: Figure) -> float | None:
-        """The mean of the repetitions, or the largest where that is what counts; None where there is none."""
-        values = self._values(figure)
-        if not values:
-            return None
-        return max(values) if figure.largest else statistics.fmean(values)
-
-    def noise(self, figure: Figure) -> float:
-        """Standard deviation over the repetitions, 0 for a single one."""
-        values = self._values(figure)
-        return statistics.stdev(values) if len(values) > 1 else 0.0
-
-    def missed(self, figure: Figure) -> bool:
-        """Whether the figure is beyond what is wanted."""
-        value = self.value(figure)
-        return value is not None and figure.limit is not None and value > figure.limit
-
-    def _values(self, figure: Figure) -> list[float]:
-        return [part.figures[figure.name] for part in self.parts]
-
-
-@dataclass(frozen=True)
-class Study:
-    """All results of one run of the command.
-
-    Attributes:
-        cases: what was run, in order.
-        who: models, then the teacher where PyBullet is installed.
-        results: (case name, who) -> result; a case that the teacher has no part in has none of it.
-        quick: whether it was the short form.
-    """
-
-    cases: list[Case]
-    who: list[str]
-    results: dict[tuple[str, str], Result]
-    quick: bool
-
-
-@dataclass(frozen=True)
 class _Job:
-    """One repetition of a case with one model (`model` is its name or path), or with the teacher."""
+    """One repetition of a case with one model, or with the teacher (`model` is None)."""
 
     case: Case
     repeat: int
     who: str
-    model: str
+    model: Model | None
     device: str
     fingerprint: str
     weight: float
@@ -169,27 +77,18 @@ def stress(
         The results of all cases.
 
     Raises:
-        SdfsimError: no such model or device, unusable shapes, another run in the folder, or it cannot be written.
+        SdfsimError: no such model or device, two models of one name, unusable shapes, another run in the folder, or a
+            folder that cannot be written.
     """
     device = str(pick_device(device))
-    names = {name: load_model(name) for name in models or bundled_models()}
+    tested = [load_model(name) for name in models or bundled_models()]
+    who = [model.name for model in tested] + [TEACHER] * _teacher_is_here()
+    if twice := {name for name in who if who.count(name) > 1}:
+        raise SdfsimError(f"two models are called {min(twice)!r}", "rename a file: results are kept by name")
     found = cases(quick=quick, shapes=shapes)
-    teacher = _teacher_is_here()
-    digests = {model.name: _digest_model(model) for model in names.values()}
-    jobs = []
-    for case in found:
-        for repeat in range(case.repeats):
-            scenes = case.scenes(repeat)
-            scene_digest, weight = _digest_scenes(case, scenes), _weight(case, scenes)
-            for name, model in names.items():
-                mark = _fingerprint(scene_digest, digests[model.name], device)
-                jobs.append(_Job(case, repeat, model.name, str(name), device, mark, weight))
-            if teacher and case.teacher:
-                mark = _fingerprint(scene_digest, ENGINE_SETTINGS, SUBSTEP, DT)
-                jobs.append(_Job(case, repeat, TEACHER, "", "", mark, 0.05 * weight))
-    who = [model.name for model in names.values()] + [TEACHER] * teacher
+    jobs = _jobs(found, tested, device, teacher=TEACHER in who)
     with locked(out):
-        if teacher:
+        if TEACHER in who:
             _write_engine_files(found, out / "engine")
         parts = _parts(jobs, out, record, on_progress or (lambda fraction, message: None))
     results = {}
@@ -200,6 +99,23 @@ def stress(
             own = tuple(parts[case.name, one, k] for k in range(case.repeats) if (case.name, one, k) in parts)
             results[case.name, one] = Result(case.name, one, own, "" if own else NO_CUDA)
     return Study(found, who, results, quick)
+
+
+def _jobs(found: list[Case], tested: list[Model], device: str, *, teacher: bool) -> list[_Job]:
+    """All there is to run; every scene is built once, for its digest and its size."""
+    digests = [_digest_model(model) for model in tested]
+    jobs = []
+    for case in found:
+        for repeat in range(case.repeats):
+            scenes = case.scenes(repeat)
+            scene_digest, weight = _digest_scenes(case, scenes), _weight(case, scenes)
+            for model, digest in zip(tested, digests, strict=True):
+                mark = _fingerprint(scene_digest, digest, device)
+                jobs.append(_Job(case, repeat, model.name, model, device, mark, weight))
+            if teacher and case.teacher:
+                mark = _fingerprint(scene_digest, ENGINE_SETTINGS, SUBSTEP, DT)
+                jobs.append(_Job(case, repeat, TEACHER, None, "", mark, 0.05 * weight))
+    return jobs
 
 
 def _parts(
@@ -225,20 +141,19 @@ def _run(job: _Job, out: Path, record: Record | None) -> Part:
     """Run one repetition, measure it, and keep the result as a file."""
     case, scenes = job.case, job.case.scenes(job.repeat)
     outside: list[str] = []
-    if job.who == TEACHER:
+    if job.model is None:
         runs = taught(case, scenes, out / "engine")
     else:
-        model = load_model(job.model)
-        runs = simulated(case, scenes, model, job.device)
+        runs = simulated(case, scenes, job.model, job.device)
         outside += [line for run in runs for line in run.rollout.meta["outside_training"]]
-        if (about := GROUPS[case.group].about) in constant_in_training(model):
+        if (about := GROUPS[case.group].about) in constant_in_training(job.model):
             outside.append(f"{about} was constant in training, so it was not learned")
     measured = case.measure(runs)
     figures = {figure.name: float(measured.figures[figure.name]) for figure in case.figures}
     broke = [run.broke for run in runs if run.broke]
     missed = any(figure.limit is not None and figures[figure.name] > figure.limit for figure in case.figures)
     recording = None
-    if record and job.who != TEACHER and (broke or (missed and job.repeat == 0)):
+    if record and job.model is not None and (broke or (missed and job.repeat == 0)):
         shown = next((run for run in runs if run.broke), runs[measured.worst])
         recording = _recorded(shown, Path("recordings") / job.who / f"{case.name}-{job.repeat}.rrd", out, record)
     part = Part(job.fingerprint, figures, broke, list(dict.fromkeys(outside)), measured.curve.tolist(), recording)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from sdfsim.studies.hard_cases import GROUPS, Case, Figure
-from sdfsim.studies.hard_cases_run import TEACHER, Result, Study
+from sdfsim.studies.hard_cases_results import TEACHER, Result, Study
 
 State = Literal["fine", "missed", "behind", "told"]
 NOTHING = "-"

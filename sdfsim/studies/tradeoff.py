@@ -231,10 +231,8 @@ def _clips(sweep: Sweep, cases: Cases, out: Path, record: Recorder) -> dict[str,
     index = cases.timed[len(cases.timed) // 2]
     for point in sweep.qualities.values():
         path = out / "clips" / f"{point['key']}.rrd"
-        if not path.exists():
-            path.parent.mkdir(exist_ok=True)
-            prepared = Ours(setting_of(point)).prepare(cases)
-            simulator = prepared.simulator(index)  # type: ignore[attr-defined]
-            record(simulator.scene, simulator.run(steps=cases.steps), path)
+        path.parent.mkdir(exist_ok=True)
+        simulator = Ours(setting_of(point)).prepare(cases).simulator(index)
+        record(simulator.scene, simulator.run(steps=cases.steps), path)
         made[point["key"]] = str(path.relative_to(out))
     return made

@@ -119,11 +119,11 @@ class Ours:
     def describe(self) -> dict[str, Any]:
         return {"setting": self.setting.to_json(), "model": weights_digest(self.setting.model)}
 
-    def prepare(self, cases: Cases) -> Prepared:
+    def prepare(self, cases: Cases) -> OursPrepared:
         with threads_of(self.setting):
             model = arranged_model(self.setting, load_model(self.setting.model)).to(pick_device(self.setting.device))
             shapes = {name: self._shape(cases, name, shape) for name, shape in cases.shapes.items()}
-        return _OursPrepared(self, cases, model, shapes)
+        return OursPrepared(self, cases, model, shapes)
 
     def _shape(self, cases: Cases, name: str, shape: Shape) -> Shape:
         if self.setting.sdf.startswith("grid") and isinstance(shape.sdf, MlpSdf):
@@ -134,8 +134,8 @@ class Ours:
 
 
 @dataclass
-class _OursPrepared:
-    """See `Prepared`."""
+class OursPrepared:
+    """See `Prepared`; `simulator` makes one of any case."""
 
     ours: Ours
     cases: Cases
@@ -164,7 +164,7 @@ class _OursPrepared:
         return together(runs)
 
     def fitted_s(self) -> float | None:
-        known = [s.source.get("sampled_s", s.certificate.get("seconds")) for s in self.shapes.values()]
+        known = [s.source.get("fitted_s", s.certificate.get("seconds")) for s in self.shapes.values()]
         return float(sum(seconds for seconds in known if seconds is not None))
 
     def scene(self, index: int) -> Scene:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sdfsim.dynamics.model import load_model
+from sdfsim.dynamics.model import Model, load_model
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, replacing, write_json
@@ -17,7 +18,8 @@ from sdfsim.scene.types import Body, Scene
 from sdfsim.shape.asset import analytic_shape, with_nodes
 from sdfsim.shape.cache import shape_from_primitive
 from sdfsim.studies.tradeoff_contenders import peak_memory, time_simulator, weights_digest
-from sdfsim.studies.tradeoff_cost import Load, fit_cost, relative_errors
+from sdfsim.studies.tradeoff_cost import CostModel, Load, fit_cost, relative_errors
+from sdfsim.studies.tradeoff_estimate import estimate, landings
 
 VERSION = 1
 STEPS = 9  # of which the first is not timed
@@ -27,6 +29,7 @@ WALL = 0.12  # of the bowl primitive, relative to its outer radius
 GRID = 48  # samples along each side of the bowl's distances
 HIGH, APART = 100.0, 5.0  # m above the floor, and times as far from each other: where nothing touches
 WITHIN = 0.3  # what a cost model may be off by on scenes that it was not fitted to
+COURSE = 60  # steps of a whole run
 NAMES = {"pile": "boxes in columns on a floor", "bowl": "balls in a bowl"}
 
 
@@ -53,13 +56,16 @@ class Growing:
         return f"{self.kind}__{self.bodies}{tail}{'__flying' if self.flying else ''}"
 
 
+COURSES = ((Growing("pile", 3), 0.0), (Growing("pile", 6), 1.5), (Growing("bowl", 5), 0.8), (Growing("pile", 2), 9.0))
+
+
 def scenes(*, quick: bool) -> list[Growing]:
     """The scenes of a study: by bodies, by nodes of 16 bodies, and without contact."""
     counts = (1, 4, 16, 64) if quick else (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
     grids = (3, 6, 12, 24) if quick else (3, 4, 6, 8, 12, 16, 24, 48, 96)
     found = [Growing(kind, count) for kind in NAMES for count in counts]
     found += [Growing(kind, 16, grid) for kind in NAMES for grid in grids]
-    return found + [Growing("pile", count, flying=True) for count in counts[::2]]
+    return found + [Growing("pile", count, flying=True) for count in counts]
 
 
 def build(one: Growing) -> Scene:
@@ -145,6 +151,8 @@ def growth(
     kept = [k for k in range(len(good)) if k % 3 != 1]
     cost = fit_cost([loads[k] for k in kept], [ms[k] for k in kept])
     off = relative_errors(cost, [loads[k] for k in held], [ms[k] for k in held])
+    on_progress("courses", 0.0, "whole runs against their estimates")
+    off_course = {f"{c.key} from {h:g} m": course(c, h, cost, used, device) for c, h in COURSES}
     report = {
         "model": used.name,
         "kind": used.kind,
@@ -155,11 +163,31 @@ def growth(
         "held_out": {good[k]["key"]: float(e) for k, e in zip(held, off, strict=True)},
         "held_out_median": float(np.median(np.abs(off))),
         "held_out_within": float((np.abs(off) <= WITHIN).mean()),
+        "courses": off_course,
         "folder": str(out),
     }
     write_json(out / "growth.json", report)
     draw(good, out / "growth.png")
     return report
+
+
+def course(one: Growing, height: float, cost: CostModel, model: Model, device: str) -> float:
+    """What `plan` would say of a scene dropped from `height` m, over what its run takes, less one."""
+    scene = build(one)
+    up = np.array([0.0, 0.0, height])
+    bodies = [replace(b, position=b.position + up) if b.motion == "dynamic" else b for b in scene.bodies]
+    simulator = Simulator(replace(scene, bodies=tuple(bodies)), model, device)
+    landed = landings(simulator, COURSE)
+    counters: dict[str, list[float]] = {"edges": [0.0], "active": [0.0], "step_ms": [0.0]}
+    for _ in range(COURSE):
+        began = time.process_time()
+        next(simulator.steps(1))
+        counters["step_ms"].append(1e3 * (time.process_time() - began))
+        for name in ("edges", "active"):
+            counters[name].append(simulator.memory.counts[name])
+    trial = {name: np.array(values[:6]) for name, values in counters.items()}
+    told = estimate(cost, simulator, trial, landed, COURSE)["step_ms"]
+    return told / float(np.mean(counters["step_ms"][2:])) - 1.0
 
 
 def _measured(one: Growing, folder: Path, model: str, device: str) -> dict[str, Any]:
@@ -233,7 +261,8 @@ def draw(points: Sequence[dict[str, Any]], path: Path) -> None:
         for row, measured in enumerate(("milliseconds a step", "memory of a run above the program's, MiB")):
             axes[row, column].set(xlabel=what, ylabel=measured)
             axes[row, column].grid(True, which="both", lw=0.3)
-            axes[row, column].legend(fontsize=8)
+            if axes[row, column].lines:
+                axes[row, column].legend(fontsize=8)
     with replacing(path) as partial:
         figure.savefig(partial, dpi=110, format="png")
     pyplot.close(figure)
@@ -256,5 +285,6 @@ def told(report: dict[str, Any]) -> tuple[list[tuple[str, ...]], list[str]]:
         f"cost model, ms: {cost}",
         f"on scenes that it was not fitted to: off by {report['held_out_median']:.0%} in the median, "
         f"{report['held_out_within']:.0%} of them within {WITHIN:.0%}",
+        *(f"plan's estimate of a run of {name}: off by {e:+.0%}" for name, e in report["courses"].items()),
         f"wrote {report['folder']}",
     ]

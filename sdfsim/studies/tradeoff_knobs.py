@@ -96,7 +96,13 @@ def setting_from(stored: Mapping[str, Any]) -> Setting:
 
 
 def for_any_scene(setting: Setting) -> bool:
-    """Whether `--quality` may stand for it: it is no matter of the machine, nor of what a scene itself decides."""
+    """Whether `--quality` may stand for it: it is no matter of the machine, nor of what a scene itself decides.
+
+    The mesh that is shown serves neither as geometry nor as nodes: of shapes that were capped, thickened or made of
+    convex pieces it is something else.
+    """
+    if setting.sdf == "exact" or setting.nodes == "vertices":
+        return False
     return setting == replace(setting, sleep=False, compiled=False, threads=1, device="cpu", free_flight="exact")
 
 
@@ -201,11 +207,10 @@ def settings(models: list[str], paper: list[str], *, quick: bool, cuda: bool) ->
         cuda: there is a CUDA device to be measured too.
     """
     base = Setting(model=models[0])
-    # A grid of 64^3 takes a while to sample, which a quick study does not have.
-    coarse = "grid 32" if quick else "grid 64"
-    lean = replace(base, nodes="thin 128", sdf=coarse)
+    lean = replace(base, nodes="thin 128", sdf="grid 64")
     chosen = [base, *(replace(base, nodes=nodes) for nodes in ("thin 32", "thin 64", "grid 7", "vertices"))]
-    chosen += [replace(base, sdf=coarse), replace(base, sdf="exact"), lean, replace(base, precision="bf16")]
+    chosen += [replace(base, sdf="grid 64"), replace(base, sdf="exact"), lean, replace(base, precision="bf16")]
+    chosen += [replace(base, nodes="thin 32", sdf="grid 32"), replace(base, nodes="grid 7", sdf="grid 64")]
     if models[0] not in paper:
         chosen += [replace(base, rounds=4), replace(lean, rounds=4)]
     if not quick:
@@ -215,8 +220,7 @@ def settings(models: list[str], paper: list[str], *, quick: bool, cuda: bool) ->
         chosen += [replace(base, reach=factor) for factor in (0.5, 2.0)]
         chosen += [replace(base, rounds=count) for count in (3, 5)] if models[0] not in paper else []
         chosen += [replace(base, sleep=True), replace(base, compiled=True), replace(lean, sleep=True)]
-        chosen += [replace(base, nodes=nodes, sdf="grid 64") for nodes in ("thin 64", "thin 256", "grid 7")]
-        chosen += [replace(base, nodes="thin 32", sdf="grid 32")]
+        chosen += [replace(base, nodes=nodes, sdf="grid 64") for nodes in ("thin 64", "thin 256")]
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     chosen += [replace(base, threads=2)] if cores > 1 and not quick else []
     chosen += [replace(base, device="cuda")] if cuda else []

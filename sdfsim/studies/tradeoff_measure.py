@@ -82,7 +82,7 @@ def _kept(contender: Contender, cases: Cases, folder: Path) -> Point | None:
 
 
 def _fingerprint(contender: Contender, cases: Cases) -> dict[str, Any]:
-    return {"version": VERSION, "cases": cases.digest(), "machine": platform.processor(), **contender.describe()}
+    return {"version": VERSION, "cases": cases.digest(), "machine": platform.node(), **contender.describe()}
 
 
 def _scored(contender: Contender, cases: Cases, folder: Path, ready: dict[str, Prepared]) -> Point:

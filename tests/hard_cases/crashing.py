@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -57,17 +58,18 @@ def run(arguments: list[str], folder: Path, moment: Moment = NEVER, prepare: Cal
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["tests.hard_cases.preloaded"])
     folder.parent.mkdir(parents=True, exist_ok=True)
-    said = folder.parent / f"{folder.name}.said"
-    child = context.Process(target=_child, args=(arguments, str(folder), moment, prepare, str(said)))
-    child.start()
-    child.join()
-    told = said.with_suffix(".told")
-    changes, seconds = json.loads(told.read_text()) if told.exists() else (0, 0.0)
-    told.unlink(missing_ok=True)
-    return Ended(child.exitcode or 0, said.read_text(errors="replace"), changes, seconds)
+    with tempfile.TemporaryDirectory() as place:  # not beside the folder, where the disk may be full
+        said, told = Path(place) / "said", Path(place) / "told"
+        child = context.Process(target=_child, args=(arguments, str(folder), moment, prepare, str(said), str(told)))
+        child.start()
+        child.join()
+        changes, seconds = json.loads(told.read_text()) if told.exists() else (0, 0.0)
+        return Ended(child.exitcode or 0, said.read_text(errors="replace"), changes, seconds)
 
 
-def _child(arguments: list[str], folder: str, moment: Moment, prepare: Callable[[], None] | None, said: str) -> None:
+def _child(
+    arguments: list[str], folder: str, moment: Moment, prepare: Callable[[], None] | None, said: str, told: str
+) -> None:
     import torch
 
     torch.set_num_threads(1)
@@ -101,7 +103,7 @@ def _child(arguments: list[str], folder: str, moment: Moment, prepare: Callable[
         cli.app(arguments)
     except SystemExit as end:
         code = int(end.code or 0)
-    Path(said).with_suffix(".told").write_text(json.dumps([count, time.process_time() - started]))
+    Path(told).write_text(json.dumps([count, time.process_time() - started]))
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)

@@ -175,9 +175,9 @@ def test_no_mesh_file_crashes_or_hangs(worker, folder, case):
 
 
 @pytest.mark.slow
-@settings(max_examples=1000, **common)
+@settings(max_examples=600, **common)
 @given(case=strange_files)
-def test_a_thousand_mesh_files(worker, folder, case):
+def test_hundreds_of_mesh_files(worker, folder, case):
     try_one(worker, folder, case)
 
 
@@ -191,7 +191,7 @@ def test_every_format_is_read(worker, folder, name):
 @pytest.mark.parametrize("name", [name for name in ORIGINALS if name != "obj"])  # an OBJ does not say how long it is
 def test_a_file_that_is_cut_short_is_refused(worker, folder, name):
     whole = ORIGINALS[name].rstrip()
-    for part in (0.3, 0.6, 0.9, 0.99, 1.0):
-        cut = whole[: min(int(part * len(whole)), len(whole) - 1)]
+    for part in (0.1, 0.3, 0.6, 0.9, 0.99):  # the last digit of a text may be missing without a trace
+        cut = whole[: int(part * len(whole))]
         answer = try_one(worker, folder, Strange(name.split("_")[0], cut))
         assert isinstance(answer, SdfsimError), f"accepted at {part:.0%}: {answer}"

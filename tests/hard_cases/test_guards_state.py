@@ -72,6 +72,7 @@ def test_a_state_of_one_frame_comes_with_the_error_of_steps():
     sim.state = spoil(sim.state, "velocity", torch.nan)
     with pytest.raises(SimulationError, match="step 5: body 'box': velocity is not finite") as caught:
         next(walk)
+    gates.assert_sound(caught.value.rollout)
     np.testing.assert_array_equal(caught.value.rollout.position[0], last.position.numpy())
 
 

@@ -8,7 +8,7 @@ import torch
 
 from pipeline.cameras import Sparse
 from pipeline.field import FieldSize, GridField
-from pipeline.landmarks import CLEARANCE, FILLED, GAP, SLOPE, FreeSpace, find_landmarks
+from pipeline.landmarks import CLEARANCE, FILLED, GAP, JUST_EMPTY, SLOPE, FreeSpace, find_landmarks
 from pipeline.normalise import Normalisation
 from pipeline.render import sdf_cache
 from tests.pipeline.test_surface import ring
@@ -50,7 +50,9 @@ def test_half_the_points_are_where_free_space_is_filled():
     filled = points.norm(dim=1) < 0.1 + FILLED + 0.01
     assert filled[:100].all() and filled[100:].float().mean() < 0.1
     rest = 0.4 - points[:, 0] + GAP
-    torch.testing.assert_close(clearance, (SLOPE * rest).clamp_max(CLEARANCE))
+    expected = (SLOPE * rest).clamp_max(CLEARANCE)
+    torch.testing.assert_close(clearance[100:], expected[100:])
+    torch.testing.assert_close(clearance[:100], expected[:100].clamp_max(JUST_EMPTY))
 
 
 def test_nothing_is_filled_in_an_empty_field():

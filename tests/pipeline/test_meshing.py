@@ -13,7 +13,6 @@ from PIL import Image
 from pipeline import meshing
 from pipeline.cameras import Sparse, View, save_views
 from pipeline.distill import Trained
-from pipeline.field import FieldSize
 from pipeline.meshing import make_meshes, read_parts
 from pipeline.normalise import Normalisation
 from pipeline.placement import load_placement
@@ -30,7 +29,7 @@ SPECK = (-0.3, 0.2, 0.5)
 class Drawn:
     """A field that is known exactly, and red where it is high."""
 
-    size = FieldSize((16, 64), (2, 2), 8, 8)
+    finest = 2 / 63
 
     def sdf(self, points: torch.Tensor) -> torch.Tensor:
         p = points.double().numpy()

@@ -67,21 +67,28 @@ def test_without_gradients_nothing_is_kept():
 
 
 def trainer(**changes) -> Trainer:
-    recipe = replace(
-        PAPER, size=TINY, **{"rays": 32, "samples": 16, "surface_points": 64, "iterations": 40, "rate": 2e-3, **changes}
-    )
+    small = {"size": TINY, "rays": 32, "samples": 16, "surface_points": 64, "iterations": 40, "rate": 2e-3}
+    recipe = replace(PAPER, **{**small, **changes})
     nothing = np.zeros((0, 3))
     sparse = Sparse(nothing, nothing.astype(np.uint8), np.zeros(0), np.zeros(0, int), np.zeros(0, int))
     landmarks = find_landmarks(sparse, [], Normalisation(np.zeros(3), 1.0))
-    return trainer_for(recipe.size)(recipe, toy_rays(), landmarks, 0)
+    rays = toy_rays()
+    # Without masks the background alone could paint both photos.
+    rays = replace(rays, mask=((rays.rgb[:, 0] == 200) * 255).to(torch.uint8))
+    return trainer_for(recipe.size)(recipe, rays, landmarks, 0)
+
+
+def falls(run: Trainer, steps: int, name: str, part: int) -> float:
+    """A loss's mean over the last steps as a share of that over the first; the eikonal loss stays small."""
+    losses = [run.step() for _ in range(steps)]
+    assert np.mean([one["eikonal"] for one in losses[-part:]]) < 0.01
+    return float(np.mean([one[name] for one in losses[-part:]]) / np.mean([one[name] for one in losses[:part]]))
 
 
 def test_training_lowers_the_loss_and_keeps_a_distance():
     run = trainer()
     assert isinstance(run, MlpTrainer)
-    losses = [run.step() for _ in range(40)]
-    assert np.mean([one["color"] for one in losses[-8:]]) < 0.75 * np.mean([one["color"] for one in losses[:8]])
-    assert losses[-1]["eikonal"] < 0.02
+    assert falls(run, 60, "color", 8) < 0.4
     assert run.converged > 0.5
     assert torch.isfinite(sdf_cache(run.field, 9)).all()
 
@@ -119,8 +126,6 @@ def test_the_field_is_read_back(tmp_path):
 
 @pytest.mark.slow
 def test_the_papers_preset_learns_on_the_cpu():
-    """The full 8 x 256 network, some hundred steps of few rays: the colours come nearer and it stays a distance."""
-    run = trainer(size=MlpSize(), rays=64, samples=32, iterations=300, surface_points=128)
-    losses = [run.step() for _ in range(300)]
-    assert np.mean([one["color"] for one in losses[-30:]]) < 0.5 * np.mean([one["color"] for one in losses[:30]])
-    assert np.mean([one["eikonal"] for one in losses[-30:]]) < 0.02
+    """The full 8 x 256 network, some hundred steps of few rays."""
+    run = trainer(size=MlpSize(), rays=32, samples=24, iterations=300, surface_points=64, rate=PAPER.rate)
+    assert falls(run, 300, "color", 20) < 0.3

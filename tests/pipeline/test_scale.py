@@ -56,9 +56,9 @@ def test_two_pixels_with_a_known_distance_set_the_scale(views, photos):
 def test_a_pixel_just_beside_a_corner_means_the_corner(views, photos):
     wall = cube(30.0, (0.0, 0, -15.6))  # Far below and behind the cube: most rays that miss it end there.
     surface = Caster(joined([cube(1.0), wall]))
-    corners = np.array([0.5, 0.5, 0.5]), np.array([-0.5, 0.5, 0.5])
-    beside = [corner * [1.01, 1.01, 1.01] for corner in corners]
-    known = Known(place(views[1], beside[0]), place(views[3], beside[1]), METRES)
+    # Left and right as the camera sees them, and a little farther out.
+    corners = np.array([[0.5, -0.5, 0.5], [-0.5, 0.5, 0.5]])
+    known = Known(*(place(views[1], corner * [1.02, 1.02, 1]) for corner in corners), np.sqrt(2) * METRES)
     assert measured(known, views, photos, surface).metres == pytest.approx(METRES, rel=0.03)
 
 

@@ -106,10 +106,11 @@ def test_two_sets_the_larger_is_taken_and_the_rest_is_named():
         (result(10, 0, still=0.9), "turntable"),
         (result(10, 2), "a texture that repeats"),
         (result(10, 0, matches=5), "overlap too little"),
+        (result(3, 2), "3 photos are too few"),
     ],
 )
 def test_what_is_wrong_with_the_photos(found, words):
-    verdict = judge(found, PHOTOS)
+    verdict = judge(found, PHOTOS[: len(found["counts"])])
     assert words in verdict["causes"][0] and words in failure_message(verdict)
 
 

@@ -167,6 +167,7 @@ def test_a_body_that_never_slides_slips_at_the_steepest_angle_tried():
 def test_slide_is_the_closed_form():
     assert measure.slide(0.0, 30.0, 2.0, 10.0) == pytest.approx(10.0)
     assert measure.slide(0.4, 20.0, 2.0, 10.0) == 0.0
+    assert measure.slide(0.4, 30.0, 2.0, 10.0) == pytest.approx(20.0 * (0.5 - 0.2 * np.sqrt(3.0)))
 
 
 def test_who_crosses_the_wall_counts_and_who_comes_over_the_rim_does_not():

@@ -99,6 +99,14 @@ def test_an_interrupted_run_goes_on_where_it_was(tmp_path, model, few, monkeypat
     assert resumed.results == run(tmp_path / "whole", model).results
 
 
+def test_two_models_of_one_name_are_refused(tmp_path, model):
+    (tmp_path / "other").mkdir()
+    second = save_model(tmp_path / "other" / Path(model).name)
+    with pytest.raises(SdfsimError, match="two models are called 'untrained'"):
+        hard_cases_run.stress(tmp_path / "out", models=[model, str(second)], quick=True)
+    assert not (tmp_path / "out").exists()
+
+
 def test_the_table_has_a_row_for_every_figure_and_says_what_was_not_run(tmp_path, model, monkeypatch):
     study = run(tmp_path / "out", model)
     table = rows(study)

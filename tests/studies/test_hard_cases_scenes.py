@@ -59,12 +59,11 @@ def test_cards_stand_on_the_floor_and_meet_over_the_middle():
 
 
 @pytest.mark.parametrize(
-    ("scene", "count", "layers"),
-    [(scenes.tower(5), 5, 5), (scenes.pyramid(4), 10, 4), (scenes.wall(5, 4), 22, 5)],
-    ids=["tower", "pyramid", "wall"],
+    ("built", "count", "layers"),
+    [("tower", 5, 5), ("pyramid", 10, 4), ("wall", 22, 5)],
 )
-def test_stacks_touch_without_overlap_and_each_body_has_something_below(scene, count, layers):
-    placed = boxes(scene)
+def test_stacks_touch_without_overlap_and_each_body_has_something_below(built, count, layers):
+    placed = boxes({"tower": scenes.tower, "pyramid": scenes.pyramid, "wall": scenes.wall}[built](layers))
     assert len(placed) == count
     for one, other in combinations(placed, 2):
         overlap = np.minimum(one[1], other[1]) - np.maximum(one[0], other[0])

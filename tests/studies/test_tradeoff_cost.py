@@ -13,6 +13,7 @@ from sdfsim.dynamics.model import Model, new_network
 from sdfsim.errors import SdfsimError
 from sdfsim.files import write_json
 from sdfsim.scene.types import Effects
+from sdfsim.studies import tradeoff_growth
 from sdfsim.studies.tradeoff_cost import CostModel, Load, fit_cost, relative_errors, stored_cost
 from sdfsim.studies.tradeoff_estimate import LOOKS, estimate, landings
 from sdfsim.studies.tradeoff_growth import BALL, BOX, Growing, build, curves, slopes
@@ -138,3 +139,23 @@ def test_slopes_are_exponents():
     assert found["pile, bodies"]["time"] == pytest.approx(1.5) and found["pile, bodies"]["memory"] == pytest.approx(0)
     assert found["bowl, bodies"]["time"] == pytest.approx(0, abs=1e-12)
     assert [name for name, _, _ in curves(points)] == ["pile, bodies", "bowl, bodies"]
+
+
+def test_a_study_of_growth_is_resumed_and_says_how_far_off_it_is(tmp_path, monkeypatch):
+    few = [Growing("pile", n, flying=flying) for n in (1, 2, 3, 4) for flying in (False, True)]
+    monkeypatch.setattr(tradeoff_growth, "scenes", lambda *, quick: few)
+    monkeypatch.setattr(tradeoff_growth, "COURSES", ((Growing("pile", 1), 0.0),))
+    monkeypatch.setattr(tradeoff_growth, "COURSE", 8)
+    monkeypatch.setattr(tradeoff_growth, "STEPS", 3)
+    told = []
+    options = {"model": "small", "quick": True, "device": "cpu", "on_progress": lambda *a: told.append(a)}
+    report = tradeoff_growth.growth(tmp_path, **options)
+    assert len(report["held_out"]) == 3 and np.isfinite(list(report["courses"].values())).all()
+    # What the network costs is by far the most of so small a step.
+    assert report["cost"]["touching"] > report["cost"]["base"] > 0
+    assert (tmp_path / "growth.png").stat().st_size > 1000
+    rows, notes = tradeoff_growth.told(report)
+    assert len(rows) == 9 and any(note.startswith("plan's estimate") for note in notes)
+    monkeypatch.setattr(tradeoff_growth, "peak_memory", None)  # what is measured again would need it
+    again = tradeoff_growth.growth(tmp_path, **options)
+    assert again["points"] == report["points"] and again["cost"] == report["cost"]

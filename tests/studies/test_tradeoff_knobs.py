@@ -46,7 +46,14 @@ def test_every_setting_has_a_key_and_a_label_of_its_own():
 
 def test_qualities_leave_machine_and_effects_alone():
     assert for_any_scene(Setting(nodes="thin 64", sdf="grid 64", rounds=3, precision="bf16", reach=0.5))
-    for change in ({"sleep": True}, {"threads": 2}, {"compiled": True}, {"device": "cuda"}):
+    for change in (
+        {"sdf": "exact"},
+        {"nodes": "vertices"},
+        {"sleep": True},
+        {"threads": 2},
+        {"compiled": True},
+        {"device": "cuda"},
+    ):
         assert not for_any_scene(Setting(**change))
 
 

@@ -186,6 +186,7 @@ def test_the_whole_study_in_small(data, tmp_path, monkeypatch):
     only = [Setting(), Setting(nodes="thin 20")]
     monkeypatch.setattr(study, "settings", lambda *_, **__: only)
     monkeypatch.setattr("sdfsim.studies.tradeoff_measure.REPEATS", 2)
+    monkeypatch.setattr("sdfsim.studies.tradeoff_cases.MOST_QUICK", 1)
     monkeypatch.setattr(study, "QUICK_ENGINES", [Engine("PyBullet", 5), Engine("PyBullet", 5, off=1e-3)])
     clips = []
 

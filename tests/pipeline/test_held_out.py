@@ -1,0 +1,119 @@
+"""What is kept out of training, what is recorded while it goes on, and how steps are cut to a budget."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from pipeline.cameras import Sparse, View
+from pipeline.distill import FEWEST_STEPS, paced, train
+from pipeline.held_out import HeldOut
+from pipeline.recipe import PRESETS
+from pipeline.render import sdf_cache
+from tests.pipeline.test_field import SMALL
+
+RED, SIDE = (200, 30, 30), 40
+
+
+def views(count: int) -> list[View]:
+    """Cameras on a ring of radius 3 that look at the origin."""
+    found = []
+    for k in range(count):
+        a = 2 * np.pi * k / count
+        turn = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+        found.append(
+            View(f"{k}.jpg", f"IMG_{k}.JPG", SIDE, SIDE, 50.0, SIDE / 2, SIDE / 2, 0.0, turn, np.array([0, 0, 3.0]))
+        )
+    return found
+
+
+def photos(folder: Path, count: int, *, masks: bool = False) -> None:
+    (folder / "images").mkdir()
+    for k in range(count):
+        Image.new("RGB", (SIDE, SIDE), RED).save(folder / "images" / f"{k}.jpg", quality=98)
+        if masks:
+            (folder / "masks").mkdir(exist_ok=True)
+            row, column = np.mgrid[0:SIDE, 0:SIDE] + 0.5 - SIDE / 2
+            # A ball of radius 0.5 at distance 3 is a disc of radius 50 * 0.5 / sqrt(9 - 0.25).
+            disc = np.hypot(row, column) < 50 * 0.5 / np.sqrt(8.75)
+            Image.fromarray((255 * disc).astype(np.uint8)).save(folder / "masks" / f"{k}.jpg.png")
+
+
+def cloud() -> Sparse:
+    points = np.random.default_rng(0).normal(size=(60, 3)) * 0.4
+    point_of, view_of = np.repeat(np.arange(60), 4), np.tile(np.arange(4), 60)
+    return Sparse(points, np.zeros((60, 3), np.uint8), np.full(60, 0.5), point_of, view_of)
+
+
+def test_training_leaves_renders_scores_and_a_recording(tmp_path):
+    photos(tmp_path, 16)
+    recipe = replace(PRESETS["quick"], size=SMALL, rays=32, samples=12, iterations=40, surface_points=16)
+    report = train(views(16), cloud(), tmp_path, tmp_path, recipe=recipe, threads=1).report
+    assert report["held_out_photos"] == ["IMG_4.JPG", "IMG_12.JPG"]
+    assert len(report["psnr_each"]) == 2 and report["psnr"] == pytest.approx(np.mean(report["psnr_each"]), abs=0.01)
+    for name in ("4.jpg", "12.jpg"):
+        assert Image.open(tmp_path / "held_out" / name).size == (SIDE, SIDE)
+    steps = [entry["step"] for entry in report["snapshots"]]
+    assert steps and steps == sorted(set(steps)) and all("psnr" in entry for entry in report["snapshots"])
+    assert (tmp_path / "training.rrd").read_bytes()[:3] == b"RRF"
+
+
+class Ball:
+    """A trainer whose field is a red ball of radius 0.5, opaque within a thousandth."""
+
+    recipe = SimpleNamespace(long_side=120, samples=48)
+    device, beta = "cpu", 0.001
+
+    def __init__(self) -> None:
+        self.field = SimpleNamespace(
+            background=torch.zeros(1), sdf=lambda p: p.norm(dim=1) - 0.5,
+            geometry_at=lambda p: (p.norm(dim=1) - 0.5, p, p),
+            color_of=lambda geometry, features, directions: torch.tensor(RED).expand(len(geometry), 3) / 255,
+        )  # fmt: skip
+        self.cache = sdf_cache(self.field, 129)  # type: ignore[arg-type]
+
+
+def test_a_field_that_is_right_scores_as_such(tmp_path):
+    """Its silhouettes overlap with the masks, and pixels of the ball are those of the photo."""
+    photos(tmp_path, 2, masks=True)
+    held = HeldOut(views(2), tmp_path, Ball(), masked=True)  # type: ignore[arg-type]
+    seen = held.compare(0)
+    assert seen.overlap is not None and seen.overlap > 0.9
+    assert np.abs(seen.picture[SIDE // 2, SIDE // 2].astype(int) - RED).max() <= 2
+    # Outside the ball the photo is red and the render is the backdrop: the error of that share of pixels.
+    inside = np.hypot(*(np.mgrid[0:SIDE, 0:SIDE] + 0.5 - SIDE / 2)) < 50 / np.sqrt(8)  # of the unit sphere
+    ball = np.hypot(*(np.mgrid[0:SIDE, 0:SIDE] + 0.5 - SIDE / 2)) < 50 * 0.5 / np.sqrt(8.75)
+    wrong = ((np.array(RED) / 255 - 0.5) ** 2).mean() * (inside & ~ball).sum() / inside.sum()
+    assert seen.psnr == pytest.approx(-10 * np.log10(wrong), abs=0.5)
+
+
+def trainer(iteration: int, iterations: int) -> SimpleNamespace:
+    return SimpleNamespace(iteration=iteration, iterations=iterations)
+
+
+@pytest.mark.parametrize(
+    ("iteration", "iterations", "elapsed", "expected"),
+    [
+        (500, 1000, 50.0, 1000),  # as planned
+        (500, 1000, 80.0, 900),  # slower: 625 would fit, but schedules must not jump
+        (500, 1000, 30.0, 1100),  # faster
+        (500, 1000, 101.0, 500),  # over: ends at once
+        (1700, 1790, 10.0, 1800),  # never more than the recipe's
+    ],
+)
+def test_steps_follow_the_clock(iteration, iterations, elapsed, expected):
+    found = paced(trainer(iteration, iterations), PRESETS["quick"], 100.0, elapsed, iteration)  # type: ignore[arg-type]
+    assert found == expected
+
+
+def test_a_budget_that_is_far_too_small_still_ends_with_a_field(tmp_path):
+    photos(tmp_path, 4)
+    recipe = replace(PRESETS["quick"], size=SMALL, rays=16, samples=12, surface_points=16)
+    report = train(views(4), cloud(), tmp_path, tmp_path, recipe=recipe, threads=1, budget=1e-3).report
+    assert report["iterations"] <= FEWEST_STEPS and (tmp_path / "field.safetensors").exists()

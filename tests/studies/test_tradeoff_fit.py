@@ -1,0 +1,59 @@
+"""Fits against their budgets: what ended by itself is not made again, what failed stays, what is there is kept."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from sdfsim.errors import SdfsimError
+from sdfsim.shape import primitives
+from sdfsim.studies import tradeoff_fit
+from sdfsim.studies.tradeoff import run
+from sdfsim.studies.tradeoff_fit import ERRORS, QUICK_BUDGETS, fit_tradeoff, told
+
+
+@pytest.fixture
+def meshes(tmp_path):
+    found = {}
+    for name in ("cube", "bad"):
+        box = primitives.box()
+        lines = [f"v {x} {y} {z}" for x, y, z in box.vertices] + [f"f {a} {b} {c}" for a, b, c in box.faces + 1]
+        (tmp_path / f"{name}.obj").write_text("\n".join(lines))
+        found[name] = tmp_path / f"{name}.obj"
+    return found
+
+
+@pytest.fixture
+def fits(monkeypatch):
+    """The budgets that were asked for; a fit here takes 7 s at most, by a clock of its own."""
+    asked, clock = [], SimpleNamespace(now=0.0)
+
+    def fit_mesh(mesh, *, name, budget):
+        asked.append((name, budget))
+        clock.now += min(budget, 7.0)
+        if name == "bad":
+            raise SdfsimError("no inside")
+        errors = dict.fromkeys(ERRORS, 0.01 / min(budget, 7.0))
+        return SimpleNamespace(certificate=errors | {"hausdorff": 0.1, "passed": budget > 6, "reason": "x", "steps": 9})
+
+    monkeypatch.setattr(tradeoff_fit, "fit_mesh", fit_mesh)
+    monkeypatch.setattr(tradeoff_fit.time, "monotonic", lambda: clock.now)
+    return asked
+
+
+def test_fits_are_made_once_and_failures_stay(meshes, fits, tmp_path):
+    out = tmp_path / "out"
+    report = fit_tradeoff(meshes, out, quick=True, on_progress=lambda *_: None)
+    # The cube's fit ends by itself at 7 of 10 s, so that 20 s would change nothing; the bad mesh fails each time.
+    assert fits == [("cube", 5.0), ("cube", 10.0), *(("bad", b) for b in QUICK_BUDGETS)]
+    cube = [p for p in report["points"] if p["name"] == "cube"]
+    assert [p["ended_by_itself"] for p in cube] == [False, False, True]
+    assert [p["error_within_0.01"] for p in cube] == pytest.approx([0.002, 0.01 / 7, 0.01 / 7])
+    assert [p["failed"] for p in report["points"] if p["name"] == "bad"] == ["no inside"] * 3
+    assert (out / "fit.png").stat().st_size > 1000 and (out / "fit.csv").read_text().count("\n") == 7
+    rows, _ = told(report)
+    assert rows[1][-1] == "missed: x" and rows[2][-1] == "met" and "no inside" in rows[4]
+    fits.clear()
+    again, _, _ = run(tmp_path, out, models=[], quick=True, on_progress=lambda *_: None)
+    assert fits == [] and [p["name"] for p in again["points"]][:1] == ["bad"]  # a folder's meshes, by name
