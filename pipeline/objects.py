@@ -231,7 +231,7 @@ def _body(volume: Volume, standing: np.ndarray, box: tuple[slice, ...], mine: np
     points = np.stack(np.meshgrid(a, b, indexing="ij"), -1).reshape(-1, 2) @ frame[:2]
     points += (level.height + layer) * level.normal
     cut = ((volume.at(points) < 0) & body.owns(points)).reshape(len(a), len(b))
-    return replace(body, hollow=ndimage.binary_fill_holes(cut) & ~cut, corner=flat.min(0))
+    return replace(body, hollow=np.asarray(ndimage.binary_fill_holes(cut)) & ~cut, corner=flat.min(0))
 
 
 def body_mesh(body: Body, field: Distance, cell: float) -> Mesh:

@@ -369,7 +369,7 @@ def test_a_hint_follows_the_error(scene, monkeypatch):
 @pytest.mark.parametrize("option", ["--json", "--device", "--verbose"])
 def test_every_command_takes_the_common_options(option):
     commands = [c.name or c.callback.__name__ for c in cli.app.registered_commands if c.callback]
-    assert len(commands) == 12
+    assert len(commands) == 14
     for command in commands:
         assert option in run(command, "--help").stdout, command
 

@@ -111,7 +111,8 @@ def load_model(name: str | Path | None = None, *, weights: bool = True) -> Model
         with safe_open(path, framework="pt") as file:
             info = json.loads((file.metadata() or {})["sdfsim_model"])
             config = info.pop("config")
-            _check_size(info["kind"], config, {k: file.get_slice(k).get_shape() for k in file.keys()})
+            if weights:
+                _check_size(info["kind"], config, {k: file.get_slice(k).get_shape() for k in file.keys()})
             network = Unread() if not weights else new_network(info["kind"], config)
             network.load_state_dict({k: file.get_tensor(k) for k in file.keys()} if weights else {})
         model = Model(name=path.stem, network=network, **info)

@@ -14,4 +14,5 @@ RATCHET = Path(__file__).resolve().parents[2] / "benchmarks" / "hard_cases_ratch
 
 @pytest.mark.slow
 def test_no_bundled_model_is_worse_than_was_accepted(tmp_path):
+    assert RATCHET.exists(), "write it: python benchmarks/hard_cases.py -o DIR --quick"
     assert slipped_back(stress(tmp_path, quick=True), RATCHET) == []
