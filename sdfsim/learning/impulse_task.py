@@ -130,6 +130,7 @@ class ImpulseTask:
             "friction": _product(body(f.friction, FLOOR[0]), index),
             "restitution": _product(body(f.restitution, FLOOR[1]), index),
         }
+        point = arm - 0.5 * gap[:, None] * normal
         graph = ContactGraph(
             inverse_mass=torch.where(moves, 1.0 / mass.clamp_min(1e-9), torch.zeros_like(mass)),
             inverse_inertia=inverse_inertia,
@@ -144,8 +145,8 @@ class ImpulseTask:
             pair=pair,
             pairs=pairs,
             normal=normal,
-            arm_first=arm,
-            arm_second=arm + other,
+            arm_first=point,
+            arm_second=point + other,
             gap=gap,
             shell=SHELL * _nearer(body(f.disc, np.inf), index),
             dt=f.dt,

@@ -30,6 +30,7 @@ CPU = torch.device("cpu")
 
 def test_cached_frames_equal_the_simulators_own_graph(ball_data):
     """A batch drawn from the cache is the graph that a step would build from the recorded state."""
+    from sdfsim.dynamics.contacts import thin_contacts
     from sdfsim.learning.dataset import Trajectory, load_shapes
 
     cached = contact_frames(ball_data, "train", 0.1)
@@ -40,7 +41,7 @@ def test_cached_frames_equal_the_simulators_own_graph(ball_data):
     found = []
     for frame in range(len(first.position) - 1):
         _, state = merged([first], [frame], shapes, Units(1.0, 1.0, 1.0), CPU)
-        contacts = find_contacts(bodies, state, rules.gravity, 0.1, first.dt, thin=True)
+        contacts = thin_contacts(bodies, find_contacts(bodies, state, rules.gravity, 0.1, first.dt))
         if len(contacts):
             found.append(contact_graph(bodies, state, fly(bodies, state, rules), contacts, rules)[1])
     task = ImpulseTask(cached, CPU, None)
