@@ -79,7 +79,7 @@ VARIANTS = [
     Variant("as the preset *small*"),
     Variant("Adam alone, no Muon", replace(SMALL, matrix_rate=None)),
     Variant("no noise", noise=None),
-    Variant("noise of 1.5 mm and 15 mm/s", noise=Noise(0.0015, 0.015)),
+    Variant("noise of 0.3 mm and 3 mm/s", noise=Noise(0.0003, 0.003)),
     Variant("squared error", task=Squared),
     Variant("32 wide, 6 rounds", sized(32, 6)),
     Variant("64 wide, 3 rounds", sized(64, 3)),

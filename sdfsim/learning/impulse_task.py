@@ -28,8 +28,8 @@ class Noise:
         speed: m/s, of its velocity, and of its surface by spinning.
     """
 
-    shift: float = 0.0003
-    speed: float = 0.003
+    shift: float = 0.0015
+    speed: float = 0.015
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class ImpulseTask:
         return {
             "size": _span(f.size[moving]),
             "speed": [0.0, float(np.percentile(speed, 99.9))],
-            "mass_ratio": [1.0, float(f.mass[moving].max() / f.mass[moving].min())],
+            "mass_ratio": [1.0, _mass_ratio(f)],
             "friction": product_range(f.friction, FLOOR[0]),
             "restitution": product_range(f.restitution, FLOOR[1]),
         }
@@ -219,6 +219,13 @@ def _disturbed(batch: Batch, noise: Disturbance) -> Batch:
 
 def _span(values: np.ndarray) -> list[float]:
     return [float(values.min()), float(values.max())]
+
+
+def _mass_ratio(f: ContactFrames) -> float:
+    """The largest ratio of two masses that move in one frame."""
+    heaviest = np.maximum.reduceat(f.mass, f.body_start[:-1])
+    lightest = np.minimum.reduceat(np.where(f.mass > 0, f.mass, np.inf), f.body_start[:-1])
+    return float((heaviest / lightest)[heaviest > 0].max())
 
 
 def _huber(error: Tensor) -> Tensor:

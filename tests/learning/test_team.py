@@ -51,5 +51,5 @@ def test_two_processes_give_the_first_steps_of_one(ball_data, tmp_path):
     trained = [name for name in one if name.startswith("network/")]
     difference = np.concatenate([np.abs(one[name] - two[name]).ravel() for name in trained])
     start = np.concatenate([np.abs(one[name] - one[name.replace("network", "average")]).ravel() for name in trained])
-    # Sums in another order differ by rounding, which Adam's first steps make visible where a gradient is next to zero.
-    assert np.quantile(difference, 0.99) < 1e-5 < 1e-4 < start.max()
+    # Sums in another order differ by rounding, which first steps make visible where a gradient is next to zero.
+    assert start.max() > 1e-4 and np.quantile(difference, 0.99) < 0.05 * start.max()
