@@ -141,13 +141,14 @@ def _loop(run: Run, held_out: Task, rollouts: Rollouts | None, out: Path, tell: 
             started = time.monotonic()
             with _uninterrupted():
                 run.advance()
-            run.seconds += time.monotonic() - started
+                run.seconds += time.monotonic() - started
+                due = run.step % min(1000, max(1, run.total // 10)) == 0 or run.step == run.total
+                if run.team.leads and due:  # a step's line in the log is part of it
+                    _log(run, held_out, rollouts, out / "log.jsonl")
             if not run.team.leads:
                 continue
             if run.step % LOG_STEPS == 0:
                 tell(run.step / run.total, f"step {run.step}, loss {run.loss:.4f}")
-            if run.step % min(1000, max(1, run.total // 10)) == 0 or run.step == run.total:
-                _log(run, held_out, rollouts, out / "log.jsonl")
             if time.monotonic() - saved > CHECKPOINT_SECONDS:
                 run.save(out / "checkpoint.npz")
                 saved = time.monotonic()
