@@ -6,6 +6,7 @@ outside it is a background of its own on contracted coordinates (Barron et al., 
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -82,7 +83,7 @@ def sample_grid(grid: Tensor, points: Tensor) -> Tensor:
     return found.view(grid.shape[1], -1).t()
 
 
-class Field(nn.Module):
+class Field(nn.Module, ABC):
     """SDF and colour in the unit sphere, and a background outside; what both encodings have in common.
 
     Attributes:
@@ -100,17 +101,17 @@ class Field(nn.Module):
     view_dependence: float = 1.0
 
     @property
+    @abstractmethod
     def finest(self) -> float:
         """Size of the smallest detail, normalised units."""
-        raise NotImplementedError
 
+    @abstractmethod
     def geometry_at(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """SDF [P] and two kinds of features [P, F] for `color_of` at points [P, 3] of normalised space."""
-        raise NotImplementedError
 
+    @abstractmethod
     def color_of(self, geometry: Tensor, features: Tensor, directions: Tensor) -> Tensor:
         """RGB [P, 3] in 0..1 seen along unit directions [P, 3]."""
-        raise NotImplementedError
 
     def sdf(self, points: Tensor) -> Tensor:
         """Signed distance [P] in normalised units at points [P, 3]."""
