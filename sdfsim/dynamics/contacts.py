@@ -22,7 +22,7 @@ _ICOSAHEDRON = [
     for axis in ((0.0, a, b * _GOLDEN) for a in (-1.0, 1.0) for b in (-1.0, 1.0))
 ]
 
-ARRAYS = ("owner", "node", "body", "arm", "distance", "normal", "ahead")
+ARRAYS = ("owner", "node", "body", "arm", "foot", "distance", "normal", "ahead")
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,8 @@ class Contacts:
         owner: [E] int64, the body whose node it is.
         node: [E] int64, index into `Bodies.node`.
         body: [E] int64, the body it meets.
-        arm: [E, 3] float64, from the owner's centre of mass to the node.
+        arm: [E, 3] float64, from the owner's centre of mass to midway between the node and the closest point.
+        foot: [E, 3] float64, to there from the centre of mass of `body`.
         distance: [E] float64, signed distance of the node from `body`.
         normal: [E, 3] float64, unit outward normal of `body` at the closest point.
         ahead: [E] float64, the distance there will be after the step if the node keeps closing in.
@@ -45,6 +46,7 @@ class Contacts:
     node: Tensor
     body: Tensor
     arm: Tensor
+    foot: Tensor
     distance: Tensor
     normal: Tensor
     ahead: Tensor
@@ -81,6 +83,8 @@ def find_contacts(
         rows: look at no more than that many nodes at once (but at all of a body's), None for `PIECE`.
         thin: keep few edges a pair. They are chosen piece by piece, so that all are never there at once.
     """
+    from sdfsim.dynamics.impact import at_impact
+
     memory = memory or Memory()
     with memory.timed("pairs_ms"):
         going, still = memory.surroundings(bodies, state, gravity, reach, dt)
@@ -94,7 +98,7 @@ def find_contacts(
         parts = []
         for pairs in zip(first.split(cuts), second.split(cuts), approach.split(cuts), strict=True):
             part = _edges(bodies, state, gravity, reach, dt, Pairs(bodies, state, *pairs), memory)
-            parts.append(thin_contacts(bodies, part) if thin else part)
+            parts.append(thin_contacts(bodies, at_impact(bodies, state, gravity, dt, part)) if thin else part)
         memory.turn()
         found = _joined(parts)
     near = number_pairs(first, second, len(bodies))[1]
@@ -140,14 +144,15 @@ def _edges(
     owner, other, node = pairs.first[pair], pairs.second[pair], tree[-1].node[item]
     arm = pose.rotate(state.orientation[owner], bodies.node[node])
     offset = state.position[owner] - state.position[other] + arm
-    normal = pose.rotate(state.orientation[other], _unit(gradient, local))
+    normal = pose.rotate(state.orientation[other], unit(gradient, local))
     velocity = node_velocity(state, owner, arm) + gravity * dt * bodies.moves[owner, None]
     arm_other = offset - distance[:, None] * normal
     velocity = velocity - node_velocity(state, other, arm_other) - gravity * dt * bodies.moves[other, None]
     closing = (velocity * normal).sum(-1).clamp_max(0.0)
     ahead = distance + closing * dt
     touching = (ahead <= reach).nonzero()[:, 0]
-    found = dict(zip(ARRAYS, (owner, node, other, arm, distance, normal, ahead), strict=True))
+    half = 0.5 * distance[:, None] * normal
+    found = dict(zip(ARRAYS, (owner, node, other, arm - half, offset - half, distance, normal, ahead), strict=True))
     return Contacts(**{k: v[touching] for k, v in found.items()}, queries=queries, waiting=waiting)
 
 
@@ -190,7 +195,8 @@ def no_contacts(bodies: Bodies) -> Contacts:
     """None at all."""
     index = torch.zeros(0, dtype=torch.int64, device=bodies.device)
     number = torch.zeros(0, dtype=torch.float64, device=bodies.device)
-    return Contacts(index, index, index, number[:, None].expand(0, 3), number, number[:, None].expand(0, 3), number)
+    empty = number[:, None].expand(0, 3)
+    return Contacts(index, index, index, empty, empty, number, empty, number)
 
 
 def _cuts(bodies: Bodies, first: Tensor, rows: int) -> list[int]:
@@ -246,7 +252,7 @@ def _approach(bodies: Bodies, state: State, gravity: Tensor, owner: Tensor, othe
     return (relative + turn) * dt + gravity.norm() * dt * dt
 
 
-def _unit(gradient: Tensor, fallback: Tensor) -> Tensor:
+def unit(gradient: Tensor, fallback: Tensor) -> Tensor:
     """Gradients as unit normals; where one vanishes, the direction from the body's centre, else straight up."""
     up = torch.tensor([0.0, 0.0, 1.0], dtype=gradient.dtype, device=gradient.device).expand_as(gradient)
     length = gradient.norm(dim=-1, keepdim=True)

@@ -177,8 +177,6 @@ def contact_graph(
     inverse_inertia = rotation @ torch.linalg.inv(bodies.inertia[active]) @ rotation.mT
     turns = bodies.moves[active] if rules.rotation else torch.zeros_like(bodies.moves[active])
     inverse_inertia = inverse_inertia * turns[:, None, None]
-    point = contacts.arm - 0.5 * contacts.distance[:, None] * contacts.normal
-    between = state.position[contacts.owner] - state.position[contacts.body]
     turn = pose.to_rotvec(pose.multiply(free.orientation[active], pose.conjugate(state.orientation[active])))
     nothing = torch.zeros_like(contacts.distance)
     # Masses enter as ratios only; relative to the heaviest they stay within single precision.
@@ -197,8 +195,8 @@ def contact_graph(
         pair=pair,
         pairs=pairs,
         normal=contacts.normal.float(),
-        arm_first=point.float(),
-        arm_second=(point + between).float(),
+        arm_first=contacts.arm.float(),
+        arm_second=contacts.foot.float(),
         gap=contacts.distance.float(),
         shell=(SHELL * torch.minimum(bodies.disc[contacts.owner], bodies.disc[contacts.body])).float(),
         friction=(_product(bodies.friction, contacts) if rules.friction else nothing).float(),

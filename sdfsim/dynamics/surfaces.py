@@ -93,7 +93,7 @@ def _contact_features(bodies: Bodies, state: State, contacts: Contacts) -> Tenso
     """
     c = contacts
     to_closest = -c.distance[:, None] * c.normal
-    seen = state.position[c.owner] + c.arm - state.position[c.body]
+    seen = c.foot + 0.5 * c.distance[:, None] * c.normal
     bounded = bodies.size[c.body].isfinite()[:, None]
     seen = torch.where(bounded, seen, -to_closest)
     closest = seen + to_closest

@@ -25,7 +25,7 @@ from sdfsim.learning.dataset import Trajectory, load_shapes, trajectory_files
 from sdfsim.learning.instants import at_instants, engine_substep
 from sdfsim.parallel import parallel
 
-FRAMES_VERSION = 3  # counts up whenever frames of the same recordings come out differently
+FRAMES_VERSION = 4  # counts up whenever frames of the same recordings come out differently
 
 
 @dataclass(frozen=True)
@@ -44,8 +44,8 @@ class ContactFrames:
         mass: [B] kg, 0 for static bodies; inertia: [B, 3]; friction, restitution, size: [B];
             disc: [B] m, radius about the centre of mass (`bodies.disc`).
         first, second: [E] int16, bodies within the frame.
-        arm: [E, 3] m, from the first body's centre of mass to its node.
-        other: [E, 3] m, first body's centre of mass from the second's (from the floor's origin below it).
+        arm: [E, 3] m, from the first body's centre of mass to the point of contact.
+        other: [E, 3] m, what leads to there from the second's (from the floor's origin), less `arm`.
         normal: [E, 3]; gap: [E] m.
         dt: s; gravity: [3] m/s^2; reach: m, the contact radius used.
     """

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from sdfsim.dynamics.bodies import Bodies, State, Units, from_scene
-from sdfsim.dynamics.contacts import find_contacts, thin_contacts
+from sdfsim.dynamics.contacts import find_contacts
 from sdfsim.learning.dataset import FLOOR, Trajectory
 from sdfsim.scene.types import Body, Scene
 from sdfsim.shape.asset import Shape, analytic_shape
@@ -79,7 +79,7 @@ def find_edges(trajectory: Trajectory, shapes: dict[str, Shape], reach: float) -
 def _edges(t: Trajectory, frames: list[int], shapes: dict[str, Shape], reach: float) -> dict[str, np.ndarray]:
     bodies, state = merged([t] * len(frames), frames, shapes, Units(1.0, 1.0, 1.0), torch.device("cpu"))
     gravity = torch.from_numpy(np.asarray(t.gravity, dtype=np.float64))
-    contacts = thin_contacts(bodies, find_contacts(bodies, state, gravity, reach, t.dt))
+    contacts = find_contacts(bodies, state, gravity, reach, t.dt, thin=True)
     per_world = t.position.shape[1]
     floor = len(bodies) - 1
     order = torch.argsort(contacts.owner // per_world, stable=True)
@@ -89,7 +89,7 @@ def _edges(t: Trajectory, frames: list[int], shapes: dict[str, Shape], reach: fl
         "first": (owner % per_world).numpy(),
         "second": torch.where(other == floor, -1, other % per_world).numpy(),
         "arm": contacts.arm[order].numpy(),
-        "other": (state.position[owner] - state.position[other]).numpy(),
+        "other": (contacts.foot - contacts.arm)[order].numpy(),
         "normal": contacts.normal[order].numpy(),
         "gap": contacts.distance[order].numpy(),
     }

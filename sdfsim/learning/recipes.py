@@ -43,7 +43,7 @@ DENSITIES = (0.1, 10.0)  # log-uniform
 MASS_RATIO = 100.0  # at most, within one scene
 OBSTACLES = {"obstacle_bowl": "bowl", "obstacle_torus": "torus", "obstacle_gear": "gear"}
 OBSTACLE_EXTENTS = (2.0, 4.0)  # m
-RESTING_SHARE, OBSTACLE_SHARE = 1 / 3, 0.3
+RESTING_SHARE, OBSTACLE_SHARE = 0.5, 0.3
 
 Placed = list[tuple[ShapeSource, TeacherBody]]
 

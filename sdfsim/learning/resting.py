@@ -9,10 +9,11 @@ from scipy.spatial.transform import Rotation
 from sdfsim.learning.shapes import ShapeSource
 from sdfsim.learning.teacher import Teacher, TeacherBody
 
-STARTS = ("still", "dropped", "nudged")
+STARTS = ("still", "dropped", "nudged", "pressed")
 GAP = 1e-3  # m, under a body that is put down
 DROP = 0.1  # m, at most, under one that is dropped
 NUDGE = 0.3  # m/s, at most, along x and along y
+PRESSED = 0.08  # of its extent: how far at most a body is moved into what is around it, along each axis
 FIELD = 3.0  # m, half the side of the square of floor that is used
 STACKED = 0.5  # part of the bodies that go on top of the one before
 STEADY = 0.03  # least distance of the centre of mass from the rim of the face it stands on, over the largest extent
@@ -21,7 +22,9 @@ STEADY = 0.03  # least distance of the centre of mass from the rim of the face i
 def at_rest(
     teacher: Teacher, rng: np.random.Generator, bodies: list[tuple[ShapeSource, TeacherBody]], start: str, tries: int
 ) -> bool:
-    """Put bodies down without overlaps: all at rest, all dropped from `DROP` at most, or all given a nudge.
+    """Put bodies down: all at rest, all dropped from `DROP` at most, all given a nudge, or pressed into one another.
+
+    Only the last overlap; from them is learned how bodies part.
 
     Args:
         teacher: the world; the bodies come after those that it has.
@@ -34,6 +37,7 @@ def at_rest(
         False when one found no room.
     """
     below, top = np.zeros(2), 0.0
+    placed = []
     for number, (source, body) in enumerate(bodies):
         index = teacher.add(body)
         for _ in range(tries):
@@ -47,9 +51,13 @@ def at_rest(
                 break
         else:
             return False
+        placed.append((index, position, rotation.as_quat()))
         below, top = position[:2], high
         if start == "nudged":
             teacher.push(index, np.array([*rng.uniform(-NUDGE, NUDGE, 2), 0.0]), np.zeros(3))
+    if start == "pressed":
+        for (_, body), (index, position, quat) in zip(bodies, placed, strict=True):
+            teacher.place(index, position + rng.uniform(-PRESSED, PRESSED, 3) * body.scale, quat)
     return True
 
 

@@ -15,7 +15,7 @@ from sdfsim.learning.frames import contact_frames
 from sdfsim.learning.generate import GRAVITY, make_dataset, make_trajectory
 from sdfsim.learning.impulse_task import ImpulseTask
 from sdfsim.learning.recipes import BALL, MASS_RATIO, OBSTACLES, RECIPES, WALL, Cast
-from sdfsim.learning.resting import DROP, NUDGE, STARTS, at_rest, steady_faces
+from sdfsim.learning.resting import DROP, NUDGE, PRESSED, STARTS, at_rest, steady_faces
 from sdfsim.learning.shapes import Origin, prepare
 from sdfsim.learning.statistics import statistics, statistics_lines
 from sdfsim.learning.teacher import Teacher, TeacherBody
@@ -79,19 +79,20 @@ def test_a_pile_starts_apart_at_rest_and_falls_onto_the_floor(cast):
     assert min(counts) >= 5 and max(counts) <= 30 and len(counts) > 5
 
 
-def test_varied_scenes_keep_to_their_ranges_and_start_clear_of_each_other(cast):
-    resting = obstacles = 0
+def test_varied_scenes_keep_to_their_ranges_and_few_start_in_each_other(cast):
+    resting = obstacles = pressed = 0
     for seed in range(40):
         placed, start, inside = spawned("varied", seed, cast)
         moving = [body for _, body in placed if body.mass > 0]
         masses = [body.mass for body in moving]
         assert max(masses) / min(masses) <= MASS_RATIO * (1 + 1e-9) and 3 <= len(moving) <= 10
         assert all(0 <= b.friction <= 1 and 0 <= b.restitution <= 0.9 for _, b in placed)
-        assert not any(inside)
+        pressed += any(inside)
         assert {s.name for s, b in placed if b.mass == 0} <= set(OBSTACLES)
         resting += bool((np.abs(start["velocity"]) <= NUDGE).all())
         obstacles += len(placed) - len(moving)
-    assert 6 <= resting <= 21 and 5 <= obstacles <= 20
+    assert 12 <= resting <= 28 and 5 <= obstacles <= 20
+    assert 1 <= pressed <= 10
 
 
 @pytest.mark.parametrize("start", STARTS)
@@ -103,7 +104,9 @@ def test_resting_starts_are_low_and_slow_and_still_cubes_stay(cast, start):
         assert at_rest(teacher, np.random.default_rng(1), bodies[::-1], start, 100)
         motion = teacher.run(50)
     lowest = motion["position"][0, :, 2] - 0.5 * np.array([b.scale for _, b in bodies[::-1]])
-    assert lowest.min() > 0 and lowest.min() <= DROP
+    pressed = PRESSED if start == "pressed" else 0.0
+    assert -pressed < lowest.min() <= DROP + pressed
+    assert (lowest.min() < 0) == (start == "pressed")
     assert np.abs(motion["velocity"][0]).max() <= NUDGE
     moved = np.linalg.norm(motion["position"] - motion["position"][0], axis=-1).max()
     assert moved < 0.005 if start == "still" else moved > 0.005

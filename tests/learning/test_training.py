@@ -30,7 +30,6 @@ CPU = torch.device("cpu")
 
 def test_cached_frames_equal_the_simulators_own_graph(ball_data):
     """A batch drawn from the cache is the graph that a step would build from the recorded state."""
-    from sdfsim.dynamics.contacts import thin_contacts
     from sdfsim.learning.dataset import Trajectory, load_shapes
 
     cached = contact_frames(ball_data, "train", 0.1)
@@ -41,7 +40,7 @@ def test_cached_frames_equal_the_simulators_own_graph(ball_data):
     found = []
     for frame in range(len(first.position) - 1):
         _, state = merged([first], [frame], shapes, Units(1.0, 1.0, 1.0), CPU)
-        contacts = thin_contacts(bodies, find_contacts(bodies, state, rules.gravity, 0.1, first.dt))
+        contacts = find_contacts(bodies, state, rules.gravity, 0.1, first.dt, thin=True)
         if len(contacts):
             found.append(contact_graph(bodies, state, fly(bodies, state, rules), contacts, rules)[1])
     task = ImpulseTask(cached, CPU, None)
@@ -79,6 +78,20 @@ def test_noise_moves_gaps_by_the_normal_displacement_and_corrects_the_target(bal
     expected = (moved * a.graph.normal).sum(-1)[floor]
     torch.testing.assert_close((b.graph.gap - a.graph.gap)[floor], expected, rtol=1e-3, atol=1e-7)
     assert shift.abs().max() > 1e-4
+
+
+def test_every_frame_is_disturbed_by_a_part_of_the_noise_from_the_least_to_all(ball_data):
+    frames = contact_frames(ball_data, "train", 0.1)
+    noise = Noise(shift=1.0, speed=10.0, least=0.01)
+    picked = np.arange(4000) % len(frames)
+    drawn = ImpulseTask(frames, CPU, noise)._noise(picked, np.random.default_rng(0), ALONE)
+    counts = np.diff(frames.body_start)[picked]
+    starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    draws = np.concatenate([drawn.shift.numpy()[:-1], drawn.push.numpy()[:-1] / 10.0], axis=1)
+    size = np.sqrt(np.add.reduceat(np.square(draws).mean(1), starts) / counts)
+    # The logarithm of a part is uniform, so of 4,000 a quarter is in each fourth of its range, but for chi^2 of draws.
+    share = np.histogram(np.log(size) / np.log(0.01), bins=[-1.0, 0.25, 0.5, 0.75, 2.0])[0] / len(picked)
+    np.testing.assert_allclose(share, 0.25, atol=0.05)
 
 
 @pytest.mark.parametrize("preset", ["tiny", "tiny-paper"])
