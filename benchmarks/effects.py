@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from sdfsim import Simulator, load_scene
-from sdfsim.dynamics.contacts import find_contacts, thin_contacts
+from sdfsim.dynamics.contacts import find_contacts
 from sdfsim.dynamics.model import load_model
 from sdfsim.dynamics.simulator import SimulationError
 from sdfsim.dynamics.sleep import STEPS as SLEEP_STEPS
@@ -166,7 +166,7 @@ def frictionless(steps: int) -> list[tuple[str, str, str]]:
     ms = timed([one, other], max(5, steps // 3))
     free = fly(one.bodies, one.state, one.rules)
     reach, dt = one.model.reach, one.rules.dt
-    contacts = thin_contacts(one.bodies, find_contacts(one.bodies, one.state, one.rules.gravity, reach, dt))
+    contacts = find_contacts(one.bodies, one.state, one.rules.gravity, reach, dt, thin=True)
     graph = contact_graph(one.bodies, one.state, free, contacts, one.rules)[1]
     with torch.no_grad():
         left, full = one.model.network(graph, friction=False), one.model.network(graph, friction=True)

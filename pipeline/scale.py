@@ -12,6 +12,7 @@ import numpy as np
 from PIL import ExifTags, Image
 
 from pipeline.cameras import View
+from pipeline.photo_file import FORMATS
 from pipeline.visibility import Caster
 from pipeline.wishes import Known
 from sdfsim.errors import SdfsimError
@@ -91,7 +92,7 @@ def source_of(photos: Path, view: View) -> Path:
 def source_size(path: Path, otherwise: tuple[int, int]) -> tuple[int, int]:
     """Width and height of a photo as it is shown upright; of frames of a video, which are no files, `otherwise`."""
     try:
-        with Image.open(path) as image:
+        with Image.open(path, formats=FORMATS) as image:
             turned = image.getexif().get(ExifTags.Base.Orientation, 1) >= 5
             return (image.height, image.width) if turned else image.size
     except (OSError, SyntaxError, ValueError):
@@ -125,7 +126,7 @@ class _Exif:
 
 def _exif(path: Path) -> _Exif:
     try:
-        with Image.open(path) as image:
+        with Image.open(path, formats=FORMATS) as image:
             exif = image.getexif()
         subject = float(exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.SubjectDistance) or 0)
         gps, tag = exif.get_ifd(ExifTags.IFD.GPSInfo), ExifTags.GPS

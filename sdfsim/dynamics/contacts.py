@@ -56,6 +56,10 @@ class Contacts:
     def __len__(self) -> int:
         return len(self.owner)
 
+    def only(self, rows: Tensor) -> Contacts:
+        """The edges `rows` [K] of them."""
+        return replace(self, **{name: getattr(self, name)[rows] for name in ARRAYS})
+
 
 def find_contacts(
     bodies: Bodies,
@@ -153,7 +157,7 @@ def _edges(
     touching = (ahead <= reach).nonzero()[:, 0]
     half = 0.5 * distance[:, None] * normal
     found = dict(zip(ARRAYS, (owner, node, other, arm - half, offset - half, distance, normal, ahead), strict=True))
-    return Contacts(**{k: v[touching] for k, v in found.items()}, queries=queries, waiting=waiting)
+    return Contacts(**found, queries=queries, waiting=waiting).only(touching)
 
 
 def _sift(
@@ -235,9 +239,7 @@ def thin_contacts(bodies: Bodies, contacts: Contacts) -> Contacts:
     number = torch.arange(edges, device=score.device)[:, None].expand_as(score)
     number = torch.where(score >= best[pair], number, edges)
     winner = torch.full((pairs, score.shape[1]), edges, device=score.device).scatter_reduce(0, group, number, "amin")
-    kept = torch.unique(winner)
-    arrays = {k: getattr(contacts, k)[kept] for k in ARRAYS}
-    return replace(contacts, **arrays)
+    return contacts.only(torch.unique(winner))
 
 
 def node_velocity(state: State, body: Tensor, arm: Tensor) -> Tensor:

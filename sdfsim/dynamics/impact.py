@@ -66,6 +66,8 @@ def _once(bodies: Bodies, state: State, gravity: Tensor, dt: float, contacts: Co
     before = before + pose.rotate(state.orientation[owner], bodies.node[c.node[row]])
     before = pose.rotate(pose.conjugate(state.orientation[other]), before)
     start = distance + (outward * (before - local)).sum(-1)
+    # An edge that opens until then was not inside before: only the plane that stands for the surface is.
+    start = torch.maximum(start, torch.minimum(distance, c.distance[row]))
     normal = pose.rotate(other_turn, outward)
     half = 0.5 * distance[:, None] * normal
     ahead = torch.minimum(start, start + (distance - start) * dt / when[:, 0])

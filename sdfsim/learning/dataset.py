@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -78,6 +79,7 @@ class Trajectory:
         return cls(**arrays)
 
 
+_NAME = re.compile(r"(?!\.)[\w. -]+")  # of a folder beside others, never a path
 _TRAILING = {"position": (3,), "quat_xyzw": (4,), "velocity": (3,), "angular_velocity": (3,)}
 _PER_BODY = {"scale": (), "mass": (), "inertia": (3,), "friction": (), "restitution": (), "static": (), "shape": ()}
 
@@ -101,6 +103,8 @@ def _check(path: Path, arrays: dict) -> None:
         raise SdfsimError(f"{path}: position: needs at least two frames (got {frames})")
     if np.abs(np.linalg.norm(arrays["quat_xyzw"], axis=-1) - 1.0).max(initial=0.0) > 1e-3:
         raise SdfsimError(f"{path}: quat_xyzw: must be unit quaternions")
+    if outside := [name for name in arrays["shape"] if not _NAME.fullmatch(str(name))]:
+        raise SdfsimError(f"{path}: shape: {outside[0]!r} is no name of a Shape folder", "letters, digits, . _ - only")
     if not (arrays["scale"] > 0).all() or not arrays["dt"] > 0:
         raise SdfsimError(f"{path}: scale and dt must be > 0")
 

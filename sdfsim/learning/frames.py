@@ -25,7 +25,7 @@ from sdfsim.learning.dataset import Trajectory, load_shapes, trajectory_files
 from sdfsim.learning.instants import at_instants, engine_substep
 from sdfsim.parallel import parallel
 
-FRAMES_VERSION = 4  # counts up whenever frames of the same recordings come out differently
+FRAMES_VERSION = 5  # counts up whenever frames of the same recordings come out differently
 
 
 @dataclass(frozen=True)

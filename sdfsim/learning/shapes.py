@@ -19,16 +19,8 @@ from sdfsim.parallel import parallel
 from sdfsim.shape import primitives
 from sdfsim.shape.distance import PiecesDistance
 from sdfsim.shape.fit import fit_pieces
-from sdfsim.shape.mesh import (
-    MESH_SUFFIXES,
-    Mesh,
-    convex_hull,
-    is_closed,
-    load_mesh,
-    load_pieces,
-    mass_properties,
-    mass_properties_of_sdf,
-)
+from sdfsim.shape.mass import mass_properties, mass_properties_of_sdf
+from sdfsim.shape.mesh import MESH_SUFFIXES, Mesh, convex_hull, is_closed, load_mesh, load_pieces
 from sdfsim.shape.solid import solidify
 
 NODES = 512  # surface nodes a shape: the vertices and edges of the pieces first, since those are what really touches

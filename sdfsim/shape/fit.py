@@ -17,7 +17,8 @@ from sdfsim.shape import training
 from sdfsim.shape.asset import Shape
 from sdfsim.shape.certificate import certify
 from sdfsim.shape.distance import DistanceOracle, MeshDistance, PiecesDistance
-from sdfsim.shape.mesh import Mesh, clean, is_closed, mass_properties, mass_properties_of_sdf
+from sdfsim.shape.mass import mass_properties, mass_properties_of_sdf
+from sdfsim.shape.mesh import Mesh, clean, is_closed
 from sdfsim.shape.mlp import MlpSdf
 from sdfsim.shape.nodes import DEFAULT_COUNT, edge_nodes, hull_nodes, sample_nodes, thin
 from sdfsim.shape.plans import PLANS

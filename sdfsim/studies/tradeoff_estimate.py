@@ -33,7 +33,9 @@ def landings(simulator: Simulator, steps: int) -> np.ndarray:
             position=state.position + state.velocity * t + 0.5 * falling * t * t,
             velocity=state.velocity + falling * t,
         )
-        contacts = find_contacts(bodies, then, rules.gravity, simulator.model.reach, rules.dt, rows=rules.rows)
+        contacts = find_contacts(
+            bodies, then, rules.gravity, simulator.model.reach, rules.dt, rows=rules.rows, thin=True
+        )
         met = torch.unique(torch.cat([contacts.owner, contacts.body])).cpu()
         first[met] = first[met].clamp_max(float(share))
     first[~bodies.moves.cpu()] = float("inf")

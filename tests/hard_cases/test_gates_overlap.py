@@ -67,7 +67,7 @@ def test_both_sides_of_a_swallowed_pair_are_pushed_opposite_ways(offset):
 def test_bodies_that_only_touch_or_hold_each_other_keep_their_normals():
     """A ring on a peg: its centre of mass is inside the peg, which is where it belongs."""
     torus = primitives.torus(0.5, 0.15)
-    from sdfsim.shape.mesh import mass_properties
+    from sdfsim.shape.mass import mass_properties
 
     volume, com, inertia = mass_properties(torus)
     ring = replace(

@@ -26,6 +26,8 @@ def test_round_trip(tmp_path):
         ({"velocity": np.full((4, 2, 3), np.nan)}, "velocity: has values that are not finite"),
         ({"quat_xyzw": np.zeros((4, 2, 3))}, "quat_xyzw: must be [4, 2, 4]"),
         ({"dt": 0.0}, "scale and dt must be > 0"),
+        ({"shape": np.array(["cube", "../cube"])}, "shape: '../cube' is no name"),
+        ({"shape": np.array(["/etc", "cube"])}, "shape: '/etc' is no name"),
     ],
 )
 def test_faults_are_named(tmp_path, change, complaint):

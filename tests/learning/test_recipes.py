@@ -21,7 +21,7 @@ from sdfsim.learning.statistics import statistics, statistics_lines
 from sdfsim.learning.teacher import Teacher, TeacherBody
 from sdfsim.shape import primitives
 from sdfsim.shape.asset import Shape, analytic_shape, sdf_of_mesh
-from sdfsim.shape.mesh import mass_properties
+from sdfsim.shape.mass import mass_properties
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,8 @@ from pipeline.parts import Parts, split
 from pipeline.surface import EXTENT, Surface, ball
 from pipeline.volume import sample_volume
 from sdfsim.shape.bvh import Winding
-from sdfsim.shape.mesh import Mesh, is_closed, mass_properties, signed_volume
+from sdfsim.shape.mass import mass_properties
+from sdfsim.shape.mesh import Mesh, is_closed, signed_volume
 
 FINEST = 0.02
 TABLE = (0.5, 0.35, 0.05)  # half sides of the top and half its thickness

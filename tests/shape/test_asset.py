@@ -21,7 +21,8 @@ from sdfsim.shape.asset import (
 from sdfsim.shape.cache import mesh_shape, shape_from_mesh, shape_from_primitive
 from sdfsim.shape.exact import MeshSdf
 from sdfsim.shape.grid import GridSdf
-from sdfsim.shape.mesh import Frame, Mesh, mass_properties_of_sdf
+from sdfsim.shape.mass import mass_properties_of_sdf
+from sdfsim.shape.mesh import Frame, Mesh
 from sdfsim.shape.mlp import MlpSdf
 from sdfsim.shape.storage import write_ply
 

@@ -12,7 +12,8 @@ from sdfsim.shape.analytic import BoxSdf, SphereSdf
 from sdfsim.shape.certificate import LIMITS, certify, thin_share, verdict
 from sdfsim.shape.coverage import coverage, hausdorff, zero_level
 from sdfsim.shape.distance import MeshDistance, PiecesDistance
-from sdfsim.shape.mesh import Mesh, is_closed, mass_properties, normal_frame, sample_surface
+from sdfsim.shape.mass import mass_properties
+from sdfsim.shape.mesh import Mesh, is_closed, normal_frame, sample_surface
 from sdfsim.shape.nodes import sample_nodes, thin
 from sdfsim.shape.sdf import Sdf
 

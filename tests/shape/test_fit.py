@@ -13,7 +13,8 @@ from sdfsim.shape import plans, primitives, training
 from sdfsim.shape.asset import Shape
 from sdfsim.shape.distance import MeshDistance
 from sdfsim.shape.fit import fit_mesh, fit_pieces, fit_solids
-from sdfsim.shape.mesh import Mesh, load_mesh, load_pieces, mass_properties, mass_properties_of_sdf
+from sdfsim.shape.mass import mass_properties, mass_properties_of_sdf
+from sdfsim.shape.mesh import Mesh, load_mesh, load_pieces
 from sdfsim.shape.mlp import MlpSdf
 from sdfsim.shape.solid import solidify
 

@@ -8,6 +8,7 @@ import pytest
 from sdfsim.errors import SdfsimError
 from sdfsim.shape import primitives
 from sdfsim.shape.analytic import BoxSdf, PlaneSdf, SphereSdf
+from sdfsim.shape.mass import mass_properties, mass_properties_of_sdf
 from sdfsim.shape.mesh import (
     Mesh,
     clean,
@@ -15,8 +16,6 @@ from sdfsim.shape.mesh import (
     is_closed,
     load_mesh,
     load_pieces,
-    mass_properties,
-    mass_properties_of_sdf,
     normal_frame,
     sample_surface,
     signed_volume,

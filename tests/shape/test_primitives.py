@@ -5,7 +5,8 @@ import pytest
 
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.distance import MeshDistance, PiecesDistance
-from sdfsim.shape.mesh import is_closed, mass_properties, signed_volume
+from sdfsim.shape.mass import mass_properties
+from sdfsim.shape.mesh import is_closed, signed_volume
 from sdfsim.shape.primitives import PRIMITIVES, convex_pieces, sphere
 
 # Handles of each solid (its genus): V - E + F = 2 - 2 * handles.
