@@ -103,7 +103,7 @@ def _check(path: Path, arrays: dict) -> None:
         raise SdfsimError(f"{path}: position: needs at least two frames (got {frames})")
     if np.abs(np.linalg.norm(arrays["quat_xyzw"], axis=-1) - 1.0).max(initial=0.0) > 1e-3:
         raise SdfsimError(f"{path}: quat_xyzw: must be unit quaternions")
-    if outside := [name for name in arrays["shape"] if not _NAME.fullmatch(str(name))]:
+    if outside := [name for name in arrays["shape"].tolist() if not _NAME.fullmatch(name)]:
         raise SdfsimError(f"{path}: shape: {outside[0]!r} is no name of a Shape folder", "letters, digits, . _ - only")
     if not (arrays["scale"] > 0).all() or not arrays["dt"] > 0:
         raise SdfsimError(f"{path}: scale and dt must be > 0")
