@@ -42,7 +42,7 @@ class Recipe:
     eikonal: float = 0.1
     curvature: float = 0.01
     sparse: float = 0.3
-    free: float = 0.5
+    free: float = 1.0
     mask: float = 0.3
     surface_points: int = 512
 

@@ -92,3 +92,33 @@ def test_trajectories_in_which_nothing_moves_are_left_out(with_bowl):
     replace(still, static=np.ones(3, dtype=bool)).save(with_bowl / "1.npz")
     assert len(trajectory_files(with_bowl)) == 2
     assert evaluate(with_bowl, model=random_model("impulse"), steps=5)["trajectories"] == 1
+
+
+def shrunk(t: Trajectory, size: float) -> Trajectory:
+    """The same motion of bodies `size` times as large, under the same gravity (equal Froude number)."""
+    time = np.sqrt(size)
+    return replace(
+        t,
+        position=t.position * size,
+        velocity=t.velocity * size / time,
+        angular_velocity=t.angular_velocity / time,
+        scale=t.scale * size,
+        mass=t.mass * size**3,
+        inertia=t.inertia * size**5,
+        dt=t.dt * time,
+    )
+
+
+def test_errors_shrink_with_the_bodies_and_are_the_same_to_the_bit_when_repeated(ball_data, tmp_path):
+    for file in trajectory_files(ball_data, "validation"):
+        (tmp_path / "validation").mkdir(exist_ok=True)
+        shrunk(Trajectory.load(file), 0.1).save(tmp_path / "validation" / file.name)
+    (tmp_path / "shapes").symlink_to(ball_data / "shapes")
+    large, again = (evaluate(ball_data, split="validation", errors_only=True) for _ in range(2))
+    small = evaluate(tmp_path, split="validation", errors_only=True)
+    assert large["model"] == again["model"]
+    one, other = large["model"]["39"], small["model"]["39"]
+    assert one["translation_rmse"] > 0.01
+    assert other["seconds"] == pytest.approx(one["seconds"] * np.sqrt(0.1))
+    assert other["translation_rmse"] == pytest.approx(0.1 * one["translation_rmse"], rel=0.02)
+    assert other["rotation_error"] == pytest.approx(one["rotation_error"], rel=0.02, abs=0.05)
