@@ -20,9 +20,7 @@ from sdfsim import Rollout, SdfsimError, load_scene
 from sdfsim.commands.arguments import seconds_of
 from sdfsim.dynamics.model import Model, new_network
 from sdfsim.dynamics.simulator import SimulationError, Simulator
-from sdfsim.shape import plans, primitives
-from sdfsim.shape.asset import load_shape
-from sdfsim.shape.checkpoint import Checkpoint
+from sdfsim.shape import primitives
 from sdfsim.shape.storage import write_ply
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -239,83 +237,6 @@ def test_the_run_of_a_model_beside_the_scene_can_be_repeated(scene, model, tmp_p
     assert run("simulate", scene, "-o", tmp_path / "run", "--viewer", "none").exit_code == 0
     config = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
     assert config["model"] == str(tmp_path / "mine.safetensors")
-
-
-def test_fitting_a_mesh_goes_on_where_it_was_interrupted(tmp_path, monkeypatch):
-    plan = replace(plans.PLANS["default"], width=16, layers=4, steps=400, batch=256, pool=4000, goal=None)
-    monkeypatch.setitem(plans.PLANS, "default", plan)
-    (tmp_path / "box.ply").write_bytes(write_ply(primitives.box()))
-    save, calls = Checkpoint.save, []
-
-    def interrupted(self, *state):
-        save(self, *state)
-        calls.append(state[-1][0])
-        if len(calls) == 1:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(Checkpoint, "save", interrupted)
-    assert run("fit", tmp_path / "box.ply", "-o", tmp_path / "box").exit_code == 130
-    done = run("fit", tmp_path / "box.ply", "-o", tmp_path / "box", "--json")
-    report = json.loads(done.stdout)
-    assert calls == [200, 400] and done.exit_code == (0 if report["passed"] else 3)
-    assert load_shape(tmp_path / "box").volume == pytest.approx(1.0)
-    assert sorted(p.name for p in (tmp_path / "box").iterdir()) == ["mesh.ply", "shape.json", "shape.safetensors"]
-
-
-def test_fitting_a_folder_ends_with_its_scene(tmp_path, monkeypatch):
-    calls = []
-
-    def run_stage(name, folder, *, progress, **options):
-        calls.append((name, {key: value for key, value in options.items() if value is not None}))
-        return {"seconds": {name: 1.0}, "paths": {}, "failed_checks": [], "notes": ["a metre is a guess"]}
-
-    monkeypatch.setattr("pipeline.stages.run_stage", run_stage)
-    done = run("fit", tmp_path, "--recipe", "paper")
-    assert done.exit_code == 0 and done.stderr == "a metre is a guess\n"
-    assert calls == [("fit", {"recipe": "paper", "device": "auto"}), ("scene", {})]
-
-
-def test_an_evaluation_is_two_tables(tmp_path, monkeypatch, model):
-    errors = {
-        "50": {
-            "seconds": 1.0,
-            "translation_rmse": 0.1714,
-            "translation_rmse_95": [0.15, 0.19],
-            "rotation_error": 12.04,
-            "rotation_error_95": [11.0, 13.0],
-        }
-    }
-    who = ("model", "ballistic", "teacher 0", "teacher 1e-6")
-    depth = {"percentile_95": 0.0123, "worst": 0.2, "steps_with_contact": 7}
-    report = {
-        "model_name": "small",
-        "trajectories": 60,
-        "bodies": 400,
-        "ms_per_step_per_trajectory": 1.5,
-        "chaos_floor": {"perturbations": {"0": errors, "1e-6": errors}, "median_farthest_unperturbed_m": 0.00053},
-        "median_survival_s": {name: {"0.25": None if "1e" in name else 0.74} for name in who},
-        "penetration": {"model": depth, "teacher": depth, "geometry": {"cube": "pieces"}, "every": 10},
-        "energy_gain": {name: {"mean": 0.01, "worst": 0.5} for name in ("model", "teacher")},
-        "resting_speed": {"model": None, "teacher": None, "bodies": 0},
-    }
-    asked = {}
-
-    def evaluate(data, **options):
-        asked.update(options)
-        return report | {"model": errors, "ballistic": errors}
-
-    monkeypatch.setattr("sdfsim.learning.evaluate.evaluate", evaluate)
-    lines = run("evaluate", tmp_path, "--free-flight", "learned", "--chaos-floor").stdout.splitlines()
-    assert asked["steps"] == 50 and asked["free_flight"] == "learned" and asked["chaos_floor"]
-    assert "50 steps = 1 s" in lines[1]
-    assert [line.split("  ")[0] for line in lines[2:5]] == ["small", "teacher, 1e-6 m/s off", "ballistic"]
-    assert all("0.171 (0.150 to 0.190)" in line and "12.0 (11.0 to 13.0)" in line for line in lines[2:5])
-    assert len({line.index("12.0") for line in lines[2:5]}) == 1
-    small, recorded, again, ballistic = (line.split() for line in lines[7:11])
-    assert small == "small 0.0123 m 0.2000 m 1.00 % 50.00 % - 0.74 s".split()
-    assert recorded[-1] == "-" and again[-3:] == [">", "1", "s"] and ballistic[-2:] == ["0.74", "s"]
-    assert any("0.0005 m (median" in line for line in lines[11:])
-    assert max(map(len, lines)) <= 120
 
 
 def stop_after(steps: int, how):

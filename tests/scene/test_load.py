@@ -7,34 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sdfsim import SceneError, Simulator, load_scene
-from sdfsim.dynamics.bodies import Units, from_scene
-from sdfsim.dynamics.contacts import find_contacts
-from sdfsim.scene.types import Scene
-from sdfsim.shape.analytic import BoxSdf
-from sdfsim.shape.asset import analytic_shape, with_sdf
-from sdfsim.shape.exact import MeshSdf
-from sdfsim.shape.grid import GridSdf
+from sdfsim import SceneError, load_scene
+from sdfsim.shape.asset import analytic_shape
 from sdfsim.shape.mesh import Mesh
 from sdfsim.shape.primitives import box
 from sdfsim.shape.storage import write_ply
 
 HEAD = "version: 1\nshapes:\n  ball: {sphere: {radius: 0.5}}\nbodies:\n"  # bodies[0] is on line 5
-
-
-@pytest.fixture
-def load(tmp_path: Path):
-    def from_text(text: str) -> Scene:
-        file = tmp_path / "scene.yaml"
-        file.write_text(text, encoding="utf-8")
-        return load_scene(file)
-
-    return from_text
 
 
 def problems_of(load, text: str) -> list[str]:
@@ -271,85 +252,6 @@ def test_nodes_can_be_sampled_anew(load):
     np.testing.assert_allclose(np.linalg.norm(nodes, axis=1), 0.2, rtol=1e-6)
 
 
-CRATE = {
-    "box": "{box: {size: [0.4, 0.4, 0.4]}}",
-    "grid": "{primitive: {name: box, size: 0.4}, sdf: grid, resolution: 64}",
-    "mesh": "{primitive: {name: box, size: 0.4}, sdf: mesh}",
-    "asset": "{asset: crate, sdf: grid}",
-    "file": "{mesh: crate.ply, units: cm, sdf: mesh}",
-}
-
-
-def falling_ball(crate: str) -> str:
-    return f"""version: 1
-shapes:
-  crate: {crate}
-  ball: {{sphere: {{radius: 0.1}}}}
-bodies:
-  - {{name: floor, plane: {{}}}}
-  - {{name: crate, shape: crate, position: [0, 0, 0.2], mass: 1}}
-  - {{name: ball, shape: ball, position: [0.03, 0.02, 0.52], velocity: [0, 0, -1], mass: 0.5}}
-"""
-
-
-@pytest.fixture
-def no_fit(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr("sdfsim.shape.fit.fit_mesh", lambda *args, **kwargs: pytest.fail("fitted"))
-
-
-def heights(scene: Scene) -> np.ndarray:
-    """[15, 3, 3] m: where the bodies are, step by step."""
-    simulator = Simulator(scene, model="small", device="cpu")
-    return np.stack([np.asarray(state.position) for state in simulator.steps(15)])
-
-
-def test_a_ball_bounces_alike_off_a_box_a_grid_and_a_mesh(load, tmp_path, no_fit):
-    crate = analytic_shape("box", size=(0.4, 0.4, 0.4))
-    crate.save(tmp_path / "crate")
-    larger = replace(crate.mesh, vertices=100 * crate.mesh.vertices)
-    (tmp_path / "crate.ply").write_bytes(write_ply(larger))
-    scenes = {key: load(falling_ball(shape)) for key, shape in CRATE.items()}
-    kinds = {key: type(scene.shapes[1].sdf) for key, scene in scenes.items()}
-    assert kinds == {"box": BoxSdf, "grid": GridSdf, "mesh": MeshSdf, "asset": GridSdf, "file": MeshSdf}
-    assert all(scene.missed == () for scene in scenes.values())
-    expected = heights(scenes["box"])
-    # Without the crate it would be half a metre lower by now.
-    assert 0.49 < expected[-1, 2, 2] < 0.51
-    for key in CRATE:
-        # Nodes differ where the shape is made from the mesh, and a node more or less is another contact.
-        np.testing.assert_allclose(heights(scenes[key]), expected, atol=1e-4 if key == "asset" else 2e-3)
-
-
-def edges(scene: Scene) -> dict[tuple[int, ...], tuple[float, np.ndarray]]:
-    """Distance m and normal [3] of every contact edge at the start, by owner, node and other body."""
-    bodies, state = from_scene(scene, Units(1.0, 1.0, 1.0), torch.device("cpu"))
-    found = find_contacts(bodies, state, torch.tensor([0.0, 0.0, -9.81]), reach=0.05, dt=0.02)
-    keys = zip(found.owner.tolist(), found.node.tolist(), found.body.tolist(), strict=True)
-    return dict(zip(keys, zip(found.distance.tolist(), found.normal.numpy(), strict=True), strict=True))
-
-
-@pytest.mark.parametrize("kind", ["grid", "mesh"])
-def test_with_the_same_nodes_contacts_and_paths_are_the_same(load, kind):
-    exact = load(falling_ball(CRATE["box"]).replace("0.52]", "0.51]"))
-    shapes = (exact.shapes[0], *(with_sdf(shape, kind, resolution=48) for shape in exact.shapes[1:]))
-    other = replace(exact, shapes=shapes)
-    first, second = edges(exact), edges(other)
-    assert len(first) > 20
-    assert len(first.keys() ^ second.keys()) <= 2  # those at the very reach of an edge
-    for key in first.keys() & second.keys():
-        assert first[key][0] == pytest.approx(second[key][0], abs=1.5e-3)
-        assert first[key][1] @ second[key][1] > 0.99  # the ball has facets, the grid cells
-    np.testing.assert_allclose(heights(other), heights(exact), atol=1e-3)
-
-
-def test_an_asset_keeps_its_own_sdf_unless_told_and_cannot_grow_a_network(load, tmp_path):
-    with_sdf(analytic_shape("box", size=(0.4, 0.4, 0.4)), "mesh").save(tmp_path / "crate")
-    assert isinstance(load(falling_ball("{asset: crate}")).shapes[1].sdf, MeshSdf)
-    (fault,) = problems_of(load, falling_ball("{asset: crate, sdf: mlp}"))
-    assert fault == "scene.yaml:3: shapes.crate.asset: box: the shape has no SDF network (fit its mesh)"
-
-
 def test_defaults_and_units(load):
     scene = load(HEAD + "  - {name: a, shape: ball, scale: 2}\n")
     body = scene.bodies[0]
@@ -413,49 +315,3 @@ def test_the_samples_are_right(sample):
     spec = read_scene(Path(__file__).parents[2] / "samples" / f"{sample}.yaml")
     spec.problems.check()
     assert sum(len(b.names()) for b in spec.bodies) >= 5
-
-
-VOCABULARY = """version 1 bodies shapes ball name a shape mass -1 .nan 1e400 plane normal offset count arrange grid
-spacing position [0,0,1] collides_with all effects contact off sphere radius 0 &x *x {} [] ~ ! | > ' " - : ,"""
-WORDS = st.sampled_from([*VOCABULARY.split(), "\n", "\n  "])
-
-
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.lists(WORDS, max_size=40))
-def test_whatever_is_written_ends_in_a_scene_or_a_scene_error(load, words):
-    try:
-        load(" ".join(words))
-    except SceneError as error:
-        assert error.problems and all("scene.yaml" in line for line in error.problems)
-
-
-VALUES = st.one_of(
-    st.none(),
-    st.booleans(),
-    st.integers(),
-    st.floats(),
-    st.text(max_size=6),
-    st.lists(st.floats() | st.integers(-3, 3), max_size=4),
-    st.sampled_from([{}, {"grid": [1, 2, 3], "spacing": 0.1}, {"normal": [0, 0, 1]}, ["a"], "all", "ball", "static"]),
-)
-KEYS = st.sampled_from(
-    "name shape plane motion scale position quat_xyzw quat_wxyz euler_xyz_deg velocity angular_velocity mass density "
-    "friction restitution collides_with count arrange other".split()
-)
-
-
-@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.dictionaries(KEYS, VALUES, max_size=5))
-def test_any_body_is_a_body_or_a_fault(load, fields):
-    import yaml
-
-    body = {"name": "a", "shape": "ball", **fields}
-    text = yaml.safe_dump({"version": 1, "shapes": {"ball": {"sphere": {"radius": 1}}}, "bodies": [body]})
-    try:
-        scene = load(text)
-    except SceneError as error:
-        assert error.problems
-        return
-    for b in scene.bodies:
-        assert np.isfinite(b.position).all() and np.isfinite(b.mass) and b.scale > 0
-        assert np.linalg.norm(b.quat_xyzw) == pytest.approx(1)

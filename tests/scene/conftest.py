@@ -1,0 +1,20 @@
+"""Scenes from text."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from sdfsim import load_scene
+from sdfsim.scene.types import Scene
+
+
+@pytest.fixture
+def load(tmp_path: Path):
+    def from_text(text: str) -> Scene:
+        file = tmp_path / "scene.yaml"
+        file.write_text(text, encoding="utf-8")
+        return load_scene(file)
+
+    return from_text

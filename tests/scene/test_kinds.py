@@ -1,0 +1,98 @@
+"""Shapes of a scene by every kind of SDF: alike in contacts and in motion."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from sdfsim import Simulator
+from sdfsim.dynamics.bodies import Units, from_scene
+from sdfsim.dynamics.contacts import find_contacts
+from sdfsim.scene.types import Scene
+from sdfsim.shape.analytic import BoxSdf
+from sdfsim.shape.asset import analytic_shape, with_sdf
+from sdfsim.shape.exact import MeshSdf
+from sdfsim.shape.grid import GridSdf
+from sdfsim.shape.storage import write_ply
+from tests.scene.test_load import problems_of
+
+CRATE = {
+    "box": "{box: {size: [0.4, 0.4, 0.4]}}",
+    "grid": "{primitive: {name: box, size: 0.4}, sdf: grid, resolution: 64}",
+    "mesh": "{primitive: {name: box, size: 0.4}, sdf: mesh}",
+    "asset": "{asset: crate, sdf: grid}",
+    "file": "{mesh: crate.ply, units: cm, sdf: mesh}",
+}
+
+
+def falling_ball(crate: str) -> str:
+    return f"""version: 1
+shapes:
+  crate: {crate}
+  ball: {{sphere: {{radius: 0.1}}}}
+bodies:
+  - {{name: floor, plane: {{}}}}
+  - {{name: crate, shape: crate, position: [0, 0, 0.2], mass: 1}}
+  - {{name: ball, shape: ball, position: [0.03, 0.02, 0.52], velocity: [0, 0, -1], mass: 0.5}}
+"""
+
+
+@pytest.fixture
+def no_fit(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr("sdfsim.shape.fit.fit_mesh", lambda *args, **kwargs: pytest.fail("fitted"))
+
+
+def heights(scene: Scene) -> np.ndarray:
+    """[15, 3, 3] m: where the bodies are, step by step."""
+    simulator = Simulator(scene, model="small", device="cpu")
+    return np.stack([np.asarray(state.position) for state in simulator.steps(15)])
+
+
+def test_a_ball_bounces_alike_off_a_box_a_grid_and_a_mesh(load, tmp_path, no_fit):
+    crate = analytic_shape("box", size=(0.4, 0.4, 0.4))
+    crate.save(tmp_path / "crate")
+    larger = replace(crate.mesh, vertices=100 * crate.mesh.vertices)
+    (tmp_path / "crate.ply").write_bytes(write_ply(larger))
+    scenes = {key: load(falling_ball(shape)) for key, shape in CRATE.items()}
+    kinds = {key: type(scene.shapes[1].sdf) for key, scene in scenes.items()}
+    assert kinds == {"box": BoxSdf, "grid": GridSdf, "mesh": MeshSdf, "asset": GridSdf, "file": MeshSdf}
+    assert all(scene.missed == () for scene in scenes.values())
+    expected = heights(scenes["box"])
+    # Without the crate it would be half a metre lower by now.
+    assert 0.49 < expected[-1, 2, 2] < 0.51
+    for key in CRATE:
+        # Nodes differ where the shape is made from the mesh, and a node more or less is another contact.
+        np.testing.assert_allclose(heights(scenes[key]), expected, atol=1e-4 if key == "asset" else 2e-3)
+
+
+def edges(scene: Scene) -> dict[tuple[int, ...], tuple[float, np.ndarray]]:
+    """Distance m and normal [3] of every contact edge at the start, by owner, node and other body."""
+    bodies, state = from_scene(scene, Units(1.0, 1.0, 1.0), torch.device("cpu"))
+    found = find_contacts(bodies, state, torch.tensor([0.0, 0.0, -9.81]), reach=0.05, dt=0.02)
+    keys = zip(found.owner.tolist(), found.node.tolist(), found.body.tolist(), strict=True)
+    return dict(zip(keys, zip(found.distance.tolist(), found.normal.numpy(), strict=True), strict=True))
+
+
+@pytest.mark.parametrize("kind", ["grid", "mesh"])
+def test_with_the_same_nodes_contacts_and_paths_are_the_same(load, kind):
+    exact = load(falling_ball(CRATE["box"]).replace("0.52]", "0.51]"))
+    shapes = (exact.shapes[0], *(with_sdf(shape, kind, resolution=48) for shape in exact.shapes[1:]))
+    other = replace(exact, shapes=shapes)
+    first, second = edges(exact), edges(other)
+    assert len(first) > 20
+    assert len(first.keys() ^ second.keys()) <= 2  # those at the very reach of an edge
+    for key in first.keys() & second.keys():
+        assert first[key][0] == pytest.approx(second[key][0], abs=1.5e-3)
+        assert first[key][1] @ second[key][1] > 0.99  # the ball has facets, the grid cells
+    np.testing.assert_allclose(heights(other), heights(exact), atol=1e-3)
+
+
+def test_an_asset_keeps_its_own_sdf_unless_told_and_cannot_grow_a_network(load, tmp_path):
+    with_sdf(analytic_shape("box", size=(0.4, 0.4, 0.4)), "mesh").save(tmp_path / "crate")
+    assert isinstance(load(falling_ball("{asset: crate}")).shapes[1].sdf, MeshSdf)
+    (fault,) = problems_of(load, falling_ball("{asset: crate, sdf: mlp}"))
+    assert fault == "scene.yaml:3: shapes.crate.asset: box: the shape has no SDF network (fit its mesh)"
