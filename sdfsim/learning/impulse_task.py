@@ -15,7 +15,7 @@ from sdfsim.learning.dataset import FLOOR, product_range
 from sdfsim.learning.frames import ContactFrames
 from sdfsim.learning.team import ALONE, Team
 
-HUBER = 0.05  # m/s: below it errors count squared, above it by their size
+HUBER = 0.01  # m/s: below it errors count squared, above it by their size; what rests may creep by less than that
 CALM_SHARE = 0.2  # how often frames in which nothing is hit are drawn, against those with the hardest hits
 
 
