@@ -21,8 +21,8 @@ _PLAIN_SECONDS = 5.0  # between two plain lines of one stage
 class Session:
     """One command from start to exit code; a context manager around its work.
 
-    Errors inside become one line and a hint on stderr, and the `SystemExit` of DESIGN's exit codes. With `as_json`
-    stdout carries exactly one JSON object (also for an error), and what libraries print there goes to stderr.
+    Errors inside become one line and a hint on stderr, and a `SystemExit`: see `sdfsim.errors` for the codes. With
+    `as_json` stdout carries exactly one JSON object (also for an error), and what libraries print goes to stderr.
 
     Args:
         as_json: report as JSON.

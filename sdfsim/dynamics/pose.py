@@ -47,29 +47,6 @@ def to_matrix(q: Tensor) -> Tensor:
     return torch.stack(rows, -1).reshape(*q.shape[:-1], 3, 3)
 
 
-def from_matrix(m: Tensor) -> Tensor:
-    """Unit quaternions [..., 4] of rotation matrices [..., 3, 3].
-
-    The largest of the four candidates (Shepperd, 1978) is taken, so that it is exact near half turns too.
-    """
-    trace = m.diagonal(dim1=-2, dim2=-1).sum(-1)
-    d = m.diagonal(dim1=-2, dim2=-1)
-    squares = torch.stack([1 + 2 * d[..., 0] - trace, 1 + 2 * d[..., 1] - trace, 1 + 2 * d[..., 2] - trace, 1 + trace])
-    xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
-    wx, wy, wz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
-    candidates = torch.stack(
-        [
-            torch.stack([squares[0], xy, xz, wx], -1),
-            torch.stack([xy, squares[1], yz, wy], -1),
-            torch.stack([xz, yz, squares[2], wz], -1),
-            torch.stack([wx, wy, wz, squares[3]], -1),
-        ],
-        -2,
-    )
-    best = squares.movedim(0, -1).argmax(-1)[..., None, None].expand(*m.shape[:-2], 1, 4)
-    return normalise(candidates.gather(-2, best).squeeze(-2))
-
-
 def from_rotvec(r: Tensor) -> Tensor:
     """Unit quaternions of rotation vectors [..., 3] rad (axis times angle)."""
     angle = r.norm(dim=-1, keepdim=True)

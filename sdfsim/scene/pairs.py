@@ -31,15 +31,6 @@ class Pairs:
     bouncy: int
 
 
-def may_touch(a: Body, b: Body) -> bool:
-    """True when both bodies list each other (or all), and at least one of them is dynamic."""
-    if "dynamic" not in (a.motion, b.motion):
-        return False
-    return (a.collides_with is None or b.name in a.collides_with) and (
-        b.collides_with is None or a.name in b.collides_with
-    )
-
-
 def contact_groups(bodies: Sequence[Body]) -> tuple[np.ndarray, np.ndarray]:
     """Bodies that list the same names and are listed by the same bodies are one group.
 

@@ -73,7 +73,6 @@ class Group:
     """Cases of one kind.
 
     Attributes:
-        row: its number in the project's list of hard cases.
         title: what they have in common.
         wanted: what a good model does, in words.
         about: the quantity of a model's ranges that the cases are about: one that never varied was not learned.
@@ -81,7 +80,6 @@ class Group:
         curve: labels (x, y) of what a case draws.
     """
 
-    row: int
     title: str
     wanted: str
     about: str = ""
@@ -92,7 +90,6 @@ class Group:
 TIME = "time (s)"
 GROUPS = {
     "yaw": Group(
-        6,
         "the whole scene turned about the vertical",
         "the same motion: what is left is rounding, grown by collisions",
         curve=(TIME, "deviation (% of size)"),
@@ -100,9 +97,8 @@ GROUPS = {
     "overlap": Group(
         11, "bodies that start inside each other", "they part at less than 3 m/s", curve=(TIME, "fastest body (m/s)")
     ),
-    "thin": Group(13, "fast bodies of 20 cm and a plate of 1 cm", "none passes through", axis="speed (m/s)"),
+    "thin": Group("fast bodies of 20 cm and a plate of 1 cm", "none passes through", axis="speed (m/s)"),
     "rest": Group(
-        14,
         "bodies at rest on the floor",
         "drift below 1 % of size, below 0.01 m/s, height within 5 %; with sleep on exactly still",
         curve=(TIME, "drift (% of size)"),
@@ -111,7 +107,6 @@ GROUPS = {
         15, "stacks", "all still stand after 3 s", axis="cubes in the tower", curve=(TIME, "largest shift (% of size)")
     ),
     "mass": Group(
-        16,
         "a heavy cube on a light one",
         "as little penetration as the teacher, and no collapse",
         about="mass_ratio",
@@ -119,7 +114,6 @@ GROUPS = {
         curve=(TIME, "largest shift (% of size)"),
     ),
     "bounce": Group(
-        17,
         "balls dropped from about 1 m",
         "a rebound of e^2 times the height, within 5 % of it",
         about="restitution",
@@ -127,7 +121,6 @@ GROUPS = {
         curve=(TIME, "height of its lowest point (m)"),
     ),
     "slope": Group(
-        17,
         "a box at rest on a slope",
         "it begins to slide within 2 degrees of atan(mu)",
         about="friction",
@@ -135,15 +128,13 @@ GROUPS = {
         curve=("degrees beyond atan(mu)", "travelled in 2 s (m)"),
     ),
     "pile": Group(
-        18,
         "a pile in a bowl",
         "no body through the wall, no energy from nothing, penetration as the teacher's",
         axis="bodies",
         curve=(TIME, "energy (% of the start's)"),
     ),
-    "energy": Group(20, "random scenes: energy from nothing", "no step adds more than 1 % of the energy at the start"),
+    "energy": Group("random scenes: energy from nothing", "no step adds more than 1 % of the energy at the start"),
     "precision": Group(
-        22,
         "other arithmetic: time until motions are 10 % of a body's size apart",
         "as late as for a start 1e-6 m/s off",
         curve=(TIME, "apart (% of size)"),

@@ -87,7 +87,7 @@ def page(study: Study) -> str:
     for name in group_order(study.cases):
         group = GROUPS[name]
         parts += [
-            f"<h2>{group.row}: {escape(group.title)}</h2>",
+            f"<h2>{escape(group.title)}</h2>",
             f"<p>Wanted: {escape(group.wanted)}.</p>",
             _table(study, [row for row in table if row.group == name]),
         ]

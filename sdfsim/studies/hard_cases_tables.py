@@ -90,7 +90,7 @@ def markdown(study: Study) -> list[str]:
         if row.group != group:
             group, case = row.group, ""
             told = GROUPS[group]
-            lines.append(f"| **{told.row}: {told.title}** |" + " |" * (len(head) - 1))
+            lines.append(f"| **{told.title}** |" + " |" * (len(head) - 1))
         marks = {"missed": "**", "behind": "*"}
         cells = [f"{marks.get(c.state, '')}{c.text}{marks.get(c.state, '')}" for c in row.cells]
         lines.append("| " + " | ".join([row.case if row.case != case else "", row.figure, row.wanted, *cells]) + " |")

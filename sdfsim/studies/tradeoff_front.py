@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-QUALITIES = ("draft", "standard", "fine")
 BEARABLE = 1.5  # a draft's error is at most so many times the least
 
 

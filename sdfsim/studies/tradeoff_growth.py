@@ -193,7 +193,7 @@ def course(one: Growing, height: float, cost: CostModel, model: Model, device: s
 def _measured(one: Growing, folder: Path, model: str, device: str) -> dict[str, Any]:
     path = folder / f"{one.key}.json"
     mark = {"version": VERSION, "model": weights_digest(model), "device": device, **asdict(one)}
-    if path.exists() and (point := read_json(path)).get("fingerprint") == mark:
+    if path.exists() and (point := read_json(path)).get("fingerprint") == mark and not point["failed"]:
         return point
     point = {"key": one.key, **asdict(one), "fingerprint": mark, "failed": ""}
     try:

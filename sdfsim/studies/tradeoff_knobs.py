@@ -31,8 +31,7 @@ class Setting:
         model: bundled name or path.
         nodes: "own", the shapes' own nodes; "thin K", K of them, outermost first; "grid N", sampled anew from
             N^3 points; "vertices", the vertices of the mesh that is shown.
-        sdf: "own"; "grid R", the own distances on a grid of R^3 samples; "exact", the geometry that it was fitted to;
-            "mlp W", a fitted network of another width.
+        sdf: "own"; "grid R", the own distances on a grid of R^3 samples; "exact", the geometry that it was fitted to.
         reach: contact radius over the model's own.
         rounds: of message passing, the first so many of the model's (None: all). What is left is a network that
             nobody has trained.
@@ -129,7 +128,7 @@ def arranged_shape(setting: Setting, shape: Shape, exact: Sdf | None = None) -> 
     """A shape as a setting wants it; closed forms keep their distances, which nothing beats.
 
     Args:
-        setting: see `Setting`; "mlp W" is up to whoever fits.
+        setting: see `Setting`.
         shape: with its own distances and nodes.
         exact: the geometry that it was fitted to; None takes its mesh.
     """

@@ -78,7 +78,9 @@ def _kept(contender: Contender, cases: Cases, folder: Path) -> Point | None:
     if not path.exists():
         return None
     point = read_json(path)
-    return point if point.get("fingerprint") == _fingerprint(contender, cases) else None
+    # What failed may have lacked an engine or memory that is there by now.
+    same = point.get("fingerprint") == _fingerprint(contender, cases)
+    return point if same and not point["failed"] else None
 
 
 def _fingerprint(contender: Contender, cases: Cases) -> dict[str, Any]:

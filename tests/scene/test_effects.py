@@ -10,8 +10,8 @@ import pytest
 
 from sdfsim import SceneError, load_scene
 from sdfsim.scene.effects import EFFECTS, plan
-from sdfsim.scene.pairs import contact_groups, count_pairs, may_touch
-from sdfsim.scene.types import Effects, Limits
+from sdfsim.scene.pairs import contact_groups, count_pairs
+from sdfsim.scene.types import Body, Effects, Limits
 
 TEXT = """
 version: 1
@@ -39,6 +39,15 @@ def test_everything_is_on_where_it_matters(scene):
     assert decided.contact.on and decided.friction.on and decided.restitution.on and decided.rotation.on
     assert decided.gravity.on and not decided.sleep.on
     assert decided.static == ("floor",) and decided.dynamic == ("a", "b", "c")
+
+
+def may_touch(a: Body, b: Body) -> bool:
+    """True when both bodies list each other (or all), and at least one of them is dynamic."""
+    if "dynamic" not in (a.motion, b.motion):
+        return False
+    return (a.collides_with is None or b.name in a.collides_with) and (
+        b.collides_with is None or a.name in b.collides_with
+    )
 
 
 def test_pairs_need_both_sides(scene):
