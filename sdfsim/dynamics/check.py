@@ -32,13 +32,7 @@ def fault(
         units: what messages are told in.
         before: the state a step earlier, if there is one.
     """
-    for name in ("position", "orientation", "velocity", "angular_velocity"):
-        bad = ~getattr(state, name)[rows].isfinite().all(-1)
-        if bool(bad.any()):
-            return int(rows[bad][0]), f"{name} is not finite"
-    bad = (state.orientation[rows].square().sum(-1) - 1.0).abs() > UNIT
-    if bool(bad.any()):
-        return int(rows[bad][0]), "orientation is no rotation"
+    turned = (state.orientation[rows].square().sum(-1) - 1.0).abs()
     limits = [
         (state.position, FARTHEST, units.length, "m from the origin, too far to be placed exactly"),
         (state.velocity, FASTEST, units.velocity, "m/s, too fast for any contact"),
@@ -47,9 +41,21 @@ def fault(
     if before is not None:
         way = (state.position - before.position) / dt
         limits.append((way, FASTEST, units.velocity, "m/s on its way through the step, too fast for any contact"))
-    for values, most, unit, what in limits:
-        size = values[rows].norm(dim=-1)
-        bad = size > most
+    sizes = [values[rows].norm(dim=-1) for values, *_ in limits]
+    sound = turned <= UNIT  # no comparison holds for what is not a number
+    for size, (_, most, *_) in zip(sizes, limits, strict=True):
+        sound = sound & (size <= most)
+    if bool(sound.all()):
+        return None
+    for name in ("position", "orientation", "velocity", "angular_velocity"):
+        bad = ~getattr(state, name)[rows].isfinite().all(-1)
+        if bool(bad.any()):
+            return int(rows[bad][0]), f"{name} is not finite"
+    bad = turned > UNIT
+    if bool(bad.any()):
+        return int(rows[bad][0]), "orientation is no rotation"
+    for size, (_, most, unit, what) in zip(sizes, limits, strict=True):
+        bad = ~(size <= most)
         if bool(bad.any()):
             return int(rows[bad][0]), f"{float(size[bad][0]) * unit:.3g} {what} (at most {most * unit:.3g})"
     return None

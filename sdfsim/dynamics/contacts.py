@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -228,7 +229,7 @@ def thin_contacts(bodies: Bodies, contacts: Contacts) -> Contacts:
     if len(contacts) == 0:
         return contacts
     pair = torch.unique(contacts.owner * len(bodies) + contacts.body, return_inverse=True)[1]
-    ways = torch.tensor(_ICOSAHEDRON, dtype=torch.float64, device=bodies.device)
+    ways = _icosahedron(bodies.device)
     outward = bodies.node[contacts.node] @ ways.T
     score = torch.cat([outward - DEPTH_PULL * contacts.ahead[:, None], -contacts.ahead[:, None]], 1)
     pairs, edges = int(pair.max()) + 1, len(contacts)
@@ -240,6 +241,12 @@ def thin_contacts(bodies: Bodies, contacts: Contacts) -> Contacts:
     number = torch.where(score >= best[pair], number, edges)
     winner = torch.full((pairs, score.shape[1]), edges, device=score.device).scatter_reduce(0, group, number, "amin")
     return contacts.only(torch.unique(winner))
+
+
+@cache
+def _icosahedron(device: torch.device) -> Tensor:
+    """[12, 3] its corners."""
+    return torch.tensor(_ICOSAHEDRON, dtype=torch.float64, device=device)
 
 
 def node_velocity(state: State, body: Tensor, arm: Tensor) -> Tensor:

@@ -45,29 +45,31 @@ def torque_free(orientation: Tensor, angular_velocity: Tensor, inertia: Tensor, 
         return orientation, angular_velocity
     inverse = torch.linalg.inv(inertia)
     rotation = to_matrix(orientation)
-    momentum = _apply(rotation @ inertia @ rotation.mT, angular_velocity)
+    momentum = _apply(rotation, _apply(inertia, _apply(rotation.mT, angular_velocity)))
     fastest = float(angular_velocity.norm(dim=-1).max())
     steps = max(1, math.ceil(min(MOST_TURN, fastest * abs(dt)) / MAX_TURN))
     h = dt / steps
 
     def spin(q: Tensor) -> Tensor:
         r = to_matrix(q)
-        return _apply(r @ inverse @ r.mT, momentum)
+        return _apply(r, _apply(inverse, _apply(r.mT, momentum)))
 
     for _ in range(steps):
-        orientation = normalise(_rkmk4(orientation, spin, h))
-    return orientation, spin(orientation)
+        orientation = normalise(_rkmk4(orientation, angular_velocity, spin, h))
+        angular_velocity = spin(orientation)
+    return orientation, angular_velocity
 
 
-def _rkmk4(q: Tensor, spin: Callable[[Tensor], Tensor], h: float) -> Tensor:
-    """One Runge-Kutta-Munthe-Kaas step of order 4 for q' = spin(q) (world axes); it never leaves the unit sphere."""
+def _rkmk4(q: Tensor, start: Tensor, spin: Callable[[Tensor], Tensor], h: float) -> Tensor:
+    """One Runge-Kutta-Munthe-Kaas step of order 4 for q' = spin(q) (world axes), where spin(q) = `start`; it never
+    leaves the unit sphere."""
 
     def slope(u: Tensor) -> Tensor:
         w = spin(multiply(from_rotvec(u), q))
         uw = torch.linalg.cross(u, w)
         return h * (w - 0.5 * uw + torch.linalg.cross(u, uw) / 12.0)  # dexp^-1, to the order needed
 
-    k1 = slope(torch.zeros_like(q[..., :3]))
+    k1 = h * start
     k2 = slope(0.5 * k1)
     k3 = slope(0.5 * k2)
     k4 = slope(k3)

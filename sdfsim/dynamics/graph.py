@@ -67,22 +67,23 @@ class ContactGraph:
 class EdgeFrames:
     """What the rounds of message passing need of every edge, computed once a step.
 
+    A body's twist is its velocity and angular velocity, stacked. Rows and columns of three are the edge's axes: normal,
+    tangent, binormal.
+
     Attributes:
-        axes: [E, 3, 3], rows normal, tangent, binormal.
         speed: [E, 1], the scale that makes velocities dimensionless.
-        mass: [E, 3] effective mass along each axis.
-        turn_first, turn_second: [E, 3, 3], row a is the angular velocity that a unit impulse along axis a gives.
-        push_first, push_second: [E, 1] inverse masses.
+        mass: [E, 3] effective mass along each axis; 0 along those on which nothing may act.
+        read_first, read_second: [E, 3, 6] of a twist, the velocity of the contact point along each axis.
+        give_first, give_second: [E, 6, 3] the twist that a unit impulse along each axis gives, opposite to the second.
         start: [E, EDGE_FEATURES] input features.
     """
 
-    axes: Tensor
     speed: Tensor
     mass: Tensor
-    turn_first: Tensor
-    turn_second: Tensor
-    push_first: Tensor
-    push_second: Tensor
+    read_first: Tensor
+    read_second: Tensor
+    give_first: Tensor
+    give_second: Tensor
     start: Tensor
 
 
@@ -103,13 +104,13 @@ def edge_frames(graph: ContactGraph, *, mirrored: bool = False) -> EdgeFrames:
     g = graph
     slip = relative_velocity(g, g.velocity, g.angular)
     lift = relative_velocity(g, g.free_velocity, g.free_angular) - slip  # what gravity and free spin add
-    axes = _axes(g.normal, slip, lift)
+    axes, tangential = _axes(g, slip, lift)
     if mirrored:
         axes = axes * axes.new_tensor([1.0, 1.0, -1.0])[:, None]
     speed = _speed_scale(g, slip)
 
-    turn_first, twist_first = _response(g.inverse_inertia[g.first], g.arm_first, axes)
-    turn_second, twist_second = _response(g.inverse_inertia[g.second], g.arm_second, axes)
+    moment_first, turn_first, twist_first = _response(g.inverse_inertia[g.first], g.arm_first, axes)
+    moment_second, turn_second, twist_second = _response(g.inverse_inertia[g.second], g.arm_second, axes)
     push_first, push_second = g.inverse_mass[g.first, None], g.inverse_mass[g.second, None]
     # Inverse effective mass matrix in the frame: how an impulse along one axis changes velocity along another.
     compliance = twist_first + twist_second
@@ -145,7 +146,15 @@ def edge_frames(graph: ContactGraph, *, mirrored: bool = False) -> EdgeFrames:
         ],
         -1,
     )
-    return EdgeFrames(axes, speed, mass, turn_first, turn_second, push_first, push_second, start)
+    return EdgeFrames(
+        speed=speed,
+        mass=torch.cat([mass[:, :1], mass[:, 1:] * tangential], -1),
+        read_first=torch.cat([axes, moment_first], -1),
+        read_second=torch.cat([axes, moment_second], -1),
+        give_first=torch.cat([axes * push_first[..., None], turn_first], -1).mT,
+        give_second=torch.cat([axes * push_second[..., None], turn_second], -1).mT.neg(),
+        start=start,
+    )
 
 
 def relative_velocity(graph: ContactGraph, velocity: Tensor, angular: Tensor) -> Tensor:
@@ -204,19 +213,35 @@ def _meeting(g: ContactGraph, normal_motion: Tensor, speed: Tensor) -> Tensor:
     return torch.cat([times, places], -1)
 
 
-def _axes(normal: Tensor, slip: Tensor, lift: Tensor) -> Tensor:
-    """[E, 3, 3] frames: normal; tangent along the sliding velocity, else gravity's tangential part; binormal."""
+def _axes(g: ContactGraph, slip: Tensor, lift: Tensor) -> tuple[Tensor, Tensor]:
+    """[E, 3, 3] frames: normal, tangent, binormal; and [E, 1] whether the tangent means anything.
+
+    The tangent is along the sliding velocity; else along the tangential part of what gravity adds; else where the
+    contact point goes when it is pushed along the normal; else along what happens at the two bodies' other contacts.
+    All of these turn with the scene. Where none exists nothing says which way a tangential impulse should go.
+    """
+    n = g.normal
 
     def tangential(v: Tensor) -> Tensor:
-        return v - (v * normal).sum(-1, keepdim=True) * normal
+        return v - (v * n).sum(-1, keepdim=True) * n
 
-    sliding, falling = tangential(slip), tangential(lift)
-    # Any fixed direction serves where neither exists: nothing tangential is at play there.
-    axis = torch.zeros_like(normal).scatter_(1, normal.abs().argmin(1, keepdim=True), 1.0)
-    tangent = torch.where(sliding.norm(dim=-1, keepdim=True) > 1e-4, sliding, falling)
-    tangent = torch.where(tangent.norm(dim=-1, keepdim=True) > 1e-5, tangent, tangential(axis))
+    def pushed(body: Tensor, arm: Tensor) -> Tensor:
+        turn = (g.inverse_inertia[body] @ torch.linalg.cross(arm, n)[..., None])[..., 0]
+        return torch.linalg.cross(turn, arm)
+
+    moves = (g.inverse_mass > 0)[:, None]
+    around = torch.zeros_like(g.velocity).index_add_(0, g.first, slip).index_add_(0, g.second, slip) * moves
+    lightest = torch.maximum(g.inverse_mass[g.first], g.inverse_mass[g.second])[:, None].clamp_min(1e-12)
+    given = (pushed(g.first, g.arm_first) + pushed(g.second, g.arm_second)) / lightest
+    ways = ((slip, 1e-4), (lift, 1e-5), (given, 1e-3), (around[g.first] + around[g.second], 1e-4))
+    axis = torch.zeros_like(n).scatter_(1, n.abs().argmin(1, keepdim=True), 1.0)
+    tangent, known = tangential(axis), torch.zeros_like(n[:, :1], dtype=torch.bool)
+    for way, least in reversed(ways):
+        along = tangential(way)
+        there = along.norm(dim=-1, keepdim=True) > least
+        tangent, known = torch.where(there, along, tangent), known | there
     tangent = tangent / tangent.norm(dim=-1, keepdim=True)
-    return torch.stack([normal, tangent, torch.linalg.cross(normal, tangent)], 1)
+    return torch.stack([n, tangent, torch.linalg.cross(n, tangent)], 1), known.to(n.dtype)
 
 
 def _speed_scale(g: ContactGraph, slip: Tensor) -> Tensor:
@@ -228,12 +253,12 @@ def _speed_scale(g: ContactGraph, slip: Tensor) -> Tensor:
     return torch.maximum(body[g.first], body[g.second])[:, None]
 
 
-def _response(inverse_inertia: Tensor, arm: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
-    """Angular velocity [E, 3, 3] per unit impulse along each axis, and the velocity it gives the contact point
-    along each axis [E, 3, 3]."""
+def _response(inverse_inertia: Tensor, arm: Tensor, axes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """[E, 3, 3] each, of unit impulses along the axes: their moments, the angular velocities they give, and the
+    velocities these give the contact point along the axes."""
     moment = torch.linalg.cross(arm[:, None].expand_as(axes), axes)
     turn = moment @ inverse_inertia.mT
-    return turn, turn @ moment.mT
+    return moment, turn, turn @ moment.mT
 
 
 def _centripetal(g: ContactGraph) -> Tensor:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State
+from sdfsim.dynamics.broad import turning
 from sdfsim.dynamics.contacts import Contacts, distances, unit
 
 TIMES = 2  # estimates of when a pair meets, each by the normals of the one before
@@ -21,7 +22,7 @@ NEAR = 0.005  # model length: who flies no farther before the impact is seen wel
 
 
 def at_impact(bodies: Bodies, state: State, gravity: Tensor, dt: float, contacts: Contacts) -> Contacts:
-    """The edges of pairs that meet later in the step, as they are at that time; the others as they are.
+    """The edges of pairs that approach, as they are when the pair meets or the step ends; the others as they are.
 
     `distance` stays the one at the start, along the new normal; `arm` and `foot` are those at the impact.
 
@@ -33,7 +34,10 @@ def at_impact(bodies: Bodies, state: State, gravity: Tensor, dt: float, contacts
         contacts: edges; all of a pair are looked at together.
     """
     for _ in range(TIMES):
+        before = contacts
         contacts = _once(bodies, state, gravity, dt, contacts)
+        if contacts is before:
+            break
     return contacts
 
 
@@ -43,8 +47,7 @@ def _once(bodies: Bodies, state: State, gravity: Tensor, dt: float, contacts: Co
     when = _meeting(bodies, dt, contacts)
     c = contacts
     speed = (state.velocity[c.owner] - state.velocity[c.body]).norm(dim=-1)
-    spin = state.angular_velocity.norm(dim=-1) * torch.where(bodies.moves, bodies.radius, 0.0)
-    speed = speed + spin[c.owner] + spin[c.body]
+    speed = speed + turning(bodies, state, c.owner) + turning(bodies, state, c.body)
     row = (speed * when > NEAR).nonzero()[:, 0]
     if not len(row):
         return contacts
@@ -87,7 +90,7 @@ def _once(bodies: Bodies, state: State, gravity: Tensor, dt: float, contacts: Co
 
 
 def _meeting(bodies: Bodies, dt: float, contacts: Contacts) -> Tensor:
-    """[E] when the first edge of each edge's pair closes; 0 where none does within the step."""
+    """[E] when the first edge of each edge's pair closes, at most the step; 0 where none ever does."""
     rate = (contacts.distance - contacts.ahead) / dt
     when = torch.where(rate > 0, contacts.distance.clamp_min(0.0) / rate.clamp_min(1e-12), torch.inf)
     pair = torch.unique(contacts.owner * len(bodies) + contacts.body, return_inverse=True)[1]

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor, nn
 
-from sdfsim.dynamics.graph import EDGE_FEATURES, ContactGraph, EdgeFrames, edge_frames, relative_velocity
+from sdfsim.dynamics.graph import EDGE_FEATURES, ContactGraph, EdgeFrames, edge_frames
 
 # Relative velocities that a round sees are no larger than this, in units of the fastest motion before the step (1.7 in
 # training). Larger ones are a prediction that runs away, which the rounds after it must not feed on.
@@ -82,6 +83,28 @@ class Round(nn.Module):
             nn.init.normal_(head.weight, std=0.01)
             nn.init.zeros_(head.bias)
 
+    def read(self, body: Tensor, edge: Tensor, first: Tensor, second: Tensor, relative: Tensor) -> Tensor:
+        """[E, width] of the edges' own latents, those of their bodies, and [E, 6] what is seen of their motion."""
+        return self.edge(torch.cat([self.normalise(edge), body[first], body[second], relative], -1))
+
+    def impulse(self, hidden: Tensor, friction: bool) -> Tensor:
+        """[E, axis, end | mean] changes of velocity; without friction the normal is the only axis."""
+        change = self.normal_impulse(hidden)[:, None]
+        if not friction:
+            return change
+        return torch.cat([change, self.tangent_impulse(hidden).reshape(-1, 2, 2).mT], 1)
+
+    def tell(
+        self, edge: Tensor, body: Tensor, hidden: Tensor, weight: Tensor, graph: ContactGraph
+    ) -> tuple[Tensor, Tensor]:
+        """Latents of edges and bodies for the next round."""
+        to_first, to_second = (self.message(hidden) * weight).chunk(2, -1)
+        heard = torch.zeros_like(body).index_add_(0, graph.first, to_first).index_add_(0, graph.second, to_second)
+        body = body + self.body(torch.cat([body, heard], -1))
+        body = body * (LOUDEST / body.norm(dim=-1, keepdim=True).clamp_min(LOUDEST))
+        # Scenery carries no message from one body to another.
+        return edge + self.latent(hidden), body * (graph.inverse_mass > 0)[:, None]
+
 
 class ImpulseNetwork(nn.Module):
     """Encode edges, then `rounds` of pushing; see the module's docstring.
@@ -110,44 +133,32 @@ class ImpulseNetwork(nn.Module):
         frames = edge_frames(graph, mirrored=mirrored)
         edge = by_rows(self.encode, rows, frames.start)
         body = edge.new_zeros(len(graph.inverse_mass), self.config.width)
-        now = Velocities(graph.free_velocity, graph.free_angular, graph.mean_velocity, graph.mean_angular)
-        for layer in self.rounds:
-            edge, body, now = self._round(layer, graph, frames, edge, body, now, friction, rows)
-        return now
-
-    def _round(self, layer, graph: ContactGraph, frames: EdgeFrames, edge, body, now: Velocities, friction, rows):
-        end = _in_frame(graph, frames, now.velocity, now.angular)
-        mean = _in_frame(graph, frames, now.mean_velocity, now.mean_angular)
-        first, second = graph.first, graph.second
-
-        def read(edge: Tensor, first: Tensor, second: Tensor, end: Tensor, mean: Tensor) -> Tensor:
-            return layer.edge(torch.cat([layer.normalise(edge), body[first], body[second], end, mean], -1))
-
-        hidden = by_rows(read, rows, edge, first, second, end, mean)
-        edge = edge + layer.latent(hidden)
-        weight = _share_of_pair(layer.attention(hidden)[:, 0], graph)[:, None]
-
-        # [E, end | mean, axis] velocity change, units of `speed`; without friction the normal is the only axis.
-        change = layer.normal_impulse(hidden)[..., None]
-        if friction:
-            change = torch.cat([change, layer.tangent_impulse(hidden).reshape(-1, 2, 2)], -1)
-        impulse = change * (weight * frames.speed)[..., None] * frames.mass[:, None, : change.shape[-1]]
-        now = Velocities(
-            *_push(graph, frames, impulse[:, 0], now.velocity, now.angular),
-            *_push(graph, frames, impulse[:, 1], now.mean_velocity, now.mean_angular),
-        )
-        to_first, to_second = (layer.message(hidden) * weight).chunk(2, -1)
-        heard = torch.zeros_like(body).index_add_(0, first, to_first).index_add_(0, second, to_second)
-        body = body + layer.body(torch.cat([body, heard], -1))
-        body = body * (LOUDEST / body.norm(dim=-1, keepdim=True).clamp_min(LOUDEST))
-        # Scenery carries no message from one body to another.
-        return edge, body * (graph.inverse_mass > 0)[:, None], now
+        end = torch.cat([graph.free_velocity, graph.free_angular], -1)
+        mean = torch.cat([graph.mean_velocity, graph.mean_angular], -1)
+        twist = torch.stack([end, mean], -1)
+        for number, layer in enumerate(self.rounds, start=1):
+            seen = _relative(graph, frames, twist)
+            hidden = by_rows(partial(layer.read, body), rows, edge, graph.first, graph.second, seen)
+            weight = _share_of_pair(layer.attention(hidden)[:, 0], graph)[:, None]
+            twist = _push(graph, frames, layer.impulse(hidden, friction) * weight[..., None], twist)
+            if number < len(self.rounds):  # nobody reads what the last round would tell
+                edge, body = layer.tell(edge, body, hidden, weight, graph)
+        end, mean = twist.unbind(-1)
+        return Velocities(end[:, :3], end[:, 3:], mean[:, :3], mean[:, 3:])
 
 
-def _in_frame(graph: ContactGraph, frames: EdgeFrames, velocity: Tensor, angular: Tensor) -> Tensor:
-    """[E, 3] dimensionless relative velocity in the edge's frame."""
-    v = relative_velocity(graph, velocity, angular)
-    return ((frames.axes @ v[..., None])[..., 0] / frames.speed).clamp(-FASTEST, FASTEST)
+def _relative(graph: ContactGraph, frames: EdgeFrames, twist: Tensor) -> Tensor:
+    """[E, 6] dimensionless relative velocities at the contact points along the edges' axes: end, then mean."""
+    relative = frames.read_first @ twist[graph.first] - frames.read_second @ twist[graph.second]
+    return (relative / frames.speed[..., None]).clamp(-FASTEST, FASTEST).mT.flatten(1)
+
+
+def _push(graph: ContactGraph, frames: EdgeFrames, change: Tensor, twist: Tensor) -> Tensor:
+    """Twists [N, 6, 2] after changes of velocity [E, axis, 2] in units of `speed`, as impulses on both bodies."""
+    axes = change.shape[1]
+    impulse = change * (frames.speed * frames.mass[:, :axes])[..., None]
+    twist = twist.index_add(0, graph.first, frames.give_first[..., :axes] @ impulse)
+    return twist.index_add(0, graph.second, frames.give_second[..., :axes] @ impulse)
 
 
 def _share_of_pair(logit: Tensor, graph: ContactGraph) -> Tensor:
@@ -157,20 +168,3 @@ def _share_of_pair(logit: Tensor, graph: ContactGraph) -> Tensor:
     raised = (logit - top[graph.pair]).exp()
     total = torch.zeros(graph.pairs, dtype=logit.dtype, device=logit.device).index_add(0, graph.pair, raised)
     return raised / total[graph.pair]
-
-
-def _push(graph: ContactGraph, frames: EdgeFrames, impulse: Tensor, velocity: Tensor, angular: Tensor):
-    """Apply impulses [E, 3] (edge frames; [E, 1] along the normal) to both: new velocities, linear and angular."""
-    world = _along(impulse, frames.axes)
-    velocity = velocity.index_add(0, graph.first, world * frames.push_first)
-    velocity = velocity.index_add(0, graph.second, -world * frames.push_second)
-    angular = angular.index_add(0, graph.first, _along(impulse, frames.turn_first))
-    angular = angular.index_add(0, graph.second, -_along(impulse, frames.turn_second))
-    return velocity, angular
-
-
-def _along(impulse: Tensor, vectors: Tensor) -> Tensor:
-    """[E, 3]: vectors [E, 3, 3] of the axes, each times the impulse [E, 3] along it; [E, 1]: of the first alone."""
-    if impulse.shape[-1] == 1:
-        return impulse * vectors[:, 0]
-    return (impulse[:, None] @ vectors)[:, 0]

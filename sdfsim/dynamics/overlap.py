@@ -29,10 +29,10 @@ def parting(bodies: Bodies, state: State, contacts: Contacts, memory: Memory) ->
     if not len(contacts):
         return contacts
     owner, body = contacts.owner, contacts.body
-    # A plane has one way out for all of a body.
-    near = (state.position[owner] - state.position[body]).norm(dim=-1) < torch.maximum(
-        _reach(bodies, owner), _reach(bodies, body)
-    )
+    # Only the centre of a body that moves counts, and no plane swallows any: it has one way out for all of a body.
+    apart = (state.position[owner] - state.position[body]).norm(dim=-1)
+    swallowed = bodies.moves[owner] & (apart < _reach(bodies, body))
+    near = swallowed | (bodies.moves[body] & (apart < _reach(bodies, owner)))
     if not bool(near.any()):
         return contacts
     pair, pairs = number_pairs(owner, body, len(bodies))

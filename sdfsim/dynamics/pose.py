@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import torch
 from torch import Tensor
 
@@ -32,19 +34,30 @@ def rotate(q: Tensor, v: Tensor) -> Tensor:
 
 def to_matrix(q: Tensor) -> Tensor:
     """Rotation matrices [..., 3, 3] of unit quaternions [..., 4]."""
-    x, y, z, w = q.unbind(-1)
-    rows = [
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - w * z),
-        2 * (x * z + w * y),
-        2 * (x * y + w * z),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - w * x),
-        2 * (x * z - w * y),
-        2 * (y * z + w * x),
-        1 - 2 * (x * x + y * y),
+    products = (q[..., :, None] * q[..., None, :]).flatten(-2)
+    return (products @ _matrix_of_products(q.dtype, q.device)).unflatten(-1, (3, 3))
+
+
+@cache
+def _matrix_of_products(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """[16, 9]: how the entries of the matrix come from the products of two components (x, y, z, w)."""
+    x, y, z, w = range(4)
+    entries = [
+        {(x, x): 1, (y, y): -1, (z, z): -1, (w, w): 1},
+        {(x, y): 2, (w, z): -2},
+        {(x, z): 2, (w, y): 2},
+        {(x, y): 2, (w, z): 2},
+        {(x, x): -1, (y, y): 1, (z, z): -1, (w, w): 1},
+        {(y, z): 2, (w, x): -2},
+        {(x, z): 2, (w, y): -2},
+        {(y, z): 2, (w, x): 2},
+        {(x, x): -1, (y, y): -1, (z, z): 1, (w, w): 1},
     ]
-    return torch.stack(rows, -1).reshape(*q.shape[:-1], 3, 3)
+    matrix = torch.zeros(16, 9, dtype=dtype)
+    for column, entry in enumerate(entries):
+        for (one, other), factor in entry.items():
+            matrix[4 * one + other, column] = factor
+    return matrix.to(device)
 
 
 def from_rotvec(r: Tensor) -> Tensor:

@@ -163,7 +163,7 @@ def respond(
     graph = contact_graph(bodies, state, free, contacts, rules)[1]
     memory.count(nodes=len(active), edges=len(contacts))
     predicted = model.network(graph, friction=rules.friction, rows=rules.rows)
-    return _move(bodies, state, free, active, predicted, rules), contacts
+    return _move(bodies, state, free, active, graph, predicted, rules), contacts
 
 
 def contact_graph(
@@ -205,18 +205,26 @@ def contact_graph(
     )
 
 
-def _move(bodies: Bodies, state: State, free: State, active: Tensor, predicted: Velocities, rules: Rules) -> State:
+def _move(
+    bodies: Bodies, state: State, free: State, active: Tensor, graph: ContactGraph, predicted: Velocities, rules: Rules
+) -> State:
     """Bodies in contact move by the predicted mean velocities and leave with the predicted end velocities."""
     chosen = bodies.moves[active]
     rows = active[chosen]
-    place = state.position[rows] + predicted.mean_velocity[chosen].double() * rules.dt
+
+    def change(now: Tensor, flown: Tensor) -> Tensor:
+        # What contact adds, so that single precision rounds that and not the motion that goes on.
+        return (now - flown)[chosen].double()
+
+    place = free.position[rows] + change(predicted.mean_velocity, graph.mean_velocity) * rules.dt
+    velocity = free.velocity[rows] + change(predicted.velocity, graph.free_velocity)
     orientation, angular = state.orientation[rows], free.angular_velocity[rows]
     if rules.rotation:
         turn = pose.from_rotvec(predicted.mean_angular[chosen].double() * rules.dt)
         orientation = pose.normalise(pose.multiply(turn, orientation))
-        angular = predicted.angular[chosen].double()
+        angular = angular + change(predicted.angular, graph.free_angular)
     now = {name: getattr(free, name) for name in _POSE}
-    return replace(free, **_put(now, rows, (place, orientation, predicted.velocity[chosen].double(), angular)))
+    return replace(free, **_put(now, rows, (place, orientation, velocity, angular)))
 
 
 def _paper_step(
