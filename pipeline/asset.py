@@ -19,7 +19,7 @@ SCENERY_SHARE = 2
 
 
 def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str = "default", seed: int = 0,
-              on_progress: Progress | None = None) -> dict:  # fmt: skip
+              device: str = "cpu", on_progress: Progress | None = None) -> dict:  # fmt: skip
     """Fits a compact SDF to the scenery and to every body, each a Shape folder in `out` that goes by its name.
 
     The scenery's solid is closed (capped where the trained space ends), so the sign of its distance is right
@@ -32,6 +32,7 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
         budget: s of fitting, for all.
         recipe: of the fits.
         seed: of the fits.
+        device: where to compute.
         on_progress: called with (fraction, message).
 
     Returns:
@@ -56,26 +57,27 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
         done += share
         folder = out / name
         if (folder / "shape.json").exists():
+            checkpoint_of(out, name).unlink(missing_ok=True)
             certificates[name] = load_shape(folder).certificate
             continue
         solid, shown = meshes_of(mesh_folder, name)
         certificates[name] = fit_one(
             solid, shown, out, name, budget=None if budget is None else budget * share, recipe=recipe, seed=seed,
-            on_progress=tell,
+            device=device, on_progress=tell,
         )  # fmt: skip
     missed = [f"{name}: {found['reason']}" for name, found in certificates.items() if not found["passed"]]
     return {"shapes": certificates, "passed": not missed, "reason": "; ".join(missed)}
 
 
 def fit_one(solid: Mesh, shown: Mesh, out: Path, name: str, *, budget: float | None, recipe: str, seed: int,
-            on_progress: Progress) -> dict:  # fmt: skip
+            device: str, on_progress: Progress) -> dict:  # fmt: skip
     """Fits one shape, saves it as the folder `out`/`name`, and returns its certificate."""
     from sdfsim.shape.fit import fit_mesh
 
-    checkpoint = out / f"{name}.checkpoint"
+    checkpoint = checkpoint_of(out, name)
     shape = fit_mesh(
         solid, name=name, recipe=recipe, budget=budget, seed=seed, cap=True,  # type: ignore[arg-type]
-        on_progress=on_progress, checkpoint=checkpoint,
+        on_progress=on_progress, checkpoint=checkpoint, device=device,
     )  # fmt: skip
     # The folder appears complete or not at all: a run that goes on keeps those that are there.
     partial = out / f".{name}.part"
@@ -84,6 +86,11 @@ def fit_one(solid: Mesh, shown: Mesh, out: Path, name: str, *, budget: float | N
     partial.rename(out / name)
     checkpoint.unlink(missing_ok=True)
     return shape.certificate
+
+
+def checkpoint_of(out: Path, name: str) -> Path:
+    """Where the fit of a shape goes on from."""
+    return out / f"{name}.checkpoint"
 
 
 def meshes_of(mesh_folder: Path, name: str) -> tuple[Mesh, Mesh]:

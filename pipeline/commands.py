@@ -92,7 +92,7 @@ def poses(
         typer.Argument(help="Folder of photos, a video, a transforms.json, or a COLMAP model.", show_default=False),
     ],
     out: Out,
-    preset: Preset = "standard",
+    preset: KeptPreset = None,
     as_json: Json = False,
     device: Device = "auto",
     verbose: Verbose = False,
@@ -101,9 +101,7 @@ def poses(
     with Session(as_json=as_json, verbose=verbose) as session:
         from pipeline import stages
 
-        report = stages.reconstruct(
-            photos, out, preset=preset, until_stage="poses", device=device, progress=session.stage_progress
-        )
+        report = stages.find_poses(photos, out, preset=preset, device=device, progress=session.stage_progress)
         _report_stages(session, report, out)
 
 

@@ -21,6 +21,7 @@ from pipeline.landmarks import find_landmarks
 from pipeline.mlp_field import MlpField, MlpSize
 from pipeline.mlp_trainer import trainer_for
 from pipeline.normalise import Normalisation, find_normalisation
+from pipeline.photos import load_photos
 from pipeline.rays import held_out, load_rays
 from pipeline.recipe import Recipe
 from pipeline.snapshots import Snapshots
@@ -58,7 +59,8 @@ def train(
         photos_folder: of the photos stage.
         out: existing folder.
         recipe: see `PRESETS`.
-        budget: s of training; the number of steps is cut to what fits, measured after the first steps.
+        budget: s of training, those before a kill included; the number of steps is cut to what fits, measured after
+            the first steps.
         seed: of everything random.
         device: where to compute.
         threads: of the CPU; None takes what is fastest now (a second thread only slows things down where another
@@ -70,7 +72,7 @@ def train(
         SdfsimError: the loss is no longer finite.
     """
     out = Path(out)
-    masked = all((Path(photos_folder) / "masks" / f"{v.name}.png").exists() for v in views)
+    masked = all(photo.mask for photo in load_photos(photos_folder))
     normalisation = find_normalisation(views, sparse, masked=masked)
     local = normalisation.views(views)
     test = held_out(len(views))
@@ -83,6 +85,7 @@ def train(
     per_step = calibrate(make(recipe, trainer.rays, landmarks, seed, device), threads)
     if budget is not None and not resumed:
         trainer.iterations = min(recipe.iterations, max(FEWEST_STEPS, int(budget / per_step)))
+    left = None if budget is None else budget - trainer.seconds
     held = HeldOut([local[i] for i in test], photos_folder, trainer, masked=masked) if test else None
     snapshots = Snapshots(out, trainer, held)
     saved, started, first = time.monotonic(), time.monotonic(), trainer.iteration
@@ -94,13 +97,13 @@ def train(
         if not all(math.isfinite(v) for v in losses.values()):
             raise SdfsimError(
                 "distill: the loss is no longer finite",
-                "the poses may be wrong: look at the recording of the poses stage, or take more photos",
+                "the poses may be wrong: look at the cameras in the report, or take more photos",
             )
         snapshots.take(smooth)
         now = time.monotonic()
         trainer.seconds = before + now - started
-        if budget is not None and trainer.iteration % PACE == 0:
-            trainer.iterations = paced(trainer, recipe, budget, now - started, trainer.iteration - first)
+        if left is not None and trainer.iteration % PACE == 0:
+            trainer.iterations = paced(trainer, recipe, left, now - started, trainer.iteration - first)
         if now - saved > checkpoint_every:
             trainer.save(checkpoint)
             saved = now
@@ -117,7 +120,7 @@ def train(
         "iterations": trainer.iterations, "rays": len(rays), "train_seconds": round(trainer.seconds, 1),
         "seconds_before": round(before, 1), "resumed": resumed, "masked": masked, "beta": beta,
         "threads": torch.get_num_threads(), "losses": {k: round(v, 5) for k, v in smooth.items()},
-        "held_out_photos": [views[i].source for i in test], "snapshots": snapshots.curve, **scores,
+        "snapshots": snapshots.curve, **scores,
     }  # fmt: skip
     save_field(trainer.field, beta, normalisation, report, out)
     checkpoint.unlink(missing_ok=True)

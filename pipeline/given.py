@@ -12,6 +12,7 @@ import numpy as np
 
 from sdfsim.errors import SdfsimError
 
+LENSES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE")  # camera models of a transforms.json
 # COLMAP's camera models, by number: name, and the names of their parameters. Models whose lens is not one that a
 # pinhole photo can be made of by OpenCV's two formulas are refused by name.
 MODELS = {
@@ -66,27 +67,32 @@ def read_given(path: Path) -> list[Given]:
 def read_transforms(path: Path) -> list[Given]:
     """Cameras of a transforms.json: camera-to-world matrices with OpenGL axes; intrinsics for all or in each frame."""
     about = json.loads(path.read_text(encoding="utf-8"))
-    if about.get("camera_model", "OPENCV") not in ("OPENCV", "PINHOLE", "OPENCV_FISHEYE", "SIMPLE_PINHOLE"):
-        raise SdfsimError(f"{path}: camera_model: {about['camera_model']!r} is not read", "allowed: OPENCV, PINHOLE")
     flip = np.diag([1.0, -1, -1])
     found = []
+    _check_lens(about, str(path))
     for frame in about["frames"]:
         values = {**about, **frame}
+        where = f"{path}: {frame['file_path']}"
+        _check_lens(values, where)
+        fisheye = values.get("camera_model") == "OPENCV_FISHEYE" or bool(values.get("is_fisheye"))
         width, height = int(values.get("w", 0)), int(values.get("h", 0))
         if "fl_x" in values:
+            if width <= 0 or height <= 0:
+                raise SdfsimError(f"{where}: fl_x without w and h", "give the size in px that fl_x is for")
             fx = float(values["fl_x"])
-        elif width:
+        elif fisheye:
+            raise SdfsimError(f"{where}: a fisheye without fl_x", "give fl_x, w and h in px")
+        elif width > 0 and height > 0:
             fx = 0.5 * width / np.tan(0.5 * float(values["camera_angle_x"]))
-        else:  # For a photo of any width: `fitted` scales it.
+        else:  # For a photo of any width: `scaled` knows it.
             width, height, fx = 1, 0, 0.5 / np.tan(0.5 * float(values["camera_angle_x"]))
         fy = float(values.get("fl_y", fx))
         cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
         pose = np.array(frame["transform_matrix"], float).reshape(4, 4)
         if not np.isfinite(pose).all() or abs(np.linalg.det(pose[:3, :3])) < 1e-6:
-            raise SdfsimError(f"{path}: {frame['file_path']}: transform_matrix is not a pose")
+            raise SdfsimError(f"{where}: transform_matrix is not a pose")
         turn = pose[:3, :3] / np.cbrt(np.linalg.det(pose[:3, :3]))
         rotation = flip @ turn.T
-        fisheye = values.get("camera_model") == "OPENCV_FISHEYE"
         names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
         lens = tuple(float(values.get(name, 0.0)) for name in names)
         found.append(
@@ -94,6 +100,13 @@ def read_transforms(path: Path) -> list[Given]:
                   rotation, -rotation @ pose[:3, 3], frame.get("mask_path"))
         )  # fmt: skip
     return found
+
+
+def _check_lens(values: dict, where: str) -> None:
+    """Raises SdfsimError for a lens that is none of `LENSES`."""
+    model = values.get("camera_model", LENSES[0])
+    if model not in LENSES:
+        raise SdfsimError(f"{where}: camera_model: {model!r} is not read", f"allowed: {', '.join(LENSES)}")
 
 
 def read_model(folder: Path) -> list[Given]:

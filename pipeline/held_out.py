@@ -42,6 +42,11 @@ class Compared:
 class HeldOut:
     """The photos that were not trained on, at a third of the training resolution.
 
+    Those that show nothing of the unit sphere are passed over: there is nothing to compare.
+
+    Attributes:
+        shown: index of each view that shows some of it.
+
     Args:
         views: in normalised space.
         photos_folder: of the photos stage.
@@ -53,11 +58,12 @@ class HeldOut:
         self.views, self.trainer, self.masked = views, trainer, masked
         longest = max(100, trainer.recipe.long_side // 3)
         self.rays = load_rays(views, photos_folder, longest, masks=masked).to(trainer.device)
+        self.shown: list[int] = self.rays.view.unique().tolist()
         self.backdrop = torch.full((3,), BACKDROP, device=trainer.device) if masked else None
 
     @torch.no_grad()
     def compare(self, number: int) -> Compared:
-        """Renders one of the views with the field as it is; its cached SDF has to be up to date."""
+        """Renders one of the `shown` views with the field as it is; its cached SDF has to be up to date."""
         trainer, rays = self.trainer, self.rays
         assert trainer.cache is not None
         index = torch.nonzero(rays.view == number)[:, 0]
@@ -85,22 +91,30 @@ class HeldOut:
 
 
 def score(held: HeldOut, out: Path, on_progress: Progress | None = None) -> dict:
-    """PSNR (and, with masks, overlap of silhouettes) of every held-out view; writes the renders to `out`/held_out.
+    """PSNR (and, with masks, overlap of silhouettes) of the held-out views; writes the renders to `out`/held_out.
 
     Args:
         held: the views.
         out: folder of the stage.
         on_progress: called with (fraction, message).
+
+    Returns:
+        For the report; empty where no view shows anything of the unit sphere.
     """
+    if not held.shown:
+        return {}
     (out / FOLDER).mkdir(exist_ok=True)
     found = []
-    for number, view in enumerate(held.views):
+    for count, number in enumerate(held.shown, 1):
         found.append(held.compare(number))
-        Image.fromarray(found[-1].picture).save(out / FOLDER / view.name, quality=92)
+        Image.fromarray(found[-1].picture).save(out / FOLDER / held.views[number].name, quality=92)
         if on_progress:
-            on_progress((number + 1) / len(held.views), f"held-out view {number + 1} of {len(held.views)}")
+            on_progress(count / len(held.shown), f"held-out view {count} of {len(held.shown)}")
     psnr = [one.psnr for one in found]
-    report = {"psnr": round(float(np.mean(psnr)), 2), "psnr_each": [round(value, 2) for value in psnr]}
+    report = {
+        "held_out_photos": [held.views[number].source for number in held.shown],
+        "psnr": round(float(np.mean(psnr)), 2), "psnr_each": [round(value, 2) for value in psnr],
+    }  # fmt: skip
     if held.masked:
         overlaps = [one.overlap for one in found if one.overlap is not None]
         report["silhouette_overlap"] = round(float(np.mean(overlaps)), 4)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 from PIL import Image
 
 from pipeline.cameras import View, load_sparse, load_views
@@ -13,6 +14,7 @@ from pipeline.cleaning import keep_faces
 from pipeline.distill import load_field
 from pipeline.field import Field
 from pipeline.parts import Parts, split
+from pipeline.photos import load_photos
 from pipeline.picture import Named, draw_names
 from pipeline.placement import Placement, place
 from pipeline.scale import Scale, measured, of_exif
@@ -30,7 +32,7 @@ SCENERY = "scene"
 
 
 def make_meshes(distill: Path, poses: Path, photos: Path, source: Path, out: Path, *, preset: str, wishes: Wishes,
-                on_progress: Progress | None = None) -> dict:  # fmt: skip
+                device: str = "cpu", on_progress: Progress | None = None) -> dict:  # fmt: skip
     """Extracts surfaces and writes them to `out`.
 
     Writes `mesh.ply` (all that photos show), of the scenery `solid.ply` (closed) and `shown.ply` (what is displayed),
@@ -40,10 +42,11 @@ def make_meshes(distill: Path, poses: Path, photos: Path, source: Path, out: Pat
         distill: folder of that stage.
         poses: folder of that stage.
         photos: folder of that stage.
-        source: the user's photos.
+        source: the user's photos, see `Source.folder`.
         out: an existing folder.
         preset: quick, standard or fine.
         wishes: what a person asks for.
+        device: where the field is sampled.
         on_progress: called with (fraction, message).
 
     Returns:
@@ -57,12 +60,12 @@ def make_meshes(distill: Path, poses: Path, photos: Path, source: Path, out: Pat
         return lambda fraction, message: on_progress(start + share * fraction, message) if on_progress else None
 
     trained = load_field(distill)
-    field = trained.field
+    field = trained.field.to(device)
     views = trained.normalisation.views(load_views(poses))
     points = trained.normalisation.apply(load_sparse(poses).xyz)
     masked = bool(trained.report["masked"])
     surface = extract(field, views, points, photos, resolution=PRESET_RESOLUTION[preset], on_progress=tell(0.0, 0.5))
-    placement = upright(surface, views, source, wishes, masked=masked)
+    placement = upright(surface, views, photos, source, wishes, masked=masked)
     limit = ball if wishes.crop is None else box_of(placement, wishes.crop)
     if wishes.crop is not None or wishes.keep:
         surface = again(surface, field, views, points, photos, wishes, limit, tell(0.5, 0.2))
@@ -80,20 +83,22 @@ def make_meshes(distill: Path, poses: Path, photos: Path, source: Path, out: Pat
     picture(parts, surface, placement, views, photos).save(out / "objects.png")
     shown = placement.mesh(surface.visible)
     return {
-        **surface.report, "extent_m": np.ptp(shown.vertices, axis=0).round(4).tolist(), "up_from": placement.up_from,
+        **surface.report, "extent_m": rounded(np.ptp(shown.vertices, axis=0)).tolist(), "up_from": placement.up_from,
         "up_within_degrees": round(placement.up_within, 2), "up_confidence": placement.up_confidence,
         "size": placement.size_from, "objects": list(parts.bodies),
-        "smallest_object_m": round(parts.smallest * placement.scale, 4),
+        "smallest_object_m": float(rounded(parts.smallest * placement.scale)),
         "left_out": [entry for entry in read_parts(out)["left_out"] if not entry["kept"]],
     }  # fmt: skip
 
 
-def upright(surface: Surface, views: list[View], source: Path, wishes: Wishes, *, masked: bool) -> Placement:
+def upright(
+    surface: Surface, views: list[View], photos: Path, source: Path, wishes: Wishes, *, masked: bool
+) -> Placement:
     """Up and scale: a known distance first, then a known size, then what EXIF says."""
     caster = Caster(surface.raw)
     scale: Scale | None = None
     if wishes.distance is not None:
-        scale = measured(wishes.distance, views, source, caster)
+        scale = measured(wishes.distance, views, load_photos(photos), caster)
     placement = place(surface.visible, views, scale, size=wishes.size, alone=masked)
     if scale is None and wishes.size is None:
         found = of_exif(views, source, caster, placement.rotation[2])
@@ -124,6 +129,13 @@ def again(surface: Surface, field: Field, views: list[View], points: np.ndarray,
     return of_volume(volume, field, views, points, photos, limit, keep=wishes.keep, on_progress=on_progress)
 
 
+def rounded(values: ArrayLike) -> np.ndarray:
+    """Values [...] to six digits of the largest: scenes are from a tenth of a millimetre to 100 km wide."""
+    values = np.asarray(values, float)
+    largest = np.abs(values).max()
+    return values.round(5 - int(np.floor(np.log10(largest)))) if largest > 0 else values
+
+
 def write_parts(parts: Parts, surface: Surface, placement: Placement, wishes: Wishes, out: Path) -> None:
     """Writes meshes in metres, `placement.json` and `parts.json`."""
 
@@ -142,11 +154,11 @@ def write_parts(parts: Parts, surface: Surface, placement: Placement, wishes: Wi
     for name, mesh in parts.bodies.items():
         moved = write(f"objects/{name}.ply", mesh)
         low, high = moved.vertices.min(0), moved.vertices.max(0)
-        objects.append({"name": name, "low": low.round(4).tolist(), "high": high.round(4).tolist()})
+        objects.append({"name": name, "low": rounded(low).tolist(), "high": rounded(high).tolist()})
     left = [
         {
-            "name": piece.name, "size_m": round(piece.size * placement.scale, 4), "why": piece.why,
-            "at": placement.points(piece.middle[None])[0].round(4).tolist(),
+            "name": piece.name, "size_m": float(rounded(piece.size * placement.scale)), "why": piece.why,
+            "at": rounded(placement.points(piece.middle[None])[0]).tolist(),
             "kept": "all" in wishes.keep or piece.name in wishes.keep,
         }
         for piece in surface.pieces
@@ -154,7 +166,7 @@ def write_parts(parts: Parts, surface: Surface, placement: Placement, wishes: Wi
     write_json(
         out / "parts.json",
         {"version": 1, "scenery": parts.solid is not None, "objects": objects, "left_out": left,
-         "smallest_m": round(parts.smallest * placement.scale, 4)},
+         "smallest_m": float(rounded(parts.smallest * placement.scale))},
     )  # fmt: skip
     write_json(out / "placement.json", placement.to_dict())
 

@@ -15,6 +15,7 @@ from sdfsim.files import write_text
 
 PRESETS = ("quick", "standard", "fine", "paper")
 DROPS = ("box", "ball", "none")
+DEVICES = ("auto", "cpu", "cuda")
 
 
 @dataclass
@@ -22,7 +23,7 @@ class Options:
     """Every option of a reconstruction, as written to config.yaml.
 
     Attributes:
-        photos: what the user gave.
+        photos: what the user gave, an absolute path.
         preset: quick, standard, fine, or paper.
         size: widest side of the scene, m; None: assumed to be 1 m.
         budget: s for everything; None: what the preset takes.
@@ -59,6 +60,8 @@ class Options:
             raise SdfsimError(f"budget: must be > 0 s (got {self.budget:g})")
         if self.size is not None and self.distance is not None:
             raise SdfsimError("size and distance: both set the scale", "give one of them")
+        if self.device not in DEVICES:
+            raise SdfsimError(f"device: {self.device!r} is not one of {', '.join(DEVICES)}")
         if self.drop not in DROPS:
             raise SdfsimError(f"drop: {self.drop!r} is not one of {', '.join(DROPS)}")
         if self.crop is not None and not np.less(self.crop[:3], self.crop[3:]).all():

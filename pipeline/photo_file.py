@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +18,12 @@ MAX_PIXELS = 200_000_000
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP")
 # Photos with a mask are shown on this grey; it has no texture, so it adds no features.
 BACKDROP = 0.5
+# What turns stored pixels upright, by EXIF orientation.
+TURNS = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180, 4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE, 6: Image.Transpose.ROTATE_270, 7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -24,12 +32,14 @@ class Picture:
 
     Attributes:
         pixels: RGB [H, W, 3] uint8.
+        original: width and height of the whole photo before it was made smaller, px; turned as `pixels` are.
         mask: [H, W] uint8 (255 = object), or None.
         focal: prior from EXIF, px of `pixels`, or None.
         camera: make and model, empty where unknown.
     """
 
     pixels: np.ndarray
+    original: tuple[int, int]
     mask: np.ndarray | None = None
     focal: float | None = None
     camera: str = ""
@@ -78,11 +88,14 @@ def read_photo(path: Path, long_side: int, mask: Path | None = None, shape: floa
     Raises:
         SdfsimError: not an image, truncated, too small or too large; the message names the file.
     """
-    image, focal, camera = _open(path, long_side)
-    turn = ImageOps.exif_transpose(image)
-    if shape is not None and abs(turn.width / turn.height / shape - 1) > abs(image.width / image.height / shape - 1):
-        turn = image
-    upright = _eight_bits(turn)
+    image, original, focal, camera = _decoded(path, long_side)
+    turn = TURNS.get(image.getexif().get(ExifTags.Base.Orientation, 1))
+    turned = _turned(image, turn)
+    if shape is not None and _off(turned, shape) > _off(image, shape):
+        turn, turned = None, image
+    if turned.size != image.size:
+        original = original[1], original[0]
+    upright = _eight_bits(turned)
     has_alpha = upright.mode in ("RGBA", "LA", "PA") or "transparency" in upright.info
     upright = upright.convert("RGBA" if has_alpha else "RGB")
     scale = min(1.0, long_side / max(upright.size))
@@ -91,30 +104,32 @@ def read_photo(path: Path, long_side: int, mask: Path | None = None, shape: floa
         upright = upright.resize(size, Image.Resampling.LANCZOS)
     pixels, inside = np.asarray(upright), None
     if mask is not None:
-        inside = read_mask(mask, upright.size, turned=turn is not image)
+        inside = read_mask(mask, upright.size, turn)
     elif has_alpha and pixels[..., 3].min() < 128:
         inside = pixels[..., 3]
     if inside is not None:
         share = inside[..., None].astype(np.float32) / 255
         pixels = (255 * (pixels[..., :3] / 255.0 * share + BACKDROP * (1 - share)) + 0.5).astype(np.uint8)
     return Picture(
-        np.ascontiguousarray(pixels[..., :3]), inside, focal * max(pixels.shape[:2]) if focal else None, camera
-    )
+        np.ascontiguousarray(pixels[..., :3]), original, inside,
+        focal * max(pixels.shape[:2]) if focal else None, camera,
+    )  # fmt: skip
 
 
-def read_mask(path: Path, size: tuple[int, int], *, turned: bool) -> np.ndarray:
+def read_mask(path: Path, size: tuple[int, int], turn: Image.Transpose | None) -> np.ndarray:
     """A mask [H, W] uint8 at the size (width, height) of its photo.
 
     Args:
         path: grey or with alpha; white is the object.
         size: px.
-        turned: the photo was turned by its EXIF orientation: a mask that only fits unturned is turned likewise.
+        turn: what the photo's stored pixels were turned by; a mask that does not fit upright was made for those, and
+            is turned likewise.
 
     Raises:
         SdfsimError: it cannot be read, or is not shaped like the photo.
     """
-    image, _, _ = _open(path, max(size))
-    for form in (ImageOps.exif_transpose(image), *([image.transpose(Image.Transpose.ROTATE_270)] if turned else [])):
+    image, _, _, _ = _decoded(path, max(size))
+    for form in (ImageOps.exif_transpose(image), _turned(image, turn)):
         if abs(form.width * size[1] / (form.height * size[0]) - 1) < 0.02:
             grey = form.getchannel("A") if form.mode == "RGBA" else form.convert("L")
             return np.asarray(grey.resize(size, Image.Resampling.BOX))
@@ -124,8 +139,13 @@ def read_mask(path: Path, size: tuple[int, int], *, turned: bool) -> np.ndarray:
     )
 
 
-def _open(path: Path, long_side: int) -> tuple[Image.Image, float | None, str]:
-    """A decoded image, its focal length in longer sides, and its camera."""
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[Image.Image]:
+    """One of the user's photos or masks, not decoded yet; PIL's own limit does not hold within.
+
+    Raises:
+        SdfsimError: too large; OSError and others of PIL where it is no image.
+    """
     limit = Image.MAX_IMAGE_PIXELS
     Image.MAX_IMAGE_PIXELS = None  # Our own limit below, before anything is decoded.
     try:
@@ -136,25 +156,38 @@ def _open(path: Path, long_side: int) -> tuple[Image.Image, float | None, str]:
                     f"{path}: too large ({width} x {height}, at most {MAX_PIXELS // 1_000_000} megapixels)",
                     "scale it down first",
                 )
-            if min(width, height) < MIN_SIDE:
+            yield image
+    finally:
+        Image.MAX_IMAGE_PIXELS = limit
+
+
+def _decoded(path: Path, long_side: int) -> tuple[Image.Image, tuple[int, int], float | None, str]:
+    """A decoded image, its size in the file, its focal length in longer sides, and its camera."""
+    try:
+        with opened(path) as image:
+            width, height = size = image.size
+            if min(size) < MIN_SIDE:
                 raise SdfsimError(f"{path}: too small ({width} x {height}, at least {MIN_SIDE} px a side)")
             focal, camera = exif_focal(image)
             if image.format == "JPEG":
                 # The decoder may skip to a smaller size, but no smaller than twice what is wanted.
                 image.draft("RGB", (2 * long_side, 2 * long_side))
             image.load()
-            return image, focal, camera
-    except SdfsimError:
-        raise
+            return image, size, focal, camera
     except UnidentifiedImageError as error:
         raise SdfsimError(f"{path}: not an image, in spite of its name", "remove it or replace it") from error
     except (OSError, SyntaxError, ValueError, EOFError) as error:
         what = "truncated" if "truncated" in str(error) else f"cannot be decoded ({error})"
         raise SdfsimError(f"{path}: {what}", "copy it again from the camera, or remove it") from error
-    except Image.DecompressionBombError as error:
-        raise SdfsimError(f"{path}: too large", "scale it down first") from error
-    finally:
-        Image.MAX_IMAGE_PIXELS = limit
+
+
+def _off(image: Image.Image, shape: float) -> float:
+    """By what share an image is wider or narrower than a shape, width over height."""
+    return abs(image.width / image.height / shape - 1)
+
+
+def _turned(image: Image.Image, turn: Image.Transpose | None) -> Image.Image:
+    return image if turn is None else image.transpose(turn)
 
 
 def _eight_bits(image: Image.Image) -> Image.Image:

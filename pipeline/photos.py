@@ -12,6 +12,7 @@ from PIL import Image
 from pipeline.cameras import View, save_views
 from pipeline.photo_file import Picture, read_photo
 from pipeline.quality import exposure, fault, sharpness
+from pipeline.rectify import Lens, rectified
 from pipeline.sources import Source, find_source
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, write_json
@@ -27,9 +28,12 @@ class Photo:
 
     Attributes:
         name: file name under `images/` (and, with `.png` added, under `masks/`).
-        source: file name the user gave, or the video's with a time.
+        source: the user's name of it, see `Source.name_of`, or the video's with a time; no two photos have the same.
         width: prepared width, px.
         height: prepared height, px.
+        original: width and height of the user's photo, px, turned as the prepared one is; of a frame of a video, which
+            nobody has as a file, those of the prepared photo.
+        lens: what the photo was freed from; None where nothing was straightened.
         focal: focal length read from EXIF, px of the prepared photo; None where EXIF has none.
         camera: make and model from EXIF, empty where unknown.
         mask: whether a mask came with it, as alpha or as a file.
@@ -41,11 +45,18 @@ class Photo:
     source: str
     width: int
     height: int
+    original: tuple[int, int]
+    lens: Lens | None
     focal: float | None
     camera: str
     mask: bool
     sharpness: float
     fault: str = ""
+
+    def prepared(self, pixels: np.ndarray, view: View) -> np.ndarray:
+        """Pixels [P, 2] of the prepared photo, of camera `view`, from those of the user's photo."""
+        found = pixels * np.array([self.width, self.height]) / self.original
+        return found if self.lens is None else self.lens.straight(found, view)
 
 
 def prepare_photos(
@@ -73,7 +84,7 @@ def prepare_photos(
     photos: list[Photo] = []
     shares: list[tuple[float, float]] = []
     views: list[View] = []
-    for origin, picture, view, fraction in _pictures(source, long_side):
+    for origin, picture, view, lens, fraction in _pictures(source, long_side):
         name = f"{len(photos):04d}.jpg"
         Image.fromarray(picture.pixels).save(out / "images" / name, quality=95, subsampling=0)
         if picture.mask is not None:
@@ -85,7 +96,10 @@ def prepare_photos(
         sharp = round(sharpness(picture.pixels), 4)
         shares.append(exposure(picture.pixels))
         focal = picture.focal if view is None else None  # A known camera is no prior.
-        photos.append(Photo(name, origin, width, height, focal, picture.camera, picture.mask is not None, sharp))
+        photos.append(
+            Photo(name, origin, width, height, picture.original, lens, focal, picture.camera,
+                  picture.mask is not None, sharp)
+        )  # fmt: skip
         if on_progress:
             on_progress(fraction, f"{len(photos)} photos")
     typical = float(np.quantile([p.sharpness for p in photos], 0.75))
@@ -96,34 +110,42 @@ def prepare_photos(
     if views:
         save_views(views, out / GIVEN)
     save_photos(photos, out)
-    return photos, [*source.notes, *notes_on(photos)]
+    return photos, [*source.notes, *notes_on(photos, len(source.masks))]
 
 
-def _pictures(source: Source, long_side: int) -> Iterator[tuple[str, Picture, View | None, float]]:
-    """Name, picture, known camera and share done of each photo."""
+def _pictures(source: Source, long_side: int) -> Iterator[tuple[str, Picture, View | None, Lens | None, float]]:
+    """Name, picture, known camera, lens and share done of each photo."""
     if source.video:
         from pipeline.video import chosen_frames
 
         for name, pixels, fraction in chosen_frames(source.video):
             image = Image.fromarray(pixels)
             image.thumbnail((long_side, long_side), Image.Resampling.LANCZOS)
-            yield name, Picture(np.asarray(image)), None, fraction
+            yield name, Picture(np.asarray(image), image.size), None, None, fraction
         return
     cameras = {}
     if source.cameras:
         from pipeline.given import read_given
 
         cameras = {camera.name: camera for camera in read_given(source.cameras)}
+    masks = _masks_that_count(source, long_side)
     for index, path in enumerate(source.photos):
         camera = cameras.get(source.frames.get(path, ""))
         shape = camera.width / camera.height if camera and camera.height else None
-        picture, view = read_photo(path, long_side, source.masks.get(path), shape), None
+        name, view, lens = source.name_of(path), None, None
+        picture = read_photo(path, long_side, masks.get(path), shape)
         if camera:
-            from pipeline.rectify import rectified
-
             _check_shape(path, picture, shape)
-            picture, view = rectified(picture, camera, path.name, path.name)
-        yield path.name, picture, view, (index + 1) / len(source.photos)
+            picture, view, lens = rectified(picture, camera, path.name, name)
+        yield name, picture, view, lens, (index + 1) / len(source.photos)
+
+
+def _masks_that_count(source: Source, long_side: int) -> dict[Path, Path]:
+    """The mask files, where every photo has one or is cut out by transparency; else none."""
+    lacking = [path for path in source.photos if path not in source.masks]
+    if source.masks and all(read_photo(path, long_side).mask is not None for path in lacking):
+        return source.masks
+    return {}
 
 
 def _check_shape(path: Path, picture: Picture, shape: float | None) -> None:
@@ -135,12 +157,18 @@ def _check_shape(path: Path, picture: Picture, shape: float | None) -> None:
         )
 
 
-def notes_on(photos: list[Photo]) -> list[str]:
-    """What a person should know about a set of photos, one line each."""
+def notes_on(photos: list[Photo], mask_files: int) -> list[str]:
+    """What a person should know about a set of photos, of which some came with mask files; one line each."""
     notes = []
     masked = sum(p.mask for p in photos)
-    if 0 < masked < len(photos):
-        notes.append(f"{masked} of {len(photos)} photos have a mask: ignored, as masks count only where all have one")
+    if masked < len(photos):
+        why = "as masks count only where every photo has one"
+        if mask_files:
+            notes.append(f"{mask_files} of {len(photos)} photos have a mask file: ignored, {why}")
+        if masked:
+            notes.append(
+                f"{masked} of {len(photos)} photos are transparent in part: grey there, but not taken as masks, {why}"
+            )
     sizes = sorted({(p.width, p.height) for p in photos})
     if len(sizes) > 1:
         notes.append("photos of several sizes: " + ", ".join(f"{w} x {h}" for w, h in sizes) + "; one camera for each")
@@ -166,6 +194,15 @@ def load_photos(folder: Path) -> list[Photo]:
     path = Path(folder) / "photos.json"
     data = read_json(path, "run the photos stage first")
     try:
-        return [Photo(**entry) for entry in data["photos"]]
+        return [
+            Photo(**{**entry, "original": tuple(entry["original"]), "lens": _lens(entry["lens"])})
+            for entry in data["photos"]
+        ]
     except (KeyError, TypeError) as error:
         raise SdfsimError(f"{path}: damaged", "run the photos stage again") from error
+
+
+def _lens(entry: dict | None) -> Lens | None:
+    if entry is None:
+        return None
+    return Lens(tuple(map(tuple, entry["matrix"])), tuple(entry["distortion"]), entry["fisheye"])

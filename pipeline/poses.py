@@ -20,7 +20,7 @@ from pipeline.cameras import load_view_file, save_views
 from pipeline.photos import GIVEN, Photo
 from pipeline.verdict import failure_hint, failure_message, judge, views_of
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
-from sdfsim.files import read_json, write_json
+from sdfsim.files import read_json, replacing, write_json
 
 Progress = Callable[[float, str], None]
 
@@ -159,7 +159,8 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
         raise SdfsimError(failure_message(verdict), hint, exit_code=EXIT_QUALITY)
     views = load_view_file(given) if job["given"] else views_of(result, photos)
     save_views(views, out / "cameras.json")
-    os.replace(folder / "sparse.npz", out / "sparse.npz")
+    with replacing(out / "sparse.npz") as partial:  # A copy: the rung's result stays whole for a run that goes on.
+        shutil.copyfile(folder / "sparse.npz", partial)
     for _, used, _ in tries:  # Tens of megabytes that nothing reads any more; the logs stay.
         (used / "database.db").unlink(missing_ok=True)
         shutil.rmtree(used / "colmap", ignore_errors=True)

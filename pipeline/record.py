@@ -8,6 +8,7 @@ import hashlib
 import json
 import os
 import shutil
+import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,11 +20,11 @@ UNFINISHED = "unfinished.json"
 
 
 def fingerprint(stage: str, inputs: str, options: dict, modules: tuple[str, ...]) -> str:
-    """Hash of a stage's inputs (their fingerprint), options and code.
+    """Hash of what a stage's result depends on: inputs, options and code.
 
     Args:
         stage: its name.
-        inputs: fingerprint of what it reads.
+        inputs: name of the result that it reads, see `finish`; of the first stage, hash of the photos.
         options: that its result depends on.
         modules: of this package whose source its result depends on.
     """
@@ -49,12 +50,26 @@ def content_of_photos(given: Path) -> str:
 
 
 def read(folder: Path) -> dict | None:
-    """The record of a finished stage: fingerprint, inputs, report, seconds; None where it has not finished."""
+    """The record of a finished stage: fingerprint, inputs, made, report, seconds; None where it has not finished."""
     try:
         known = json.loads((folder / RECORD).read_text(encoding="utf-8"))
-        return known if {"fingerprint", "inputs", "report", "seconds"} <= set(known) else None
-    except (OSError, ValueError, TypeError):
+        # Where a record names no result of its own, its fingerprint is the name that later stages know it by.
+        return {"made": known["fingerprint"], **known} if {"inputs", "report", "seconds"} <= set(known) else None
+    except (OSError, ValueError, TypeError, KeyError):
         return None
+
+
+def check_replaceable(place: Path) -> None:
+    """That nothing lies at a stage's place but an earlier result of it.
+
+    Raises:
+        SdfsimError: something else does, which is never replaced.
+    """
+    if os.path.lexists(place) and read(place) is None:
+        raise SdfsimError(
+            f"{place}: in the way, and not replaced: sdfsim did not write it (it holds no {RECORD})",
+            "choose another folder to write to, or move it away",
+        )
 
 
 def begin(work: Path, wanted: str, *, fresh: bool) -> Path:
@@ -74,27 +89,47 @@ def begin(work: Path, wanted: str, *, fresh: bool) -> Path:
             shutil.rmtree(work)
         work.mkdir(parents=True)
         write_json(work / UNFINISHED, {"fingerprint": wanted})
+    for half_written in work.rglob(".*.part"):
+        if half_written.is_file():
+            half_written.unlink()
     return work
 
 
+def clear(work: Path, place: Path) -> None:
+    """Removes what killed runs left of a stage whose result is there: the work on another, the result before it."""
+    for left in (work, _old(place)):
+        shutil.rmtree(left, ignore_errors=True)
+
+
+def _old(place: Path) -> Path:
+    return place.with_name(f".{place.name}.old")
+
+
 def finish(work: Path, place: Path, wanted: str, inputs: str, report: dict, seconds: float) -> None:
-    """Writes the record and moves the finished folder to its place.
+    """Writes the record and moves the finished folder to its place, in place of an earlier result of the stage.
+
+    Each result gets a name of its own, `made`: two of the same fingerprint may differ (time budgets, GPUs).
 
     Args:
         work: the folder that `begin` gave.
         place: where the result belongs.
         wanted: fingerprint of the stage.
-        inputs: fingerprint of what it read.
+        inputs: name of the result that it read.
         report: of the stage.
         seconds: that it took.
+
+    Raises:
+        SdfsimError: what lies at the place was not written by `finish`.
     """
+    check_replaceable(place)
     # The mark of unfinished work goes last: where the record cannot be written, the next run goes on from here.
     write_json(
         work / RECORD,
-        {"version": 1, "fingerprint": wanted, "inputs": inputs, "seconds": seconds, "report": report},
-    )
+        {"version": 1, "fingerprint": wanted, "inputs": inputs, "made": uuid.uuid4().hex, "seconds": seconds,
+         "report": report},
+    )  # fmt: skip
     place.parent.mkdir(parents=True, exist_ok=True)
-    old = place.with_name(f".{place.name}.old")
+    old = _old(place)
     shutil.rmtree(old, ignore_errors=True)
     # A folder cannot be replaced in one step; between the two renames the stage counts as not done.
     if place.exists():

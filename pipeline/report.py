@@ -32,7 +32,7 @@ def current(folder: Path) -> dict[str, dict]:
     before = None
     for stage in STAGES:
         known = record.read(place_of(folder, stage))
-        if known is None or (before is not None and known["inputs"] != before["fingerprint"]):
+        if known is None or (before is not None and known["inputs"] != before["made"]):
             break
         found[stage] = before = known
     return found

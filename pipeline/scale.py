@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import ExifTags, Image
+from PIL import ExifTags
 
 from pipeline.cameras import View
-from pipeline.photo_file import FORMATS
+from pipeline.photo_file import opened
+from pipeline.photos import Photo
 from pipeline.visibility import Caster
 from pipeline.wishes import Known
 from sdfsim.errors import SdfsimError
@@ -35,17 +36,17 @@ class Scale:
     source: str
 
 
-def measured(known: Known, views: list[View], photos: Path, surface: Caster) -> Scale:
+def measured(known: Known, views: list[View], photos: list[Photo], surface: Caster) -> Scale:
     """The scale at which a known distance is what it should be.
 
     Args:
         known: the distance.
         views: cameras in normalised space.
-        photos: the user's folder; pixels are those of the files in there, turned upright.
+        photos: what the views' photos were made of; pixels are those of the user's own photos.
         surface: in normalised space.
 
     Raises:
-        SdfsimError: no such posed photo, a pixel outside it, or one that shows nothing of the surface.
+        SdfsimError: no such posed photo or several, a pixel outside it, or one that shows nothing of the surface.
     """
     start, end = (_locate(text, views, photos, surface) for text in (known.start, known.end))
     found = float(np.linalg.norm(end - start))
@@ -54,26 +55,21 @@ def measured(known: Known, views: list[View], photos: Path, surface: Caster) -> 
     return Scale(known.metres / found, f"given: {known.start} to {known.end} = {known.metres:g} m")
 
 
-def _locate(text: str, views: list[View], photos: Path, surface: Caster) -> np.ndarray:
+def _locate(text: str, views: list[View], photos: list[Photo], surface: Caster) -> np.ndarray:
     """Position [3] of one end of a known distance."""
     pixel = re.fullmatch(r"(.+):(\d+(?:\.\d+)?),(\d+(?:\.\d+)?)", text)
     name = pixel[1] if pixel else text
-    view = next((v for v in views if name in (v.source, Path(v.source).name)), None)
-    if view is None:
-        near = difflib.get_close_matches(name, [v.source for v in views], 3, 0.3) or [v.source for v in views[:3]]
-        raise SdfsimError(
-            f"distance: no posed photo is called {name!r}",
-            f"write PHOTO:X,Y for a pixel or PHOTO for the camera; photos: {', '.join(near)}, ...",
-        )
+    view = _called(name, views)
     if pixel is None:
         return view.center
+    photo = next(photo for photo in photos if photo.name == view.name)
     x, y = float(pixel[2]), float(pixel[3])
-    width, height = source_size(source_of(photos, view), (view.width, view.height))
+    width, height = photo.original
     if not (x <= width and y <= height):
         raise SdfsimError(f"distance: {text} lies outside the photo ({width} x {height} px)")
     turn = np.arange(8) * np.pi / 4
     around = np.concatenate([r * np.stack([np.cos(turn), np.sin(turn)], 1) for r in NEARBY]) * view.width
-    spots = np.array([x * view.width / width, y * view.height / height]) + around
+    spots = photo.prepared(np.array([[x, y]]), view) + around
     rays = view.rays(spots[:, 0], spots[:, 1])
     away = surface.hits(view.center, rays)[0]
     if not np.isfinite(away).any():
@@ -83,20 +79,21 @@ def _locate(text: str, views: list[View], photos: Path, surface: Caster) -> np.n
     return view.center + away[best] * rays[best]
 
 
-def source_of(photos: Path, view: View) -> Path:
-    """The file that a view comes from, in the user's folder or in its subfolder `images`."""
-    inner = photos / "images" / view.source
-    return inner if inner.is_file() else photos / view.source
-
-
-def source_size(path: Path, otherwise: tuple[int, int]) -> tuple[int, int]:
-    """Width and height of a photo as it is shown upright; of frames of a video, which are no files, `otherwise`."""
-    try:
-        with Image.open(path, formats=FORMATS) as image:
-            turned = image.getexif().get(ExifTags.Base.Orientation, 1) >= 5
-            return (image.height, image.width) if turned else image.size
-    except (OSError, SyntaxError, ValueError):
-        return otherwise
+def _called(name: str, views: list[View]) -> View:
+    """The view of the photo with this name, with or without its subfolder."""
+    found = [v for v in views if v.source == name] or [v for v in views if Path(v.source).name == name]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise SdfsimError(
+            f"distance: {len(found)} posed photos are called {name!r}",
+            f"write its folder as well: {', '.join(v.source for v in found[:3])}",
+        )
+    near = difflib.get_close_matches(name, [v.source for v in views], 3, 0.3) or [v.source for v in views[:3]]
+    raise SdfsimError(
+        f"distance: no posed photo is called {name!r}",
+        f"write PHOTO:X,Y for a pixel or PHOTO for the camera; photos: {', '.join(near)}, ...",
+    )
 
 
 def of_exif(views: list[View], photos: Path, surface: Caster, up: np.ndarray) -> Scale | None:
@@ -104,14 +101,14 @@ def of_exif(views: list[View], photos: Path, surface: Caster, up: np.ndarray) ->
 
     Args:
         views: cameras in normalised space.
-        photos: the user's folder.
+        photos: the user's folder, see `Source.folder`.
         surface: in normalised space.
         up: [3] unit, in normalised space.
 
     Returns:
         The scale; None where too little is written down, or it does not agree with the poses.
     """
-    notes = [_exif(source_of(photos, view)) for view in views]
+    notes = [_exif(photos / view.source) for view in views]
     return _from_positions(views, notes, up) or _from_subjects(views, notes, surface)
 
 
@@ -126,7 +123,7 @@ class _Exif:
 
 def _exif(path: Path) -> _Exif:
     try:
-        with Image.open(path, formats=FORMATS) as image:
+        with opened(path) as image:
             exif = image.getexif()
         subject = float(exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.SubjectDistance) or 0)
         gps, tag = exif.get_ifd(ExifTags.IFD.GPSInfo), ExifTags.GPS
@@ -140,7 +137,7 @@ def _exif(path: Path) -> _Exif:
             position = np.array(degrees) * signs
         error = float(gps.get(tag.GPSHPositioningError) or GPS_ERROR)
         return _Exif(position, error, subject if 0 < subject < 1e4 else None)
-    except (OSError, SyntaxError, ValueError, TypeError, ZeroDivisionError, OverflowError):
+    except (SdfsimError, OSError, SyntaxError, ValueError, TypeError, ZeroDivisionError, OverflowError):
         return _Exif()  # Broken EXIF is common and never worth failing for.
 
 

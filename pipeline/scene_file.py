@@ -5,16 +5,17 @@ from __future__ import annotations
 import hashlib
 import itertools
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+import yaml
 
 from pipeline.asset import origin_of
 from pipeline.cleaning import joined
 from pipeline.drop import LEVEL, Drop, choose_drop
-from pipeline.meshing import read_parts
+from pipeline.meshing import read_parts, rounded
 from pipeline.placement import Placement, load_placement
 from sdfsim.errors import SdfsimError
 from sdfsim.files import write_text
@@ -63,33 +64,34 @@ def scene_text(placement: Placement, drop: Drop | None, *, scenery: bool = True,
         "gravity: [0, 0, -9.81]           # m/s^2",
         "shapes:",
     ]
-    bodies = [f"  - {{name: floor, motion: static, plane: {{normal: [0, 0, 1], offset: {placement.floor:g}}}}}"]
+    plane = {"normal": [0, 0, 1], "offset": float(rounded(placement.floor))}
+    bodies = [f"  - {{name: floor, motion: static, plane: {_flow(plane)}}}"]
     if scenery:
         lines.append("  scene: {asset: assets/scene}")
         bodies.append(f"  - {{name: scene, shape: scene, motion: static, {SURFACE}}}")
     for body in found:
         lines.append(f"  {body.name}: {{asset: assets/{body.name}}}")
         moves = "motion: static" if body.static else f"density: {DENSITY:g}"
-        bodies.append(
-            f"  - {{name: {body.name}, shape: {body.name}, position: {_numbers(body.origin)}, {moves}, {SURFACE}}}"
-        )
+        position = _flow(rounded(body.origin).tolist())
+        bodies.append(f"  - {{name: {body.name}, shape: {body.name}, position: {position}, {moves}, {SURFACE}}}")
     if drop is not None:
-        size = _numbers((drop.side, drop.side, drop.thickness))
-        lines.append(f"  {shape}: " + (f"{{box: {{size: {size}}}}}" if shape == "box" else
-                                       f"{{sphere: {{radius: {drop.thickness / 2:.4f}}}}}"))  # fmt: skip
+        box = {"box": {"size": rounded((drop.side, drop.side, drop.thickness)).tolist()}}
+        ball = {"sphere": {"radius": float(rounded(drop.thickness / 2))}}
+        lines.append(f"  {shape}: {_flow(box if shape == 'box' else ball)}")
         bodies += [
             f"  - name: {shape}",
             f"    shape: {shape}",
-            f"    position: {_numbers(drop.position)}     # m",
-            f"    quat_xyzw: {_numbers(drop.quat_xyzw, 5)}  # level with the surface below",
+            f"    position: {_flow(rounded(drop.position).tolist())}     # m",
+            f"    quat_xyzw: {_flow(rounded(drop.quat_xyzw).tolist())}  # level with the surface below",
             f"    density: {DENSITY:g}                 # kg/m^3",
             *(f"    {part}" for part in SURFACE.split(", ")),
         ]
     return "\n".join([*lines, "bodies:", *bodies, ""])
 
 
-def _numbers(values: Iterable[float], digits: int = 4) -> str:
-    return "[" + ", ".join(f"{value:.{digits}f}" for value in values) + "]"
+def _flow(content: dict | list) -> str:
+    """One line of YAML. Its numbers are not Python's: 1e-05 would be read as a text."""
+    return yaml.safe_dump(content, default_flow_style=True, sort_keys=False, width=1000).strip()
 
 
 def write_scene(mesh_folder: Path, scene_file: Path, *, shape: str = "box", static: Sequence[str] = (),

@@ -23,7 +23,7 @@ class Snapshots:
     Args:
         out: folder of the stage.
         trainer: to look at.
-        held: held-out views, or None where there are too few photos; the first is rendered each time.
+        held: held-out views, or None where there are too few photos; the first that shows anything is rendered.
     """
 
     def __init__(self, out: Path, trainer: Trainer, held: HeldOut | None) -> None:
@@ -53,8 +53,8 @@ class Snapshots:
         for name, value in losses.items():
             self.stream.log(f"loss/{name}", rr.Scalars(value))
         entry = {"step": trainer.iteration, "seconds": round(trainer.seconds, 1)}
-        if self.held is not None:
-            seen = self.held.compare(0)
+        if self.held is not None and self.held.shown:
+            seen = self.held.compare(self.held.shown[0])
             self.stream.log("held_out/psnr", rr.Scalars(seen.psnr))
             self.stream.log("held_out/render", rr.Image(seen.picture))
             entry["psnr"] = round(seen.psnr, 2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -37,8 +38,12 @@ class Source:
 
     @property
     def folder(self) -> Path:
-        """Where the photos lie that have names."""
-        return (self.photos[0] if self.photos else self.video or Path()).parent
+        """The folder in and below which all photos lie; absolute."""
+        return Path(os.path.commonpath([path.absolute().parent for path in self.photos or (self.video or Path(),)]))
+
+    def name_of(self, photo: Path) -> str:
+        """What a photo is called: its file's name, where subfolders hold photos with theirs before it; no two alike."""
+        return photo.absolute().relative_to(self.folder).as_posix()
 
     def files(self) -> list[Path]:
         """Every file whose content the result depends on."""
@@ -56,7 +61,7 @@ def find_source(given: Path) -> Source:
     or like the photo with `.png` behind it, as COLMAP has them; white is the object.
 
     Raises:
-        SdfsimError: nothing there, or fewer than three photos.
+        SdfsimError: nothing there, fewer than three photos, or two cameras of one photo.
     """
     given = Path(given)
     if not given.exists():
@@ -149,6 +154,8 @@ def _with_cameras(cameras: Path) -> Source:
         if photo is None:
             missing.append(frame.name)
             continue
+        if photo in names:
+            raise SdfsimError(f"{cameras}: {names[photo]} and {frame.name} are the same photo: {photo}", "remove one")
         photos.append(photo)
         names[photo] = frame.name
         if frame.mask is not None and (cameras.parent / frame.mask).is_file():

@@ -81,7 +81,8 @@ def field_distance(field: Field) -> Distance:
 
     @torch.no_grad()
     def distance(points: np.ndarray) -> np.ndarray:
-        return field.sdf(torch.from_numpy(np.ascontiguousarray(points, np.float32))).numpy()
+        there = torch.from_numpy(np.ascontiguousarray(points, np.float32)).to(field.background.device)
+        return field.sdf(there).cpu().numpy()
 
     return distance
 
@@ -173,10 +174,11 @@ def of_volume(
 @torch.no_grad()
 def field_colors(field: Field, mesh: Mesh) -> np.ndarray:
     """The field's colour [V, 3] in 0..1 of each vertex, seen straight on."""
-    points = torch.tensor(mesh.vertices, dtype=torch.float32)
-    against = -torch.tensor(vertex_normals(mesh), dtype=torch.float32)
+    device = field.background.device
+    points = torch.tensor(mesh.vertices, dtype=torch.float32, device=device)
+    against = -torch.tensor(vertex_normals(mesh), dtype=torch.float32, device=device)
     parts = []
     for p, d in zip(points.split(1 << 16), against.split(1 << 16), strict=True):
         _, geometry, features = field.geometry_at(p)
         parts.append(field.color_of(geometry, features, d))
-    return torch.cat(parts).numpy()
+    return torch.cat(parts).cpu().numpy()

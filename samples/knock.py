@@ -19,6 +19,7 @@ import yaml
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from pipeline.drop import Above
+from pipeline.meshing import SCENERY, rounded
 from sdfsim.files import write_text
 from sdfsim.shape.asset import Shape, load_shape
 
@@ -55,8 +56,9 @@ def throw(body: dict, shape: Shape, above: Above) -> tuple[float, dict]:
     # As fast upwards as gravity takes away on half the way: it hits at the height that it starts from.
     velocity = [*(speed * direction), 0.5 * GRAVITY * flight / speed]
     return radius, {
-        "name": "thrown", "shape": "thrown", "position": start.round(4).tolist(),
-        "velocity": np.round(velocity, 3).tolist(), "mass": round(HEAVIER * float(body["density"]) * shape.volume, 4),
+        "name": "thrown", "shape": "thrown", "position": rounded(start).tolist(),
+        "velocity": rounded(velocity).tolist(),
+        "mass": float(rounded(HEAVIER * float(body["density"]) * shape.volume)),
         "friction": body["friction"], "restitution": body["restitution"],
     }  # fmt: skip
 
@@ -74,10 +76,12 @@ def main() -> None:
     if target is None:
         names = [body["name"] for body in bodies if "density" in body]
         parser.error(f"{arguments.folder}/scene.yaml has no body {arguments.body!r} that can move (it has {names})")
+    if SCENERY not in assets:
+        parser.error(f"{arguments.folder}/scene.yaml has no scenery, so there is no edge to knock a body over")
     shapes = {name: load_shape(arguments.folder / asset) for name, asset in assets.items()}
-    radius, ball = throw(target, shapes[target["shape"]], Above(shapes["scene"].mesh))
+    radius, ball = throw(target, shapes[target["shape"]], Above(shapes[SCENERY].mesh))
     scene["shapes"] = {name: {"asset": asset} for name, asset in assets.items()}
-    scene["shapes"]["thrown"] = {"sphere": {"radius": round(radius, 4)}}
+    scene["shapes"]["thrown"] = {"sphere": {"radius": float(rounded(radius))}}
     scene["bodies"] = [*bodies, ball]
     write_text(arguments.folder / "knock.yaml", yaml.safe_dump(scene, sort_keys=False))
     print(f"wrote {arguments.folder / 'knock.yaml'}")

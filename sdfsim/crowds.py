@@ -53,12 +53,14 @@ def crowds(scene: Scene, world: str) -> list[Crowd]:
         scene: bodies and shapes.
         world: the entity path that theirs begin with.
     """
+    import rerun as rr
+
     found = []
     shape = np.array([b.shape if b.motion != "static" else -1 for b in scene.bodies])
     scale = np.array([b.scale for b in scene.bodies])
     for number, name in enumerate(s.name for s in scene.shapes):
         members = np.flatnonzero(shape == number)
         for k in range(COLORS if len(members) >= MANY else 0):
-            some = members[k::COLORS]
-            found.append(Crowd(f"{world}/crowds/{number}_{name}/{k}", number, some, scale[some]))
+            some, called = members[k::COLORS], rr.escape_entity_path_part(f"{number}_{name}")
+            found.append(Crowd(f"{world}/crowds/{called}/{k}", number, some, scale[some]))
     return found

@@ -5,8 +5,10 @@ from __future__ import annotations
 import hashlib
 import shutil
 import time
-from dataclasses import fields, replace
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,26 +16,33 @@ import torch
 from sdfsim.dynamics.bodies import Sleep, State
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.simulator import Simulator, join
+from sdfsim.dynamics.sleep import Rest
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_arrays, write_arrays
+from sdfsim.shape.bank import SdfBank
 
 EVERY = 30.0  # s between two checkpoints
 _STATE = "state.npz"
+_ANEW = "leave --resume away to start anew"
 
 
 class Checkpoint:
-    """What is kept of one run: its frames in parts, and the state that the last part leads to.
+    """What is kept of one run: its frames in parts, the state that the last part leads to, and how long all has rested.
 
     Args:
         folder: of the run.
         simulator: at its start.
+
+    Attributes:
+        rest: for how long everything has rested.
     """
 
     def __init__(self, folder: Path, simulator: Simulator) -> None:
         self._folder = folder / "checkpoint"
         self._simulator = simulator
         self._identity = identity(simulator)
-        self._fresh: list[tuple[Rollout, State, int]] = []  # one entry a step: an interruption splits none
+        self.rest = Rest()
+        self._fresh: list[tuple[Rollout, State, int, Rest]] = []  # one entry a step: an interruption splits none
         self._parts = 0
         self._saved = time.monotonic()
 
@@ -45,20 +54,24 @@ class Checkpoint:
         """
         if not (self._folder / _STATE).exists():
             return []
-        kept = read_arrays(self._folder / _STATE, "a checkpoint", "leave --resume away to start anew")
-        if str(kept["identity"]) != self._identity:
-            raise SdfsimError(
-                f"{self._folder}: is of another scene, model or seed", "leave --resume away to start anew"
-            )
-        self._parts = int(kept["parts"])
+        kept = read_arrays(self._folder / _STATE, "a checkpoint", _ANEW)
         simulator = self._simulator
-        simulator.state = _state(kept, simulator.device)
-        simulator.steps_done = int(kept["steps_done"])
+        try:
+            if str(kept["identity"]) != self._identity:
+                raise SdfsimError(f"{self._folder}: is of another scene, model or seed", _ANEW)
+            self._parts = int(kept["parts"])
+            simulator.state = _state(kept, simulator.device)
+            simulator.steps_done = int(kept["steps_done"])
+            self.rest = Rest(torch.as_tensor(kept["rest.anchor"], device=simulator.device), int(kept["rest.quiet"]))
+        except (KeyError, TypeError, ValueError) as error:
+            raise SdfsimError(f"{self._folder / _STATE}: not a checkpoint of this version ({error})", _ANEW) from error
         return [Rollout.load(self._folder / _part(k)) for k in range(self._parts)]
 
     def add(self, frame: Rollout) -> None:
-        """Keep a frame; on disk when the last time is long enough ago."""
-        self._fresh.append((frame, self._simulator.state, self._simulator.steps_done))
+        """Keep a frame and the state it tells of; on disk when the last time is long enough ago."""
+        simulator = self._simulator
+        self.rest = self.rest.after(simulator.bodies, simulator.state)
+        self._fresh.append((frame, simulator.state, simulator.steps_done, self.rest))
         if time.monotonic() - self._saved > EVERY:
             self.save()
 
@@ -66,10 +79,10 @@ class Checkpoint:
         """Bring what is new to the disk; the state comes last, so that it never tells of a part that is not there."""
         if self._fresh:
             self._folder.mkdir(exist_ok=True)
-            frames, states, steps = zip(*self._fresh, strict=True)
-            join(list(frames)).save(self._folder / _part(self._parts))
-            done = {"identity": self._identity, "parts": self._parts + 1, "steps_done": steps[-1]}
-            write_arrays(self._folder / _STATE, {**done, **_arrays(states[-1])}, compressed=False)
+            _, state, steps, rest = self._fresh[-1]
+            join([frame for frame, *_ in self._fresh]).save(self._folder / _part(self._parts))
+            done = {"identity": self._identity, "parts": self._parts + 1, "steps_done": steps}
+            write_arrays(self._folder / _STATE, {**done, **_arrays(state, rest)}, compressed=False)
             self._fresh = []  # not before: Ctrl-C amid this saves once more, and must write the same part again
             self._parts += 1
         self._saved = time.monotonic()
@@ -81,26 +94,40 @@ class Checkpoint:
 
 
 def identity(simulator: Simulator) -> str:
-    """A hash of all that decides how a run goes: bodies, start, rules and weights."""
-    told = hashlib.sha256(f"{simulator.dt!r} {simulator.seed} {replace(simulator.rules, rows=None)}".encode())
-    parts = [getattr(simulator.bodies, f.name) for f in fields(simulator.bodies)]
-    parts += [*_arrays(simulator.state).values(), *simulator.model.network.state_dict().values()]
-    for part in parts:
-        if isinstance(part, torch.Tensor):
-            part = part.cpu().numpy()
-        if isinstance(part, np.ndarray):
-            told.update(np.ascontiguousarray(part).tobytes())
+    """A hash of all that decides how a run goes: bodies with their paths and distances, start, rules, units, model."""
+    s, told = simulator, hashlib.sha256()
+    model = (s.model.kind, s.model.reach, *s.model.network.state_dict().items())
+    for piece in _pieces((s.dt, s.seed, replace(s.rules, rows=None), s.units, s.bodies, s.state, model)):
+        told.update(piece)
     return told.hexdigest()
+
+
+def _pieces(value: Any) -> Iterator[bytes]:
+    """All that `value` is made of, to the last bit."""
+    if isinstance(value, torch.Tensor):
+        value = value.cpu().numpy()
+    elif isinstance(value, SdfBank):
+        value = value.sdfs
+    if isinstance(value, np.ndarray):
+        yield f"{value.dtype}{value.shape}".encode()
+        yield np.ascontiguousarray(value).tobytes()
+    elif is_dataclass(value) or isinstance(value, tuple):
+        parts = value if isinstance(value, tuple) else [getattr(value, field.name) for field in fields(value)]
+        yield f"{type(value).__name__}{len(parts)}".encode()
+        for part in parts:
+            yield from _pieces(part)
+    else:
+        yield repr(value).encode()
 
 
 def _part(number: int) -> str:
     return f"part_{number:04}.npz"
 
 
-def _arrays(state: State) -> dict[str, np.ndarray]:
-    """Every array of a state, and of who sleeps in it, by name."""
-    found: dict[str, np.ndarray] = {"time": np.array(state.time)}
-    for prefix, of in (("", state), ("sleep.", state.sleep)):
+def _arrays(state: State, rest: Rest) -> dict[str, np.ndarray]:
+    """Every array of a state, of who sleeps in it and of how long all has rested, by name."""
+    found = {"time": np.array(state.time), "rest.quiet": np.array(rest.quiet)}
+    for prefix, of in (("", state), ("sleep.", state.sleep), ("rest.", rest)):
         for field in fields(of) if of is not None else ():
             value = getattr(of, field.name)
             if isinstance(value, torch.Tensor):

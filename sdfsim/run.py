@@ -15,7 +15,6 @@ from sdfsim.dynamics.memory import COUNTS, PHASES
 from sdfsim.dynamics.model import Model, load_model
 from sdfsim.dynamics.rollout import Rollout, energy_from_nothing
 from sdfsim.dynamics.simulator import SimulationError, Simulator, join, pick_device
-from sdfsim.dynamics.sleep import Rest
 from sdfsim.errors import SdfsimError
 from sdfsim.files import check_writable, locked, write_json, write_text
 from sdfsim.learning import tables
@@ -116,7 +115,6 @@ def simulate(
         "guard": guard,
         "device": str(simulator.device),
     }
-    rest, settled = Rest(simulator.bodies), False
     out.mkdir(parents=True, exist_ok=True)
     with locked(out):
         kept = Checkpoint(out, simulator)
@@ -130,21 +128,19 @@ def simulate(
         write_text(out / "config.yaml", yaml.safe_dump(config, sort_keys=False))
         live = _live(scene, viewer, join(frames), on_address, bind)
 
-        def on_step(frame: Rollout) -> bool:
-            nonlocal settled
-            frames.append(frame)
-            kept.add(frame)
-            if live:
-                live.log_steps(frame)
-            on_progress("simulate", float(frame.time[-1]) / length, f"{frame.time[-1]:.2f} of {length:g} s simulated")
-            settled = until_settled and rest.settled(simulator.state)
-            return settled
-
         started, broken = time.monotonic(), None
-        left = max(1, round(length / simulator.dt)) - simulator.steps_done
+        settled = until_settled and kept.rest.settled  # already, where it was killed between its last step and the end
+        left = 0 if settled else max(1, round(length / simulator.dt)) - simulator.steps_done
         try:
-            if left > 0:
-                simulator.run(steps=left, on_step=on_step)
+            for frame in simulator.frames(left):
+                frames.append(frame)
+                kept.add(frame)
+                if live:
+                    live.log_steps(frame)
+                now = float(frame.time[-1])
+                on_progress("simulate", now / length, f"{now:.2f} of {length:g} s simulated")
+                if settled := until_settled and kept.rest.settled:
+                    break
         except (SimulationError, KeyboardInterrupt) as error:
             broken = error
             kept.save()
@@ -155,7 +151,7 @@ def simulate(
         report["status"] = "done" if broken is None else "failed" if isinstance(broken, SdfsimError) else "interrupted"
         report["folder"] = str(out)
         report["quality"] = quality_note(quality) if quality else None
-        report["failed_checks"] = _missed(scene)
+        report["failed_checks"] = [f"fit of shape {told}" for told in scene.missed]
         if until_settled:
             report["settled"] = settled
         if isinstance(broken, SdfsimError):
@@ -168,7 +164,7 @@ def simulate(
         if not isinstance(broken, KeyboardInterrupt):
             kept.clear()
         if isinstance(broken, SimulationError):
-            broken.hint = f"what was computed is in {out}; {broken.hint}"
+            broken.rollout, broken.hint = rollout, f"what was computed is in {out}; {broken.hint}"
         if broken is not None:
             raise broken
         return report
@@ -179,10 +175,6 @@ def _load(scene_file: Path, on_progress: Progress, allow_outside: bool) -> Scene
         on_progress("shapes", fraction, message)
 
     return load_scene(scene_file, tell, allow_outside=allow_outside)
-
-
-def _missed(scene: Scene) -> list[str]:
-    return [f"fit of shape {told}" for told in scene.missed]
 
 
 def _repeatable(asked: str | None, model: Model) -> str:

@@ -240,17 +240,19 @@ def test_the_run_of_a_model_beside_the_scene_can_be_repeated(scene, model, tmp_p
 
 
 def stop_after(steps: int, how):
-    """A `Simulator.run` that breaks after some steps, as `how(rollout)` says."""
-    real = Simulator.run
+    """A `Simulator.frames` that breaks after some steps, as `how(frame)` says."""
+    real = Simulator.frames
 
-    def broken(self, **options):
-        raise how(real(self, **(options | {"steps": steps})))
+    def broken(self, count):
+        for frame in real(self, steps):
+            yield frame
+        raise how(frame)
 
     return broken
 
 
 def test_a_broken_state_is_code_3_with_what_was_computed(scene, model, tmp_path, monkeypatch):
-    monkeypatch.setattr(Simulator, "run", stop_after(3, lambda r: SimulationError("step 4: not finite", r)))
+    monkeypatch.setattr(Simulator, "frames", stop_after(3, lambda f: SimulationError("step 4: not finite", f)))
     out = tmp_path / "run"
     done = run("simulate", scene, "-o", out, "--model", model, "--json")
     assert done.exit_code == 3 and "error: step 4: not finite" in done.stderr
@@ -260,7 +262,7 @@ def test_a_broken_state_is_code_3_with_what_was_computed(scene, model, tmp_path,
 
 
 def test_an_interrupt_is_code_130_with_what_was_computed(scene, model, tmp_path, monkeypatch):
-    monkeypatch.setattr(Simulator, "run", stop_after(3, lambda r: KeyboardInterrupt()))
+    monkeypatch.setattr(Simulator, "frames", stop_after(3, lambda f: KeyboardInterrupt()))
     out = tmp_path / "run"
     done = run("simulate", scene, "-o", out, "--model", model)
     assert done.exit_code == 130 and "interrupted" in done.stderr

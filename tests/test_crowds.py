@@ -14,11 +14,12 @@ from sdfsim.shape.primitives import sphere
 from tests.test_playback import read
 
 
-def crowd(tmp_path, count: int, frames: int):
+def crowd(tmp_path, count: int, frames: int, name: str = "ball"):
     (tmp_path / "scene.yaml").write_text(
-        "version: 1\nshapes:\n  ball: {sphere: {radius: 0.5}}\n  brick: {box: {size: [1, 2, 3]}}\nbodies:\n"
+        f"version: 1\nshapes:\n  {name}: {{sphere: {{radius: 0.5}}}}\n"
+        "  brick: {box: {size: [1, 2, 3]}}\nbodies:\n"
         "  - {name: floor, plane: {}}\n  - {name: brick, shape: brick, position: [0, 3, 0]}\n"
-        f"  - {{name: balls, shape: ball, scale: 2, arrange: {{grid: [{count}, 1, 1], spacing: 3}}}}\n"
+        f"  - {{name: balls, shape: {name}, scale: 2, arrange: {{grid: [{count}, 1, 1], spacing: 3}}}}\n"
     )
     scene = load_scene(tmp_path / "scene.yaml")
     rng, shape = np.random.default_rng(0), (frames, len(scene.bodies))
@@ -54,6 +55,15 @@ def test_every_copy_is_where_its_body_is(tmp_path):
         np.testing.assert_allclose(scales, 2.0)
         corners = np.array(found[path + "!"]["Mesh3D:vertex_positions"][0])
         np.testing.assert_allclose(np.linalg.norm(corners, axis=1), 0.5, atol=1e-3)
+
+
+def test_the_name_of_a_shape_is_one_part_of_a_path(tmp_path):
+    import rerun as rr
+
+    scene, rollout = crowd(tmp_path, MANY, 1, name="red ball/1")
+    save_rollout(scene, rollout, tmp_path / "rollout.rrd")
+    found = [path for path in read(tmp_path / "rollout.rrd") if "crowds" in path and not path.endswith("!")]
+    assert sorted(found) == [rr.new_entity_path(["world", "crowds", "2_red ball/1", str(k)]) for k in range(COLORS)]
 
 
 def test_few_are_drawn_one_by_one(tmp_path):

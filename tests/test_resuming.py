@@ -1,12 +1,19 @@
 """A run that was interrupted goes on as if nothing had happened, and ends early when asked to."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sdfsim import SdfsimError, progress, resuming, run
+from sdfsim import SdfsimError, Simulator, load_scene, progress, resuming, run
 from sdfsim.dynamics.rollout import Rollout
+from sdfsim.dynamics.sleep import STEPS
+from sdfsim.files import read_arrays, write_arrays
+from sdfsim.scene.types import Scene, Waypoints
+from sdfsim.shape.asset import analytic_shape
+from sdfsim.shape.grid import sample_grid
+from tests.dynamics.conftest import make_body, random_model
 
 TOWER = Path(__file__).resolve().parents[1] / "samples" / "tower.yaml"
 
@@ -63,6 +70,102 @@ def test_another_run_is_not_gone_on_with(sleepy, tmp_path, monkeypatch):
     assert (tmp_path / "run" / "rollout.npz").exists()
     assert simulate(sleepy, tmp_path / "run", seconds=0.05)["status"] == "done"  # anew
     assert not (tmp_path / "run" / "checkpoint").exists()
+
+
+def described() -> tuple[Scene, dict]:
+    """A ball beside a paddle on a path, and the options of its simulator: the same at every call."""
+    ball = analytic_shape("sphere", radius=0.5)
+    ball = replace(ball, sdf=sample_grid(ball.sdf, ball.sdf.bounds, 4))
+    still = np.array([[0.0, 0.0, 0.0, 1.0]] * 2)
+    path = Waypoints(np.array([0.0, 1.0]), np.array([[0.0, 0.0, -2.0], [0.0, 0.0, -1.0]]), still)
+    bodies = (make_body("paddle", 0, [0, 0, -2], motion="kinematic", path=path), make_body("ball", 0, [0, 0, 0]))
+    return Scene((ball,), bodies, np.array([5.0, 0.0, -12.0]), 1.0), {"model": random_model("impulse")}
+
+
+def waypoint(scene: Scene, options: dict):
+    path = scene.bodies[0].path
+    other = replace(path, position=path.position + np.array([[0, 0, 0], [0, 0, 1e-9]]))
+    return replace(scene, bodies=(replace(scene.bodies[0], path=other), scene.bodies[1])), options
+
+
+def distances(scene: Scene, options: dict):
+    values = scene.shapes[0].sdf.values.clone()
+    values[1, 2, 3] += 1e-4
+    return replace(scene, shapes=(replace(scene.shapes[0], sdf=replace(scene.shapes[0].sdf, values=values)),)), options
+
+
+def kind_of_distance(scene: Scene, options: dict):
+    ball = analytic_shape("sphere", radius=0.5)
+    exact = replace(ball, nodes=scene.shapes[0].nodes)
+    assert (exact.sdf.bounds == scene.shapes[0].sdf.bounds).all()
+    return replace(scene, shapes=(exact,)), options
+
+
+def reach(scene: Scene, options: dict):
+    return scene, {"model": replace(options["model"], reach=0.11)}
+
+
+def down(scene: Scene, options: dict):
+    """As strong, and hardly turned: the same step."""
+    gravity = np.array([5.0 + 12e-9, 0.0, -12.0 + 5e-9])
+    assert np.linalg.norm(gravity) == np.linalg.norm(scene.gravity)
+    return replace(scene, gravity=gravity), options
+
+
+def size(scene: Scene, options: dict):
+    """Four times as large under four times the gravity: the same in the model's units, and the same step."""
+    ball = scene.shapes[0]
+    far = [replace(b, scale=4.0, position=4.0 * b.position, mass=1.0) for b in scene.bodies]
+    path = scene.bodies[0].path
+    far[0] = replace(far[0], path=replace(path, position=4.0 * path.position))
+    return replace(scene, shapes=(ball,), bodies=tuple(far), gravity=4.0 * scene.gravity), options
+
+
+def same(scene: Scene, options: dict):
+    return scene, options
+
+
+@pytest.mark.parametrize("change", [same, waypoint, distances, kind_of_distance, reach, down, size])
+def test_the_identity_of_a_run_is_all_that_decides_it(change):
+    scene, options = described()
+    other, others = change(*described())
+    equal = resuming.identity(Simulator(scene, **options)) == resuming.identity(Simulator(other, **others))
+    assert equal == (change is same)
+
+
+LACK = ["identity", "parts", "steps_done", "time", "position", "rest.quiet", "rest.anchor"]
+
+
+@pytest.mark.parametrize("lack", [*LACK, "word", "meta"])
+def test_a_checkpoint_that_lacks_something_is_told(sleepy, tmp_path, lack):
+    with pytest.raises(KeyboardInterrupt):
+        simulate(sleepy, tmp_path / "run", stop=0.5)
+    folder = tmp_path / "run" / "checkpoint"
+    name, wrong = ("part_0000.npz", {"meta": "{"}) if lack == "meta" else ("state.npz", {"parts": "two"})
+    arrays = read_arrays(folder / name, "a checkpoint")
+    if lack in LACK:
+        del arrays[lack]
+        wrong = {}
+    write_arrays(folder / name, arrays | wrong)
+    with pytest.raises(SdfsimError, match=f"{name}: not a "):
+        simulate(sleepy, tmp_path / "run", resume=True)
+
+
+@pytest.mark.parametrize("after", [2, STEPS - 1, STEPS])
+def test_a_run_until_all_rests_ends_where_it_would_have_however_often_it_is_killed(tmp_path, monkeypatch, after):
+    """One that is killed after its last step, before its results are written, makes no step more."""
+    monkeypatch.setattr(resuming, "EVERY", 0.0)
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(
+        "version: 1\ngravity: [0, 0, 0]\nshapes: {ball: {sphere: {radius: 0.5}}}\nbodies: [{name: b, shape: ball}]\n"
+    )
+    step = Simulator(load_scene(scene)).dt
+    options = {"seconds": 100 * step, "until_settled": True}
+    with pytest.raises(Killed):
+        simulate(scene, tmp_path / "run", stop=(after - 0.5) / 100, kind=Killed, **options)
+    whole = simulate(scene, tmp_path / "whole", **options)
+    resumed = simulate(scene, tmp_path / "run", resume=True, **options)
+    assert whole["settled"] and resumed["settled"] and whole["steps"] == resumed["steps"] == STEPS
 
 
 def test_a_run_ends_when_everything_rests(tmp_path):

@@ -42,7 +42,8 @@ def run(scene: Scene | str, steps: int, *, model: str | None = None, always: boo
     frames: list[Rollout] = []
     began, broken = time.process_time(), None
     try:
-        simulator.run(steps=steps, on_step=lambda frame: frames.append(frame))
+        for frame in simulator.frames(steps):
+            frames.append(frame)
     except SimulationError as error:
         broken = error.message
     spent = time.process_time() - began

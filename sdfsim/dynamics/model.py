@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass, field
+from copy import deepcopy
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -51,9 +52,11 @@ class Model:
     card: dict[str, Any] = field(default_factory=dict)
 
     def to(self, device: torch.device) -> Model:
-        """The same model with its weights on `device`."""
-        self.network.to(device)
-        return self
+        """The same model with its weights on `device`: this one, or a copy where they are elsewhere."""
+        there = {weight.device for weight in self.network.state_dict().values()}
+        if all(at.type == device.type and device.index in (None, at.index) for at in there):
+            return self
+        return replace(self, network=deepcopy(self.network).to(device))
 
     def save(self, path: Path) -> None:
         """Write a `.safetensors` file whose metadata holds all that is not weights (temporary name, then renamed)."""

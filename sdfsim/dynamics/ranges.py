@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 
 from sdfsim.dynamics.bodies import Units, largest_extent
@@ -58,15 +60,10 @@ def constant_in_training(model: Model) -> list[str]:
 
 
 def _products(scene: Scene, name: str) -> list[float]:
-    """The products of a coefficient over all pairs with a dynamic body, each value once."""
-    count: dict[tuple[float, bool], int] = {}
-    for body in scene.bodies:
-        key = (getattr(body, name), body.motion == "dynamic")
-        count[key] = count.get(key, 0) + 1
-    listed = list(count.items())
-    return [
-        one * other
-        for k, ((one, moves), many) in enumerate(listed)
-        for (other, goes), _ in listed[k if many > 1 else k + 1 :]
-        if moves or goes
-    ]
+    """Products of a coefficient of pairs with a dynamic body, the smallest and the largest of all such among them."""
+    moving, others = (
+        sorted(getattr(b, name) for b in scene.bodies if (b.motion == "dynamic") == moves) for moves in (True, False)
+    )
+    # A product is extreme where both of its factors are, and two dynamic bodies cannot both be the same one.
+    ends = moving[:2] + moving[2:][-2:]
+    return [a * b for a, b in combinations(ends, 2)] + [a * b for a in ends for b in (*others[:1], *others[-1:])]

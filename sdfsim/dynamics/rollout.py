@@ -22,8 +22,9 @@ class Rollout:
         orientation: [T+1, N, 4] float64 xyzw, shape axes -> world.
         velocity: [T+1, N, 3] m/s.
         angular_velocity: [T+1, N, 3] rad/s, world frame.
-        contact_count: [T+1] int64, contact edges that acted in the step that led here (0 first).
-        contact_point: [sum(contact_count), 3] float64 m, world, in step order.
+        contact_count: [T+1] int64, contact edges that acted in the step that led here (0 where none did).
+        contact_point: [sum(contact_count), 3] float64 m, world, in step order: the edges' nodes, on the bodies as they
+            are in this entry.
         contact_body: [sum(contact_count), 2] int64, (owner of the node, body it meets).
         counters: name -> [T+1] array: `kinetic_energy` J, `potential_energy` J, `contacts`,
             `worst_penetration` m, `step_ms`, and what else the simulator counts.
@@ -76,7 +77,7 @@ class Rollout:
             names = tuple(str(n) for n in arrays.pop("names"))
             meta = json.loads(str(arrays.pop("meta")))
             return cls(**arrays, counters=counters, names=names, meta=meta)
-        except (KeyError, TypeError) as error:
+        except (KeyError, TypeError, ValueError) as error:
             raise SdfsimError(f"{path}: not a rollout of sdfsim ({error})") from error
 
 

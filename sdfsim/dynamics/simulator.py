@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -151,18 +151,19 @@ class Simulator:
             self._step()
             yield self.si_state()
 
-    def run(
-        self,
-        seconds: float | None = None,
-        steps: int | None = None,
-        on_step: Callable[[Rollout], bool | None] | None = None,
-    ) -> Rollout:
+    def frames(self, count: int) -> Iterator[Rollout]:
+        """Advance by `count` steps, yielding a rollout of one frame after each; raises as `steps` does."""
+        for _ in range(count):
+            started = time.perf_counter()
+            self._step()
+            yield self._frame(1e3 * (time.perf_counter() - started))
+
+    def run(self, seconds: float | None = None, steps: int | None = None) -> Rollout:
         """Simulate and keep everything.
 
         Args:
             seconds: how long (default: the scene's duration).
             steps: how many steps instead.
-            on_step: called after each step with its one frame; the run ends early when it returns True.
 
         Raises:
             SimulationError: the state broke; what was computed is in its `rollout`.
@@ -171,15 +172,11 @@ class Simulator:
             steps = max(1, round((self.scene.duration if seconds is None else seconds) / self.dt))
         self._accept()
         frames = [self.initial_rollout()]
-        for _ in range(steps):
-            started = time.perf_counter()
-            try:
-                self._step()
-            except SimulationError as error:
-                raise SimulationError(error.message, join(frames)) from None
-            frames.append(self._frame(1e3 * (time.perf_counter() - started)))
-            if on_step and on_step(frames[-1]):
-                break
+        try:
+            for frame in self.frames(steps):
+                frames.append(frame)
+        except SimulationError as error:
+            raise SimulationError(error.message, join(frames)) from None
         return join(frames)
 
     def initial_rollout(self) -> Rollout:
@@ -228,8 +225,9 @@ class Simulator:
         count = 0 if c is None else len(c)
         points, pairs = np.zeros((0, 3)), np.zeros((0, 2), dtype=np.int64)
         if c is not None and count:
-            # The edges were found before the step: they belong to where the nodes are at its start.
-            points = (self._contact_points(c) * u.length).cpu().numpy()
+            # The edges were found at the start of the step; their nodes are told where this frame has the bodies.
+            turned = pose.rotate(self.state.orientation[c.owner], self.bodies.node[c.node])
+            points = ((self.state.position[c.owner] + turned) * u.length).cpu().numpy()
             pairs = torch.stack([c.owner, c.body], -1).cpu().numpy()
         depth = float((-c.distance).clamp_min(0.0).max()) * u.length if c is not None and count else 0.0
         counters = {
@@ -265,11 +263,6 @@ class Simulator:
                 "python": platform.python_version(),
             },
         )
-
-    def _contact_points(self, contacts: Contacts) -> torch.Tensor:
-        """[E, 3] world, model units: the nodes as they are now."""
-        turned = pose.rotate(self.state.orientation[contacts.owner], self.bodies.node[contacts.node])
-        return self.state.position[contacts.owner] + turned
 
     def _energies(self) -> dict[str, float]:
         """Kinetic and potential energy in joules of all dynamic bodies."""

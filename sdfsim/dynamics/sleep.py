@@ -8,7 +8,7 @@ or when gravity changes.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -90,7 +90,8 @@ def settle(bodies: Bodies, state: State, contacts: Contacts, gravity: Tensor) ->
     label = islands(bodies, contacts)
     busy = bodies.moves & (quiet < STEPS)
     scripted = bodies.tracks.body if bodies.tracks is not None else rows[:0]
-    pushed = _beside(contacts, scripted[(state.velocity[scripted] != 0).any(-1)], len(bodies))
+    going = (state.velocity[scripted] != 0).any(-1) | (state.angular_velocity[scripted] != 0).any(-1)
+    pushed = _beside(contacts, scripted[going], len(bodies))
     restless = torch.isin(label, label[busy | (bodies.moves & pushed)])
     tired = bodies.moves & ~restless & (sleep.island < 0)
     return _freeze(bodies, state, contacts, label, tired, gravity) if bool(tired.any()) else state
@@ -156,24 +157,26 @@ def islands(bodies: Bodies, contacts: Contacts) -> Tensor:
     return torch.as_tensor(label, dtype=torch.int64, device=bodies.device)
 
 
+@dataclass(frozen=True)
 class Rest:
-    """Watches whether everything has come to rest: for `STEPS` steps no point of a dynamic body goes beyond `STRAY`.
+    """For how long everything has rested: no point of a dynamic body has gone beyond `STRAY` of where it was.
 
-    Args:
-        bodies: N bodies.
+    Attributes:
+        anchor: [D, 7] float64, the poses of the dynamic bodies that they have stayed near; None before the first state.
+        quiet: for how many steps.
     """
 
-    def __init__(self, bodies: Bodies) -> None:
-        self._radius = bodies.radius[bodies.moves]
-        self._rows = bodies.moves
-        self._anchor: Tensor | None = None
-        self._quiet = 0
+    anchor: Tensor | None = None
+    quiet: int = 0
 
-    def settled(self, state: State) -> bool:
-        """Whether they rest in `state`, which follows that of the call before."""
-        pose = torch.cat([state.position[self._rows], state.orientation[self._rows]], -1)
-        if self._anchor is None or bool((_strayed(self._anchor, pose, self._radius) >= STRAY).any()):
-            self._anchor, self._quiet = pose, 0
-        else:
-            self._quiet += 1
-        return self._quiet >= STEPS
+    @property
+    def settled(self) -> bool:
+        """Whether that is long enough."""
+        return self.quiet >= STEPS
+
+    def after(self, bodies: Bodies, state: State) -> Rest:
+        """What is so with `state`, the one that follows."""
+        pose = torch.cat([state.position, state.orientation], -1)[bodies.moves]
+        if self.anchor is None or bool((_strayed(self.anchor, pose, bodies.radius[bodies.moves]) >= STRAY).any()):
+            return Rest(pose)
+        return replace(self, quiet=self.quiet + 1)

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -16,6 +17,7 @@ from sdfsim.errors import SdfsimError
 from sdfsim.files import write_text
 from sdfsim.learning import tables
 from sdfsim.learning.evaluate import evaluate
+from sdfsim.learning.presets import PRESETS
 from sdfsim.learning.recipes import RECIPES
 
 
@@ -54,12 +56,20 @@ def _other_seed(model: Model, path: Path, other: Path) -> Model:
     """A further model, checked to be what the card will say it is: trained likewise, with another outcome."""
     found = load_model(other)
     for what in ("preset_name", "preset", "optimiser_steps", "data"):
-        if found.card.get(what) != model.card.get(what):
+        if _trained(found.card, what) != _trained(model.card, what):
             raise SdfsimError(f"{other}: trained with another {what.replace('_', ' ')} than {path}")
     ours, theirs = model.network.state_dict(), found.network.state_dict()
     if all(torch.equal(weights, theirs[key]) for key, weights in ours.items()):
-        raise SdfsimError(f"{other}: the same weights as {path}", "train with another --seed")
+        hint = "`python -m sdfsim.learning.train DATA RUN --seed K` trains from another seed"
+        raise SdfsimError(f"{other}: the same weights as {path}", hint)
     return found
+
+
+def _trained(card: dict, what: str) -> Any:
+    """An entry of a card, less the test trajectories, which a machine that only trains does not have."""
+    if what != "data":
+        return card.get(what)
+    return [d | {"trajectories": {**d["trajectories"], "test": None}} for d in card["data"]]
 
 
 def card_text(model: Model, report: dict, learned: dict | None) -> str:
@@ -67,6 +77,7 @@ def card_text(model: Model, report: dict, learned: dict | None) -> str:
     parameters = sum(p.numel() for p in model.network.parameters())
     card, preset = model.card, model.card["preset"]
     names = {"name": "this model", "ballistic": "flying on without contact"}
+    folders = _folders(card["data"])
     extra = []
     if learned:
         extra.append(("this model, free flight learned too (as published)", *tables.error_cells(learned["model"])))
@@ -76,13 +87,13 @@ def card_text(model: Model, report: dict, learned: dict | None) -> str:
         f"# {model.name}",
         "",
         f"The *{model.kind}* network, {parameters:,} parameters, {json.dumps(preset['config'])}; step {model.dt} s at",
-        f"{model.gravity:g} m/s^2 for bodies of {model.length:.2f} m on average, rescaled to any scene (Froude).",
+        f"{model.gravity:g} m/s^2 for bodies of {model.length:.2f} m (the middle of the sizes it has seen), rescaled",
+        "to any scene (Froude).",
         "",
         "## Training",
         "",
         *(
-            f"Data: {d['recipe']} (seed {d['seed']}, {d['shapes']} shapes), made with {d['engine']};"
-            f" {d['trajectories']['train']:,} trajectories."
+            f"Data: {d['recipe']} (seed {d['seed']}, {d['shapes']} shapes), made with {d['engine']}{_trajectories(d)}."
             for d in card["data"]
         ),
         "Surfaces and nodes are those of the convex pieces that the engine collides.",
@@ -91,8 +102,8 @@ def card_text(model: Model, report: dict, learned: dict | None) -> str:
         "",
         "Repeat with:",
         "",
-        *(f"    {line}" for line in _commands(card)),
-        f"    python -m sdfsim.learning.bundle RUN/model.safetensors {_folder(card['data'][0])} --name {model.name}"
+        *(f"    {line}" for line in _commands(card, folders)),
+        f"    python -m sdfsim.learning.bundle RUN/model.safetensors {folders[0]} --name {model.name}"
         f"{' --seeds OTHERS' if others else ''}",
         "",
         "## Ranges it has seen",
@@ -119,27 +130,45 @@ def card_text(model: Model, report: dict, learned: dict | None) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _commands(card: dict) -> list[str]:
+def _trajectories(made: dict) -> str:
+    """How many trained; models of older versions may not know."""
+    count = made["trajectories"].get("train")
+    return "" if count is None else f"; {count:,} trajectories"
+
+
+def _commands(card: dict, folders: list[str]) -> list[str]:
     """What makes the data and trains on them."""
     lines = [
-        f"sdfsim dataset {made['recipe']} -o {_folder(made)}{_shapes(made)} --trajectories {count}"
+        f"sdfsim dataset {made['recipe']} -o {folder}{_shapes(made)} --trajectories {count}"
         f" --seed {made['seed']} --split {split}"
-        for made in card["data"]
+        for folder, made in zip(folders, card["data"], strict=True)
         for split, count in made["trajectories"].items()
     ]
-    folders = " ".join(f"--data {_folder(made)}" for made in card["data"])
-    return [*lines, f"sdfsim train {folders} -o RUN --preset {card['preset_name']}"]
+    return [*lines, _training(card, folders)]
+
+
+def _training(card: dict, folders: list[str]) -> str:
+    """What trains: `sdfsim train` knows neither seeds nor numbers of steps but the preset's own."""
+    name, seed, steps = card["preset_name"], card.get("seed", 0), card["optimiser_steps"]
+    usual = PRESETS[name].steps if name in PRESETS else card["preset"]["steps"]
+    if seed == 0 and steps == usual:
+        return f"sdfsim train {' '.join(f'--data {folder}' for folder in folders)} -o RUN --preset {name}"
+    options = (f" --seed {seed}" if seed else "") + (f" --steps {steps}" if steps != usual else "")
+    return f"python -m sdfsim.learning.train {' '.join(folders)} RUN --preset {name}{options}"
 
 
 def _shapes(made: dict) -> str:
     """The options that say which shapes a recipe draws from."""
     recipe = RECIPES.get(made["recipe"])
     given = " --shapes SHAPES" if recipe is None or recipe.given else ""
-    return given + (f" --random-solids {made['random_solids']}" if made.get("random_solids") else "")
+    options = {"random-solids": made.get("random_solids"), "bodies": made.get("bodies")}
+    return given + "".join(f" --{option} {count}" for option, count in options.items() if count)
 
 
-def _folder(made: dict) -> str:
-    return made["recipe"].upper()
+def _folders(data: list[dict]) -> list[str]:
+    """A folder for each dataset, numbered where several are of one recipe."""
+    names = [made["recipe"].upper() for made in data]
+    return [f"{n}-{names[: k + 1].count(n)}" if names.count(n) > 1 else n for k, n in enumerate(names)]
 
 
 def _training_rows(card: dict, parameters: int) -> tables.Rows:

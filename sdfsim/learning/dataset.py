@@ -72,10 +72,9 @@ class Trajectory:
         missing = [f.name for f in fields(cls) if f.name not in arrays]
         if missing:
             raise SdfsimError(f"{path}: missing field(s) {', '.join(missing)}")
-        arrays = {f.name: arrays[f.name] for f in fields(cls)}
-        arrays["shape"] = arrays["shape"].astype(str)
-        arrays["dt"] = float(arrays["dt"])
+        arrays = {f.name: _typed(path, f.name, arrays[f.name]) for f in fields(cls)}
         _check(path, arrays)
+        arrays["dt"] = float(arrays["dt"])
         return cls(**arrays)
 
 
@@ -84,18 +83,35 @@ _TRAILING = {"position": (3,), "quat_xyzw": (4,), "velocity": (3,), "angular_vel
 _PER_BODY = {"scale": (), "mass": (), "inertia": (3,), "friction": (), "restitution": (), "static": (), "shape": ()}
 
 
+def _typed(path: Path, name: str, values: np.ndarray) -> np.ndarray:
+    """A field as the type that the rest of the code counts on."""
+    try:
+        if name == "shape":
+            return values.astype(str)
+        numbers = values.astype(np.float64, casting="same_kind", copy=False)
+    except (TypeError, ValueError) as error:
+        raise SdfsimError(
+            f"{path}: {name}: must be {'names' if name == 'shape' else 'real numbers'}: {error}"
+        ) from error
+    if name != "static":
+        return numbers
+    if not np.isin(numbers, (0.0, 1.0)).all():
+        raise SdfsimError(f"{path}: static: must be true or false (or 1 or 0)")
+    return numbers.astype(bool)
+
+
 def _check(path: Path, arrays: dict) -> None:
     if arrays["position"].ndim != 3:
         raise SdfsimError(f"{path}: position: must be [T, N, 3] (got {list(arrays['position'].shape)})")
     frames, bodies = arrays["position"].shape[:2]
     expected = {k: (frames, bodies, *t) for k, t in _TRAILING.items()}
-    expected |= {k: (bodies, *t) for k, t in _PER_BODY.items()} | {"gravity": (3,)}
+    expected |= {k: (bodies, *t) for k, t in _PER_BODY.items()} | {"gravity": (3,), "dt": ()}
     for name, shape in expected.items():
         if arrays[name].shape != shape:
             raise SdfsimError(f"{path}: {name}: must be {list(shape)} (got {list(arrays[name].shape)})")
         if name not in ("shape", "static") and not np.isfinite(arrays[name]).all():
             raise SdfsimError(f"{path}: {name}: has values that are not finite")
-    moving = ~arrays["static"].astype(bool)
+    moving = ~arrays["static"]
     for name in ("mass", "inertia"):
         if not (arrays[name][moving] > 0).all():
             raise SdfsimError(f"{path}: {name}: must be > 0 for bodies that move")

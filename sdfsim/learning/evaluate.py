@@ -178,7 +178,7 @@ def _errors(motions: Motions, recorded: Motions) -> dict[str, dict]:
 
 def score(motion: Trajectory, truth: Trajectory, horizons: list[int]) -> Score:
     """Errors of a motion over the steps up to each horizon, of the bodies that move."""
-    moving = ~truth.static.astype(bool)
+    moving = ~truth.static
     p, q = motion.position[1:, moving], motion.quat_xyzw[1:, moving]
     truth_p, truth_q = truth.position[1:, moving], truth.quat_xyzw[1:, moving]
     return Score(
@@ -217,7 +217,7 @@ def _survival(contenders: dict[str, Motions], recorded: Motions) -> dict:
 
 def _distance(motion: Trajectory, truth: Trajectory) -> np.ndarray:
     """[T, N] m: translation errors of the bodies that move, the first frame included."""
-    moving = ~truth.static.astype(bool)
+    moving = ~truth.static
     return np.linalg.norm(motion.position[:, moving] - truth.position[:, moving], axis=-1)
 
 

@@ -120,7 +120,7 @@ def perturbed(t: Trajectory, size: float, seed: list[int]) -> Trajectory:
     """The trajectory with velocities of its moving bodies changed by `size` m/s in random directions."""
     direction = np.random.default_rng(seed).normal(size=t.velocity[0].shape)
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
-    return replace(t, velocity=t.velocity + size * direction * ~t.static.astype(bool)[:, None])
+    return replace(t, velocity=t.velocity + size * direction * ~t.static[:, None])
 
 
 def _check_teacher(info: dict, trajectories: list[Trajectory]) -> None:

@@ -48,6 +48,7 @@ class ContactFrames:
         other: [E, 3] m, what leads to there from the second's (from the floor's origin), less `arm`.
         normal: [E, 3]; gap: [E] m.
         dt: s; gravity: [3] m/s^2; reach: m, the contact radius used.
+        trajectories: [K] int64, how many were searched, of each of the K sets that were joined; 0 where unknown.
     """
 
     body_start: np.ndarray
@@ -76,25 +77,48 @@ class ContactFrames:
     dt: float
     gravity: np.ndarray
     reach: float
+    trajectories: np.ndarray
 
     def __len__(self) -> int:
         return len(self.edge_start) - 1
 
     def save(self, path: Path) -> None:
         """Write the cache file."""
-        write_arrays(path, {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}, compressed=False)
+        arrays = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
+        write_arrays(path, arrays | {"version": np.array(FRAMES_VERSION)}, compressed=False)
 
     @classmethod
-    def load(cls, path: Path) -> ContactFrames:
-        """Read a cache file. Raises SdfsimError when it is not one."""
-        arrays = read_arrays(path, "contact frames", "delete it to have it made again")
+    def load(cls, path: Path, *, must_tell: bool = False) -> ContactFrames:
+        """Read a cache file.
+
+        Args:
+            path: of the file.
+            must_tell: refuse one that does not say that it is of this version (elsewhere its name proves it).
+
+        Raises:
+            SdfsimError: not contact frames, or not of this version.
+        """
+        arrays: dict[str, Any] = read_arrays(path, "contact frames", "delete it to have it made again")
+        made_by = arrays.pop("version", None)  # those that lack it, and the counts, are older than both
+        if must_tell and (made_by is None or int(made_by) != FRAMES_VERSION):
+            said = "does not say by which version" if made_by is None else f"says by version {made_by}"
+            raise SdfsimError(
+                f"{path}: {said} its contacts were found (this is version {FRAMES_VERSION})",
+                "where the trajectories are, delete it and train once: it is made again; then copy it here",
+            )
+        arrays.setdefault("trajectories", np.zeros(1, dtype=np.int64))
         if missing := [f.name for f in fields(cls) if f.name not in arrays]:
             raise SdfsimError(f"{path}: no {missing[0]} in it", "delete it to have it made again")
-        return cls(**_typed(arrays))
+        arrays |= {name: float(arrays[name]) for name in ("dt", "reach")}
+        return cls(**arrays)
 
-
-def _typed(arrays: dict[str, np.ndarray]) -> dict[str, Any]:
-    return {k: float(v) if k in ("dt", "reach") else v for k, v in arrays.items()}
+    def digest(self) -> str:
+        """Changes with what is trained on."""
+        digest = hashlib.sha256(f"{self.dt} {self.reach}".encode())
+        for field in fields(self):
+            if field.name not in ("dt", "reach", "trajectories"):
+                digest.update(np.ascontiguousarray(getattr(self, field.name)).data)
+        return digest.hexdigest()[:16]
 
 
 def contact_frames(
@@ -110,7 +134,7 @@ def contact_frames(
         # A machine that only trains may have been given nothing but the cache.
         made = list(folder.glob(f"{split}-{reach:g}-*.npz"))
         if len(made) == 1:
-            return ContactFrames.load(made[0])
+            return ContactFrames.load(made[0], must_tell=True)
     files = trajectory_files(data, split)
     cached = folder / f"{split}-{reach:g}-{_fingerprint(data, files)}.npz"
     if cached.exists():
@@ -220,4 +244,5 @@ def _concatenate(parts: list[dict[str, np.ndarray]], like: Trajectory, reach: fl
         "edge_start": np.concatenate([[0], np.cumsum(joined.pop("edges"))]),
     }
     small = {k: v.astype(np.int16 if k in ("first", "second") else np.float32) for k, v in joined.items()}
-    return ContactFrames(**starts, **small, dt=like.dt, gravity=like.gravity, reach=reach)
+    common = {"dt": like.dt, "gravity": like.gravity, "reach": reach, "trajectories": np.array([len(parts)])}
+    return ContactFrames(**starts, **small, **common)

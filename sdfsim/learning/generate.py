@@ -20,6 +20,7 @@ from sdfsim.parallel import parallel
 GRAVITY = (0.0, 0.0, -10.0)  # m/s^2
 STEPS = 100
 MOST_BODIES = 512
+REDRAWS = 1000  # of a scene in which a body found no room
 
 Progress = Callable[[float, str], None]
 
@@ -122,8 +123,11 @@ def make_trajectory(recipe: str, rng: np.random.Generator, cast: Cast) -> Trajec
         recipe: a name in `RECIPES`.
         rng: what the scene is drawn from.
         cast: shapes and scenery.
+
+    Raises:
+        SdfsimError: no scene of `REDRAWS` had room for its bodies.
     """
-    while True:
+    for _ in range(REDRAWS):
         with Teacher(np.array(GRAVITY), FLOOR) as teacher:
             placed = RECIPES[recipe].spawn(teacher, rng, cast)
             if placed is None:
@@ -144,6 +148,9 @@ def make_trajectory(recipe: str, rng: np.random.Generator, cast: Cast) -> Trajec
             dt=DT,
             gravity=np.array(GRAVITY),
         )
+    raise SdfsimError(
+        f"no room for the bodies of {recipe} in any of {REDRAWS:,} draws of a scene", "are the meshes in metres?"
+    )
 
 
 def _make_one(recipe: str, index: int, seed: int, split: str, cast: Cast, path: Path) -> None:

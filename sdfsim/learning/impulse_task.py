@@ -80,6 +80,15 @@ class ImpulseTask:
         self.noise = noise
         self.weight = _importance(frames)
 
+    def digest(self) -> str:
+        """Changes with the data."""
+        return self.frames.digest()
+
+    @property
+    def counts(self) -> list[int]:
+        """Trajectories of each dataset."""
+        return self.frames.trajectories.tolist()
+
     @property
     def dt(self) -> float:
         """s, the recorded step."""

@@ -34,6 +34,6 @@ def at_instants(trajectory: Trajectory, substep: float) -> Trajectory:
     airborne = np.zeros(trajectory.velocity.shape[:2], dtype=bool)
     airborne[:-1] |= flies
     airborne[1:] |= flies
-    airborne &= ~trajectory.static.astype(bool)
+    airborne &= ~trajectory.static
     lead = 0.5 * substep * trajectory.gravity * airborne[..., None]
     return replace(trajectory, velocity=trajectory.velocity + lead)

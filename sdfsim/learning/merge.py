@@ -26,15 +26,18 @@ def merged(
 ) -> tuple[Bodies, State]:
     """Bodies of all trajectories, each at its frame, then one floor they share; worlds do not touch each other.
 
+    Masses and inertias are told relative to the mean mass of what moves in the trajectory, as `Simulator` has them:
+    the *paper* network is given inverse masses as they are.
+
     Args:
         trajectories: W of them.
         frames: [W] the frame each is taken at.
         shapes: Shape of every name in use. The dataset's body frames sit at the centre of mass, so do these.
-        units: model units.
+        units: model units of length and time; its mass is to be 1.
         device: of the tensors.
         floor: its friction and restitution.
     """
-    scene, world = scene_of(trajectories, frames, shapes, floor)
+    scene, world = scene_of([_relative(t) for t in trajectories], frames, shapes, floor)
     tensors, state = from_scene(scene, units, device)
     return replace(tensors, world=torch.tensor(world, device=device)), state
 
@@ -42,7 +45,7 @@ def merged(
 def scene_of(
     trajectories: list[Trajectory], frames: list[int], shapes: dict[str, Shape], floor: tuple[float, float] = FLOOR
 ) -> tuple[Scene, list[int]]:
-    """The scene that `merged` makes tensors of, and the world of each of its bodies (-1: the floor's, in all)."""
+    """One scene of all trajectories, each at its frame, and the world of each of its bodies (-1, the floor: in all)."""
     names = sorted({str(n) for t in trajectories for n in t.shape})
     centred = [replace(shapes[n], com=np.zeros(3)) for n in names]
     bodies, world = [], []
@@ -93,6 +96,12 @@ def _edges(t: Trajectory, frames: list[int], shapes: dict[str, Shape], reach: fl
         "normal": contacts.normal[order].numpy(),
         "gap": contacts.distance[order].numpy(),
     }
+
+
+def _relative(t: Trajectory) -> Trajectory:
+    """The trajectory with masses and inertias in units of the mean mass of the bodies that move."""
+    mean = 1.0 if t.static.all() else float(t.mass[~t.static].mean())
+    return replace(t, mass=t.mass / mean, inertia=t.inertia / mean)
 
 
 def _body(t: Trajectory, frame: int, i: int, shape: int, name: str) -> Body:

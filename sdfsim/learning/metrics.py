@@ -31,7 +31,7 @@ def interval(values: np.ndarray, seed: int = 0, draws: int = 1000) -> list[float
 
 def energy(motion: Trajectory) -> np.ndarray:
     """[T] J: kinetic and potential energy of the bodies that move, heights taken from the origin (the floor)."""
-    moving = ~motion.static.astype(bool)
+    moving = ~motion.static
     mass, inertia = motion.mass[moving], motion.inertia[moving]
     velocity, quat = motion.velocity[:, moving], motion.quat_xyzw[:, moving]
     turned = Rotation.from_quat(quat.reshape(-1, 4)).inv()
@@ -58,7 +58,7 @@ def speeds(motion: Trajectory, steps: int = REST_STEPS) -> np.ndarray:
 
 def resting(recorded: Trajectory) -> np.ndarray:
     """[N] bool: the bodies, static ones left out, that are slower than `REST_SPEED` in all of the last steps."""
-    return (speeds(recorded) < REST_SPEED).all(0) & ~recorded.static.astype(bool)
+    return (speeds(recorded) < REST_SPEED).all(0) & ~recorded.static
 
 
 def survival(error: np.ndarray, limit: float) -> np.ndarray:

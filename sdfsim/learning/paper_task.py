@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import hashlib
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +51,21 @@ class PaperTask:
         self.dt = self.trajectories[0].dt
         self.gravity = float(np.linalg.norm(self.trajectories[0].gravity))
 
+    def digest(self) -> str:
+        """Changes with the data."""
+        digest = hashlib.sha256()
+        for t in self.trajectories:
+            for field in fields(t):
+                digest.update(np.ascontiguousarray(getattr(t, field.name)).tobytes())
+        for name, shape in sorted(self.shapes.items()):
+            digest.update(name.encode() + np.ascontiguousarray(shape.nodes).tobytes())
+        return digest.hexdigest()[:16]
+
+    @property
+    def counts(self) -> list[int]:
+        """Trajectories of each dataset: of the one."""
+        return [len(self.trajectories)]
+
     def prepare(self, network: PaperNetwork, rng: np.random.Generator) -> None:
         """Set the network's feature statistics from a few batches."""
         for _ in range(WARM_BATCHES):
@@ -62,12 +78,13 @@ class PaperTask:
         """`count` recorded steps as one graph, or the part of them that falls to one of a team."""
         picked = [self.trajectories[i] for i in rng.integers(len(self.trajectories), size=count)]
         frames = [int(rng.integers(2, len(t.position) - 1)) for t in picked]
+        yaw = pose.from_rotvec(torch.tensor([0.0, 0.0, rng.uniform(0, 2 * np.pi)], dtype=torch.float64))
+        noise = self._noise(picked, rng, team)
         picked, frames = picked[team.share(count)], frames[team.share(count)]
         units = Units(1.0, 1.0, 1.0)
         bodies, state = merged(picked, frames, self.shapes, units, self.device)
-        yaw = pose.from_rotvec(torch.tensor([0.0, 0.0, rng.uniform(0, 2 * np.pi)], dtype=torch.float64))
         poses = [self._poses(picked, frames, offset, yaw) for offset in (-2, -1, 0, 1)]
-        noisy = self._disturbed(poses, bodies, rng) if self.noise else poses
+        noisy = poses if noise is None else _disturbed(poses, bodies, noise)
         state = State(
             position=noisy[2][0],
             orientation=noisy[2][1],
@@ -97,14 +114,14 @@ class PaperTask:
         """[low, high] of what the trajectories hold, SI units, coefficients as products with the floor's."""
         extent = {name: float(np.ptp(shape.sdf.bounds, axis=0).max()) for name, shape in self.shapes.items()}
         size = [extent[str(n)] * s for t in self.trajectories for n, s in zip(t.shape, t.scale, strict=True)]
-        mass = np.concatenate([t.mass[~t.static] for t in self.trajectories])
+        masses = [t.mass[~t.static] for t in self.trajectories if not t.static.all()]
         friction = np.concatenate([t.friction for t in self.trajectories])
         restitution = np.concatenate([t.restitution for t in self.trajectories])
         speed = np.concatenate([np.linalg.norm(t.velocity, axis=-1).ravel() for t in self.trajectories])
         return {
             "size": [float(min(size)), float(max(size))],
             "speed": [0.0, float(np.percentile(speed, 99.9))],
-            "mass_ratio": [1.0, float(mass.max() / mass.min())],
+            "mass_ratio": [1.0, float(max(mass.max() / mass.min() for mass in masses))],
             "friction": product_range(friction, FLOOR[0]),
             "restitution": product_range(restitution, FLOOR[1]),
         }
@@ -118,19 +135,31 @@ class PaperTask:
         yaw = yaw.expand_as(turn)
         return pose.rotate(yaw, place).to(self.device), pose.multiply(yaw, turn).to(self.device)
 
-    def _disturbed(self, poses, bodies: Bodies, rng: np.random.Generator):
-        """A random walk of rigid displacements over the three input poses, each step of size `noise` at the last."""
-        assert self.noise is not None
-        moves = bodies.moves[:, None]
-        lever = torch.where(bodies.moves, 2.0 / bodies.size, torch.zeros_like(bodies.size))[:, None]
-        shift = turn = torch.zeros_like(poses[0][0])
-        result = []
-        for position, quat in poses[:3]:
-            step = rng.normal(scale=self.noise / np.sqrt(3), size=(2, len(bodies), 3))
-            draw = torch.from_numpy(step).to(self.device) * moves
-            shift, turn = shift + draw[0], turn + draw[1] * lever
-            result.append((position + shift, pose.multiply(pose.from_rotvec(turn), quat)))
-        return [*result, poses[3]]
+    def _noise(self, picked: list[Trajectory], rng: np.random.Generator, team: Team) -> Tensor | None:
+        """Noise of the whole batch, so that it does not depend on the team's size; then this one's part of it.
+
+        Returns:
+            [3, 2, N + 1, 3] m: of each input pose, shifts and turns at the surface, of its bodies and the floor.
+        """
+        if self.noise is None:
+            return None
+        ends = np.cumsum([0] + [t.position.shape[1] for t in picked])
+        # Sizes 1 / sqrt(3), so that the last pose of the walk is off by `noise`.
+        steps = rng.normal(scale=self.noise / np.sqrt(3), size=(3, 2, ends[-1] + 1, 3))
+        mine = team.share(len(picked))
+        rows = [*range(ends[mine.start], ends[mine.stop]), ends[-1]]
+        return torch.from_numpy(steps[:, :, rows]).to(self.device)
+
+
+def _disturbed(poses, bodies: Bodies, noise: Tensor):
+    """Rigid displacements that walk over the three input poses by the steps `noise` [3, 2, N, 3] m."""
+    lever = torch.where(bodies.moves, 2.0 / bodies.size, torch.zeros_like(bodies.size))[:, None]
+    shift, turn = (noise * bodies.moves[:, None]).cumsum(0).unbind(1)
+    walked = [
+        (position + s, pose.multiply(pose.from_rotvec(t * lever), quat))
+        for (position, quat), s, t in zip(poses, shift, turn, strict=False)
+    ]
+    return [*walked, poses[3]]
 
 
 def _mirror(batch: Batch) -> Batch:

@@ -69,7 +69,7 @@ def deepest(motion: Trajectory, solids: dict[str, Solid], every: int = EVERY) ->
     frames, bodies = position.shape[:2]
     turn = Rotation.from_quat(motion.quat_xyzw[kept].reshape(-1, 4)).as_matrix().reshape(frames, bodies, 3, 3)
     own = [solids[str(name)] for name in motion.shape]
-    moving = ~motion.static.astype(bool)
+    moving = ~motion.static
     bounds = motion.scale[:, None, None] * np.stack([solid.bounds for solid in own])
     touch = TOUCH * float(np.ptp(bounds[moving], axis=1).max(-1).mean())
     lowest = np.full(frames, np.inf)

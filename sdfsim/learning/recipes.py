@@ -146,8 +146,9 @@ def varied(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Placed | N
     def draw(source: ShapeSource) -> TeacherBody:
         extent = rng.uniform(*VARIED_EXTENTS)
         volume = source.volume * extent**3
-        low = max(volume * DENSITIES[0], max(masses, default=0.0) / MASS_RATIO)
-        high = min(volume * DENSITIES[1], min(masses, default=np.inf) * MASS_RATIO)
+        heaviest, most = max(masses, default=0.0), min(masses, default=np.inf) * MASS_RATIO
+        low = min(max(volume * DENSITIES[0], heaviest / MASS_RATIO), most)
+        high = max(min(volume * DENSITIES[1], most), low)  # the ratio wins over the densities
         masses.append(float(np.exp(rng.uniform(np.log(low), np.log(high)))))
         return TeacherBody(source.urdf, extent, masses[-1], rng.uniform(*FRICTIONS), rng.uniform(*RESTITUTIONS))
 

@@ -109,4 +109,4 @@ def _units(model: Model, like: Trajectory) -> Units:
     """Model units in which the recorded step is the model's own."""
     strength = float(np.linalg.norm(like.gravity)) or model.gravity
     length = (like.dt / model.dt) ** 2 * strength / model.gravity
-    return Units(length=length, time=like.dt / model.dt, mass=length**3)  # the recipe's densities are the model's
+    return Units(length=length, time=like.dt / model.dt, mass=1.0)

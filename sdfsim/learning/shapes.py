@@ -96,8 +96,9 @@ def find_shapes(shapes: Path, engine: Path) -> list[ShapeSource]:
         mesh = load_mesh(folder / VISUAL)
         volume = mass_properties(mesh)[0]
         # Kubric's assets have their centre of mass at the origin; their URDF says so and the engine takes it.
-        pieces = folder / COLLISION
-        urdf = write_urdf(pieces.resolve(), np.zeros(3), engine / f"{folder.name}.urdf")
+        pieces = engine / f"{folder.name}.obj"
+        write_text(pieces, (folder / COLLISION).read_text(encoding="utf-8"))
+        urdf = _engine_file(pieces)
         found.append(ShapeSource(folder.name, urdf, volume, mesh.vertices, pieces, folder / VISUAL, np.zeros(3), 1.0))
     if not found:
         raise SdfsimError(f"{shapes}: no shapes found", f"expected NAME/{VISUAL} and NAME/{COLLISION}")
@@ -191,7 +192,6 @@ def _prepare_one(origin: Origin, engine: Path) -> dict:
     else:
         moved = [Mesh((piece.vertices - com) / size, piece.faces) for piece in pieces]
         write_text(engine / f"{origin.name}.obj", wavefront(moved))
-        write_urdf((engine / f"{origin.name}.obj").resolve(), np.zeros(3), engine / f"{origin.name}.urdf")
         record = {"sha256": digest, "volume": volume / size**3, "com": com.tolist(), "size": size}
     write_json(file, record)
     return record
@@ -238,9 +238,16 @@ class _Union:
 def _source(origin: Origin, record: dict, engine: Path) -> ShapeSource:
     pieces = engine / f"{origin.name}.obj"
     vertices = np.concatenate([piece.vertices for piece in load_pieces(pieces)])
-    urdf = engine / f"{origin.name}.urdf"
+    urdf = _engine_file(pieces)
     com = np.array(record["com"])
     return ShapeSource(origin.name, urdf, record["volume"], vertices, pieces, origin.mesh, com, record["size"])
+
+
+def _engine_file(pieces: Path) -> Path:
+    """Write NAME.urdf beside NAME.obj, the pieces about their centre of mass: a dataset can be moved."""
+    # Not the bare name: the engine looks in the working directory first, where meshes of that name may well lie.
+    mesh = Path("..", pieces.resolve().parent.name, pieces.name)
+    return write_urdf(mesh, np.zeros(3), pieces.with_suffix(".urdf"))
 
 
 def _fit_one(source: ShapeSource, out: Path) -> None:

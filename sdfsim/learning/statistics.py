@@ -41,7 +41,7 @@ def statistics(data: Path, split: str) -> dict:
     """
     trajectories = [Trajectory.load(file) for file in trajectory_files(data, split)]
     shapes = load_shapes(data, {str(name) for t in trajectories for name in t.shape})
-    moving = [~t.static.astype(bool) for t in trajectories]
+    moving = [~t.static for t in trajectories]
     pairs = list(zip(trajectories, moving, strict=True))
     extents = {name: float(np.ptp(shape.sdf.bounds, axis=0).max()) for name, shape in shapes.items()}
     speed = [np.linalg.norm(t.velocity[:, m], axis=-1) for t, m in pairs]

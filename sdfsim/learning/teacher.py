@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from sdfsim.errors import SdfsimError
+from sdfsim.files import write_text
 
 SUBSTEP = 1.0 / 250.0  # s
 SUBSTEPS = 5
@@ -57,8 +58,11 @@ def import_pybullet():
 
 
 def write_urdf(mesh: Path, com: np.ndarray, path: Path) -> Path:
-    """Write a URDF whose base frame sits at the centre of mass `com` [3] m of `mesh` (an OBJ)."""
-    path.write_text(URDF_TEMPLATE.format(mesh=mesh, x=-com[0], y=-com[1], z=-com[2]))
+    """Write a URDF whose base frame sits at the centre of mass `com` [3] m of `mesh` (an OBJ).
+
+    A relative `mesh` is looked for from the folder of the URDF, so that both can be moved together.
+    """
+    write_text(path, URDF_TEMPLATE.format(mesh=mesh, x=-com[0], y=-com[1], z=-com[2]))
     return path
 
 

@@ -74,21 +74,25 @@ def train(
     if checkpoint.exists() and not resume:
         raise SdfsimError(f"{checkpoint} exists", "continue with --resume, or choose another -o")
     tell = on_progress or (lambda fraction, message: None)
+    infos = [read_info(folder) for folder in folders]
     team, device = gather_team(device)
     place = pick_device(device)
     with locked(out) if team.leads else nullcontext():
         with team.in_turn():  # the first finds contacts and caches them, the others read
             task, held_out = _tasks(plan, folders, place, lambda f, m: tell(0.0, m))
+        each = zip(folders, infos, task.counts, held_out.counts, strict=True)
+        made = [_made(folder, info, *counts) for folder, info, *counts in each]
         run = Run(plan, task, total, seed, place, team)
         if checkpoint.exists():
             run.load(checkpoint)
         team.wait()
         if team.leads:
             _shorten(out / "log.jsonl", run.step)
-        _loop(run, held_out, held_out_rollouts(folders[0], place) if team.leads else None, out, tell)
+        watched = held_out_rollouts(folders[0], place, lambda m: tell(0.0, m)) if team.leads else None
+        _loop(run, held_out, watched, out, tell)
         report = {"steps": run.step, "seconds": run.seconds, "loss": run.loss}
         if team.leads:
-            model = run.export(name=preset, data=[_made(folder) for folder in folders], ranges=task.ranges())
+            model = run.export(name=preset, data=made, ranges=task.ranges())
             report |= {"model": _saved(model, out), "held_out_loss": held_out_loss(run, held_out)}
     return report
 
@@ -102,11 +106,13 @@ def _saved(model: Model, out: Path) -> str | None:
     return str(out / "model.safetensors")
 
 
-def _made(data: Path) -> dict[str, Any]:
-    """What a model's card tells of a dataset."""
-    info = read_info(data)
-    counts = {split: len(list((data / split).glob("*.npz"))) for split in SPLITS if (data / split).is_dir()}
+def _made(data: Path, info: dict, train: int, validation: int) -> dict[str, Any]:
+    """What a model's card tells of a dataset; how many trajectories there were, where they are not here."""
+    here = {split: len(list((data / split).glob("*.npz"))) for split in SPLITS if (data / split).is_dir()}
+    counts = {"train": train, "validation": validation} | here
     known = {k: info.get(k) for k in ("recipe", "seed", "engine", "engine_version")}
+    if info.get("bodies"):
+        known["bodies"] = info["bodies"]
     shapes = info.get("shapes", [])
     solids = sum(name.startswith(SOLID) for name in shapes)
     return known | {"shapes": len(shapes), "random_solids": solids, "trajectories": counts}

@@ -26,6 +26,11 @@ BAD_BATCHES = 20  # consecutive batches without a finite gradient before trainin
 class Task(Protocol):
     """What a network is trained on: batches and their loss."""
 
+    def digest(self) -> str: ...
+
+    @property
+    def counts(self) -> list[int]: ...
+
     def draw(self, rng: np.random.Generator, count: int, team: Team = ALONE) -> Any: ...
 
     def loss(self, network: Any, batch: Any, *, mirrored: bool = False) -> Tensor: ...
@@ -52,6 +57,7 @@ class Run:
 
         torch.manual_seed(seed)
         self.plan, self.task, self.total, self.seed, self.device, self.team = plan, task, total, seed, device, team
+        self.digest = task.digest()
         self.network: nn.Module = new_network(plan.kind, plan.config).to(device)
         if hasattr(task, "prepare"):
             task.prepare(self.network, np.random.default_rng([seed, 1]))
@@ -111,16 +117,20 @@ class Run:
         for name, value in self.optimiser.state().items():
             arrays[f"optimiser/{name}"] = value.cpu().numpy()
         progress = {"step": self.step, "seconds": self.seconds, "loss": self.loss, "total": self.total}
-        arrays["run"] = np.array(json.dumps({"plan": asdict(self.plan), "seed": self.seed, **progress}))
+        origin = {"plan": asdict(self.plan), "seed": self.seed, "data": self.digest}
+        arrays["run"] = np.array(json.dumps(origin | progress))
         write_arrays(path, arrays, compressed=False)
 
     def load(self, path: Path) -> None:
-        """Take up a saved run. Raises SdfsimError when it is another preset's or seed's, or unreadable."""
+        """Take up a saved run. Raises SdfsimError when it is of another preset, seed or data, or unreadable."""
         arrays = read_arrays(path, "a checkpoint", "delete it to start anew")
         try:
             info: dict[str, Any] = json.loads(str(arrays["run"]))
             if info["plan"] != asdict(self.plan) or info["seed"] != self.seed or info["total"] != self.total:
                 raise SdfsimError(f"{path} belongs to another preset, seed or number of steps", "choose another -o")
+            # Runs that were begun before data had a digest are taken at their word.
+            if info.get("data", self.digest) != self.digest:
+                raise SdfsimError(f"{path} was trained on other data", "give the same --data, or choose another -o")
             tensors = {k: torch.from_numpy(v).to(self.device) for k, v in arrays.items() if k != "run"}
             self.network.load_state_dict({k[8:]: v for k, v in tensors.items() if k.startswith("network/")})
             self.average = {k[8:]: v for k, v in tensors.items() if k.startswith("average/")}
@@ -137,6 +147,7 @@ class Run:
 
         card = {
             "data": data,
+            "seed": self.seed,
             "optimiser_steps": self.step,
             "seconds": round(self.seconds),
             "threads": torch.get_num_threads(),

@@ -8,12 +8,14 @@ from __future__ import annotations
 import argparse
 import json
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
 
+from sdfsim.errors import SdfsimError
 from sdfsim.learning.dataset import Trajectory, load_shapes, trajectory_files
 from sdfsim.learning.instants import at_instants, engine_substep
 from sdfsim.learning.training_run import Run
@@ -43,7 +45,6 @@ class Rollouts:
 
     def __call__(self, run: Run) -> dict[str, float]:
         """Translation RMSE in m and mean rotation error in degrees of the averaged weights; NaN where they blow up."""
-        from sdfsim.errors import SdfsimError
         from sdfsim.learning.metrics import rotation_error, translation_rmse
         from sdfsim.learning.rollouts import batches, roll_out
 
@@ -57,22 +58,24 @@ class Rollouts:
             except SdfsimError:
                 return {"rollout_m": math.nan, "rollout_degrees": math.nan}
             for one, truth in zip(predicted, group, strict=True):
-                moving = ~truth.static.astype(bool)
+                moving = ~truth.static
                 metres.append(translation_rmse(one.position[:, moving], truth.position[:, moving]))
                 degrees.append(rotation_error(one.quat_xyzw[:, moving], truth.quat_xyzw[:, moving]))
         return {"rollout_m": sum(metres) / len(metres), "rollout_degrees": sum(degrees) / len(degrees)}
 
 
-def held_out_rollouts(data: Path, device: torch.device) -> Rollouts | None:
-    """The first validation trajectories; None where a machine that only trains has no trajectories or shapes."""
+def held_out_rollouts(data: Path, device: torch.device, tell: Callable[[str], None]) -> Rollouts | None:
+    """The first validation trajectories; None, and why is told, where they, shapes or libraries are not at hand."""
     if not (data / "validation").is_dir():
+        tell(f"no rollouts while training: {data / 'validation'} is not here")
         return None
     try:
         from sdfsim.learning.rollouts import first_frames
 
         recorded = [Trajectory.load(f) for f in trajectory_files(data, "validation")[:WATCHED]]
         shapes = load_shapes(data, {str(n) for t in recorded for n in t.shape})
-    except ImportError:
+    except (ImportError, SdfsimError) as error:
+        tell(f"no rollouts while training: {error}")
         return None
     recorded = [t for t in recorded if not t.static.all()]
     steps = min(STEPS, *(len(t.position) - 1 for t in recorded)) if recorded else 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -54,10 +54,6 @@ class Plan:
     def effects(self) -> dict[str, Effect]:
         """Every decision by its name."""
         return {name: getattr(self, name) for name in EFFECTS}
-
-    def to_dict(self) -> dict:
-        """Plain data for --json."""
-        return asdict(self)
 
 
 EFFECTS = (

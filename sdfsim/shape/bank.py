@@ -63,10 +63,6 @@ class SdfBank:
         self._group_of = torch.tensor(group_of, dtype=torch.int64, device=self.device)
         self._slot_of = torch.tensor(slot_of, dtype=torch.int64, device=self.device)
 
-    def to(self, device: torch.device | str) -> SdfBank:
-        """The same bank on `device`."""
-        return SdfBank(self.sdfs, device)
-
     def __call__(self, index: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Distance and gradient of shape `index[p]` at `points[p]`.
 

@@ -3,9 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
+from sdfsim.dynamics.ranges import _products
 from sdfsim.dynamics.simulator import Simulator
-from tests.dynamics.conftest import random_model
+from sdfsim.scene.types import Scene
+from tests.dynamics.conftest import make_body, random_model
 
 RANGES = {
     "size": [0.7, 2.1],
@@ -40,3 +43,24 @@ def test_every_quantity_is_flagged_with_its_values(dropped):
         "restitution of two bodies, multiplied",
     ]
     assert "0.1 to 1 here" in lines[0] and "0 to 40 here" in lines[1]
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_products_reach_from_the_smallest_to_the_largest_of_all_pairs(box_shape, seed):
+    """As many as there are bodies are never looked at, let alone pairs of them."""
+    rng = np.random.default_rng(seed)
+    values = rng.choice([0.0, 0.2, 0.5, 1.0, *rng.random(3)], rng.integers(0, 30) if seed % 2 else rng.integers(0, 4))
+    motions = [str(m) for m in rng.choice(["dynamic", "static", "kinematic"], len(values))]
+    bodies = [
+        make_body(str(k), 0, [0, 0, 0], motion=motion, friction=float(value))
+        for k, (motion, value) in enumerate(zip(motions, values, strict=True))
+    ]
+    everything = [
+        one.friction * other.friction
+        for k, one in enumerate(bodies)
+        for other in bodies[:k]
+        if "dynamic" in (one.motion, other.motion)
+    ]
+    found = _products(Scene((box_shape,), tuple(bodies), np.zeros(3), 1.0), "friction")
+    assert len(found) <= 14
+    assert len(found) == len(everything) == 0 or (min(found), max(found)) == (min(everything), max(everything))

@@ -167,6 +167,16 @@ def test_a_body_on_a_path_wakes_its_neighbours_when_it_starts():
     assert asleep(simulator) == {4, 5}
 
 
+def test_nobody_sleeps_beside_a_body_that_turns_on_its_path():
+    turned = np.array([0.0, 0.0, np.sin(0.05), np.cos(0.05)])
+    path = Waypoints(np.array([0.0, 10.0]), np.zeros((2, 3)), np.stack([STILL, turned]))
+    simulator = Simulator(two_islands(motion="kinematic", path=path), resting_model())
+    for _ in range(STEPS + 5):
+        simulator.run(steps=1)
+        assert not asleep(simulator) & {1, 2}
+    assert asleep(simulator) == {4, 5} and (simulator.state.velocity[0] == 0).all()
+
+
 def test_a_state_keeps_who_sleeps():
     simulator = run_until_asleep(two_islands(flyer_speed=1.0))
     kept = simulator.state

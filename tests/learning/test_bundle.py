@@ -1,12 +1,14 @@
 """Replacing a bundled model: weights, errors and card come out of one call."""
 
+from dataclasses import replace
+
 import pytest
 
 pytest.importorskip("pybullet")
 
 from sdfsim.dynamics.model import load_model
 from sdfsim.errors import SdfsimError
-from sdfsim.learning.bundle import bundle
+from sdfsim.learning.bundle import _commands, _folders, bundle
 from sdfsim.learning.generate import make_dataset
 from sdfsim.learning.train import train
 
@@ -47,6 +49,45 @@ def test_other_seeds_must_be_of_the_same_preset_and_not_the_same_model(cube_data
     with pytest.raises(SdfsimError, match="another optimiser steps"):
         bundle(trained[0], cube_data, "mine", tmp_path, seeds=[tmp_path / "other" / "model.safetensors"])
     assert not (tmp_path / "mine.safetensors").exists()
+
+
+def test_the_card_says_how_to_repeat_exactly_this_training(cube_data, trained):
+    model = load_model(trained[2])
+    assert model.card["seed"] == 2 and model.card["optimiser_steps"] == 20
+    made = {"engine": "pybullet", "shapes": 2, "random_solids": 0}
+    piles = [
+        made | {"recipe": "pile", "seed": seed, "trajectories": {"train": 5}, "bodies": count}
+        for seed, count in ((0, 8), (7, None))
+    ]
+    data = [*model.card["data"], *piles]
+    lines = _commands(model.card | {"data": data}, _folders(data))
+    assert _folders(data) == ["MOVI-B", "PILE-1", "PILE-2"]
+    assert lines[3:5] == [
+        "sdfsim dataset pile -o PILE-1 --shapes SHAPES --bodies 8 --trajectories 5 --seed 0 --split train",
+        "sdfsim dataset pile -o PILE-2 --shapes SHAPES --trajectories 5 --seed 7 --split train",
+    ]
+    module = "python -m sdfsim.learning.train MOVI-B PILE-1 PILE-2 RUN --preset tiny"
+    assert lines[5] == f"{module} --seed 2 --steps 20"
+    usual = {"seed": 0, "optimiser_steps": 150, "data": data}
+    assert _commands(model.card | usual, _folders(data))[5] == (
+        "sdfsim train --data MOVI-B --data PILE-1 --data PILE-2 -o RUN --preset tiny"
+    )
+
+
+def test_models_from_before_the_card_told_seed_and_counts_are_still_bundled(cube_data, trained, tmp_path):
+    """And one trained where there were no test trajectories is another seed of one trained where they are."""
+    model = load_model(trained[0])
+    known = [d | {"trajectories": {}} for d in model.card["data"]]
+    card = {k: v for k, v in model.card.items() if k != "seed"} | {"data": known}
+    replace(model, card=card).save(tmp_path / "old.safetensors")
+    bundle(tmp_path / "old.safetensors", cube_data, "mine", tmp_path / "models")
+    text = (tmp_path / "models" / "mine.md").read_text()
+    assert "made with pybullet.\n" in text and "learning.train MOVI-B RUN --preset tiny --steps 20" in text
+    assert "on average" not in text
+    other = load_model(trained[1])
+    trained_only = [d | {"trajectories": {"train": 2, "validation": 2}} for d in other.card["data"]]
+    replace(other, card=other.card | {"data": trained_only}).save(tmp_path / "other.safetensors")
+    assert len(bundle(trained[0], cube_data, "mine", tmp_path, [tmp_path / "other.safetensors"])["other_seeds"]) == 1
 
 
 def _error(report: dict, size: str) -> float:

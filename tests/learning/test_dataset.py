@@ -50,3 +50,31 @@ def test_missing_fields_truncation_and_empty_folders(tmp_path):
         trajectory_files(tmp_path / "empty")
     with pytest.raises(SdfsimError, match=r"dataset\.json"):
         read_info(tmp_path / "empty")
+
+
+def test_whole_numbers_are_read_as_what_they_mean(tmp_path):
+    """Also where a writer of its own has no booleans: 0 and 1 are not to be taken for indices."""
+    whole = {"static": np.array([0, 1]), "mass": np.array([2, 0]), "inertia": np.ones((2, 3), dtype=np.int32)}
+    replace(trajectory(), **whole, velocity=np.zeros((4, 2, 3), dtype=np.float32)).save(tmp_path / "a.npz")
+    found = Trajectory.load(tmp_path / "a.npz")
+    assert found.static.dtype == bool and found.mass[~found.static].tolist() == [2.0]
+    assert {getattr(found, name).dtype for name in ("mass", "inertia", "velocity")} == {np.dtype(np.float64)}
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"static": np.array([0, 2])}, "static: must be true or false"),
+        ({"static": np.array(["yes", "no"])}, "static: must be real numbers"),
+        ({"mass": np.array(["2", "1"])}, "mass: must be real numbers"),
+        ({"friction": np.array([0.5, 0.5j])}, "friction: must be real numbers"),
+        ({"dt": np.array([0.02, 0.02])}, "dt: must be []"),
+        ({"dt": "soon"}, "dt: must be real numbers"),
+        ({"shape": np.array([b"c\xff", b"b"])}, "shape: must be names"),
+    ],
+)
+def test_fields_of_another_type_are_named(tmp_path, change, complaint):
+    replace(trajectory(), **change).save(tmp_path / "a.npz")
+    with pytest.raises(SdfsimError) as error:
+        Trajectory.load(tmp_path / "a.npz")
+    assert complaint in error.value.message and "a.npz" in error.value.message

@@ -9,7 +9,7 @@ import torch
 pytest.importorskip("pybullet")
 
 from sdfsim.errors import SdfsimError
-from sdfsim.learning import merge
+from sdfsim.learning import generate, merge
 from sdfsim.learning.dataset import SPLITS, Trajectory, load_shapes, trajectory_files
 from sdfsim.learning.frames import contact_frames
 from sdfsim.learning.generate import GRAVITY, make_dataset, make_trajectory
@@ -93,6 +93,28 @@ def test_varied_scenes_keep_to_their_ranges_and_few_start_in_each_other(cast):
         obstacles += len(placed) - len(moving)
     assert 12 <= resting <= 28 and 5 <= obstacles <= 20
     assert 1 <= pressed <= 10
+
+
+def test_the_mass_ratio_of_varied_scenes_holds_whatever_the_volumes_are(cast):
+    """Of bodies whose densities alone would differ more: the ratio wins."""
+    cube = cast.shapes[0]
+    both = replace(cast, shapes=[cube, replace(cube, name="sliver", volume=1e-5 * cube.volume)])
+    mixed = 0
+    for seed in range(30):
+        placed, _, _ = spawned("varied", seed, both)
+        masses = [body.mass for _, body in placed if body.mass > 0]
+        assert max(masses) / min(masses) <= MASS_RATIO * (1 + 1e-9)
+        mixed += len({source.name for source, body in placed if body.mass > 0}) == 2
+    assert mixed > 10
+
+
+def test_shapes_that_fit_nowhere_are_told_and_not_waited_for(cast, monkeypatch):
+    monkeypatch.setattr(generate, "REDRAWS", 3)
+    (cube,) = cast.shapes
+    large = replace(cube, vertices=100 * cube.vertices)  # metres taken for centimetres
+    with pytest.raises(SdfsimError, match="no room for the bodies of movi-b") as error:
+        make_trajectory("movi-b", np.random.default_rng(0), replace(cast, shapes=[large]))
+    assert "metres" in error.value.hint
 
 
 @pytest.mark.parametrize("start", STARTS)

@@ -1,6 +1,8 @@
 """A dataset's shapes: decomposed, centred, split by name; and the refusals of `make_dataset`."""
 
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,9 +12,10 @@ pytest.importorskip("pybullet")
 from sdfsim.errors import SdfsimError
 from sdfsim.learning import decompose as cutting
 from sdfsim.learning.decompose import decompose, wavefront
+from sdfsim.learning.floor import engine_file
 from sdfsim.learning.generate import make_dataset
 from sdfsim.learning.shapes import COLLISION, VISUAL, find_shapes, origins, prepare, split_of
-from sdfsim.learning.teacher import Teacher, TeacherBody
+from sdfsim.learning.teacher import Teacher, TeacherBody, write_urdf
 from sdfsim.shape import primitives
 from sdfsim.shape.mesh import Mesh, signed_volume
 from sdfsim.shape.storage import write_ply
@@ -81,6 +84,35 @@ def test_the_engine_collides_the_pieces_about_their_centre_of_mass(prepared):
         motion = teacher.run(100)
         assert teacher.inertia(0) == pytest.approx([0.25 * 0.3125, 0.25 * 1.0625, 0.25 * 1.25], rel=0.05)
     assert motion["position"][-1, 0, 2] == pytest.approx(0.125, abs=0.01)
+
+
+@pytest.mark.parametrize("absolute", [False, True])
+def test_engine_files_can_be_moved_and_older_ones_are_made_so(tmp_path, monkeypatch, absolute):
+    """In whatever folder the engine works, and whatever lies there."""
+    block = primitives.box((1.0, 1.0, 1.0))
+    (tmp_path / "block.ply").write_bytes(write_ply(block))
+    (tmp_path / "block").mkdir()
+    for name in (VISUAL, COLLISION):
+        (tmp_path / "block" / name).write_text(wavefront([block]))
+    (tmp_path / "block.ply").unlink()
+    first = tmp_path / "first" / "shapes" / "engine"
+    sources = [*prepare(origins(tmp_path), first / "own", ignore)[0], *find_shapes(tmp_path, first / "kubric")]
+    if absolute:  # as they were written once
+        for source in sources:
+            write_urdf(source.pieces.resolve(), np.zeros(3), source.urdf)
+        prepare(origins(tmp_path), first / "own", ignore)
+        find_shapes(tmp_path, first / "kubric")
+    shutil.rmtree(tmp_path / "block")
+    (tmp_path / "first").rename(tmp_path / "second")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "block.obj").write_text(wavefront([primitives.box((4.0, 4.0, 4.0))]))
+    for kind in ("own", "kubric"):
+        for start in (Path(), tmp_path):
+            urdf = start / "second" / "shapes" / "engine" / kind / "block.urdf"
+            assert engine_file(tmp_path / "second", f"{kind}/block").samefile(urdf)
+            with Teacher(np.array([0.0, 0.0, -10.0])) as teacher:
+                teacher.add(TeacherBody(urdf, 1.0, 6.0, 0.5, 0.0), (0.0, 0.0, 2.0))
+                assert teacher.inertia(0) == pytest.approx([1.0, 1.0, 1.0], rel=0.1)
 
 
 def test_random_solids_are_numbered_and_no_name_is_taken_twice(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from pipeline.placement import Placement
 from pipeline.scene_file import DENSITY, Found, scene_text, write_scene
 from sdfsim.errors import SdfsimError
 from sdfsim.files import write_json
+from sdfsim.scene.load import load_scene
 from sdfsim.shape.asset import Shape, analytic_shape
 from sdfsim.shape.mesh import Mesh
 from sdfsim.shape.storage import write_ply
@@ -155,3 +157,44 @@ def test_every_part_is_fitted_in_its_own_frame_and_kept_when_killed(meshes, tmp_
     np.testing.assert_allclose(fits[1][1].vertices.min(0), [-0.1, -0.1, 0.0], atol=1e-6)
     assert report["passed"] is False and report["reason"] == "object1: too thin"
     assert fit_parts(meshes, out, budget=30.0) == report and len(fits) == 2
+
+
+def test_a_checkpoint_that_a_kill_left_beside_its_shape_goes(meshes, tmp_path, monkeypatch):
+    def fit_mesh(solid: Mesh, *, name: str, checkpoint: Path, device: str, **options) -> Shape:
+        checkpoint.write_text("state")
+        certificate = {"passed": True, "reason": ""}
+        return replace(analytic_shape("box", size=(0.2, 0.2, 0.2), name=name), mesh=solid, certificate=certificate)
+
+    monkeypatch.setattr("sdfsim.shape.fit.fit_mesh", fit_mesh)
+    out = tmp_path / "assets"
+    out.mkdir()
+    fit_parts(meshes, out, budget=None)
+    assert sorted(p.name for p in out.iterdir()) == ["object1", "scene"]
+    (out / "object1.checkpoint").write_text("state")  # It ended between the shape's last step and this file's removal.
+    fit_parts(meshes, out, budget=None)
+    assert sorted(p.name for p in out.iterdir()) == ["object1", "scene"]
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e-2, 1.0, 1e5])
+@pytest.mark.parametrize("shape", ["box", "ball"])
+def test_a_scene_of_any_size_that_is_allowed_is_the_same_scene(tmp_path, scale, shape):
+    """Lengths are those of the scene of 1 m times its size, to six digits, and the file can be loaded."""
+    mesh = scenery()
+    place, size = choose_drop(mesh, mesh), 2 * scale
+    drop = replace(place, side=place.side * size, thickness=place.thickness * size,
+                   position=tuple(size * v for v in place.position))  # fmt: skip
+    text = scene_text(replace(PLACEMENT, floor=-0.125 * size), drop, scenery=False, shape=shape,
+                      found=[Found("object1", size * np.array([0.1, -0.2, 1e-3]))])  # fmt: skip
+    data = yaml.safe_load(text)
+    bodies = {body["name"]: body for body in data["bodies"]}
+    assert bodies["floor"]["plane"]["offset"] == pytest.approx(-0.125 * size, rel=1e-5)
+    np.testing.assert_allclose(bodies["object1"]["position"], size * np.array([0.1, -0.2, 1e-3]), atol=1e-5 * size)
+    np.testing.assert_allclose(bodies[shape]["position"], drop.position, rtol=1e-5, atol=1e-5 * size)
+    if shape == "box":
+        wanted = (drop.side, drop.side, drop.thickness)
+        np.testing.assert_allclose(data["shapes"]["box"]["box"]["size"], wanted, rtol=1e-5)
+    else:
+        assert data["shapes"]["ball"]["sphere"]["radius"] == pytest.approx(drop.thickness / 2, rel=1e-5)
+    analytic_shape("box", size=3 * [0.1 * size], name="object1").save(tmp_path / "assets" / "object1")
+    (tmp_path / "scene.yaml").write_text(text)
+    assert [body.name for body in load_scene(tmp_path / "scene.yaml").bodies] == ["floor", "object1", shape]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -19,6 +22,7 @@ from pipeline.field import (
 )
 from pipeline.landmarks import find_landmarks
 from pipeline.normalise import Normalisation
+from pipeline.photos import save_photos
 from pipeline.rays import Rays, camera_rays, load_rays
 from pipeline.recipe import PRESETS
 from pipeline.render import choose_samples, sdf_cache, sphere_interval
@@ -187,24 +191,30 @@ def test_masks_make_what_they_exclude_transparent():
     assert np.mean(losses[-5:]) < 0.7 * np.mean(losses[:5])
 
 
-def test_train_writes_and_reads_back(tmp_path):
-    from dataclasses import replace
-
+def posed_noise(folder: Path) -> tuple[list[View], Sparse]:
+    """Four photos of noise, as the photos stage leaves them, and cameras around points that mean nothing."""
     from PIL import Image
 
-    from pipeline.distill import load_field
+    from tests.pipeline.test_verdict import photo
 
-    (tmp_path / "images").mkdir()
+    (folder / "images").mkdir()
     rng = np.random.default_rng(0)
     views = []
     for k in range(4):
-        Image.fromarray(rng.integers(0, 255, (40, 40, 3), dtype=np.uint8)).save(tmp_path / "images" / f"{k}.jpg")
+        Image.fromarray(rng.integers(0, 255, (40, 40, 3), dtype=np.uint8)).save(folder / "images" / f"{k}.jpg")
         a = k * np.pi / 2
         turn = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
         views.append(View(f"{k}.jpg", f"{k}.jpg", 40, 40, 50.0, 20.0, 20.0, 0.0, turn, np.array([0.0, 0, 3])))
+    save_photos([replace(photo(k, 40, 40), name=f"{k}.jpg") for k in range(4)], folder)
     points = rng.normal(size=(50, 3)) * 0.3
     point_of, view_of = np.repeat(np.arange(50), 4), np.tile(np.arange(4), 50)
-    sparse = Sparse(points, np.zeros((50, 3), np.uint8), np.full(50, 0.5), point_of, view_of)
+    return views, Sparse(points, np.zeros((50, 3), np.uint8), np.full(50, 0.5), point_of, view_of)
+
+
+def test_train_writes_and_reads_back(tmp_path):
+    from pipeline.distill import load_field
+
+    views, sparse = posed_noise(tmp_path)
     recipe = replace(PRESETS["quick"], size=SMALL, rays=32, iterations=6, surface_points=16)
     trained = train(views, sparse, tmp_path, tmp_path, recipe=recipe, threads=1)
     again = load_field(tmp_path)

@@ -13,10 +13,12 @@ from PIL import Image
 
 from pipeline.cameras import Sparse, View
 from pipeline.distill import FEWEST_STEPS, paced, train
-from pipeline.held_out import HeldOut
+from pipeline.held_out import FOLDER, HeldOut, score
+from pipeline.photos import save_photos
 from pipeline.recipe import PRESETS
 from pipeline.render import sdf_cache
 from tests.pipeline.test_field import SMALL
+from tests.pipeline.test_verdict import photo
 
 RED, SIDE = (200, 30, 30), 40
 
@@ -33,8 +35,15 @@ def views(count: int) -> list[View]:
     return found
 
 
+def away(view: View) -> View:
+    """A camera in the same place that looks the other way."""
+    back = np.diag([-1.0, 1, -1])
+    return replace(view, rotation=back @ view.rotation, translation=back @ view.translation)
+
+
 def photos(folder: Path, count: int, *, masks: bool = False) -> None:
     (folder / "images").mkdir()
+    save_photos([replace(photo(k, SIDE, SIDE), name=f"{k}.jpg", mask=masks) for k in range(count)], folder)
     for k in range(count):
         Image.new("RGB", (SIDE, SIDE), RED).save(folder / "images" / f"{k}.jpg", quality=98)
         if masks:
@@ -93,6 +102,28 @@ def test_a_field_that_is_right_scores_as_such(tmp_path):
     assert seen.psnr == pytest.approx(-10 * np.log10(wrong), abs=0.5)
 
 
+def test_held_out_photos_that_show_nothing_of_the_sphere_are_passed_over(tmp_path):
+    photos(tmp_path, 16)
+    recipe = replace(PRESETS["quick"], size=SMALL, rays=32, samples=12, iterations=40, surface_points=16)
+    ring = views(16)
+    ring[4] = away(ring[4])
+    report = train(ring, cloud(), tmp_path, tmp_path, recipe=recipe, threads=1).report
+    assert report["held_out_photos"] == ["IMG_12.JPG"] and len(report["psnr_each"]) == 1
+    assert np.isfinite(report["psnr"]) and [p.name for p in (tmp_path / FOLDER).iterdir()] == ["12.jpg"]
+    assert report["snapshots"] and all(np.isfinite(entry["psnr"]) for entry in report["snapshots"])
+    none = HeldOut([away(view) for view in views(2)], tmp_path, Ball(), masked=False)  # type: ignore[arg-type]
+    assert none.shown == [] and score(none, tmp_path) == {}
+
+
+def test_masks_count_only_where_every_photo_has_one_posed_or_not(tmp_path):
+    photos(tmp_path, 4, masks=True)
+    recipe = replace(PRESETS["quick"], size=SMALL, rays=16, samples=12, iterations=2, surface_points=16)
+    assert train(views(4), cloud(), tmp_path, tmp_path, recipe=recipe, threads=1).report["masked"]
+    known = [replace(photo(k, SIDE, SIDE), name=f"{k}.jpg", mask=k < 4) for k in range(5)]
+    save_photos(known, tmp_path)
+    assert not train(views(4), cloud(), tmp_path, tmp_path, recipe=recipe, threads=1).report["masked"]
+
+
 def trainer(iteration: int, iterations: int) -> SimpleNamespace:
     return SimpleNamespace(iteration=iteration, iterations=iterations)
 
@@ -104,7 +135,7 @@ def trainer(iteration: int, iterations: int) -> SimpleNamespace:
         (500, 1000, 80.0, 900),  # slower: 625 would fit, but schedules must not jump
         (500, 1000, 30.0, 1100),  # faster
         (500, 1000, 101.0, 500),  # over: ends at once
-        (1700, 1790, 10.0, 1800),  # never more than the recipe's
+        (3500, 3590, 10.0, PRESETS["quick"].iterations),  # never more than the recipe's
     ],
 )
 def test_steps_follow_the_clock(iteration, iterations, elapsed, expected):

@@ -13,8 +13,9 @@ from PIL import Image
 from pipeline import meshing
 from pipeline.cameras import Sparse, View, save_views
 from pipeline.distill import Trained
-from pipeline.meshing import make_meshes, read_parts
+from pipeline.meshing import make_meshes, read_parts, rounded
 from pipeline.normalise import Normalisation
+from pipeline.photos import Photo, save_photos
 from pipeline.placement import load_placement
 from pipeline.wishes import Known, Wishes
 from sdfsim.errors import SdfsimError
@@ -30,6 +31,10 @@ class Drawn:
     """A field that is known exactly, and red where it is high."""
 
     finest = 2 / 63
+    background = torch.zeros(1)
+
+    def to(self, device: str) -> Drawn:
+        return self
 
     def sdf(self, points: torch.Tensor) -> torch.Tensor:
         p = points.double().numpy()
@@ -64,6 +69,10 @@ def run(tmp_path_factory) -> Path:
     count = len(xyz)
     sparse = Sparse(xyz, np.zeros((count, 3), np.uint8), np.full(count, 0.3), np.arange(count), np.zeros(count, int))
     np.savez(folder / "poses" / "sparse.npz", **vars(sparse))
+    prepared = [
+        Photo(v.name, v.source, v.width, v.height, (v.width, v.height), None, None, "", False, 0.4) for v in views
+    ]
+    save_photos(prepared, folder / "photos")
     for view in views:
         for path in (folder / "photos" / "images" / view.name, folder / "source" / view.source):
             Image.new("RGB", (view.width, view.height), (180, 90, 40)).save(path)
@@ -126,3 +135,20 @@ def test_cropping_leaves_the_frame_and_what_is_within(mesh):
     assert (vertices > corners[0] - 0.02).all() and (vertices < corners[1] + 0.02).all()
     with pytest.raises(SdfsimError, match="crop: the box holds nothing"):
         mesh(crop=np.array([[5.0, 5, 5], [6, 6, 6]]))
+
+
+def test_lengths_are_told_to_six_digits_of_the_largest():
+    np.testing.assert_array_equal(rounded([1234567.8, -3.24, 0.0]), [1234570.0, 0.0, 0.0])
+    np.testing.assert_array_equal(rounded([2 / 3, -1e-17, 1e-4 / 3]), [0.666667, 0.0, 3.3e-05])
+    assert rounded(2e-6 / 3) == 6.66667e-07 and rounded(0.0) == 0.0 and rounded(100.0) == 100.0
+
+
+def test_lengths_of_a_tiny_scene_are_those_of_its_meshes(mesh):
+    report, folder = mesh(size=2e-4)
+    parts, cup = read_parts(folder), load_mesh(folder / "objects" / "object1.ply").vertices
+    told = [report["extent_m"], parts["objects"][0]["low"], parts["objects"][0]["high"]]
+    found = [np.ptp(load_mesh(folder / "mesh.ply").vertices, axis=0), cup.min(0), cup.max(0)]
+    np.testing.assert_allclose(np.array(told) / 2e-4, np.array(found) / 2e-4, rtol=1e-4, atol=1e-4)
+    assert report["smallest_object_m"] == parts["smallest_m"]
+    assert parts["smallest_m"] / load_placement(folder).scale == pytest.approx(4 * Drawn.finest, rel=1e-4)
+    assert parts["left_out"][0]["size_m"] / load_placement(folder).scale == pytest.approx(0.06, rel=0.1)

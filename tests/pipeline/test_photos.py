@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image, ImageOps
 
+from pipeline.photo_file import TURNS, read_photo
 from pipeline.photos import load_photos, prepare_photos
 from sdfsim.errors import EXIT_ERROR, SdfsimError
 
@@ -132,3 +133,91 @@ def test_sixteen_bit_grey_is_scaled_not_clipped(tmp_path):
     photos, _ = prepare_photos(tmp_path / "in", tmp_path, long_side=80)
     deep = next(p for p in photos if p.source == "deep.png")
     assert abs(int(np.asarray(Image.open(tmp_path / "images" / deep.name))[40, 40, 0]) - 128) <= 1
+
+
+def test_mask_files_that_only_some_photos_have_change_nothing(tmp_path):
+    fill(tmp_path / "in", 4)
+    (tmp_path / "masks").mkdir()
+    for k in range(2):
+        Image.new("L", (120, 80)).save(tmp_path / "masks" / f"{k}.png")
+    photos, notes = prepare_photos(tmp_path / "in", tmp_path / "in", long_side=120)
+    assert not any(photo.mask for photo in photos) and not (tmp_path / "in" / "masks").exists()
+    for k in range(4):
+        found = np.asarray(Image.open(tmp_path / "in" / "images" / f"000{k}.jpg")).astype(int)
+        assert np.abs(found - np.asarray(Image.open(tmp_path / "in" / f"{k}.jpg"))).mean() < 8  # JPEG, twice
+    assert "2 of 4 photos have a mask file: ignored, as masks count only where every photo has one" in notes
+
+
+def test_transparency_that_only_some_photos_have_is_grey_and_no_mask(tmp_path):
+    fill(tmp_path / "in", 3)
+    picture(seed=9).convert("RGBA").save(tmp_path / "in" / "opaque.png")
+    Image.new("RGBA", (120, 80), (255, 0, 0, 0)).save(tmp_path / "in" / "z.png")
+    _, notes = prepare_photos(tmp_path / "in", tmp_path, long_side=120)
+    assert np.abs(np.asarray(Image.open(tmp_path / "images" / "0004.jpg")).astype(int) - 128).max() <= 2
+    assert any(note.startswith("1 of 5 photos are transparent in part: grey there, but not taken") for note in notes)
+
+
+def test_mask_files_and_transparency_count_together(tmp_path):
+    fill(tmp_path / "in", 2)
+    Image.new("RGBA", (120, 80), (255, 0, 0, 0)).save(tmp_path / "in" / "z.png")
+    (tmp_path / "masks").mkdir()
+    for k in range(2):
+        Image.new("L", (120, 80), 255 * k).save(tmp_path / "masks" / f"{k}.png")
+    photos, notes = prepare_photos(tmp_path / "in", tmp_path / "in", long_side=120)
+    assert all(photo.mask for photo in photos) and not any("mask" in note for note in notes)
+    for k in (0, 2):
+        found = np.asarray(Image.open(tmp_path / "in" / "images" / f"000{k}.jpg")).astype(int)
+        assert np.abs(found - 128).max() <= 2
+
+
+def stored(path: Path, orientation: int | None) -> tuple[np.ndarray, np.ndarray]:
+    """Writes a photo of a white angle with this EXIF orientation; gives its pixels [H, W] as stored and upright."""
+    pixels = np.zeros((90, 120), np.uint8)
+    pixels[10:80, 20:40] = pixels[60:80, 20:110] = 255
+    image = Image.fromarray(pixels)
+    exif = image.getexif()
+    if orientation:
+        exif[ExifTags.Base.Orientation] = orientation
+    image.convert("RGB").save(path, exif=exif)
+    return pixels, np.asarray(ImageOps.exif_transpose(Image.open(path)).convert("L"))
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+@pytest.mark.parametrize("turned", [False, True], ids=["upright mask", "mask of stored pixels"])
+@pytest.mark.parametrize("orientation", [1, 2, 3, 4, 5, 6, 7, 8])
+def test_a_mask_lies_on_its_photo_pixel_by_pixel(tmp_path, orientation, turned, suffix):
+    pixels, upright = stored(tmp_path / f"a.{suffix}", orientation)
+    if turned and (orientation < 5 or suffix == "tif"):
+        pytest.skip("nothing tells it from an upright one" if orientation < 5 else "PIL gives TIFF upright")
+    Image.fromarray(pixels if turned else upright).save(tmp_path / "mask.png")
+    found = read_photo(tmp_path / f"a.{suffix}", 120, tmp_path / "mask.png")
+    np.testing.assert_array_equal(found.mask, upright)
+    np.testing.assert_array_equal(found.pixels, np.where(upright[..., None] > 0, 255, 128).repeat(3, 2))
+    assert found.original == upright.shape[::-1] and (orientation in TURNS) == (orientation > 1)
+
+
+@pytest.mark.parametrize("orientation", [None, 1, 3])
+def test_a_mask_is_never_turned_where_its_photo_is_not(tmp_path, orientation):
+    pixels, _ = stored(tmp_path / "a.png", orientation)
+    Image.fromarray(pixels.T).save(tmp_path / "mask.png")
+    with pytest.raises(SdfsimError, match=r"mask\.png: a mask of 90 x 120 does not fit"):
+        read_photo(tmp_path / "a.png", 120, tmp_path / "mask.png")
+
+
+@pytest.mark.parametrize("tagged", [False, True])
+def test_a_photo_that_its_camera_has_unturned_stays_so_with_its_mask(tmp_path, tagged):
+    pixels, _ = stored(tmp_path / "a.png", 6)
+    stored(tmp_path / "mask.png", 6 if tagged else None)
+    found = read_photo(tmp_path / "a.png", 60, tmp_path / "mask.png", shape=120 / 90)
+    assert found.pixels.shape[:2] == (45, 60) and found.original == (120, 90)
+    small = np.asarray(Image.fromarray(pixels).resize((60, 45), Image.Resampling.BOX))
+    np.testing.assert_array_equal(found.mask, small)
+
+
+def test_the_original_size_is_that_of_the_file_however_it_is_decoded(tmp_path):
+    image = picture(1001, 667)
+    exif = image.getexif()
+    exif[ExifTags.Base.Orientation] = 8
+    image.save(tmp_path / "a.jpg", exif=exif)
+    found = read_photo(tmp_path / "a.jpg", 100)  # The decoder skips to a quarter of the size or less.
+    assert found.pixels.shape[:2] == (100, 67) and found.original == (667, 1001)

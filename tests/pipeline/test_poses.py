@@ -130,6 +130,23 @@ def test_a_finished_rung_is_not_run_again(tmp_path, monkeypatch):
     assert run_worker(job, tmp_path / "try", 1.0, lambda fraction, message: None) == {"views": []}
 
 
+def test_poses_that_could_not_be_moved_to_their_place_are_found_again(tmp_path, monkeypatch):
+    """A full disk or a kill after the last line of `solve`: the next run takes the results of the rungs again."""
+
+    def run(job, folder, timeout, report):
+        if not folder.exists():
+            folder.mkdir()
+            write_arrays(folder / "sparse.npz", {"xyz": np.ones((1, 3))})
+        return result(10, 10)
+
+    monkeypatch.setattr(poses, "run_worker", run)
+    first = solve([photo(k) for k in range(10)], tmp_path, tmp_path)
+    again = solve([photo(k) for k in range(10)], tmp_path, tmp_path)
+    assert again["posed"] == first["posed"] == 10
+    with np.load(tmp_path / "sparse.npz") as arrays:
+        assert (arrays["xyz"] == 1).all()
+
+
 def test_the_leavings_of_another_job_go(tmp_path, monkeypatch):
     write_json(tmp_path / "job.json", {"count": 4})
     (tmp_path / "database.db").write_text("old")

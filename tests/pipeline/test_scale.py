@@ -11,7 +11,9 @@ from PIL import ExifTags, Image
 
 from pipeline.cameras import View
 from pipeline.cleaning import joined
-from pipeline.scale import GPS_ERROR, measured, of_exif, source_size
+from pipeline.photos import Photo
+from pipeline.rectify import Lens
+from pipeline.scale import GPS_ERROR, measured, of_exif
 from pipeline.visibility import Caster
 from pipeline.wishes import Known
 from sdfsim.errors import SdfsimError
@@ -31,11 +33,12 @@ def views() -> list[View]:
 
 
 @pytest.fixture
-def photos(tmp_path: Path, views: list[View]) -> Path:
-    """Files twice as large as the prepared photos."""
-    for view in views:
-        Image.new("RGB", (2 * view.width, 2 * view.height)).save(tmp_path / view.source)
-    return tmp_path
+def photos(views: list[View]) -> list[Photo]:
+    """Made of files twice as large."""
+    return [
+        Photo(v.name, v.source, v.width, v.height, (2 * v.width, 2 * v.height), None, None, "", False, 0.4)
+        for v in views
+    ]
 
 
 def place(view: View, point: np.ndarray, scale: float = 2.0) -> str:
@@ -88,13 +91,28 @@ def test_distances_that_make_no_sense_are_refused(known):
         known.check()
 
 
-def test_pixels_are_those_of_the_upright_photo(tmp_path):
-    image = Image.new("RGB", (60, 40))
-    exif = image.getexif()
-    exif[ExifTags.Base.Orientation] = 6
-    image.save(tmp_path / "turned.jpg", exif=exif)
-    assert source_size(tmp_path / "turned.jpg", (1, 1)) == (40, 60)
-    assert source_size(tmp_path / "missing.jpg", (7, 8)) == (7, 8)
+def test_a_pixel_is_followed_through_the_lens(views, photos):
+    surface = Caster(cube(1.0))
+    lens = Lens(((560.0, 0, 325), (0, 560, 236), (0, 0, 1)), (-0.25, 0.04, 0.0, 0.0), False)
+    known = []
+    for view, corner in ((views[1], [0.499, 0.499, 0.5]), (views[3], [-0.499, 0.499, 0.5])):
+        x, y, z = view.rotation @ corner + view.translation
+        r = (x * x + y * y) / z**2
+        bend = 1 - 0.25 * r + 0.04 * r * r
+        u, v = 2 * (560 * bend * x / z + 325), 2 * (560 * bend * y / z + 236)
+        known.append(f"{view.source}:{u:.4f},{v:.4f}")
+    scale = measured(Known(*known, 0.998 * METRES), views, [replace(p, lens=lens) for p in photos], surface)
+    assert scale.metres == pytest.approx(METRES, rel=1e-3)
+
+
+def test_photos_of_the_same_name_have_to_be_told_apart(views, photos):
+    views = [replace(view, source=f"cam{k}/1.jpg") for k, view in enumerate(views)]
+    apart = float(np.linalg.norm(views[0].center - views[2].center))
+    known = Known("cam0/1.jpg", "cam2/1.jpg", METRES * apart)
+    assert measured(known, views, photos, Caster(cube(1.0))).metres == pytest.approx(METRES)
+    with pytest.raises(SdfsimError, match=r"8 posed photos are called '1\.jpg'") as caught:
+        measured(Known("1.jpg", "cam2/1.jpg", 1.0), views, photos, Caster(cube(1.0)))
+    assert "cam0/1.jpg, cam1/1.jpg" in caught.value.hint
 
 
 def write_exif(photos: Path, views: list[View], metres: float, noise: float, subject: bool) -> None:
@@ -115,6 +133,7 @@ def write_exif(photos: Path, views: list[View], metres: float, noise: float, sub
                 minutes = value % 1 * 60
                 gps[key] = (float(int(value)), float(int(minutes)), minutes % 1 * 60)
                 gps[key - 1] = letter
+        (photos / view.source).parent.mkdir(exist_ok=True)
         image.save(photos / view.source, exif=exif)
 
 
@@ -143,5 +162,18 @@ def test_subject_distances_set_the_scale_where_they_agree(tmp_path, views):
     assert of_exif(views, tmp_path, surface, UP) is None
 
 
-def test_photos_without_exif_set_no_scale(photos, views):
-    assert of_exif(views, photos, Caster(cube(1.0)), UP) is None
+def test_positions_are_read_in_subfolders_and_of_the_largest_photos(tmp_path, views, monkeypatch):
+    """Photos of up to 200 megapixels are read; PIL on its own refuses them from 179 on."""
+    views = [replace(view, source=f"cam{k}/1.jpg") for k, view in enumerate(views)]
+    write_exif(tmp_path, views, 20.0, 0.5, subject=False)
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 64 * 48 // 2 - 1)
+    found = of_exif(views, tmp_path, Caster(cube(1.0)), UP)
+    assert found is not None and found.metres == pytest.approx(20.0, rel=0.02)
+    assert Image.MAX_IMAGE_PIXELS == 64 * 48 // 2 - 1
+
+
+def test_photos_without_exif_set_no_scale(tmp_path, views):
+    for view in views:
+        Image.new("RGB", (64, 48)).save(tmp_path / view.source)
+    assert of_exif(views, tmp_path, Caster(cube(1.0)), UP) is None
+    assert of_exif(views, tmp_path / "gone", Caster(cube(1.0)), UP) is None

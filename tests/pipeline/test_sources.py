@@ -12,7 +12,7 @@ from PIL import Image
 
 from pipeline.cameras import load_view_file
 from pipeline.given import read_given
-from pipeline.photos import GIVEN, prepare_photos
+from pipeline.photos import GIVEN, load_photos, prepare_photos
 from pipeline.sources import find_source
 from sdfsim.errors import SdfsimError
 
@@ -136,6 +136,101 @@ def test_a_lens_is_straightened(tmp_path):
     assert np.abs(found - np.stack([x, y], -1))[inside].max() > 0.03  # it was bent before
 
 
+FISHEYE = {"fl_x": 80.0, "fl_y": 80.0, "cx": 62.0, "cy": 43.0}
+
+
+@pytest.mark.parametrize("where", ["camera_model", "is_fisheye", "each frame", "COLMAP"])
+def test_an_ideal_fisheye_is_straightened_though_its_coefficients_are_all_zero(tmp_path, where):
+    """Equidistant: a ray at an angle t to the axis is f t from the middle of the photo, f tan t from the pinhole's."""
+    row, column = np.mgrid[0 : SIZE[1], 0 : SIZE[0]] + 0.5
+    x, y = (column - FISHEYE["cx"]) / FISHEYE["fl_x"], (row - FISHEYE["cy"]) / FISHEYE["fl_y"]
+    angle = np.hypot(x, y)
+    u, v = x * np.tan(angle) / angle, y * np.tan(angle) / angle
+    shown = np.stack([128 + 80 * u, 128 + 80 * v, np.zeros_like(u)], -1)
+    (tmp_path / "images").mkdir()
+    for name in NAMES:
+        Image.fromarray((shown + 0.5).clip(0, 255).astype(np.uint8)).save(tmp_path / "images" / f"{name[0]}.png")
+    if where == "COLMAP":
+        given = tmp_path / "sparse"
+        write_text_model(given, "1 OPENCV_FISHEYE 120 90 80 80 62 43 0 0 0 0")
+        text = (given / "images.txt").read_text()
+        (given / "images.txt").write_text(text.replace(".jpg", ".png"))
+    else:
+        fisheye = {"is_fisheye": True} if where == "is_fisheye" else {"camera_model": "OPENCV_FISHEYE"}
+        files = [f"images/{name[0]}.png" for name in NAMES]
+        given = write_transforms(tmp_path, files, **FISHEYE, **({} if where == "each frame" else fisheye))
+        if where == "each frame":
+            about = json.loads(given.read_text())
+            about["frames"] = [{**frame, **fisheye} for frame in about["frames"]]
+            given.write_text(json.dumps(about))
+    prepare_photos(given, fresh(tmp_path / "out"))
+    view = load_view_file(tmp_path / "out" / GIVEN)[0]
+    pixels = np.asarray(Image.open(tmp_path / "out" / "images" / view.name)).astype(float)
+    found = (pixels[..., :2] - 128) / 80
+    expected = np.stack([(column - view.cx) / view.focal, (row - view.cy) / view.focal], -1)
+    inside = np.s_[4:-4, 4:-4]
+    off = (found - expected)[inside]  # A grey value is 0.0125, half a pixel 0.006.
+    assert np.abs(off).max() < 0.05 and np.abs(off.mean((0, 1))).max() < 1e-3
+    assert np.abs(np.stack([x - u, y - v], -1))[inside].max() > 0.1  # so much it was bent before
+
+
+def brown(x: float, y: float, k1: float, k2: float, p1: float, p2: float) -> tuple[float, float]:
+    """OpenCV's distortion, as its documentation has it."""
+    r = x * x + y * y
+    radial = 1 + k1 * r + k2 * r * r
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (r + 2 * x * x),
+        y * radial + p1 * (r + 2 * y * y) + 2 * p2 * x * y,
+    )
+
+
+def kannala(x: float, y: float, k1: float, k2: float, k3: float, k4: float) -> tuple[float, float]:
+    """OpenCV's fisheye model."""
+    r = np.hypot(x, y)
+    t = np.arctan(r)
+    bent = t * (1 + k1 * t**2 + k2 * t**4 + k3 * t**6 + k4 * t**8)
+    return x * bent / r, y * bent / r
+
+
+@pytest.mark.parametrize(
+    ("model", "lens"),
+    [
+        (brown, {"k1": -0.2, "k2": 0.03, "p1": 0.002, "p2": -0.001}),
+        (kannala, {"k1": 0.05, "k2": -0.02, "k3": 0.004, "k4": -0.001}),
+        (kannala, {"k1": 0.0, "k2": 0.0, "k3": 0.0, "k4": 0.0}),
+        (brown, {"k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}),
+    ],
+    ids=["bent", "fisheye", "ideal fisheye", "straight"],
+)
+def test_a_pixel_of_the_users_photo_is_found_in_the_prepared_one(tmp_path, model, lens):
+    """Points of the world, through the lens into the user's photo, from there into the smaller, cut, prepared one."""
+    photos(tmp_path / "images", NAMES)
+    inner = {"fl_x": 80.0, "fl_y": 80.0, "cx": 62.0, "cy": 43.0, "is_fisheye": model is kannala}
+    given = write_transforms(tmp_path, [f"images/{name}" for name in NAMES], **inner, **lens)
+    prepared, _ = prepare_photos(given, tmp_path, long_side=96)
+    assert load_photos(tmp_path) == prepared
+    photo, view = prepared[1], load_view_file(tmp_path / GIVEN)[1]
+    assert photo.original == SIZE and (photo.width, photo.height) == (96, 72)
+    rays = np.random.default_rng(0).uniform([-0.6, -0.45, 1], [0.6, 0.45, 1], (50, 3))
+    points = (rays * 2.5) @ view.rotation + view.center
+    bent = np.array([model(x, y, *lens.values()) for x, y, _ in rays])
+    pixels = bent * [80.0, 80.0] + [62.0, 43.0]
+    found = photo.prepared(pixels, view)
+    np.testing.assert_allclose(found, view.project(points)[0], atol=1e-6)
+    scaled = np.abs(pixels * 0.8 - found).max()  # What a smaller copy alone would make of them.
+    assert scaled < 1e-9 if not any(lens.values()) and model is brown else scaled > 1
+
+
+def test_photos_of_the_same_name_in_several_folders_keep_apart(tmp_path):
+    names = ["left/1.jpg", "right/1.jpg", "right/2.jpg"]
+    photos(tmp_path, names)
+    given = write_transforms(tmp_path, names)
+    prepared, _ = prepare_photos(given, fresh(tmp_path / "out"))
+    assert [p.source for p in prepared] == [v.source for v in load_view_file(tmp_path / "out" / GIVEN)] == names
+    source = find_source(given)
+    assert [source.folder / p.source for p in prepared] == [path.absolute() for path in source.photos]
+
+
 @pytest.mark.parametrize("name", ["a.jpg.png", "a.png", "a.jpg"])
 def test_masks_in_a_folder_go_by_the_photos_names(tmp_path, name):
     photos(tmp_path / "images", NAMES)
@@ -154,7 +249,8 @@ def test_masks_in_a_folder_go_by_the_photos_names(tmp_path, name):
 def test_a_mask_of_another_shape_is_named(tmp_path):
     photos(tmp_path / "images", NAMES)
     (tmp_path / "masks").mkdir()
-    Image.new("L", (90, 90)).save(tmp_path / "masks" / "b.png")
+    for name, size in (("a.png", SIZE), ("b.png", (90, 90)), ("c.png", SIZE)):
+        Image.new("L", size).save(tmp_path / "masks" / name)
     with pytest.raises(SdfsimError, match=r"b\.png: a mask of 90 x 90 does not fit"):
         prepare_photos(tmp_path, tmp_path)
 
@@ -169,13 +265,22 @@ def test_cameras_beside_the_photos_are_mentioned_not_used(tmp_path):
 @pytest.mark.parametrize(
     ("content", "words"),
     [("{", "cannot be read as cameras"), ('{"frames": []}', "0 cameras, at least 3"),
-     ('{"camera_model": "PANO", "frames": []}', "camera_model: 'PANO' is not read")],
+     ('{"camera_model": "PANO", "frames": []}', "camera_model: 'PANO' is not read"),
+     ('{"frames": [{"file_path": "a.jpg", "camera_model": "PANO"}]}', r"a\.jpg: camera_model: 'PANO' is not read"),
+     ('{"fl_x": 9, "w": 5, "frames": [{"file_path": "a.jpg"}]}', r"a\.jpg: fl_x without w and h"),
+     ('{"camera_angle_x": 2, "is_fisheye": true, "frames": [{"file_path": "a.jpg"}]}', r"a fisheye without fl_x")],
 )  # fmt: skip
 def test_bad_transforms_are_one_line(tmp_path, content, words):
     (tmp_path / "transforms.json").write_text(content)
     with pytest.raises(SdfsimError, match=words) as caught:
         find_source(tmp_path / "transforms.json")
     assert "\n" not in caught.value.message
+
+
+def test_two_cameras_of_one_photo_are_named(tmp_path):
+    photos(tmp_path, NAMES)
+    with pytest.raises(SdfsimError, match=r"\./a\.jpg and a\.jpg are the same photo"):
+        find_source(write_transforms(tmp_path, ["./a.jpg", *NAMES]))
 
 
 def test_cameras_without_photos_are_named(tmp_path):

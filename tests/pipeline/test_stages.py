@@ -6,46 +6,15 @@ import json
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline import record, report_page, stages
+from pipeline import record, stages
 from pipeline.report import notes
 from sdfsim.errors import SdfsimError
 from sdfsim.files import locked
 
 ROOT = Path(__file__).resolve().parent.parent.parent
-
-
-@pytest.fixture
-def photos(tmp_path) -> Path:
-    folder = tmp_path / "photos"
-    folder.mkdir()
-    for k in range(3):
-        pixels = np.random.default_rng(k).integers(0, 255, (80, 80, 3), dtype=np.uint8)
-        Image.fromarray(pixels).save(folder / f"{k}.png")
-    return folder
-
-
-@pytest.fixture
-def calls(monkeypatch) -> list[str]:
-    """Replaces what stages do by a note of their names and one file each."""
-    done: list[str] = []
-
-    def action(name: str):
-        def act(run: stages.Run, work: Path) -> dict:
-            done.append(name)
-            (work / "result").write_text(name)
-            if name == "scene":
-                (run.folder / "scene.yaml").write_text("version: 1\n")
-            return {"name": name}
-
-        return act
-
-    monkeypatch.setattr(stages, "ACTIONS", {name: action(name) for name in stages.STAGES})
-    monkeypatch.setattr(report_page, "write_page", lambda folder, report: None)  # There is nothing to show.
-    return done
 
 
 def test_unchanged_stages_are_skipped(photos, tmp_path, calls):
@@ -118,8 +87,8 @@ def test_run_stage_needs_the_stages_before(photos, tmp_path, calls):
         stages.run_stage("distill", tmp_path / "out")
     stages.run_stage("poses", tmp_path / "out")
     calls.clear()
-    report = stages.run_stage("distill", tmp_path / "out", budget=5.0, preset=None)
-    assert calls == ["distill"] and report["options"]["preset"] == "quick" and report["options"]["budget"] == 5.0
+    report = stages.run_stage("distill", tmp_path / "out", seed=5, preset=None)
+    assert calls == ["distill"] and report["options"]["preset"] == "quick" and report["options"]["seed"] == 5
 
 
 @pytest.mark.parametrize(

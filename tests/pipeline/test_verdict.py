@@ -12,7 +12,8 @@ from pipeline.verdict import failure_hint, failure_message, find, judge, view_sp
 
 
 def photo(index: int, width: int = 640, height: int = 480, focal: float | None = None, fault: str = "") -> Photo:
-    return Photo(f"{index:04d}.jpg", f"IMG_{index}.JPG", width, height, focal, "", False, 0.4, fault)
+    size = (width, height)
+    return Photo(f"{index:04d}.jpg", f"IMG_{index}.JPG", *size, size, None, focal, "", False, 0.4, fault)
 
 
 def result(count: int, posed: int, *, focal: float = 600.0, error: float = 0.5, features: int = 2000,

@@ -65,12 +65,12 @@ def test_the_bank_takes_strangers_and_devices(mixed: list[Sdf]) -> None:
         def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
             return points[:, 0] - 1, torch.tensor([1.0, 0, 0]).expand_as(points)
 
-    bank = SdfBank([*mixed, Slab()]).to("cpu")
+    bank = SdfBank([*mixed, Slab()], "cpu")
     points = torch.rand(20, 3)
     distance, _ = bank(torch.full((20,), len(mixed)), points)
     torch.testing.assert_close(distance, points[:, 0] - 1)
     # "meta" stands in for a GPU: every index the bank looks up must have moved.
-    assert SdfBank([SphereSdf(0.3), PlaneSdf()]).to("meta")._slot_of.device.type == "meta"
+    assert SdfBank([SphereSdf(0.3), PlaneSdf()], "meta")._slot_of.device.type == "meta"
 
 
 def test_order_of_questions_does_not_matter() -> None:
@@ -120,7 +120,7 @@ def test_a_grid_alone_is_not_copied() -> None:
 def test_cuda_gives_what_the_cpu_gives(mixed: list[Sdf]) -> None:
     index, points = torch.randint(len(mixed), (5000,)), torch.rand(5000, 3)
     here = SdfBank(mixed)(index, points)
-    there = SdfBank(mixed).to("cuda")(index.cuda(), points.cuda())
+    there = SdfBank(mixed, "cuda")(index.cuda(), points.cuda())
     torch.testing.assert_close(here[0], there[0].cpu(), rtol=1e-3, atol=1e-3)
 
 
@@ -131,7 +131,7 @@ def test_cuda_gives_what_the_cpu_gives(mixed: list[Sdf]) -> None:
 def test_a_bank_without_networks_goes_to_cuda_too(sdfs: list[Sdf]) -> None:
     index, points = torch.randint(len(sdfs), (5000,)), torch.rand(5000, 3)
     here = SdfBank(sdfs)(index, points)
-    bank = SdfBank(sdfs).to("cuda")
+    bank = SdfBank(sdfs, "cuda")
     assert bank.device.type == "cuda"
     there = bank(index.cuda(), points.cuda())
     assert there[0].is_cuda and there[1].is_cuda
