@@ -95,7 +95,7 @@ GROUPS = {
         curve=(TIME, "deviation (% of size)"),
     ),
     "overlap": Group(
-        11, "bodies that start inside each other", "they part at less than 3 m/s", curve=(TIME, "fastest body (m/s)")
+        "bodies that start inside each other", "they part at less than 3 m/s", curve=(TIME, "fastest body (m/s)")
     ),
     "thin": Group("fast bodies of 20 cm and a plate of 1 cm", "none passes through", axis="speed (m/s)"),
     "rest": Group(
@@ -104,7 +104,7 @@ GROUPS = {
         curve=(TIME, "drift (% of size)"),
     ),
     "stack": Group(
-        15, "stacks", "all still stand after 3 s", axis="cubes in the tower", curve=(TIME, "largest shift (% of size)")
+        "stacks", "all still stand after 3 s", axis="cubes in the tower", curve=(TIME, "largest shift (% of size)")
     ),
     "mass": Group(
         "a heavy cube on a light one",

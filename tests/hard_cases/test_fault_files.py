@@ -155,6 +155,8 @@ def commands(home: Path, out: Path) -> list[tuple]:
     """Every command that writes a folder, with what it reads."""
     (home / "scene.yaml").write_text(SCENE)
     (home / "box.ply").write_bytes(write_ply(box()))
+    (home / "data").mkdir()
+    (home / "data" / "dataset.json").write_text("{}")
     return [
         ("simulate", home / "scene.yaml", "-o", out, "--viewer", "none"),
         ("fit", home / "box.ply", "-o", out),
