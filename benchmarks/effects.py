@@ -98,13 +98,14 @@ def timed(simulators: list[Simulator], steps: int) -> list[float]:
 
 def samples(steps: int) -> None:
     """A row for each variant of each sample: the cost of its whole run."""
-    rows = [("scene", "variant", "ms a step", "distances", "edges", "active", "asleep")]
+    rows = [("scene", "variant", "ms a step", "distances", "waiting", "edges", "active", "asleep")]
     for file in sorted(SAMPLES.glob("*.yaml")):
         scene = load_scene(file)
         for name, change in VARIANTS.items():
             counters = Simulator(change(scene), device="cpu").run(steps=steps).counters
             values = [f"{np.median(counters['step_ms'][1:]):.2f}"]
-            values += [f"{counters[k][1:].mean():.1f}" for k in ("sdf_queries", "edges", "active", "asleep")]
+            told = ("sdf_queries", "sdf_waiting", "edges", "active", "asleep")
+            values += [f"{counters[k][1:].mean():.1f}" for k in told]
             rows.append((file.stem, name, *values))
     print("\n".join(columns(rows)))
 

@@ -7,9 +7,10 @@ step turns with the scene, whatever the weights are.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -136,7 +137,7 @@ class ImpulseNetwork(nn.Module):
         end = torch.cat([graph.free_velocity, graph.free_angular], -1)
         mean = torch.cat([graph.mean_velocity, graph.mean_angular], -1)
         twist = torch.stack([end, mean], -1)
-        for number, layer in enumerate(self.rounds, start=1):
+        for number, layer in enumerate(cast("Iterable[Round]", self.rounds), start=1):
             seen = _relative(graph, frames, twist)
             hidden = by_rows(partial(layer.read, body), rows, edge, graph.first, graph.second, seen)
             weight = _share_of_pair(layer.attention(hidden)[:, 0], graph)[:, None]
