@@ -63,7 +63,7 @@ def _again(before: dict[str, Any] | None, budget: float) -> dict[str, Any] | Non
 def _fitted(name: str, file: Path, budget: float, folder: Path) -> dict[str, Any]:
     path = folder / f"{name}__{budget:g}.json"
     mark = {"fit_version": FIT_VERSION, "bytes": file.stat().st_size, "budget": budget}
-    if path.exists() and (point := read_json(path)).get("fingerprint") == mark and not point["failed"]:
+    if path.exists() and (point := read_json(path)).get("fingerprint") == mark:
         return point
     point: dict[str, Any] = {"name": name, "budget_s": budget, "fingerprint": mark, "failed": ""}
     point["ended_by_itself"] = False

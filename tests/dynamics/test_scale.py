@@ -153,15 +153,18 @@ def test_fitted_shapes_with_many_nodes_keep_every_edge():
 
 def test_rest_is_when_nothing_strays_for_long_enough():
     bodies, state = bodies_of(stacks(2))
-    rest = Rest(bodies)
-    trembling = [replace(state, position=state.position + 0.2 * STRAY * (-1) ** k) for k in range(STEPS + 2)]
-    told = [rest.settled(each) for each in trembling]
+    rest, told = Rest(), []
+    for k in range(STEPS + 2):
+        rest = rest.after(bodies, replace(state, position=state.position + 0.2 * STRAY * (-1) ** k))
+        told.append(rest.settled)
     assert told == [False] * STEPS + [True, True]
     moved = state.position.clone()
     moved[3, 0] += 2 * STRAY
-    assert not rest.settled(replace(state, position=moved))
+    assert not rest.after(bodies, replace(state, position=moved)).settled
     fallen = state.position.clone()
     fallen[0, 2] -= 1.0  # the floor is not asked
-    rest = Rest(bodies)
-    assert [rest.settled(replace(state, position=p)) for p in (state.position, fallen)][1] is False
-    assert all(not rest.settled(replace(state, position=fallen * 0 + k)) for k in range(STEPS + 3))
+    rest, told = Rest(), []
+    for position in (state.position, fallen, *(fallen * 0 + k for k in range(STEPS + 3))):
+        rest = rest.after(bodies, replace(state, position=position))
+        told.append(rest.settled)
+    assert not any(told)

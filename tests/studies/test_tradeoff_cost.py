@@ -152,7 +152,7 @@ def test_a_study_of_growth_is_resumed_and_says_how_far_off_it_is(tmp_path, monke
     report = tradeoff_growth.growth(tmp_path, **options)
     assert len(report["held_out"]) == 3 and np.isfinite(list(report["courses"].values())).all()
     # What the network costs is by far the most of so small a step.
-    assert report["cost"]["touching"] > report["cost"]["base"] > 0
+    assert report["cost"]["touching"] > report["cost"]["base"] >= 0
     assert (tmp_path / "growth.png").stat().st_size > 1000
     rows, notes = tradeoff_growth.told(report)
     assert len(rows) == 9 and any(note.startswith("plan's estimate") for note in notes)
