@@ -6,11 +6,13 @@ import contextlib
 import json
 import math
 import os
+import signal
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Sequence
-from types import TracebackType
+from types import FrameType, TracebackType
 from typing import Any
 
 from sdfsim.errors import EXIT_ERROR, EXIT_INTERRUPTED, SceneError, SdfsimError
@@ -34,10 +36,12 @@ class Session:
         self.verbose = verbose
         self.exit_code = 0
         self._result: dict[str, Any] | None = None
+        self._pressed = False
         self._clean_up = contextlib.ExitStack()
         self._bar = _Bar()
 
     def __enter__(self) -> Session:
+        self._hear()
         if self.as_json:
             sys.stdout.flush()
             real = os.dup(1)  # native libraries write to the descriptor, past sys.stdout
@@ -76,10 +80,25 @@ class Session:
         if isinstance(error, OSError):
             where = f"{error.filename}: " if error.filename else ""
             return self._fail(f"{where}{error.strerror or error}", "", EXIT_ERROR)
+        if self._pressed:  # a library that was interrupted while it was being imported fails in its own way
+            return self._fail("interrupted; what was finished is kept", "", EXIT_INTERRUPTED)
         if isinstance(error, Exception):
             hint = "" if self.verbose else "this is a fault of sdfsim; -v shows where"
             return self._fail(f"internal error: {type(error).__name__}: {error}", hint, EXIT_ERROR)
         return None
+
+    def _hear(self) -> None:
+        """Remember that Ctrl-C was pressed, whatever becomes of the exception it raises."""
+        default = signal.default_int_handler
+        if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) is not default:
+            return
+
+        def pressed(number: int, frame: FrameType | None) -> None:
+            self._pressed = True
+            raise KeyboardInterrupt
+
+        signal.signal(signal.SIGINT, pressed)
+        self._clean_up.callback(signal.signal, signal.SIGINT, default)
 
     def _lost_output(self, error: OSError) -> int:
         """The report cannot be written. Whoever read it and closed the pipe, such as `head`, has seen enough."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -268,6 +269,19 @@ def test_an_interrupt_is_code_130_with_what_was_computed(scene, model, tmp_path,
     assert done.exit_code == 130 and "interrupted" in done.stderr
     assert len(Rollout.load(out / "rollout.npz")) == 3
     assert json.loads((out / "report.json").read_text())["status"] == "interrupted"
+
+
+def test_an_interrupt_that_a_library_turns_into_another_error_is_code_130_too(scene, monkeypatch):
+    def interrupted(*_, **__):
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            raise TypeError("half imported") from None
+
+    monkeypatch.setattr("sdfsim.planning.describe", interrupted)
+    done = run("plan", scene)
+    assert (done.exit_code, "internal" in done.stderr) == (130, False), done.stderr
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_tracebacks_only_with_v(scene, monkeypatch):
