@@ -109,11 +109,16 @@ def in_velocities(name: str, value: float):
     return spoiled
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("-inf"), 1e30], ids=str)
-@pytest.mark.parametrize("name", ["velocity", "angular", "mean_velocity", "mean_angular"])
+IMPOSSIBLE = [
+    (name, value)
+    for name in ("velocity", "angular", "mean_velocity", "mean_angular")
+    for value in (float("nan"), float("-inf"), 1e30)
+    if (name, value) != ("mean_angular", 1e30)  # a turn is a turn, however often it goes round
+]
+
+
+@pytest.mark.parametrize(("name", "value"), IMPOSSIBLE)
 def test_an_answer_of_the_impulse_network_that_cannot_be(name, value):
-    if (name, value) == ("mean_angular", 1e30):
-        pytest.skip("a turn is a turn, however often it goes round")
     model = random_model("impulse", push=0.1)
     breaking(model.network, 3, in_velocities(name, value))
     sim = Simulator(gates.mixed(), model)

@@ -10,7 +10,7 @@ import torch
 from pipeline import actions, asset, distill, meshing, stages
 from pipeline.options import Options, read_config
 from sdfsim.errors import SdfsimError
-from tests.test_cli import run as command
+from tests.cli.conftest import run as command
 
 
 @pytest.fixture

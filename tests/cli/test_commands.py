@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -14,45 +13,15 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from typer.testing import CliRunner
 
 import cli
-from sdfsim import Rollout, SdfsimError, load_scene
+from sdfsim import Rollout, load_scene
 from sdfsim.commands.arguments import seconds_of
-from sdfsim.dynamics.model import Model, new_network
-from sdfsim.dynamics.simulator import SimulationError, Simulator
 from sdfsim.shape import primitives
 from sdfsim.shape.storage import write_ply
+from tests.cli.conftest import SCENE, run
 
-ROOT = Path(__file__).resolve().parents[1]
-SCENE = """
-version: 1
-duration: 0.2
-shapes:
-  ball: {sphere: {radius: 0.5}}
-bodies:
-  - {name: floor, plane: {}}
-  - {name: ball, shape: ball, position: [0, 0, 5]}
-"""
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory) -> str:
-    """Untrained weights: what the commands do around the network does not depend on them."""
-    path = tmp_path_factory.mktemp("model") / "untrained.safetensors"
-    torch.manual_seed(0)
-    Model("untrained", "impulse", new_network("impulse", {"width": 8, "rounds": 1}), 0.02, 10.0, 1.0, 0.1).save(path)
-    return str(path)
-
-
-@pytest.fixture
-def scene(tmp_path) -> str:
-    (tmp_path / "scene.yaml").write_text(SCENE)
-    return str(tmp_path / "scene.yaml")
-
-
-def run(*arguments: object):
-    return CliRunner().invoke(cli.app, [str(a) for a in arguments])
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_simulate_leaves_a_run_folder_and_says_how_to_watch_it(scene, model, tmp_path):
@@ -238,69 +207,6 @@ def test_the_run_of_a_model_beside_the_scene_can_be_repeated(scene, model, tmp_p
     assert run("simulate", scene, "-o", tmp_path / "run", "--viewer", "none").exit_code == 0
     config = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
     assert config["model"] == str(tmp_path / "mine.safetensors")
-
-
-def stop_after(steps: int, how):
-    """A `Simulator.frames` that breaks after some steps, as `how(frame)` says."""
-    real = Simulator.frames
-
-    def broken(self, count):
-        for frame in real(self, steps):
-            yield frame
-        raise how(frame)
-
-    return broken
-
-
-def test_a_broken_state_is_code_3_with_what_was_computed(scene, model, tmp_path, monkeypatch):
-    monkeypatch.setattr(Simulator, "frames", stop_after(3, lambda f: SimulationError("step 4: not finite", f)))
-    out = tmp_path / "run"
-    done = run("simulate", scene, "-o", out, "--model", model, "--json")
-    assert done.exit_code == 3 and "error: step 4: not finite" in done.stderr
-    assert json.loads(done.stdout)["exit_code"] == 3
-    assert len(Rollout.load(out / "rollout.npz")) == 3 and (out / "rollout.rrd").exists()
-    assert json.loads((out / "report.json").read_text())["status"] == "failed"
-
-
-def test_an_interrupt_is_code_130_with_what_was_computed(scene, model, tmp_path, monkeypatch):
-    monkeypatch.setattr(Simulator, "frames", stop_after(3, lambda f: KeyboardInterrupt()))
-    out = tmp_path / "run"
-    done = run("simulate", scene, "-o", out, "--model", model)
-    assert done.exit_code == 130 and "interrupted" in done.stderr
-    assert len(Rollout.load(out / "rollout.npz")) == 3
-    assert json.loads((out / "report.json").read_text())["status"] == "interrupted"
-
-
-def test_an_interrupt_that_a_library_turns_into_another_error_is_code_130_too(scene, monkeypatch):
-    def interrupted(*_, **__):
-        try:
-            signal.raise_signal(signal.SIGINT)
-        except KeyboardInterrupt:
-            raise TypeError("half imported") from None
-
-    monkeypatch.setattr("sdfsim.planning.describe", interrupted)
-    done = run("plan", scene)
-    assert (done.exit_code, "internal" in done.stderr) == (130, False), done.stderr
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
-def test_tracebacks_only_with_v(scene, monkeypatch):
-    def fail(*arguments, **options):
-        raise ZeroDivisionError("a fault of ours")
-
-    monkeypatch.setattr("sdfsim.planning.describe", fail)
-    plain, verbose = run("plan", scene), run("plan", scene, "-v")
-    assert plain.exit_code == verbose.exit_code == 1
-    assert "internal error: ZeroDivisionError" in plain.stderr and "Traceback" not in plain.stderr
-    assert "Traceback" in verbose.stderr
-
-
-def test_a_hint_follows_the_error(scene, monkeypatch):
-    def fail(*arguments, **options):
-        raise SdfsimError("what is wrong", "what to try")
-
-    monkeypatch.setattr("sdfsim.planning.describe", fail)
-    assert run("plan", scene).stderr == "error: what is wrong\nhint: what to try\n"
 
 
 @pytest.mark.parametrize("option", ["--json", "--device", "--verbose"])

@@ -11,7 +11,7 @@ from sdfsim.shape import plans, primitives
 from sdfsim.shape.asset import load_shape
 from sdfsim.shape.checkpoint import Checkpoint
 from sdfsim.shape.storage import write_ply
-from tests.test_cli import run
+from tests.cli.conftest import run
 
 
 def test_fitting_a_mesh_goes_on_where_it_was_interrupted(tmp_path, monkeypatch):

@@ -1,0 +1,73 @@
+"""Commands that break or are broken off: exit codes, what is told, and what is kept."""
+
+from __future__ import annotations
+
+import json
+import signal
+
+from sdfsim import Rollout, SdfsimError
+from sdfsim.dynamics.simulator import SimulationError, Simulator
+from tests.cli.conftest import run
+
+
+def stop_after(steps: int, how):
+    """A `Simulator.frames` that breaks after some steps, as `how(frame)` says."""
+    real = Simulator.frames
+
+    def broken(self, count):
+        for frame in real(self, steps):
+            yield frame
+        raise how(frame)
+
+    return broken
+
+
+def test_a_broken_state_is_code_3_with_what_was_computed(scene, model, tmp_path, monkeypatch):
+    monkeypatch.setattr(Simulator, "frames", stop_after(3, lambda f: SimulationError("step 4: not finite", f)))
+    out = tmp_path / "run"
+    done = run("simulate", scene, "-o", out, "--model", model, "--json")
+    assert done.exit_code == 3 and "error: step 4: not finite" in done.stderr
+    assert json.loads(done.stdout)["exit_code"] == 3
+    assert len(Rollout.load(out / "rollout.npz")) == 3 and (out / "rollout.rrd").exists()
+    assert json.loads((out / "report.json").read_text())["status"] == "failed"
+
+
+def test_an_interrupt_is_code_130_with_what_was_computed(scene, model, tmp_path, monkeypatch):
+    monkeypatch.setattr(Simulator, "frames", stop_after(3, lambda f: KeyboardInterrupt()))
+    out = tmp_path / "run"
+    done = run("simulate", scene, "-o", out, "--model", model)
+    assert done.exit_code == 130 and "interrupted" in done.stderr
+    assert len(Rollout.load(out / "rollout.npz")) == 3
+    assert json.loads((out / "report.json").read_text())["status"] == "interrupted"
+
+
+def test_an_interrupt_that_a_library_turns_into_another_error_is_code_130_too(scene, monkeypatch):
+    def interrupted(*_, **__):
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            raise TypeError("half imported") from None
+
+    monkeypatch.setattr("sdfsim.planning.describe", interrupted)
+    done = run("plan", scene)
+    assert (done.exit_code, "internal" in done.stderr) == (130, False), done.stderr
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_tracebacks_only_with_v(scene, monkeypatch):
+    def fail(*arguments, **options):
+        raise ZeroDivisionError("a fault of ours")
+
+    monkeypatch.setattr("sdfsim.planning.describe", fail)
+    plain, verbose = run("plan", scene), run("plan", scene, "-v")
+    assert plain.exit_code == verbose.exit_code == 1
+    assert "internal error: ZeroDivisionError" in plain.stderr and "Traceback" not in plain.stderr
+    assert "Traceback" in verbose.stderr
+
+
+def test_a_hint_follows_the_error(scene, monkeypatch):
+    def fail(*arguments, **options):
+        raise SdfsimError("what is wrong", "what to try")
+
+    monkeypatch.setattr("sdfsim.planning.describe", fail)
+    assert run("plan", scene).stderr == "error: what is wrong\nhint: what to try\n"
