@@ -12,7 +12,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "samples"))
 
 import large
 
-from benchmarks.scale_parts import accuracy, page
+from benchmarks.scale_parts import overlaps, page
 
 
 def test_balls_start_inside_the_bowl_without_touching():
@@ -33,7 +33,7 @@ def test_scenes_have_the_bodies_and_nodes_they_say(tmp_path, monkeypatch):
     assert len(moving) == 5 and {len(bowl.shapes[b.shape].nodes) for b in moving} == {50}
     assert {b.scale for b in moving} == {0.52}
     start = np.array([b.position for b in moving])[None]
-    assert accuracy.depth(bowl, start).max() == 0.0
+    assert overlaps.depth(bowl, start).max() == 0.0
     monkeypatch.setitem(large.HEAPS, "heaps", large.Heap(("box", "sphere"), 380, 300, (0.25, 0.5), 6, 400))
     heap = load_scene(large.write_scene("heaps", tmp_path / "heap", 7))
     assert [heap.shapes[b.shape].name for b in heap.bodies[1:]] == ["box", "sphere"] * 3 + ["box"]
@@ -45,14 +45,17 @@ def test_scenes_have_the_bodies_and_nodes_they_say(tmp_path, monkeypatch):
 def test_depth_is_the_overlap_of_spheres_bowl_and_floor(tmp_path):
     scene = load_scene(large.write_scene("bowl", tmp_path, 2, 50))
     bowl = next(b for b in scene.bodies if b.name == "bowl")
-    inner, radius = 0.5 * bowl.scale * (1 - accuracy.WALL), 0.26
+    inner, radius = 0.5 * bowl.scale * (1 - overlaps.WALL), 0.26
     far, aside = bowl.position + np.array([0.0, 0.0, 1.0]), np.array([0.1, 0.0, 0.0])
     apart = np.array([far, far + 6 * aside])
     overlapping = np.array([far, far + 5 * aside])
     in_wall = np.array([far, bowl.position - [0, 0, inner - radius + 0.03]])
     beside = np.array([far, [50.0, 0, 0.25]])
-    got = accuracy.depth(scene, np.stack([apart, overlapping, in_wall, beside]))
+    got = overlaps.depth(scene, np.stack([apart, overlapping, in_wall, beside]))
     np.testing.assert_allclose(got, [0.0, 0.02, 0.03, 0.01], atol=1e-9)
+    nearly = np.array([far, far + 5.24 * aside, far - 5.23 * aside])  # 4 and 3 mm apart: in contact, not deep
+    np.testing.assert_array_equal(overlaps.overlaps(scene, nearly), [0.0, 0.0])
+    assert not len(overlaps.overlaps(scene, apart))
 
 
 def test_slopes_and_series():

@@ -168,11 +168,12 @@ def run(engine: str, scene_file: str, dt: float, steps: int) -> dict:
     else:
         stream = bullet(scene, dt, steps, concave=engine == "bullet concave")
     place = next(stream)[0]
-    ready, contacts, depth = time.process_time(), [], []
+    ready, contacts, depth, every = time.process_time(), [], [], []
     for now, distances in stream:
         place = now
         contacts.append(len(distances))
         depth.append(max(0.0, -min(distances, default=0.0)))
+        every.extend(max(0.0, -d) for d in distances)
     moving = [b for b in scene.bodies if b.motion == "dynamic"]
     return {
         "bodies": len(moving),
@@ -181,6 +182,7 @@ def run(engine: str, scene_file: str, dt: float, steps: int) -> dict:
         "load_s": ready - began,
         "contacts": float(np.mean(contacts)),
         "penetration_95": float(np.percentile(depth, 95)),
+        "overlap_95": float(np.percentile(every, 95)) if every else None,
         "peak_mib": memory("VmHWM") - before,
         "below": int((place[:, 2] < 0).sum()),
         "finite": bool(np.isfinite(place).all()),

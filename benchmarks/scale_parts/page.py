@@ -49,9 +49,19 @@ def _growth(results: Results) -> str:
     for nodes in (64, 512):
         found = series(results, f"growth_{nodes}")
         for count, r in found:
-            depth = 100 * r["penetration_95"] / 0.52
+            depth, overlap = (100 * (r[k] or 0.0) / 0.52 for k in ("penetration_95", "overlap_95"))
             values = [f"{r['nodes']:,}", f"{r['contacts']:.0f}", f"{r['ms']:.1f}", f"{r['peak_mib']:.0f}"]
-            rows.append([str(count), str(nodes), *values, f"{depth:.1f} %", str(r["lost"]), r["broken"] or ""])
+            rows.append(
+                [
+                    str(count),
+                    str(nodes),
+                    *values,
+                    f"{overlap:.1f} %",
+                    f"{depth:.1f} %",
+                    str(r["lost"]),
+                    r["broken"] or "",
+                ]
+            )
         large = [(c, r) for c, r in found if c >= 16]
         if len(large) > 1:
             cost, memory = ([r[k] for _, r in large] for k in ("ms", "peak_mib"))
@@ -64,7 +74,18 @@ def _growth(results: Results) -> str:
             )
     if not rows:
         return ""
-    head = ["spheres", "nodes each", "nodes", "contacts", "ms a step", "MiB", "deepest node 95 %", "lost", ""]
+    head = [
+        "spheres",
+        "nodes each",
+        "nodes",
+        "contacts",
+        "ms a step",
+        "MiB",
+        "overlap 95 %",
+        "deepest node 95 %",
+        "lost",
+        "",
+    ]
     return "### Growth\n\n" + _table(head, rows) + "\n\n" + "\n\n".join(notes)
 
 
@@ -119,12 +140,13 @@ def _engines(results: Results) -> str:
         mine = dict(series(results, ours)) if ours else {}
         for engine, name in ENGINES.items():
             for count, r in series(results, f"engine_{scene}_{engine}"):
-                depth = f"{1e3 * r['penetration_95']:.1f} mm"
+                depths = [f"{1e3 * (r[k] or 0.0):.1f} mm" for k in ("overlap_95", "penetration_95")]
                 fate = [str(r["below"]), "" if r["finite"] else "not finite"]
-                values = [f"{r['ms']:.2f}", f"{r['peak_mib']:.0f}", f"{r['contacts']:.0f}", depth, *fate]
+                values = [f"{r['ms']:.2f}", f"{r['peak_mib']:.0f}", f"{r['contacts']:.0f}", *depths, *fate]
                 ratio = f"{mine[count]['ms'] / r['ms']:.1f}" if count in mine else ""
                 rows.append([f"{count} {what}", name, *values[:1], ratio, *values[1:]])
-    head = ["scene", "engine", "ms a step", "ours takes", "MiB", "contacts", "penetration 95 %", "below the floor", ""]
+    head = ["scene", "engine", "ms a step", "ours takes", "MiB", "contacts"]
+    head += ["overlap 95 %", "deepest 95 %", "below the floor", ""]
     return "### Engines\n\n" + _table(head, rows) if rows else ""
 
 
