@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import shutil
 import time
 from collections.abc import Callable
@@ -173,7 +174,7 @@ def main() -> None:
     changes = shapes_of(args.meshes)
     results = {}
     for variant in [*VARIANTS, *([DETAILED] if args.meshes else [])]:
-        kept = args.out / f"{variant.name.replace('*', '').replace(' ', '_')}-{args.steps}.json"
+        kept = args.out / f"{re.sub('[^A-Za-z0-9.]+', '_', variant.name)}-{args.steps}.json"
         if not kept.exists():
             data = subset(args.data, args.out / "data" / variant.shapes.replace(" ", "_"), changes[variant.shapes])
             found = measure(variant, data, args.steps)

@@ -23,7 +23,7 @@ _ICOSAHEDRON = [
     for axis in ((0.0, a, b * _GOLDEN) for a in (-1.0, 1.0) for b in (-1.0, 1.0))
 ]
 
-ARRAYS = ("owner", "node", "body", "arm", "foot", "distance", "normal", "ahead")
+ARRAYS = ("owner", "node", "body", "point", "arm", "foot", "distance", "normal", "ahead")
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,7 @@ class Contacts:
         owner: [E] int64, the body whose node it is.
         node: [E] int64, index into `Bodies.node`.
         body: [E] int64, the body it meets.
+        point: [E, 3] float64, the node about the owner's centre of mass in its axes, or where its surface is nearest.
         arm: [E, 3] float64, from the owner's centre of mass to midway between the node and the closest point.
         foot: [E, 3] float64, to there from the centre of mass of `body`.
         distance: [E] float64, signed distance of the node from `body`.
@@ -46,6 +47,7 @@ class Contacts:
     owner: Tensor
     node: Tensor
     body: Tensor
+    point: Tensor
     arm: Tensor
     foot: Tensor
     distance: Tensor
@@ -72,8 +74,9 @@ def find_contacts(
     rows: int | None = None,
     *,
     thin: bool = False,
+    rounded: bool = True,
 ) -> Contacts:
-    """All contact edges of a state, or those of them that `thin_contacts` keeps.
+    """All contact edges of a state from its nodes; or few, from where round surfaces will be nearest when they meet.
 
     An edge exists where d + min(0, closing velocity * dt) <= reach: a fixed threshold would let a fast body bounce
     inside one step without ever having had an edge.
@@ -86,9 +89,11 @@ def find_contacts(
         dt: the step, model time.
         memory: of the run; it saves work and counts it.
         rows: look at no more than that many nodes at once (but at all of a body's), None for `PIECE`.
-        thin: keep few edges a pair. They are chosen piece by piece, so that all are never there at once.
+        thin: `round_off`, `at_impact` and `thin_contacts`, piece by piece, so that all edges are never there at once.
+        rounded: False leaves out the first of these.
     """
     from sdfsim.dynamics.impact import at_impact
+    from sdfsim.dynamics.rounding import round_off
 
     memory = memory or Memory()
     with memory.timed("pairs_ms"):
@@ -103,7 +108,10 @@ def find_contacts(
         parts = []
         for pairs in zip(first.split(cuts), second.split(cuts), approach.split(cuts), strict=True):
             part = _edges(bodies, state, gravity, reach, dt, Pairs(bodies, state, *pairs), memory)
-            parts.append(thin_contacts(bodies, at_impact(bodies, state, gravity, dt, part)) if thin else part)
+            if thin:
+                part = round_off(bodies, state, part, memory) if rounded else part
+                part = thin_contacts(bodies, at_impact(bodies, state, gravity, dt, part))
+            parts.append(part)
         memory.turn()
         found = _joined(parts)
     near = number_pairs(first, second, len(bodies))[1]
@@ -147,7 +155,8 @@ def _edges(
             close = (least(trust, distance, layer.radius[item]) <= most).nonzero()[:, 0]
             pair, parent = pair[close], item[close]
     owner, other, node = pairs.first[pair], pairs.second[pair], tree[-1].node[item]
-    arm = pose.rotate(state.orientation[owner], bodies.node[node])
+    point = bodies.node[node]
+    arm = pose.rotate(state.orientation[owner], point)
     offset = state.position[owner] - state.position[other] + arm
     normal = pose.rotate(state.orientation[other], unit(gradient, local))
     velocity = node_velocity(state, owner, arm) + gravity * dt * bodies.moves[owner, None]
@@ -157,8 +166,8 @@ def _edges(
     ahead = distance + closing * dt
     touching = (ahead <= reach).nonzero()[:, 0]
     half = 0.5 * distance[:, None] * normal
-    found = dict(zip(ARRAYS, (owner, node, other, arm - half, offset - half, distance, normal, ahead), strict=True))
-    return Contacts(**found, queries=queries, waiting=waiting).only(touching)
+    found = (owner, node, other, point, arm - half, offset - half, distance, normal, ahead)
+    return Contacts(**dict(zip(ARRAYS, found, strict=True)), queries=queries, waiting=waiting).only(touching)
 
 
 def _sift(
@@ -201,7 +210,7 @@ def no_contacts(bodies: Bodies) -> Contacts:
     index = torch.zeros(0, dtype=torch.int64, device=bodies.device)
     number = torch.zeros(0, dtype=torch.float64, device=bodies.device)
     empty = number[:, None].expand(0, 3)
-    return Contacts(index, index, index, empty, empty, number, empty, number)
+    return Contacts(index, index, index, empty, empty, empty, number, empty, number)
 
 
 def _cuts(bodies: Bodies, first: Tensor, rows: int) -> list[int]:
@@ -230,7 +239,7 @@ def thin_contacts(bodies: Bodies, contacts: Contacts) -> Contacts:
         return contacts
     pair = torch.unique(contacts.owner * len(bodies) + contacts.body, return_inverse=True)[1]
     ways = _icosahedron(bodies.device)
-    outward = bodies.node[contacts.node] @ ways.T
+    outward = contacts.point @ ways.T
     score = torch.cat([outward - DEPTH_PULL * contacts.ahead[:, None], -contacts.ahead[:, None]], 1)
     pairs, edges = int(pair.max()) + 1, len(contacts)
     group = pair[:, None].expand_as(score)

@@ -60,13 +60,13 @@ def _once(bodies: Bodies, state: State, gravity: Tensor, dt: float, contacts: Co
         return place, pose.multiply(turn, state.orientation[body])
 
     (place, turn), (other_place, other_turn) = flown(owner), flown(other)
-    arm = pose.rotate(turn, bodies.node[c.node[row]])
+    arm = pose.rotate(turn, c.point[row])
     offset = place - other_place + arm
     local = pose.rotate(pose.conjugate(other_turn), offset)
     distance, gradient = distances(bodies, other, local)
     outward = unit(gradient, local)
     before = state.position[owner] - state.position[other]
-    before = before + pose.rotate(state.orientation[owner], bodies.node[c.node[row]])
+    before = before + pose.rotate(state.orientation[owner], c.point[row])
     before = pose.rotate(pose.conjugate(state.orientation[other]), before)
     start = distance + (outward * (before - local)).sum(-1)
     # An edge that opens until then was not inside before: only the plane that stands for the surface is.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -13,6 +14,9 @@ from sdfsim.dynamics.bodies import Bodies, State
 from sdfsim.dynamics.broad import Still, moving, swept_boxes
 from sdfsim.dynamics.clusters import Layer, layers
 from sdfsim.scene.types import Limits
+
+if TYPE_CHECKING:
+    from sdfsim.dynamics.rounding import Curvature
 
 COUNTS = {
     "pairs": "pairs of bodies that the broad phase let through",
@@ -125,6 +129,7 @@ class Memory:
         self.waits = (Waits(), Waits(), Waits())
         self.counts = dict.fromkeys((*COUNTS, *PHASES, "energy_gain"), 0.0)
         self._tree: tuple[Tensor, tuple[Layer, Layer, Layer]] | None = None
+        self._bend: tuple[Tensor, Curvature] | None = None
         self._last: State | None = None
         self._still: tuple[Tensor, Still] | None = None
         self._cuda = False
@@ -134,6 +139,14 @@ class Memory:
         if self._tree is None or self._tree[0] is not bodies.node:
             self._tree = (bodies.node, layers(bodies))
         return self._tree[1]
+
+    def curvature(self, bodies: Bodies) -> Curvature:
+        """How the bodies' surfaces bend around their nodes, measured once."""
+        from sdfsim.dynamics.rounding import curvature
+
+        if self._bend is None or self._bend[0] is not bodies.node:
+            self._bend = (bodies.node, curvature(bodies))
+        return self._bend[1]
 
     def turn(self) -> None:
         """A search is over: what it noted replaces what was known."""

@@ -82,7 +82,8 @@ def find_edges(trajectory: Trajectory, shapes: dict[str, Shape], reach: float) -
 def _edges(t: Trajectory, frames: list[int], shapes: dict[str, Shape], reach: float) -> dict[str, np.ndarray]:
     bodies, state = merged([t] * len(frames), frames, shapes, Units(1.0, 1.0, 1.0), torch.device("cpu"))
     gravity = torch.from_numpy(np.asarray(t.gravity, dtype=np.float64))
-    contacts = find_contacts(bodies, state, gravity, reach, t.dt, thin=True)
+    # The engine's solids have facets, and touch at their corners: nodes.
+    contacts = find_contacts(bodies, state, gravity, reach, t.dt, thin=True, rounded=False)
     per_world = t.position.shape[1]
     floor = len(bodies) - 1
     order = torch.argsort(contacts.owner // per_world, stable=True)
