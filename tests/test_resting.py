@@ -50,9 +50,9 @@ def test_what_falls_ten_centimetres_comes_to_rest_and_stays(name):
     assert creep(name, 1.0) < 0.01
 
 
-@pytest.mark.xfail(strict=True, reason="two in five drops leave it creeping by 2.5 % of its size in 5 s")
 def test_a_sphere_comes_to_rest_and_stays_too():
-    assert max(creep("sphere", drop) for drop in (1.0, 1.02, 1.03)) < 0.01
+    """From whichever height, since a sphere that was once set rolling rolls on."""
+    assert max(creep("sphere", drop) for drop in (1.0, 1.02, 1.03)) < 0.001
 
 
 def test_a_tower_of_three_boxes_stands_three_seconds():

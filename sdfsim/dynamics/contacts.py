@@ -109,7 +109,7 @@ def find_contacts(
         for pairs in zip(first.split(cuts), second.split(cuts), approach.split(cuts), strict=True):
             part = _edges(bodies, state, gravity, reach, dt, Pairs(bodies, state, *pairs), memory)
             if thin:
-                part = round_off(bodies, state, part, memory) if rounded else part
+                part = round_off(bodies, state, part, reach, memory) if rounded else part
                 part = thin_contacts(bodies, at_impact(bodies, state, gravity, dt, part))
             parts.append(part)
         memory.turn()

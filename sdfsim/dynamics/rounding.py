@@ -19,11 +19,15 @@ from sdfsim.dynamics.bodies import Bodies, State
 from sdfsim.dynamics.contacts import Contacts, distances, unit
 from sdfsim.dynamics.memory import Memory
 
+NEAR = 0.4  # of the contact radius: of a pair no point of which comes nearer in this step nothing needs to be known
 FLAT = 0.05  # rad by which a node's piece of surface turns; below it there is nothing to find beyond the node
 SHARP = 0.7  # rad; above it is an edge or a corner
 UNEVEN = 0.25  # of a curvature: how much it may differ from side to side, and over twice the way
 STEP = 0.25  # of a node's piece, over which its curvature is measured
 WAY = 2.0  # pieces to go at most, as if the other surface were flat: between two alike it is half of that
+SECANTS = 2
+ALIGNED = 1e-4  # rad; normals that are nearer to opposite are so but for rounding
+OFF = 0.02  # of a piece, by which a point found may be farther from the other surface than the node was
 SAME = 0.02  # of a body's radius: places nearer to one another than about this are one contact
 
 
@@ -95,13 +99,14 @@ def _measured(bodies: Bodies, shape: int, nodes: Tensor) -> tuple[Tensor, Tensor
     return normal, bend, piece, same & (askew < UNEVEN * most) & (turn > FLAT) & (turn < SHARP)
 
 
-def round_off(bodies: Bodies, state: State, contacts: Contacts, memory: Memory) -> Contacts:
+def round_off(bodies: Bodies, state: State, contacts: Contacts, reach: float, memory: Memory) -> Contacts:
     """The edges, with those from smooth surface where it is nearest to the other body, one for each such place.
 
     Args:
         bodies: N bodies.
         state: theirs.
         contacts: E edges.
+        reach: contact radius D, model length.
         memory: of the run.
     """
     if not len(contacts):
@@ -109,6 +114,11 @@ def round_off(bodies: Bodies, state: State, contacts: Contacts, memory: Memory) 
     known = memory.curvature(bodies)
     place = known.start[bodies.shape[contacts.owner]] + contacts.node - bodies.node_start[contacts.owner]
     smooth = known.smooth[place]
+    if not bool(smooth.any()):
+        return contacts
+    pair = torch.unique(contacts.owner * len(bodies) + contacts.body, return_inverse=True)[1]
+    first = torch.full((int(pair.max()) + 1,), torch.inf, dtype=torch.float64, device=bodies.device)
+    smooth = smooth & (first.scatter_reduce(0, pair, contacts.ahead, "amin")[pair] < NEAR * reach)
     rows = smooth.nonzero()[:, 0]
     if not len(rows):
         return contacts
@@ -116,25 +126,30 @@ def round_off(bodies: Bodies, state: State, contacts: Contacts, memory: Memory) 
     near = (arc.length < WAY * arc.piece).nonzero()[:, 0]
     rows, arc = rows[near], arc.only(near)
     some = contacts.only(rows)
-    # At first as if the other surface were flat: what is left to turn there tells how it bends.
-    left = _nearest(bodies, state, some, arc, arc.length)[1]
-    way = arc.length * (arc.turn / (arc.turn - left)).nan_to_num(nan=1.0)
-    found, _ = _nearest(bodies, state, some, arc, way.clamp(-arc.piece, arc.piece))
-    within, nearer = way.abs() <= arc.piece, found.distance <= some.distance
+    # Secants: what the normal has still to turn, at the node, half of the way as if the other surface were flat (which
+    # is all of it where they are alike), and so on.
+    before, left = torch.zeros_like(arc.length), arc.turn
+    way = 0.5 * arc.length
+    for _ in range(SECANTS):
+        now = _nearest(bodies, state, some, arc, way)[1]
+        gone = (way - before) * now / (left - now)
+        before, left = way, now
+        way = torch.where(now.abs() > ALIGNED, way + gone, way).clamp(-arc.piece, 2.0 * arc.piece)
+    found, _ = _nearest(bodies, state, some, arc, way)
+    within, nearer = way.abs() < arc.piece, found.distance <= some.distance + OFF * arc.piece
     smooth = smooth.index_fill(0, rows[within & ~nearer], False)  # these did not go as foreseen: they stay as they are
-    queries, good = contacts.queries + 4 * len(rows), (within & nearer).nonzero()[:, 0]
+    queries, good = contacts.queries + 2 * (SECANTS + 1) * len(rows), (within & nearer).nonzero()[:, 0]
     rows, found = rows[good], found.only(good)
     names = ("point", "arm", "foot", "normal", "distance", "ahead")
     moved = {name: getattr(contacts, name).index_copy(0, rows, getattr(found, name)) for name in names}
     contacts = replace(contacts, **moved, queries=queries)
-    return contacts.only(_distinct(bodies, contacts, smooth, rows))
+    return contacts.only(_distinct(bodies, contacts, pair, smooth, rows))
 
 
-def _distinct(bodies: Bodies, contacts: Contacts, smooth: Tensor, rows: Tensor) -> Tensor:
+def _distinct(bodies: Bodies, contacts: Contacts, pair: Tensor, smooth: Tensor, rows: Tensor) -> Tensor:
     """Which edges remain: all that are not `smooth` [E], and of those that were moved, `rows` [K], the deepest at each
     place. Of a pair that would have none, the deepest."""
     cell = (contacts.point[rows] / (SAME * bodies.radius[contacts.owner[rows], None])).round().long()
-    pair = torch.unique(contacts.owner * len(bodies) + contacts.body, return_inverse=True)[1]
     here = torch.unique(torch.cat([pair[rows, None], cell], 1), dim=0, return_inverse=True)[1]
     kept = ~smooth
     kept[rows[_deepest(here, contacts.ahead[rows])]] = True
