@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from sdfsim.dynamics import pose
@@ -66,11 +65,13 @@ def curvature(bodies: Bodies) -> Curvature:
 
 def _measured(bodies: Bodies, shape: int, nodes: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """`Curvature` of nodes [K, 3] m of one shape, by the normals a little to either side of them."""
+    from scipy.spatial import KDTree
+
     if len(nodes) < 5:  # too few to know for how much of the surface each of them stands
         nothing = nodes.new_zeros(len(nodes))
         return nodes, nodes[:, :, None] * nodes[:, None], nothing, nothing > 0
     place = nodes.cpu().numpy()
-    piece = torch.as_tensor(cKDTree(place).query(place, 5)[0][:, 4], device=nodes.device)
+    piece = torch.as_tensor(KDTree(place).query(place, 5)[0][:, 4], device=nodes.device)
     index = torch.full((len(nodes),), shape, device=nodes.device)
 
     def normals(points: Tensor) -> Tensor:
@@ -89,7 +90,7 @@ def _measured(bodies: Bodies, shape: int, nodes: Tensor) -> tuple[Tensor, Tensor
             there, back = normals(nodes + step * way) - normal, normal - normals(nodes - step * way)
             bend = bend + (0.5 * (there + back) / step)[:, :, None] * way[:, None]
             askew = torch.maximum(askew, 0.5 * (there - back).norm(dim=-1) / step[:, 0])
-        return along @ (0.5 * (bend + bend.mT)) @ along, askew
+        return (along @ (0.5 * (bend + bend.mT)) @ along).nan_to_num(), askew
 
     (bend, askew), (wider, _) = bent(STEP * piece[:, None]), bent(2 * STEP * piece[:, None])
     most = torch.linalg.eigvalsh(bend).abs().amax(-1)
