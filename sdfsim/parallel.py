@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -22,7 +23,7 @@ def parallel(function: Callable[..., Any], jobs: Sequence[tuple]) -> Iterator[tu
 
     if not jobs:
         return
-    calls = (delayed(_one)(function, index, job) for index, job in enumerate(jobs))
+    calls = (delayed(_one)(function, index, job, os.getpid()) for index, job in enumerate(jobs))
     ended: Any = Parallel(n_jobs=-1, return_as="generator_unordered")(calls)
     yield from ended
 
@@ -55,11 +56,12 @@ def cluster(address: str | None) -> Iterator[None]:
         yield
 
 
-def _one(function: Callable[..., Any], index: int, job: tuple) -> tuple[int, Any]:
-    """In a worker: one thread, and Ctrl-C is the caller's business."""
+def _one(function: Callable[..., Any], index: int, job: tuple, caller: int) -> tuple[int, Any]:
+    """In a worker: one thread, and Ctrl-C is the caller's business. On a single core the caller works itself."""
     from sdfsim.threads import limit_threads
 
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-    limit_threads(1)
+    if os.getpid() != caller:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+        limit_threads(1)
     return index, function(*job)

@@ -110,6 +110,20 @@ def test_work_is_spread_over_processes_of_one_thread() -> None:
         list(parallel(where, [(n,) for n in range(10, 20)]))
 
 
+def test_on_a_single_core_the_caller_works_and_still_hears_ctrl_c() -> None:
+    import os
+    import signal
+
+    import torch
+    from joblib import parallel_config
+
+    before = signal.getsignal(signal.SIGINT), torch.get_num_threads()
+    with parallel_config(backend="sequential"):
+        found = dict(parallel(where, [(3,)]))
+    assert found[0][:2] == (9, os.getpid())
+    assert (signal.getsignal(signal.SIGINT), torch.get_num_threads()) == before
+
+
 def test_the_same_call_works_on_a_cluster(meshes: Path, tmp_path: Path) -> None:
     from distributed import LocalCluster
 
