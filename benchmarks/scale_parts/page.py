@@ -49,7 +49,7 @@ def _growth(results: Results) -> str:
     for nodes in (64, 512):
         found = series(results, f"growth_{nodes}")
         for count, r in found:
-            depth, overlap = (100 * (r.get(k) or 0.0) / 0.52 for k in ("penetration_95", "overlap_95"))
+            depth, overlap = (100 * r[k] / 0.52 for k in ("penetration_95", "overlap_95"))
             values = [f"{r['nodes']:,}", f"{r['contacts']:.0f}", f"{r['ms']:.1f}", f"{r['peak_mib']:.0f}"]
             rows.append(
                 [
@@ -140,7 +140,7 @@ def _engines(results: Results) -> str:
         mine = dict(series(results, ours)) if ours else {}
         for engine, name in ENGINES.items():
             for count, r in series(results, f"engine_{scene}_{engine}"):
-                depths = [f"{1e3 * (r.get(k) or 0.0):.1f} mm" for k in ("overlap_95", "penetration_95")]
+                depths = [f"{1e3 * r[k]:.1f} mm" for k in ("overlap_95", "penetration_95")]
                 fate = [str(r["below"]), "" if r["finite"] else "not finite"]
                 values = [f"{r['ms']:.2f}", f"{r['peak_mib']:.0f}", f"{r['contacts']:.0f}", *depths, *fate]
                 ratio = f"{mine[count]['ms'] / r['ms']:.1f}" if count in mine else ""
