@@ -2,7 +2,7 @@
 
 Nodes sample a surface. Of a sphere on the ground none is at its lowest point, and a push that acts a few degrees aside
 of it sets the sphere rolling. Where the surface around a node is smooth, its normal and curvature tell how it goes on:
-the point whose normal is opposite to the other body's is found in two tries, both asked of both SDFs. Corners and edges
+the point whose normal is opposite to the other body's is found by secants, each asked of both SDFs. Corners and edges
 need none of this: they are nodes, and nearest where they are.
 """
 
@@ -24,7 +24,7 @@ SHARP = 0.7  # rad; above it is an edge or a corner
 UNEVEN = 0.25  # of a curvature: how much it may differ from side to side, and over twice the way
 STEP = 0.25  # of a node's piece, over which its curvature is measured
 WAY = 2.0  # pieces to go at most, as if the other surface were flat: between two alike it is half of that
-SECANTS = 2
+SECANTS = 2  # after the first guess
 ALIGNED = 1e-4  # rad; normals that are nearer to opposite are so but for rounding
 OFF = 0.02  # of a piece, by which a point found may be farther from the other surface than the node was
 SAME = 0.02  # of a body's radius: places nearer to one another than about this are one contact
@@ -127,16 +127,7 @@ def round_off(bodies: Bodies, state: State, contacts: Contacts, reach: float, me
     near = (arc.length < WAY * arc.piece).nonzero()[:, 0]
     rows, arc = rows[near], arc.only(near)
     some = contacts.only(rows)
-    # Secants: what the normal has still to turn, at the node, half of the way as if the other surface were flat (which
-    # is all of it where they are alike), and so on.
-    before, left = torch.zeros_like(arc.length), arc.turn
-    way = 0.5 * arc.length
-    for _ in range(SECANTS):
-        now = _nearest(bodies, state, some, arc, way)[1]
-        gone = (way - before) * now / (left - now)
-        before, left = way, now
-        way = torch.where(now.abs() > ALIGNED, way + gone, way).clamp(-arc.piece, 2.0 * arc.piece)
-    found, _ = _nearest(bodies, state, some, arc, way)
+    found, way = _search(bodies, state, some, arc)
     within, nearer = way.abs() < arc.piece, found.distance <= some.distance + OFF * arc.piece
     smooth = smooth.index_fill(0, rows[within & ~nearer], False)  # these did not go as foreseen: they stay as they are
     queries, good = contacts.queries + 2 * (SECANTS + 1) * len(rows), (within & nearer).nonzero()[:, 0]
@@ -145,6 +136,18 @@ def round_off(bodies: Bodies, state: State, contacts: Contacts, reach: float, me
     moved = {name: getattr(contacts, name).index_copy(0, rows, getattr(found, name)) for name in names}
     contacts = replace(contacts, **moved, queries=queries)
     return contacts.only(_distinct(bodies, contacts, pair, smooth, rows))
+
+
+def _search(bodies: Bodies, state: State, contacts: Contacts, arc: _Arcs) -> tuple[Contacts, Tensor]:
+    """The edges [K] from where the two normals are opposite, and how far [K] along the arcs that is, by secants."""
+    before, left = torch.zeros_like(arc.length), arc.turn
+    way = 0.5 * arc.length  # all of it where the two are alike; by what is left to turn there, both are known
+    for _ in range(SECANTS):
+        now = _nearest(bodies, state, contacts, arc, way)[1]
+        gone = (way - before) * now / (left - now)
+        before, left = way, now
+        way = torch.where(now.abs() > ALIGNED, way + gone, way).clamp(-arc.piece, WAY * arc.piece)
+    return _nearest(bodies, state, contacts, arc, way)[0], way
 
 
 def _distinct(bodies: Bodies, contacts: Contacts, pair: Tensor, smooth: Tensor, rows: Tensor) -> Tensor:
