@@ -51,17 +51,8 @@ def _growth(results: Results) -> str:
         for count, r in found:
             depth, overlap = (100 * r[k] / 0.52 for k in ("penetration_95", "overlap_95"))
             values = [f"{r['nodes']:,}", f"{r['contacts']:.0f}", f"{r['ms']:.1f}", f"{r['peak_mib']:.0f}"]
-            rows.append(
-                [
-                    str(count),
-                    str(nodes),
-                    *values,
-                    f"{overlap:.1f} %",
-                    f"{depth:.1f} %",
-                    str(r["lost"]),
-                    r["broken"] or "",
-                ]
-            )
+            values += [f"{overlap:.1f} %", f"{depth:.1f} %", str(r["lost"]), r["broken"] or ""]
+            rows.append([str(count), str(nodes), *values])
         large = [(c, r) for c, r in found if c >= 16]
         if len(large) > 1:
             cost, memory = ([r[k] for _, r in large] for k in ("ms", "peak_mib"))
@@ -74,18 +65,8 @@ def _growth(results: Results) -> str:
             )
     if not rows:
         return ""
-    head = [
-        "spheres",
-        "nodes each",
-        "nodes",
-        "contacts",
-        "ms a step",
-        "MiB",
-        "overlap 95 %",
-        "deepest node 95 %",
-        "lost",
-        "",
-    ]
+    head = ["spheres", "nodes each", "nodes", "contacts", "ms a step", "MiB"]
+    head += ["overlap 95 %", "deepest node 95 %", "lost", ""]
     return "### Growth\n\n" + _table(head, rows) + "\n\n" + "\n\n".join(notes)
 
 

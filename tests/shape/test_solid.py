@@ -13,7 +13,6 @@ from sdfsim.shape.distance import MeshDistance, merge
 from sdfsim.shape.mesh import Mesh, is_closed, load_mesh, sample_surface, signed_volume
 from sdfsim.shape.solid import solidify
 
-DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 CUBE = primitives.box()
 BALL = primitives.sphere(0.5, subdivisions=4)
 
@@ -297,11 +296,8 @@ def test_a_hundred_thousand_faces_take_seconds_and_stay_as_they_are() -> None:
 @pytest.mark.parametrize(
     ("file", "solid"), [("cow", True), ("cheburashka", True), ("alligator", False), ("woody", False), ("beetle", False)]
 )
-def test_meshes_from_the_field(file: str, solid: bool) -> None:
-    path = DATA / "meshes" / f"{file}.obj"
-    if not path.is_file():
-        pytest.skip(f"{path} is not there")
-    mesh = load_mesh(path)
+def test_meshes_from_the_field(file: str, solid: bool, data_dir: Path) -> None:
+    mesh = load_mesh(data_dir / "meshes" / f"{file}.obj")
     if solid:
         assert solidify(mesh, name=file).mass_properties()[0] > 0
         return
