@@ -15,6 +15,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from pipeline.trilinear import interpolate
+
 
 @dataclass(frozen=True)
 class FieldSize:
@@ -75,19 +77,11 @@ def contract(points: Tensor) -> Tensor:
     return points / radius * (2 - 1 / radius) / 2
 
 
-def sample_grid(grid: Tensor, points: Tensor) -> Tensor:
-    """Trilinear values [P, C] of a grid [1, C, n, n, n] (z, y, x order) at points [P, 3] in [-1, 1]."""
-    found = functional.grid_sample(
-        grid, points.view(1, 1, 1, -1, 3), mode="bilinear", padding_mode="border", align_corners=True
-    )
-    return found.view(grid.shape[1], -1).t()
-
-
 class Field(nn.Module, ABC):
     """SDF and colour in the unit sphere, and a background outside; what both encodings have in common.
 
     Attributes:
-        background: [1, 4, n, n, n], channel 0 density before softplus, channels 1 to 3 colour before sigmoid.
+        background: [n, n, n, 4], channel 0 density before softplus, channels 1 to 3 colour before sigmoid.
         size: of the encoding, with `to_dict`.
         start_radius: radius of the sphere that the SDF starts from.
         active: how many levels of detail are in use.
@@ -132,7 +126,7 @@ class Field(nn.Module, ABC):
         closest = (origins * origins).sum(1, keepdim=True) - along**2
         distance = along + torch.sqrt((radius**2 - closest).clamp_min(1e-6))
         points = origins[:, None] + distance[..., None] * directions[:, None]
-        values = sample_grid(self.background, contract(points).view(-1, 3)).view(*jitter.shape, 4)
+        values = interpolate(self.background, contract(points).view(-1, 3)).view(*jitter.shape, 4)
         # Optical depth per step of inverse radius, so that far steps are not heavier than near ones.
         depth = functional.softplus(values[..., 0] * 10 - 1.0)
         depth = torch.cat([depth[:, :-1], torch.full_like(depth[:, -1:], 20.0)], 1)
@@ -160,7 +154,7 @@ class GridField(Field):
             return nn.Parameter((torch.rand(*shape, generator=rng) * 2 - 1) * bound)
 
         self.grids = nn.ParameterList(
-            [uniform(1, c, n, n, n, bound=1e-3) for n, c in zip(size.levels, size.channels, strict=True)]
+            [uniform(n, n, n, c, bound=1e-3) for n, c in zip(size.levels, size.channels, strict=True)]
         )
         inputs, width = 3 + sum(size.channels), size.width
 
@@ -179,7 +173,7 @@ class GridField(Field):
             layer(GEOMETRY + 8 + sum(size.channels), width), nn.ReLU(), layer(width, 3, gain=0.3)
         )
         n = size.background
-        self.background = uniform(1, 4, n, n, n, bound=1e-2)
+        self.background = uniform(n, n, n, 4, bound=1e-2)
 
     @property
     def finest(self) -> float:
@@ -188,7 +182,7 @@ class GridField(Field):
 
     def features(self, points: Tensor) -> Tensor:
         """Grid features [P, F] at points [P, 3]; zeros for levels that are not active yet."""
-        found = [sample_grid(grid, points) for grid in list(self.grids)[: self.active]]
+        found = [interpolate(grid, points) for grid in list(self.grids)[: self.active]]
         missing = sum(self.size.channels[self.active :])
         if missing:
             found.append(points.new_zeros(len(points), missing))

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from pipeline.cameras import Sparse, View
-from pipeline.field import sample_grid
 from pipeline.normalise import Normalisation, point_weights
+from pipeline.trilinear import interpolate
 
 # Lines of sight end this far before their points, normalised units.
 GAP = 0.015
@@ -83,13 +83,13 @@ class FreeSpace:
         return len(self.start)
 
     def look(self, cache: Tensor, rng: torch.Generator) -> None:
-        """Finds filled places by the SDF on a grid [1, 1, n, n, n] over [-1, 1]^3, at random places of every line."""
+        """Finds filled places by the SDF on a grid [n, n, n, 1] over [-1, 1]^3, at random places of every line."""
         device = self.start.device
         found = []
         for _ in range(TRIES):
             along = torch.rand(len(self), generator=rng).to(device)
             line = torch.arange(len(self), device=device)
-            wrong = sample_grid(cache, self.at(line, along)[0])[:, 0] < FILLED
+            wrong = interpolate(cache, self.at(line, along)[0])[:, 0] < FILLED
             found.append(torch.stack([line[wrong].float(), along[wrong]], 1))
         self.filled = torch.cat(found)
 

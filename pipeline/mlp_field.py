@@ -63,7 +63,7 @@ class MlpField(Field):
         super().__init__()
         self.size, self.start_radius = size, start_radius
         n = size.background
-        self.background = nn.Parameter((torch.rand(1, 4, n, n, n, generator=rng) * 2 - 1) * 1e-2)
+        self.background = nn.Parameter((torch.rand(n, n, n, 4, generator=rng) * 2 - 1) * 1e-2)
         inputs = 3 + 6 * size.frequencies
         self.skip = size.depth // 2
         layers = []

@@ -11,9 +11,10 @@ import yaml
 
 from pipeline.wishes import Known, Wishes
 from sdfsim.errors import SdfsimError
-from sdfsim.files import write_text
+from sdfsim.files import CONFIG, write_text
 
 PRESETS = ("quick", "standard", "fine", "paper")
+COMMAND = "reconstruct"
 DROPS = ("box", "ball", "none")
 DEVICES = ("auto", "cpu", "cuda")
 
@@ -108,8 +109,8 @@ class Options:
 
 def write_config(options: Options, folder: Path) -> None:
     """Writes config.yaml: every option as resolved."""
-    text = yaml.safe_dump({"version": 1, **asdict(options)}, sort_keys=False, allow_unicode=True)
-    write_text(folder / "config.yaml", text)
+    text = yaml.safe_dump({"command": COMMAND, "version": 1, **asdict(options)}, sort_keys=False, allow_unicode=True)
+    write_text(folder / CONFIG, text)
 
 
 def read_config(folder: Path) -> Options:
@@ -119,8 +120,9 @@ def read_config(folder: Path) -> Options:
         SdfsimError: it is missing or not one of ours.
     """
     try:
-        data = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
+        data = yaml.safe_load((folder / CONFIG).read_text(encoding="utf-8"))
         data.pop("version", None)
+        data.pop("command", None)
         return Options(**data)
     except (OSError, yaml.YAMLError, TypeError, AttributeError) as error:
         raise SdfsimError(f"{folder}: not the folder of a reconstruction", "run `sdfsim reconstruct` first") from error

@@ -33,7 +33,7 @@ class Recipe:
 
     size: FieldSize | MlpSize = FieldSize()  # noqa: RUF009  frozen
     start_radius: float = 0.25
-    iterations: int = 3600
+    iterations: int = 4200
     rays: int = 512
     samples: int = 32
     long_side: int = 480
@@ -49,7 +49,7 @@ class Recipe:
 
 PRESETS = {
     "quick": Recipe(),
-    "standard": Recipe(iterations=6000, rays=768, samples=40, long_side=800, beta=(0.1, 0.0025)),
+    "standard": Recipe(iterations=8000, rays=768, samples=40, long_side=800, beta=(0.1, 0.0025)),
     "fine": Recipe(
         size=FieldSize((16, 32, 64, 128, 224), (4, 4, 4, 4, 2), 64, 96),
         iterations=20000, rays=1024, samples=48, long_side=1280, beta=(0.1, 0.0015),

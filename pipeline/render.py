@@ -8,12 +8,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from pipeline.field import BACKGROUND_SAMPLES, Field, laplace_density, render_weights, sample_grid
+from pipeline.field import BACKGROUND_SAMPLES, Field, laplace_density, render_weights
+from pipeline.trilinear import interpolate
 
 
 @torch.no_grad()
 def sdf_cache(field: Field, resolution: int, coarse: int = 4) -> Tensor:
-    """The SDF on a grid [1, 1, n, n, n] over [-1, 1]^3 (z, y, x order), from which samples along rays are chosen.
+    """The SDF on a grid [n, n, n, 1] over [-1, 1]^3 (z, y, x order), from which samples along rays are chosen.
 
     Every `coarse`-th value is the field's, the others only in blocks that the surface may cross; elsewhere, in empty
     space and deep inside, they are interpolated.
@@ -31,17 +32,17 @@ def sdf_cache(field: Field, resolution: int, coarse: int = 4) -> Tensor:
 
     knots = torch.stack(torch.meshgrid(*[line[::coarse]] * 3, indexing="ij"), -1)
     rough = values(knots.view(-1, 3).flip(1)).view(1, 1, *knots.shape[:3])
-    cache = functional.interpolate(rough, size=(resolution,) * 3, mode="trilinear", align_corners=True)
+    cache = functional.interpolate(rough, size=(resolution,) * 3, mode="trilinear", align_corners=True)[0, 0]
     low, high = -functional.max_pool3d(-rough, 2, 1), functional.max_pool3d(rough, 2, 1)
     reach = 3**0.5 * coarse * float(line[1] - line[0])
     block = torch.nonzero((low < reach) & (high > -reach))[:, 2:] * coarse
     step = torch.stack(torch.meshgrid(*[torch.arange(coarse + 1, device=device)] * 3, indexing="ij"), -1).view(-1, 3)
     near = torch.zeros_like(cache, dtype=torch.bool)
     index = (block[:, None] + step).reshape(-1, 3)
-    near[0, 0, index[:, 0], index[:, 1], index[:, 2]] = True
-    index = torch.nonzero(near)[:, 2:]
-    cache[0, 0, index[:, 0], index[:, 1], index[:, 2]] = values(line[index].flip(1))
-    return cache
+    near[index[:, 0], index[:, 1], index[:, 2]] = True
+    index = torch.nonzero(near)
+    cache[index[:, 0], index[:, 1], index[:, 2]] = values(line[index].flip(1))
+    return cache[..., None]
 
 
 def sphere_interval(origins: Tensor, directions: Tensor, near: float = 0.02) -> tuple[Tensor, Tensor]:
@@ -92,9 +93,9 @@ def choose_samples(
     length = (leave - enter)[:, None]
     steps = (torch.arange(bins, device=cache.device) + 0.5) / bins
     points = origins[:, None] + (enter[:, None] + length * steps)[..., None] * directions[:, None]
-    sdf = sample_grid(cache, points.view(-1, 3)).view(len(origins), bins)
+    sdf = interpolate(cache, points.view(-1, 3)).view(len(origins), bins)
     # The cache knows the surface only to a fraction of its cell: no narrower than that.
-    broad = max(beta, 0.6 / cache.shape[-1])
+    broad = max(beta, 0.6 / cache.shape[0])
     weights, _ = render_weights(laplace_density(sdf, broad), (length / bins).expand(-1, bins))
     cumulative = torch.cumsum(weights + 1e-4, 1)
     cumulative = cumulative / cumulative[:, -1:]

@@ -65,7 +65,7 @@ class Snapshots:
     def _mesh(self, rr) -> None:
         """The surface on the cached grid, in normalised space."""
         assert self.trainer.cache is not None
-        values = self.trainer.cache[0, 0].permute(2, 1, 0).cpu().numpy()
+        values = self.trainer.cache[..., 0].permute(2, 1, 0).cpu().numpy()
         try:
             mesh = Volume(values, -np.ones(3), 2 / (len(values) - 1)).mesh()
         except SdfsimError:

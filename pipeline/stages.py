@@ -10,10 +10,10 @@ from typing import Any
 
 from pipeline import record
 from pipeline.actions import ACTIONS, Progress, Run
-from pipeline.options import Options, read_config, write_config
+from pipeline.options import COMMAND, Options, read_config, write_config
 from pipeline.report import STAGES, current, write_report
 from sdfsim.errors import SdfsimError
-from sdfsim.files import locked
+from sdfsim.files import CONFIG, check_own, locked
 
 # Whose source code makes a stage's result; a change there makes the result old.
 # fmt: off
@@ -22,11 +22,11 @@ CODE = {
     "poses": ("photos", "cameras", "poses", "poses_worker", "pair_checks", "verdict", "normalise"),
     "distill": (
         "photo_file", "cameras", "normalise", "rays", "field", "landmarks", "render", "recipe", "trainer", "distill",
-        "held_out", "mlp_field", "mlp_trainer", "error_bound",
+        "held_out", "trilinear", "mlp_field", "mlp_trainer", "error_bound",
     ),
     "mesh": (
         "cameras", "normalise", "field", "distill", "volume", "visibility", "cleaning", "surface", "objects", "parts",
-        "placement", "scale", "picture", "meshing",
+        "placement", "scale", "picture", "meshing", "trilinear",
     ),
     "fit": ("asset",),
     "scene": ("scene_file", "drop", "placement", "asset", "meshing"),
@@ -100,7 +100,7 @@ def find_poses(photos: str | Path, out: str | Path, *, progress: Progress | None
     Raises:
         SdfsimError: as `reconstruct`.
     """
-    kept = asdict(read_config(Path(out))) if (Path(out) / "config.yaml").exists() else {}
+    kept = asdict(read_config(Path(out))) if (Path(out) / CONFIG).exists() else {}
     given = {key: value for key, value in changes.items() if value is not None}
     return reconstruct(**{**kept, **given, "photos": photos}, out=out, until_stage="poses", progress=progress)
 
@@ -154,6 +154,7 @@ def check_before(run: Run, names: Sequence[str]) -> None:
     """
     if run.options.device == "cuda":
         run.device()
+    check_own(run.folder, COMMAND, "report.json", "report.html")
     for name in names:
         record.check_replaceable(run.place(name))
 

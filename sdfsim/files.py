@@ -14,10 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from sdfsim.errors import SdfsimError
 
 LOCK = ".lock"
+# What a run was asked for, the command first.
+CONFIG = "config.yaml"
 # What an archive may unpack to: so many bytes, or so many times its own size.
 FREELY, MOST_GROWTH = 2**30, 100
 
@@ -141,3 +144,28 @@ def check_writable(folder: Path) -> None:
             pass
     except OSError as error:
         raise SdfsimError(f"{folder}: cannot be written: {error.strerror}", "choose another -o") from error
+
+
+def check_own(folder: Path, command: str, *names: str) -> None:
+    """That what a run replaces in a folder comes from an earlier run of the same command, as its config.yaml tells.
+
+    Args:
+        folder: that the run writes to; need not exist.
+        command: as config.yaml names it.
+        *names: of files that the run replaces besides config.yaml.
+
+    Raises:
+        SdfsimError: something else lies there.
+    """
+    there = [name for name in (CONFIG, *names) if os.path.lexists(folder / name)]
+    if not there:
+        return
+    try:
+        config = yaml.safe_load((folder / CONFIG).read_text(encoding="utf-8"))
+    except (OSError, ValueError, yaml.YAMLError):
+        config = None
+    if not isinstance(config, dict) or config.get("command") != command:
+        raise SdfsimError(
+            f"{folder / there[0]}: in the way, and not replaced: not from an earlier `sdfsim {command}`",
+            "choose another folder to write to, or move it away",
+        )

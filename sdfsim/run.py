@@ -16,7 +16,7 @@ from sdfsim.dynamics.model import Model, load_model
 from sdfsim.dynamics.rollout import Rollout, energy_from_nothing
 from sdfsim.dynamics.simulator import SimulationError, Simulator, join, pick_device
 from sdfsim.errors import SdfsimError
-from sdfsim.files import check_writable, locked, write_json, write_text
+from sdfsim.files import CONFIG, check_own, check_writable, locked, write_json, write_text
 from sdfsim.learning import tables
 from sdfsim.playback import Playback, save_rollout
 from sdfsim.progress import columns
@@ -94,6 +94,7 @@ def simulate(
     if quality:
         quality_setting(quality)
     check_writable(out)
+    check_own(out, "simulate", *_RESULTS)
     if viewer in ("native", "web"):
         from sdfsim.viewer import check_screen
 
@@ -125,7 +126,7 @@ def simulate(
             kept.clear()
             frames = [simulator.initial_rollout()]
             kept.add(frames[0])
-        write_text(out / "config.yaml", yaml.safe_dump(config, sort_keys=False))
+        write_text(out / CONFIG, yaml.safe_dump(config, sort_keys=False))
         live = _live(scene, viewer, join(frames), on_address, bind)
 
         started, broken = time.monotonic(), None

@@ -89,7 +89,7 @@ def test_fresh_field_is_a_ball():
 def test_samples_gather_at_the_surface():
     line = torch.linspace(-1, 1, 64)
     z, y, x = torch.meshgrid(line, line, line, indexing="ij")
-    cache = (torch.stack([x, y, z]).norm(dim=0) - 0.5)[None, None]
+    cache = (torch.stack([x, y, z]).norm(dim=0) - 0.5)[..., None]
     origin, direction = torch.tensor([[0.0, 0, -3]]), torch.tensor([[0.0, 0, 1]])
     found = choose_samples(cache, origin, direction, 0.01, torch.full((1, 32), 0.5))
     assert (found.distance.diff() >= 0).all()

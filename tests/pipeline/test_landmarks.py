@@ -16,7 +16,7 @@ from tests.pipeline.test_surface import ring
 
 def ball_cache(radius: float, n: int = 65) -> torch.Tensor:
     line = torch.linspace(-1, 1, n)
-    return (torch.stack(torch.meshgrid(line, line, line, indexing="ij")).norm(dim=0) - radius)[None, None]
+    return (torch.stack(torch.meshgrid(line, line, line, indexing="ij")).norm(dim=0) - radius)[..., None]
 
 
 def test_lines_of_sight_end_before_their_points_and_stay_in_the_sphere():
@@ -69,7 +69,7 @@ def test_the_cache_is_the_field_near_its_surface_and_has_its_signs_everywhere():
         field.grids[1].normal_(0, 0.05, generator=torch.Generator().manual_seed(0))
         line = torch.linspace(-1, 1, 41)
         z, y, x = torch.meshgrid(line, line, line, indexing="ij")
-        dense = field.sdf(torch.stack([x, y, z], -1).view(-1, 3)).view(1, 1, 41, 41, 41)
+        dense = field.sdf(torch.stack([x, y, z], -1).view(-1, 3)).view(41, 41, 41, 1)
     asked = []
     plain = field.sdf
     field.sdf = lambda points: asked.append(len(points)) or plain(points)  # type: ignore[method-assign]

@@ -11,11 +11,21 @@ from PIL import Image
 from pipeline import record, stages
 from pipeline.report import STAGES, place_of
 from sdfsim.errors import SdfsimError
+from sdfsim.run import simulate
 
 
 def tree(folder: Path) -> dict[str, bytes]:
     """Every file of a folder."""
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def simulate_tower(out: Path) -> None:
+    """One step."""
+    scene = Path(__file__).parents[2] / "samples" / "tower.yaml"
+    simulate(
+        scene, out, model=None, seconds=0.02, seed=None, viewer="none", device="cpu", on_progress=lambda *_: None,
+        on_address=lambda _: None,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("finished", [False, True])
@@ -72,6 +82,28 @@ def test_anything_else_where_a_result_belongs_is_refused_before_the_first_stage(
         stages.reconstruct(photos, out)
     assert "choose another folder" in caught.value.hint
     assert calls == [] and tree(out) == before
+
+
+@pytest.mark.parametrize("name", ["config.yaml", "report.json", "report.html"])
+def test_files_of_the_users_among_the_results_stay(photos, tmp_path, calls, name):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / name).write_text("mine: true")
+    with pytest.raises(SdfsimError, match=f"{name}: in the way, and not replaced"):
+        stages.reconstruct(photos, out)
+    assert calls == [] and tree(out) == {name: b"mine: true"}
+
+
+def test_the_folder_of_another_command_is_left_alone(photos, tmp_path, calls):
+    """Each writes a config.yaml and a report.json: neither takes the other's folder."""
+    simulate_tower(tmp_path / "run")
+    stages.reconstruct(photos, tmp_path / "scan", until_stage="photos")
+    before = tree(tmp_path / "run"), tree(tmp_path / "scan")
+    with pytest.raises(SdfsimError, match="not from an earlier `sdfsim reconstruct`"):
+        stages.reconstruct(photos, tmp_path / "run")
+    with pytest.raises(SdfsimError, match="not from an earlier `sdfsim simulate`"):
+        simulate_tower(tmp_path / "scan")
+    assert (tree(tmp_path / "run"), tree(tmp_path / "scan")) == before
 
 
 def test_one_stage_alone_replaces_nothing_of_the_users_either(photos, tmp_path, calls):

@@ -1,0 +1,52 @@
+"""Trilinear interpolation of grids that are learned.
+
+torch's `grid_sample` does the same for volumes, with one thread a volume and channel by channel: it was half of a
+training step. Here the eight corners of a point are rows of a table, summed by `embedding_bag`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+
+def interpolate(grid: Tensor, points: Tensor) -> Tensor:
+    """Trilinear values [P, C] of a grid [n, n, n, C] (z, y, x order) over [-1, 1]^3, outside those of its border.
+
+    Differentiable in the grid, not in the points.
+
+    Args:
+        grid: n at least 2; its outermost samples lie on the faces of the cube.
+        points: [P, 3] x, y, z.
+    """
+    side, channels = grid.shape[0], grid.shape[3]
+    place = ((points.detach().t() + 1) * (0.5 * (side - 1))).clamp(0, side - 1)
+    cell = place.long().clamp_max(side - 2)
+    x1, y1, z1 = place - cell
+    x0, y0, z0 = 1 - x1, 1 - y1, 1 - z1
+    first = cell[0] + side * cell[1] + side * side * cell[2]
+    steps = [x + side * y + side * side * z for z in (0, 1) for y in (0, 1) for x in (0, 1)]
+    rows = first[:, None] + torch.tensor(steps, device=points.device)
+    weights = torch.stack([face * x for face in (z0 * y0, z0 * y1, z1 * y0, z1 * y1) for x in (x0, x1)], 1)
+    return _WeightedRows.apply(grid.reshape(-1, channels), rows, weights)  # type: ignore[no-any-return]
+
+
+class _WeightedRows(torch.autograd.Function):
+    """Sums of rows of a table; unlike `embedding_bag`'s own, its gradient does not sort."""
+
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
+        """[P, C] from a table [N, C] by rows [P, K] and their weights [P, K]."""
+        ctx.save_for_backward(rows, weights)
+        ctx.shape = table.shape
+        return functional.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
+        """Gradient of the table."""
+        rows, weights = ctx.saved_tensors
+        parts = (weights[..., None] * grads[0][:, None]).view(-1, ctx.shape[1])
+        return grads[0].new_zeros(ctx.shape).index_add_(0, rows.view(-1), parts), None, None
