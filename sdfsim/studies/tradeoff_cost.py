@@ -25,12 +25,15 @@ class Load:
         touching: share of the steps in which anything touches: the network is asked at all.
         nodes: surface nodes of the bodies that have a contact.
         edges: contact edges that the network sees.
+        roundness: share of the moving bodies' nodes that lie on smooth surfaces, which meet in few edges; the time of
+            a step is no matter of it.
     """
 
     bodies: float
     touching: float
     nodes: float
     edges: float
+    roundness: float = 0.0
 
     def row(self) -> list[float]:
         """One, then the quantities."""
@@ -45,7 +48,8 @@ class CostModel:
         base: of any step.
         body, node, edge: of each of them.
         touching: of the network's being asked at all.
-        edges_a_body: contact edges of a body that has any, in the median of the scenes it was fitted to.
+        edges_a_body, edges_a_round_body: contact edges of a body that has any, with corners or without; in the
+            median of the scenes it was fitted to.
     """
 
     base: float
@@ -54,11 +58,16 @@ class CostModel:
     node: float
     edge: float
     edges_a_body: float
+    edges_a_round_body: float
 
     def __call__(self, load: Load) -> float:
         """ms of a step."""
         weights = (self.base, self.body, self.touching, self.node, self.edge)
         return float(np.dot(weights, load.row()))
+
+    def edges(self, in_contact: float, roundness: float) -> float:
+        """Contact edges of so many bodies that touch something."""
+        return in_contact * (self.edges_a_body * (1 - roundness) + self.edges_a_round_body * roundness)
 
     def to_json(self) -> dict[str, float]:
         """All coefficients by name."""
@@ -82,9 +91,12 @@ def fit_cost(loads: Sequence[Load], milliseconds: Sequence[float]) -> CostModel:
         raise SdfsimError(f"a cost model needs at least {rows.shape[1]} scenes (got {len(rows)})")
     scale = np.maximum(np.abs(rows).max(0), 1e-12)
     weights = nnls(rows / scale / taken[:, None], np.ones(len(taken)))[0] / scale
-    touching = [load for load in loads if load.edges > 0]
-    known = [load.edges / load.bodies for load in touching]
-    return CostModel(*(float(w) for w in weights), edges_a_body=float(np.median(known)) if known else 0.0)
+    kinds: dict[bool, list[float]] = {False: [], True: []}
+    for load in loads:
+        if load.edges > 0:
+            kinds[load.roundness > 0.5].append(load.edges / load.bodies)
+    edges = [float(np.median(known)) if known else 0.0 for known in kinds.values()]
+    return CostModel(*(float(w) for w in weights), *edges)
 
 
 def relative_errors(model: CostModel, loads: Sequence[Load], milliseconds: Sequence[float]) -> np.ndarray:

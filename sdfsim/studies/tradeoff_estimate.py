@@ -42,6 +42,16 @@ def landings(simulator: Simulator, steps: int) -> np.ndarray:
     return (1.0 - first.clamp_max(1.0)).numpy()
 
 
+def roundness(simulator: Simulator) -> float:
+    """Share of the moving bodies' nodes around which the surface is smooth."""
+    bodies = simulator.bodies
+    known = simulator.memory.curvature(bodies)
+    of_shape = [part.double().mean() if len(part) else 0.0 for part in known.smooth.tensor_split(known.start[1:-1].cpu())]
+    count = (bodies.node_start[1:] - bodies.node_start[:-1])[bodies.moves].double()
+    share = torch.tensor(of_shape, dtype=torch.float64, device=bodies.device)[bodies.shape[bodies.moves]]
+    return float((share * count).sum() / count.sum().clamp_min(1))
+
+
 def estimate(
     cost: CostModel, simulator: Simulator, counters: dict[str, np.ndarray], landed: np.ndarray, steps: int
 ) -> dict[str, Any]:
@@ -66,7 +76,7 @@ def estimate(
         bodies=moving,
         touching=max(float(landed.max(initial=0.0)), trial.touching),
         nodes=own * max(float(landed.sum()), float(active.mean())),
-        edges=max(cost.edges_a_body * float(landed.sum()), trial.edges),
+        edges=max(cost.edges(float(landed.sum()), roundness(simulator)), trial.edges),
     )
     step_ms = float(np.median(counters["step_ms"][2:])) * cost(whole) / max(cost(trial), 1e-9)
     return {

@@ -19,9 +19,9 @@ from sdfsim.shape.asset import analytic_shape, with_nodes
 from sdfsim.shape.cache import shape_from_primitive
 from sdfsim.studies.tradeoff_contenders import peak_memory, time_simulator, weights_digest
 from sdfsim.studies.tradeoff_cost import CostModel, Load, fit_cost, relative_errors
-from sdfsim.studies.tradeoff_estimate import estimate, landings
+from sdfsim.studies.tradeoff_estimate import estimate, landings, roundness
 
-VERSION = 1
+VERSION = 2
 STEPS = 9  # of which the first is not timed
 BALL, BOX = 0.7, 0.6  # m: radius, side
 GAP = 0.02  # m between neighbours at the start: they are within reach of each other
@@ -202,12 +202,18 @@ def _measured(one: Growing, folder: Path, model: str, device: str) -> dict[str, 
             repeats = [time_simulator(Simulator(scene, model, device), STEPS) for _ in range(3)]
         counts = repeats[0].scenes[0]
         own = counts["nodes"] / max(1.0, counts["bodies"])
+        touching = float(counts["edges"] > 0)
         point |= {
             # The least of three: what others do on the machine only adds.
             "ms": min(r.scenes[0]["ms"] for r in repeats),
             "mib": memory["mib"],
             "all_nodes": counts["nodes"],
-            "load": asdict(Load(counts["bodies"], float(counts["edges"] > 0), own * counts["active"], counts["edges"])),
+            "load": asdict(
+                Load(
+                    counts["bodies"], touching, own * counts["active"], counts["edges"],
+                    roundness(Simulator(scene, model, device)),
+                )
+            ),
         }
     except (SdfsimError, RuntimeError, MemoryError) as error:
         point["failed"] = str(error).splitlines()[0]

@@ -15,10 +15,12 @@ from sdfsim.files import write_json
 from sdfsim.scene.types import Effects
 from sdfsim.studies import tradeoff_growth
 from sdfsim.studies.tradeoff_cost import CostModel, Load, fit_cost, relative_errors, stored_cost
-from sdfsim.studies.tradeoff_estimate import LOOKS, estimate, landings
+from sdfsim.studies.tradeoff_estimate import LOOKS, estimate, landings, roundness
 from sdfsim.studies.tradeoff_growth import BALL, BOX, Growing, build, curves, slopes
 
-PLANTED = CostModel(base=2.0, body=0.01, touching=5.0, node=2e-4, edge=0.03, edges_a_body=10.0)
+PLANTED = CostModel(
+    base=2.0, body=0.01, touching=5.0, node=2e-4, edge=0.03, edges_a_body=10.0, edges_a_round_body=3.0
+)  # fmt: skip
 
 
 def loads(count: int) -> list[Load]:
@@ -26,8 +28,9 @@ def loads(count: int) -> list[Load]:
     found = []
     for _ in range(count):
         bodies = float(rng.integers(1, 500))
-        touching = float(rng.integers(2))
-        found.append(Load(bodies, touching, touching * bodies * float(rng.integers(20, 500)), touching * bodies * 10.0))
+        touching, roundness = (float(rng.integers(2)) for _ in range(2))
+        nodes = touching * bodies * float(rng.integers(20, 500))
+        found.append(Load(bodies, touching, nodes, PLANTED.edges(touching * bodies, roundness), roundness))
     return found
 
 
@@ -89,6 +92,15 @@ def test_a_body_lands_when_it_has_fallen_far_enough(model):
     assert landings(Simulator(falling(500.0), model), steps)[1] == 0.0
     apart = replace(falling(0.0), effects=Effects(contact="off"))
     assert landings(Simulator(apart, model), steps).sum() == 0.0
+
+
+def test_balls_are_round_and_boxes_are_not(model):
+    ball, box = (Simulator(build(Growing(kind, 3)), model) for kind in ("bowl", "pile"))
+    assert roundness(ball) == 1.0 and roundness(box) < 0.5
+    counters = {"edges": np.ones(6), "active": np.ones(6), "step_ms": np.full(6, 4.0)}
+    landed = np.array([0.0, 0.0, 1.0, 1.0, 1.0])
+    assert estimate(PLANTED, ball, counters, landed, 100)["edges"] == pytest.approx(9.0)
+    assert estimate(PLANTED, box, counters, landed, 100)["edges"] > 15.0
 
 
 def test_a_run_is_estimated_by_the_ratio_to_its_first_steps(model):
