@@ -33,7 +33,7 @@ class Recipe:
 
     size: FieldSize | MlpSize = FieldSize()  # noqa: RUF009  frozen
     start_radius: float = 0.25
-    iterations: int = 4200
+    iterations: int = 4000
     rays: int = 512
     samples: int = 32
     long_side: int = 480

@@ -46,7 +46,9 @@ def roundness(simulator: Simulator) -> float:
     """Share of the moving bodies' nodes around which the surface is smooth."""
     bodies = simulator.bodies
     known = simulator.memory.curvature(bodies)
-    of_shape = [part.double().mean() if len(part) else 0.0 for part in known.smooth.tensor_split(known.start[1:-1].cpu())]
+    of_shape = [
+        part.double().mean() if len(part) else 0.0 for part in known.smooth.tensor_split(known.start[1:-1].cpu())
+    ]
     count = (bodies.node_start[1:] - bodies.node_start[:-1])[bodies.moves].double()
     share = torch.tensor(of_shape, dtype=torch.float64, device=bodies.device)[bodies.shape[bodies.moves]]
     return float((share * count).sum() / count.sum().clamp_min(1))

@@ -210,7 +210,10 @@ def _measured(one: Growing, folder: Path, model: str, device: str) -> dict[str, 
             "all_nodes": counts["nodes"],
             "load": asdict(
                 Load(
-                    counts["bodies"], touching, own * counts["active"], counts["edges"],
+                    counts["bodies"],
+                    touching,
+                    own * counts["active"],
+                    counts["edges"],
                     roundness(Simulator(scene, model, device)),
                 )
             ),

@@ -164,7 +164,7 @@ def tiny_simulate() -> None:
 
 
 def tiny_reconstruct() -> None:
-    """Poses that are given, and 12 steps of training with a checkpoint after each."""
+    """Poses that are given, 12 steps of training with a checkpoint after each, and a tiny fit of the ball it began as."""
     from pipeline import distill, recipe, stages
     from pipeline.field import FieldSize
 
@@ -175,6 +175,7 @@ def tiny_reconstruct() -> None:
     # One thread: its sums do not depend on how busy the machine is.
     distill.train.__kwdefaults__ |= {"checkpoint_every": 0.0, "threads": 1}
     stages.ACTIONS["poses"] = _given_poses
+    tiny_fit()
 
 
 def _given_poses(run: Any, work: Path) -> dict:

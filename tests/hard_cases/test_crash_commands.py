@@ -101,7 +101,11 @@ def of_reconstruct(folder: Path) -> dict:
 
     report = json.loads((folder / "report.json").read_text())
     photos = {path.name: path.read_bytes() for path in (folder / "photos" / "images").iterdir()}
-    return bits(load_file(folder / "distill" / "field.safetensors")) | photos | {"stages": list(report["stages"])}
+    made = {name: (folder / name).read_bytes() for name in ("scene.yaml", "mesh/mesh.ply")}
+    shape = of_fit(folder / "assets" / "scene")
+    return bits(load_file(folder / "distill" / "field.safetensors")) | photos | made | shape | {
+        "stages": list(report["stages"])
+    }  # fmt: skip
 
 
 def falling(seed: int) -> Trajectory:
@@ -149,10 +153,10 @@ def works(tmp_path_factory) -> dict[str, Work]:
     for k in range(4):
         pixels = np.random.default_rng(k).integers(0, 255, (80, 80, 3), dtype=np.uint8)
         Image.fromarray(pixels).save(home / "photos" / f"{k}.png")
-    reconstruct = ("reconstruct", str(home / "photos"), "--preset", "quick", "--until", "distill")
+    reconstruct = ("reconstruct", str(home / "photos"), "--preset", "quick")
     simulate = ("simulate", str(home / "scene.yaml"), "--viewer", "none")
     return {
-        "reconstruct": Work(reconstruct, (), crashing.tiny_reconstruct, of_reconstruct),
+        "reconstruct": Work(reconstruct, (), crashing.tiny_reconstruct, of_reconstruct, 3),
         "fit": Work(("fit", str(home / "box.ply")), (), crashing.tiny_fit, of_fit, 3),
         "simulate": Work(simulate, ("--resume",), crashing.tiny_simulate, of_simulate),
         "train": Work(("train", "--data", str(home / "data")), ("--resume",), crashing.tiny_train, of_train),

@@ -38,7 +38,9 @@ def test_a_linear_function_of_x_y_z_is_itself():
     z, y, x = torch.meshgrid(line, line, line, indexing="ij")
     points = torch.rand(100, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 2 - 1
     found = interpolate((x + 10 * y + 100 * z)[..., None], points)[:, 0]
-    torch.testing.assert_close(found, points @ torch.tensor([1.0, 10.0, 100.0], dtype=torch.float64), rtol=0, atol=1e-12)
+    torch.testing.assert_close(
+        found, points @ torch.tensor([1.0, 10.0, 100.0], dtype=torch.float64), rtol=0, atol=1e-12
+    )
 
 
 def test_nothing_asked_is_nothing_found():
