@@ -164,7 +164,7 @@ def tiny_simulate() -> None:
 
 
 def tiny_reconstruct() -> None:
-    """Poses that are given, 12 steps of training with a checkpoint after each, and a tiny fit of the ball it began as."""
+    """Poses that are given, 12 steps of training, a checkpoint after each, and a tiny fit of the ball it began as."""
     from pipeline import distill, recipe, stages
     from pipeline.field import FieldSize
 
