@@ -74,9 +74,10 @@ def _locate(text: str, views: list[View], photos: list[Photo], surface: Caster) 
     away = surface.hits(view.center, rays)[0]
     if not np.isfinite(away).any():
         raise SdfsimError(f"distance: {text} shows nothing of the surface", "choose a pixel on what was reconstructed")
-    # People point at corners, and just beside one is what lies far behind it: the first pixel that shows none of that.
+    # People point at corners, which come out a little rounded, and just beside one is what lies far behind it: as far
+    # away as the first pixel that shows none of that, but where they pointed.
     best = int((away < BEHIND * away.min()).argmax())
-    return view.center + away[best] * rays[best]
+    return view.center + away[best] * rays[0]
 
 
 def _called(name: str, views: list[View]) -> View:

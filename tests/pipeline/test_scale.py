@@ -65,6 +65,14 @@ def test_a_pixel_just_beside_a_corner_means_the_corner(views, photos):
     assert measured(known, views, photos, surface).metres == pytest.approx(METRES, rel=0.03)
 
 
+def test_corners_that_came_out_rounded_are_where_they_were_pointed_at(views, photos):
+    wall = cube(30.0, (0.0, 0, -15.6))
+    surface = Caster(joined([cube(0.98), wall]))  # corners by a hundredth too far inside
+    corners = np.array([[0.5, -0.5, 0.5], [-0.5, 0.5, 0.5]])
+    known = Known(*(place(views[1], corner) for corner in corners), np.sqrt(2) * METRES)
+    assert measured(known, views, photos, surface).metres == pytest.approx(METRES, rel=0.005)
+
+
 def test_a_photo_without_a_pixel_is_its_camera(views, photos):
     apart = float(np.linalg.norm(views[0].center - views[2].center))
     scale = measured(Known("photo0.jpg", "photo2.jpg", METRES * apart), views, photos, Caster(cube(1.0)))
