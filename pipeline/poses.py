@@ -56,6 +56,11 @@ def _about_focal(verdicts: list[dict]) -> bool:
     return any("EXIF" in failure for failure in verdicts[0]["failures"])
 
 
+def _moved(verdicts: list[dict]) -> bool:
+    """Photos that a turn on the spot explains all alike tell nothing of depth, however many features they have."""
+    return verdicts[-1]["turn_only_pairs"] <= 0.9
+
+
 def _hopeful(verdicts: list[dict]) -> bool:
     """More of the same cannot mend photos from one spot, or of nothing."""
     last = verdicts[-1]
@@ -67,7 +72,7 @@ LADDER = (
     Rung("without what stands still in the picture", {**ORDINARY, "moving_only": True},
          lambda verdicts: verdicts[0]["still_pairs"] > 0.5),
     Rung("focal length of EXIF held", {**ORDINARY, "hold_focal": True}, _about_focal, "ordinary"),
-    Rung("more pixels and features, looser thresholds", MORE, lambda verdicts: True),
+    Rung("more pixels and features, looser thresholds", MORE, _moved),
     Rung("global mapping", {**MORE, "mapper": "global"}, _hopeful, "more pixels and features, looser thresholds"),
     Rung("affine features", {**MORE, "max_features": 6000, "affine": True},
          lambda verdicts: _hopeful(verdicts) and "repeats" not in " ".join(verdicts[-1]["failures"])),
@@ -138,6 +143,8 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
             # What the rungs before found out says more than that this one broke.
             told.append({"name": rung.name, "posed": 0, "failures": [error.message]})
             continue
+        if tries:  # Looser thresholds take unlike places for alike, and so hide what the strict ones have told.
+            result["turn_only"] = max(result["turn_only"], tries[0][2]["turn_only"])
         verdict = judge(result, photos)
         tries.append((verdict, folder, result))
         told.append({"name": rung.name, "posed": verdict["posed"], "failures": verdict["failures"],
