@@ -45,8 +45,12 @@ class Findings:
     rotation_only: float = 0.0
 
 
-def find(result: dict) -> Findings:
-    """Looks at a worker's counts and pairs."""
+def find(result: dict, photos: list[Photo]) -> Findings:
+    """Looks at a worker's counts and pairs.
+
+    Blurred photos match each other, for want of anything finer; a group of nothing else is no group.
+    """
+    sound = {photo.name for photo in photos if not photo.fault}
     counts, pairs = result["counts"], result.get("pairs", [])
     group = {name: name for name in counts}
 
@@ -62,10 +66,12 @@ def find(result: dict) -> Findings:
     members: dict[str, list[str]] = {}
     for name in sorted(counts):
         members.setdefault(root(name), []).append(name)
+    groups = [names for names in members.values() if sound.intersection(names)]
+    groups += [[name] for names in members.values() for name in names if not sound.intersection(names)]
     linked = [pair for pair in pairs if pair["matches"] >= FEW_MATCHES]
     share = 1 / max(1, len(linked))
     return Findings(
-        sorted(members.values(), key=lambda names: (-len(names), names[0])),
+        sorted(groups, key=lambda names: (-len(names), names[0])),
         sum(entry["features"] < FEW_FEATURES for entry in counts.values()) / max(1, len(counts)),
         share * sum(pair["still"] > STILL for pair in linked),
         result.get("turn_only", 0.0),
@@ -97,7 +103,7 @@ def judge(result: dict, photos: list[Photo]) -> dict:
     """
     views = views_of(result, photos)
     posed = {view.name for view in views}
-    found = find(result)
+    found = find(result, photos)
     needed = needed_photos(len(photos), found)
     left_out = [{"photo": p.source, "why": left_out_reason(p, result, found)} for p in photos if p.name not in posed]
     failures, warnings = [], []

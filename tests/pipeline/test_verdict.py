@@ -120,6 +120,12 @@ def test_blurred_photos_are_left_out_as_such():
     assert all(entry["why"].startswith("blurred") for entry in verdict["left_out"])
 
 
+def test_blurred_photos_that_match_each_other_are_no_set_of_their_own():
+    verdict = judge(two_things(), [photo(k, fault="blurred" if k > 10 else "") for k in range(18)])
+    assert all(entry["why"].startswith("blurred") for entry in verdict["left_out"]) and len(verdict["left_out"]) == 7
+    assert verdict["causes"] == [] and verdict["components"] == [11] + 7 * [1]
+
+
 def test_cameras_on_one_side_are_no_closed_object():
     verdict = judge(result(10, 10, span=90.0), PHOTOS)
     assert verdict["failures"] == [] and "from one side (81 degrees" in verdict["warnings"][0]
@@ -138,4 +144,4 @@ def test_cameras_too_close_together_fail():
 def test_components_need_more_than_a_few_matches():
     found = result(6, 0, matches=200)
     found["pairs"][2]["matches"] = 20
-    assert [len(group) for group in find(found).components] == [3, 3]
+    assert [len(group) for group in find(found, PHOTOS[:6]).components] == [3, 3]
