@@ -57,14 +57,14 @@ def _about_focal(verdicts: list[dict]) -> bool:
 
 
 def _moved(verdicts: list[dict]) -> bool:
-    """Photos that a turn on the spot explains all alike tell nothing of depth, however many features they have."""
-    return verdicts[-1]["turn_only_pairs"] <= 0.9
+    """Photos that a turn on the spot explains, or of a background that stands still, tell no more with more matches."""
+    return verdicts[0]["turn_only_pairs"] <= 0.9 and verdicts[0]["still_pairs"] <= 0.5
 
 
 def _hopeful(verdicts: list[dict]) -> bool:
     """More of the same cannot mend photos from one spot, or of nothing."""
     last = verdicts[-1]
-    return last["turn_only_pairs"] <= 0.5 and last["components"][0] >= last["needed"]
+    return _moved(verdicts) and last["turn_only_pairs"] <= 0.5 and last["components"][0] >= last["needed"]
 
 
 LADDER = (
@@ -143,9 +143,7 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
             # What the rungs before found out says more than that this one broke.
             told.append({"name": rung.name, "posed": 0, "failures": [error.message]})
             continue
-        if tries:  # Looser thresholds take unlike places for alike, and so hide what the strict ones have told.
-            result["turn_only"] = max(result["turn_only"], tries[0][2]["turn_only"])
-        verdict = judge(result, photos)
+        verdict = judge(result, photos, tries[0][2] if tries else None)
         tries.append((verdict, folder, result))
         told.append({"name": rung.name, "posed": verdict["posed"], "failures": verdict["failures"],
                      "seconds": round(time.monotonic() - started, 1)})  # fmt: skip

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -88,7 +88,7 @@ def views_of(result: dict, photos: list[Photo]) -> list[View]:
     ]  # fmt: skip
 
 
-def judge(result: dict, photos: list[Photo]) -> dict:
+def judge(result: dict, photos: list[Photo], ordinary: dict | None = None) -> dict:
     """Decides whether a reconstruction can be trusted.
 
     "All registered" is not "right": repeating textures give complete but wrong reconstructions, which show in the
@@ -97,6 +97,8 @@ def judge(result: dict, photos: list[Photo]) -> dict:
     Args:
         result: of the worker.
         photos: all photos.
+        ordinary: of the worker at ordinary thresholds, if `result` is not. Its matches tell best how the camera moved:
+            looser thresholds take unlike places for alike, and others leave out what stands still.
 
     Returns:
         A dict for the report; `failures` is empty when the poses may be used, `warnings` are for the reader.
@@ -104,6 +106,11 @@ def judge(result: dict, photos: list[Photo]) -> dict:
     views = views_of(result, photos)
     posed = {view.name for view in views}
     found = find(result, photos)
+    if ordinary is not None:
+        first = find(ordinary, photos)
+        found = replace(
+            found, still=max(found.still, first.still), rotation_only=max(found.rotation_only, first.rotation_only)
+        )
     needed = needed_photos(len(photos), found)
     left_out = [{"photo": p.source, "why": left_out_reason(p, result, found)} for p in photos if p.name not in posed]
     failures, warnings = [], []

@@ -115,6 +115,16 @@ def test_what_is_wrong_with_the_photos(found, words):
     assert words in verdict["causes"][0] and words in failure_message(verdict)
 
 
+@pytest.mark.parametrize(
+    ("first", "words"),
+    [({**result(10, 0), "turn_only": 0.8}, "from one spot"), (result(10, 0, still=0.9), "turntable")],
+)
+def test_how_the_camera_moved_is_told_by_the_ordinary_matches(first, words):
+    verdict = judge(result(10, 3), PHOTOS, first)
+    assert words in verdict["causes"][0]
+    assert words not in judge(result(10, 3), PHOTOS)["causes"][0]
+
+
 def test_blurred_photos_are_left_out_as_such():
     verdict = judge(result(10, 6), [photo(k, fault="blurred" if k > 5 else "") for k in range(10)])
     assert all(entry["why"].startswith("blurred") for entry in verdict["left_out"])
