@@ -115,7 +115,8 @@ def copy_project(place: Path) -> None:
 def failing(place: Path, tests: str) -> list[str]:
     """The tests that fail in a copy, at most three; a program that dies is told as such."""
     environment = {**os.environ, "PYTHONPATH": str(place), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "pytest", "--maxfail=3", "-m", "not slow and not gpu", "--tb=no", "-rf", *tests.split()]
+    options = ["--maxfail=3", "-m", "not slow and not gpu", "--tb=no", "-rf"]
+    command = [sys.executable, "-m", "pytest", *options, *tests.split()]
     ended = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True)
     red = [line.split()[1] for line in ended.stdout.splitlines() if line.startswith("FAILED tests/")]
     if ended.returncode < 0:
