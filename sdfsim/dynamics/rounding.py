@@ -151,15 +151,13 @@ def _search(bodies: Bodies, state: State, contacts: Contacts, arc: _Arcs) -> tup
 
 
 def _distinct(bodies: Bodies, contacts: Contacts, pair: Tensor, smooth: Tensor, rows: Tensor) -> Tensor:
-    """Which edges remain: all that are not `smooth` [E], and of those that were moved, `rows` [K], the deepest at each
-    place. Of a pair that would have none, the deepest."""
+    """Which edges remain: all that are not `smooth` [E], of those that were moved, `rows` [K], the deepest at each
+    place, and the deepest of each pair, whatever it is."""
     cell = (contacts.point[rows] / (SAME * bodies.radius[contacts.owner[rows], None])).round().long()
     here = torch.unique(torch.cat([pair[rows, None], cell], 1), dim=0, return_inverse=True)[1]
     kept = ~smooth
     kept[rows[_deepest(here, contacts.ahead[rows])]] = True
-    some = torch.zeros(int(pair.max()) + 1, dtype=torch.bool, device=pair.device).index_fill_(0, pair[kept], True)
-    last = _deepest(pair, contacts.ahead)
-    kept[last] |= ~some[pair[last]]
+    kept[_deepest(pair, contacts.ahead)] = True
     return kept.nonzero()[:, 0]
 
 
