@@ -168,12 +168,13 @@ def test_two_runs_never_write_one_folder(tmp_path):
     out = tmp_path / "out"
     with locked(out):
         (out / "report.json").write_text("{}")
+        (out / "config.yaml").write_text("command: simulate\n")
         for command in commands(tmp_path, out):
             done = run(*command)
             assert done.exit_code == 1, command
             assert f"{out}: another run is writing to this folder" in done.stderr and "wait until" in done.stderr
-        assert sorted(p.name for p in out.iterdir()) == [LOCK, "report.json"]
-    assert [p.name for p in out.iterdir()] == ["report.json"]
+        assert sorted(p.name for p in out.iterdir()) == [LOCK, "config.yaml", "report.json"]
+    assert sorted(p.name for p in out.iterdir()) == ["config.yaml", "report.json"]
 
 
 def test_what_a_killed_run_left_is_no_lock_and_is_cleared_away(tmp_path):

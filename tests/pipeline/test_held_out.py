@@ -135,7 +135,7 @@ def trainer(iteration: int, iterations: int) -> SimpleNamespace:
         (500, 1000, 80.0, 900),  # slower: 625 would fit, but schedules must not jump
         (500, 1000, 30.0, 1100),  # faster
         (500, 1000, 101.0, 500),  # over: ends at once
-        (3500, 3590, 10.0, PRESETS["quick"].iterations),  # never more than the recipe's
+        (3900, 3990, 10.0, PRESETS["quick"].iterations),  # never more than the recipe's
     ],
 )
 def test_steps_follow_the_clock(iteration, iterations, elapsed, expected):

@@ -8,18 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.cameras import Sparse, load_sparse, load_views
-from pipeline.distill import load_field, save_field, train
+from pipeline.cameras import Sparse
+from pipeline.distill import load_field, save_field
 from pipeline.landmarks import find_landmarks
 from pipeline.mlp_field import MlpField, MlpSize, encoded
 from pipeline.mlp_trainer import MlpTrainer, trainer_for
 from pipeline.normalise import Normalisation
-from pipeline.photos import prepare_photos
-from pipeline.poses import solve
 from pipeline.recipe import PRESETS
 from pipeline.render import sdf_cache
 from pipeline.trainer import Trainer
-from tests.pipeline import photo_sets
 from tests.pipeline.test_field import one_thread, toy_rays  # noqa: F401  a fixture
 
 TINY = MlpSize(depth=4, width=32, frequencies=3, color_depth=2, view_frequencies=2, background=8)
@@ -132,22 +129,3 @@ def test_the_papers_preset_learns_on_the_cpu():
     """The full 8 x 256 network, some hundred steps of few rays."""
     run = trainer(size=MlpSize(), rays=32, samples=24, iterations=300, surface_points=64, rate=PAPER.rate)
     assert falls(run, 300, "color", 20) < 0.3
-
-
-@pytest.mark.slow
-def test_the_papers_network_at_its_full_size_learns_a_scene(tmp_path):
-    """300 steps of the preset, with fewer rays: colours come near, most rays converge, and distances stay distances."""
-    photo_sets.good(tmp_path / "in", 12)
-    photos, _ = prepare_photos(tmp_path / "in" / "transforms.json", tmp_path)
-    solve(photos, tmp_path, tmp_path)
-    recipe = replace(PAPER, iterations=300, rays=128, surface_points=256, long_side=160)
-    (tmp_path / "out").mkdir()
-    errors: list[float] = []
-    trained = train(
-        load_views(tmp_path), load_sparse(tmp_path), tmp_path, tmp_path / "out", recipe=recipe,
-        on_progress=lambda _, text: errors.append(float(text.split()[-1])) if text.startswith("step") else None,
-    )  # fmt: skip
-    print(errors[0], errors[-1], trained.report["losses"], trained.beta, trained.report.get("psnr"))
-    assert len(errors) == 30 and errors[-1] < 0.5 * errors[0]
-    assert trained.report["losses"]["eikonal"] < 0.1 * recipe.eikonal
-    assert 0 < trained.beta < 0.1
