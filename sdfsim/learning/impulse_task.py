@@ -169,19 +169,27 @@ class ImpulseTask:
         counts = torch.zeros_like(moves)
         counts[index.flatten()] = True
         batch = Batch(graph, truth, body(f.size, 1.0), counts & moves)
-        return batch if noise is None else _disturbed(batch, noise)
+        return batch if noise is None else disturbed(batch, noise)
 
     def loss(self, network: ImpulseNetwork, batch: Batch, *, mirrored: bool = False) -> Tensor:
         """Mean pseudo-Huber error of end and mean velocities, angular ones times half the body's size."""
-        predicted = network(batch.graph, mirrored=mirrored)
+        return self.error(network(batch.graph, mirrored=mirrored), batch)
+
+    def error(self, predicted: Velocities, batch: Batch) -> Tensor:
+        """The same of what a network has said."""
         lever = 0.5 * batch.size[:, None]
         terms = [
-            _huber(predicted.velocity - batch.truth.velocity),
-            _huber(predicted.mean_velocity - batch.truth.mean_velocity),
-            _huber((predicted.angular - batch.truth.angular) * lever),
-            _huber((predicted.mean_angular - batch.truth.mean_angular) * lever),
+            self.size_of(predicted.velocity - batch.truth.velocity),
+            self.size_of(predicted.mean_velocity - batch.truth.mean_velocity),
+            self.size_of((predicted.angular - batch.truth.angular) * lever),
+            self.size_of((predicted.mean_angular - batch.truth.mean_angular) * lever),
         ]
-        return torch.stack(terms).mean(0)[batch.counts].sum() / max(1, self.weight_of(batch))
+        return torch.stack(terms).mean(0)[batch.counts].sum() / max(1, int(batch.counts.sum()))
+
+    @staticmethod
+    def size_of(error: Tensor) -> Tensor:
+        """[N] pseudo-Huber size of errors [N, 3] m/s."""
+        return (error.square().sum(-1) + HUBER**2).sqrt() - HUBER
 
     def weight_of(self, batch: Batch) -> int:
         """Over how many bodies a batch's loss is the mean."""
@@ -205,7 +213,7 @@ class ImpulseTask:
         return Disturbance(normal(shift), normal(shift), normal(speed), normal(speed))
 
 
-def _disturbed(batch: Batch, noise: Disturbance) -> Batch:
+def disturbed(batch: Batch, noise: Disturbance) -> Batch:
     """Shift, turn and push bodies a little; mean velocities still lead to the recorded pose."""
     g = batch.graph
     moves, lever = (g.inverse_mass > 0)[:, None], 2.0 / batch.size[:, None]
@@ -240,11 +248,6 @@ def _mass_ratio(f: ContactFrames) -> float:
     heaviest = np.maximum.reduceat(f.mass, f.body_start[:-1])
     lightest = np.minimum.reduceat(np.where(f.mass > 0, f.mass, np.inf), f.body_start[:-1])
     return float((heaviest / lightest)[heaviest > 0].max())
-
-
-def _huber(error: Tensor) -> Tensor:
-    """[N] smooth error of [N, 3] vectors."""
-    return (error.square().sum(-1) + HUBER**2).sqrt() - HUBER
 
 
 def _product(coefficient: Tensor, index: Tensor) -> Tensor:

@@ -63,6 +63,15 @@ def test_intermediate_axis_flips_and_conserves():
     torch.testing.assert_close(energy_after, energy, rtol=1e-6, atol=0)
 
 
+def test_a_rotation_in_single_precision_is_one_in_double_after_a_step():
+    """A quaternion that is long by rounding would stay so: products of quaternions keep the product of lengths."""
+    q, w = spin_state([0.3, -1.2, 0.4])
+    long = q * (1.0 + 1e-7)
+    after, _ = torque_free(long, w, TOP, 0.02)
+    assert abs(float(after.norm()) - 1.0) < 1e-15
+    assert float(pose.angle_between(after, torque_free(q, w, TOP, 0.02)[0])) < 1e-7
+
+
 def test_a_scene_without_contacts_never_calls_the_network(dropped):
     model = random_model("impulse")
     model.network.forward = lambda *a, **k: (_ for _ in ()).throw(AssertionError("network called"))

@@ -14,6 +14,8 @@ from typer.testing import CliRunner
 import cli
 from sdfsim import Rollout, SdfsimError
 from sdfsim.dynamics import check
+from sdfsim.dynamics.bodies import Units
+from sdfsim.dynamics.freeflight import MOST_TURN
 from sdfsim.dynamics.impulse import ImpulseNetwork, Velocities
 from sdfsim.dynamics.simulator import SimulationError, Simulator
 from sdfsim.dynamics.step import Rules
@@ -86,6 +88,25 @@ def test_rounding_is_no_fault_and_the_threshold_is_that_of_the_matrix():
     assert (turn.mT @ turn - torch.eye(3, dtype=torch.float64)).abs().max() <= 1e-5
     sim.state = replace(sim.state, orientation=sim.state.orientation.float().double())
     sim.run(steps=2)
+
+
+@pytest.mark.parametrize(
+    ("name", "most", "told"),
+    [
+        ("position", check.FARTHEST, "too far to be placed exactly"),
+        ("velocity", check.FASTEST, "too fast for any contact"),
+        ("angular_velocity", MOST_TURN / 0.02, "too fast to be followed"),
+    ],
+)
+def test_limits_lie_where_they_are_said_to(name, most, told):
+    sim = Simulator(gates.mixed(), random_model("impulse", push=0.1))
+    units, rows = Units(length=1.0, time=1.0, mass=1.0), torch.arange(len(sim.bodies))
+    for share, message in ((0.999, None), (1.001, told)):
+        state = sim.state
+        values = torch.zeros_like(getattr(state, name))
+        values[1] = share * most * torch.tensor([0.6, 0.0, -0.8], dtype=values.dtype)
+        found = check.fault(replace(state, **{name: values}), rows, 0.02, units)
+        assert found is None if message is None else found is not None and found[0] == 1 and message in found[1]
 
 
 def breaking(network, at_call: int, spoiled):

@@ -6,7 +6,7 @@ import pytest
 
 pytest.importorskip("pybullet")
 
-from sdfsim.dynamics.model import load_model
+from sdfsim.dynamics.model import Model, load_model, new_network
 from sdfsim.errors import SdfsimError
 from sdfsim.learning.bundle import _commands, _folders, bundle
 from sdfsim.learning.generate import make_dataset
@@ -40,6 +40,20 @@ def test_a_trained_model_is_bundled_with_its_errors(cube_data, trained, tmp_path
     assert rows["other training seeds (2): low - high"][3].strip() == f"{min(others):.1f} - {max(others):.1f}"
     assert "m, 50 steps = 1 s" in card and "penetration 95 %" in card and "| 20 | 16 |" in card
     assert "--preset tiny" in card and "--trajectories 3 --seed 1 --split test" in card
+
+
+def test_other_models_are_told_beside_it_with_what_they_cost(cube_data, trained, tmp_path):
+    other = tmp_path / "other.safetensors"
+    paper = Model("p", "paper", new_network("paper", {"width": 8, "steps": 1}), 0.02, 10.0, 1.0, 0.1, nodes=8)
+    cost = {"preset": {"config": {"width": 8, "steps": 1}}, "optimiser_steps": 900, "seconds": 1800.0, "device": "cpu"}
+    replace(paper, card=cost).save(other)
+    report = bundle(trained[0], cube_data, "mine", tmp_path / "models", beside=[other])
+    told = "the *paper* network (1 x 8), 900 steps in 0.50 h on cpu"
+    assert list(report["beside"]) == [told, f"{told}, free flight learned too (as published)"]
+    card = (tmp_path / "models" / "mine.md").read_text()
+    for what, errors in report["beside"].items():
+        assert f"| {what} | {errors['50']['translation_rmse']:.3f} (" in card
+    assert "--name mine --beside MODELS\n" in card
 
 
 def test_other_seeds_must_be_of_the_same_preset_and_not_the_same_model(cube_data, presets, trained, tmp_path):
