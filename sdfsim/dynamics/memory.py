@@ -36,7 +36,7 @@ PHASES = {
     "network_ms": "network",
     "sleep_ms": "sleep",
 }
-PIECE = 2**18  # nodes looked at together at most: more at once is slower, and takes memory
+PIECE = 2**20  # nodes that are gone through together at most; in smaller parts a large scene takes twice the time
 _SLACK = 1e-9  # model lengths, for the rounding of distances
 BYTES_A_ROW = 4096  # what an edge of the network takes; a node near a surface takes no more while it is worked on
 # What a run takes beside its scene, as measured on scenes of docs/scale.md: torch's own at the first step, the working
@@ -61,7 +61,7 @@ def peak_bytes(*, bodies: int, nodes: int, edges: float, points: float, fitted: 
         fitted: whether some of the distances are networks.
         rows: see `row_limit`.
     """
-    at_once = min(points, PIECE, rows or PIECE)
+    at_once = min(points, PIECE // 4, rows or PIECE)  # of a piece seldom more than a quarter comes near
     standing = BYTES_AT_LEAST + BYTES_FITTED * fitted + BYTES_A_BODY * bodies + BYTES_A_NODE * nodes
     return standing + BYTES_A_ROW * edges + BYTES_A_POINT * at_once
 
