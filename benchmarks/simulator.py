@@ -19,17 +19,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from sdfsim.dynamics.impulse import Velocities
 from sdfsim.learning.dataset import read_info, trajectory_files
 from sdfsim.learning.evaluate import evaluate
-from sdfsim.learning.frames import ContactFrames, contact_frames
-from sdfsim.learning.impulse_task import Batch, Disturbance, ImpulseTask, Noise, disturbed
+from sdfsim.learning.frames import contact_frames
+from sdfsim.learning.impulse_task import ImpulseTask, Noise
 from sdfsim.learning.presets import PRESETS, Preset
-from sdfsim.learning.team import ALONE, Team
 from sdfsim.learning.training_run import Run, held_out_loss
 from sdfsim.shape.asset import Shape, load_shape
 from sdfsim.shape.fit import fit_mesh
@@ -46,62 +43,6 @@ class Squared(ImpulseTask):
     @staticmethod
     def size_of(error: Tensor) -> Tensor:
         return error.square().sum(-1)
-
-
-class Unrolled(ImpulseTask):
-    """Steps in a row: each starts where the network left the bodies, and its error leads back through those before."""
-
-    steps = 2
-
-    def __init__(self, frames: ContactFrames, device: torch.device, noise: Noise | None) -> None:
-        super().__init__(frames, device, noise)
-        follows = np.append(followed(frames), False)
-        for step in range(1, self.steps):
-            self.weight[~follows[np.minimum(np.arange(len(frames)) + step - 1, len(frames))]] = 0.0
-        self.weight /= self.weight.sum()
-
-    def draw(self, rng: np.random.Generator, count: int, team: Team = ALONE) -> list[Batch]:
-        picked = np.sort(rng.choice(len(self.frames), size=count, p=self.weight))
-        later = [self.batch(picked + step) for step in range(1, self.steps)]
-        return [self.batch(picked, self._noise(picked, rng, team)), *later]
-
-    def loss(self, network, batch: list[Batch], *, mirrored: bool = False) -> Tensor:
-        errors, left = [], None
-        for one in batch:
-            one = one if left is None else disturbed(one, left)
-            predicted = network(one.graph, mirrored=mirrored)
-            errors.append(self.error(predicted, one))
-            left = left_over(predicted, one)
-        return torch.stack(errors).mean()
-
-    def weight_of(self, batch: list[Batch]) -> int:
-        return sum(super(Unrolled, self).weight_of(one) for one in batch)
-
-
-class Unrolled4(Unrolled):
-    """Four steps in a row."""
-
-    steps = 4
-
-
-def followed(frames: ContactFrames) -> np.ndarray:
-    """[F - 1] bool: the next frame is the next step of the same bodies, which start as this one recorded their end."""
-    start, same = frames.body_start, []
-    for one, two, end in zip(start[:-2], start[1:-1], start[2:], strict=True):
-        alike = two - one == end - two and np.array_equal(frames.mass[one:two], frames.mass[two:end])
-        same.append(alike and np.array_equal(frames.end_velocity[one:two], frames.velocity[two:end]))
-    return np.array(same)
-
-
-def left_over(predicted: Velocities, batch: Batch) -> Disturbance:
-    """By how much a step's end lies beside what was recorded; nothing where bodies fly."""
-    there, lever, dt = batch.counts[:, None], 0.5 * batch.size[:, None], batch.graph.dt
-    return Disturbance(
-        shift=(predicted.mean_velocity - batch.truth.mean_velocity) * dt * there,
-        turn=(predicted.mean_angular - batch.truth.mean_angular) * dt * lever * there,
-        push=(predicted.velocity - batch.truth.velocity) * there,
-        spin=(predicted.angular - batch.truth.angular) * lever * there,
-    )
 
 
 @dataclass(frozen=True)
@@ -135,8 +76,8 @@ VARIANTS = [
     Variant("noise of 0.3 mm and 3 mm/s in every frame", noise=Noise(0.0003, 0.003, 1.0)),
     Variant("noise of 1.5 mm and 15 mm/s in every frame", noise=Noise(0.0015, 0.015, 1.0)),
     Variant("squared error", task=Squared),
-    Variant("unrolled over 2 steps", task=Unrolled),
-    Variant("unrolled over 4 steps", task=Unrolled4),
+    Variant("unrolled over 2 steps", replace(SMALL, in_row=2, late=1.0)),
+    Variant("unrolled over 4 steps", replace(SMALL, in_row=4, late=1.0)),
     Variant("32 wide, 6 rounds", sized(32, 6)),
     Variant("64 wide, 3 rounds", sized(64, 3)),
     Variant("96 wide, 6 rounds", sized(96, 6)),

@@ -49,7 +49,7 @@ class Recipe:
 
 PRESETS = {
     "quick": Recipe(),
-    "standard": Recipe(iterations=8000, rays=768, samples=40, long_side=800, beta=(0.1, 0.0025)),
+    "standard": Recipe(iterations=7500, rays=768, samples=40, long_side=800, beta=(0.1, 0.0025)),
     "fine": Recipe(
         size=FieldSize((16, 32, 64, 128, 224), (4, 4, 4, 4, 2), 64, 96),
         iterations=20000, rays=1024, samples=48, long_side=1280, beta=(0.1, 0.0015),

@@ -115,7 +115,7 @@ class ImpulseTask:
     def draw(self, rng: np.random.Generator, count: int, team: Team = ALONE) -> Batch:
         """A batch of `count` frames, or the part of it that falls to one of a team."""
         picked = np.sort(rng.choice(len(self.frames), size=count, p=self.weight))
-        return self.batch(picked[team.share(count)], self._noise(picked, rng, team))
+        return self.batch(picked[team.share(count)], self.noise_for(picked, rng, team))
 
     def batch(self, picked: np.ndarray, noise: Disturbance | None = None) -> Batch:
         """The frames `picked` [K] as one graph whose last body is the floor; disturbed when `noise` is given."""
@@ -195,7 +195,7 @@ class ImpulseTask:
         """Over how many bodies a batch's loss is the mean."""
         return int(batch.counts.sum())
 
-    def _noise(self, picked: np.ndarray, rng: np.random.Generator, team: Team) -> Disturbance | None:
+    def noise_for(self, picked: np.ndarray, rng: np.random.Generator, team: Team) -> Disturbance | None:
         """Noise of the whole batch, so that it does not depend on the team's size; then this one's part of it."""
         if self.noise is None:
             return None

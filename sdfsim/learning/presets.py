@@ -17,6 +17,8 @@ class Preset:
         rate: peak learning rate of Adam; it falls to a hundredth along a cosine.
         matrix_rate: the same of Muon, which then trains the hidden matrices; None leaves all to Adam, as published.
         reach: m, contact radius D.
+        in_row: steps trained in a row over the last `late` part of the training (impulse), see `unrolled`; 1 for none.
+        late: part of the steps of the optimiser.
         noise: standard deviation of pose noise (*paper*: m, as published), or None for the network's default.
     """
 
@@ -28,6 +30,8 @@ class Preset:
     reach: float = 0.1
     noise: float | None = None
     matrix_rate: float | None = None
+    in_row: int = 1
+    late: float = 0.0
 
 
 PRESETS = {

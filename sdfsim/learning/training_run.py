@@ -17,6 +17,7 @@ from sdfsim.files import read_arrays, write_arrays
 from sdfsim.learning.optimiser import Optimiser
 from sdfsim.learning.presets import Preset
 from sdfsim.learning.team import ALONE, Team
+from sdfsim.learning.unrolled import Unrolled
 
 EMA_DECAY = 0.999
 CLIP = 1.0
@@ -57,6 +58,7 @@ class Run:
 
         torch.manual_seed(seed)
         self.plan, self.task, self.total, self.seed, self.device, self.team = plan, task, total, seed, device, team
+        self.late = Unrolled(task, plan.in_row) if plan.in_row > 1 else task
         self.digest = task.digest()
         self.network: nn.Module = new_network(plan.kind, plan.config).to(device)
         if hasattr(task, "prepare"):
@@ -71,9 +73,10 @@ class Run:
         """One optimiser step on a batch that depends on (seed, step) alone."""
         rng = np.random.default_rng([self.seed, 0, self.step])
         flipped = rng.integers(2)
-        batch = self.task.draw(rng, self.plan.batch, self.team)
-        loss = self.task.loss(self.network, batch, mirrored=bool(flipped))
-        weight = self.task.weight_of(batch)
+        task = self.late if self.step >= (1.0 - self.plan.late) * self.total else self.task
+        batch = task.draw(rng, self.plan.batch, self.team)
+        loss = task.loss(self.network, batch, mirrored=bool(flipped))
+        weight = task.weight_of(batch)
         loss = loss * (weight / max(1.0, self.team.total(weight, self.device)))
         self.optimiser.zero_grad()
         loss.backward()

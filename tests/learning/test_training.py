@@ -70,7 +70,7 @@ def test_noise_moves_gaps_by_the_normal_displacement_and_corrects_the_target(bal
     frames = contact_frames(ball_data, "train", 0.1)
     exact, noisy = (ImpulseTask(frames, CPU, n) for n in (None, Noise(shift=1e-3, speed=0.0)))
     picked = np.arange(6)
-    a, b = exact.batch(picked), noisy.batch(picked, noisy._noise(picked, np.random.default_rng(0), ALONE))
+    a, b = exact.batch(picked), noisy.batch(picked, noisy.noise_for(picked, np.random.default_rng(0), ALONE))
     shift = (a.truth.mean_velocity - b.truth.mean_velocity) * a.graph.dt
     turn = (a.truth.mean_angular - b.truth.mean_angular) * a.graph.dt
     moved = shift[a.graph.first] + torch.linalg.cross(turn[a.graph.first], a.graph.arm_first)
@@ -84,7 +84,7 @@ def test_every_frame_is_disturbed_by_a_part_of_the_noise_from_the_least_to_all(b
     frames = contact_frames(ball_data, "train", 0.1)
     noise = Noise(shift=1.0, speed=10.0, least=0.01)
     picked = np.arange(4000) % len(frames)
-    drawn = ImpulseTask(frames, CPU, noise)._noise(picked, np.random.default_rng(0), ALONE)
+    drawn = ImpulseTask(frames, CPU, noise).noise_for(picked, np.random.default_rng(0), ALONE)
     counts = np.diff(frames.body_start)[picked]
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
     draws = np.concatenate([drawn.shift.numpy()[:-1], drawn.push.numpy()[:-1] / 10.0], axis=1)
