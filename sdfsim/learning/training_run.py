@@ -58,7 +58,7 @@ class Run:
 
         torch.manual_seed(seed)
         self.plan, self.task, self.total, self.seed, self.device, self.team = plan, task, total, seed, device, team
-        self.late = Unrolled(task, plan.in_row) if plan.in_row > 1 else task
+        self.late: Any = Unrolled(task, plan.in_row) if plan.in_row > 1 else task
         self.digest = task.digest()
         self.network: nn.Module = new_network(plan.kind, plan.config).to(device)
         if hasattr(task, "prepare"):
