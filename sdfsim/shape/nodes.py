@@ -15,7 +15,7 @@ VOXEL = 0.025
 REACHED = 0.005
 PROJECTIONS = 3
 DEFAULT_GRID = 24
-DEFAULT_COUNT = 128
+DEFAULT_COUNT = 512  # what the bundled model was trained with; docs/tradeoff.md has what fewer cost
 # Faces that meet at less than this cosine (20 degrees) make an edge worth nodes of its own.
 SHARP = 0.94
 
