@@ -59,7 +59,7 @@ def test_a_torus_in_a_few_hundred_steps(monkeypatch: pytest.MonkeyPatch) -> None
     ratio = shape.sdf(far * 0.2 + [5.0, 0.0, -3.0])[0] / 0.2 / truth
     assert 0.85 < ratio.min()
     assert ratio.max() < 1.12
-    assert shape.nodes.shape == (128, 3)
+    assert shape.nodes.shape == (512, 3)
     on = (shape.nodes - [5.0, 0.0, -3.0]) / 0.2
     assert np.abs(np.hypot(np.hypot(on[:, 0], on[:, 1]) - 0.35, on[:, 2]) - 0.15).max() < 3e-3
     assert shape.volume == pytest.approx(mass_properties(mesh)[0] * 0.2**3)

@@ -89,7 +89,7 @@ def test_a_mesh_has_a_shape_without_any_fit(kind, member: type) -> None:
     assert isinstance(shape.sdf, member)
     assert shape.volume == pytest.approx(0.048)
     exact = BoxSdf((0.2, 0.3, 0.1))
-    assert len(shape.nodes) == 128
+    assert len(shape.nodes) == 512
     assert np.abs(exact(shape.nodes)[0]).max() < 0.006
     corners = {tuple(np.round(node, 9)) for node in shape.nodes[:8]}
     assert corners == {tuple(np.round(vertex, 9)) for vertex in crate.vertices}
