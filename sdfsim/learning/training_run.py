@@ -164,7 +164,7 @@ class Run:
             network=self.averaged(),
             dt=self.task.dt,
             gravity=self.task.gravity,
-            length=float(np.mean(ranges["size"])),
+            length=float(np.sqrt(np.prod(ranges["size"]))),
             reach=self.plan.reach,
             nodes=getattr(self.task, "nodes", None),
             ranges=ranges,
