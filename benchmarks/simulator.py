@@ -78,6 +78,7 @@ VARIANTS = [
     Variant("squared error", task=Squared),
     Variant("unrolled over 2 steps", replace(SMALL, in_row=2, late=1.0)),
     Variant("unrolled over 4 steps", replace(SMALL, in_row=4, late=1.0)),
+    Variant("matrix products in bfloat16", replace(SMALL, bf16=True)),
     Variant("32 wide, 6 rounds", sized(32, 6)),
     Variant("64 wide, 3 rounds", sized(64, 3)),
     Variant("96 wide, 6 rounds", sized(96, 6)),

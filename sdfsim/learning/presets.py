@@ -19,6 +19,7 @@ class Preset:
         reach: m, contact radius D.
         in_row: steps trained in a row over the last `late` part of the training (impulse), see `unrolled`; 1 for none.
         late: part of the steps of the optimiser.
+        bf16: matrix products in bfloat16, see `dynamics.precision`.
         noise: standard deviation of pose noise (*paper*: m, as published), or None for the network's default.
     """
 
@@ -32,6 +33,7 @@ class Preset:
     matrix_rate: float | None = None
     in_row: int = 1
     late: float = 0.0
+    bf16: bool = False
 
 
 # Over which part of the training steps follow one another: benchmarks/simulator.py.

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from sdfsim.dynamics.precision import in_bfloat16
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_arrays, write_arrays
 from sdfsim.learning.optimiser import Optimiser
@@ -63,6 +64,7 @@ class Run:
         self.network: nn.Module = new_network(plan.kind, plan.config).to(device)
         if hasattr(task, "prepare"):
             task.prepare(self.network, np.random.default_rng([seed, 1]))
+        self.computing = in_bfloat16(self.network) if plan.bf16 else self.network
         # Averaged are the trained weights; feature statistics are fixed before the first step.
         self.weights = dict(self.network.named_parameters())
         self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
@@ -75,7 +77,7 @@ class Run:
         flipped = rng.integers(2)
         task = self.late if self.step >= (1.0 - self.plan.late) * self.total else self.task
         batch = task.draw(rng, self.plan.batch, self.team)
-        loss = task.loss(self.network, batch, mirrored=bool(flipped))
+        loss = task.loss(self.computing, batch, mirrored=bool(flipped))
         weight = task.weight_of(batch)
         loss = loss * (weight / max(1.0, self.team.total(weight, self.device)))
         self.optimiser.zero_grad()

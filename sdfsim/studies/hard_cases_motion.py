@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
-
-import torch
-from torch import nn
 
 from sdfsim.dynamics.model import Model
+from sdfsim.dynamics.precision import in_bfloat16
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.simulator import SimulationError, Simulator
 from sdfsim.scene.types import Scene
@@ -50,32 +47,5 @@ def _checked(scene: Scene, rollout: Rollout) -> Run:
 def in_variant(model: Model, variant: Variant, device: str) -> tuple[Model, str]:
     """The model as a case wants it, and the device that it runs on."""
     if variant == "bfloat16":
-        return replace(model, network=Reduced(model.network)), device
+        return replace(model, network=in_bfloat16(model.network)), device
     return model, "cuda"
-
-
-class Reduced(nn.Module):
-    """A network whose linear layers are computed in bfloat16, as mixed-precision inference does; the rest is as it was.
-
-    Args:
-        network: stays as it is.
-    """
-
-    def __init__(self, network: nn.Module) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, *args: Any, **kwargs: Any) -> Any:
-        """As the network's own."""
-        hooks = [m.register_forward_hook(_in_bfloat16) for m in self.network.modules() if isinstance(m, nn.Linear)]
-        try:
-            return self.network(*args, **kwargs)
-        finally:
-            for hook in hooks:
-                hook.remove()
-
-
-def _in_bfloat16(layer: nn.Module, inputs: tuple[torch.Tensor, ...], output: torch.Tensor) -> torch.Tensor:
-    assert isinstance(layer, nn.Linear)
-    bias = None if layer.bias is None else layer.bias.bfloat16()
-    return nn.functional.linear(inputs[0].bfloat16(), layer.weight.bfloat16(), bias).to(output.dtype)

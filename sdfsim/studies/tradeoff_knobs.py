@@ -14,6 +14,7 @@ import torch
 from torch import nn
 
 from sdfsim.dynamics.model import Model
+from sdfsim.dynamics.precision import in_bfloat16
 from sdfsim.errors import SdfsimError
 from sdfsim.scene.types import Scene
 from sdfsim.shape.asset import Shape, with_nodes, with_sdf
@@ -118,7 +119,7 @@ def arranged_model(setting: Setting, model: Model) -> Model:
             raise SdfsimError(f"{model.name}: has no {setting.rounds} rounds", "choose another --quality or model")
         network = _shortened(network, setting.rounds)
     if setting.precision == "bf16":
-        network = _in_bf16(network)
+        network = in_bfloat16(network)
     if setting.compiled:
         network = torch.compile(network)
     return replace(model, network=network, reach=model.reach * setting.reach)
@@ -166,27 +167,6 @@ def threads_of(setting: Setting) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-class _Rough(nn.Module):
-    """A linear layer whose product is taken in bfloat16; what goes in and comes out is single precision."""
-
-    def __init__(self, layer: nn.Linear) -> None:
-        super().__init__()
-        self.layer = deepcopy(layer).bfloat16()
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return self.layer(x.bfloat16()).float()
-
-
-def _in_bf16(network: nn.Module) -> nn.Module:
-    """A copy of a network with all its linear layers in bfloat16."""
-    rough = deepcopy(network)
-    for parent in list(rough.modules()):
-        for name, child in list(parent.named_children()):
-            if isinstance(child, nn.Linear):
-                setattr(parent, name, _Rough(child))
-    return rough
 
 
 def _shortened(network: nn.Module, rounds: int) -> nn.Module:

@@ -128,6 +128,14 @@ def test_an_interrupted_run_resumes_to_the_bit(ball_data, presets, tmp_path, mon
     assert all(torch.equal(one[k], other[k]) for k in one)
 
 
+def test_with_products_in_bfloat16_it_learns_nearly_the_same(ball_data, presets, tmp_path):
+    start, exact, rough = (
+        train(ball_data, tmp_path / f"{preset}{steps}", preset=preset, steps=steps)["held_out_loss"]
+        for preset, steps in (("tiny", 1), ("tiny", 150), ("tiny-bf16", 150))
+    )
+    assert exact < 0.8 * start and exact != rough == pytest.approx(exact, rel=0.1)
+
+
 def test_a_checkpoint_of_another_run_is_refused(ball_data, presets, tmp_path):
     train(ball_data, tmp_path, preset="tiny", steps=5)
     with pytest.raises(SdfsimError, match="another preset, seed or number of steps"):
