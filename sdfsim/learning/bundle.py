@@ -122,7 +122,7 @@ def card_text(model: Model, report: dict, *, beside: bool) -> str:
         "## Training",
         "",
         *(
-            f"Data: {d['recipe']} (seed {d['seed']}, {d['shapes']} shapes), made with {d['engine']}{_trajectories(d)}."
+            f"Data: {d['recipe']} (seed {d['seed']}, {_cast(d)}), made with {d['engine']}{_trajectories(d)}."
             for d in card["data"]
         ),
         "Surfaces and nodes are those of the convex pieces that the engine collides.",
@@ -157,6 +157,13 @@ def card_text(model: Model, report: dict, *, beside: bool) -> str:
         *(f"- {line}" for line in tables.notes(report)),
     ]
     return "\n".join(lines) + "\n"
+
+
+def _cast(made: dict) -> str:
+    """How many shapes there are, and if each belongs to one split alone."""
+    recipe = RECIPES.get(made["recipe"])
+    plain = recipe is None or recipe.kubasic or not recipe.given
+    return f"{made['shapes']} shapes{'' if plain else ', each in one split alone'}"
 
 
 def _trajectories(made: dict) -> str:

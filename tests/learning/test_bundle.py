@@ -8,7 +8,7 @@ pytest.importorskip("pybullet")
 
 from sdfsim.dynamics.model import Model, load_model, new_network
 from sdfsim.errors import SdfsimError
-from sdfsim.learning.bundle import _commands, _folders, bundle
+from sdfsim.learning.bundle import _cast, _commands, _folders, bundle
 from sdfsim.learning.generate import make_dataset
 from sdfsim.learning.train import train
 
@@ -76,6 +76,7 @@ def test_the_card_says_how_to_repeat_exactly_this_training(cube_data, trained):
     data = [*model.card["data"], *piles]
     lines = _commands(model.card | {"data": data}, _folders(data))
     assert _folders(data) == ["MOVI-B", "PILE-1", "PILE-2"]
+    assert [_cast(made) for made in data[:2]] == ["1 shapes", "2 shapes, each in one split alone"]
     assert lines[3:5] == [
         "sdfsim dataset pile -o PILE-1 --shapes SHAPES --bodies 8 --trajectories 5 --seed 0 --split train",
         "sdfsim dataset pile -o PILE-2 --shapes SHAPES --trajectories 5 --seed 7 --split train",
