@@ -1,9 +1,10 @@
 """Question: what does the time that a reconstruction may take buy?
 
-    python benchmarks/tradeoff_reconstruct.py -o runs/tradeoff_reconstruct [--minutes 1 2 4 8 16] [--preset quick]
+    python benchmarks/tradeoff_reconstruct.py -o runs/tradeoff_reconstruct
 
-Poses the rendered photo set once, then trains a field for each budget, and measures the surface against the truth and
-the held-out views. Writes reconstruct.png, reconstruct.csv and reconstruct.json; budgets that are there are kept.
+Poses the rendered photo set once, then trains a field for each preset and budget, and measures the surface against the
+truth and the held-out views. Poses come on top of the budget. Writes reconstruct.png, reconstruct.csv and
+reconstruct.json; points that are there are kept.
 """
 
 from __future__ import annotations
@@ -24,21 +25,23 @@ from sdfsim.files import read_json, replacing, write_json
 
 ROOT = Path(__file__).resolve().parent.parent
 PHOTOS = ROOT / "samples" / "photos" / "table_vase"
-COLUMNS = ("minutes", "wall_s", "cpu_s", "psnr", "surface_median", "surface_p90", "missing_median", "failed")
+BUDGETS = {"quick": (1, 2, 4, 8), "standard": (8, 16)}  # minutes; with more, a preset stops at its number of steps
+ERRORS = ("psnr", "surface_median", "surface_p90", "missing_median")
+COLUMNS = ("preset", "minutes", "steps", "wall_s", "cpu_s", *ERRORS, "failed")
 
 
 def measured(minutes: float, preset: str, posed: Path, out: Path) -> dict:
     """One budget: `psnr` dB of held-out views, surface errors in percent of the table's width; `failed` if it did."""
-    folder, kept = out / f"{minutes:g}m", out / "points" / f"{minutes:g}m.json"
+    folder, kept = out / f"{preset}_{minutes:g}m", out / "points" / f"{preset}_{minutes:g}m.json"
     if kept.exists():
         return read_json(kept)
     if not folder.exists():
         shutil.copytree(posed, folder)
-    point: dict = dict.fromkeys(COLUMNS) | {"minutes": minutes, "preset": preset, "failed": ""}
+    point: dict = dict.fromkeys(COLUMNS) | {"preset": preset, "minutes": minutes, "failed": ""}
     wall, cpu = time.monotonic(), time.process_time()
     try:
         report = reconstruct(PHOTOS, folder, preset=preset, budget=60 * minutes, until_stage="mesh")
-        point["psnr"] = report["psnr"]
+        point |= {"psnr": report["psnr"], "steps": report["stages"]["distill"]["iterations"]}
         surface = evaluate(folder, PHOTOS)["surface_percent_of_table_width"]
         point |= {"surface_median": surface["surface"]["median"], "surface_p90": surface["surface"]["p90"]}
         point["missing_median"] = surface["missing"]["median"]
@@ -51,20 +54,25 @@ def measured(minutes: float, preset: str, posed: Path, out: Path) -> dict:
 
 
 def draw(points: list[dict], path: Path) -> None:
-    """Surface error and PSNR against the budget."""
+    """Surface error and PSNR against the budget; a style of line for each preset."""
     from matplotlib import pyplot
 
     figure, (left, right) = pyplot.subplots(1, 2, figsize=(10, 4.5), layout="constrained")
-    good = [p for p in points if not p["failed"]]
-    minutes = [p["minutes"] for p in good]
-    for key, what in (("surface_median", "median"), ("surface_p90", "90th percentile"), ("missing_median", "missing")):
-        left.loglog(minutes, [p[key] for p in good], "o-", label=what)
+    for preset, style in zip(BUDGETS, ("o-", "s--"), strict=True):
+        good = [p for p in points if not p["failed"] and p["preset"] == preset]
+        minutes = [p["minutes"] for p in good]
+        what = {"surface_median": "median", "surface_p90": "90th percentile", "missing_median": "missing"}
+        for number, (key, name) in enumerate(what.items()):
+            left.loglog(minutes, [p[key] for p in good], style, color=f"C{number}", label=f"{preset}: {name}")
+        right.semilogx(minutes, [p["psnr"] for p in good], style, color="C3", label=preset)
     left.set(xlabel="budget, minutes", ylabel="surface error, % of the table's width")
-    left.legend()
-    right.semilogx(minutes, [p["psnr"] for p in good], "o-")
     right.set(xlabel="budget, minutes", ylabel="PSNR of held-out views, dB")
+    ticks = sorted({p["minutes"] for p in points})
     for axes in (left, right):
+        axes.legend(fontsize="small")
         axes.grid(True, which="both", lw=0.3)
+        axes.set_xticks(ticks, [f"{minutes:g}" for minutes in ticks])
+        axes.minorticks_off()
     with replacing(path) as partial:
         figure.savefig(partial, dpi=110, format="png")
 
@@ -72,12 +80,10 @@ def draw(points: list[dict], path: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--out", type=Path, required=True)
-    parser.add_argument("--minutes", type=float, nargs="+", default=[1, 2, 4, 8, 16])
-    parser.add_argument("--preset", default="quick")
     chosen = parser.parse_args()
     posed = chosen.out / "posed"
-    reconstruct(PHOTOS, posed, preset=chosen.preset, until_stage="poses")
-    points = [measured(m, chosen.preset, posed, chosen.out) for m in chosen.minutes]
+    reconstruct(PHOTOS, posed, preset=next(iter(BUDGETS)), until_stage="poses")
+    points = [measured(m, preset, posed, chosen.out) for preset, budgets in BUDGETS.items() for m in budgets]
     write_json(chosen.out / "reconstruct.json", points)
     with replacing(chosen.out / "reconstruct.csv") as partial, open(partial, "w", newline="") as handle:
         writer = csv.DictWriter(handle, COLUMNS, extrasaction="ignore")
