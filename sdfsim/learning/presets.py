@@ -40,7 +40,7 @@ class Preset:
 LATE = {"in_row": 2, "late": 0.4}
 
 PRESETS = {
-    "small": Preset("impulse", {"width": 64, "rounds": 6}, 16_000, batch=32, rate=2e-3, matrix_rate=0.01, **LATE),
+    "small": Preset("impulse", {"width": 64, "rounds": 6}, 20_000, batch=32, rate=2e-3, matrix_rate=0.01, **LATE),
     "base": Preset("impulse", {"width": 128, "rounds": 8}, 100_000, batch=64, rate=1e-3, matrix_rate=0.01, **LATE),
     "paper": Preset("paper", {"width": 128, "steps": 10}, steps=1_000_000, batch=8, rate=1e-3, noise=0.003),
 }
