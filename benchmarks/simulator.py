@@ -34,7 +34,7 @@ from sdfsim.shape.mesh import load_mesh
 
 TRAIN, VALIDATION = 150, 40  # trajectories
 STEPS = 1500
-SMALL, USUAL = replace(PRESETS["small"], in_row=1, late=0.0), Noise()  # 1,500 steps are too few to end on pairs
+SMALL, USUAL = PRESETS["small"], Noise()
 
 
 class Squared(ImpulseTask):
@@ -70,7 +70,7 @@ def sized(width: int, rounds: int) -> Preset:
 
 
 VARIANTS = [
-    Variant("as the preset *small*, in single steps"),
+    Variant("as the preset *small*"),
     Variant("Adam alone, no Muon", replace(SMALL, matrix_rate=None)),
     Variant("no noise", noise=None),
     Variant("noise of 0.3 mm and 3 mm/s in every frame", noise=Noise(0.0003, 0.003, 1.0)),
