@@ -33,7 +33,7 @@ class Model:
         network: in evaluation mode.
         dt: s, the step of the training data.
         gravity: m/s^2, its magnitude in the training data.
-        length: m, geometric middle of the range of training bodies' largest extents; other scenes are rescaled to it.
+        length: m, the middle of the range of training bodies' largest extents; other scenes are rescaled to it.
         reach: m, contact radius D.
         nodes: surface nodes a body it was trained with, the first of each shape's; None for all.
         ranges: name -> [low, high] of what training saw (friction, restitution, mass_ratio, speed, size).

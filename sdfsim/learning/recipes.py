@@ -37,7 +37,7 @@ PILE_RADIUS = 0.55  # m for one body, growing with the third root of their numbe
 PILE_GAPS = (0.02, 0.15)  # m between the boxes around bodies
 PILE_TRIES = 8  # places for one body, of which it takes the lowest
 
-VARIED_EXTENTS = (0.7, 3.0)  # m, log-uniform: to the largest of MOVi-C
+VARIED_EXTENTS = (0.7, 1.4)  # m
 FRICTIONS, RESTITUTIONS = (0.0, 1.0), (0.0, 0.9)
 DENSITIES = (0.1, 10.0)  # log-uniform
 MASS_RATIO = 100.0  # at most, within one scene
@@ -144,7 +144,7 @@ def varied(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Placed | N
     masses: list[float] = []
 
     def draw(source: ShapeSource) -> TeacherBody:
-        extent = float(np.exp(rng.uniform(*np.log(VARIED_EXTENTS))))
+        extent = rng.uniform(*VARIED_EXTENTS)
         volume = source.volume * extent**3
         heaviest, most = max(masses, default=0.0), min(masses, default=np.inf) * MASS_RATIO
         low = min(max(volume * DENSITIES[0], heaviest / MASS_RATIO), most)

@@ -166,7 +166,7 @@ class Run:
             network=self.averaged(),
             dt=self.task.dt,
             gravity=self.task.gravity,
-            length=float(np.sqrt(np.prod(ranges["size"]))),
+            length=float(np.mean(ranges["size"])),
             reach=self.plan.reach,
             nodes=getattr(self.task, "nodes", None),
             ranges=ranges,
