@@ -15,6 +15,7 @@ from sdfsim.dynamics.clusters import Layer
 from sdfsim.dynamics.graph import number_pairs
 from sdfsim.dynamics.memory import PIECE, Memory, Waits, least
 
+FEW_PAIRS = 32  # of bodies near each other
 DEPTH_PULL = 5.0  # how much farther out (in lengths) a node must be to be kept for each length it is higher
 _GOLDEN = (1.0 + 5.0**0.5) / 2.0
 _ICOSAHEDRON = [
@@ -107,7 +108,8 @@ def find_contacts(
         cuts = _cuts(bodies, first, min(rows or PIECE, PIECE))
         parts = []
         for pairs in zip(first.split(cuts), second.split(cuts), approach.split(cuts), strict=True):
-            part = _edges(bodies, state, gravity, reach, dt, Pairs(bodies, state, *pairs), memory)
+            few = len(first) <= FEW_PAIRS
+            part = _edges(bodies, state, gravity, reach, dt, Pairs(bodies, state, *pairs), memory, few=few)
             if thin:
                 part = round_off(bodies, state, part, reach, memory) if rounded else part
                 part = thin_contacts(bodies, at_impact(bodies, state, gravity, dt, part))
@@ -141,13 +143,20 @@ class Pairs:
 
 
 def _edges(
-    bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, pairs: Pairs, memory: Memory
+    bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, pairs: Pairs, memory: Memory, *, few: bool
 ) -> Contacts:
-    """The edges from nodes of the first bodies of `pairs` to the second: balls of nodes first, then what is near."""
+    """The edges from nodes of the first bodies of `pairs` to the second: balls of nodes first, then what is near.
+
+    Where there are `few` pairs in all, the balls around whole bodies are not worth a query of their own.
+    """
     pair, parent = torch.arange(len(pairs.first), device=bodies.device), pairs.first
     queries = waiting = 0
     tree = memory.tree(bodies)
     for layer, waits in zip(tree, memory.waits, strict=True):
+        if layer is tree[0] and few:
+            row, parent = expand(layer.start[parent], layer.start[parent + 1])
+            pair = pair[row]
+            continue
         pair, item, local, distance, gradient, waited = _sift(bodies, layer, reach, pairs, pair, parent, waits)
         queries, waiting = queries + len(pair), waiting + waited
         if layer is not tree[-1]:

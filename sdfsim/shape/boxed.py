@@ -84,18 +84,21 @@ def _beyond(
         closer = length < shortest
         shortest, ray = torch.where(closer, length, shortest), torch.where(closer[:, None], way, ray)
 
-    def foot_towards(goal: torch.Tensor) -> torch.Tensor:
-        way = points - goal
+    def feet_towards(*goals: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """A foot for each goal, of one query."""
+        way = points - torch.stack(goals)
         # Of the sides of the box that lie between, the segment passes the one it comes to last.
         passed = ((points.abs() - BOX) / way.abs().clamp_min(1e-12)).clamp(0, 1).amax(-1, keepdim=True)
         entry = (points - passed * way).clamp(-BOX, BOX)
-        value, gradient = inner(rows, entry)
+        value, gradient = inner(rows.repeat(len(goals)), entry.flatten(0, 1))
         unit = gradient / gradient.norm(dim=-1, keepdim=True).clamp_min(1e-6)
-        return (entry - value.clamp_min(0)[:, None] * unit).clamp(-BOX, BOX)
+        foot = entry - (value.clamp_min(0)[:, None] * unit).view_as(entry)
+        return foot.clamp(-BOX, BOX).unbind()
 
     first = first.clamp(-BOX, BOX)
-    middle = foot_towards(torch.zeros_like(points))
-    for foot in (first, foot_towards(first), middle, foot_towards(middle)):
+    nearer, middle = feet_towards(first, torch.zeros_like(points))
+    (through,) = feet_towards(middle)
+    for foot in (first, nearer, middle, through):
         consider(foot)
     out = (points.abs() - BOX).amax(-1)
     value = shortest * (1.0 - CAUTION * (out / FADE).clamp(0.0, 1.0))
