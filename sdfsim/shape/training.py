@@ -76,8 +76,7 @@ def train(
         near, far = run.judge()
         if budget is not None:
             pace = (time.monotonic() - looping) / (run.step - before)
-            kept = min(0.1 * budget + RESERVE, 0.5 * budget)
-            run.hurry(run.step + int((budget - kept - (time.monotonic() - started)) / pace))
+            run.hurry(run.step + int((training_share(budget) - (time.monotonic() - started)) / pace))
         run.retire()
         last = max(int(run.stop.max()), 1)
         errors = f"error {near:.2g} near, {far:.2g} in the box"
@@ -85,6 +84,11 @@ def train(
         if saved is not None and run.step % (2 * CHECK) == 0:
             run.save(saved)
     return run.results()
+
+
+def training_share(budget: float) -> float:
+    """Seconds of a budget that the training may take; the rest is the certificate's."""
+    return budget - min(0.1 * budget + RESERVE, 0.5 * budget)
 
 
 class _Run:

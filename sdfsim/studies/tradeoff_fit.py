@@ -14,10 +14,10 @@ from sdfsim.files import read_json, replacing, write_json, write_text
 from sdfsim.shape.certificate import LIMITS
 from sdfsim.shape.fit import FIT_VERSION, fit_mesh
 from sdfsim.shape.mesh import load_mesh
+from sdfsim.shape.training import training_share
 
 BUDGETS = (5.0, 10.0, 20.0, 40.0, 60.0, 120.0)  # s
 QUICK_BUDGETS, QUICK_MESHES = (5.0, 10.0, 20.0), 2
-ENDED = 0.9  # of its budget: a fit that took less ended by itself, and does so with any larger one
 ERRORS = tuple(name for name, _ in LIMITS)
 
 
@@ -54,8 +54,8 @@ def fit_tradeoff(
 
 
 def _again(before: dict[str, Any] | None, budget: float) -> dict[str, Any] | None:
-    """The outcome of a larger budget where the fit before ended by itself."""
-    if before is None or before["failed"] or before["wall_s"] >= ENDED * before["budget_s"]:
+    """The outcome of a larger budget where the fit before ended by itself, sooner than its training had to."""
+    if before is None or before["failed"] or before["wall_s"] >= training_share(before["budget_s"]):
         return None
     return before | {"budget_s": budget, "ended_by_itself": True}
 
