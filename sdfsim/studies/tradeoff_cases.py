@@ -21,10 +21,12 @@ from sdfsim.learning.penetration import Solid, engine_pieces, exact_solids
 from sdfsim.learning.rollouts import first_frames
 from sdfsim.scene.types import Scene
 from sdfsim.shape.asset import Shape, load_shape
-from sdfsim.shape.distance import PiecesDistance
+from sdfsim.shape.distance import DistanceOracle, PiecesDistance
 from sdfsim.shape.grid import sample_grid
 from sdfsim.shape.mesh import Mesh
+from sdfsim.shape.plans import PLANS
 from sdfsim.shape.sdf import accepts_numpy
+from sdfsim.shape.training import train
 
 MOST, MOST_QUICK = 20, 8  # trajectories
 STEPS, TIMED_STEPS = 100, 80
@@ -117,6 +119,20 @@ def sampled(shape: Shape, resolution: int, scratch: Path) -> Shape:
     took = time.process_time() - began + float(shape.certificate.get("seconds") or 0.0)
     note = {"sdf": "grid", "resolution": resolution, "fitted_s": took}
     made = replace(shape, sdf=grid, certificate={}, source=shape.source | note)
+    made.save(folder)
+    return made
+
+
+def refitted(shape: Shape, width: int, oracle: DistanceOracle, scratch: Path) -> Shape:
+    """A shape whose network is of another width, fitted once to `oracle`, and kept; `source` says how long it took."""
+    folder = scratch / f"width-{width}" / shape.name
+    if folder.exists():
+        return load_shape(folder)
+    began = time.process_time()
+    plan = replace(PLANS["default"], width=width)
+    sdf, _ = train([oracle], plan, budget=None, seed=0, tell=lambda fraction, message: None)[0]
+    note = {"width": width, "fitted_s": time.process_time() - began}
+    made = replace(shape, sdf=sdf, certificate={}, source=shape.source | note)
     made.save(folder)
     return made
 

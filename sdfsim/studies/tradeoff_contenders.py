@@ -19,9 +19,10 @@ from sdfsim.learning.dataset import Trajectory
 from sdfsim.learning.rollouts import roll_out
 from sdfsim.scene.types import Effects, Scene
 from sdfsim.shape.asset import Shape
-from sdfsim.shape.distance import PiecesDistance
+from sdfsim.shape.distance import MeshDistance, PiecesDistance
 from sdfsim.shape.mlp import MlpSdf
-from sdfsim.studies.tradeoff_cases import Cases, PiecesSdf, sampled
+from sdfsim.shape.solid import solidify
+from sdfsim.studies.tradeoff_cases import Cases, PiecesSdf, refitted, sampled
 from sdfsim.studies.tradeoff_knobs import Setting, arranged_model, arranged_scene, arranged_shape, threads_of
 
 
@@ -128,6 +129,11 @@ class Ours:
     def _shape(self, cases: Cases, name: str, shape: Shape) -> Shape:
         if self.setting.sdf.startswith("grid") and isinstance(shape.sdf, MlpSdf):
             shape = sampled(shape, int(self.setting.sdf.split()[1]), cases.scratch)
+            return arranged_shape(replace(self.setting, sdf="own"), shape)
+        if self.setting.sdf.startswith("width") and isinstance(shape.sdf, MlpSdf):
+            pieces = cases.pieces[name]
+            oracle = PiecesDistance(pieces) if pieces else MeshDistance(solidify(shape.mesh, name=name))
+            shape = refitted(shape, int(self.setting.sdf.split()[1]), oracle, cases.scratch)
             return arranged_shape(replace(self.setting, sdf="own"), shape)
         asked = self.setting.sdf == "exact" and cases.pieces[name]
         return arranged_shape(self.setting, shape, PiecesSdf(PiecesDistance(cases.pieces[name])) if asked else None)

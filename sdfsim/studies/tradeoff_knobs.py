@@ -32,7 +32,8 @@ class Setting:
         model: bundled name or path.
         nodes: "own", the shapes' own nodes; "thin K", K of them, outermost first; "grid N", sampled anew from
             N^3 points; "vertices", the vertices of the mesh that is shown.
-        sdf: "own"; "grid R", the own distances on a grid of R^3 samples; "exact", the geometry that it was fitted to.
+        sdf: "own"; "grid R", the own distances on a grid of R^3 samples; "width W", a network of that width (own: 64);
+            "exact", the geometry that it was fitted to.
         reach: contact radius over the model's own.
         rounds: of message passing, the first so many of the model's (None: all). What is left is a network that
             nobody has trained.
@@ -99,9 +100,9 @@ def for_any_scene(setting: Setting) -> bool:
     """Whether `--quality` may stand for it: it is no matter of the machine, nor of what a scene itself decides.
 
     The mesh that is shown serves neither as geometry nor as nodes: of shapes that were capped, thickened or made of
-    convex pieces it is something else.
+    convex pieces it is something else. Nothing is fitted anew.
     """
-    if setting.sdf == "exact" or setting.nodes == "vertices":
+    if setting.sdf == "exact" or setting.sdf.startswith("width") or setting.nodes == "vertices":
         return False
     return setting == replace(setting, sleep=False, compiled=False, threads=1, device="cpu", free_flight="exact")
 
@@ -195,7 +196,7 @@ def settings(models: list[str], paper: list[str], *, quick: bool, cuda: bool) ->
     if not quick:
         chosen += [replace(base, nodes=f"thin {count}") for count in (128, 256)]
         chosen += [replace(base, nodes=f"grid {side}") for side in (4, 5, 6, 8, 10, 12)]
-        chosen += [replace(base, sdf=kind) for kind in ("grid 32", "grid 128")]
+        chosen += [replace(base, sdf=kind) for kind in ("grid 32", "grid 128", "width 32", "width 128")]
         chosen += [replace(base, reach=factor) for factor in (0.5, 2.0)]
         chosen += [replace(base, rounds=count) for count in (3, 5)] if models[0] not in paper else []
         chosen += [replace(base, sleep=True), replace(base, compiled=True), replace(lean, sleep=True)]

@@ -47,6 +47,7 @@ def test_qualities_leave_machine_and_effects_alone():
     assert for_any_scene(Setting(nodes="thin 64", sdf="grid 64", rounds=3, precision="bf16", reach=0.5))
     for change in (
         {"sdf": "exact"},
+        {"sdf": "width 32"},
         {"nodes": "vertices"},
         {"sleep": True},
         {"threads": 2},

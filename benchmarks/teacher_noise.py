@@ -1,0 +1,138 @@
+"""How exact a step must be for a rollout to be so: the teacher itself, disturbed at every step, against its recordings.
+
+    python benchmarks/teacher_noise.py DATA [--split validation] [--trajectories 100]
+
+DATA is a movi-b dataset. Every row runs the teacher from the recorded starts and disturbs it at the end of each
+recorded step: it forgets its contact points from earlier steps, bodies are displaced, or what contact did to their
+velocities is changed by a part of it. A learned model that errs by as much in each of its steps can hardly do better.
+The first row is the undisturbed teacher. Needs the extra `data`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from sdfsim.learning import metrics
+from sdfsim.learning.dataset import FLOOR, Trajectory, trajectory_files
+from sdfsim.learning.evaluate import score
+from sdfsim.learning.floor import engine_file, started
+from sdfsim.learning.teacher import Teacher
+from sdfsim.parallel import parallel
+
+HORIZONS = (50, 100)
+SHIFTS = (1e-4, 1e-3, 3e-3)  # m
+PARTS = (0.02, 0.05, 0.1, 0.15, 0.2, 0.3)
+ASIDE = 50.0  # m between bodies while contact points are forgotten
+TOUCHED = 1e-3  # m/s, changes of velocity below which nothing has touched a body
+
+STATE = ("position", "quat_xyzw", "velocity", "angular_velocity")
+State = list[np.ndarray]  # [N, 3 or 4] each, of all bodies
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """What is done to the teacher after each step.
+
+    Attributes:
+        name: in the table.
+        forgets: contact points from earlier steps are lost.
+        shift: m, standard deviation of displacements along each axis; they do not add up: the next step ends where it
+            would have without them, but for what they changed.
+        part: of the change of velocity by contact, standard deviation of its error over all six components together.
+    """
+
+    name: str
+    forgets: bool = False
+    shift: float = 0.0
+    part: float = 0.0
+
+
+DISTURBANCES = [
+    Disturbance("none"),
+    Disturbance("contact points forgotten", forgets=True),
+    *(Disturbance(f"placed {1e3 * shift:g} mm off", forgets=True, shift=shift) for shift in SHIFTS),
+    *(Disturbance(f"impulses {100 * part:g} % off", part=part) for part in PARTS),
+]
+
+
+def disturbed(t: Trajectory, how: Disturbance, urdfs: dict[str, Path], seed: list[int]) -> Trajectory:
+    """The teacher's motion from the first frame of `t`, disturbed after each step."""
+    rng = np.random.default_rng(seed)
+    with started(t, urdfs, FLOOR) as teacher:
+        states = [[getattr(t, name)[0] for name in STATE]]
+        for _ in range(len(t.position) - 1):
+            before = states[-1]
+            shift = how.shift * rng.normal(size=before[0].shape) * ~t.static[:, None]
+            if how.forgets:
+                _forget(teacher, t)
+                _put(teacher, t, [before[0] + shift, *before[1:]])
+            step = teacher.run(1)
+            after = [step[name][-1] for name in STATE]
+            if how.part:
+                after = _hit_otherwise(t, before, after, how.part, rng)
+                _put(teacher, t, after)
+            states.append([after[0] - shift, *after[1:]])
+    motion = {name: np.array(values) for name, values in zip(STATE, zip(*states, strict=True), strict=True)}
+    return replace(t, **motion)
+
+
+def _put(teacher: Teacher, t: Trajectory, state: State) -> None:
+    for i in np.flatnonzero(~t.static).tolist():
+        teacher.place(i, state[0][i], state[1][i])
+        teacher.push(i, state[2][i], state[3][i])
+
+
+def _forget(teacher: Teacher, t: Trajectory) -> None:
+    """All bodies are put apart for a moment: the engine drops what it kept of their contacts."""
+    for i in np.flatnonzero(~t.static).tolist():
+        teacher.place(i, np.array([ASIDE * (1 + i), ASIDE, ASIDE]), np.array([0.0, 0.0, 0.0, 1.0]))
+    teacher.overlaps(0)  # makes it look
+
+
+def _hit_otherwise(t: Trajectory, before: State, after: State, part: float, rng: np.random.Generator) -> State:
+    """The state after a step whose contacts changed velocities by a little more, less, or elsewhere."""
+    position, quat, velocity, angular = after
+    lever = 0.5 * t.scale[:, None]
+    hit = np.concatenate([velocity - before[2] - t.gravity * t.dt, (angular - before[3]) * lever], axis=1)
+    size = np.linalg.norm(hit, axis=1, keepdims=True) * (~t.static[:, None])
+    error = part * np.where(size > TOUCHED, size, 0.0) * rng.normal(size=hit.shape) / np.sqrt(6.0)
+    # On average a hit falls in the middle of the step.
+    return [position + 0.5 * t.dt * error[:, :3], quat, velocity + error[:, :3], angular + error[:, 3:] / lever]
+
+
+def row(how: Disturbance, motions: list[Trajectory], recorded: list[Trajectory]) -> str:
+    """A line of the table."""
+    scores = [score(motion, truth, list(HORIZONS)) for motion, truth in zip(motions, recorded, strict=True)]
+    bodies = np.array([s.bodies for s in scores])
+    share = bodies / bodies.mean()
+    cells = []
+    for h in HORIZONS:
+        squared = np.array([s.squared[h] for s in scores]) * share
+        low, high = (np.sqrt(v) for v in metrics.interval(squared))
+        degrees = (np.array([s.angle[h] for s in scores]) * share).mean()
+        cells += [f"{np.sqrt(squared.mean()):.3f} ({low:.3f} to {high:.3f})", f"{degrees:.1f}"]
+    return f"| {how.name} | " + " | ".join(cells) + " |"
+
+
+def main() -> None:
+    """Command line of this script."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--split", default="validation")
+    parser.add_argument("--trajectories", type=int, default=100)
+    args = parser.parse_args()
+    recorded = [Trajectory.load(f) for f in trajectory_files(args.data, args.split)[: args.trajectories]]
+    urdfs = {name: engine_file(args.data, name) for name in {str(n) for t in recorded for n in t.shape}}
+    print("| each step | m, 50 steps | degrees | m, 100 steps | degrees |\n| --- | --- | --- | --- | --- |")
+    for how in DISTURBANCES:
+        jobs = [(t, how, urdfs, [0, k]) for k, t in enumerate(recorded)]
+        done = dict(parallel(disturbed, jobs))
+        print(row(how, [done[k] for k in range(len(recorded))], recorded), flush=True)
+
+
+if __name__ == "__main__":
+    main()
