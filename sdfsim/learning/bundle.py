@@ -17,7 +17,7 @@ from sdfsim.errors import SdfsimError
 from sdfsim.files import write_text
 from sdfsim.learning import tables
 from sdfsim.learning.evaluate import evaluate
-from sdfsim.learning.presets import PRESETS
+from sdfsim.learning.presets import PRESETS, Preset
 from sdfsim.learning.recipes import RECIPES
 
 
@@ -98,6 +98,8 @@ def _other_seed(model: Model, path: Path, other: Path) -> Model:
 
 def _trained(card: dict, what: str) -> Any:
     """An entry of a card, less the test trajectories, which a machine that only trains does not have."""
+    if what == "preset":
+        return Preset(**card["preset"])  # older cards lack what was the same for all
     if what != "data":
         return card.get(what)
     return [d | {"trajectories": {**d["trajectories"], "test": None}} for d in card["data"]]

@@ -15,6 +15,7 @@ DROP = 0.1  # m, at most, under one that is dropped
 NUDGE = 0.3  # m/s, at most, along x and along y
 PRESSED = 0.08  # of its extent: how far at most a body is moved into what is around it, along each axis
 FIELD = 3.0  # m, half the side of the square of floor that is used
+STACKED = 0.5  # part of the bodies that go on top of the one before
 STEADY = 0.03  # least distance of the centre of mass from the rim of the face it stands on, over the largest extent
 
 
@@ -36,12 +37,11 @@ def at_rest(
         False when one found no room.
     """
     below, top = np.zeros(2), 0.0
-    stack = rng.random()  # part of the bodies that go on top of the one before: from a field to a tower
     placed = []
     for number, (source, body) in enumerate(bodies):
         index = teacher.add(body)
         for _ in range(tries):
-            stacked = number > 0 and rng.random() < stack
+            stacked = number > 0 and rng.random() < STACKED
             place = below + rng.uniform(-0.1, 0.1, 2) * body.scale if stacked else rng.uniform(-FIELD, FIELD, 2)
             gap = rng.uniform(GAP, DROP) if start == "dropped" else GAP
             rotation = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)) * _standing(source.vertices, rng)

@@ -101,7 +101,8 @@ def test_models_from_before_the_card_told_seed_and_counts_are_still_bundled(cube
     assert "on average" not in text
     other = load_model(trained[1])
     trained_only = [d | {"trajectories": {"train": 2, "validation": 2}} for d in other.card["data"]]
-    replace(other, card=other.card | {"data": trained_only}).save(tmp_path / "other.safetensors")
+    plan = {k: v for k, v in other.card["preset"].items() if k not in ("in_row", "late", "bf16")}
+    replace(other, card=other.card | {"data": trained_only, "preset": plan}).save(tmp_path / "other.safetensors")
     assert len(bundle(trained[0], cube_data, "mine", tmp_path, [tmp_path / "other.safetensors"])["other_seeds"]) == 1
 
 
