@@ -27,7 +27,7 @@ Guard = Literal["none", "energy"]
 Motion = tuple[Tensor, Tensor]  # velocities and angular velocities [R, 3]
 # Model units: by how much the root mean square speed of an island may go beyond what energy allows, at the end of a
 # step (where nothing guards energy; three times what gravity adds in a step of training) and on average on its way
-# through it (overlaps are left in few steps). Ten times the most that the bundled model makes on its test data.
+# through it (overlaps are left in few steps). On its test data the bundled model makes 0.08 and 0.14 at most.
 ESCAPE, LEAVE = 0.6, 6.0
 ROUNDING = 1e-6  # of the energies compared: velocities come out of a network in single precision
 
