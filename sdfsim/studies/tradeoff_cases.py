@@ -30,6 +30,7 @@ from sdfsim.shape.training import train
 
 MOST, MOST_QUICK = 20, 8  # trajectories
 STEPS, TIMED_STEPS = 100, 80
+FIT_SECONDS = 60.0  # at most, for a network of another width
 
 
 @dataclass(frozen=True)
@@ -124,13 +125,16 @@ def sampled(shape: Shape, resolution: int, scratch: Path) -> Shape:
 
 
 def refitted(shape: Shape, width: int, oracle: DistanceOracle, scratch: Path) -> Shape:
-    """A shape whose network is of another width, fitted once to `oracle`, and kept; `source` says how long it took."""
+    """A shape whose network is of another width, fitted once to `oracle` in `FIT_SECONDS` at most, and kept.
+
+    Its `source` says how long that took.
+    """
     folder = scratch / f"width-{width}" / shape.name
     if folder.exists():
         return load_shape(folder)
     began = time.process_time()
     plan = replace(PLANS["default"], width=width)
-    sdf, _ = train([oracle], plan, budget=None, seed=0, tell=lambda fraction, message: None)[0]
+    sdf, _ = train([oracle], plan, budget=FIT_SECONDS, seed=0, tell=lambda fraction, message: None)[0]
     note = {"width": width, "fitted_s": time.process_time() - began}
     made = replace(shape, sdf=sdf, certificate={}, source=shape.source | note)
     made.save(folder)
