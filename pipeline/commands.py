@@ -64,6 +64,7 @@ def reconstruct(
     verbose: Verbose = False,
 ) -> None:
     """Photos -> a scene that can be simulated, by all stages."""
+    corners = _corners(crop)
     with Session(as_json=as_json, verbose=verbose) as session:
         from pipeline import stages
 
@@ -73,7 +74,7 @@ def reconstruct(
             preset=preset,
             size=size,
             distance=list(distance) if distance else None,
-            crop=_corners(crop),
+            crop=corners,
             keep=keep or [],
             static=static or [],
             drop=drop,

@@ -151,7 +151,7 @@ def simulate(
         report = summary(rollout, time.monotonic() - started)
         report["status"] = "done" if broken is None else "failed" if isinstance(broken, SdfsimError) else "interrupted"
         report["folder"] = str(out)
-        report["quality"] = quality_note(quality) if quality else None
+        report["quality"] = quality_note(quality, model or scene.model) if quality else None
         report["failed_checks"] = [f"fit of shape {told}" for told in scene.missed]
         if until_settled:
             report["settled"] = settled

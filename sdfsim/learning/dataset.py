@@ -78,6 +78,7 @@ class Trajectory:
         return cls(**arrays)
 
 
+LONGEST_STEP = 10.0  # s
 _NAME = re.compile(r"(?!\.)[\w. -]+")  # of a folder beside others, never a path
 _TRAILING = {"position": (3,), "quat_xyzw": (4,), "velocity": (3,), "angular_velocity": (3,)}
 _PER_BODY = {"scale": (), "mass": (), "inertia": (3,), "friction": (), "restitution": (), "static": (), "shape": ()}
@@ -121,8 +122,10 @@ def _check(path: Path, arrays: dict) -> None:
         raise SdfsimError(f"{path}: quat_xyzw: must be unit quaternions")
     if outside := [name for name in arrays["shape"].tolist() if not _NAME.fullmatch(name)]:
         raise SdfsimError(f"{path}: shape: {outside[0]!r} is no name of a Shape folder", "letters, digits, . _ - only")
-    if not (arrays["scale"] > 0).all() or not arrays["dt"] > 0:
-        raise SdfsimError(f"{path}: scale and dt must be > 0")
+    if not (arrays["scale"] > 0).all() or not 0 < arrays["dt"] <= LONGEST_STEP:
+        raise SdfsimError(f"{path}: scale must be > 0, dt > 0 and at most {LONGEST_STEP:g} s")
+    if (arrays["friction"] < 0).any() or ((arrays["restitution"] < 0) | (arrays["restitution"] > 1)).any():
+        raise SdfsimError(f"{path}: friction must be >= 0, restitution from 0 to 1")
 
 
 def write_info(folder: Path, info: dict) -> None:

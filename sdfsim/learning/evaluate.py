@@ -78,6 +78,7 @@ def evaluate(
         "chaos_floor": "perturbations" -> name -> errors; or "left_out", why.
         "survival", "median_survival_s": of all of them, by limit in m.
         "penetration" m, "energy_gain" (a fraction), "resting_speed" m/s: of the model and of the teacher's recording.
+        "engine_substep": s, the recording engine's inner step; 0 where no dataset.json tells it.
         Further counts, and milliseconds a step.
 
     Raises:
@@ -105,6 +106,7 @@ def evaluate(
         "trajectories": len(recorded),
         "bodies": int(sum(t.position.shape[1] for t in recorded)),
         "dt": recorded[0].dt,
+        "engine_substep": substep,
         "ms_per_step_per_trajectory": 1e3 * seconds / longest / len(recorded),
         **{who: _errors(motions, recorded) for who, motions in contenders.items()},
         **floor_report,
@@ -125,6 +127,8 @@ def _load(data: Path, split: str) -> tuple[Motions, dict[str, Shape]]:
     recorded = [t for group in batches(recorded) for t in group if not t.static.all()]
     if not recorded:
         raise SdfsimError(f"{data}: nothing moves in any trajectory")
+    if len(steps := {t.dt for t in recorded}) > 1:
+        raise SdfsimError(f"{data}: trajectories of different steps ({', '.join(f'{dt:g} s' for dt in sorted(steps))})")
     return recorded, load_shapes(data, {str(n) for t in recorded for n in t.shape})
 
 

@@ -7,18 +7,27 @@ from pathlib import Path
 
 import numpy as np
 
+from sdfsim.errors import SdfsimError
 from sdfsim.learning.dataset import Trajectory, read_info
 
+LONGEST = 1.0  # s, an engine's inner step
 EXACTLY = 1e-3  # part of what gravity adds in a step, by which a free flight may miss it
 
 
 def engine_substep(data: Path) -> float:
-    """The engine's inner step in s, where the dataset (a folder or one of its splits) tells it; 0 elsewhere."""
+    """The engine's inner step in s, where the dataset (a folder or one of its splits) tells it; 0 elsewhere.
+
+    Raises:
+        SdfsimError: what is told is no such step.
+    """
     for folder in (data, data.parent):
         if (folder / "dataset.json").exists():
-            settings = read_info(folder).get("engine_settings")
-            found = settings.get("timeStep") if isinstance(settings, dict) else None
-            return float(found) if isinstance(found, int | float) else 0.0
+            settings = read_info(folder).get("engine_settings", {})
+            found = settings.get("timeStep", 0.0) if isinstance(settings, dict) else settings
+            if isinstance(found, bool) or not isinstance(found, int | float) or not 0.0 <= found <= LONGEST:
+                where = f"{folder / 'dataset.json'}: engine_settings.timeStep"
+                raise SdfsimError(f"{where}: must be 0 (unknown) to {LONGEST:g} s (got {found!r})")
+            return float(found)
     return 0.0
 
 

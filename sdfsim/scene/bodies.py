@@ -13,6 +13,7 @@ from sdfsim.scene.types import Motion, Waypoints
 
 DEFAULT_DENSITY = 1000.0  # kg/m^3, of a dynamic body that gives neither mass nor density
 DEFAULT_FRICTION = 0.5
+MOST_FRICTION = 1000.0
 DEFAULT_RESTITUTION = 0.5
 MOST_COPIES = 100_000
 MOST_NAMED = 20  # in one message
@@ -134,7 +135,7 @@ def _body(item: Value, shapes: dict[str, str | None]) -> BodySpec:
         angular_velocity=spin,
         mass=section.number("mass", "kg", above=0, default=1.0) if "mass" in section else None,
         density=section.number("density", "kg/m^3", above=0, default=DEFAULT_DENSITY),
-        friction=section.number("friction", least=0, default=DEFAULT_FRICTION),
+        friction=section.number("friction", least=0, most=MOST_FRICTION, default=DEFAULT_FRICTION),
         restitution=section.number("restitution", least=0, most=1, default=DEFAULT_RESTITUTION),
         offsets=offsets,
         grouped=grouped,

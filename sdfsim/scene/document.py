@@ -16,7 +16,8 @@ import yaml
 
 from sdfsim.errors import SceneError
 
-_NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?")
+LARGEST = 1e12  # of any number: beyond it powers and products of what is legal are no longer finite
+_NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _NOT_FINITE = re.compile(r"[-+]?\.?(nan|inf|infinity)", re.IGNORECASE)
 _NULL = ("", "~", "null", "Null", "NULL")
 _SHOWN = 40
@@ -87,7 +88,7 @@ class Value:
         most: float | None = None,
         default: float = 0.0,
     ) -> float:
-        """A finite number with `above` < x, `least` <= x, `most` >= x."""
+        """A finite number, no larger than `LARGEST`, with `above` < x, `least` <= x, `most` >= x."""
         what = "a number" + (f" in {unit}" if unit else "")
         node = self.node
         if not isinstance(node, yaml.ScalarNode) or node.style is not None:
@@ -101,7 +102,9 @@ class Value:
             self.wrong(f"must be {what} (got {self.shown()})")
             return default
         got = f"(got {node.value}{' ' + unit if unit else ''})"
-        if above is not None and value <= above:
+        if abs(value) > LARGEST:
+            self.wrong(f"must be at most {LARGEST:g} {got}")
+        elif above is not None and value <= above:
             self.wrong(f"must be > {above:g} {got}")
         elif least is not None and value < least:
             self.wrong(f"must be >= {least:g} {got}")
@@ -114,7 +117,7 @@ class Value:
     def integer(self, *, least: int, default: int) -> int:
         """A whole number that is at least `least`."""
         node = self.node
-        if not isinstance(node, yaml.ScalarNode) or not re.fullmatch(r"[-+]?\d{1,18}", node.value) or node.style:
+        if not isinstance(node, yaml.ScalarNode) or not re.fullmatch(r"[-+]?[0-9]{1,18}", node.value) or node.style:
             self.wrong(f"must be a whole number (got {self.shown()})")
             return default
         if int(node.value) < least:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from sdfsim.errors import SdfsimError
 from sdfsim.shape.gltf import check_gltf
 from sdfsim.shape.repair import without_doubles
 from sdfsim.shape.rows import check_rows
+from sdfsim.shape.wavefront import counted_forwards
 
 # Its readers log what they pass over, some with tracebacks; who wants to see that can still listen.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
@@ -88,6 +90,7 @@ def load_mesh(path: str | Path) -> Mesh:
             absurd size.
     """
     import trimesh
+    from trimesh.resolvers import FilePathResolver
 
     path = Path(path)
     if not path.is_file():
@@ -101,8 +104,14 @@ def load_mesh(path: str | Path) -> Mesh:
         check_gltf(path)
     if path.suffix.lower() in (".off", ".ply"):
         check_rows(path)
+    text = counted_forwards(path) if path.suffix.lower() == ".obj" else None
     try:
-        loaded: Any = trimesh.load(path, force="mesh", process=False)
+        if text is None:
+            loaded: Any = trimesh.load(path, force="mesh", process=False)
+        else:
+            loaded = trimesh.load(
+                BytesIO(text), "obj", resolver=FilePathResolver(str(path)), force="mesh", process=False
+            )
         vertices = np.array(loaded.vertices, dtype=np.float64).reshape(-1, 3)
         faces = np.array(getattr(loaded, "faces", []), dtype=np.int64).reshape(-1, 3)
         colors = _vertex_colors(loaded, len(vertices))

@@ -26,6 +26,7 @@ STEP = 1e-4
 TRIFLE = 1e-3
 # A sheet thinner than this is below what a fit resolves (mean errors of 0.0015 near the surface are allowed).
 THINNEST = 0.01
+THICKEST = 2.0  # likewise, of what is thickened
 HINT = "--cap (cap: on) closes openings of any size, --thicken METRES (thicken: METRES) gives a sheet a thickness"
 
 
@@ -83,7 +84,7 @@ def solidify(mesh: Mesh, *, name: str = "mesh", cap: bool = False, thicken: floa
         thicken: m; the solid is all within half of this distance from the mesh instead.
 
     Raises:
-        SdfsimError: the mesh encloses no volume, is open beyond small holes, or `thicken` is too small.
+        SdfsimError: the mesh encloses no volume, is open beyond small holes, or `thicken` is too small or too large.
     """
     mesh = clean(mesh, name=name)
     frame = normal_frame(np.stack([mesh.vertices.min(0), mesh.vertices.max(0)]))
@@ -245,7 +246,12 @@ def _thickened(mesh: Mesh, frame: Frame, name: str, thickness: float) -> Solid:
     from skimage.measure import marching_cubes
 
     size = frame.scale + thickness
-    if not (np.isfinite(thickness) and thickness >= THINNEST * size):
+    if not thickness <= THICKEST * frame.scale:
+        raise SdfsimError(
+            f"{name}: a thickness of {thickness:g} m is too large for a mesh of {frame.scale:.3g} m",
+            f"use at most {THICKEST * frame.scale:.2g} m",
+        )
+    if not thickness >= THINNEST * size:
         raise SdfsimError(
             f"{name}: a thickness of {thickness:g} m is too small for a mesh of {frame.scale:.3g} m",
             f"use at least {THINNEST * frame.scale / (1 - THINNEST):.2g} m",

@@ -47,8 +47,14 @@ def at_quality(name: str, scene: Scene, model: str | Path | None, path: Path = Q
         SdfsimError: no such quality, or the model is of a kind that it was not measured for.
     """
     setting = quality_setting(name, path)
-    chosen = model or scene.model or setting.model
-    return arranged_scene(setting, scene), arranged_model(setting, load_model(chosen))
+    chosen = load_model(model or scene.model or setting.model)
+    if chosen.kind != (measured := load_model(setting.model, weights=False)).kind:
+        raise SdfsimError(
+            f"quality {name} was measured with {setting.model}, an {measured.kind} network; {chosen.name} is a "
+            f"{chosen.kind} one",
+            "leave --quality away",
+        )
+    return arranged_scene(setting, scene), arranged_model(setting, chosen)
 
 
 def store(folder: Path, qualities: Path = QUALITY_FILE, costs: Path = COSTS_FILE) -> list[str]:
@@ -89,14 +95,16 @@ def store(folder: Path, qualities: Path = QUALITY_FILE, costs: Path = COSTS_FILE
     return told
 
 
-def quality_note(name: str, path: Path = QUALITY_FILE) -> str:
-    """One line: what a quality is, and what was measured of it."""
+def quality_note(name: str, model: str | Path | None, path: Path = QUALITY_FILE) -> str:
+    """One line: what a quality is, and what was measured of it; also if `model` (None: the measured one) is another."""
     stored = read_json(path, _MEASURE)
     entry, steps = stored["qualities"][name], str(stored["horizon_steps"])
     error = entry["errors"][steps]["translation_rmse"]
+    other = "" if model is None or str(model) == entry["setting"]["model"] else f"; {model} was not"
+    scenes = f"{stored['trajectories']} scenes of {stored['measured_on']}{other}"
     return (
         f"quality {name}: {entry['label']} ({entry['ms']['median']:.0f} ms a simulated second and "
-        f"{error:.3f} m after {steps} steps, measured on {stored['trajectories']} scenes of {stored['measured_on']})"
+        f"{error:.3f} m after {steps} steps, measured on {scenes})"
     )
 
 

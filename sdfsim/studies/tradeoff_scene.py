@@ -46,12 +46,14 @@ def cases_of_scene(
 
     Raises:
         SdfsimError: bad input; a floor other than one level plane, or bodies on a path, which the teacher does not
-            know; PyBullet is not installed.
+            know; nothing moves; PyBullet is not installed.
     """
     scene = load_scene(path, on_progress)
     floor, height = _floor(scene)
     units = scene_units(scene, load_model(model, weights=False), None)
     solid = [b for b in scene.bodies if not isinstance(scene.shapes[b.shape].sdf, PlaneSdf)]
+    if not any(b.motion == "dynamic" for b in solid):
+        raise SdfsimError(f"{scene.path}: nothing moves in it")
     shapes = {str(k): _centred(scene.shapes[k], str(k)) for k in sorted({b.shape for b in solid})}
     on_progress(0.5, "convex pieces for the teacher")
     urdfs = {name: engine_file(shape, scratch / "engine") for name, shape in shapes.items()}

@@ -245,3 +245,15 @@ def test_the_wheel_holds_everything(tmp_path):
     assert "sdfsim = cli:app" in entry
     assert any(n.endswith("LICENSE") for n in names)
     assert not any(n.startswith(("tests", "samples")) for n in names)
+
+
+def test_a_folder_without_a_name_is_not_the_current_one(scene, model, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    done = run("simulate", scene, "-o", "", "--model", model, "--seconds", 0.1)
+    assert done.exit_code == 2 and "is empty" in done.stderr and sorted(tmp_path.rglob("*")) == before
+
+
+def test_corners_that_are_none_are_wrong_usage_of_reconstruct_too(tmp_path):
+    done = run("reconstruct", tmp_path, "-o", tmp_path / "run", "--crop", "1,1", "0,0,0")
+    assert done.exit_code == 2 and "two corners X,Y,Z" in done.stderr

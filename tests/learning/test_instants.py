@@ -3,8 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
-from sdfsim.learning.instants import at_instants
+from sdfsim.errors import SdfsimError
+from sdfsim.files import write_json
+from sdfsim.learning.instants import at_instants, engine_substep
 from tests.learning.conftest import balls
 
 SUBSTEP, DT, GRAVITY = 0.004, 0.02, np.array([0.0, 0.0, -10.0])
@@ -41,3 +44,17 @@ def test_what_lies_keeps_its_velocity():
 def test_static_bodies_do_not_fall():
     motion = at_instants(replace(symplectic(12, 3.0), static=np.array([True])), SUBSTEP)
     np.testing.assert_array_equal(motion.velocity, symplectic(12, 3.0).velocity)
+
+
+@pytest.mark.parametrize("settings", ["x", None, {"timeStep": "abc"}, {"timeStep": -1}, {"timeStep": 1e9}])
+def test_an_inner_step_that_is_none_is_named(tmp_path, settings):
+    write_json(tmp_path / "dataset.json", {"engine_settings": settings})
+    with pytest.raises(SdfsimError, match=r"dataset.json: engine_settings.timeStep: must be 0 \(unknown\) to 1 s"):
+        engine_substep(tmp_path)
+
+
+def test_an_inner_step_is_that_of_the_dataset_or_unknown(tmp_path):
+    assert engine_substep(tmp_path) == 0.0
+    write_json(tmp_path / "dataset.json", {"engine_settings": {"timeStep": 0.004}})
+    (tmp_path / "test").mkdir()
+    assert engine_substep(tmp_path) == engine_substep(tmp_path / "test") == 0.004

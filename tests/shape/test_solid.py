@@ -305,3 +305,10 @@ def test_meshes_from_the_field(file: str, solid: bool, data_dir: Path) -> None:
         solidify(mesh, name=file)
     thick = solidify(mesh, name=file, thicken=0.03 * float(np.ptp(mesh.vertices, axis=0).max()))
     assert is_closed(thick.surface)
+
+
+@pytest.mark.parametrize("thickness", [1e9, np.inf])
+def test_a_thickness_beyond_the_size_of_the_mesh_is_refused(thickness):
+    sheet = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]]))
+    with pytest.raises(SdfsimError, match="too large for a mesh of 1 m"):
+        solidify(sheet, thicken=thickness)

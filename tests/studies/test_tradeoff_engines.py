@@ -96,3 +96,9 @@ def test_scenes_that_the_teacher_does_not_know_are_refused(tmp_path, floor, mess
     (tmp_path / "scene.yaml").write_text("\n".join(lines))
     with pytest.raises(SdfsimError, match=message):
         cases_of_scene(tmp_path / "scene.yaml", "small", tmp_path, quick=True, on_progress=lambda *_: None)
+
+
+def test_a_scene_in_which_nothing_moves_has_nothing_to_compare(tmp_path):
+    (tmp_path / "scene.yaml").write_text("\n".join(line for line in SCENE.splitlines() if "shape: box" not in line))
+    with pytest.raises(SdfsimError, match="nothing moves"):
+        cases_of_scene(tmp_path / "scene.yaml", "small", tmp_path, quick=True, on_progress=lambda *_: None)

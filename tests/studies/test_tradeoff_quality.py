@@ -9,11 +9,12 @@ from typer.testing import CliRunner
 
 import cli
 from sdfsim import load_scene
+from sdfsim.dynamics.model import Model, new_network
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, write_json
 from sdfsim.studies.tradeoff_cost import COSTS_FILE
 from sdfsim.studies.tradeoff_knobs import Setting, for_any_scene, setting_from
-from sdfsim.studies.tradeoff_quality import QUALITY_FILE, at_quality, quality_setting, store
+from sdfsim.studies.tradeoff_quality import QUALITY_FILE, at_quality, quality_note, quality_setting, store
 
 SCENE = """
 version: 1
@@ -36,6 +37,15 @@ def measured(**changes) -> dict:
     ]  # fmt: skip
     report = {"source": "x/data", "quick": False, "sdfsim": "0", "trajectories": 3, "bodies": 9, "horizon_steps": 50}
     return report | {"dt_s": 0.02, "points": points, "qualities": {name: name for name in chosen}} | changes
+
+
+def test_a_quality_is_for_networks_of_the_kind_it_was_measured_with(scene, tmp_path):
+    network = new_network("paper", {"width": 8, "steps": 1})
+    Model("mine", "paper", network, 0.02, 10.0, 1.4, 0.1).save(tmp_path / "mine.safetensors")
+    with pytest.raises(SdfsimError, match="measured with small, an impulse network; mine is a paper one"):
+        at_quality("draft", load_scene(scene), tmp_path / "mine.safetensors")
+    assert "; other was not)" in quality_note("draft", "other")
+    assert quality_note("draft", None) == quality_note("draft", "small")
 
 
 @pytest.fixture
