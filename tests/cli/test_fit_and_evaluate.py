@@ -81,7 +81,7 @@ def test_an_evaluation_is_two_tables(tmp_path, monkeypatch):
     monkeypatch.setattr("sdfsim.learning.evaluate.evaluate", evaluate)
     lines = run("evaluate", tmp_path, "--free-flight", "learned", "--chaos-floor").stdout.splitlines()
     assert asked["steps"] == 50 and asked["free_flight"] == "learned" and asked["chaos_floor"]
-    assert any("No dataset.json tells the engine's inner step" in line for line in lines)
+    assert any("No dataset.json tells" in line for line in lines)
     assert "50 steps = 1 s" in lines[1]
     assert [line.split("  ")[0] for line in lines[2:5]] == ["small", "teacher, 1e-6 m/s off", "ballistic"]
     assert all("0.171 (0.150 to 0.190)" in line and "12.0 (11.0 to 13.0)" in line for line in lines[2:5])
