@@ -74,9 +74,7 @@ def notes(report: dict[str, Any]) -> list[str]:
     if shown := sorted(name for name, kind in depth["geometry"].items() if kind == "shown mesh"):
         lines.append(f"Without the engine's files, penetration is into the mesh that is shown of {', '.join(shown)}.")
     if not report["engine_substep"]:
-        lines.append(
-            "No dataset.json tells the engine's inner step: velocities count as at the positions' instants."
-        )
+        lines.append("No dataset.json tells the engine's inner step: velocities count as at the positions' instants.")
     if "left_out" in floor:
         lines.append(f"The teacher's chaos floor is left out: {floor['left_out']}.")
     elif floor:
