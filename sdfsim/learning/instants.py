@@ -22,7 +22,7 @@ def engine_substep(data: Path) -> float:
     """
     for folder in (data, data.parent):
         if (folder / "dataset.json").exists():
-            settings = read_info(folder).get("engine_settings", {})
+            settings = read_info(folder).get("engine_settings") or {}
             found = settings.get("timeStep", 0.0) if isinstance(settings, dict) else settings
             if isinstance(found, bool) or not isinstance(found, int | float) or not 0.0 <= found <= LONGEST:
                 where = f"{folder / 'dataset.json'}: engine_settings.timeStep"
