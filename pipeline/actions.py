@@ -66,9 +66,13 @@ def do_poses(run: Run, work: Path) -> dict:
     """Poses stage."""
     from pipeline.photos import load_photos
     from pipeline.poses import solve
+    from pipeline.scale import check_places
 
-    photos = run.place("photos")
-    return solve(load_photos(photos), photos, work, seed=run.options.seed, on_progress=run.tell("poses"))
+    folder = run.place("photos")
+    photos, known = load_photos(folder), run.options.wishes().distance
+    if known is not None:
+        check_places(known, photos)  # rather than after minutes of poses and training
+    return solve(photos, folder, work, seed=run.options.seed, on_progress=run.tell("poses"))
 
 
 def do_distill(run: Run, work: Path) -> dict:

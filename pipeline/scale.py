@@ -5,8 +5,10 @@ from __future__ import annotations
 import difflib
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from PIL import ExifTags
@@ -26,6 +28,8 @@ SUBJECT_SCATTER = 0.2
 NEARBY, BEHIND = (0.0, 0.008, 0.016, 0.024), 1.1
 FEWEST = 3  # photos with EXIF distances or positions
 EARTH = 6_371_000.0  # m
+
+Named = TypeVar("Named", View, Photo)
 
 
 @dataclass(frozen=True)
@@ -55,18 +59,26 @@ def measured(known: Known, views: list[View], photos: list[Photo], surface: Cast
     return Scale(known.metres / found, f"given: {known.start} to {known.end} = {known.metres:g} m")
 
 
+def check_places(known: Known, photos: list[Photo]) -> None:
+    """What can be known of a distance's ends before there are poses.
+
+    Raises:
+        SdfsimError: no such photo or several, or a pixel outside it.
+    """
+    for text in (known.start, known.end):
+        name, pixel = _parts(text)
+        _check_pixel(text, pixel, _called(name, photos, "photo"))
+
+
 def _locate(text: str, views: list[View], photos: list[Photo], surface: Caster) -> np.ndarray:
     """Position [3] of one end of a known distance."""
-    pixel = re.fullmatch(r"(.+):(\d+(?:\.\d+)?),(\d+(?:\.\d+)?)", text)
-    name = pixel[1] if pixel else text
-    view = _called(name, views)
+    name, pixel = _parts(text)
+    view = _called(name, views, "posed photo")
     if pixel is None:
         return view.center
     photo = next(photo for photo in photos if photo.name == view.name)
-    x, y = float(pixel[2]), float(pixel[3])
-    width, height = photo.original
-    if not (x <= width and y <= height):
-        raise SdfsimError(f"distance: {text} lies outside the photo ({width} x {height} px)")
+    _check_pixel(text, pixel, photo)
+    x, y = pixel
     turn = np.arange(8) * np.pi / 4
     around = np.concatenate([r * np.stack([np.cos(turn), np.sin(turn)], 1) for r in NEARBY]) * view.width
     spots = photo.prepared(np.array([[x, y]]), view) + around
@@ -80,19 +92,31 @@ def _locate(text: str, views: list[View], photos: list[Photo], surface: Caster) 
     return view.center + away[best] * rays[0]
 
 
-def _called(name: str, views: list[View]) -> View:
-    """The view of the photo with this name, with or without its subfolder."""
+def _parts(text: str) -> tuple[str, tuple[float, float] | None]:
+    """The photo's name, and the pixel if one is given."""
+    pixel = re.fullmatch(r"(.+):(\d+(?:\.\d+)?),(\d+(?:\.\d+)?)", text)
+    return (pixel[1], (float(pixel[2]), float(pixel[3]))) if pixel else (text, None)
+
+
+def _check_pixel(text: str, pixel: tuple[float, float] | None, photo: Photo) -> None:
+    width, height = photo.original
+    if pixel is not None and not (pixel[0] <= width and pixel[1] <= height):
+        raise SdfsimError(f"distance: {text} lies outside the photo ({width} x {height} px)")
+
+
+def _called(name: str, views: Sequence[Named], what: str) -> Named:
+    """The one of `views` whose photo has this name, with or without its subfolder."""
     found = [v for v in views if v.source == name] or [v for v in views if Path(v.source).name == name]
     if len(found) == 1:
         return found[0]
     if found:
         raise SdfsimError(
-            f"distance: {len(found)} posed photos are called {name!r}",
+            f"distance: {len(found)} {what}s are called {name!r}",
             f"write its folder as well: {', '.join(v.source for v in found[:3])}",
         )
     near = difflib.get_close_matches(name, [v.source for v in views], 3, 0.3) or [v.source for v in views[:3]]
     raise SdfsimError(
-        f"distance: no posed photo is called {name!r}",
+        f"distance: no {what} is called {name!r}",
         f"write PHOTO:X,Y for a pixel or PHOTO for the camera; photos: {', '.join(near)}, ...",
     )
 

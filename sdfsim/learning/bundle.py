@@ -113,7 +113,8 @@ def card_text(model: Model, report: dict, *, beside: bool) -> str:
     folders = _folders(card["data"])
     extra = [(what, *tables.error_cells(errors)) for what, errors in report["beside"].items()]
     if others := report.get("other_seeds"):
-        extra.append((f"other training seeds ({len(others)}): low - high", *tables.range_cells(others)))
+        several = f"other training seeds ({len(others)}): low - high"
+        extra.append((several if len(others) > 1 else "another training seed", *tables.range_cells(others)))
     lines = [
         f"# {model.name}",
         "",

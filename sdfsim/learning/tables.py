@@ -37,12 +37,13 @@ def error_cells(horizons: dict[str, dict]) -> list[str]:
 
 
 def range_cells(models: list[dict[str, dict]]) -> list[str]:
-    """For each horizon, the lowest and highest translation and rotation error of several models."""
+    """For each horizon, the lowest and highest translation and rotation error of models; one number where they agree."""
     cells = []
     for steps in models[0]:
         for what, digits in (("translation_rmse", 3), ("rotation_error", 1)):
             values = [horizons[steps][what] for horizons in models]
-            cells.append(f"{min(values):.{digits}f} - {max(values):.{digits}f}")
+            ends = dict.fromkeys(f"{value:.{digits}f}" for value in (min(values), max(values)))
+            cells.append(" - ".join(ends))
     return cells
 
 
