@@ -106,6 +106,8 @@ def evaluate(
         "trajectories": len(recorded),
         "bodies": int(sum(t.position.shape[1] for t in recorded)),
         "dt": recorded[0].dt,
+        "steps": longest,
+        "steps_asked": steps,
         "engine_substep": substep,
         "ms_per_step_per_trajectory": 1e3 * seconds / longest / len(recorded),
         **{who: _errors(motions, recorded) for who, motions in contenders.items()},

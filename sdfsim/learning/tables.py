@@ -37,7 +37,7 @@ def error_cells(horizons: dict[str, dict]) -> list[str]:
 
 
 def range_cells(models: list[dict[str, dict]]) -> list[str]:
-    """For each horizon, the lowest and highest translation and rotation error of models; one number where they agree."""
+    """For each horizon, the lowest and highest translation and rotation error of models; one number if equal."""
     cells = []
     for steps in models[0]:
         for what, digits in (("translation_rmse", 3), ("rotation_error", 1)):
@@ -74,6 +74,8 @@ def notes(report: dict[str, Any]) -> list[str]:
     ]
     if shown := sorted(name for name, kind in depth["geometry"].items() if kind == "shown mesh"):
         lines.append(f"Without the engine's files, penetration is into the mesh that is shown of {', '.join(shown)}.")
+    if (steps := report["steps"]) < report["steps_asked"]:
+        lines.append(f"The shortest recording ends after {steps} steps; {report['steps_asked']} were asked for.")
     if not report["engine_substep"]:
         lines.append("No dataset.json tells the engine's inner step: velocities count as at the positions' instants.")
     if "left_out" in floor:

@@ -13,7 +13,7 @@ from pipeline.cameras import View
 from pipeline.cleaning import joined
 from pipeline.photos import Photo
 from pipeline.rectify import Lens
-from pipeline.scale import GPS_ERROR, measured, of_exif
+from pipeline.scale import GPS_ERROR, check_places, measured, of_exif
 from pipeline.visibility import Caster
 from pipeline.wishes import Known
 from sdfsim.errors import SdfsimError
@@ -91,6 +91,20 @@ def test_a_photo_without_a_pixel_is_its_camera(views, photos):
 def test_places_that_are_none_are_named(views, photos, start, end, says):
     with pytest.raises(SdfsimError, match=says):
         measured(Known(start, end, 1.0), views, photos, Caster(cube(1.0)))
+
+
+@pytest.mark.parametrize(
+    ("end", "says"),
+    [
+        ("photo9.jpg:1,1", "no photo is called 'photo9.jpg'"),
+        ("photo1.jpg:2000,1", r"photo1.jpg:2000,1 lies outside the photo \(1280 x 960 px\)"),
+        (".jpg", "no photo is called '.jpg'"),
+    ],
+)
+def test_photos_and_pixels_that_are_none_are_named_before_there_are_poses(photos, end, says):
+    check_places(Known("photo0.jpg", "photo1.jpg:1280,960", 1.0), photos)
+    with pytest.raises(SdfsimError, match=says):
+        check_places(Known("photo0.jpg", end, 1.0), photos)
 
 
 @pytest.mark.parametrize("known", [Known("a:1,1", "b:1,1", 0.0), Known("a:1,1", "a:1,1", 1.0)])

@@ -124,3 +124,14 @@ def test_poses_of_a_folder_in_work_keep_its_other_options(photos, tmp_path, call
     assert read_config(out) == before and calls == []
     assert command("poses", photos, "-o", out, "--preset", "fine").exit_code == 0
     assert read_config(out) == before.changed({"preset": "fine"})
+
+
+def test_a_place_that_is_not_in_the_photos_is_refused_before_the_poses(photos, tmp_path, calls, monkeypatch):
+    for stage in ("photos", "poses"):
+        monkeypatch.setitem(stages.ACTIONS, stage, ACTIONS[stage])
+    monkeypatch.setattr("pipeline.poses.solve", lambda *places, **options: calls.append("solved") or {})
+    with pytest.raises(SdfsimError, match=r"distance: no photo is called 'cup\.png'"):
+        stages.reconstruct(photos, tmp_path / "out", distance=["0.png:3,4", "cup.png:1,1", 0.1])
+    assert calls == []
+    stages.reconstruct(photos, tmp_path / "out", distance=["0.png:3,4", "2.png:1,1", 0.1], until_stage="poses")
+    assert calls == ["solved"]
