@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from pipeline.photos import Photo
-from pipeline.verdict import failure_hint, failure_message, find, judge, view_span, views_of
+from pipeline.verdict import failure_hint, failure_message, find, judge, views_of
+from pipeline.viewpoints import view_span
 
 
 def photo(index: int, width: int = 640, height: int = 480, focal: float | None = None, fault: str = "") -> Photo:
