@@ -163,10 +163,13 @@ def card_text(model: Model, report: dict, *, beside: bool) -> str:
 
 
 def _cast(made: dict) -> str:
-    """How many shapes there are, and if each belongs to one split alone."""
+    """How many shapes there are, and if each belongs to one split alone, as a recipe's own scenery does not."""
     recipe = RECIPES.get(made["recipe"])
-    plain = recipe is None or recipe.kubasic or not recipe.given
-    return f"{made['shapes']} shapes{'' if plain else ', each in one split alone'}"
+    if recipe is None or recipe.kubasic or not recipe.given:
+        return f"{made['shapes']} shapes"
+    own = len(recipe.scenery)
+    also = f", and {own} of the recipe's own in all" if own else ""
+    return f"{made['shapes'] - own} shapes, each in one split alone{also}"
 
 
 def _trajectories(made: dict) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -84,6 +85,13 @@ _TRAILING = {"position": (3,), "quat_xyzw": (4,), "velocity": (3,), "angular_vel
 _PER_BODY = {"scale": (), "mass": (), "inertia": (3,), "friction": (), "restitution": (), "static": (), "shape": ()}
 
 
+def check_names(where: str, names: Iterable[str]) -> None:
+    """Raises SdfsimError where one of the names cannot be that of a Shape folder of a dataset."""
+    for name in names:
+        if not _NAME.fullmatch(name):
+            raise SdfsimError(f"{where}: {name!r} is no name of a Shape folder", "letters, digits, spaces, . _ - only")
+
+
 def _typed(path: Path, name: str, values: np.ndarray) -> np.ndarray:
     """A field as the type that the rest of the code counts on."""
     try:
@@ -120,8 +128,7 @@ def _check(path: Path, arrays: dict) -> None:
         raise SdfsimError(f"{path}: position: needs at least two frames (got {frames})")
     if np.abs(np.linalg.norm(arrays["quat_xyzw"], axis=-1) - 1.0).max(initial=0.0) > 1e-3:
         raise SdfsimError(f"{path}: quat_xyzw: must be unit quaternions")
-    if outside := [name for name in arrays["shape"].tolist() if not _NAME.fullmatch(name)]:
-        raise SdfsimError(f"{path}: shape: {outside[0]!r} is no name of a Shape folder", "letters, digits, . _ - only")
+    check_names(f"{path}: shape", arrays["shape"].tolist())
     if not (arrays["scale"] > 0).all() or not 0 < arrays["dt"] <= LONGEST_STEP:
         raise SdfsimError(f"{path}: scale must be > 0, dt > 0 and at most {LONGEST_STEP:g} s")
     if (arrays["friction"] < 0).any() or ((arrays["restitution"] < 0) | (arrays["restitution"] > 1)).any():

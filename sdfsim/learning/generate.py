@@ -12,7 +12,17 @@ from sdfsim.errors import SdfsimError
 from sdfsim.files import locked
 from sdfsim.learning.dataset import FLOOR, SPLITS, Trajectory, read_info, write_info
 from sdfsim.learning.recipes import RECIPES, Cast, Recipe
-from sdfsim.learning.shapes import Origin, ShapeSource, find_shapes, fit_shapes, origins, prepare, split_of
+from sdfsim.learning.shapes import (
+    Origin,
+    ShapeSource,
+    find_shapes,
+    fit_shapes,
+    kubasic_origins,
+    made_from,
+    origins,
+    prepare,
+    split_of,
+)
 from sdfsim.learning.statistics import statistics, statistics_lines
 from sdfsim.learning.teacher import DT, ENGINE_SETTINGS, SUBSTEP, Teacher, import_pybullet
 from sdfsim.parallel import parallel
@@ -65,7 +75,7 @@ def make_dataset(
     plan = _checked(recipe, split, trajectories, shapes, random_solids, bodies)
     tell = on_progress or (lambda fraction, message: None)
     engine = import_pybullet()
-    cast, found = _cast(plan, shapes, random_solids, out / "shapes" / "engine", lambda f, m: tell(0.1 * f, m))
+    given = _origins(plan, shapes, random_solids)
     info = {
         "recipe": recipe,
         "seed": seed,
@@ -73,33 +83,25 @@ def make_dataset(
         "engine_version": str(engine.getAPIVersion()),
         "engine_settings": ENGINE_SETTINGS | {"timeStep": SUBSTEP},
         "floor": {"friction": FLOOR[0], "restitution": FLOOR[1]},
-        **found,
+        "made_from": made_from(given),
     }
     if plan.counted:
         info["bodies"] = bodies
-    if (out / "dataset.json").exists() and read_info(out) != info:
-        raise SdfsimError(
-            f"{out} holds a dataset of another recipe, seed, engine, count or set of shapes", "choose another -o"
-        )
-    if not plan.kubasic:
-        cast = replace(cast, shapes=[s for s in cast.shapes if split_of(s.name) == split])
-    if plan.given and not cast.shapes:
-        raise SdfsimError(f"none of the {len(info['shapes'])} shapes belongs to the {split} split", "give more shapes")
     with locked(out):
-        folder = out / split
-        folder.mkdir(parents=True, exist_ok=True)
+        # Before anything is written: engine files of another dataset's shapes must stay what they are.
+        _check_same(out, info)
+        cast, found = _cast(plan, shapes, given, out / "shapes" / "engine", lambda f, m: tell(0.1 * f, m))
+        info |= found
+        _check_same(out, info)
+        cast = replace(_of_split(plan, cast, split), bodies=bodies)
         fit_shapes([*cast.shapes, *cast.scenery.values()], out / "shapes", lambda f, m: tell(0.1 + 0.4 * f, m))
         write_info(out, info)
-        cast = replace(cast, bodies=bodies)
-        todo = [k for k in range(trajectories) if not (folder / f"{k:05d}.npz").exists()]
-        jobs = [(recipe, k, seed, split, cast, folder / f"{k:05d}.npz") for k in todo]
-        for done, _ in enumerate(parallel(_make_one, jobs), start=1):
-            tell(0.5 + 0.5 * done / len(todo), f"trajectory {done} of {len(todo)}")
+        made_now = _make_all(recipe, seed, split, cast, out / split, trajectories, lambda f, m: tell(0.5 + 0.5 * f, m))
         return {
             "dataset": str(out),
             "split": split,
             "trajectories": trajectories,
-            "made_now": len(todo),
+            "made_now": made_now,
             "shapes": len(cast.shapes),
             "left_out": info.get("left_out", {}),
             "statistics": statistics(out, split),
@@ -153,6 +155,18 @@ def make_trajectory(recipe: str, rng: np.random.Generator, cast: Cast) -> Trajec
     )
 
 
+def _make_all(
+    recipe: str, seed: int, split: str, cast: Cast, folder: Path, count: int, on_progress: Progress
+) -> int:
+    """Write the first `count` trajectories of a split that are not there yet; how many those were."""
+    folder.mkdir(parents=True, exist_ok=True)
+    todo = [k for k in range(count) if not (folder / f"{k:05d}.npz").exists()]
+    jobs = [(recipe, k, seed, split, cast, folder / f"{k:05d}.npz") for k in todo]
+    for done, _ in enumerate(parallel(_make_one, jobs), start=1):
+        on_progress(done / len(todo), f"trajectory {done} of {len(todo)}")
+    return len(todo)
+
+
 def _make_one(recipe: str, index: int, seed: int, split: str, cast: Cast, path: Path) -> None:
     make_trajectory(recipe, np.random.default_rng([seed, SPLITS.index(split), index]), cast).save(path)
 
@@ -181,20 +195,47 @@ def _checked(
     return plan
 
 
+def _check_same(out: Path, info: dict) -> None:
+    """Raises SdfsimError when the folder holds a dataset of which anything in `info` is not true."""
+    if (out / "dataset.json").exists():
+        there = read_info(out)
+        if any(there.get(key) != value for key, value in info.items()):
+            raise SdfsimError(
+                f"{out} holds a dataset of another recipe, seed, engine, count or set of shapes", "choose another -o"
+            )
+
+
+def _origins(plan: Recipe, shapes: Path | None, random_solids: int) -> list[Origin]:
+    """Where the shapes of a recipe come from, its own scenery last."""
+    if plan.kubasic:
+        assert shapes is not None
+        return kubasic_origins(shapes)
+    given = origins(shapes, random_solids) if plan.given else []
+    if taken := {o.name for o in given} & set(plan.scenery):
+        raise SdfsimError(f"{shapes}: the recipe has a shape {min(taken)!r} of its own", "rename yours")
+    return given + [Origin(name, primitive=kind) for name, kind in plan.scenery.items()]
+
+
 def _cast(
-    plan: Recipe, shapes: Path | None, random_solids: int, engine: Path, on_progress: Progress
+    plan: Recipe, shapes: Path | None, given: list[Origin], engine: Path, on_progress: Progress
 ) -> tuple[Cast, dict]:
     """All shapes of a recipe, and what `dataset.json` says of them."""
     if plan.kubasic:
         assert shapes is not None
         sources = find_shapes(shapes, engine)
         return Cast(sources), {"shapes": [s.name for s in sources]}
-    given = origins(shapes, random_solids) if plan.given else []
-    own = [Origin(name, primitive=kind) for name, kind in plan.scenery.items()]
-    if taken := {o.name for o in given} & set(plan.scenery):
-        raise SdfsimError(f"{shapes}: the recipe has a shape {min(taken)!r} of its own", "rename yours")
-    found, info = prepare(given + own, engine, on_progress)
+    found, info = prepare(given, engine, on_progress)
     return _sorted_out(found, plan), info
+
+
+def _of_split(plan: Recipe, cast: Cast, split: str) -> Cast:
+    """The cast with the shapes of one split; Kubric's are in all."""
+    if plan.kubasic:
+        return cast
+    mine = [s for s in cast.shapes if split_of(s.name) == split]
+    if plan.given and not mine:
+        raise SdfsimError(f"none of the {len(cast.shapes)} shapes belongs to the {split} split", "give more shapes")
+    return replace(cast, shapes=mine)
 
 
 def _sorted_out(found: list[ShapeSource], plan: Recipe) -> Cast:

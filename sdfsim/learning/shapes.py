@@ -12,7 +12,7 @@ import numpy as np
 
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, write_json, write_text
-from sdfsim.learning.dataset import SOLID
+from sdfsim.learning.dataset import SOLID, check_names
 from sdfsim.learning.decompose import VHACD, decompose, wavefront
 from sdfsim.learning.teacher import write_urdf
 from sdfsim.parallel import parallel
@@ -92,16 +92,28 @@ def find_shapes(shapes: Path, engine: Path) -> list[ShapeSource]:
     """
     engine.mkdir(parents=True, exist_ok=True)
     found = []
-    for folder in _shape_folders(shapes):
-        mesh = load_mesh(folder / VISUAL)
+    for origin in kubasic_origins(shapes):
+        assert origin.mesh is not None and origin.pieces is not None
+        mesh = load_mesh(origin.mesh)
         volume = mass_properties(mesh)[0]
         # Kubric's assets have their centre of mass at the origin; their URDF says so and the engine takes it.
-        pieces = engine / f"{folder.name}.obj"
-        write_text(pieces, (folder / COLLISION).read_text(encoding="utf-8"))
+        pieces = engine / f"{origin.name}.obj"
+        write_text(pieces, origin.pieces.read_text(encoding="utf-8"))
         urdf = _engine_file(pieces)
-        found.append(ShapeSource(folder.name, urdf, volume, mesh.vertices, pieces, folder / VISUAL, np.zeros(3), 1.0))
+        found.append(ShapeSource(origin.name, urdf, volume, mesh.vertices, pieces, origin.mesh, np.zeros(3), 1.0))
+    return found
+
+
+def kubasic_origins(shapes: Path) -> list[Origin]:
+    """The NAME/ folders of a folder (see `find_shapes`), in name order.
+
+    Raises:
+        SdfsimError: there are none, or one of a name that no Shape folder can have.
+    """
+    found = [Origin(f.name, f / VISUAL, f / COLLISION) for f in _shape_folders(shapes)]
     if not found:
         raise SdfsimError(f"{shapes}: no shapes found", f"expected NAME/{VISUAL} and NAME/{COLLISION}")
+    check_names(f"{shapes}", [origin.name for origin in found])
     return found
 
 
@@ -109,7 +121,7 @@ def origins(shapes: Path | None, random_solids: int = 0) -> list[Origin]:
     """Mesh files and NAME/ folders (see `find_shapes`) of a folder, then the first of PyBullet's random solids.
 
     Raises:
-        SdfsimError: no shapes, more solids than there are, or one name twice.
+        SdfsimError: no shapes, more solids than there are, one name twice, or one that no Shape folder can have.
     """
     found = []
     if shapes is not None:
@@ -127,7 +139,13 @@ def origins(shapes: Path | None, random_solids: int = 0) -> list[Origin]:
     names = [origin.name for origin in found]
     if twice := {name for name in names if names.count(name) > 1}:
         raise SdfsimError(f"{shapes}: two shapes are called {min(twice)!r}", "rename one")
+    check_names(f"{shapes}", names)
     return found
+
+
+def made_from(found: list[Origin]) -> dict[str, dict[str, str]]:
+    """Name -> how its pieces come about and what changes with its geometry: what `dataset.json` is to say."""
+    return {origin.name: {"pieces": origin.how, "sha256": origin.digest()} for origin in found}
 
 
 def prepare(found: list[Origin], engine: Path, on_progress: Progress) -> tuple[list[ShapeSource], dict]:
@@ -139,8 +157,8 @@ def prepare(found: list[Origin], engine: Path, on_progress: Progress) -> tuple[l
         on_progress: called with the fraction done and a message.
 
     Returns:
-        The usable shapes in the order of `found`; and what `dataset.json` is to say: `shapes`, `made_from`
-        (name -> pieces, digest), `left_out` (name -> why) and `vhacd`.
+        The usable shapes in the order of `found`; and what `dataset.json` is to say: `shapes`, `left_out`
+        (name -> why) and `vhacd`.
     """
     engine.mkdir(parents=True, exist_ok=True)
     records: list[dict[str, Any]] = [{}] * len(found)
@@ -152,7 +170,6 @@ def prepare(found: list[Origin], engine: Path, on_progress: Progress) -> tuple[l
     kept = [(o, r) for o, r in pairs if "left_out" not in r]
     info = {
         "shapes": [o.name for o, _ in kept],
-        "made_from": {o.name: {"pieces": o.how, "sha256": r["sha256"]} for o, r in kept},
         "left_out": left_out,
         "vhacd": VHACD,
     }

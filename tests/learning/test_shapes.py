@@ -10,15 +10,18 @@ import pytest
 pytest.importorskip("pybullet")
 
 from sdfsim.errors import SdfsimError
+from sdfsim.files import locked
 from sdfsim.learning import decompose as cutting
+from sdfsim.learning import generate
 from sdfsim.learning.decompose import decompose, wavefront
 from sdfsim.learning.floor import engine_file
 from sdfsim.learning.generate import make_dataset
-from sdfsim.learning.shapes import COLLISION, VISUAL, find_shapes, origins, prepare, split_of
+from sdfsim.learning.shapes import COLLISION, VISUAL, find_shapes, made_from, origins, prepare, split_of
 from sdfsim.learning.teacher import Teacher, TeacherBody, write_urdf
 from sdfsim.shape import primitives
 from sdfsim.shape.mesh import Mesh, signed_volume
 from sdfsim.shape.storage import write_ply
+from tests.learning.conftest import CUBE
 
 NAMES = [f"shape {k}" for k in range(2000)]
 
@@ -66,7 +69,8 @@ def test_an_angle_becomes_convex_pieces_of_nearly_its_volume_without_a_word(tmp_
 def test_prepared_shapes_are_centred_of_unit_extent_and_kept_and_sheets_are_left_out(prepared):
     found, engine, sources, info = prepared
     assert [s.name for s in sources] == ["block"] and list(info["left_out"]) == ["sheet"]
-    assert info["made_from"]["block"]["pieces"] == "own" and "thinner" in info["left_out"]["sheet"]
+    assert {name: how["pieces"] for name, how in made_from(found).items()} == {"block": "own", "sheet": "vhacd"}
+    assert "thinner" in info["left_out"]["sheet"]
     (block,) = sources
     assert np.ptp(block.vertices, axis=0) == pytest.approx([1.0, 0.5, 0.25])
     assert block.vertices.min(0) == pytest.approx(-block.vertices.max(0))
@@ -122,6 +126,41 @@ def test_random_solids_are_numbered_and_no_name_is_taken_twice(tmp_path):
         (tmp_path / name).write_text("")
     with pytest.raises(SdfsimError, match="two shapes are called 'one'"):
         origins(tmp_path)
+
+
+def test_names_that_no_dataset_could_hold_are_refused_before_anything_is_made(tmp_path):
+    (tmp_path / "cup (1).obj").write_text(CUBE)
+    with pytest.raises(SdfsimError, match=r"'cup \(1\)' is no name of a Shape folder"):
+        make_dataset("movi-c", tmp_path / "data", shapes=tmp_path, trajectories=1)
+    assert not (tmp_path / "data").exists()
+    for name in (VISUAL, COLLISION):
+        (tmp_path / "a+b").mkdir(exist_ok=True)
+        (tmp_path / "a+b" / name).write_text(CUBE)
+    with pytest.raises(SdfsimError, match=r"'a\+b' is no name"):
+        make_dataset("movi-b", tmp_path / "data", shapes=tmp_path, trajectories=1)
+
+
+@pytest.mark.parametrize("recipe", ["movi-b", "pile"])
+def test_another_shape_of_the_same_name_leaves_a_dataset_as_it_is(tmp_path, monkeypatch, recipe):
+    """What its recordings were made with is never written over."""
+    monkeypatch.setattr(generate, "fit_shapes", lambda *_: None)
+    monkeypatch.setattr(generate, "_make_one", lambda *a: a[-1].write_text(""))
+    monkeypatch.setattr(generate, "parallel", lambda work, jobs: ((k, work(*job)) for k, job in enumerate(jobs)))
+    monkeypatch.setattr(generate, "statistics", lambda *_: {})
+    for name, mesh in (("first", primitives.box((1.0, 1.0, 1.0))), ("second", primitives.box((1.0, 1.0, 0.7)))):
+        (tmp_path / name / "block").mkdir(parents=True)
+        for file in (VISUAL, COLLISION):
+            (tmp_path / name / "block" / file).write_text(wavefront([mesh]))
+    out = tmp_path / "data"
+    make_dataset(recipe, out, shapes=tmp_path / "first", trajectories=1)
+    engine = out / "shapes" / "engine" / "block.obj"
+    before = engine.read_bytes()
+    with pytest.raises(SdfsimError, match="another recipe, seed, engine, count or set of shapes"):
+        make_dataset(recipe, out, shapes=tmp_path / "second", trajectories=2)
+    assert engine.read_bytes() == before
+    with locked(out), pytest.raises(SdfsimError, match="another run"):
+        make_dataset(recipe, out, shapes=tmp_path / "first", trajectories=2)
+    assert make_dataset(recipe, out, shapes=tmp_path / "first", trajectories=2)["made_now"] == 1
 
 
 @pytest.mark.parametrize(
