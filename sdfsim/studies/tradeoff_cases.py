@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import time
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -20,17 +19,14 @@ from sdfsim.learning.merge import scene_of
 from sdfsim.learning.penetration import Solid, engine_pieces, exact_solids
 from sdfsim.learning.rollouts import first_frames
 from sdfsim.scene.types import Scene
-from sdfsim.shape.asset import Shape, load_shape
-from sdfsim.shape.distance import DistanceOracle, PiecesDistance
-from sdfsim.shape.grid import sample_grid
+from sdfsim.shape.asset import Shape
+from sdfsim.shape.distance import PiecesDistance
 from sdfsim.shape.mesh import Mesh
-from sdfsim.shape.plans import PLANS
 from sdfsim.shape.sdf import accepts_numpy
-from sdfsim.shape.training import train
+from sdfsim.studies.tradeoff_shapes import digest_of
 
 MOST, MOST_QUICK = 20, 8  # trajectories
 STEPS, TIMED_STEPS = 100, 80
-FIT_SECONDS = 60.0  # at most, for a network of another width
 
 
 @dataclass(frozen=True)
@@ -82,11 +78,14 @@ class Cases:
 
     def digest(self) -> str:
         """Changes with all that a measurement depends on but the contender itself."""
-        told = hashlib.sha256(f"{self.steps} {self.timed} {self.timed_steps} {self.floor}".encode())
-        for t in self.recorded:
-            told.update(np.ascontiguousarray(t.position).tobytes())
+        plain = (self.steps, self.timed, self.timed_steps, self.floor, self.length, self.time)
+        told = hashlib.sha256(repr(plain).encode())
+        for t in (*self.recorded, *self.starts):
+            for name, value in vars(t).items():
+                told.update(name.encode() + np.ascontiguousarray(value).tobytes())
         for name, shape in sorted(self.shapes.items()):
-            told.update(name.encode() + np.ascontiguousarray(shape.nodes).tobytes())
+            pieces = [piece.digest() for piece in self.pieces.get(name, [])]
+            told.update(repr((name, digest_of(shape), pieces)).encode())
         return told.hexdigest()[:16]
 
 
@@ -108,37 +107,6 @@ class PiecesSdf:
         truth = self.oracle(asked)
         away = np.where(truth.distance == 0, 1.0, truth.distance)[:, None]
         return torch.from_numpy(truth.distance).to(points), torch.from_numpy((asked - truth.closest) / away).to(points)
-
-
-def sampled(shape: Shape, resolution: int, scratch: Path) -> Shape:
-    """A shape whose network's distances are sampled on a grid, once, and kept; `source` says how long it took."""
-    folder = scratch / f"grid-{resolution}" / shape.name
-    if folder.exists():
-        return load_shape(folder)
-    began = time.process_time()
-    grid = sample_grid(shape.sdf, shape.sdf.bounds, resolution)
-    took = time.process_time() - began + float(shape.certificate.get("seconds") or 0.0)
-    note = {"sdf": "grid", "resolution": resolution, "fitted_s": took}
-    made = replace(shape, sdf=grid, certificate={}, source=shape.source | note)
-    made.save(folder)
-    return made
-
-
-def refitted(shape: Shape, width: int, oracle: DistanceOracle, scratch: Path) -> Shape:
-    """A shape whose network is of another width, fitted once to `oracle` in `FIT_SECONDS` at most, and kept.
-
-    Its `source` says how long that took.
-    """
-    folder = scratch / f"width-{width}" / shape.name
-    if folder.exists():
-        return load_shape(folder)
-    began = time.process_time()
-    plan = replace(PLANS["default"], width=width)
-    sdf, _ = train([oracle], plan, budget=FIT_SECONDS, seed=0, tell=lambda fraction, message: None)[0]
-    note = {"width": width, "fitted_s": time.process_time() - began}
-    made = replace(shape, sdf=sdf, certificate={}, source=shape.source | note)
-    made.save(folder)
-    return made
 
 
 def load_cases(data: Path, scratch: Path, *, quick: bool) -> Cases:

@@ -22,8 +22,9 @@ from sdfsim.shape.asset import Shape
 from sdfsim.shape.distance import MeshDistance, PiecesDistance
 from sdfsim.shape.mlp import MlpSdf
 from sdfsim.shape.solid import solidify
-from sdfsim.studies.tradeoff_cases import Cases, PiecesSdf, refitted, sampled
+from sdfsim.studies.tradeoff_cases import Cases, PiecesSdf
 from sdfsim.studies.tradeoff_knobs import Setting, arranged_model, arranged_scene, arranged_shape, threads_of
+from sdfsim.studies.tradeoff_shapes import refitted, sampled
 
 
 @dataclass(frozen=True)
