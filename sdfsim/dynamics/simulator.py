@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import re
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -52,7 +53,12 @@ def scene_units(scene: Scene, model: Model, dt: float | None = None) -> Units:
         scene: what is to be simulated.
         model: knows the size and gravity it was trained at.
         dt: s, fixes the scale by the wanted step instead of by the bodies' size.
+
+    Raises:
+        SdfsimError: a step that is no positive number.
     """
+    if dt is not None and not 0.0 < dt < np.inf:
+        raise SdfsimError(f"dt: must be > 0 s and finite (got {dt:g})")
     strength = float(np.linalg.norm(scene.gravity)) or EARTH
     moving = [b for b in scene.bodies if b.motion == "dynamic"]
     sizes = [largest_extent(scene.shapes[b.shape]) * b.scale for b in moving]
@@ -84,7 +90,7 @@ class Simulator:
         outside_training: what of the scene the model has not seen in training, one line each.
 
     Raises:
-        SdfsimError: no such model or device, a body that moves without mass or without nodes that tell how it turns,
+        SdfsimError: no such model or device, a step that is none, a body that moves without mass or without nodes that tell how it turns,
             one that is too far away or too fast.
     """
 
@@ -210,6 +216,8 @@ class Simulator:
         if broken := self._fault(self.state, everybody(self.bodies)):
             self.state = self._good
             raise self._broke(broken)
+        if self.model.kind == "paper":
+            self.state = _history_told(self.state, self._good, self.bodies, self.rules)
         self._good = self.state
 
     def _fault(self, state: State, rows: torch.Tensor, before: State | None = None) -> str | None:
@@ -291,10 +299,38 @@ def with_history(state: State, bodies: Bodies, rules: Rules) -> State:
     )
 
 
+def _history_told(state: State, before: State, bodies: Bodies, rules: Rules) -> State:
+    """A state from outside, with earlier poses that go with it.
+
+    Those that it shares with the state `before` are of that one's motion: bodies that were changed since get the poses
+    that their velocities lead from. A state with earlier poses of its own, such as a restored one, keeps them.
+    """
+    if state.earlier_position is None or state.earlier_orientation is None:
+        return with_history(state, bodies, rules)
+    if state.earlier_position is not before.earlier_position:
+        return state
+    changed = torch.zeros_like(bodies.moves)
+    for name in ("position", "orientation", "velocity", "angular_velocity"):
+        changed |= (getattr(state, name) != getattr(before, name)).any(-1)
+    told = with_history(state, bodies, rules)
+    return replace(
+        state,
+        earlier_position=torch.where(changed[:, None], told.earlier_position, state.earlier_position),
+        earlier_orientation=torch.where(changed[:, None], told.earlier_orientation, state.earlier_orientation),
+    )
+
+
 def pick_device(name: str) -> torch.device:
-    """ "auto", "cpu" or "cuda" as a device. Raises SdfsimError when CUDA is asked for and absent."""
+    """ "auto", "cpu", "cuda" or "cuda:0" as a device.
+
+    Raises:
+        SdfsimError: another name, or CUDA is asked for and absent.
+    """
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    if name == "cuda" and not torch.cuda.is_available():
-        raise SdfsimError("--device cuda: no CUDA device here", "use --device cpu")
-    return torch.device(name)
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", name, re.ASCII):
+        raise SdfsimError(f"device: {name!r} is not auto, cpu or cuda")
+    place = torch.device(name)
+    if place.type == "cuda" and (place.index or 0) >= torch.cuda.device_count():
+        raise SdfsimError(f"--device {name}: no CUDA device here", "use --device cpu")
+    return place

@@ -135,6 +135,12 @@ def _check(path: Path, arrays: dict) -> None:
         raise SdfsimError(f"{path}: friction must be >= 0, restitution from 0 to 1")
 
 
+def check_alike(where: str, trajectories: Iterable[Trajectory]) -> None:
+    """Raises SdfsimError where trajectories that are used together differ in step or gravity."""
+    if len({(t.dt, *t.gravity.tolist()) for t in trajectories}) > 1:
+        raise SdfsimError(f"{where}: its trajectories differ in step or gravity", "give a dataset of one recipe")
+
+
 def write_info(folder: Path, info: dict) -> None:
     """Write `dataset.json` (recipe, seed, engine with version and settings)."""
     write_json(folder / "dataset.json", info)

@@ -127,7 +127,7 @@ def contact_frames(
     """The contact frames of a dataset split: from the cache file beside it, else found now and cached.
 
     Raises:
-        SdfsimError: no trajectories, or unreadable ones.
+        SdfsimError: no trajectories, unreadable ones, or some that differ in step or gravity.
     """
     folder = data / "frames"
     if not (data / split).is_dir():
@@ -139,6 +139,7 @@ def contact_frames(
     cached = folder / f"{split}-{reach:g}-{_fingerprint(data, files)}.npz"
     if cached.exists():
         return ContactFrames.load(cached)
+    check_alike(str(data / split), map(Trajectory.load, files))
     parts: list[dict[str, np.ndarray]] = [{}] * len(files)
     for done, (index, part) in enumerate(parallel(_of_file, [(f, reach) for f in files]), start=1):
         parts[index] = part

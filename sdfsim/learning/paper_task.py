@@ -15,7 +15,7 @@ from sdfsim.dynamics.bodies import Bodies, State, Units
 from sdfsim.dynamics.contacts import find_contacts
 from sdfsim.dynamics.paper import PaperNetwork, SurfaceGraph
 from sdfsim.dynamics.surfaces import node_owner, surface_graph, target_acceleration
-from sdfsim.learning.dataset import FLOOR, Trajectory, load_shapes, product_range, trajectory_files
+from sdfsim.learning.dataset import FLOOR, Trajectory, check_alike, load_shapes, product_range, trajectory_files
 from sdfsim.learning.merge import merged
 from sdfsim.learning.team import ALONE, Team
 
@@ -45,6 +45,7 @@ class PaperTask:
 
     def __init__(self, data: Path, split: str, reach: float, device: torch.device, noise: float | None) -> None:
         self.trajectories = [Trajectory.load(f) for f in trajectory_files(data, split)]
+        check_alike(f"{data / split}", self.trajectories)
         names = {str(n) for t in self.trajectories for n in t.shape}
         self.shapes = {k: replace(s, nodes=s.nodes[:NODES]) for k, s in load_shapes(data, names).items()}
         self.reach, self.device, self.noise, self.nodes = reach, device, noise, NODES
@@ -111,15 +112,21 @@ class PaperTask:
         return int(batch.moves.sum())
 
     def ranges(self) -> dict[str, list[float]]:
-        """[low, high] of what the trajectories hold, SI units, coefficients as products with the floor's."""
+        """[low, high] of what the trajectories hold, SI units, coefficients as products with the floor's.
+
+        Sizes and speeds are those of the bodies that move.
+        """
         extent = {name: float(np.ptp(shape.sdf.bounds, axis=0).max()) for name, shape in self.shapes.items()}
-        size = [extent[str(n)] * s for t in self.trajectories for n, s in zip(t.shape, t.scale, strict=True)]
+        size = np.concatenate([[extent[str(n)] for n in t.shape] * t.scale for t in self.trajectories])
+        size = size[~np.concatenate([t.static for t in self.trajectories])]
         masses = [t.mass[~t.static] for t in self.trajectories if not t.static.all()]
         friction = np.concatenate([t.friction for t in self.trajectories])
         restitution = np.concatenate([t.restitution for t in self.trajectories])
-        speed = np.concatenate([np.linalg.norm(t.velocity, axis=-1).ravel() for t in self.trajectories])
+        speed = np.concatenate(
+            [np.linalg.norm(t.velocity[:, ~t.static], axis=-1).ravel() for t in self.trajectories]
+        )
         return {
-            "size": [float(min(size)), float(max(size))],
+            "size": [float(size.min()), float(size.max())],
             "speed": [0.0, float(np.percentile(speed, 99.9))],
             "mass_ratio": [1.0, float(max(mass.max() / mass.min() for mass in masses))],
             "friction": product_range(friction, FLOOR[0]),

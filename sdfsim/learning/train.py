@@ -69,7 +69,9 @@ def train(
         raise SdfsimError(f"unknown preset {preset!r}", f"known: {', '.join(PRESETS)}")
     plan = PRESETS[preset]
     folders = [data] if isinstance(data, Path) else list(data)
-    total = steps or plan.steps
+    if steps is not None and steps < 1:
+        raise SdfsimError(f"steps: must be at least 1 (got {steps})")
+    total = plan.steps if steps is None else steps
     checkpoint = out / "checkpoint.npz"
     if checkpoint.exists() and not resume:
         raise SdfsimError(f"{checkpoint} exists", "continue with --resume, or choose another -o")

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from sdfsim.errors import SdfsimError
-from sdfsim.learning.dataset import FLOOR, Trajectory, load_shapes, read_info, trajectory_files
+from sdfsim.learning.dataset import FLOOR, Trajectory, check_alike, load_shapes, read_info, trajectory_files
 from sdfsim.learning.floor import engine_file
 from sdfsim.learning.instants import at_instants, engine_substep
 from sdfsim.learning.merge import scene_of
@@ -124,8 +124,7 @@ def load_cases(data: Path, scratch: Path, *, quick: bool) -> Cases:
     recorded = [t for t in map(Trajectory.load, files) if not t.static.all()]
     if not recorded:
         raise SdfsimError(f"{data}: nothing moves in any trajectory")
-    if len({(t.dt, *t.gravity) for t in recorded}) > 1:
-        raise SdfsimError(f"{data}: its trajectories differ in step or gravity", "give a dataset of one recipe")
+    check_alike(str(data), recorded)
     longest = min(50 if quick else STEPS, *(len(t.position) - 1 for t in recorded))
     recorded = [first_frames(t, longest + 1) for t in recorded]
     substep = engine_substep(data)

@@ -43,8 +43,10 @@ def landings(simulator: Simulator, steps: int) -> np.ndarray:
 
 
 def roundness(simulator: Simulator) -> float:
-    """Share of the moving bodies' nodes around which the surface is smooth."""
+    """Share of the moving bodies' nodes around which the surface is smooth; of no account where nothing may touch."""
     bodies = simulator.bodies
+    if not simulator.rules.contact:
+        return 0.0
     known = simulator.memory.curvature(bodies)
     of_shape = [
         part.double().mean() if len(part) else 0.0 for part in known.smooth.tensor_split(known.start[1:-1].cpu())

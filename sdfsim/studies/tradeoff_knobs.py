@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -73,7 +74,7 @@ class Setting:
             "device": self.device,
         }
         changed = [text for name, text in told.items() if getattr(self, name) != getattr(Setting(), name)]
-        return ", ".join([self.model.rsplit("/", 1)[-1].removesuffix(".safetensors"), *changed])
+        return ", ".join([_named(self.model), *changed])
 
     @property
     def key(self) -> str:
@@ -86,6 +87,14 @@ class Setting:
     def to_json(self) -> dict[str, Any]:
         """All knobs by name."""
         return asdict(self)
+
+
+def _named(model: str) -> str:
+    """A model's name; of a file as training leaves it, that of its folder."""
+    path = Path(model)
+    if path.suffix != ".safetensors":
+        return model
+    return path.parent.name if path.stem == "model" and path.parent.name else path.stem
 
 
 def setting_from(stored: Mapping[str, Any]) -> Setting:
