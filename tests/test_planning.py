@@ -116,3 +116,18 @@ def test_the_trial_of_a_plan_counts_what_the_run_counts(scene, model):
     backwards = replace(made, bodies=made.bodies[::-1])
     other = Simulator(backwards, model).run(steps=5).counters
     np.testing.assert_array_equal(first["sdf_queries"], other["sdf_queries"])
+
+
+def test_a_scene_in_which_nothing_may_touch_is_planned(tmp_path, model):
+    scene = tmp_path / "scene.yaml"
+    scene.write_text("""
+version: 1
+duration: 0.2
+shapes: {ball: {sphere: {radius: 0.5}}}
+bodies:
+  - {name: floor, plane: {}, collides_with: []}
+  - {name: ball, shape: ball, position: [0, 0, 0.5], collides_with: []}
+""")
+    report = told(scene, model)
+    assert report["effects"]["contact"]["on"] is False and report["step"]["edges"] == 0
+    assert report["run"]["in_contact"] == 0

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sdfsim.commands.arguments import Device, Json, Out, Verbose, tell_failed
+from sdfsim.commands.arguments import Device, Json, Out, Verbose, folder_of, tell_failed
 from sdfsim.progress import Session, columns
 
 
@@ -22,7 +22,8 @@ def tradeoff(
         ),
     ] = None,
     model: Annotated[
-        list[str] | None, typer.Option(help="Bundled models or paths, the one to turn knobs on first (default: all).")
+        list[str] | None,
+        typer.Option(help="Bundled models or paths, the one to turn knobs on first (default: all; growth: one)."),
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="A few settings, in minutes.")] = False,
     as_json: Json = False,
@@ -49,9 +50,12 @@ def tradeoff(
 
 
 def stress(
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder to write; finished cases in it are kept.")] = Path(
-        "stress"
-    ),
+    out: Annotated[
+        Path,
+        typer.Option(
+            "-o", "--out", parser=folder_of, metavar="PATH", help="Folder to write; finished cases in it are kept."
+        ),
+    ] = Path("stress"),
     model: Annotated[
         list[str] | None, typer.Option(help="Bundled model or path; may be given again (default: all bundled ones).")
     ] = None,

@@ -75,8 +75,3 @@ def to_rotvec(q: Tensor) -> Tensor:
     angle = 2.0 * torch.atan2(s, q[..., 3:])
     tiny = s < 1e-12
     return torch.where(tiny, 2.0 * q[..., :3], q[..., :3] * (angle / s.clamp_min(1e-30)))
-
-
-def angle_between(a: Tensor, b: Tensor) -> Tensor:
-    """Angle [...] rad of the rotation from `a` to `b`, unit quaternions [..., 4]."""
-    return to_rotvec(multiply(b, conjugate(a))).norm(dim=-1)

@@ -18,12 +18,13 @@ from sdfsim.dynamics.bodies import Bodies, State, Units, awake, from_scene, larg
 from sdfsim.dynamics.check import check_nodes, fault
 from sdfsim.dynamics.contacts import Contacts
 from sdfsim.dynamics.energy import Guard, kinetic
+from sdfsim.dynamics.history import history_told, with_history
 from sdfsim.dynamics.memory import Memory, row_limit
 from sdfsim.dynamics.model import Model, load_model
 from sdfsim.dynamics.ranges import outside_training
 from sdfsim.dynamics.rollout import Rollout, join
 from sdfsim.dynamics.sleep import nobody_asleep
-from sdfsim.dynamics.step import FreeFlight, Rules, fly, step
+from sdfsim.dynamics.step import FreeFlight, Rules, step
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.scene.effects import plan
 from sdfsim.scene.types import Scene
@@ -90,8 +91,8 @@ class Simulator:
         outside_training: what of the scene the model has not seen in training, one line each.
 
     Raises:
-        SdfsimError: no such model or device, a step that is none, a body that moves without mass or without nodes that tell how it turns,
-            one that is too far away or too fast.
+        SdfsimError: no such model or device, a step that is none, a body that moves without mass or without nodes
+            that tell how it turns, one that is too far away or too fast.
     """
 
     def __init__(
@@ -217,7 +218,7 @@ class Simulator:
             self.state = self._good
             raise self._broke(broken)
         if self.model.kind == "paper":
-            self.state = _history_told(self.state, self._good, self.bodies, self.rules)
+            self.state = history_told(self.state, self._good, self.bodies, self.rules)
         self._good = self.state
 
     def _fault(self, state: State, rows: torch.Tensor, before: State | None = None) -> str | None:
@@ -285,39 +286,6 @@ class Simulator:
 def everybody(bodies: Bodies) -> torch.Tensor:
     """[N] int64, all of them."""
     return torch.arange(len(bodies), device=bodies.device)
-
-
-def with_history(state: State, bodies: Bodies, rules: Rules) -> State:
-    """The same state with the two poses it would have come from in free flight (the *paper* network's input)."""
-    back = replace(rules, dt=-rules.dt)
-    one = fly(bodies, replace(state, sleep=None), back)
-    two = fly(bodies, one, back)
-    return replace(
-        state,
-        earlier_position=torch.stack([two.position, one.position]),
-        earlier_orientation=torch.stack([two.orientation, one.orientation]),
-    )
-
-
-def _history_told(state: State, before: State, bodies: Bodies, rules: Rules) -> State:
-    """A state from outside, with earlier poses that go with it.
-
-    Those that it shares with the state `before` are of that one's motion: bodies that were changed since get the poses
-    that their velocities lead from. A state with earlier poses of its own, such as a restored one, keeps them.
-    """
-    if state.earlier_position is None or state.earlier_orientation is None:
-        return with_history(state, bodies, rules)
-    if state.earlier_position is not before.earlier_position:
-        return state
-    changed = torch.zeros_like(bodies.moves)
-    for name in ("position", "orientation", "velocity", "angular_velocity"):
-        changed |= (getattr(state, name) != getattr(before, name)).any(-1)
-    told = with_history(state, bodies, rules)
-    return replace(
-        state,
-        earlier_position=torch.where(changed[:, None], told.earlier_position, state.earlier_position),
-        earlier_orientation=torch.where(changed[:, None], told.earlier_orientation, state.earlier_orientation),
-    )
 
 
 def pick_device(name: str) -> torch.device:

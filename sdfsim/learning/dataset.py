@@ -154,16 +154,16 @@ def read_info(folder: Path) -> dict:
     return info
 
 
-def trajectory_files(folder: Path, split: str | None = None) -> list[Path]:
+def trajectory_files(folder: Path, split: str) -> list[Path]:
     """Trajectory files of a dataset in name order: of `folder/split/`, or of `folder` where nothing is split.
 
     Raises:
         SdfsimError: when there are none, or the dataset has other splits but not this one.
     """
     split_up = [name for name in SPLITS if (folder / name).is_dir()]
-    if split_up and split and split not in split_up:
+    if split_up and split not in split_up:
         raise SdfsimError(f"{folder}: no {split} split here, only {', '.join(split_up)}")
-    home = folder / split if split and split_up else folder
+    home = folder / split if split_up else folder
     files = sorted(p for p in home.glob("*.npz") if not p.name.startswith("."))
     if not files:
         raise SdfsimError(f"{home}: no trajectories (*.npz) here", "make some with `sdfsim dataset movi-b`")

@@ -21,7 +21,7 @@ from sdfsim.dynamics.freeflight import torque_free
 from sdfsim.dynamics.pose import conjugate, multiply, to_rotvec
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_arrays, write_arrays
-from sdfsim.learning.dataset import Trajectory, load_shapes, trajectory_files
+from sdfsim.learning.dataset import Trajectory, check_alike, load_shapes, trajectory_files
 from sdfsim.learning.instants import at_instants, engine_substep
 from sdfsim.parallel import parallel
 

@@ -155,9 +155,7 @@ def make_trajectory(recipe: str, rng: np.random.Generator, cast: Cast) -> Trajec
     )
 
 
-def _make_all(
-    recipe: str, seed: int, split: str, cast: Cast, folder: Path, count: int, on_progress: Progress
-) -> int:
+def _make_all(recipe: str, seed: int, split: str, cast: Cast, folder: Path, count: int, on_progress: Progress) -> int:
     """Write the first `count` trajectories of a split that are not there yet; how many those were."""
     folder.mkdir(parents=True, exist_ok=True)
     todo = [k for k in range(count) if not (folder / f"{k:05d}.npz").exists()]

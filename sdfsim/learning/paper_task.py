@@ -122,9 +122,7 @@ class PaperTask:
         masses = [t.mass[~t.static] for t in self.trajectories if not t.static.all()]
         friction = np.concatenate([t.friction for t in self.trajectories])
         restitution = np.concatenate([t.restitution for t in self.trajectories])
-        speed = np.concatenate(
-            [np.linalg.norm(t.velocity[:, ~t.static], axis=-1).ravel() for t in self.trajectories]
-        )
+        speed = np.concatenate([np.linalg.norm(t.velocity[:, ~t.static], axis=-1).ravel() for t in self.trajectories])
         return {
             "size": [float(size.min()), float(size.max())],
             "speed": [0.0, float(np.percentile(speed, 99.9))],

@@ -9,9 +9,9 @@ import torch
 
 from sdfsim.dynamics.bodies import Units
 from sdfsim.dynamics.energy import Guard
+from sdfsim.dynamics.history import with_history
 from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.model import Model
-from sdfsim.dynamics.simulator import with_history
 from sdfsim.dynamics.sleep import nobody_asleep
 from sdfsim.dynamics.step import FreeFlight, Rules, step
 from sdfsim.errors import EXIT_QUALITY, SdfsimError

@@ -13,7 +13,7 @@ from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, replacing, write_json, write_text
 from sdfsim.shape.certificate import LIMITS
 from sdfsim.shape.fit import FIT_VERSION, fit_mesh
-from sdfsim.shape.mesh import load_mesh
+from sdfsim.shape.mesh import Mesh, load_mesh
 from sdfsim.shape.training import training_share
 
 BUDGETS = (5.0, 10.0, 20.0, 40.0, 60.0, 120.0)  # s
@@ -34,18 +34,23 @@ def fit_tradeoff(
 
     Returns:
         The content of fit.json: a point a fit, with the seconds that it took and the errors of its certificate.
+
+    Raises:
+        SdfsimError: a mesh that cannot be read, or nothing could be fitted.
     """
     budgets = QUICK_BUDGETS if quick else BUDGETS
-    chosen = dict(list(meshes.items())[: QUICK_MESHES if quick else None])
+    chosen = {name: load_mesh(file) for name, file in list(meshes.items())[: QUICK_MESHES if quick else None]}
     points: list[dict[str, Any]] = []
-    for k, (name, file) in enumerate(chosen.items()):
+    for k, (name, mesh) in enumerate(chosen.items()):
         before = None
         for j, budget in enumerate(budgets):
             done = (k + j / len(budgets)) / len(chosen)
             on_progress("fit", done, f"{name}, {budget:g} s")
-            before = _again(before, budget) or _fitted(name, file, budget, out / "points" / "fit")
+            before = _again(before, budget) or _fitted(name, mesh, budget, out / "points" / "fit")
             points.append(before)
     on_progress("fit", 1.0, "measured")
+    if all(p["failed"] for p in points):
+        raise SdfsimError(f"nothing could be fitted: {points[0]['failed']}")
     report = {"quick": quick, "points": points, "limits": dict(LIMITS), "folder": str(out)}
     write_json(out / "fit.json", report)
     write_text(out / "fit.csv", table(points))
@@ -60,16 +65,16 @@ def _again(before: dict[str, Any] | None, budget: float) -> dict[str, Any] | Non
     return before | {"budget_s": budget, "ended_by_itself": True}
 
 
-def _fitted(name: str, file: Path, budget: float, folder: Path) -> dict[str, Any]:
+def _fitted(name: str, mesh: Mesh, budget: float, folder: Path) -> dict[str, Any]:
     path = folder / f"{name}__{budget:g}.json"
-    mark = {"fit_version": FIT_VERSION, "bytes": file.stat().st_size, "budget": budget}
+    mark = {"fit_version": FIT_VERSION, "mesh": mesh.digest(), "budget": budget}
     if path.exists() and (point := read_json(path)).get("fingerprint") == mark:
         return point
     point: dict[str, Any] = {"name": name, "budget_s": budget, "fingerprint": mark, "failed": ""}
     point["ended_by_itself"] = False
     wall, cpu = time.monotonic(), time.process_time()
     try:
-        certificate = fit_mesh(load_mesh(file), name=name, budget=budget).certificate
+        certificate = fit_mesh(mesh, name=name, budget=budget).certificate
         point |= {key: certificate[key] for key in (*ERRORS, "hausdorff", "passed", "reason", "steps")}
     except SdfsimError as error:
         point["failed"] = error.message

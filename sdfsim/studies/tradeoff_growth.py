@@ -2,130 +2,39 @@
 
 from __future__ import annotations
 
-import time
+import platform
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sdfsim.dynamics.model import Model, load_model
-from sdfsim.dynamics.simulator import Simulator
+from sdfsim.dynamics.simulator import Simulator, pick_device
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, replacing, write_json
-from sdfsim.scene.types import Body, Scene
-from sdfsim.shape.asset import analytic_shape, with_nodes
-from sdfsim.shape.cache import shape_from_primitive
-from sdfsim.studies.tradeoff_contenders import peak_memory, time_simulator, weights_digest
+from sdfsim.studies.tradeoff_contenders import clock_of, peak_memory, time_simulator, weights_digest
 from sdfsim.studies.tradeoff_cost import CostModel, Load, fit_cost, relative_errors
 from sdfsim.studies.tradeoff_estimate import estimate, landings, roundness
+from sdfsim.studies.tradeoff_growing import NAMES, Growing, build, scenes
+from sdfsim.studies.tradeoff_knobs import Setting, threads_of
 
 VERSION = 2
 STEPS = 9  # of which the first is not timed
-BALL, BOX = 0.7, 0.6  # m: radius, side
-GAP = 0.02  # m between neighbours at the start: they are within reach of each other
-WALL = 0.12  # of the bowl primitive, relative to its outer radius
-GRID = 48  # samples along each side of the bowl's distances
-HIGH, APART = 100.0, 5.0  # m above the floor, and times as far from each other: where nothing touches
 WITHIN = 0.3  # what a cost model may be off by on scenes that it was not fitted to
 COURSE = 60  # steps of a whole run
-NAMES = {"pile": "boxes in columns on a floor", "bowl": "balls in a bowl"}
-
-
-@dataclass(frozen=True)
-class Growing:
-    """One scene of the study.
-
-    Attributes:
-        kind: of `NAMES`.
-        bodies: how many move.
-        nodes: N of the N^3 grid that a body's nodes are sampled from; None for its own (98 or 128).
-        flying: high above what it would touch.
-    """
-
-    kind: str
-    bodies: int
-    nodes: int | None = None
-    flying: bool = False
-
-    @property
-    def key(self) -> str:
-        """A file name."""
-        tail = "" if self.nodes is None else f"__nodes-{self.nodes}"
-        return f"{self.kind}__{self.bodies}{tail}{'__flying' if self.flying else ''}"
 
 
 COURSES = ((Growing("pile", 3), 0.0), (Growing("pile", 6), 1.5), (Growing("bowl", 5), 0.8), (Growing("pile", 2), 9.0))
-
-
-def scenes(*, quick: bool) -> list[Growing]:
-    """The scenes of a study: by bodies, by nodes of 16 bodies, and without contact."""
-    counts = (1, 4, 16, 64) if quick else (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
-    grids = (3, 6, 12, 24) if quick else (3, 4, 6, 8, 12, 16, 24, 48, 96)
-    found = [Growing(kind, count) for kind in NAMES for count in counts]
-    found += [Growing(kind, 16, grid) for kind in NAMES for grid in grids]
-    return found + [Growing("pile", count, flying=True) for count in counts]
-
-
-def build(one: Growing) -> Scene:
-    """The scene, in metres, at 9.81 m/s^2."""
-    shapes, held = [analytic_shape("plane")], [_body("floor", 0, np.zeros(3), 0.0)]
-    if one.kind == "pile":
-        shape, places = analytic_shape("box", size=(BOX, BOX, BOX)), _columns(one.bodies)
-    else:
-        shape, (places, outer) = analytic_shape("sphere", radius=BALL), _in_bowl(one.bodies)
-        shapes.append(shape_from_primitive("bowl", 2 * outer, sdf="grid", resolution=GRID))
-        held.append(_body("bowl", 1, np.array([0.0, 0.0, outer]), 0.0))
-    shapes.append(shape if one.nodes is None else with_nodes(shape, one.nodes))
-    if one.flying:
-        places = APART * places + np.array([0.0, 0.0, HIGH])
-    moving = [_body(f"body{k}", len(shapes) - 1, place, 1.0) for k, place in enumerate(places)]
-    return Scene(tuple(shapes), (*held, *moving), np.array([0.0, 0.0, -9.81]), duration=1.0)
-
-
-def _columns(count: int) -> np.ndarray:
-    """[count, 3] m: boxes in columns of four, the lowest on the floor."""
-    column, level = np.divmod(np.arange(count), 4)
-    side = int(np.ceil((count / 4) ** 0.5))
-    return np.stack([*np.divmod(column, side), level], 1) * (BOX + GAP) + np.array([0.0, 0.0, 0.5 * BOX])
-
-
-def _in_bowl(count: int) -> tuple[np.ndarray, float]:
-    """[count, 3] m: balls in the lowest layers of a bowl that stands on the floor; and its outer radius m."""
-    step, inner = 2 * BALL + GAP, 2.0 * BALL
-    while True:
-        reach = int(inner / step) + 1
-        axis = np.arange(-reach, reach + 1) * step
-        lattice = np.stack(np.meshgrid(axis, axis, axis - 0.5 * step, indexing="ij"), -1).reshape(-1, 3)
-        inside = lattice[(np.linalg.norm(lattice, axis=1) <= inner - BALL) & (lattice[:, 2] <= 0)]
-        if len(inside) >= count:
-            order = np.lexsort((np.hypot(inside[:, 0], inside[:, 1]).round(6), inside[:, 2].round(6)))
-            outer = inner / (1 - WALL)
-            return inside[order[:count]] + np.array([0.0, 0.0, outer]), outer
-        inner *= 1.1
-
-
-def _body(name: str, shape: int, position: np.ndarray, mass: float) -> Body:
-    return Body(
-        name=name,
-        shape=shape,
-        motion="dynamic" if mass else "static",
-        scale=1.0,
-        position=np.asarray(position, dtype=float),
-        quat_xyzw=np.array([0.0, 0.0, 0.0, 1.0]),
-        velocity=np.zeros(3),
-        angular_velocity=np.zeros(3),
-        mass=mass,
-        friction=0.5,
-        restitution=0.3,
-    )
 
 
 def growth(
     out: Path, *, model: str | None, quick: bool, device: str, on_progress: Callable[[str, float, str], None]
 ) -> dict[str, Any]:
     """Time the scenes, fit the cost model to two of three and check it on the others; growth.png and growth.json.
+
+    All of it runs in one thread, so that times tell of the work and not of how many cores share it.
 
     Args:
         out: folder to write; scenes that it holds already are not run again.
@@ -137,6 +46,14 @@ def growth(
     Returns:
         The content of growth.json: points, slopes, the cost model and its errors on scenes that it has not seen.
     """
+    with threads_of(Setting()):
+        return _growth(out, model, quick, str(pick_device(device)), on_progress)
+
+
+def _growth(
+    out: Path, model: str | None, quick: bool, device: str, on_progress: Callable[[str, float, str], None]
+) -> dict[str, Any]:
+    """See `growth`."""
     used = load_model(model)
     # What a process takes only once, the first thing it simulates must not be charged with.
     time_simulator(Simulator(build(Growing("pile", 2)), used, device), STEPS)
@@ -179,10 +96,11 @@ def course(one: Growing, height: float, cost: CostModel, model: Model, device: s
     simulator = Simulator(replace(scene, bodies=tuple(bodies)), model, device)
     landed = landings(simulator, COURSE)
     counters: dict[str, list[float]] = {"edges": [0.0], "active": [0.0], "step_ms": [0.0]}
+    clock = clock_of(simulator.device)
     for _ in range(COURSE):
-        began = time.process_time()
+        began = clock()
         next(simulator.steps(1))
-        counters["step_ms"].append(1e3 * (time.process_time() - began))
+        counters["step_ms"].append(1e3 * (clock() - began))
         for name in ("edges", "active"):
             counters[name].append(simulator.memory.counts[name])
     trial = {name: np.array(values[:6]) for name, values in counters.items()}
@@ -192,7 +110,8 @@ def course(one: Growing, height: float, cost: CostModel, model: Model, device: s
 
 def _measured(one: Growing, folder: Path, model: str, device: str) -> dict[str, Any]:
     path = folder / f"{one.key}.json"
-    mark = {"version": VERSION, "model": weights_digest(model), "device": device, **asdict(one)}
+    mark = {"version": VERSION, "model": weights_digest(model), "machine": platform.node(), "device": device}
+    mark |= asdict(one)
     if path.exists() and (point := read_json(path)).get("fingerprint") == mark and not point["failed"]:
         return point
     point = {"key": one.key, **asdict(one), "fingerprint": mark, "failed": ""}

@@ -68,9 +68,7 @@ def _marks(axes: Any, shown: Sequence[tuple[int, Point]], best: Sequence[Point],
         x, y = point["ms"]["median"], max(error(point, steps), lowest)
         style = STYLES[point["kind"]] | ({"marker": "v"} if error(point, steps) < lowest else {})
         axes.errorbar(x, y, xerr=[[0], [max(0.0, point["ms"]["p95"] - x)]], ms=7, lw=0.8, **style)
-        axes.annotate(
-            str(number), (x, y), xytext=(5, 4), textcoords="offset points", fontsize=8, annotation_clip=True
-        )
+        axes.annotate(str(number), (x, y), xytext=(5, 4), textcoords="offset points", fontsize=8, annotation_clip=True)
     axes.plot([p["ms"]["median"] for p in best], [error(p, steps) for p in best], color="#1f6fb4", lw=1.2, alpha=0.5)
     axes.set(xscale="log", yscale="log", xlabel="milliseconds of computing per simulated second")
     axes.grid(True, which="both", lw=0.3, alpha=0.6)

@@ -39,7 +39,7 @@ def write_report(report: dict[str, Any], beaten: str, path: Path) -> None:
         _diagram(report, steps),
         f"<p>The default, {html.escape(told['default'])}, is beaten in both by",
         f"(* by more than the choice of scenes explains): {html.escape(beaten)}. The most",
-        f"accurate of the front takes {told['fastest_over_most_accurate']:.1f} times as long as the fastest.</p>",
+        f"accurate of the front takes {told['slowest_over_fastest_of_front']:.1f} times as long as the fastest.</p>",
         "<h2>Qualities</h2><ul>",
         *(_quality(name, key, report) for name, key in report["qualities"].items()),
         "</ul><h2>All points</h2>",

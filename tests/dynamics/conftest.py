@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from sdfsim.dynamics import pose
 from sdfsim.dynamics.model import Model, new_network
 from sdfsim.scene.types import Body, Scene
 from sdfsim.shape.asset import analytic_shape
@@ -35,6 +36,11 @@ def random_model(kind: str, seed: int = 0, push: float = 0.5, **config: int) -> 
             torch.nn.init.normal_(layer.tangent_impulse.weight, std=push)
     network.eval().requires_grad_(False)
     return Model("random", kind, network, dt=0.02, gravity=10.0, length=1.0, reach=0.1)
+
+
+def angle_between(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Angle [...] rad of the rotation from `a` to `b`, unit quaternions [..., 4]."""
+    return pose.to_rotvec(pose.multiply(b, pose.conjugate(a))).norm(dim=-1)
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from sdfsim.dynamics import pose
 from sdfsim.dynamics.freeflight import torque_free
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.scene.types import Scene
-from tests.dynamics.conftest import make_body, random_model
+from tests.dynamics.conftest import angle_between, make_body, random_model
 
 TOP = torch.diag(torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))[None]
 
@@ -69,7 +69,7 @@ def test_a_rotation_in_single_precision_is_one_in_double_after_a_step():
     long = q * (1.0 + 1e-7)
     after, _ = torque_free(long, w, TOP, 0.02)
     assert abs(float(after.norm()) - 1.0) < 1e-15
-    assert float(pose.angle_between(after, torque_free(q, w, TOP, 0.02)[0])) < 1e-7
+    assert float(angle_between(after, torque_free(q, w, TOP, 0.02)[0])) < 1e-7
 
 
 def test_a_scene_without_contacts_never_calls_the_network(dropped):

@@ -7,12 +7,11 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from sdfsim.dynamics import pose
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.dynamics.step import contact_graph, find_contacts, fly
 from sdfsim.scene.types import Scene
 from sdfsim.shape.asset import analytic_shape
-from tests.dynamics.conftest import make_body, random_model
+from tests.dynamics.conftest import angle_between, make_body, random_model
 
 
 def linear_momentum(sim: Simulator) -> torch.Tensor:
@@ -70,7 +69,7 @@ def test_turning_the_scene_with_its_gravity_turns_the_rollout(dropped):
     assert plain.contact_count.sum() > 0
     expected = rotation.apply(plain.position.reshape(-1, 3)).reshape(plain.position.shape)
     np.testing.assert_allclose(other.position, expected, atol=1e-4)
-    angle = pose.angle_between(
+    angle = angle_between(
         torch.from_numpy(other.orientation),
         torch.from_numpy((rotation * Rotation.from_quat(plain.orientation.reshape(-1, 4))).as_quat()).reshape(
             other.orientation.shape

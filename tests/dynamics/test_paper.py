@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from sdfsim.dynamics import pose
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.dynamics.surfaces import advance, node_owner
 from sdfsim.scene.types import Effects
-from tests.dynamics.conftest import random_model
+from tests.dynamics.conftest import angle_between, random_model
 
 
 def paper_model(push: float = 1e-3):
@@ -40,7 +39,7 @@ def test_a_common_acceleration_moves_the_centre_by_it(free_pair):
     with_push = advance(sim.bodies, sim.state, push[owner], sim.rules.dt)
     without = advance(sim.bodies, sim.state, torch.zeros_like(push[owner]), sim.rules.dt)
     torch.testing.assert_close(with_push.position - without.position, push, rtol=0, atol=1e-9)
-    assert float(pose.angle_between(with_push.orientation, without.orientation).max()) < 1e-6
+    assert float(angle_between(with_push.orientation, without.orientation).max()) < 1e-6
 
 
 def test_exact_free_flight_leaves_the_high_body_to_gravity_and_learned_does_not(dropped):
@@ -76,3 +75,30 @@ def test_friction_and_restitution_off_equal_bodies_without_them(dropped):
     none = Simulator(replace(dropped, bodies=bare), model).run(steps=6)
     np.testing.assert_array_equal(off.position, none.position)
     assert np.abs(off.position - Simulator(dropped, model).run(steps=6).position).max() > 1e-6
+
+
+def test_a_body_that_is_changed_goes_on_as_its_new_state_says_and_the_others_as_before(dropped):
+    calm = paper_model(push=2e-6)
+    changed, plain = (Simulator(dropped, calm, free_flight="learned") for _ in range(2))
+    for sim in (changed, plain):
+        list(sim.steps(3))
+    velocity, position = changed.state.velocity.clone(), changed.state.position.clone()
+    velocity[3] = torch.tensor([4.0, 0.0, 1.0], dtype=torch.float64)
+    position[3, 0] += 7.0
+    changed.state = replace(changed.state, velocity=velocity, position=position)
+    ((after,), (kept,)) = (list(sim.steps(1)) for sim in (changed, plain))
+    step = changed.rules.dt
+    # Half a step of gravity is in the pose that the velocity leads from.
+    way = changed.state.position[3] - position[3] - velocity[3] * step
+    assert float(way.norm()) < 10.0 * step**2
+    assert torch.equal(after.position[:3], kept.position[:3])
+
+
+def test_a_state_of_another_run_keeps_its_own_history_and_one_without_gets_one(dropped):
+    one, other, bare = (Simulator(dropped, paper_model(), free_flight="learned") for _ in range(3))
+    list(one.steps(3))
+    other.state = one.state
+    bare.state = replace(one.state, earlier_position=None, earlier_orientation=None)
+    (went,), (same,), (near,) = (list(sim.steps(1)) for sim in (one, other, bare))
+    assert torch.equal(went.position, same.position)
+    torch.testing.assert_close(went.position, near.position, rtol=0, atol=0.02)

@@ -4,9 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from sdfsim.dynamics.ranges import _products
 from sdfsim.dynamics.simulator import Simulator
+from sdfsim.errors import SdfsimError
 from sdfsim.scene.types import Scene
 from tests.dynamics.conftest import make_body, random_model
 
@@ -64,3 +66,19 @@ def test_products_reach_from_the_smallest_to_the_largest_of_all_pairs(box_shape,
     found = _products(Scene((box_shape,), tuple(bodies), np.zeros(3), 1.0), "friction")
     assert len(found) <= 14
     assert len(found) == len(everything) == 0 or (min(found), max(found)) == (min(everything), max(everything))
+
+
+@pytest.mark.parametrize("dt", [0.0, -0.01, np.nan, np.inf])
+def test_steps_that_are_none_are_refused(dropped, dt):
+    with pytest.raises(SdfsimError, match="dt: must be > 0 s and finite"):
+        Simulator(dropped, random_model("impulse"), dt=dt)
+
+
+@pytest.mark.parametrize(
+    ("device", "says"),
+    [("gpu", "device: 'gpu' is not auto, cpu or cuda"), ("cuda", "no CUDA"), ("cuda:3", "--device cuda:3: no CUDA")],
+)
+def test_devices_that_are_not_there_are_named(dropped, monkeypatch, device, says):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    with pytest.raises(SdfsimError, match=says):
+        Simulator(dropped, random_model("impulse"), device)

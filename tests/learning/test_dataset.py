@@ -16,7 +16,7 @@ def test_round_trip(tmp_path):
     two = Trajectory.load(tmp_path / "a.npz")
     assert two.dt == one.dt and list(two.shape) == ["cube", "spot"]
     np.testing.assert_array_equal(two.position, one.position)
-    assert trajectory_files(tmp_path) == [tmp_path / "a.npz"]
+    assert trajectory_files(tmp_path, "test") == [tmp_path / "a.npz"]
 
 
 @pytest.mark.parametrize(
@@ -50,7 +50,7 @@ def test_missing_fields_truncation_and_empty_folders(tmp_path):
         Trajectory.load(tmp_path / "torn.npz")
     (tmp_path / "empty").mkdir()
     with pytest.raises(SdfsimError, match="no trajectories"):
-        trajectory_files(tmp_path / "empty")
+        trajectory_files(tmp_path / "empty", "test")
     with pytest.raises(SdfsimError, match=r"dataset\.json"):
         read_info(tmp_path / "empty")
 

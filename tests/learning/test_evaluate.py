@@ -91,7 +91,7 @@ def test_static_concave_scenery_is_no_body_of_the_errors(with_bowl, ball_data):
 def test_trajectories_in_which_nothing_moves_are_left_out(with_bowl):
     still = Trajectory.load(with_bowl / "0.npz")
     replace(still, static=np.ones(3, dtype=bool)).save(with_bowl / "1.npz")
-    assert len(trajectory_files(with_bowl)) == 2
+    assert len(trajectory_files(with_bowl, "test")) == 2
     assert evaluate(with_bowl, model=random_model("impulse"), steps=5)["trajectories"] == 1
 
 

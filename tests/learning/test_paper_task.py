@@ -1,5 +1,6 @@
 """The *paper* network's batches: the inputs that the simulator gives it, noise that does not depend on who draws it."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -8,12 +9,15 @@ import torch
 
 from sdfsim.dynamics.bodies import Units
 from sdfsim.dynamics.simulator import Simulator
+from sdfsim.errors import SdfsimError
 from sdfsim.learning.dataset import Trajectory, load_shapes
+from sdfsim.learning.frames import contact_frames
 from sdfsim.learning.merge import merged, scene_of
 from sdfsim.learning.paper_task import PaperTask
 from sdfsim.learning.rollouts import roll_out
 from sdfsim.learning.team import Team
 from tests.dynamics.conftest import random_model
+from tests.learning.conftest import bouncing
 
 CPU = torch.device("cpu")
 
@@ -88,3 +92,26 @@ def test_noise_walks_by_the_given_size(ball_data):
     assert noise is not None and noise.shape == (3, 2, 4001, 3)
     size = noise[:, 0].cumsum(0).std((1, 2)).tolist()
     assert size == pytest.approx([0.003 * (k / 3) ** 0.5 for k in (1, 2, 3)], rel=0.03)
+
+
+def test_ranges_are_of_what_moves(pair, ball_data):
+    """Scenery is as large as it likes, and does not set the model's unit of length."""
+    (one, _), _ = pair
+    task = PaperTask(ball_data, "train", 0.1, CPU, None)
+    task.trajectories = [one]
+    known = task.ranges()
+    scenery = {"static": np.array([False, True]), "scale": np.array([1.0, 9.0]), "mass": np.array([2.0, 0.0])}
+    task.trajectories = [one, replace(one, **scenery, velocity=one.velocity * [[[1.0], [9.0]]])]
+    assert task.ranges()["size"] == known["size"] and task.ranges()["speed"][1] < 2 * known["speed"][1]
+
+
+def test_trajectories_of_different_steps_are_not_trained_on_together(ball_data, tmp_path):
+    shutil.copytree(ball_data, tmp_path / "data")
+    for other in ({"dt": 0.01}, {"gravity": np.array([0.0, 0.0, -5.0])}):
+        replace(bouncing(3), **other).save(tmp_path / "data" / "train" / "9.npz")
+        for read in (
+            lambda data: PaperTask(data, "train", 0.1, CPU, None),
+            lambda data: contact_frames(data, "train", 0.1),
+        ):
+            with pytest.raises(SdfsimError, match=r"train: its trajectories differ in step or gravity"):
+                read(tmp_path / "data")

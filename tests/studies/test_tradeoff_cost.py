@@ -16,7 +16,8 @@ from sdfsim.scene.types import Effects
 from sdfsim.studies import tradeoff_growth
 from sdfsim.studies.tradeoff_cost import CostModel, Load, fit_cost, relative_errors, stored_cost
 from sdfsim.studies.tradeoff_estimate import LOOKS, estimate, landings, roundness
-from sdfsim.studies.tradeoff_growth import BALL, BOX, Growing, build, curves, slopes
+from sdfsim.studies.tradeoff_growing import BALL, BOX, Growing, build
+from sdfsim.studies.tradeoff_growth import curves, slopes
 
 PLANTED = CostModel(
     base=2.0, body=0.01, touching=5.0, node=2e-4, edge=0.03, edges_a_body=10.0, edges_a_round_body=3.0

@@ -64,5 +64,32 @@ def test_fits_are_made_once_and_failures_stay(meshes, fits, tmp_path):
     rows, _ = told(report)
     assert rows[1][-1] == "missed: x" and rows[2][-1] == "met" and "no inside" in rows[4]
     fits.clear()
-    again, _, _ = run(tmp_path, out, models=[], quick=True, on_progress=lambda *_: None)
+    again, _, _ = run(tmp_path, out, models=[], quick=True, device="auto", on_progress=lambda *_: None)
     assert fits == [] and [p["name"] for p in again["points"]][:1] == ["bad"]  # a folder's meshes, by name
+    # As long a file as before, of another mesh.
+    text = meshes["cube"].read_text().replace("v 0.5", "v 0.4").replace("v -0.5", "v -0.4")
+    assert len(text) == len(meshes["cube"].read_text())
+    meshes["cube"].write_text(text)
+    fit_tradeoff(meshes, out, quick=True, on_progress=lambda *_: None)
+    assert [name for name, _ in fits] == ["cube", "cube"]
+
+
+def test_what_cannot_be_measured_of_fits_is_refused(meshes, fits, tmp_path):
+    def asked(source, **options):
+        plain = {"models": [], "quick": True, "device": "auto", "on_progress": lambda *_: None}
+        return run(source, tmp_path / "out", **(plain | options))
+
+    with pytest.raises(SdfsimError, match="nothing could be fitted: no inside"):
+        asked(meshes["bad"])
+    with pytest.raises(SdfsimError, match="fits of meshes are measured on the CPU, without a model"):
+        asked(meshes["cube"], models=["small"])
+    with pytest.raises(SdfsimError, match="fits of meshes are measured on the CPU"):
+        asked(meshes["cube"], device="cuda")
+    with pytest.raises(SdfsimError, match="growth is measured with one model"):
+        asked(None, models=["small", "other"])
+    (tmp_path / "cube.stl").write_text("")
+    with pytest.raises(SdfsimError, match="two meshes are called 'cube'"):
+        asked(tmp_path)
+    (tmp_path / "broken.off").write_text("OFF nonsense")
+    with pytest.raises(SdfsimError, match=r"broken\.off"):
+        asked(tmp_path / "broken.off")

@@ -153,7 +153,7 @@ def test_what_beats_the_default_is_told_with_its_certainty(cases, tmp_path):
     sweep = Sweep(measure(fakes, cases, tmp_path, quietly), "50")
     told = claims(sweep)
     assert told["default_beaten_by"] == told["default_clearly_beaten_by"] == ["small__better"]
-    assert told["fastest_over_most_accurate"] == 1.0 and clearly(sweep.points[1], sweep.points[0], "50")
+    assert told["slowest_over_fastest_of_front"] == 1.0 and clearly(sweep.points[1], sweep.points[0], "50")
     assert told.get("resampled") is None
     noisy = [
         dict(p, errors={"50": {"squared_by_trajectory": v}})
