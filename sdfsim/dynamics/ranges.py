@@ -1,7 +1,8 @@
-"""Where a scene leaves what a model has seen in training: its predictions are then extrapolation, and are flagged."""
+"""Where scenes leave what a model has seen in training: its predictions are then extrapolation, and are flagged."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
@@ -10,35 +11,31 @@ from sdfsim.dynamics.bodies import Units, largest_extent
 from sdfsim.dynamics.model import Model
 from sdfsim.scene.types import Scene
 
+LABELS = {
+    "size": "largest side of a body, m",
+    "speed": "speed at the start, m/s",
+    "mass_ratio": "heaviest to lightest body",
+    "friction": "friction of two bodies, multiplied",
+    "restitution": "restitution of two bodies, multiplied",
+}
 SLACK = 0.05  # relative: rounding, and fits that end a little beyond the solid
 
 
-def outside_training(scene: Scene, model: Model, units: Units) -> list[str]:
-    """One line for every quantity of `scene` that lies outside the ranges of `model`; empty when it knows them all.
+def outside_training(scenes: Sequence[Scene], model: Model, units: Units) -> list[str]:
+    """One line for every quantity of `scenes` that lies outside the ranges of `model`; empty when it knows them all.
 
     Sizes and speeds are compared in model units, so that a small or slow scene is not by itself unknown. Scenery is
     not compared in size: what matters of it is the surface near a contact.
     """
-    moving = [b for b in scene.bodies if b.motion == "dynamic"]
-    if not moving or not model.ranges:
+    if not model.ranges:
         return []
-    seen = {
-        "size": [largest_extent(scene.shapes[b.shape]) * b.scale / units.length for b in moving],
-        "speed": [float(np.linalg.norm(b.velocity)) / units.velocity for b in moving],
-        "mass_ratio": [max(b.mass for b in moving) / min(b.mass for b in moving)],
-        "friction": _products(scene, "friction"),
-        "restitution": _products(scene, "restitution"),
-    }
+    seen: dict[str, list[float]] = {name: [] for name in LABELS}
+    for scene in scenes:
+        for name, values in _values(scene, units).items():
+            seen[name] += values
     si = {"size": units.length, "speed": units.velocity}
-    labels = {
-        "size": "largest side of a body, m",
-        "speed": "speed at the start, m/s",
-        "mass_ratio": "heaviest to lightest body",
-        "friction": "friction of two bodies, multiplied",
-        "restitution": "restitution of two bodies, multiplied",
-    }
     lines = []
-    if any(b.motion == "kinematic" for b in scene.bodies):
+    if any(b.motion == "kinematic" for scene in scenes for b in scene.bodies):
         lines.append(f"bodies on a path: {model.name} has seen none in training")
     for name, values in seen.items():
         if not values or name not in model.ranges:
@@ -48,10 +45,24 @@ def outside_training(scene: Scene, model: Model, units: Units) -> list[str]:
         if min(values) < low - slack or max(values) > high + slack:
             unit = si.get(name, 1.0)
             lines.append(
-                f"{labels[name]}: {min(values) * unit:.3g} to {max(values) * unit:.3g} here, "
+                f"{LABELS[name]}: {min(values) * unit:.3g} to {max(values) * unit:.3g} here, "
                 f"{model.name} was trained on {low * unit:.3g} to {high * unit:.3g}"
             )
     return lines
+
+
+def _values(scene: Scene, units: Units) -> dict[str, list[float]]:
+    """What a scene has of each quantity of `LABELS`; nothing where nothing moves by itself."""
+    moving = [b for b in scene.bodies if b.motion == "dynamic"]
+    if not moving:
+        return {}
+    return {
+        "size": [largest_extent(scene.shapes[b.shape]) * b.scale / units.length for b in moving],
+        "speed": [float(np.linalg.norm(b.velocity)) / units.velocity for b in moving],
+        "mass_ratio": [max(b.mass for b in moving) / min(b.mass for b in moving)],
+        "friction": _products(scene, "friction"),
+        "restitution": _products(scene, "restitution"),
+    }
 
 
 def constant_in_training(model: Model) -> list[str]:

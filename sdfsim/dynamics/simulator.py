@@ -117,7 +117,7 @@ class Simulator:
         self.seed = scene.seed if seed is None else seed
         self.units = scene_units(scene, self.model, dt)
         self.dt = self.model.dt * self.units.time
-        self.outside_training = outside_training(scene, self.model, self.units)
+        self.outside_training = outside_training([scene], self.model, self.units)
         gravity = torch.tensor(scene.gravity / self.units.acceleration, dtype=torch.float64, device=self.device)
         self.rules = Rules(
             gravity=gravity,

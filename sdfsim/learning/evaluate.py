@@ -11,14 +11,16 @@ import numpy as np
 
 from sdfsim.dynamics.energy import Guard
 from sdfsim.dynamics.model import Model, load_model
+from sdfsim.dynamics.ranges import outside_training
 from sdfsim.dynamics.simulator import pick_device
 from sdfsim.dynamics.step import FreeFlight
 from sdfsim.errors import SdfsimError
 from sdfsim.learning import floor, metrics
 from sdfsim.learning.dataset import Trajectory, load_shapes, trajectory_files
 from sdfsim.learning.instants import at_instants, engine_substep
+from sdfsim.learning.merge import scene_of
 from sdfsim.learning.penetration import EVERY, Solid, exact_solids, penetration
-from sdfsim.learning.rollouts import batches, first_frames, roll_out
+from sdfsim.learning.rollouts import batches, first_frames, model_units, roll_out
 from sdfsim.shape.asset import Shape
 
 HORIZONS = (50, 100)  # steps, as the paper reports
@@ -76,6 +78,7 @@ def evaluate(
         bodies and steps, with 95 % intervals over trajectories:
         "model", "ballistic": errors.
         "chaos_floor": "perturbations" -> name -> errors; or "left_out", why.
+        "outside_training": what of the scenes the model has not seen, one line each.
         "survival", "median_survival_s": of all of them, by limit in m.
         "penetration" m, "energy_gain" (a fraction), "resting_speed" m/s: of the model and of the teacher's recording.
         "engine_substep": s, the recording engine's inner step; 0 where no dataset.json tells it.
@@ -109,6 +112,7 @@ def evaluate(
         "steps": longest,
         "steps_asked": steps,
         "engine_substep": substep,
+        "outside_training": _outside(used, recorded, shapes),
         "ms_per_step_per_trajectory": 1e3 * seconds / longest / len(recorded),
         **{who: _errors(motions, recorded) for who, motions in contenders.items()},
         **floor_report,
@@ -157,6 +161,12 @@ def _simulate(
         seconds += time.perf_counter() - started
         motions["ballistic"] += roll_out(model, group, known, longest, place, contact=False)
     return motions, seconds
+
+
+def _outside(model: Model, recorded: Motions, shapes: dict[str, Shape]) -> list[str]:
+    """What of the scenes the model has not seen in training, one line each."""
+    scenes = [scene_of([t], [0], shapes)[0] for t in recorded]
+    return outside_training(scenes, model, model_units(model, recorded[0]))
 
 
 def _teacher_again(data: Path, recorded: Motions) -> tuple[dict[str, Motions], dict]:

@@ -56,7 +56,7 @@ def roll_out(
     Raises:
         SdfsimError: a state that is not finite (exit code 3).
     """
-    units = _units(model, group[0])
+    units = model_units(model, group[0])
     bodies, state = merged(group, [0] * len(group), shapes, units, device, floor)
     gravity = torch.tensor(group[0].gravity / units.acceleration, dtype=torch.float64, device=device)
     rules = Rules(gravity=gravity, dt=model.dt, contact=contact, free_flight=free_flight, guard=guard)
@@ -105,7 +105,7 @@ def first_frames(trajectory: Trajectory, count: int) -> Trajectory:
     return replace(trajectory, **{name: getattr(trajectory, name)[:count] for name in names})
 
 
-def _units(model: Model, like: Trajectory) -> Units:
+def model_units(model: Model, like: Trajectory) -> Units:
     """Model units in which the recorded step is the model's own."""
     strength = float(np.linalg.norm(like.gravity)) or model.gravity
     length = (like.dt / model.dt) ** 2 * strength / model.gravity

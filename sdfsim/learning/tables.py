@@ -76,6 +76,7 @@ def notes(report: dict[str, Any]) -> list[str]:
         lines.append(f"Without the engine's files, penetration is into the mesh that is shown of {', '.join(shown)}.")
     if (steps := report["steps"]) < report["steps_asked"]:
         lines.append(f"The shortest recording ends after {steps} steps; {report['steps_asked']} were asked for.")
+    lines += [f"Outside the model's training: {line}." for line in report["outside_training"]]
     if not report["engine_substep"]:
         lines.append("No dataset.json tells the engine's inner step: velocities count as at the positions' instants.")
     if "left_out" in floor:

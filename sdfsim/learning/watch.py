@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from sdfsim.errors import SdfsimError
+from sdfsim.files import replacing
 from sdfsim.learning.dataset import Trajectory, load_shapes, trajectory_files
 from sdfsim.learning.instants import at_instants, engine_substep
 from sdfsim.learning.training_run import Run
@@ -44,13 +46,16 @@ class Rollouts:
     device: torch.device
 
     def __call__(self, run: Run) -> dict[str, float]:
-        """Translation RMSE in m and mean rotation error in degrees of the averaged weights; NaN where they blow up."""
+        """Translation RMSE in m and mean rotation error in degrees of the averaged weights; NaN where they blow up.
+
+        Over all bodies that move and all steps, as `evaluate` has them.
+        """
         from sdfsim.learning.metrics import rotation_error, translation_rmse
         from sdfsim.learning.rollouts import batches, roll_out
 
         model = run.export(name="watched", data=[], ranges=run.task.ranges())
         steps = len(self.recorded[0].position) - 1
-        metres, degrees = [], []
+        squared, degrees, bodies = 0.0, 0.0, 0
         known = {name: replace(s, nodes=s.nodes[: model.nodes]) for name, s in self.shapes.items()}
         for group in batches([at_instants(t, self.substep) for t in self.recorded]):
             try:
@@ -59,9 +64,11 @@ class Rollouts:
                 return {"rollout_m": math.nan, "rollout_degrees": math.nan}
             for one, truth in zip(predicted, group, strict=True):
                 moving = ~truth.static
-                metres.append(translation_rmse(one.position[:, moving], truth.position[:, moving]))
-                degrees.append(rotation_error(one.quat_xyzw[:, moving], truth.quat_xyzw[:, moving]))
-        return {"rollout_m": sum(metres) / len(metres), "rollout_degrees": sum(degrees) / len(degrees)}
+                count = int(moving.sum())
+                squared += count * translation_rmse(one.position[1:, moving], truth.position[1:, moving]) ** 2
+                degrees += count * rotation_error(one.quat_xyzw[1:, moving], truth.quat_xyzw[1:, moving])
+                bodies += count
+        return {"rollout_m": math.sqrt(squared / bodies), "rollout_degrees": degrees / bodies}
 
 
 def held_out_rollouts(data: Path, device: torch.device, tell: Callable[[str], None]) -> Rollouts | None:
@@ -84,10 +91,26 @@ def held_out_rollouts(data: Path, device: torch.device, tell: Callable[[str], No
 
 
 def draw(run: Path, picture: Path) -> None:
-    """Curves of RUN/log.jsonl as a picture (needs matplotlib)."""
-    from matplotlib.figure import Figure
+    """Curves of RUN/log.jsonl as a picture (needs matplotlib).
 
-    log = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
+    Raises:
+        SdfsimError: no log there, or not one of training; matplotlib is not installed.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise SdfsimError("curves need matplotlib", "pip install -e '.[bench]'") from error
+    path = run / "log.jsonl"
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+        # A run that goes on, or was killed, may have written part of its last line.
+        log = [json.loads(line) for line in lines if line.endswith("\n")]
+        for name in ("step", "loss", "held_out_loss"):
+            _ = [float(entry[name]) for entry in log]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SdfsimError(
+            f"{path}: not the log of a training run", "give the folder that `sdfsim train` wrote"
+        ) from error
     figure = Figure(figsize=(9, 3.2), layout="constrained")
     one, two = figure.subplots(1, 2)
     one.plot([e["step"] for e in log], [e["loss"] for e in log], label="training (hard frames more often)")
@@ -97,7 +120,8 @@ def draw(run: Path, picture: Path) -> None:
     rolled = [e for e in log if "rollout_m" in e]
     two.plot([e["step"] for e in rolled], [e["rollout_m"] for e in rolled], "o-", color="C2")
     two.set(xlabel="optimiser step", ylabel=f"rollout error, m (first {STEPS} steps)", ylim=(0, None))
-    figure.savefig(picture, dpi=120)
+    with replacing(picture) as partial:
+        figure.savefig(partial, dpi=120, format="png")
 
 
 def main() -> None:
@@ -106,7 +130,10 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("-o", "--out", type=Path, required=True)
     args = parser.parse_args()
-    draw(args.run, args.out)
+    try:
+        draw(args.run, args.out)
+    except SdfsimError as error:
+        sys.exit(f"error: {error}\n{error.hint}".rstrip())
 
 
 if __name__ == "__main__":

@@ -28,6 +28,8 @@ from sdfsim.shape.mlp import MlpSdf
 from sdfsim.studies.hard_cases_teacher import engine_file
 from sdfsim.studies.tradeoff_cases import STEPS, TIMED_STEPS, Cases
 
+PHYSICAL = ("contact", "friction", "restitution", "rotation")  # effects that the teacher always has
+
 
 def cases_of_scene(
     path: Path, model: str, scratch: Path, *, quick: bool, on_progress: Callable[[float, str], None]
@@ -45,8 +47,8 @@ def cases_of_scene(
         on_progress: called with the fraction done and a message.
 
     Raises:
-        SdfsimError: bad input; a floor other than one level plane, or bodies on a path, which the teacher does not
-            know; nothing moves; PyBullet is not installed.
+        SdfsimError: bad input; a floor other than one level plane, bodies on a path, bodies that may not touch all
+            others, or effects that are off; nothing moves; PyBullet is not installed.
     """
     scene = load_scene(path, on_progress)
     floor, height = _floor(scene)
@@ -90,6 +92,12 @@ def _floor(scene: Scene) -> tuple[Body, float]:
         raise SdfsimError(f"{scene.path}: needs one level plane as its floor (has {len(planes)} planes)")
     if any(b.motion == "kinematic" for b in scene.bodies):
         raise SdfsimError(f"{scene.path}: has bodies on a path, which the teacher does not know")
+    if any(b.collides_with is not None for b in scene.bodies):
+        raise SdfsimError(f"{scene.path}: has bodies that may not touch all others, which is not measured")
+    if off := [
+        name for name in ("contact", "friction", "restitution", "rotation") if getattr(scene.effects, name) == "off"
+    ]:
+        raise SdfsimError(f"{scene.path}: effects: {off[0]} is off, which is not measured", "leave it at auto")
     return planes[0], float(planes[0].position[2])
 
 

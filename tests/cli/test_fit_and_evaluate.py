@@ -67,6 +67,7 @@ def test_an_evaluation_is_two_tables(tmp_path, monkeypatch):
         "ms_per_step_per_trajectory": 1.5,
         "steps": 50,
         "steps_asked": 60,
+        "outside_training": ["largest side of a body, m: 1 to 3 here, small was trained on 0.7 to 2"],
         "engine_substep": 0.0,
         "chaos_floor": {"perturbations": {"0": errors, "1e-6": errors}, "median_farthest_unperturbed_m": 0.00053},
         "median_survival_s": {name: {"0.25": None if "1e" in name else 0.74} for name in who},
@@ -84,6 +85,7 @@ def test_an_evaluation_is_two_tables(tmp_path, monkeypatch):
     lines = run("evaluate", tmp_path, "--free-flight", "learned", "--chaos-floor").stdout.splitlines()
     assert asked["steps"] == 50 and asked["free_flight"] == "learned" and asked["chaos_floor"]
     assert any("No dataset.json tells" in line for line in lines)
+    assert any("Outside the model's training: largest side" in line for line in lines)
     assert any("ends after 50 steps; 60 were asked for" in line for line in lines)
     assert "50 steps = 1 s" in lines[1]
     assert [line.split("  ")[0] for line in lines[2:5]] == ["small", "teacher, 1e-6 m/s off", "ballistic"]

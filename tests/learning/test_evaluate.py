@@ -59,7 +59,10 @@ def test_a_perfect_model_has_no_error_and_loses_nobody(ball_data, replayed):
 
 def test_bounces_by_hand_reach_the_floor_and_are_no_deeper(ball_data, replayed):
     """The balls' centres are never below their radius: nodes touch the floor and do not enter it."""
-    report = evaluate(ball_data, model=random_model("impulse"), split="train")
+    known = {"size": [0.2, 0.5], "speed": [0.0, 20.0], "mass_ratio": [1.0, 1.5], "friction": [0.0, 1.0]}
+    report = evaluate(ball_data, model=replace(random_model("impulse"), ranges=known), split="train")
+    size, ratio = report["outside_training"]
+    assert "1 to 1 here, random was trained on 0.2 to 0.5" in size and ratio.startswith("heaviest to lightest body: 2")
     depth = report["penetration"]["teacher"]
     assert depth["steps_with_contact"] > 0 and depth["worst"] < 1e-9
     assert report["penetration"]["geometry"] == {"ball": "closed form"}

@@ -17,6 +17,7 @@ from sdfsim.errors import SdfsimError
 from sdfsim.learning import frames as frames_module
 from sdfsim.learning import train as train_module
 from sdfsim.learning import watch
+from sdfsim.learning.evaluate import evaluate
 from sdfsim.learning.frames import contact_frames, join_frames
 from sdfsim.learning.impulse_task import ImpulseTask, Noise
 from sdfsim.learning.merge import merged
@@ -198,5 +199,26 @@ def test_the_log_tells_rollouts_and_is_drawn(ball_data, presets, tmp_path):
     train(ball_data, tmp_path / "run", preset="tiny", steps=20)
     entries = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
     assert all(0 < e["rollout_m"] < 100 and 0 <= e["rollout_degrees"] <= 180 for e in entries)
+    report = evaluate(ball_data, model=tmp_path / "run" / "model.safetensors", split="validation", errors_only=True)
+    assert entries[-1]["rollout_m"] == pytest.approx(report["model"]["39"]["translation_rmse"], rel=1e-4)
+    assert entries[-1]["rollout_degrees"] == pytest.approx(report["model"]["39"]["rotation_error"], rel=1e-4)
+    with open(tmp_path / "run" / "log.jsonl", "a") as log:
+        log.write('{"step": 21, "lo')  # a run that is still writing
     watch.draw(tmp_path / "run", tmp_path / "curves.png")
     assert (tmp_path / "curves.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_curves_of_what_is_no_log_are_refused(tmp_path):
+    pytest.importorskip("matplotlib")
+    for text in (None, "nonsense\n", '{"step": 1}\n'):
+        if text is not None:
+            (tmp_path / "log.jsonl").write_text(text)
+        with pytest.raises(SdfsimError, match="not the log of a training run"):
+            watch.draw(tmp_path, tmp_path / "curves.png")
+    assert not (tmp_path / "curves.png").exists()
+
+
+@pytest.mark.parametrize("steps", [0, -5])
+def test_steps_that_are_none_are_refused(ball_data, presets, tmp_path, steps):
+    with pytest.raises(SdfsimError, match="steps: must be at least 1"):
+        train(ball_data, tmp_path / "run", preset="tiny", steps=steps)

@@ -88,6 +88,7 @@ def test_other_steps_and_missing_pieces_are_told(cases):
     [
         ("{name: floor, plane: {normal: [0, 1, 1]}}", "one level plane"),
         ("{name: b, shape: box, motion: static}", "0 planes"),
+        ("{name: floor, plane: {}, collides_with: []}", "may not touch all others"),
     ],
 )
 def test_scenes_that_the_teacher_does_not_know_are_refused(tmp_path, floor, message):
@@ -95,6 +96,12 @@ def test_scenes_that_the_teacher_does_not_know_are_refused(tmp_path, floor, mess
     lines[6] = f"  - {floor}"
     (tmp_path / "scene.yaml").write_text("\n".join(lines))
     with pytest.raises(SdfsimError, match=message):
+        cases_of_scene(tmp_path / "scene.yaml", "small", tmp_path, quick=True, on_progress=lambda *_: None)
+
+
+def test_effects_that_are_off_are_not_measured_as_if_they_were_on(tmp_path):
+    (tmp_path / "scene.yaml").write_text(SCENE.replace("version: 1", "version: 1\neffects: {friction: off}"))
+    with pytest.raises(SdfsimError, match="effects: friction is off"):
         cases_of_scene(tmp_path / "scene.yaml", "small", tmp_path, quick=True, on_progress=lambda *_: None)
 
 
