@@ -7,6 +7,7 @@ way out for the centre, which an SDF's gradient tells everywhere, on the medial 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -14,9 +15,12 @@ from torch import Tensor
 
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State
-from sdfsim.dynamics.contacts import Contacts, distances
+from sdfsim.dynamics.contacts import Contacts, distances, find_contacts
 from sdfsim.dynamics.graph import number_pairs
 from sdfsim.dynamics.memory import Memory
+
+# Part of its largest side by which bodies start inside one another in the training data at most.
+DEEPEST = 0.16
 
 
 def parting(bodies: Bodies, state: State, contacts: Contacts, memory: Memory) -> Contacts:
@@ -45,6 +49,36 @@ def parting(bodies: Bodies, state: State, contacts: Contacts, memory: Memory) ->
     towards = torch.where(owner == first[pair], 1.0, -1.0)[:, None] * way[pair]
     swallowed = (towards != 0).any(-1, keepdim=True)
     return replace(contacts, normal=torch.where(swallowed, towards, contacts.normal))
+
+
+def deep_starts(bodies: Bodies, state: State, names: Sequence[str], metres: float, rows: int | None) -> list[str]:
+    """A line where pairs are deeper inside one another than any that models were trained on; empty where none is.
+
+    Args:
+        bodies: N bodies.
+        state: theirs.
+        names: [N] of the bodies.
+        metres: in a model unit.
+        rows: how many nodes to look at at once, None for all.
+    """
+    nothing = torch.zeros(3, dtype=torch.float64, device=bodies.device)
+    inside = find_contacts(bodies, state, nothing, reach=0.0, dt=0.0, rows=rows)
+    if not len(inside):
+        return []
+    # Of the two the smaller one that moves is what the way out is long or short for.
+    size = torch.where(bodies.moves, bodies.size, torch.inf)
+    part = -inside.distance / torch.minimum(size[inside.owner], size[inside.body])
+    deep = part > DEEPEST
+    if not bool(deep.any()):
+        return []
+    pairs = number_pairs(inside.owner[deep], inside.body[deep], len(bodies))[1]
+    worst = int(part.argmax())
+    owner, body = (names[int(i[worst])] for i in (inside.owner, inside.body))
+    return [
+        f"pairs that start inside one another: {pairs} here, {owner!r} in {body!r} by "
+        f"{-float(inside.distance[worst]) * metres:.3g} m, {float(part[worst]):.0%} of a body's size; "
+        f"trained on up to {DEEPEST:.0%}"
+    ]
 
 
 def _inside(bodies: Bodies, state: State, one: Tensor, other: Tensor, memory: Memory) -> tuple[Tensor, Tensor]:

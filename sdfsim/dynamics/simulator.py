@@ -14,13 +14,15 @@ import torch
 
 import sdfsim
 from sdfsim.dynamics import pose
-from sdfsim.dynamics.bodies import Bodies, State, Units, awake, from_scene, largest_extent
+from sdfsim.dynamics.bodies import Bodies, State, awake, from_scene
 from sdfsim.dynamics.check import check_nodes, fault
 from sdfsim.dynamics.contacts import Contacts
 from sdfsim.dynamics.energy import Guard, kinetic
+from sdfsim.dynamics.froude import scene_units
 from sdfsim.dynamics.history import history_told, with_history
 from sdfsim.dynamics.memory import Memory, row_limit
 from sdfsim.dynamics.model import Model, load_model
+from sdfsim.dynamics.overlap import deep_starts
 from sdfsim.dynamics.ranges import outside_training
 from sdfsim.dynamics.rollout import Rollout, join
 from sdfsim.dynamics.sleep import nobody_asleep
@@ -28,8 +30,6 @@ from sdfsim.dynamics.step import FreeFlight, Rules, step
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.scene.effects import plan
 from sdfsim.scene.types import Scene
-
-EARTH = 9.81  # m/s^2, sets the time scale of scenes without gravity
 
 
 class SimulationError(SdfsimError):
@@ -45,30 +45,6 @@ class SimulationError(SdfsimError):
             message, "try another model, or look for bodies that overlap at the start", exit_code=EXIT_QUALITY
         )
         self.rollout = rollout
-
-
-def scene_units(scene: Scene, model: Model, dt: float | None = None) -> Units:
-    """Model units for a scene: bodies of the model's size, at the model's gravity (Froude scaling).
-
-    Args:
-        scene: what is to be simulated.
-        model: knows the size and gravity it was trained at.
-        dt: s, fixes the scale by the wanted step instead of by the bodies' size.
-
-    Raises:
-        SdfsimError: a step that is no positive number.
-    """
-    if dt is not None and not 0.0 < dt < np.inf:
-        raise SdfsimError(f"dt: must be > 0 s and finite (got {dt:g})")
-    strength = float(np.linalg.norm(scene.gravity)) or EARTH
-    moving = [b for b in scene.bodies if b.motion == "dynamic"]
-    sizes = [largest_extent(scene.shapes[b.shape]) * b.scale for b in moving]
-    if dt is not None:
-        length = (dt / model.dt) ** 2 * strength / model.gravity
-    else:
-        length = float(np.mean(sizes)) / model.length if sizes else 1.0
-    mass = float(np.mean([b.mass for b in moving])) if moving else 1.0
-    return Units(length=length, time=float(np.sqrt(length * model.gravity / strength)), mass=mass)
 
 
 class Simulator:
@@ -133,6 +109,9 @@ class Simulator:
         )
         check_nodes(scene, self.model.nodes)
         self.bodies, self.state = from_scene(scene, self.units, self.device, self.model.nodes)
+        if effects.contact.on and self.model.ranges:
+            names = [b.name for b in scene.bodies]
+            self.outside_training += deep_starts(self.bodies, self.state, names, self.units.length, self.rules.rows)
         if self.model.kind == "paper":
             self.state = with_history(self.state, self.bodies, self.rules)
         if effects.sleep.on:

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
+from sdfsim.dynamics.overlap import DEEPEST
 from sdfsim.learning.shapes import ShapeSource
 from sdfsim.learning.teacher import Teacher, TeacherBody
 
@@ -13,7 +14,7 @@ STARTS = ("still", "dropped", "nudged", "pressed")
 GAP = 1e-3  # m, under a body that is put down
 DROP = 0.1  # m, at most, under one that is dropped
 NUDGE = 0.3  # m/s, at most, along x and along y
-PRESSED = 0.08  # of its extent: how far at most a body is moved into what is around it, along each axis
+PRESSED = 0.5 * DEEPEST  # of its extent: how far at most a body is moved into what is around it, along each axis
 FIELD = 3.0  # m, half the side of the square of floor that is used
 STACKED = 0.5  # part of the bodies that go on top of the one before
 STEADY = 0.03  # least distance of the centre of mass from the rim of the face it stands on, over the largest extent

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sdfsim.dynamics.bodies import Units
+from sdfsim.dynamics.froude import scene_units
 from sdfsim.dynamics.model import load_model
-from sdfsim.dynamics.simulator import scene_units
 from sdfsim.errors import SdfsimError
 from sdfsim.learning.dataset import Trajectory
 from sdfsim.learning.floor import collision_mesh, run_again
