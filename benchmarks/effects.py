@@ -25,6 +25,7 @@ from sdfsim.dynamics.model import load_model
 from sdfsim.dynamics.simulator import SimulationError
 from sdfsim.dynamics.sleep import STEPS as SLEEP_STEPS
 from sdfsim.dynamics.step import contact_graph, fly
+from sdfsim.errors import run_main
 from sdfsim.learning.frames import contact_frames
 from sdfsim.learning.impulse_task import ImpulseTask
 from sdfsim.progress import columns
@@ -211,6 +212,8 @@ def main() -> None:
     parser.add_argument("--data", type=Path)
     parser.add_argument("--paper", type=Path)
     chosen = parser.parse_args()
+    if chosen.only == "always-on" and chosen.paper is None:
+        parser.error("--only always-on needs --paper")
     torch.set_num_threads(1)
     if chosen.only in (None, "samples"):
         samples(chosen.steps)
@@ -222,4 +225,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

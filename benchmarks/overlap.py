@@ -10,6 +10,7 @@ import argparse
 import numpy as np
 
 from sdfsim.dynamics.simulator import Simulator
+from sdfsim.errors import run_main
 from sdfsim.progress import columns
 from sdfsim.scene.types import Body, Scene
 from sdfsim.shape.asset import analytic_shape
@@ -67,4 +68,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

@@ -23,6 +23,7 @@ from pipeline.cameras import View, load_views
 from pipeline.distill import load_field
 from pipeline.meshing import read_parts
 from pipeline.placement import load_placement
+from sdfsim.errors import run_main
 
 
 def similarity(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
@@ -193,4 +194,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

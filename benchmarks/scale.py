@@ -24,6 +24,7 @@ import large
 
 from benchmarks.scale_parts import accuracy, engines, ours, page
 from sdfsim import Simulator, load_scene
+from sdfsim.errors import run_main
 from sdfsim.files import read_json, write_json
 
 BOWLS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
@@ -153,4 +154,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from benchmarks.sdf_parts import cost, recipes, spread, stages
 from benchmarks.sdf_parts.study import Study
-from sdfsim.errors import SdfsimError
+from sdfsim.errors import SdfsimError, run_main
 from sdfsim.files import write_text
 
 MESH = "visual_geometry.obj"
@@ -90,26 +90,23 @@ def main() -> None:
         parts = []
     if not parts or not set(parts) <= set(PARTS):
         parser.error(f"--parts takes numbers from 1 to {len(PARTS)}, separated by commas (got {arguments.parts})")
-    try:
-        meshes = find_meshes(arguments.meshes)
-        chosen = tuple(arguments.shapes.split(",")) if arguments.shapes else None
-        unknown = sorted(set(chosen or ()) - set(meshes))
-        if unknown:
-            raise SdfsimError(f"no such shape: {', '.join(unknown)}", f"there are {', '.join(meshes)}")
-        study = Study(
-            meshes, arguments.out, arguments.pictures, arguments.seconds, arguments.threads, chosen, arguments.points
-        )
-        study.open()
-        for number in parts:
-            PARTS[number].measure(study)
-            draw = PARTS[number].draw
-            if draw is not None:
-                draw(study)
-            write_text(study.out / "sdf.md", report(study, list(PARTS)))
-    except SdfsimError as error:
-        parser.exit(error.exit_code, f"{error}\n" + (f"{error.hint}\n" if error.hint else ""))
+    meshes = find_meshes(arguments.meshes)
+    chosen = tuple(arguments.shapes.split(",")) if arguments.shapes else None
+    unknown = sorted(set(chosen or ()) - set(meshes))
+    if unknown:
+        raise SdfsimError(f"no such shape: {', '.join(unknown)}", f"there are {', '.join(meshes)}")
+    study = Study(
+        meshes, arguments.out, arguments.pictures, arguments.seconds, arguments.threads, chosen, arguments.points
+    )
+    study.open()
+    for number in parts:
+        PARTS[number].measure(study)
+        draw = PARTS[number].draw
+        if draw is not None:
+            draw(study)
+        write_text(study.out / "sdf.md", report(study, list(PARTS)))
     print(report(study, parts), end="")
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

@@ -11,7 +11,6 @@ variant whose surfaces are the detailed meshes.
 from __future__ import annotations
 
 import argparse
-import json
 import re
 import shutil
 import time
@@ -22,6 +21,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from sdfsim.errors import run_main
+from sdfsim.files import read_json, write_json, write_text
 from sdfsim.learning.dataset import read_info, trajectory_files
 from sdfsim.learning.evaluate import evaluate
 from sdfsim.learning.frames import contact_frames
@@ -174,12 +175,12 @@ def main() -> None:
         if not kept.exists():
             data = subset(args.data, args.out / "data" / variant.shapes.replace(" ", "_"), changes[variant.shapes])
             found = measure(variant, data, args.steps)
-            kept.write_text(json.dumps(found, indent=2))
-        results[variant.name] = json.loads(kept.read_text())
-        (args.out / "table.md").write_text(table(results))
+            write_json(kept, found)
+        results[variant.name] = read_json(kept)
+        write_text(args.out / "table.md", table(results))
         print(variant.name, results[variant.name], flush=True)
     print(table(results))
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from sdfsim.dynamics.model import load_model
+from sdfsim.errors import run_main
 from sdfsim.learning import metrics
 from sdfsim.learning.dataset import FLOOR, Trajectory, trajectory_files
 from sdfsim.learning.evaluate import score
@@ -164,4 +165,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from benchmarks.reconstruct import evaluate
 from pipeline.stages import reconstruct
-from sdfsim.errors import SdfsimError
+from sdfsim.errors import SdfsimError, run_main
 from sdfsim.files import read_json, replacing, write_json
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -36,7 +36,9 @@ def measured(minutes: float, preset: str, posed: Path, out: Path) -> dict:
     if kept.exists():
         return read_json(kept)
     if not folder.exists():
-        shutil.copytree(posed, folder)
+        partial = folder.with_name(f".{folder.name}.part")
+        shutil.rmtree(partial, ignore_errors=True)
+        shutil.copytree(posed, partial).rename(folder)
     point: dict = dict.fromkeys(COLUMNS) | {"preset": preset, "minutes": minutes, "failed": ""}
     wall, cpu = time.monotonic(), time.process_time()
     try:
@@ -95,4 +97,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

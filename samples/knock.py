@@ -20,7 +20,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from pipeline.drop import Above
 from pipeline.meshing import SCENERY, rounded
+from sdfsim.errors import run_main
 from sdfsim.files import write_text
+from sdfsim.scene.load import load_scene
 from sdfsim.shape.asset import Shape, load_shape
 
 GRAVITY = 9.81  # m/s^2
@@ -69,6 +71,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="of a reconstruction")
     parser.add_argument("body", help="its name in scene.yaml (mesh/objects.png shows the names)")
     arguments = parser.parse_args()
+    load_scene(arguments.folder / "scene.yaml")  # says what is wrong with it
     scene = yaml.safe_load((arguments.folder / "scene.yaml").read_text(encoding="utf-8"))
     assets = {name: shape["asset"] for name, shape in scene["shapes"].items() if "asset" in shape}
     bodies = [body for body in scene["bodies"] if "plane" in body or body["shape"] in assets]
@@ -88,4 +91,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

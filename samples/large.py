@@ -21,6 +21,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from sdfsim.dynamics.simulator import Simulator
+from sdfsim.errors import run_main
 from sdfsim.files import write_text
 from sdfsim.scene.load import load_scene
 from sdfsim.shape.asset import Shape, analytic_shape, load_shape, scaled
@@ -181,4 +182,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

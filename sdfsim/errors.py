@@ -1,6 +1,9 @@
-"""The one error type of the project; `cli.py` turns it into one line, a hint and an exit code."""
+"""The one error type of the project; `cli.py` and `run_main` turn it into one line, a hint and an exit code."""
 
 from __future__ import annotations
+
+import sys
+from collections.abc import Callable
 
 EXIT_ERROR = 1
 EXIT_QUALITY = 3
@@ -42,3 +45,14 @@ class SceneError(SdfsimError):
     def __init__(self, problems: list[str], hint: str = "") -> None:
         self.problems = [printable(problem) for problem in problems]
         super().__init__("\n".join(self.problems), hint)
+
+
+def run_main(main: Callable[[], None]) -> None:
+    """Run a script's `main`, and end the process where that meets what a user can act on, or is interrupted."""
+    try:
+        main()
+    except SdfsimError as error:
+        print(f"error: {error}", *([f"hint: {error.hint}"] if error.hint else []), sep="\n", file=sys.stderr)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        sys.exit(EXIT_INTERRUPTED)

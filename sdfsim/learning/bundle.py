@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any
 import torch
 
 from sdfsim.dynamics.model import BUNDLED, Model, load_model
-from sdfsim.errors import SdfsimError
+from sdfsim.errors import SdfsimError, run_main
 from sdfsim.files import write_text
 from sdfsim.learning import tables
 from sdfsim.learning.evaluate import evaluate
@@ -241,12 +240,9 @@ def main() -> None:
     parser.add_argument("--seeds", type=Path, nargs="+", default=[], help="models of the same preset, other seeds")
     parser.add_argument("--beside", type=Path, nargs="+", default=[], help="models to tell the errors of as well")
     args = parser.parse_args()
-    try:
-        report = bundle(args.model, args.data, args.name, seeds=args.seeds, beside=args.beside)
-    except SdfsimError as error:
-        sys.exit(f"error: {error}\n{error.hint}")
+    report = bundle(args.model, args.data, args.name, seeds=args.seeds, beside=args.beside)
     print(json.dumps({k: report[k] for k in ("model", "ballistic", "other_seeds")}, indent=2))
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

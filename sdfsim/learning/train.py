@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from sdfsim.errors import SdfsimError
+from sdfsim.errors import SdfsimError, run_main
 from sdfsim.files import locked, write_text
 from sdfsim.learning.dataset import SOLID, SPLITS, read_info
 from sdfsim.learning.presets import PRESETS, Preset
@@ -219,12 +218,9 @@ def main() -> None:
     parser.add_argument("--resume", action="store_true")
     args = parser.parse_args()
     options = {name: getattr(args, name) for name in ("preset", "resume", "steps", "seed", "device")}
-    try:
-        report = train(args.data, args.out, **options, on_progress=lambda f, m: print(f"{f:6.1%}  {m}", flush=True))
-    except SdfsimError as error:
-        sys.exit(f"error: {error}\n{error.hint}")
+    report = train(args.data, args.out, **options, on_progress=lambda f, m: print(f"{f:6.1%}  {m}", flush=True))
     print(json.dumps(report))
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

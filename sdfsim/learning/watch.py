@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from sdfsim.errors import SdfsimError
+from sdfsim.errors import SdfsimError, run_main
 from sdfsim.files import replacing
 from sdfsim.learning.dataset import Trajectory, load_shapes, trajectory_files
 from sdfsim.learning.instants import at_instants, engine_substep
@@ -130,11 +129,8 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("-o", "--out", type=Path, required=True)
     args = parser.parse_args()
-    try:
-        draw(args.run, args.out)
-    except SdfsimError as error:
-        sys.exit(f"error: {error}\n{error.hint}".rstrip())
+    draw(args.run, args.out)
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

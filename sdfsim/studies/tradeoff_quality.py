@@ -6,12 +6,11 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import Any
 
 from sdfsim.dynamics.model import BUNDLED, Model, load_model
-from sdfsim.errors import SdfsimError
+from sdfsim.errors import SdfsimError, run_main
 from sdfsim.files import read_json, write_json
 from sdfsim.scene.types import Scene
 from sdfsim.studies.tradeoff_cost import COSTS_FILE
@@ -112,11 +111,8 @@ def main() -> None:
     """Command line of this module."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
-    try:
-        print("\n".join(store(parser.parse_args().folder)))
-    except SdfsimError as error:
-        sys.exit(f"error: {error}\n{error.hint}")
+    print("\n".join(store(parser.parse_args().folder)))
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import json
 import signal
+from functools import partial
+
+import pytest
 
 from sdfsim import Rollout, SdfsimError
 from sdfsim.dynamics.simulator import SimulationError, Simulator
+from sdfsim.errors import run_main
 from tests.cli.conftest import run
 
 
@@ -75,3 +79,16 @@ def test_a_hint_follows_the_error(scene, monkeypatch):
 
     monkeypatch.setattr("sdfsim.planning.describe", fail)
     assert run("plan", scene).stderr == "error: what is wrong\nhint: what to try\n"
+
+
+def test_scripts_say_the_same_and_end_with_the_same_codes(capsys):
+    def fail(error: BaseException):
+        raise error
+
+    failed = SdfsimError("what is wrong", "what to try", exit_code=3)
+    for error, code in ((failed, 3), (SdfsimError("no hint"), 1), (KeyboardInterrupt(), 130)):
+        with pytest.raises(SystemExit) as end:
+            run_main(partial(fail, error))
+        assert end.value.code == code
+    assert capsys.readouterr().err == "error: what is wrong\nhint: what to try\nerror: no hint\n"
+    run_main(lambda: None)
