@@ -36,7 +36,6 @@ LEVELS = {
     "scene": 3,
     "dynamics": 4,
     "learning": 5,
-    "baselines": 5,
     "studies": 6,
     "commands": 9,
 }
