@@ -154,6 +154,24 @@ def read_info(folder: Path) -> dict:
     return info
 
 
+def home_of(data: Path) -> Path | None:
+    """The folder with the `dataset.json` that tells of a dataset or of one of its splits; None without any."""
+    return next((folder for folder in (data, data.parent) if (folder / "dataset.json").exists()), None)
+
+
+def floor_of(info: dict) -> tuple[float, float]:
+    """Friction and restitution of the floor that `dataset.json` tells, or the recipes' own.
+
+    Raises:
+        SdfsimError: what is told is neither.
+    """
+    told = info.get("floor") or {"friction": FLOOR[0], "restitution": FLOOR[1]}
+    try:
+        return float(told["friction"]), float(told["restitution"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise SdfsimError(f"dataset.json: floor: must have friction and restitution (got {told!r})") from error
+
+
 def trajectory_files(folder: Path, split: str) -> list[Path]:
     """Trajectory files of a dataset in name order: of `folder/split/`, or of `folder` where nothing is split.
 

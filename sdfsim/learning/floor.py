@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from sdfsim.errors import SdfsimError
-from sdfsim.learning.dataset import FLOOR, Trajectory, read_info, shapes_folder
+from sdfsim.learning.dataset import Trajectory, floor_of, home_of, read_info, shapes_folder
 from sdfsim.learning.teacher import DT, ENGINE_SETTINGS, SUBSTEP, SUBSTEPS, Teacher, TeacherBody, import_pybullet
 from sdfsim.parallel import parallel
 
@@ -37,12 +37,11 @@ def chaos_floor(data: Path, trajectories: list[Trajectory], steps: int, seed: in
         SdfsimError: PyBullet or an engine file is absent, or the recording is not this teacher's.
     """
     import_pybullet()
-    info = read_info(data if (data / "dataset.json").exists() else data.parent)
+    info = read_info(home_of(data) or data.parent)
     _check_teacher(info, trajectories)
     names = {str(n) for t in trajectories for n in t.shape}
     urdfs = {name: engine_file(data, name) for name in names}
-    floor = info.get("floor") or {"friction": FLOOR[0], "restitution": FLOOR[1]}
-    surface = (float(floor["friction"]), float(floor["restitution"]))
+    surface = floor_of(info)
     jobs = [
         (perturbed(t, size, [seed, k]), urdfs, surface, steps)
         for size in PERTURBATIONS.values()

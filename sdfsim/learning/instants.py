@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from sdfsim.errors import SdfsimError
-from sdfsim.learning.dataset import Trajectory, read_info
+from sdfsim.learning.dataset import Trajectory, home_of, read_info
 
 LONGEST = 1.0  # s, an engine's inner step
 EXACTLY = 1e-3  # part of what gravity adds in a step, by which a free flight may miss it
@@ -20,15 +20,15 @@ def engine_substep(data: Path) -> float:
     Raises:
         SdfsimError: what is told is no such step.
     """
-    for folder in (data, data.parent):
-        if (folder / "dataset.json").exists():
-            settings = read_info(folder).get("engine_settings") or {}
-            found = settings.get("timeStep", 0.0) if isinstance(settings, dict) else settings
-            if isinstance(found, bool) or not isinstance(found, int | float) or not 0.0 <= found <= LONGEST:
-                where = f"{folder / 'dataset.json'}: engine_settings.timeStep"
-                raise SdfsimError(f"{where}: must be 0 (unknown) to {LONGEST:g} s (got {found!r})")
-            return float(found)
-    return 0.0
+    home = home_of(data)
+    if home is None:
+        return 0.0
+    settings = read_info(home).get("engine_settings") or {}
+    found = settings.get("timeStep", 0.0) if isinstance(settings, dict) else settings
+    if isinstance(found, bool) or not isinstance(found, int | float) or not 0.0 <= found <= LONGEST:
+        where = f"{home / 'dataset.json'}: engine_settings.timeStep"
+        raise SdfsimError(f"{where}: must be 0 (unknown) to {LONGEST:g} s (got {found!r})")
+    return float(found)
 
 
 def at_instants(trajectory: Trajectory, substep: float) -> Trajectory:

@@ -20,7 +20,7 @@ class Preset:
         in_row: steps trained in a row over the last `late` part of the training (impulse), see `unrolled`; 1 for none.
         late: part of the steps of the optimiser.
         bf16: matrix products in bfloat16, see `dynamics.precision`.
-        noise: standard deviation of pose noise (*paper*: m, as published), or None for the network's default.
+        noise: m, standard deviation of pose noise of the *paper* network (None: none); *impulse* has its own.
     """
 
     kind: str

@@ -121,7 +121,7 @@ class Run:
             arrays[f"average/{name}"] = self.average[name].cpu().numpy()
         for name, value in self.optimiser.state().items():
             arrays[f"optimiser/{name}"] = value.cpu().numpy()
-        progress = {"step": self.step, "seconds": self.seconds, "loss": self.loss, "total": self.total}
+        progress = {name: getattr(self, name) for name in ("step", "seconds", "loss", "total", "skipped")}
         origin = {"plan": asdict(self.plan), "seed": self.seed, "data": self.digest}
         arrays["run"] = np.array(json.dumps(origin | progress))
         write_arrays(path, arrays, compressed=False)
@@ -141,6 +141,7 @@ class Run:
             self.average = {k[8:]: v for k, v in tensors.items() if k.startswith("average/")}
             self.optimiser.load({k[10:]: v for k, v in tensors.items() if k.startswith("optimiser/")})
             self.step, self.seconds, self.loss = info["step"], info["seconds"], info["loss"]
+            self.skipped = info.get("skipped", 0)
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise SdfsimError(
                 f"{path}: not a checkpoint of this training: {error}", "delete it to start anew"

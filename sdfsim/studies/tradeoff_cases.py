@@ -12,7 +12,16 @@ import numpy as np
 import torch
 
 from sdfsim.errors import SdfsimError
-from sdfsim.learning.dataset import FLOOR, Trajectory, check_alike, load_shapes, read_info, trajectory_files
+from sdfsim.learning.dataset import (
+    FLOOR,
+    Trajectory,
+    check_alike,
+    floor_of,
+    home_of,
+    load_shapes,
+    read_info,
+    trajectory_files,
+)
 from sdfsim.learning.floor import engine_file
 from sdfsim.learning.instants import at_instants, engine_substep
 from sdfsim.learning.merge import scene_of
@@ -141,7 +150,7 @@ def load_cases(data: Path, scratch: Path, *, quick: bool) -> Cases:
         urdfs=_engine_files(data, shapes),
         pieces={name: engine_pieces(data, name) for name in shapes},
         solids=exact_solids(data, shapes),
-        floor=_floor(data),
+        floor=FLOOR if (home := home_of(data)) is None else floor_of(read_info(home)),
         timed=timed,
         timed_steps=min(30 if quick else TIMED_STEPS, longest),
     )
@@ -154,9 +163,3 @@ def _engine_files(data: Path, names: Iterable[str]) -> dict[str, Path]:
         with suppress(SdfsimError):
             found[name] = engine_file(data, name)
     return found
-
-
-def _floor(data: Path) -> tuple[float, float]:
-    home = data if (data / "dataset.json").exists() else data.parent
-    said = read_info(home).get("floor") if (home / "dataset.json").exists() else None
-    return (float(said["friction"]), float(said["restitution"])) if isinstance(said, dict) else FLOOR

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sdfsim.errors import SdfsimError
-from sdfsim.learning.dataset import Trajectory, read_info, trajectory_files
+from sdfsim.learning.dataset import FLOOR, Trajectory, floor_of, home_of, read_info, trajectory_files, write_info
 from tests.learning.conftest import trajectory
 
 
@@ -81,3 +81,14 @@ def test_fields_of_another_type_are_named(tmp_path, change, complaint):
     with pytest.raises(SdfsimError) as error:
         Trajectory.load(tmp_path / "a.npz")
     assert complaint in error.value.message and "a.npz" in error.value.message
+
+
+def test_the_floor_is_what_the_dataset_says_else_the_recipes(tmp_path):
+    assert floor_of({}) == floor_of({"floor": None}) == FLOOR
+    assert floor_of({"floor": {"friction": 0.2, "restitution": 0}}) == (0.2, 0.0)
+    for wrong in ({"friction": 0.2}, [0.2, 0.3], {"friction": "rough", "restitution": 0.1}):
+        with pytest.raises(SdfsimError, match="floor: must have friction and restitution"):
+            floor_of({"floor": wrong})
+    assert home_of(tmp_path / "test") is None
+    write_info(tmp_path, {"recipe": "balls"})
+    assert home_of(tmp_path) == home_of(tmp_path / "test") == tmp_path
