@@ -278,6 +278,7 @@ def pick_device(name: str) -> torch.device:
     if not re.fullmatch(r"cpu|cuda(:\d+)?", name, re.ASCII):
         raise SdfsimError(f"device: {name!r} is not auto, cpu or cuda")
     place = torch.device(name)
-    if place.type == "cuda" and (place.index or 0) >= torch.cuda.device_count():
+    there = torch.cuda.is_available() and (place.index is None or place.index < torch.cuda.device_count())
+    if place.type == "cuda" and not there:
         raise SdfsimError(f"--device {name}: no CUDA device here", "use --device cpu")
     return place

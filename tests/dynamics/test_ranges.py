@@ -106,6 +106,7 @@ def test_steps_that_are_none_are_refused(dropped, dt):
     [("gpu", "device: 'gpu' is not auto, cpu or cuda"), ("cuda", "no CUDA"), ("cuda:3", "--device cuda:3: no CUDA")],
 )
 def test_devices_that_are_not_there_are_named(dropped, monkeypatch, device, says):
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: device == "cuda:3")
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     with pytest.raises(SdfsimError, match=says):
         Simulator(dropped, random_model("impulse"), device)
