@@ -14,5 +14,7 @@ def data_dir() -> Path:
     default = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
     folder = Path(os.environ.get("SDFSIM_DATA") or default)
     if not (folder / "kubasic").is_dir():
-        pytest.skip(f"no test data at {folder} (set SDFSIM_DATA to a folder that holds kubasic/)")
+        pytest.skip(
+            f"meshes that are not part of the project are not at {folder} (set SDFSIM_DATA, see CONTRIBUTING.md)"
+        )
     return folder

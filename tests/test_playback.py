@@ -127,7 +127,9 @@ def test_a_recording_that_cannot_be_written_is_our_error(scene, rollout, tmp_pat
         save_rollout(scene, rollout, tmp_path / "nowhere" / "rollout.rrd")
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+@pytest.mark.skipif(
+    not Path("/dev/full").exists(), reason="/dev/full, a disk that is always full, exists on Linux only"
+)
 def test_a_full_disk_is_our_error_and_leaves_nothing_half(scene, rollout, tmp_path):
     (tmp_path / f".rollout.rrd.{os.getpid()}.part").symlink_to("/dev/full")
     with pytest.raises(SdfsimError, match="No space left"):

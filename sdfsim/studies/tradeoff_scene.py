@@ -51,6 +51,7 @@ def cases_of_scene(
             others, or effects that are off; nothing moves; PyBullet is not installed.
     """
     scene = load_scene(path, on_progress)
+    _check_known(scene)
     floor, height = _floor(scene)
     units = scene_units(scene, load_model(model, weights=False), None)
     solid = [b for b in scene.bodies if not isinstance(scene.shapes[b.shape].sdf, PlaneSdf)]
@@ -84,20 +85,22 @@ def cases_of_scene(
     )
 
 
+def _check_known(scene: Scene) -> None:
+    """Raises SdfsimError where the teacher, or `scene_of`, would make another scene of it."""
+    if any(b.motion == "kinematic" for b in scene.bodies):
+        raise SdfsimError(f"{scene.path}: has bodies on a path, which the teacher does not know")
+    if any(b.collides_with is not None for b in scene.bodies):
+        raise SdfsimError(f"{scene.path}: has bodies that may not touch all others, which is not measured")
+    if off := [name for name in PHYSICAL if getattr(scene.effects, name) == "off"]:
+        raise SdfsimError(f"{scene.path}: effects: {off[0]} is off, which is not measured", "leave it at auto")
+
+
 def _floor(scene: Scene) -> tuple[Body, float]:
     """The floor and its height m."""
     planes = [b for b in scene.bodies if isinstance(scene.shapes[b.shape].sdf, PlaneSdf)]
     up = [Rotation.from_quat(b.quat_xyzw).apply([0.0, 0.0, 1.0]) for b in planes]
     if len(planes) != 1 or up[0][2] < 1 - 1e-9:
         raise SdfsimError(f"{scene.path}: needs one level plane as its floor (has {len(planes)} planes)")
-    if any(b.motion == "kinematic" for b in scene.bodies):
-        raise SdfsimError(f"{scene.path}: has bodies on a path, which the teacher does not know")
-    if any(b.collides_with is not None for b in scene.bodies):
-        raise SdfsimError(f"{scene.path}: has bodies that may not touch all others, which is not measured")
-    if off := [
-        name for name in ("contact", "friction", "restitution", "rotation") if getattr(scene.effects, name) == "off"
-    ]:
-        raise SdfsimError(f"{scene.path}: effects: {off[0]} is off, which is not measured", "leave it at auto")
     return planes[0], float(planes[0].position[2])
 
 

@@ -149,7 +149,9 @@ def test_bad_input_is_one_line_and_code_1(scene, model, tmp_path, arguments, tol
     assert told.format(**names) in errors[0] and "Traceback" not in done.stderr
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+@pytest.mark.skipif(
+    not Path("/dev/full").exists(), reason="/dev/full, a disk that is always full, exists on Linux only"
+)
 def test_a_full_disk_is_one_line(scene, model, tmp_path):
     out = tmp_path / "run"
     out.mkdir()
@@ -159,7 +161,9 @@ def test_a_full_disk_is_one_line(scene, model, tmp_path):
     assert not (out / "rollout.npz").exists()
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+@pytest.mark.skipif(
+    not Path("/dev/full").exists(), reason="/dev/full, a disk that is always full, exists on Linux only"
+)
 @pytest.mark.parametrize("options", [["--json"], []])
 def test_a_report_that_cannot_be_written_is_one_line(options):
     command = [sys.executable, "-c", "import cli; cli.app()", "info", *options]

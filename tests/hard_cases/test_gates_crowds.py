@@ -74,14 +74,18 @@ def assert_runs_on(model, settle: int, steps: int, sleep: str) -> None:
     assert resident() < memory + 32.0
 
 
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="reads /proc to see the memory of a process")
+@pytest.mark.skipif(
+    not Path("/proc/self/statm").exists(), reason="/proc, which tells a process's memory, exists on Linux only"
+)
 @pytest.mark.parametrize("sleep", ["off"])
 def test_hundreds_of_steps_of_a_pile(model, sleep):
     assert_runs_on(model, 150, 150, sleep)
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="reads /proc to see the memory of a process")
+@pytest.mark.skipif(
+    not Path("/proc/self/statm").exists(), reason="/proc, which tells a process's memory, exists on Linux only"
+)
 @pytest.mark.parametrize("sleep", ["on", "off"])
 def test_ten_thousand_steps_of_a_settled_pile(model, sleep):
     assert_runs_on(model, 400, 10_000, sleep)

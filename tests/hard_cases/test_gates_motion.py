@@ -89,7 +89,9 @@ def test_the_order_of_bodies_does_not_matter(model):
 def test_the_order_of_nodes_does_not_matter(model):
     """Networks that look at the first so many nodes have others then, which is another body."""
     if model.nodes is not None:
-        pytest.skip(f"{model.name} looks at the first {model.nodes} nodes of a shape")
+        pytest.skip(
+            f"does not hold for {model.name}: it takes a shape's first {model.nodes} nodes, others in another order"
+        )
     scene, rng = gates.mixed(), np.random.default_rng(0)
     shapes = tuple(replace(s, nodes=s.nodes[rng.permutation(len(s.nodes))]) for s in scene.shapes)
     assert apart(model, scene, replace(scene, shapes=shapes), 25) <= 1e-4

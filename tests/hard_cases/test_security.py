@@ -215,7 +215,7 @@ def listening(port: int) -> list[str]:
     return found
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc/net")
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc/net, which tells who listens where, exists on Linux only")
 def test_the_live_viewer_listens_on_this_machine_only(home, monkeypatch):
     from sdfsim import viewer
     from sdfsim.playback import Playback
