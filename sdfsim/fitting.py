@@ -16,7 +16,7 @@ from sdfsim.progress import columns, duration
 from sdfsim.shape.asset import RECORD_FILE, Shape
 from sdfsim.shape.distance import MeshDistance
 from sdfsim.shape.fit import FIT_VERSION, fit_mesh, fit_solids
-from sdfsim.shape.mesh import MESH_SUFFIXES, load_mesh
+from sdfsim.shape.mesh import MESH_SUFFIXES, Mesh, load_mesh
 from sdfsim.shape.solid import solidify
 
 Progress = Callable[[float, str], None]
@@ -68,7 +68,7 @@ def fit(mesh_file: Path, out: Path, options: Options, *, device: str, on_progres
             checkpoint=checkpoint,
             device=pick_device(device),
         )
-        report = _save(shape, mesh_file, out, options)
+        report = _save(shape, _request(mesh, options), out)
         checkpoint.unlink(missing_ok=True)
     missed = [] if shape.certificate["passed"] else [f"fit: {shape.certificate['reason']}"]
     return report | {"failed_checks": missed}
@@ -192,10 +192,12 @@ def _stacked(todo: list[tuple[str, Path]], out: Path, options: Options, device: 
     for before in range(0, len(todo), STACK):
         group = todo[before : before + STACK]
         solids: dict[str, MeshDistance] = {}
+        requests: dict[str, str] = {}
         for name, file in group:
             try:
-                solid = solidify(load_mesh(file), name=name, cap=options.cap, thicken=options.thicken)
-                solids[name] = MeshDistance(solid)
+                mesh = load_mesh(file)
+                solids[name] = MeshDistance(solidify(mesh, name=name, cap=options.cap, thicken=options.thicken))
+                requests[name] = _request(mesh, options)
             except SdfsimError as error:
                 yield name, {"error": error.message, "hint": error.hint}
 
@@ -205,14 +207,13 @@ def _stacked(todo: list[tuple[str, Path]], out: Path, options: Options, device: 
         if solids:
             budget = None if options.budget is None else options.budget * len(solids)
             shapes = fit_solids(solids, recipe=options.recipe, budget=budget, device=device, on_progress=tell)
-            files = dict(group)
             for shape in shapes:
-                yield shape.name, _save(shape, files[shape.name], out / shape.name, options)
+                yield shape.name, _save(shape, requests[shape.name], out / shape.name)
 
 
-def _save(shape: Shape, file: Path, folder: Path, options: Options) -> dict[str, Any]:
-    """Write a shape with a note of what it was made from, and report on it."""
-    shape = replace(shape, source=shape.source | {"request": _request(file, options)})
+def _save(shape: Shape, request: str, folder: Path) -> dict[str, Any]:
+    """Write a shape with the `_request` that it was made for, and report on it."""
+    shape = replace(shape, source=shape.source | {"request": request})
     shape.save(folder)
     return _report(shape.certificate, shape.volume, len(shape.nodes), shape.source, folder)
 
@@ -222,9 +223,9 @@ def _report(certificate: dict, volume: float, nodes: int, source: dict, folder: 
     return known | certificate
 
 
-def _request(file: Path, options: Options) -> str:
-    """Changes with everything that a fit depends on."""
-    return hashlib.sha256(file.read_bytes() + f"|{options}|{FIT_VERSION}".encode()).hexdigest()
+def _request(mesh: Mesh, options: Options) -> str:
+    """Changes with everything that a fit depends on; a file names others, so its own bytes do not tell."""
+    return hashlib.sha256(f"{mesh.digest()}|{options}|{FIT_VERSION}".encode()).hexdigest()
 
 
 def _kept(file: Path, folder: Path, options: Options) -> dict[str, Any] | None:
@@ -232,7 +233,8 @@ def _kept(file: Path, folder: Path, options: Options) -> dict[str, Any] | None:
     from sdfsim.shape.asset import load_shape
 
     try:
-        if read_json(folder / RECORD_FILE)["source"].get("request") != _request(file, options):
+        made_for = read_json(folder / RECORD_FILE)["source"]["request"]
+        if made_for != _request(load_mesh(file), options):
             return None
         shape = load_shape(folder)
     except (SdfsimError, OSError, KeyError, TypeError, AttributeError):
