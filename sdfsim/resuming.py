@@ -18,12 +18,14 @@ from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.simulator import Simulator, join
 from sdfsim.dynamics.sleep import Rest
 from sdfsim.errors import SdfsimError
-from sdfsim.files import read_arrays, write_arrays
+from sdfsim.files import read_arrays, read_json, write_arrays
 from sdfsim.shape.bank import SdfBank
 
+CHECKPOINT = "checkpoint"  # folder in that of the run
 EVERY = 30.0  # s between two checkpoints
 _STATE = "state.npz"
 _ANEW = "leave --resume away to start anew"
+_OTHER = "is of another scene, model or seed"
 
 
 class Checkpoint:
@@ -34,13 +36,14 @@ class Checkpoint:
         simulator: at its start.
 
     Attributes:
+        identity: of the run, see the function of this name.
         rest: for how long everything has rested.
     """
 
     def __init__(self, folder: Path, simulator: Simulator) -> None:
-        self._folder = folder / "checkpoint"
+        self._folder = folder / CHECKPOINT
         self._simulator = simulator
-        self._identity = identity(simulator)
+        self.identity = identity(simulator)
         self.rest = Rest()
         self._fresh: list[tuple[Rollout, State, int, Rest]] = []  # one entry a step: an interruption splits none
         self._parts = 0
@@ -57,8 +60,8 @@ class Checkpoint:
         kept = read_arrays(self._folder / _STATE, "a checkpoint", _ANEW)
         simulator = self._simulator
         try:
-            if str(kept["identity"]) != self._identity:
-                raise SdfsimError(f"{self._folder}: is of another scene, model or seed", _ANEW)
+            if str(kept["identity"]) != self.identity:
+                raise SdfsimError(f"{self._folder}: {_OTHER}", _ANEW)
             self._parts = int(kept["parts"])
             simulator.state = _state(kept, simulator.device)
             simulator.steps_done = int(kept["steps_done"])
@@ -81,7 +84,7 @@ class Checkpoint:
             self._folder.mkdir(exist_ok=True)
             _, state, steps, rest = self._fresh[-1]
             join([frame for frame, *_ in self._fresh]).save(self._folder / _part(self._parts))
-            done = {"identity": self._identity, "parts": self._parts + 1, "steps_done": steps}
+            done = {"identity": self.identity, "parts": self._parts + 1, "steps_done": steps}
             write_arrays(self._folder / _STATE, {**done, **_arrays(state, rest)}, compressed=False)
             self._fresh = []  # not before: Ctrl-C amid this saves once more, and must write the same part again
             self._parts += 1
@@ -91,6 +94,34 @@ class Checkpoint:
         """Nothing is to be gone on with. The state goes first: parts that a kill leaves are nothing without it."""
         (self._folder / _STATE).unlink(missing_ok=True)
         shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def finished(report_file: Path, identity: str, steps: int, *, until_settled: bool) -> dict[str, Any] | None:
+    """The report of a run that is finished; None where it was interrupted or is not there.
+
+    Args:
+        report_file: report.json of the run folder.
+        identity: of the run that is asked for.
+        steps: that it takes at most.
+        until_settled: whether it ends as soon as everything has come to rest.
+
+    Raises:
+        SdfsimError: the finished run is another one or of another length, or its state broke.
+    """
+    if not report_file.exists():
+        return None
+    report, folder = read_json(report_file, _ANEW), report_file.parent
+    if report["status"] == "interrupted":
+        return None
+    if report.get("identity") != identity:
+        raise SdfsimError(f"{folder}: {_OTHER}", _ANEW)
+    if report["status"] == "failed":
+        raise SdfsimError(f"{folder}: this run has ended: {report['error']}", _ANEW)
+    settled = until_settled and report.get("settled") and report["steps"] < steps
+    if report["steps"] != steps and not settled:
+        told = f"{report['steps']} steps, {report['simulated_s']:.4g} s"
+        raise SdfsimError(f"{folder}: finished after {told}; its length cannot be changed", "choose a new -o")
+    return report
 
 
 def identity(simulator: Simulator) -> str:

@@ -20,10 +20,9 @@ from sdfsim.files import CONFIG, check_own, check_writable, locked, write_json, 
 from sdfsim.learning import tables
 from sdfsim.playback import Playback, save_rollout
 from sdfsim.progress import columns
-from sdfsim.resuming import Checkpoint
+from sdfsim.resuming import CHECKPOINT, Checkpoint, finished
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.types import Scene
-from sdfsim.studies.tradeoff_quality import at_quality, quality_note, quality_setting
 
 Viewer = Literal["none", "file", "native", "web"]
 Progress = Callable[[str, float, str], None]  # stage, fraction of it that is done, message
@@ -38,7 +37,8 @@ _PACKAGES = (
     "rerun-sdk",
     "pybullet",
 )
-_RESULTS = ("report.json", "rollout.npz", "rollout.rrd")
+_REPORT = "report.json"
+_RESULTS = (_REPORT, "rollout.npz", "rollout.rrd")
 
 
 def simulate(
@@ -51,13 +51,12 @@ def simulate(
     viewer: Viewer,
     device: str,
     on_progress: Progress,
-    on_address: Callable[[str], None],
+    say: Callable[[str], None],
     bind: str = "127.0.0.1",
     allow_outside: bool = False,
     until_settled: bool = False,
     resume: bool = False,
     guard: Guard = "none",
-    quality: str | None = None,
 ) -> dict[str, Any]:
     """Simulate a scene and write config.yaml, report.json, rollout.npz and (unless `viewer` is none) rollout.rrd.
 
@@ -70,12 +69,12 @@ def simulate(
         viewer: where to watch: not at all, later from the file, or live in a window or a page.
         device: cpu, cuda or auto.
         on_progress: called with (stage, fraction, message).
-        on_address: called with the address of the page that `viewer` web serves.
+        say: called with a line for the person: what was replaced, where the page of `viewer` web is.
         bind: address of this machine that a live viewer listens on.
         allow_outside: whether the scene may name files outside of its own folder.
         until_settled: end as soon as everything has come to rest.
-        resume: go on with the run in `out` that was interrupted; from the start where there is none.
-        quality: draft, standard or fine: measured settings of the simulator (None: shapes and model as they are).
+        resume: go on with the run in `out` that was interrupted; from the start where there is none. A finished one is
+            left as it is, and its report is returned.
         guard: "energy" holds back contact that makes energy.
 
     Returns:
@@ -83,7 +82,8 @@ def simulate(
         certificate.
 
     Raises:
-        SdfsimError: bad input, an output that cannot be written, or another run that writes to the same folder.
+        SdfsimError: bad input, an output that cannot be written, another run that writes to the same folder, or a
+            finished run to resume that is another one than this.
         SimulationError: the state broke; what was computed before is in the folder.
         KeyboardInterrupt: likewise.
     """
@@ -91,8 +91,6 @@ def simulate(
     pick_device(device)
     if model:
         load_model(model, weights=False)
-    if quality:
-        quality_setting(quality)
     check_writable(out)
     check_own(out, "simulate", *_RESULTS)
     if viewer in ("native", "web"):
@@ -100,8 +98,7 @@ def simulate(
 
         check_screen(viewer)
     scene = _load(scene_file, on_progress, allow_outside)
-    scene, used = at_quality(quality, scene, model) if quality else (scene, model)
-    simulator = Simulator(scene, model=used, device=device, seed=seed, guard=guard)
+    simulator = Simulator(scene, model=model, device=device, seed=seed, guard=guard)
     length = scene.duration if seconds is None else seconds
     config = {
         "command": "simulate",
@@ -109,7 +106,6 @@ def simulate(
         "model": _repeatable(model or scene.model, simulator.model),
         "seconds": float(length),
         "seed": int(simulator.seed),
-        "quality": quality,
         "viewer": viewer,
         "allow_outside": allow_outside,
         "until_settled": until_settled,
@@ -119,7 +115,14 @@ def simulate(
     out.mkdir(parents=True, exist_ok=True)
     with locked(out):
         kept = Checkpoint(out, simulator)
+        steps = max(1, round(length / simulator.dt))
+        if resume and (done := finished(out / _REPORT, kept.identity, steps, until_settled=until_settled)):
+            kept.clear()  # where it was killed between its last file and its end
+            say(f"{out}: finished already")
+            return done
         frames = kept.restore() if resume else []
+        if not frames and any((out / name).exists() for name in (*_RESULTS, CHECKPOINT)):
+            say(f"replaced the earlier run in {out}")
         for name in _RESULTS:
             (out / name).unlink(missing_ok=True)
         if not frames:
@@ -127,11 +130,11 @@ def simulate(
             frames = [simulator.initial_rollout()]
             kept.add(frames[0])
         write_text(out / CONFIG, yaml.safe_dump(config, sort_keys=False))
-        live = _live(scene, viewer, join(frames), on_address, bind)
+        live = _live(scene, viewer, join(frames), say, bind)
 
         started, broken = time.monotonic(), None
         settled = until_settled and kept.rest.settled  # already, where it was killed between its last step and the end
-        left = 0 if settled else max(1, round(length / simulator.dt)) - simulator.steps_done
+        left = 0 if settled else steps - simulator.steps_done
         try:
             for frame in simulator.frames(left):
                 frames.append(frame)
@@ -151,7 +154,7 @@ def simulate(
         report = summary(rollout, time.monotonic() - started)
         report["status"] = "done" if broken is None else "failed" if isinstance(broken, SdfsimError) else "interrupted"
         report["folder"] = str(out)
-        report["quality"] = quality_note(quality, model or scene.model) if quality else None
+        report["identity"] = kept.identity
         report["failed_checks"] = [f"fit of shape {told}" for told in scene.missed]
         if until_settled:
             report["settled"] = settled
@@ -161,7 +164,7 @@ def simulate(
         if viewer != "none":
             save_rollout(scene, rollout, out / "rollout.rrd")
             report["recording"] = str(out / "rollout.rrd")
-        write_json(out / "report.json", report)
+        write_json(out / _REPORT, report)
         if not isinstance(broken, KeyboardInterrupt):
             kept.clear()
         if isinstance(broken, SimulationError):
@@ -183,14 +186,14 @@ def _repeatable(asked: str | None, model: Model) -> str:
     return str(Path(asked).resolve()) if asked and asked.endswith(".safetensors") else model.name
 
 
-def _live(scene: Any, viewer: Viewer, first: Rollout, on_address: Callable[[str], None], bind: str) -> Playback | None:
+def _live(scene: Any, viewer: Viewer, first: Rollout, say: Callable[[str], None], bind: str) -> Playback | None:
     if viewer not in ("native", "web"):
         return None
     from sdfsim.viewer import stream_to_viewer
 
     live = Playback(scene)
     if address := stream_to_viewer(live, viewer, bind=bind):
-        on_address(address)
+        say(f"watch it at {address}")
     live.log_static()
     live.log_steps(first)
     return live

@@ -24,7 +24,7 @@ def simulate(scene: Path, out: Path, *, stop: float | None = None, kind=Keyboard
             raise kind
 
     settings = {"model": None, "seed": None, "viewer": "none", "device": "cpu"}
-    settings |= {"on_progress": on_progress, "on_address": print, "seconds": seconds}
+    settings |= {"on_progress": on_progress, "say": print, "seconds": seconds}
     return run.simulate(scene, out, **(settings | options))
 
 
@@ -70,6 +70,30 @@ def test_another_run_is_not_gone_on_with(sleepy, tmp_path, monkeypatch):
     assert (tmp_path / "run" / "rollout.npz").exists()
     assert simulate(sleepy, tmp_path / "run", seconds=0.05)["status"] == "done"  # anew
     assert not (tmp_path / "run" / "checkpoint").exists()
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_a_finished_run_is_left_as_it_is(sleepy, tmp_path, capsys):
+    out = tmp_path / "run"
+    report = simulate(sleepy, out, seed=3)
+    before = content(out)
+    again = simulate(sleepy, out, seed=3, resume=True)
+    assert capsys.readouterr().out == f"{out}: finished already\n"
+    assert again == report and content(out) == before
+    for other, told in (({"seconds": 0.3}, "finished after 9 steps, 0.15"), ({"seed": 4}, "another scene")):
+        with pytest.raises(SdfsimError, match=told):
+            simulate(sleepy, out, **({"seed": 3, "resume": True} | other))
+        assert content(out) == before
+
+
+def test_what_is_replaced_is_told(sleepy, tmp_path, capsys):
+    out = tmp_path / "run"
+    for told in ("", f"replaced the earlier run in {out}\n"):
+        simulate(sleepy, out, seconds=0.02)
+        assert capsys.readouterr().out == told
 
 
 def described() -> tuple[Scene, dict]:
@@ -166,6 +190,7 @@ def test_a_run_until_all_rests_ends_where_it_would_have_however_often_it_is_kill
     whole = simulate(scene, tmp_path / "whole", **options)
     resumed = simulate(scene, tmp_path / "run", resume=True, **options)
     assert whole["settled"] and resumed["settled"] and whole["steps"] == resumed["steps"] == STEPS
+    assert simulate(scene, tmp_path / "whole", resume=True, **options) == whole
 
 
 def test_a_run_ends_when_everything_rests(tmp_path):

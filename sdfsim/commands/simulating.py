@@ -17,10 +17,6 @@ def simulate(
     model: Model = None,
     seconds: Annotated[float | None, typer.Option(help="Simulated time (default: the scene's).")] = None,
     seed: Annotated[int | None, typer.Option(help="Default: the scene's.", min=0)] = None,
-    quality: Annotated[
-        Literal["draft", "standard", "fine"] | None,
-        typer.Option(help="A measured compromise of error and time (default: shapes and model as they are)."),
-    ] = None,
     viewer: Annotated[Literal["none", "file", "native", "web"], typer.Option(help="Where to watch.")] = "file",
     until_settled: Annotated[
         bool, typer.Option("--until-settled", help="End as soon as everything rests (--seconds at the latest).")
@@ -47,7 +43,6 @@ def simulate(
             model=model,
             seconds=seconds,
             seed=seed,
-            quality=quality,
             viewer=viewer,
             bind=bind,
             allow_outside=allow_outside,
@@ -56,12 +51,11 @@ def simulate(
             guard=guard,
             device=device,
             on_progress=session.stage_progress,
-            on_address=lambda address: session.say(f"watch it at {address}"),
+            say=session.say,
         )
         lines = [
             f"{report['steps']} steps of {report['dt_s']:.4g} s in {duration(report['wall_s'])}"
             f" (median {report['step_ms_median']:.1f} ms a step)",
-            *([report["quality"]] if report["quality"] else []),
             f"mean contacts {report['contacts_mean']:.1f}, worst penetration {report['worst_penetration_m']:.2g} m",
             *run.energy_lines(report),
             *([] if report.get("settled", True) else ["not settled: give it more --seconds"]),
@@ -70,7 +64,7 @@ def simulate(
             *(f"outside the model's training: {line}" for line in report["outside_training"]),
         ]
         tell_failed(session, report)
-        if viewer != "none":
+        if "recording" in report:
             lines.append(f"watch it: sdfsim view {report['recording']}   (or: rerun {report['recording']})")
         session.report(report, lines)
         if viewer == "web":

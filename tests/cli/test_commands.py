@@ -43,6 +43,9 @@ def test_a_second_run_replaces_the_first(scene, model, tmp_path):
     done = run("simulate", scene, "-o", tmp_path / "run", "--model", model, "--seconds", 0.1, "--viewer", "none")
     assert done.exit_code == 0
     assert not (tmp_path / "run" / "rollout.rrd").exists()
+    assert done.stderr.count(f"replaced the earlier run in {tmp_path / 'run'}\n") == 1
+    done = run("simulate", scene, "-o", tmp_path / "run", "--model", model, "--seconds", 0.1, "--resume")
+    assert done.exit_code == 0 and f"{tmp_path / 'run'}: finished already\n" in done.stderr
 
 
 def test_json_is_one_object_and_nothing_else(scene, model, tmp_path):

@@ -24,7 +24,7 @@ def simulate_tower(out: Path) -> None:
     scene = Path(__file__).parents[2] / "samples" / "tower.yaml"
     simulate(
         scene, out, model=None, seconds=0.02, seed=None, viewer="none", device="cpu", on_progress=lambda *_: None,
-        on_address=lambda _: None,
+        say=lambda _: None,
     )  # fmt: skip
 
 
