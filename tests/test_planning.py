@@ -79,6 +79,12 @@ def test_plan_tells_all_there_is_to_know(scene, model):
         assert word in lines
 
 
+def test_plan_tells_how_long_the_run_will_take(scene):
+    report = told(scene, "small")
+    assert 0 < report["run"]["seconds"] < 60 and report["run"]["in_contact"] == 2
+    assert report["run"]["seconds"] == pytest.approx(1e-3 * report["run"]["step_ms"] * report["steps"])
+
+
 def test_plan_reads_no_weights_where_the_run_would_not(scene, model, monkeypatch):
     scene.write_text(SCENE.replace("restitution: off", "contact: off"))
     monkeypatch.setattr("sdfsim.dynamics.model.new_network", lambda *_: pytest.fail("weights were read"))

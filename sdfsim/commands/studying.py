@@ -32,7 +32,6 @@ def tradeoff(
 ) -> None:
     """What accuracy costs in time: knobs, models and engines on the same scenes; what is measured is kept in -o."""
     with Session(as_json=as_json, verbose=verbose) as session:
-        from sdfsim.playback import save_rollout
         from sdfsim.studies import tradeoff as study
         from sdfsim.studies.hard_cases_plots import check_matplotlib
 
@@ -44,7 +43,6 @@ def tradeoff(
             quick=quick,
             device=device,
             on_progress=session.stage_progress,
-            record=save_rollout,
         )
         session.report(report, [*columns(rows), *notes])
 

@@ -1,4 +1,4 @@
-"""How much error for how many milliseconds: sweeps the knobs, and tells the front, the qualities and the claims."""
+"""How much error for how many milliseconds: sweeps the knobs, and tells the front and the claims."""
 
 from __future__ import annotations
 
@@ -11,25 +11,22 @@ import numpy as np
 
 import sdfsim
 from sdfsim.dynamics.model import bundled_models, load_model
-from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.simulator import pick_device
 from sdfsim.errors import SdfsimError
 from sdfsim.files import locked, write_json, write_text
 from sdfsim.learning import metrics
-from sdfsim.scene.types import Scene
 from sdfsim.shape.mesh import MESH_SUFFIXES
 from sdfsim.studies.tradeoff_cases import Cases, load_cases
 from sdfsim.studies.tradeoff_contenders import Contender, Ours
 from sdfsim.studies.tradeoff_engines import Engine
-from sdfsim.studies.tradeoff_front import front, qualities
-from sdfsim.studies.tradeoff_knobs import Setting, for_any_scene, setting_from, settings
+from sdfsim.studies.tradeoff_front import front
+from sdfsim.studies.tradeoff_knobs import Setting, setting_from, settings
 from sdfsim.studies.tradeoff_measure import Point, measure
 from sdfsim.studies.tradeoff_picture import draw
 from sdfsim.studies.tradeoff_report import write_report
 from sdfsim.studies.tradeoff_told import Rows, beaten_by, table, told
 
 Progress = Callable[[float, str], None]
-Recorder = Callable[[Scene, Rollout, Path], None]
 FLOOR = Engine("PyBullet", 5, off=1e-3)
 QUICK_ENGINES = [FLOOR, Engine("PyBullet", 5), Engine("PyBullet", 1), Engine("MuJoCo", 5)]
 ENGINES = [FLOOR, *(Engine("PyBullet", k) for k in (5, 4, 3, 2, 1)), *(Engine("MuJoCo", k) for k in (10, 5, 2))]
@@ -57,15 +54,6 @@ class Sweep:
         """Those of ours that no other of ours beats, by time."""
         return [self.ours[k] for k in front([p["ms"]["median"] for p in self.ours], [*map(self.error, self.ours)])]
 
-    @property
-    def qualities(self) -> dict[str, Point]:
-        """The points that `--quality` stands for."""
-        fit = [p for p in self.ours if for_any_scene(setting_of(p))]
-        if not fit:
-            return {}
-        chosen = qualities([p["ms"]["median"] for p in fit], [self.error(p) for p in fit])
-        return {name: fit[k] for name, k in chosen.items()}
-
     def error(self, point: Point) -> float:
         """Translation RMSE m up to the front's horizon."""
         return point["errors"][self.steps]["translation_rmse"]
@@ -84,7 +72,7 @@ def run(
     Args:
         source: dataset folder, scene file, mesh file or folder of meshes, or None.
         out, models, quick: see `tradeoff`.
-        rest: `device`, `on_progress` and `record`, as there.
+        rest: `device` and `on_progress`, as there.
 
     Returns:
         The report, the rows of a table of it, and lines that follow the table.
@@ -140,9 +128,8 @@ def tradeoff(
     quick: bool,
     device: str,
     on_progress: Callable[[str, float, str], None],
-    record: Recorder,
 ) -> dict[str, Any]:
-    """Sweep the knobs on recorded scenes and write tradeoff.png, tradeoff.csv, tradeoff.json, report.html and clips.
+    """Sweep the knobs on recorded scenes and write tradeoff.png, tradeoff.csv, tradeoff.json and report.html.
 
     Args:
         source: dataset folder, or a scene file, which the teacher is then asked about.
@@ -151,7 +138,6 @@ def tradeoff(
         quick: fewer settings on fewer, shorter scenes.
         device: "cpu", "cuda" or "auto"; CUDA is a knob beside the others where it is not "cpu".
         on_progress: called with (stage, fraction, message).
-        record: writes a rollout of a scene to a file that can be watched.
 
     Returns:
         The content of tradeoff.json.
@@ -170,7 +156,6 @@ def tradeoff(
     sweep = Sweep(points, steps)
     if not sweep.ours:
         raise SdfsimError(f"nothing of ours could be measured: {points[0]['failed']}")
-    clips = _clips(sweep, cases, out, record)
     report = {
         "source": str(source),
         "quick": quick,
@@ -181,9 +166,7 @@ def tradeoff(
         "dt_s": cases.recorded[0].dt * cases.time,
         "points": [{k: v for k, v in p.items() if k != "end"} for p in points],
         "front": [p["key"] for p in sweep.front],
-        "qualities": {name: p["key"] for name, p in sweep.qualities.items()},
         "claims": claims(sweep),
-        "clips": clips,
         "folder": str(out),
     }
     write_json(out / "tradeoff.json", report)
@@ -231,16 +214,3 @@ def _cases(source: Path, model: str, out: Path, quick: bool, tell: Progress) -> 
         return cases_of_scene(source, model, out / "shapes", quick=quick, on_progress=tell)
     tell(0.0, "reading trajectories and shapes")
     return load_cases(source, out / "shapes", quick=quick)
-
-
-def _clips(sweep: Sweep, cases: Cases, out: Path, record: Recorder) -> dict[str, str]:
-    """Recordings of the qualities in the middle one of the timed scenes, by key."""
-    made: dict[str, str] = {}
-    index = cases.timed[len(cases.timed) // 2]
-    for point in sweep.qualities.values():
-        path = out / "clips" / f"{point['key']}.rrd"
-        path.parent.mkdir(exist_ok=True)
-        simulator = Ours(setting_of(point)).prepare(cases).simulator(index)
-        record(simulator.scene, simulator.run(steps=cases.steps), path)
-        made[point["key"]] = str(path.relative_to(out))
-    return made

@@ -1,7 +1,11 @@
-"""What a step costs, as a sum over what is in it: fitted to measured steps, used by `plan`."""
+"""What a step costs, as a sum over what is in it: fitted to measured steps, used by `plan`.
+
+`python -m sdfsim.studies.tradeoff_cost DIR` stores what `sdfsim tradeoff -o DIR` has measured, for the bundled models.
+"""
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from sdfsim.dynamics.model import BUNDLED, Model
-from sdfsim.errors import SdfsimError
-from sdfsim.files import read_json
+from sdfsim.errors import SdfsimError, run_main
+from sdfsim.files import read_json, write_json
 
 COSTS_FILE = BUNDLED / "costs.json"
 
@@ -116,3 +120,28 @@ def stored_cost(model: Model, path: Path = COSTS_FILE) -> CostModel | None:
     same_kind = [entry for entry in known.values() if entry["kind"] == model.kind]
     entry = known.get(model.name) or (same_kind[0] if same_kind else None)
     return CostModel(**entry["cost"]) if entry else None
+
+
+def store_cost(folder: Path, path: Path = COSTS_FILE) -> None:
+    """Keep the cost model of a folder of `sdfsim tradeoff -o`, beside those of other models.
+
+    Raises:
+        SdfsimError: the folder holds none.
+    """
+    report = read_json(folder / "growth.json", "measure it: sdfsim tradeoff -o DIR")
+    models = read_json(path)["models"] if path.exists() else {}
+    kept = ("kind", "quick", "cost", "held_out_median", "held_out_within")
+    models[report["model"]] = {what: report[what] for what in kept}
+    write_json(path, {"models": models})
+
+
+def main() -> None:
+    """Command line of this module."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    store_cost(parser.parse_args().folder)
+    print(f"wrote {COSTS_FILE}")
+
+
+if __name__ == "__main__":
+    run_main(main)

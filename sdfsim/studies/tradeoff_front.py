@@ -1,12 +1,10 @@
-"""The best that can be had for the time: Pareto fronts, and the three points of them that `--quality` stands for."""
+"""The best that can be had for the time: the Pareto front, and the spread of repeats."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-
-BEARABLE = 1.5  # a draft's error is at most so many times the least
 
 
 def front(time: Sequence[float], error: Sequence[float]) -> list[int]:
@@ -24,20 +22,6 @@ def front(time: Sequence[float], error: Sequence[float]) -> list[int]:
         elif time[k] == time[kept[-1]] and error[k] == error[kept[-1]]:
             kept.append(k)
     return kept
-
-
-def qualities(time: Sequence[float], error: Sequence[float]) -> dict[str, int]:
-    """The points of the front that the three qualities stand for.
-
-    fine is the most accurate; draft the fastest whose error is at most `BEARABLE` times that of fine; standard the one
-    with the least product of time and error between them (one of the two where nothing is between).
-    """
-    best = front(time, error)
-    fine = best[-1]
-    draft = next(k for k in best if error[k] <= BEARABLE * error[fine])
-    between = best[best.index(draft) + 1 : best.index(fine)] or [draft, fine]
-    standard = min(between, key=lambda k: time[k] * error[k])
-    return {"draft": draft, "standard": standard, "fine": fine}
 
 
 def spread(values: Sequence[float]) -> dict[str, float]:

@@ -105,17 +105,6 @@ def setting_from(stored: Mapping[str, Any]) -> Setting:
         raise SdfsimError(f"not a setting of this version: {error}", "measure again: sdfsim tradeoff") from error
 
 
-def for_any_scene(setting: Setting) -> bool:
-    """Whether `--quality` may stand for it: it is no matter of the machine, nor of what a scene itself decides.
-
-    The mesh that is shown serves neither as geometry nor as nodes: of shapes that were capped, thickened or made of
-    convex pieces it is something else. Nothing is fitted anew.
-    """
-    if setting.sdf == "exact" or setting.sdf.startswith("width") or setting.nodes == "vertices":
-        return False
-    return setting == replace(setting, sleep=False, compiled=False, threads=1, device="cpu", free_flight="exact")
-
-
 def arranged_model(setting: Setting, model: Model) -> Model:
     """The model as a setting wants it.
 
@@ -126,7 +115,7 @@ def arranged_model(setting: Setting, model: Model) -> Model:
     if setting.rounds is not None:
         rounds = getattr(network, "rounds", None)
         if rounds is None or not 1 <= setting.rounds <= len(rounds):
-            raise SdfsimError(f"{model.name}: has no {setting.rounds} rounds", "choose another --quality or model")
+            raise SdfsimError(f"{model.name}: has no {setting.rounds} rounds", "choose another model")
         network = _shortened(network, setting.rounds)
     if setting.precision == "bf16":
         network = in_bfloat16(network)

@@ -27,7 +27,7 @@ def write_report(report: dict[str, Any], beaten: str, path: Path) -> None:
     Args:
         report: what `tradeoff` returns.
         beaten: what beats the default, in words.
-        path: of the HTML file; clips are linked beside it.
+        path: of the HTML file.
     """
     steps = str(report["horizon_steps"])
     told = report["claims"]
@@ -40,21 +40,12 @@ def write_report(report: dict[str, Any], beaten: str, path: Path) -> None:
         f"<p>The default, {html.escape(told['default'])}, is beaten in both by",
         f"(* by more than the choice of scenes explains): {html.escape(beaten)}. The most",
         f"accurate of the front takes {told['slowest_over_fastest_of_front']:.1f} times as long as the fastest.</p>",
-        "<h2>Qualities</h2><ul>",
-        *(_quality(name, key, report) for name, key in report["qualities"].items()),
-        "</ul><h2>All points</h2>",
+        "<h2>All points</h2>",
         _table(report, steps),
         f"<p>sdfsim {html.escape(report['sdfsim'])}. Bold: on the front of ours. One-thread times are the processor's,"
         " as the clock shows them on a free core.</p></html>",
     ]
     write_text(path, "\n".join(parts))
-
-
-def _quality(name: str, key: str, report: dict[str, Any]) -> str:
-    point = next(p for p in report["points"] if p["key"] == key)
-    clip = report["clips"].get(key)
-    link = f' - <a href="{html.escape(clip)}">recording</a> (sdfsim view)' if clip else ""
-    return f"<li><b>{name}</b>: {html.escape(point['label'])}{link}</li>"
 
 
 def _diagram(report: dict[str, Any], steps: str) -> str:

@@ -46,17 +46,15 @@ def told(report: dict[str, Any]) -> tuple[Rows, list[str]]:
     """The report of `tradeoff` for people: a row a point, by time, and the claims."""
     steps, best = str(report["horizon_steps"]), set(report["front"])
     rows: Rows = [("", "ms / s", "p95", "m", "degrees", "penetration m", "MiB")]
-    named = {key: name for name, key in report["qualities"].items()}
     for p in sorted(report["points"], key=lambda p: p["ms"]["median"] if p["ms"] else float("inf")):
         if p["failed"] or not p["ms"]:
             rows.append((f"{p['label']}: {p['failed'] or 'not timed'}", *[""] * 6))
             continue
-        mark = f"* {named.get(p['key'], '')}" if p["key"] in best else named.get(p["key"], "")
         error = p["errors"][steps]
         numbers = (p["ms"]["median"], p["ms"]["p95"], error["translation_rmse"], error["rotation_error"])
         cells = [f"{v:.3g}" for v in numbers]
         cells += ["-" if p[name] is None else f"{p[name]:.2g}" for name in ("penetration_p95", "peak_mib")]
-        rows.append((f"{p['label']} {mark}".strip(), *cells))
+        rows.append((f"{p['label']} *" if p["key"] in best else p["label"], *cells))
     return rows, _notes(report)
 
 

@@ -11,10 +11,10 @@ import torch
 from sdfsim import Simulator
 from sdfsim.dynamics.model import Model, new_network
 from sdfsim.errors import SdfsimError
-from sdfsim.files import write_json
+from sdfsim.files import read_json, write_json
 from sdfsim.scene.types import Effects
 from sdfsim.studies import tradeoff_growth
-from sdfsim.studies.tradeoff_cost import CostModel, Load, fit_cost, relative_errors, stored_cost
+from sdfsim.studies.tradeoff_cost import CostModel, Load, fit_cost, relative_errors, store_cost, stored_cost
 from sdfsim.studies.tradeoff_estimate import LOOKS, estimate, landings, roundness
 from sdfsim.studies.tradeoff_growing import BALL, BOX, Growing, build
 from sdfsim.studies.tradeoff_growth import curves, slopes
@@ -72,6 +72,17 @@ def test_stored_costs_are_the_model_s_own_else_of_its_kind(tmp_path, model):
     assert stored_cost(model, file) == PLANTED
     assert stored_cost(replace(model, kind="paper"), file) == other
     assert stored_cost(replace(model, kind="unheard of"), file) is None
+
+
+def test_costs_of_one_model_leave_those_of_others(tmp_path):
+    with pytest.raises(SdfsimError, match=r"growth\.json"):
+        store_cost(tmp_path, tmp_path / "c.json")
+    grown = {"kind": "impulse", "quick": True, "cost": {"base": 1.0}, "held_out_median": 0.1, "held_out_within": 1.0}
+    for name in ("small", "base"):
+        write_json(tmp_path / "growth.json", grown | {"model": name})
+        store_cost(tmp_path, tmp_path / "c.json")
+    stored = read_json(tmp_path / "c.json")["models"]
+    assert set(stored) == {"small", "base"} and stored["base"] == grown
 
 
 def falling(height: float):

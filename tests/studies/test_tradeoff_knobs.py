@@ -13,7 +13,6 @@ from sdfsim.studies.tradeoff_knobs import (
     Setting,
     arranged_model,
     arranged_shape,
-    for_any_scene,
     setting_from,
     settings,
     threads_of,
@@ -41,20 +40,6 @@ def test_every_setting_has_a_key_and_a_label_of_its_own():
         assert chosen[0] == Setting(model="small") and setting_from(chosen[-1].to_json()) == chosen[-1]
     with pytest.raises(SdfsimError, match="not a setting"):
         setting_from({"unheard": 1})
-
-
-def test_qualities_leave_machine_and_effects_alone():
-    assert for_any_scene(Setting(nodes="thin 64", sdf="grid 64", rounds=3, precision="bf16", reach=0.5))
-    for change in (
-        {"sdf": "exact"},
-        {"sdf": "width 32"},
-        {"nodes": "vertices"},
-        {"sleep": True},
-        {"threads": 2},
-        {"compiled": True},
-        {"device": "cuda"},
-    ):
-        assert not for_any_scene(Setting(**change))
 
 
 def test_rounds_are_the_first_ones(model):

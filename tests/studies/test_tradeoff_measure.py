@@ -172,8 +172,7 @@ def test_page_and_picture_stand_alone(cases, tmp_path):
     assert (tmp_path / "a.png").read_bytes()[:4] == b"\x89PNG"
     report = {
         "source": "<data>", "trajectories": 3, "bodies": 9, "horizon_steps": 50, "dt_s": 0.02, "sdfsim": "0",
-        "points": points, "front": [p["key"] for p in sweep.front], "clips": {"small": "clips/small.rrd"},
-        "qualities": {name: p["key"] for name, p in sweep.qualities.items()}, "claims": claims(sweep),
+        "points": points, "front": [p["key"] for p in sweep.front], "claims": claims(sweep),
     }  # fmt: skip
     write_report(report, "none", tmp_path / "r.html")
     text = (tmp_path / "r.html").read_text()
@@ -188,13 +187,7 @@ def test_the_whole_study_in_small(data, tmp_path, monkeypatch):
     monkeypatch.setattr("sdfsim.studies.tradeoff_measure.REPEATS", 2)
     monkeypatch.setattr("sdfsim.studies.tradeoff_cases.MOST_QUICK", 1)
     monkeypatch.setattr(study, "QUICK_ENGINES", [Engine("PyBullet", 5), Engine("PyBullet", 5, off=1e-3)])
-    clips = []
-
-    def record(scene, rollout, path) -> None:
-        clips.append((len(scene.bodies), len(rollout)))
-        path.write_bytes(b"clip")
-
-    options = {"models": [], "quick": True, "device": "cpu", "on_progress": quietly, "record": record}
+    options = {"models": [], "quick": True, "device": "cpu", "on_progress": quietly}
     report, rows, notes = study.run(data, tmp_path, **options)
     by_key = {p["key"]: p for p in report["points"]}
     assert set(by_key) == {"small", "small__nodes-20", "ballistic", "pybullet__5", "pybullet__5__off-0.001"}
@@ -205,12 +198,10 @@ def test_the_whole_study_in_small(data, tmp_path, monkeypatch):
     for name in ("tradeoff.png", "tradeoff.csv", "tradeoff.json", "report.html"):
         assert (tmp_path / name).stat().st_size > 500
     assert json.loads((tmp_path / "tradeoff.json").read_text())["front"] == report["front"]
-    assert clips and all((tmp_path / path).exists() for path in report["clips"].values())
     assert len(rows) == 6 and any("front of ours" in note for note in notes)
-    assert set(report["qualities"]) == {"draft", "standard", "fine"}
 
 
 def test_nothing_to_study_is_one_clear_line(tmp_path):
-    options = {"models": [], "quick": True, "device": "cpu", "on_progress": quietly, "record": quietly}
+    options = {"models": [], "quick": True, "device": "cpu", "on_progress": quietly}
     with pytest.raises(SdfsimError, match="no such file or folder"):
         study.run(tmp_path / "absent", tmp_path / "out", **options)
