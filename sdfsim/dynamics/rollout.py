@@ -23,11 +23,12 @@ class Rollout:
         velocity: [T+1, N, 3] m/s.
         angular_velocity: [T+1, N, 3] rad/s, world frame.
         contact_count: [T+1] int64, contact edges that acted in the step that led here (0 where none did).
-        contact_point: [sum(contact_count), 3] float64 m, world, in step order: the edges' nodes, on the bodies as they
-            are in this entry.
+        contact_point: [sum(contact_count), 3] float64 m, world, in step order: the points of their owners on which
+            the edges acted, with the bodies as they are in this entry.
         contact_body: [sum(contact_count), 2] int64, (owner of the node, body it meets).
-        counters: name -> [T+1] array: `kinetic_energy` J, `potential_energy` J, `contacts`,
-            `worst_penetration` m, `step_ms`, and what else the simulator counts.
+        counters: name -> [T+1] array: `kinetic_energy` J, `potential_energy` J, `contacts`, `worst_penetration` m,
+            `step_ms`, and what else the simulator counts. The penetration is how deep the deepest of an entry's
+            contact points lies within the body it meets, by that body's distances; 0 where none does.
         names: N body names.
         meta: model, seed, versions, dt s.
     """

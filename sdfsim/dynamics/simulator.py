@@ -16,7 +16,7 @@ import sdfsim
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State, awake, from_scene
 from sdfsim.dynamics.check import check_nodes, fault
-from sdfsim.dynamics.contacts import Contacts
+from sdfsim.dynamics.contacts import Contacts, distances
 from sdfsim.dynamics.energy import Guard, kinetic
 from sdfsim.dynamics.froude import scene_units
 from sdfsim.dynamics.history import history_told, with_history
@@ -211,13 +211,15 @@ class Simulator:
     def _frame(self, milliseconds: float) -> Rollout:
         state, c, u = self.si_state(), self.contacts, self.units
         count = 0 if c is None else len(c)
-        points, pairs = np.zeros((0, 3)), np.zeros((0, 2), dtype=np.int64)
+        points, pairs, depth = np.zeros((0, 3)), np.zeros((0, 2), dtype=np.int64), 0.0
         if c is not None and count:
-            # The edges were found at the start of the step; their nodes are told where this frame has the bodies.
-            turned = pose.rotate(self.state.orientation[c.owner], self.bodies.node[c.node])
-            points = ((self.state.position[c.owner] + turned) * u.length).cpu().numpy()
+            # The edges were found at the start of the step; their points are told where this frame has the bodies.
+            place, turn = self.state.position, self.state.orientation
+            point = place[c.owner] + pose.rotate(turn[c.owner], c.point)
+            points = (point * u.length).cpu().numpy()
             pairs = torch.stack([c.owner, c.body], -1).cpu().numpy()
-        depth = float((-c.distance).clamp_min(0.0).max()) * u.length if c is not None and count else 0.0
+            local = pose.rotate(pose.conjugate(turn[c.body]), point - place[c.body])
+            depth = float((-distances(self.bodies, c.body, local)[0]).clamp_min(0.0).max()) * u.length
         counters = {
             **self._energies(),
             "contacts": float(count),
