@@ -87,6 +87,7 @@ def make_meshes(distill: Path, poses: Path, photos: Path, source: Path, out: Pat
         "up_within_degrees": round(placement.up_within, 2), "up_confidence": placement.up_confidence,
         "size": placement.size_from, "objects": list(parts.bodies),
         "smallest_object_m": float(rounded(parts.smallest * placement.scale)),
+        "crumbs": parts.crumbs,
         "left_out": [entry for entry in read_parts(out)["left_out"] if not entry["kept"]],
     }  # fmt: skip
 
@@ -166,7 +167,7 @@ def write_parts(parts: Parts, surface: Surface, placement: Placement, wishes: Wi
     write_json(
         out / "parts.json",
         {"version": 1, "scenery": parts.solid is not None, "objects": objects, "left_out": left,
-         "smallest_m": float(rounded(parts.smallest * placement.scale))},
+         "crumbs": parts.crumbs, "smallest_m": float(rounded(parts.smallest * placement.scale))},
     )  # fmt: skip
     write_json(out / "placement.json", placement.to_dict())
 

@@ -24,6 +24,8 @@ LARGEST_FOOT = 0.5
 SEEN_SHARE = 0.2
 # Least share of a body's lowest layer that has the solid of the plane right below it.
 STANDS = 0.3
+# What hangs beside a body and is smaller than this share of it was torn off it by noise, and goes where it goes.
+CRUMB = 0.05
 # How far sideways, in contact layers, what is around a body's foot is taken away together with it.
 FILLET = 3.0
 
@@ -59,6 +61,7 @@ class Body:
         low: [3] position of the first of these samples.
         cell: between them.
         layer: thickness of the contact layer, in which the field cannot tell body and plane apart.
+        crumbs: how many crumbs beside it count as its own.
         hollow: [A, B] bool on the plane: places that the body goes around at the top of the contact layer.
         corner: [2] of the first of these, in the axes of `frame_of` the plane.
     """
@@ -70,6 +73,7 @@ class Body:
     low: np.ndarray
     cell: float
     layer: float
+    crumbs: int
     hollow: np.ndarray
     corner: np.ndarray
 
@@ -163,7 +167,8 @@ def find_bodies(surface: Surface, levels: list[Level], layer: float, smallest: f
         label = np.empty(solid.shape, np.int32)
         count = int(ndimage.label(solid & (height > layer), output=label))  # type: ignore[arg-type]
         others = [other for other in levels if other is not level and level.above(other.height * other.normal) > layer]
-        for number, box in enumerate(ndimage.find_objects(label, count), start=1):
+        boxes = ndimage.find_objects(label, count)
+        for number, box in enumerate(boxes, start=1):
             mine = label[box] == number
             if (at_rim[box] & mine).any() or (taken[box] & mine).any() or mine.sum() < 8:
                 continue
@@ -178,10 +183,41 @@ def find_bodies(surface: Surface, levels: list[Level], layer: float, smallest: f
                 continue
             if _share_seen(place, vertices, seen) < SEEN_SHARE:
                 continue
+            crumbs = _crumbs(label, boxes, number, height, layer, volume.cell)
+            axes = zip(*(boxes[k - 1] for k in (number, *crumbs)), strict=True)
+            box = tuple(slice(min(p.start for p in parts), max(p.stop for p in parts)) for parts in axes)
+            mine = np.isin(label[box], [number, *crumbs])
             taken[box] |= mine
-            found.append(_body(volume, solid & (height > layer), box, mine, level, layer, float(sides.max())))
+            standing = solid & (height > layer)
+            found.append(_body(volume, standing, box, mine, level, layer, len(crumbs), float(sides.max())))
     found.sort(key=lambda body: -body.size)
     return [replace(body, name=f"object{number}") for number, body in enumerate(found, start=1)]
+
+
+def _crumbs(label: np.ndarray, boxes: list[tuple[slice, ...]], number: int, height: np.ndarray, layer: float,
+            cell: float) -> list[int]:  # fmt: skip
+    """Numbers of the components next to component `number` that reach no plane and are far smaller than it.
+
+    Args:
+        label: [X, Y, Z] component of each sample.
+        boxes: of the components, in their order.
+        number: of the component.
+        height: [X, Y, Z] of the samples above the plane.
+        layer: thickness of the contact layer.
+        cell: between samples.
+    """
+    margin = int(np.ceil(FILLET * layer / cell))
+    box = boxes[number - 1]
+    wide = tuple(slice(max(part.start - margin, 0), part.stop + margin) for part in box)
+    around, size = label[wide], int((label[box] == number).sum())
+    found = []
+    for other in np.setdiff1d(np.unique(around), [0, number]):
+        own = boxes[other - 1]
+        inside = all(w.start <= o.start and o.stop <= w.stop for w, o in zip(wide, own, strict=True))
+        samples = label[own] == other
+        if inside and samples.sum() < CRUMB * size and height[own][samples].min() > layer + 1.5 * cell:
+            found.append(int(other))
+    return found
 
 
 def _carries(place: Volume, other: Level, cell: float) -> bool:
@@ -212,7 +248,7 @@ def _share_seen(place: Volume, vertices: np.ndarray, seen: np.ndarray) -> float:
 
 
 def _body(volume: Volume, standing: np.ndarray, box: tuple[slice, ...], mine: np.ndarray, level: Level, layer: float,
-          size: float) -> Body:  # fmt: skip
+          crumbs: int, size: float) -> Body:  # fmt: skip
     """The body of one component: all samples around it that are nearer to it than to what else is on the plane."""
     margin = int(np.ceil((FILLET + 1) * layer / volume.cell)) + 1
     start = [max(part.start - margin, 0) for part in box]
@@ -224,7 +260,7 @@ def _body(volume: Volume, standing: np.ndarray, box: tuple[slice, ...], mine: np
     ndimage.distance_transform_edt(label == 0, return_indices=True, distances=away, indices=nearest)
     own = (label[tuple(nearest)] == 2) & (away * volume.cell <= FILLET * layer)
     corner = volume.low + volume.cell * np.array(start)
-    body = Body("", level, size, own, corner, volume.cell, layer, np.zeros((0, 0), bool), np.zeros(2))
+    body = Body("", level, size, own, corner, volume.cell, layer, crumbs, np.zeros((0, 0), bool), np.zeros(2))
     frame = frame_of(level.normal)
     flat = (corner + volume.cell * np.argwhere(own)) @ frame[:2].T
     a, b = (np.arange(low, high, 0.5 * volume.cell) for low, high in zip(flat.min(0), flat.max(0), strict=True))

@@ -33,6 +33,7 @@ class Parts:
         bodies: closed mesh of each body by name, with colours; the largest first.
         smallest: what rises less than this above its plane stayed part of the scenery.
         levels: the level planes, largest first.
+        crumbs: how many crumbs beside bodies went where these went.
     """
 
     solid: Mesh | None
@@ -40,6 +41,7 @@ class Parts:
     bodies: dict[str, Mesh]
     smallest: float
     levels: list[Level]
+    crumbs: int = 0
 
 
 def split(surface: Surface, distance: Distance, finest: float, views: list[View], photos_folder: Path, up: np.ndarray,
@@ -71,7 +73,7 @@ def split(surface: Surface, distance: Distance, finest: float, views: list[View]
         found = look(Visibility(mesh, 0.75 * surface.volume.cell, blocking), views, photos_folder)
         meshes[body.name] = colored(mesh, found.color, found.weight > 0)
     solid, shown = scenery(surface, bodies, distance)
-    return Parts(solid, shown, meshes, smallest, levels)
+    return Parts(solid, shown, meshes, smallest, levels, sum(body.crumbs for body in bodies))
 
 
 def whole_bodies(surface: Surface) -> dict[str, Mesh]:

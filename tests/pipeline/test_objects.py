@@ -100,6 +100,27 @@ def test_where_the_cup_stood_the_table_is_whole():
         assert len(near) > 50 and np.abs(near[:, 2] - TOP).max() < 0.2 * FINEST
 
 
+def test_crumbs_that_hang_beside_a_body_do_not_stay_in_the_scenery():
+    def torn(p: np.ndarray) -> np.ndarray:
+        crumbs = [box(p, (0.1, 0.125, TOP + 0.25), (0.03, 0.02, 0.02)), box(p, (0.27, -0.05, TOP + 0.27), (0.02,) * 3)]
+        return np.minimum.reduce([both(p), *crumbs])
+
+    parts, clean = parts_of(torn), parts_of(both)
+    assert list(parts.bodies) == ["object1"] and parts.crumbs == 2 and clean.crumbs == 0
+    for mesh in (parts.solid, parts.shown):
+        assert mesh is not None and mesh.vertices[:, 2].max() < TOP + 0.3 * FINEST
+    assert is_closed(parts.bodies["object1"])
+    assert signed_volume(parts.bodies["object1"]) == pytest.approx(signed_volume(clean.bodies["object1"]), rel=0.02)
+
+
+def test_a_small_thing_that_stands_beside_a_body_is_no_crumb():
+    def scene(p: np.ndarray) -> np.ndarray:
+        return np.minimum(both(p), box(p, (0.1, 0.15, TOP + 0.06), (0.025, 0.025, 0.06)))
+
+    parts = parts_of(scene)
+    assert parts.crumbs == 0 and len(parts.bodies) == 2
+
+
 def test_several_bodies_are_named_from_the_largest_down():
     def scene(p: np.ndarray) -> np.ndarray:
         things = cup(p), cup(p, (-0.25, 0.1), 0.1, 0.2), box(p, (-0.3, 0.0, -0.4), (0.08, 0.08, 0.1))
