@@ -56,7 +56,7 @@ def describe(
     scene = load_scene(scene_file, tell, allow_outside=allow_outside)
     decided = plan(scene)
     simulator = Simulator(scene, model=model, device=device)
-    units, steps = simulator.units, max(1, round(scene.duration / simulator.dt))
+    units, steps = simulator.units, simulator.steps_in(scene.duration)
     return {
         "scene": str(scene_file),
         "effects": {name: asdict(effect) for name, effect in decided.effects().items()},

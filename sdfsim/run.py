@@ -14,7 +14,7 @@ from sdfsim.dynamics.energy import Guard
 from sdfsim.dynamics.memory import COUNTS, PHASES
 from sdfsim.dynamics.model import Model, load_model
 from sdfsim.dynamics.rollout import Rollout, energy_from_nothing
-from sdfsim.dynamics.simulator import SimulationError, Simulator, join, pick_device
+from sdfsim.dynamics.simulator import SimulationError, Simulator, check_seconds, join, pick_device
 from sdfsim.errors import SdfsimError
 from sdfsim.files import CONFIG, check_own, check_writable, locked, write_json, write_text
 from sdfsim.learning import tables
@@ -89,6 +89,8 @@ def simulate(
     """
     # Everything that can be wrong from the start, before shapes are fitted for minutes or earlier results are deleted.
     pick_device(device)
+    if seconds is not None:
+        check_seconds(seconds)
     if model:
         load_model(model, weights=False)
     check_writable(out)
@@ -115,7 +117,7 @@ def simulate(
     out.mkdir(parents=True, exist_ok=True)
     with locked(out):
         kept = Checkpoint(out, simulator)
-        steps = max(1, round(length / simulator.dt))
+        steps = simulator.steps_in(length)
         if resume and (done := finished(out / _REPORT, kept.identity, steps, until_settled=until_settled)):
             kept.clear()  # where it was killed between its last file and its end
             say(f"{out}: finished already")

@@ -89,6 +89,15 @@ def test_a_finished_run_is_left_as_it_is(sleepy, tmp_path, capsys):
         assert content(out) == before
 
 
+@pytest.mark.parametrize("seconds", [-1.0, float("nan"), float("inf")])
+def test_what_is_no_time_replaces_nothing(sleepy, tmp_path, seconds):
+    simulate(sleepy, tmp_path / "run", seconds=0.02)
+    before = content(tmp_path / "run")
+    with pytest.raises(SdfsimError, match="seconds: must be >= 0"):
+        simulate(sleepy, tmp_path / "run", seconds=seconds)
+    assert content(tmp_path / "run") == before
+
+
 def test_what_is_replaced_is_told(sleepy, tmp_path, capsys):
     out = tmp_path / "run"
     for told in ("", f"replaced the earlier run in {out}\n"):

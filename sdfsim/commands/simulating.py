@@ -32,8 +32,8 @@ def simulate(
     verbose: Verbose = False,
 ) -> None:
     """Scene -> motion, in a run folder."""
-    if seconds is not None and not (0 < seconds < float("inf")):
-        raise typer.BadParameter("--seconds must be > 0")
+    if seconds is not None and not (0 <= seconds < float("inf")):
+        raise typer.BadParameter("--seconds must be >= 0")
     with Session(as_json=as_json, verbose=verbose) as session:
         from sdfsim import run
 
@@ -53,9 +53,10 @@ def simulate(
             on_progress=session.stage_progress,
             say=session.say,
         )
+        median = report["step_ms_median"]
         lines = [
             f"{report['steps']} steps of {report['dt_s']:.4g} s in {duration(report['wall_s'])}"
-            f" (median {report['step_ms_median']:.1f} ms a step)",
+            + ("" if median is None else f" (median {median:.1f} ms a step)"),
             f"mean contacts {report['contacts_mean']:.1f}, worst penetration {report['worst_penetration_m']:.2g} m",
             *run.energy_lines(report),
             *([] if report.get("settled", True) else ["not settled: give it more --seconds"]),

@@ -148,15 +148,15 @@ class Simulator:
         """Simulate and keep everything.
 
         Args:
-            seconds: how long (default: the scene's duration).
+            seconds: how long (default: the scene's duration); see `steps_in`.
             steps: how many steps instead.
 
         Raises:
+            SdfsimError: a length of time that is negative or not finite.
             SimulationError: the state broke; what was computed is in its `rollout`.
         """
         if steps is None:
-            steps = max(1, round((self.scene.duration if seconds is None else seconds) / self.dt))
-        self._accept()
+            steps = self.steps_in(self.scene.duration if seconds is None else seconds)
         frames = [self.initial_rollout()]
         try:
             for frame in self.frames(steps):
@@ -165,8 +165,18 @@ class Simulator:
             raise SimulationError(error.message, join(frames)) from None
         return join(frames)
 
+    def steps_in(self, seconds: float) -> int:
+        """The number of steps that comes nearest to `seconds`: none for 0 s, else at least one.
+
+        Raises:
+            SdfsimError: `seconds` is negative or not finite.
+        """
+        check_seconds(seconds)
+        return max(1, round(seconds / self.dt)) if seconds else 0
+
     def initial_rollout(self) -> Rollout:
-        """The present state as a rollout of one frame."""
+        """The present state as a rollout of one frame; raises as `steps` does."""
+        self._accept()
         return self._frame(0.0)
 
     def si_state(self) -> State:
@@ -193,7 +203,10 @@ class Simulator:
         """A state that came from outside is looked at before anything is computed from it."""
         if self.state is self._good:
             return
-        if broken := self._fault(self.state, everybody(self.bodies)):
+        broken = self._fault(self.state, everybody(self.bodies))
+        if broken is None and not np.isfinite(self.state.time):
+            broken = "time is not finite"
+        if broken:
             self.state = self._good
             raise self._broke(broken)
         if self.model.kind == "paper":
@@ -267,6 +280,12 @@ class Simulator:
 def everybody(bodies: Bodies) -> torch.Tensor:
     """[N] int64, all of them."""
     return torch.arange(len(bodies), device=bodies.device)
+
+
+def check_seconds(seconds: float) -> None:
+    """Raises SdfsimError where `seconds` is no length of time."""
+    if not 0.0 <= seconds < np.inf:
+        raise SdfsimError(f"seconds: must be >= 0 and finite (got {seconds:g})")
 
 
 def pick_device(name: str) -> torch.device:

@@ -48,6 +48,13 @@ def test_a_second_run_replaces_the_first(scene, model, tmp_path):
     assert done.exit_code == 0 and f"{tmp_path / 'run'}: finished already\n" in done.stderr
 
 
+def test_no_time_is_no_step(scene, model, tmp_path):
+    done = run("simulate", scene, "-o", tmp_path / "run", "--model", model, "--seconds", 0)
+    assert done.exit_code == 0, done.stderr
+    assert done.stdout.startswith("0 steps of ")
+    assert len(Rollout.load(tmp_path / "run" / "rollout.npz")) == 0
+
+
 def test_json_is_one_object_and_nothing_else(scene, model, tmp_path):
     for arguments in (
         ("simulate", scene, "-o", tmp_path / "run", "--model", model, "--seconds", 0.1),
