@@ -26,7 +26,6 @@ def bundle(
     name: str,
     folder: Path = BUNDLED,
     seeds: Sequence[Path] = (),
-    beside: Sequence[Path] = (),
 ) -> dict:
     """Evaluate a trained model on the test split of `data`, then write `NAME.safetensors` and its card `NAME.md`.
 
@@ -36,10 +35,10 @@ def bundle(
         name: the bundled model's name.
         folder: of the bundled models.
         seeds: models of the same preset trained from other seeds; the range of their errors goes into the card.
-        beside: other models whose errors go into the card, with what their training cost.
 
     Returns:
-        The evaluation's report; `other_seeds` holds the errors of `seeds`, `beside` those of `beside` by what they are.
+        The evaluation's report; `other_seeds` holds the errors of `seeds`, `as_published` those of a paper network that
+        predicts free flight too (None for other networks).
 
     Raises:
         SdfsimError: a model of `seeds` is of another preset, or the same again.
@@ -48,38 +47,17 @@ def bundle(
     others = [_other_seed(model, path, other) for other in seeds]
     report = evaluate(data, model=model, chaos_floor=True)
     report["other_seeds"] = [evaluate(data, model=other, errors_only=True)["model"] for other in others]
-    report["beside"] = {}
+    report["as_published"] = None
     if model.kind == "paper":
-        report["beside"] |= _as_published(model, "this model", data)
-    for other in [load_model(path) for path in beside]:
-        told = _told(other)
-        report["beside"][told] = evaluate(data, model=other, errors_only=True)["model"]
-        if other.kind == "paper":
-            report["beside"] |= _as_published(other, told, data)
-    kept = ("model", "ballistic", "other_seeds", "beside", "chaos_floor", "median_survival_s")
+        report["as_published"] = evaluate(data, model=model, free_flight="learned", errors_only=True)["model"]
+    kept = ("model", "ballistic", "other_seeds", "as_published", "chaos_floor", "median_survival_s")
     kept += ("penetration", "energy_gain", "resting_speed")
     results = {"errors": {what: report[what] for what in kept}, "test_trajectories": report["trajectories"]}
     model = replace(model, name=name, card=model.card | results)
     folder.mkdir(parents=True, exist_ok=True)
     model.save(folder / f"{name}.safetensors")
-    write_text(folder / f"{name}.md", card_text(model, report, beside=bool(beside)))
+    write_text(folder / f"{name}.md", card_text(model, report))
     return report
-
-
-def _as_published(model: Model, told: str, data: Path) -> dict:
-    """Errors of a paper network that predicts free flight too."""
-    errors = evaluate(data, model=model, free_flight="learned", errors_only=True)["model"]
-    return {f"{told}, free flight learned too (as published)": errors}
-
-
-def _told(model: Model) -> str:
-    """What a model is and what it cost."""
-    card = model.card
-    size = " x ".join(str(value) for value in reversed(card["preset"]["config"].values()))
-    hours = card["seconds"] / 3600
-    return (
-        f"the *{model.kind}* network ({size}), {card['optimiser_steps']:,} steps in {hours:.2f} h on {card['device']}"
-    )
 
 
 def _other_seed(model: Model, path: Path, other: Path) -> Model:
@@ -104,13 +82,15 @@ def _trained(card: dict, what: str) -> Any:
     return [d | {"trajectories": {**d["trajectories"], "test": None}} for d in card["data"]]
 
 
-def card_text(model: Model, report: dict, *, beside: bool) -> str:
+def card_text(model: Model, report: dict) -> str:
     """The model card as Markdown."""
     parameters = sum(p.numel() for p in model.network.parameters())
     card, preset = model.card, model.card["preset"]
     names = {"name": "this model", "ballistic": "flying on without contact"}
     folders = _folders(card["data"])
-    extra = [(what, *tables.error_cells(errors)) for what, errors in report["beside"].items()]
+    extra: tables.Rows = []
+    if published := report["as_published"]:
+        extra.append(("this model, free flight learned too (as published)", *tables.error_cells(published)))
     if others := report.get("other_seeds"):
         several = f"other training seeds ({len(others)}): low - high"
         extra.append((several if len(others) > 1 else "another training seed", *tables.range_cells(others)))
@@ -135,7 +115,7 @@ def card_text(model: Model, report: dict, *, beside: bool) -> str:
         "",
         *(f"    {line}" for line in _commands(card, folders)),
         f"    python -m sdfsim.learning.bundle RUN/model.safetensors {folders[0]} --name {model.name}"
-        f"{' --seeds OTHERS' if others else ''}{' --beside MODELS' if beside else ''}",
+        f"{' --seeds OTHERS' if others else ''}",
         "",
         "## Ranges it has seen",
         "",
@@ -238,9 +218,8 @@ def main() -> None:
     parser.add_argument("data", type=Path)
     parser.add_argument("--name", required=True)
     parser.add_argument("--seeds", type=Path, nargs="+", default=[], help="models of the same preset, other seeds")
-    parser.add_argument("--beside", type=Path, nargs="+", default=[], help="models to tell the errors of as well")
     args = parser.parse_args()
-    report = bundle(args.model, args.data, args.name, seeds=args.seeds, beside=args.beside)
+    report = bundle(args.model, args.data, args.name, seeds=args.seeds)
     print(json.dumps({k: report[k] for k in ("model", "ballistic", "other_seeds")}, indent=2))
 
 

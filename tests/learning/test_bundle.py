@@ -42,18 +42,15 @@ def test_a_trained_model_is_bundled_with_its_errors(cube_data, trained, tmp_path
     assert "--preset tiny" in card and "--trajectories 3 --seed 1 --split test" in card
 
 
-def test_other_models_are_told_beside_it_with_what_they_cost(cube_data, trained, tmp_path):
-    other = tmp_path / "other.safetensors"
-    paper = Model("p", "paper", new_network("paper", {"width": 8, "steps": 1}), 0.02, 10.0, 1.0, 0.1, nodes=8)
-    cost = {"preset": {"config": {"width": 8, "steps": 1}}, "optimiser_steps": 900, "seconds": 1800.0, "device": "cpu"}
-    replace(paper, card=cost).save(other)
-    report = bundle(trained[0], cube_data, "mine", tmp_path / "models", beside=[other])
-    told = "the *paper* network (1 x 8), 900 steps in 0.50 h on cpu"
-    assert list(report["beside"]) == [told, f"{told}, free flight learned too (as published)"]
+def test_a_paper_network_is_told_as_published_too(cube_data, trained, tmp_path):
+    plan = {"config": {"width": 8, "steps": 1}}
+    card = load_model(trained[0]).card
+    paper = Model("p", "paper", new_network("paper", plan["config"]), 0.02, 10.0, 1.0, 0.1, nodes=8)
+    replace(paper, card=card | {"preset": card["preset"] | plan}).save(tmp_path / "paper.safetensors")
+    report = bundle(tmp_path / "paper.safetensors", cube_data, "mine", tmp_path / "models")
+    error = report["as_published"]["50"]["translation_rmse"]
     card = (tmp_path / "models" / "mine.md").read_text()
-    for what, errors in report["beside"].items():
-        assert f"| {what} | {errors['50']['translation_rmse']:.3f} (" in card
-    assert "--name mine --beside MODELS\n" in card
+    assert f"| this model, free flight learned too (as published) | {error:.3f} (" in card
 
 
 def test_other_seeds_must_be_of_the_same_preset_and_not_the_same_model(cube_data, presets, trained, tmp_path):
