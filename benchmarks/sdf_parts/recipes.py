@@ -54,37 +54,32 @@ def measure_widths(study: Study) -> None:
 
 
 def tables_of_recipes(study: Study) -> str:
-    """Errors of both recipes by shape, their factors, and how soon ours is as good."""
+    """Errors of both recipes by shape, and their factors."""
     fits = study.results.get("fits", {})
     ours, theirs = fits.get("default", {}), fits.get("paper", {})
     both = [name for name in study.meshes if name in ours and name in theirs]
     if not both:
         return ""
-    rows, factors, soon = [], [], []
+    rows, factors = [], []
     for name in both:
         rows.append([name, "ours", *_cells(ours[name])])
         rows.append(["", "paper", *_cells(theirs[name])])
         quotients = [ratio(theirs[name]["errors"][key], ours[name]["errors"][key]) for key in ERRORS]
         factors.append(quotients)
         rows.append(["", "**paper / ours**", *(factor(q) for q in quotients), "", ""])
-        soon.append(_as_good(ours[name]["curve"], theirs[name]["curve"]))
     middle = [_median([row[i] for row in factors]) for i in range(len(ERRORS))]
     least = [min((row[i] for row in factors if row[i] is not None), default=None) for i in range(len(ERRORS))]
     summary = [["median", *map(factor, middle)], ["least", *map(factor, least)]]
     fitted = sum(ours[name]["passed"] for name in both), sum(theirs[name]["passed"] for name in both)
+    updates = [theirs[name]["updates"] for name in both]
     text = [
         f"Lengths relative to the largest extent; budget {study.seconds:g} s for either, certificate included. Within "
-        f"all limits: ours {fitted[0]}, paper {fitted[1]} of {len(both)}.",
+        f"all limits: ours {fitted[0]}, paper {fitted[1]} of {len(both)}. The published recipe had {min(updates):,} to "
+        f"{max(updates):,} of its {PLANS['paper'].steps:,} updates: this compares {study.seconds:g} s of fitting and "
+        "nothing else.",
         table(["shape", "recipe", *HEAD], rows),
         "Factors paper / ours over the shapes (where ours has an error at all):",
         table(["", *HEAD[: len(ERRORS)]], summary),
-        "After how many seconds ours is as good as the paper's recipe at its end, by the checks during training. These "
-        "judge the bare networks, every 100 updates; the certificate above judges shapes, whose bounding box keeps "
-        "even a poor network from being far off in the box.",
-        table(
-            ["shape", "paper's last check, s", "near: ours at, s", "in box: ours at, s"],
-            [[name, *(number(value) for value in row)] for name, row in zip(both, soon, strict=True)],
-        ),
     ]
     return "\n\n".join(text)
 
@@ -161,14 +156,6 @@ def _variant(width: int) -> str:
 
 def _cells(fit: dict[str, Any]) -> list[str]:
     return [*(number(fit["errors"][key]) for key in ERRORS), str(fit["updates"]), f"{fit['seconds']:.0f}"]
-
-
-def _as_good(ours: list[list[float]], theirs: list[list[float]]) -> list[float | None]:
-    """Seconds of the paper's last check, and when ours was first as good, near the surface and in the box."""
-    if not theirs:
-        return [None, None, None]
-    last = theirs[-1]
-    return [last[1], *(next((row[1] for row in ours if row[k] <= last[k]), None) for k in (2, 3))]
 
 
 def _median(values: list[float | None]) -> float | None:
