@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 
-from sdfsim.dynamics.bodies import State, Units
+from sdfsim.dynamics.bodies import Bodies, State, Units
 from sdfsim.dynamics.freeflight import MOST_TURN
 from sdfsim.errors import SdfsimError
 from sdfsim.scene.types import Scene
@@ -59,6 +61,27 @@ def fault(
         if bool(bad.any()):
             return int(rows[bad][0]), f"{float(size[bad][0]) * unit:.3g} {what} (at most {most * unit:.3g})"
     return None
+
+
+def check_sizes(bodies: Bodies, names: Sequence[str], metres: float) -> None:
+    """That the surface of every body keeps to where points are placed exactly.
+
+    Args:
+        bodies: N bodies.
+        names: [N] of them.
+        metres: in a model unit.
+
+    Raises:
+        SdfsimError: a body that has an end is too large.
+    """
+    large = ((bodies.size > FARTHEST) & bodies.size.isfinite()).nonzero()[:, 0]
+    if len(large):
+        size = float(bodies.size[large[0]]) * metres
+        raise SdfsimError(
+            f"body {names[int(large[0])]!r}: {size:.3g} m wide, too large to be placed exactly "
+            f"(at most {FARTHEST * metres:.3g})",
+            "look at its scale, and at the size and units of its shape",
+        )
 
 
 def check_nodes(scene: Scene, nodes_a_body: int | None) -> None:

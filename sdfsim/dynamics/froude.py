@@ -10,6 +10,9 @@ from sdfsim.errors import SdfsimError
 from sdfsim.scene.types import Scene
 
 EARTH = 9.81  # m/s^2, sets the time scale of scenes without gravity
+# Times: how much wider a body may be than most that move. Their mean size sets the step, and one that is wider makes it
+# so long that the others turn out of all bounds in their first contact.
+MOST_WIDER = 1e4
 
 
 def scene_units(scene: Scene, model: Model, dt: float | None = None) -> Units:
@@ -21,7 +24,7 @@ def scene_units(scene: Scene, model: Model, dt: float | None = None) -> Units:
         dt: s, fixes the scale by the wanted step instead of by the bodies' size.
 
     Raises:
-        SdfsimError: a step that is no positive number.
+        SdfsimError: a step that is no positive number, or bodies of sizes that no step serves.
     """
     if dt is not None and not 0.0 < dt < np.inf:
         raise SdfsimError(f"dt: must be > 0 s and finite (got {dt:g})")
@@ -30,7 +33,32 @@ def scene_units(scene: Scene, model: Model, dt: float | None = None) -> Units:
     sizes = [largest_extent(scene.shapes[b.shape]) * b.scale for b in moving]
     if dt is not None:
         length = (dt / model.dt) ** 2 * strength / model.gravity
+    elif sizes:
+        _check_sizes([b.name for b in moving], np.array(sizes))
+        length = float(np.mean(sizes)) / model.length
     else:
-        length = float(np.mean(sizes)) / model.length if sizes else 1.0
+        length = 1.0
     mass = float(np.mean([b.mass for b in moving])) if moving else 1.0
     return Units(length=length, time=float(np.sqrt(length * model.gravity / strength)), mass=mass)
+
+
+def _check_sizes(names: list[str], sizes: np.ndarray) -> None:
+    """That no body is far wider than most. Of the two that are compared the less ordinary one is to blame.
+
+    Args:
+        names: of N bodies that move, at least one.
+        sizes: [N] m.
+
+    Raises:
+        SdfsimError: one is.
+    """
+    order = np.argsort(sizes, kind="stable")
+    usual, widest = order[(len(order) - 1) // 2], order[-1]
+    if not MOST_WIDER * sizes[usual] < sizes[widest] < np.inf:
+        return
+    absurd, other = sorted((usual, widest), key=lambda k: -abs(np.log10(sizes[k])))
+    raise SdfsimError(
+        f"body {names[absurd]!r}: {sizes[absurd]:.3g} m wide beside body {names[other]!r} of {sizes[other]:.3g} m "
+        f"(at most {MOST_WIDER:g} times apart)",
+        "look at its scale, and at the size and units of its shape",
+    )

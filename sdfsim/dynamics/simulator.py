@@ -15,7 +15,7 @@ import torch
 import sdfsim
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State, awake, from_scene
-from sdfsim.dynamics.check import check_nodes, fault
+from sdfsim.dynamics.check import check_nodes, check_sizes, fault
 from sdfsim.dynamics.contacts import Contacts, distances
 from sdfsim.dynamics.energy import Guard, kinetic
 from sdfsim.dynamics.froude import scene_units
@@ -68,7 +68,7 @@ class Simulator:
 
     Raises:
         SdfsimError: no such model or device, a step that is none, a body that moves without mass or without nodes
-            that tell how it turns, one that is too far away or too fast.
+            that tell how it turns, one that is too large, too far away or too fast.
     """
 
     def __init__(
@@ -109,16 +109,17 @@ class Simulator:
         )
         check_nodes(scene, self.model.nodes)
         self.bodies, self.state = from_scene(scene, self.units, self.device, self.model.nodes)
+        self._names = tuple(b.name for b in scene.bodies)
+        check_sizes(self.bodies, self._names, self.units.length)
         if effects.contact.on and self.model.ranges:
-            names = [b.name for b in scene.bodies]
-            self.outside_training += deep_starts(self.bodies, self.state, names, self.units.length, self.rules.rows)
+            found = deep_starts(self.bodies, self.state, self._names, self.units.length, self.rules.rows)
+            self.outside_training += found
         if self.model.kind == "paper":
             self.state = with_history(self.state, self.bodies, self.rules)
         if effects.sleep.on:
             self.state = replace(self.state, sleep=nobody_asleep(self.bodies, gravity))
         self.memory = Memory()
         self._dynamic = self.bodies.moves.nonzero()[:, 0]
-        self._names = tuple(b.name for b in scene.bodies)
         weight = self.bodies.mass[self._dynamic] * self.rules.gravity.norm()
         self._lift = float((weight * self.bodies.size[self._dynamic]).sum()) * self.units.energy
         self.contacts: Contacts | None = None
