@@ -46,6 +46,14 @@ Cluster = Annotated[
 ]
 
 
+def check_device(device: str) -> None:
+    """That the device is there, for commands that compute on none. Raises SdfsimError otherwise."""
+    if device == "cuda":
+        from sdfsim.dynamics.simulator import pick_device
+
+        pick_device(device)
+
+
 def tell_failed(session: Session, report: dict) -> None:
     """Say every failed check; there being one is the exit code."""
     for check in report["failed_checks"]:

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from sdfsim.commands.arguments import Cluster, Device, Json, Model, Out, Verbose
+from sdfsim.commands.arguments import Cluster, Device, Json, Model, Out, Verbose, check_device
 from sdfsim.progress import Session
 
 
@@ -35,6 +35,7 @@ def dataset(
         from sdfsim.learning.generate import make_dataset, report_lines
         from sdfsim.parallel import cluster as working_on
 
+        check_device(device)
         with working_on(cluster):
             report = make_dataset(
                 recipe,

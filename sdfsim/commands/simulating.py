@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from sdfsim.commands.arguments import Bind, Device, Json, Model, Out, Outside, Verbose, tell_failed
+from sdfsim.commands.arguments import Bind, Device, Json, Model, Out, Outside, Verbose, check_device, tell_failed
 from sdfsim.progress import Session, duration
 
 
@@ -108,6 +108,7 @@ def view(
     with Session(as_json=as_json, verbose=verbose) as session:
         from sdfsim import viewer
 
+        check_device(device)
         if picture is not None:
             viewer.screenshot(recording, picture, at=at)
             session.report({"screenshot": str(picture)})
@@ -121,4 +122,5 @@ def info(as_json: Json = False, device: Device = "auto", verbose: Verbose = Fals
     with Session(as_json=as_json, verbose=verbose) as session:
         from sdfsim import run
 
+        check_device(device)
         session.report(run.environment())

@@ -159,6 +159,17 @@ def test_bad_input_is_one_line_and_code_1(scene, model, tmp_path, arguments, tol
     assert told.format(**names) in errors[0] and "Traceback" not in done.stderr
 
 
+@pytest.mark.parametrize(
+    "arguments", [("info",), ("view", "x.rrd"), ("dataset", "pile", "-o", "x", "--trajectories", "1")]
+)
+def test_a_device_that_is_not_there_is_told_by_commands_that_compute_on_none(arguments, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    done = run(*arguments, "--device", "cuda")
+    assert done.exit_code == 1 and done.stderr.startswith("error: --device cuda: no CUDA device here\n")
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.skipif(
     not Path("/dev/full").exists(), reason="/dev/full, a disk that is always full, exists on Linux only"
 )
