@@ -29,15 +29,16 @@ class Sdf(Protocol):
 
         The result has the dtype and device of `points`. Never NaN: where the gradient is undefined
         (medial axis, an edge) any valid one-sided gradient is returned. The implementations of this
-        package also take a NumPy array and then return NumPy arrays.
+        package also take a NumPy array, or what makes one, and then return NumPy arrays.
         """
         ...
 
 
 def accepts_numpy(call: Callable[..., tuple[torch.Tensor, torch.Tensor]]) -> Callable[..., tuple[Any, Any]]:
-    """Let an Sdf's `__call__` also take a NumPy array [P, 3], and then answer in NumPy of the same dtype.
+    """Let an Sdf's `__call__` also take what makes a NumPy array [P, 3], and then answer in NumPy of the same dtype.
 
-    An object with a `device` attribute is evaluated there; the answer comes back to the host.
+    Whole numbers become float64. An object with a `device` attribute is evaluated there; the answer comes back to the
+    host.
 
     Raises:
         ValueError: (from the wrapped call) `points` is not [P, 3].
@@ -45,14 +46,14 @@ def accepts_numpy(call: Callable[..., tuple[torch.Tensor, torch.Tensor]]) -> Cal
 
     @wraps(call)
     def wrapper(self: Any, points: Any) -> tuple[Any, Any]:
-        if len(points.shape) != 2 or points.shape[1] != 3:
-            raise ValueError(f"points must be [P, 3], got {list(points.shape)}")
-        if isinstance(points, torch.Tensor):
-            return call(self, points)
-        array = np.asarray(points)
-        if not np.issubdtype(array.dtype, np.floating):
-            array = array.astype(np.float64)
-        tensor = torch.from_numpy(np.ascontiguousarray(array)).to(getattr(self, "device", "cpu"))
+        given = points if isinstance(points, torch.Tensor) else np.asarray(points)
+        if given.ndim != 2 or given.shape[1] != 3:
+            raise ValueError(f"points must be [P, 3], got {list(given.shape)}")
+        if isinstance(given, torch.Tensor):
+            return call(self, given)
+        if not np.issubdtype(given.dtype, np.floating):
+            given = given.astype(np.float64)
+        tensor = torch.from_numpy(np.ascontiguousarray(given)).to(getattr(self, "device", "cpu"))
         distance, gradient = call(self, tensor)
         return distance.cpu().numpy(), gradient.cpu().numpy()
 

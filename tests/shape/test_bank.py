@@ -58,6 +58,18 @@ def test_the_bank_is_each_one_alone(mixed: list[Sdf], count: int, dtype: torch.d
         torch.testing.assert_close(gradient[index == number], alone[1], rtol=1e-3, atol=1e-4)
 
 
+def test_each_kind_takes_whatever_makes_an_array(mixed: list[Sdf]) -> None:
+    rows = [[0, 0, 1], [2, -1, 0]]
+    for sdf in mixed:
+        expected = sdf(np.array(rows, dtype=np.float64))
+        for points in (rows, tuple(map(tuple, rows)), np.array(rows), [np.array(row) for row in rows]):
+            for found, wanted in zip(sdf(points), expected, strict=True):
+                assert isinstance(found, np.ndarray) and found.dtype == np.float64
+                np.testing.assert_array_equal(found, wanted)
+        with pytest.raises(ValueError, match=r"\[P, 3\]"):
+            sdf([0.0, 0.0, 1.0])
+
+
 def test_the_bank_takes_strangers_and_devices(mixed: list[Sdf]) -> None:
     class Slab:
         bounds = np.array([[-1.0] * 3, [1.0] * 3])
