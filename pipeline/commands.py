@@ -169,6 +169,7 @@ def fit(
     thicken: Annotated[
         float | None, typer.Option(help="Thickness to give an open sheet, metres (with -o).", min=0.0)
     ] = None,
+    units: Annotated[Literal["m", "cm", "mm", "in"], typer.Option(help="Of the mesh files (with -o).")] = "m",
     cluster: Cluster = None,
     as_json: Json = False,
     device: Device = "auto",
@@ -182,15 +183,15 @@ def fit(
     if out is None:
         if len(sources) > 1 or not sources[0].is_dir():
             raise typer.BadParameter("a mesh file needs -o SHAPE_DIR")
-        if cap or thicken is not None or cluster is not None:
-            raise typer.BadParameter("--cap, --thicken and --cluster go with -o")
+        if cap or thicken is not None or units != "m" or cluster is not None:
+            raise typer.BadParameter("--cap, --thicken, --units and --cluster go with -o")
         _stage("fit", sources[0], as_json, verbose, then="scene", budget=budget, recipe=recipe, device=device)
         return
     with Session(as_json=as_json, verbose=verbose) as session:
         from sdfsim import fitting
         from sdfsim.parallel import cluster as working_on
 
-        options = fitting.Options(recipe or "default", budget, cap, thicken)
+        options = fitting.Options(recipe or "default", budget, cap, thicken, units)
         if len(sources) == 1 and not sources[0].is_dir():
             report = fitting.fit(sources[0], out, options, device=device, on_progress=session.progress)
             lines = fitting.fit_lines(report)

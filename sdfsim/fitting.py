@@ -8,11 +8,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from sdfsim.dynamics.bodies import largest_extent
 from sdfsim.dynamics.simulator import pick_device
 from sdfsim.errors import SdfsimError
 from sdfsim.files import check_writable, locked, read_json
 from sdfsim.parallel import parallel
 from sdfsim.progress import columns, duration
+from sdfsim.scene.schema import UNITS
 from sdfsim.shape.asset import RECORD_FILE, Shape
 from sdfsim.shape.distance import MeshDistance
 from sdfsim.shape.fit import FIT_VERSION, fit_mesh, fit_solids
@@ -23,24 +25,27 @@ Progress = Callable[[float, str], None]
 
 # Shapes that one GPU trains side by side: some 40 MB each.
 STACK = 256
+# m, sizes that need no word.
+USUAL = (1e-3, 100.0)
 ERRORS = ("error_within_0.01", "error_within_0.1", "error_in_box", "projected_from_0.01", "hausdorff", "sign_errors")
 
 
 @dataclass(frozen=True)
 class Options:
-    """How meshes are fitted; see `fit_mesh`."""
+    """How meshes are fitted; see `fit_mesh`. `units` are those of the mesh files, as in scene.yaml."""
 
     recipe: Literal["default", "paper"] = "default"
     budget: float | None = None
     cap: bool = False
     thicken: float | None = None
+    units: Literal["m", "cm", "mm", "in"] = "m"
 
 
 def fit(mesh_file: Path, out: Path, options: Options, *, device: str, on_progress: Progress) -> dict[str, Any]:
     """Fit a mesh file and write the shape folder `out`; a fit that was cut off goes on where it was.
 
     Args:
-        mesh_file: to be fitted, in metres.
+        mesh_file: to be fitted.
         out: shape folder.
         options: of the fit.
         device: cpu, cuda or auto.
@@ -53,7 +58,7 @@ def fit(mesh_file: Path, out: Path, options: Options, *, device: str, on_progres
     Raises:
         SdfsimError: the mesh cannot be used, the folder cannot be written, or another run is writing to it.
     """
-    mesh = load_mesh(mesh_file)
+    mesh = _load(mesh_file, options)
     check_writable(out)
     with locked(out):
         checkpoint = out / "fit.checkpoint"
@@ -168,7 +173,8 @@ def batch_lines(report: dict[str, Any]) -> list[str]:
             errors = ("-" if found.get(key) is None else f"{found[key]:.2g}" for key in ERRORS)
             rows.append((name, _verdict(found), f"{found['seconds']:.1f}", str(found["steps"]), *errors))
     problems = [f"{name}: {found['error']}" for name, found in report["shapes"].items() if "error" in found]
-    return [*columns(rows), *problems, f"wrote {report['folder']}"]
+    notes = [f"{name}: {note}" for name, found in report["shapes"].items() for note in found.get("notes", [])]
+    return [*columns(rows), *problems, *notes, f"wrote {report['folder']}"]
 
 
 def _verdict(report: dict[str, Any]) -> str:
@@ -195,7 +201,7 @@ def _stacked(todo: list[tuple[str, Path]], out: Path, options: Options, device: 
         requests: dict[str, str] = {}
         for name, file in group:
             try:
-                mesh = load_mesh(file)
+                mesh = _load(file, options)
                 solids[name] = MeshDistance(solidify(mesh, name=name, cap=options.cap, thicken=options.thicken))
                 requests[name] = _request(mesh, options)
             except SdfsimError as error:
@@ -215,12 +221,21 @@ def _save(shape: Shape, request: str, folder: Path) -> dict[str, Any]:
     """Write a shape with the `_request` that it was made for, and report on it."""
     shape = replace(shape, source=shape.source | {"request": request})
     shape.save(folder)
-    return _report(shape.certificate, shape.volume, len(shape.nodes), shape.source, folder)
+    return _report(shape, folder)
 
 
-def _report(certificate: dict, volume: float, nodes: int, source: dict, folder: Path) -> dict[str, Any]:
-    known = {"folder": str(folder), "volume_m3": volume, "nodes": nodes, "notes": source.get("notes", [])}
-    return known | certificate
+def _report(shape: Shape, folder: Path) -> dict[str, Any]:
+    notes, size = list(shape.source.get("notes", [])), largest_extent(shape)
+    if not USUAL[0] <= size <= USUAL[1]:
+        notes.append(f"it is {size:.3g} m wide; where that is wrong, --units says what the file counts in")
+    known = {"folder": str(folder), "volume_m3": shape.volume, "nodes": len(shape.nodes), "notes": notes}
+    return known | shape.certificate
+
+
+def _load(file: Path, options: Options) -> Mesh:
+    """The mesh of a file in metres."""
+    mesh = load_mesh(file)
+    return replace(mesh, vertices=mesh.vertices * UNITS[options.units])
 
 
 def _request(mesh: Mesh, options: Options) -> str:
@@ -234,9 +249,9 @@ def _kept(file: Path, folder: Path, options: Options) -> dict[str, Any] | None:
 
     try:
         made_for = read_json(folder / RECORD_FILE)["source"]["request"]
-        if made_for != _request(load_mesh(file), options):
+        if made_for != _request(_load(file, options), options):
             return None
         shape = load_shape(folder)
     except (SdfsimError, OSError, KeyError, TypeError, AttributeError):
         return None
-    return _report(shape.certificate, shape.volume, len(shape.nodes), shape.source, folder)
+    return _report(shape, folder)

@@ -15,8 +15,9 @@ from sdfsim import fitting
 from sdfsim.errors import SdfsimError
 from sdfsim.fitting import Options, fit_many, named_meshes
 from sdfsim.parallel import cluster, parallel
+from sdfsim.scene.schema import UNITS
 from sdfsim.shape import primitives
-from sdfsim.shape.asset import load_shape
+from sdfsim.shape.asset import load_shape, scaled
 from sdfsim.shape.mesh import Mesh
 from sdfsim.shape.storage import write_ply
 
@@ -81,6 +82,25 @@ def test_a_mesh_whose_data_lie_in_a_file_beside_it_is_fitted_anew_when_that_chan
     assert (tmp_path / "shapes" / "box" / "shape.json").stat().st_mtime_ns == written
     corners.write_bytes((2 * np.frombuffer(corners.read_bytes(), np.float32)).tobytes())
     assert volume() == pytest.approx(8.0)
+
+
+def test_units_are_those_of_a_scene_file_and_odd_sizes_are_told(tmp_path: Path) -> None:
+    size, file, out = np.array([20.0, 30.0, 40.0]), tmp_path / "box.ply", tmp_path / "box"
+    file.write_bytes(write_ply(primitives.box((20.0, 30.0, 40.0))))
+    arguments = ["fit", str(file), "-o", str(out), "--budget", "0.1s", "--device", "cpu", "--units", "cm"]
+    assert "--units" not in CliRunner().invoke(cli.app, arguments).stdout
+    shape = load_shape(out)
+    np.testing.assert_allclose(np.ptp(shape.mesh.vertices, axis=0), 0.01 * size)
+    assert shape.volume == pytest.approx(0.024)
+    for units, metres in UNITS.items():
+        options = Options(budget=0.1, units=units)
+        np.testing.assert_allclose(np.ptp(fitting._load(file, options).vertices, axis=0), metres * size)
+        assert (fitting._kept(file, out, options) is None) == (units != "cm")
+    for factor, told in ((1.0, None), (0.001, "0.0004"), (1000.0, "400")):
+        report = fitting._report(scaled(shape, factor), out)
+        note = f"it is {told} m wide; where that is wrong, --units says what the file counts in"
+        assert report["notes"] == ([note] if told else [])
+        assert (f"box: {note}" in fitting.batch_lines({"folder": "", "shapes": {"box": report}})) == bool(told)
 
 
 def test_one_stack_gives_the_same_shapes_as_processes(

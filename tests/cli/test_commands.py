@@ -124,6 +124,7 @@ def test_a_bad_scene_is_one_line_and_code_1(tmp_path, command, field, fault):
         ("fit", "mesh.obj"),
         ("fit", "a.obj", "b.obj"),
         ("fit", ".", "--cap"),
+        ("fit", ".", "--units", "mm"),
         ("evaluate", "data", "--free-flight", "high"),
         ("nonsense",),
     ],
