@@ -175,16 +175,27 @@ def _picture(viewer: subprocess.Popen, address: str, picture: Path, at: float | 
         if viewer.poll() is not None or time.monotonic() - started > _START_SECONDS:
             raise ConnectionError("the viewer did not start")
         time.sleep(0.2)
-    times = [t for recording in state.recordings for t in recording.timelines if t.name == "time"]
-    if times:
-        first, last = (times[0].start or 0) * 1e-9, (times[0].end or 0) * 1e-9
-        if at is not None and not first <= at <= last + 1e-6:
-            raise SdfsimError(f"--at {at:g}: the recording holds {first:g} to {last:g} s")
-        client.set_time("time", duration=last if at is None else at, play_state="paused")
+    timelines = {t.name: t for recording in state.recordings for t in recording.timelines}
+    if time_line := timelines.get("time"):
+        first, last = (time_line.start or 0) * 1e-9, (time_line.end or 0) * 1e-9
+        count = timelines.get("step")
+        steps = (count.end or 0) - (count.start or 0) if count else 0
+        client.set_time("time", duration=_moment(at, first, last, steps), play_state="paused")
     time.sleep(_TOAST_SECONDS)
     client.save_screenshot(str(picture.resolve()))
     if not picture.exists():
         raise SdfsimError(f"{picture}: cannot be written")
+
+
+def _moment(at: float | None, first: float, last: float, steps: int) -> float:
+    """The time in s to show, between the `first` and the `last` of a recording of so many steps.
+
+    A run is a whole number of steps, so it ends up to one before the time that was asked for: that is its end too.
+    """
+    step = (last - first) / steps if steps else 0.0
+    if at is not None and not first <= at <= last + max(step, 1e-6):
+        raise SdfsimError(f"--at {at:g}: the recording holds {first:g} to {last:g} s")
+    return last if at is None else min(at, last)
 
 
 def _end(process: subprocess.Popen) -> None:
