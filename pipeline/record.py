@@ -19,19 +19,16 @@ RECORD = "stage.json"
 UNFINISHED = "unfinished.json"
 
 
-def fingerprint(stage: str, inputs: str, options: dict, modules: tuple[str, ...]) -> str:
-    """Hash of what a stage's result depends on: inputs, options and code.
+def fingerprint(stage: str, version: int, inputs: str, options: dict) -> str:
+    """Hash of what a stage's result depends on.
 
     Args:
         stage: its name.
+        version: of its code, see `STAGE_VERSIONS`.
         inputs: name of the result that it reads, see `finish`; of the first stage, hash of the photos.
         options: that its result depends on.
-        modules: of this package whose source its result depends on.
     """
-    digest = hashlib.sha256(json.dumps([stage, inputs, options], sort_keys=True).encode())
-    for name in modules:
-        digest.update((Path(__file__).parent / f"{name}.py").read_bytes())
-    return digest.hexdigest()
+    return hashlib.sha256(json.dumps([stage, version, inputs, options], sort_keys=True).encode()).hexdigest()
 
 
 def content_of_photos(given: Path) -> str:

@@ -43,6 +43,24 @@ def test_what_changed_is_done_again(photos, tmp_path, calls, changes, expected):
     assert calls == expected
 
 
+@pytest.mark.parametrize("stage", stages.STAGES)
+def test_a_stage_of_another_version_is_done_again_with_those_after_it(photos, tmp_path, calls, monkeypatch, stage):
+    stages.reconstruct(photos, tmp_path / "out", preset="quick")
+    calls.clear()
+    monkeypatch.setitem(stages.STAGE_VERSIONS, stage, stages.STAGE_VERSIONS[stage] + 1)
+    stages.reconstruct(photos, tmp_path / "out", preset="quick")
+    assert calls == list(stages.STAGES[stages.STAGES.index(stage) :])
+
+
+def test_a_changed_comment_changes_no_stage(photos, tmp_path, calls, monkeypatch):
+    stages.reconstruct(photos, tmp_path / "out", preset="quick")
+    calls.clear()
+    ordinary = Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda path: ordinary(path) + b"#" * (path.suffix == ".py"))
+    stages.reconstruct(photos, tmp_path / "out", preset="quick")
+    assert calls == []
+
+
 def test_another_photo_changes_everything(photos, tmp_path, calls):
     stages.reconstruct(photos, tmp_path / "out", preset="quick")
     calls.clear()
