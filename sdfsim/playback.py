@@ -53,6 +53,7 @@ _STATIC_COLOR = (150, 150, 155)
 _NODE_COLOR = (20, 20, 20)
 _CONTACT_COLOR = (255, 40, 40)
 _PHOTO_PIXELS = 320
+FARTHEST = 1.0  # what leaves the scene for good must not make it a dot
 
 
 class Playback:
@@ -60,13 +61,15 @@ class Playback:
 
     Args:
         scene: what moves.
+        motion: how it does, where that is known already: the first view shows all of it.
     """
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, motion: Rollout | None = None) -> None:
         import rerun as rr
 
         self._rr = rr
         self._scene = scene
+        self._framed = framed(scene, motion)
         self._step = 0
         self._com = [b.scale * scene.shapes[b.shape].com for b in scene.bodies]
         self._crowds = crowds(scene, WORLD)
@@ -79,7 +82,7 @@ class Playback:
         import rerun.blueprint as rrb
 
         hidden = [CONTACTS, *(f"{path}/nodes" for _, path in self._alone)]
-        centre, radius = _extent(self._scene)
+        centre, radius = self._framed
         view = rrb.Spatial3DView(
             origin=WORLD,
             name="scene",
@@ -104,7 +107,7 @@ class Playback:
         rr, scene = self._rr, self._scene
         self.stream.send_blueprint(self.blueprint())
         self.stream.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        size = _extent(scene)[1]
+        size = self._framed[1]
         hues = distinct_colors(len(self._alone) + len(self._crowds))
         for crowd in self._crowds:
             shape = scene.shapes[crowd.shape]
@@ -163,7 +166,7 @@ def save_rollout(scene: Scene, rollout: Rollout, path: Path) -> None:
     Raises:
         SdfsimError: the file cannot be written.
     """
-    playback = Playback(scene)
+    playback = Playback(scene, rollout)
     encoded = playback.stream.binary_stream()
     playback.log_static()
     playback.log_steps(rollout)
@@ -278,22 +281,40 @@ def _eye(centre: np.ndarray, radius: float, up: np.ndarray) -> rrb.EyeControls3D
     return rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=centre + radius * away, look_target=centre, eye_up=up)
 
 
-def _extent(scene: Scene) -> tuple[np.ndarray, float]:
-    """Centre [3] m and radius m of the bodies at the start, planes left out."""
+def framed(scene: Scene, motion: Rollout | None = None) -> tuple[np.ndarray, float]:
+    """Centre [3] m and radius m of what the first view has to show.
+
+    The bodies at the start, planes left out, and the places on planes that they are over, as what is held up by
+    nothing falls there; and, where the motion is known, their way. What flies farther than `FARTHEST` times the size
+    of all this is followed so far only.
+    """
     from scipy.spatial.transform import Rotation
 
-    corners = []
-    for body in scene.bodies:
-        shape = scene.shapes[body.shape]
-        if np.all(np.isfinite(shape.sdf.bounds)) and len(shape.mesh.vertices):
+    boxes: dict[int, np.ndarray] = {}
+    planes = []
+    for k, body in enumerate(scene.bodies):
+        shape, turn = scene.shapes[body.shape], Rotation.from_quat(body.quat_xyzw)
+        if not np.all(np.isfinite(shape.sdf.bounds)):
+            planes.append((body.position, turn.apply([0.0, 0.0, 1.0])))
+        elif len(shape.mesh.vertices):
             box = np.stack([shape.mesh.vertices.min(0), shape.mesh.vertices.max(0)]) * body.scale
-            turn = Rotation.from_quat(body.quat_xyzw)
-            corners.append(body.position + turn.apply(np.stack(np.meshgrid(*box.T), -1).reshape(-1, 3)))
-    if not corners:
+            boxes[k] = body.position + turn.apply(np.stack(np.meshgrid(*box.T), -1).reshape(-1, 3))
+    if not boxes:
         return np.zeros(3), 1.0
-    every = np.concatenate(corners)
-    low, high = every.min(0), every.max(0)
+    start = np.concatenate(list(boxes.values()))
+    below = [start - ((start - at) @ normal)[:, None] * normal for at, normal in planes]
+    low, high = _bounds(np.concatenate([start, *below]))
+    if motion is not None:
+        size = float((high - low).max())
+        for k, corners in boxes.items():
+            half = np.linalg.norm(np.ptp(corners, axis=0)) / 2 if scene.bodies[k].motion != "static" else 0.0
+            way = np.clip(motion.position[:, k], low - FARTHEST * size, high + FARTHEST * size)
+            low, high = np.minimum(low, way.min(0) - half), np.maximum(high, way.max(0) + half)
     return (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
+
+
+def _bounds(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return points.min(0), points.max(0)
 
 
 def _shaded(rr: Any, mesh: Mesh, color: tuple[int, ...]) -> rr.Mesh3D:

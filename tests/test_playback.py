@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim import SdfsimError, load_scene
 from sdfsim.dynamics.rollout import Rollout
-from sdfsim.playback import PLOTS, Playback, PosedPhoto, save_reconstruction, save_rollout
+from sdfsim.playback import FARTHEST, PLOTS, Playback, PosedPhoto, framed, save_reconstruction, save_rollout
 from sdfsim.shading import distinct_colors, with_normals
 from sdfsim.shape.mesh import Mesh
 from sdfsim.shape.primitives import box, sphere
@@ -46,6 +46,30 @@ def rollout(scene) -> Rollout:
         counters={key: rng.random(STEPS + 1) for key in PLOTS},
         names=tuple(b.name for b in scene.bodies),
     )
+
+
+def test_the_first_view_shows_all_of_the_motion(scene, rollout):
+    rollout.position[:, 2, 2] = np.linspace(
+        0.0, -8.0, STEPS + 1
+    )  # the ball falls, and does not stop at its start's view
+    centre, radius = framed(scene, rollout)
+    for k in (2, 3):
+        away = np.linalg.norm(rollout.position[:, k] - centre, axis=1)
+        assert (away + np.sqrt(3) * 0.5 < radius).all()
+    assert radius > framed(scene)[1]
+    # What leaves for good does not make the rest a dot.
+    rollout.position[:, 2, 0] = np.linspace(0.0, 1e6, STEPS + 1)
+    assert framed(scene, rollout)[1] < (FARTHEST + 1) * 2 * framed(scene)[1] * np.sqrt(3)
+
+
+def test_before_the_motion_is_known_the_view_reaches_down_to_the_floor(tmp_path):
+    (tmp_path / "scene.yaml").write_text(
+        "version: 1\nshapes:\n  ball: {sphere: {radius: 0.1}}\nbodies:\n"
+        "  - {name: floor, plane: {}}\n  - {name: ball, shape: ball, position: [3, 0, 1]}\n"
+    )
+    centre, radius = framed(load_scene(tmp_path / "scene.yaml"))
+    for height in (0.0, 1.1):
+        assert np.linalg.norm(centre - [3, 0, height]) < radius < 1.0
 
 
 def read(path: Path) -> dict[str, dict[str, list]]:
