@@ -5,6 +5,7 @@ The names below load their modules on first use, so that `import sdfsim` stays l
 
 from __future__ import annotations
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,10 @@ if TYPE_CHECKING:
     from sdfsim.errors import SceneError, SdfsimError
     from sdfsim.scene.load import load_scene
     from sdfsim.shape.asset import Shape, load_shape
+
+# Threads of torch that wait for one another by spinning take the processor from those they wait for: beside other
+# programs a step then takes ten times as long. Has an effect only before torch is imported.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 __version__ = "0.1.0"
 __all__ = ["Rollout", "SceneError", "SdfsimError", "Shape", "Simulator", "load_scene", "load_shape"]
