@@ -116,7 +116,7 @@ def do_fit(run: Run, work: Path) -> dict:
     if budget is None and run.options.budget is not None:
         budget = max(10.0, FIT_SHARE * run.options.budget)
     return fit_parts(
-        run.place("mesh"), work, budget=budget, recipe=run.options.recipe, seed=run.options.seed,
+        run.place("mesh"), work, budget=budget, recipe=run.options.fit_recipe(), seed=run.options.seed,
         device=run.device(), on_progress=run.tell("fit"),
     )  # fmt: skip
 

@@ -36,7 +36,7 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
         on_progress: called with (fraction, message).
 
     Returns:
-        `shapes`: a certificate each; `passed` and `reason` for all of them.
+        `shapes`: a certificate each; `passed`, `reason` and `caveats` (a line each) for all of them.
 
     Raises:
         SdfsimError: the mesh stage has not run, or a mesh cannot be used.
@@ -66,7 +66,8 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
             device=device, on_progress=tell,
         )  # fmt: skip
     missed = [f"{name}: {found['reason']}" for name, found in certificates.items() if not found["passed"]]
-    return {"shapes": certificates, "passed": not missed, "reason": "; ".join(missed)}
+    caveats = [f"{name}: {found['caveat']}" for name, found in certificates.items() if found["caveat"]]
+    return {"shapes": certificates, "passed": not missed, "reason": "; ".join(missed), "caveats": caveats}
 
 
 def fit_one(solid: Mesh, shown: Mesh, out: Path, name: str, *, budget: float | None, recipe: str, seed: int,

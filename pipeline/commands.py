@@ -161,8 +161,8 @@ def fit(
         Path | None, typer.Option("-o", "--out", help="Shape folder of one mesh file; of several, a folder of them.")
     ] = None,
     recipe: Annotated[
-        Literal["default", "paper"] | None,
-        typer.Option(help="How networks are fitted (a reconstruction: as before).", show_default=False),
+        Literal["quick", "default", "paper"] | None,
+        typer.Option(help="How networks are fitted (a reconstruction: as its preset says).", show_default=False),
     ] = None,
     budget: Budget = None,
     cap: Annotated[bool, typer.Option("--cap", help="Close openings of any size (with -o).")] = False,

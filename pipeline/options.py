@@ -30,7 +30,7 @@ class Options:
         budget: s for everything; None: what the preset takes.
         seed: of everything random.
         device: auto, cpu or cuda.
-        recipe: of the fit.
+        recipe: of the fit; None: quick for the preset quick, else the default one.
         distance: two places and the metres between them, see `Known`; None: size counts.
         crop: m, corners x, y, z, x, y, z of the box that is kept; None: everything.
         keep: pieces to keep that would be left out, by name; "all" for every one.
@@ -44,7 +44,7 @@ class Options:
     budget: float | None = None
     seed: int = 0
     device: str = "auto"
-    recipe: str = "default"
+    recipe: str | None = None
     distance: list | None = None
     crop: list[float] | None = None
     keep: list[str] = field(default_factory=list)
@@ -90,6 +90,10 @@ class Options:
         crop = None if self.crop is None else np.reshape(self.crop, (2, 3))
         return Wishes(self.size, known, crop, tuple(self.keep))
 
+    def fit_recipe(self) -> str:
+        """The recipe of the fit, see `fit_mesh`."""
+        return self.recipe or ("quick" if self.preset == "quick" else "default")
+
     def of_stage(self, stage: str) -> dict[str, Any]:
         """The options that a stage's result depends on."""
         common = {"preset": self.preset, "seed": self.seed}
@@ -103,7 +107,7 @@ class Options:
             keys = ("preset", "size", "distance", "crop", "keep")
             return {key: getattr(self, key) for key in keys}
         if stage == "fit":
-            return {"seed": self.seed, "budget": self.budget, "recipe": self.recipe}
+            return {"seed": self.seed, "budget": self.budget, "recipe": self.fit_recipe()}
         return {"seed": self.seed, "drop": self.drop, "static": self.static}
 
 

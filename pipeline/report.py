@@ -127,7 +127,7 @@ def improvements(report: dict) -> list[str]:
     if str(stages.get("mesh", {}).get("size", "")).startswith("assumed"):
         lines.append("give --size or --distance: until then nobody knows how large the scene is")
     if report["failed_checks"]:
-        lines.append("fit for longer (a larger --budget), or mend the mesh: a certificate was missed")
+        lines.append("fit for longer (a larger --budget), or mend the mesh: a shape is not usable")
     return lines
 
 
@@ -149,6 +149,9 @@ def notes(stages: dict[str, dict]) -> list[str]:
         lines.append(f"bodies of their own: {', '.join(mesh['objects'])} (mesh/objects.png shows which is which)")
     if "smallest_object_m" in mesh:
         lines.append(f"what rises less than {mesh['smallest_object_m']:.2g} m stays part of what it stands on")
+    if mesh.get("crumbs"):
+        lines.append(f"{mesh['crumbs']} loose crumbs beside bodies were taken away with them")
+    lines += [f"usable, not exact: {caveat}" for caveat in stages.get("fit", {}).get("caveats", [])]
     pieces = mesh.get("left_out", [])
     for piece in pieces[:NAMED]:
         name = piece["name"]

@@ -140,11 +140,17 @@ def _shapes(report: dict) -> str:
     """One row a fitted shape, with the numbers of its certificate as they are."""
     shapes = report["stages"].get("fit", {}).get("shapes", {})
     rows = [
-        (name, "passed" if one["passed"] else f"missed: {one['reason']}", *(f"{one[key]:.2g}" for key in CERTIFICATE))
+        (name, _exactness(one), *(f"{one[key]:.2g}" for key in CERTIFICATE))
         for name, one in shapes.items()
     ]
     head = ("shape", "certificate", *(key.replace("_", " ") for key in CERTIFICATE))
     return _section("Signed distances", _table(rows, head))
+
+
+def _exactness(certificate: dict) -> str:
+    if not certificate["passed"]:
+        return f"not usable: {certificate['reason']}"
+    return f"usable, {certificate['caveat']}" if certificate["caveat"] else "exact"
 
 
 CERTIFICATE = ("error_within_0.01", "error_within_0.1", "error_in_box", "sign_errors")

@@ -29,6 +29,7 @@ GRAVITY = 9.81  # m/s^2
 HEAVIER = 2.0  # the ball's mass over the body's
 SPARE = 1.4  # speed over what sliding to the edge takes
 SLOWEST = 1.5  # m/s
+SECONDS = 2.0  # until all that is knocked off lies on the floor
 
 
 def edge(above: Above, at: np.ndarray, base: float, size: float) -> tuple[np.ndarray, float]:
@@ -86,6 +87,7 @@ def main() -> None:
     scene["shapes"] = {name: {"asset": asset} for name, asset in assets.items()}
     scene["shapes"]["thrown"] = {"sphere": {"radius": float(rounded(radius))}}
     scene["bodies"] = [*bodies, ball]
+    scene["duration"] = SECONDS
     write_text(arguments.folder / "knock.yaml", yaml.safe_dump(scene, sort_keys=False))
     print(f"wrote {arguments.folder / 'knock.yaml'}")
 

@@ -17,7 +17,7 @@ from sdfsim.progress import columns, duration
 from sdfsim.scene.schema import UNITS
 from sdfsim.shape.asset import RECORD_FILE, Shape
 from sdfsim.shape.distance import MeshDistance
-from sdfsim.shape.fit import FIT_VERSION, fit_mesh, fit_solids
+from sdfsim.shape.fit import FIT_VERSION, Recipe, fit_mesh, fit_solids
 from sdfsim.shape.mesh import MESH_SUFFIXES, Mesh, load_mesh
 from sdfsim.shape.solid import solidify
 
@@ -34,7 +34,7 @@ ERRORS = ("error_within_0.01", "error_within_0.1", "error_in_box", "projected_fr
 class Options:
     """How meshes are fitted; see `fit_mesh`. `units` are those of the mesh files, as in scene.yaml."""
 
-    recipe: Literal["default", "paper"] = "default"
+    recipe: Recipe = "default"
     budget: float | None = None
     cap: bool = False
     thicken: float | None = None
@@ -151,7 +151,7 @@ def fit_many(
             reports[name] = kept
     todo = [(name, file) for name, file in meshes.items() if name not in reports]
     on_progress(0.0, f"{len(todo)} meshes to fit" + (f", {len(reports)} fitted before" if reports else ""))
-    if where.type == "cuda" and options.recipe == "default":
+    if where.type == "cuda" and options.recipe != "paper":
         made = _stacked(todo, out, options, str(where), on_progress)
     else:
         made = ((todo[i][0], found) for i, found in parallel(_fit_one, [(f, out / n, options) for n, f in todo]))

@@ -18,7 +18,7 @@ import torch
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, write_json
 from sdfsim.shape.asset import RECORD_FILE, Shape, load_shape
-from sdfsim.shape.certificate import LIMITS
+from sdfsim.shape.certificate import EXACT
 from sdfsim.shape.distance import MeshDistance
 from sdfsim.shape.fit import FIT_VERSION, fit_mesh
 from sdfsim.shape.mesh import load_mesh
@@ -27,7 +27,7 @@ from sdfsim.shape.solid import solidify
 from sdfsim.threads import limit_threads
 
 RESULTS = "sdf.json"
-ERRORS = tuple(key for key, _ in LIMITS)
+ERRORS = tuple(key for key, _ in EXACT)
 _STEP = re.compile(r"step (\d+) of \d+, error (\S+) near, (\S+) in the box")
 
 
@@ -139,8 +139,8 @@ class Study:
         certificate = shape.certificate
         record = {
             "errors": {key: certificate[key] for key in ERRORS},
-            "passed": certificate["passed"],
-            "reason": certificate["reason"],
+            "passed": certificate["passed"] and not certificate["caveat"],
+            "reason": certificate["reason"] or certificate["caveat"],
             "hausdorff": certificate["hausdorff"],
             "updates": certificate["steps"],
             "seconds": round(time.monotonic() - started, 2),

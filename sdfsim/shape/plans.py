@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from sdfsim.shape.sweep import Activation
@@ -100,3 +100,5 @@ PLANS = {
         fold=False,
     ),
 }
+# A surface from a few minutes of training is not known as exactly as a full fit would follow it.
+PLANS["quick"] = replace(PLANS["default"], steps=2000, settle=600)

@@ -11,14 +11,14 @@ from typing import Any
 
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, replacing, write_json, write_text
-from sdfsim.shape.certificate import LIMITS
+from sdfsim.shape.certificate import EXACT
 from sdfsim.shape.fit import FIT_VERSION, fit_mesh
 from sdfsim.shape.mesh import Mesh, load_mesh
 from sdfsim.shape.training import training_share
 
 BUDGETS = (5.0, 10.0, 20.0, 40.0, 60.0, 120.0)  # s
 QUICK_BUDGETS, QUICK_MESHES = (5.0, 10.0, 20.0), 2
-ERRORS = tuple(name for name, _ in LIMITS)
+ERRORS = tuple(name for name, _ in EXACT)
 
 
 def fit_tradeoff(
@@ -51,7 +51,7 @@ def fit_tradeoff(
     on_progress("fit", 1.0, "measured")
     if all(p["failed"] for p in points):
         raise SdfsimError(f"nothing could be fitted: {points[0]['failed']}")
-    report = {"quick": quick, "points": points, "limits": dict(LIMITS), "folder": str(out)}
+    report = {"quick": quick, "points": points, "limits": dict(EXACT), "folder": str(out)}
     write_json(out / "fit.json", report)
     write_text(out / "fit.csv", table(points))
     draw(points, out / "fit.png")
@@ -75,7 +75,9 @@ def _fitted(name: str, mesh: Mesh, budget: float, folder: Path) -> dict[str, Any
     wall, cpu = time.monotonic(), time.process_time()
     try:
         certificate = fit_mesh(mesh, name=name, budget=budget).certificate
-        point |= {key: certificate[key] for key in (*ERRORS, "hausdorff", "passed", "reason", "steps")}
+        point |= {key: certificate[key] for key in (*ERRORS, "hausdorff", "steps")}
+        point["reason"] = certificate["reason"] or certificate["caveat"]
+        point["passed"] = not point["reason"]
     except SdfsimError as error:
         point["failed"] = error.message
     point |= {"wall_s": time.monotonic() - wall, "cpu_s": time.process_time() - cpu}
@@ -105,7 +107,7 @@ def draw(points: list[dict[str, Any]], path: Path) -> None:
 
     figure, axes = pyplot.subplots(1, 2, figsize=(11, 5), layout="constrained")
     good = [p for p in points if not p["failed"] and not p["ended_by_itself"]]
-    for plot, (key, limit) in zip(axes, (LIMITS[0], LIMITS[2]), strict=True):
+    for plot, (key, limit) in zip(axes, (EXACT[0], EXACT[2]), strict=True):
         for name in dict.fromkeys(p["name"] for p in good):
             mine = [p for p in good if p["name"] == name and p[key]]
             (line,) = plot.loglog([p["cpu_s"] for p in mine], [p[key] for p in mine], "-", lw=1, label=name)

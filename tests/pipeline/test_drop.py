@@ -146,7 +146,7 @@ def test_every_part_is_fitted_in_its_own_frame_and_kept_when_killed(meshes, tmp_
 
     def fit_mesh(solid: Mesh, *, name: str, **options) -> Shape:
         fits.append((name, solid, options["budget"]))
-        certificate = {"passed": name != "object1", "reason": "too thin"}
+        certificate = {"passed": name != "object1", "reason": "too thin" if name == "object1" else "", "caveat": ""}
         return replace(analytic_shape("box", size=(0.2, 0.2, 0.2), name=name), mesh=solid, certificate=certificate)
 
     monkeypatch.setattr("sdfsim.shape.fit.fit_mesh", fit_mesh)
@@ -162,13 +162,14 @@ def test_every_part_is_fitted_in_its_own_frame_and_kept_when_killed(meshes, tmp_
 def test_a_checkpoint_that_a_kill_left_beside_its_shape_goes(meshes, tmp_path, monkeypatch):
     def fit_mesh(solid: Mesh, *, name: str, checkpoint: Path, device: str, **options) -> Shape:
         checkpoint.write_text("state")
-        certificate = {"passed": True, "reason": ""}
+        certificate = {"passed": True, "reason": "", "caveat": "rough"}
         return replace(analytic_shape("box", size=(0.2, 0.2, 0.2), name=name), mesh=solid, certificate=certificate)
 
     monkeypatch.setattr("sdfsim.shape.fit.fit_mesh", fit_mesh)
     out = tmp_path / "assets"
     out.mkdir()
-    fit_parts(meshes, out, budget=None)
+    report = fit_parts(meshes, out, budget=None)
+    assert report["passed"] and report["caveats"] == ["scene: rough", "object1: rough"]
     assert sorted(p.name for p in out.iterdir()) == ["object1", "scene"]
     (out / "object1.checkpoint").write_text("state")  # It ended between the shape's last step and this file's removal.
     fit_parts(meshes, out, budget=None)

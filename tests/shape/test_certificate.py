@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from sdfsim.shape import primitives
 from sdfsim.shape.analytic import BoxSdf, SphereSdf
-from sdfsim.shape.certificate import LIMITS, certify, thin_share, verdict
+from sdfsim.shape.certificate import EXACT, USABLE, certify, thin_share, verdict
 from sdfsim.shape.coverage import coverage, hausdorff, zero_level
 from sdfsim.shape.distance import MeshDistance, PiecesDistance
 from sdfsim.shape.mass import mass_properties
@@ -59,7 +59,7 @@ def test_the_certificate_of_the_truth_is_clean_and_json(cube: MeshDistance) -> N
     got = certify(CUBE, cube, points=2000)
     assert got["passed"]
     assert got["reason"] == ""
-    assert max(got[key] for key, _ in LIMITS) < 1e-5
+    assert max(got[key] for key, _ in EXACT) < 1e-5
     assert got["gradient_norm"] == pytest.approx([1.0, 1.0], abs=1e-6)
     assert got["far_field_ratio"] == pytest.approx(1.0, abs=1e-5)
     # The grid that finds the level cuts its edges off by 0.004: it must not show.
@@ -78,7 +78,17 @@ def test_the_certificate_of_a_lie_is_not(cube: MeshDistance) -> None:
     # From the cube's corner to the ball; every point of the ball is within the distance of its face-diagonal points.
     assert got["hausdorff_from_mesh"] == pytest.approx(3**0.5 / 2 - 0.5, abs=0.02)
     assert got["hausdorff_from_level"] == pytest.approx(0.5 - 0.5 / 3**0.5, abs=0.005)
-    assert not verdict({key: float("nan") for key, _ in LIMITS})["passed"]
+    assert not verdict({key: float("nan") for key, _ in EXACT})["passed"]
+
+
+def test_what_is_usable_but_not_exact_passes_with_a_caveat(cube: MeshDistance) -> None:
+    assert all(dict(EXACT)[key] < limit for key, limit in USABLE)
+    got = certify(shifted(CUBE, 0.0012), cube, points=500)
+    assert got["passed"] and got["reason"] == ""
+    assert got["caveat"] == "error_within_0.01 is 0.0012, exact fits have 0.001: fine detail, or too short a fit"
+    assert verdict(dict(EXACT)) == {"passed": True, "reason": "", "caveat": ""}
+    at_limit = verdict(dict(EXACT) | dict(USABLE))
+    assert at_limit["passed"] and at_limit["caveat"]
 
 
 @pytest.mark.parametrize("scale", [0.02, 1.0, 40.0])
