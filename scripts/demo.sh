@@ -1,22 +1,29 @@
 #!/usr/bin/env bash
-# The whole way on a bundled photo set: set-up, photos -> scene, scene -> motion. Leaves runs/demo/rollout/rollout.rrd.
+# The whole way on a bundled photo set: set-up, photos -> scene, scene -> motion: a ball knocks a vase off a table.
+# Usage: bash scripts/demo.sh [FOLDER [OPTION ...]]   (runs/demo; options of `sdfsim reconstruct`, such as --budget 4m)
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 bash scripts/setup.sh
+out="${1:-runs/demo}"
 sdfsim=.venv/bin/sdfsim
 
-echo "1/2  reconstructing samples/photos/table_vase (the table is 1.2 m wide)"
+echo "1/3  reconstructing samples/photos/table_vase (the table is 1.2 m wide)"
 # Two corners of the table, as one of the photos shows them.
-"$sdfsim" reconstruct samples/photos/table_vase -o runs/demo/scene --preset quick \
-    --distance 041.jpg:68,364 041.jpg:574,341 1.2
+"$sdfsim" reconstruct samples/photos/table_vase -o "$out/scene" --preset quick --drop none \
+    --distance 041.jpg:68,364 041.jpg:574,341 1.2 "${@:2}"
 
-echo "2/2  dropping a body onto it"
-"$sdfsim" simulate runs/demo/scene/scene.yaml -o runs/demo/rollout
+echo "2/3  throwing a ball at the vase"
+.venv/bin/python samples/knock.py "$out/scene" object1
+"$sdfsim" simulate "$out/scene/knock.yaml" -o "$out/rollout"
 
-cat <<'TEXT'
+echo "3/3  taking a picture"
+picture="$out/rollout/rollout.png"
+"$sdfsim" view "$out/rollout/rollout.rrd" --screenshot "$picture" --at 0.4 || picture="no picture: see above"
 
-Watch it:                 .venv/bin/sdfsim view runs/demo/rollout/rollout.rrd
-in the browser:           .venv/bin/sdfsim view runs/demo/rollout/rollout.rrd --web
-without a screen:         .venv/bin/sdfsim view runs/demo/rollout/rollout.rrd --screenshot demo.png --at 1.0
-cameras and surface:      .venv/bin/sdfsim view runs/demo/scene/reconstruction.rrd
+cat <<TEXT
+
+A picture of it:          $picture
+Watch it:                 $sdfsim view $out/rollout/rollout.rrd
+in the browser:           $sdfsim view $out/rollout/rollout.rrd --web
+cameras and surface:      $sdfsim view $out/scene/reconstruction.rrd
 TEXT

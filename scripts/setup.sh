@@ -12,10 +12,13 @@ libraries=(
     libudev.so.1:libudev1 libusb-1.0.so.0:libusb-1.0-0 libgomp.so.1:libgomp1
 )
 
-missing_libraries() {
+# Pictures without a screen need a Vulkan driver; all else works without one.
+drivers=(libvulkan.so.1:libvulkan1 libvulkan_lvp.so:mesa-vulkan-drivers)
+
+missing() {
     local known entry
     known="$(ldconfig -p 2>/dev/null || /sbin/ldconfig -p 2>/dev/null || true)"
-    for entry in "${libraries[@]}"; do
+    for entry in "$@"; do
         grep -qF "${entry%%:*} " <<<"$known" || printf '%s ' "${entry#*:}"
     done
 }
@@ -31,6 +34,7 @@ find_python() {
     done
 }
 
+# Whether it can; with a reason where it cannot.
 install_packages() {
     local as_root=()
     if [ "$(id -u)" -ne 0 ]; then
@@ -45,12 +49,12 @@ install_packages() {
         fi
     fi
     say "this machine lacks: $*"
-    say "install it, then run this again:   sudo apt-get update && sudo apt-get install -y $*"
-    exit 1
+    say "to install it:   sudo apt-get update && sudo apt-get install -y $*"
+    return 1
 }
 
 wanted=()
-read -ra absent <<<"$(missing_libraries)"
+read -ra absent <<<"$(missing "${libraries[@]}")"
 wanted+=("${absent[@]}")
 python="$(find_python)"
 if [ -z "$python" ]; then
@@ -59,12 +63,17 @@ elif [ ! -x .venv/bin/python ] && ! "$python" -c 'import ensurepip' 2>/dev/null;
     wanted+=("$(basename "$(readlink -f "$(command -v "$python")")")-venv")
 fi
 if [ "${#wanted[@]}" -gt 0 ]; then
-    install_packages "${wanted[@]}"
+    install_packages "${wanted[@]}" || exit 1
     python="$(find_python)"
     if [ -z "$python" ]; then
         say "Python 3.11, 3.12 or 3.13 is needed, and this system's package is older or newer"
         exit 1
     fi
+fi
+
+read -ra absent <<<"$(missing "${drivers[@]}")"
+if [ "${#absent[@]}" -gt 0 ]; then
+    install_packages "${absent[@]}" || say "without it, only pictures that are taken without a screen are missing"
 fi
 
 # The mark of a finished set-up: what it was made from, then the extras that are in. Those stay in.

@@ -1,0 +1,44 @@
+"""The README's first command, in its cheapest honest form, does what it shows: a ball knocks the vase off the table."""
+
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from sdfsim import Rollout, load_scene
+
+ROOT = Path(__file__).resolve().parents[2]
+BUDGET = "4m"
+TABLE = 0.55  # m, the height of its top in samples/photos/table_vase
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("demo")
+    subprocess.run(["bash", "scripts/demo.sh", str(out), "--budget", BUDGET], cwd=ROOT, check=True)
+    return out
+
+
+@pytest.mark.gate
+def test_the_vase_leaves_the_table_and_nothing_goes_through_the_floor(demo):
+    scene, rollout = load_scene(demo / "scene" / "knock.yaml"), Rollout.load(demo / "rollout" / "rollout.npz")
+    bodies = {body.name: (k, body, scene.shapes[body.shape]) for k, body in enumerate(scene.bodies)}
+    k, vase, shape = bodies["object1"]
+    high = rollout.position[:, k, 2]
+    assert high[0] > TABLE and high[-1] < 0.6 * TABLE
+    for k, body, shape in (bodies["object1"], bodies["thrown"]):
+        own = body.scale * (shape.mesh.vertices - shape.com)
+        for position, turn in zip(rollout.position[::10, k], rollout.orientation[::10, k], strict=True):
+            lowest = (Rotation.from_quat(turn).apply(own) + position)[:, 2].min()
+            assert lowest > -0.02 * np.ptp(own, axis=0).max()
+
+
+@pytest.mark.gate
+def test_a_picture_of_it_lies_beside_the_recording(demo):
+    assert (demo / "rollout" / "rollout.rrd").stat().st_size > 100_000
+    with Image.open(demo / "rollout" / "rollout.png") as picture:
+        view = np.asarray(picture.convert("RGB"), dtype=float)[100:800, 100:1100]
+    assert view.std(axis=(0, 1)).min() > 10  # something is in it

@@ -1,0 +1,41 @@
+"""The bundled model moves bodies as well as it did: MOVi-B scenes of four plain shapes, made anew by the teacher."""
+
+from pathlib import Path
+
+import pytest
+
+from sdfsim.learning.evaluate import evaluate
+from sdfsim.learning.generate import make_dataset
+from sdfsim.shape import primitives
+from sdfsim.shape.asset import analytic_shape
+from sdfsim.shape.mesh import Mesh
+
+TRAJECTORIES = 30
+
+
+def wavefront(pieces: list[Mesh]) -> str:
+    lines, before = [], 1
+    for number, piece in enumerate(pieces):
+        lines.append(f"o piece{number}")
+        lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in piece.vertices]
+        lines += [f"f {a} {b} {c}" for a, b, c in piece.faces + before]
+        before += len(piece.vertices)
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.gate
+def test_errors_on_plain_shapes_are_todays(tmp_path: Path):
+    pytest.importorskip("pybullet")
+    meshes, data = tmp_path / "meshes", tmp_path / "data"
+    shapes = {"cube": primitives.box(), "cone": primitives.cone(segments=24), "cylinder": primitives.cylinder(segments=24)}
+    for name, mesh in shapes.items():
+        (meshes / name).mkdir(parents=True)
+        for file in ("visual_geometry.obj", "collision_geometry.obj"):
+            (meshes / name / file).write_text(wavefront([mesh]))
+    analytic_shape("box", size=(1.0, 1.0, 1.0), name="cube").save(data / "shapes" / "cube")
+    make_dataset("movi-b", data, shapes=meshes, trajectories=TRAJECTORIES, seed=7, split="test")
+    report = evaluate(data, model="small", steps=50)
+    at_50 = report["model"]["50"]
+    print(at_50)
+    assert at_50["translation_rmse"] < 0.2
+    assert at_50["rotation_error"] < 12.0
