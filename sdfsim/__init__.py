@@ -16,9 +16,10 @@ if TYPE_CHECKING:
     from sdfsim.scene.load import load_scene
     from sdfsim.shape.asset import Shape, load_shape
 
-# Threads of torch that wait for one another by spinning take the processor from those they wait for: beside other
-# programs a step then takes ten times as long. Has an effect only before torch is imported.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+# Threads of torch wait for one another by spinning, and beside other programs they take the processor from those they
+# wait for: a step then takes ten times as long. So they spin for some 10 microseconds only, which costs nothing on a
+# free machine. Has an effect only before torch is imported.
+os.environ.setdefault("GOMP_SPINCOUNT", "10000")
 
 __version__ = "0.1.0"
 __all__ = ["Rollout", "SceneError", "SdfsimError", "Shape", "Simulator", "load_scene", "load_shape"]
