@@ -98,9 +98,11 @@ def hold_back(
     end = _share(bodies, found, after, _end(flown, rows), _end(after, rows), fast)
     way = torch.ones_like(end)
     if found.jumped:
-        way = _share(bodies, found, after, _way(state, flown, rows, dt), _way(state, after, rows, dt), far)
+        way = _share(bodies, found, after, _way(state, flown, rows, dt), _way(state, after, rows, dt), far).clamp_min(0.0)
     if state.earlier_position is not None:
         way = torch.minimum(way, end)  # the paper network takes its velocities from the poses
+    way = torch.where(end < 0.0, 0.0, way)  # turned by what contact made of it, it has too much energy at any speed
+    end = end.clamp_min(0.0)
     held = (torch.minimum(end, way) < 1.0)[found.island]
     if bool(held.any()):
         after = _blend(flown, after, rows, end[found.island, None], way[found.island, None])
@@ -153,8 +155,8 @@ def kinetic(bodies: Bodies, rows: Tensor, orientation: Tensor, motion: Motion) -
 def _share(bodies: Bodies, found: Balance, after: State, start: Motion, stop: Motion, most: Tensor) -> Tensor:
     """[K] how much of the way from `start` to `stop` keeps the kinetic energy of an island to `most` [K]: 1 for all.
 
-    Along it the energy is a parabola (at the orientations after the step). Where none of it keeps to `most`, its lowest
-    point is taken. What is far beyond reason is left as it is, for the check of the state to name.
+    Along it the energy is a parabola (at the orientations after the step). Where none of it keeps to `most`, the share
+    is -1. What is far beyond reason is left as it is, for the check of the state to name.
     """
 
     def energy(motion: Motion) -> Tensor:
@@ -168,8 +170,9 @@ def _share(bodies: Bodies, found: Balance, after: State, start: Motion, stop: Mo
     square = energy((stop[0] - start[0], stop[1] - start[1])).clamp_min(torch.finfo(most.dtype).tiny)
     middle = -0.5 * (reached - lowest - square) / square
     inside = middle.square() + (most - lowest) / square
-    share = (middle + inside.clamp_min(0.0).sqrt()).clamp(0.0, 1.0)
-    return torch.where(over, share, 1.0)
+    share = middle + inside.clamp_min(0.0).sqrt()
+    none = (inside < 0.0) | (share < 0.0)
+    return torch.where(over, torch.where(none, -1.0, share.clamp_max(1.0)), 1.0)
 
 
 def _blend(flown: State, after: State, rows: Tensor, end: Tensor, way: Tensor) -> State:
