@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # The whole way on a bundled photo set: set-up, photos -> scene, scene -> motion: a ball knocks a vase off a table.
-# Usage: bash scripts/demo.sh [FOLDER [OPTION ...]]   (runs/demo; options of `sdfsim reconstruct`, such as --budget 4m)
+# Usage: bash scripts/demo.sh [FOLDER]   (default: runs/demo)
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 bash scripts/setup.sh
@@ -10,7 +10,7 @@ sdfsim=.venv/bin/sdfsim
 echo "1/3  reconstructing samples/photos/table_vase (the table is 1.2 m wide)"
 # Two corners of the table, as one of the photos shows them.
 "$sdfsim" reconstruct samples/photos/table_vase -o "$out/scene" --preset quick --drop none \
-    --distance 041.jpg:68,364 041.jpg:574,341 1.2 "${@:2}"
+    --distance 041.jpg:68,364 041.jpg:574,341 1.2
 
 echo "2/3  throwing a ball at the vase"
 .venv/bin/python samples/knock.py "$out/scene" object1

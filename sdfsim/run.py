@@ -78,8 +78,8 @@ def simulate(
         guard: "energy" holds back contact that makes energy.
 
     Returns:
-        The content of report.json; `failed_checks` names the shapes that were fitted for this scene and missed their
-        certificate.
+        The content of report.json; of the shapes that were fitted for this scene, `failed_checks` names those that are
+        not usable, and `caveats` those that are not exact.
 
     Raises:
         SdfsimError: bad input, an output that cannot be written, another run that writes to the same folder, or a
@@ -158,6 +158,7 @@ def simulate(
         report["folder"] = str(out)
         report["identity"] = kept.identity
         report["failed_checks"] = [f"fit of shape {told}" for told in scene.missed]
+        report["caveats"] = [f"fit of shape {told}" for told in scene.caveats]
         if until_settled:
             report["settled"] = settled
         if isinstance(broken, SdfsimError):

@@ -63,6 +63,7 @@ def simulate(
             *run.cost_lines(report),
             f"wrote {out}",
             *(f"outside the model's training: {line}" for line in report["outside_training"]),
+            *(f"usable, not exact: {line}" for line in report["caveats"]),
         ]
         tell_failed(session, report)
         if "recording" in report:

@@ -57,7 +57,8 @@ def load_scene(path: Path | str, on_progress: Progress | None = None, *, allow_o
         effects=spec.effects,
         limits=spec.limits,
         path=path,
-        missed=tuple(f"{s.name}: {s.certificate['reason']}" for s in fitted if not s.certificate.get("passed", True)),
+        missed=tuple(f"{s.name}: {s.certificate['reason']}" for s in fitted if s.certificate.get("reason")),
+        caveats=tuple(f"{s.name}: {s.certificate['caveat']}" for s in fitted if s.certificate.get("caveat")),
     )
 
 

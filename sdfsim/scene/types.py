@@ -101,7 +101,8 @@ class Scene:
         effects: what the file asked for.
         limits: what a run must keep to.
         path: the file it came from, if any.
-        missed: shapes fitted for this scene whose certificate was not met, with the reason, one line each.
+        missed: shapes fitted for this scene that are not usable, with the reason, one line each.
+        caveats: those that are, but are not as exact as fits can be; one line each.
     """
 
     shapes: tuple[Shape, ...]
@@ -114,3 +115,4 @@ class Scene:
     limits: Limits = Limits()
     path: Path | None = None
     missed: tuple[str, ...] = ()
+    caveats: tuple[str, ...] = ()

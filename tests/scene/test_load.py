@@ -206,15 +206,18 @@ def test_a_model_file_is_taken_from_the_scenes_folder(tmp_path):
         assert load_scene(file, allow_outside=True).model == meant
 
 
-def test_a_shape_that_missed_its_certificate_is_named(load, monkeypatch):
+def test_a_shape_that_is_not_exact_is_named(load, monkeypatch):
     text = "version: 1\nshapes:\n  b: {primitive: {name: box}}\nbodies:\n  - {name: a, shape: b}\n"
-    for certificate, missed in (
-        ({"passed": True, "reason": ""}, ()),
-        ({"passed": False, "reason": "thin walls"}, ("b: thin walls",)),
+    for certificate, told in (
+        ({}, ((), ())),
+        ({"passed": True, "reason": "", "caveat": ""}, ((), ())),
+        ({"passed": True, "reason": "", "caveat": "rough"}, ((), ("b: rough",))),
+        ({"passed": False, "reason": "thin walls", "caveat": ""}, (("b: thin walls",), ())),
     ):
         shape = replace(analytic_shape("box", size=(1, 1, 1), name="b"), certificate=certificate)
         monkeypatch.setattr("sdfsim.scene.load.shape_from_primitive", lambda *a, shape=shape, **k: shape)
-        assert load(text).missed == missed
+        scene = load(text)
+        assert (scene.missed, scene.caveats) == told
 
 
 def test_a_wrong_kind_of_sdf_is_one_fault_not_two(load):
