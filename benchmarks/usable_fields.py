@@ -151,7 +151,7 @@ def scene_on(table: Shape, gap: float) -> Scene:
 
 
 def behaviour(table: Shape, model: str) -> dict[str, np.ndarray]:
-    """Of cubes `height` [C] m and `creep` [C] m/s at rest; of balls `after` [B, 2] m/s, sideways after the first hit."""
+    """Of cubes `height` [C] m and `creep` [C] m/s at rest; of balls `after` [B, 2] m/s, sideways after a hit."""
     laid = Simulator(scene_on(table, 0.0), model).run(SECONDS)
     fallen = Simulator(scene_on(table, HEIGHT), model).run(SECONDS)
     count = ROWS * ROWS

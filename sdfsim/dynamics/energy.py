@@ -98,7 +98,8 @@ def hold_back(
     end = _share(bodies, found, after, _end(flown, rows), _end(after, rows), fast)
     way = torch.ones_like(end)
     if found.jumped:
-        way = _share(bodies, found, after, _way(state, flown, rows, dt), _way(state, after, rows, dt), far).clamp_min(0.0)
+        way = _share(bodies, found, after, _way(state, flown, rows, dt), _way(state, after, rows, dt), far)
+        way = way.clamp_min(0.0)
     if state.earlier_position is not None:
         way = torch.minimum(way, end)  # the paper network takes its velocities from the poses
     way = torch.where(end < 0.0, 0.0, way)  # turned by what contact made of it, it has too much energy at any speed

@@ -117,7 +117,8 @@ def certify(
         (median 1 - cosine), `gradient_norm` (median) with `gradient_norm_p5` and `gradient_norm_p95`, and
         `projected` (mean); None in bins of fewer than 20 points.
 
-        `coverage` of the nodes as in `coverage.coverage`, if there are any; and `passed`, `reason` and `caveat` of `verdict`.
+        `coverage` of the nodes as in `coverage.coverage`, if there are any; and `passed`, `reason` and `caveat` of
+        `verdict`.
     """
     # A stream of its own, so that no seed of the fit draws these points.
     rng = np.random.default_rng([seed, 0xCE47])
@@ -173,10 +174,12 @@ def verdict(errors: dict) -> dict:
         return next(((key, limit) for key, limit in limits if not errors[key] <= limit), None)
 
     if wrong := missed(USABLE):
-        return {"passed": False, "reason": f"{wrong[0]} is {errors[wrong[0]]:.2g}, allowed {wrong[1]:.2g}", "caveat": ""}
-    rough = missed(EXACT)
-    told = f"{rough[0]} is {errors[rough[0]]:.2g}, exact fits have {rough[1]:.2g}" if rough else ""
-    return {"passed": True, "reason": "", "caveat": told}
+        key, limit = wrong
+        return {"passed": False, "reason": f"{key} is {errors[key]:.2g}, allowed {limit:.2g}", "caveat": ""}
+    if rough := missed(EXACT):
+        key, limit = rough
+        return {"passed": True, "reason": "", "caveat": f"{key} is {errors[key]:.2g}, exact fits have {limit:.2g}"}
+    return {"passed": True, "reason": "", "caveat": ""}
 
 
 def cause(oracle: DistanceOracle, thin: float = THIN, *, seed: int = 1) -> str:
