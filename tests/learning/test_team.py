@@ -42,14 +42,16 @@ def test_the_parts_losses_add_up_to_the_whole_batchs_loss(ball_data):
     assert sum(loss for loss, _ in parts) == pytest.approx(whole[0], rel=1e-5)
 
 
-def test_two_processes_give_the_first_steps_of_one(ball_data, tmp_path):
-    train(ball_data, tmp_path / "one", preset="small", steps=3)
+def test_two_processes_have_the_gradients_of_one(ball_data, tmp_path):
+    """After one step an optimiser's momentum is a multiple of the gradient. Weights would not do: they move by as much
+    where a gradient is next to zero, in a direction that rounding decides."""
+    train(ball_data, tmp_path / "one", preset="small", steps=1)
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
-    command += ["-m", "sdfsim.learning.train", str(ball_data), str(tmp_path / "two"), "--steps", "3", "--device", "cpu"]
-    subprocess.run(command, cwd=ROOT, check=True, capture_output=True, timeout=300)
+    command += ["-m", "sdfsim.learning.train", str(ball_data), str(tmp_path / "two"), "--steps", "1", "--device", "cpu"]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True, timeout=600)
     one, two = (dict(np.load(tmp_path / name / "checkpoint.npz")) for name in ("one", "two"))
-    trained = [name for name in one if name.startswith("network/")]
-    difference = np.concatenate([np.abs(one[name] - two[name]).ravel() for name in trained])
-    start = np.concatenate([np.abs(one[name] - one[name.replace("network", "average")]).ravel() for name in trained])
-    # Sums in another order differ by rounding, which first steps make visible where a gradient is next to zero.
-    assert start.max() > 1e-4 and np.quantile(difference, 0.99) < 0.05 * start.max()
+    momenta = [name for name in one if name.endswith(("/exp_avg", "/momentum_buffer"))]
+    assert len(momenta) == sum(name.startswith("network/") for name in one)
+    assert max(np.abs(one[name]).max() for name in momenta) > 1e-4
+    for name in momenta:
+        assert np.abs(one[name] - two[name]).max() <= 1e-4 * np.abs(one[name]).max(), name
