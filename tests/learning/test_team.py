@@ -52,6 +52,7 @@ def test_two_processes_have_the_gradients_of_one(ball_data, tmp_path):
     one, two = (dict(np.load(tmp_path / name / "checkpoint.npz")) for name in ("one", "two"))
     momenta = [name for name in one if name.endswith(("/exp_avg", "/momentum_buffer"))]
     assert len(momenta) > 100
-    assert max(np.abs(one[name]).max() for name in momenta) > 1e-4
-    for name in momenta:
-        assert np.abs(one[name] - two[name]).max() <= 1e-4 * np.abs(one[name]).max(), name
+    largest = max(np.abs(one[name]).max() for name in momenta)
+    assert largest > 1e-4
+    for name in momenta:  # attention is the same whatever its bias is: that one's gradient is rounding alone
+        assert np.abs(one[name] - two[name]).max() <= 1e-4 * np.abs(one[name]).max() + 1e-7 * largest, name
