@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,7 +60,6 @@ class Bodies:
         moves: [N] bool, True for dynamic bodies: they fly, and contacts push them.
         bounds: [N, 2, 3] float64, box of the solid about the centre of mass, shape axes, scaled.
         size: [N] float64, largest side of `bounds` (infinite for a plane).
-        disc: [N] float64, see the function of this name.
         radius: [N] float64, how far `bounds` reach from the centre of mass (infinite for a plane).
         node: [M, 3] float64, surface nodes about the centre of mass, shape axes, scaled.
         node_start: [N + 1] int64, body k owns nodes node_start[k] : node_start[k + 1].
@@ -83,7 +81,6 @@ class Bodies:
     moves: Tensor
     bounds: Tensor
     size: Tensor
-    disc: Tensor
     radius: Tensor
     node: Tensor
     node_start: Tensor
@@ -159,19 +156,6 @@ def awake(bodies: Bodies, state: State) -> Tensor:
     return moves.nonzero()[:, 0]
 
 
-def disc(bounds: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
-    """[N] radius of bodies with `bounds` [N, 2, 3] about their centres of mass; infinite for a plane.
-
-    Half the diagonal of the box, and how far its middle is off: with this measure the engine of the training data
-    scales the distance at which it begins to act on a contact.
-    """
-    bounds = np.asarray(bounds)
-    finite = np.asarray(np.isfinite(bounds).all((1, 2)))
-    box = np.where(finite[:, None, None], bounds, 0.0)
-    radius = np.linalg.norm(box.mean(1), axis=-1) + 0.5 * np.linalg.norm(box[:, 1] - box[:, 0], axis=-1)
-    return np.where(finite, radius, np.inf)
-
-
 def from_scene(
     scene: Scene, units: Units, device: torch.device, nodes_a_body: int | None = None
 ) -> tuple[Bodies, State]:
@@ -219,7 +203,6 @@ def from_scene(
         bounds=tensor(bounds),
         size=tensor((bounds[:, 1] - bounds[:, 0]).max(-1)),
         radius=tensor(np.linalg.norm(np.abs(bounds).max(1), axis=-1)),
-        disc=tensor(disc(bounds)),
         node=tensor(np.concatenate(nodes).reshape(-1, 3)),
         node_start=tensor(np.concatenate([[0], np.cumsum([len(n) for n in nodes])]), torch.int64),
         group=tensor(group, torch.int64),

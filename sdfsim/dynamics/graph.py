@@ -12,9 +12,8 @@ import torch
 from torch import Tensor
 
 REST_SPEED = 0.2  # model units: what gravity adds to a speed in one step of training; slower counts as resting
-EDGE_FEATURES = 34
-SUBSTEPS = 5  # inner steps of the engine that the training data come from, in one step
-SHELL = 0.02  # of a body's radius: that engine acts on contacts nearer than this
+EDGE_FEATURES = 32
+SUBSTEPS = 5  # inner steps in one step of the engine that the training data come from; some recordings have fewer
 
 
 @dataclass(frozen=True)
@@ -36,7 +35,7 @@ class ContactGraph:
         normal: [E, 3], outward from `second`.
         arm_first, arm_second: [E, 3].
         gap: [E] signed distance.
-        shell: [E] distance below which the engine acts on the contact.
+        substeps: [E] inner steps that the engine makes in this step, at most `SUBSTEPS`.
         friction, restitution: [E] products of the two bodies' coefficients.
         dt: the step.
     """
@@ -57,7 +56,7 @@ class ContactGraph:
     arm_first: Tensor
     arm_second: Tensor
     gap: Tensor
-    shell: Tensor
+    substeps: Tensor
     friction: Tensor
     restitution: Tensor
     dt: float
@@ -166,27 +165,29 @@ def relative_velocity(graph: ContactGraph, velocity: Tensor, angular: Tensor) ->
 
 
 def _meeting(g: ContactGraph, normal_motion: Tensor, speed: Tensor) -> Tensor:
-    """[E, 9] where and when an engine of finite inner steps would first act on a contact, if all flew on till then.
+    """[E, 7] where and when an engine of finite inner steps would first act on a contact, if all flew on till then.
 
-    Whether a body is hit in this step, how long it flies on before, and how far from the surface it is turned around
-    follow from the inner step at which its distance is first found below `shell`. That is a matter of quotients and
-    thresholds, which are known and which a small network learns badly.
+    Such an engine acts on surfaces that touch or overlap at the start of an inner step. Whether a body is hit in this
+    step, how long it flies on before, and how deep it is by then follow from the first such inner step. That is a
+    matter of quotients and thresholds, which are known and which a small network learns badly.
 
     Args:
         g: the graph.
         normal_motion: [E, 3] along the normal: relative velocity, and what gravity and turning add to it in a step.
         speed: [E, 1], the scale.
     """
-    inner = g.dt / SUBSTEPS
-    start, gain = normal_motion[:, 0], normal_motion[:, 1:].sum(-1) / SUBSTEPS  # velocity, and its change an inner step
+    inner = g.dt / g.substeps
+    # Relative velocity, and its change in an inner step.
+    start, gain = normal_motion[:, 0], normal_motion[:, 1:].sum(-1) / g.substeps
     count = torch.arange(SUBSTEPS, dtype=start.dtype, device=start.device)
     # Symplectic Euler, as engines do it: [E, SUBSTEPS] distances at the start of each inner step.
-    path = g.gap[:, None] + inner * (start[:, None] * count + gain[:, None] * count * (count + 1) / 2)
-    seen = (path < g.shell[:, None]).to(start.dtype)
-    own = (1.0 - seen.cummax(1).values).sum(1)  # inner steps before the contact is seen, SUBSTEPS: not in this step
+    path = g.gap[:, None] + inner[:, None] * (start[:, None] * count + gain[:, None] * count * (count + 1) / 2)
+    seen = ((path <= 0.0) & (count < g.substeps[:, None])).to(start.dtype)
+    # Part of the step that is over before the contact is seen; 1: it is not seen in this step.
+    own = ((1.0 - seen.cummax(1).values).sum(1) / g.substeps).clamp_max(1.0)
 
     def earliest(rows: int, *index: Tensor) -> Tensor:
-        first = torch.full((rows,), float(SUBSTEPS), dtype=start.dtype, device=start.device)
+        first = torch.ones(rows, dtype=start.dtype, device=start.device)
         for which in index:
             first = first.scatter_reduce(0, which, own, "amin")
         return first
@@ -194,22 +195,13 @@ def _meeting(g: ContactGraph, normal_motion: Tensor, speed: Tensor) -> Tensor:
     of_pair = earliest(g.pairs, g.pair)[g.pair]
     of_body = earliest(len(g.inverse_mass), g.first, g.second)
     # Scenery meets many at once, which is of no account to any of them.
-    of_body = torch.where(g.inverse_mass > 0, of_body, torch.full_like(of_body, float(SUBSTEPS)))
-    at = of_pair.clamp_max(SUBSTEPS - 1)
+    of_body = torch.where(g.inverse_mass > 0, of_body, torch.ones_like(of_body))
+    at = torch.minimum((of_pair * g.substeps).round(), g.substeps - 1)
     distance = path.gather(1, at.long()[:, None])[:, 0]
     arriving = (start + gain * (at + 1)) / speed[:, 0]
     reach = inner * speed[:, 0]
-    times = torch.stack([own, of_pair, of_body[g.first], of_body[g.second]], -1) / SUBSTEPS
-    places = torch.stack(
-        [
-            torch.asinh(distance / reach),
-            (distance / g.shell).clamp(-3.0, 3.0),
-            (distance < g.shell).to(start.dtype),
-            arriving,
-            torch.asinh(g.shell / reach),
-        ],
-        -1,
-    )
+    times = torch.stack([own, of_pair, of_body[g.first], of_body[g.second]], -1)
+    places = torch.stack([torch.asinh(distance / reach), (distance <= 0.0).to(start.dtype), arriving], -1)
     return torch.cat([times, places], -1)
 
 

@@ -17,7 +17,7 @@ from sdfsim.dynamics.bodies import Bodies, State, awake
 from sdfsim.dynamics.contacts import Contacts, find_contacts, no_contacts
 from sdfsim.dynamics.energy import Guard, hold_back
 from sdfsim.dynamics.freeflight import ballistic, torque_free
-from sdfsim.dynamics.graph import SHELL, ContactGraph, number_pairs
+from sdfsim.dynamics.graph import SUBSTEPS, ContactGraph, number_pairs
 from sdfsim.dynamics.impulse import Velocities
 from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.model import Model
@@ -36,6 +36,7 @@ class Rules:
     Attributes:
         gravity: [3] float64.
         dt: the step.
+        substeps: inner steps of the engine whose motion is asked for.
         falls: False where gravity is zero: free flight without acceleration.
         contact: False leaves every body in free flight.
         friction: False computes no tangential impulse.
@@ -48,6 +49,7 @@ class Rules:
 
     gravity: Tensor
     dt: float
+    substeps: int = SUBSTEPS
     falls: bool = True
     contact: bool = True
     friction: bool = True
@@ -198,7 +200,7 @@ def contact_graph(
         arm_first=contacts.arm.float(),
         arm_second=contacts.foot.float(),
         gap=contacts.distance.float(),
-        shell=(SHELL * torch.minimum(bodies.disc[contacts.owner], bodies.disc[contacts.body])).float(),
+        substeps=torch.full_like(contacts.distance, rules.substeps).float(),
         friction=(_product(bodies.friction, contacts) if rules.friction else nothing).float(),
         restitution=(_product(bodies.restitution, contacts) if rules.restitution else nothing).float(),
         dt=rules.dt,

@@ -19,6 +19,8 @@ from sdfsim.learning.evaluate import evaluate
 from sdfsim.learning.presets import PRESETS, Preset
 from sdfsim.learning.recipes import RECIPES
 
+MODEL, BASELINE = "this model", "flying on without contact"  # in the tables of a card
+
 
 def bundle(
     path: Path,
@@ -26,6 +28,7 @@ def bundle(
     name: str,
     folder: Path = BUNDLED,
     seeds: Sequence[Path] = (),
+    at_frames: Path | None = None,
 ) -> dict:
     """Evaluate a trained model on the test split of `data`, then write `NAME.safetensors` and its card `NAME.md`.
 
@@ -35,10 +38,11 @@ def bundle(
         name: the bundled model's name.
         folder: of the bundled models.
         seeds: models of the same preset trained from other seeds; the range of their errors goes into the card.
+        at_frames: a dataset of 60 frames a second with test/, for the protocol of errors at a frame alone.
 
     Returns:
-        The evaluation's report; `other_seeds` holds the errors of `seeds`, `as_published` those of a paper network that
-        predicts free flight too (None for other networks).
+        The evaluation's report; `at_frames` is that of the other dataset (None without one), `other_seeds` holds the
+        errors of `seeds`, `as_published` those of a paper network that predicts free flight too (None for others).
 
     Raises:
         SdfsimError: a model of `seeds` is of another preset, or the same again.
@@ -50,6 +54,7 @@ def bundle(
     report["as_published"] = None
     if model.kind == "paper":
         report["as_published"] = evaluate(data, model=model, free_flight="learned", errors_only=True)["model"]
+    report["at_frames"] = None if at_frames is None else evaluate(at_frames, model=model, chaos_floor=True)
     kept = ("model", "ballistic", "other_seeds", "as_published", "chaos_floor", "median_survival_s")
     kept += ("penetration", "energy_gain", "resting_speed")
     results = {"errors": {what: report[what] for what in kept}, "test_trajectories": report["trajectories"]}
@@ -86,7 +91,6 @@ def card_text(model: Model, report: dict) -> str:
     """The model card as Markdown."""
     parameters = sum(p.numel() for p in model.network.parameters())
     card, preset = model.card, model.card["preset"]
-    names = {"name": "this model", "ballistic": "flying on without contact"}
     folders = _folders(card["data"])
     extra: tables.Rows = []
     if published := report["as_published"]:
@@ -115,7 +119,7 @@ def card_text(model: Model, report: dict) -> str:
         "",
         *(f"    {line}" for line in _commands(card, folders)),
         f"    python -m sdfsim.learning.bundle RUN/model.safetensors {folders[0]} --name {model.name}"
-        f"{' --seeds OTHERS' if others else ''}",
+        f"{' --seeds OTHERS' if others else ''}{' --at-frames MOVI-B-60' if report['at_frames'] else ''}",
         "",
         "## Ranges it has seen",
         "",
@@ -130,15 +134,27 @@ def card_text(model: Model, report: dict) -> str:
         f"{report['trajectories']} test trajectories ({report['bodies']} bodies) of the same recipe, all rolled out",
         "from their first frame: translation RMSE and mean rotation error; 95 % intervals over trajectories.",
         "",
-        *_markdown(tables.error_rows(report, **names, extra=extra)),
+        *_markdown(tables.error_rows(report, name=MODEL, ballistic=BASELINE, extra=extra)),
+        *_at_frames(report),
         "",
         "## Quality of the motion",
         "",
-        *_markdown(tables.quality_rows(report, **names)),
+        *_markdown(tables.quality_rows(report, name=MODEL, ballistic=BASELINE)),
         "",
         *(f"- {line}" for line in tables.notes(report)),
     ]
     return "\n".join(lines) + "\n"
+
+
+def _at_frames(report: dict) -> list[str]:
+    """The other protocol's table, where it was measured."""
+    other = report["at_frames"]
+    if other is None:
+        return []
+    told = f"{other['trajectories']} test trajectories of {1 / other['dt']:.0f} frames a second, in a frame alone:"
+    about = "translation is the mean over trajectories of the RMSE over bodies."
+    rows = tables.error_rows(other, name=MODEL, ballistic=BASELINE, at_frame=True)
+    return ["", told, about, "", *_markdown(rows)]
 
 
 def _cast(made: dict) -> str:
@@ -217,9 +233,10 @@ def main() -> None:
     parser.add_argument("model", type=Path)
     parser.add_argument("data", type=Path)
     parser.add_argument("--name", required=True)
+    parser.add_argument("--at-frames", type=Path, help="dataset of 60 frames a second: errors at frames alone")
     parser.add_argument("--seeds", type=Path, nargs="+", default=[], help="models of the same preset, other seeds")
     args = parser.parse_args()
-    report = bundle(args.model, args.data, args.name, seeds=args.seeds)
+    report = bundle(args.model, args.data, args.name, seeds=args.seeds, at_frames=args.at_frames)
     print(json.dumps({k: report[k] for k in ("model", "ballistic", "other_seeds")}, indent=2))
 
 

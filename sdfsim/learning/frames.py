@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from sdfsim.dynamics.bodies import disc
 from sdfsim.dynamics.freeflight import torque_free
+from sdfsim.dynamics.graph import SUBSTEPS
 from sdfsim.dynamics.pose import conjugate, multiply, to_rotvec
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_arrays, write_arrays
@@ -25,12 +25,17 @@ from sdfsim.learning.dataset import Trajectory, check_alike, load_shapes, trajec
 from sdfsim.learning.instants import at_instants, engine_substep
 from sdfsim.parallel import parallel
 
-FRAMES_VERSION = 5  # counts up whenever frames of the same recordings come out differently
+STEP = 0.02  # s, the step that networks know
+FRAMES_VERSION = 6  # counts up whenever frames of the same recordings come out differently
 
 
 @dataclass(frozen=True)
 class ContactFrames:
-    """F frames with contact out of many trajectories, flattened; SI units.
+    """F frames with contact out of many trajectories, flattened.
+
+    Units are metres and seconds where the recorded step is `STEP`. Recordings of other steps are told in units in which
+    it is that long and gravity is what it is (Froude scaling): to a network, which knows no other step, their bodies
+    are larger or smaller.
 
     A frame holds its trajectory's bodies that move or not, at the start of a step (rows of the body arrays), and
     its contact edges. `second` = -1 means the floor.
@@ -41,13 +46,13 @@ class ContactFrames:
         free_angular, mean_angular: [B, 3] rad/s in free flight, at the end of the step and as its mean.
         end_velocity, end_angular, moved, turned: [B, 3] recorded: velocities at the end of the step, and mean
             linear and angular velocity over it.
-        mass: [B] kg, 0 for static bodies; inertia: [B, 3]; friction, restitution, size: [B];
-            disc: [B] m, radius about the centre of mass (`bodies.disc`).
+        mass: [B] kg, 0 for static bodies; inertia: [B, 3]; friction, restitution, size: [B].
+        substeps: [F] uint8, inner steps of the engine in one step.
         first, second: [E] int16, bodies within the frame.
         arm: [E, 3] m, from the first body's centre of mass to the point of contact.
         other: [E, 3] m, what leads to there from the second's (from the floor's origin), less `arm`.
         normal: [E, 3]; gap: [E] m.
-        dt: s; gravity: [3] m/s^2; reach: m, the contact radius used.
+        dt: s, `STEP`; gravity: [3] m/s^2; reach: m, the contact radius used.
         trajectories: [K] int64, how many were searched, of each of the K sets that were joined; 0 where unknown.
     """
 
@@ -67,7 +72,7 @@ class ContactFrames:
     friction: np.ndarray
     restitution: np.ndarray
     size: np.ndarray
-    disc: np.ndarray
+    substeps: np.ndarray
     first: np.ndarray
     second: np.ndarray
     arm: np.ndarray
@@ -145,7 +150,7 @@ def contact_frames(
         parts[index] = part
         if on_progress:
             on_progress(done / len(files), f"contacts of {split} trajectory {done} of {len(files)}")
-    frames = _concatenate(parts, Trajectory.load(files[0]), reach)
+    frames = _concatenate(parts, Trajectory.load(files[0]).gravity, reach)
     folder.mkdir(exist_ok=True)
     for old in folder.glob(f"{split}-{reach:g}-*.npz"):
         old.unlink()
@@ -192,12 +197,42 @@ def _shape(folder: Path, name: str):
 def _of_file(path: Path, reach: float) -> dict[str, np.ndarray]:
     from sdfsim.learning.merge import find_edges  # needs the SDFs, hence more than torch and numpy
 
-    trajectory = at_instants(Trajectory.load(path), engine_substep(path.parent))
+    substep = engine_substep(path.parent)
+    trajectory = at_instants(Trajectory.load(path), substep)
+    substeps = inner_steps(trajectory.dt, substep)
+    trajectory = in_steps_of(trajectory, STEP)
     shapes = {str(n): _shape(path.parent, str(n)) for n in trajectory.shape}
-    return _of_trajectory(trajectory, find_edges(trajectory, shapes, reach), shapes)
+    return _of_trajectory(trajectory, find_edges(trajectory, shapes, reach), shapes, substeps)
 
 
-def _of_trajectory(t: Trajectory, edges: dict[str, np.ndarray], shapes) -> dict[str, np.ndarray]:
+def in_steps_of(t: Trajectory, dt: float) -> Trajectory:
+    """The same motion in units of time in which its step is `dt`, and of length in which gravity stays what it is."""
+    time = t.dt / dt
+    length = time**2
+    return replace(
+        t,
+        position=t.position / length,
+        velocity=t.velocity / (length / time),
+        angular_velocity=t.angular_velocity * time,
+        scale=t.scale / length,
+        inertia=t.inertia / length**2,
+        dt=dt,
+    )
+
+
+def inner_steps(dt: float, substep: float) -> int:
+    """Inner steps of `substep` s in a recorded step of `dt` s; what is not told (0) counts as in our own recordings.
+
+    Raises:
+        SdfsimError: more than a network knows of.
+    """
+    count = round(dt / substep) if substep > 0 else SUBSTEPS
+    if not 1 <= count <= SUBSTEPS:
+        raise SdfsimError(f"recorded steps of {dt:g} s hold {count} inner ones of the engine", f"at most {SUBSTEPS}")
+    return count
+
+
+def _of_trajectory(t: Trajectory, edges: dict[str, np.ndarray], shapes, substeps: int) -> dict[str, np.ndarray]:
     """One trajectory's part of the arrays. `edges` come sorted by frame, `frame` telling which."""
     count = np.bincount(edges["frame"], minlength=len(t.position) - 1)
     used = np.flatnonzero(count)
@@ -234,16 +269,17 @@ def _of_trajectory(t: Trajectory, edges: dict[str, np.ndarray], shapes) -> dict[
         "friction": each(t.friction),
         "restitution": each(t.restitution),
         "size": each(extent),
-        "disc": each(disc([shapes[str(n)].sdf.bounds for n in t.shape]) * t.scale),
+        "substeps": np.full(len(used), substeps),
     } | {k: edges[k] for k in ("first", "second", "arm", "other", "normal", "gap")}
 
 
-def _concatenate(parts: list[dict[str, np.ndarray]], like: Trajectory, reach: float) -> ContactFrames:
+def _concatenate(parts: list[dict[str, np.ndarray]], gravity: np.ndarray, reach: float) -> ContactFrames:
     joined = {k: np.concatenate([p[k] for p in parts]) for k in parts[0]}
     starts = {
         "body_start": np.concatenate([[0], np.cumsum(joined.pop("bodies"))]),
         "edge_start": np.concatenate([[0], np.cumsum(joined.pop("edges"))]),
     }
-    small = {k: v.astype(np.int16 if k in ("first", "second") else np.float32) for k, v in joined.items()}
-    common = {"dt": like.dt, "gravity": like.gravity, "reach": reach, "trajectories": np.array([len(parts)])}
+    kinds = {"first": np.int16, "second": np.int16, "substeps": np.uint8}
+    small = {k: v.astype(kinds.get(k, np.float32)) for k, v in joined.items()}
+    common = {"dt": STEP, "gravity": gravity, "reach": reach, "trajectories": np.array([len(parts)])}
     return ContactFrames(**starts, **small, **common)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sdfsim.dynamics import pose
-from sdfsim.dynamics.graph import SHELL, ContactGraph, number_pairs
+from sdfsim.dynamics.graph import ContactGraph, number_pairs
 from sdfsim.dynamics.impulse import ImpulseNetwork, Velocities
 from sdfsim.learning.dataset import FLOOR, product_range
 from sdfsim.learning.frames import ContactFrames
@@ -161,7 +161,7 @@ class ImpulseTask:
             arm_first=arm,
             arm_second=arm + other,
             gap=gap,
-            shell=SHELL * _nearer(body(f.disc, np.inf), index),
+            substeps=torch.from_numpy(f.substeps[picked][edge_of].astype(np.float32)).to(self.device),
             dt=f.dt,
             **coefficients,
         )
@@ -252,10 +252,6 @@ def _mass_ratio(f: ContactFrames) -> float:
 
 def _product(coefficient: Tensor, index: Tensor) -> Tensor:
     return coefficient[index[0]] * coefficient[index[1]]
-
-
-def _nearer(radius: Tensor, index: Tensor) -> Tensor:
-    return torch.minimum(radius[index[0]], radius[index[1]])
 
 
 def _ranges(start: np.ndarray, picked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

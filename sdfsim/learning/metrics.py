@@ -7,6 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim.learning.dataset import Trajectory
 
+HORIZONS = (50, 100)  # steps; errors over all steps up to there are what Rubanova et al. 2024 report
+FRAMES = (25, 50, 75, 100)  # steps; errors there are what HOPNet (Wei et al. 2025) and RigidFormer (2026) report
 REST_SPEED = 0.05  # m/s, what rests in a recording is slower than this
 REST_STEPS = 10  # the last steps, in which it has to be
 

@@ -9,6 +9,7 @@ import torch
 
 from sdfsim.dynamics.bodies import Units
 from sdfsim.dynamics.energy import Guard
+from sdfsim.dynamics.graph import SUBSTEPS
 from sdfsim.dynamics.history import with_history
 from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.model import Model
@@ -33,6 +34,7 @@ def roll_out(
     contact: bool = True,
     sleep: bool = False,
     guard: Guard = "none",
+    substeps: int = SUBSTEPS,
     floor: tuple[float, float] = FLOOR,
 ) -> list[Trajectory]:
     """Simulate one batch from its first frames.
@@ -48,6 +50,7 @@ def roll_out(
         contact: False leaves every body in free flight.
         sleep: freeze what has come to rest.
         guard: "energy" holds back contact that makes energy.
+        substeps: inner steps that the recording engine makes in one step.
         floor: its friction and restitution.
 
     Returns:
@@ -59,7 +62,7 @@ def roll_out(
     units = model_units(model, group[0])
     bodies, state = merged(group, [0] * len(group), shapes, units, device, floor)
     gravity = torch.tensor(group[0].gravity / units.acceleration, dtype=torch.float64, device=device)
-    rules = Rules(gravity=gravity, dt=model.dt, contact=contact, free_flight=free_flight, guard=guard)
+    rules = Rules(gravity, model.dt, substeps, contact=contact, free_flight=free_flight, guard=guard)
     if model.kind == "paper":
         state = with_history(state, bodies, rules)
     if sleep:

@@ -4,47 +4,65 @@ from __future__ import annotations
 
 from typing import Any
 
+from sdfsim.learning import metrics
+
 SURVIVED = "0.25"  # m, the limit whose median survival time is shown
 NOTHING = "-"
 Rows = list[tuple[str, ...]]
 
 
-def error_rows(report: dict[str, Any], *, name: str, ballistic: str, extra: Rows | None = None) -> Rows:
+def error_rows(
+    report: dict[str, Any], *, name: str, ballistic: str, at_frame: bool = False, extra: Rows | None = None
+) -> Rows:
     """Errors at every horizon, a row each for the model, the teacher run again, and flight without contact.
 
     Args:
         report: of `evaluate`.
         name: what the model is called.
         ballistic: what the baseline is called.
+        at_frame: errors in a frame alone, at those of `metrics.FRAMES`; else over all steps up to a horizon.
         extra: further rows, below the model's (see `error_cells` and `range_cells`).
     """
     head = [""]
-    for steps, errors in report["model"].items():
-        time = f"{steps} steps = {errors['seconds']:g} s"
+    for steps, errors in _shown(report["model"], at_frame).items():
+        time = f"{f'frame {steps}' if at_frame else f'{steps} steps'} = {errors['seconds']:.3g} s"
         head += [f"m, {time}", f"degrees, {time}"]
-    again = [(teacher_name(size), *error_cells(errors)) for size, errors in _perturbed(report).items()]
-    mine = (name, *error_cells(report["model"]))
-    return [tuple(head), mine, *(extra or []), *again, (ballistic, *error_cells(report["ballistic"]))]
+
+    def cells(errors: dict[str, dict]) -> list[str]:
+        return error_cells(errors, at_frame=at_frame)
+
+    again = [(teacher_name(size), *cells(errors)) for size, errors in _perturbed(report).items()]
+    mine = (name, *cells(report["model"]))
+    return [tuple(head), mine, *(extra or []), *again, (ballistic, *cells(report["ballistic"]))]
 
 
-def error_cells(horizons: dict[str, dict]) -> list[str]:
+def error_cells(horizons: dict[str, dict], *, at_frame: bool = False) -> list[str]:
     """For each horizon, translation and rotation with their intervals."""
     cells = []
-    for errors in horizons.values():
+    for errors in _shown(horizons, at_frame).values():
         cells.append(_with_interval(errors["translation_rmse"], errors["translation_rmse_95"], 3))
         cells.append(_with_interval(errors["rotation_error"], errors["rotation_error_95"], 1))
     return cells
 
 
-def range_cells(models: list[dict[str, dict]]) -> list[str]:
+def range_cells(models: list[dict[str, dict]], *, at_frame: bool = False) -> list[str]:
     """For each horizon, the lowest and highest translation and rotation error of models; one number if equal."""
     cells = []
-    for steps in models[0]:
+    for steps in _shown(models[0], at_frame):
         for what, digits in (("translation_rmse", 3), ("rotation_error", 1)):
-            values = [horizons[steps][what] for horizons in models]
+            values = [_shown(horizons, at_frame)[steps][what] for horizons in models]
             ends = dict.fromkeys(f"{value:.{digits}f}" for value in (min(values), max(values)))
             cells.append(" - ".join(ends))
     return cells
+
+
+def _shown(horizons: dict[str, dict], at_frame: bool) -> dict[str, dict]:
+    """What one of the two protocols shows of the errors at all horizons."""
+    if at_frame:
+        there = {steps: errors for steps, errors in horizons.items() if int(steps) in metrics.FRAMES}
+        return {steps: {"seconds": errors["seconds"], **errors["at_frame"]} for steps, errors in there.items()}
+    longest = max(map(int, horizons))
+    return {steps: errors for steps, errors in horizons.items() if int(steps) in (*metrics.HORIZONS, longest)}
 
 
 def quality_rows(report: dict[str, Any], *, name: str, ballistic: str) -> Rows:

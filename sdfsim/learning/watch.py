@@ -18,6 +18,7 @@ import torch
 from sdfsim.errors import SdfsimError, run_main
 from sdfsim.files import replacing
 from sdfsim.learning.dataset import Trajectory, load_shapes, trajectory_files
+from sdfsim.learning.frames import inner_steps
 from sdfsim.learning.instants import at_instants, engine_substep
 from sdfsim.learning.training_run import Run
 
@@ -58,7 +59,8 @@ class Rollouts:
         known = {name: replace(s, nodes=s.nodes[: model.nodes]) for name, s in self.shapes.items()}
         for group in batches([at_instants(t, self.substep) for t in self.recorded]):
             try:
-                predicted = roll_out(model, group, known, steps, self.device)
+                inner = inner_steps(group[0].dt, self.substep)
+                predicted = roll_out(model, group, known, steps, self.device, substeps=inner)
             except SdfsimError:
                 return {"rollout_m": math.nan, "rollout_degrees": math.nan}
             for one, truth in zip(predicted, group, strict=True):

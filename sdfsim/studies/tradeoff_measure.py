@@ -14,7 +14,7 @@ from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, write_json
 from sdfsim.learning import metrics
 from sdfsim.learning.dataset import Trajectory
-from sdfsim.learning.evaluate import HORIZONS, score
+from sdfsim.learning.evaluate import score
 from sdfsim.learning.penetration import penetration
 from sdfsim.learning.rollouts import first_frames
 from sdfsim.studies.tradeoff_cases import Cases
@@ -115,7 +115,7 @@ def _scored(contender: Contender, cases: Cases, folder: Path, ready: dict[str, P
 
 def judged(motions: list[Trajectory], cases: Cases) -> dict[str, Any]:
     """Errors at the horizons, penetration and energy of motions; `failed` where they blew up."""
-    horizons = sorted({h for h in HORIZONS if h <= cases.steps} | {cases.steps})
+    horizons = sorted({h for h in metrics.HORIZONS if h <= cases.steps} | {cases.steps})
     if not all(np.isfinite(m.position).all() and np.isfinite(m.quat_xyzw).all() for m in motions):
         return {"failed": "a state is not finite"}
     scores = [score(motion, truth, horizons) for motion, truth in zip(motions, cases.recorded, strict=True)]
