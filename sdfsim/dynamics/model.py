@@ -20,6 +20,7 @@ from sdfsim.files import replacing
 BUNDLED = Path(__file__).resolve().parent.parent / "models"
 DEFAULT_MODEL = "small"
 MOST = 4096  # of any size of a network
+MODEL_VERSION = 2  # 1: trained on a teacher whose contacts acted before surfaces touched
 NETWORKS = {"impulse": (ImpulseConfig, ImpulseNetwork), "paper": (PaperConfig, PaperNetwork)}
 
 
@@ -63,6 +64,7 @@ class Model:
         from safetensors.torch import save
 
         info = {
+            "version": MODEL_VERSION,
             "kind": self.kind,
             "config": asdict(self.network.config),  # type: ignore[call-overload]
             **{k: getattr(self, k) for k in ("dt", "gravity", "length", "reach", "nodes", "ranges", "card")},
@@ -113,6 +115,8 @@ def load_model(name: str | Path | None = None, *, weights: bool = True) -> Model
     try:
         with safe_open(path, framework="pt") as file:
             info = json.loads((file.metadata() or {})["sdfsim_model"])
+            if info.pop("version", 1) != MODEL_VERSION:
+                raise ValueError("it was trained on another teacher's data; train it again")
             config = info.pop("config")
             if weights:
                 _check_size(info["kind"], config, {k: file.get_slice(k).get_shape() for k in file.keys()})
