@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.scale_parts.ours import memory, peak_from_here
 from sdfsim import load_scene
-from sdfsim.learning.teacher import ENGINE_SETTINGS, import_pybullet
+from sdfsim.learning.teacher import BODY_SETTINGS, ENGINE_SETTINGS, MAXIMAL, import_pybullet
 from sdfsim.scene.types import Body, Scene
 from sdfsim.shape.analytic import PlaneSdf, SphereSdf
 from sdfsim.shape.mesh import Mesh
@@ -83,7 +83,7 @@ def _bullet_body(pb, scene: Scene, body: Body, folder: Path, *, concave: bool) -
     shape = scene.shapes[body.shape]
     if isinstance(shape.sdf, PlaneSdf):
         form = pb.createCollisionShape(pb.GEOM_BOX, halfExtents=[100.0, 100.0, 1.0])
-        handle = pb.createMultiBody(0.0, form, basePosition=[0.0, 0.0, -1.0])
+        handle = pb.createMultiBody(0.0, form, basePosition=[0.0, 0.0, -1.0], **MAXIMAL)
     else:
         if isinstance(shape.sdf, SphereSdf):
             form = pb.createCollisionShape(pb.GEOM_SPHERE, radius=shape.sdf.radius * body.scale)
@@ -94,16 +94,9 @@ def _bullet_body(pb, scene: Scene, body: Body, folder: Path, *, concave: bool) -
                 path.write_text(obj(whole if concave else pieces_of(scene, body)))
             flags = pb.GEOM_FORCE_CONCAVE_TRIMESH if concave else 0
             form = pb.createCollisionShape(pb.GEOM_MESH, fileName=str(path), meshScale=[body.scale] * 3, flags=flags)
-        handle = pb.createMultiBody(body.mass, form, -1, centre(scene, body).tolist(), body.quat_xyzw.tolist())
-    pb.changeDynamics(
-        handle,
-        -1,
-        lateralFriction=body.friction,
-        restitution=body.restitution,
-        linearDamping=0.0,
-        angularDamping=0.0,
-        activationState=pb.ACTIVATION_STATE_DISABLE_SLEEPING,
-    )
+        place = centre(scene, body).tolist(), body.quat_xyzw.tolist()
+        handle = pb.createMultiBody(body.mass, form, -1, *place, **MAXIMAL)
+    pb.changeDynamics(handle, -1, lateralFriction=body.friction, restitution=body.restitution, **BODY_SETTINGS)
     return handle
 
 

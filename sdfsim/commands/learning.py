@@ -23,6 +23,7 @@ def dataset(
         int, typer.Option(help="So many of PyBullet's random solids beside them (not movi-b).", min=0, max=1000)
     ] = 0,
     bodies: Annotated[int | None, typer.Option(help="How many move (bowl, pile).", min=1, max=512)] = None,
+    fps: Annotated[Literal["50", "60"], typer.Option(help="Recorded frames a second.")] = "50",
     seed: Annotated[int, typer.Option(min=0)] = 0,
     split: Literal["train", "validation", "test"] = "train",
     cluster: Cluster = None,
@@ -44,6 +45,7 @@ def dataset(
                 shapes=shapes,
                 random_solids=random_solids,
                 bodies=bodies,
+                fps=int(fps),
                 seed=seed,
                 split=split,
                 on_progress=session.progress,

@@ -12,6 +12,7 @@ import numpy as np
 
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_arrays, read_json, write_arrays, write_json
+from sdfsim.learning.teacher import TEACHER_VERSION
 
 if TYPE_CHECKING:
     from sdfsim.shape.asset import Shape
@@ -142,15 +143,27 @@ def check_alike(where: str, trajectories: Iterable[Trajectory]) -> None:
 
 
 def write_info(folder: Path, info: dict) -> None:
-    """Write `dataset.json` (recipe, seed, engine with version and settings)."""
+    """Write `dataset.json` (recipe, seed, version of the teacher, engine with version and settings)."""
     write_json(folder / "dataset.json", info)
 
 
 def read_info(folder: Path) -> dict:
-    """`dataset.json` of a dataset folder. Raises SdfsimError when it is absent or not JSON."""
+    """`dataset.json` of a dataset folder.
+
+    Raises:
+        SdfsimError: absent, not a JSON object, or of `sdfsim dataset` with another version of the teacher.
+    """
     info = read_json(folder / "dataset.json", "a dataset folder is what `sdfsim dataset` writes")
     if not isinstance(info, dict):
         raise SdfsimError(f"{folder / 'dataset.json'}: must be a JSON object")
+    ours = info.get("engine") == "pybullet" and {"recipe", "engine_settings"} <= set(info)
+    if ours and info.get("teacher") != TEACHER_VERSION:
+        raise SdfsimError(
+            f"{folder}: made by an earlier teacher whose contacts acted before surfaces touched"
+            if info.get("teacher", 1) == 1
+            else f"{folder}: made by version {info['teacher']!r} of the teacher, not by {TEACHER_VERSION}",
+            "make it again with `sdfsim dataset`",
+        )
     return info
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from sdfsim.errors import SdfsimError
 from sdfsim.learning.dataset import Trajectory, floor_of, home_of, read_info, shapes_folder
-from sdfsim.learning.teacher import DT, ENGINE_SETTINGS, SUBSTEP, SUBSTEPS, Teacher, TeacherBody, import_pybullet
+from sdfsim.learning.teacher import Teacher, TeacherBody, engine_settings, import_pybullet, substeps_of
 from sdfsim.parallel import parallel
 
 # m/s; 0 tells what the recording alone does not bring back: an engine's state is more than its recorded frames.
@@ -56,7 +56,7 @@ def run_again(start: Trajectory, urdfs: dict[str, Path], floor: tuple[float, flo
     """The teacher's motion of `steps` steps from the first frame of `start`.
 
     Raises:
-        SdfsimError: the engine takes another inertia than the recorded one.
+        SdfsimError: a step that is none of the teacher's, or the engine takes another inertia than the recorded one.
     """
     with started(start, urdfs, floor) as teacher:
         return replace(start, **teacher.run(steps))
@@ -64,10 +64,11 @@ def run_again(start: Trajectory, urdfs: dict[str, Path], floor: tuple[float, flo
 
 @contextmanager
 def started(
-    start: Trajectory, urdfs: dict[str, Path], floor: tuple[float, float], substeps: int = SUBSTEPS
+    start: Trajectory, urdfs: dict[str, Path], floor: tuple[float, float], substeps: int | None = None
 ) -> Iterator[Teacher]:
-    """The teacher at the first frame of `start`. Raises as `run_again` does."""
-    with Teacher(start.gravity, floor, substeps) as teacher:
+    """The teacher at the first frame of `start`, in its own inner steps unless told. Raises as `run_again` does."""
+    inner = substeps or substeps_of(start.dt)
+    with Teacher(start.gravity, floor, step=start.dt, substeps=inner) as teacher:
         for i, name in enumerate(start.shape):
             mass = 0.0 if start.static[i] else float(start.mass[i])
             body = TeacherBody(
@@ -88,10 +89,14 @@ def engine_file(data: Path, shape: str) -> Path:
     path = shapes_folder(data) / "engine" / f"{shape}.urdf"
     if not path.is_file():
         raise SdfsimError(f"{path}: no engine file of shape {shape!r}", "`sdfsim dataset` writes them")
-    mesh, _ = collision_mesh(path)
-    if not mesh.is_file():
+    if not is_sphere(path) and not (mesh := collision_mesh(path)[0]).is_file():
         raise SdfsimError(f"{path}: the mesh that it names, {mesh}, is absent", "make the dataset again")
     return path
+
+
+def is_sphere(urdf: Path) -> bool:
+    """Whether a URDF's body collides as an exact sphere. Raises SdfsimError when it is unreadable."""
+    return any(body.find("geometry/sphere") is not None for body in _collisions(urdf))
 
 
 def collision_mesh(urdf: Path) -> tuple[Path, np.ndarray]:
@@ -100,10 +105,7 @@ def collision_mesh(urdf: Path) -> tuple[Path, np.ndarray]:
     Raises:
         SdfsimError: unreadable, or anything but one mesh, unturned and at its own size.
     """
-    try:
-        bodies = ElementTree.parse(urdf).getroot().findall("link/collision")
-    except (OSError, ElementTree.ParseError) as error:
-        raise SdfsimError(f"{urdf}: cannot be read as a URDF: {error}") from error
+    bodies = _collisions(urdf)
     mesh = bodies[0].find("geometry/mesh") if len(bodies) == 1 else None
     if mesh is None or "scale" in mesh.attrib or "filename" not in mesh.attrib:
         raise SdfsimError(f"{urdf}: must hold one collision mesh without a scale")
@@ -113,6 +115,13 @@ def collision_mesh(urdf: Path) -> tuple[Path, np.ndarray]:
         raise SdfsimError(f"{urdf}: the collision mesh must not be turned")
     offset = np.array([float(value) for value in attributes.get("xyz", "0 0 0").split()])
     return urdf.parent / mesh.attrib["filename"], offset
+
+
+def _collisions(urdf: Path) -> list[ElementTree.Element]:
+    try:
+        return ElementTree.parse(urdf).getroot().findall("link/collision")
+    except (OSError, ElementTree.ParseError) as error:
+        raise SdfsimError(f"{urdf}: cannot be read as a URDF: {error}") from error
 
 
 def perturbed(t: Trajectory, size: float, seed: list[int]) -> Trajectory:
@@ -127,8 +136,7 @@ def _check_teacher(info: dict, trajectories: list[Trajectory]) -> None:
     settings = info.get("engine_settings")
     if info.get("engine") != "pybullet" or not isinstance(settings, dict):
         raise SdfsimError(f"recorded by {info.get('engine') or 'an unnamed engine'}, not by PyBullet as it is set here")
-    ours = ENGINE_SETTINGS | {"timeStep": SUBSTEP}
-    if other := [name for name, value in ours.items() if settings.get(name) != value]:
-        raise SdfsimError(f"recorded with other engine settings ({', '.join(other)})")
-    if any(abs(t.dt - DT) > 1e-9 for t in trajectories):
-        raise SdfsimError(f"recorded with another step than {DT} s")
+    for step in {t.dt for t in trajectories}:
+        ours = engine_settings(step, substeps_of(step))
+        if other := [name for name, value in ours.items() if settings.get(name) != value]:
+            raise SdfsimError(f"recorded with other engine settings ({', '.join(other)})")

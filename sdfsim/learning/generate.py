@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,7 @@ from sdfsim.learning.shapes import (
     split_of,
 )
 from sdfsim.learning.statistics import statistics, statistics_lines
-from sdfsim.learning.teacher import DT, ENGINE_SETTINGS, SUBSTEP, Teacher, import_pybullet
+from sdfsim.learning.teacher import FPS, RATES, TEACHER_VERSION, Teacher, engine_settings, import_pybullet
 from sdfsim.parallel import parallel
 
 GRAVITY = (0.0, 0.0, -10.0)  # m/s^2
@@ -43,6 +44,7 @@ def make_dataset(
     shapes: Path | None = None,
     random_solids: int = 0,
     bodies: int | None = None,
+    fps: int = FPS,
     seed: int = 0,
     split: str = "train",
     on_progress: Progress | None = None,
@@ -61,6 +63,7 @@ def make_dataset(
             piece a group); all recipes but movi-b also take mesh files, which are cut into pieces by V-HACD.
         random_solids: how many of PyBullet's random solids there are beside them.
         bodies: how many move, instead of the recipe's range (bowl and pile).
+        fps: recorded frames a second, in `RATES`.
         seed: of the dataset.
         split: "train", "validation" or "test".
         on_progress: called with the fraction done and a message.
@@ -69,19 +72,23 @@ def make_dataset(
         A report: paths, counts, and `statistics` of the split.
 
     Raises:
-        SdfsimError: unknown recipe or split, an option that the recipe has no use for, no usable shapes, PyBullet
+        SdfsimError: unknown recipe, split or rate, an option that the recipe has no use for, no usable shapes, PyBullet
             absent, another dataset in `out`, or another run writing to it.
     """
     plan = _checked(recipe, split, trajectories, shapes, random_solids, bodies)
+    if fps not in RATES:
+        raise SdfsimError(f"--fps must be {' or '.join(map(str, RATES))} (got {fps})")
     tell = on_progress or (lambda fraction, message: None)
     engine = import_pybullet()
     given = _origins(plan, shapes, random_solids)
     info = {
         "recipe": recipe,
         "seed": seed,
+        "fps": fps,
+        "teacher": TEACHER_VERSION,
         "engine": "pybullet",
         "engine_version": str(engine.getAPIVersion()),
-        "engine_settings": ENGINE_SETTINGS | {"timeStep": SUBSTEP},
+        "engine_settings": engine_settings(1.0 / fps, RATES[fps]),
         "floor": {"friction": FLOOR[0], "restitution": FLOOR[1]},
         "made_from": made_from(given),
     }
@@ -96,7 +103,8 @@ def make_dataset(
         cast = replace(_of_split(plan, cast, split), bodies=bodies)
         fit_shapes([*cast.shapes, *cast.scenery.values()], out / "shapes", lambda f, m: tell(0.1 + 0.4 * f, m))
         write_info(out, info)
-        made_now = _make_all(recipe, seed, split, cast, out / split, trajectories, lambda f, m: tell(0.5 + 0.5 * f, m))
+        one = partial(_make_one, recipe, cast, fps, seed, split)
+        made_now = _make_all(one, out / split, trajectories, lambda f, m: tell(0.5 + 0.5 * f, m))
         return {
             "dataset": str(out),
             "split": split,
@@ -118,19 +126,20 @@ def report_lines(report: dict) -> list[str]:
     return lines + statistics_lines(report["statistics"])
 
 
-def make_trajectory(recipe: str, rng: np.random.Generator, cast: Cast) -> Trajectory:
+def make_trajectory(recipe: str, rng: np.random.Generator, cast: Cast, fps: int = FPS) -> Trajectory:
     """One trajectory of `STEPS` steps.
 
     Args:
         recipe: a name in `RECIPES`.
         rng: what the scene is drawn from.
         cast: shapes and scenery.
+        fps: recorded frames a second, in `RATES`.
 
     Raises:
         SdfsimError: no scene of `REDRAWS` had room for its bodies.
     """
     for _ in range(REDRAWS):
-        with Teacher(np.array(GRAVITY), FLOOR) as teacher:
+        with Teacher(np.array(GRAVITY), FLOOR, step=1.0 / fps, substeps=RATES[fps]) as teacher:
             placed = RECIPES[recipe].spawn(teacher, rng, cast)
             if placed is None:
                 continue
@@ -147,7 +156,7 @@ def make_trajectory(recipe: str, rng: np.random.Generator, cast: Cast) -> Trajec
             friction=np.array([b.friction for b in specs]),
             restitution=np.array([b.restitution for b in specs]),
             static=mass == 0,
-            dt=DT,
+            dt=1.0 / fps,
             gravity=np.array(GRAVITY),
         )
     raise SdfsimError(
@@ -155,18 +164,18 @@ def make_trajectory(recipe: str, rng: np.random.Generator, cast: Cast) -> Trajec
     )
 
 
-def _make_all(recipe: str, seed: int, split: str, cast: Cast, folder: Path, count: int, on_progress: Progress) -> int:
+def _make_all(make_one: Callable[[int, Path], None], folder: Path, count: int, on_progress: Progress) -> int:
     """Write the first `count` trajectories of a split that are not there yet; how many those were."""
     folder.mkdir(parents=True, exist_ok=True)
     todo = [k for k in range(count) if not (folder / f"{k:05d}.npz").exists()]
-    jobs = [(recipe, k, seed, split, cast, folder / f"{k:05d}.npz") for k in todo]
-    for done, _ in enumerate(parallel(_make_one, jobs), start=1):
+    jobs = [(k, folder / f"{k:05d}.npz") for k in todo]
+    for done, _ in enumerate(parallel(make_one, jobs), start=1):
         on_progress(done / len(todo), f"trajectory {done} of {len(todo)}")
     return len(todo)
 
 
-def _make_one(recipe: str, index: int, seed: int, split: str, cast: Cast, path: Path) -> None:
-    make_trajectory(recipe, np.random.default_rng([seed, SPLITS.index(split), index]), cast).save(path)
+def _make_one(recipe: str, cast: Cast, fps: int, seed: int, split: str, index: int, path: Path) -> None:
+    make_trajectory(recipe, np.random.default_rng([seed, SPLITS.index(split), index]), cast, fps).save(path)
 
 
 def _checked(
@@ -197,6 +206,11 @@ def _check_same(out: Path, info: dict) -> None:
     """Raises SdfsimError when the folder holds a dataset of which anything in `info` is not true."""
     if (out / "dataset.json").exists():
         there = read_info(out)
+        if there.get("fps") != info["fps"]:
+            raise SdfsimError(
+                f"{out} holds a dataset of {there.get('fps')} frames a second, not {info['fps']}",
+                "give the same --fps, or choose another -o",
+            )
         if any(there.get(key) != value for key, value in info.items()):
             raise SdfsimError(
                 f"{out} holds a dataset of another recipe, seed, engine, count or set of shapes", "choose another -o"

@@ -11,7 +11,7 @@ from sdfsim.learning.shapes import ShapeSource
 from sdfsim.learning.teacher import Teacher, TeacherBody
 
 STARTS = ("still", "dropped", "nudged", "pressed")
-GAP = 1e-3  # m, under a body that is put down
+GAP = 2.5e-3  # m, under a body that is put down: around the engine's convex pieces are 1 mm, so 2 mm between two
 DROP = 0.1  # m, at most, under one that is dropped
 NUDGE = 0.3  # m/s, at most, along x and along y
 PRESSED = 0.5 * DEEPEST  # of its extent: how far at most a body is moved into what is around it, along each axis
@@ -45,10 +45,10 @@ def at_rest(
             stacked = number > 0 and rng.random() < STACKED
             place = below + rng.uniform(-0.1, 0.1, 2) * body.scale if stacked else rng.uniform(-FIELD, FIELD, 2)
             gap = rng.uniform(GAP, DROP) if start == "dropped" else GAP
-            rotation = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)) * _standing(source.vertices, rng)
+            rotation = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)) * standing(source.vertices, rng)
             position, high = upright(source, body, place, (top if stacked else 0.0) + gap, rotation)
             teacher.place(index, position, rotation.as_quat())
-            if not teacher.penetrates(index):
+            if not teacher.overlaps(index):
                 break
         else:
             return False
@@ -71,8 +71,11 @@ def upright(
     return position, float(position[2] + heights.max())
 
 
-def _standing(vertices: np.ndarray, rng: np.random.Generator) -> Rotation:
-    """A rotation in which the shape stands flat: on a random one of its steady faces, or any where it has none."""
+def standing(vertices: np.ndarray, rng: np.random.Generator) -> Rotation:
+    """A rotation in which a shape of `vertices` [V, 3] about its centre of mass stands flat.
+
+    It stands on a random one of its steady faces; any rotation where it has none.
+    """
     faces = steady_faces(vertices)
     if len(faces) == 0:
         return Rotation.random(rng=rng)

@@ -1,4 +1,36 @@
-"""The teacher: PyBullet with Kubric's settings (an optional extra, `pip install sdfsim[data]`)."""
+"""The teacher: PyBullet with Kubric's settings (an optional extra, `pip install sdfsim[data]`).
+
+Lines are Kubric's: `sim` is kubric/simulator/pybullet.py, `ab` and `c` are challenges/movi/movi_*_worker.py. The engine
+is that of pybullet 3.2.7. "As there" means that ours is the same.
+
+| setting | Kubric | what the engine makes of it | here |
+| --- | --- | --- | --- |
+| maximal coordinates | sim:84, 100, 125, floor too | btRigidBody in place of btMultiBody | as there |
+| contact threshold | sim:85, 101, 133: 0, floor too | contacts act at distance <= 0, else 20 mm early | as there |
+| restitution threshold | sim:38: 0 | e times the approach speed, also of the slowest | as there |
+| warm starting | sim:38: 0 | impulses start at 0 in every inner step | as there |
+| split impulse | sim:39: on | only below -40 mm; else 8 % of a depth a step become speed | as there |
+| contact slop | sim:39: 0 | all of a penetration is pushed out | as there |
+| cone friction | sim:39: off | read for btMultiBody alone: along the slip and across | as there |
+| overlapping pairs | sim:40: deterministic | pairs are sorted: a scene repeats | as there |
+| iterations | not set | 50, or until the residual is below 1e-7 | as there |
+| damping | not set | 0 for btRigidBody (0.04 for btMultiBody) | as there |
+| sleeping | not set | off unless a URDF is loaded with URDF_ENABLE_SLEEPING | as there |
+| rolling, spinning friction | not set | 0 | as there |
+| mass | set_mass, set_static | changes inertia too; 0 is static | as there |
+| inertia | no URDF_USE_INERTIA_FROM_FILE | that of the hulls' bounding box; exact of a sphere | as there |
+| friction, restitution | setters, 0 to 1 | the two bodies' values are multiplied | as there |
+| gravity | core/scene.py:67: (0, 0, -10) | | the recipes': as there |
+| collision margin | not set | 1 mm around hulls; within boxes and spheres | as there |
+| recorded velocities | getBaseVelocity at a frame | those that the next inner step starts from | as there |
+| overlap test | sim:145: getClosestPoints, distance 0 | hulls with their margins | as there |
+| inner step | core/scene.py:66: 1/240 s | | the same at 60 frames/s, else 1/250 s: 50 divides it |
+| frames | sim:170: every 240 // rate-th step | 12 a second (ab:72) | 50 or 60: a rollout's steps |
+| floor | ab:87, c:95: "dome", scale 2, 1 | a hull 159, 79 m wide, its margin on top of z = 0 | box, top at z = 0 |
+
+The floor is a box because its upper face is the plane z = 0 exactly, which is what learned models meet; rebounds on the
+dome are as high. Spheres of our own recipes are exact; Kubric's is a hull, as all of its bodies, and rolls as one.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +42,12 @@ import numpy as np
 from sdfsim.errors import SdfsimError
 from sdfsim.files import write_text
 
-SUBSTEP = 1.0 / 250.0  # s
-SUBSTEPS = 5
-DT = SUBSTEP * SUBSTEPS  # s, one recorded step
+TEACHER_VERSION = 2  # `dataset.json` tells it; datasets of another version are not used
+RATES = {50: 5, 60: 4}  # recorded frames a second -> inner steps in one
+FPS = 50  # unless another rate is asked for
+DT = 1.0 / FPS  # s, one recorded step at that rate
+SUBSTEPS = RATES[FPS]
+SUBSTEP = DT / SUBSTEPS  # s
 ENGINE_SETTINGS = {
     "restitutionVelocityThreshold": 0.0,
     "warmStartingFactor": 0.0,
@@ -21,10 +56,13 @@ ENGINE_SETTINGS = {
     "enableConeFriction": False,
     "deterministicOverlappingPairs": True,
 }
+BODY_SETTINGS = {"contactProcessingThreshold": 0.0}
+MAXIMAL = {"useMaximalCoordinates": True}
 FAR = (0.0, 0.0, -100.0)  # m, where bodies wait to be placed
+APART = 1000.0  # m between bodies that are not to touch
 URDF_TEMPLATE = """<robot name="body"><link name="base">
 <inertial><origin xyz="0 0 0"/><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
-<collision><origin xyz="{x} {y} {z}"/><geometry><mesh filename="{mesh}"/></geometry></collision>
+<collision><origin xyz="{x} {y} {z}"/><geometry>{geometry}</geometry></collision>
 </link></robot>
 """
 
@@ -34,7 +72,7 @@ class TeacherBody:
     """One body as the engine needs it.
 
     Attributes:
-        urdf: file whose collision mesh is an OBJ with one convex piece per group.
+        urdf: file whose collision mesh is an OBJ with one convex piece per group, or whose body is an exact form.
         scale: uniform size factor.
         mass: kg (0 for static).
         friction: lateral friction coefficient.
@@ -62,8 +100,32 @@ def write_urdf(mesh: Path, com: np.ndarray, path: Path) -> Path:
 
     A relative `mesh` is looked for from the folder of the URDF, so that both can be moved together.
     """
-    write_text(path, URDF_TEMPLATE.format(mesh=mesh, x=-com[0], y=-com[1], z=-com[2]))
+    write_text(path, URDF_TEMPLATE.format(geometry=f'<mesh filename="{mesh}"/>', x=-com[0], y=-com[1], z=-com[2]))
     return path
+
+
+def write_form_urdf(geometry: str, path: Path) -> Path:
+    """Write the URDF of an exact form about its centre; `geometry` is its URDF element: '<sphere radius="1"/>'."""
+    write_text(path, URDF_TEMPLATE.format(geometry=geometry, x=0, y=0, z=0))
+    return path
+
+
+def engine_settings(step: float, substeps: int) -> dict:
+    """What `dataset.json` is to say of the engine at recorded steps of `step` s in `substeps` inner ones."""
+    return ENGINE_SETTINGS | BODY_SETTINGS | MAXIMAL | {"timeStep": step / substeps}
+
+
+def substeps_of(step: float) -> int:
+    """Inner steps in a recorded step of `step` s.
+
+    Raises:
+        SdfsimError: the teacher records at no such rate.
+    """
+    for fps, substeps in RATES.items():
+        if abs(step - 1.0 / fps) < 1e-9:
+            return substeps
+    rates = " or ".join(str(fps) for fps in RATES)
+    raise SdfsimError(f"a recorded step of {step:g} s is none of this teacher's, which records at {rates} frames/s")
 
 
 class Teacher:
@@ -72,24 +134,33 @@ class Teacher:
     Args:
         gravity: [3] m/s^2.
         floor: (friction, restitution) of the floor, or None for no floor.
-        substeps: of the engine in one recorded step; the recordings have `SUBSTEPS`.
+        step: s, one recorded step.
+        substeps: of the engine in one recorded step.
     """
 
     def __init__(
-        self, gravity: np.ndarray, floor: tuple[float, float] | None = (0.3, 0.5), substeps: int = SUBSTEPS
+        self,
+        gravity: np.ndarray,
+        floor: tuple[float, float] | None = (0.3, 0.5),
+        *,
+        step: float = DT,
+        substeps: int = SUBSTEPS,
     ) -> None:
         self.pb = import_pybullet()
         self.substeps = substeps
         self.client = self.pb.connect(self.pb.DIRECT)
         self.bodies: list[int] = []
+        self._floor: int | None = None
+        self._settled = True
+        self._gravity = gravity
         self._call("setPhysicsEngineParameter", **ENGINE_SETTINGS)
         self._call("setGravity", *gravity)
-        self._call("setTimeStep", DT / substeps)
+        self._call("setTimeStep", step / substeps)
         if floor is not None:
-            # A very large box, as in Kubric: its upper face is z = 0.
             shape = self._call("createCollisionShape", self.pb.GEOM_BOX, halfExtents=[100.0, 100.0, 1.0])
-            ground = self._call("createMultiBody", 0.0, shape, basePosition=[0.0, 0.0, -1.0])
-            self._call("changeDynamics", ground, -1, lateralFriction=floor[0], restitution=floor[1])
+            self._floor = self._call("createMultiBody", 0.0, shape, basePosition=[0.0, 0.0, -1.0], **MAXIMAL)
+            surface = {"lateralFriction": floor[0], "restitution": floor[1]}
+            self._call("changeDynamics", self._floor, -1, **surface, **BODY_SETTINGS)
 
     def _call(self, name: str, *args, **kwargs):
         return getattr(self.pb, name)(*args, **kwargs, physicsClientId=self.client)
@@ -108,6 +179,7 @@ class Teacher:
             baseOrientation=list(quat),
             globalScaling=body.scale,
             useFixedBase=int(body.mass == 0),
+            **MAXIMAL,
         )
         self._call(
             "changeDynamics",
@@ -116,42 +188,49 @@ class Teacher:
             mass=body.mass,
             lateralFriction=body.friction,
             restitution=body.restitution,
-            linearDamping=0.0,
-            angularDamping=0.0,
-            activationState=self.pb.ACTIVATION_STATE_DISABLE_SLEEPING,
+            **BODY_SETTINGS,
         )
         self.bodies.append(handle)
+        self._settled = False
         return len(self.bodies) - 1
 
     def overlaps(self, index: int) -> bool:
-        """Whether body `index` touches or penetrates anything."""
-        self._call("performCollisionDetection")
-        return bool(self._call("getContactPoints", self.bodies[index]))
-
-    def penetrates(self, index: int) -> bool:
-        """Whether body `index` is inside anything; to touch is allowed."""
-        self._call("performCollisionDetection")
-        return any(contact[8] < 0.0 for contact in self._call("getContactPoints", self.bodies[index]))
+        """Whether body `index` touches or penetrates anything; around convex pieces is a margin of 1 mm."""
+        mine = self.bodies[index]
+        others = [other for other in (self._floor, *self.bodies) if other not in (None, mine)]
+        return any(self._call("getClosestPoints", mine, other, 0.0) for other in others)
 
     def inertia(self, index: int) -> np.ndarray:
         """[3] kg m^2: the diagonal that the engine uses, body axes."""
         return np.array(self._call("getDynamicsInfo", self.bodies[index], -1)[2])
 
-    def place(self, index: int, position: np.ndarray, quat: np.ndarray) -> None:
-        """Move body `index` without giving it a velocity."""
+    def set_inertia(self, index: int, diagonal: np.ndarray) -> None:
+        """Replace the inertia of body `index` by `diagonal` [3] kg m^2, body axes."""
+        handle = self.bodies[index]
+        # Without a mass the engine takes that of its command before.
+        mass = self._call("getDynamicsInfo", handle, -1)[0]
+        self._call("changeDynamics", handle, -1, mass=mass, localInertiaDiagonal=list(diagonal))
+        self._settled = False
+
+    def place(self, index: int, position: np.ndarray | tuple[float, ...], quat: np.ndarray | tuple[float, ...]) -> None:
+        """Move body `index` to `position` [3] m, orientation `quat` [4] xyzw; its velocity becomes 0."""
         self._call("resetBasePositionAndOrientation", self.bodies[index], list(position), list(quat))
 
-    def push(self, index: int, velocity: np.ndarray, angular_velocity: np.ndarray) -> None:
+    def push(
+        self, index: int, velocity: np.ndarray | tuple[float, ...], angular_velocity: np.ndarray | tuple[float, ...]
+    ) -> None:
         """Set linear [3] m/s and angular [3] rad/s velocity, world frame."""
         self._call("resetBaseVelocity", self.bodies[index], list(velocity), list(angular_velocity))
 
     def run(self, steps: int) -> dict[str, np.ndarray]:
-        """Simulate `steps` recorded steps of `DT`.
+        """Simulate `steps` recorded steps.
 
         Returns:
             position [steps+1, N, 3] m, quat_xyzw [steps+1, N, 4], velocity and angular_velocity
             [steps+1, N, 3] in m/s and rad/s; entry 0 is the state at the call.
         """
+        if not self._settled:
+            self._settle()
         frames = [self._state()]
         for _ in range(steps):
             for _ in range(self.substeps):
@@ -164,6 +243,25 @@ class Teacher:
         poses = [self._call("getBasePositionAndOrientation", b) for b in self.bodies]
         speeds = [self._call("getBaseVelocity", b) for b in self.bodies]
         return [p[0] for p in poses], [p[1] for p in poses], [s[0] for s in speeds], [s[1] for s in speeds]
+
+    def _settle(self) -> None:
+        """Take one inner step with the moving bodies far from everything, and put them back as they were.
+
+        The engine turns inertias into the world's axes only at the end of a step. Bodies that touch something in their
+        first one would answer with the inertia of the URDF's 1 kg.
+        """
+        state = list(zip(*self._state(), strict=True))
+        moving = [i for i, body in enumerate(self.bodies) if self._call("getDynamicsInfo", body, -1)[0] > 0]
+        for i in moving:
+            self.place(i, (APART * (i + 1), 0.0, -APART), state[i][1])
+        self._call("setGravity", 0.0, 0.0, 0.0)
+        self._call("stepSimulation")
+        self._call("setGravity", *self._gravity)
+        for i in moving:
+            position, quat, velocity, angular = state[i]
+            self.place(i, position, quat)
+            self.push(i, velocity, angular)
+        self._settled = True
 
     def close(self) -> None:
         """Leave the engine."""

@@ -18,7 +18,7 @@ from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.simulator import pick_device
 from sdfsim.errors import SdfsimError
 from sdfsim.files import locked, read_json, write_json
-from sdfsim.learning.teacher import DT, ENGINE_SETTINGS, SUBSTEP, import_pybullet
+from sdfsim.learning.teacher import DT, SUBSTEPS, TEACHER_VERSION, engine_settings, import_pybullet
 from sdfsim.parallel import parallel
 from sdfsim.scene.types import Scene
 from sdfsim.shape.analytic import PlaneSdf
@@ -113,7 +113,7 @@ def _jobs(found: list[Case], tested: list[Model], device: str, *, teacher: bool)
                 mark = _fingerprint(scene_digest, digest, device)
                 jobs.append(_Job(case, repeat, model.name, model, device, mark, weight))
             if teacher and case.teacher:
-                mark = _fingerprint(scene_digest, ENGINE_SETTINGS, SUBSTEP, DT)
+                mark = _fingerprint(scene_digest, TEACHER_VERSION, engine_settings(DT, SUBSTEPS), DT)
                 jobs.append(_Job(case, repeat, TEACHER, None, "", mark, 0.05 * weight))
     return jobs
 

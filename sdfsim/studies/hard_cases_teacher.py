@@ -11,19 +11,13 @@ from sdfsim.dynamics.rollout import Rollout
 from sdfsim.errors import SdfsimError
 from sdfsim.files import replacing, write_text
 from sdfsim.learning.decompose import decompose, wavefront
-from sdfsim.learning.teacher import DT, Teacher, TeacherBody, write_urdf
+from sdfsim.learning.teacher import DT, Teacher, TeacherBody, write_form_urdf, write_urdf
 from sdfsim.scene.types import Body, Scene
 from sdfsim.shape.analytic import BoxSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.asset import Shape
 from sdfsim.shape.mesh import Mesh
 from sdfsim.shape.primitives import PRIMITIVES, convex_pieces
 from sdfsim.studies.hard_cases_scenes import body_inertia
-
-_ANALYTIC = """<robot name="body"><link name="base">
-<inertial><origin xyz="0 0 0"/><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
-<collision><geometry>{geometry}</geometry></collision>
-</link></robot>
-"""
 
 
 def engine_file(shape: Shape, folder: Path) -> Path:
@@ -44,7 +38,7 @@ def engine_file(shape: Shape, folder: Path) -> Path:
     urdf = folder / f"{name}.urdf"
     if not urdf.exists():
         folder.mkdir(parents=True, exist_ok=True)
-        write_text(urdf, _ANALYTIC.format(geometry=geometry))
+        write_form_urdf(geometry, urdf)
     return urdf
 
 
@@ -123,7 +117,5 @@ def _add(teacher: Teacher, body: Body, shape: Shape, folder: Path) -> None:
     centre = body.position + Rotation.from_quat(body.quat_xyzw).apply(shape.com * body.scale)
     index = teacher.add(one, centre, body.quat_xyzw)
     if mass:
-        inertia = np.diag(body_inertia(body, shape)).tolist()
-        handle = teacher.bodies[index]
-        teacher.pb.changeDynamics(handle, -1, localInertiaDiagonal=inertia, physicsClientId=teacher.client)
+        teacher.set_inertia(index, np.diag(body_inertia(body, shape)))
         teacher.push(index, body.velocity, body.angular_velocity)

@@ -7,6 +7,7 @@ import pytest
 
 from sdfsim.errors import SdfsimError
 from sdfsim.learning.dataset import FLOOR, Trajectory, floor_of, home_of, read_info, trajectory_files, write_info
+from sdfsim.learning.teacher import TEACHER_VERSION
 from tests.learning.conftest import trajectory
 
 
@@ -92,3 +93,17 @@ def test_the_floor_is_what_the_dataset_says_else_the_recipes(tmp_path):
     assert home_of(tmp_path / "test") is None
     write_info(tmp_path, {"recipe": "balls"})
     assert home_of(tmp_path) == home_of(tmp_path / "test") == tmp_path
+
+
+def test_datasets_of_another_version_of_the_teacher_are_refused_and_those_of_others_are_not(tmp_path):
+    ours = {"recipe": "movi-b", "engine": "pybullet", "engine_settings": {"timeStep": 0.004}}
+    for version, complaint in (({}, "an earlier teacher whose contacts acted before"), ({"teacher": 9}, "version 9")):
+        write_info(tmp_path, ours | version)
+        with pytest.raises(SdfsimError, match=complaint) as error:
+            read_info(tmp_path)
+        assert "sdfsim dataset" in error.value.hint and "\n" not in error.value.message
+    for others in ({"recipe": "balls"}, {**ours, "engine": "mujoco"}, {"engine": "pybullet", "engine_settings": {}}):
+        write_info(tmp_path, others)
+        assert read_info(tmp_path) == others
+    write_info(tmp_path, ours | {"teacher": TEACHER_VERSION})
+    assert read_info(tmp_path)["teacher"] == 2

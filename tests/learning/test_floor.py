@@ -10,9 +10,10 @@ pytest.importorskip("pybullet")
 
 from sdfsim.errors import SdfsimError
 from sdfsim.learning import floor as floor_module
-from sdfsim.learning.dataset import Trajectory, trajectory_files
+from sdfsim.learning.dataset import Trajectory, read_info, trajectory_files
 from sdfsim.learning.evaluate import evaluate
 from sdfsim.learning.floor import chaos_floor, engine_file, run_again
+from sdfsim.learning.generate import make_dataset
 from sdfsim.learning.tables import error_rows, notes
 from tests.dynamics.conftest import random_model
 
@@ -72,6 +73,17 @@ def test_the_recording_comes_back_before_chaos_grows(cube_data):
     """Only rounding differs (an orientation goes through a matrix and back), so the first second agrees closely."""
     report = evaluate(cube_data, model=random_model("impulse", push=0.02), steps=50, chaos_floor=True)
     assert report["chaos_floor"]["perturbations"]["0"]["50"]["translation_rmse"] < 1e-4
+
+
+def test_recordings_of_60_frames_a_second_come_back_too(cube_data, cube_meshes, tmp_path):
+    (tmp_path / "shapes").mkdir()
+    (tmp_path / "shapes" / "cube").symlink_to(cube_data / "shapes" / "cube")
+    make_dataset("movi-b", tmp_path, shapes=cube_meshes, trajectories=1, split="test", fps=60)
+    assert read_info(tmp_path)["engine_settings"]["timeStep"] == pytest.approx(1 / 240)
+    recorded = Trajectory.load(tmp_path / "test" / "00000.npz")
+    assert len(recorded.position) == 101 and recorded.dt == pytest.approx(1 / 60)
+    again = chaos_floor(tmp_path, [recorded], 30)["0"][0]
+    np.testing.assert_allclose(again.position, recorded.position[:31], atol=1e-4)
 
 
 def test_without_the_engine_the_rows_are_left_out_in_one_line(falling, monkeypatch):
