@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim.errors import SdfsimError
 from sdfsim.learning.dataset import Trajectory
-from sdfsim.learning.floor import collision_mesh, engine_file
+from sdfsim.learning.floor import collision_mesh, engine_file, is_sphere
 from sdfsim.shape.asset import Shape, with_sdf
 from sdfsim.shape.distance import PiecesDistance
 from sdfsim.shape.exact import MeshSdf
@@ -137,9 +137,13 @@ def _of_sdf(shape: Shape, kind: str) -> Solid:
 
 
 def engine_pieces(data: Path, name: str) -> list[Mesh]:
-    """The convex pieces that the engine collides, in the body's frame; none where the dataset does not lead to them."""
+    """The convex pieces that the engine collides, in the body's frame; none where the dataset does not lead to them.
+
+    Of an exact sphere they are a hull of points on it.
+    """
     try:
-        path, offset = collision_mesh(engine_file(data, name))
+        urdf = engine_file(data, name)
+        path, offset = (urdf.with_suffix(".obj"), np.zeros(3)) if is_sphere(urdf) else collision_mesh(urdf)
         return [Mesh(piece.vertices + offset, piece.faces) for piece in load_pieces(path)]
     except SdfsimError:
         return []

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sdfsim.learning.dataset import FLOOR
+from sdfsim.learning.moving import set_moving
 from sdfsim.learning.resting import STARTS, at_rest, upright
 from sdfsim.learning.shapes import ShapeSource
 from sdfsim.learning.teacher import Teacher, TeacherBody
@@ -38,12 +39,24 @@ PILE_GAPS = (0.02, 0.15)  # m between the boxes around bodies
 PILE_TRIES = 8  # places for one body, of which it takes the lowest
 
 VARIED_EXTENTS = (0.7, 1.4)  # m
-FRICTIONS, RESTITUTIONS = (0.0, 1.0), (0.0, 0.9)
+FRICTIONS, RESTITUTIONS = (0.0, 1.0), (0.0, 1.0)
 DENSITIES = (0.1, 10.0)  # log-uniform
 MASS_RATIO = 100.0  # at most, within one scene
 OBSTACLES = {"obstacle_bowl": "bowl", "obstacle_torus": "torus", "obstacle_gear": "gear"}
 OBSTACLE_EXTENTS = (2.0, 4.0)  # m
-RESTING_SHARE, OBSTACLE_SHARE = 0.5, 0.3
+OBSTACLE_SHARE = 0.3  # of the scenes whose bodies are tossed or at rest
+# Of the scenes, by how they start: tossed as in MOVi, `at_rest`, or in one of the motions of `set_moving`.
+SHARES = {
+    "tossed": 0.35,
+    "resting": 0.35,
+    "rolling": 0.08,
+    "sliding": 0.07,
+    "falling": 0.07,
+    "head-on": 0.05,
+    "spinning": 0.03,
+}
+FEW = (1, 4)  # bodies in plain motion; head-on two or four
+BALL_SHARE = 0.5  # of the bodies in plain motion; all of those that roll
 
 Placed = list[tuple[ShapeSource, TeacherBody]]
 
@@ -134,9 +147,16 @@ def pile(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Placed:
 
 
 def varied(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Placed | None:
-    """Any friction, restitution and mass ratio; a part of the scenes at or near rest, a part with an obstacle."""
+    """Any friction, restitution and mass ratio, and starts of all kinds.
+
+    Of the scenes, 35 % are tossed as in MOVi and 35 % are at or near rest (in equal parts the kinds of `STARTS`); an
+    obstacle is in 30 % of both. In the others one to four bodies, half of them balls, are in plain motion on an empty
+    floor: in 8 % balls roll, in 7 % bodies slide to a stop, in 7 % they fall straight, in 3 % they spin in place, and
+    in 5 % one or two pairs meet head-on in flight, far above the floor.
+    """
+    start = str(rng.choice(list(SHARES), p=list(SHARES.values())))
     placed = []
-    if rng.random() < OBSTACLE_SHARE:
+    if start in ("tossed", "resting") and rng.random() < OBSTACLE_SHARE:
         source = cast.scenery[str(rng.choice(list(OBSTACLES)))]
         extent = rng.uniform(*OBSTACLE_EXTENTS)
         placed.append((source, _static(source, extent, rng.uniform(*FRICTIONS), rng.uniform(*RESTITUTIONS))))
@@ -152,13 +172,18 @@ def varied(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Placed | N
         masses.append(float(np.exp(rng.uniform(np.log(low), np.log(high)))))
         return TeacherBody(source.urdf, extent, masses[-1], rng.uniform(*FRICTIONS), rng.uniform(*RESTITUTIONS))
 
-    if rng.random() < RESTING_SHARE:
-        picked = rng.integers(len(cast.shapes), size=rng.integers(*_closed(COUNT)))
-        bodies = [(cast.shapes[k], draw(cast.shapes[k])) for k in picked]
-        start = str(rng.choice(STARTS))
-        return placed + bodies if at_rest(teacher, rng, bodies, start, TRIES) else None
-    tossed = _toss(teacher, rng, cast, draw)
-    return None if tossed is None else placed + tossed
+    if start == "tossed":
+        tossed = _toss(teacher, rng, cast, draw)
+        return None if tossed is None else placed + tossed
+    if start == "resting":
+        picked = [cast.shapes[k] for k in rng.integers(len(cast.shapes), size=rng.integers(*_closed(COUNT)))]
+        bodies = [(source, draw(source)) for source in picked]
+        return placed + bodies if at_rest(teacher, rng, bodies, str(rng.choice(STARTS)), TRIES) else None
+    count = 2 * int(rng.integers(1, 3)) if start == "head-on" else int(rng.integers(*_closed(FEW)))
+    balls = rng.random(count) < (1.0 if start == "rolling" else BALL_SHARE)
+    picked = [cast.scenery["ball"] if ball else cast.shapes[rng.integers(len(cast.shapes))] for ball in balls]
+    bodies = [(source, draw(source)) for source in picked]
+    return bodies if set_moving(teacher, rng, bodies, start, TRIES) else None
 
 
 RECIPES = {
@@ -166,7 +191,7 @@ RECIPES = {
     "movi-c": Recipe(movi_c),
     "bowl": Recipe(bowl, given=False, counted=True, scenery={"bowl": "bowl", "ball": "sphere"}),
     "pile": Recipe(pile, counted=True),
-    "varied": Recipe(varied, scenery=OBSTACLES),
+    "varied": Recipe(varied, scenery=OBSTACLES | {"ball": "sphere"}),
 }
 
 

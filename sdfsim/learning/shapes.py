@@ -14,9 +14,10 @@ from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, write_json, write_text
 from sdfsim.learning.dataset import SOLID, check_names
 from sdfsim.learning.decompose import VHACD, decompose, wavefront
-from sdfsim.learning.teacher import write_urdf
+from sdfsim.learning.teacher import write_form_urdf, write_urdf
 from sdfsim.parallel import parallel
 from sdfsim.shape import primitives
+from sdfsim.shape.asset import analytic_shape
 from sdfsim.shape.distance import PiecesDistance
 from sdfsim.shape.fit import fit_pieces
 from sdfsim.shape.mass import mass_properties, mass_properties_of_sdf
@@ -43,6 +44,7 @@ class ShapeSource:
         pieces: OBJ of the convex pieces, in the frame of the engine.
         display: mesh file to show, or None for the pieces' own boundary.
         com, size: the displayed mesh comes into the engine's frame by (vertex - com [3]) / size.
+        sphere: the engine's body is an exact sphere of diameter 1 m, `pieces` a hull of points on it.
     """
 
     name: str
@@ -53,6 +55,7 @@ class ShapeSource:
     display: Path | None
     com: np.ndarray
     size: float
+    sphere: bool = False
 
 
 @dataclass(frozen=True)
@@ -207,6 +210,8 @@ def _prepare_one(origin: Origin, engine: Path) -> dict:
             reason = reason.replace(str(path), path.name) if path else reason
         record: dict[str, Any] = {"sha256": digest, "left_out": reason}
     else:
+        if origin.primitive == "sphere":
+            volume, com, size = np.pi / 6.0, np.zeros(3), 1.0
         moved = [Mesh((piece.vertices - com) / size, piece.faces) for piece in pieces]
         write_text(engine / f"{origin.name}.obj", wavefront(moved))
         record = {"sha256": digest, "volume": volume / size**3, "com": com.tolist(), "size": size}
@@ -216,7 +221,7 @@ def _prepare_one(origin: Origin, engine: Path) -> dict:
 
 def _pieces(origin: Origin, engine: Path) -> list[Mesh]:
     if origin.primitive == "sphere":
-        return [convex_hull(primitives.sphere(subdivisions=2).vertices)]
+        return [convex_hull(primitives.sphere().vertices)]
     if origin.primitive:
         return primitives.convex_pieces(origin.primitive)
     if origin.pieces is not None:
@@ -255,9 +260,12 @@ class _Union:
 def _source(origin: Origin, record: dict, engine: Path) -> ShapeSource:
     pieces = engine / f"{origin.name}.obj"
     vertices = np.concatenate([piece.vertices for piece in load_pieces(pieces)])
-    urdf = _engine_file(pieces)
+    # A ball of facets would lose a third of its speed in 3 s of rolling.
+    sphere = origin.primitive == "sphere"
+    ball = '<sphere radius="0.5"/>'
+    urdf = write_form_urdf(ball, pieces.with_suffix(".urdf")) if sphere else _engine_file(pieces)
     com = np.array(record["com"])
-    return ShapeSource(origin.name, urdf, record["volume"], vertices, pieces, origin.mesh, com, record["size"])
+    return ShapeSource(origin.name, urdf, record["volume"], vertices, pieces, origin.mesh, com, record["size"], sphere)
 
 
 def _engine_file(pieces: Path) -> Path:
@@ -268,6 +276,9 @@ def _engine_file(pieces: Path) -> Path:
 
 
 def _fit_one(source: ShapeSource, out: Path) -> None:
+    if source.sphere:
+        analytic_shape("sphere", radius=0.5, name=source.name).save(out)
+        return
     display = None
     if source.display is not None:
         mesh = load_mesh(source.display)

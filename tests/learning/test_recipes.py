@@ -9,12 +9,13 @@ import torch
 pytest.importorskip("pybullet")
 
 from sdfsim.errors import SdfsimError
-from sdfsim.learning import generate, merge
+from sdfsim.learning import generate, merge, recipes
 from sdfsim.learning.dataset import SPLITS, Trajectory, load_shapes, trajectory_files
 from sdfsim.learning.frames import contact_frames
 from sdfsim.learning.generate import GRAVITY, make_dataset, make_trajectory
 from sdfsim.learning.impulse_task import ImpulseTask
-from sdfsim.learning.recipes import BALL, MASS_RATIO, OBSTACLES, RECIPES, WALL, Cast
+from sdfsim.learning.moving import MOTIONS, SPINS, set_moving
+from sdfsim.learning.recipes import BALL, MASS_RATIO, OBSTACLES, RECIPES, SHARES, WALL, Cast
 from sdfsim.learning.resting import DROP, NUDGE, PRESSED, STARTS, at_rest, steady_faces
 from sdfsim.learning.shapes import Origin, prepare
 from sdfsim.learning.statistics import statistics, statistics_lines
@@ -40,7 +41,8 @@ def spawned(recipe: str, seed: int, cast: Cast):
         with Teacher(np.array(GRAVITY)) as teacher:
             placed = RECIPES[recipe].spawn(teacher, rng, cast)
             if placed is not None:
-                return placed, teacher.run(0), [teacher.penetrates(i) for i in range(len(placed))]
+                moving = [i for i, (_, body) in enumerate(placed) if body.mass > 0]
+                return placed, teacher.run(0), [teacher.overlaps(i) for i in moving]
 
 
 def test_movi_c_keeps_to_its_ranges(cast):
@@ -80,19 +82,77 @@ def test_a_pile_starts_apart_at_rest_and_falls_onto_the_floor(cast):
 
 
 def test_varied_scenes_keep_to_their_ranges_and_few_start_in_each_other(cast):
-    resting = obstacles = pressed = 0
-    for seed in range(40):
+    resting = obstacles = pressed = balls = 0
+    coefficients = []
+    for seed in range(60):
         placed, start, inside = spawned("varied", seed, cast)
         moving = [body for _, body in placed if body.mass > 0]
         masses = [body.mass for body in moving]
-        assert max(masses) / min(masses) <= MASS_RATIO * (1 + 1e-9) and 3 <= len(moving) <= 10
-        assert all(0 <= b.friction <= 1 and 0 <= b.restitution <= 0.9 for _, b in placed)
+        assert max(masses) / min(masses) <= MASS_RATIO * (1 + 1e-9) and 1 <= len(moving) <= 10
+        coefficients += [(b.friction, b.restitution) for _, b in placed]
+        assert all(0.7 <= b.scale <= 1.4 for b in moving)
+        balls += any(source.name == "ball" for source, _ in placed)
         pressed += any(inside)
         assert {s.name for s, b in placed if b.mass == 0} <= set(OBSTACLES)
         resting += bool((np.abs(start["velocity"]) <= NUDGE).all())
         obstacles += len(placed) - len(moving)
-    assert 12 <= resting <= 28 and 5 <= obstacles <= 20
-    assert 1 <= pressed <= 10
+    assert 12 <= resting <= 40 and 5 <= obstacles <= 24 and 8 <= balls <= 24
+    assert 1 <= pressed <= 12
+    low, high = np.min(coefficients, axis=0), np.max(coefficients, axis=0)
+    assert (low >= 0).all() and (low < 0.05).all() and (high > 0.95).all() and (high <= 1).all()
+
+
+def test_the_shares_of_varied_starts_are_those_that_are_told(cast, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(recipes, "_toss", lambda *_: drawn.append("tossed"))
+    monkeypatch.setattr(recipes, "at_rest", lambda *_: drawn.append("resting"))
+    monkeypatch.setattr(recipes, "set_moving", lambda *args: drawn.append(args[3]))
+    rng = np.random.default_rng(0)
+    with Teacher(np.array(GRAVITY)) as teacher:
+        for _ in range(1000):
+            assert RECIPES["varied"].spawn(teacher, rng, cast) is None
+    assert set(SHARES) == {"tossed", "resting", *MOTIONS} and sum(SHARES.values()) == pytest.approx(1.0)
+    assert {name: drawn.count(name) / 1000 for name in SHARES} == pytest.approx(SHARES, abs=0.04)
+
+
+def in_motion(motion: str, seed: int, cast: Cast, steps: int, count: int = 2):
+    """Balls and cubes, from a start in plain motion on."""
+    sources = [cast.scenery["ball"]] if motion == "rolling" else [cast.scenery["ball"], *cast.shapes]
+    with Teacher(np.array(GRAVITY)) as teacher:
+        bodies = [(s, TeacherBody(s.urdf, 1.0, 2.0, 0.8, 0.5)) for s in (sources * count)[:count]]
+        assert set_moving(teacher, np.random.default_rng(seed), bodies, motion, 100)
+        assert not any(teacher.overlaps(i) for i in range(count))
+        return teacher.run(steps)
+
+
+def test_bodies_in_plain_motion_do_what_their_start_says(cast):
+    rolling = [in_motion("rolling", seed, cast, 0, 4) for seed in range(10)]
+    velocity, spin = (np.concatenate([m[name][0] for m in rolling]) for name in ("velocity", "angular_velocity"))
+    off = np.linalg.norm(np.cross(spin, [0.0, 0.0, -0.5]) + velocity, axis=1)
+    along = (np.abs(velocity[:, :2]) < 1e-9).any(1)
+    assert 8 <= (off < 1e-9).sum() <= 32 and 8 <= along.sum() <= 32 and not velocity[:, 2].any()
+    slides = in_motion("sliding", 0, cast, 100)
+    assert not slides["angular_velocity"][0].any()
+    assert np.linalg.norm(slides["velocity"][[0, -1], 1], axis=-1) @ [0, 1] < 0.1, "the cube has stopped"
+    spins = in_motion("spinning", 0, cast, 25)
+    assert not spins["velocity"][0].any() and (np.abs(spins["angular_velocity"][0]) >= [0, 0, SPINS[0]]).all()
+    assert np.abs(spins["position"][-1] - spins["position"][0])[:, :2].max() < 0.05
+    falls = in_motion("falling", 0, cast, 5)
+    assert not falls["velocity"][0].any() and (falls["velocity"][-1, :, 2] < -0.2).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_head_on_pairs_meet_in_flight_and_touch_nothing_else(cast, seed):
+    motion = in_motion("head-on", seed, cast, 100, 4)
+    assert motion["position"][..., 2].min() > 5.0
+    velocity = motion["velocity"]
+    for pair in ([0, 1], [2, 3]):
+        closing = np.cross(velocity[0, pair[0]], velocity[0, pair[1]])
+        assert np.abs(closing).max() < 1e-9 and velocity[0, pair[0]] @ velocity[0, pair[1]] < 0
+        hit = np.abs(velocity[-1, pair[0], :2] - velocity[0, pair[0], :2]).max()
+        assert hit > 0.1
+        momentum = velocity[:, pair, :2].sum(1)
+        np.testing.assert_allclose(momentum, momentum[:1].repeat(101, 0), atol=1e-9)
 
 
 def test_the_mass_ratio_of_varied_scenes_holds_whatever_the_volumes_are(cast):
@@ -167,6 +227,10 @@ def test_a_dataset_goes_on_where_it_was_and_refuses_another(cube_meshes, tmp_pat
     again = make_dataset("pile", tmp_path, trajectories=2, shapes=cube_meshes, bodies=4)
     assert report["made_now"] == 2 and again["made_now"] == 1 and again["statistics"] == report["statistics"]
     np.testing.assert_array_equal(Trajectory.load(files[1]).position, before[1])
+    with pytest.raises(SdfsimError, match="a dataset of 50 frames a second, not 60"):
+        make_dataset("pile", tmp_path, trajectories=2, shapes=cube_meshes, bodies=4, fps=60)
+    with pytest.raises(SdfsimError, match="--fps must be 50 or 60"):
+        make_dataset("pile", tmp_path, trajectories=2, shapes=cube_meshes, bodies=4, fps=30)
     with pytest.raises(SdfsimError, match="another recipe, seed, engine, count"):
         make_dataset("pile", tmp_path, trajectories=2, shapes=cube_meshes, bodies=5)
     found = report["statistics"]
