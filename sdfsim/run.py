@@ -273,7 +273,7 @@ def evaluation_lines(report: dict[str, Any]) -> list[str]:
         *columns(tables.error_rows(report, **names)),
         "",
         "Errors at a frame alone: translation is the mean over trajectories of the RMSE over bodies",
-        *columns(tables.error_rows(report, **names, at_frame=True)),
+        *columns(tables.error_rows(report, **names, at_frame=True, intervals=False)),
         "",
         *columns(tables.quality_rows(report, **names)),
         "",

@@ -12,7 +12,13 @@ Rows = list[tuple[str, ...]]
 
 
 def error_rows(
-    report: dict[str, Any], *, name: str, ballistic: str, at_frame: bool = False, extra: Rows | None = None
+    report: dict[str, Any],
+    *,
+    name: str,
+    ballistic: str,
+    at_frame: bool = False,
+    intervals: bool = True,
+    extra: Rows | None = None,
 ) -> Rows:
     """Errors at every horizon, a row each for the model, the teacher run again, and flight without contact.
 
@@ -21,6 +27,7 @@ def error_rows(
         name: what the model is called.
         ballistic: what the baseline is called.
         at_frame: errors in a frame alone, at those of `metrics.FRAMES`; else over all steps up to a horizon.
+        intervals: with those of 95 %.
         extra: further rows, below the model's (see `error_cells` and `range_cells`).
     """
     head = [""]
@@ -29,28 +36,29 @@ def error_rows(
         head += [f"m, {time}", f"degrees, {time}"]
 
     def cells(errors: dict[str, dict]) -> list[str]:
-        return error_cells(errors, at_frame=at_frame)
+        return error_cells(errors, at_frame=at_frame, intervals=intervals)
 
     again = [(teacher_name(size), *cells(errors)) for size, errors in _perturbed(report).items()]
     mine = (name, *cells(report["model"]))
     return [tuple(head), mine, *(extra or []), *again, (ballistic, *cells(report["ballistic"]))]
 
 
-def error_cells(horizons: dict[str, dict], *, at_frame: bool = False) -> list[str]:
-    """For each horizon, translation and rotation with their intervals."""
+def error_cells(horizons: dict[str, dict], *, at_frame: bool = False, intervals: bool = True) -> list[str]:
+    """For each horizon, translation and rotation, with their intervals or without."""
     cells = []
     for errors in _shown(horizons, at_frame).values():
-        cells.append(_with_interval(errors["translation_rmse"], errors["translation_rmse_95"], 3))
-        cells.append(_with_interval(errors["rotation_error"], errors["rotation_error_95"], 1))
+        for what, digits in (("translation_rmse", 3), ("rotation_error", 1)):
+            ends = errors[f"{what}_95"] if intervals else None
+            cells.append(_with_interval(errors[what], ends, digits))
     return cells
 
 
-def range_cells(models: list[dict[str, dict]], *, at_frame: bool = False) -> list[str]:
+def range_cells(models: list[dict[str, dict]]) -> list[str]:
     """For each horizon, the lowest and highest translation and rotation error of models; one number if equal."""
     cells = []
-    for steps in _shown(models[0], at_frame):
+    for steps in _shown(models[0], at_frame=False):
         for what, digits in (("translation_rmse", 3), ("rotation_error", 1)):
-            values = [_shown(horizons, at_frame)[steps][what] for horizons in models]
+            values = [horizons[steps][what] for horizons in models]
             ends = dict.fromkeys(f"{value:.{digits}f}" for value in (min(values), max(values)))
             cells.append(" - ".join(ends))
     return cells
@@ -118,8 +126,9 @@ def _perturbed(report: dict[str, Any]) -> dict[str, dict]:
     return {size: errors for size, errors in runs.items() if size != "0"}
 
 
-def _with_interval(value: float, ends: list[float], digits: int) -> str:
-    return f"{value:.{digits}f} ({ends[0]:.{digits}f} to {ends[1]:.{digits}f})"
+def _with_interval(value: float, ends: list[float] | None, digits: int) -> str:
+    told = f"{value:.{digits}f}"
+    return told if ends is None else f"{told} ({ends[0]:.{digits}f} to {ends[1]:.{digits}f})"
 
 
 def _quality_cells(report: dict[str, Any], who: str) -> list[str]:

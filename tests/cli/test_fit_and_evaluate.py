@@ -48,7 +48,7 @@ def test_fitting_a_folder_ends_with_its_scene(tmp_path, monkeypatch):
     assert calls == [("fit", {"recipe": "paper", "device": "auto"}), ("scene", {})]
 
 
-def test_an_evaluation_is_two_tables(tmp_path, monkeypatch):
+def test_an_evaluation_is_three_tables(tmp_path, monkeypatch):
     errors = {
         "50": {
             "seconds": 1.0,
@@ -56,6 +56,12 @@ def test_an_evaluation_is_two_tables(tmp_path, monkeypatch):
             "translation_rmse_95": [0.15, 0.19],
             "rotation_error": 12.04,
             "rotation_error_95": [11.0, 13.0],
+            "at_frame": {
+                "translation_rmse": 0.321,
+                "translation_rmse_95": [0.3, 0.4],
+                "rotation_error": 15.0,
+                "rotation_error_95": [14.0, 16.0],
+            },
         }
     }
     who = ("model", "ballistic", "teacher 0", "teacher 1e-6")
@@ -91,8 +97,10 @@ def test_an_evaluation_is_two_tables(tmp_path, monkeypatch):
     assert [line.split("  ")[0] for line in lines[2:5]] == ["small", "teacher, 1e-6 m/s off", "ballistic"]
     assert all("0.171 (0.150 to 0.190)" in line and "12.0 (11.0 to 13.0)" in line for line in lines[2:5])
     assert len({line.index("12.0") for line in lines[2:5]}) == 1
-    small, recorded, again, ballistic = (line.split() for line in lines[7:11])
+    assert "frame 50 = 1 s" in lines[7]
+    assert all(line.endswith("15.0") and "0.321" in line for line in lines[8:11])
+    small, recorded, again, ballistic = (line.split() for line in lines[13:17])
     assert small == "small 0.0123 m 0.2000 m 1.00 % 50.00 % - 0.74 s".split()
     assert recorded[-1] == "-" and again[-3:] == [">", "1", "s"] and ballistic[-2:] == ["0.74", "s"]
-    assert any("0.0005 m (median" in line for line in lines[11:])
+    assert any("0.0005 m (median" in line for line in lines[17:])
     assert max(map(len, lines)) <= 120
