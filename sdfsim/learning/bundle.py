@@ -18,6 +18,7 @@ from sdfsim.learning import tables
 from sdfsim.learning.evaluate import evaluate
 from sdfsim.learning.presets import PRESETS, Preset
 from sdfsim.learning.recipes import RECIPES
+from sdfsim.learning.teacher import FPS
 
 MODEL, BASELINE = "this model", "flying on without contact"  # in the tables of a card
 
@@ -176,7 +177,7 @@ def _trajectories(made: dict) -> str:
 def _commands(card: dict, folders: list[str]) -> list[str]:
     """What makes the data and trains on them."""
     lines = [
-        f"sdfsim dataset {made['recipe']} -o {folder}{_shapes(made)} --trajectories {count}"
+        f"sdfsim dataset {made['recipe']} -o {folder}{_rate(made)}{_shapes(made)} --trajectories {count}"
         f" --seed {made['seed']} --split {split}"
         for folder, made in zip(folders, card["data"], strict=True)
         for split, count in made["trajectories"].items()
@@ -202,9 +203,14 @@ def _shapes(made: dict) -> str:
     return given + "".join(f" --{option} {count}" for option, count in options.items() if count)
 
 
+def _rate(made: dict) -> str:
+    """The option for a rate of frames that is not the usual one."""
+    return f" --fps {made['fps']}" if made.get("fps", FPS) != FPS else ""
+
+
 def _folders(data: list[dict]) -> list[str]:
-    """A folder for each dataset, numbered where several are of one recipe."""
-    names = [made["recipe"].upper() for made in data]
+    """A folder for each dataset, numbered where several are of one recipe and rate."""
+    names = [made["recipe"].upper() + _rate(made).replace(" --fps ", "-") for made in data]
     return [f"{n}-{names[: k + 1].count(n)}" if names.count(n) > 1 else n for k, n in enumerate(names)]
 
 

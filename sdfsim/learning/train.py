@@ -112,8 +112,7 @@ def _made(data: Path, info: dict, train: int, validation: int) -> dict[str, Any]
     here = {split: len(list((data / split).glob("*.npz"))) for split in SPLITS if (data / split).is_dir()}
     counts = {"train": train, "validation": validation} | here
     known = {k: info.get(k) for k in ("recipe", "seed", "engine", "engine_version")}
-    if info.get("bodies"):
-        known["bodies"] = info["bodies"]
+    known |= {k: info[k] for k in ("bodies", "fps") if info.get(k)}
     shapes = info.get("shapes", [])
     solids = sum(name.startswith(SOLID) for name in shapes)
     return known | {"shapes": len(shapes), "random_solids": solids, "trajectories": counts}

@@ -44,7 +44,7 @@ class Work:
         again: what is added to go on after a kill.
         prepare: makes its settings tiny.
         result: everything that two runs must agree in, from their folder.
-        code: of an undisturbed run (3 where so short a fit misses its certificate).
+        code: of an undisturbed run (3 where so short a fit cannot be used).
     """
 
     arguments: tuple[str, ...]
@@ -156,7 +156,7 @@ def works(tmp_path_factory) -> dict[str, Work]:
     reconstruct = ("reconstruct", str(home / "photos"), "--preset", "quick")
     simulate = ("simulate", str(home / "scene.yaml"), "--viewer", "none")
     return {
-        "reconstruct": Work(reconstruct, (), crashing.tiny_reconstruct, of_reconstruct, 3),
+        "reconstruct": Work(reconstruct, (), crashing.tiny_reconstruct, of_reconstruct),
         "fit": Work(("fit", str(home / "box.ply")), (), crashing.tiny_fit, of_fit, 3),
         "simulate": Work(simulate, ("--resume",), crashing.tiny_simulate, of_simulate),
         "train": Work(("train", "--data", str(home / "data")), ("--resume",), crashing.tiny_train, of_train),
