@@ -221,10 +221,12 @@ def test_a_shape_with_mirror_planes_is_fitted_on_one_side(tiny: None) -> None:
 
 
 def test_side_by_side_is_each_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    # The goals are met at different updates, so that some leave the stack before the others.
+    # The goals are met at different updates, so that some leave the stack before the others; and early, since rounding,
+    # which differs with the size of the stack, grows from update to update.
     plan = replace(
-        plans.PLANS["default"], width=16, layers=4, batch=256, pool=5000, goal=(5e-3, 1, 1, 1), settle=200, steps=1200
+        plans.PLANS["default"], width=16, layers=4, batch=256, pool=5000, goal=(6e-2, 1, 1, 1), settle=20, steps=300
     )
+    monkeypatch.setattr(training, "CHECK", 10)
     monkeypatch.setitem(plans.PLANS, "default", plan)
     meshes = {
         "cone": primitives.cone(),
@@ -241,8 +243,7 @@ def test_side_by_side_is_each_alone(monkeypatch: pytest.MonkeyPatch) -> None:
         alone = fit_mesh(meshes[name], name=name)
         assert shape.certificate["steps"] == alone.certificate["steps"]
         assert shape.volume == alone.volume
-        # Rounding differs with the size of the stack, and grows through hundreds of updates.
-        torch.testing.assert_close(shape.sdf(points)[0], alone.sdf(points)[0], rtol=0, atol=2e-3)
+        torch.testing.assert_close(shape.sdf(points)[0], alone.sdf(points)[0], rtol=0, atol=1e-5)
 
 
 def test_one_that_breaks_does_not_spoil_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
