@@ -38,7 +38,7 @@ class Preset:
 
 PRESETS = {
     "small": Preset(
-        "impulse", {"width": 64, "rounds": 6}, steps=24_000, batch=32, rate=2e-3, matrix_rate=0.01, in_row=2, late=0.25
+        "impulse", {"width": 64, "rounds": 6}, steps=16_000, batch=32, rate=2e-3, matrix_rate=0.01, in_row=2, late=0.25
     ),
     "base": Preset("impulse", {"width": 128, "rounds": 8}, steps=100_000, batch=64, rate=1e-3, matrix_rate=0.01),
     "paper": Preset("paper", {"width": 128, "steps": 10}, steps=1_000_000, batch=8, rate=1e-3, noise=0.003),
