@@ -13,6 +13,9 @@ from torch import Tensor
 
 REST_SPEED = 0.2  # model units: what gravity adds to a speed in one step of training; slower counts as resting
 EDGE_FEATURES = 32
+# Model length: nearer than this surfaces touch. The engine's own limit is 0, where all lies that was put down exactly:
+# there rounding would decide.
+TOUCH = 1e-4
 SUBSTEPS = 5  # inner steps in one step of the engine that the training data come from; some recordings have fewer
 
 
@@ -182,7 +185,7 @@ def _meeting(g: ContactGraph, normal_motion: Tensor, speed: Tensor) -> Tensor:
     count = torch.arange(SUBSTEPS, dtype=start.dtype, device=start.device)
     # Symplectic Euler, as engines do it: [E, SUBSTEPS] distances at the start of each inner step.
     path = g.gap[:, None] + inner[:, None] * (start[:, None] * count + gain[:, None] * count * (count + 1) / 2)
-    seen = ((path <= 0.0) & (count < g.substeps[:, None])).to(start.dtype)
+    seen = ((path <= TOUCH) & (count < g.substeps[:, None])).to(start.dtype)
     # Part of the step that is over before the contact is seen; 1: it is not seen in this step.
     own = ((1.0 - seen.cummax(1).values).sum(1) / g.substeps).clamp_max(1.0)
 
@@ -201,7 +204,7 @@ def _meeting(g: ContactGraph, normal_motion: Tensor, speed: Tensor) -> Tensor:
     arriving = (start + gain * (at + 1)) / speed[:, 0]
     reach = inner * speed[:, 0]
     times = torch.stack([own, of_pair, of_body[g.first], of_body[g.second]], -1)
-    places = torch.stack([torch.asinh(distance / reach), (distance <= 0.0).to(start.dtype), arriving], -1)
+    places = torch.stack([torch.asinh(distance / reach), (distance <= TOUCH).to(start.dtype), arriving], -1)
     return torch.cat([times, places], -1)
 
 

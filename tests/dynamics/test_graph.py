@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sdfsim.dynamics.graph import REST_SPEED, SUBSTEPS, ContactGraph, edge_frames
+from sdfsim.dynamics.graph import REST_SPEED, SUBSTEPS, TOUCH, ContactGraph, edge_frames
 
 
 def falling(gaps: list[float], speeds: list[float], radius: float = 0.5, substeps: int = SUBSTEPS) -> ContactGraph:
@@ -48,7 +48,7 @@ def seen_at(gap: float, speed: float, substeps: int) -> tuple[int, float]:
     """The inner step at which an engine finds the ball touching, and its distance then (else at the last)."""
     inner, velocity = 0.02 / substeps, -speed
     for k in range(substeps):
-        if gap <= 0.0:
+        if gap <= TOUCH:
             return k, gap
         last = gap
         velocity -= 10.0 * inner

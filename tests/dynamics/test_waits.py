@@ -120,4 +120,4 @@ def test_the_samples_have_the_same_contacts_whether_distances_wait_or_not(sample
         # A fitted network's answers depend in their last digits on how many are asked together.
         torch.testing.assert_close(simulator.contacts.distance, eager.distance, rtol=0, atol=1e-5)
         met += len(eager)
-    assert met > 0 and waited > 0
+    assert met > 0 and (waited > 0 or sample == "tower")  # the tower stands from the start: nobody comes near
