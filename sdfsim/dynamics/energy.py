@@ -29,6 +29,7 @@ Motion = tuple[Tensor, Tensor]  # velocities and angular velocities [R, 3]
 # step (where nothing guards energy; three times what gravity adds in a step of training) and on average on its way
 # through it (overlaps are left in few steps). On its test data the bundled model makes 0.08 and 0.14 at most.
 ESCAPE, LEAVE = 0.6, 6.0
+WILD = 2.0  # times the energy that is allowed: a pose with that much is not to be kept
 ROUNDING = 1e-6  # of the energies compared: velocities come out of a network in single precision
 
 
@@ -156,8 +157,9 @@ def kinetic(bodies: Bodies, rows: Tensor, orientation: Tensor, motion: Motion) -
 def _share(bodies: Bodies, found: Balance, after: State, start: Motion, stop: Motion, most: Tensor) -> Tensor:
     """[K] how much of the way from `start` to `stop` keeps the kinetic energy of an island to `most` [K]: 1 for all.
 
-    Along it the energy is a parabola (at the orientations after the step). Where none of it keeps to `most`, the share
-    is -1. What is far beyond reason is left as it is, for the check of the state to name.
+    Along it the energy is a parabola (at the orientations after the step). Where none of it keeps to `most`, its lowest
+    point is taken; the share is -1 where that has more than `WILD` times as much. What is far beyond reason is left as
+    it is, for the check of the state to name.
     """
 
     def energy(motion: Motion) -> Tensor:
@@ -171,9 +173,9 @@ def _share(bodies: Bodies, found: Balance, after: State, start: Motion, stop: Mo
     square = energy((stop[0] - start[0], stop[1] - start[1])).clamp_min(torch.finfo(most.dtype).tiny)
     middle = -0.5 * (reached - lowest - square) / square
     inside = middle.square() + (most - lowest) / square
-    share = middle + inside.clamp_min(0.0).sqrt()
-    none = (inside < 0.0) | (share < 0.0)
-    return torch.where(over, torch.where(none, -1.0, share.clamp_max(1.0)), 1.0)
+    share = (middle + inside.clamp_min(0.0).sqrt()).clamp(0.0, 1.0)
+    left = lowest + square * (share.square() - 2.0 * middle * share)
+    return torch.where(over, torch.where(left > WILD * most, -1.0, share), 1.0)
 
 
 def _blend(flown: State, after: State, rows: Tensor, end: Tensor, way: Tensor) -> State:

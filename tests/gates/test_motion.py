@@ -36,5 +36,6 @@ def test_errors_on_plain_shapes_are_todays(tmp_path: Path):
     make_dataset("movi-b", data, shapes=meshes, trajectories=TRAJECTORIES, seed=7, split="test")
     report = evaluate(data, model="small", steps=50)
     at_50 = report["model"]["50"]
+    # 0.155 m (0.109 to 0.195) and 8.6 degrees (5.2 to 12.1): today's, and their intervals' ends.
     assert at_50["translation_rmse"] < 0.2
     assert at_50["rotation_error"] < 12.0

@@ -144,7 +144,7 @@ def tiny_fit() -> None:
     from sdfsim.shape import plans, training
 
     plan = replace(plans.PLANS["default"], width=8, layers=3, steps=120, batch=64, pool=1000, goal=None)
-    plans.PLANS["default"] = plan
+    plans.PLANS["default"] = plans.PLANS["quick"] = plan
     training.CHECK = 20
 
 

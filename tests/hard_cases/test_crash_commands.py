@@ -156,7 +156,7 @@ def works(tmp_path_factory) -> dict[str, Work]:
     reconstruct = ("reconstruct", str(home / "photos"), "--preset", "quick")
     simulate = ("simulate", str(home / "scene.yaml"), "--viewer", "none")
     return {
-        "reconstruct": Work(reconstruct, (), crashing.tiny_reconstruct, of_reconstruct),
+        "reconstruct": Work(reconstruct, (), crashing.tiny_reconstruct, of_reconstruct, 3),
         "fit": Work(("fit", str(home / "box.ply")), (), crashing.tiny_fit, of_fit, 3),
         "simulate": Work(simulate, ("--resume",), crashing.tiny_simulate, of_simulate),
         "train": Work(("train", "--data", str(home / "data")), ("--resume",), crashing.tiny_train, of_train),

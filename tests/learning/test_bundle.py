@@ -75,7 +75,7 @@ def test_the_card_says_how_to_repeat_exactly_this_training(cube_data, trained):
     assert _folders(data) == ["MOVI-B", "PILE-1", "PILE-2"]
     assert [_cast(made) for made in data[:2]] == ["1 shapes", "2 shapes, each in one split alone"]
     varied = made | {"recipe": "varied", "shapes": 9}
-    assert _cast(varied) == "6 shapes, each in one split alone, and 3 of the recipe's own in all"
+    assert _cast(varied) == "5 shapes, each in one split alone, and 4 of the recipe's own in all"
     assert lines[3:5] == [
         "sdfsim dataset pile -o PILE-1 --shapes SHAPES --bodies 8 --trajectories 5 --seed 0 --split train",
         "sdfsim dataset pile -o PILE-2 --shapes SHAPES --trajectories 5 --seed 7 --split train",

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sdfsim.dynamics.model import load_model
 from sdfsim.errors import SdfsimError
 from sdfsim.studies.tradeoff_contenders import Ours
 from sdfsim.studies.tradeoff_engines import Engine
@@ -42,7 +43,7 @@ def flight(cases, motion):
 
 
 def test_a_scene_becomes_a_case_in_the_model_s_units(cases):
-    assert cases.length == pytest.approx(0.1 / 1.4, rel=0.02)
+    assert cases.length == pytest.approx(0.1 / load_model("small").length, rel=0.02)
     assert cases.time == pytest.approx(np.sqrt(cases.length * 10.0 / 9.81))
     assert cases.steps == min(50, round(0.4 / cases.time / 0.02))
     assert cases.floor == (0.8, 0.5) and np.allclose(cases.recorded[0].gravity, [0, 0, -10])

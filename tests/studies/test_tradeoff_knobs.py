@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from sdfsim.dynamics.graph import EDGE_FEATURES
 from sdfsim.dynamics.model import Model, new_network
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.asset import analytic_shape, with_sdf
@@ -53,7 +54,7 @@ def test_rounds_are_the_first_ones(model):
 
 def test_bf16_rounds_products_and_nothing_else(model):
     rough = arranged_model(Setting(precision="bf16"), model).network
-    x = torch.randn(64, 34, generator=torch.Generator().manual_seed(0))
+    x = torch.randn(64, EDGE_FEATURES, generator=torch.Generator().manual_seed(0))
     exact, near = model.network.encode(x), rough.encode(x)
     assert near.dtype == torch.float32 and not torch.equal(exact, near)
     assert (exact - near).abs().max() < 0.03 * exact.abs().max()
