@@ -97,7 +97,7 @@ def head_on(model: str, size: float) -> Iterator[Law]:
     drift = 0.0
     for speed in (0.3, 1.0, 3.0):
         v = speed * sqrt(size)
-        bodies = [body(n, 0, [x, 0, 0], size, velocity=[-np.sign(x) * v / 2, 0, 0], restitution=sqrt(e))
+        bodies = [body(n, 0, [x, 0, 10 * size], size, velocity=[-np.sign(x) * v / 2, 0, 0], restitution=sqrt(e))
                   for n, x in (("a", -0.7 * size), ("b", 0.7 * size))]  # fmt: skip
         motion = run(model, ball(size), bodies, 1.2 * size / v, weight=0.0)
         after = motion.velocity[-1, :2, 0]
