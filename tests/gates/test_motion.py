@@ -4,23 +4,13 @@ from pathlib import Path
 
 import pytest
 
+from sdfsim.learning.decompose import wavefront
 from sdfsim.learning.evaluate import evaluate
 from sdfsim.learning.generate import make_dataset
 from sdfsim.shape import primitives
 from sdfsim.shape.asset import analytic_shape
-from sdfsim.shape.mesh import Mesh
 
 TRAJECTORIES = 30
-
-
-def wavefront(pieces: list[Mesh]) -> str:
-    lines, before = [], 1
-    for number, piece in enumerate(pieces):
-        lines.append(f"o piece{number}")
-        lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in piece.vertices]
-        lines += [f"f {a} {b} {c}" for a, b, c in piece.faces + before]
-        before += len(piece.vertices)
-    return "\n".join(lines) + "\n"
 
 
 @pytest.mark.gate
