@@ -223,7 +223,7 @@ def _training_rows(card: dict, parameters: int) -> tables.Rows:
             f"{card['optimiser_steps']:,}",
             str(card["preset"]["batch"]),
             f"{card['seconds']:,} s = {card['seconds'] / 3600:.2f} h",
-            f"{card['device']}, {card['threads']} thread(s)",
+            f"{card['device']}, {card.get('processes', 1)} process(es) of {card['threads']} thread(s)",
         ),
     ]
 

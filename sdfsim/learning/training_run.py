@@ -156,6 +156,7 @@ class Run:
             "seed": self.seed,
             "optimiser_steps": self.step,
             "seconds": round(self.seconds),
+            "processes": self.team.size,
             "threads": torch.get_num_threads(),
             "device": str(self.device),
             "preset_name": name,
