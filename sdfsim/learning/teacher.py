@@ -28,8 +28,8 @@ is that of pybullet 3.2.7. "As there" means that ours is the same.
 | frames | sim:170: every 240 // rate-th step | 12 a second (ab:72) | 50 or 60: a rollout's steps |
 | floor | ab:87, c:95: "dome", scale 2, 1 | a hull 159, 79 m wide, its margin on top of z = 0 | box, top at z = 0 |
 
-One thing is done that Kubric does not: an inner step is taken before the first with the bodies far apart, since the engine
-has the inertias of a mass of 1 kg in it. Bodies that start in the air move the same.
+One thing is done that Kubric does not. An inner step is taken before the first, with the bodies far apart, because the
+engine has the inertias of a mass of 1 kg in it. Bodies that start in the air move the same.
 
 The floor is a box because its upper face is the plane z = 0 exactly, which is what learned models meet; rebounds on the
 dome are as high. Spheres of our own recipes are exact; Kubric's is a hull, as all of its bodies, and rolls as one.
