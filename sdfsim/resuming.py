@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from sdfsim.dynamics.bodies import Sleep, State
+from sdfsim.dynamics.bodies import Sleep, State, Touch
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.simulator import Simulator, join
 from sdfsim.dynamics.sleep import Rest
@@ -158,7 +158,7 @@ def _part(number: int) -> str:
 def _arrays(state: State, rest: Rest) -> dict[str, np.ndarray]:
     """Every array of a state, of who sleeps in it and of how long all has rested, by name."""
     found = {"time": np.array(state.time), "rest.quiet": np.array(rest.quiet)}
-    for prefix, of in (("", state), ("sleep.", state.sleep), ("rest.", rest)):
+    for prefix, of in (("", state), ("sleep.", state.sleep), ("touch.", state.touch), ("rest.", rest)):
         for field in fields(of) if of is not None else ():
             value = getattr(of, field.name)
             if isinstance(value, torch.Tensor):
@@ -171,5 +171,10 @@ def _state(arrays: dict[str, np.ndarray], device: torch.device) -> State:
         names = {f.name: prefix + f.name for f in fields(kind) if f.name != "time"}
         return {k: torch.as_tensor(arrays[name], device=device) for k, name in names.items() if name in arrays}
 
-    asleep = tensors(Sleep, "sleep.")
-    return State(**tensors(State, ""), sleep=Sleep(**asleep) if asleep else None, time=float(arrays["time"]))
+    asleep, touch = tensors(Sleep, "sleep."), tensors(Touch, "touch.")
+    return State(
+        **tensors(State, ""),
+        sleep=Sleep(**asleep) if asleep else None,
+        touch=Touch(**touch) if touch else None,
+        time=float(arrays["time"]),
+    )

@@ -291,7 +291,7 @@ def environment() -> dict[str, Any]:
     import torch
 
     import sdfsim
-    from sdfsim.dynamics.model import bundled_models
+    from sdfsim.dynamics.model import model_names
 
     versions = {"sdfsim": sdfsim.__version__, "python": platform.python_version()}
     for name in _PACKAGES:
@@ -304,5 +304,5 @@ def environment() -> dict[str, Any]:
         "versions": versions,
         "devices": ["cpu", *(f"cuda:{i} {name}" for i, name in enumerate(gpus))],
         "cpu_threads": torch.get_num_threads(),
-        "models": bundled_models(),
+        "models": model_names(),
     }

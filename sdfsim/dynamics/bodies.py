@@ -126,6 +126,33 @@ class Sleep:
 
 
 @dataclass(frozen=True)
+class Touch:
+    """What the contact solve knows of N bodies from one step to the next.
+
+    Attributes:
+        touching: [N] bool, whether contacts acted in the last inner step.
+        quiet: [N] int64, for how many steps a body in contact has stayed near its anchor.
+        anchor: [N, 7] float64, position and orientation that it has stayed near.
+        island: [N] int64, a number shared by the bodies that fell asleep together; -1 for all that are awake.
+        pair: [P, 2] int64, bodies with contact points; count: [P] int64, how many each pair has.
+        point: [P, 8, 14] float64: where a point is on either body (about its centre of mass, in its axes), the normal
+            from the second to the first, the distance, the impulse along the normal and the tangential one [3].
+        held: [N, 13] float64, position, orientation and velocities that the last step ended with.
+        gravity: [3], what it was made under.
+    """
+
+    touching: Tensor
+    quiet: Tensor
+    anchor: Tensor
+    island: Tensor
+    pair: Tensor
+    count: Tensor
+    point: Tensor
+    held: Tensor
+    gravity: Tensor
+
+
+@dataclass(frozen=True)
 class State:
     """Where N bodies are and how they move.
 
@@ -136,7 +163,8 @@ class State:
         angular_velocity: [N, 3] float64, world frame.
         earlier_position, earlier_orientation: [2, N, 3] and [2, N, 4], the two poses before (oldest first),
             for the *paper* network; None where nobody needs them.
-        sleep: who is frozen; None where sleep is off.
+        sleep: who is frozen; None where sleep is off, and for the solver.
+        touch: contacts and sleep of the solver; None before its first step.
         time: since the start.
     """
 
@@ -147,12 +175,14 @@ class State:
     earlier_position: Tensor | None = None
     earlier_orientation: Tensor | None = None
     sleep: Sleep | None = None
+    touch: Touch | None = None
     time: float = 0.0
 
 
 def awake(bodies: Bodies, state: State) -> Tensor:
     """[A] int64, the dynamic bodies that are not asleep."""
-    moves = bodies.moves if state.sleep is None else bodies.moves & (state.sleep.island < 0)
+    of = state.touch or state.sleep
+    moves = bodies.moves if of is None else bodies.moves & (of.island < 0)
     return moves.nonzero()[:, 0]
 
 

@@ -17,6 +17,7 @@ from sdfsim.scene.types import Limits
 
 if TYPE_CHECKING:
     from sdfsim.dynamics.rounding import Curvature
+    from sdfsim.dynamics.solver import Compiled
 
 COUNTS = {
     "pairs": "pairs of bodies that the broad phase let through",
@@ -24,6 +25,7 @@ COUNTS = {
     "sdf_waiting": "nodes, or balls of them, near a surface that cannot reach it yet, by an earlier answer",
     "nodes": "nodes of the graph that the network saw",
     "edges": "edges of that graph",
+    "contacts": "contact points that the solver held",
     "free": "dynamic bodies in free flight",
     "active": "dynamic bodies that the network moved",
     "asleep": "dynamic bodies asleep",
@@ -34,6 +36,7 @@ PHASES = {
     "distances_ms": "signed distances",
     "flight_ms": "free flight",
     "network_ms": "network",
+    "contact_ms": "contact solve",
     "sleep_ms": "sleep",
 }
 PIECE = 2**20  # nodes that are gone through together at most; in smaller parts a large scene takes twice the time
@@ -130,6 +133,7 @@ class Memory:
         self.counts = dict.fromkeys((*COUNTS, *PHASES, "energy_gain"), 0.0)
         self._tree: tuple[Tensor, tuple[Layer, Layer, Layer]] | None = None
         self._bend: tuple[Tensor, Curvature] | None = None
+        self._compiled: Compiled | None = None
         self._last: State | None = None
         self._still: tuple[Tensor, Still] | None = None
         self._cuda = False
@@ -139,6 +143,14 @@ class Memory:
         if self._tree is None or self._tree[0] is not bodies.node:
             self._tree = (bodies.node, layers(bodies))
         return self._tree[1]
+
+    def compiled(self, bodies: Bodies, state: State) -> Compiled:
+        """The bodies as the contact solve wants them, made once."""
+        from sdfsim.dynamics.solver import Compiled
+
+        if self._compiled is None or self._compiled.bodies is not bodies:
+            self._compiled = Compiled(bodies, state)
+        return self._compiled
 
     def curvature(self, bodies: Bodies) -> Curvature:
         """How the bodies' surfaces bend around their nodes, measured once."""
@@ -165,7 +177,8 @@ class Memory:
     def end(self, bodies: Bodies, state: State) -> None:
         """The step led to `state`."""
         self._last = state
-        asleep = 0 if state.sleep is None else int((state.sleep.island >= 0).sum())
+        of = state.touch or state.sleep
+        asleep = 0 if of is None else int((of.island >= 0).sum())
         self.count(asleep=asleep, free=int(bodies.moves.sum()) - asleep - self.counts["active"])
 
     def count(self, **more: float) -> None:

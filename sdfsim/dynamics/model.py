@@ -21,6 +21,7 @@ BUNDLED = Path(__file__).resolve().parent.parent / "models"
 DEFAULT_MODEL = "small"
 MOST = 4096  # of any size of a network
 MODEL_VERSION = 2  # 1: trained on a teacher whose contacts acted before surfaces touched
+SOLVER = "solver"
 NETWORKS = {"impulse": (ImpulseConfig, ImpulseNetwork), "paper": (PaperConfig, PaperNetwork)}
 
 
@@ -30,11 +31,12 @@ class Model:
 
     Attributes:
         name: bundled name or file stem.
-        kind: "impulse" or "paper".
-        network: in evaluation mode.
-        dt: s, the step of the training data.
+        kind: "solver", "impulse" or "paper".
+        network: in evaluation mode; the solver has none.
+        dt: s, the step of the training data, or of the solver for bodies of `length` at `gravity`.
         gravity: m/s^2, its magnitude in the training data.
-        length: m, the middle of the range of training bodies' largest extents; other scenes are rescaled to it.
+        length: m, the middle of the range of training bodies' largest extents; other scenes are rescaled to it. The
+            solver is rescaled to the smallest body that moves.
         reach: m, contact radius D.
         nodes: surface nodes a body it was trained with, the first of each shape's; None for all.
         ranges: name -> [low, high] of what training saw (friction, restitution, mass_ratio, speed, size).
@@ -82,12 +84,17 @@ def new_network(kind: str, config: dict[str, Any]) -> nn.Module:
 
 
 def bundled_models() -> list[str]:
-    """Names of the models that come with the package."""
+    """Names of the networks that come with the package."""
     return sorted(p.stem for p in BUNDLED.glob("*.safetensors"))
 
 
+def model_names() -> list[str]:
+    """What a model may be called: the solver, and the bundled networks."""
+    return [SOLVER, *bundled_models()]
+
+
 class Unread(nn.Module):
-    """Stands for weights that nothing will ask."""
+    """Stands for weights that nothing will ask, or that there are none of."""
 
     def forward(self, *_: Any, **__: Any) -> None:
         """Never to be called."""
@@ -107,10 +114,12 @@ def load_model(name: str | Path | None = None, *, weights: bool = True) -> Model
     from safetensors import SafetensorError, safe_open
 
     name = name or DEFAULT_MODEL
+    if name == SOLVER:
+        return Model(SOLVER, SOLVER, Unread().eval(), dt=0.02, gravity=10.0, length=1.4, reach=0.02)
     path = Path(name) if str(name).endswith(".safetensors") else BUNDLED / f"{name}.safetensors"
     if not path.exists():
         raise SdfsimError(
-            f"model {str(name)!r} not found", f"bundled: {', '.join(bundled_models())}; or the path of a .safetensors"
+            f"model {str(name)!r} not found", f"there are {', '.join(model_names())}; or the path of a .safetensors"
         )
     try:
         with safe_open(path, framework="pt") as file:

@@ -21,7 +21,7 @@ from sdfsim.dynamics.energy import Guard, kinetic
 from sdfsim.dynamics.froude import scene_units
 from sdfsim.dynamics.history import history_told, with_history
 from sdfsim.dynamics.memory import Memory, row_limit
-from sdfsim.dynamics.model import Model, load_model
+from sdfsim.dynamics.model import SOLVER, Model, load_model
 from sdfsim.dynamics.overlap import deep_starts
 from sdfsim.dynamics.ranges import outside_training
 from sdfsim.dynamics.rollout import Rollout, join
@@ -87,7 +87,10 @@ class Simulator:
         effects = plan(scene)
         model = model if model is not None else scene.model
         asked = effects.contact.on or free_flight == "learned"
-        self.model = (model if isinstance(model, Model) else load_model(model, weights=asked)).to(self.device)
+        self.model = model if isinstance(model, Model) else load_model(model, weights=asked)
+        if self.model.kind == SOLVER:
+            self.device = torch.device("cpu")  # the compiled step has no other
+        self.model = self.model.to(self.device)
         if free_flight == "learned" and self.model.kind != "paper":
             raise SdfsimError("free_flight 'learned' exists for the paper network only", "give a model of that kind")
         self.seed = scene.seed if seed is None else seed
@@ -106,6 +109,7 @@ class Simulator:
             free_flight=free_flight,
             rows=row_limit(scene.limits),
             guard=guard,
+            sleep=self.model.kind == SOLVER and effects.contact.on and scene.effects.sleep != "off",
         )
         check_nodes(scene, self.model.nodes)
         self.bodies, self.state = from_scene(scene, self.units, self.device, self.model.nodes)
@@ -116,7 +120,7 @@ class Simulator:
             self.outside_training += found
         if self.model.kind == "paper":
             self.state = with_history(self.state, self.bodies, self.rules)
-        if effects.sleep.on:
+        if effects.sleep.on and self.model.kind != SOLVER:
             self.state = replace(self.state, sleep=nobody_asleep(self.bodies, gravity))
         self.memory = Memory()
         self._dynamic = self.bodies.moves.nonzero()[:, 0]
@@ -226,6 +230,11 @@ class Simulator:
         state, c, u = self.si_state(), self.contacts, self.units
         count = 0 if c is None else len(c)
         points, pairs, depth = np.zeros((0, 3)), np.zeros((0, 2), dtype=np.int64), 0.0
+        if self.state.touch is not None:
+            from sdfsim.dynamics.solver import contact_points
+
+            points, pairs, depth = contact_points(self.state)
+            points, depth, count = points * u.length, depth * u.length, len(points)
         if c is not None and count:
             # The edges were found at the start of the step; their points are told where this frame has the bodies.
             place, turn = self.state.position, self.state.orientation

@@ -20,7 +20,7 @@ from sdfsim.dynamics.freeflight import ballistic, torque_free
 from sdfsim.dynamics.graph import SUBSTEPS, ContactGraph, number_pairs
 from sdfsim.dynamics.impulse import Velocities
 from sdfsim.dynamics.memory import Memory
-from sdfsim.dynamics.model import Model
+from sdfsim.dynamics.model import SOLVER, Model
 from sdfsim.dynamics.overlap import parting
 from sdfsim.dynamics.sleep import settle, stir, touched, wake
 from sdfsim.dynamics.surfaces import compact, predict
@@ -45,6 +45,7 @@ class Rules:
         free_flight: "exact", or "learned" where the *paper* network predicts all of every body's motion.
         rows: how many nodes or edges to work on at once; None for all.
         guard: "energy" holds back contact that makes energy.
+        sleep: whether the solver freezes what rests; networks have it in the state.
     """
 
     gravity: Tensor
@@ -58,6 +59,7 @@ class Rules:
     free_flight: FreeFlight = "exact"
     rows: int | None = None
     guard: Guard = "none"
+    sleep: bool = False
 
 
 @torch.no_grad()
@@ -79,6 +81,12 @@ def step(
     memory = memory or Memory()
     edited = memory.begin(bodies, state)
     state = stir(bodies, drive(bodies, state, rules), rules.gravity, edited=edited)
+    if model.kind == SOLVER and rules.contact:
+        from sdfsim.dynamics.solver import solver_step  # numba takes its time to load
+
+        state = solver_step(bodies, state, rules, memory)
+        memory.end(bodies, state)
+        return state, None
     contacts = None
     if rules.contact:
         state, contacts = meet(model, bodies, state, rules, memory)

@@ -12,7 +12,7 @@ from sdfsim.dynamics.energy import Guard
 from sdfsim.dynamics.graph import SUBSTEPS
 from sdfsim.dynamics.history import with_history
 from sdfsim.dynamics.memory import Memory
-from sdfsim.dynamics.model import Model
+from sdfsim.dynamics.model import SOLVER, Model
 from sdfsim.dynamics.sleep import nobody_asleep
 from sdfsim.dynamics.step import FreeFlight, Rules, step
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
@@ -62,7 +62,7 @@ def roll_out(
     units = model_units(model, group[0])
     bodies, state = merged(group, [0] * len(group), shapes, units, device, floor)
     gravity = torch.tensor(group[0].gravity / units.acceleration, dtype=torch.float64, device=device)
-    rules = Rules(gravity, model.dt, substeps, contact=contact, free_flight=free_flight, guard=guard)
+    rules = Rules(gravity, group[0].dt / units.time, substeps, contact=contact, free_flight=free_flight, guard=guard)
     if model.kind == "paper":
         state = with_history(state, bodies, rules)
     if sleep:
@@ -109,7 +109,9 @@ def first_frames(trajectory: Trajectory, count: int) -> Trajectory:
 
 
 def model_units(model: Model, like: Trajectory) -> Units:
-    """Model units in which the recorded step is the model's own."""
+    """Model units in which the recorded step is the model's own; for the solver those of its bodies of a metre."""
     strength = float(np.linalg.norm(like.gravity)) or model.gravity
+    if model.kind == SOLVER:  # it takes the inner steps that it is told
+        return Units(length=1.0, time=float(np.sqrt(model.gravity / strength)), mass=1.0)
     length = (like.dt / model.dt) ** 2 * strength / model.gravity
     return Units(length=length, time=like.dt / model.dt, mass=1.0)

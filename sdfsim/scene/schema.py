@@ -20,7 +20,7 @@ DEFAULT_GRAVITY = (0.0, 0.0, -9.81)  # m/s^2
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 
 _TOP = ("version", "model", "duration", "seed", "gravity", "effects", "limits", "shapes", "bodies")
-_SHAPE_KINDS = ("asset", "mesh", "primitive", "sphere", "box", "plane")
+_SHAPE_KINDS = ("asset", "mesh", "primitive", "sphere", "capsule", "cylinder", "box", "plane")
 _SDF_KINDS = ("mlp", "grid", "mesh")
 FEWEST_NODES, MOST_NODES = 3, 128  # along each side of the sampling grid
 _WITH_SDF = ("asset", "mesh", "primitive")  # the others have an exact SDF of their own
@@ -35,7 +35,7 @@ class ShapeSpec:
 
     Attributes:
         name: its key.
-        kind: asset, mesh, primitive, sphere, box or plane.
+        kind: asset, mesh, primitive, sphere, capsule, cylinder, box or plane.
         place: where faults of it are reported.
         path: of an asset or mesh, resolved against the scene's folder.
         units: metres per unit of the mesh file.
@@ -215,12 +215,25 @@ def _shape(name: str, item: Value, home: Home) -> ShapeSpec | None:
         sphere = kind.section(["radius"])
         sphere.required("radius")
         spec.options = {"radius": sphere.number("radius", "m", above=0, default=1.0)}
+    elif spec.kind in ("capsule", "cylinder"):
+        spec.options = _upright(kind, spec.kind)
     elif spec.kind == "box":
         size = kind.section(["size"]).required("size")
         spec.options = {"size": _positive(size) if size else np.ones(3)}
     elif not kind.is_null():
         kind.section((), advice=_PLANE_ADVICE)
     return spec
+
+
+def _upright(item: Value, kind: str) -> dict[str, float]:
+    """`capsule: {radius: 0.1, height: 0.5}`, along z."""
+    section = item.section(["radius", "height"])
+    for key in ("radius", "height"):
+        section.required(key)
+    found = {key: section.number(key, "m", above=0, default=1.0) for key in ("radius", "height")}
+    if kind == "capsule" and "height" in section and "radius" in section and found["height"] <= 2 * found["radius"]:
+        section["height"].wrong(f"must be above twice the radius, its caps included (got {found['height']:g} m)")
+    return found
 
 
 def _sdf(section: Section, spec: ShapeSpec) -> None:

@@ -1,4 +1,4 @@
-"""Exact signed distances of the plane, the sphere and the box, with a defined gradient everywhere."""
+"""Exact signed distances of plane, sphere, capsule, box and cylinder, with a defined gradient everywhere."""
 
 from __future__ import annotations
 
@@ -53,6 +53,44 @@ def box_distance(points: torch.Tensor, half: torch.Tensor) -> tuple[torch.Tensor
     outside = length > tiny
     gradient = torch.where(outside[:, None], beyond / length.clamp_min(tiny)[:, None], inward)
     return torch.where(outside, length, deepest), side * gradient
+
+
+def capsule_distance(
+    points: torch.Tensor, radius: torch.Tensor, half: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Distance [P] to all within `radius` [P] or [1] of the segment |z| <= `half` [P] or [1], and its gradient [P, 3].
+
+    Args:
+        points: [P, 3] m.
+        radius, half: m.
+    """
+    up = torch.zeros_like(points)
+    up[:, 2] = torch.minimum(torch.maximum(points[:, 2], -half), half)
+    return sphere_distance(points - up, radius)
+
+
+def cylinder_distance(
+    points: torch.Tensor, radius: torch.Tensor, half: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Distance [P] to a cylinder about z of half height `half` [P] or [1], and its gradient [P, 3].
+
+    Inside, the gradient points to the nearer of side and end; of equally near ones to the end.
+    """
+    tiny = torch.finfo(points.dtype).tiny
+    away = points[:, :2].norm(dim=1)
+    outward = torch.zeros_like(points)
+    outward[:, 0] = 1.0
+    outward[:, :2] = torch.where((away > tiny)[:, None], points[:, :2] / away.clamp_min(tiny)[:, None], outward[:, :2])
+    end = torch.zeros_like(points)
+    end[:, 2] = torch.where(points[:, 2] < 0, -1.0, 1.0).to(points.dtype)
+    aside, above = away - radius, points[:, 2].abs() - half
+    corner = (aside > 0) & (above > 0)
+    length = torch.sqrt(aside.clamp_min(0) ** 2 + above.clamp_min(0) ** 2)
+    slanted = (aside[:, None] * outward + above[:, None] * end) / length.clamp_min(tiny)[:, None]
+    side = aside > above
+    distance = torch.where(corner, length, torch.maximum(aside, above))
+    gradient = torch.where(corner[:, None], slanted, torch.where(side[:, None], outward, end))
+    return distance, gradient
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,3 +174,77 @@ class BoxSdf:
     def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Distance [P] m and unit gradient [P, 3] at `points` [P, 3] m."""
         return box_distance(points, torch.tensor([self.half], dtype=points.dtype, device=points.device))
+
+
+@dataclass(frozen=True, eq=False)
+class CapsuleSdf:
+    """All within a radius of a segment along z whose middle is the origin.
+
+    Attributes:
+        radius: m, > 0.
+        half: m, > 0, half the length of the segment.
+
+    Raises:
+        SdfsimError: one of them is not a positive finite number.
+    """
+
+    radius: float
+    half: float
+
+    def __post_init__(self) -> None:
+        _check_round("capsule", self.radius, self.half)
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """[2, 3] m."""
+        high = np.array([self.radius, self.radius, self.half + self.radius])
+        return np.stack([-high, high])
+
+    def to(self, device: torch.device | str) -> CapsuleSdf:
+        """Itself: it holds no tensors."""
+        return self
+
+    @accepts_numpy
+    def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Distance [P] m and unit gradient [P, 3] at `points` [P, 3] m."""
+        return capsule_distance(points, points.new_tensor([self.radius]), points.new_tensor([self.half]))
+
+
+@dataclass(frozen=True, eq=False)
+class CylinderSdf:
+    """A cylinder about z whose middle is the origin.
+
+    Attributes:
+        radius: m, > 0.
+        half: m, > 0, half its height.
+
+    Raises:
+        SdfsimError: one of them is not a positive finite number.
+    """
+
+    radius: float
+    half: float
+
+    def __post_init__(self) -> None:
+        _check_round("cylinder", self.radius, self.half)
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """[2, 3] m."""
+        high = np.array([self.radius, self.radius, self.half])
+        return np.stack([-high, high])
+
+    def to(self, device: torch.device | str) -> CylinderSdf:
+        """Itself: it holds no tensors."""
+        return self
+
+    @accepts_numpy
+    def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Distance [P] m and unit gradient [P, 3] at `points` [P, 3] m."""
+        return cylinder_distance(points, points.new_tensor([self.radius]), points.new_tensor([self.half]))
+
+
+def _check_round(kind: str, radius: float, half: float) -> None:
+    for name, value in (("radius", radius), ("half height", half)):
+        if not (np.isfinite(value) and value > 0):
+            raise SdfsimError(f"{kind} {name} must be > 0 (got {value})")

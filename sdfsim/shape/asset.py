@@ -12,11 +12,11 @@ import torch
 
 from sdfsim.errors import SdfsimError
 from sdfsim.files import write_json
-from sdfsim.shape.analytic import BoxSdf, PlaneSdf, SphereSdf
+from sdfsim.shape.analytic import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.distance import MeshDistance
 from sdfsim.shape.exact import MeshSdf
 from sdfsim.shape.grid import GridSdf, sample_grid
-from sdfsim.shape.mesh import Frame, Mesh
+from sdfsim.shape.mesh import Frame, Mesh, convex_hull
 from sdfsim.shape.mlp import MlpSdf
 from sdfsim.shape.sdf import Sdf
 from sdfsim.shape.storage import (
@@ -161,6 +161,8 @@ def scaled(shape: Shape, factor: float) -> Shape:
         sdf = replace(sdf, frame=frame, bounds=sdf.bounds * factor)
     elif isinstance(sdf, SphereSdf):
         sdf = SphereSdf(sdf.radius * factor)
+    elif isinstance(sdf, CapsuleSdf | CylinderSdf):
+        sdf = replace(sdf, radius=sdf.radius * factor, half=sdf.half * factor)
     elif isinstance(sdf, BoxSdf):
         x, y, z = sdf.half
         sdf = BoxSdf((x * factor, y * factor, z * factor))
@@ -239,24 +241,26 @@ def sdf_of_mesh(
 
 
 def analytic_shape(
-    kind: Literal["plane", "sphere", "box"],
+    kind: Literal["plane", "sphere", "capsule", "cylinder", "box"],
     *,
     radius: float | None = None,
+    height: float | None = None,
     size: Sequence[float] | np.ndarray | None = None,
     name: str | None = None,
 ) -> Shape:
     """A shape with an exact SDF, about the origin.
 
     Args:
-        kind: "plane" (z = 0, +z outside, infinite), "sphere" or "box".
-        radius: of the sphere, m.
+        kind: "plane" (z = 0, +z outside, infinite), "sphere", "capsule", "cylinder" or "box".
+        radius: of the sphere, capsule or cylinder, m.
+        height: of the capsule, its caps included, or cylinder, both along z; m.
         size: (x, y, z) full extents of the box, m.
         name: by default the kind.
 
     Returns:
         Shape with exact mass properties (per unit density; those of the plane are 0), a mesh for display (of the
-        plane: a 20 m square) and nodes: sphere 128 spread as a Fibonacci spiral, box 8 corners and points
-        along edges and on faces, plane none.
+        plane: a 20 m square) and nodes: sphere 128 spread as a Fibonacci spiral, capsule and cylinder rings,
+        box 8 corners and points along edges and on faces, plane none.
 
     Raises:
         SdfsimError: unknown kind, or a size that is missing or not positive.
@@ -285,9 +289,49 @@ def analytic_shape(
         volume = 8.0 * x * y * z
         inertia = volume / 3.0 * np.diag([y * y + z * z, z * z + x * x, x * x + y * y])
         mesh, nodes = primitives.box((2 * x, 2 * y, 2 * z)), _box_nodes(np.array([x, y, z]))
+    elif kind in ("capsule", "cylinder"):
+        if radius is None or height is None:
+            raise SdfsimError(f"a {kind} needs a radius and a height")
+        caps = 2.0 * radius if kind == "capsule" else 0.0
+        if not height > caps:
+            raise SdfsimError(f"a capsule's height must be above twice its radius (got {height:g} and {radius:g})")
+        half = 0.5 * (float(height) - caps)
+        sdf = (CapsuleSdf if kind == "capsule" else CylinderSdf)(float(radius), half)
+        volume, inertia = _round_mass(sdf.radius, half, caps=caps > 0)
+        nodes = _round_nodes(sdf.radius, half, caps=caps > 0)
+        mesh = convex_hull(_round_nodes(sdf.radius, half, caps=caps > 0, around=48))
     else:
-        raise SdfsimError(f"unknown analytic shape {kind!r}", "use plane, sphere or box")
+        raise SdfsimError(f"unknown analytic shape {kind!r}", "use plane, sphere, capsule, cylinder or box")
     return Shape(name or kind, mesh, sdf, nodes, float(volume), np.zeros(3), inertia, source=source)
+
+
+def _round_mass(radius: float, half: float, *, caps: bool) -> tuple[float, np.ndarray]:
+    """Volume m^3 and inertia [3, 3] m^5 (per unit density) of a cylinder about z, with half balls at its ends."""
+    trunk = 2.0 * np.pi * radius**2 * half
+    across, about = trunk * (radius**2 / 4.0 + half**2 / 3.0), trunk * radius**2 / 2.0
+    if caps:
+        balls = 4.0 / 3.0 * np.pi * radius**3
+        # Half balls whose flat sides lie at +-half, their middles 3/8 of the radius beyond.
+        across += balls * (0.4 * radius**2 + half**2 + 0.75 * half * radius)
+        about += 0.4 * balls * radius**2
+        trunk += balls
+    return trunk, np.diag([across, across, about])
+
+
+def _round_nodes(radius: float, half: float, *, caps: bool, around: int = 16) -> np.ndarray:
+    """Rings about z on the surface of a capsule or cylinder: [K, 3] m, those of the ends first."""
+    turns = 2.0 * np.pi * np.arange(around) / around
+    circle = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    rings = [(radius, half * z) for z in (-1.0, 1.0)]
+    if caps:
+        tilts = np.arange(1, 4) * np.pi / 8.0
+        rings += [(radius * np.cos(t), z * (half + radius * np.sin(t))) for t in tilts for z in (-1.0, 1.0)]
+    else:
+        rings += [(0.5 * radius, half * z) for z in (-1.0, 1.0)]
+    rings += [(radius, half * z) for z in (-0.5, 0.0, 0.5)]
+    tips = np.array([[0.0, 0.0, z * (half + (radius if caps else 0.0))] for z in (-1.0, 1.0)])
+    placed = [np.column_stack([r * circle, np.full(around, z)]) for r, z in rings]
+    return np.concatenate([*placed, tips])
 
 
 def _sphere_nodes(radius: float, count: int) -> np.ndarray:

@@ -9,7 +9,18 @@ import numpy as np
 import torch
 
 from sdfsim.shape import grid, mlp
-from sdfsim.shape.analytic import BoxSdf, PlaneSdf, SphereSdf, box_distance, plane_distance, sphere_distance
+from sdfsim.shape.analytic import (
+    BoxSdf,
+    CapsuleSdf,
+    CylinderSdf,
+    PlaneSdf,
+    SphereSdf,
+    box_distance,
+    capsule_distance,
+    cylinder_distance,
+    plane_distance,
+    sphere_distance,
+)
 from sdfsim.shape.boxed import everywhere, half_extents
 from sdfsim.shape.grid import GridSdf, trilinear
 from sdfsim.shape.mlp import MlpSdf, sides
@@ -22,8 +33,8 @@ FITTED_TRUST = 0.8  # of a fitted or sampled distance: its errors are far smalle
 class SdfBank:
     """Many SDFs asked at once: each point of its own shape.
 
-    Networks of one architecture share batched matrix products, grids of one resolution a gather; spheres, boxes and
-    planes are evaluated by kind. Anything else that speaks the protocol (an exact mesh) is called once per shape.
+    Networks of one architecture share batched matrix products, grids of one resolution a gather; closed forms
+    are evaluated by kind. Anything else that speaks the protocol (an exact mesh) is called once per shape.
 
     What a kind needs is brought to the device when one of its shapes is first asked for.
 
@@ -46,7 +57,7 @@ class SdfBank:
                 key: object = sdf.architecture
             elif isinstance(sdf, GridSdf):
                 key = (GridSdf, sdf.resolution)
-            elif isinstance(sdf, PlaneSdf | SphereSdf | BoxSdf):
+            elif isinstance(sdf, PlaneSdf | SphereSdf | CapsuleSdf | CylinderSdf | BoxSdf):
                 key = type(sdf)
             else:
                 key = number
@@ -107,6 +118,14 @@ def _group(sdfs: list[Sdf], device: torch.device):
     if isinstance(first, BoxSdf):
         half = torch.tensor([sdf.half for sdf in sdfs if isinstance(sdf, BoxSdf)], dtype=torch.float64, device=device)
         return lambda slot, points: box_distance(points, half[slot].to(points.dtype))
+    if isinstance(first, CapsuleSdf | CylinderSdf):
+        sizes = torch.tensor(
+            [(sdf.radius, sdf.half) for sdf in sdfs if isinstance(sdf, CapsuleSdf | CylinderSdf)],
+            dtype=torch.float64,
+            device=device,
+        )
+        ask = capsule_distance if isinstance(first, CapsuleSdf) else cylinder_distance
+        return lambda slot, points: ask(points, *sizes[slot].to(points.dtype).unbind(1))
     return lambda slot, points: first(points)
 
 

@@ -14,7 +14,8 @@ import torch
 class Sdf(Protocol):
     """A signed distance with its gradient: positive outside, negative inside, metres, the shape's own frame.
 
-    Its members: `MlpSdf` (a fitted network), the closed forms `PlaneSdf`, `SphereSdf` and `BoxSdf`, `GridSdf` (samples)
+    Its members: `MlpSdf` (a fitted network), the closed forms `PlaneSdf`, `SphereSdf`,
+    `CapsuleSdf`, `CylinderSdf` and `BoxSdf`, `GridSdf` (samples)
     and `MeshSdf` (the exact mesh); `SdfBank` asks many of them at once.
 
     Attributes:

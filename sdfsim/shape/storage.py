@@ -10,7 +10,7 @@ import torch
 
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, replacing
-from sdfsim.shape.analytic import BoxSdf, PlaneSdf, SphereSdf
+from sdfsim.shape.analytic import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.exact import MeshSdf
 from sdfsim.shape.grid import GridSdf
 from sdfsim.shape.mesh import Frame, Mesh
@@ -57,6 +57,9 @@ def sdf_to_file(sdf: Sdf, mesh: Mesh) -> tuple[dict[str, torch.Tensor], dict[str
         return {}, {"kind": "mesh"}
     if isinstance(sdf, SphereSdf):
         return {}, {"kind": "sphere", "radius": sdf.radius}
+    if isinstance(sdf, CapsuleSdf | CylinderSdf):
+        kind = "capsule" if isinstance(sdf, CapsuleSdf) else "cylinder"
+        return {}, {"kind": kind, "radius": sdf.radius, "half": sdf.half}
     if isinstance(sdf, BoxSdf):
         return {}, {"kind": "box", "half": list(sdf.half)}
     if isinstance(sdf, PlaneSdf):
@@ -100,6 +103,9 @@ def sdf_from_file(description: dict[str, Any], tensors: dict[str, torch.Tensor],
         return MeshSdf(mesh)
     if kind == "sphere":
         return SphereSdf(positive(description["radius"], "radius"))
+    if kind in ("capsule", "cylinder"):
+        make = CapsuleSdf if kind == "capsule" else CylinderSdf
+        return make(positive(description["radius"], "radius"), positive(description["half"], "half"))
     if kind == "box":
         x, y, z = description["half"]
         return BoxSdf((positive(x, "half"), positive(y, "half"), positive(z, "half")))

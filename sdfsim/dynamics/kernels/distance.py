@@ -1,0 +1,159 @@
+"""Signed distances of all kinds of shapes, compiled: closed forms, and grids of bricks.
+
+Lengths are those of the shape at scale 1, places are in its own frame.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from sdfsim.dynamics.kernels.vectors import BARE, along, dot, norm
+
+PLANE, SPHERE, CAPSULE, BOX, CYLINDER, GRID = range(6)
+TINY = 1e-12
+
+
+# Columns of the table of shapes: kind; sizes (sphere: radius; capsule and cylinder: radius, half height, of a capsule
+# without its caps; box: half extents); thickness of the thinnest walls; of a grid the first sample, the cell, bricks
+# along each side, and where its samples and brick numbers begin.
+KIND, SIZE, THICKNESS, LOW, CELL, BRICKS, COARSE, BRICK, FIELDS = 0, 1, 4, 5, 8, 9, 12, 13, 14
+
+
+class Shapes(NamedTuple):
+    """S shapes; arrays end to end where their number differs from shape to shape.
+
+    Attributes:
+        table: [S, FIELDS] float64.
+        brick: int64, where in `sample` the 9^3 distances of a brick begin; -1 for bricks far from the surface.
+        sample: float32 distances, at the corners of bricks and in bricks.
+        node: [K, 3] surface nodes, leaf by leaf.
+        inward: [K, 3] from each a little into the solid, away from all faces that meet there.
+        leaf_node: [L + 1] int64, leaf l holds nodes leaf_node[l] : leaf_node[l + 1].
+        leaf_ball: [L, 4] centre and radius of a ball around these.
+        clump_start: [S + 1] int64, shape s has clumps clump_start[s] : clump_start[s + 1].
+        clump_leaf: [C + 1] int64 likewise of the leaves that they hold.
+        clump_ball: [C, 4].
+    """
+
+    table: np.ndarray
+    brick: np.ndarray
+    sample: np.ndarray
+    node: np.ndarray
+    inward: np.ndarray
+    leaf_node: np.ndarray
+    leaf_ball: np.ndarray
+    clump_start: np.ndarray
+    clump_leaf: np.ndarray
+    clump_ball: np.ndarray
+
+
+@njit(**BARE)
+def distance(table, brick, sample, s, p):
+    """Signed distance and unit gradient of shape s at p."""
+    kind = table[s, KIND]
+    if kind == GRID:
+        return _grid(table, brick, sample, s, p)
+    if kind == PLANE:
+        return p[2], (0.0, 0.0, 1.0)
+    a, b, c = table[s, SIZE], table[s, SIZE + 1], table[s, SIZE + 2]
+    if kind == SPHERE:
+        return _ball(p, a)
+    if kind == CAPSULE:
+        return _ball((p[0], p[1], p[2] - min(max(p[2], -b), b)), a)
+    if kind == BOX:
+        return _box(p, a, b, c)
+    return _cylinder(p, a, b)
+
+
+@njit(**BARE)
+def _ball(p, radius):
+    length = norm(p)
+    if length < TINY:
+        return -radius, (0.0, 0.0, 1.0)
+    return length - radius, (p[0] / length, p[1] / length, p[2] / length)
+
+
+@njit(**BARE)
+def _box(p, a, b, c):
+    sx = -1.0 if p[0] < 0.0 else 1.0
+    sy = -1.0 if p[1] < 0.0 else 1.0
+    sz = -1.0 if p[2] < 0.0 else 1.0
+    x, y, z = sx * p[0] - a, sy * p[1] - b, sz * p[2] - c
+    out = (max(x, 0.0), max(y, 0.0), max(z, 0.0))
+    length = norm(out)
+    if length > TINY:
+        return length, (sx * out[0] / length, sy * out[1] / length, sz * out[2] / length)
+    if x >= y and x >= z:
+        return x, (sx, 0.0, 0.0)
+    if y >= z:
+        return y, (0.0, sy, 0.0)
+    return z, (0.0, 0.0, sz)
+
+
+@njit(**BARE)
+def _cylinder(p, radius, half):
+    r = math.sqrt(p[0] * p[0] + p[1] * p[1])
+    cx, cy = (p[0] / r, p[1] / r) if r > TINY else (1.0, 0.0)
+    sz = -1.0 if p[2] < 0.0 else 1.0
+    x, z = r - radius, sz * p[2] - half
+    if x > 0.0 and z > 0.0:
+        length = math.sqrt(x * x + z * z)
+        return length, (cx * x / length, cy * x / length, sz * z / length)
+    if x > z:
+        return x, (cx, cy, 0.0)
+    return z, (0.0, 0.0, sz)
+
+
+@njit(**BARE)
+def _grid(table, brick, sample, s, p):
+    """Trilinear in the brick around p, or between the corners of bricks; the distance to the box adds beyond it."""
+    cell = table[s, CELL]
+    nx, ny, nz = int(table[s, BRICKS]), int(table[s, BRICKS + 1]), int(table[s, BRICKS + 2])
+    x, y, z = (p[0] - table[s, LOW]) / cell, (p[1] - table[s, LOW + 1]) / cell, (p[2] - table[s, LOW + 2]) / cell
+    cx, cy, cz = min(max(x, 0.0), 8.0 * nx), min(max(y, 0.0), 8.0 * ny), min(max(z, 0.0), 8.0 * nz)
+    beyond = ((x - cx) * cell, (y - cy) * cell, (z - cz) * cell)
+    i, j, k = min(int(cx) >> 3, nx - 1), min(int(cy) >> 3, ny - 1), min(int(cz) >> 3, nz - 1)
+    o = brick[int(table[s, BRICK]) + (i * ny + j) * nz + k]
+    if o >= 0:
+        u, v, w = cx - 8.0 * i, cy - 8.0 * j, cz - 8.0 * k
+        i, j, k = min(int(u), 7), min(int(v), 7), min(int(w), 7)
+        o += (i * 9 + j) * 9 + k
+        e, f = 81, 9
+    else:
+        u, v, w = cx / 8.0, cy / 8.0, cz / 8.0
+        o = int(table[s, COARSE]) + (i * (ny + 1) + j) * (nz + 1) + k
+        e, f = (ny + 1) * (nz + 1), nz + 1
+    d, slope = _trilinear(
+        sample[o], sample[o + 1], sample[o + f], sample[o + f + 1],
+        sample[o + e], sample[o + e + 1], sample[o + e + f], sample[o + e + f + 1], u - i, v - j, w - k,
+    )  # fmt: skip
+    length = norm(slope)
+    normal = (0.0, 0.0, 1.0) if length < TINY else (slope[0] / length, slope[1] / length, slope[2] / length)
+    far = dot(beyond, beyond)
+    if far > 0.0:
+        # The solid lies within the box, which is convex: it is no nearer than this.
+        d = max(d, 0.0)
+        normal = along(beyond, normal, d)
+        d = math.sqrt(far + d * d)
+        normal = (normal[0] / d, normal[1] / d, normal[2] / d)
+        length = norm(normal)
+        normal = (normal[0] / length, normal[1] / length, normal[2] / length)
+    return d, normal
+
+
+@njit(**BARE)
+def _trilinear(a000, a001, a010, a011, a100, a101, a110, a111, u, v, w):
+    """The interpolant between eight corners and its slope a cell."""
+    a = np.float64(a000) + w * (a001 - a000)
+    b = np.float64(a010) + w * (a011 - a010)
+    c = np.float64(a100) + w * (a101 - a100)
+    d = np.float64(a110) + w * (a111 - a110)
+    ab = a + v * (b - a)
+    cd = c + v * (d - c)
+    z0 = (a001 - a000) + v * ((a011 - a010) - (a001 - a000))
+    z1 = (a101 - a100) + v * ((a111 - a110) - (a101 - a100))
+    return ab + u * (cd - ab), (cd - ab, (b - a) + u * ((d - c) - (b - a)), z0 + u * (z1 - z0))

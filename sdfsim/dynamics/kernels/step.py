@@ -1,0 +1,339 @@
+"""One step, compiled: look around once, then inner steps of contact, impulses and motion."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from sdfsim.dynamics.kernels.collide import collide, look_around, nearest
+from sdfsim.dynamics.kernels.distance import THICKNESS
+from sdfsim.dynamics.kernels.solve import _root, respond
+from sdfsim.dynamics.kernels.vectors import (
+    BARE,
+    FAST,
+    add,
+    along,
+    cross,
+    get,
+    norm,
+    put,
+    scale,
+    sub,
+    to_matrix,
+    turn,
+    turn_back,
+    turned_by,
+    vector,
+)
+
+THIN = 0.4  # of a wall: who goes farther in an inner step is watched on its way
+MOST_TURN = 0.1  # rad in one stage of torque-free rotation
+
+
+@njit(**FAST)
+def step(shapes, world, motion, rules, manifolds):
+    """Advance `motion` by one step, in place.
+
+    Returns:
+        The manifolds at its end, and counts: pairs looked at, contacts of the last inner step, islands, bodies that
+        contacts moved, whether anybody had to be looked for again.
+    """
+    n = len(world.shape)
+    matrix, inverse = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
+    free, change, shift = np.zeros((n, 6)), np.zeros((n, 6)), np.zeros((n, 6))
+    span = rules.inner * rules.steps
+    for b in range(n):
+        to_matrix(motion.orientation, b, matrix)
+    manifolds, ways, start, near, leaf = look_around(shapes, world, motion, matrix, rules, span, manifolds)
+    while rules.sleep and _woken(world, motion, manifolds, near):
+        manifolds, ways, start, near, leaf = look_around(shapes, world, motion, matrix, rules, span, manifolds)
+    beside = np.zeros(n, np.bool_)
+    for p in range(len(start)):
+        if near[p, 0] + near[p, 1] > 0:
+            beside[manifolds.pair[p, 0]] = True
+            beside[manifolds.pair[p, 1]] = True
+    gone = np.zeros(n)
+    trial, frame = np.empty((1, 4)), np.empty((1, 3, 3))
+    met = np.zeros(n, np.bool_)
+    contacts = islands = looked = 0
+    _lag(world, motion, rules)
+    for k in range(rules.steps):
+        for b in range(n):
+            if gone[b] > ways[b] and world.moves[b]:
+                left = rules.inner * (rules.steps - k)
+                manifolds, ways, start, near, leaf = look_around(shapes, world, motion, matrix, rules, left, manifolds)
+                gone[:] = 0.0
+                looked += 1
+                for p in range(len(start)):
+                    if near[p, 0] + near[p, 1] > 0:
+                        beside[manifolds.pair[p, 0]] = True
+                        beside[manifolds.pair[p, 1]] = True
+                break
+        for b in range(n):
+            free[b] = 0.0
+            motion.touching[b] = False
+            if world.moves[b] and motion.island[b] < 0 and beside[b]:
+                _prepare(world, motion, matrix, inverse, rules, free, b)
+        collide(shapes, world, motion, matrix, rules, manifolds, start, near, leaf)
+        contacts, islands = respond(world, motion, matrix, inverse, free, rules, manifolds, change, shift)
+        part = _parts(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, free, change)
+        for b in range(n):
+            if motion.island[b] < 0 and (world.moves[b] or world.scripted[b]):
+                moved = _advance(world, motion, matrix, rules, free, change, shift, part[b], trial, frame, b)
+                gone[b] += moved
+                met[b] = met[b] or motion.touching[b]
+    _lead(world, motion, rules)
+    if rules.sleep:
+        _settle(world, motion, rules, manifolds)
+    return manifolds, (len(start), contacts, islands, int(met.sum()), looked)
+
+
+@njit(**BARE)
+def _lag(world, motion, rules):
+    """Velocities at an instant become those of the inner step before it, which contacts are solved with."""
+    for b in range(len(world.shape)):
+        if world.moves[b] and motion.island[b] < 0 and not motion.touching[b]:
+            put(motion.velocity, b, along(get(motion.velocity, b), vector(rules.gravity), -0.5 * rules.inner))
+
+
+@njit(**BARE)
+def _lead(world, motion, rules):
+    """And back, for bodies that nothing held in the last inner step: their motion is then exact in free flight."""
+    for b in range(len(world.shape)):
+        if world.moves[b] and motion.island[b] < 0 and not motion.touching[b]:
+            put(motion.velocity, b, along(get(motion.velocity, b), vector(rules.gravity), 0.5 * rules.inner))
+
+
+@njit(**BARE)
+def _prepare(world, motion, matrix, inverse, rules, free, b):
+    """Inverse inertia in world axes, and what gravity and the gyroscopic torque make of the velocities."""
+    for x in range(3):
+        free[b, x] = rules.gravity[x] * rules.inner
+    for x in range(3):
+        for y in range(3):
+            total = 0.0
+            for i in range(3):
+                for j in range(3):
+                    total += matrix[b, x, i] * world.inverse_inertia[b, i, j] * matrix[b, y, j]
+            inverse[b, x, y] = total
+    if world.isotropic[b]:
+        return
+    w = get(motion.angular, b)
+    momentum = turn(matrix, b, turn(world.inertia, b, turn_back(matrix, b, w)))
+    # Explicit at the middle of the inner step: keeps energy to third order.
+    half = turn(inverse, b, cross(momentum, w))
+    middle = along(w, half, 0.5 * rules.inner)
+    later = turn(matrix, b, turn(world.inertia, b, turn_back(matrix, b, middle)))
+    change = scale(turn(inverse, b, cross(later, middle)), rules.inner)
+    free[b, 3], free[b, 4], free[b, 5] = change[0], change[1], change[2]
+
+
+@njit(**BARE)
+def _advance(world, motion, matrix, rules, free, change, shift, part, trial, frame, b):
+    """Move a body by one inner step; returns how far at most any of its points has gone."""
+    if world.scripted[b]:
+        v, w = get(motion.velocity, b), get(motion.angular, b)
+    else:
+        for x in range(6):
+            if change[b, x] != 0.0 or shift[b, x] != 0.0:
+                motion.touching[b] = True
+        v = add(get(motion.velocity, b), scale(vector(rules.gravity), rules.inner))
+        v = add(v, (change[b, 0], change[b, 1], change[b, 2]))
+        put(motion.velocity, b, v)
+        v = add(v, (shift[b, 0], shift[b, 1], shift[b, 2]))
+        if not rules.rotation:
+            w = (0.0, 0.0, 0.0)
+            put(motion.angular, b, w)
+        elif motion.touching[b] or world.isotropic[b]:
+            w = add(
+                get(motion.angular, b),
+                (free[b, 3] + change[b, 3], free[b, 4] + change[b, 4], free[b, 5] + change[b, 5]),
+            )
+            put(motion.angular, b, w)
+            w = add(w, (shift[b, 3], shift[b, 4], shift[b, 5]))
+        else:
+            w = get(motion.angular, b)
+            put(motion.position, b, along(get(motion.position, b), v, rules.inner * part))
+            _torque_free(world, motion, matrix, rules.inner * part, trial, frame, b)
+            return (norm(v) + norm(w) * world.radius[b]) * rules.inner
+    put(motion.position, b, along(get(motion.position, b), v, rules.inner * part))
+    if w[0] != 0.0 or w[1] != 0.0 or w[2] != 0.0:
+        q = turned_by(scale(w, rules.inner * part), motion.orientation, b)
+        for x in range(4):
+            motion.orientation[b, x] = q[x]
+        to_matrix(motion.orientation, b, matrix)
+    return (norm(v) + norm(w) * world.radius[b]) * rules.inner
+
+
+@njit(**BARE)
+def _torque_free(world, motion, matrix, span, trial, frame, b):
+    """Rotation without torque: angular momentum is kept exactly, the pose to fourth order (Runge-Kutta-Munthe-Kaas)."""
+    w = get(motion.angular, b)
+    speed = norm(w)
+    if speed == 0.0:
+        return
+    momentum = turn(matrix, b, turn(world.inertia, b, turn_back(matrix, b, w)))
+    stages = max(1, math.ceil(min(speed * span, 100.0) / MOST_TURN))
+    h = span / stages
+    for _ in range(stages):
+        k1 = scale(w, h)
+        k2 = _slope(world, motion.orientation, momentum, scale(k1, 0.5), h, b, trial, frame)
+        k3 = _slope(world, motion.orientation, momentum, scale(k2, 0.5), h, b, trial, frame)
+        k4 = _slope(world, motion.orientation, momentum, k3, h, b, trial, frame)
+        total = scale(add(add(k1, k4), scale(add(k2, k3), 2.0)), 1.0 / 6.0)
+        q = turned_by(total, motion.orientation, b)
+        for x in range(4):
+            motion.orientation[b, x] = q[x]
+        to_matrix(motion.orientation, b, matrix)
+        w = turn(matrix, b, turn(world.inverse_inertia, b, turn_back(matrix, b, momentum)))
+    put(motion.angular, b, w)
+
+
+@njit(**BARE)
+def _slope(world, orientation, momentum, u, h, b, trial, frame):
+    q = turned_by(u, orientation, b)
+    for x in range(4):
+        trial[0, x] = q[x]
+    to_matrix(trial, 0, frame)
+    w = turn(frame, 0, turn(world.inverse_inertia, b, turn_back(frame, 0, momentum)))
+    one = cross(u, w)
+    two = cross(u, one)
+    return scale(add(along(w, one, -0.5), scale(two, 1.0 / 12.0)), h)
+
+
+@njit(**FAST)
+def _parts(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, free, change):
+    """[N] how much of the inner step each body may move, so that none passes through what is thinner than its way."""
+    part = np.ones(len(world.shape))
+    for p in range(len(start)):
+        if near[p, 0] + near[p, 1] == 0:
+            continue
+        a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
+        v, w = _after(motion.velocity, free, change, 0, a), _after(motion.angular, free, change, 3, a)
+        speed = norm(sub(v, _after(motion.velocity, free, change, 0, b))) + norm(w) * world.radius[a]
+        if world.moves[b] or world.scripted[b]:
+            speed += norm(_after(motion.angular, free, change, 3, b)) * world.radius[b]
+        thin = min(
+            shapes.table[world.shape[a], THICKNESS] * world.scale[a],
+            shapes.table[world.shape[b], THICKNESS] * world.scale[b],
+        )
+        if speed * rules.inner > THIN * thin:
+            free_part = _clear(
+                shapes, world, motion, matrix, rules, manifolds, start, near, leaf, free, change, p, speed, thin
+            )
+            part[a], part[b] = min(part[a], free_part), min(part[b], free_part)
+    return part
+
+
+@njit(**FAST)
+def _clear(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, free, change, p, speed, thin):
+    """How much of the inner step a pair may move until it overlaps a little: conservative advancement."""
+    place, frame, turned = np.empty((2, 3)), np.empty((2, 3, 3)), np.empty((2, 4))
+    scales, coms = np.empty(2), np.empty((2, 3))
+    for side in range(2):
+        body = manifolds.pair[p, side]
+        scales[side] = world.scale[body]
+        put(coms, side, get(world.com, body))
+    deep = 0.1 * thin
+    t = 0.0
+    for _ in range(64):
+        for side in range(2):
+            body = manifolds.pair[p, side]
+            span = rules.inner * t
+            put(place, side, along(get(motion.position, body), _after(motion.velocity, free, change, 0, body), span))
+            q = turned_by(scale(_after(motion.angular, free, change, 3, body), span), motion.orientation, body)
+            for x in range(4):
+                turned[side, x] = q[x]
+            to_matrix(turned, side, frame)
+        gap = nearest(shapes, world.shape, place, frame, scales, coms, manifolds.pair, start, near, leaf, p)
+        if t == 0.0 and gap <= 0.0:
+            return 1.0  # in contact already, and answered
+        if gap <= -0.5 * deep:
+            return t
+        t += (gap + deep) / (speed * rules.inner)
+        if t >= 1.0:
+            return 1.0
+    return t
+
+
+@njit(**BARE)
+def _after(velocity, free, change, column, b):
+    return (
+        velocity[b, 0] + free[b, column] + change[b, column],
+        velocity[b, 1] + free[b, column + 1] + change[b, column + 1],
+        velocity[b, 2] + free[b, column + 2] + change[b, column + 2],
+    )
+
+
+@njit(**BARE)
+def _woken(world, motion, manifolds, near):
+    """Wake the islands that something awake may touch in this step; whether there were any."""
+    found = False
+    for p in range(len(near)):
+        a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
+        if near[p, 0] + near[p, 1] == 0:
+            continue
+        for sleeper, other in ((a, b), (b, a)):
+            island = motion.island[sleeper]
+            if island < 0:
+                continue
+            awake = motion.island[other] < 0 and (world.moves[other] or world.scripted[other])
+            moving = norm(get(motion.velocity, other)) + norm(get(motion.angular, other)) > 0.0
+            if awake and moving:
+                found = True
+                for c in range(len(motion.island)):
+                    if motion.island[c] == island:
+                        motion.island[c] = -1
+                        motion.quiet[c] = 0
+                        motion.touching[c] = True
+    return found
+
+
+@njit(**FAST)
+def _settle(world, motion, rules, manifolds):
+    """Freeze the islands all of which have stayed where they were for long enough."""
+    n = len(world.shape)
+    for b in range(n):
+        if not world.moves[b] or motion.island[b] >= 0:
+            continue
+        anchor = motion.anchor[b]
+        cosine = 0.0
+        for x in range(4):
+            cosine += anchor[3 + x] * motion.orientation[b, x]
+        away = sub(get(motion.position, b), (anchor[0], anchor[1], anchor[2]))
+        strayed = norm(away) + 2.0 * math.sqrt(max(0.0, 1.0 - cosine * cosine)) * world.radius[b]
+        if motion.touching[b] and strayed < rules.stray:
+            motion.quiet[b] += 1
+        else:
+            motion.quiet[b] = 0
+            for x in range(3):
+                anchor[x] = motion.position[b, x]
+            for x in range(4):
+                anchor[3 + x] = motion.orientation[b, x]
+    if motion.quiet.max() < rules.rest:
+        return
+    parent = np.arange(n)
+    for m in range(len(manifolds.count)):
+        a, b = manifolds.pair[m, 0], manifolds.pair[m, 1]
+        if manifolds.count[m] and world.moves[a] and world.moves[b]:
+            one, other = _root(parent, a), _root(parent, b)
+            if one != other:
+                parent[max(one, other)] = min(one, other)
+    restless = np.zeros(n, np.bool_)
+    for b in range(n):
+        if world.moves[b] and motion.island[b] < 0 and motion.quiet[b] < rules.rest:
+            restless[_root(parent, b)] = True
+    for m in range(len(manifolds.count)):
+        a, b = manifolds.pair[m, 0], manifolds.pair[m, 1]
+        if manifolds.count[m] and world.scripted[b]:
+            if norm(get(motion.velocity, b)) + norm(get(motion.angular, b)) > 0.0:
+                restless[_root(parent, a)] = True
+    number = motion.island.max() + 1
+    for b in range(n):
+        if world.moves[b] and motion.island[b] < 0 and not restless[_root(parent, b)]:
+            motion.island[b] = number + _root(parent, b)
+            put(motion.velocity, b, (0.0, 0.0, 0.0))
+            put(motion.angular, b, (0.0, 0.0, 0.0))
+            motion.touching[b] = True

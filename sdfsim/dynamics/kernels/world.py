@@ -1,0 +1,139 @@
+"""What the compiled step works on: bodies, their motion, contacts, rules; model units throughout."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+POINTS = 8  # of a manifold at most
+# Columns of a contact point: where it is on either body (about its centre of mass, in its axes), the unit normal from
+# the second body to the first (world), the distance, and the impulses of the last inner step: along the normal, and
+# the tangential one (world).
+FIRST, SECOND, NORMAL, GAP, PUSH, DRAG, COLUMNS = 0, 3, 6, 9, 10, 11, 14
+
+
+class World(NamedTuple):
+    """N bodies, as they stay.
+
+    Attributes:
+        shape: [N] int64, -1 for a body that nothing may touch.
+        scale: [N].
+        com: [N, 3] centre of mass from the shape's origin, scaled.
+        centre, half: [N, 3] middle of the box around the solid from the centre of mass, and its half extents.
+        radius: [N] how far the solid reaches from the centre of mass.
+        inverse_mass: [N], 0 unless dynamic.
+        inertia, inverse_inertia: [N, 3, 3] in the body's axes; the inverse is 0 where nothing turns.
+        isotropic: [N] bool, whether angular velocity is constant in free flight.
+        friction, restitution: [N].
+        moves: [N] bool, dynamic.
+        scripted: [N] bool, kinematic.
+        group: [N] int64; allowed: [G, G] bool, whether two groups may touch.
+        realm: [N] int64, bodies of two realms never meet; -1 is in all.
+        plane: [K] int64, the bodies that are infinite.
+        still: [M] int64, the other static bodies, in the order of their lower ends along `axis`.
+        low, high: [M, 3] their boxes; reach: [M] the highest end so far along `axis`.
+        axis: 0, 1 or 2.
+    """
+
+    shape: np.ndarray
+    scale: np.ndarray
+    com: np.ndarray
+    centre: np.ndarray
+    half: np.ndarray
+    radius: np.ndarray
+    inverse_mass: np.ndarray
+    inertia: np.ndarray
+    inverse_inertia: np.ndarray
+    isotropic: np.ndarray
+    friction: np.ndarray
+    restitution: np.ndarray
+    moves: np.ndarray
+    scripted: np.ndarray
+    group: np.ndarray
+    allowed: np.ndarray
+    realm: np.ndarray
+    plane: np.ndarray
+    still: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    reach: np.ndarray
+    axis: int
+
+
+class Motion(NamedTuple):
+    """Where N bodies are and how they move; the step writes to it.
+
+    Attributes:
+        position: [N, 3]; orientation: [N, 4] xyzw; velocity, angular: [N, 3] of the centres of mass, world.
+        touching: [N] bool, whether contacts acted in the last inner step: the velocity is then that of this whole
+            inner step, and not that at its end (what rests has none).
+        quiet: [N] int64, for how many steps a body has stayed near its anchor.
+        anchor: [N, 7] the pose that it has stayed near.
+        island: [N] int64, a number shared by the bodies that fell asleep together, -1 for all that are awake.
+    """
+
+    position: np.ndarray
+    orientation: np.ndarray
+    velocity: np.ndarray
+    angular: np.ndarray
+    touching: np.ndarray
+    quiet: np.ndarray
+    anchor: np.ndarray
+    island: np.ndarray
+
+
+class Manifolds(NamedTuple):
+    """The contacts of P pairs of bodies.
+
+    Attributes:
+        pair: [P, 2] int64, ordered; the first is a body that moves, or the less of two that do.
+        count: [P] int64 points of each.
+        point: [P, POINTS, COLUMNS].
+    """
+
+    pair: np.ndarray
+    count: np.ndarray
+    point: np.ndarray
+
+
+class Rules(NamedTuple):
+    """What is in play.
+
+    Attributes:
+        gravity: [3].
+        inner: the inner step.
+        steps: inner steps in a step.
+        friction, restitution, rotation, sleep: whether they are.
+        reach: contacts are kept up to this distance, and while they have slid by no more.
+        look: new points are looked for up to this distance.
+        together: points that are deeper than the deepest less this meet in one impact.
+        erp: the share of a penetration that an inner step resolves.
+        slop: penetration that is left as it is, so that what rests has contacts that do not come and go.
+        split: deeper penetration is resolved without a lasting velocity.
+        slow: approaches slower than this end at the surface, without a rebound.
+        rounds: of the solver at most.
+        exact: it ends when no impulse changes a velocity by more.
+        apart: points of a manifold are at least so far from each other.
+        stray: who stays within this of its anchor is quiet; rest: for so many steps, and it falls asleep.
+    """
+
+    gravity: np.ndarray
+    inner: float
+    steps: int
+    friction: bool
+    restitution: bool
+    rotation: bool
+    sleep: bool
+    reach: float
+    look: float
+    together: float
+    erp: float
+    slop: float
+    split: float
+    slow: float
+    rounds: int
+    exact: float
+    apart: float
+    stray: float
+    rest: int

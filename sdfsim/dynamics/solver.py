@@ -1,0 +1,359 @@
+"""The explicit contact solve as a model: scenes as the compiled step wants them, and that step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+
+from sdfsim.dynamics import pose
+from sdfsim.dynamics.bodies import Bodies, State, Touch
+from sdfsim.dynamics.kernels import distance as kinds
+from sdfsim.dynamics.kernels import world as compiled
+from sdfsim.dynamics.kernels.step import step as compiled_step
+from sdfsim.shape.analytic import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, SphereSdf
+from sdfsim.shape.baked import BakedGrid, baked, inwards
+from sdfsim.shape.sdf import Sdf
+
+if TYPE_CHECKING:
+    from sdfsim.dynamics.memory import Memory
+    from sdfsim.dynamics.step import Rules
+
+ANALYTIC = PlaneSdf | SphereSdf | BoxSdf | CapsuleSdf | CylinderSdf
+Tree = tuple[np.ndarray, np.ndarray, list[list[np.ndarray]]]
+LEAF, CLUMP = 16, 256  # nodes that a leaf and a clump of leaves hold at most
+TOUCHING = 1e-3  # model lengths, within which a point is told as a contact
+INWARD = 0.004  # of a solid's largest extent, from where its nodes look out
+
+
+@dataclass(frozen=True)
+class SolverRules:
+    """What the solve is made of; lengths and speeds in model units, in which the smallest bodies are about 1.4 wide.
+
+    Attributes:
+        reach: contacts are kept up to this distance; look: new ones are looked for up to this one.
+        together: points that are deeper than the deepest less this meet in one impact.
+        erp: the share of a penetration that an inner step resolves, through velocity.
+        slop: penetration that is left as it is, so that what rests has contacts that do not come and go.
+        split: deeper penetration than this is resolved without a lasting velocity.
+        slow: g times the inner step times this is the approach that ends at the surface without a rebound.
+        rounds: of sequential impulses at most.
+        exact: they end when no impulse changes a velocity by more.
+        apart: points of a manifold are at least so far from each other.
+        stray, rest: who stays within `stray` for so many steps falls asleep.
+    """
+
+    reach: float = 0.02
+    look: float = 0.004
+    together: float = 1e-4
+    erp: float = 0.08
+    slop: float = 5e-4
+    split: float = 0.04
+    slow: float = 2.0
+    rounds: int = 50
+    exact: float = 1e-5
+    apart: float = 0.03
+    stray: float = 0.005
+    rest: int = 25
+
+
+class Compiled:
+    """One scene as the compiled step wants it.
+
+    Args:
+        bodies: of the scene, model units.
+        state: its start.
+    """
+
+    def __init__(self, bodies: Bodies, state: State) -> None:
+        self.bodies = bodies
+        self.shapes = compiled_shapes(bodies)
+        self.place(state)
+
+    def place(self, state: State) -> None:
+        """Scenery lies where `state` has it."""
+        self.world = compiled_world(self.bodies, state)
+
+    def run(
+        self, motion: compiled.Motion, manifolds: compiled.Manifolds, rules: compiled.Rules
+    ) -> tuple[compiled.Manifolds, tuple[int, ...]]:
+        """One step: `motion` is written to; the contacts at its end, and what was counted."""
+        return compiled_step(self.shapes, self.world, motion, rules, manifolds)
+
+
+def solver_step(bodies: Bodies, state: State, rules: Rules, memory: Memory) -> State:
+    """Advance `state` by one step of the contact solve.
+
+    Args:
+        bodies: N bodies.
+        state: theirs; scripted bodies have the velocities of the coming step.
+        rules: what is in play.
+        memory: of the run; it holds the compiled scene.
+    """
+    scene = memory.compiled(bodies, state)
+    inside = compiled_rules(
+        rules.gravity.cpu().numpy(), rules.dt, rules.substeps, friction=rules.friction,
+        restitution=rules.restitution, rotation=rules.rotation, sleep=rules.sleep,
+    )  # fmt: skip
+    with memory.timed("contact_ms"):
+        after, counts = _solve(bodies, state, scene, inside)
+    memory.count(pairs=counts[0], contacts=counts[1], active=counts[3])
+    return after
+
+
+def _solve(bodies: Bodies, state: State, scene: Compiled, rules: compiled.Rules) -> tuple[State, tuple[int, ...]]:
+    motion, manifolds = taken_up(bodies, state, scene, rules)
+    manifolds, counts = scene.run(motion, manifolds, rules)
+    after = replace(
+        state,
+        position=torch.from_numpy(motion.position),
+        orientation=torch.from_numpy(motion.orientation),
+        velocity=torch.from_numpy(motion.velocity),
+        angular_velocity=torch.from_numpy(motion.angular),
+        time=state.time + rules.inner * rules.steps,
+    )
+    if bodies.tracks is not None:
+        place, orientation = bodies.tracks.at(after.time)
+        at = bodies.tracks.body
+        after = replace(
+            after,
+            position=after.position.index_copy(0, at, place),
+            orientation=after.orientation.index_copy(0, at, orientation),
+        )
+    touch = Touch(
+        touching=torch.from_numpy(motion.touching),
+        quiet=torch.from_numpy(motion.quiet),
+        anchor=torch.from_numpy(motion.anchor),
+        island=torch.from_numpy(motion.island),
+        pair=torch.from_numpy(manifolds.pair),
+        count=torch.from_numpy(manifolds.count),
+        point=torch.from_numpy(manifolds.point),
+        held=_held(after),
+        gravity=torch.from_numpy(rules.gravity),
+    )
+    return replace(after, touch=touch), counts
+
+
+def taken_up(
+    bodies: Bodies, state: State, scene: Compiled, rules: compiled.Rules
+) -> tuple[compiled.Motion, compiled.Manifolds]:
+    """Copies of a state as the compiled step writes to them; whoever was changed from outside is awake, and so are
+    those that slept with it or on it."""
+    position, orientation, velocity, angular = (
+        np.array(t.cpu().numpy(), dtype=np.float64)
+        for t in (state.position, state.orientation, state.velocity, state.angular_velocity)
+    )
+    n, touch = len(position), state.touch
+    if touch is None:
+        anchor = np.concatenate([position, orientation], 1)
+        still, nobody = np.zeros(n, np.int64), np.full(n, -1, np.int64)
+        motion = compiled.Motion(position, orientation, velocity, angular, still > 0, still, anchor, nobody)
+        return motion, no_manifolds()
+    island, quiet = np.array(touch.island.numpy()), np.array(touch.quiet.numpy())
+    touching = np.array(touch.touching.numpy())
+    if not torch.equal(touch.gravity, torch.from_numpy(rules.gravity)):
+        island[:], quiet[:] = -1, 0
+    changed = (_held(state) != touch.held).any(-1).numpy()
+    if scene.world.scripted.any():
+        changed &= ~scene.world.scripted
+    if changed.any():
+        if (changed & ~scene.world.moves).any():
+            scene.place(state)
+        beside = touch.pair.numpy()[touch.count.numpy() > 0]
+        restless = changed.copy()
+        restless[beside[changed[beside[:, 1]], 0]] = True
+        restless[beside[changed[beside[:, 0]], 1]] = True
+        up = np.isin(island, island[restless & (island >= 0)])
+        island[up], quiet[up | changed] = -1, 0
+        touching[changed] = False
+    motion = compiled.Motion(
+        position, orientation, velocity, angular, touching, quiet, np.array(touch.anchor.numpy()), island
+    )
+    return motion, compiled.Manifolds(touch.pair.numpy(), touch.count.numpy(), touch.point.numpy())
+
+
+def _held(state: State) -> torch.Tensor:
+    return torch.cat([state.position, state.orientation, state.velocity, state.angular_velocity], -1)
+
+
+def contact_points(state: State) -> tuple[np.ndarray, np.ndarray, float]:
+    """Where bodies touch: points [E, 3] in the world, the two bodies of each [E, 2], the deepest penetration."""
+    touch = state.touch
+    if touch is None or not len(touch.pair):
+        return np.zeros((0, 3)), np.zeros((0, 2), np.int64), 0.0
+    there = torch.arange(compiled.POINTS)[None] < touch.count[:, None]
+    pair, point = touch.pair[:, None].expand(-1, compiled.POINTS, 2)[there], touch.point[there]
+    close = point[:, compiled.GAP] <= TOUCHING
+    pair, point = pair[close], point[close]
+    first = pair[:, 0]
+    place = state.position[first] + pose.rotate(state.orientation[first], point[:, :3])
+    depth = float((-point[:, compiled.GAP]).clamp_min(0.0).max()) if len(point) else 0.0
+    return place.numpy(), pair.numpy(), depth
+
+
+def compiled_rules(
+    gravity: np.ndarray, dt: float, substeps: int, *, friction: bool = True, restitution: bool = True,
+    rotation: bool = True, sleep: bool = False, own: SolverRules | None = None,
+) -> compiled.Rules:  # fmt: skip
+    """The rules of a run, model units."""
+    own = own or SolverRules()
+    inner = dt / substeps
+    return compiled.Rules(
+        gravity=np.asarray(gravity, dtype=np.float64), inner=inner, steps=substeps, friction=friction,
+        restitution=restitution, rotation=rotation, sleep=sleep, reach=own.reach, look=own.look,
+        together=own.together, erp=own.erp, slop=own.slop, split=own.split,
+        slow=own.slow * float(np.linalg.norm(gravity)) * inner, rounds=own.rounds, exact=own.exact, apart=own.apart,
+        stray=own.stray, rest=own.rest,
+    )  # fmt: skip
+
+
+def no_manifolds() -> compiled.Manifolds:
+    """Nothing is known of any contact."""
+    return compiled.Manifolds(
+        np.zeros((0, 2), np.int64), np.zeros(0, np.int64), np.zeros((0, compiled.POINTS, compiled.COLUMNS))
+    )
+
+
+def compiled_shapes(bodies: Bodies) -> kinds.Shapes:
+    """The shapes of a scene, baked where they have no closed form."""
+    sdfs: Sequence[Sdf] = bodies.bank.sdfs
+    count = len(sdfs)
+    table = np.zeros((count, kinds.FIELDS))
+    table[:, kinds.THICKNESS], table[:, kinds.CELL] = np.inf, 1.0
+    brick, sample, trees = [np.zeros(0, np.int32)], [np.zeros(0, np.float32)], []
+    owner = {int(s): k for k, s in reversed(list(enumerate(bodies.shape.tolist()))) if s >= 0}
+    for s, sdf in enumerate(sdfs):
+        grid, tree = _geometry(sdf, _nodes_of(bodies, owner[s]))
+        trees.append(tree)
+        row = table[s]
+        sizes, walls = row[kinds.SIZE : kinds.SIZE + 3], slice(kinds.THICKNESS, kinds.THICKNESS + 1)
+        if isinstance(sdf, PlaneSdf):
+            row[kinds.KIND] = kinds.PLANE
+        elif isinstance(sdf, SphereSdf):
+            row[kinds.KIND], sizes[0], row[walls] = kinds.SPHERE, sdf.radius, 2.0 * sdf.radius
+        elif isinstance(sdf, BoxSdf):
+            row[kinds.KIND], sizes[:], row[walls] = kinds.BOX, sdf.half, 2.0 * min(sdf.half)
+        elif isinstance(sdf, CapsuleSdf):
+            row[kinds.KIND], sizes[:2], row[walls] = kinds.CAPSULE, (sdf.radius, sdf.half), 2.0 * sdf.radius
+        elif isinstance(sdf, CylinderSdf):
+            row[kinds.KIND], sizes[:2] = kinds.CYLINDER, (sdf.radius, sdf.half)
+            row[walls] = 2.0 * min(sdf.radius, sdf.half)
+        elif grid is not None:
+            row[kinds.KIND], row[walls], row[kinds.CELL] = kinds.GRID, grid.thickness, grid.cell
+            row[kinds.LOW : kinds.LOW + 3], row[kinds.BRICKS : kinds.BRICKS + 3] = grid.low, grid.brick.shape
+            row[kinds.COARSE], row[kinds.BRICK] = sum(map(len, sample)), sum(map(len, brick))
+            sample.append(grid.coarse.reshape(-1))
+            first, size = sum(map(len, sample)), grid.fine[:1].size
+            brick.append(np.where(grid.brick >= 0, grid.brick.astype(np.int64) * size + first, -1).reshape(-1))
+            sample.append(grid.fine.reshape(-1))
+    return kinds.Shapes(table, np.concatenate(brick).astype(np.int64), np.concatenate(sample), *_joined(trees))
+
+
+_known: WeakKeyDictionary[Sdf, tuple[BakedGrid | None, Tree]] = WeakKeyDictionary()
+
+
+def _geometry(sdf: Sdf, nodes: np.ndarray) -> tuple[BakedGrid | None, Tree]:
+    """The grid of an SDF that has no closed form, and its nodes in leaves; made once for all scenes of a process."""
+    kept = _known.get(sdf)
+    if kept is None or len(kept[1][0]) != len(nodes):
+        grid = None if isinstance(sdf, ANALYTIC) else baked(sdf, nodes)
+        kept = grid, (nodes, INWARD * _extent(sdf) * inwards(sdf, nodes), _tree(nodes))
+        _known[sdf] = kept
+    return kept
+
+
+def compiled_world(bodies: Bodies, state: State) -> compiled.World:
+    """The bodies of a scene."""
+    array = {name: getattr(bodies, name).cpu().numpy() for name in _ARRAYS}
+    bounds = np.where(np.isfinite(array["bounds"]), array["bounds"], 0.0)
+    inertia = array["inertia"]
+    moves = array["moves"]
+    eigen = np.linalg.eigvalsh(inertia)
+    isotropic = eigen[:, 2] - eigen[:, 0] <= 1e-9 * eigen[:, 2]
+    scripted = np.zeros(len(moves), bool)
+    if bodies.tracks is not None:
+        scripted[bodies.tracks.body.cpu().numpy()] = True
+    infinite = ~np.isfinite(array["radius"])
+    plane = np.flatnonzero(infinite & (array["shape"] >= 0))
+    still = np.flatnonzero(~infinite & ~moves & ~scripted & (array["shape"] >= 0))
+    centre, half = bounds.mean(1), 0.5 * (bounds[:, 1] - bounds[:, 0])
+    turn = pose.to_matrix(state.orientation.cpu()).numpy()[still]
+    middle = state.position.cpu().numpy()[still] + np.einsum("nij,nj->ni", turn, centre[still])
+    wide = np.einsum("nij,nj->ni", np.abs(turn), half[still])
+    low, high = middle - wide, middle + wide
+    axis = int(np.argmax(np.ptp(low, axis=0))) if len(still) else 0
+    order = np.argsort(low[:, axis], kind="stable")
+    low, high = low[order], high[order]
+    return compiled.World(
+        shape=array["shape"], scale=array["scale"], com=array["com"], centre=centre, half=half, radius=array["radius"],
+        inverse_mass=array["inverse_mass"], inertia=inertia,
+        inverse_inertia=np.linalg.inv(inertia) * moves[:, None, None], isotropic=isotropic,
+        friction=array["friction"], restitution=array["restitution"], moves=moves, scripted=scripted,
+        group=array["group"], allowed=array["allowed"], realm=array["world"], plane=plane, still=still[order],
+        low=low, high=high, reach=np.maximum.accumulate(high[:, axis]) if len(still) else np.zeros(0), axis=axis,
+    )  # fmt: skip
+
+
+_ARRAYS = (
+    *("shape", "scale", "com", "bounds", "radius", "inverse_mass", "inertia", "friction", "restitution", "moves"),
+    *("group", "allowed", "world"),
+)
+
+
+def _nodes_of(bodies: Bodies, k: int) -> np.ndarray:
+    """[K, 3] surface nodes of the shape of body k, at scale 1 in the shape's own frame."""
+    first, last = int(bodies.node_start[k]), int(bodies.node_start[k + 1])
+    return ((bodies.node[first:last] + bodies.com[k]) / bodies.scale[k]).cpu().numpy()
+
+
+def _extent(sdf: Sdf) -> float:
+    low, high = sdf.bounds
+    return float((high - low).max()) if np.isfinite(high).all() else 0.0
+
+
+def _tree(nodes: np.ndarray) -> list[list[np.ndarray]]:
+    """In clumps of leaves the numbers of the nodes that lie together."""
+    every = np.arange(len(nodes))
+    return [_split(nodes, clump, LEAF) for clump in _split(nodes, every, CLUMP)] if len(nodes) else []
+
+
+def _split(nodes: np.ndarray, chosen: np.ndarray, most: int) -> list[np.ndarray]:
+    """Halved along the longest side until no part has more than `most`."""
+    if len(chosen) <= most:
+        return [chosen]
+    places = nodes[chosen]
+    axis = int(np.argmax(np.ptp(places, axis=0)))
+    order = chosen[np.argsort(places[:, axis], kind="stable")]
+    middle = len(order) // 2
+    return _split(nodes, order[:middle], most) + _split(nodes, order[middle:], most)
+
+
+def _joined(trees: list[Tree]) -> tuple[np.ndarray, ...]:
+    """The node arrays of `kinds.Shapes`."""
+    node, inward = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    leaf_node, leaf_ball = [0], [np.zeros((0, 4))]
+    clump_start, clump_leaf, clump_ball = [0], [0], [np.zeros((0, 4))]
+    for nodes, within, clumps in trees:
+        for leaves in clumps:
+            for leaf in leaves:
+                node.append(nodes[leaf])
+                inward.append(within[leaf])
+                leaf_node.append(leaf_node[-1] + len(leaf))
+                leaf_ball.append(_ball(nodes[leaf]))
+            clump_leaf.append(clump_leaf[-1] + len(leaves))
+            clump_ball.append(_ball(nodes[np.concatenate(leaves)]))
+        clump_start.append(len(clump_leaf) - 1)
+    whole = [np.array(x, dtype=np.int64) for x in (leaf_node, clump_start, clump_leaf)]
+    return (
+        np.concatenate(node), np.concatenate(inward), whole[0], np.concatenate(leaf_ball), whole[1], whole[2],
+        np.concatenate(clump_ball),
+    )  # fmt: skip
+
+
+def _ball(places: np.ndarray) -> np.ndarray:
+    middle = 0.5 * (places.min(0) + places.max(0))
+    return np.array([[*middle, np.linalg.norm(places - middle, axis=1).max()]])
