@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -10,7 +11,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import torch
 
-from sdfsim.dynamics import pose
+from sdfsim.dynamics import kernels, pose
 from sdfsim.dynamics.bodies import Bodies, State, Touch
 from sdfsim.dynamics.kernels import distance as kinds
 from sdfsim.dynamics.kernels import world as compiled
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from sdfsim.dynamics.memory import Memory
     from sdfsim.dynamics.step import Rules
 
+_log = logging.getLogger(__name__)
 ANALYTIC = PlaneSdf | SphereSdf | BoxSdf | CapsuleSdf | CylinderSdf
 Tree = tuple[np.ndarray, np.ndarray, list[list[np.ndarray]]]
 LEAF, CLUMP = 16, 256  # nodes that a leaf and a clump of leaves hold at most
@@ -70,6 +72,8 @@ class Compiled:
     """
 
     def __init__(self, bodies: Bodies, state: State) -> None:
+        if not kernels.compiled():
+            _log.warning("compiling the contact step, once for this version: about two minutes")
         self.bodies = bodies
         self.shapes = compiled_shapes(bodies)
         self.place(state)
@@ -83,6 +87,20 @@ class Compiled:
     ) -> tuple[compiled.Manifolds, tuple[int, ...]]:
         """One step: `motion` is written to; the contacts at its end, and what was counted."""
         return compiled_step(self.shapes, self.world, motion, rules, manifolds)
+
+
+def warm() -> None:
+    """Have the step compiled now, so that nobody waits for it later."""
+    from sdfsim.dynamics.bodies import Units, from_scene
+    from sdfsim.scene.types import Body, Scene
+    from sdfsim.shape.asset import analytic_shape
+
+    still = np.zeros(3)
+    ball = Body("ball", 0, "dynamic", 1.0, still, np.array([0.0, 0.0, 0.0, 1.0]), still, still, 1.0, 0.5, 0.5)
+    one = Scene((analytic_shape("sphere", radius=0.5),), (ball,), still, 0.0)
+    bodies, state = from_scene(one, Units(1.0, 1.0, 1.0), torch.device("cpu"))
+    scene, rules = Compiled(bodies, state), compiled_rules(np.zeros(3), 0.02, 5)
+    scene.run(*taken_up(bodies, state, scene, rules), rules)
 
 
 def solver_step(bodies: Bodies, state: State, rules: Rules, memory: Memory) -> State:

@@ -131,7 +131,9 @@ def _of_pairs(choice: str, touching: bool, count: int, name: str, note: str = ""
 def _sleep(choice: str, touching: bool) -> Effect:
     if not touching:
         return Effect(False, "contact is off: nothing can come to rest", "effects.sleep")
-    why = (
-        "the file says on: resting islands freeze until disturbed" if choice == "on" else "the file does not ask for it"
-    )
+    why = {
+        "on": "the file says on: resting islands freeze until disturbed",
+        "off": "the file says off",
+        "auto": "the file does not ask for it (the solver does it by itself)",
+    }[choice]
     return Effect(choice == "on", why, "effects.sleep")

@@ -153,9 +153,8 @@ def _effects(value: Value | None) -> Effects:
     if value is None or value.is_null():
         return Effects()
     choices: dict[str, tuple[str, ...]] = {
-        name: ("auto", "on", "off") for name in ("contact", "friction", "restitution", "rotation")
+        name: ("auto", "on", "off") for name in ("contact", "friction", "restitution", "rotation", "sleep")
     }
-    choices["sleep"] = ("off", "on")
     chosen: dict[str, Any] = {key: item.choice(choices[key], choices[key][0]) for key, item in value.section(choices)}
     return Effects(**chosen)
 

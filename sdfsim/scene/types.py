@@ -21,7 +21,7 @@ class Effects:
     friction: Literal["auto", "on", "off"] = "auto"
     restitution: Literal["auto", "on", "off"] = "auto"
     rotation: Literal["auto", "on", "off"] = "auto"
-    sleep: Literal["on", "off"] = "off"
+    sleep: Literal["auto", "on", "off"] = "auto"
 
 
 @dataclass(frozen=True)

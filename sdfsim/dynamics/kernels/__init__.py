@@ -22,6 +22,11 @@ def _cache() -> Path:
     return home / "sdfsim" / "kernels" / told.hexdigest()[:16]
 
 
+def compiled() -> bool:
+    """Whether the step was compiled before, so that it is there in a second."""
+    return any(_cache().glob("**/step.step-*.nbi"))
+
+
 _settings: Any = config
 _before = _settings.CACHE_DIR
 if not _before:

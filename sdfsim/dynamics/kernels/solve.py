@@ -17,6 +17,7 @@ AXIS, ARM, OTHER, SPIN, COUNTER, MASS, WANTED, IMPULSE, WIDTH = 0, 3, 6, 9, 12, 
 # A face presses all over, and resists being turned less than its corners would: by the mean distance from its middle,
 # which is 0.54 of that of the corners for a square, 0.67 of the rim's for a disc, 0.5 of that of the ends for a line.
 SPREAD = 0.58
+TOUCH = 1e-6  # model lengths: nearer is touching, so that rounding does not decide when what starts in contact is met
 AT_REST = 1e-9  # squared: slower tangential motion has no direction
 MANY = 64  # islands of contacts from which on threads are worth their while
 
@@ -96,13 +97,13 @@ def _equations(world, motion, matrix, inverse, free, rules, manifolds):
             then = add(now, _coming(free, a, b, arm, other))
             approach = dot(now, n)
             gap = point[GAP]
-            if gap > 0.0 and (-approach > rules.slow or gap + dot(then, n) * rules.inner > 0.0):
+            if gap > TOUCH and (-approach > rules.slow or gap + dot(then, n) * rules.inner > 0.0):
                 point[PUSH] = point[DRAG] = point[DRAG + 1] = point[DRAG + 2] = 0.0
                 continue
             _row(world.inverse_mass, inverse, a, b, arm, other, n, row, count, 0)
             target = -approach * bounce if -approach > rules.slow else 0.0
             deep = 0.0
-            if gap > 0.0:
+            if gap > TOUCH:
                 target = -gap / rules.inner
             elif gap > -rules.split:
                 if gap < -rules.slop:

@@ -1,0 +1,67 @@
+"""Grids of bricks: as exact as they say, thin walls included, and kept between runs."""
+
+import numpy as np
+import pytest
+
+from sdfsim.dynamics.kernels.distance import GRID, distance
+from sdfsim.dynamics.solver import compiled_shapes
+from sdfsim.shape import baked as module
+from sdfsim.shape.asset import analytic_shape, with_sdf
+from sdfsim.shape.baked import bake, baked, wall_thickness
+
+
+@pytest.fixture(scope="module")
+def block():
+    return with_sdf(analytic_shape("box", size=(1.0, 0.6, 0.2)), "mesh")
+
+
+def test_a_grid_is_as_exact_as_it_says(block):
+    grid = bake(block.sdf, block.nodes)
+    assert 0.0 < grid.error < grid.cell
+    assert grid.cell == pytest.approx(1.0 / module.CELLS)
+    points = np.random.default_rng(0).uniform([-0.5, -0.3, -0.1], [0.5, 0.3, 0.1], (2000, 3)) * 1.02
+    exact = block.sdf(points)[0]
+    near = np.abs(exact) < 2 * grid.cell
+    assert np.abs(module.interpolated(grid, points[near]) - exact[near]).max() <= 1.1 * grid.error
+
+
+@pytest.mark.parametrize("wall", [0.2, 0.05, 0.008])
+def test_thin_walls_are_measured_and_get_finer_grids(wall):
+    plate = with_sdf(analytic_shape("box", size=(1.0, 1.0, wall)), "mesh")
+    assert wall_thickness(plate.sdf, plate.nodes) == pytest.approx(wall, rel=0.35)
+    if wall < 0.01:
+        assert bake(plate.sdf, plate.nodes).cell <= 0.5 * 1.4 * wall
+
+
+def test_a_grid_is_kept(block, tmp_path, monkeypatch):
+    first = baked(block.sdf, block.nodes, tmp_path)
+    monkeypatch.setattr(module, "bake", lambda *_: pytest.fail("baked again"))
+    again = baked(block.sdf, block.nodes, tmp_path)
+    np.testing.assert_array_equal(first.fine, again.fine)
+    assert again.error == first.error
+
+
+@pytest.mark.parametrize("kind", ["sphere", "box", "capsule", "cylinder", "mesh"])
+def test_the_compiled_distance_is_that_of_the_shape(kind, block):
+    import torch
+
+    from sdfsim.dynamics.bodies import Units, from_scene
+    from sdfsim.scene.types import Scene
+    from tests.dynamics.test_laws import body
+
+    shape = {
+        "sphere": lambda: analytic_shape("sphere", radius=0.4),
+        "box": lambda: analytic_shape("box", size=(1.0, 0.6, 0.2)),
+        "capsule": lambda: analytic_shape("capsule", radius=0.2, height=1.0),
+        "cylinder": lambda: analytic_shape("cylinder", radius=0.3, height=0.8),
+        "mesh": lambda: block,
+    }[kind]()
+    scene = Scene((shape,), (body("a", 0, [0, 0, 0]),), np.zeros(3), 1.0)
+    shapes = compiled_shapes(from_scene(scene, Units(1.0, 1.0, 1.0), torch.device("cpu"))[0])
+    slack = bake(block.sdf, block.nodes).error if shapes.table[0, 0] == GRID else 1e-12
+    points = np.random.default_rng(1).uniform(-1.02, 1.02, (500, 3)) * shape.sdf.bounds[1]
+    for p, exact, normal in zip(points, *shape.sdf(points), strict=True):
+        d, n = distance(shapes.table, shapes.brick, shapes.sample, 0, tuple(p))
+        assert abs(d - exact) <= (slack if abs(exact) < 0.01 or kind != "mesh" else 0.06)
+        if kind != "mesh":
+            np.testing.assert_allclose(n, normal, atol=1e-9)
