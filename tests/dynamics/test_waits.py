@@ -85,7 +85,7 @@ def test_little_memory_gives_the_same_result_in_pieces():
             return bank(index, points)
 
     tight.bodies = replace(tight.bodies, bank=Counting())
-    one, other = whole.run(steps=10), tight.run(steps=10)
+    one, other = whole.run(steps=8), tight.run(steps=8)
     assert (one.contact_count == other.contact_count).all() and one.contact_count.sum() > 100
     np.testing.assert_allclose(other.position, one.position, atol=1e-6)
     nodes = (tight.bodies.node_start[1:] - tight.bodies.node_start[:-1]).max()
