@@ -67,6 +67,7 @@ class Bodies:
         allowed: [G, G] bool, whether bodies of two groups may touch.
         world: [N] int64: bodies of two worlds never meet; -1 is in all of them.
         bank: signed distances of the shapes that may be touched.
+        pieces: of each of these the vertices of its convex pieces, shape frame in m; none of most.
         tracks: the paths of kinematic bodies, None where there are none.
     """
 
@@ -88,6 +89,7 @@ class Bodies:
     allowed: Tensor
     world: Tensor
     bank: SdfBank
+    pieces: tuple[tuple[np.ndarray, ...], ...] = ()
     tracks: Tracks | None = None
 
     def __len__(self) -> int:
@@ -135,8 +137,9 @@ class Touch:
         anchor: [N, 7] float64, position and orientation that it has stayed near.
         island: [N] int64, a number shared by the bodies that fell asleep together; -1 for all that are awake.
         pair: [P, 2] int64, bodies with contact points; count: [P] int64, how many each pair has.
-        point: [P, 8, 14] float64: where a point is on either body (about its centre of mass, in its axes), the normal
-            from the second to the first, the distance, the impulse along the normal and the tangential one [3].
+        point: [P, 24, 16] float64: where a point is on either body (about its centre of mass, in its axes), the normal
+            from the second to the first, the distance, the impulse along the normal and the tangential one [3], the two
+            patches that meet.
         held: [N, 13] float64, position, orientation and velocities that the last step ended with.
         gravity: [3], what it was made under.
     """
@@ -239,6 +242,7 @@ def from_scene(
         allowed=tensor(allowed, torch.bool),
         world=torch.zeros(len(scene.bodies), dtype=torch.int64, device=device),
         bank=SdfBank([scene.shapes[k].sdf for k in touched], device),
+        pieces=tuple(scene.shapes[k].pieces for k in touched),
         tracks=from_paths(paths, com, length=units.length, time=units.time, device=device),
     )
     orientation = tensor([b.quat_xyzw for b in scene.bodies])

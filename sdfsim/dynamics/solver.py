@@ -18,6 +18,7 @@ from sdfsim.dynamics.kernels import world as compiled
 from sdfsim.dynamics.kernels.step import step as compiled_step
 from sdfsim.shape.analytic import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.baked import BakedGrid, baked, inwards
+from sdfsim.shape.patches import Surface, surface_of
 from sdfsim.shape.sdf import Sdf
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 ANALYTIC = PlaneSdf | SphereSdf | BoxSdf | CapsuleSdf | CylinderSdf
-Tree = tuple[np.ndarray, np.ndarray, list[list[np.ndarray]]]
+Clumps = list[list[np.ndarray]]
 LEAF, CLUMP = 16, 256  # nodes that a leaf and a clump of leaves hold at most
 TOUCHING = 1e-3  # model lengths, within which a point is told as a contact
 INWARD = 0.004  # of a solid's largest extent, from where its nodes look out
@@ -115,7 +116,7 @@ def solver_step(bodies: Bodies, state: State, rules: Rules, memory: Memory) -> S
     scene = memory.compiled(bodies, state)
     inside = compiled_rules(
         rules.gravity.cpu().numpy(), rules.dt, rules.substeps, friction=rules.friction,
-        restitution=rules.restitution, rotation=rules.rotation, sleep=rules.sleep,
+        restitution=rules.restitution, rotation=rules.rotation, sleep=rules.sleep, margin=rules.margin, adds=rules.adds,
     )  # fmt: skip
     with memory.timed("contact_ms"):
         after, counts = _solve(bodies, state, scene, inside)
@@ -215,17 +216,18 @@ def contact_points(state: State) -> tuple[np.ndarray, np.ndarray, float]:
 
 def compiled_rules(
     gravity: np.ndarray, dt: float, substeps: int, *, friction: bool = True, restitution: bool = True,
-    rotation: bool = True, sleep: bool = False, own: SolverRules | None = None,
+    rotation: bool = True, sleep: bool = False, margin: float = 0.0, adds: bool = False,
+    own: SolverRules | None = None,
 ) -> compiled.Rules:  # fmt: skip
     """The rules of a run, model units."""
     own = own or SolverRules()
     inner = dt / substeps
     return compiled.Rules(
         gravity=np.asarray(gravity, dtype=np.float64), inner=inner, steps=substeps, friction=friction,
-        restitution=restitution, rotation=rotation, sleep=sleep, reach=own.reach, look=own.look,
+        restitution=restitution, rotation=rotation, sleep=sleep, reach=own.reach, look=own.look + 2.0 * margin,
         together=own.together, erp=own.erp, slop=own.slop, split=own.split,
         slow=own.slow * float(np.linalg.norm(gravity)) * inner, rounds=own.rounds, exact=own.exact, apart=own.apart,
-        stray=own.stray, rest=own.rest,
+        stray=own.stray, rest=own.rest, margin=margin, adds=adds,
     )  # fmt: skip
 
 
@@ -241,13 +243,18 @@ def compiled_shapes(bodies: Bodies) -> kinds.Shapes:
     sdfs: Sequence[Sdf] = bodies.bank.sdfs
     count = len(sdfs)
     table = np.zeros((count, kinds.FIELDS))
-    table[:, kinds.THICKNESS], table[:, kinds.CELL] = np.inf, 1.0
+    table[:, kinds.THICKNESS], table[:, kinds.CELL], table[:, kinds.PATCH] = np.inf, 1.0, -1.0
     brick, sample, trees = [np.zeros(0, np.int32)], [np.zeros(0, np.float32)], []
+    label = [np.zeros(0, np.int16)]
     owner = {int(s): k for k, s in reversed(list(enumerate(bodies.shape.tolist()))) if s >= 0}
     for s, sdf in enumerate(sdfs):
-        grid, tree = _geometry(sdf, _nodes_of(bodies, owner[s]))
-        trees.append(tree)
+        grid, surface, inward, clumps = _geometry(sdf, _nodes_of(bodies, owner[s]), bodies.pieces[s])
+        trees.append((surface, inward, clumps))
         row = table[s]
+        if surface.nearest is not None:
+            row[kinds.PATCH_LOW : kinds.PATCH_LOW + 3], row[kinds.PATCH_CELL] = surface.low, surface.cell
+            row[kinds.PATCHES : kinds.PATCHES + 3], row[kinds.PATCH] = surface.nearest.shape, sum(map(len, label))
+            label.append(surface.nearest.reshape(-1))
         sizes, walls = row[kinds.SIZE : kinds.SIZE + 3], slice(kinds.THICKNESS, kinds.THICKNESS + 1)
         if isinstance(sdf, PlaneSdf):
             row[kinds.KIND] = kinds.PLANE
@@ -268,20 +275,29 @@ def compiled_shapes(bodies: Bodies) -> kinds.Shapes:
             first, size = sum(map(len, sample)), grid.fine[:1].size
             brick.append(np.where(grid.brick >= 0, grid.brick.astype(np.int64) * size + first, -1).reshape(-1))
             sample.append(grid.fine.reshape(-1))
-    return kinds.Shapes(table, np.concatenate(brick).astype(np.int64), np.concatenate(sample), *_joined(trees))
+    return kinds.Shapes(
+        table, np.concatenate(brick).astype(np.int64), np.concatenate(sample), *_joined(trees), np.concatenate(label)
+    )
 
 
-_known: WeakKeyDictionary[Sdf, tuple[BakedGrid | None, Tree]] = WeakKeyDictionary()
+_known: WeakKeyDictionary[Sdf, tuple[np.ndarray, BakedGrid | None, Surface, np.ndarray, Clumps]] = WeakKeyDictionary()
 
 
-def _geometry(sdf: Sdf, nodes: np.ndarray) -> tuple[BakedGrid | None, Tree]:
-    """The grid of an SDF that has no closed form, and its nodes in leaves; made once for all scenes of a process."""
+def _geometry(
+    sdf: Sdf, nodes: np.ndarray, pieces: tuple[np.ndarray, ...]
+) -> tuple[BakedGrid | None, Surface, np.ndarray, Clumps]:
+    """The grid of an SDF that has no closed form, its surface, from where its nodes look out, and these in leaves.
+
+    Made once for all scenes of a process.
+    """
     kept = _known.get(sdf)
-    if kept is None or len(kept[1][0]) != len(nodes):
+    if kept is None or kept[0].shape != nodes.shape or (kept[0] != nodes).any():
         grid = None if isinstance(sdf, ANALYTIC) else baked(sdf, nodes)
-        kept = grid, (nodes, INWARD * _extent(sdf) * inwards(sdf, nodes), _tree(nodes))
+        surface = surface_of(sdf, nodes, pieces)
+        inward = INWARD * _extent(sdf) * inwards(sdf, surface.nodes)
+        kept = nodes, grid, surface, inward, _clumps(surface.nodes, surface.patch)
         _known[sdf] = kept
-    return kept
+    return kept[1:]
 
 
 def compiled_world(bodies: Bodies, state: State) -> compiled.World:
@@ -333,10 +349,15 @@ def _extent(sdf: Sdf) -> float:
     return float((high - low).max()) if np.isfinite(high).all() else 0.0
 
 
-def _tree(nodes: np.ndarray) -> list[list[np.ndarray]]:
-    """In clumps of leaves the numbers of the nodes that lie together."""
-    every = np.arange(len(nodes))
-    return [_split(nodes, clump, LEAF) for clump in _split(nodes, every, CLUMP)] if len(nodes) else []
+def _clumps(nodes: np.ndarray, patch: np.ndarray) -> Clumps:
+    """In clumps of leaves the numbers of the nodes that lie together; a leaf has nodes of one patch only."""
+    if not len(nodes):
+        return []
+    clumps = _split(nodes, np.arange(len(nodes)), CLUMP)
+    return [
+        [leaf for p in np.unique(patch[clump]) for leaf in _split(nodes, clump[patch[clump] == p], LEAF)]
+        for clump in clumps
+    ]
 
 
 def _split(nodes: np.ndarray, chosen: np.ndarray, most: int) -> list[np.ndarray]:
@@ -350,25 +371,28 @@ def _split(nodes: np.ndarray, chosen: np.ndarray, most: int) -> list[np.ndarray]
     return _split(nodes, order[:middle], most) + _split(nodes, order[middle:], most)
 
 
-def _joined(trees: list[Tree]) -> tuple[np.ndarray, ...]:
+def _joined(trees: list[tuple[Surface, np.ndarray, Clumps]]) -> tuple[np.ndarray, ...]:
     """The node arrays of `kinds.Shapes`."""
     node, inward = [np.zeros((0, 3))], [np.zeros((0, 3))]
     leaf_node, leaf_ball = [0], [np.zeros((0, 4))]
     clump_start, clump_leaf, clump_ball = [0], [0], [np.zeros((0, 4))]
-    for nodes, within, clumps in trees:
+    leaf_patch = []
+    for surface, within, clumps in trees:
+        nodes = surface.nodes
         for leaves in clumps:
             for leaf in leaves:
                 node.append(nodes[leaf])
                 inward.append(within[leaf])
                 leaf_node.append(leaf_node[-1] + len(leaf))
                 leaf_ball.append(_ball(nodes[leaf]))
+                leaf_patch.append(surface.patch[leaf[0]])
             clump_leaf.append(clump_leaf[-1] + len(leaves))
             clump_ball.append(_ball(nodes[np.concatenate(leaves)]))
         clump_start.append(len(clump_leaf) - 1)
     whole = [np.array(x, dtype=np.int64) for x in (leaf_node, clump_start, clump_leaf)]
     return (
         np.concatenate(node), np.concatenate(inward), whole[0], np.concatenate(leaf_ball), whole[1], whole[2],
-        np.concatenate(clump_ball),
+        np.concatenate(clump_ball), np.array(leaf_patch, dtype=np.int64),
     )  # fmt: skip
 
 

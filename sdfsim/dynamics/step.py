@@ -46,6 +46,8 @@ class Rules:
         rows: how many nodes or edges to work on at once; None for all.
         guard: "energy" holds back contact that makes energy.
         sleep: whether the solver freezes what rests; networks have it in the state.
+        margin: by which all bodies but planes are larger for the solver than their distances say; adds: whether what
+            it pushes out adds to the speed of a rebound. Both are habits of the teacher, for comparisons with it.
     """
 
     gravity: Tensor
@@ -60,6 +62,8 @@ class Rules:
     rows: int | None = None
     guard: Guard = "none"
     sleep: bool = False
+    margin: float = 0.0
+    adds: bool = False
 
 
 @torch.no_grad()

@@ -163,7 +163,9 @@ def _simulate(
     for k, group in enumerate(groups):
         tell(0.8 * k / len(groups), f"{model.name}: batch {k + 1} of {len(groups)}, {longest} steps")
         started = time.perf_counter()
-        motions["model"] += roll_out(model, group, known, longest, place, free_flight, guard=guard, substeps=inner)
+        motions["model"] += roll_out(
+            model, group, known, longest, place, free_flight, guard=guard, substeps=inner, as_teacher=True
+        )
         seconds += time.perf_counter() - started
         motions["ballistic"] += roll_out(model, group, known, longest, place, contact=False)
     return motions, seconds

@@ -11,6 +11,7 @@ from sdfsim.errors import SdfsimError
 from sdfsim.learning.dataset import Trajectory, home_of, read_info
 
 LONGEST = 1.0  # s, an engine's inner step
+MARGIN = 1e-3  # m, around the convex pieces of every body that the teacher loads from a file (Bullet's default)
 EXACTLY = 1e-3  # part of what gravity adds in a step, by which a free flight may miss it
 
 

@@ -17,6 +17,7 @@ from sdfsim.dynamics.sleep import nobody_asleep
 from sdfsim.dynamics.step import FreeFlight, Rules, step
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.learning.dataset import FLOOR, Trajectory
+from sdfsim.learning.instants import MARGIN
 from sdfsim.learning.merge import merged
 from sdfsim.shape.asset import Shape
 
@@ -35,6 +36,7 @@ def roll_out(
     sleep: bool = False,
     guard: Guard = "none",
     substeps: int = SUBSTEPS,
+    as_teacher: bool = False,
     floor: tuple[float, float] = FLOOR,
 ) -> list[Trajectory]:
     """Simulate one batch from its first frames.
@@ -51,6 +53,8 @@ def roll_out(
         sleep: freeze what has come to rest.
         guard: "energy" holds back contact that makes energy.
         substeps: inner steps that the recording engine makes in one step.
+        as_teacher: the solver takes on what the recording engine does without a law that asks for it: bodies are
+            larger by `MARGIN` than their shapes, and what is pushed out adds to the speed of a rebound.
         floor: its friction and restitution.
 
     Returns:
@@ -62,7 +66,10 @@ def roll_out(
     units = model_units(model, group[0])
     bodies, state = merged(group, [0] * len(group), shapes, units, device, floor)
     gravity = torch.tensor(group[0].gravity / units.acceleration, dtype=torch.float64, device=device)
-    rules = Rules(gravity, group[0].dt / units.time, substeps, contact=contact, free_flight=free_flight, guard=guard)
+    rules = Rules(
+        gravity, group[0].dt / units.time, substeps, contact=contact, free_flight=free_flight, guard=guard,
+        margin=MARGIN / units.length if as_teacher else 0.0, adds=as_teacher,
+    )  # fmt: skip
     if model.kind == "paper":
         state = with_history(state, bodies, rules)
     if sleep:

@@ -51,6 +51,7 @@ class Shape:
         inertia: [3, 3] float64 kg m^2 per unit density, about `com`, shape axes.
         certificate: fit errors measured on held-out points (empty where nothing was fitted).
         source: where it came from and a content hash (for caching and for the record).
+        pieces: the vertices [V, 3] float64 m of each of its convex pieces, where it was made of such.
     """
 
     name: str
@@ -62,6 +63,7 @@ class Shape:
     inertia: np.ndarray
     certificate: dict = field(default_factory=dict)
     source: dict = field(default_factory=dict)
+    pieces: tuple[np.ndarray, ...] = ()
 
     def save(self, folder: str | Path) -> Path:
         """Write the shape folder: shape.safetensors, mesh.ply and, last, shape.json.
@@ -78,6 +80,8 @@ class Shape:
         folder = Path(folder)
         tensors, description = sdf_to_file(self.sdf, self.mesh)
         tensors["nodes"] = torch.from_numpy(np.ascontiguousarray(self.nodes, dtype=np.float64))
+        if self.pieces:
+            tensors["pieces"] = torch.from_numpy(np.concatenate(self.pieces))
         tensors["bounds"] = torch.from_numpy(np.ascontiguousarray(self.sdf.bounds, dtype=np.float64))
         record = {
             "version": FORMAT_VERSION,
@@ -90,6 +94,7 @@ class Shape:
             "inertia": self.inertia.tolist(),
             "certificate": self.certificate,
             "source": self.source,
+            "pieces": [len(piece) for piece in self.pieces],
         }
         from safetensors.torch import save as to_bytes
 
@@ -139,10 +144,15 @@ def load_shape(folder: str | Path) -> Shape:
             inertia=finite(record["inertia"], "inertia", 3, 3),
             certificate=dict(record["certificate"]),
             source=dict(record["source"]),
+            pieces=_pieces(tensors, record.get("pieces", [])),
         )
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
         raise SdfsimError(f"{folder}: not a valid shape folder ({reason})") from error
+
+
+def _pieces(tensors: dict[str, torch.Tensor], sizes: list[int]) -> tuple[np.ndarray, ...]:
+    return tuple(piece.numpy() for piece in tensors["pieces"].split(sizes)) if sizes else ()
 
 
 def scaled(shape: Shape, factor: float) -> Shape:
@@ -173,6 +183,7 @@ def scaled(shape: Shape, factor: float) -> Shape:
     return replace(
         shape,
         mesh=replace(shape.mesh, vertices=shape.mesh.vertices * factor),
+        pieces=tuple(piece * factor for piece in shape.pieces),
         sdf=sdf,
         nodes=shape.nodes * factor,
         volume=shape.volume * factor**3,

@@ -183,7 +183,9 @@ def fit_pieces(
     single = len(pieces) == 1 and is_closed(pieces[0])
     volume, com, inertia = mass_properties(pieces[0]) if single else mass_properties_of_sdf(_OracleSdf(oracle))
     mesh = display if display is not None else clean(oracle.surface, name=name)
-    return Shape(name, mesh, sdf, points, volume, com, inertia, certificate, _source("pieces", recipe, pieces))
+    source = _source("pieces", recipe, pieces)
+    hulls = tuple(piece.vertices for piece in pieces)
+    return Shape(name, mesh, sdf, points, volume, com, inertia, certificate, source, hulls)
 
 
 def _train(

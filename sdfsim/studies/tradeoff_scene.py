@@ -148,7 +148,8 @@ def _centred(shape: Shape, name: str) -> Shape:
         sdf = replace(sdf, frame=replace(sdf.frame, centre=sdf.frame.centre - shape.com), bounds=sdf.bounds - shape.com)
     elif isinstance(sdf, MeshSdf):
         sdf = MeshSdf(replace(sdf.mesh, vertices=sdf.mesh.vertices - shape.com))
-    return replace(shape, name=name, mesh=mesh, sdf=sdf, nodes=shape.nodes - shape.com, com=np.zeros(3))
+    pieces = tuple(piece - shape.com for piece in shape.pieces)
+    return replace(shape, name=name, mesh=mesh, sdf=sdf, nodes=shape.nodes - shape.com, com=np.zeros(3), pieces=pieces)
 
 
 def _pieces(shape: Shape, urdf: Path) -> list[Mesh]:

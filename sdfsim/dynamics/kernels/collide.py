@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from sdfsim.dynamics.kernels.distance import CAPSULE, KIND, PLANE, SIZE, SPHERE, distance
+from sdfsim.dynamics.kernels.distance import CAPSULE, KIND, PLANE, SIZE, SPHERE, distance, patch_of
 from sdfsim.dynamics.kernels.vectors import (
     BARE,
     FAST,
@@ -16,17 +16,20 @@ from sdfsim.dynamics.kernels.vectors import (
     dot,
     get,
     norm,
+    put,
     scale,
     sub,
     turn,
     turn_back,
     vector,
 )
-from sdfsim.dynamics.kernels.world import COLUMNS, FIRST, GAP, NORMAL, POINTS, PUSH, SECOND, Manifolds
+from sdfsim.dynamics.kernels.world import COLUMNS, DRAG, FIRST, GAP, KEY, NORMAL, NOTE, POINTS, PUSH, SECOND, Manifolds
 
-FOUND = 24  # contact points that a pair may find in one look
-SIDE = 10  # of these from the nodes of either body
-PATCH = 4  # points of a manifold whose normals are alike
+FOUND = 48  # contact points that a pair may find in one look
+SIDE = 24  # of these from the nodes of either body
+EACH = 4  # points of a manifold that are of the same two patches
+KEYS = 1024  # patches of a shape at most
+ALIKE = 0.9  # cosine between normals that are taken for one
 ROUNDS = 12  # of refinement
 OUTWARD = 1e-3  # how much deeper another node must be to be preferred to one that is farther out by a length
 STRIDE = 0.02  # of a body's size, the first step of the refinement
@@ -393,7 +396,8 @@ def _nodes(shapes, world, motion, matrix, rules, a, b, side, leaves, found, coun
     s, t = world.shape[one], world.shape[other]
     w, c = _map(motion.position, matrix, world.scale, world.com, one, other)
     k, own = world.scale[other], world.scale[one]
-    best, which = np.empty(SIDE), np.empty(SIDE, np.int64)
+    best, which, keys = np.empty(SIDE), np.empty(SIDE, np.int64), np.empty(SIDE, np.int64)
+    normals = np.empty((SIDE, 3))
     stride = STRIDE * shapes.clump_ball[shapes.clump_start[s], 3]
     kept = 0
     for i in leaves:
@@ -401,27 +405,34 @@ def _nodes(shapes, world, motion, matrix, rules, a, b, side, leaves, found, coun
         if k * d - own * shapes.leaf_ball[i, 3] > rules.look:
             continue
         deepest, chosen, lowest = 0.0, -1, 1e300
+        facing = (0.0, 0.0, 0.0)
         for u in range(shapes.leaf_node[i], shapes.leaf_node[i + 1]):
             p = get(shapes.node, u)
-            d, _ = _gap(table, brick, sample, t, w, c, p, get(shapes.inward, u))
+            d, n = _gap(table, brick, sample, t, w, c, p, get(shapes.inward, u))
             d *= k
             score = d - OUTWARD * own * norm(p)
             if d <= rules.look and score < lowest:
-                deepest, chosen, lowest = d, u, score
+                deepest, chosen, lowest, facing = d, u, score, n
         if chosen < 0:
             continue
-        place = kept
-        if kept == SIDE:  # the shallowest makes room
-            place = 0
-            for e in range(1, SIDE):
-                if best[e] > best[place]:
+        patch, there = shapes.leaf_patch[i], patch_of(table, shapes.label, t, _mapped(w, c, get(shapes.node, chosen)))
+        key = patch * KEYS + there if side == 0 else there * KEYS + patch
+        # Of those that are of the same two patches and face the same way the deepest, and of all.
+        alike, place, worst = 0, -1, -1
+        for e in range(kept):
+            if keys[e] == key and dot(facing, get(normals, e)) > ALIKE:
+                alike += 1
+                if place < 0 or best[e] > best[place]:
                     place = e
-            if best[place] <= deepest:
-                continue
-        else:
-            kept += 1
-        best[place] = deepest
-        which[place] = chosen
+            if worst < 0 or best[e] > best[worst]:
+                worst = e
+        if alike < EACH:
+            place = kept if kept < SIDE else worst
+        if place < kept and best[place] <= deepest:
+            continue
+        kept = max(kept, place + 1)
+        best[place], which[place], keys[place] = deepest, chosen, key
+        put(normals, place, facing)
     for e in range(kept):
         if count == FOUND:
             break
@@ -441,8 +452,9 @@ def _nodes(shapes, world, motion, matrix, rules, a, b, side, leaves, found, coun
             found[count, (SECOND if side == 0 else FIRST) + x] = theirs[x]
             found[count, NORMAL + x] = normal[x]
             found[count, PUSH + x] = 0.0
+        found[count, DRAG + 2] = 0.0
         found[count, GAP] = d
-        found[count, COLUMNS - 1] = 0.0
+        found[count, KEY] = keys[e]
         count += 1
     return count
 
@@ -531,7 +543,8 @@ def _round(shapes, world, motion, matrix, rules, a, b, side, found):
             found[count, (SECOND if side == 0 else FIRST) + x] = theirs[x]
             found[count, NORMAL + x] = normal[x]
             found[count, PUSH + x] = 0.0
-        found[count, COLUMNS - 1] = 0.0
+        found[count, DRAG + 2] = 0.0
+        found[count, KEY] = 0.0
         found[count, GAP] = gap
         count += 1
     return count
@@ -588,16 +601,16 @@ def _first_to_touch(rules, found, count):
     The others follow in the next inner steps, when the impact has been answered.
     """
     for e in range(count):
-        found[e, COLUMNS - 1] = 0.0
+        found[e, NOTE] = 0.0
         for f in range(count):
             alike = 0.0
             for x in range(3):
                 alike += found[e, NORMAL + x] * found[f, NORMAL + x]
-            if alike > 0.9 and found[f, GAP] < found[e, GAP] - rules.together:
-                found[e, COLUMNS - 1] = 1.0
+            if alike > ALIKE and found[e, KEY] == found[f, KEY] and found[f, GAP] < found[e, GAP] - rules.together:
+                found[e, NOTE] = 1.0
     kept = 0
     for e in range(count):
-        if found[e, COLUMNS - 1] == 0.0:
+        if found[e, NOTE] == 0.0:
             for x in range(COLUMNS):
                 found[kept, x] = found[e, x]
             kept += 1
@@ -631,7 +644,7 @@ def _merged(rules, point, known, found, count, rounded):
             every[total] = point[k]
             total += 1
         elif every[twin, PUSH] == 0.0:
-            for x in range(PUSH, COLUMNS):
+            for x in range(PUSH, KEY):
                 every[twin, x] = point[k, x]
     # The deepest first, then always the one that is farthest from those chosen.
     away = np.full(total, 1e300)
@@ -652,10 +665,10 @@ def _merged(rules, point, known, found, count, rounded):
             for x in range(3):
                 gone += (every[e, x] - every[chosen, x]) ** 2
                 turned += (every[e, NORMAL + x] - every[chosen, NORMAL + x]) ** 2
-            if turned < 0.02:
+            if turned < 0.02 and every[e, KEY] == every[chosen, KEY]:
                 alike[e] += 1
             away[e] = min(away[e], gone + 0.01 * turned)
-            if away[e] > farthest and alike[e] < PATCH:
+            if away[e] > farthest and alike[e] < EACH:
                 farthest, following = away[e], e
         chosen = following
     return kept

@@ -20,7 +20,10 @@ TINY = 1e-12
 # Columns of the table of shapes: kind; sizes (sphere: radius; capsule and cylinder: radius, half height, of a capsule
 # without its caps; box: half extents); thickness of the thinnest walls; of a grid the first sample, the cell, bricks
 # along each side, and where its samples and brick numbers begin.
-KIND, SIZE, THICKNESS, LOW, CELL, BRICKS, COARSE, BRICK, FIELDS = 0, 1, 4, 5, 8, 9, 12, 13, 14
+KIND, SIZE, THICKNESS, LOW, CELL, BRICKS, COARSE, BRICK = 0, 1, 4, 5, 8, 9, 12, 13
+# And of a shape of several patches: the first place with a label, the distance between two, how many there are along
+# each side, and where they begin; -1 where there is one patch only.
+PATCH_LOW, PATCH_CELL, PATCHES, PATCH, FIELDS = 14, 17, 18, 21, 22
 
 
 class Shapes(NamedTuple):
@@ -37,6 +40,8 @@ class Shapes(NamedTuple):
         clump_start: [S + 1] int64, shape s has clumps clump_start[s] : clump_start[s + 1].
         clump_leaf: [C + 1] int64 likewise of the leaves that they hold.
         clump_ball: [C, 4].
+        leaf_patch: [L] int64, the patch of the surface that a leaf's nodes are of.
+        label: int16, the patches that are nearest to places all over.
     """
 
     table: np.ndarray
@@ -49,6 +54,8 @@ class Shapes(NamedTuple):
     clump_start: np.ndarray
     clump_leaf: np.ndarray
     clump_ball: np.ndarray
+    leaf_patch: np.ndarray
+    label: np.ndarray
 
 
 @njit(**BARE)
@@ -67,6 +74,20 @@ def distance(table, brick, sample, s, p):
     if kind == BOX:
         return _box(p, a, b, c)
     return _cylinder(p, a, b)
+
+
+@njit(**BARE)
+def patch_of(table, label, s, p):
+    """The patch of shape s that is nearest to p."""
+    first = int(table[s, PATCH])
+    if first < 0:
+        return 0
+    cell = table[s, PATCH_CELL]
+    nx, ny, nz = int(table[s, PATCHES]), int(table[s, PATCHES + 1]), int(table[s, PATCHES + 2])
+    i = min(max(int((p[0] - table[s, PATCH_LOW]) / cell + 0.5), 0), nx - 1)
+    j = min(max(int((p[1] - table[s, PATCH_LOW + 1]) / cell + 0.5), 0), ny - 1)
+    k = min(max(int((p[2] - table[s, PATCH_LOW + 2]) / cell + 0.5), 0), nz - 1)
+    return int(label[first + (i * ny + j) * nz + k])
 
 
 @njit(**BARE)

@@ -87,6 +87,7 @@ def _equations(world, motion, matrix, inverse, free, rules, manifolds):
             continue
         friction = world.friction[a] * world.friction[b] if rules.friction else 0.0
         bounce = world.restitution[a] * world.restitution[b] if rules.restitution else 0.0
+        margin = rules.margin * ((world.radius[a] < math.inf) + (world.radius[b] < math.inf))
         flat, middle, opposite = _patch(matrix, manifolds.point, m, manifolds.count[m], a, b)
         for k in range(manifolds.count[m]):
             point = manifolds.point[m, k]
@@ -96,7 +97,7 @@ def _equations(world, motion, matrix, inverse, free, rules, manifolds):
             now = _relative(motion.velocity, motion.angular, a, b, arm, other)
             then = add(now, _coming(free, a, b, arm, other))
             approach = dot(now, n)
-            gap = point[GAP]
+            gap = point[GAP] - margin
             if gap > TOUCH and (-approach > rules.slow or gap + dot(then, n) * rules.inner > 0.0):
                 point[PUSH] = point[DRAG] = point[DRAG + 1] = point[DRAG + 2] = 0.0
                 continue
@@ -107,7 +108,8 @@ def _equations(world, motion, matrix, inverse, free, rules, manifolds):
                 target = -gap / rules.inner
             elif gap > -rules.split:
                 if gap < -rules.slop:
-                    target = max(target, (-gap - rules.slop) * rules.erp / rules.inner)
+                    push = (-gap - rules.slop) * rules.erp / rules.inner
+                    target = max(push, min(target + push, -approach) if rules.adds else target)
             else:
                 deep = -gap * rules.erp / rules.inner
             row[count, 0, WANTED] = target - dot(then, n)

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numba import njit
 
-from sdfsim.dynamics.kernels.collide import collide, look_around, nearest
-from sdfsim.dynamics.kernels.distance import THICKNESS
+from sdfsim.dynamics.kernels.collide import collide, is_round, look_around, nearest
+from sdfsim.dynamics.kernels.distance import SIZE, THICKNESS
 from sdfsim.dynamics.kernels.solve import _root, respond
 from sdfsim.dynamics.kernels.vectors import (
     BARE,
@@ -215,20 +215,32 @@ def _parts(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, f
         speed = norm(sub(v, _after(motion.velocity, free, change, 0, b))) + norm(w) * world.radius[a]
         if world.moves[b] or world.scripted[b]:
             speed += norm(_after(motion.angular, free, change, 3, b)) * world.radius[b]
-        thin = min(
-            shapes.table[world.shape[a], THICKNESS] * world.scale[a],
-            shapes.table[world.shape[b], THICKNESS] * world.scale[b],
-        )
-        if speed * rules.inner > THIN * thin:
+        depth = _harmless(shapes, world, a, b)
+        if speed * rules.inner > depth:
             free_part = _clear(
-                shapes, world, motion, matrix, rules, manifolds, start, near, leaf, free, change, p, speed, thin
+                shapes, world, motion, matrix, rules, manifolds, start, near, leaf, free, change, p, speed, depth
             )
             part[a], part[b] = min(part[a], free_part), min(part[b], free_part)
     return part
 
 
+@njit(**BARE)
+def _harmless(shapes, world, a, b):
+    """How deep two bodies may overlap before a distance points out of the wrong side of a wall."""
+    depth = math.inf
+    for side in range(2):
+        one, other = (a, b) if side == 0 else (b, a)
+        s, t = world.shape[one], world.shape[other]
+        within = THIN * shapes.table[t, THICKNESS] * world.scale[other]
+        if is_round(shapes.table, s):
+            return within + shapes.table[s, SIZE] * world.scale[one]
+        if shapes.clump_start[s + 1] > shapes.clump_start[s] and not is_round(shapes.table, t):
+            depth = min(depth, within)
+    return depth
+
+
 @njit(**FAST)
-def _clear(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, free, change, p, speed, thin):
+def _clear(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, free, change, p, speed, depth):
     """How much of the inner step a pair may move until it overlaps a little: conservative advancement."""
     place, frame, turned = np.empty((2, 3)), np.empty((2, 3, 3)), np.empty((2, 4))
     scales, coms = np.empty(2), np.empty((2, 3))
@@ -236,7 +248,7 @@ def _clear(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, f
         body = manifolds.pair[p, side]
         scales[side] = world.scale[body]
         put(coms, side, get(world.com, body))
-    deep = 0.1 * thin
+    deep = 0.75 * depth
     t = 0.0
     for _ in range(64):
         for side in range(2):

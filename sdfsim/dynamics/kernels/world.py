@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-POINTS = 8  # of a manifold at most
+POINTS = 24  # of a manifold at most
 # Columns of a contact point: where it is on either body (about its centre of mass, in its axes), the unit normal from
-# the second body to the first (world), the distance, and the impulses of the last inner step: along the normal, and
-# the tangential one (world).
-FIRST, SECOND, NORMAL, GAP, PUSH, DRAG, COLUMNS = 0, 3, 6, 9, 10, 11, 14
+# the second body to the first (world), the distance, the impulses of the last inner step: along the normal, and the
+# tangential one (world); the two patches that meet there, and a place for notes.
+FIRST, SECOND, NORMAL, GAP, PUSH, DRAG, KEY, NOTE, COLUMNS = 0, 3, 6, 9, 10, 11, 14, 15, 16
 
 
 class World(NamedTuple):
@@ -116,6 +116,8 @@ class Rules(NamedTuple):
         exact: it ends when no impulse changes a velocity by more.
         apart: points of a manifold are at least so far from each other.
         stray: who stays within this of its anchor is quiet; rest: for so many steps, and it falls asleep.
+        margin: all bodies but planes are larger by this than their distances say.
+        adds: whether what is pushed out adds to the speed of a rebound.
     """
 
     gravity: np.ndarray
@@ -137,3 +139,5 @@ class Rules(NamedTuple):
     apart: float
     stray: float
     rest: int
+    margin: float
+    adds: bool
