@@ -292,7 +292,7 @@ def _geometry(
     """
     kept = _known.get(sdf)
     if kept is None or kept[0].shape != nodes.shape or (kept[0] != nodes).any():
-        grid = None if isinstance(sdf, ANALYTIC) else baked(sdf, nodes)
+        grid = None if isinstance(sdf, ANALYTIC) else baked(sdf, nodes, pieces)
         surface = surface_of(sdf, nodes, pieces)
         inward = INWARD * _extent(sdf) * inwards(sdf, surface.nodes)
         kept = nodes, grid, surface, inward, _clumps(surface.nodes, surface.patch)

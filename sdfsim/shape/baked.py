@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,7 +17,9 @@ import torch
 
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_arrays, write_arrays
+from sdfsim.shape.distance import PiecesDistance
 from sdfsim.shape.grid import GridSdf
+from sdfsim.shape.mesh import convex_hull
 from sdfsim.shape.mlp import MlpSdf
 from sdfsim.shape.sdf import Sdf
 
@@ -54,17 +57,21 @@ class BakedGrid:
     error: float
 
 
-def baked(sdf: Sdf, nodes: np.ndarray, cache_dir: Path | None = None) -> BakedGrid:
+Distances = Callable[[np.ndarray], np.ndarray]
+
+
+def baked(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = (), cache_dir: Path | None = None) -> BakedGrid:
     """The grid of an SDF, baked on first use and then taken from the cache.
 
     Args:
         sdf: of a solid that has an end.
         nodes: [K, 3] m on its surface, where the thickness of its walls is measured.
+        pieces: vertices [V, 3] m of the convex pieces that the SDF was fitted to: the grid is then of their union.
         cache_dir: by default `sdfsim/baked` in the user's cache folder.
     """
     if cache_dir is None:
         cache_dir = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sdfsim" / "baked"
-    path = cache_dir / f"{_digest(sdf)}-{BAKE_VERSION}.npz"
+    path = cache_dir / f"{_digest(sdf, pieces)}-{BAKE_VERSION}.npz"
     if path.is_file():
         try:
             kept = read_arrays(path, "a baked grid", "delete it")
@@ -72,7 +79,7 @@ def baked(sdf: Sdf, nodes: np.ndarray, cache_dir: Path | None = None) -> BakedGr
             return BakedGrid(kept["low"], cell, kept["coarse"], kept["brick"], kept["fine"], thickness, error)
         except (SdfsimError, KeyError):
             path.unlink(missing_ok=True)  # a damaged entry is only a cache miss
-    grid = bake(sdf, nodes)
+    grid = bake(sdf, nodes, pieces)
     try:
         cache_dir.mkdir(parents=True, exist_ok=True)
         write_arrays(path, {name: np.asarray(value) for name, value in vars(grid).items()}, compressed=False)
@@ -81,8 +88,9 @@ def baked(sdf: Sdf, nodes: np.ndarray, cache_dir: Path | None = None) -> BakedGr
     return grid
 
 
-def bake(sdf: Sdf, nodes: np.ndarray) -> BakedGrid:
+def bake(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = ()) -> BakedGrid:
     """Sample an SDF: `CELLS` along the largest extent, more where walls are thin, up to `FINEST`."""
+    ask = _of_pieces(pieces) if len(pieces) else _of(sdf)
     extent = float(np.ptp(sdf.bounds, axis=0).max())
     thickness = wall_thickness(sdf, nodes)
     cells = CELLS
@@ -93,17 +101,17 @@ def bake(sdf: Sdf, nodes: np.ndarray) -> BakedGrid:
     count = np.ceil((high - low) / (SIDE * cell)).astype(int)
     low = 0.5 * (low + high) - 0.5 * count * SIDE * cell
     corners = _places(low, SIDE * cell, [np.arange(n + 1) for n in count])
-    coarse = _distances(sdf, corners).reshape(count + 1)
+    coarse = _distances(ask, corners).reshape(count + 1)
     middles = _places(low, SIDE * cell, [np.arange(n) + 0.5 for n in count])
     # Distances change by no more than the way gone; two cells are for contacts that have not quite been made.
-    near = np.abs(_distances(sdf, middles)) <= (0.5 * np.sqrt(3.0) * SIDE + 2.0) * cell
+    near = np.abs(_distances(ask, middles)) <= (0.5 * np.sqrt(3.0) * SIDE + 2.0) * cell
     brick = np.full(len(middles), -1, dtype=np.int32)
     brick[near] = np.arange(near.sum())
     steps = (np.arange(SIDE + 1) - 0.5 * SIDE) * cell
     offsets = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(1, -1, 3)
-    fine = _distances(sdf, (middles[near][:, None] + offsets).reshape(-1, 3)).reshape(-1, *(SIDE + 1,) * 3)
+    fine = _distances(ask, (middles[near][:, None] + offsets).reshape(-1, 3)).reshape(-1, *(SIDE + 1,) * 3)
     grid = BakedGrid(low, cell, coarse, brick.reshape(count), fine, thickness, 0.0)
-    return replace(grid, error=_error(sdf, grid, middles[near]))
+    return replace(grid, error=_error(ask, grid, middles[near]))
 
 
 def inwards(sdf: Sdf, nodes: np.ndarray) -> np.ndarray:
@@ -153,11 +161,11 @@ def interpolated(grid: BakedGrid, points: np.ndarray) -> np.ndarray:
     return total
 
 
-def _error(sdf: Sdf, grid: BakedGrid, middles: np.ndarray) -> float:
+def _error(ask: Distances, grid: BakedGrid, middles: np.ndarray) -> float:
     generator = np.random.default_rng(0)
     some = middles[generator.integers(len(middles), size=20_000)]
     points = some + generator.uniform(-0.5, 0.5, some.shape) * SIDE * grid.cell
-    exact = _distances(sdf, points)
+    exact = _distances(ask, points)
     close = np.abs(exact) <= 2.0 * grid.cell
     return float(np.abs(interpolated(grid, points) - exact)[close].max(initial=0.0))
 
@@ -166,10 +174,17 @@ def _places(low: np.ndarray, spacing: float, axes: list[np.ndarray]) -> np.ndarr
     return low + spacing * np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def _distances(sdf: Sdf, points: np.ndarray) -> np.ndarray:
-    return np.concatenate([_ask(sdf, part)[0] for part in np.array_split(points, -(-len(points) // CHUNK))]).astype(
-        np.float32
-    )
+def _distances(ask: Distances, points: np.ndarray) -> np.ndarray:
+    return np.concatenate([ask(part) for part in np.array_split(points, -(-len(points) // CHUNK))]).astype(np.float32)
+
+
+def _of(sdf: Sdf) -> Distances:
+    return lambda points: _ask(sdf, points)[0]
+
+
+def _of_pieces(pieces: Sequence[np.ndarray]) -> Distances:
+    exact = PiecesDistance([convex_hull(piece) for piece in pieces])
+    return lambda points: exact(points).distance
 
 
 def _ask(sdf: Sdf, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -178,7 +193,7 @@ def _ask(sdf: Sdf, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return distance.cpu().numpy(), gradient.cpu().numpy()
 
 
-def _digest(sdf: Sdf) -> str:
+def _digest(sdf: Sdf, pieces: Sequence[np.ndarray]) -> str:
     """Changes with all that a grid depends on."""
     told = hashlib.sha256(f"{type(sdf).__name__} {CELLS} {FINEST}".encode())
     if isinstance(sdf, MlpSdf):
@@ -195,5 +210,6 @@ def _digest(sdf: Sdf) -> str:
         parts = []
     for part in parts:
         told.update(part.detach().cpu().numpy().tobytes())
-    told.update(np.ascontiguousarray(sdf.bounds).tobytes())
+    for array in (sdf.bounds, *pieces):
+        told.update(np.ascontiguousarray(array).tobytes())
     return told.hexdigest()[:32]

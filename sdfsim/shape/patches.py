@@ -10,12 +10,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
+from sdfsim.shape.distance import PiecesDistance
+from sdfsim.shape.mesh import convex_hull
 from sdfsim.shape.sdf import Sdf
 
 CELLS = 40  # of the lattice that tells the nearest patch, along the largest extent
-OUTSIDE = 0.01  # of the extent: vertices that lie deeper in the union are not on its surface
+OUTSIDE = 1e-3  # of the extent: vertices that lie deeper in the union are not on its surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,9 +48,9 @@ def surface_of(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray]) -> Sur
     if len(pieces) == 0:
         return Surface(nodes, np.zeros(len(nodes), np.int64), None, np.zeros(3), 1.0)
     extent = float(np.ptp(sdf.bounds, axis=0).max())
-    vertices = np.concatenate(pieces)
-    with torch.no_grad():
-        bare = sdf(torch.from_numpy(vertices))[0].numpy() > -OUTSIDE * extent
+    vertices, union = np.concatenate(pieces), PiecesDistance([convex_hull(piece) for piece in pieces])
+    bare = union(vertices).distance > -OUTSIDE * extent
+    nodes = union(nodes).closest  # those of a fitted surface lie beside it
     owner = np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
     cell = extent / CELLS
     low = sdf.bounds[0] - cell
