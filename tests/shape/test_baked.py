@@ -34,9 +34,9 @@ def test_thin_walls_are_measured_and_get_finer_grids(wall):
 
 
 def test_a_grid_is_kept(block, tmp_path, monkeypatch):
-    first = baked(block.sdf, block.nodes, tmp_path)
+    first = baked(block.sdf, block.nodes, cache_dir=tmp_path)
     monkeypatch.setattr(module, "bake", lambda *_: pytest.fail("baked again"))
-    again = baked(block.sdf, block.nodes, tmp_path)
+    again = baked(block.sdf, block.nodes, cache_dir=tmp_path)
     np.testing.assert_array_equal(first.fine, again.fine)
     assert again.error == first.error
 

@@ -169,10 +169,12 @@ def _grid(table, brick, sample, s, p):
 @njit(**BARE)
 def _trilinear(a000, a001, a010, a011, a100, a101, a110, a111, u, v, w):
     """The interpolant between eight corners and its slope a cell."""
-    a = np.float64(a000) + w * (a001 - a000)
-    b = np.float64(a010) + w * (a011 - a010)
-    c = np.float64(a100) + w * (a101 - a100)
-    d = np.float64(a110) + w * (a111 - a110)
+    a000, a001, a010, a011 = np.float64(a000), np.float64(a001), np.float64(a010), np.float64(a011)
+    a100, a101, a110, a111 = np.float64(a100), np.float64(a101), np.float64(a110), np.float64(a111)
+    a = a000 + w * (a001 - a000)
+    b = a010 + w * (a011 - a010)
+    c = a100 + w * (a101 - a100)
+    d = a110 + w * (a111 - a110)
     ab = a + v * (b - a)
     cd = c + v * (d - c)
     z0 = (a001 - a000) + v * ((a011 - a010) - (a001 - a000))

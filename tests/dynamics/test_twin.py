@@ -1,0 +1,143 @@
+"""The compiled contact step against its readable twin, and the twin's gradients against differences."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from sdfsim.dynamics import twin
+from sdfsim.dynamics.bodies import Units, from_scene
+from sdfsim.dynamics.kernels.distance import distance as kernel_distance
+from sdfsim.dynamics.solver import Compiled, compiled_rules, no_manifolds, taken_up
+from sdfsim.scene.types import Scene
+from sdfsim.shape.asset import analytic_shape, load_shape
+from sdfsim.shape.primitives import convex_pieces
+from tests.dynamics.test_laws import ball, body, cube
+from tests.dynamics.test_solver import heap
+from tests.dynamics.test_waits import SHAPES
+
+ONE = Units(1.0, 1.0, 1.0)
+
+
+def compiled(scene: Scene, **rules):
+    bodies, state = from_scene(scene, ONE, torch.device("cpu"))
+    inside = Compiled(bodies, state)
+    rules = compiled_rules(scene.gravity, 0.02, 5, **rules)
+    motion, _ = taken_up(bodies, state, inside, rules)
+    return inside, motion, rules
+
+
+def tops(seed: int) -> Scene:
+    """Fitted shapes, one of them of convex pieces, on a slope; nothing is symmetric, so no choice is a tie."""
+    draw = np.random.default_rng(seed)
+    ring = load_shape(SHAPES / "ring")
+    pieces = tuple(0.22 * p.vertices * (1.0 + 0.05 * draw.random(p.vertices.shape)) for p in convex_pieces("torus"))
+    shapes = (
+        replace(ring, pieces=pieces), load_shape(SHAPES / "bowl"), load_shape(SHAPES / "can"), cube(1.0),
+        analytic_shape("plane"),
+    )  # fmt: skip
+    bodies = []
+    for k in range(4):
+        quat = draw.normal(size=4)
+        bodies.append(
+            body(
+                str(k), k, [*draw.uniform(-0.2, 0.2, 2), 0.7 + 0.7 * k], draw.uniform(0.5, 5.0),
+                scale=1.0 / np.ptp(shapes[k].sdf.bounds, axis=0).max(), quat_xyzw=quat / np.linalg.norm(quat),
+                velocity=draw.normal(size=3), angular_velocity=2.0 * draw.normal(size=3),
+                friction=draw.uniform(0, 1), restitution=draw.uniform(0, 1),
+            )
+        )  # fmt: skip
+    return Scene(shapes, (*bodies, floor(4)), np.array([1.0, 0.5, -9.0]), 1.0)
+
+
+def floor(shape: int):
+    return body("floor", shape, [0, 0, 0], 0.0, motion="static", friction=0.8, restitution=1.0)
+
+
+@pytest.mark.parametrize(
+    ("scene", "steps", "rules"),
+    [(heap(0, 4), 60, {}), (heap(1, 4), 60, {"margin": 1e-3, "adds": True}), (tops(0), 45, {}), (tops(1), 45, {})],
+    ids=["closed forms", "as the teacher", "fitted", "fitted, other"],
+)
+def test_the_compiled_step_is_its_twin(scene, steps, rules):
+    """Step by step from the compiled states: chaos would soon make more of a rounding."""
+    inside, motion, rules = compiled(scene, **rules)
+    manifolds, points = no_manifolds(), 0
+    for k in range(steps):
+        if k % 6:
+            manifolds, _ = inside.run(motion, manifolds, rules)
+            continue
+        bodies, moving = twin.of_compiled(inside, motion)
+        after, contacts = twin.step(inside.shapes, bodies, moving, rules, twin.contacts_of(manifolds))
+        manifolds, counts = inside.run(motion, manifolds, rules)
+        assert sum(map(len, contacts.values())) == manifolds.count.sum()
+        for name, bound in (("position", 1e-9), ("orientation", 1e-9), ("velocity", 1e-7), ("angular", 1e-7)):
+            np.testing.assert_allclose(getattr(after, name).numpy(), getattr(motion, name), atol=bound, rtol=0)
+        points += counts[1]
+    assert points > 20
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        analytic_shape("sphere", radius=0.3), analytic_shape("capsule", radius=0.2, height=1.0),
+        analytic_shape("box", size=(1.0, 0.6, 0.3)), analytic_shape("cylinder", radius=0.3, height=0.5),
+        load_shape(SHAPES / "bowl"),
+    ],
+    ids=["sphere", "capsule", "box", "cylinder", "grid"],
+)  # fmt: skip
+def test_distances_are_those_of_the_twin(shape):
+    inside, _, _ = compiled(Scene((shape,), (body("it", 0, [0, 0, 0], 1.0),), np.zeros(3), 1.0))
+    shapes = inside.shapes
+    places = np.random.default_rng(0).uniform(-1.0, 1.0, (2000, 3))
+    d, n = twin.distance(shapes, 0, torch.from_numpy(places))
+    found = [kernel_distance(shapes.table, shapes.brick, shapes.sample, 0, tuple(p)) for p in places]
+    np.testing.assert_allclose(d.numpy(), [x[0] for x in found], atol=1e-12)
+    np.testing.assert_allclose(n.numpy(), [x[1] for x in found], atol=1e-9)
+
+
+THROW = {"velocity": np.array([1.5, 0.2, -0.5]), "friction": 0.1, "restitution": 0.7, "mass": 1.3}
+
+
+def thrown(velocity, friction, restitution, mass) -> Scene:
+    """A ball that bounces off the floor and then off another ball."""
+    first = body("first", 0, [0.0, 0.0, 0.56], mass, velocity=velocity, friction=friction, restitution=restitution)
+    other = body("other", 0, [1.15, 0.1, 0.9], 1.0, friction=1.0, restitution=1.0)
+    return Scene((ball(1.0), analytic_shape("plane")), (first, other, floor(1)), np.array([0.0, 0.0, -9.81]), 1.0)
+
+
+@pytest.mark.parametrize("name", THROW)
+def test_gradients_are_differences_of_the_compiled_step(name):
+    """Where a ball is after 0.24 s, with two impacts on the way, told by the first body's values."""
+
+    def end(value) -> np.ndarray:
+        inside, motion, rules = compiled(thrown(**(THROW | {name: value})))
+        manifolds = no_manifolds()
+        for _ in range(12):
+            manifolds, _ = inside.run(motion, manifolds, rules)
+        return motion.position[:2].copy()
+
+    inside, motion, rules = compiled(thrown(**THROW))
+    bodies, moving = twin.of_compiled(inside, motion)
+    value = torch.tensor(THROW[name], dtype=torch.float64, requires_grad=True)
+    if name == "velocity":
+        moving = replace(moving, velocity=torch.cat([value[None], moving.velocity[1:]]))
+    elif name == "mass":
+        share = torch.stack([value / THROW["mass"], *torch.ones(2, dtype=torch.float64)])
+        bodies = replace(
+            bodies, inverse_mass=bodies.inverse_mass / share, inertia=bodies.inertia * share[:, None, None],
+            inverse_inertia=bodies.inverse_inertia / share[:, None, None],
+        )  # fmt: skip
+    else:
+        bodies = replace(bodies, **{name: torch.cat([value[None], getattr(bodies, name)[1:]])})
+    contacts: twin.Contacts = {}
+    for _ in range(12):
+        moving, contacts = twin.step(inside.shapes, bodies, moving, rules, contacts)
+    np.testing.assert_allclose(moving.position[:2].detach().numpy(), end(THROW[name]), atol=1e-9)
+    weights = torch.tensor([[1.0, 2.0, 3.0], [-2.0, 1.0, 0.5]], dtype=torch.float64)
+    (gradient,) = torch.autograd.grad((moving.position[:2] * weights).sum(), value)
+    steps = 1e-6 * np.eye(3) if name == "velocity" else [np.array(1e-6)]
+    wanted = [((end(THROW[name] + h) - end(THROW[name] - h)) * weights.numpy()).sum() / 2e-6 for h in steps]
+    assert np.abs(wanted).max() > 1e-3
+    np.testing.assert_allclose(gradient.numpy().reshape(-1), wanted, rtol=1e-4, atol=1e-6)
