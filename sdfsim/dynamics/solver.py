@@ -276,7 +276,11 @@ def compiled_shapes(bodies: Bodies) -> kinds.Shapes:
             brick.append(np.where(grid.brick >= 0, grid.brick.astype(np.int64) * size + first, -1).reshape(-1))
             sample.append(grid.fine.reshape(-1))
     return kinds.Shapes(
-        table, np.concatenate(brick).astype(np.int64), np.concatenate(sample), *_joined(trees), np.concatenate(label)
+        table,
+        np.concatenate(brick).astype(np.int64),
+        np.concatenate(sample),
+        *_joined(trees),
+        label=np.concatenate(label),
     )
 
 

@@ -651,7 +651,7 @@ def advance(
         for series, value in zip((position, orientation, velocity, angular), (x, q / q.norm(), v, w), strict=True):
             series.append(value)
         touching.append(touched)
-    return Moving(*(torch.stack(x) for x in (position, orientation, velocity, angular)), touching)
+    return Moving(*(torch.stack(x) for x in (position, orientation, velocity, angular)), touching=touching)
 
 
 def _torque_free(bodies: Bodies, b: int, q: Tensor, w: Tensor, span: float) -> tuple[Tensor, Tensor]:

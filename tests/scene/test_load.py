@@ -99,7 +99,7 @@ TOP = [
     ("shapes: {cup: {sphere: {radius: 0}}}", "shapes.cup.sphere.radius: must be > 0 (got 0 m)"),
     ("shapes: {cup: {sphere: {}}}", "shapes.cup.sphere.radius: is required"),
     ("shapes: {cup: {box: {size: [1, -1, 1]}}}", "shapes.cup.box.size[1]: must be > 0 (got -1 m)"),
-    ("shapes: {cup: {}}", "shapes.cup: one of asset, mesh, primitive, sphere, capsule, cylinder, box, plane is required"),
+    ("shapes: {cup: {}}", "shapes.cup: one of asset, mesh, primitive, sphere, capsule, cylinder, box, plane is"),
     ("shapes: {cup: {shpere: {}}}", "shapes.cup.shpere: unknown key (did you mean 'sphere'?)"),
     ("shapes: {cup: {sphere: {radius: 1}, units: cm}}", "shapes.cup.units: goes with mesh only"),
     ("shapes: {cup: {sphere: {radius: 1}, cap: on}}", "shapes.cup.cap: goes with mesh only"),
