@@ -139,10 +139,7 @@ def _surface(folder: Path, report: dict) -> str:
 def _shapes(report: dict) -> str:
     """One row a fitted shape, with the numbers of its certificate as they are."""
     shapes = report["stages"].get("fit", {}).get("shapes", {})
-    rows = [
-        (name, _exactness(one), *(f"{one[key]:.2g}" for key in CERTIFICATE))
-        for name, one in shapes.items()
-    ]
+    rows = [(name, _exactness(one), *(f"{one[key]:.2g}" for key in CERTIFICATE)) for name, one in shapes.items()]
     head = ("shape", "certificate", *(key.replace("_", " ") for key in CERTIFICATE))
     return _section("Signed distances", _table(rows, head))
 
