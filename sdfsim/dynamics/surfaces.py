@@ -14,7 +14,7 @@ from sdfsim.dynamics.contacts import Contacts
 from sdfsim.dynamics.matching import match_shapes
 from sdfsim.dynamics.paper import PaperNetwork, SurfaceGraph
 
-_NOT_PER_BODY = ("node", "node_start", "allowed", "bank", "tracks")
+_NOT_PER_BODY = ("pieces", "node", "node_start", "allowed", "bank", "tracks")
 
 
 def node_owner(bodies: Bodies) -> Tensor:
