@@ -82,12 +82,18 @@ class Compiled:
     def place(self, state: State) -> None:
         """Scenery lies where `state` has it."""
         self.world = compiled_world(self.bodies, state)
+        n = len(self.bodies)
+        self.work = compiled.Work(
+            matrix=pose.to_matrix(state.orientation.cpu()).numpy(), inverse=np.zeros((n, 3, 3)),
+            free=np.zeros((n, 6)), change=np.zeros((n, 6)), shift=np.zeros((n, 6)), part=np.ones(n),
+            parent=np.zeros(n, np.int64), number=np.zeros(n, np.int64),
+        )  # fmt: skip
 
     def run(
         self, motion: compiled.Motion, manifolds: compiled.Manifolds, rules: compiled.Rules
     ) -> tuple[compiled.Manifolds, tuple[int, ...]]:
         """One step: `motion` is written to; the contacts at its end, and what was counted."""
-        return compiled_step(self.shapes, self.world, motion, rules, manifolds)
+        return compiled_step(self.shapes, self.world, self.work, motion, rules, manifolds)
 
 
 def warm() -> None:
@@ -331,7 +337,8 @@ def compiled_world(bodies: Bodies, state: State) -> compiled.World:
         inverse_mass=array["inverse_mass"], inertia=inertia,
         inverse_inertia=np.linalg.inv(inertia) * moves[:, None, None], isotropic=isotropic,
         friction=array["friction"], restitution=array["restitution"], moves=moves, scripted=scripted,
-        group=array["group"], allowed=array["allowed"], realm=array["world"], plane=plane, still=still[order],
+        group=array["group"], allowed=array["allowed"], realm=array["world"],
+        going=np.flatnonzero(moves | scripted), plane=plane, still=still[order],
         low=low, high=high, reach=np.maximum.accumulate(high[:, axis]) if len(still) else np.zeros(0), axis=axis,
     )  # fmt: skip
 

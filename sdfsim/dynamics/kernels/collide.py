@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
@@ -16,7 +17,6 @@ from sdfsim.dynamics.kernels.vectors import (
     dot,
     get,
     norm,
-    put,
     scale,
     sub,
     turn,
@@ -34,6 +34,7 @@ ROUNDS = 12  # of refinement
 OUTWARD = 1e-3  # how much deeper another node must be to be preferred to one that is farther out by a length
 STRIDE = 0.02  # of a body's size, the first step of the refinement
 MANY = 48  # pairs from which on threads are worth their while
+SHARES = 16  # of the pairs, each with its own scratch, that threads take in turn
 
 
 @njit(**FAST)
@@ -57,7 +58,7 @@ def _swept(world, motion, matrix, rules, span):
     n = len(world.shape)
     ways, low, high = np.zeros(n), np.empty((n, 3)), np.empty((n, 3))
     fall = norm(vector(rules.gravity)) * span
-    for b in range(n):
+    for b in world.going:
         if world.shape[b] < 0 or not math.isfinite(world.radius[b]):
             continue
         if motion.island[b] < 0 and (world.moves[b] or world.scripted[b]):
@@ -93,10 +94,10 @@ def _overlap(low, high, a, other_low, other_high, b):
 def _pairs(world, motion, low, high):
     """[P, 2] bodies whose boxes overlap, in a fixed order: sweep and prune along the axis on which they spread most."""
     n = len(world.shape)
-    going = np.empty(n, np.int64)
+    going = np.empty(len(world.going), np.int64)
     count = 0
-    for b in range(n):
-        if world.shape[b] >= 0 and (world.moves[b] or world.scripted[b]):
+    for b in world.going:
+        if world.shape[b] >= 0:
             going[count] = b
             count += 1
     going = going[:count]
@@ -316,56 +317,102 @@ def _near(shapes, world, motion, matrix, pairs, ways, reach, start, near, leaf, 
         near[p, side] = found
 
 
+class Scratch(NamedTuple):
+    """Room for what is found of one pair, once for each of S shares: compiled code allocates slowly.
+
+    Attributes:
+        found: [S, FOUND, COLUMNS] new points; every: [S, FOUND + POINTS, COLUMNS] with those that were known.
+        depth, node, key, normal: [S, SIDE] and [S, SIDE, 3] of the nodes that are to become points.
+        away, alike: [S, FOUND + POINTS] how far from those chosen a point is, and how many of these are of its kind.
+    """
+
+    found: np.ndarray
+    every: np.ndarray
+    depth: np.ndarray
+    node: np.ndarray
+    key: np.ndarray
+    normal: np.ndarray
+    away: np.ndarray
+    alike: np.ndarray
+
+
 @njit(**FAST)
-def collide(shapes, world, motion, matrix, rules, manifolds, start, near, leaf):
+def scratch_room():
+    most = FOUND + POINTS
+    return Scratch(
+        np.empty((SHARES, FOUND, COLUMNS)), np.empty((SHARES, most, COLUMNS)), np.empty((SHARES, SIDE)),
+        np.empty((SHARES, SIDE), np.int64), np.empty((SHARES, SIDE), np.int64), np.empty((SHARES, SIDE, 3)),
+        np.empty((SHARES, most)), np.empty((SHARES, most), np.int64),
+    )  # fmt: skip
+
+
+@njit(**FAST)
+def collide(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, scratch):
     """Bring all manifolds up to the present poses: old points moved along or dropped, new ones found and merged."""
-    count = len(start)
-    if count >= MANY:
-        _collide_many(shapes, world, motion, matrix, rules, manifolds, start, near, leaf)
+    if len(start) >= MANY:
+        _collide_many(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, scratch)
     else:
-        for p in range(count):
-            _collide_pair(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, p)
+        for p in range(len(start)):
+            _collide_pair(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, scratch, 0, p)
 
 
 @njit(parallel=True, **FAST)
-def _collide_many(shapes, world, motion, matrix, rules, manifolds, start, near, leaf):
-    for p in prange(len(start)):
-        _collide_pair(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, p)
-
-
-@njit(**FAST)
-def _collide_pair(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, p):
-    a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
-    point = manifolds.point[p]
-    if near[p, 0] + near[p, 1] == 0:
-        manifolds.count[p] = 0
-        return
-    s, t = world.shape[a], world.shape[b]
-    found = np.empty((FOUND, COLUMNS))
-    count = 0
-    if is_round(shapes.table, s) or is_round(shapes.table, t):
-        one = 0 if is_round(shapes.table, s) else 1
-        count = _round(shapes, world, motion, matrix, rules, a, b, one, found)
-        known = manifolds.count[p] if shapes.table[world.shape[manifolds.pair[p, one]], KIND] == SPHERE else 0
-        known = 0 if is_round(shapes.table, s) and is_round(shapes.table, t) else known
-        known = _moved(shapes, world, motion, matrix, rules, a, b, point, known)
-        manifolds.count[p] = _merged(rules, point, known, found, count, True)
-        return
-    known = _moved(shapes, world, motion, matrix, rules, a, b, point, manifolds.count[p])
-    for side in range(2):
-        first = start[p, side]
-        some = leaf[first : first + near[p, side]]
-        count = _nodes(shapes, world, motion, matrix, rules, a, b, side, some, found, count)
-    count = _first_to_touch(rules, found, count)
-    manifolds.count[p] = _merged(rules, point, known, found, count, False)
+def _collide_many(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, scratch):
+    for t in prange(SHARES):
+        for p in range(t, len(start), SHARES):
+            _collide_pair(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, scratch, t, p)
 
 
 @njit(**BARE)
-def _moved(shapes, world, motion, matrix, rules, a, b, point, count):
+def _collide_pair(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, scratch, t, p):
+    a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
+    if near[p, 0] + near[p, 1] == 0:
+        manifolds.count[p] = 0
+        return
+    if is_round(shapes.table, world.shape[a]) or is_round(shapes.table, world.shape[b]):
+        _collide_round(shapes, world, motion, matrix, rules, manifolds, scratch, t, p)
+        return
+    known = _moved(shapes, world, motion, matrix, rules, manifolds, p, manifolds.count[p])
+    count = 0
+    for side in range(2):
+        first = start[p, side]
+        count = _nodes(
+            shapes, world, motion, matrix, rules, a, b, side, leaf, first, first + near[p, side], scratch, t, count
+        )
+    count = _first_to_touch(rules, scratch.found, t, count)
+    manifolds.count[p] = _merged(rules, manifolds.point, p, known, scratch, t, count, False)
+
+
+@njit(**BARE)
+def _collide_round(shapes, world, motion, matrix, rules, manifolds, scratch, t, p):
+    """The manifold of a pair with a sphere or a capsule."""
+    a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
+    first, second = shapes.table[world.shape[a], KIND], shapes.table[world.shape[b], KIND]
+    one, other = first == SPHERE or first == CAPSULE, second == SPHERE or second == CAPSULE
+    known, found, point = manifolds.count[p], scratch.found, manifolds.point
+    count = _round(shapes, world, motion, matrix, rules, a, b, 0 if one else 1, found, t)
+    if count == 1 and first == SPHERE and second == SPHERE:
+        for x in range(COLUMNS):
+            if known == 0 or x < PUSH or x >= KEY:
+                point[p, 0, x] = found[t, 0, x]
+        manifolds.count[p] = 1
+        return
+    if (one and other) or (first if one else second) != SPHERE:
+        known = 0
+    known = _moved(shapes, world, motion, matrix, rules, manifolds, p, known)
+    if count + known > 0:
+        known = _merged(rules, point, p, known, scratch, t, count, True)
+    manifolds.count[p] = known
+
+
+@njit(**BARE)
+def _moved(shapes, world, motion, matrix, rules, manifolds, p, count):
     """Old points at the present poses; those that have parted or slid too far are dropped."""
+    a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
+    point = manifolds.point
     kept = 0
     for k in range(count):
-        n = (point[k, NORMAL], point[k, NORMAL + 1], point[k, NORMAL + 2])
+        n = (point[p, k, NORMAL], point[p, k, NORMAL + 1], point[p, k, NORMAL + 2])
         for side in range(2):
             # The point of a ball that is touched is where the normal says, however it has rolled.
             body = a if side == 0 else b
@@ -373,90 +420,94 @@ def _moved(shapes, world, motion, matrix, rules, a, b, point, count):
                 radius = shapes.table[world.shape[body], SIZE] * world.scale[body] * (-1.0 if side == 0 else 1.0)
                 here = turn_back(matrix, body, scale(n, radius))
                 for c in range(3):
-                    point[k, 3 * side + c] = here[c] - world.com[body, c]
-        first = turn(matrix, a, (point[k, 0], point[k, 1], point[k, 2]))
-        second = turn(matrix, b, (point[k, 3], point[k, 4], point[k, 5]))
+                    point[p, k, 3 * side + c] = here[c] - world.com[body, c]
+        first = turn(matrix, a, (point[p, k, 0], point[p, k, 1], point[p, k, 2]))
+        second = turn(matrix, b, (point[p, k, 3], point[p, k, 4], point[p, k, 5]))
         offset = add(sub(get(motion.position, a), get(motion.position, b)), sub(first, second))
         gap = dot(offset, n)
         slid = along(offset, n, -gap)
         if gap > rules.reach or dot(slid, slid) > rules.reach * rules.reach:
             continue
         for c in range(COLUMNS):
-            point[kept, c] = point[k, c]
-        point[kept, GAP] = gap
+            point[p, kept, c] = point[p, k, c]
+        point[p, kept, GAP] = gap
         kept += 1
     return kept
 
 
-@njit(**FAST)
-def _nodes(shapes, world, motion, matrix, rules, a, b, side, leaves, found, count):
-    """The deepest node of each near leaf of one body in the other's distances, refined; added to `found`."""
+@njit(**BARE)
+def _nodes(shapes, world, motion, matrix, rules, a, b, side, leaf, first, last, scratch, t, count):
+    """The deepest node of each near leaf of one body in the other's distances, refined; added to what is found."""
     table, brick, sample = shapes.table, shapes.brick, shapes.sample
+    depth, node, keys, normal = scratch.depth, scratch.node, scratch.key, scratch.normal
     one, other = (a, b) if side == 0 else (b, a)
-    s, t = world.shape[one], world.shape[other]
+    r, s = world.shape[one], world.shape[other]
     w, c = _map(motion.position, matrix, world.scale, world.com, one, other)
     k, own = world.scale[other], world.scale[one]
-    best, which, keys = np.empty(SIDE), np.empty(SIDE, np.int64), np.empty(SIDE, np.int64)
-    normals = np.empty((SIDE, 3))
-    stride = STRIDE * shapes.clump_ball[shapes.clump_start[s], 3]
+    stride = STRIDE * shapes.clump_ball[shapes.clump_start[r], 3]
     kept = 0
-    for i in leaves:
-        d, _ = distance(table, brick, sample, t, _mapped(w, c, get(shapes.leaf_ball, i)))
+    for at in range(first, last):
+        i = leaf[at]
+        d, _ = distance(table, brick, sample, s, _mapped(w, c, get(shapes.leaf_ball, i)))
         if k * d - own * shapes.leaf_ball[i, 3] > rules.look:
             continue
         deepest, chosen, lowest = 0.0, -1, 1e300
         facing = (0.0, 0.0, 0.0)
         for u in range(shapes.leaf_node[i], shapes.leaf_node[i + 1]):
             p = get(shapes.node, u)
-            d, n = _gap(table, brick, sample, t, w, c, p, get(shapes.inward, u))
+            d, n = _gap(table, brick, sample, s, w, c, p, get(shapes.inward, u))
             d *= k
             score = d - OUTWARD * own * norm(p)
             if d <= rules.look and score < lowest:
                 deepest, chosen, lowest, facing = d, u, score, n
         if chosen < 0:
             continue
-        patch, there = shapes.leaf_patch[i], patch_of(table, shapes.label, t, _mapped(w, c, get(shapes.node, chosen)))
+        patch, there = shapes.leaf_patch[i], patch_of(table, shapes.label, s, _mapped(w, c, get(shapes.node, chosen)))
         key = patch * KEYS + there if side == 0 else there * KEYS + patch
         # Of those that are of the same two patches and face the same way the deepest, and of all.
         alike, place, worst = 0, -1, -1
         for e in range(kept):
-            if keys[e] == key and dot(facing, get(normals, e)) > ALIKE:
+            if keys[t, e] == key and dot(facing, (normal[t, e, 0], normal[t, e, 1], normal[t, e, 2])) > ALIKE:
                 alike += 1
-                if place < 0 or best[e] > best[place]:
+                if place < 0 or depth[t, e] > depth[t, place]:
                     place = e
-            if worst < 0 or best[e] > best[worst]:
+            if worst < 0 or depth[t, e] > depth[t, worst]:
                 worst = e
         if alike < EACH:
             place = kept if kept < SIDE else worst
-        if place < kept and best[place] <= deepest:
+        if place < kept and depth[t, place] <= deepest:
             continue
         kept = max(kept, place + 1)
-        best[place], which[place], keys[place] = deepest, chosen, key
-        put(normals, place, facing)
+        depth[t, place], node[t, place], keys[t, place] = deepest, chosen, key
+        for x in range(3):
+            normal[t, place, x] = facing[x]
     for e in range(kept):
         if count == FOUND:
             break
-        u = which[e]
-        p, d, n = _refined(table, brick, sample, stride, s, t, w, c, k, own, get(shapes.node, u), get(shapes.inward, u))
+        u = node[t, e]
+        p, d, n = _refined(table, brick, sample, stride, r, s, w, c, k, own, get(shapes.node, u), get(shapes.inward, u))
         if d > rules.look:
             continue
         # p of shape `one` -> about its centre of mass; its foot on the other, likewise.
         mine = sub(scale(p, own), get(world.com, one))
-        q = _mapped(w, c, p)
-        theirs = sub(along(scale(q, k), n, -d), get(world.com, other))
-        normal = turn(matrix, other, n)
-        if side == 1:
-            normal = scale(normal, -1.0)
-        for x in range(3):
-            found[count, (FIRST if side == 0 else SECOND) + x] = mine[x]
-            found[count, (SECOND if side == 0 else FIRST) + x] = theirs[x]
-            found[count, NORMAL + x] = normal[x]
-            found[count, PUSH + x] = 0.0
-        found[count, DRAG + 2] = 0.0
-        found[count, GAP] = d
-        found[count, KEY] = keys[e]
+        theirs = sub(along(scale(_mapped(w, c, p), k), n, -d), get(world.com, other))
+        _write(scratch.found, t, count, side, mine, theirs, turn(matrix, other, n), d, keys[t, e])
         count += 1
     return count
+
+
+@njit(**BARE)
+def _write(found, t, count, side, mine, theirs, normal, gap, key):
+    """A new point, as found by the body that is first (0) or second (1) of its pair."""
+    for x in range(3):
+        found[t, count, (FIRST if side == 0 else SECOND) + x] = mine[x]
+        found[t, count, (SECOND if side == 0 else FIRST) + x] = theirs[x]
+        found[t, count, NORMAL + x] = normal[x] if side == 0 else -normal[x]
+        found[t, count, DRAG + x] = 0.0
+    found[t, count, PUSH] = 0.0
+    found[t, count, GAP] = gap
+    found[t, count, KEY] = key
+    found[t, count, NOTE] = 0.0
 
 
 @njit(**BARE)
@@ -508,7 +559,7 @@ def _refined(table, brick, sample, stride, s, t, w, c, k, own, p, inward):
 
 
 @njit(**BARE)
-def _round(shapes, world, motion, matrix, rules, a, b, side, found):
+def _round(shapes, world, motion, matrix, rules, a, b, side, found, at):
     """A sphere or capsule against anything: the distance at its core, less its radius."""
     table, brick, sample = shapes.table, shapes.brick, shapes.sample
     one, other = (a, b) if side == 0 else (b, a)
@@ -518,16 +569,17 @@ def _round(shapes, world, motion, matrix, rules, a, b, side, found):
     radius = shapes.table[s, SIZE]
     tried = 1
     half = 0.0
-    at = (0.0, 0.0, 0.0)
+    heights = (0.0, 0.0, 0.0)
     if shapes.table[s, KIND] == CAPSULE:
         half = shapes.table[s, SIZE + 1]
         tried = 3
-        at = (-half, half, _lowest(table, brick, sample, t, w, c, half) if shapes.table[t, KIND] != PLANE else half)
+        between = half if shapes.table[t, KIND] == PLANE else _lowest(table, brick, sample, t, w, c, half)
+        heights = (-half, half, between)
     count = 0
     for e in range(tried):
-        if e == 2 and half - abs(at[2]) < 0.05 * half:
+        if e == 2 and half - abs(heights[2]) < 0.05 * half:
             continue
-        core = (0.0, 0.0, at[e])
+        core = (0.0, 0.0, heights[e])
         d, n = distance(table, brick, sample, t, _mapped(w, c, core))
         gap = k * d - own * radius
         if gap > rules.reach:
@@ -535,17 +587,7 @@ def _round(shapes, world, motion, matrix, rules, a, b, side, found):
         mine = turn_back(matrix, one, turn(matrix, other, scale(n, -own * radius)))
         mine = sub(add(scale(core, own), mine), get(world.com, one))
         theirs = sub(along(scale(_mapped(w, c, core), k), n, -k * d), get(world.com, other))
-        normal = turn(matrix, other, n)
-        if side == 1:
-            normal = scale(normal, -1.0)
-        for x in range(3):
-            found[count, (FIRST if side == 0 else SECOND) + x] = mine[x]
-            found[count, (SECOND if side == 0 else FIRST) + x] = theirs[x]
-            found[count, NORMAL + x] = normal[x]
-            found[count, PUSH + x] = 0.0
-        found[count, DRAG + 2] = 0.0
-        found[count, KEY] = 0.0
-        found[count, GAP] = gap
+        _write(found, at, count, side, mine, theirs, turn(matrix, other, n), gap, 0)
         count += 1
     return count
 
@@ -595,80 +637,82 @@ def _lowest(table, brick, sample, t, w, c, half):
 
 
 @njit(**BARE)
-def _first_to_touch(rules, found, count):
+def _first_to_touch(rules, found, t, count):
     """Of points with one normal only the deepest are kept, and those that are as deep: what an impact meets first.
 
     The others follow in the next inner steps, when the impact has been answered.
     """
     for e in range(count):
-        found[e, NOTE] = 0.0
+        found[t, e, NOTE] = 0.0
         for f in range(count):
             alike = 0.0
             for x in range(3):
-                alike += found[e, NORMAL + x] * found[f, NORMAL + x]
-            if alike > ALIKE and found[e, KEY] == found[f, KEY] and found[f, GAP] < found[e, GAP] - rules.together:
-                found[e, NOTE] = 1.0
+                alike += found[t, e, NORMAL + x] * found[t, f, NORMAL + x]
+            deeper = found[t, f, GAP] < found[t, e, GAP] - rules.together
+            if alike > ALIKE and deeper and found[t, e, KEY] == found[t, f, KEY]:
+                found[t, e, NOTE] = 1.0
     kept = 0
     for e in range(count):
-        if found[e, NOTE] == 0.0:
+        if found[t, e, NOTE] == 0.0:
             for x in range(COLUMNS):
-                found[kept, x] = found[e, x]
+                found[t, kept, x] = found[t, e, x]
             kept += 1
     return kept
 
 
-@njit(**FAST)
-def _merged(rules, point, known, found, count, rounded):
+@njit(**BARE)
+def _merged(rules, point, p, known, scratch, t, count, rounded):
     """Old and new points of a pair in one manifold, spread far; of points that nearly coincide the new ones.
 
     Returns how many there are.
     """
-    every = np.empty((FOUND + POINTS, COLUMNS))
-    total = 0
-    for k in range(count):
-        every[total] = found[k]
-        total += 1
+    found, every, away, alike = scratch.found, scratch.every, scratch.away, scratch.alike
+    for e in range(count):
+        for x in range(COLUMNS):
+            every[t, e, x] = found[t, e, x]
+    total = count
     same = rules.reach * rules.reach
     for k in range(known):
         twin = -1
         for e in range(count):
             turned = 0.0
-            away = 0.0
+            gone = 0.0
             for x in range(3):
-                turned += point[k, NORMAL + x] * found[e, NORMAL + x]
-                away += (point[k, x] - found[e, x]) ** 2
-            if (away < same and turned > 0.8) or (rounded and turned > 0.99):
+                turned += point[p, k, NORMAL + x] * found[t, e, NORMAL + x]
+                gone += (point[p, k, x] - found[t, e, x]) ** 2
+            if (gone < same and turned > 0.8) or (rounded and turned > 0.99):
                 twin = e
                 break
         if twin < 0:
-            every[total] = point[k]
+            for x in range(COLUMNS):
+                every[t, total, x] = point[p, k, x]
             total += 1
-        elif every[twin, PUSH] == 0.0:
+        elif every[t, twin, PUSH] == 0.0:
             for x in range(PUSH, KEY):
-                every[twin, x] = point[k, x]
+                every[t, twin, x] = point[p, k, x]
     # The deepest first, then always the one that is farthest from those chosen.
-    away = np.full(total, 1e300)
-    kept = 0
-    alike = np.zeros(total, np.int64)
     chosen, lowest = -1, 1e300
     for e in range(total):
-        score = every[e, GAP] - OUTWARD * norm((every[e, 0], every[e, 1], every[e, 2]))
+        away[t, e], alike[t, e] = 1e300, 0
+        score = every[t, e, GAP] - OUTWARD * norm((every[t, e, 0], every[t, e, 1], every[t, e, 2]))
         if score < lowest:
             chosen, lowest = e, score
+    kept = 0
     while chosen >= 0 and kept < POINTS:
-        point[kept] = every[chosen]
+        for x in range(COLUMNS):
+            point[p, kept, x] = every[t, chosen, x]
         kept += 1
         farthest, following = rules.apart * rules.apart, -1
         for e in range(total):
             gone = 0.0
             turned = 0.0
             for x in range(3):
-                gone += (every[e, x] - every[chosen, x]) ** 2
-                turned += (every[e, NORMAL + x] - every[chosen, NORMAL + x]) ** 2
-            if turned < 0.02 and every[e, KEY] == every[chosen, KEY]:
-                alike[e] += 1
-            away[e] = min(away[e], gone + 0.01 * turned)
-            if away[e] > farthest and alike[e] < EACH:
-                farthest, following = away[e], e
+                gone += (every[t, e, x] - every[t, chosen, x]) ** 2
+                turned += (every[t, e, NORMAL + x] - every[t, chosen, NORMAL + x]) ** 2
+            if turned < 0.02 and every[t, e, KEY] == every[t, chosen, KEY]:
+                alike[t, e] += 1
+            away[t, e] = min(away[t, e], gone + 0.01 * turned)
+            if away[t, e] > farthest and alike[t, e] < EACH:
+                farthest, following = away[t, e], e
         chosen = following
     return kept

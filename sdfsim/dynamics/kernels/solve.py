@@ -43,22 +43,14 @@ class System(NamedTuple):
 
 
 @njit(**FAST)
-def respond(world, motion, matrix, inverse, free, rules, manifolds, change, shift):
-    """Solve for the impulses of all contacts; they go to the manifolds.
-
-    Args:
-        world, motion, matrix, rules, manifolds: as everywhere.
-        inverse: [N, 3, 3] inverse inertia, world axes.
-        free: [N, 6] what the inner step makes of the velocities without contact.
-        change: [N, 6] out: what contact adds.
-        shift: [N, 6] out: velocities that only move, and are forgotten.
+def respond(world, work, motion, rules, manifolds):
+    """Solve for the impulses of all contacts; they go to the manifolds, and to `change` and `shift` of `work`.
 
     Returns:
         The number of contacts, and of the islands that they make.
     """
-    change[:] = 0.0
-    shift[:] = 0.0
-    system = _equations(world, motion, matrix, inverse, free, rules, manifolds)
+    change, shift = work.change, work.shift
+    system = _equations(world, work, motion, rules, manifolds)
     islands = len(system.start) - 1
     if islands >= MANY:
         _solve_many(world, rules, system, change, shift)
@@ -75,7 +67,8 @@ def respond(world, motion, matrix, inverse, free, rules, manifolds, change, shif
 
 
 @njit(**FAST)
-def _equations(world, motion, matrix, inverse, free, rules, manifolds):
+def _equations(world, work, motion, rules, manifolds):
+    matrix, inverse, free = work.matrix, work.inverse, work.free
     most = manifolds.count.sum()
     where = np.empty((most, 4), np.int64)
     row = np.empty((most, 3, WIDTH))
@@ -141,7 +134,7 @@ def _equations(world, motion, matrix, inverse, free, rules, manifolds):
                         row[count, e, x] = 0.0
             where[count, 0], where[count, 1], where[count, 2], where[count, 3] = m, k, a, b
             count += 1
-    start, order = _islands(world, where[:count])
+    start, order = _islands(world, work.parent, work.number, where[:count])
     return System(where[:count], row[:count], grip[:count], wanted[:count], pushed[:count], start, order)
 
 
@@ -212,17 +205,17 @@ def _root(parent, b):
 
 
 @njit(**FAST)
-def _islands(world, where):
+def _islands(world, parent, number, where):
     """Contacts ordered by island: bodies that move, joined by contacts."""
-    n = len(world.shape)
-    parent = np.arange(n)
+    for c in range(len(where)):
+        for e in range(2, 4):
+            parent[where[c, e]], number[where[c, e]] = where[c, e], -1
     for c in range(len(where)):
         a, b = where[c, 2], where[c, 3]
         if world.moves[a] and world.moves[b]:
             one, other = _root(parent, a), _root(parent, b)
             if one != other:
                 parent[max(one, other)] = min(one, other)
-    number = np.full(n, -1, np.int64)
     islands = 0
     label = np.empty(len(where), np.int64)
     for c in range(len(where)):

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import njit
 
-from sdfsim.dynamics.kernels.collide import collide, is_round, look_around, nearest
+from sdfsim.dynamics.kernels.collide import collide, is_round, look_around, nearest, scratch_room
 from sdfsim.dynamics.kernels.distance import SIZE, THICKNESS
 from sdfsim.dynamics.kernels.solve import _root, respond
 from sdfsim.dynamics.kernels.vectors import (
@@ -33,18 +33,17 @@ MOST_TURN = 0.1  # rad in one stage of torque-free rotation
 
 
 @njit(**FAST)
-def step(shapes, world, motion, rules, manifolds):
-    """Advance `motion` by one step, in place.
+def step(shapes, world, work, motion, rules, manifolds):
+    """Advance `motion` by one step, in place; time is that of the bodies that go, however many others there are.
 
     Returns:
         The manifolds at its end, and counts: pairs looked at, contacts of the last inner step, islands, bodies that
         contacts moved, whether anybody had to be looked for again.
     """
     n = len(world.shape)
-    matrix, inverse = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
-    free, change, shift = np.zeros((n, 6)), np.zeros((n, 6)), np.zeros((n, 6))
+    matrix, inverse, free, change, shift = work.matrix, work.inverse, work.free, work.change, work.shift
     span = rules.inner * rules.steps
-    for b in range(n):
+    for b in world.going:
         to_matrix(motion.orientation, b, matrix)
     manifolds, ways, start, near, leaf = look_around(shapes, world, motion, matrix, rules, span, manifolds)
     while rules.sleep and _woken(world, motion, manifolds, near):
@@ -56,11 +55,11 @@ def step(shapes, world, motion, rules, manifolds):
             beside[manifolds.pair[p, 1]] = True
     gone = np.zeros(n)
     trial, frame = np.empty((1, 4)), np.empty((1, 3, 3))
-    met = np.zeros(n, np.bool_)
+    met, scratch = np.zeros(n, np.bool_), scratch_room()
     contacts = islands = looked = 0
     _lag(world, motion, rules)
     for k in range(rules.steps):
-        for b in range(n):
+        for b in world.going:
             if gone[b] > ways[b] and world.moves[b]:
                 left = rules.inner * (rules.steps - k)
                 manifolds, ways, start, near, leaf = look_around(shapes, world, motion, matrix, rules, left, manifolds)
@@ -71,17 +70,18 @@ def step(shapes, world, motion, rules, manifolds):
                         beside[manifolds.pair[p, 0]] = True
                         beside[manifolds.pair[p, 1]] = True
                 break
-        for b in range(n):
-            free[b] = 0.0
+        for b in world.going:
+            for x in range(6):
+                free[b, x] = change[b, x] = shift[b, x] = 0.0
             motion.touching[b] = False
             if world.moves[b] and motion.island[b] < 0 and beside[b]:
                 _prepare(world, motion, matrix, inverse, rules, free, b)
-        collide(shapes, world, motion, matrix, rules, manifolds, start, near, leaf)
-        contacts, islands = respond(world, motion, matrix, inverse, free, rules, manifolds, change, shift)
-        part = _parts(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, free, change)
-        for b in range(n):
+        collide(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, scratch)
+        contacts, islands = respond(world, work, motion, rules, manifolds)
+        _parts(shapes, world, work, motion, rules, manifolds, start, near, leaf)
+        for b in world.going:
             if motion.island[b] < 0 and (world.moves[b] or world.scripted[b]):
-                moved = _advance(world, motion, matrix, rules, free, change, shift, part[b], trial, frame, b)
+                moved = _advance(world, motion, matrix, rules, free, change, shift, work.part[b], trial, frame, b)
                 gone[b] += moved
                 met[b] = met[b] or motion.touching[b]
     _lead(world, motion, rules)
@@ -93,7 +93,7 @@ def step(shapes, world, motion, rules, manifolds):
 @njit(**BARE)
 def _lag(world, motion, rules):
     """Velocities at an instant become those of the inner step before it, which contacts are solved with."""
-    for b in range(len(world.shape)):
+    for b in world.going:
         if world.moves[b] and motion.island[b] < 0 and not motion.touching[b]:
             put(motion.velocity, b, along(get(motion.velocity, b), vector(rules.gravity), -0.5 * rules.inner))
 
@@ -101,7 +101,7 @@ def _lag(world, motion, rules):
 @njit(**BARE)
 def _lead(world, motion, rules):
     """And back, for bodies that nothing held in the last inner step: their motion is then exact in free flight."""
-    for b in range(len(world.shape)):
+    for b in world.going:
         if world.moves[b] and motion.island[b] < 0 and not motion.touching[b]:
             put(motion.velocity, b, along(get(motion.velocity, b), vector(rules.gravity), 0.5 * rules.inner))
 
@@ -204,9 +204,11 @@ def _slope(world, orientation, momentum, u, h, b, trial, frame):
 
 
 @njit(**FAST)
-def _parts(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, free, change):
-    """[N] how much of the inner step each body may move, so that none passes through what is thinner than its way."""
-    part = np.ones(len(world.shape))
+def _parts(shapes, world, work, motion, rules, manifolds, start, near, leaf):
+    """How much of the inner step each body may move, so that none passes through what is thinner than its way."""
+    free, change, part, matrix = work.free, work.change, work.part, work.matrix
+    for b in world.going:
+        part[b] = 1.0
     for p in range(len(start)):
         if near[p, 0] + near[p, 1] == 0:
             continue
@@ -221,7 +223,6 @@ def _parts(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, f
                 shapes, world, motion, matrix, rules, manifolds, start, near, leaf, free, change, p, speed, depth
             )
             part[a], part[b] = min(part[a], free_part), min(part[b], free_part)
-    return part
 
 
 @njit(**BARE)
@@ -307,7 +308,7 @@ def _woken(world, motion, manifolds, near):
 def _settle(world, motion, rules, manifolds):
     """Freeze the islands all of which have stayed where they were for long enough."""
     n = len(world.shape)
-    for b in range(n):
+    for b in world.going:
         if not world.moves[b] or motion.island[b] >= 0:
             continue
         anchor = motion.anchor[b]

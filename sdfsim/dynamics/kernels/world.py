@@ -30,6 +30,7 @@ class World(NamedTuple):
         scripted: [N] bool, kinematic.
         group: [N] int64; allowed: [G, G] bool, whether two groups may touch.
         realm: [N] int64, bodies of two realms never meet; -1 is in all.
+        going: [A] int64, the bodies that move or are scripted.
         plane: [K] int64, the bodies that are infinite.
         still: [M] int64, the other static bodies, in the order of their lower ends along `axis`.
         low, high: [M, 3] their boxes; reach: [M] the highest end so far along `axis`.
@@ -53,12 +54,34 @@ class World(NamedTuple):
     group: np.ndarray
     allowed: np.ndarray
     realm: np.ndarray
+    going: np.ndarray
     plane: np.ndarray
     still: np.ndarray
     low: np.ndarray
     high: np.ndarray
     reach: np.ndarray
     axis: int
+
+
+class Work(NamedTuple):
+    """What a step fills in for the bodies that go, and keeps for all others, so that these cost nothing.
+
+    Attributes:
+        matrix, inverse: [N, 3, 3] rotation and inverse inertia, world axes.
+        free, change, shift: [N, 6] what an inner step makes of velocities without contact, what contact adds, and
+            velocities that only move and are forgotten.
+        part: [N] how much of the inner step a body may move.
+        parent, number: [N] int64 for finding islands.
+    """
+
+    matrix: np.ndarray
+    inverse: np.ndarray
+    free: np.ndarray
+    change: np.ndarray
+    shift: np.ndarray
+    part: np.ndarray
+    parent: np.ndarray
+    number: np.ndarray
 
 
 class Motion(NamedTuple):
