@@ -39,6 +39,7 @@ class SolverRules:
 
     Attributes:
         reach: contacts are kept up to this distance; look: new ones are looked for up to this one.
+        still: pairs that have moved by less within a step are not looked at again.
         together: points that are deeper than the deepest less this meet in one impact.
         erp: the share of a penetration that an inner step resolves, through velocity.
         slop: penetration that is left as it is, so that what rests has contacts that do not come and go.
@@ -52,13 +53,14 @@ class SolverRules:
 
     reach: float = 0.02
     look: float = 0.004
+    still: float = 1e-4
     together: float = 1e-4
     erp: float = 0.08
     slop: float = 5e-4
     split: float = 0.04
     slow: float = 2.0
     rounds: int = 50
-    exact: float = 1e-5
+    exact: float = 1e-4
     apart: float = 0.03
     stray: float = 0.005
     rest: int = 25
@@ -86,6 +88,8 @@ class Compiled:
         self.work = compiled.Work(
             matrix=pose.to_matrix(state.orientation.cpu()).numpy(), inverse=np.zeros((n, 3, 3)),
             free=np.zeros((n, 6)), change=np.zeros((n, 6)), shift=np.zeros((n, 6)), part=np.ones(n),
+            ways=np.zeros(n), gone=np.zeros(n), low=np.zeros((n, 3)), high=np.zeros((n, 3)),
+            beside=np.zeros(n, np.bool_), met=np.zeros(n, np.bool_),
             parent=np.zeros(n, np.int64), number=np.zeros(n, np.int64),
         )  # fmt: skip
 
@@ -231,7 +235,7 @@ def compiled_rules(
     return compiled.Rules(
         gravity=np.asarray(gravity, dtype=np.float64), inner=inner, steps=substeps, friction=friction,
         restitution=restitution, rotation=rotation, sleep=sleep, reach=own.reach, look=own.look + 2.0 * margin,
-        together=own.together, erp=own.erp, slop=own.slop, split=own.split,
+        still=own.still, together=own.together, erp=own.erp, slop=own.slop, split=own.split,
         slow=own.slow * float(np.linalg.norm(gravity)) * inner, rounds=own.rounds, exact=own.exact, apart=own.apart,
         stray=own.stray, rest=own.rest, margin=margin, adds=adds,
     )  # fmt: skip

@@ -43,6 +43,7 @@ class Bodies:
     moves: list[bool]
     isotropic: list[bool]
     infinite: list[bool]
+    radius: Tensor
     meets: Tensor
 
 
@@ -133,7 +134,7 @@ def of_compiled(scene: Compiled, motion: Motion) -> tuple[Bodies, Moving]:
     return bodies, moving
 
 
-_TENSORS = ("scale", "com", "inverse_mass", "inertia", "inverse_inertia", "friction", "restitution")
+_TENSORS = ("scale", "com", "radius", "inverse_mass", "inertia", "inverse_inertia", "friction", "restitution")
 
 
 def step(
@@ -142,20 +143,34 @@ def step(
     """Advance by one step; see `kernels.step.step`."""
     gravity = torch.from_numpy(rules.gravity)
     moving = _shifted(bodies, moving, -0.5 * rules.inner * gravity)
+    gone = torch.zeros(len(bodies.moves), dtype=torch.float64)
+    looked: dict[tuple[int, int], float] = {}
     for _ in range(rules.steps):
-        contacts = {
-            pair: points
-            for pair in _pairs(bodies)
-            if (points := touching_points(shapes, bodies, moving, rules, pair, contacts.get(pair, [])))
-        }
+        kept = {}
+        for pair in _pairs(bodies):
+            went = float(gone[list(pair)].sum())
+            anew = went - looked.get(pair, -torch.inf) >= rules.still
+            if anew:
+                looked[pair] = went
+            if points := touching_points(shapes, bodies, moving, rules, pair, contacts.get(pair, []), anew=anew):
+                kept[pair] = points
+        contacts = kept
         free = _free(bodies, moving, gravity, rules)
         rows = equations(bodies, moving, rules, gravity, free, contacts)
         change, shift = torch.zeros_like(free), torch.zeros_like(free)
         for island in _islands(bodies, rows):
             change, shift = sequential_impulses(bodies, rules, island, change, shift)
         contacts = _remembered(contacts, rows)
-        moving = advance(bodies, moving, rules, gravity, free, change, shift)
+        before, moving = moving, advance(bodies, moving, rules, gravity, free, change, shift)
+        gone += _way(bodies, before, moving)
     return _shifted(bodies, moving, 0.5 * rules.inner * gravity), contacts
+
+
+def _way(bodies: Bodies, before: Moving, after: Moving) -> Tensor:
+    """[N] how far any point of a body has moved at most."""
+    turned = pose.to_rotvec(pose.multiply(after.orientation, pose.conjugate(before.orientation)))
+    way = (after.position - before.position).norm(dim=1) + turned.norm(dim=1) * bodies.radius
+    return torch.where(torch.tensor(bodies.infinite), 0.0, way).detach()
 
 
 def _shifted(bodies: Bodies, moving: Moving, change: Tensor) -> Moving:
@@ -176,9 +191,10 @@ def _pairs(bodies: Bodies) -> list[tuple[int, int]]:
 
 
 def touching_points(
-    shapes: kinds.Shapes, bodies: Bodies, moving: Moving, rules: Rules, pair: tuple[int, int], old: list[Point]
-) -> list[Point]:
-    """The contact points of a pair: old ones that still hold, and new ones."""
+    shapes: kinds.Shapes, bodies: Bodies, moving: Moving, rules: Rules, pair: tuple[int, int], old: list[Point], *,
+    anew: bool,
+) -> list[Point]:  # fmt: skip
+    """The contact points of a pair: old ones that still hold, and where it is looked at `anew` further ones."""
     a, b = pair
     round_a, round_b = (_kind(shapes, bodies, body) in ROUND for body in pair)
     if round_a or round_b:
@@ -187,6 +203,8 @@ def touching_points(
         known = _still_there(shapes, bodies, moving, rules, pair, old if ball and not (round_a and round_b) else [])
         return _spread(rules, known, found, rounded=True)
     known = _still_there(shapes, bodies, moving, rules, pair, old)
+    if not anew:
+        return known
     found = _of_nodes(shapes, bodies, moving, rules, a, b) + [
         _turned(point) for point in _of_nodes(shapes, bodies, moving, rules, b, a)
     ]
@@ -299,10 +317,10 @@ def _down(
     d, n = (x[0] for x in _seen_from_within(shapes, bodies, moving, one, other, p[None], inward[None]))
     d = d / k
     stride = ways.STRIDE * float(shapes.clump_ball[shapes.clump_start[s], 3])
-    least = 1e-3 * stride
+    least = stride * (ways.FINEST / ways.STRIDE)
+    _, own = distance(shapes, s, p[None])
     for _ in range(ways.ROUNDS):
         downhill = pose.rotate(pose.conjugate(moving.orientation[one]), pose.rotate(moving.orientation[other], n))
-        _, own = distance(shapes, s, p[None])
         downhill = downhill - (downhill @ own[0]) * own[0]
         slope = downhill.norm()
         if slope < 0.02:

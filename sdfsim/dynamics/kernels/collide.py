@@ -32,33 +32,56 @@ KEYS = 1024  # patches of a shape at most
 ALIKE = 0.9  # cosine between normals that are taken for one
 ROUNDS = 12  # of refinement
 OUTWARD = 1e-3  # how much deeper another node must be to be preferred to one that is farther out by a length
-STRIDE = 0.02  # of a body's size, the first step of the refinement
+STRIDE, FINEST = 0.02, 5e-4  # of a body's size, the first step of the refinement and the last
 MANY = 48  # pairs from which on threads are worth their while
 SHARES = 16  # of the pairs, each with its own scratch, that threads take in turn
 
 
+class Near(NamedTuple):
+    """The leaves of nodes of either body that the other of P pairs may touch, until bodies are looked for again.
+
+    Attributes:
+        start, count: [P, 2] for either side the place of its first leaf and how many are near.
+        leaf: [L] which.
+        away: [L] how far each is at least, once the ways of both bodies since then are taken off.
+        looked: [P] the ways of both bodies when new points were last looked for; -inf for never.
+        away_all: [P] the least of `away`; -inf where it is not known.
+    """
+
+    start: np.ndarray
+    count: np.ndarray
+    leaf: np.ndarray
+    away: np.ndarray
+    looked: np.ndarray
+    away_all: np.ndarray
+
+
 @njit(**FAST)
-def look_around(shapes, world, motion, matrix, rules, span, old):
-    """Pairs of bodies that may touch within `span` of time, which of their nodes are near, and their manifolds.
+def look_around(shapes, world, work, motion, rules, span, old):
+    """Pairs of bodies that may touch within `span` of time, and which of their nodes are near.
+
+    Of `work` it sets how far each body may go until it must be looked around again, and who has somebody near.
 
     Returns:
-        The pairs with the points of `old`; how far each body may go until it must be looked at again; for either side
-        of each pair the place of its first leaf [P, 2], how many are near [P, 2], and these leaves.
+        The manifolds of these pairs, with the points of `old`, and those of bodies that sleep; what is near.
     """
-    ways, low, high = _swept(world, motion, matrix, rules, span)
-    pairs = _pairs(world, motion, low, high)
+    _swept(world, work, motion, rules, span)
+    pairs = _pairs(world, motion, work.low, work.high)
     manifolds = _carried(world, motion, pairs, old)
-    start, count, leaf = _near_leaves(shapes, world, motion, matrix, manifolds.pair, ways, rules.reach)
-    return manifolds, ways, start, count, leaf
+    near = _near_leaves(shapes, world, motion, work.matrix, pairs, work.ways, rules.reach)
+    for p in range(len(pairs)):
+        if near.count[p, 0] + near.count[p, 1] > 0:
+            work.beside[pairs[p, 0]] = work.beside[pairs[p, 1]] = True
+    return manifolds, near
 
 
-@njit(**FAST)
-def _swept(world, motion, matrix, rules, span):
-    """How far [N] any point of a body may go, and the boxes around all that they may reach."""
-    n = len(world.shape)
-    ways, low, high = np.zeros(n), np.empty((n, 3)), np.empty((n, 3))
+@njit(**BARE)
+def _swept(world, work, motion, rules, span):
+    """How far any point of a body may go, and the box around all that it may reach."""
+    ways, low, high, matrix = work.ways, work.low, work.high, work.matrix
     fall = norm(vector(rules.gravity)) * span
     for b in world.going:
+        ways[b], work.gone[b], work.beside[b] = 0.0, 0.0, False
         if world.shape[b] < 0 or not math.isfinite(world.radius[b]):
             continue
         if motion.island[b] < 0 and (world.moves[b] or world.scripted[b]):
@@ -73,7 +96,14 @@ def _swept(world, motion, matrix, rules, span):
                 wide += abs(matrix[b, a, c]) * world.half[b, c]
             low[b, a] = middle[a] - wide
             high[b, a] = middle[a] + wide
-    return ways, low, high
+
+
+@njit(**BARE)
+def _stirs(world, motion, b):
+    """Whether a body is awake, or led along."""
+    if world.scripted[b]:
+        return norm(get(motion.velocity, b)) + norm(get(motion.angular, b)) > 0.0
+    return world.moves[b] and motion.island[b] < 0
 
 
 @njit(**BARE)
@@ -97,7 +127,7 @@ def _pairs(world, motion, low, high):
     going = np.empty(len(world.going), np.int64)
     count = 0
     for b in world.going:
-        if world.shape[b] >= 0:
+        if world.shape[b] >= 0 and math.isfinite(world.radius[b]):
             going[count] = b
             count += 1
     going = going[:count]
@@ -119,21 +149,23 @@ def _pairs(world, motion, low, high):
         order[i] = going[rank[i]]
     for i in range(count):
         a = order[i]
-        awake = world.moves[a] and motion.island[a] < 0
+        awake = _stirs(world, motion, a)
         for j in range(i + 1, count):
             b = order[j]
             if low[b, axis] > high[a, axis]:
                 break
-            if not (awake or (world.moves[b] and motion.island[b] < 0)):
+            if not (awake or _stirs(world, motion, b)) or not (world.moves[a] or world.moves[b]):
                 continue
             if _overlap(low, high, a, low, high, b) and _may_meet(world, a, b):
                 swap = (b < a and world.moves[b]) or not world.moves[a]
                 found, pairs = _append(found, pairs, b if swap else a, a if swap else b)
-        if not awake:
+        if not world.moves[a]:
             continue
         for k in range(len(world.plane)):
-            if _may_meet(world, a, world.plane[k]):
+            if (awake or _stirs(world, motion, world.plane[k])) and _may_meet(world, a, world.plane[k]):
                 found, pairs = _append(found, pairs, a, world.plane[k])
+        if not awake:
+            continue
         last, beyond = 0, len(world.still)
         while last < beyond:
             k = (last + beyond) // 2
@@ -191,28 +223,31 @@ def _append(found, count, a, b):
 def _carried(world, motion, pairs, old):
     """The manifolds of `pairs` with what is known of them, and those of bodies that sleep."""
     n = len(world.shape)
-    kept = np.zeros(len(old.count), np.bool_)
+    key, asleep = np.empty(len(old.count)), np.zeros(len(old.count), np.bool_)
     for k in range(len(old.count)):
         a, b = old.pair[k, 0], old.pair[k, 1]
-        kept[k] = motion.island[a] >= 0 and (motion.island[b] >= 0 or not world.moves[b])
+        key[k] = a * n + b
+        asleep[k] = motion.island[a] >= 0 and (motion.island[b] >= 0 or not world.moves[b])
+    order = _sorted(key)
     here = len(pairs)
-    total = here + kept.sum()
+    total = here + asleep.sum()
     pair = np.empty((total, 2), np.int64)
     count = np.zeros(total, np.int64)
     point = np.empty((total, POINTS, COLUMNS))
     pair[:here] = pairs
     at = 0
     for k in range(here):
-        key = pairs[k, 0] * n + pairs[k, 1]
-        while at < len(old.count) and old.pair[at, 0] * n + old.pair[at, 1] < key:
+        wanted = pairs[k, 0] * n + pairs[k, 1]
+        while at < len(order) and key[order[at]] < wanted:
             at += 1
-        if at < len(old.count) and old.pair[at, 0] * n + old.pair[at, 1] == key:
-            count[k] = old.count[at]
-            point[k, : count[k]] = old.point[at, : count[k]]
-            kept[at] = False
+        if at < len(order) and key[order[at]] == wanted:
+            known = order[at]
+            count[k] = old.count[known]
+            point[k, : count[k]] = old.point[known, : count[k]]
+            asleep[known] = False
     end = here
     for k in range(len(old.count)):
-        if kept[k]:
+        if asleep[k]:
             pair[end] = old.pair[k]
             count[end] = old.count[k]
             point[end, : count[end]] = old.point[k, : count[end]]
@@ -255,7 +290,6 @@ def is_round(table, s):
 
 @njit(**FAST)
 def _near_leaves(shapes, world, motion, matrix, pairs, ways, reach):
-    """For either side of each pair the leaves of nodes that the other may touch: first place, number, and which."""
     count = len(pairs)
     start = np.zeros((count, 2), np.int64)
     total = 0
@@ -265,24 +299,26 @@ def _near_leaves(shapes, world, motion, matrix, pairs, ways, reach):
             s, other = world.shape[pairs[p, side]], world.shape[pairs[p, 1 - side]]
             if not (is_round(shapes.table, s) or is_round(shapes.table, other)):
                 total += shapes.clump_leaf[shapes.clump_start[s + 1]] - shapes.clump_leaf[shapes.clump_start[s]]
-    near = np.zeros((count, 2), np.int64)
-    leaf = np.empty(total, np.int32)
+    near = Near(
+        start, np.zeros((count, 2), np.int64), np.empty(total, np.int32), np.empty(total),
+        np.full(count, -math.inf), np.full(count, -math.inf),
+    )  # fmt: skip
     if count >= MANY:
-        _near_many(shapes, world, motion, matrix, pairs, ways, reach, start, near, leaf)
+        _near_many(shapes, world, motion, matrix, pairs, ways, reach, near)
     else:
         for p in range(count):
-            _near(shapes, world, motion, matrix, pairs, ways, reach, start, near, leaf, p)
-    return start, near, leaf
+            _near(shapes, world, motion, matrix, pairs, ways, reach, near, p)
+    return near
 
 
 @njit(parallel=True, **FAST)
-def _near_many(shapes, world, motion, matrix, pairs, ways, reach, start, near, leaf):
+def _near_many(shapes, world, motion, matrix, pairs, ways, reach, near):
     for p in prange(len(pairs)):
-        _near(shapes, world, motion, matrix, pairs, ways, reach, start, near, leaf, p)
+        _near(shapes, world, motion, matrix, pairs, ways, reach, near, p)
 
 
 @njit(**BARE)
-def _near(shapes, world, motion, matrix, pairs, ways, reach, start, near, leaf, p):
+def _near(shapes, world, motion, matrix, pairs, ways, reach, near, p):
     table, brick, sample = shapes.table, shapes.brick, shapes.sample
     a, b = pairs[p, 0], pairs[p, 1]
     most = ways[a] + ways[b] + reach
@@ -297,24 +333,25 @@ def _near(shapes, world, motion, matrix, pairs, ways, reach, start, near, leaf, 
         size = (
             shapes.table[s, SIZE] + (shapes.table[s, SIZE + 1] if shapes.table[s, KIND] == CAPSULE else 0.0)
         ) * world.scale[one]
-        near[p, 0] = 1 if d * k - size <= most else 0
+        near.count[p, 0] = 1 if d * k - size <= most else 0
         return
     for side in range(2):
         one, other = pairs[p, side], pairs[p, 1 - side]
         s, t = world.shape[one], world.shape[other]
         w, c = _map(motion.position, matrix, world.scale, world.com, one, other)
         k, own = world.scale[other], world.scale[one]
-        found = 0
+        at = near.start[p, side]
         for clump in range(shapes.clump_start[s], shapes.clump_start[s + 1]):
             d, _ = distance(table, brick, sample, t, _mapped(w, c, get(shapes.clump_ball, clump)))
             if k * d - own * shapes.clump_ball[clump, 3] > most:
                 continue
             for i in range(shapes.clump_leaf[clump], shapes.clump_leaf[clump + 1]):
                 d, _ = distance(table, brick, sample, t, _mapped(w, c, get(shapes.leaf_ball, i)))
-                if k * d - own * shapes.leaf_ball[i, 3] <= most:
-                    leaf[start[p, side] + found] = i
-                    found += 1
-        near[p, side] = found
+                away = k * d - own * shapes.leaf_ball[i, 3]
+                if away <= most:
+                    near.leaf[at], near.away[at] = i, away
+                    at += 1
+        near.count[p, side] = at - near.start[p, side]
 
 
 class Scratch(NamedTuple):
@@ -347,38 +384,43 @@ def scratch_room():
 
 
 @njit(**FAST)
-def collide(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, scratch):
-    """Bring all manifolds up to the present poses: old points moved along or dropped, new ones found and merged."""
-    if len(start) >= MANY:
-        _collide_many(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, scratch)
+def collide(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch):
+    """Bring all manifolds up to the present poses: old points moved along or dropped, new ones found and merged.
+
+    `gone` [N] is how far any point of a body may have moved since `near` was made.
+    """
+    if len(near.start) >= MANY:
+        _collide_many(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch)
     else:
-        for p in range(len(start)):
-            _collide_pair(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, scratch, 0, p)
+        for p in range(len(near.start)):
+            _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, 0, p)
 
 
 @njit(parallel=True, **FAST)
-def _collide_many(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, scratch):
+def _collide_many(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch):
     for t in prange(SHARES):
-        for p in range(t, len(start), SHARES):
-            _collide_pair(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, scratch, t, p)
+        for p in range(t, len(near.start), SHARES):
+            _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, t, p)
 
 
 @njit(**BARE)
-def _collide_pair(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, scratch, t, p):
+def _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, t, p):
     a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
-    if near[p, 0] + near[p, 1] == 0:
+    if near.count[p, 0] + near.count[p, 1] == 0:
         manifolds.count[p] = 0
         return
     if is_round(shapes.table, world.shape[a]) or is_round(shapes.table, world.shape[b]):
         _collide_round(shapes, world, motion, matrix, rules, manifolds, scratch, t, p)
         return
     known = _moved(shapes, world, motion, matrix, rules, manifolds, p, manifolds.count[p])
+    manifolds.count[p] = known
+    went = gone[a] + gone[b]
+    if went - near.looked[p] < rules.still:
+        return
+    near.looked[p], near.away_all[p] = went, math.inf
     count = 0
     for side in range(2):
-        first = start[p, side]
-        count = _nodes(
-            shapes, world, motion, matrix, rules, a, b, side, leaf, first, first + near[p, side], scratch, t, count
-        )
+        count = _nodes(shapes, world, motion, matrix, rules, a, b, side, near, p, went, scratch, t, count)
     count = _first_to_touch(rules, scratch.found, t, count)
     manifolds.count[p] = _merged(rules, manifolds.point, p, known, scratch, t, count, False)
 
@@ -436,7 +478,7 @@ def _moved(shapes, world, motion, matrix, rules, manifolds, p, count):
 
 
 @njit(**BARE)
-def _nodes(shapes, world, motion, matrix, rules, a, b, side, leaf, first, last, scratch, t, count):
+def _nodes(shapes, world, motion, matrix, rules, a, b, side, near, pair, went, scratch, t, count):
     """The deepest node of each near leaf of one body in the other's distances, refined; added to what is found."""
     table, brick, sample = shapes.table, shapes.brick, shapes.sample
     depth, node, keys, normal = scratch.depth, scratch.node, scratch.key, scratch.normal
@@ -446,10 +488,13 @@ def _nodes(shapes, world, motion, matrix, rules, a, b, side, leaf, first, last, 
     k, own = world.scale[other], world.scale[one]
     stride = STRIDE * shapes.clump_ball[shapes.clump_start[r], 3]
     kept = 0
-    for at in range(first, last):
-        i = leaf[at]
-        d, _ = distance(table, brick, sample, s, _mapped(w, c, get(shapes.leaf_ball, i)))
-        if k * d - own * shapes.leaf_ball[i, 3] > rules.look:
+    for at in range(near.start[pair, side], near.start[pair, side] + near.count[pair, side]):
+        i = near.leaf[at]
+        if near.away[at] - went <= rules.look:
+            d, _ = distance(table, brick, sample, s, _mapped(w, c, get(shapes.leaf_ball, i)))
+            near.away[at] = k * d - own * shapes.leaf_ball[i, 3] + went
+        near.away_all[pair] = min(near.away_all[pair], near.away[at])
+        if near.away[at] - went > rules.look:
             continue
         deepest, chosen, lowest = 0.0, -1, 1e300
         facing = (0.0, 0.0, 0.0)
@@ -528,7 +573,8 @@ def _refined(table, brick, sample, stride, s, t, w, c, k, own, p, inward):
     """From node p of shape s down the distance of t along the surface of s: place, distance, normal in t's axes."""
     d, n = _gap(table, brick, sample, t, w, c, p, inward)
     ratio = k / own
-    least = 1e-3 * stride
+    least = stride * (FINEST / STRIDE)
+    _, m = distance(table, brick, sample, s, p)
     for _ in range(ROUNDS):
         # The other's normal in own axes (w is a rotation times own / k), less its part across the own surface.
         g = (
@@ -536,7 +582,6 @@ def _refined(table, brick, sample, stride, s, t, w, c, k, own, p, inward):
             (w[0][1] * n[0] + w[1][1] * n[1] + w[2][1] * n[2]) * ratio,
             (w[0][2] * n[0] + w[1][2] * n[1] + w[2][2] * n[2]) * ratio,
         )
-        _, m = distance(table, brick, sample, s, p)
         g = along(g, m, -dot(g, m))
         slope = norm(g)
         if slope < 0.02:
@@ -593,7 +638,7 @@ def _round(shapes, world, motion, matrix, rules, a, b, side, found, at):
 
 
 @njit(**BARE)
-def nearest(shapes, shape, place, frame, scales, coms, pairs, start, near, leaf, p):
+def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p):
     """The least distance of pair p with its two bodies at `place` and `frame`, of the nodes that were near."""
     table, brick, sample = shapes.table, shapes.brick, shapes.sample
     least = math.inf
@@ -607,8 +652,8 @@ def nearest(shapes, shape, place, frame, scales, coms, pairs, start, near, leaf,
                 d, _ = distance(table, brick, sample, t, _mapped(w, c, (0.0, 0.0, 0.5 * e * half)))
                 least = min(least, k * d - scales[side] * table[s, SIZE])
         elif not is_round(table, t):
-            for i in range(start[p, side], start[p, side] + near[p, side]):
-                e = leaf[i]
+            for i in range(near.start[p, side], near.start[p, side] + near.count[p, side]):
+                e = near.leaf[i]
                 d, _ = distance(table, brick, sample, t, _mapped(w, c, get(shapes.leaf_ball, e)))
                 if k * d - scales[side] * shapes.leaf_ball[e, 3] < least:
                     for u in range(shapes.leaf_node[e], shapes.leaf_node[e + 1]):

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from sdfsim.dynamics.kernels.vectors import BARE, along, dot, norm
+from sdfsim.dynamics.kernels.vectors import BARE, along, dot, norm, scale
 
 PLANE, SPHERE, CAPSULE, BOX, CYLINDER, GRID = range(6)
 TINY = 1e-12
@@ -134,7 +134,8 @@ def _grid(table, brick, sample, s, p):
     """Trilinear in the brick around p, or between the corners of bricks; the distance to the box adds beyond it."""
     cell = table[s, CELL]
     nx, ny, nz = int(table[s, BRICKS]), int(table[s, BRICKS + 1]), int(table[s, BRICKS + 2])
-    x, y, z = (p[0] - table[s, LOW]) / cell, (p[1] - table[s, LOW + 1]) / cell, (p[2] - table[s, LOW + 2]) / cell
+    a = 1.0 / cell
+    x, y, z = a * (p[0] - table[s, LOW]), a * (p[1] - table[s, LOW + 1]), a * (p[2] - table[s, LOW + 2])
     cx, cy, cz = min(max(x, 0.0), 8.0 * nx), min(max(y, 0.0), 8.0 * ny), min(max(z, 0.0), 8.0 * nz)
     beyond = ((x - cx) * cell, (y - cy) * cell, (z - cz) * cell)
     i, j, k = min(int(cx) >> 3, nx - 1), min(int(cy) >> 3, ny - 1), min(int(cz) >> 3, nz - 1)
@@ -153,16 +154,14 @@ def _grid(table, brick, sample, s, p):
         sample[o + e], sample[o + e + 1], sample[o + e + f], sample[o + e + f + 1], u - i, v - j, w - k,
     )  # fmt: skip
     length = norm(slope)
-    normal = (0.0, 0.0, 1.0) if length < TINY else (slope[0] / length, slope[1] / length, slope[2] / length)
+    normal = (0.0, 0.0, 1.0) if length < TINY else scale(slope, 1.0 / length)
     far = dot(beyond, beyond)
     if far > 0.0:
         # The solid lies within the box, which is convex: it is no nearer than this.
         d = max(d, 0.0)
         normal = along(beyond, normal, d)
         d = math.sqrt(far + d * d)
-        normal = (normal[0] / d, normal[1] / d, normal[2] / d)
-        length = norm(normal)
-        normal = (normal[0] / length, normal[1] / length, normal[2] / length)
+        normal = scale(normal, 1.0 / norm(normal))
     return d, normal
 
 

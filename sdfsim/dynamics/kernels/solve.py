@@ -273,28 +273,41 @@ def _solve(world, rules, system, change, shift, island):
         worst = 0.0
         for o in range(first, last):
             c = order[o]
-            worst = max(worst, _relax(where, row, mass, change, c, 0, 0.0, math.inf))
+            worst = max(worst, _relax(where, row, mass, change, c, 0, 1, 0.0, math.inf))
         for o in range(first, last):
             c = order[o]
             if grip[c] > 0.0:
                 most = grip[c] * row[c, 0, IMPULSE]
-                for e in range(1, 3):
-                    worst = max(worst, _relax(where, row, mass, change, c, e, -most, most))
+                worst = max(worst, _relax(where, row, mass, change, c, 1, 3, -most, most))
         if worst <= rules.exact:
             break
 
 
 @njit(**BARE)
-def _relax(where, row, mass, change, c, e, least, most):
-    """Bring one row to its wanted velocity, as far as its limits allow; returns by how much that changed."""
-    short = row[c, e, WANTED] - _speed(where, row, change, c, e)
-    total = min(max(row[c, e, IMPULSE] + short * row[c, e, MASS], least), most)
-    step = total - row[c, e, IMPULSE]
-    if step == 0.0:
-        return 0.0
-    row[c, e, IMPULSE] = total
-    _apply(where, row, mass, change, c, e, step)
-    return abs(step / row[c, e, MASS])
+def _relax(where, row, mass, change, c, first, last, least, most):
+    """Bring rows of a contact to their wanted velocities, as far as limits allow; returns by how much that changed."""
+    a, b = where[c, 2], where[c, 3]
+    v, w = (change[a, 0], change[a, 1], change[a, 2]), (change[a, 3], change[a, 4], change[a, 5])
+    u, z = (change[b, 0], change[b, 1], change[b, 2]), (change[b, 3], change[b, 4], change[b, 5])
+    worst = 0.0
+    for e in range(first, last):
+        axis = (row[c, e, AXIS], row[c, e, AXIS + 1], row[c, e, AXIS + 2])
+        arm = (row[c, e, ARM], row[c, e, ARM + 1], row[c, e, ARM + 2])
+        other = (row[c, e, OTHER], row[c, e, OTHER + 1], row[c, e, OTHER + 2])
+        short = row[c, e, WANTED] - dot(axis, sub(v, u)) - dot(arm, w) - dot(other, z)
+        total = min(max(row[c, e, IMPULSE] + short * row[c, e, MASS], least), most)
+        step = total - row[c, e, IMPULSE]
+        if step == 0.0:
+            continue
+        row[c, e, IMPULSE] = total
+        v, u = along(v, axis, step * mass[a]), along(u, axis, -step * mass[b])
+        w = along(w, (row[c, e, SPIN], row[c, e, SPIN + 1], row[c, e, SPIN + 2]), step)
+        z = along(z, (row[c, e, COUNTER], row[c, e, COUNTER + 1], row[c, e, COUNTER + 2]), step)
+        worst = max(worst, abs(step / row[c, e, MASS]))
+    if worst > 0.0:
+        for x in range(3):
+            change[a, x], change[a, 3 + x], change[b, x], change[b, 3 + x] = v[x], w[x], u[x], z[x]
+    return worst
 
 
 @njit(**BARE)

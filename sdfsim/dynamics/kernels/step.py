@@ -40,54 +40,46 @@ def step(shapes, world, work, motion, rules, manifolds):
         The manifolds at its end, and counts: pairs looked at, contacts of the last inner step, islands, bodies that
         contacts moved, whether anybody had to be looked for again.
     """
-    n = len(world.shape)
     matrix, inverse, free, change, shift = work.matrix, work.inverse, work.free, work.change, work.shift
     span = rules.inner * rules.steps
     for b in world.going:
         to_matrix(motion.orientation, b, matrix)
-    manifolds, ways, start, near, leaf = look_around(shapes, world, motion, matrix, rules, span, manifolds)
+        work.met[b] = False
+    manifolds, near = look_around(shapes, world, work, motion, rules, span, manifolds)
     while rules.sleep and _woken(world, motion, manifolds, near):
-        manifolds, ways, start, near, leaf = look_around(shapes, world, motion, matrix, rules, span, manifolds)
-    beside = np.zeros(n, np.bool_)
-    for p in range(len(start)):
-        if near[p, 0] + near[p, 1] > 0:
-            beside[manifolds.pair[p, 0]] = True
-            beside[manifolds.pair[p, 1]] = True
-    gone = np.zeros(n)
+        manifolds, near = look_around(shapes, world, work, motion, rules, span, manifolds)
     trial, frame = np.empty((1, 4)), np.empty((1, 3, 3))
-    met, scratch = np.zeros(n, np.bool_), scratch_room()
+    scratch = scratch_room()
     contacts = islands = looked = 0
     _lag(world, motion, rules)
     for k in range(rules.steps):
         for b in world.going:
-            if gone[b] > ways[b] and world.moves[b]:
+            if work.gone[b] > work.ways[b] and world.moves[b]:
                 left = rules.inner * (rules.steps - k)
-                manifolds, ways, start, near, leaf = look_around(shapes, world, motion, matrix, rules, left, manifolds)
-                gone[:] = 0.0
+                manifolds, near = look_around(shapes, world, work, motion, rules, left, manifolds)
                 looked += 1
-                for p in range(len(start)):
-                    if near[p, 0] + near[p, 1] > 0:
-                        beside[manifolds.pair[p, 0]] = True
-                        beside[manifolds.pair[p, 1]] = True
                 break
         for b in world.going:
             for x in range(6):
                 free[b, x] = change[b, x] = shift[b, x] = 0.0
             motion.touching[b] = False
-            if world.moves[b] and motion.island[b] < 0 and beside[b]:
+            if world.moves[b] and motion.island[b] < 0 and work.beside[b]:
                 _prepare(world, motion, matrix, inverse, rules, free, b)
-        collide(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, scratch)
+        collide(shapes, world, motion, matrix, rules, manifolds, near, work.gone, scratch)
         contacts, islands = respond(world, work, motion, rules, manifolds)
-        _parts(shapes, world, work, motion, rules, manifolds, start, near, leaf)
+        _parts(shapes, world, work, motion, rules, manifolds, near)
         for b in world.going:
             if motion.island[b] < 0 and (world.moves[b] or world.scripted[b]):
                 moved = _advance(world, motion, matrix, rules, free, change, shift, work.part[b], trial, frame, b)
-                gone[b] += moved
-                met[b] = met[b] or motion.touching[b]
+                work.gone[b] += moved
+                work.met[b] = work.met[b] or motion.touching[b]
+    met = 0
+    for b in world.going:
+        met += work.met[b]
     _lead(world, motion, rules)
     if rules.sleep:
         _settle(world, motion, rules, manifolds)
-    return manifolds, (len(start), contacts, islands, int(met.sum()), looked)
+    return manifolds, (len(near.start), contacts, islands, met, looked)
 
 
 @njit(**BARE)
@@ -135,6 +127,9 @@ def _advance(world, motion, matrix, rules, free, change, shift, part, trial, fra
     """Move a body by one inner step; returns how far at most any of its points has gone."""
     if world.scripted[b]:
         v, w = get(motion.velocity, b), get(motion.angular, b)
+        if w[0] == w[1] == w[2] == 0.0:  # a plane reaches to infinity, and may be led along
+            put(motion.position, b, along(get(motion.position, b), v, rules.inner * part))
+            return norm(v) * rules.inner
     else:
         for x in range(6):
             if change[b, x] != 0.0 or shift[b, x] != 0.0:
@@ -204,13 +199,13 @@ def _slope(world, orientation, momentum, u, h, b, trial, frame):
 
 
 @njit(**FAST)
-def _parts(shapes, world, work, motion, rules, manifolds, start, near, leaf):
+def _parts(shapes, world, work, motion, rules, manifolds, near):
     """How much of the inner step each body may move, so that none passes through what is thinner than its way."""
     free, change, part, matrix = work.free, work.change, work.part, work.matrix
     for b in world.going:
         part[b] = 1.0
-    for p in range(len(start)):
-        if near[p, 0] + near[p, 1] == 0:
+    for p in range(len(near.start)):
+        if near.count[p, 0] + near.count[p, 1] == 0:
             continue
         a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
         v, w = _after(motion.velocity, free, change, 0, a), _after(motion.angular, free, change, 3, a)
@@ -218,10 +213,9 @@ def _parts(shapes, world, work, motion, rules, manifolds, start, near, leaf):
         if world.moves[b] or world.scripted[b]:
             speed += norm(_after(motion.angular, free, change, 3, b)) * world.radius[b]
         depth = _harmless(shapes, world, a, b)
-        if speed * rules.inner > depth:
-            free_part = _clear(
-                shapes, world, motion, matrix, rules, manifolds, start, near, leaf, free, change, p, speed, depth
-            )
+        away = near.away_all[p] - work.gone[a] - work.gone[b]
+        if speed * rules.inner > depth and not away > speed * rules.inner:
+            free_part = _clear(shapes, world, motion, matrix, rules, manifolds, near, free, change, p, speed, depth)
             part[a], part[b] = min(part[a], free_part), min(part[b], free_part)
 
 
@@ -241,7 +235,7 @@ def _harmless(shapes, world, a, b):
 
 
 @njit(**FAST)
-def _clear(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, free, change, p, speed, depth):
+def _clear(shapes, world, motion, matrix, rules, manifolds, near, free, change, p, speed, depth):
     """How much of the inner step a pair may move until it overlaps a little: conservative advancement."""
     place, frame, turned = np.empty((2, 3)), np.empty((2, 3, 3)), np.empty((2, 4))
     scales, coms = np.empty(2), np.empty((2, 3))
@@ -260,7 +254,7 @@ def _clear(shapes, world, motion, matrix, rules, manifolds, start, near, leaf, f
             for x in range(4):
                 turned[side, x] = q[x]
             to_matrix(turned, side, frame)
-        gap = nearest(shapes, world.shape, place, frame, scales, coms, manifolds.pair, start, near, leaf, p)
+        gap = nearest(shapes, world.shape, place, frame, scales, coms, manifolds.pair, near, p)
         if t == 0.0 and gap <= 0.0:
             return 1.0  # in contact already, and answered
         if gap <= -0.5 * deep:
@@ -284,9 +278,9 @@ def _after(velocity, free, change, column, b):
 def _woken(world, motion, manifolds, near):
     """Wake the islands that something awake may touch in this step; whether there were any."""
     found = False
-    for p in range(len(near)):
+    for p in range(len(near.start)):
         a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
-        if near[p, 0] + near[p, 1] == 0:
+        if near.count[p, 0] + near.count[p, 1] == 0:
             continue
         for sleeper, other in ((a, b), (b, a)):
             island = motion.island[sleeper]

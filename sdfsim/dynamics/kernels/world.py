@@ -71,6 +71,9 @@ class Work(NamedTuple):
         free, change, shift: [N, 6] what an inner step makes of velocities without contact, what contact adds, and
             velocities that only move and are forgotten.
         part: [N] how much of the inner step a body may move.
+        ways: [N] how far a body may move until it has to be looked around again; gone: [N] how far it has.
+        low, high: [N, 3] the box of all that it may reach till then.
+        beside, met: [N] bool, whether somebody is near, and whether contacts acted in this step.
         parent, number: [N] int64 for finding islands.
     """
 
@@ -80,6 +83,12 @@ class Work(NamedTuple):
     change: np.ndarray
     shift: np.ndarray
     part: np.ndarray
+    ways: np.ndarray
+    gone: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    beside: np.ndarray
+    met: np.ndarray
     parent: np.ndarray
     number: np.ndarray
 
@@ -130,6 +139,7 @@ class Rules(NamedTuple):
         friction, restitution, rotation, sleep: whether they are.
         reach: contacts are kept up to this distance, and while they have slid by no more.
         look: new points are looked for up to this distance.
+        still: pairs that have moved by less since new points were looked for keep those that they have.
         together: points that are deeper than the deepest less this meet in one impact.
         erp: the share of a penetration that an inner step resolves.
         slop: penetration that is left as it is, so that what rests has contacts that do not come and go.
@@ -152,6 +162,7 @@ class Rules(NamedTuple):
     sleep: bool
     reach: float
     look: float
+    still: float
     together: float
     erp: float
     slop: float
