@@ -161,7 +161,7 @@ def step(
         for island in _islands(bodies, rows):
             change, shift = sequential_impulses(bodies, rules, island, change, shift)
         contacts = _remembered(contacts, rows)
-        before, moving = moving, advance(bodies, moving, rules, gravity, free, change, shift)
+        before, moving = moving, advance(bodies, moving, rules, gravity, change, shift)
         gone += _way(bodies, before, moving)
     return _shifted(bodies, moving, 0.5 * rules.inner * gravity), contacts
 
@@ -205,6 +205,9 @@ def touching_points(
     known = _still_there(shapes, bodies, moving, rules, pair, old)
     if not anew:
         return known
+    for one, other in ((a, b), (b, a)):
+        if middle := _swallowed(shapes, bodies, moving, one, other):
+            return [middle if one == a else _turned(middle)]
     found = _of_nodes(shapes, bodies, moving, rules, a, b) + [
         _turned(point) for point in _of_nodes(shapes, bodies, moving, rules, b, a)
     ]
@@ -296,6 +299,24 @@ def _of_nodes(shapes: kinds.Shapes, bodies: Bodies, moving: Moving, rules: Rules
         foot = _into(bodies, moving, one, other, p[None])[0] * bodies.scale[other] - gap * normal
         points.append(Point(mine, foot - bodies.com[other], pose.rotate(moving.orientation[other], normal), gap, key))
     return points
+
+
+def _swallowed(shapes: kinds.Shapes, bodies: Bodies, moving: Moving, one: int, other: int) -> Point | None:
+    """The one contact of two bodies where the centre of `one` is inside both solids."""
+    away = (moving.position[one] - moving.position[other]).norm()
+    if not bodies.moves[one] or bodies.infinite[other] or away >= bodies.radius[other]:
+        return None
+    centre = (bodies.com[one] / bodies.scale[one])[None]
+    there = _into(bodies, moving, one, other, centre)
+    own, _ = distance(shapes, bodies.shape[one], centre)
+    d, n = (x[0] for x in distance(shapes, bodies.shape[other], there))
+    if own[0] >= 0 or d >= 0:
+        return None
+    k = bodies.scale[other]
+    return Point(
+        first=torch.zeros_like(centre[0]), second=k * (there[0] - d * n) - bodies.com[other],
+        normal=pose.rotate(moving.orientation[other], n), gap=k * d,
+    )  # fmt: skip
 
 
 def _seen_from_within(
@@ -486,9 +507,16 @@ def equations(
         bounce = bodies.restitution[a] * bodies.restitution[b] if rules.restitution else nothing
         margin = rules.margin * ((not bodies.infinite[a]) + (not bodies.infinite[b]))
         middle = _middle_of_face(points)
+
+        def met(ends: tuple[Tensor, Tensor], a: int = a, b: int = b) -> tuple[Tensor, Tensor]:
+            """Where both feel the impulse, from either centre of mass: half way between the ends of a contact."""
+            one, other = (pose.rotate(moving.orientation[x], end) for x, end in zip((a, b), ends, strict=True))
+            apart = moving.position[a] + one - moving.position[b] - other
+            return one - 0.5 * apart, other + 0.5 * apart
+
         for number, point in enumerate(points):
             n, gap = point.normal, point.gap - margin
-            arms = tuple(pose.rotate(moving.orientation[x], end) for x, end in ((a, point.first), (b, point.second)))
+            arms = met((point.first, point.second))
 
             def relative(linear: Tensor, angular: Tensor, arms: tuple = arms, a: int = a, b: int = b) -> Tensor:
                 one = linear[a] + torch.linalg.cross(angular[a], arms[0])
@@ -515,8 +543,8 @@ def equations(
                 if middle is not None:
                     # A face presses all over, and resists being turned less than its corners would.
                     arms = tuple(
-                        (1.0 - solving.SPREAD) * pose.rotate(moving.orientation[x], m) + solving.SPREAD * arm
-                        for x, m, arm in zip((a, b), middle, arms, strict=True)
+                        (1.0 - solving.SPREAD) * end + solving.SPREAD * arm
+                        for end, arm in zip(met(middle), arms, strict=True)
                     )
                     then = relative(moving.velocity, moving.angular, arms) + relative(free[:, :3], free[:, 3:], arms)
                     slip = then - (then @ n) * n
@@ -646,9 +674,7 @@ def _remembered(contacts: Contacts, rows: list[Equations]) -> Contacts:
 # Motion
 
 
-def advance(
-    bodies: Bodies, moving: Moving, rules: Rules, gravity: Tensor, free: Tensor, change: Tensor, shift: Tensor
-) -> Moving:
+def advance(bodies: Bodies, moving: Moving, rules: Rules, gravity: Tensor, change: Tensor, shift: Tensor) -> Moving:
     """Move all bodies by one inner step: positions with the new velocities."""
     position, orientation, velocity, angular, touching = [], [], [], [], []
     for b, moves in enumerate(bodies.moves):
@@ -656,16 +682,14 @@ def advance(
         touched = bool((change[b] != 0.0).any() or (shift[b] != 0.0).any()) and moves
         if moves:
             v = v + gravity * rules.inner + change[b, :3]
-            if not rules.rotation:
-                w = torch.zeros_like(w)
-            elif touched or bodies.isotropic[b]:
-                w = w + free[b, 3:] + change[b, 3:]
+            w = (w + change[b, 3:]) * float(rules.rotation)
         x = x + rules.inner * (v + shift[b, :3])
-        if moves and rules.rotation and not touched and not bodies.isotropic[b]:
+        further = shift[b, 3:] * float(rules.rotation)
+        if moves and rules.rotation and not bodies.isotropic[b]:
             q, w = _torque_free(bodies, b, q, w, rules.inner)
         else:
-            turned = w + shift[b, 3:] * float(rules.rotation)
-            q = pose.multiply(pose.from_rotvec(turned * rules.inner), q)
+            further = further + w
+        q = pose.multiply(pose.from_rotvec(further * rules.inner), q)
         for series, value in zip((position, orientation, velocity, angular), (x, q / q.norm(), v, w), strict=True):
             series.append(value)
         touching.append(touched)

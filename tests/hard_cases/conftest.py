@@ -1,15 +1,21 @@
-"""What the gates run on: every bundled model, the processor and, where there is one, the graphics card."""
+"""What the gates run on: the contact solve, every bundled network, and the devices that there are."""
 
 from __future__ import annotations
 
 import pytest
 
-from sdfsim.dynamics.model import Model, bundled_models, load_model
+from sdfsim.dynamics.model import Model, bundled_models, load_model, model_names
+
+
+@pytest.fixture(scope="session", params=model_names())
+def model(request) -> Model:
+    """The contact solve and every bundled network."""
+    return load_model(request.param)
 
 
 @pytest.fixture(scope="session", params=bundled_models())
-def model(request) -> Model:
-    """Every bundled model."""
+def network(request) -> Model:
+    """Every bundled network."""
     return load_model(request.param)
 
 

@@ -106,13 +106,13 @@ def test_ten_thousand_static_bodies_cost_one_mover_what_ten_do(model):
     few, many = run(10), run(10_000)
     for name in ("pairs", "sdf_queries", "nodes", "edges", "active", "free"):
         np.testing.assert_array_equal(few.counters[name], many.counters[name], err_msg=name)
-    assert few.counters["sdf_queries"].sum() > 0
+    assert few.counters["pairs"].sum() > 0
     np.testing.assert_array_equal(few.position[:, :4], many.position[:, :4])
 
 
-def test_masses_beyond_training_are_flagged(model):
+def test_masses_beyond_training_are_flagged(network):
     """`simulate` and `plan` print these lines, see tests/test_planning.py."""
-    lines = Simulator(gates.unequal(), model).outside_training
+    lines = Simulator(gates.unequal(), network).outside_training
     assert [line for line in lines if line.startswith("heaviest to lightest body: 1e+03 to 1e+03 here")]
     scene = gates.placed(gates.CUBE, [(0, 0, 0.5), (0.1, 0, 1.55)], floor=True)
-    assert not [line for line in Simulator(scene, model).outside_training if "heaviest" in line]
+    assert not [line for line in Simulator(scene, network).outside_training if "heaviest" in line]

@@ -30,7 +30,7 @@ def test_every_case_stays_sound(model, device, case):
     scene = gates.CASES[case]()
     rollout = Simulator(scene, model, device).run(steps=40)
     gates.assert_sound(rollout)
-    assert rollout.contact_count.sum() > 0
+    assert rollout.counters["active"].sum() > 0  # what is shot has left again when a step ends
     assert np.abs(rollout.position).max() < 40.0 and np.abs(rollout.velocity).max() < 60.0
 
 
@@ -81,7 +81,8 @@ def apart(model, one, other, steps: int, there=lambda p: p, back=lambda p: p, de
     near, far = (Simulator(s, model, device) for s in (one, other))
     rows, contacts, worst = gates.moving(one), 0, 0.0
     for _ in range(steps):
-        far.state = there(near.state)
+        start = replace(near.state, touch=None)
+        near.state, far.state = start, there(start)  # both forget what they know of contacts
         (mine,), (theirs,) = near.frames(1), far.frames(1)
         contacts += int(mine.contact_count.sum())
         worst = max(worst, float(np.abs(back(theirs.position[0])[rows] - mine.position[0, rows]).max()))

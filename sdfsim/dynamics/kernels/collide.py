@@ -420,6 +420,11 @@ def _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, s
     near.looked[p], near.away_all[p] = went, math.inf
     count = 0
     for side in range(2):
+        if _swallowed(shapes, world, motion, matrix, a, b, side, scratch.found, t):
+            manifolds.count[p] = _merged(rules, manifolds.point, p, 0, scratch, t, 1, False)
+            near.away_all[p] = -math.inf
+            return
+    for side in range(2):
         count = _nodes(shapes, world, motion, matrix, rules, a, b, side, near, p, went, scratch, t, count)
     count = _first_to_touch(rules, scratch.found, t, count)
     manifolds.count[p] = _merged(rules, manifolds.point, p, known, scratch, t, count, False)
@@ -445,6 +450,32 @@ def _collide_round(shapes, world, motion, matrix, rules, manifolds, scratch, t, 
     if count + known > 0:
         known = _merged(rules, point, p, known, scratch, t, count, True)
     manifolds.count[p] = known
+
+
+@njit(**BARE)
+def _swallowed(shapes, world, motion, matrix, a, b, side, found, t):
+    """Whether the centre of one body is inside both solids (that of a ring on a peg is not inside the ring).
+
+    The nearest surface is then the wrong way out for the nodes beyond the other's middle. The pair has one contact
+    instead, at this centre, along the other's normal there.
+    """
+    one, other = (a, b) if side == 0 else (b, a)
+    away = norm(sub(get(motion.position, one), get(motion.position, other)))
+    if not world.moves[one] or not away < world.radius[other] < math.inf:
+        return False
+    table, brick, sample = shapes.table, shapes.brick, shapes.sample
+    k, centre = world.scale[other], scale(get(world.com, one), 1.0 / world.scale[one])
+    own, _ = distance(table, brick, sample, world.shape[one], centre)
+    if own >= 0.0:
+        return False
+    w, c = _map(motion.position, matrix, world.scale, world.com, one, other)
+    there = _mapped(w, c, centre)
+    d, n = distance(table, brick, sample, world.shape[other], there)
+    if d >= 0.0:
+        return False
+    theirs = sub(along(scale(there, k), n, -k * d), get(world.com, other))
+    _write(found, t, 0, side, (0.0, 0.0, 0.0), theirs, turn(matrix, other, n), k * d, 0)
+    return True
 
 
 @njit(**BARE)

@@ -81,12 +81,15 @@ def _equations(world, work, motion, rules, manifolds):
         friction = world.friction[a] * world.friction[b] if rules.friction else 0.0
         bounce = world.restitution[a] * world.restitution[b] if rules.restitution else 0.0
         margin = rules.margin * ((world.radius[a] < math.inf) + (world.radius[b] < math.inf))
+        between = sub(get(motion.position, a), get(motion.position, b))
         flat, middle, opposite = _patch(matrix, manifolds.point, m, manifolds.count[m], a, b)
+        middle, opposite = _met(between, middle, opposite)
         for k in range(manifolds.count[m]):
             point = manifolds.point[m, k]
             n = (point[NORMAL], point[NORMAL + 1], point[NORMAL + 2])
             arm = turn(matrix, a, (point[0], point[1], point[2]))
             other = turn(matrix, b, (point[3], point[4], point[5]))
+            arm, other = _met(between, arm, other)
             now = _relative(motion.velocity, motion.angular, a, b, arm, other)
             then = add(now, _coming(free, a, b, arm, other))
             approach = dot(now, n)
@@ -136,6 +139,13 @@ def _equations(world, work, motion, rules, manifolds):
             count += 1
     start, order = _islands(world, work.parent, work.number, where[:count])
     return System(where[:count], row[:count], grip[:count], wanted[:count], pushed[:count], start, order)
+
+
+@njit(**BARE)
+def _met(between, arm, other):
+    """Both ends of a contact moved half way to one another: an impulse at one place keeps angular momentum."""
+    apart = add(between, sub(arm, other))
+    return along(arm, apart, -0.5), along(other, apart, 0.5)
 
 
 @njit(**BARE)

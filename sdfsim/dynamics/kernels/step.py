@@ -70,7 +70,7 @@ def step(shapes, world, work, motion, rules, manifolds):
         _parts(shapes, world, work, motion, rules, manifolds, near)
         for b in world.going:
             if motion.island[b] < 0 and (world.moves[b] or world.scripted[b]):
-                moved = _advance(world, motion, matrix, rules, free, change, shift, work.part[b], trial, frame, b)
+                moved = _advance(world, motion, matrix, rules, change, shift, work.part[b], trial, frame, b)
                 work.gone[b] += moved
                 work.met[b] = work.met[b] or motion.touching[b]
     met = 0
@@ -123,7 +123,7 @@ def _prepare(world, motion, matrix, inverse, rules, free, b):
 
 
 @njit(**BARE)
-def _advance(world, motion, matrix, rules, free, change, shift, part, trial, frame, b):
+def _advance(world, motion, matrix, rules, change, shift, part, trial, frame, b):
     """Move a body by one inner step; returns how far at most any of its points has gone."""
     if world.scripted[b]:
         v, w = get(motion.velocity, b), get(motion.angular, b)
@@ -138,28 +138,32 @@ def _advance(world, motion, matrix, rules, free, change, shift, part, trial, fra
         v = add(v, (change[b, 0], change[b, 1], change[b, 2]))
         put(motion.velocity, b, v)
         v = add(v, (shift[b, 0], shift[b, 1], shift[b, 2]))
-        if not rules.rotation:
-            w = (0.0, 0.0, 0.0)
-            put(motion.angular, b, w)
-        elif motion.touching[b] or world.isotropic[b]:
-            w = add(
-                get(motion.angular, b),
-                (free[b, 3] + change[b, 3], free[b, 4] + change[b, 4], free[b, 5] + change[b, 5]),
-            )
-            put(motion.angular, b, w)
-            w = add(w, (shift[b, 3], shift[b, 4], shift[b, 5]))
-        else:
-            w = get(motion.angular, b)
+        w = (0.0, 0.0, 0.0)
+        if rules.rotation:
+            # What the gyroscopic torque adds comes with the exact motion below, which keeps angular momentum.
+            w = add(get(motion.angular, b), (change[b, 3], change[b, 4], change[b, 5]))
+        put(motion.angular, b, w)
+        if rules.rotation and not world.isotropic[b]:
             put(motion.position, b, along(get(motion.position, b), v, rules.inner * part))
             _torque_free(world, motion, matrix, rules.inner * part, trial, frame, b)
-            return (norm(v) + norm(w) * world.radius[b]) * rules.inner
+            turned = (shift[b, 3], shift[b, 4], shift[b, 5])
+            _turn_on(motion, matrix, scale(turned, rules.inner * part), b)
+            return (norm(v) + (norm(w) + norm(turned)) * world.radius[b]) * rules.inner
+        if rules.rotation:
+            w = add(w, (shift[b, 3], shift[b, 4], shift[b, 5]))
     put(motion.position, b, along(get(motion.position, b), v, rules.inner * part))
-    if w[0] != 0.0 or w[1] != 0.0 or w[2] != 0.0:
-        q = turned_by(scale(w, rules.inner * part), motion.orientation, b)
+    _turn_on(motion, matrix, scale(w, rules.inner * part), b)
+    return (norm(v) + norm(w) * world.radius[b]) * rules.inner
+
+
+@njit(**BARE)
+def _turn_on(motion, matrix, r, b):
+    """Turn a body by a rotation vector."""
+    if r[0] != 0.0 or r[1] != 0.0 or r[2] != 0.0:
+        q = turned_by(r, motion.orientation, b)
         for x in range(4):
             motion.orientation[b, x] = q[x]
         to_matrix(motion.orientation, b, matrix)
-    return (norm(v) + norm(w) * world.radius[b]) * rules.inner
 
 
 @njit(**BARE)
