@@ -1,4 +1,4 @@
-"""What the default model must hold: what is dropped comes to rest and stays there, and a tower stands."""
+"""What solve and network must hold: what is dropped comes to rest and stays there, and a tower stands."""
 
 from pathlib import Path
 
@@ -35,27 +35,31 @@ SHAPES = {
 }
 
 
-def creep(name: str, drop: float) -> float:
+def creep(model: str, name: str, drop: float) -> float:
     """How far the shape goes in SECONDS once it should rest, over its size, when dropped from `drop` times DROP."""
     shape = SHAPES[name]()
     size = np.ptp(shape.nodes, axis=0).max()
     lowest = (shape.nodes - shape.com)[:, 2].min()
-    rollout = Simulator(on_floor(shape, [drop * DROP * size - lowest])).run(seconds=SETTLED + SECONDS)
+    rollout = Simulator(on_floor(shape, [drop * DROP * size - lowest]), model).run(seconds=SETTLED + SECONDS)
     after = rollout.position[rollout.time >= SETTLED][:, 1]
     return float(np.linalg.norm(after - after[0], axis=1).max() / size)
 
 
 @pytest.mark.parametrize("name", ["box", "can"])
-def test_what_falls_ten_centimetres_comes_to_rest_and_stays(name):
-    assert creep(name, 1.0) < 0.03  # 2.2 % for the can: a network alone does not know that what lies stays
+@pytest.mark.parametrize(("model", "most"), [("solver", 1e-12), pytest.param("small", 0.03, marks=pytest.mark.slow)])
+def test_what_falls_ten_centimetres_comes_to_rest_and_stays(model, most, name):
+    """2.2 % for the can with `small`: a network alone does not know that what lies stays."""
+    assert creep(model, name, 1.0) < most
 
 
-def test_a_sphere_comes_to_rest_and_stays_too():
+@pytest.mark.parametrize(("model", "most"), [("solver", 1e-12), pytest.param("small", 0.002, marks=pytest.mark.slow)])
+def test_a_sphere_comes_to_rest_and_stays_too(model, most):
     """From whichever height, since a sphere that was once set rolling rolls on."""
-    assert max(creep("sphere", drop) for drop in (1.0, 1.02, 1.03)) < 0.002
+    assert max(creep(model, "sphere", drop) for drop in (1.0, 1.02, 1.03)) < most
 
 
-def test_a_tower_of_three_boxes_stands_three_seconds():
-    rollout = Simulator(on_floor(SHAPES["box"](), [0.5, 1.5, 2.5])).run(seconds=3.0)
+@pytest.mark.parametrize(("model", "most"), [("solver", 0.001), ("small", 0.1)])
+def test_a_tower_of_three_boxes_stands_three_seconds(model, most):
+    rollout = Simulator(on_floor(SHAPES["box"](), [0.5, 1.5, 2.5]), model).run(seconds=3.0)
     moved = np.linalg.norm(rollout.position[:, 1:] - rollout.position[0, 1:], axis=2)
-    assert moved.max() < 0.1
+    assert moved.max() < most

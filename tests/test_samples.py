@@ -1,4 +1,4 @@
-"""Every bundled sample with the bundled model: 200 steps, finite, rotations orthonormal, nothing under the floor."""
+"""Every bundled sample with every model: 200 steps, finite, rotations orthonormal, nothing under the floor."""
 
 from pathlib import Path
 
@@ -7,15 +7,26 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import sdfsim
-from sdfsim.dynamics.model import bundled_models, load_model
+from sdfsim.dynamics.model import SOLVER, bundled_models, load_model, model_names
 
 SAMPLES = sorted((Path(__file__).parent.parent / "samples").glob("*.yaml"))
 
 
-@pytest.mark.parametrize("path", SAMPLES, ids=lambda p: p.stem)
-def test_two_hundred_steps_hold_together(path):
+LONG = {"tower", "pile"}  # with a network
+
+
+@pytest.mark.parametrize(
+    ("path", "model"),
+    [
+        pytest.param(path, model, marks=[pytest.mark.slow] if path.stem in LONG and model != SOLVER else [])
+        for path in SAMPLES
+        for model in model_names()
+    ],
+    ids=lambda p: getattr(p, "stem", p),
+)
+def test_two_hundred_steps_hold_together(path, model):
     scene = sdfsim.load_scene(path)
-    rollout = sdfsim.Simulator(scene).run(steps=200)
+    rollout = sdfsim.Simulator(scene, model).run(steps=200)
     assert len(rollout) == 200 and rollout.contact_count.sum() > 0
     for name in ("position", "orientation", "velocity", "angular_velocity"):
         assert np.isfinite(getattr(rollout, name)).all(), name

@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import pytest
 
-from sdfsim.dynamics.model import Model, bundled_models, load_model, model_names
+from sdfsim.dynamics.model import SOLVER, Model, bundled_models, load_model, model_names
 
 
 @pytest.fixture(scope="session", params=model_names())
 def model(request) -> Model:
     """The contact solve and every bundled network."""
+    return load_model(request.param)
+
+
+@pytest.fixture(
+    scope="session", params=[SOLVER, *(pytest.param(name, marks=pytest.mark.slow) for name in bundled_models())]
+)
+def crowd_model(request) -> Model:
+    """For scenes where many bodies touch: networks take minutes there."""
     return load_model(request.param)
 
 

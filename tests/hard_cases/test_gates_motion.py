@@ -127,7 +127,9 @@ def test_the_order_of_nodes_does_not_matter(model):
     assert apart(model, scene, replace(scene, shapes=shapes), 25) <= 1e-4
 
 
-@pytest.mark.parametrize(("size", "strength"), [(0.01, 9.81), (100.0, 9.81), (1.0, 1.62)])
+@pytest.mark.parametrize(
+    ("size", "strength"), [(0.01, 9.81), pytest.param(100.0, 9.81, marks=pytest.mark.slow), (1.0, 1.62)]
+)
 def test_units_do_not_matter(model, size, strength):
     scene = gates.mixed()
     time = np.sqrt(size * 9.81 / strength)

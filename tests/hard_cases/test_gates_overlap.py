@@ -41,9 +41,9 @@ def test_a_body_half_in_the_floor_comes_up(model, shape):
     assert rollout.position[-1, 0, 2] > 0.2 and np.linalg.norm(rollout.velocity, axis=-1).max() < EXIT
 
 
-def test_a_heap_of_overlapping_cubes_comes_apart_and_stays_together(model):
+def test_a_heap_of_overlapping_cubes_comes_apart_and_stays_together(crowd_model):
     """Without the limit on what contact may add in a step this ends, in the fourth step, with 6,000 rad/s."""
-    rollout = Simulator(gates.heap(), model).run(steps=60)
+    rollout = Simulator(gates.heap(), crowd_model).run(steps=60)
     gates.assert_sound(rollout)
     assert np.linalg.norm(rollout.velocity, axis=-1).max() < 15.0 and np.abs(rollout.position).max() < 20.0
     assert rollout.position[-1, :27, 2].min() > 0.2  # the floor holds them

@@ -45,6 +45,7 @@ def fitted() -> Shape:
         inertia=np.diag([1.0, 2.0, 3.0]) / 3,
         certificate={"passed": False, "reason": "thin walls", "error_in_box": 0.01},
         source={"file": "ring.obj"},
+        pieces=tuple(np.random.default_rng(k).random((4 + k, 3)) for k in range(3)),
     )
 
 
@@ -67,6 +68,8 @@ def test_a_saved_shape_comes_back_bit_for_bit(tmp_path: Path) -> None:
         np.testing.assert_array_equal(getattr(back, key), getattr(shape, key))
     for key in ("vertices", "faces", "colors"):
         np.testing.assert_array_equal(getattr(back.mesh, key), getattr(shape.mesh, key))
+    for piece, expected in zip(back.pieces, shape.pieces, strict=True):
+        np.testing.assert_array_equal(piece, expected)
     np.testing.assert_array_equal(back.sdf.bounds, shape.sdf.bounds)
     points = torch.rand(50, 3, dtype=torch.float64) + torch.tensor([0.5, 1.5, 2.5])
     for one, other in zip(back.sdf(points), shape.sdf(points), strict=True):
@@ -211,5 +214,6 @@ def test_scaling_scales_everything() -> None:
     points = np.random.default_rng(0).normal(size=(20, 3)) * 0.1 + [1, 2, 3]
     np.testing.assert_allclose(twice.sdf(2 * points)[0], 2 * shape.sdf(points)[0], rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(twice.sdf.bounds, 2 * shape.sdf.bounds)
+    np.testing.assert_array_equal(twice.pieces[2], 2 * shape.pieces[2])
     with pytest.raises(SdfsimError, match="> 0"):
         scaled(shape, 0.0)

@@ -8,6 +8,7 @@ from sdfsim.dynamics.solver import compiled_shapes
 from sdfsim.shape import baked as module
 from sdfsim.shape.asset import analytic_shape, with_sdf
 from sdfsim.shape.baked import bake, baked, wall_thickness
+from sdfsim.shape.patches import surface_of
 
 
 @pytest.fixture(scope="module")
@@ -31,6 +32,35 @@ def test_thin_walls_are_measured_and_get_finer_grids(wall):
     assert wall_thickness(plate.sdf, plate.nodes) == pytest.approx(wall, rel=0.35)
     if wall < 0.01:
         assert bake(plate.sdf, plate.nodes).cell <= 0.5 * 1.4 * wall
+
+
+def two_halves() -> list[np.ndarray]:
+    """A bar of two convex pieces with a step between them."""
+    corners = analytic_shape("box", size=(1.0, 0.4, 0.4)).mesh.vertices
+    aside = np.array([0.5, 0.0, 0.0])
+    return [corners - aside, corners * np.array([1.0, 0.5, 0.5]) + aside]
+
+
+def test_where_pieces_are_known_the_grid_is_of_these():
+    pieces = two_halves()
+    bar = with_sdf(analytic_shape("box", size=(2.0, 0.4, 0.4)), "mesh")
+    grid = bake(bar.sdf, bar.nodes, pieces)
+    above = np.array([[-0.5, 0.0, 0.21], [0.5, 0.0, 0.11], [0.5, 0.0, 0.15]])
+    np.testing.assert_allclose(module.interpolated(grid, above), [0.01, 0.01, 0.05], atol=2 * grid.error)
+
+
+def test_the_surface_of_pieces_has_a_patch_for_each():
+    pieces = two_halves()
+    bar = with_sdf(analytic_shape("box", size=(2.0, 0.4, 0.4)), "mesh")
+    nodes = np.array([[-0.9, 0.0, 0.25], [0.4, 0.02, 0.08]])  # beside the surface, as those of a fitted SDF are
+    surface = surface_of(bar.sdf, nodes, pieces)
+    vertices = surface.nodes[:-2]
+    assert {tuple(v) for v in vertices.round(9)} == {tuple(v) for v in np.concatenate(pieces).round(9)}
+    np.testing.assert_allclose(surface.nodes[-2:], [[-0.9, 0.0, 0.2], [0.4, 0.02, 0.1]], atol=1e-6)
+    np.testing.assert_array_equal(surface.patch, [0] * 8 + [1] * 8 + [0, 1])
+    assert surface.nearest is not None
+    at = np.round((np.array([[-0.8, 0.0, 0.2], [0.8, 0.0, 0.2]]) - surface.low) / surface.cell).astype(int)
+    assert [int(surface.nearest[tuple(k)]) for k in at] == [0, 1]
 
 
 def test_a_grid_is_kept(block, tmp_path, monkeypatch):

@@ -182,6 +182,7 @@ def test_pieces_keep_their_own_vertices_as_nodes(monkeypatch: pytest.MonkeyPatch
     display = primitives.box()
     shape = fit_pieces(pieces, name="block", display=display, nodes=40)
     assert shape.mesh is display
+    assert [len(piece) for piece in shape.pieces] == [8, 8, 8]
     assert shape.nodes.shape == (40, 3)
     corners = {tuple(corner) for corner in primitives.box().vertices}
     assert {tuple(node) for node in shape.nodes[:8]} == corners
