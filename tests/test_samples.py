@@ -12,7 +12,7 @@ from sdfsim.dynamics.model import SOLVER, bundled_models, load_model, model_name
 SAMPLES = sorted((Path(__file__).parent.parent / "samples").glob("*.yaml"))
 
 
-LONG = {"tower", "pile"}  # with a network
+LONG = {"tower", "pile", "spheres_in_bowl"}  # with a network
 
 
 @pytest.mark.parametrize(
@@ -43,9 +43,10 @@ def test_two_hundred_steps_hold_together(path, model):
             assert (rollout.position[frame, k] + turned)[:, 2].min() > -0.1 * size, (body.name, frame)
 
 
-def test_spheres_stay_in_the_bowl():
+@pytest.mark.parametrize("model", [SOLVER, pytest.param("small", marks=pytest.mark.slow)])
+def test_spheres_stay_in_the_bowl(model):
     scene = sdfsim.load_scene(Path(__file__).parent.parent / "samples" / "spheres_in_bowl.yaml")
-    rollout = sdfsim.Simulator(scene).run(seconds=2.0)
+    rollout = sdfsim.Simulator(scene, model).run(seconds=2.0)
     bowl = next(b for b in scene.bodies if b.name == "bowl")
     rim = np.ptp(scene.shapes[bowl.shape].sdf.bounds[:, 0]) * bowl.scale / 2
     moving = [k for k, b in enumerate(scene.bodies) if b.motion == "dynamic"]

@@ -31,13 +31,15 @@ def thrown(seed: int, *, floor: bool) -> Scene:
     for k in range(draw.integers(2, 7)):
         kind = int(draw.integers(0, len(shapes) - 1))
         quat, place = draw.normal(size=4), draw.uniform(-1.2, 1.2, 3)
+        above = np.array([0.0, 0.0, 2.5 * floor])
         speed, spin = draw.choice([0.3, 3.0, 20.0]), draw.choice([0.0, 1.0, 10.0])
         bodies.append(
             body(
-                str(k), kind, place + [0.0, 0.0, 2.5 * floor], 10.0 ** draw.uniform(-1.5, 1.5),
+                str(k), kind, place + above, 10.0 ** draw.uniform(-1.5, 1.5),
                 scale=draw.uniform(0.5, 2.0) / np.ptp(shapes[kind].nodes, axis=0).max(),
                 quat_xyzw=quat / np.linalg.norm(quat), velocity=speed * draw.normal(size=3) - 2.0 * (not floor) * place,
-                angular_velocity=spin * draw.normal(size=3), friction=draw.uniform(0, 1), restitution=draw.uniform(0, 1),
+                angular_velocity=spin * draw.normal(size=3),
+                friction=draw.uniform(0, 1), restitution=draw.uniform(0, 1),
             )
         )  # fmt: skip
     if floor:
