@@ -8,7 +8,8 @@ from itertools import combinations
 import numpy as np
 
 from sdfsim.dynamics.bodies import Units, largest_extent
-from sdfsim.dynamics.model import Model
+from sdfsim.dynamics.graph import SUBSTEPS
+from sdfsim.dynamics.model import SOLVER, Model
 from sdfsim.scene.types import Scene
 
 LABELS = {
@@ -18,6 +19,7 @@ LABELS = {
     "friction": "friction of two bodies, multiplied",
     "restitution": "restitution of two bodies, multiplied",
 }
+LONGEST = 0.01  # s, an inner step of the contact solve
 SLACK = 0.05  # relative: rounding, and fits that end a little beyond the solid
 
 
@@ -25,8 +27,12 @@ def outside_training(scenes: Sequence[Scene], model: Model, units: Units) -> lis
     """One line for every quantity of `scenes` that lies outside the ranges of `model`; empty when it knows them all.
 
     Sizes and speeds are compared in model units, so that a small or slow scene is not by itself unknown. Scenery is
-    not compared in size: what matters of it is the surface near a contact.
+    not compared in size: what matters of it is the surface near a contact. The contact solve has seen no training; it
+    is told where its inner step is longer than any that its laws were checked with.
     """
+    inner = model.dt * units.time / SUBSTEPS
+    if model.kind == SOLVER and inner > LONGEST:
+        return [f"inner step: {1e3 * inner:.3g} ms here, checked up to {1e3 * LONGEST:g} ms (small bodies shorten it)"]
     if not model.ranges:
         return []
     seen: dict[str, list[float]] = {name: [] for name in LABELS}

@@ -143,3 +143,16 @@ def test_effects_that_are_off_do_not_act():
     sim = Simulator(scene, "solver")
     sim.rules = replace(base.rules, restitution=False, sleep=False)
     assert sim.run(steps=5).position.shape == base.run(steps=5).position.shape
+
+
+def test_a_long_inner_step_is_told():
+    """4 ms are for bodies of 1.4 m: at nine metres it is 10 ms."""
+
+    def lines(size: float) -> list[str]:
+        shapes = (cube(size), analytic_shape("plane"))
+        bodies = (body("one", 0, [0, 0, size]), body("floor", 1, [0, 0, 0], 0.0, motion="static"))
+        return Simulator(Scene(shapes, bodies, np.array([0.0, 0.0, -9.81]), 1.0), "solver").outside_training
+
+    assert lines(4.0) == []
+    (line,) = lines(40.0)
+    assert line.startswith("inner step: ") and "checked up to 10 ms" in line
