@@ -20,8 +20,6 @@ from sdfsim.scene.schema import DEFAULT_DURATION, DEFAULT_GRAVITY
 from sdfsim.scene.thin import may_pass_through
 from sdfsim.scene.types import Effects, Scene
 from sdfsim.shape.mlp import MlpSdf
-from sdfsim.studies.tradeoff_cost import stored_cost
-from sdfsim.studies.tradeoff_estimate import estimate, landings
 
 TRIAL_STEPS = 5
 
@@ -81,16 +79,14 @@ def describe(
 
 
 def _costs(simulator: Simulator, decided: Plan, steps: int) -> dict[str, Any]:
-    """Pairs by what filters them; nodes, edges, memory and time of a step; time of the run, where costs are known."""
-    cost = stored_cost(simulator.model)
-    landed = None if cost is None else landings(simulator, steps)
+    """Pairs by what filters them; nodes, edges, memory and time of a step; time of the run at that pace."""
     counters = simulator.run(steps=TRIAL_STEPS).counters
     near = int(counters["pairs"][1])
-    run = None if cost is None or landed is None else estimate(cost, simulator, counters, landed, steps)
+    step_ms = float(np.median(counters["step_ms"][1:]))
     memory = peak_bytes(
         bodies=len(simulator.bodies),
         nodes=len(simulator.bodies.node),
-        edges=max(float(counters["edges"].max()), 0.0 if run is None else run["edges"]),
+        edges=float(counters["edges"].max()),
         points=float((counters["sdf_queries"] + counters["sdf_waiting"]).max()),
         fitted=any(isinstance(sdf, MlpSdf) for sdf in simulator.bodies.bank.sdfs),
         rows=simulator.rules.rows,
@@ -101,8 +97,8 @@ def _costs(simulator: Simulator, decided: Plan, steps: int) -> dict[str, Any]:
             **{k: float(counters[k][1:].max()) for k in ("nodes", "edges", "sdf_queries")},
             "memory_mib": memory / 2**20,
         },
-        "step_ms": float(np.median(counters["step_ms"][1:])),
-        "run": run,
+        "step_ms": step_ms,
+        "run_s": 1e-3 * step_ms * steps,
     }
 
 
@@ -141,20 +137,11 @@ def plan_lines(report: dict[str, Any]) -> list[str]:
         f"model {report['model']} on {report['device']}: {report['steps']} steps of {report['dt_s']:.4g} s",
         f"a step (over the first {TRIAL_STEPS}): {report['step_ms']:.1f} ms, {step['sdf_queries']:.0f} distances, "
         f"{step['nodes']:.0f} nodes and {step['edges']:.0f} edges in the network, {step['memory_mib']:.0f} MiB",
-        *_run_lines(report["run"]),
+        f"the whole run at that pace: {duration(report['run_s'])}; more where bodies meet later on",
         f"Froude scaling: the model's metre is {units['length_m']:.4g} m, its second {units['time_s']:.4g} s, "
         f"its kilogram {units['mass_kg']:.4g} kg",
         *(f"outside the model's training: {line}" for line in report["outside_training"]),
         *(f"constant in the model's training, so not learned: {name}" for name in report["constant_in_training"]),
         *(f"may pass through: {line}" for line in report["may_pass_through"]),
         *(f"not the default: {name}: {said}" for name, said in report["not_default"].items()),
-    ]
-
-
-def _run_lines(run: dict[str, float] | None) -> list[str]:
-    if run is None:
-        return []
-    return [
-        f"the whole run: about {duration(run['seconds'])}, {run['step_ms']:.1f} ms a step with {run['in_contact']:.1f} "
-        f"bodies in contact and {run['edges']:.0f} edges in the mean"
     ]

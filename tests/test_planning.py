@@ -81,8 +81,8 @@ def test_plan_tells_all_there_is_to_know(scene, model):
 
 def test_plan_tells_how_long_the_run_will_take(scene):
     report = told(scene, "small")
-    assert 0 < report["run"]["seconds"] < 60 and report["run"]["in_contact"] == 2
-    assert report["run"]["seconds"] == pytest.approx(1e-3 * report["run"]["step_ms"] * report["steps"])
+    assert report["run_s"] == pytest.approx(1e-3 * report["step_ms"] * report["steps"])
+    assert any(line.startswith("the whole run at that pace: ") for line in plan_lines(report))
 
 
 def test_plan_reads_no_weights_where_the_run_would_not(scene, model, monkeypatch):
@@ -136,4 +136,3 @@ bodies:
 """)
     report = told(scene, model)
     assert report["effects"]["contact"]["on"] is False and report["step"]["edges"] == 0
-    assert report["run"]["in_contact"] == 0

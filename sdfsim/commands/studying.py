@@ -14,16 +14,14 @@ from sdfsim.progress import Session, columns
 def tradeoff(
     out: Out,
     source: Annotated[
-        Path | None,
+        Path,
         typer.Argument(
-            metavar="DATA|SCENE|MESHES",
-            help="Dataset or scene.yaml: error against time. Meshes: the same of fits. Nothing: growth with size.",
-            show_default=False,
+            metavar="DATA|SCENE|MESHES", help="Dataset or scene.yaml: error against time. Meshes: the same of fits."
         ),
-    ] = None,
+    ],
     model: Annotated[
         list[str] | None,
-        typer.Option(help="Bundled models or paths, the one to turn knobs on first (default: all; growth: one)."),
+        typer.Option(help="Bundled models or paths, the one to turn knobs on first (default: all)."),
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="A few settings, in minutes.")] = False,
     as_json: Json = False,

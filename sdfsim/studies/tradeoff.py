@@ -65,12 +65,12 @@ def setting_of(point: Point) -> Setting:
 
 
 def run(
-    source: Path | None, out: Path, *, models: list[str], quick: bool, **rest: Any
+    source: Path, out: Path, *, models: list[str], quick: bool, **rest: Any
 ) -> tuple[dict[str, Any], Rows, list[str]]:
-    """The study that `source` asks for: of growth (None), of fits (meshes), else `tradeoff`.
+    """The study that `source` asks for: of fits (meshes), else `tradeoff`.
 
     Args:
-        source: dataset folder, scene file, mesh file or folder of meshes, or None.
+        source: dataset folder, scene file, mesh file or folder of meshes.
         out, models, quick: see `tradeoff`.
         rest: `device` and `on_progress`, as there.
 
@@ -85,17 +85,9 @@ def run(
 
 
 def _run(
-    source: Path | None, out: Path, models: list[str], quick: bool, **rest: Any
+    source: Path, out: Path, models: list[str], quick: bool, **rest: Any
 ) -> tuple[dict[str, Any], Rows, list[str]]:
     tell = rest["on_progress"]
-    if source is None:
-        if len(models) > 1:
-            raise SdfsimError("--model: growth is measured with one model", "give one, or a dataset or scene")
-        from sdfsim.studies import tradeoff_growth
-
-        model = models[0] if models else None
-        report = tradeoff_growth.growth(out, model=model, quick=quick, device=rest["device"], on_progress=tell)
-        return report, *tradeoff_growth.told(report)
     if meshes := _meshes(source):
         if models or rest["device"] == "cuda":
             raise SdfsimError("--model and --device: fits of meshes are measured on the CPU, without a model")

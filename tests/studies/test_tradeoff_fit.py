@@ -86,8 +86,6 @@ def test_what_cannot_be_measured_of_fits_is_refused(meshes, fits, tmp_path):
         asked(meshes["cube"], models=["small"])
     with pytest.raises(SdfsimError, match="fits of meshes are measured on the CPU"):
         asked(meshes["cube"], device="cuda")
-    with pytest.raises(SdfsimError, match="growth is measured with one model"):
-        asked(None, models=["small", "other"])
     (tmp_path / "cube.stl").write_text("")
     with pytest.raises(SdfsimError, match="two meshes are called 'cube'"):
         asked(tmp_path)
