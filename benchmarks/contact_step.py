@@ -24,12 +24,12 @@ import numpy as np
 from benchmarks.scale_parts.engines import bullet
 from benchmarks.scale_parts.ours import apart, with_nodes_cut
 from samples.large import write_scene
+from sdfsim.data.batching import scene_of
+from sdfsim.data.dataset import Trajectory, load_shapes, trajectory_files
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.dynamics.solver import Compiled, compiled_rules, taken_up
 from sdfsim.errors import run_main
-from sdfsim.learning.dataset import Trajectory, load_shapes, trajectory_files
-from sdfsim.learning.floor import engine_file, started
-from sdfsim.learning.merge import scene_of
+from sdfsim.evaluation.baselines import engine_file, started
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.types import Scene
 

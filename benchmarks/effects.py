@@ -26,11 +26,11 @@ from sdfsim.dynamics.simulator import SimulationError
 from sdfsim.dynamics.sleep import STEPS as SLEEP_STEPS
 from sdfsim.dynamics.step import contact_graph, fly
 from sdfsim.errors import run_main
-from sdfsim.learning.frames import contact_frames
-from sdfsim.learning.impulse_task import ImpulseTask
 from sdfsim.progress import columns
 from sdfsim.scene.types import Body, Effects, Limits, Scene
 from sdfsim.shape.asset import analytic_shape
+from sdfsim.training.contact_cache import contact_frames
+from sdfsim.training.impulse_task import ImpulseTask
 
 SAMPLES = Path(__file__).resolve().parents[1] / "samples"
 HELD_OUT = 20  # batches of frames

@@ -12,15 +12,15 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from sdfsim.evaluation.hard_cases_page import write_report
+from sdfsim.evaluation.hard_cases_plots import group_picture
+from sdfsim.evaluation.hard_cases_ratchet import accepted
+from sdfsim.evaluation.hard_cases_results import Study
+from sdfsim.evaluation.hard_cases_run import stress
+from sdfsim.evaluation.hard_cases_tables import LEGEND, losses, markdown
 from sdfsim.files import replacing, write_json, write_text
 from sdfsim.playback import save_rollout
 from sdfsim.progress import Session
-from sdfsim.studies.hard_cases_page import write_report
-from sdfsim.studies.hard_cases_plots import group_picture
-from sdfsim.studies.hard_cases_ratchet import accepted
-from sdfsim.studies.hard_cases_results import Study
-from sdfsim.studies.hard_cases_run import stress
-from sdfsim.studies.hard_cases_tables import LEGEND, losses, markdown
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENT = ROOT / "docs" / "stability.md"

@@ -21,17 +21,17 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from sdfsim.data.dataset import read_info, trajectory_files
 from sdfsim.errors import run_main
+from sdfsim.evaluation.evaluate import evaluate
 from sdfsim.files import read_json, write_json, write_text
-from sdfsim.learning.dataset import read_info, trajectory_files
-from sdfsim.learning.evaluate import evaluate
-from sdfsim.learning.frames import contact_frames
-from sdfsim.learning.impulse_task import ImpulseTask, Noise
-from sdfsim.learning.presets import PRESETS, Preset
-from sdfsim.learning.training_run import Run, held_out_loss
 from sdfsim.shape.asset import Shape, load_shape
 from sdfsim.shape.fit import fit_mesh
 from sdfsim.shape.mesh import load_mesh
+from sdfsim.training.contact_cache import contact_frames
+from sdfsim.training.impulse_task import ImpulseTask, Noise
+from sdfsim.training.presets import PRESETS, Preset
+from sdfsim.training.run import Run, held_out_loss
 
 TRAIN, VALIDATION = 150, 40  # trajectories
 STEPS = 1500

@@ -18,16 +18,16 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from sdfsim.data import metrics
+from sdfsim.data.dataset import FLOOR, Trajectory, trajectory_files
+from sdfsim.data.pybullet_sim import Teacher
 from sdfsim.dynamics.model import load_model
 from sdfsim.errors import run_main
-from sdfsim.learning import metrics
-from sdfsim.learning.dataset import FLOOR, Trajectory, trajectory_files
-from sdfsim.learning.evaluate import score
-from sdfsim.learning.floor import engine_file, started
-from sdfsim.learning.frames import contact_frames
-from sdfsim.learning.impulse_task import ImpulseTask
-from sdfsim.learning.teacher import Teacher
+from sdfsim.evaluation.baselines import engine_file, started
+from sdfsim.evaluation.evaluate import score
 from sdfsim.parallel import parallel
+from sdfsim.training.contact_cache import contact_frames
+from sdfsim.training.impulse_task import ImpulseTask
 
 HORIZONS = (50, 100)
 SHIFTS = (1e-4, 1e-3, 3e-3)  # m

@@ -16,8 +16,8 @@ from sdfsim.dynamics.model import Model, load_model
 from sdfsim.dynamics.rollout import Rollout, energy_from_nothing
 from sdfsim.dynamics.simulator import SimulationError, Simulator, check_seconds, join, pick_device
 from sdfsim.errors import SdfsimError
+from sdfsim.evaluation import tables
 from sdfsim.files import CONFIG, check_own, check_writable, locked, write_json, write_text
-from sdfsim.learning import tables
 from sdfsim.playback import Playback, save_rollout
 from sdfsim.progress import columns
 from sdfsim.resuming import CHECKPOINT, Checkpoint, finished

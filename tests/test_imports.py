@@ -35,8 +35,9 @@ LEVELS = {
     "shape": 2,
     "scene": 3,
     "dynamics": 4,
-    "learning": 5,
-    "studies": 6,
+    "data": 5,
+    "training": 6,
+    "evaluation": 7,
     "commands": 9,
 }
 TOP = 8  # playback and the other modules directly in sdfsim

@@ -33,7 +33,7 @@ def dataset(
 ) -> None:
     """Trajectories of the teacher (PyBullet) to learn from."""
     with Session(as_json=as_json, verbose=verbose) as session:
-        from sdfsim.learning.generate import make_dataset, report_lines
+        from sdfsim.data.generate import make_dataset, report_lines
         from sdfsim.parallel import cluster as working_on
 
         check_device(device)
@@ -66,7 +66,7 @@ def train(
 ) -> None:
     """Train a model on datasets."""
     with Session(as_json=as_json, verbose=verbose) as session:
-        from sdfsim.learning.train import train as run_training
+        from sdfsim.training.train import train as run_training
 
         session.report(
             run_training(data, out, preset=preset, resume=resume, device=device, on_progress=session.progress)
@@ -94,7 +94,7 @@ def evaluate(
     """Errors of a model's rollouts on recorded trajectories, and the quality of its motion."""
     with Session(as_json=as_json, verbose=verbose) as session:
         from sdfsim import run
-        from sdfsim.learning.evaluate import evaluate as run_evaluation
+        from sdfsim.evaluation.evaluate import evaluate as run_evaluation
 
         report = run_evaluation(
             data,

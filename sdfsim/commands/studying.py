@@ -30,8 +30,8 @@ def tradeoff(
 ) -> None:
     """What accuracy costs in time: knobs, models and engines on the same scenes; what is measured is kept in -o."""
     with Session(as_json=as_json, verbose=verbose) as session:
-        from sdfsim.studies import tradeoff as study
-        from sdfsim.studies.hard_cases_plots import check_matplotlib
+        from sdfsim.evaluation import tradeoff as study
+        from sdfsim.evaluation.hard_cases_plots import check_matplotlib
 
         check_matplotlib()
         report, rows, notes = study.run(
@@ -63,10 +63,10 @@ def stress(
 ) -> None:
     """The hard cases, with every model and the teacher: a table, a page, and recordings of what went wrong."""
     with Session(as_json=as_json, verbose=verbose) as session:
+        from sdfsim.evaluation import hard_cases_run
+        from sdfsim.evaluation.hard_cases_page import report_notes, report_table, write_report
+        from sdfsim.evaluation.hard_cases_plots import check_matplotlib
         from sdfsim.playback import save_rollout
-        from sdfsim.studies import hard_cases_run
-        from sdfsim.studies.hard_cases_page import report_notes, report_table, write_report
-        from sdfsim.studies.hard_cases_plots import check_matplotlib
 
         check_matplotlib()
         study = hard_cases_run.stress(

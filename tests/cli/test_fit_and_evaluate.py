@@ -87,7 +87,7 @@ def test_an_evaluation_is_three_tables(tmp_path, monkeypatch):
         asked.update(options)
         return report | {"model": errors, "ballistic": errors}
 
-    monkeypatch.setattr("sdfsim.learning.evaluate.evaluate", evaluate)
+    monkeypatch.setattr("sdfsim.evaluation.evaluate.evaluate", evaluate)
     lines = run("evaluate", tmp_path, "--free-flight", "learned", "--chaos-floor").stdout.splitlines()
     assert asked["steps"] == 50 and asked["free_flight"] == "learned" and asked["chaos_floor"]
     assert any("No dataset.json tells" in line for line in lines)

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from sdfsim.learning.decompose import wavefront
-from sdfsim.learning.evaluate import evaluate
-from sdfsim.learning.generate import make_dataset
+from sdfsim.data.convex_pieces import wavefront
+from sdfsim.data.generate import make_dataset
+from sdfsim.evaluation.evaluate import evaluate
 from sdfsim.shape import primitives
 from sdfsim.shape.asset import analytic_shape
 

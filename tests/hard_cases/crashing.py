@@ -150,7 +150,7 @@ def tiny_fit() -> None:
 
 def tiny_train() -> None:
     """A training of 30 steps with a checkpoint after each, and a line of the log every three."""
-    from sdfsim.learning import train
+    from sdfsim.training import train
 
     train.PRESETS["small"] = train.Preset("impulse", {"width": 8, "rounds": 1}, steps=30, batch=4, rate=3e-3)
     train.CHECKPOINT_SECONDS = 0.0

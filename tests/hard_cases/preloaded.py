@@ -3,8 +3,8 @@
 import cli
 import pipeline.stages
 import sdfsim.fitting
-import sdfsim.learning.train
 import sdfsim.run
 import sdfsim.shape.fit
+import sdfsim.training.train
 
 __all__ = ["cli", "pipeline", "sdfsim"]

@@ -14,8 +14,8 @@ import pytest
 import torch
 from PIL import Image
 
+from sdfsim.data.dataset import Trajectory
 from sdfsim.dynamics.model import Model, new_network
-from sdfsim.learning.dataset import Trajectory
 from sdfsim.shape.asset import analytic_shape
 from sdfsim.shape.primitives import box
 from sdfsim.shape.storage import write_ply

@@ -130,7 +130,7 @@ def test_a_damaged_cache_entry_is_made_again(tmp_path, name):
 
 
 def test_a_training_checkpoint_that_is_cut_short_is_one_line(tmp_path, monkeypatch):
-    from sdfsim.learning import train
+    from sdfsim.training import train
     from tests.hard_cases import crashing
     from tests.hard_cases.test_crash_commands import write_cubes
 

@@ -1,0 +1,1 @@
+"""Recorded motion: the teacher, its scenarios, the dataset format, and what is read off recordings."""

@@ -1,0 +1,255 @@
+"""Datasets made by the teacher: shapes, then trajectories on all cores."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from sdfsim.data.dataset import FLOOR, SPLITS, Trajectory, read_info, write_info
+from sdfsim.data.pybullet_sim import FPS, RATES, TEACHER_VERSION, Teacher, engine_settings, import_pybullet
+from sdfsim.data.scenarios import RECIPES, Cast, Recipe
+from sdfsim.data.shape_assets import (
+    Origin,
+    ShapeSource,
+    find_shapes,
+    fit_shapes,
+    kubasic_origins,
+    made_from,
+    origins,
+    prepare,
+    split_of,
+)
+from sdfsim.data.statistics import statistics, statistics_lines
+from sdfsim.errors import SdfsimError
+from sdfsim.files import locked
+from sdfsim.parallel import parallel
+
+GRAVITY = (0.0, 0.0, -10.0)  # m/s^2
+STEPS = 100
+MOST_BODIES = 512
+REDRAWS = 1000  # of a scene in which a body found no room
+
+Progress = Callable[[float, str], None]
+
+
+def make_dataset(
+    recipe: str,
+    out: Path,
+    *,
+    trajectories: int,
+    shapes: Path | None = None,
+    random_solids: int = 0,
+    bodies: int | None = None,
+    fps: int = FPS,
+    seed: int = 0,
+    split: str = "train",
+    on_progress: Progress | None = None,
+) -> dict:
+    """Write `trajectories` files under `out/SPLIT/` and the Shape folders under `out/shapes/`.
+
+    Files that exist are kept, so that an interrupted run goes on where it was. With the same shapes, trajectory k of
+    a split depends on (seed, split, k) alone. Every recipe but movi-b draws a split's bodies from that split's shapes
+    (see `split_of`), so that those of validation and test are never trained on.
+
+    Args:
+        recipe: a name in `RECIPES`.
+        out: dataset folder.
+        trajectories: how many.
+        shapes: folder of NAME/ folders, each with `visual_geometry.obj` and `collision_geometry.obj` (one convex
+            piece a group); all recipes but movi-b also take mesh files, which are cut into pieces by V-HACD.
+        random_solids: how many of PyBullet's random solids there are beside them.
+        bodies: how many move, instead of the recipe's range (bowl and pile).
+        fps: recorded frames a second, in `RATES`.
+        seed: of the dataset.
+        split: "train", "validation" or "test".
+        on_progress: called with the fraction done and a message.
+
+    Returns:
+        A report: paths, counts, and `statistics` of the split.
+
+    Raises:
+        SdfsimError: unknown recipe, split or rate, an option that the recipe has no use for, no usable shapes, PyBullet
+            absent, another dataset in `out`, or another run writing to it.
+    """
+    plan = _checked(recipe, split, trajectories, shapes, random_solids, bodies)
+    if fps not in RATES:
+        raise SdfsimError(f"--fps must be {' or '.join(map(str, RATES))} (got {fps})")
+    tell = on_progress or (lambda fraction, message: None)
+    engine = import_pybullet()
+    given = _origins(plan, shapes, random_solids)
+    info = {
+        "recipe": recipe,
+        "seed": seed,
+        "fps": fps,
+        "teacher": TEACHER_VERSION,
+        "engine": "pybullet",
+        "engine_version": str(engine.getAPIVersion()),
+        "engine_settings": engine_settings(1.0 / fps, RATES[fps]),
+        "floor": {"friction": FLOOR[0], "restitution": FLOOR[1]},
+        "made_from": made_from(given),
+    }
+    if plan.counted:
+        info["bodies"] = bodies
+    with locked(out):
+        # Before anything is written: engine files of another dataset's shapes must stay what they are.
+        _check_same(out, info)
+        cast, found = _cast(plan, shapes, given, out / "shapes" / "engine", lambda f, m: tell(0.1 * f, m))
+        info |= found
+        _check_same(out, info)
+        cast = replace(_of_split(plan, cast, split), bodies=bodies)
+        fit_shapes([*cast.shapes, *cast.scenery.values()], out / "shapes", lambda f, m: tell(0.1 + 0.4 * f, m))
+        write_info(out, info)
+        one = partial(_make_one, recipe, cast, fps, seed, split)
+        made_now = _make_all(one, out / split, trajectories, lambda f, m: tell(0.5 + 0.5 * f, m))
+        return {
+            "dataset": str(out),
+            "split": split,
+            "trajectories": trajectories,
+            "made_now": made_now,
+            "shapes": len(cast.shapes),
+            "left_out": info.get("left_out", {}),
+            "statistics": statistics(out, split),
+        }
+
+
+def report_lines(report: dict) -> list[str]:
+    """The report of `make_dataset` for people."""
+    lines = [
+        f"{report['dataset']}: {report['trajectories']} {report['split']} trajectories, {report['made_now']} made now; "
+        f"{report['shapes']} shapes to draw from",
+        *(f"left out: {name}: {why}" for name, why in report["left_out"].items()),
+    ]
+    return lines + statistics_lines(report["statistics"])
+
+
+def make_trajectory(recipe: str, rng: np.random.Generator, cast: Cast, fps: int = FPS) -> Trajectory:
+    """One trajectory of `STEPS` steps.
+
+    Args:
+        recipe: a name in `RECIPES`.
+        rng: what the scene is drawn from.
+        cast: shapes and scenery.
+        fps: recorded frames a second, in `RATES`.
+
+    Raises:
+        SdfsimError: no scene of `REDRAWS` had room for its bodies.
+    """
+    for _ in range(REDRAWS):
+        with Teacher(np.array(GRAVITY), FLOOR, step=1.0 / fps, substeps=RATES[fps]) as teacher:
+            placed = RECIPES[recipe].spawn(teacher, rng, cast)
+            if placed is None:
+                continue
+            motion = teacher.run(STEPS)
+            inertia = np.array([teacher.inertia(i) for i in range(len(placed))])
+        specs = [body for _, body in placed]
+        mass = np.array([b.mass for b in specs])
+        return Trajectory(
+            **motion,
+            shape=np.array([source.name for source, _ in placed]),
+            scale=np.array([b.scale for b in specs]),
+            mass=mass,
+            inertia=inertia,
+            friction=np.array([b.friction for b in specs]),
+            restitution=np.array([b.restitution for b in specs]),
+            static=mass == 0,
+            dt=1.0 / fps,
+            gravity=np.array(GRAVITY),
+        )
+    raise SdfsimError(
+        f"no room for the bodies of {recipe} in any of {REDRAWS:,} draws of a scene", "are the meshes in metres?"
+    )
+
+
+def _make_all(make_one: Callable[[int, Path], None], folder: Path, count: int, on_progress: Progress) -> int:
+    """Write the first `count` trajectories of a split that are not there yet; how many those were."""
+    folder.mkdir(parents=True, exist_ok=True)
+    todo = [k for k in range(count) if not (folder / f"{k:05d}.npz").exists()]
+    jobs = [(k, folder / f"{k:05d}.npz") for k in todo]
+    for done, _ in enumerate(parallel(make_one, jobs), start=1):
+        on_progress(done / len(todo), f"trajectory {done} of {len(todo)}")
+    return len(todo)
+
+
+def _make_one(recipe: str, cast: Cast, fps: int, seed: int, split: str, index: int, path: Path) -> None:
+    make_trajectory(recipe, np.random.default_rng([seed, SPLITS.index(split), index]), cast, fps).save(path)
+
+
+def _checked(
+    recipe: str, split: str, trajectories: int, shapes: Path | None, random_solids: int, bodies: int | None
+) -> Recipe:
+    """The recipe, when everything goes with it."""
+    if recipe not in RECIPES:
+        raise SdfsimError(f"unknown recipe {recipe!r}", f"known: {', '.join(RECIPES)}")
+    if split not in SPLITS:
+        raise SdfsimError(f"unknown split {split!r}", f"known: {', '.join(SPLITS)}")
+    if trajectories < 1:
+        raise SdfsimError("--trajectories must be at least 1")
+    plan = RECIPES[recipe]
+    if bodies is not None and not (plan.counted and 1 <= bodies <= MOST_BODIES):
+        counted = " and ".join(name for name, r in RECIPES.items() if r.counted)
+        raise SdfsimError(f"--bodies goes with {counted}, and is 1 to {MOST_BODIES} (got {bodies} for {recipe})")
+    if plan.given and shapes is None and (plan.kubasic or not random_solids):
+        also = "" if plan.kubasic else " or --random-solids N"
+        raise SdfsimError(f"{recipe} needs shapes", f"give --shapes FOLDER{also}")
+    if (plan.kubasic or not plan.given) and random_solids:
+        raise SdfsimError(f"{recipe} has no use for --random-solids")
+    if not plan.given and shapes is not None:
+        raise SdfsimError(f"{recipe} brings its own shapes", "leave out --shapes")
+    return plan
+
+
+def _check_same(out: Path, info: dict) -> None:
+    """Raises SdfsimError when the folder holds a dataset of which anything in `info` is not true."""
+    if (out / "dataset.json").exists():
+        there = read_info(out)
+        if there.get("fps") != info["fps"]:
+            raise SdfsimError(
+                f"{out} holds a dataset of {there.get('fps')} frames a second, not {info['fps']}",
+                "give the same --fps, or choose another -o",
+            )
+        if any(there.get(key) != value for key, value in info.items()):
+            raise SdfsimError(
+                f"{out} holds a dataset of another recipe, seed, engine, count or set of shapes", "choose another -o"
+            )
+
+
+def _origins(plan: Recipe, shapes: Path | None, random_solids: int) -> list[Origin]:
+    """Where the shapes of a recipe come from, its own scenery last."""
+    if plan.kubasic:
+        assert shapes is not None
+        return kubasic_origins(shapes)
+    given = origins(shapes, random_solids) if plan.given else []
+    if taken := {o.name for o in given} & set(plan.scenery):
+        raise SdfsimError(f"{shapes}: the recipe has a shape {min(taken)!r} of its own", "rename yours")
+    return given + [Origin(name, primitive=kind) for name, kind in plan.scenery.items()]
+
+
+def _cast(
+    plan: Recipe, shapes: Path | None, given: list[Origin], engine: Path, on_progress: Progress
+) -> tuple[Cast, dict]:
+    """All shapes of a recipe, and what `dataset.json` says of them."""
+    if plan.kubasic:
+        assert shapes is not None
+        sources = find_shapes(shapes, engine)
+        return Cast(sources), {"shapes": [s.name for s in sources]}
+    found, info = prepare(given, engine, on_progress)
+    return _sorted_out(found, plan), info
+
+
+def _of_split(plan: Recipe, cast: Cast, split: str) -> Cast:
+    """The cast with the shapes of one split; Kubric's are in all."""
+    if plan.kubasic:
+        return cast
+    mine = [s for s in cast.shapes if split_of(s.name) == split]
+    if plan.given and not mine:
+        raise SdfsimError(f"none of the {len(cast.shapes)} shapes belongs to the {split} split", "give more shapes")
+    return replace(cast, shapes=mine)
+
+
+def _sorted_out(found: list[ShapeSource], plan: Recipe) -> Cast:
+    scenery = {s.name: s for s in found if s.name in plan.scenery}
+    return Cast([s for s in found if s.name not in plan.scenery], scenery)

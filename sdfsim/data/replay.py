@@ -1,0 +1,124 @@
+"""Recorded trajectories simulated again by a model, many side by side."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from sdfsim.data.batching import merged
+from sdfsim.data.dataset import FLOOR, Trajectory
+from sdfsim.data.velocities import MARGIN
+from sdfsim.dynamics.bodies import Units
+from sdfsim.dynamics.energy import Guard
+from sdfsim.dynamics.graph import SUBSTEPS
+from sdfsim.dynamics.history import with_history
+from sdfsim.dynamics.memory import Memory
+from sdfsim.dynamics.model import SOLVER, Model
+from sdfsim.dynamics.sleep import nobody_asleep
+from sdfsim.dynamics.step import FreeFlight, Rules, step
+from sdfsim.errors import EXIT_QUALITY, SdfsimError
+from sdfsim.shape.asset import Shape
+
+BATCH = 50  # trajectories simulated side by side
+
+
+def roll_out(
+    model: Model,
+    group: list[Trajectory],
+    shapes: dict[str, Shape],
+    steps: int,
+    device: torch.device,
+    free_flight: FreeFlight = "exact",
+    *,
+    contact: bool = True,
+    sleep: bool = False,
+    guard: Guard = "none",
+    substeps: int = SUBSTEPS,
+    as_teacher: bool = False,
+    floor: tuple[float, float] = FLOOR,
+) -> list[Trajectory]:
+    """Simulate one batch from its first frames.
+
+    Args:
+        model: what simulates.
+        group: trajectories of one step and one gravity; only their first frames are used. Their velocities are those
+            at the instant of the positions (see `at_instants`).
+        shapes: of every name in use, with the nodes that the model is to have.
+        steps: how many.
+        device: where to compute.
+        free_flight: "exact", or "learned" for the *paper* network.
+        contact: False leaves every body in free flight.
+        sleep: freeze what has come to rest.
+        guard: "energy" holds back contact that makes energy.
+        substeps: inner steps that the recording engine makes in one step.
+        as_teacher: the solver takes on what the recording engine does without a law that asks for it: bodies are
+            larger by `MARGIN` than their shapes, and what is pushed out adds to the speed of a rebound.
+        floor: its friction and restitution.
+
+    Returns:
+        For each of the group, the same bodies in the predicted motion: steps + 1 frames.
+
+    Raises:
+        SdfsimError: a state that is not finite (exit code 3).
+    """
+    units = model_units(model, group[0])
+    bodies, state = merged(group, [0] * len(group), shapes, units, device, floor)
+    gravity = torch.tensor(group[0].gravity / units.acceleration, dtype=torch.float64, device=device)
+    rules = Rules(
+        gravity, group[0].dt / units.time, substeps, contact=contact, free_flight=free_flight, guard=guard,
+        margin=MARGIN / units.length if as_teacher else 0.0, adds=as_teacher,
+    )  # fmt: skip
+    if model.kind == "paper":
+        state = with_history(state, bodies, rules)
+    if sleep:
+        state = replace(state, sleep=nobody_asleep(bodies, gravity))
+    states, memory = [state], Memory()
+    for k in range(steps):
+        state, _ = step(model, bodies, state, rules, memory)
+        broken = ~(state.position.isfinite().all(-1) & state.orientation.isfinite().all(-1))
+        if broken.any():
+            raise SdfsimError(f"step {k + 1}: {int(broken.sum())} bodies are not finite", exit_code=EXIT_QUALITY)
+        states.append(state)
+    position, quat, velocity, angular = (
+        np.stack([getattr(s, name).cpu().numpy() for s in states])
+        for name in ("position", "orientation", "velocity", "angular_velocity")
+    )
+    motions, at = [], 0
+    for t in group:
+        mine = slice(at, at + t.position.shape[1])
+        at = mine.stop
+        motions.append(
+            replace(
+                t,
+                position=position[:, mine] * units.length,
+                quat_xyzw=quat[:, mine],
+                velocity=velocity[:, mine] * units.velocity,
+                angular_velocity=angular[:, mine] / units.time,
+            )
+        )
+    return motions
+
+
+def batches(trajectories: list[Trajectory]) -> list[list[Trajectory]]:
+    """Batches of trajectories that share step and gravity, so that they run as one."""
+    groups: dict[tuple, list[Trajectory]] = {}
+    for t in trajectories:
+        groups.setdefault((t.dt, *t.gravity), []).append(t)
+    return [g[i : i + BATCH] for g in groups.values() for i in range(0, len(g), BATCH)]
+
+
+def first_frames(trajectory: Trajectory, count: int) -> Trajectory:
+    """The first `count` frames."""
+    names = ("position", "quat_xyzw", "velocity", "angular_velocity")
+    return replace(trajectory, **{name: getattr(trajectory, name)[:count] for name in names})
+
+
+def model_units(model: Model, like: Trajectory) -> Units:
+    """Model units in which the recorded step is the model's own; for the solver those of its bodies of a metre."""
+    strength = float(np.linalg.norm(like.gravity)) or model.gravity
+    if model.kind == SOLVER:  # it takes the inner steps that it is told
+        return Units(length=1.0, time=float(np.sqrt(model.gravity / strength)), mass=1.0)
+    length = (like.dt / model.dt) ** 2 * strength / model.gravity
+    return Units(length=length, time=like.dt / model.dt, mass=1.0)

@@ -1,0 +1,280 @@
+"""What the teacher's scenes start from: MOVi-B and MOVi-C as Kubric spawns them (Greff et al., 2022), and our own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sdfsim.data.dataset import FLOOR
+from sdfsim.data.pybullet_sim import Teacher, TeacherBody
+from sdfsim.data.shape_assets import ShapeSource
+from sdfsim.data.starts_moving import set_moving
+from sdfsim.data.starts_resting import STARTS, at_rest, upright
+
+REGION = ((-5.0, -5.0, 1.0), (5.0, 5.0, 5.0))  # m, holds every tossed body's bounds at the start
+COUNT = (3, 10)
+TRIES = 100  # places for one body before the scene is drawn again
+
+SIZES = (0.7, 1.4)
+MATERIALS = {"metal": (2.7, 0.4, 0.3), "rubber": (1.1, 0.8, 0.7)}  # density, friction, restitution
+
+# MOVi-C: largest extent in m; Kubric's coefficients. Meshes at hand have no true size, so none has a mass of its own:
+# all have rubber's density.
+EXTENTS_C = (0.75, 3.0)
+PLAIN = (1.1, 0.5, 0.5)  # density, friction, restitution
+
+BALL = 0.52  # m, diameter
+BALLS = (1, 16)
+ROOM = 2.0  # a bowl's inside over the space that its balls fill
+PACKED = 0.6  # of which balls are so much
+WALL = 0.12  # of the bowl primitive, relative to its outer radius
+
+PILE = (5, 30)
+PILE_EXTENTS = (0.5, 1.5)  # m
+PILE_RADIUS = 0.55  # m for one body, growing with the third root of their number
+PILE_GAPS = (0.02, 0.15)  # m between the boxes around bodies
+PILE_TRIES = 8  # places for one body, of which it takes the lowest
+
+VARIED_EXTENTS = (0.7, 1.4)  # m
+FRICTIONS, RESTITUTIONS = (0.0, 1.0), (0.0, 1.0)
+DENSITIES = (0.1, 10.0)  # log-uniform
+MASS_RATIO = 100.0  # at most, within one scene
+OBSTACLES = {"obstacle_bowl": "bowl", "obstacle_torus": "torus", "obstacle_gear": "gear"}
+OBSTACLE_EXTENTS = (2.0, 4.0)  # m
+OBSTACLE_SHARE = 0.3  # of the scenes whose bodies are tossed or at rest
+# Of the scenes, by how they start: tossed as in MOVi, `at_rest`, or in one of the motions of `set_moving`.
+SHARES = {
+    "tossed": 0.35,
+    "resting": 0.35,
+    "rolling": 0.08,
+    "sliding": 0.07,
+    "falling": 0.07,
+    "head-on": 0.05,
+    "spinning": 0.03,
+}
+FEW = (1, 4)  # bodies in plain motion; head-on two or four
+BALL_SHARE = 0.5  # of the bodies in plain motion; all of those that roll
+
+Placed = list[tuple[ShapeSource, TeacherBody]]
+
+
+@dataclass(frozen=True)
+class Cast:
+    """What a scene is made of.
+
+    Attributes:
+        shapes: to draw bodies from.
+        scenery: the recipe's own shapes, by name.
+        bodies: how many bodies move, None for the recipe's own range.
+    """
+
+    shapes: list[ShapeSource]
+    scenery: dict[str, ShapeSource] = field(default_factory=dict)
+    bodies: int | None = None
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How scenes start.
+
+    Attributes:
+        spawn: puts the bodies of a scene into the teacher's world and tells them in its order, those that are static
+            with mass 0; None where one found no room.
+        kubasic: takes NAME/ folders as they are, in all splits; otherwise shapes are split by name.
+        given: draws bodies from shapes that the caller gives.
+        counted: can make a fixed number of bodies.
+        scenery: the recipe's own shapes, name -> primitive.
+    """
+
+    spawn: Callable[[Teacher, np.random.Generator, Cast], Placed | None]
+    kubasic: bool = False
+    given: bool = True
+    counted: bool = False
+    scenery: dict[str, str] = field(default_factory=dict)
+
+
+def movi_b(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Placed | None:
+    """Kubric's `movi_ab_worker`, restated."""
+
+    def draw(source: ShapeSource) -> TeacherBody:
+        scale = rng.uniform(*SIZES)
+        density, friction, restitution = MATERIALS[str(rng.choice(list(MATERIALS)))]
+        return TeacherBody(source.urdf, scale, source.volume * density * scale**3, friction, restitution)
+
+    return _toss(teacher, rng, cast, draw)
+
+
+def movi_c(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Placed | None:
+    """Kubric's `movi_c_worker`, restated."""
+    return _toss(teacher, rng, cast, lambda source: _body(source, rng.uniform(*EXTENTS_C), *PLAIN))
+
+
+def bowl(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Placed:
+    """Balls in loose layers above a bowl that has room for them."""
+    count = cast.bodies or int(rng.integers(BALLS[0], BALLS[1] + 1))
+    inner = BALL * (ROOM * count / (4 * PACKED)) ** (1 / 3)
+    vessel, ball = cast.scenery["bowl"], cast.scenery["ball"]
+    placed = [(vessel, _static(vessel, 2 * inner / (1 - WALL), *FLOOR))]
+    high = _stand(teacher, placed[0], np.zeros(2), Rotation.identity())
+    for position in _layers(rng, count, max(0.75 * inner - 0.5 * BALL, 0.0)):
+        placed.append((ball, _body(ball, BALL, *PLAIN)))
+        _put(teacher, placed[-1][1], position + np.array([0.0, 0.0, high]), Rotation.random(rng=rng))
+        teacher.push(len(placed) - 1, rng.uniform((-1.0, -1.0, 0.0), (1.0, 1.0, 0.0)), np.zeros(3))
+    return placed
+
+
+def pile(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Placed:
+    """Bodies of MOVi-B's materials at rest above each other in a column, dropped."""
+    count = cast.bodies or int(rng.integers(PILE[0], PILE[1] + 1))
+    radius = PILE_RADIUS * count ** (1 / 3)
+    placed, boxes = [], np.empty((0, 2, 3))
+    for _ in range(count):
+        source = cast.shapes[rng.integers(len(cast.shapes))]
+        body = _body(source, rng.uniform(*PILE_EXTENTS), *MATERIALS[str(rng.choice(list(MATERIALS)))])
+        rotation = Rotation.random(rng=rng)
+        low, high = _box(source, body, rotation)
+        places = np.array([radius * np.sqrt(rng.random()) * _direction(rng) for _ in range(PILE_TRIES)])
+        below = [((boxes[:, 0, :2] < p + high[:2]) & (boxes[:, 1, :2] > p + low[:2])).all(1) for p in places]
+        tops = [boxes[under, 1, 2].max(initial=0.0) for under in below]
+        position = np.array([*places[np.argmin(tops)], min(tops) + rng.uniform(*PILE_GAPS) - low[2]])
+        boxes = np.concatenate([boxes, [[position + low, position + high]]])
+        _put(teacher, body, position, rotation)
+        placed.append((source, body))
+    return placed
+
+
+def varied(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Placed | None:
+    """Any friction, restitution and mass ratio, and starts of all kinds.
+
+    Of the scenes, 35 % are tossed as in MOVi and 35 % are at or near rest (in equal parts the kinds of `STARTS`); an
+    obstacle is in 30 % of both. In the others one to four bodies, half of them balls, are in plain motion on an empty
+    floor: in 8 % balls roll, in 7 % bodies slide to a stop, in 7 % they fall straight, in 3 % they spin in place, and
+    in 5 % one or two pairs meet head-on in flight, far above the floor.
+    """
+    start = str(rng.choice(list(SHARES), p=list(SHARES.values())))
+    placed = []
+    if start in ("tossed", "resting") and rng.random() < OBSTACLE_SHARE:
+        source = cast.scenery[str(rng.choice(list(OBSTACLES)))]
+        extent = rng.uniform(*OBSTACLE_EXTENTS)
+        placed.append((source, _static(source, extent, rng.uniform(*FRICTIONS), rng.uniform(*RESTITUTIONS))))
+        _stand(teacher, placed[0], rng.uniform(-1.0, 1.0, 2), Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)))
+    masses: list[float] = []
+
+    def draw(source: ShapeSource) -> TeacherBody:
+        extent = rng.uniform(*VARIED_EXTENTS)
+        volume = source.volume * extent**3
+        heaviest, most = max(masses, default=0.0), min(masses, default=np.inf) * MASS_RATIO
+        low = min(max(volume * DENSITIES[0], heaviest / MASS_RATIO), most)
+        high = max(min(volume * DENSITIES[1], most), low)  # the ratio wins over the densities
+        masses.append(float(np.exp(rng.uniform(np.log(low), np.log(high)))))
+        return TeacherBody(source.urdf, extent, masses[-1], rng.uniform(*FRICTIONS), rng.uniform(*RESTITUTIONS))
+
+    if start == "tossed":
+        tossed = _toss(teacher, rng, cast, draw)
+        return None if tossed is None else placed + tossed
+    if start == "resting":
+        picked = [cast.shapes[k] for k in rng.integers(len(cast.shapes), size=rng.integers(*_closed(COUNT)))]
+        bodies = [(source, draw(source)) for source in picked]
+        return placed + bodies if at_rest(teacher, rng, bodies, str(rng.choice(STARTS)), TRIES) else None
+    count = 2 * int(rng.integers(1, 3)) if start == "head-on" else int(rng.integers(*_closed(FEW)))
+    balls = rng.random(count) < (1.0 if start == "rolling" else BALL_SHARE)
+    picked = [cast.scenery["ball"] if ball else cast.shapes[rng.integers(len(cast.shapes))] for ball in balls]
+    bodies = [(source, draw(source)) for source in picked]
+    return bodies if set_moving(teacher, rng, bodies, start, TRIES) else None
+
+
+RECIPES = {
+    "movi-b": Recipe(movi_b, kubasic=True),
+    "movi-c": Recipe(movi_c),
+    "bowl": Recipe(bowl, given=False, counted=True, scenery={"bowl": "bowl", "ball": "sphere"}),
+    "pile": Recipe(pile, counted=True),
+    "varied": Recipe(varied, scenery=OBSTACLES | {"ball": "sphere"}),
+}
+
+
+def _toss(
+    teacher: Teacher, rng: np.random.Generator, cast: Cast, draw: Callable[[ShapeSource], TeacherBody]
+) -> Placed | None:
+    """Kubric's 3 to 10 bodies without overlaps, thrown across; None when one finds no room in `TRIES` tries."""
+    placed = []
+    for _ in range(rng.integers(*_closed(COUNT))):
+        source = cast.shapes[rng.integers(len(cast.shapes))]
+        body = draw(source)
+        index = teacher.add(body)
+        position = _free_place(teacher, rng, source, body, index)
+        if position is None:
+            return None
+        aim = rng.uniform((-4.0, -4.0, 0.0), (4.0, 4.0, 0.0))
+        teacher.push(index, aim - position * (1.0, 1.0, 0.0), np.zeros(3))
+        placed.append((source, body))
+    return placed
+
+
+def _free_place(
+    teacher: Teacher, rng: np.random.Generator, source: ShapeSource, body: TeacherBody, index: int
+) -> np.ndarray | None:
+    for _ in range(TRIES):
+        rotation = Rotation.random(rng=rng)
+        low, high = _box(source, body, rotation)
+        if (REGION[1] - high < REGION[0] - low).any():
+            continue
+        position = rng.uniform(REGION[0] - low, REGION[1] - high)
+        teacher.place(index, position, rotation.as_quat())
+        if not teacher.overlaps(index):
+            return position
+    return None
+
+
+def _layers(rng: np.random.Generator, count: int, radius: float) -> np.ndarray:
+    """[count, 3] m: centres of balls that do not touch, in layers from z = 0 within `radius` of the z axis."""
+    spacing, layers, found = 1.1 * BALL, [], 0
+    steps = np.arange(-np.ceil(radius / spacing) - 1, np.ceil(radius / spacing) + 2)
+    while found < count:
+        lattice = spacing * (np.stack(np.meshgrid(steps, steps), -1).reshape(-1, 2) + rng.random(2))
+        inside = lattice[np.linalg.norm(lattice, axis=1) <= radius]
+        if len(inside) == 0:
+            inside = radius * np.sqrt(rng.random()) * _direction(rng)[None]
+        inside = rng.permutation(inside)[: count - found]
+        layers.append(np.column_stack([inside, np.full(len(inside), spacing * len(layers))]))
+        found += len(inside)
+    centres = np.concatenate(layers)
+    return centres + rng.uniform(-0.04, 0.04, centres.shape) * BALL
+
+
+def _body(source: ShapeSource, extent: float, density: float, friction: float, restitution: float) -> TeacherBody:
+    """A body of a shape whose largest extent is 1 m at scale 1."""
+    return TeacherBody(source.urdf, extent, source.volume * density * extent**3, friction, restitution)
+
+
+def _static(source: ShapeSource, extent: float, friction: float, restitution: float) -> TeacherBody:
+    return TeacherBody(source.urdf, extent, 0.0, friction, restitution)
+
+
+def _stand(teacher: Teacher, one: tuple[ShapeSource, TeacherBody], place: np.ndarray, rotation: Rotation) -> float:
+    """Put a body on the floor at `place` [2] m; the height of its top, m."""
+    position, top = upright(*one, place, 0.0, rotation)
+    _put(teacher, one[1], position, rotation)
+    return top
+
+
+def _put(teacher: Teacher, body: TeacherBody, position: np.ndarray, rotation: Rotation) -> None:
+    teacher.place(teacher.add(body), position, rotation.as_quat())
+
+
+def _box(source: ShapeSource, body: TeacherBody, rotation: Rotation) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest corner [3] m of the box around a turned body, about its centre of mass."""
+    vertices = body.scale * rotation.apply(source.vertices)
+    return vertices.min(0), vertices.max(0)
+
+
+def _direction(rng: np.random.Generator) -> np.ndarray:
+    """A unit vector [2]."""
+    turn = rng.uniform(0.0, 2 * np.pi)
+    return np.array([np.cos(turn), np.sin(turn)])
+
+
+def _closed(span: tuple[int, int]) -> tuple[int, int]:
+    return span[0], span[1] + 1

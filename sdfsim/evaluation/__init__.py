@@ -1,0 +1,1 @@
+"""How good and how expensive: models against recordings, error against time, the hard cases."""

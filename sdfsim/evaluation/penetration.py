@@ -1,0 +1,149 @@
+"""How deep bodies are inside each other and the floor, measured on their exact geometry."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sdfsim.data.dataset import Trajectory
+from sdfsim.errors import SdfsimError
+from sdfsim.evaluation.baselines import collision_mesh, engine_file, is_sphere
+from sdfsim.shape.asset import Shape, with_sdf
+from sdfsim.shape.distance import PiecesDistance
+from sdfsim.shape.exact import MeshSdf
+from sdfsim.shape.grid import GridSdf
+from sdfsim.shape.mesh import Mesh, load_pieces
+from sdfsim.shape.mlp import MlpSdf
+
+TOUCH = 0.01  # mean sizes of the moving bodies; a node this near to another surface is in contact
+EVERY = 10  # frames between two that are looked at
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A shape's exact geometry about its centre of mass, at scale 1.
+
+    Attributes:
+        nodes: [K, 3] m, surface nodes.
+        bounds: [2, 3] m, box of the solid (infinite for a plane).
+        distance: [P, 3] m -> [P] m, negative inside.
+        kind: "pieces" (the convex pieces that an engine collides), "mesh" (the shape's), "shown mesh" (the same, where
+            the engine collides pieces that are not at hand) or "closed form".
+    """
+
+    nodes: np.ndarray
+    bounds: np.ndarray
+    distance: Callable[[np.ndarray], np.ndarray]
+    kind: str
+
+
+def exact_solids(data: Path, shapes: dict[str, Shape]) -> dict[str, Solid]:
+    """The exact geometry of every shape of a dataset.
+
+    A shape that was fitted to an engine's convex pieces is those pieces, where the dataset's engine file leads to
+    them: the mesh beside it is what is shown. Other learned or sampled distances give way to those of the mesh.
+    """
+    return {name: _solid(data, name, shape) for name, shape in shapes.items()}
+
+
+def deepest(motion: Trajectory, solids: dict[str, Solid], every: int = EVERY) -> np.ndarray:
+    """The deepest node of any body in any other body, or in the floor z = 0, frame by frame.
+
+    Pairs of static bodies, and static bodies in the floor, do not count.
+
+    Args:
+        motion: T frames.
+        solids: of every name in use.
+        every: frame `every`, 2 `every`, ... are looked at.
+
+    Returns:
+        [F] m, signed distance of that node: negative inside; infinite where nothing touches.
+    """
+    kept = slice(every, None, every)
+    position = motion.position[kept]
+    frames, bodies = position.shape[:2]
+    turn = Rotation.from_quat(motion.quat_xyzw[kept].reshape(-1, 4)).as_matrix().reshape(frames, bodies, 3, 3)
+    own = [solids[str(name)] for name in motion.shape]
+    moving = ~motion.static
+    bounds = motion.scale[:, None, None] * np.stack([solid.bounds for solid in own])
+    touch = TOUCH * float(np.ptp(bounds[moving], axis=1).max(-1).mean())
+    lowest = np.full(frames, np.inf)
+    for i in np.flatnonzero(moving):
+        heights = position[:, i, None, 2] + motion.scale[i] * turn[:, i, 2] @ own[i].nodes.T
+        lowest = np.minimum(lowest, heights.min(1, initial=np.inf))
+    questions = defaultdict(list)
+    for f, i, j in zip(*np.nonzero(_near(position, turn, bounds, moving, touch)), strict=True):
+        world = position[f, i] - position[f, j] + motion.scale[i] * own[i].nodes @ turn[f, i].T
+        local = world @ turn[f, j]
+        low, high = bounds[j]
+        inside = local[((local >= low - touch) & (local <= high + touch)).all(1)]
+        if len(inside):
+            questions[str(motion.shape[j])].append((f, motion.scale[j], inside))
+    for name, asked in questions.items():  # all of one shape at once: a question has a price of its own
+        frame, scale = (np.repeat([q[k] for q in asked], [len(q[2]) for q in asked]) for k in (0, 1))
+        distance = scale * solids[name].distance(np.concatenate([q[2] for q in asked]) / scale[:, None])
+        np.minimum.at(lowest, frame, distance)
+    return np.where(lowest <= touch, lowest, np.inf)
+
+
+def penetration(motions: list[Trajectory], solids: dict[str, Solid]) -> dict:
+    """Penetration m over the frames of all `motions` in which something touches.
+
+    Returns:
+        percentile_95 and worst of the depth of a frame's deepest node (None where nothing touches), and
+        steps_with_contact.
+    """
+    distance = np.concatenate([deepest(motion, solids) for motion in motions])
+    depth = np.maximum(0.0, -distance[np.isfinite(distance)])
+    return {
+        "percentile_95": float(np.percentile(depth, 95)) if len(depth) else None,
+        "worst": float(depth.max()) if len(depth) else None,
+        "steps_with_contact": len(depth),
+    }
+
+
+def _near(position: np.ndarray, turn: np.ndarray, bounds: np.ndarray, moving: np.ndarray, touch: float) -> np.ndarray:
+    """[F, N, N] bool: the boxes around two bodies come within `touch` m, and one of the two moves."""
+    finite = np.asarray(np.isfinite(bounds).all((1, 2)))
+    bounds = np.where(finite[:, None, None], bounds, 0.0)
+    centre = position + (turn @ bounds.mean(1)[..., None])[..., 0]
+    half = (np.abs(turn) @ (0.5 * (bounds[:, 1] - bounds[:, 0]))[..., None])[..., 0] + 0.5 * touch
+    half = np.where(finite[:, None], half, np.inf)
+    gap = np.abs(centre[:, :, None] - centre[:, None]) - half[:, :, None] - half[:, None]
+    pairs = (moving[:, None] | moving[None]) & ~np.eye(len(bounds), dtype=bool)
+    return (gap <= 0).all(-1) & pairs
+
+
+def _solid(data: Path, name: str, shape: Shape) -> Solid:
+    # A dataset's body frames sit at the centre of mass, and so do its shapes' origins.
+    if not isinstance(shape.sdf, MlpSdf | GridSdf):
+        return _of_sdf(shape, "mesh" if isinstance(shape.sdf, MeshSdf) else "closed form")
+    if shape.source.get("kind") != "pieces":
+        return _of_sdf(with_sdf(shape, "mesh"), "mesh")
+    if not (pieces := engine_pieces(data, name)):
+        return _of_sdf(with_sdf(shape, "mesh"), "shown mesh")
+    oracle = PiecesDistance(pieces)
+    return Solid(shape.nodes, oracle.bounds, lambda points: oracle(points).distance, "pieces")
+
+
+def _of_sdf(shape: Shape, kind: str) -> Solid:
+    sdf = shape.sdf
+    return Solid(shape.nodes, np.asarray(sdf.bounds), lambda points: np.asarray(sdf(points)[0]), kind)
+
+
+def engine_pieces(data: Path, name: str) -> list[Mesh]:
+    """The convex pieces that the engine collides, in the body's frame; none where the dataset does not lead to them.
+
+    Of an exact sphere they are a hull of points on it.
+    """
+    try:
+        urdf = engine_file(data, name)
+        path, offset = (urdf.with_suffix(".obj"), np.zeros(3)) if is_sphere(urdf) else collision_mesh(urdf)
+        return [Mesh(piece.vertices + offset, piece.faces) for piece in load_pieces(path)]
+    except SdfsimError:
+        return []

@@ -1,1 +1,0 @@
-"""Studies: what the simulator costs, and where it fails."""

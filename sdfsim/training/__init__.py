@@ -1,0 +1,1 @@
+"""From recorded motion to weights: contact frames, tasks, the training loop."""

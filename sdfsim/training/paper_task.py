@@ -1,0 +1,186 @@
+"""What training the *paper* network means: recorded steps of whole scenes, and a loss on node accelerations."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sdfsim.data.batching import merged
+from sdfsim.data.dataset import FLOOR, Trajectory, check_alike, load_shapes, product_range, trajectory_files
+from sdfsim.dynamics import pose
+from sdfsim.dynamics.bodies import Bodies, State, Units
+from sdfsim.dynamics.contacts import find_contacts
+from sdfsim.dynamics.paper import PaperNetwork, SurfaceGraph
+from sdfsim.dynamics.surfaces import node_owner, surface_graph, target_acceleration
+from sdfsim.training.distributed import ALONE, Team
+
+NODES = 64  # surface nodes a body: the first of each shape's, which are its corners and then the most spread
+WARM_BATCHES = 20  # batches that set the feature statistics before the first step
+
+
+@dataclass(frozen=True)
+class Batch:
+    """A graph, the accelerations [M, 3] that were recorded, and which nodes move [M]."""
+
+    graph: SurfaceGraph
+    target: Tensor
+    moves: Tensor
+
+
+class PaperTask:
+    """Draws recorded steps of random trajectories, turned by a random yaw, with rigid pose noise.
+
+    Args:
+        data: dataset folder.
+        split: "train" or "validation".
+        reach: m, contact radius D.
+        device: where batches are made.
+        noise: m, standard deviation of the noise on the earlier poses (paper: 0.003), None for exact inputs.
+    """
+
+    def __init__(self, data: Path, split: str, reach: float, device: torch.device, noise: float | None) -> None:
+        self.trajectories = [Trajectory.load(f) for f in trajectory_files(data, split)]
+        check_alike(f"{data / split}", self.trajectories)
+        names = {str(n) for t in self.trajectories for n in t.shape}
+        self.shapes = {k: replace(s, nodes=s.nodes[:NODES]) for k, s in load_shapes(data, names).items()}
+        self.reach, self.device, self.noise, self.nodes = reach, device, noise, NODES
+        self.dt = self.trajectories[0].dt
+        self.gravity = float(np.linalg.norm(self.trajectories[0].gravity))
+
+    def digest(self) -> str:
+        """Changes with the data."""
+        digest = hashlib.sha256()
+        for t in self.trajectories:
+            for field in fields(t):
+                digest.update(np.ascontiguousarray(getattr(t, field.name)).tobytes())
+        for name, shape in sorted(self.shapes.items()):
+            digest.update(name.encode() + np.ascontiguousarray(shape.nodes).tobytes())
+        return digest.hexdigest()[:16]
+
+    @property
+    def counts(self) -> list[int]:
+        """Trajectories of each dataset: of the one."""
+        return [len(self.trajectories)]
+
+    def prepare(self, network: PaperNetwork, rng: np.random.Generator) -> None:
+        """Set the network's feature statistics from a few batches."""
+        for _ in range(WARM_BATCHES):
+            batch = self.draw(rng, 4)
+            for name in ("body", "node", "intra", "contact"):
+                network.scale[name].observe(getattr(batch.graph, name))  # type: ignore[operator]
+            network.target.observe(batch.target[batch.moves])
+
+    def draw(self, rng: np.random.Generator, count: int, team: Team = ALONE) -> Batch:
+        """`count` recorded steps as one graph, or the part of them that falls to one of a team."""
+        picked = [self.trajectories[i] for i in rng.integers(len(self.trajectories), size=count)]
+        frames = [int(rng.integers(2, len(t.position) - 1)) for t in picked]
+        yaw = pose.from_rotvec(torch.tensor([0.0, 0.0, rng.uniform(0, 2 * np.pi)], dtype=torch.float64))
+        noise = self._noise(picked, rng, team)
+        picked, frames = picked[team.share(count)], frames[team.share(count)]
+        units = Units(1.0, 1.0, 1.0)
+        bodies, state = merged(picked, frames, self.shapes, units, self.device)
+        poses = [self._poses(picked, frames, offset, yaw) for offset in (-2, -1, 0, 1)]
+        noisy = poses if noise is None else _disturbed(poses, bodies, noise)
+        state = State(
+            position=noisy[2][0],
+            orientation=noisy[2][1],
+            velocity=(noisy[2][0] - noisy[1][0]) / self.dt,
+            angular_velocity=pose.to_rotvec(pose.multiply(noisy[2][1], pose.conjugate(noisy[1][1]))) / self.dt,
+            earlier_position=torch.stack([noisy[0][0], noisy[1][0]]),
+            earlier_orientation=torch.stack([noisy[0][1], noisy[1][1]]),
+        )
+        gravity = torch.tensor(picked[0].gravity, dtype=torch.float64, device=self.device)
+        contacts = find_contacts(bodies, state, gravity, self.reach, self.dt)
+        # The target leads from the disturbed poses to the recorded one, so that errors are learnt to be undone.
+        target = target_acceleration(bodies, state, *poses[3])
+        return Batch(surface_graph(bodies, state, contacts), target.float(), bodies.moves[node_owner(bodies)])
+
+    def loss(self, network: PaperNetwork, batch: Batch, *, mirrored: bool = False) -> Tensor:
+        """Mean squared error of the standardised accelerations; a mirror image reverses the y axis of the world."""
+        if mirrored:
+            batch = _mirror(batch)
+        error = network(batch.graph) - network.target(batch.target)
+        return error[batch.moves].square().mean()
+
+    def weight_of(self, batch: Batch) -> int:
+        """Over how many nodes a batch's loss is the mean."""
+        return int(batch.moves.sum())
+
+    def ranges(self) -> dict[str, list[float]]:
+        """[low, high] of what the trajectories hold, SI units, coefficients as products with the floor's.
+
+        Sizes and speeds are those of the bodies that move.
+        """
+        extent = {name: float(np.ptp(shape.sdf.bounds, axis=0).max()) for name, shape in self.shapes.items()}
+        size = np.concatenate([[extent[str(n)] for n in t.shape] * t.scale for t in self.trajectories])
+        size = size[~np.concatenate([t.static for t in self.trajectories])]
+        masses = [t.mass[~t.static] for t in self.trajectories if not t.static.all()]
+        friction = np.concatenate([t.friction for t in self.trajectories])
+        restitution = np.concatenate([t.restitution for t in self.trajectories])
+        speed = np.concatenate([np.linalg.norm(t.velocity[:, ~t.static], axis=-1).ravel() for t in self.trajectories])
+        return {
+            "size": [float(size.min()), float(size.max())],
+            "speed": [0.0, float(np.percentile(speed, 99.9))],
+            "mass_ratio": [1.0, float(max(mass.max() / mass.min() for mass in masses))],
+            "friction": product_range(friction, FLOOR[0]),
+            "restitution": product_range(restitution, FLOOR[1]),
+        }
+
+    def _poses(self, picked: list[Trajectory], frames: list[int], offset: int, yaw: Tensor) -> tuple[Tensor, Tensor]:
+        """Positions [N, 3] and orientations [N, 4] of all bodies at frame + offset, then the floor's."""
+        each = [(t.position[f + offset], t.quat_xyzw[f + offset]) for t, f in zip(picked, frames, strict=True)]
+        each.append((np.zeros((1, 3)), np.array([[0.0, 0.0, 0.0, 1.0]])))
+        position, quat = (np.concatenate(part) for part in zip(*each, strict=True))
+        place, turn = torch.from_numpy(position), torch.from_numpy(quat)
+        yaw = yaw.expand_as(turn)
+        return pose.rotate(yaw, place).to(self.device), pose.multiply(yaw, turn).to(self.device)
+
+    def _noise(self, picked: list[Trajectory], rng: np.random.Generator, team: Team) -> Tensor | None:
+        """Noise of the whole batch, so that it does not depend on the team's size; then this one's part of it.
+
+        Returns:
+            [3, 2, N + 1, 3] m: of each input pose, shifts and turns at the surface, of its bodies and the floor.
+        """
+        if self.noise is None:
+            return None
+        ends = np.cumsum([0] + [t.position.shape[1] for t in picked])
+        # Sizes 1 / sqrt(3), so that the last pose of the walk is off by `noise`.
+        steps = rng.normal(scale=self.noise / np.sqrt(3), size=(3, 2, ends[-1] + 1, 3))
+        mine = team.share(len(picked))
+        rows = [*range(ends[mine.start], ends[mine.stop]), ends[-1]]
+        return torch.from_numpy(steps[:, :, rows]).to(self.device)
+
+
+def _disturbed(poses, bodies: Bodies, noise: Tensor):
+    """Rigid displacements that walk over the three input poses by the steps `noise` [3, 2, N, 3] m."""
+    lever = torch.where(bodies.moves, 2.0 / bodies.size, torch.zeros_like(bodies.size))[:, None]
+    shift, turn = (noise * bodies.moves[:, None]).cumsum(0).unbind(1)
+    walked = [
+        (position + s, pose.multiply(pose.from_rotvec(t * lever), quat))
+        for (position, quat), s, t in zip(poses, shift, turn, strict=False)
+    ]
+    return [*walked, poses[3]]
+
+
+def _mirror(batch: Batch) -> Batch:
+    """Reverse y of every vector feature; body-frame reference offsets stay (a mirrored body has its own frame)."""
+    g = batch.graph
+
+    def flip(values: Tensor, columns: tuple[int, ...]) -> Tensor:
+        sign = torch.ones(values.shape[-1], dtype=values.dtype, device=values.device)
+        sign[list(columns)] = -1.0
+        return values * sign
+
+    graph = replace(
+        g,
+        body=flip(g.body, (1, 4, 7)),
+        node=flip(g.node, (1, 4, 7)),
+        intra=flip(g.intra, (1, 5)),
+        contact=flip(g.contact, (1, 4, 7, 10)),
+    )
+    return replace(batch, graph=graph, target=flip(batch.target, (1,)))

@@ -1,0 +1,184 @@
+"""One training run: everything that changes while a network is trained, and how it is saved."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from sdfsim.dynamics.precision import in_bfloat16
+from sdfsim.errors import SdfsimError
+from sdfsim.files import read_arrays, write_arrays
+from sdfsim.training.distributed import ALONE, Team
+from sdfsim.training.optimiser import Optimiser
+from sdfsim.training.presets import Preset
+from sdfsim.training.unrolled import Unrolled
+
+EMA_DECAY = 0.999
+CLIP = 1.0
+BAD_BATCHES = 20  # consecutive batches without a finite gradient before training gives up
+
+
+class Task(Protocol):
+    """What a network is trained on: batches and their loss."""
+
+    def digest(self) -> str: ...
+
+    @property
+    def counts(self) -> list[int]: ...
+
+    def draw(self, rng: np.random.Generator, count: int, team: Team = ALONE) -> Any: ...
+
+    def loss(self, network: Any, batch: Any, *, mirrored: bool = False) -> Tensor: ...
+
+    def weight_of(self, batch: Any) -> int: ...
+
+
+class Run:
+    """Everything that changes while training, and how to save it.
+
+    Args:
+        plan: preset.
+        task: gives batches and losses.
+        total: optimiser steps of the whole run (the learning rate depends on it).
+        seed: of weights and batches.
+        device: of weights and batches.
+        team: who shares the work.
+    """
+
+    def __init__(
+        self, plan: Preset, task: Any, total: int, seed: int, device: torch.device, team: Team = ALONE
+    ) -> None:
+        from sdfsim.dynamics.model import new_network
+
+        torch.manual_seed(seed)
+        self.plan, self.task, self.total, self.seed, self.device, self.team = plan, task, total, seed, device, team
+        self.late: Any = Unrolled(task, plan.in_row) if plan.in_row > 1 else task
+        self.digest = task.digest()
+        self.network: nn.Module = new_network(plan.kind, plan.config).to(device)
+        if hasattr(task, "prepare"):
+            task.prepare(self.network, np.random.default_rng([seed, 1]))
+        self.computing = in_bfloat16(self.network) if plan.bf16 else self.network
+        # Averaged are the trained weights; feature statistics are fixed before the first step.
+        self.weights = dict(self.network.named_parameters())
+        self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
+        self.optimiser = Optimiser(self.network, plan)
+        self.step, self.seconds, self.loss, self.skipped = 0, 0.0, math.nan, 0
+
+    def advance(self) -> None:
+        """One optimiser step on a batch that depends on (seed, step) alone."""
+        rng = np.random.default_rng([self.seed, 0, self.step])
+        flipped = rng.integers(2)
+        task = self.late if self.step >= (1.0 - self.plan.late) * self.total else self.task
+        batch = task.draw(rng, self.plan.batch, self.team)
+        loss = task.loss(self.computing, batch, mirrored=bool(flipped))
+        weight = task.weight_of(batch)
+        loss = loss * (weight / max(1.0, self.team.total(weight, self.device)))
+        self.optimiser.zero_grad()
+        loss.backward()
+        self.team.add_gradients(self.network.parameters())
+        norm = nn.utils.clip_grad_norm_(self.network.parameters(), CLIP)
+        if bool(norm.isfinite()):
+            self.optimiser.step(self.share())
+            self.skipped = 0
+        else:
+            self.skipped += 1
+            if self.skipped >= BAD_BATCHES:
+                raise SdfsimError(f"training diverged at step {self.step}: no finite gradient in {BAD_BATCHES} batches")
+        self.step += 1
+        value = self.team.total(float(loss.detach()), self.device)
+        self.loss = value if math.isnan(self.loss) else 0.99 * self.loss + 0.01 * value
+        decay = min(EMA_DECAY, (1.0 + self.step) / (10.0 + self.step))
+        with torch.no_grad():
+            for name, weight in self.weights.items():
+                self.average[name].lerp_(weight, 1.0 - decay)
+
+    def share(self) -> float:
+        """Of the peak learning rates: a warm-up over 2 % of all steps, 1000 at most, then a cosine to a hundredth."""
+        warm = min(1.0, (self.step + 1) / max(1.0, min(1000.0, 0.02 * self.total)))
+        fall = 0.5 * (1.0 + math.cos(math.pi * min(1.0, self.step / self.total)))
+        return warm * (0.01 + 0.99 * fall)
+
+    def averaged(self) -> nn.Module:
+        """The network with its averaged weights."""
+        from sdfsim.dynamics.model import new_network
+
+        network = new_network(self.plan.kind, self.plan.config).to(self.device)
+        network.load_state_dict(self.average)
+        return network.eval().requires_grad_(False)
+
+    def save(self, path: Path) -> None:
+        """Write everything. Arrays only: nothing is pickled."""
+        arrays: dict[str, np.ndarray] = {}
+        for name, weight in self.network.state_dict().items():
+            arrays[f"network/{name}"] = weight.cpu().numpy()
+            arrays[f"average/{name}"] = self.average[name].cpu().numpy()
+        for name, value in self.optimiser.state().items():
+            arrays[f"optimiser/{name}"] = value.cpu().numpy()
+        progress = {name: getattr(self, name) for name in ("step", "seconds", "loss", "total", "skipped")}
+        origin = {"plan": asdict(self.plan), "seed": self.seed, "data": self.digest}
+        arrays["run"] = np.array(json.dumps(origin | progress))
+        write_arrays(path, arrays, compressed=False)
+
+    def load(self, path: Path) -> None:
+        """Take up a saved run. Raises SdfsimError when it is of another preset, seed or data, or unreadable."""
+        arrays = read_arrays(path, "a checkpoint", "delete it to start anew")
+        try:
+            info: dict[str, Any] = json.loads(str(arrays["run"]))
+            if info["plan"] != asdict(self.plan) or info["seed"] != self.seed or info["total"] != self.total:
+                raise SdfsimError(f"{path} belongs to another preset, seed or number of steps", "choose another -o")
+            # Runs that were begun before data had a digest are taken at their word.
+            if info.get("data", self.digest) != self.digest:
+                raise SdfsimError(f"{path} was trained on other data", "give the same --data, or choose another -o")
+            tensors = {k: torch.from_numpy(v).to(self.device) for k, v in arrays.items() if k != "run"}
+            self.network.load_state_dict({k[8:]: v for k, v in tensors.items() if k.startswith("network/")})
+            self.average = {k[8:]: v for k, v in tensors.items() if k.startswith("average/")}
+            self.optimiser.load({k[10:]: v for k, v in tensors.items() if k.startswith("optimiser/")})
+            self.step, self.seconds, self.loss = info["step"], info["seconds"], info["loss"]
+            self.skipped = info.get("skipped", 0)
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            raise SdfsimError(
+                f"{path}: not a checkpoint of this training: {error}", "delete it to start anew"
+            ) from error
+
+    def export(self, *, name: str, data: list[dict[str, Any]], ranges: dict[str, list[float]]):
+        """The averaged weights as a `Model`."""
+        from sdfsim.dynamics.model import Model
+
+        card = {
+            "data": data,
+            "seed": self.seed,
+            "optimiser_steps": self.step,
+            "seconds": round(self.seconds),
+            "processes": self.team.size,
+            "threads": torch.get_num_threads(),
+            "device": str(self.device),
+            "preset_name": name,
+            "preset": asdict(self.plan),
+        }
+        return Model(
+            name=name,
+            kind=self.plan.kind,
+            network=self.averaged(),
+            dt=self.task.dt,
+            gravity=self.task.gravity,
+            length=float(np.mean(ranges["size"])),
+            reach=self.plan.reach,
+            nodes=getattr(self.task, "nodes", None),
+            ranges=ranges,
+            card=card,
+        )
+
+
+def held_out_loss(run: Run, task: Task, batches: int = 8) -> float:
+    """Loss of the averaged weights on a fixed set of held-out batches."""
+    network, rng = run.averaged(), np.random.default_rng(12345)
+    with torch.no_grad():
+        losses = [float(task.loss(network, task.draw(rng, 64))) for _ in range(batches)]
+    return float(np.mean(losses))

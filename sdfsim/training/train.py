@@ -1,0 +1,225 @@
+"""Training: one loop for both networks, resumable to the step, needing only torch and numpy once frames are cached."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from sdfsim.data.dataset import SOLID, SPLITS, read_info
+from sdfsim.errors import SdfsimError, run_main
+from sdfsim.files import locked, write_text
+from sdfsim.training.distributed import gather_team
+from sdfsim.training.presets import PRESETS, Preset
+from sdfsim.training.run import Run, Task, held_out_loss
+from sdfsim.training.validation import Rollouts, held_out_rollouts
+
+if TYPE_CHECKING:
+    from sdfsim.dynamics.model import Model
+
+CHECKPOINT_SECONDS = 60.0
+LOG_STEPS = 100
+ROLLOUTS = 10  # times in a run that held-out trajectories are rolled out
+
+Progress = Callable[[float, str], None]
+
+
+def train(
+    data: Path | Sequence[Path],
+    out: Path,
+    *,
+    preset: str = "small",
+    resume: bool = False,
+    steps: int | None = None,
+    seed: int = 0,
+    device: str = "cpu",
+    on_progress: Progress | None = None,
+) -> dict:
+    """Train a preset on one dataset or several; write `model.safetensors`, `log.jsonl` and a checkpoint under `out`.
+
+    Args:
+        data: dataset folders with train/ and validation/; several (impulse only) are drawn from as if they were one.
+        out: training folder.
+        preset: name in `PRESETS`.
+        resume: go on from the checkpoint in `out`; the result equals an uninterrupted run's.
+        steps: of the optimiser, instead of the preset's.
+        seed: of initial weights and batches.
+        device: "cpu", "cuda" or "auto".
+        on_progress: called with the fraction done and a message.
+
+    Returns:
+        A report: paths, losses, seconds.
+
+    Raises:
+        SdfsimError: unknown preset, unusable data, a checkpoint in `out` without `resume`, another run writing
+            to it, diverged training.
+    """
+    from sdfsim.dynamics.simulator import pick_device
+
+    if preset not in PRESETS:
+        raise SdfsimError(f"unknown preset {preset!r}", f"known: {', '.join(PRESETS)}")
+    plan = PRESETS[preset]
+    folders = [data] if isinstance(data, Path) else list(data)
+    if steps is not None and steps < 1:
+        raise SdfsimError(f"steps: must be at least 1 (got {steps})")
+    total = plan.steps if steps is None else steps
+    checkpoint = out / "checkpoint.npz"
+    if checkpoint.exists() and not resume:
+        raise SdfsimError(f"{checkpoint} exists", "continue with --resume, or choose another -o")
+    tell = on_progress or (lambda fraction, message: None)
+    infos = [read_info(folder) for folder in folders]
+    team, device = gather_team(device)
+    place = pick_device(device)
+    with locked(out) if team.leads else nullcontext():
+        with team.in_turn():  # the first finds contacts and caches them, the others read
+            task, held_out = _tasks(plan, folders, place, lambda f, m: tell(0.0, m))
+        each = zip(folders, infos, task.counts, held_out.counts, strict=True)
+        made = [_made(folder, info, *counts) for folder, info, *counts in each]
+        run = Run(plan, task, total, seed, place, team)
+        if checkpoint.exists():
+            run.load(checkpoint)
+        team.wait()
+        if team.leads:
+            _shorten(out / "log.jsonl", run.step)
+        watched = held_out_rollouts(folders[0], place, lambda m: tell(0.0, m)) if team.leads else None
+        _loop(run, held_out, watched, out, tell)
+        report = {"steps": run.step, "seconds": run.seconds, "loss": run.loss}
+        if team.leads:
+            model = run.export(name=preset, data=made, ranges=task.ranges())
+            report |= {"model": _saved(model, out), "held_out_loss": held_out_loss(run, held_out)}
+    return report
+
+
+def _saved(model: Model, out: Path) -> str | None:
+    """Write the model; None where safetensors is missing: --resume writes it from the checkpoint elsewhere."""
+    try:
+        model.save(out / "model.safetensors")
+    except ImportError:
+        return None
+    return str(out / "model.safetensors")
+
+
+def _made(data: Path, info: dict, train: int, validation: int) -> dict[str, Any]:
+    """What a model's card tells of a dataset; how many trajectories there were, where they are not here."""
+    here = {split: len(list((data / split).glob("*.npz"))) for split in SPLITS if (data / split).is_dir()}
+    counts = {"train": train, "validation": validation} | here
+    known = {k: info.get(k) for k in ("recipe", "seed", "engine", "engine_version")}
+    known |= {k: info[k] for k in ("bodies", "fps") if info.get(k)}
+    shapes = info.get("shapes", [])
+    solids = sum(name.startswith(SOLID) for name in shapes)
+    return known | {"shapes": len(shapes), "random_solids": solids, "trajectories": counts}
+
+
+def _tasks(plan: Preset, folders: Sequence[Path], device: torch.device, tell: Progress):
+    """Training and held-out tasks of a preset."""
+    if plan.kind == "impulse":
+        from sdfsim.training.contact_cache import contact_frames, join_frames
+        from sdfsim.training.impulse_task import ImpulseTask, Noise
+
+        sets = {
+            split: join_frames([contact_frames(folder, split, plan.reach, on_progress=tell) for folder in folders])
+            for split in ("train", "validation")
+        }
+        return ImpulseTask(sets["train"], device, Noise()), ImpulseTask(sets["validation"], device, None)
+    from sdfsim.training.paper_task import PaperTask
+
+    if len(folders) > 1:
+        raise SdfsimError("the paper network trains on one dataset", "give a single --data")
+    data = folders[0]
+    return (
+        PaperTask(data, "train", plan.reach, device, plan.noise),
+        PaperTask(data, "validation", plan.reach, device, None),
+    )
+
+
+def _loop(run: Run, held_out: Task, rollouts: Rollouts | None, out: Path, tell: Progress) -> None:
+    saved = time.monotonic()
+    try:
+        while run.step < run.total:
+            started = time.monotonic()
+            with _uninterrupted():
+                run.advance()
+                run.seconds += time.monotonic() - started
+                due = run.step % min(1000, max(1, run.total // 10)) == 0 or run.step == run.total
+                if run.team.leads and due:  # a step's line in the log is part of it
+                    _log(run, held_out, rollouts, out / "log.jsonl")
+            if not run.team.leads:
+                continue
+            if run.step % LOG_STEPS == 0:
+                tell(run.step / run.total, f"step {run.step}, loss {run.loss:.4f}")
+            if time.monotonic() - saved > CHECKPOINT_SECONDS:
+                run.save(out / "checkpoint.npz")
+                saved = time.monotonic()
+    finally:
+        # Also on Ctrl-C: what has been learned is kept.
+        if run.team.leads:
+            run.save(out / "checkpoint.npz")
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Ctrl-C waits for the end of a step: a checkpoint of half a step would make the resumed run another one."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread hears of Ctrl-C
+        return
+    pressed: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, frame: pressed.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if pressed:
+        raise KeyboardInterrupt
+
+
+def _shorten(log: Path, step: int) -> None:
+    """Leave of a log what was written up to a step, in whole lines: the rest will be done, and logged, again."""
+    if not log.exists():
+        return
+    kept = []
+    for line in log.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True):
+        try:
+            entry = json.loads(line)
+        except ValueError:
+            break  # a kill has cut it short
+        if entry["step"] > step:
+            break
+        kept.append(line)
+    write_text(log, "".join(kept))
+
+
+def _log(run: Run, held_out: Task, rollouts: Rollouts | None, path: Path) -> None:
+    entry: dict[str, Any] = {"step": run.step, "seconds": round(run.seconds, 1), "loss": run.loss}
+    entry |= {"rate": run.plan.rate * run.share(), "held_out_loss": held_out_loss(run, held_out)}
+    if rollouts and (run.step % max(1, run.total // ROLLOUTS) == 0 or run.step == run.total):
+        entry |= rollouts(run)
+    with open(path, "a") as log:
+        log.write(json.dumps(entry) + "\n")
+
+
+def main() -> None:
+    """Command line of this module, for machines that have only torch and numpy."""
+    parser = argparse.ArgumentParser(description="Train on a dataset whose contact frames are cached.")
+    parser.add_argument("data", type=Path, nargs="+")
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--preset", default="small", choices=list(PRESETS))
+    parser.add_argument("--steps", type=int)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--device", default="auto", choices=["auto", "cpu", "cuda"])
+    parser.add_argument("--resume", action="store_true")
+    args = parser.parse_args()
+    options = {name: getattr(args, name) for name in ("preset", "resume", "steps", "seed", "device")}
+    report = train(args.data, args.out, **options, on_progress=lambda f, m: print(f"{f:6.1%}  {m}", flush=True))
+    print(json.dumps(report))
+
+
+if __name__ == "__main__":
+    run_main(main)

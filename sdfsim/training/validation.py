@@ -1,0 +1,138 @@
+"""What is watched while a network is trained: rollouts of held-out trajectories, and curves of the log.
+
+`python -m sdfsim.training.validation RUN -o curves.png` draws the curves.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from sdfsim.data.dataset import Trajectory, load_shapes, trajectory_files
+from sdfsim.data.velocities import at_instants, engine_substep
+from sdfsim.errors import SdfsimError, run_main
+from sdfsim.files import replacing
+from sdfsim.training.contact_cache import inner_steps
+from sdfsim.training.run import Run
+
+if TYPE_CHECKING:
+    from sdfsim.shape.asset import Shape
+
+WATCHED = 10  # held-out trajectories that are rolled out
+STEPS = 50
+
+
+@dataclass(frozen=True)
+class Rollouts:
+    """Held-out trajectories and what is needed to roll them out.
+
+    Attributes:
+        recorded: their first frames.
+        shapes: by name.
+        substep: s, the recording engine's inner step.
+        device: where to simulate.
+    """
+
+    recorded: list[Trajectory]
+    shapes: dict[str, Shape]
+    substep: float
+    device: torch.device
+
+    def __call__(self, run: Run) -> dict[str, float]:
+        """Translation RMSE in m and mean rotation error in degrees of the averaged weights; NaN where they blow up.
+
+        Over all bodies that move and all steps, as `evaluate` has them.
+        """
+        from sdfsim.data.metrics import rotation_error, translation_rmse
+        from sdfsim.data.replay import batches, roll_out
+
+        model = run.export(name="watched", data=[], ranges=run.task.ranges())
+        steps = len(self.recorded[0].position) - 1
+        squared, degrees, bodies = 0.0, 0.0, 0
+        known = {name: replace(s, nodes=s.nodes[: model.nodes]) for name, s in self.shapes.items()}
+        for group in batches([at_instants(t, self.substep) for t in self.recorded]):
+            try:
+                inner = inner_steps(group[0].dt, self.substep)
+                predicted = roll_out(model, group, known, steps, self.device, substeps=inner)
+            except SdfsimError:
+                return {"rollout_m": math.nan, "rollout_degrees": math.nan}
+            for one, truth in zip(predicted, group, strict=True):
+                moving = ~truth.static
+                count = int(moving.sum())
+                squared += count * translation_rmse(one.position[1:, moving], truth.position[1:, moving]) ** 2
+                degrees += count * rotation_error(one.quat_xyzw[1:, moving], truth.quat_xyzw[1:, moving])
+                bodies += count
+        return {"rollout_m": math.sqrt(squared / bodies), "rollout_degrees": degrees / bodies}
+
+
+def held_out_rollouts(data: Path, device: torch.device, tell: Callable[[str], None]) -> Rollouts | None:
+    """The first validation trajectories; None, and why is told, where they, shapes or libraries are not at hand."""
+    if not (data / "validation").is_dir():
+        tell(f"no rollouts while training: {data / 'validation'} is not here")
+        return None
+    try:
+        from sdfsim.data.replay import first_frames
+
+        recorded = [Trajectory.load(f) for f in trajectory_files(data, "validation")[:WATCHED]]
+        shapes = load_shapes(data, {str(n) for t in recorded for n in t.shape})
+    except (ImportError, SdfsimError) as error:
+        tell(f"no rollouts while training: {error}")
+        return None
+    recorded = [t for t in recorded if not t.static.all()]
+    steps = min(STEPS, *(len(t.position) - 1 for t in recorded)) if recorded else 0
+    substep = engine_substep(data)
+    return Rollouts([first_frames(t, steps + 1) for t in recorded], shapes, substep, device) if recorded else None
+
+
+def draw(run: Path, picture: Path) -> None:
+    """Curves of RUN/log.jsonl as a picture (needs matplotlib).
+
+    Raises:
+        SdfsimError: no log there, or not one of training; matplotlib is not installed.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise SdfsimError("curves need matplotlib", "pip install -e '.[bench]'") from error
+    path = run / "log.jsonl"
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+        # A run that goes on, or was killed, may have written part of its last line.
+        log = [json.loads(line) for line in lines if line.endswith("\n")]
+        for name in ("step", "loss", "held_out_loss"):
+            _ = [float(entry[name]) for entry in log]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SdfsimError(
+            f"{path}: not the log of a training run", "give the folder that `sdfsim train` wrote"
+        ) from error
+    figure = Figure(figsize=(9, 3.2), layout="constrained")
+    one, two = figure.subplots(1, 2)
+    one.plot([e["step"] for e in log], [e["loss"] for e in log], label="training (hard frames more often)")
+    one.plot([e["step"] for e in log], [e["held_out_loss"] for e in log], label="held out")
+    one.set(xlabel="optimiser step", ylabel="one-step loss", yscale="log")
+    one.legend()
+    rolled = [e for e in log if "rollout_m" in e]
+    two.plot([e["step"] for e in rolled], [e["rollout_m"] for e in rolled], "o-", color="C2")
+    two.set(xlabel="optimiser step", ylabel=f"rollout error, m (first {STEPS} steps)", ylim=(0, None))
+    with replacing(picture) as partial:
+        figure.savefig(partial, dpi=120, format="png")
+
+
+def main() -> None:
+    """Command line of this module."""
+    parser = argparse.ArgumentParser(description="Draw the curves of a training run.")
+    parser.add_argument("run", type=Path)
+    parser.add_argument("-o", "--out", type=Path, required=True)
+    args = parser.parse_args()
+    draw(args.run, args.out)
+
+
+if __name__ == "__main__":
+    run_main(main)

@@ -1,0 +1,94 @@
+"""What is reported against numbers that can be worked out by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sdfsim.data.metrics import (
+    energy,
+    energy_gain,
+    interval,
+    median_survival,
+    resting,
+    rotation_error,
+    speeds,
+    survival,
+    translation_rmse,
+)
+from tests.recordings import balls
+
+
+def test_translation_rmse_of_a_constant_offset_is_its_length():
+    truth = np.random.default_rng(0).normal(size=(7, 3, 3))
+    assert translation_rmse(truth + np.array([3.0, 4.0, 0.0]), truth) == pytest.approx(5.0)
+
+
+def test_rotation_error_is_the_mean_angle_and_ignores_the_quaternions_sign():
+    truth = Rotation.random(12, random_state=0)
+    turn = Rotation.from_rotvec(np.repeat([[0.0, 0.0, np.radians(10)], [np.radians(30), 0.0, 0.0]], 6, axis=0))
+    quat = (truth * turn).as_quat().reshape(6, 2, 4)
+    assert rotation_error(-quat, truth.as_quat().reshape(6, 2, 4)) == pytest.approx(20.0)
+
+
+def test_interval_covers_the_mean_and_shrinks_with_more_data():
+    values = np.random.default_rng(1).normal(2.0, 1.0, size=400)
+    low, high = interval(values)
+    assert low < values.mean() < high
+    few = interval(values[:25])
+    assert high - low < 0.5 * (few[1] - few[0])
+
+
+def flight(seconds: float = 1.0, **fields):
+    """A ball thrown from 20 m along an exact parabola, spinning."""
+    time = np.arange(0.0, seconds, 0.02)[:, None, None]
+    start, gravity = np.array([1.0, 2.0, -3.0]), np.array([0.0, 0.0, -10.0])
+    position = np.array([0.0, 0.0, 20.0]) + start * time + 0.5 * gravity * time**2
+    spin = np.tile([1.0, -2.0, 3.0], (len(time), 1, 1))
+    return balls(position, velocity=start + gravity * time, angular_velocity=spin, **fields)
+
+
+def test_the_energy_of_a_flying_body_is_constant_and_is_what_it_should_be():
+    course = energy(flight(mass=np.array([2.0])))
+    np.testing.assert_allclose(course, 0.5 * 2.0 * 14.0 + 0.5 * 0.1 * 14.0 + 2.0 * 10.0 * 20.0, rtol=1e-12)
+    assert energy_gain(flight()) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_spin_is_taken_about_the_bodys_own_axes():
+    quarter = Rotation.from_euler("x", 90, degrees=True).as_quat()  # the body's z axis becomes the world's -y axis
+    turned = balls(np.zeros((2, 1, 3)), quat_xyzw=np.tile(quarter, (2, 1, 1)), inertia=np.array([[1.0, 2.0, 3.0]]))
+    turned = replace(turned, angular_velocity=np.tile([0.0, 4.0, 0.0], (2, 1, 1)))
+    np.testing.assert_allclose(energy(turned), 0.5 * 3.0 * 16.0)
+
+
+def test_a_springs_push_is_the_gain_and_scenery_has_no_part_in_it():
+    """1 kg at rest 2 m up has 20 J; 3 m/s more are 4.5 J. The static body is heavy, and would drown that."""
+    still = balls(np.tile([[0.0, 0.0, 2.0], [5.0, 0.0, 3.0]], (6, 1, 1)), static=np.array([False, True]))
+    still = replace(still, mass=np.array([1.0, 1e6]))
+    velocity = still.velocity.copy()
+    velocity[3:, 0] = [3.0, 0.0, 0.0]
+    velocity[5, 0] = 0.0
+    assert energy_gain(replace(still, velocity=velocity)) == pytest.approx(4.5 / 20.0)
+    assert energy_gain(still) == 0.0
+    assert energy_gain(replace(still, position=0.0 * still.position)) is None
+
+
+def test_what_rests_is_told_by_displacement_in_the_last_steps():
+    """Ball 0 creeps at 0.02 m/s, 1 stops only in the end, 2 is scenery; recorded velocities say nothing of it."""
+    step = np.zeros((30, 3, 3))
+    step[:, 0, 0] = 0.02 * 0.02
+    step[:-5, 1, 1] = 0.1 * 0.02
+    motion = balls(np.cumsum(step, axis=0), static=np.array([False, False, True]))
+    np.testing.assert_allclose(speeds(motion)[:, 0], 0.02)
+    assert speeds(motion).shape == (10, 3) and resting(motion).tolist() == [True, False, False]
+
+
+def test_survivors_are_those_that_have_never_left():
+    """Three of four leave 0.25 m, at frames 2, 4 and 6; one of them comes back, and stays lost."""
+    error = np.zeros((8, 4))
+    error[2, 0], error[4:, 1], error[6:, 2] = 0.3, 0.25, 9.0
+    share = survival(error, 0.25)
+    np.testing.assert_array_equal(share, [1, 1, 0.75, 0.75, 0.5, 0.5, 0.25, 0.25])
+    assert median_survival(share, 0.02) == pytest.approx(0.12)
+    assert median_survival(survival(error, 10.0), 0.02) is None

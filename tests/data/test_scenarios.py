@@ -1,0 +1,277 @@
+"""The recipes on cubes and balls: ranges, rest, scenery that stays, repeatability, statistics."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("pybullet")
+
+from sdfsim.data import batching, generate, scenarios
+from sdfsim.data.dataset import SPLITS, Trajectory, load_shapes, trajectory_files
+from sdfsim.data.generate import GRAVITY, make_dataset, make_trajectory
+from sdfsim.data.pybullet_sim import Teacher, TeacherBody
+from sdfsim.data.scenarios import BALL, MASS_RATIO, OBSTACLES, RECIPES, SHARES, WALL, Cast
+from sdfsim.data.shape_assets import Origin, prepare
+from sdfsim.data.starts_moving import MOTIONS, SPINS, set_moving
+from sdfsim.data.starts_resting import DROP, NUDGE, PRESSED, STARTS, at_rest, steady_faces
+from sdfsim.data.statistics import statistics, statistics_lines
+from sdfsim.errors import SdfsimError
+from sdfsim.shape import primitives
+from sdfsim.shape.asset import Shape, analytic_shape, sdf_of_mesh
+from sdfsim.shape.mass import mass_properties
+from sdfsim.training.contact_cache import contact_frames
+from sdfsim.training.impulse_task import ImpulseTask
+
+
+@pytest.fixture(scope="module")
+def cast(tmp_path_factory):
+    """Cubes to draw from, and the scenery of all scenarios."""
+    scenery = {name: kind for recipe in RECIPES.values() for name, kind in recipe.scenery.items()}
+    found = [Origin(name, primitive=kind) for name, kind in {"cube": "box", **scenery}.items()]
+    sources, _ = prepare(found, tmp_path_factory.mktemp("engine"), lambda fraction, message: None)
+    return Cast(sources[:1], {s.name: s for s in sources[1:]})
+
+
+def spawned(recipe: str, seed: int, cast: Cast):
+    """The start of a scene that found room: bodies and the engine's state of them."""
+    rng = np.random.default_rng(seed)
+    while True:
+        with Teacher(np.array(GRAVITY)) as teacher:
+            placed = RECIPES[recipe].spawn(teacher, rng, cast)
+            if placed is not None:
+                moving = [i for i, (_, body) in enumerate(placed) if body.mass > 0]
+                return placed, teacher.run(0), [teacher.overlaps(i) for i in moving]
+
+
+def test_movi_c_keeps_to_its_ranges(cast):
+    t = make_trajectory("movi-c", np.random.default_rng(0), cast)
+    assert 3 <= len(t.shape) <= 10 and len(t.position) == 101
+    assert ((t.scale >= 0.75) & (t.scale <= 3.0)).all()
+    assert (t.friction == 0.5).all() and (t.restitution == 0.5).all() and not t.static.any()
+    assert t.mass == pytest.approx(1.1 * t.scale**3)
+    aim = t.velocity[0] + t.position[0] * [1, 1, 0]
+    assert (np.abs(aim[:, :2]) <= 4.0).all() and (t.velocity[0][:, 2] == 0).all()
+
+
+@pytest.mark.parametrize("count", [1, 24])
+def test_balls_start_apart_and_stay_in_a_bowl_that_never_moves(cast, count):
+    t = make_trajectory("bowl", np.random.default_rng(count), replace(cast, bodies=count))
+    assert list(t.static) == [True] + [False] * count and t.mass[0] == 0
+    assert np.ptp(t.position[:, 0], axis=0).max() == 0 and not t.velocity[:, 0].any()
+    start, end = t.position[0, 1:], t.position[-1, 1:]
+    apart = np.linalg.norm(start[:, None] - start[None], axis=-1) + BALL * np.eye(count)
+    assert apart.min() >= BALL - 1e-9 and (t.scale[1:] == BALL).all()
+    inner = 0.5 * t.scale[0] * (1 - WALL)
+    rim = 0.5 * t.scale[0]
+    # Nothing is in the wall: a ball's farthest point is within the inner sphere, but for a contact margin.
+    assert np.linalg.norm(end - [0, 0, rim], axis=1).max() <= inner - 0.5 * BALL + 0.01
+    assert (start[:, 2] > rim - 0.1 * BALL).all() and (end[:, 2] < start[:, 2]).all()
+
+
+def test_a_pile_starts_apart_at_rest_and_falls_onto_the_floor(cast):
+    placed, start, inside = spawned("pile", 0, replace(cast, bodies=20))
+    assert len(placed) == 20 and not any(inside) and not start["velocity"].any()
+    t = make_trajectory("pile", np.random.default_rng(0), replace(cast, bodies=20))
+    np.testing.assert_array_equal(t.position[0], start["position"][0])
+    assert (t.position[-1, :, 2] > 0.4 * t.scale).all()
+    assert t.position[-1, :, 2].mean() < 0.7 * t.position[0, :, 2].mean()
+    counts = {len(spawned("pile", seed, cast)[0]) for seed in range(12)}
+    assert min(counts) >= 5 and max(counts) <= 30 and len(counts) > 5
+
+
+def test_varied_scenes_keep_to_their_ranges_and_few_start_in_each_other(cast):
+    resting = obstacles = pressed = balls = 0
+    coefficients = []
+    for seed in range(60):
+        placed, start, inside = spawned("varied", seed, cast)
+        moving = [body for _, body in placed if body.mass > 0]
+        masses = [body.mass for body in moving]
+        assert max(masses) / min(masses) <= MASS_RATIO * (1 + 1e-9) and 1 <= len(moving) <= 10
+        coefficients += [(b.friction, b.restitution) for _, b in placed]
+        assert all(0.7 <= b.scale <= 1.4 for b in moving)
+        balls += any(source.name == "ball" for source, _ in placed)
+        pressed += any(inside)
+        assert {s.name for s, b in placed if b.mass == 0} <= set(OBSTACLES)
+        resting += bool((np.abs(start["velocity"]) <= NUDGE).all())
+        obstacles += len(placed) - len(moving)
+    assert 12 <= resting <= 40 and 5 <= obstacles <= 24 and 8 <= balls <= 24
+    assert 1 <= pressed <= 12
+    low, high = np.min(coefficients, axis=0), np.max(coefficients, axis=0)
+    assert (low >= 0).all() and (low < 0.05).all() and (high > 0.95).all() and (high <= 1).all()
+
+
+def test_the_shares_of_varied_starts_are_those_that_are_told(cast, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(scenarios, "_toss", lambda *_: drawn.append("tossed"))
+    monkeypatch.setattr(scenarios, "at_rest", lambda *_: drawn.append("resting"))
+    monkeypatch.setattr(scenarios, "set_moving", lambda *args: drawn.append(args[3]))
+    rng = np.random.default_rng(0)
+    with Teacher(np.array(GRAVITY)) as teacher:
+        for _ in range(1000):
+            assert RECIPES["varied"].spawn(teacher, rng, cast) is None
+    assert set(SHARES) == {"tossed", "resting", *MOTIONS} and sum(SHARES.values()) == pytest.approx(1.0)
+    assert {name: drawn.count(name) / 1000 for name in SHARES} == pytest.approx(SHARES, abs=0.04)
+
+
+def in_motion(motion: str, seed: int, cast: Cast, steps: int, count: int = 2):
+    """Balls and cubes, from a start in plain motion on."""
+    sources = [cast.scenery["ball"]] if motion == "rolling" else [cast.scenery["ball"], *cast.shapes]
+    with Teacher(np.array(GRAVITY)) as teacher:
+        bodies = [(s, TeacherBody(s.urdf, 1.0, 2.0, 0.8, 0.5)) for s in (sources * count)[:count]]
+        assert set_moving(teacher, np.random.default_rng(seed), bodies, motion, 100)
+        assert not any(teacher.overlaps(i) for i in range(count))
+        return teacher.run(steps)
+
+
+def test_bodies_in_plain_motion_do_what_their_start_says(cast):
+    rolling = [in_motion("rolling", seed, cast, 0, 4) for seed in range(10)]
+    velocity, spin = (np.concatenate([m[name][0] for m in rolling]) for name in ("velocity", "angular_velocity"))
+    off = np.linalg.norm(np.cross(spin, [0.0, 0.0, -0.5]) + velocity, axis=1)
+    along = (np.abs(velocity[:, :2]) < 1e-9).any(1)
+    assert 8 <= (off < 1e-9).sum() <= 32 and 8 <= along.sum() <= 32 and not velocity[:, 2].any()
+    slides = in_motion("sliding", 0, cast, 100)
+    assert not slides["angular_velocity"][0].any()
+    assert np.linalg.norm(slides["velocity"][[0, -1], 1], axis=-1) @ [0, 1] < 0.1, "the cube has stopped"
+    spins = in_motion("spinning", 0, cast, 25)
+    assert not spins["velocity"][0].any() and (np.abs(spins["angular_velocity"][0]) >= [0, 0, SPINS[0]]).all()
+    assert np.abs(spins["position"][-1] - spins["position"][0])[:, :2].max() < 0.05
+    falls = in_motion("falling", 0, cast, 5)
+    assert not falls["velocity"][0].any() and (falls["velocity"][-1, :, 2] < -0.2).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_head_on_pairs_meet_in_flight_and_touch_nothing_else(cast, seed):
+    motion = in_motion("head-on", seed, cast, 100, 4)
+    assert motion["position"][..., 2].min() > 5.0
+    velocity = motion["velocity"]
+    for pair in ([0, 1], [2, 3]):
+        closing = np.cross(velocity[0, pair[0]], velocity[0, pair[1]])
+        assert np.abs(closing).max() < 1e-9 and velocity[0, pair[0]] @ velocity[0, pair[1]] < 0
+        hit = np.abs(velocity[-1, pair[0], :2] - velocity[0, pair[0], :2]).max()
+        assert hit > 0.1
+        momentum = velocity[:, pair, :2].sum(1)
+        np.testing.assert_allclose(momentum, momentum[:1].repeat(101, 0), atol=1e-9)
+
+
+def test_the_mass_ratio_of_varied_scenes_holds_whatever_the_volumes_are(cast):
+    """Of bodies whose densities alone would differ more: the ratio wins."""
+    cube = cast.shapes[0]
+    both = replace(cast, shapes=[cube, replace(cube, name="sliver", volume=1e-5 * cube.volume)])
+    mixed = 0
+    for seed in range(30):
+        placed, _, _ = spawned("varied", seed, both)
+        masses = [body.mass for _, body in placed if body.mass > 0]
+        assert max(masses) / min(masses) <= MASS_RATIO * (1 + 1e-9)
+        mixed += len({source.name for source, body in placed if body.mass > 0}) == 2
+    assert mixed > 10
+
+
+def test_shapes_that_fit_nowhere_are_told_and_not_waited_for(cast, monkeypatch):
+    monkeypatch.setattr(generate, "REDRAWS", 3)
+    (cube,) = cast.shapes
+    large = replace(cube, vertices=100 * cube.vertices)  # metres taken for centimetres
+    with pytest.raises(SdfsimError, match="no room for the bodies of movi-b") as error:
+        make_trajectory("movi-b", np.random.default_rng(0), replace(cast, shapes=[large]))
+    assert "metres" in error.value.hint
+
+
+@pytest.mark.parametrize("start", STARTS)
+def test_resting_starts_are_low_and_slow_and_still_cubes_stay(cast, start):
+    (cube,) = cast.shapes
+    with Teacher(np.array(GRAVITY)) as teacher:
+        bodies = [(cube, TeacherBody(cube.urdf, 0.8 + 0.05 * k, 1.0, 0.5, 0.2)) for k in range(6)]
+        # Smaller ones on top: a cube that hangs over may fall.
+        assert at_rest(teacher, np.random.default_rng(1), bodies[::-1], start, 100)
+        motion = teacher.run(50)
+    lowest = motion["position"][0, :, 2] - 0.5 * np.array([b.scale for _, b in bodies[::-1]])
+    pressed = PRESSED if start == "pressed" else 0.0
+    assert -pressed < lowest.min() <= DROP + pressed
+    assert (lowest.min() < 0) == (start == "pressed")
+    assert np.abs(motion["velocity"][0]).max() <= NUDGE
+    moved = np.linalg.norm(motion["position"] - motion["position"][0], axis=-1).max()
+    assert moved < 0.005 if start == "still" else moved > 0.005
+
+
+def test_a_body_stands_on_the_faces_that_its_centre_is_above(cast):
+    corners = primitives.box((1.0, 1.0, 1.0)).vertices
+    assert sorted(map(tuple, steady_faces(corners).round(6) + 0.0)) == sorted(
+        map(tuple, np.concatenate([np.eye(3), -np.eye(3)]))
+    )
+    # A frustum whose centre of mass is beside its small end: only the other five faces are steady.
+    low, high = corners[corners[:, 2] < 0], corners[corners[:, 2] > 0] * [0.1, 0.1, 1.0] + [0.3, 0.0, 0.0]
+    faces = steady_faces(np.concatenate([low, high]))
+    assert not (faces[:, 2] > 0.99).any() and (faces[:, 2] < -0.99).sum() == 1
+
+
+@pytest.mark.parametrize("recipe", ["movi-c", "bowl", "pile", "varied"])
+def test_a_trajectory_depends_on_seed_split_and_number_alone(cast, recipe):
+    few = replace(cast, bodies=4) if RECIPES[recipe].counted else cast
+
+    def made(seed: int, split: str, index: int) -> Trajectory:
+        return make_trajectory(recipe, np.random.default_rng([seed, SPLITS.index(split), index]), few)
+
+    one = made(0, "train", 3)
+    np.testing.assert_array_equal(made(0, "train", 3).position, one.position)
+    for other in (made(1, "train", 3), made(0, "test", 3), made(0, "train", 2)):
+        assert other.position.shape != one.position.shape or not np.array_equal(other.position, one.position)
+
+
+def test_a_dataset_goes_on_where_it_was_and_refuses_another(cube_meshes, tmp_path):
+    analytic_shape("box", size=(1.0, 1.0, 1.0), name="cube").save(tmp_path / "shapes" / "cube")
+    report = make_dataset("pile", tmp_path, trajectories=2, shapes=cube_meshes, bodies=4)
+    files = trajectory_files(tmp_path, "train")
+    before = [Trajectory.load(file).position for file in files]
+    files[1].unlink()
+    again = make_dataset("pile", tmp_path, trajectories=2, shapes=cube_meshes, bodies=4)
+    assert report["made_now"] == 2 and again["made_now"] == 1 and again["statistics"] == report["statistics"]
+    np.testing.assert_array_equal(Trajectory.load(files[1]).position, before[1])
+    with pytest.raises(SdfsimError, match="a dataset of 50 frames a second, not 60"):
+        make_dataset("pile", tmp_path, trajectories=2, shapes=cube_meshes, bodies=4, fps=60)
+    with pytest.raises(SdfsimError, match="--fps must be 50 or 60"):
+        make_dataset("pile", tmp_path, trajectories=2, shapes=cube_meshes, bodies=4, fps=30)
+    with pytest.raises(SdfsimError, match="another recipe, seed, engine, count"):
+        make_dataset("pile", tmp_path, trajectories=2, shapes=cube_meshes, bodies=5)
+    found = report["statistics"]
+    assert found["bodies"] == [4, 4, 4] and found["static_bodies"] == 0 and found["resting_at_start"] == 1.0
+    assert 0.5 <= found["extent_m"][0] <= found["extent_m"][2] <= 1.5
+    assert "  bodies: 4 to 4, mean 4" in statistics_lines(found)
+
+
+def bowl_shapes(folder):
+    """Shape folders of the bowl recipe without a fit: a coarse grid, and a sphere."""
+    mesh = primitives.bowl()
+    volume, com, inertia = mass_properties(mesh)
+    mesh = replace(mesh, vertices=mesh.vertices - com)
+    sdf, _ = sdf_of_mesh(mesh, "grid", 24)
+    Shape("bowl", mesh, sdf, mesh.vertices[::8], volume, com, inertia).save(folder / "bowl")
+    analytic_shape("sphere", radius=0.5, name="ball").save(folder / "ball")
+
+
+def test_static_scenery_takes_part_in_contacts_but_never_in_what_is_learnt(cast, tmp_path, monkeypatch):
+    bowl_shapes(tmp_path / "shapes")
+    (tmp_path / "train").mkdir()
+    t = make_trajectory("bowl", np.random.default_rng(0), replace(cast, bodies=5))
+    t.save(tmp_path / "train" / "00000.npz")
+    frames = contact_frames(tmp_path, "train", 0.1)
+    assert (frames.mass.reshape(-1, 6)[:, 0] == 0).all() and (frames.mass.reshape(-1, 6)[:, 1:] > 0).all()
+    assert (frames.first == 0).any() and (frames.second == 0).any()  # the bowl's nodes count, and so does its surface
+    task = ImpulseTask(frames, torch.device("cpu"), None)
+    batch = task.batch(np.arange(len(frames)))
+    fixed = torch.arange(len(batch.counts)) % 6 == 0
+    assert not batch.counts[fixed].any() and not batch.graph.inverse_mass[fixed].any()
+    assert not batch.graph.inverse_inertia[fixed].any() and batch.graph.gap.isfinite().all()
+    assert task.ranges()["mass_ratio"] == [1.0, 1.0] and np.isfinite(task.weight).all()
+    shapes = load_shapes(tmp_path, {"bowl", "ball"})
+    whole = batching.find_edges(t, shapes, 0.1)
+    monkeypatch.setattr(batching, "TOGETHER", 50)
+    for name, values in batching.find_edges(t, shapes, 0.1).items():
+        np.testing.assert_allclose(values, whole[name], atol=1e-9)
+
+
+def test_statistics_of_balls_are_those_of_their_closed_forms(ball_data):
+    found = statistics(ball_data, "train")
+    assert found["bodies"] == [2, 2, 2] and found["volume_m3"] == pytest.approx([4 / 3 * np.pi / 8] * 3)
+    assert found["mass_ratio"] == pytest.approx([2.0] * 3) and found["nodes_per_scene"] == 256
+    assert 0 < found["contacts_per_step"] < 256 and "published" not in found

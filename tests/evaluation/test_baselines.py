@@ -1,0 +1,123 @@
+"""The teacher against itself: a start that differs by next to nothing, closed forms where nothing is chaotic."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pybullet")
+
+from sdfsim.data.dataset import Trajectory, read_info, trajectory_files
+from sdfsim.data.generate import make_dataset
+from sdfsim.errors import SdfsimError
+from sdfsim.evaluation import baselines
+from sdfsim.evaluation.baselines import chaos_floor, engine_file, run_again
+from sdfsim.evaluation.evaluate import evaluate
+from sdfsim.evaluation.tables import error_rows, notes
+from tests.dynamics.conftest import random_model
+
+
+@pytest.fixture
+def falling(cube_data, cube_meshes, tmp_path):
+    """A dataset of one cube that falls freely for 2 s, spinning, beside a static one; as the teacher records it."""
+    whole = Trajectory.load(trajectory_files(cube_data, "test")[0])
+    of_bodies = ("scale", "mass", "friction", "restitution", "shape")
+    two = replace(
+        whole,
+        **{name: getattr(whole, name)[[0, 0]] for name in of_bodies},
+        **{name: getattr(whole, name)[:, [0, 0]].copy() for name in ("quat_xyzw", "velocity")},
+        position=np.tile([[0.0, 0.0, 50.0], [5.0, 0.0, 0.5]], (101, 1, 1)),
+        angular_velocity=np.tile([[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]], (101, 1, 1)),
+        inertia=whole.inertia[[0, 0]],
+        static=np.array([False, True]),
+    )
+    two.velocity[:, 1] = 0.0
+    urdf = engine_file(cube_data, "cube")
+    for name in ("shapes", "test"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "shapes" / "cube").symlink_to(cube_data / "shapes" / "cube")
+    (tmp_path / "shapes" / "engine").symlink_to(cube_data / "shapes" / "engine")
+    (tmp_path / "dataset.json").write_text((cube_data / "dataset.json").read_text())
+    run_again(two, {"cube": urdf}, (0.3, 0.5), 100).save(tmp_path / "test" / "0.npz")
+    return tmp_path
+
+
+def test_free_fall_keeps_a_perturbation_as_it_is(falling):
+    """A start that is e m/s off is e t off at t: e dt sqrt(mean k^2) over the steps; scenery stays where it is."""
+    report = evaluate(falling, model=random_model("impulse"), chaos_floor=True)
+    expected = 0.02 * np.sqrt(np.mean(np.arange(1, 101) ** 2.0))
+    runs = report["chaos_floor"]["perturbations"]
+    for name, size in (("1e-3", 1e-3), ("1e-6", 1e-6)):
+        assert runs[name]["100"]["translation_rmse"] == pytest.approx(size * expected, rel=1e-4)
+        assert runs[name]["100"]["rotation_error"] < 1e-5
+    assert runs["0"]["100"]["translation_rmse"] < 1e-9
+    assert report["chaos_floor"]["median_farthest_unperturbed_m"] < 1e-9
+    assert report["energy_gain"]["teacher"]["worst"] < 1e-9 and report["penetration"]["teacher"]["worst"] is None
+    assert set(report["survival"]["teacher 1e-3"]["0.1"]) == {1.0}
+
+
+def test_perturbations_repeat_and_have_the_size_they_are_named_by(cube_data):
+    trajectories = [Trajectory.load(f) for f in trajectory_files(cube_data, "test")]
+    one, two = (chaos_floor(cube_data, trajectories, 20) for _ in range(2))
+    for a, b, t in zip(one["1e-3"], two["1e-3"], trajectories, strict=True):
+        np.testing.assert_array_equal(a.position, b.position)
+        np.testing.assert_allclose(np.linalg.norm(a.velocity[0] - t.velocity[0], axis=-1), 1e-3, rtol=1e-9)
+        assert len(a.position) == 21
+    np.testing.assert_array_equal(one["0"][0].position[0], trajectories[0].position[0])
+    other = chaos_floor(cube_data, trajectories, 1, seed=1)
+    assert not np.array_equal(other["1e-3"][0].velocity[0], one["1e-3"][0].velocity[0])
+
+
+def test_the_recording_comes_back_before_chaos_grows(cube_data):
+    """Only rounding differs (an orientation goes through a matrix and back), so the first second agrees closely."""
+    report = evaluate(cube_data, model=random_model("impulse", push=0.02), steps=50, chaos_floor=True)
+    assert report["chaos_floor"]["perturbations"]["0"]["50"]["translation_rmse"] < 1e-4
+
+
+def test_recordings_of_60_frames_a_second_come_back_too(cube_data, cube_meshes, tmp_path):
+    (tmp_path / "shapes").mkdir()
+    (tmp_path / "shapes" / "cube").symlink_to(cube_data / "shapes" / "cube")
+    make_dataset("movi-b", tmp_path, shapes=cube_meshes, trajectories=1, split="test", fps=60)
+    assert read_info(tmp_path)["engine_settings"]["timeStep"] == pytest.approx(1 / 240)
+    recorded = Trajectory.load(tmp_path / "test" / "00000.npz")
+    assert len(recorded.position) == 101 and recorded.dt == pytest.approx(1 / 60)
+    again = chaos_floor(tmp_path, [recorded], 30)["0"][0]
+    np.testing.assert_allclose(again.position, recorded.position[:31], atol=1e-4)
+
+
+def test_without_the_engine_the_rows_are_left_out_in_one_line(falling, monkeypatch):
+    def absent():
+        raise SdfsimError("PyBullet is not installed", "pip install 'sdfsim[data]'")
+
+    monkeypatch.setattr(baselines, "import_pybullet", absent)
+    report = evaluate(falling, model=random_model("impulse"), chaos_floor=True)
+    assert set(report["chaos_floor"]) == {"left_out"}
+    assert [line for line in notes(report) if "PyBullet is not installed (pip install 'sdfsim[data]')" in line]
+    assert [row[0] for row in error_rows(report, name="mine", ballistic="none")] == ["", "mine", "none"]
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"engine": "mujoco"}, "recorded by mujoco"),
+        ({"engine_settings": {"timeStep": 0.01}}, "other engine settings"),
+    ],
+)
+def test_recordings_of_others_have_no_floor(falling, change, complaint):
+    info = json.loads((falling / "dataset.json").read_text()) | change
+    (falling / "dataset.json").write_text(json.dumps(info))
+    trajectories = [Trajectory.load(f) for f in trajectory_files(falling, "test")]
+    with pytest.raises(SdfsimError, match=complaint):
+        chaos_floor(falling, trajectories, 5)
+
+
+def test_missing_engine_files_and_another_inertia_are_named(falling):
+    trajectories = [Trajectory.load(f) for f in trajectory_files(falling, "test")]
+    with pytest.raises(SdfsimError, match="inertia"):
+        chaos_floor(falling, [replace(t, inertia=2 * t.inertia) for t in trajectories], 5)
+    with pytest.raises(SdfsimError, match=r"dt|step"):
+        chaos_floor(falling, [replace(t, dt=0.01) for t in trajectories], 5)
+    (falling / "shapes" / "engine").unlink()
+    with pytest.raises(SdfsimError, match="no engine file of shape 'cube'"):
+        chaos_floor(falling, trajectories, 5)

@@ -1,0 +1,117 @@
+"""The *paper* network's batches: the inputs that the simulator gives it, noise that does not depend on who draws it."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from sdfsim.data.batching import merged, scene_of
+from sdfsim.data.dataset import Trajectory, load_shapes
+from sdfsim.data.replay import roll_out
+from sdfsim.dynamics.bodies import Units
+from sdfsim.dynamics.simulator import Simulator
+from sdfsim.errors import SdfsimError
+from sdfsim.training.contact_cache import contact_frames
+from sdfsim.training.distributed import Team
+from sdfsim.training.paper_task import PaperTask
+from tests.dynamics.conftest import random_model
+from tests.recordings import bouncing
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture
+def pair(ball_data):
+    """Two trajectories that start on the floor, the bodies of one seventy times as heavy; and the shapes."""
+    one, two = (Trajectory.load(ball_data / "train" / f"{k}.npz") for k in range(2))
+    one, two = (replace(t, position=t.position - [0, 0, t.position[0, :, 2].min() - 0.5]) for t in (one, two))
+    return [one, replace(two, mass=70 * two.mass, inertia=70 * two.inertia)], load_shapes(ball_data, {"ball"})
+
+
+@pytest.mark.parametrize(("kind", "free_flight"), [("paper", "learned"), ("paper", "exact"), ("impulse", "exact")])
+def test_the_first_step_of_an_evaluation_is_the_simulators(pair, kind, free_flight):
+    """Also of scenes whose bodies weigh differently: neither knows what a kilogram is."""
+    group, shapes = pair
+    model = random_model(kind)
+    for t in group:
+        (motion,) = roll_out(model, [t], shapes, 1, CPU, free_flight)
+        (flown,) = roll_out(model, [t], shapes, 1, CPU, contact=False)
+        assert np.abs(motion.position - flown.position).max() > 1e-4
+        simulator = Simulator(scene_of([t], [0], shapes)[0], model, dt=t.dt, free_flight=free_flight)
+        (state,) = simulator.steps(1)
+        np.testing.assert_allclose(motion.position[1], state.position[:-1].numpy(), rtol=0, atol=1e-6)
+        np.testing.assert_allclose(motion.velocity[1], state.velocity[:-1].numpy(), rtol=0, atol=1e-4)
+
+
+def test_training_sees_masses_relative_to_the_scenes_mean(pair, ball_data):
+    group, shapes = pair
+    bodies, _ = merged(group, [0, 0], shapes, Units(1.0, 1.0, 1.0), CPU)
+    # 2 and 1 kg, and 140 and 70 kg: around 1.5 and 105.
+    assert bodies.inverse_mass.tolist() == pytest.approx([0.75, 1.5, 0.75, 1.5, 0.0])
+    radii = (torch.diagonal(bodies.inertia, dim1=1, dim2=2)[:4, 0] / bodies.mass[:4]).tolist()
+    assert radii == pytest.approx([0.05, 0.1, 0.05, 0.1])
+    task = PaperTask(ball_data, "train", 0.1, CPU, None)
+    task.trajectories = group
+    seen = task.draw(np.random.default_rng(0), 8).graph.body[:, 9]
+    assert sorted(set(seen.tolist())) == pytest.approx([0.0, 0.75, 1.5])
+
+
+def test_bodies_alone_that_never_move_have_no_mean_mass(pair):
+    group, shapes = pair
+    still = replace(group[0], static=np.ones(2, dtype=bool), mass=np.zeros(2))
+    bodies, _ = merged([still], [0], shapes, Units(1.0, 1.0, 1.0), CPU)
+    assert bodies.mass.tolist() == [0.0, 0.0, 0.0]
+
+
+def test_the_mass_ratio_is_that_within_a_scene(pair, ball_data):
+    task = PaperTask(ball_data, "train", 0.1, CPU, None)
+    task.trajectories = pair[0]
+    assert task.ranges()["mass_ratio"] == [1.0, pytest.approx(2.0)]
+
+
+def test_the_parts_of_a_noisy_batch_are_the_batch(ball_data):
+    task = PaperTask(ball_data, "train", 0.1, CPU, 0.003)
+
+    def drawn(team: Team):
+        batch = task.draw(np.random.default_rng(3), 8, team)
+        return torch.cat([batch.graph.node, batch.target], -1)[batch.moves]
+
+    whole, parts = drawn(Team()), [drawn(Team(rank, 3)) for rank in range(3)]
+    torch.testing.assert_close(torch.cat(parts), whole, rtol=0, atol=0)
+    exact = PaperTask(ball_data, "train", 0.1, CPU, None).draw(np.random.default_rng(3), 8)
+    assert not torch.equal(exact.graph.node, task.draw(np.random.default_rng(3), 8).graph.node)
+
+
+def test_noise_walks_by_the_given_size(ball_data):
+    """The last of three poses is off by it, the first by a third of the variance; the recorded target is not."""
+    task = PaperTask(ball_data, "train", 0.1, CPU, 0.003)
+    picked = [task.trajectories[k % 6] for k in range(2000)]
+    noise = task._noise(picked, np.random.default_rng(0), Team())
+    assert noise is not None and noise.shape == (3, 2, 4001, 3)
+    size = noise[:, 0].cumsum(0).std((1, 2)).tolist()
+    assert size == pytest.approx([0.003 * (k / 3) ** 0.5 for k in (1, 2, 3)], rel=0.03)
+
+
+def test_ranges_are_of_what_moves(pair, ball_data):
+    """Scenery is as large as it likes, and does not set the model's unit of length."""
+    (one, _), _ = pair
+    task = PaperTask(ball_data, "train", 0.1, CPU, None)
+    task.trajectories = [one]
+    known = task.ranges()
+    scenery = {"static": np.array([False, True]), "scale": np.array([1.0, 9.0]), "mass": np.array([2.0, 0.0])}
+    task.trajectories = [one, replace(one, **scenery, velocity=one.velocity * [[[1.0], [9.0]]])]
+    assert task.ranges()["size"] == known["size"] and task.ranges()["speed"][1] < 2 * known["speed"][1]
+
+
+def test_trajectories_of_different_steps_are_not_trained_on_together(ball_data, tmp_path):
+    shutil.copytree(ball_data, tmp_path / "data")
+    for other in ({"dt": 0.01}, {"gravity": np.array([0.0, 0.0, -5.0])}):
+        replace(bouncing(3), **other).save(tmp_path / "data" / "train" / "9.npz")
+        for read in (
+            lambda data: PaperTask(data, "train", 0.1, CPU, None),
+            lambda data: contact_frames(data, "train", 0.1),
+        ):
+            with pytest.raises(SdfsimError, match=r"train: its trajectories differ in step or gravity"):
+                read(tmp_path / "data")

@@ -1,0 +1,111 @@
+"""What a run goes on with: the same data, frames of this version, all that the model's card needs."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from sdfsim.data.dataset import Trajectory
+from sdfsim.dynamics.model import load_model
+from sdfsim.errors import SdfsimError
+from sdfsim.training import contact_cache
+from sdfsim.training.contact_cache import ContactFrames, contact_frames
+from sdfsim.training.train import train
+from tests.recordings import bouncing
+
+
+@pytest.fixture
+def frames_only(ball_data, tmp_path):
+    """What the machine that trains is given: contact frames and dataset.json."""
+    for split in ("train", "validation"):
+        contact_frames(ball_data, split, 0.1)
+    shutil.copytree(ball_data / "frames", tmp_path / "given" / "frames")
+    shutil.copy(ball_data / "dataset.json", tmp_path / "given")
+    return tmp_path / "given"
+
+
+def rewritten(file, change) -> None:
+    """An .npz again with `change` applied to its arrays."""
+    with np.load(file) as data:
+        arrays = dict(data)
+    change(arrays)
+    np.savez(file, **arrays)
+
+
+def test_frames_alone_train_the_same_model_with_the_same_card(frames_only, ball_data, presets, tmp_path):
+    train(frames_only, tmp_path / "one", preset="tiny", steps=5)
+    train(ball_data, tmp_path / "two", preset="tiny", steps=5)
+    one, two = (load_model(tmp_path / name / "model.safetensors") for name in ("one", "two"))
+    assert one.card["data"] == two.card["data"]
+    assert one.card["data"][0]["trajectories"] == {"train": 6, "validation": 2}
+    weights = two.network.state_dict()
+    assert all(torch.equal(value, weights[name]) for name, value in one.network.state_dict().items())
+    both = contact_frames(frames_only, "train", 0.1), contact_frames(frames_only, "validation", 0.1)
+    assert contact_cache.join_frames(list(both)).trajectories.tolist() == [6, 2]
+
+
+def test_what_the_card_needs_is_missed_before_training(frames_only, presets, tmp_path):
+    (frames_only / "dataset.json").unlink()
+    with pytest.raises(SdfsimError, match=r"dataset\.json"):
+        train(frames_only, tmp_path / "run", preset="tiny", steps=5)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("version", [None, contact_cache.FRAMES_VERSION - 1])
+def test_frames_of_another_version_are_refused_where_nothing_else_tells_it(frames_only, ball_data, version):
+    def change(arrays):
+        del arrays["version"], arrays["trajectories"]
+        if version is not None:
+            arrays["version"] = np.array(version)
+
+    file = next((frames_only / "frames").glob("train-*.npz"))
+    rewritten(file, change)
+    with pytest.raises(SdfsimError, match="its contacts were found") as error:
+        contact_frames(frames_only, "train", 0.1)
+    assert file.name in error.value.message and "made again" in error.value.hint
+    # Beside the trajectories the name proves the version: caches from before it was written go on being used.
+    again = ContactFrames.load(file)
+    assert again.trajectories.tolist() == [0] and again.digest() == contact_frames(ball_data, "train", 0.1).digest()
+
+
+@pytest.mark.parametrize("preset", ["tiny", "tiny-paper"])
+def test_a_run_does_not_go_on_with_other_data(ball_data, presets, preset, tmp_path):
+    other = tmp_path / "other"
+    shutil.copytree(ball_data, other, ignore=shutil.ignore_patterns("frames"))
+    bouncing(55).save(other / "train" / "3.npz")
+    train(ball_data, tmp_path / "run", preset=preset, steps=2)
+    before = (tmp_path / "run" / "checkpoint.npz").read_bytes()
+    with pytest.raises(SdfsimError, match="trained on other data"):
+        train(other, tmp_path / "run", preset=preset, steps=2, resume=True)
+    assert (tmp_path / "run" / "checkpoint.npz").read_bytes() == before
+    shutil.copytree(ball_data, tmp_path / "copy")
+    assert train(tmp_path / "copy", tmp_path / "run", preset=preset, steps=2, resume=True)["steps"] == 2
+
+
+def test_a_checkpoint_from_before_data_had_a_digest_goes_on(ball_data, presets, tmp_path):
+    train(ball_data, tmp_path, preset="tiny", steps=2)
+
+    def change(arrays):
+        run = json.loads(str(arrays["run"]))
+        del run["data"]
+        arrays["run"] = np.array(json.dumps(run))
+
+    rewritten(tmp_path / "checkpoint.npz", change)
+    assert train(ball_data, tmp_path, preset="tiny", steps=2, resume=True)["steps"] == 2
+
+
+def test_training_goes_without_rollouts_where_shapes_are_missing_and_says_so(ball_data, presets, tmp_path):
+    data, told = tmp_path / "data", []
+    contact_frames(ball_data, "train", 0.1)
+    contact_frames(ball_data, "validation", 0.1)
+    shutil.copytree(ball_data, data)
+    (data / "shapes" / "ball" / "sdf.npz").unlink(missing_ok=True)
+    for file in (data / "shapes" / "ball").iterdir():
+        if file.name != "shape.json":
+            file.unlink()
+    train(data, tmp_path / "run", preset="tiny", steps=5, on_progress=lambda f, m: told.append(m))
+    assert sum(m.startswith("no rollouts while training: ") for m in told) == 1
+    assert "rollout_m" not in (tmp_path / "run" / "log.jsonl").read_text()
+    assert Trajectory.load(data / "train" / "0.npz").dt == 0.02
