@@ -15,7 +15,7 @@ from sdfsim.dynamics.energy import Guard
 from sdfsim.dynamics.graph import SUBSTEPS
 from sdfsim.dynamics.history import with_history
 from sdfsim.dynamics.memory import Memory
-from sdfsim.dynamics.model import SOLVER, Model
+from sdfsim.dynamics.model import Model
 from sdfsim.dynamics.sleep import nobody_asleep
 from sdfsim.dynamics.step import FreeFlight, Rules, step
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
@@ -67,7 +67,7 @@ def roll_out(
     bodies, state = merged(group, [0] * len(group), shapes, units, device, floor)
     gravity = torch.tensor(group[0].gravity / units.acceleration, dtype=torch.float64, device=device)
     rules = Rules(
-        gravity, group[0].dt / units.time, substeps, contact=contact, free_flight=free_flight, guard=guard,
+        gravity, group[0].dt / units.time, model.inner or substeps, contact=contact, free_flight=free_flight, guard=guard,
         margin=MARGIN / units.length if as_teacher else 0.0, adds=as_teacher,
     )  # fmt: skip
     if model.kind == "paper":
@@ -118,7 +118,7 @@ def first_frames(trajectory: Trajectory, count: int) -> Trajectory:
 def model_units(model: Model, like: Trajectory) -> Units:
     """Model units in which the recorded step is the model's own; for the solver those of its bodies of a metre."""
     strength = float(np.linalg.norm(like.gravity)) or model.gravity
-    if model.kind == SOLVER:  # it takes the inner steps that it is told
+    if model.kind != "paper":  # the solve takes the inner steps that it is told
         return Units(length=1.0, time=float(np.sqrt(model.gravity / strength)), mass=1.0)
     length = (like.dt / model.dt) ** 2 * strength / model.gravity
     return Units(length=length, time=like.dt / model.dt, mass=1.0)

@@ -6,39 +6,35 @@ the prediction turns with the scene and does not depend on the choice of units.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
 
 REST_SPEED = 0.2  # model units: what gravity adds to a speed in one step of training; slower counts as resting
-EDGE_FEATURES = 32
-# Model length: nearer than this surfaces touch. The engine's own limit is 0, where all lies that was put down exactly:
-# there rounding would decide.
-TOUCH = 1e-4
+EDGE_FEATURES = 30
 SUBSTEPS = 5  # inner steps in one step of the engine that the training data come from; some recordings have fewer
 
 
 @dataclass(frozen=True)
 class ContactGraph:
-    """N bodies and E contact edges in single precision, relative quantities only.
-
-    The edge's point is midway between the node of body `first` and the closest point of body `second`; `arm_*`
-    reach it from the centres of mass.
+    """N bodies and E places where the contact solve had them meet or nearly meet, in single precision.
 
     Attributes:
         inverse_mass: [N], 0 for bodies that do not move.
         inverse_inertia: [N, 3, 3], world axes, 0 for bodies that do not move.
         velocity, angular: [N, 3] at the start of the step.
         free_velocity, free_angular: [N, 3] at its end in free flight.
-        mean_velocity, mean_angular: [N, 3] the mean over the step in free flight.
+        solved_velocity, solved_angular: [N, 3] at its end as the solve has it.
+        mean_velocity, mean_angular: [N, 3] the mean over the step as the solve has it.
         first, second: [E] int64.
         pair: [E] int64, number of the unordered pair of bodies, 0 ... pairs - 1.
         pairs: how many pairs there are.
-        normal: [E, 3], outward from `second`.
-        arm_first, arm_second: [E, 3].
-        gap: [E] signed distance.
-        substeps: [E] inner steps that the engine makes in this step, at most `SUBSTEPS`.
+        normal: [E, 3], from `second` to `first`.
+        arm_first, arm_second: [E, 3] from the centres of mass.
+        impulse: [E, 3] that the solve gave `first`, and opposite `second`.
+        gap: [E] signed distance when the place was first looked at.
+        when: [E] the part of the step that was over by then.
         friction, restitution: [E] products of the two bodies' coefficients.
         dt: the step.
     """
@@ -49,6 +45,8 @@ class ContactGraph:
     angular: Tensor
     free_velocity: Tensor
     free_angular: Tensor
+    solved_velocity: Tensor
+    solved_angular: Tensor
     mean_velocity: Tensor
     mean_angular: Tensor
     first: Tensor
@@ -58,11 +56,17 @@ class ContactGraph:
     normal: Tensor
     arm_first: Tensor
     arm_second: Tensor
+    impulse: Tensor
     gap: Tensor
-    substeps: Tensor
+    when: Tensor
     friction: Tensor
     restitution: Tensor
     dt: float
+
+    def to(self, device: torch.device) -> ContactGraph:
+        """The same on another device."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return replace(self, **{k: v.to(device) for k, v in values.items() if isinstance(v, Tensor)})
 
 
 @dataclass(frozen=True)
@@ -77,6 +81,8 @@ class EdgeFrames:
         mass: [E, 3] effective mass along each axis; 0 along those on which nothing may act.
         read_first, read_second: [E, 3, 6] of a twist, the velocity of the contact point along each axis.
         give_first, give_second: [E, 6, 3] the twist that a unit impulse along each axis gives, opposite to the second.
+        solved: [E, 3] impulse of the solve along each axis.
+        slip: [E, 3] relative velocity at the start of the step along each axis.
         start: [E, EDGE_FEATURES] input features.
     """
 
@@ -86,6 +92,8 @@ class EdgeFrames:
     read_second: Tensor
     give_first: Tensor
     give_second: Tensor
+    solved: Tensor
+    slip: Tensor
     start: Tensor
 
 
@@ -127,8 +135,10 @@ def edge_frames(graph: ContactGraph, *, mirrored: bool = False) -> EdgeFrames:
         [push_first * mass[:, :1], push_second * mass[:, :1], twist_first[:, 0, 0, None] * mass[:, :1]], -1
     )
     count = torch.zeros(g.pairs, dtype=g.gap.dtype, device=g.gap.device).index_add_(0, g.pair, torch.ones_like(g.gap))
+    solved = (axes @ g.impulse[..., None])[..., 0]
     in_frame = axes @ torch.stack([slip, lift, _centripetal(g)], -1)  # [E, axis, quantity]
     scaled = (in_frame / speed[..., None]).flatten(1)
+    given = solved / (mass * speed)
     gap = g.gap[:, None] / (speed * g.dt)
     fixed = torch.stack([(push_first == 0)[:, 0], (push_second == 0)[:, 0]], -1).to(gap.dtype)
     start = torch.cat(
@@ -136,6 +146,7 @@ def edge_frames(graph: ContactGraph, *, mirrored: bool = False) -> EdgeFrames:
             torch.asinh(gap),
             g.gap[:, None] * 10.0,
             scaled,
+            torch.asinh(given),
             torch.log(speed / REST_SPEED),
             torch.log(mass[:, 1:] / mass[:, :1]),
             coupling,
@@ -144,7 +155,8 @@ def edge_frames(graph: ContactGraph, *, mirrored: bool = False) -> EdgeFrames:
             g.restitution[:, None],
             torch.log(count[g.pair])[:, None] * 0.5,
             fixed,
-            _meeting(g, in_frame[:, 0], speed),
+            g.when[:, None],
+            (given[:, :1] > 0).to(gap.dtype),
         ],
         -1,
     )
@@ -155,6 +167,8 @@ def edge_frames(graph: ContactGraph, *, mirrored: bool = False) -> EdgeFrames:
         read_second=torch.cat([axes, moment_second], -1),
         give_first=torch.cat([axes * push_first[..., None], turn_first], -1).mT,
         give_second=torch.cat([axes * push_second[..., None], turn_second], -1).mT.neg(),
+        solved=solved,
+        slip=in_frame[..., 0],
         start=start,
     )
 
@@ -165,47 +179,6 @@ def relative_velocity(graph: ContactGraph, velocity: Tensor, angular: Tensor) ->
     one = velocity[g.first] + torch.linalg.cross(angular[g.first], g.arm_first)
     two = velocity[g.second] + torch.linalg.cross(angular[g.second], g.arm_second)
     return one - two
-
-
-def _meeting(g: ContactGraph, normal_motion: Tensor, speed: Tensor) -> Tensor:
-    """[E, 7] where and when an engine of finite inner steps would first act on a contact, if all flew on till then.
-
-    Such an engine acts on surfaces that touch or overlap at the start of an inner step. Whether a body is hit in this
-    step, how long it flies on before, and how deep it is by then follow from the first such inner step. That is a
-    matter of quotients and thresholds, which are known and which a small network learns badly.
-
-    Args:
-        g: the graph.
-        normal_motion: [E, 3] along the normal: relative velocity, and what gravity and turning add to it in a step.
-        speed: [E, 1], the scale.
-    """
-    inner = g.dt / g.substeps
-    # Relative velocity, and its change in an inner step.
-    start, gain = normal_motion[:, 0], normal_motion[:, 1:].sum(-1) / g.substeps
-    count = torch.arange(SUBSTEPS, dtype=start.dtype, device=start.device)
-    # Symplectic Euler, as engines do it: [E, SUBSTEPS] distances at the start of each inner step.
-    path = g.gap[:, None] + inner[:, None] * (start[:, None] * count + gain[:, None] * count * (count + 1) / 2)
-    seen = ((path <= TOUCH) & (count < g.substeps[:, None])).to(start.dtype)
-    # Part of the step that is over before the contact is seen; 1: it is not seen in this step.
-    own = ((1.0 - seen.cummax(1).values).sum(1) / g.substeps).clamp_max(1.0)
-
-    def earliest(rows: int, *index: Tensor) -> Tensor:
-        first = torch.ones(rows, dtype=start.dtype, device=start.device)
-        for which in index:
-            first = first.scatter_reduce(0, which, own, "amin")
-        return first
-
-    of_pair = earliest(g.pairs, g.pair)[g.pair]
-    of_body = earliest(len(g.inverse_mass), g.first, g.second)
-    # Scenery meets many at once, which is of no account to any of them.
-    of_body = torch.where(g.inverse_mass > 0, of_body, torch.ones_like(of_body))
-    at = torch.minimum((of_pair * g.substeps).round(), g.substeps - 1)
-    distance = path.gather(1, at.long()[:, None])[:, 0]
-    arriving = (start + gain * (at + 1)) / speed[:, 0]
-    reach = inner * speed[:, 0]
-    times = torch.stack([own, of_pair, of_body[g.first], of_body[g.second]], -1)
-    places = torch.stack([torch.asinh(distance / reach), (distance <= TOUCH).to(start.dtype), arriving], -1)
-    return torch.cat([times, places], -1)
 
 
 def _axes(g: ContactGraph, slip: Tensor, lift: Tensor) -> tuple[Tensor, Tensor]:

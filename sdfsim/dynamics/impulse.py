@@ -1,14 +1,16 @@
-"""The *impulse* network: message passing between bodies over contact edges, whose decoded quantities are impulses.
+"""The *impulse* network: message passing between bodies over contact edges, on top of the contact solve.
 
-An impulse acts on both bodies of an edge, equal and opposite, at the contact point, with their true mass and
-inertia. So linear momentum is conserved exactly, angular momentum exactly at the instant the impulses act, and the
-step turns with the scene, whatever the weights are.
+What it decodes are impulses. They act on both bodies of an edge, equal and opposite, at the contact point, with their
+true mass and inertia. So linear momentum is conserved exactly, angular momentum exactly at the instant the impulses
+act, and the step turns with the scene, whatever the weights are.
+
+The rounds start from what the solve makes of the step, and what they add is held to a trust region (`bounded`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import cast
 
@@ -17,12 +19,9 @@ from torch import Tensor, nn
 
 from sdfsim.dynamics.graph import EDGE_FEATURES, ContactGraph, EdgeFrames, edge_frames
 
-# Relative velocities that a round sees are no larger than this, in units of the fastest motion before the step (1.7 in
-# training). Larger ones are a prediction that runs away, which the rounds after it must not feed on.
-FASTEST = 3.0
-# Longest latent vector of a body (5 in training). One among many more neighbours than there were hears so much that the
-# next rounds would amplify it without end.
-LOUDEST = 6.0
+# Model units, relative speeds of two surfaces before the step: up to the first what they do is left to the solve, from
+# the second on the network has its full say. So what rests, rolls or stands in a tower does what the solve knows.
+CALM, LIVELY = 0.05, 0.5
 
 
 @dataclass(frozen=True)
@@ -32,10 +31,13 @@ class ImpulseConfig:
     Attributes:
         width: of every latent and hidden layer.
         rounds: of message passing, each with weights of its own.
+        alone: 1 for a network that is given where contacts are but not what the solve makes of them, and that nothing
+            bounds: what learning alone gives, for comparison.
     """
 
     width: int = 64
     rounds: int = 6
+    alone: int = 0
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,6 @@ class Round(nn.Module):
         to_first, to_second = (self.message(hidden) * weight).chunk(2, -1)
         heard = torch.zeros_like(body).index_add_(0, graph.first, to_first).index_add_(0, graph.second, to_second)
         body = body + self.body(torch.cat([body, heard], -1))
-        body = body * (LOUDEST / body.norm(dim=-1, keepdim=True).clamp_min(LOUDEST))
         # Scenery carries no message from one body to another.
         return edge + self.latent(hidden), body * (graph.inverse_mass > 0)[:, None]
 
@@ -121,7 +122,13 @@ class ImpulseNetwork(nn.Module):
         self.rounds = nn.ModuleList(Round(config.width) for _ in range(config.rounds))
 
     def forward(
-        self, graph: ContactGraph, *, friction: bool = True, mirrored: bool = False, rows: int | None = None
+        self,
+        graph: ContactGraph,
+        *,
+        friction: bool = True,
+        mirrored: bool = False,
+        rows: int | None = None,
+        trust: float = 1.0,
     ) -> Velocities:
         """Velocities after the contacts have acted.
 
@@ -130,36 +137,133 @@ class ImpulseNetwork(nn.Module):
             friction: False computes no tangential impulse at all.
             mirrored: see `edge_frames`.
             rows: update no more than that many edges at once; None for all.
+            trust: of the trust region; at 0 the solve stands alone.
         """
+        alone = bool(self.config.alone)
+        graph = without_solve(graph) if alone else graph
         frames = edge_frames(graph, mirrored=mirrored)
         edge = by_rows(self.encode, rows, frames.start)
         body = edge.new_zeros(len(graph.inverse_mass), self.config.width)
-        end = torch.cat([graph.free_velocity, graph.free_angular], -1)
+        end = torch.cat([graph.solved_velocity, graph.solved_angular], -1)
         mean = torch.cat([graph.mean_velocity, graph.mean_angular], -1)
-        twist = torch.stack([end, mean], -1)
+        start = twist = torch.stack([end, mean], -1)
+        added = edge.new_zeros(len(edge), 3 if friction else 1, 2)
         for number, layer in enumerate(cast("Iterable[Round]", self.rounds), start=1):
-            seen = _relative(graph, frames, twist)
+            seen = (relative(graph, frames, twist) / frames.speed[..., None]).mT.flatten(1)
             hidden = by_rows(partial(layer.read, body), rows, edge, graph.first, graph.second, seen)
             weight = _share_of_pair(layer.attention(hidden)[:, 0], graph)[:, None]
-            twist = _push(graph, frames, layer.impulse(hidden, friction) * weight[..., None], twist)
+            change = layer.impulse(hidden, friction) * weight[..., None]
+            added = added + change * (frames.speed * frames.mass[:, : added.shape[1]])[..., None]
+            twist = pushed(graph, frames, added, start)
             if number < len(self.rounds):  # nobody reads what the last round would tell
                 edge, body = layer.tell(edge, body, hidden, weight, graph)
+        if not alone:
+            twist = pushed(graph, frames, bounded(graph, frames, added, start, trust), start)
         end, mean = twist.unbind(-1)
         return Velocities(end[:, :3], end[:, 3:], mean[:, :3], mean[:, 3:])
 
 
-def _relative(graph: ContactGraph, frames: EdgeFrames, twist: Tensor) -> Tensor:
-    """[E, 6] dimensionless relative velocities at the contact points along the edges' axes: end, then mean."""
-    relative = frames.read_first @ twist[graph.first] - frames.read_second @ twist[graph.second]
-    return (relative / frames.speed[..., None]).clamp(-FASTEST, FASTEST).mT.flatten(1)
+def without_solve(graph: ContactGraph) -> ContactGraph:
+    """The graph with free flight in place of what the solve makes of the step."""
+    return replace(
+        graph,
+        solved_velocity=graph.free_velocity,
+        solved_angular=graph.free_angular,
+        mean_velocity=0.5 * (graph.velocity + graph.free_velocity),
+        mean_angular=0.5 * (graph.angular + graph.free_angular),
+        impulse=torch.zeros_like(graph.impulse),
+    )
 
 
-def _push(graph: ContactGraph, frames: EdgeFrames, change: Tensor, twist: Tensor) -> Tensor:
-    """Twists [N, 6, 2] after changes of velocity [E, axis, 2] in units of `speed`, as impulses on both bodies."""
-    axes = change.shape[1]
-    impulse = change * (frames.speed * frames.mass[:, :axes])[..., None]
+def relative(graph: ContactGraph, frames: EdgeFrames, twist: Tensor) -> Tensor:
+    """[E, 3, K] relative velocities at the contact points along the edges' axes, for twists [N, 6, K]."""
+    return frames.read_first @ twist[graph.first] - frames.read_second @ twist[graph.second]
+
+
+def pushed(graph: ContactGraph, frames: EdgeFrames, impulse: Tensor, twist: Tensor) -> Tensor:
+    """Twists [N, 6, K] after impulses [E, axis, K] on the first bodies, opposite on the second."""
+    axes = impulse.shape[1]
     twist = twist.index_add(0, graph.first, frames.give_first[..., :axes] @ impulse)
     return twist.index_add(0, graph.second, frames.give_second[..., :axes] @ impulse)
+
+
+def bounded(graph: ContactGraph, frames: EdgeFrames, added: Tensor, start: Tensor, trust: float) -> Tensor:
+    """What may be added to the solve, of what the network would add.
+
+    - Only where surfaces moved against each other before the step, see `CALM`.
+    - Solve and network together never pull, push no more than twice as hard as the solve, or than closes what is left
+      of an overlap over the step, and keep to the friction cone.
+    - No more kinetic energy than the solve took, island by island.
+
+    Args:
+        graph: bodies and edges.
+        frames: of the edges.
+        added: [E, axis, 2] impulses: at the end of the step, and those that move bodies in it.
+        start: [N, 6, 2] twists from the solve.
+        trust: 0 to 1.
+    """
+    lively = ((frames.slip.norm(dim=-1) - CALM) / (LIVELY - CALM)).clamp(0.0, 1.0) * trust
+    added = added * lively[:, None, None]
+    seen = relative(graph, frames, start)
+    push, drag = frames.solved[:, 0], frames.solved[:, 1:]
+    left = graph.gap + seen[:, 0, 1] * (1.0 - graph.when) * graph.dt
+    most = 2.0 * push + frames.mass[:, 0] * (-left / graph.dt).clamp_min(0.0)
+    normal = torch.minimum((push + added[:, 0, 0]).clamp_min(0.0), most)
+    ends = [(normal - push)[:, None]]
+    if added.shape[1] == 3:
+        hold = torch.maximum(graph.friction * normal, drag.norm(dim=-1))
+        total = drag + added[:, 1:, 0]
+        ends.append(_shortened(total, hold) - drag)
+    end = torch.cat(ends, 1)
+    end = end * _energy_share(graph, frames, end, seen[..., 0], start)[:, None]
+    return torch.stack([end, _shortened(added[..., 1], most)], -1)
+
+
+def _shortened(vector: Tensor, most: Tensor) -> Tensor:
+    """[E, K] vectors no longer than `most` [E]."""
+    length = vector.square().sum(-1).clamp_min(1e-24).sqrt()
+    return vector * (most / length).clamp_max(1.0)[:, None]
+
+
+def _energy_share(graph: ContactGraph, frames: EdgeFrames, end: Tensor, seen: Tensor, start: Tensor) -> Tensor:
+    """[E] the share of impulses `end` [E, axis] that adds no more energy to an island than the solve took from it.
+
+    The work of an impulse is its product with the mean of the relative velocities before and after it.
+    """
+    with torch.no_grad():
+        free = torch.cat([graph.free_velocity, graph.free_angular], -1)[..., None]
+        before = relative(graph, frames, free)[..., 0]
+        taken = (-0.5 * frames.solved * (before + seen)).sum(-1).clamp_min(0.0)
+        change = relative(graph, frames, pushed(graph, frames, end[..., None], torch.zeros_like(start[..., :1])))[
+            ..., 0
+        ]
+        axes = end.shape[1]
+        island = islands(graph)
+        size = len(graph.inverse_mass)
+
+        def total(values: Tensor) -> Tensor:
+            return torch.zeros(size, dtype=values.dtype, device=values.device).index_add_(0, island, values)
+
+        least = total(taken)
+        linear, square = total((end * seen[:, :axes]).sum(-1)), total(0.5 * (end * change[:, :axes]).sum(-1))
+        root = (linear.square() + 4.0 * square * least).clamp_min(0.0).sqrt()
+        share = torch.where(linear + square <= least, 1.0, (root - linear) / (2.0 * square).clamp_min(1e-30))
+        return share.clamp(0.0, 1.0)[island]
+
+
+def islands(graph: ContactGraph) -> Tensor:
+    """[E] the island of every edge: the least number of the bodies that move and are joined by edges."""
+    moves = graph.inverse_mass > 0
+    label = torch.arange(len(moves), device=moves.device)
+    one = torch.where(moves[graph.first], graph.first, graph.second)
+    other = torch.where(moves[graph.second], graph.second, graph.first)
+    while True:
+        least = torch.minimum(label[one], label[other])
+        lower = label.scatter_reduce(0, one, least, "amin").scatter_reduce(0, other, least, "amin")
+        lower = lower[lower]
+        if torch.equal(lower, label):
+            return label[one]
+        label = lower
 
 
 def _share_of_pair(logit: Tensor, graph: ContactGraph) -> Tensor:

@@ -20,7 +20,7 @@ from sdfsim.files import replacing
 BUNDLED = Path(__file__).resolve().parent.parent / "models"
 DEFAULT_MODEL = "small"
 MOST = 4096  # of any size of a network
-MODEL_VERSION = 2  # 1: trained on a teacher whose contacts acted before surfaces touched
+MODEL_VERSION = 3  # 2: networks without the contact solve; 1: of an earlier teacher
 SOLVER = "solver"
 NETWORKS = {"impulse": (ImpulseConfig, ImpulseNetwork), "paper": (PaperConfig, PaperNetwork)}
 
@@ -39,6 +39,7 @@ class Model:
             solver is rescaled to the smallest body that moves.
         reach: m, contact radius D.
         nodes: surface nodes a body it was trained with, the first of each shape's; None for all.
+        inner: inner steps of the solve in a step; 0 for those of the recording engine (5 where none has recorded).
         ranges: name -> [low, high] of what training saw (friction, restitution, mass_ratio, speed, size).
         card: training record (data, steps, seconds, errors).
     """
@@ -51,6 +52,7 @@ class Model:
     length: float
     reach: float
     nodes: int | None = None
+    inner: int = 0
     ranges: dict[str, list[float]] = field(default_factory=dict)
     card: dict[str, Any] = field(default_factory=dict)
 
@@ -69,7 +71,7 @@ class Model:
             "version": MODEL_VERSION,
             "kind": self.kind,
             "config": asdict(self.network.config),  # type: ignore[call-overload]
-            **{k: getattr(self, k) for k in ("dt", "gravity", "length", "reach", "nodes", "ranges", "card")},
+            **{k: getattr(self, k) for k in ("dt", "gravity", "length", "reach", "nodes", "inner", "ranges", "card")},
         }
         weights = {k: v.detach().cpu().contiguous() for k, v in self.network.state_dict().items()}
         with replacing(path) as partial:
@@ -125,7 +127,7 @@ def load_model(name: str | Path | None = None, *, weights: bool = True) -> Model
         with safe_open(path, framework="pt") as file:
             info = json.loads((file.metadata() or {})["sdfsim_model"])
             if info.pop("version", 1) != MODEL_VERSION:
-                raise ValueError("it was trained on another teacher's data; train it again")
+                raise ValueError("it is of an earlier version; train it again")
             config = info.pop("config")
             if weights:
                 _check_size(info["kind"], config, {k: file.get_slice(k).get_shape() for k in file.keys()})

@@ -14,6 +14,7 @@ import torch
 from sdfsim.dynamics import kernels, pose
 from sdfsim.dynamics.bodies import Bodies, State, Touch
 from sdfsim.dynamics.kernels import distance as kinds
+from sdfsim.dynamics.kernels import record
 from sdfsim.dynamics.kernels import world as compiled
 from sdfsim.dynamics.kernels.step import step as compiled_step
 from sdfsim.shape.analytic import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, SphereSdf
@@ -95,8 +96,8 @@ class Compiled:
 
     def run(
         self, motion: compiled.Motion, manifolds: compiled.Manifolds, rules: compiled.Rules
-    ) -> tuple[compiled.Manifolds, tuple[int, ...]]:
-        """One step: `motion` is written to; the contacts at its end, and what was counted."""
+    ) -> tuple[compiled.Manifolds, record.Edges, tuple[int, ...]]:
+        """One step: `motion` is written to; the contacts at its end, what they did, and what was counted."""
         return compiled_step(self.shapes, self.world, self.work, motion, rules, manifolds)
 
 
@@ -114,7 +115,43 @@ def warm() -> None:
     scene.run(*taken_up(bodies, state, scene, rules), rules)
 
 
-def solver_step(bodies: Bodies, state: State, rules: Rules, memory: Memory) -> State:
+@dataclass(frozen=True)
+class Acts:
+    """What contacts did in a step, at E places where bodies met or nearly met; model units, world axes.
+
+    Attributes:
+        first, second: [E] int64, the two bodies; the first one moves.
+        arm_first, arm_second: [E, 3] from their centres of mass to the contact.
+        normal: [E, 3] from the second to the first.
+        impulse: [E, 3] on the first, opposite on the second; 0 where they only were near.
+        gap: [E] the distance when it was first looked at.
+        when: [E] the part of the step that was over by then.
+    """
+
+    first: torch.Tensor
+    second: torch.Tensor
+    arm_first: torch.Tensor
+    arm_second: torch.Tensor
+    normal: torch.Tensor
+    impulse: torch.Tensor
+    gap: torch.Tensor
+    when: torch.Tensor
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+
+def acts_of(edges: record.Edges, steps: int) -> Acts:
+    """What the compiled step noted, `steps` inner steps long."""
+    count = int(edges.count[0])
+    pair, value = torch.from_numpy(edges.pair[:count]), torch.from_numpy(edges.value[:count])
+    vectors = (value[:, k : k + 3] for k in (record.ARM, record.OTHER, record.AXIS, record.GIVEN))
+    return Acts(pair[:, 0], pair[:, 1], *vectors, value[:, record.APART], value[:, record.WHEN] / steps)
+
+
+def solver_step(
+    bodies: Bodies, state: State, rules: Rules, memory: Memory, *, note: bool = False
+) -> tuple[State, Acts]:
     """Advance `state` by one step of the contact solve.
 
     Args:
@@ -122,21 +159,25 @@ def solver_step(bodies: Bodies, state: State, rules: Rules, memory: Memory) -> S
         state: theirs; scripted bodies have the velocities of the coming step.
         rules: what is in play.
         memory: of the run; it holds the compiled scene.
+        note: whether what contacts did is wanted; there is none otherwise.
     """
     scene = memory.compiled(bodies, state)
     inside = compiled_rules(
         rules.gravity.cpu().numpy(), rules.dt, rules.substeps, friction=rules.friction,
         restitution=rules.restitution, rotation=rules.rotation, sleep=rules.sleep, margin=rules.margin, adds=rules.adds,
+        note=note,
     )  # fmt: skip
     with memory.timed("contact_ms"):
-        after, counts = _solve(bodies, state, scene, inside)
+        after, edges, counts = _solve(bodies, state, scene, inside)
     memory.count(pairs=counts[0], contacts=counts[1], active=counts[3])
-    return after
+    return after, acts_of(edges, rules.substeps)
 
 
-def _solve(bodies: Bodies, state: State, scene: Compiled, rules: compiled.Rules) -> tuple[State, tuple[int, ...]]:
+def _solve(
+    bodies: Bodies, state: State, scene: Compiled, rules: compiled.Rules
+) -> tuple[State, record.Edges, tuple[int, ...]]:
     motion, manifolds = taken_up(bodies, state, scene, rules)
-    manifolds, counts = scene.run(motion, manifolds, rules)
+    manifolds, edges, counts = scene.run(motion, manifolds, rules)
     after = replace(
         state,
         position=torch.from_numpy(motion.position),
@@ -161,10 +202,10 @@ def _solve(bodies: Bodies, state: State, scene: Compiled, rules: compiled.Rules)
         pair=torch.from_numpy(manifolds.pair),
         count=torch.from_numpy(manifolds.count),
         point=torch.from_numpy(manifolds.point),
-        held=_held(after),
+        held=held(after),
         gravity=torch.from_numpy(rules.gravity),
     )
-    return replace(after, touch=touch), counts
+    return replace(after, touch=touch), edges, counts
 
 
 def taken_up(
@@ -186,7 +227,7 @@ def taken_up(
     touching = np.array(touch.touching.numpy())
     if not torch.equal(touch.gravity, torch.from_numpy(rules.gravity)):
         island[:], quiet[:] = -1, 0
-    changed = (_held(state) != touch.held).any(-1).numpy()
+    changed = (held(state) != touch.held).any(-1).numpy()
     if scene.world.scripted.any():
         changed &= ~scene.world.scripted
     if changed.any():
@@ -205,7 +246,8 @@ def taken_up(
     return motion, compiled.Manifolds(touch.pair.numpy(), touch.count.numpy(), touch.point.numpy())
 
 
-def _held(state: State) -> torch.Tensor:
+def held(state: State) -> torch.Tensor:
+    """[N, 13] poses and velocities, by which a state that somebody changed is known."""
     return torch.cat([state.position, state.orientation, state.velocity, state.angular_velocity], -1)
 
 
@@ -226,7 +268,7 @@ def contact_points(state: State) -> tuple[np.ndarray, np.ndarray, float]:
 
 def compiled_rules(
     gravity: np.ndarray, dt: float, substeps: int, *, friction: bool = True, restitution: bool = True,
-    rotation: bool = True, sleep: bool = False, margin: float = 0.0, adds: bool = False,
+    rotation: bool = True, sleep: bool = False, margin: float = 0.0, adds: bool = False, note: bool = False,
     own: SolverRules | None = None,
 ) -> compiled.Rules:  # fmt: skip
     """The rules of a run, model units."""
@@ -237,7 +279,7 @@ def compiled_rules(
         restitution=restitution, rotation=rotation, sleep=sleep, reach=own.reach, look=own.look + 2.0 * margin,
         still=own.still, together=own.together, erp=own.erp, slop=own.slop, split=own.split,
         slow=own.slow * float(np.linalg.norm(gravity)) * inner, rounds=own.rounds, exact=own.exact, apart=own.apart,
-        stray=own.stray, rest=own.rest, margin=margin, adds=adds,
+        stray=own.stray, rest=own.rest, margin=margin, adds=adds, note=note,
     )  # fmt: skip
 
 

@@ -7,7 +7,7 @@ network's graph, and what sleeps is not looked at until something moves beside i
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor
@@ -18,12 +18,14 @@ from sdfsim.dynamics.contacts import Contacts, find_contacts, no_contacts
 from sdfsim.dynamics.energy import Guard, hold_back
 from sdfsim.dynamics.freeflight import ballistic, torque_free
 from sdfsim.dynamics.graph import SUBSTEPS, ContactGraph, number_pairs
-from sdfsim.dynamics.impulse import Velocities
 from sdfsim.dynamics.memory import Memory
-from sdfsim.dynamics.model import SOLVER, Model
+from sdfsim.dynamics.model import Model
 from sdfsim.dynamics.overlap import parting
 from sdfsim.dynamics.sleep import settle, stir, touched, wake
 from sdfsim.dynamics.surfaces import compact, predict
+
+if TYPE_CHECKING:
+    from sdfsim.dynamics.solver import Acts
 
 FreeFlight = Literal["exact", "learned"]
 _POSE = ("position", "orientation", "velocity", "angular_velocity")
@@ -48,6 +50,7 @@ class Rules:
         sleep: whether the solver freezes what rests; networks have it in the state.
         margin: by which all bodies but planes are larger for the solver than their distances say; adds: whether what
             it pushes out adds to the speed of a rebound. Both are habits of the teacher, for comparisons with it.
+        trust: in what the network adds to the solve; 0 where a scene is beyond its training.
     """
 
     gravity: Tensor
@@ -64,6 +67,7 @@ class Rules:
     sleep: bool = False
     margin: float = 0.0
     adds: bool = False
+    trust: float = 1.0
 
 
 @torch.no_grad()
@@ -85,12 +89,17 @@ def step(
     memory = memory or Memory()
     edited = memory.begin(bodies, state)
     state = stir(bodies, drive(bodies, state, rules), rules.gravity, edited=edited)
-    if model.kind == SOLVER and rules.contact:
-        from sdfsim.dynamics.solver import solver_step  # numba takes its time to load
+    if model.kind != "paper" and rules.contact:
+        from sdfsim.dynamics.solver import held, solver_step  # numba takes its time to load
 
-        state = solver_step(bodies, state, rules, memory)
-        memory.end(bodies, state)
-        return state, None
+        on_top = model.kind == "impulse" and rules.trust > 0.0
+        solved, acts = solver_step(bodies, state, rules, memory, note=on_top)
+        if on_top and len(acts):
+            with memory.timed("network_ms"):
+                solved = correct(model, bodies, state, solved, acts, rules, memory)
+                solved = replace(solved, touch=replace(solved.touch, held=held(solved)))
+        memory.end(bodies, solved)
+        return solved, None
     contacts = None
     if rules.contact:
         state, contacts = meet(model, bodies, state, rules, memory)
@@ -172,73 +181,86 @@ def respond(
     memory.count(active=moved)
     if not moved:
         return free, contacts
-    if model.kind == "paper":
-        return _paper_step(model, bodies, state, free, contacts, active, rules, memory), contacts
-    graph = contact_graph(bodies, state, free, contacts, rules)[1]
-    memory.count(nodes=len(active), edges=len(contacts))
-    predicted = model.network(graph, friction=rules.friction, rows=rules.rows)
-    return _move(bodies, state, free, active, graph, predicted, rules), contacts
+    return _paper_step(model, bodies, state, free, contacts, active, rules, memory), contacts
+
+
+def correct(
+    model: Model, bodies: Bodies, state: State, solved: State, acts: Acts, rules: Rules, memory: Memory
+) -> State:
+    """What the network makes of the solve: only bodies that have met somebody are in its graph."""
+    active, graph = contact_graph(bodies, state, solved, acts, rules, model.dt)
+    device = next(model.network.parameters()).device
+    predicted = model.network(graph.to(device), friction=rules.friction, rows=rules.rows, trust=rules.trust)
+    # From the network's units of time and length back to those of the bodies.
+    time = rules.dt / model.dt
+    memory.count(nodes=len(active), edges=len(acts))
+    chosen = (graph.inverse_mass > 0).cpu()
+    rows = active.cpu()[chosen]
+
+    def added(now: Tensor, before: Tensor) -> Tensor:
+        # What the network adds, so that single precision rounds that and not the motion that goes on.
+        return (now.cpu() - before)[chosen].double()
+
+    turn = pose.from_rotvec(added(predicted.mean_angular, graph.mean_angular) * model.dt)
+    place = solved.position[rows] + added(predicted.mean_velocity, graph.mean_velocity) * time * rules.dt
+    velocity = solved.velocity[rows] + added(predicted.velocity, graph.solved_velocity) * time
+    orientation, angular = solved.orientation[rows], solved.angular_velocity[rows]
+    if rules.rotation:
+        orientation = pose.normalise(pose.multiply(turn, orientation))
+        angular = angular + added(predicted.angular, graph.solved_angular) / time
+    now = {name: getattr(solved, name) for name in _POSE}
+    return replace(solved, **_put(now, rows, (place, orientation, velocity, angular)))
 
 
 def contact_graph(
-    bodies: Bodies, state: State, free: State, contacts: Contacts, rules: Rules
+    bodies: Bodies, state: State, solved: State, acts: Acts, rules: Rules, dt: float
 ) -> tuple[Tensor, ContactGraph]:
-    """The bodies [A] that have a contact edge, and the graph among them in single precision."""
-    active, index = torch.unique(torch.cat([contacts.owner, contacts.body]), return_inverse=True)
+    """The bodies [A] that met somebody, and the graph among them in single precision.
+
+    It is told in units in which the step lasts `dt` and gravity is what it is (Froude scaling): a network knows no
+    other step, and takes a longer one for the same step of smaller bodies.
+    """
+    time = rules.dt / dt
+    length = time**2
+    active, index = torch.unique(torch.cat([acts.first, acts.second]), return_inverse=True)
     first, second = index.chunk(2)
     pair, pairs = number_pairs(first, second, len(active))
     rotation = pose.to_matrix(state.orientation[active])
-    inverse_inertia = rotation @ torch.linalg.inv(bodies.inertia[active]) @ rotation.mT
-    turns = bodies.moves[active] if rules.rotation else torch.zeros_like(bodies.moves[active])
-    inverse_inertia = inverse_inertia * turns[:, None, None]
-    turn = pose.to_rotvec(pose.multiply(free.orientation[active], pose.conjugate(state.orientation[active])))
-    nothing = torch.zeros_like(contacts.distance)
+    moves = bodies.moves[active]
+    turns = (moves if rules.rotation else torch.zeros_like(moves))[:, None, None]
+    inverse_inertia = rotation @ torch.linalg.inv(bodies.inertia[active]) @ rotation.mT * turns
+    spin = torque_free(state.orientation[active], state.angular_velocity[active], bodies.inertia[active], rules.dt)[1]
+    spin = torch.where(turns[..., 0], spin, state.angular_velocity[active])
+    turned = pose.multiply(solved.orientation[active], pose.conjugate(state.orientation[active]))
+    nothing = torch.zeros_like(acts.gap)
     # Masses enter as ratios only; relative to the heaviest they stay within single precision.
     heaviest = bodies.mass[active].max()
-    return active, ContactGraph(
-        inverse_mass=(bodies.inverse_mass[active] * heaviest).float(),
-        inverse_inertia=(inverse_inertia * heaviest).float(),
-        velocity=state.velocity[active].float(),
-        angular=state.angular_velocity[active].float(),
-        free_velocity=free.velocity[active].float(),
-        free_angular=free.angular_velocity[active].float(),
-        mean_velocity=((free.position - state.position)[active] / rules.dt).float(),
-        mean_angular=(turn / rules.dt).float(),
-        first=first,
-        second=second,
-        pair=pair,
-        pairs=pairs,
-        normal=contacts.normal.float(),
-        arm_first=contacts.arm.float(),
-        arm_second=contacts.foot.float(),
-        gap=contacts.distance.float(),
-        substeps=torch.full_like(contacts.distance, rules.substeps).float(),
-        friction=(_product(bodies.friction, contacts) if rules.friction else nothing).float(),
-        restitution=(_product(bodies.restitution, contacts) if rules.restitution else nothing).float(),
-        dt=rules.dt,
-    )
 
+    def product(coefficient: Tensor) -> Tensor:
+        return coefficient[acts.first] * coefficient[acts.second]
 
-def _move(
-    bodies: Bodies, state: State, free: State, active: Tensor, graph: ContactGraph, predicted: Velocities, rules: Rules
-) -> State:
-    """Bodies in contact move by the predicted mean velocities and leave with the predicted end velocities."""
-    chosen = bodies.moves[active]
-    rows = active[chosen]
-
-    def change(now: Tensor, flown: Tensor) -> Tensor:
-        # What contact adds, so that single precision rounds that and not the motion that goes on.
-        return (now - flown)[chosen].double()
-
-    place = free.position[rows] + change(predicted.mean_velocity, graph.mean_velocity) * rules.dt
-    velocity = free.velocity[rows] + change(predicted.velocity, graph.free_velocity)
-    orientation, angular = state.orientation[rows], free.angular_velocity[rows]
-    if rules.rotation:
-        turn = pose.from_rotvec(predicted.mean_angular[chosen].double() * rules.dt)
-        orientation = pose.normalise(pose.multiply(turn, orientation))
-        angular = angular + change(predicted.angular, graph.free_angular)
-    now = {name: getattr(free, name) for name in _POSE}
-    return replace(free, **_put(now, rows, (place, orientation, velocity, angular)))
+    values = {
+        "inverse_mass": bodies.inverse_mass[active] * heaviest,
+        "inverse_inertia": inverse_inertia * heaviest * length**2,
+        "velocity": state.velocity[active] / time,
+        "angular": state.angular_velocity[active] * time,
+        "free_velocity": (state.velocity[active] + rules.gravity * rules.dt * moves[:, None]) / time,
+        "free_angular": spin * time,
+        "solved_velocity": solved.velocity[active] / time,
+        "solved_angular": solved.angular_velocity[active] * time,
+        "mean_velocity": (solved.position - state.position)[active] / rules.dt / time,
+        "mean_angular": pose.to_rotvec(turned) / dt,
+        "normal": acts.normal,
+        "arm_first": acts.arm_first / length,
+        "arm_second": acts.arm_second / length,
+        "impulse": acts.impulse / heaviest / time,
+        "gap": acts.gap / length,
+        "when": acts.when,
+        "friction": product(bodies.friction) if rules.friction else nothing,
+        "restitution": product(bodies.restitution) if rules.restitution else nothing,
+    }
+    single = {name: value.float() for name, value in values.items()}
+    return active, ContactGraph(**single, first=first, second=second, pair=pair, pairs=pairs, dt=dt)
 
 
 def _paper_step(

@@ -1,7 +1,8 @@
-"""Contact frames: every recorded step in which something touches, with its contact edges found once.
+"""Contact frames: recorded steps in which something touches, with what the contact solve makes of each.
 
-Training then needs no signed distances: a small rigid disturbance of the bodies changes an edge's gap by the normal
-component of the relative displacement, to first order.
+The solve follows a recording step by step, every step from where the recording has the bodies. So training needs
+neither signed distances nor the solve itself, only torch and numpy. Disturbed starts are solved as well: in a rollout a
+network meets states that are a little beside what is recorded.
 """
 
 from __future__ import annotations
@@ -9,31 +10,56 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from sdfsim.data.dataset import Trajectory, check_alike, load_shapes, trajectory_files
-from sdfsim.data.velocities import at_instants, engine_substep
+from sdfsim.data.velocities import MARGIN, at_instants, engine_substep
+from sdfsim.dynamics import pose
 from sdfsim.dynamics.freeflight import torque_free
 from sdfsim.dynamics.graph import SUBSTEPS
-from sdfsim.dynamics.pose import conjugate, multiply, to_rotvec
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_arrays, write_arrays
 from sdfsim.parallel import parallel
 
+if TYPE_CHECKING:
+    from sdfsim.dynamics.bodies import Bodies, State
+    from sdfsim.dynamics.solver import Acts
+
 STEP = 0.02  # s, the step that networks know
-FRAMES_VERSION = 6  # counts up whenever frames of the same recordings come out differently
+FRAMES_VERSION = 7  # counts up whenever frames of the same recordings come out differently
+TOGETHER = 25  # trajectories that are followed side by side
+_SMALL = {"first": np.int16, "second": np.int16}
+
+
+@dataclass(frozen=True)
+class Solved:
+    """How recordings are followed.
+
+    Attributes:
+        stride: recorded steps in a step of the network.
+        inner: inner steps of the solve in it; 0 for those of the recording engine.
+        draws: how often every recording is followed: first from the states as they are, then from disturbed ones.
+        shift, speed: m and m/s, standard deviations of the disturbance of a body's place and velocity, and by turning
+            and spinning of its surface. Every body's is a part of it, log-uniform from `least` to all.
+    """
+
+    stride: int = 1
+    inner: int = 0
+    draws: int = 2
+    shift: float = 0.003
+    speed: float = 0.03
+    least: float = 0.05
 
 
 @dataclass(frozen=True)
 class ContactFrames:
     """F frames with contact out of many trajectories, flattened.
 
-    Units are metres and seconds where the recorded step is `STEP`. Recordings of other steps are told in units in which
+    Units are metres, seconds and kilograms where the step is `STEP`. Frames of other steps are told in units in which
     it is that long and gravity is what it is (Froude scaling): to a network, which knows no other step, their bodies
     are larger or smaller.
 
@@ -43,17 +69,18 @@ class ContactFrames:
     Attributes:
         body_start, edge_start: [F + 1] int64, frame k owns rows body_start[k] : body_start[k + 1].
         orientation: [B, 4]; velocity, angular: [B, 3] at the start of the step.
-        free_angular, mean_angular: [B, 3] rad/s in free flight, at the end of the step and as its mean.
-        end_velocity, end_angular, moved, turned: [B, 3] recorded: velocities at the end of the step, and mean
-            linear and angular velocity over it.
+        free_angular: [B, 3] rad/s at its end in free flight.
+        solved_velocity, solved_angular, solved_moved, solved_turned: [B, 3] what the solve makes of the step: velocities
+            at its end, and mean linear and angular velocity over it.
+        end_velocity, end_angular, moved, turned: [B, 3] the same as recorded.
         mass: [B] kg, 0 for static bodies; inertia: [B, 3]; friction, restitution, size: [B].
-        substeps: [F] uint8, inner steps of the engine in one step.
         first, second: [E] int16, bodies within the frame.
-        arm: [E, 3] m, from the first body's centre of mass to the point of contact.
-        other: [E, 3] m, what leads to there from the second's (from the floor's origin), less `arm`.
-        normal: [E, 3]; gap: [E] m.
-        dt: s, `STEP`; gravity: [3] m/s^2; reach: m, the contact radius used.
-        trajectories: [K] int64, how many were searched, of each of the K sets that were joined; 0 where unknown.
+        arm_first, arm_second: [E, 3] m, from the centres of mass (the floor's: its origin) to the contact.
+        normal: [E, 3] from the second to the first.
+        impulse: [E, 3] kg m/s, of the solve on the first body.
+        gap: [E] m; when: [E] part of the step that was over when it was met.
+        dt: s, `STEP`; gravity: [3] m/s^2.
+        trajectories: [K] int64, how many were followed, of each of the K sets that were joined.
     """
 
     body_start: np.ndarray
@@ -62,7 +89,10 @@ class ContactFrames:
     velocity: np.ndarray
     angular: np.ndarray
     free_angular: np.ndarray
-    mean_angular: np.ndarray
+    solved_velocity: np.ndarray
+    solved_angular: np.ndarray
+    solved_moved: np.ndarray
+    solved_turned: np.ndarray
     end_velocity: np.ndarray
     end_angular: np.ndarray
     moved: np.ndarray
@@ -72,16 +102,16 @@ class ContactFrames:
     friction: np.ndarray
     restitution: np.ndarray
     size: np.ndarray
-    substeps: np.ndarray
     first: np.ndarray
     second: np.ndarray
-    arm: np.ndarray
-    other: np.ndarray
+    arm_first: np.ndarray
+    arm_second: np.ndarray
     normal: np.ndarray
+    impulse: np.ndarray
     gap: np.ndarray
+    when: np.ndarray
     dt: float
     gravity: np.ndarray
-    reach: float
     trajectories: np.ndarray
 
     def __len__(self) -> int:
@@ -93,66 +123,58 @@ class ContactFrames:
         write_arrays(path, arrays | {"version": np.array(FRAMES_VERSION)}, compressed=False)
 
     @classmethod
-    def load(cls, path: Path, *, must_tell: bool = False) -> ContactFrames:
+    def load(cls, path: Path) -> ContactFrames:
         """Read a cache file.
-
-        Args:
-            path: of the file.
-            must_tell: refuse one that does not say that it is of this version (elsewhere its name proves it).
 
         Raises:
             SdfsimError: not contact frames, or not of this version.
         """
         arrays: dict[str, Any] = read_arrays(path, "contact frames", "delete it to have it made again")
-        made_by = arrays.pop("version", None)  # those that lack it, and the counts, are older than both
-        if must_tell and (made_by is None or int(made_by) != FRAMES_VERSION):
-            said = "does not say by which version" if made_by is None else f"says by version {made_by}"
+        if int(arrays.pop("version", 0)) != FRAMES_VERSION or set(arrays) != {f.name for f in fields(cls)}:
             raise SdfsimError(
-                f"{path}: {said} its contacts were found (this is version {FRAMES_VERSION})",
+                f"{path}: not contact frames of this version of sdfsim ({FRAMES_VERSION})",
                 "where the trajectories are, delete it and train once: it is made again; then copy it here",
             )
-        arrays.setdefault("trajectories", np.zeros(1, dtype=np.int64))
-        if missing := [f.name for f in fields(cls) if f.name not in arrays]:
-            raise SdfsimError(f"{path}: no {missing[0]} in it", "delete it to have it made again")
-        arrays |= {name: float(arrays[name]) for name in ("dt", "reach")}
-        return cls(**arrays)
+        return cls(**arrays | {"dt": float(arrays["dt"])})
 
     def digest(self) -> str:
         """Changes with what is trained on."""
-        digest = hashlib.sha256(f"{self.dt} {self.reach}".encode())
+        digest = hashlib.sha256(f"{self.dt}".encode())
         for field in fields(self):
-            if field.name not in ("dt", "reach", "trajectories"):
+            if field.name not in ("dt", "trajectories"):
                 digest.update(np.ascontiguousarray(getattr(self, field.name)).data)
         return digest.hexdigest()[:16]
 
 
 def contact_frames(
-    data: Path, split: str, reach: float, *, on_progress: Callable[[float, str], None] | None = None
+    data: Path, split: str, how: Solved, *, on_progress: Callable[[float, str], None] | None = None
 ) -> ContactFrames:
-    """The contact frames of a dataset split: from the cache file beside it, else found now and cached.
+    """The contact frames of a dataset split: from the cache file beside it, else made now and cached.
 
     Raises:
         SdfsimError: no trajectories, unreadable ones, or some that differ in step or gravity.
     """
     folder = data / "frames"
+    name = f"{split}-{how.stride}-{how.inner}-{how.draws}"
     if not (data / split).is_dir():
         # A machine that only trains may have been given nothing but the cache.
-        made = list(folder.glob(f"{split}-{reach:g}-*.npz"))
+        made = list(folder.glob(f"{name}-*.npz"))
         if len(made) == 1:
-            return ContactFrames.load(made[0], must_tell=True)
+            return ContactFrames.load(made[0])
     files = trajectory_files(data, split)
-    cached = folder / f"{split}-{reach:g}-{_fingerprint(data, files)}.npz"
+    cached = folder / f"{name}-{_fingerprint(data, files, how)}.npz"
     if cached.exists():
         return ContactFrames.load(cached)
     check_alike(str(data / split), map(Trajectory.load, files))
-    parts: list[dict[str, np.ndarray]] = [{}] * len(files)
-    for done, (index, part) in enumerate(parallel(_of_file, [(f, reach) for f in files]), start=1):
+    groups = [files[i : i + TOGETHER] for i in range(0, len(files), TOGETHER)]
+    parts: list[list[dict[str, np.ndarray]]] = [[]] * len(groups)
+    for done, (index, part) in enumerate(parallel(_followed, [(group, how) for group in groups]), start=1):
         parts[index] = part
         if on_progress:
-            on_progress(done / len(files), f"contacts of {split} trajectory {done} of {len(files)}")
-    frames = _concatenate(parts, Trajectory.load(files[0]).gravity, reach)
+            on_progress(done / len(groups), f"contacts of {split}, part {done} of {len(groups)}")
+    frames = _concatenate([p for part in parts for p in part], Trajectory.load(files[0]).gravity, len(files))
     folder.mkdir(exist_ok=True)
-    for old in folder.glob(f"{split}-{reach:g}-*.npz"):
+    for old in folder.glob(f"{name}-*.npz"):
         old.unlink()
     frames.save(cached)
     return frames
@@ -162,13 +184,12 @@ def join_frames(sets: list[ContactFrames]) -> ContactFrames:
     """Several sets of frames as one.
 
     Raises:
-        SdfsimError: they differ in step, gravity or contact radius.
+        SdfsimError: they differ in gravity.
     """
     one = sets[0]
-    for other in sets[1:]:
-        if (one.dt, one.reach) != (other.dt, other.reach) or not np.allclose(one.gravity, other.gravity):
-            raise SdfsimError("datasets that are trained on together must share step and gravity")
-    whole: dict[str, Any] = {"dt": one.dt, "gravity": one.gravity, "reach": one.reach}
+    if any(not np.allclose(one.gravity, other.gravity) for other in sets[1:]):
+        raise SdfsimError("datasets that are trained on together must share gravity")
+    whole: dict[str, Any] = {"dt": one.dt, "gravity": one.gravity}
     for field in fields(ContactFrames):
         if field.name in whole:
             continue
@@ -180,51 +201,11 @@ def join_frames(sets: list[ContactFrames]) -> ContactFrames:
     return ContactFrames(**whole)
 
 
-def _fingerprint(data: Path, files: list[Path]) -> str:
-    """Changes with the trajectories (names and sizes), the recipe, the shapes, and the way contacts are found."""
-    digest = hashlib.sha256(f"{FRAMES_VERSION} {[(f.name, f.stat().st_size) for f in files]}".encode())
-    for record in (data / "dataset.json", *sorted((data / "shapes").glob("*/shape.json"))):
-        if record.exists():
-            digest.update(record.read_bytes())
-    return digest.hexdigest()[:12]
-
-
-@cache
-def _shape(folder: Path, name: str):
-    return load_shapes(folder, {name})[name]
-
-
-def _of_file(path: Path, reach: float) -> dict[str, np.ndarray]:
-    from sdfsim.data.batching import find_edges  # needs the SDFs, hence more than torch and numpy
-
-    substep = engine_substep(path.parent)
-    trajectory = at_instants(Trajectory.load(path), substep)
-    substeps = inner_steps(trajectory.dt, substep)
-    trajectory = in_steps_of(trajectory, STEP)
-    shapes = {str(n): _shape(path.parent, str(n)) for n in trajectory.shape}
-    return _of_trajectory(trajectory, find_edges(trajectory, shapes, reach), shapes, substeps)
-
-
-def in_steps_of(t: Trajectory, dt: float) -> Trajectory:
-    """The same motion in units of time in which its step is `dt`, and of length in which gravity stays what it is."""
-    time = t.dt / dt
-    length = time**2
-    return replace(
-        t,
-        position=t.position / length,
-        velocity=t.velocity / (length / time),
-        angular_velocity=t.angular_velocity * time,
-        scale=t.scale / length,
-        inertia=t.inertia / length**2,
-        dt=dt,
-    )
-
-
 def inner_steps(dt: float, substep: float) -> int:
     """Inner steps of `substep` s in a recorded step of `dt` s; what is not told (0) counts as in our own recordings.
 
     Raises:
-        SdfsimError: more than a network knows of.
+        SdfsimError: more than 5.
     """
     count = round(dt / substep) if substep > 0 else SUBSTEPS
     if not 1 <= count <= SUBSTEPS:
@@ -232,54 +213,144 @@ def inner_steps(dt: float, substep: float) -> int:
     return count
 
 
-def _of_trajectory(t: Trajectory, edges: dict[str, np.ndarray], shapes, substeps: int) -> dict[str, np.ndarray]:
-    """One trajectory's part of the arrays. `edges` come sorted by frame, `frame` telling which."""
-    count = np.bincount(edges["frame"], minlength=len(t.position) - 1)
-    used = np.flatnonzero(count)
-    bodies = t.position.shape[1]
-    now, then = used, used + 1
-
-    def rows(array: np.ndarray, when: np.ndarray) -> np.ndarray:
-        return array[when].reshape(-1, array.shape[-1])
-
-    def each(array: np.ndarray) -> np.ndarray:
-        return np.tile(array, (len(used),) + (1,) * (array.ndim - 1))
-
-    orientation, angular = rows(t.quat_xyzw, now), rows(t.angular_velocity, now)
-    inertia = each(np.where(t.static[:, None], 1.0, t.inertia))
-    tensor = torch.from_numpy
-    start = tensor(orientation)
-    free, free_angular = torque_free(start, tensor(angular), torch.diag_embed(tensor(inertia)), t.dt)
-    turned = to_rotvec(multiply(tensor(rows(t.quat_xyzw, then)), conjugate(start))) / t.dt
-    extent = np.array([np.ptp(shapes[str(n)].sdf.bounds, axis=0).max() for n in t.shape]) * t.scale
-    return {
-        "bodies": np.full(len(used), bodies),
-        "edges": count[used],
-        "orientation": orientation,
-        "velocity": rows(t.velocity, now),
-        "angular": angular,
-        "free_angular": free_angular.numpy(),
-        "mean_angular": (to_rotvec(multiply(free, conjugate(start))) / t.dt).numpy(),
-        "end_velocity": rows(t.velocity, then),
-        "end_angular": rows(t.angular_velocity, then),
-        "moved": (rows(t.position, then) - rows(t.position, now)) / t.dt,
-        "turned": turned.numpy(),
-        "mass": each(np.where(t.static, 0.0, t.mass)),
-        "inertia": inertia,
-        "friction": each(t.friction),
-        "restitution": each(t.restitution),
-        "size": each(extent),
-        "substeps": np.full(len(used), substeps),
-    } | {k: edges[k] for k in ("first", "second", "arm", "other", "normal", "gap")}
+def _fingerprint(data: Path, files: list[Path], how: Solved) -> str:
+    """Changes with the trajectories (names and sizes), the recipe, the shapes, and the way contacts are solved."""
+    digest = hashlib.sha256(f"{FRAMES_VERSION} {how} {[(f.name, f.stat().st_size) for f in files]}".encode())
+    for record in (data / "dataset.json", *sorted((data / "shapes").glob("*/shape.json"))):
+        if record.exists():
+            digest.update(record.read_bytes())
+    return digest.hexdigest()[:12]
 
 
-def _concatenate(parts: list[dict[str, np.ndarray]], gravity: np.ndarray, reach: float) -> ContactFrames:
+def _followed(files: list[Path], how: Solved) -> list[dict[str, np.ndarray]]:
+    """Parts of the arrays, one for each draw and step: all trajectories of a group at that step."""
+    from sdfsim.data.batching import merged  # needs the SDFs, hence more than torch and numpy
+    from sdfsim.dynamics.bodies import Units
+    from sdfsim.dynamics.memory import Memory
+    from sdfsim.dynamics.solver import solver_step
+    from sdfsim.dynamics.step import Rules
+
+    substep = engine_substep(files[0].parent)
+    group = [at_instants(Trajectory.load(file), substep) for file in files]
+    shapes = load_shapes(files[0].parent, {str(n) for t in group for n in t.shape})
+    bodies, start = merged(group, [0] * len(group), shapes, Units(1.0, 1.0, 1.0), torch.device("cpu"))
+    inner = how.inner or how.stride * inner_steps(group[0].dt, substep)
+    gravity = torch.from_numpy(np.asarray(group[0].gravity, dtype=np.float64))
+    rules = Rules(gravity, group[0].dt * how.stride, inner, margin=MARGIN, adds=True)
+    count = min(len(t.position) for t in group)
+    parts = []
+    for draw in range(how.draws):
+        rng = np.random.default_rng([draw, int(hashlib.sha256(files[0].name.encode()).hexdigest()[:8], 16)])
+        memory, touch = Memory(), None
+        for now in range(0, count - how.stride, how.stride):
+            state = replace(_recorded(group, now, start), touch=touch)
+            state = _disturbed(bodies, state, how, rng) if draw else state
+            after, acts = solver_step(bodies, state, rules, memory, note=True)
+            touch = after.touch
+            parts += _of_step(bodies, state, after, acts, _recorded(group, now + how.stride, start), rules.dt)
+    return parts
+
+
+def _recorded(group: list[Trajectory], frame: int, like: State) -> State:
+    """The state of all trajectories of a group at a frame; the floor is last."""
+
+    def of(name: str, floor: torch.Tensor) -> torch.Tensor:
+        rows = np.concatenate([getattr(t, name)[frame] for t in group])
+        return torch.cat([torch.from_numpy(rows), floor[-1:]])
+
+    return replace(
+        like,
+        position=of("position", like.position),
+        orientation=of("quat_xyzw", like.orientation),
+        velocity=of("velocity", like.velocity),
+        angular_velocity=of("angular_velocity", like.angular_velocity),
+    )
+
+
+def _disturbed(bodies: Bodies, state: State, how: Solved, rng: np.random.Generator) -> State:
+    moves = bodies.moves.numpy()[:, None]
+    lever = 2.0 / np.minimum(bodies.size.numpy(), 1e3)[:, None]
+    part = how.least ** rng.random((len(bodies), 1)) * moves
+
+    def draw(scale: float | np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(rng.standard_normal((len(bodies), 3)) * part * scale)
+
+    turn = pose.from_rotvec(draw(how.shift * lever))
+    return replace(
+        state,
+        position=state.position + draw(how.shift),
+        orientation=pose.normalise(pose.multiply(turn, state.orientation)),
+        velocity=state.velocity + draw(how.speed),
+        angular_velocity=state.angular_velocity + draw(how.speed * lever),
+    )
+
+
+def _of_step(
+    bodies: Bodies, state: State, after: State, acts: Acts, recorded: State, dt: float
+) -> list[dict[str, np.ndarray]]:
+    """The frames of a step of several trajectories as one part of the arrays, in units in which it lasts `STEP`."""
+    if not len(acts):
+        return []
+    floor = len(bodies) - 1
+    world = bodies.world.numpy()
+    of_edge = world[acts.first.numpy()]
+    order = np.argsort(of_edge, kind="stable")
+    used, count = np.unique(of_edge, return_counts=True)
+    rows = np.flatnonzero(np.isin(world, used))
+    sizes = np.bincount(world[rows])[used]
+    begins = np.searchsorted(world[:floor], np.arange(world.max() + 1))
+    time = dt / STEP
+    length = time**2
+
+    def body(values: torch.Tensor, unit: float = 1.0) -> np.ndarray:
+        return values.numpy()[rows] / unit
+
+    def edge(values: torch.Tensor, unit: float = 1.0) -> np.ndarray:
+        return values.numpy()[order] / unit
+
+    def turned(end: State) -> torch.Tensor:
+        return pose.to_rotvec(pose.multiply(end.orientation, pose.conjugate(state.orientation))) / dt
+
+    free = torque_free(state.orientation, state.angular_velocity, bodies.inertia, dt)[1]
+    second = acts.second.numpy()[order]
+    speed = length / time
+    result = {
+        "bodies": sizes,
+        "edges": count,
+        "orientation": body(state.orientation),
+        "velocity": body(state.velocity, speed),
+        "angular": body(state.angular_velocity, 1.0 / time),
+        "free_angular": body(free, 1.0 / time),
+        "mass": body(bodies.mass),
+        "inertia": body(bodies.inertia.diagonal(dim1=-2, dim2=-1), length**2),
+        "friction": body(bodies.friction),
+        "restitution": body(bodies.restitution),
+        "size": body(bodies.size, length),
+        "first": acts.first.numpy()[order] - begins[of_edge[order]],
+        "second": np.where(second == floor, -1, second - begins[of_edge[order]]),
+        "arm_first": edge(acts.arm_first, length),
+        "arm_second": edge(acts.arm_second, length),
+        "normal": edge(acts.normal),
+        "impulse": edge(acts.impulse, speed),
+        "gap": edge(acts.gap, length),
+        "when": edge(acts.when),
+    }
+    names = (("solved_velocity", "solved_angular", "solved_moved", "solved_turned"),)
+    names += (("end_velocity", "end_angular", "moved", "turned"),)
+    for (velocity, angular, moved, turning), end in zip(names, (after, recorded), strict=True):
+        result[velocity] = body(end.velocity, speed)
+        result[angular] = body(end.angular_velocity, 1.0 / time)
+        result[moved] = body((end.position - state.position) / dt, speed)
+        result[turning] = body(turned(end), 1.0 / time)
+    return [result]
+
+
+def _concatenate(parts: list[dict[str, np.ndarray]], gravity: np.ndarray, trajectories: int) -> ContactFrames:
     joined = {k: np.concatenate([p[k] for p in parts]) for k in parts[0]}
     starts = {
         "body_start": np.concatenate([[0], np.cumsum(joined.pop("bodies"))]),
         "edge_start": np.concatenate([[0], np.cumsum(joined.pop("edges"))]),
     }
-    kinds = {"first": np.int16, "second": np.int16, "substeps": np.uint8}
-    small = {k: v.astype(kinds.get(k, np.float32)) for k, v in joined.items()}
-    common = {"dt": STEP, "gravity": gravity, "reach": reach, "trajectories": np.array([len(parts)])}
+    small = {k: v.astype(_SMALL.get(k, np.float32)) for k, v in joined.items()}
+    common = {"dt": STEP, "gravity": np.asarray(gravity), "trajectories": np.array([trajectories])}
     return ContactFrames(**starts, **small, **common)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -17,35 +17,6 @@ from sdfsim.training.distributed import ALONE, Team
 
 HUBER = 0.01  # m/s: below it errors count squared, above it by their size; what rests may creep by less than that
 CALM_SHARE = 0.2  # how often frames in which nothing is hit are drawn, against those with the hardest hits
-
-
-@dataclass(frozen=True)
-class Noise:
-    """Disturbance of the inputs: standard deviations of a rigid displacement and of the velocities.
-
-    Every frame is disturbed by a part of it, log-uniform from `least` to all. Small ones keep hits sharp, large ones
-    teach what holds a loaded stack up and pushes bodies out of one another.
-
-    Attributes:
-        shift: m, of a body's position, and of its surface by turning.
-        speed: m/s, of its velocity, and of its surface by spinning.
-        least: the smallest part.
-    """
-
-    shift: float = 0.003
-    speed: float = 0.03
-    least: float = 0.05
-
-
-@dataclass(frozen=True)
-class Disturbance:
-    """Draws of the noise for B bodies, [B, 3] each: displacements in m, those by turning at the bodies' surfaces, then
-    velocities in m/s likewise."""
-
-    shift: Tensor
-    turn: Tensor
-    push: Tensor
-    spin: Tensor
 
 
 @dataclass(frozen=True)
@@ -71,13 +42,11 @@ class ImpulseTask:
     Args:
         frames: of one split.
         device: where batches are made.
-        noise: of training inputs; None for exact inputs.
     """
 
-    def __init__(self, frames: ContactFrames, device: torch.device, noise: Noise | None) -> None:
+    def __init__(self, frames: ContactFrames, device: torch.device) -> None:
         self.frames = frames
         self.device = device
-        self.noise = noise
         self.weight = _importance(frames)
 
     def digest(self) -> str:
@@ -115,10 +84,10 @@ class ImpulseTask:
     def draw(self, rng: np.random.Generator, count: int, team: Team = ALONE) -> Batch:
         """A batch of `count` frames, or the part of it that falls to one of a team."""
         picked = np.sort(rng.choice(len(self.frames), size=count, p=self.weight))
-        return self.batch(picked[team.share(count)], self.noise_for(picked, rng, team))
+        return self.batch(picked[team.share(count)])
 
-    def batch(self, picked: np.ndarray, noise: Disturbance | None = None) -> Batch:
-        """The frames `picked` [K] as one graph whose last body is the floor; disturbed when `noise` is given."""
+    def batch(self, picked: np.ndarray) -> Batch:
+        """The frames `picked` [K] as one graph whose last body is the floor."""
         f = self.frames
         rows, body_of = _ranges(f.body_start, picked)
         edges, edge_of = _ranges(f.edge_start, picked)
@@ -137,8 +106,10 @@ class ImpulseTask:
         inverse_inertia = rotation * (1.0 / body(f.inertia, 1.0))[:, None] @ rotation.mT * moves[:, None, None]
         fall = torch.as_tensor(f.gravity * f.dt, dtype=torch.float32, device=self.device) * moves[:, None]
         index = torch.from_numpy(np.stack([first, second]).astype(np.int64)).to(self.device)
-        arm, other, normal = (torch.from_numpy(a[edges]).to(self.device) for a in (f.arm, f.other, f.normal))
-        gap = torch.from_numpy(f.gap[edges]).to(self.device)
+
+        def edge(array: np.ndarray) -> Tensor:
+            return torch.from_numpy(array[edges]).to(self.device)
+
         pair, pairs = number_pairs(index[0], index[1], len(mass))
         coefficients = {
             "friction": _product(body(f.friction, FLOOR[0]), index),
@@ -151,32 +122,31 @@ class ImpulseTask:
             angular=angular,
             free_velocity=velocity + fall,
             free_angular=body(f.free_angular),
-            mean_velocity=velocity + 0.5 * fall,
-            mean_angular=body(f.mean_angular),
+            solved_velocity=body(f.solved_velocity),
+            solved_angular=body(f.solved_angular),
+            mean_velocity=body(f.solved_moved),
+            mean_angular=body(f.solved_turned),
             first=index[0],
             second=index[1],
             pair=pair,
             pairs=pairs,
-            normal=normal,
-            arm_first=arm,
-            arm_second=arm + other,
-            gap=gap,
-            substeps=torch.from_numpy(f.substeps[picked][edge_of].astype(np.float32)).to(self.device),
+            normal=edge(f.normal),
+            arm_first=edge(f.arm_first),
+            arm_second=edge(f.arm_second),
+            impulse=edge(f.impulse),
+            gap=edge(f.gap),
+            when=edge(f.when),
             dt=f.dt,
             **coefficients,
         )
         truth = Velocities(body(f.end_velocity), body(f.end_angular), body(f.moved), body(f.turned))
         counts = torch.zeros_like(moves)
         counts[index.flatten()] = True
-        batch = Batch(graph, truth, body(f.size, 1.0), counts & moves)
-        return batch if noise is None else disturbed(batch, noise)
+        return Batch(graph, truth, body(f.size, 1.0), counts & moves)
 
     def loss(self, network: ImpulseNetwork, batch: Batch, *, mirrored: bool = False) -> Tensor:
         """Mean pseudo-Huber error of end and mean velocities, angular ones times half the body's size."""
-        return self.error(network(batch.graph, mirrored=mirrored), batch)
-
-    def error(self, predicted: Velocities, batch: Batch) -> Tensor:
-        """The same of what a network has said."""
+        predicted = network(batch.graph, mirrored=mirrored)
         lever = 0.5 * batch.size[:, None]
         terms = [
             self.size_of(predicted.velocity - batch.truth.velocity),
@@ -194,49 +164,6 @@ class ImpulseTask:
     def weight_of(self, batch: Batch) -> int:
         """Over how many bodies a batch's loss is the mean."""
         return int(batch.counts.sum())
-
-    def noise_for(self, picked: np.ndarray, rng: np.random.Generator, team: Team) -> Disturbance | None:
-        """Noise of the whole batch, so that it does not depend on the team's size; then this one's part of it."""
-        if self.noise is None:
-            return None
-        counts = np.diff(self.frames.body_start)[picked]
-        mine = np.zeros(len(picked), dtype=bool)
-        mine[team.share(len(picked))] = True
-        rows = np.repeat(mine, counts)
-        part = np.repeat(self.noise.least ** rng.random(len(picked), dtype=np.float32), counts)[rows, None]
-
-        def normal(scale: float) -> Tensor:
-            draw = rng.standard_normal((len(rows), 3), dtype=np.float32)[rows] * part * np.float32(scale)
-            return torch.from_numpy(np.concatenate([draw, np.zeros((1, 3), dtype=np.float32)])).to(self.device)
-
-        shift, speed = self.noise.shift, self.noise.speed
-        return Disturbance(normal(shift), normal(shift), normal(speed), normal(speed))
-
-
-def disturbed(batch: Batch, noise: Disturbance) -> Batch:
-    """Shift, turn and push bodies a little; mean velocities still lead to the recorded pose."""
-    g = batch.graph
-    moves, lever = (g.inverse_mass > 0)[:, None], 2.0 / batch.size[:, None]
-    shift, push = noise.shift * moves, noise.push * moves
-    turn, spin = noise.turn * moves * lever, noise.spin * moves * lever
-    one = shift[g.first] + torch.linalg.cross(turn[g.first], g.arm_first)
-    two = shift[g.second] + torch.linalg.cross(turn[g.second], g.arm_second)
-    graph = replace(
-        g,
-        gap=g.gap + ((one - two) * g.normal).sum(-1),
-        velocity=g.velocity + push,
-        free_velocity=g.free_velocity + push,
-        mean_velocity=g.mean_velocity + push,
-        angular=g.angular + spin,
-        free_angular=g.free_angular + spin,
-        mean_angular=g.mean_angular + spin,
-    )
-    truth = replace(
-        batch.truth,
-        mean_velocity=batch.truth.mean_velocity - shift / g.dt,
-        mean_angular=batch.truth.mean_angular - turn / g.dt,
-    )
-    return replace(batch, graph=graph, truth=truth)
 
 
 def _span(values: np.ndarray) -> list[float]:

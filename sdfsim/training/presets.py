@@ -17,8 +17,8 @@ class Preset:
         rate: peak learning rate of Adam; it falls to a hundredth along a cosine.
         matrix_rate: the same of Muon, which then trains the hidden matrices; None leaves all to Adam, as published.
         reach: m, contact radius D.
-        in_row: steps trained in a row over the last `late` part of the training (impulse), see `unrolled`; 1 for none.
-        late: part of the steps of the optimiser.
+        strides: recorded steps in a step (impulse); several for a network of several step lengths.
+        inner: inner steps of the solve in a step; 0 for those of the recording engine.
         bf16: matrix products in bfloat16, see `dynamics.precision`.
         noise: m, standard deviation of pose noise of the *paper* network (None: none); *impulse* has its own.
     """
@@ -31,14 +31,16 @@ class Preset:
     reach: float = 0.1
     noise: float | None = None
     matrix_rate: float | None = None
-    in_row: int = 1
-    late: float = 0.0
+    strides: tuple[int, ...] = (1,)
+    inner: int = 0
     bf16: bool = False
 
 
 PRESETS = {
-    "small": Preset(
-        "impulse", {"width": 64, "rounds": 6}, steps=16_000, batch=32, rate=2e-3, matrix_rate=0.01, in_row=2, late=0.25
+    "small": Preset("impulse", {"width": 32, "rounds": 4}, steps=16_000, batch=32, rate=2e-3, matrix_rate=0.01),
+    "alone": Preset("impulse", {"width": 64, "rounds": 6, "alone": 1}, 16_000, batch=32, rate=2e-3, matrix_rate=0.01),
+    "long": Preset(
+        "impulse", {"width": 32, "rounds": 4}, 16_000, batch=32, rate=2e-3, matrix_rate=0.01, strides=(1, 2), inner=1
     ),
     "base": Preset("impulse", {"width": 128, "rounds": 8}, steps=100_000, batch=64, rate=1e-3, matrix_rate=0.01),
     "paper": Preset("paper", {"width": 128, "steps": 10}, steps=1_000_000, batch=8, rate=1e-3, noise=0.003),

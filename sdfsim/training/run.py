@@ -18,7 +18,6 @@ from sdfsim.files import read_arrays, write_arrays
 from sdfsim.training.distributed import ALONE, Team
 from sdfsim.training.optimiser import Optimiser
 from sdfsim.training.presets import Preset
-from sdfsim.training.unrolled import Unrolled
 
 EMA_DECAY = 0.999
 CLIP = 1.0
@@ -59,7 +58,6 @@ class Run:
 
         torch.manual_seed(seed)
         self.plan, self.task, self.total, self.seed, self.device, self.team = plan, task, total, seed, device, team
-        self.late: Any = Unrolled(task, plan.in_row) if plan.in_row > 1 else task
         self.digest = task.digest()
         self.network: nn.Module = new_network(plan.kind, plan.config).to(device)
         if hasattr(task, "prepare"):
@@ -75,7 +73,7 @@ class Run:
         """One optimiser step on a batch that depends on (seed, step) alone."""
         rng = np.random.default_rng([self.seed, 0, self.step])
         flipped = rng.integers(2)
-        task = self.late if self.step >= (1.0 - self.plan.late) * self.total else self.task
+        task = self.task
         batch = task.draw(rng, self.plan.batch, self.team)
         loss = task.loss(self.computing, batch, mirrored=bool(flipped))
         weight = task.weight_of(batch)
@@ -171,6 +169,7 @@ class Run:
             length=float(np.mean(ranges["size"])),
             reach=self.plan.reach,
             nodes=getattr(self.task, "nodes", None),
+            inner=self.plan.inner,
             ranges=ranges,
             card=card,
         )

@@ -121,14 +121,15 @@ def _made(data: Path, info: dict, train: int, validation: int) -> dict[str, Any]
 def _tasks(plan: Preset, folders: Sequence[Path], device: torch.device, tell: Progress):
     """Training and held-out tasks of a preset."""
     if plan.kind == "impulse":
-        from sdfsim.training.contact_cache import contact_frames, join_frames
-        from sdfsim.training.impulse_task import ImpulseTask, Noise
+        from sdfsim.training.contact_cache import Solved, contact_frames, join_frames
+        from sdfsim.training.impulse_task import ImpulseTask
 
-        sets = {
-            split: join_frames([contact_frames(folder, split, plan.reach, on_progress=tell) for folder in folders])
-            for split in ("train", "validation")
-        }
-        return ImpulseTask(sets["train"], device, Noise()), ImpulseTask(sets["validation"], device, None)
+        def task(split: str, draws: int) -> ImpulseTask:
+            how = [Solved(stride, plan.inner, draws) for stride in plan.strides]
+            sets = [contact_frames(folder, split, h, on_progress=tell) for folder in folders for h in how]
+            return ImpulseTask(join_frames(sets), device)
+
+        return task("train", 2), task("validation", 1)
     from sdfsim.training.paper_task import PaperTask
 
     if len(folders) > 1:

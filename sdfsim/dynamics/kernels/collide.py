@@ -65,8 +65,8 @@ def look_around(shapes, world, work, motion, rules, span, old):
     Returns:
         The manifolds of these pairs, with the points of `old`, and those of bodies that sleep; what is near.
     """
-    _swept(world, work, motion, rules, span)
-    pairs = _pairs(world, motion, work.low, work.high)
+    swept(world, work, motion, rules, span)
+    pairs = near_pairs(world, motion, work.low, work.high)
     manifolds = _carried(world, motion, pairs, old)
     near = _near_leaves(shapes, world, motion, work.matrix, pairs, work.ways, rules.reach)
     for p in range(len(pairs)):
@@ -76,7 +76,7 @@ def look_around(shapes, world, work, motion, rules, span, old):
 
 
 @njit(**BARE)
-def _swept(world, work, motion, rules, span):
+def swept(world, work, motion, rules, span):
     """How far any point of a body may go, and the box around all that it may reach."""
     ways, low, high, matrix = work.ways, work.low, work.high, work.matrix
     fall = norm(vector(rules.gravity)) * span
@@ -121,7 +121,7 @@ def _overlap(low, high, a, other_low, other_high, b):
 
 
 @njit(**FAST)
-def _pairs(world, motion, low, high):
+def near_pairs(world, motion, low, high):
     """[P, 2] bodies whose boxes overlap, in a fixed order: sweep and prune along the axis on which they spread most."""
     n = len(world.shape)
     going = np.empty(len(world.going), np.int64)
@@ -143,7 +143,7 @@ def _pairs(world, motion, low, high):
     along_axis = np.empty(count)
     for i in range(count):
         along_axis[i] = low[going[i], axis]
-    rank = _sorted(along_axis)
+    rank = sorted_order(along_axis)
     order = np.empty(count, np.int64)
     for i in range(count):
         order[i] = going[rank[i]]
@@ -181,7 +181,7 @@ def _pairs(world, motion, low, high):
     key = np.empty(pairs)
     for p in range(pairs):
         key[p] = found[p, 0] * n + found[p, 1]
-    rank = _sorted(key)
+    rank = sorted_order(key)
     ordered = np.empty((pairs, 2), np.int64)
     for p in range(pairs):
         ordered[p, 0], ordered[p, 1] = found[rank[p], 0], found[rank[p], 1]
@@ -189,7 +189,7 @@ def _pairs(world, motion, low, high):
 
 
 @njit(**FAST)
-def _sorted(values):
+def sorted_order(values):
     """The order that sorts `values`, equal ones as they come: a merge sort; numpy's takes seconds to compile."""
     n = len(values)
     order, other = np.arange(n), np.empty(n, np.int64)
@@ -228,7 +228,7 @@ def _carried(world, motion, pairs, old):
         a, b = old.pair[k, 0], old.pair[k, 1]
         key[k] = a * n + b
         asleep[k] = motion.island[a] >= 0 and (motion.island[b] >= 0 or not world.moves[b])
-    order = _sorted(key)
+    order = sorted_order(key)
     here = len(pairs)
     total = here + asleep.sum()
     pair = np.empty((total, 2), np.int64)
@@ -256,7 +256,7 @@ def _carried(world, motion, pairs, old):
 
 
 @njit(**BARE)
-def _map(position, matrix, scales, coms, a, b):
+def map_between(position, matrix, scales, coms, a, b):
     """Rows of W and the vector c: a point p of shape a is at W p + c of shape b (both at scale 1)."""
     ratio = scales[a] / scales[b]
     x = turn_back(matrix, b, (matrix[a, 0, 0], matrix[a, 1, 0], matrix[a, 2, 0]))
@@ -278,7 +278,7 @@ def _map(position, matrix, scales, coms, a, b):
 
 
 @njit(**BARE)
-def _mapped(w, c, p):
+def mapped(w, c, p):
     return dot(w[0], p) + c[0], dot(w[1], p) + c[1], dot(w[2], p) + c[2]
 
 
@@ -326,9 +326,9 @@ def _near(shapes, world, motion, matrix, pairs, ways, reach, near, p):
         # One query tells whether the ball around either may touch the other; 1 stands for yes.
         one = a if is_round(shapes.table, world.shape[a]) else b
         other = b if one == a else a
-        w, c = _map(motion.position, matrix, world.scale, world.com, one, other)
+        w, c = map_between(motion.position, matrix, world.scale, world.com, one, other)
         k = world.scale[other]
-        d, _ = distance(table, brick, sample, world.shape[other], _mapped(w, c, (0.0, 0.0, 0.0)))
+        d, _ = distance(table, brick, sample, world.shape[other], mapped(w, c, (0.0, 0.0, 0.0)))
         s = world.shape[one]
         size = (
             shapes.table[s, SIZE] + (shapes.table[s, SIZE + 1] if shapes.table[s, KIND] == CAPSULE else 0.0)
@@ -338,15 +338,15 @@ def _near(shapes, world, motion, matrix, pairs, ways, reach, near, p):
     for side in range(2):
         one, other = pairs[p, side], pairs[p, 1 - side]
         s, t = world.shape[one], world.shape[other]
-        w, c = _map(motion.position, matrix, world.scale, world.com, one, other)
+        w, c = map_between(motion.position, matrix, world.scale, world.com, one, other)
         k, own = world.scale[other], world.scale[one]
         at = near.start[p, side]
         for clump in range(shapes.clump_start[s], shapes.clump_start[s + 1]):
-            d, _ = distance(table, brick, sample, t, _mapped(w, c, get(shapes.clump_ball, clump)))
+            d, _ = distance(table, brick, sample, t, mapped(w, c, get(shapes.clump_ball, clump)))
             if k * d - own * shapes.clump_ball[clump, 3] > most:
                 continue
             for i in range(shapes.clump_leaf[clump], shapes.clump_leaf[clump + 1]):
-                d, _ = distance(table, brick, sample, t, _mapped(w, c, get(shapes.leaf_ball, i)))
+                d, _ = distance(table, brick, sample, t, mapped(w, c, get(shapes.leaf_ball, i)))
                 away = k * d - own * shapes.leaf_ball[i, 3]
                 if away <= most:
                     near.leaf[at], near.away[at] = i, away
@@ -468,8 +468,8 @@ def _swallowed(shapes, world, motion, matrix, a, b, side, found, t):
     own, _ = distance(table, brick, sample, world.shape[one], centre)
     if own >= 0.0:
         return False
-    w, c = _map(motion.position, matrix, world.scale, world.com, one, other)
-    there = _mapped(w, c, centre)
+    w, c = map_between(motion.position, matrix, world.scale, world.com, one, other)
+    there = mapped(w, c, centre)
     d, n = distance(table, brick, sample, world.shape[other], there)
     if d >= 0.0:
         return False
@@ -515,14 +515,14 @@ def _nodes(shapes, world, motion, matrix, rules, a, b, side, near, pair, went, s
     depth, node, keys, normal = scratch.depth, scratch.node, scratch.key, scratch.normal
     one, other = (a, b) if side == 0 else (b, a)
     r, s = world.shape[one], world.shape[other]
-    w, c = _map(motion.position, matrix, world.scale, world.com, one, other)
+    w, c = map_between(motion.position, matrix, world.scale, world.com, one, other)
     k, own = world.scale[other], world.scale[one]
     stride = STRIDE * shapes.clump_ball[shapes.clump_start[r], 3]
     kept = 0
     for at in range(near.start[pair, side], near.start[pair, side] + near.count[pair, side]):
         i = near.leaf[at]
         if near.away[at] - went <= rules.look:
-            d, _ = distance(table, brick, sample, s, _mapped(w, c, get(shapes.leaf_ball, i)))
+            d, _ = distance(table, brick, sample, s, mapped(w, c, get(shapes.leaf_ball, i)))
             near.away[at] = k * d - own * shapes.leaf_ball[i, 3] + went
         near.away_all[pair] = min(near.away_all[pair], near.away[at])
         if near.away[at] - went > rules.look:
@@ -538,7 +538,7 @@ def _nodes(shapes, world, motion, matrix, rules, a, b, side, near, pair, went, s
                 deepest, chosen, lowest, facing = d, u, score, n
         if chosen < 0:
             continue
-        patch, there = shapes.leaf_patch[i], patch_of(table, shapes.label, s, _mapped(w, c, get(shapes.node, chosen)))
+        patch, there = shapes.leaf_patch[i], patch_of(table, shapes.label, s, mapped(w, c, get(shapes.node, chosen)))
         key = patch * KEYS + there if side == 0 else there * KEYS + patch
         # Of those that are of the same two patches and face the same way the deepest, and of all.
         alike, place, worst = 0, -1, -1
@@ -566,7 +566,7 @@ def _nodes(shapes, world, motion, matrix, rules, a, b, side, near, pair, went, s
             continue
         # p of shape `one` -> about its centre of mass; its foot on the other, likewise.
         mine = sub(scale(p, own), get(world.com, one))
-        theirs = sub(along(scale(_mapped(w, c, p), k), n, -d), get(world.com, other))
+        theirs = sub(along(scale(mapped(w, c, p), k), n, -d), get(world.com, other))
         _write(scratch.found, t, count, side, mine, theirs, turn(matrix, other, n), d, keys[t, e])
         count += 1
     return count
@@ -593,9 +593,9 @@ def _gap(table, brick, sample, t, w, c, p, inward):
     On an edge of t its own distance has two normals, and the one that parts two stacked boxes is not always the
     nearer. From within, only the face that is met is near.
     """
-    q = _mapped(w, c, add(p, inward))
+    q = mapped(w, c, add(p, inward))
     d, n = distance(table, brick, sample, t, q)
-    back = sub(q, _mapped(w, c, p))
+    back = sub(q, mapped(w, c, p))
     return d - dot(back, n), n
 
 
@@ -622,7 +622,7 @@ def _refined(table, brick, sample, stride, s, t, w, c, k, own, p, inward):
             q = along(p, g, -stride / slope)
             own_d, m = distance(table, brick, sample, s, q)
             q = along(q, m, -own_d)
-            there, normal = distance(table, brick, sample, t, _mapped(w, c, q))
+            there, normal = distance(table, brick, sample, t, mapped(w, c, q))
             if there < d - 1e-9:
                 better = True
                 p, d, n = q, there, normal
@@ -640,7 +640,7 @@ def _round(shapes, world, motion, matrix, rules, a, b, side, found, at):
     table, brick, sample = shapes.table, shapes.brick, shapes.sample
     one, other = (a, b) if side == 0 else (b, a)
     s, t = world.shape[one], world.shape[other]
-    w, c = _map(motion.position, matrix, world.scale, world.com, one, other)
+    w, c = map_between(motion.position, matrix, world.scale, world.com, one, other)
     k, own = world.scale[other], world.scale[one]
     radius = shapes.table[s, SIZE]
     tried = 1
@@ -656,13 +656,13 @@ def _round(shapes, world, motion, matrix, rules, a, b, side, found, at):
         if e == 2 and half - abs(heights[2]) < 0.05 * half:
             continue
         core = (0.0, 0.0, heights[e])
-        d, n = distance(table, brick, sample, t, _mapped(w, c, core))
+        d, n = distance(table, brick, sample, t, mapped(w, c, core))
         gap = k * d - own * radius
         if gap > rules.reach:
             continue
         mine = turn_back(matrix, one, turn(matrix, other, scale(n, -own * radius)))
         mine = sub(add(scale(core, own), mine), get(world.com, one))
-        theirs = sub(along(scale(_mapped(w, c, core), k), n, -k * d), get(world.com, other))
+        theirs = sub(along(scale(mapped(w, c, core), k), n, -k * d), get(world.com, other))
         _write(found, at, count, side, mine, theirs, turn(matrix, other, n), gap, 0)
         count += 1
     return count
@@ -675,20 +675,20 @@ def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p):
     least = math.inf
     for side in range(2):
         s, t = shape[pairs[p, side]], shape[pairs[p, 1 - side]]
-        w, c = _map(place, frame, scales, coms, side, 1 - side)
+        w, c = map_between(place, frame, scales, coms, side, 1 - side)
         k = scales[1 - side]
         if is_round(table, s):
             half = table[s, SIZE + 1] if table[s, KIND] == CAPSULE else 0.0
             for e in range(-2, 3):
-                d, _ = distance(table, brick, sample, t, _mapped(w, c, (0.0, 0.0, 0.5 * e * half)))
+                d, _ = distance(table, brick, sample, t, mapped(w, c, (0.0, 0.0, 0.5 * e * half)))
                 least = min(least, k * d - scales[side] * table[s, SIZE])
         elif not is_round(table, t):
             for i in range(near.start[p, side], near.start[p, side] + near.count[p, side]):
                 e = near.leaf[i]
-                d, _ = distance(table, brick, sample, t, _mapped(w, c, get(shapes.leaf_ball, e)))
+                d, _ = distance(table, brick, sample, t, mapped(w, c, get(shapes.leaf_ball, e)))
                 if k * d - scales[side] * shapes.leaf_ball[e, 3] < least:
                     for u in range(shapes.leaf_node[e], shapes.leaf_node[e + 1]):
-                        d, _ = distance(table, brick, sample, t, _mapped(w, c, get(shapes.node, u)))
+                        d, _ = distance(table, brick, sample, t, mapped(w, c, get(shapes.node, u)))
                         least = min(least, k * d)
     return least
 
@@ -698,17 +698,17 @@ def _lowest(table, brick, sample, t, w, c, half):
     """Where between -half and half of its axis a capsule is nearest to shape t: golden section."""
     low, high = -half, half
     one, other = high - 0.6180339887498949 * (high - low), low + 0.6180339887498949 * (high - low)
-    f, _ = distance(table, brick, sample, t, _mapped(w, c, (0.0, 0.0, one)))
-    g, _ = distance(table, brick, sample, t, _mapped(w, c, (0.0, 0.0, other)))
+    f, _ = distance(table, brick, sample, t, mapped(w, c, (0.0, 0.0, one)))
+    g, _ = distance(table, brick, sample, t, mapped(w, c, (0.0, 0.0, other)))
     for _ in range(30):
         if f <= g:
             high, other, g = other, one, f
             one = high - 0.6180339887498949 * (high - low)
-            f, _ = distance(table, brick, sample, t, _mapped(w, c, (0.0, 0.0, one)))
+            f, _ = distance(table, brick, sample, t, mapped(w, c, (0.0, 0.0, one)))
         else:
             low, one, f = one, other, g
             other = low + 0.6180339887498949 * (high - low)
-            g, _ = distance(table, brick, sample, t, _mapped(w, c, (0.0, 0.0, other)))
+            g, _ = distance(table, brick, sample, t, mapped(w, c, (0.0, 0.0, other)))
     return 0.5 * (low + high)
 
 

@@ -47,7 +47,7 @@ def respond(world, work, motion, rules, manifolds):
     """Solve for the impulses of all contacts; they go to the manifolds, and to `change` and `shift` of `work`.
 
     Returns:
-        The number of contacts, and of the islands that they make.
+        The equations that were solved.
     """
     change, shift = work.change, work.shift
     system = _equations(world, work, motion, rules, manifolds)
@@ -63,7 +63,7 @@ def respond(world, work, motion, rules, manifolds):
         for x in range(3):
             one, other = system.row[c, 1], system.row[c, 2]
             point[DRAG + x] = one[IMPULSE] * one[AXIS + x] + other[IMPULSE] * other[AXIS + x]
-    return len(system.where), islands
+    return system
 
 
 @njit(**FAST)
@@ -83,13 +83,13 @@ def _equations(world, work, motion, rules, manifolds):
         margin = rules.margin * ((world.radius[a] < math.inf) + (world.radius[b] < math.inf))
         between = sub(get(motion.position, a), get(motion.position, b))
         flat, middle, opposite = _patch(matrix, manifolds.point, m, manifolds.count[m], a, b)
-        middle, opposite = _met(between, middle, opposite)
+        middle, opposite = met_half_way(between, middle, opposite)
         for k in range(manifolds.count[m]):
             point = manifolds.point[m, k]
             n = (point[NORMAL], point[NORMAL + 1], point[NORMAL + 2])
             arm = turn(matrix, a, (point[0], point[1], point[2]))
             other = turn(matrix, b, (point[3], point[4], point[5]))
-            arm, other = _met(between, arm, other)
+            arm, other = met_half_way(between, arm, other)
             now = _relative(motion.velocity, motion.angular, a, b, arm, other)
             then = add(now, _coming(free, a, b, arm, other))
             approach = dot(now, n)
@@ -142,7 +142,7 @@ def _equations(world, work, motion, rules, manifolds):
 
 
 @njit(**BARE)
-def _met(between, arm, other):
+def met_half_way(between, arm, other):
     """Both ends of a contact moved half way to one another: an impulse at one place keeps angular momentum."""
     apart = add(between, sub(arm, other))
     return along(arm, apart, -0.5), along(other, apart, 0.5)

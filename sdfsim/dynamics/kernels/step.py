@@ -9,6 +9,7 @@ from numba import njit
 
 from sdfsim.dynamics.kernels.collide import collide, is_round, look_around, nearest, scratch_room
 from sdfsim.dynamics.kernels.distance import SIZE, THICKNESS
+from sdfsim.dynamics.kernels.record import gathered, no_edges, noted
 from sdfsim.dynamics.kernels.solve import _root, respond
 from sdfsim.dynamics.kernels.vectors import (
     BARE,
@@ -37,8 +38,8 @@ def step(shapes, world, work, motion, rules, manifolds):
     """Advance `motion` by one step, in place; time is that of the bodies that go, however many others there are.
 
     Returns:
-        The manifolds at its end, and counts: pairs looked at, contacts of the last inner step, islands, bodies that
-        contacts moved, whether anybody had to be looked for again.
+        The manifolds at its end; what contacts did, where it is to be noted; and counts: pairs looked at, contacts of
+        the last inner step, islands, bodies that contacts moved, whether anybody had to be looked for again.
     """
     matrix, inverse, free, change, shift = work.matrix, work.inverse, work.free, work.change, work.shift
     span = rules.inner * rules.steps
@@ -51,6 +52,7 @@ def step(shapes, world, work, motion, rules, manifolds):
     trial, frame = np.empty((1, 4)), np.empty((1, 3, 3))
     scratch = scratch_room()
     contacts = islands = looked = 0
+    edges = no_edges(64 if rules.note else 0)
     _lag(world, motion, rules)
     for k in range(rules.steps):
         for b in world.going:
@@ -66,7 +68,10 @@ def step(shapes, world, work, motion, rules, manifolds):
             if world.moves[b] and motion.island[b] < 0 and work.beside[b]:
                 _prepare(world, motion, matrix, inverse, rules, free, b)
         collide(shapes, world, motion, matrix, rules, manifolds, near, work.gone, scratch)
-        contacts, islands = respond(world, work, motion, rules, manifolds)
+        system = respond(world, work, motion, rules, manifolds)
+        contacts, islands = len(system.where), len(system.start) - 1
+        if rules.note:
+            edges = noted(motion, matrix, manifolds, system, k, edges)
         _parts(shapes, world, work, motion, rules, manifolds, near)
         for b in world.going:
             if motion.island[b] < 0 and (world.moves[b] or world.scripted[b]):
@@ -76,10 +81,12 @@ def step(shapes, world, work, motion, rules, manifolds):
     met = 0
     for b in world.going:
         met += work.met[b]
+    if rules.note:
+        edges = gathered(world, motion, matrix, manifolds, len(near.start), rules.steps, edges)
     _lead(world, motion, rules)
     if rules.sleep:
         _settle(world, motion, rules, manifolds)
-    return manifolds, (len(near.start), contacts, islands, met, looked)
+    return manifolds, edges, (len(near.start), contacts, islands, met, looked)
 
 
 @njit(**BARE)

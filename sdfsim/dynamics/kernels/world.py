@@ -151,6 +151,7 @@ class Rules(NamedTuple):
         stray: who stays within this of its anchor is quiet; rest: for so many steps, and it falls asleep.
         margin: all bodies but planes are larger by this than their distances say.
         adds: whether what is pushed out adds to the speed of a rebound.
+        note: whether what contacts did in the step is wanted, see `record`.
     """
 
     gravity: np.ndarray
@@ -175,3 +176,4 @@ class Rules(NamedTuple):
     rest: int
     margin: float
     adds: bool
+    note: bool
