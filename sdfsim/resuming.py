@@ -13,13 +13,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from sdfsim.dynamics.bodies import Sleep, State, Touch
+from sdfsim.dynamics.bodies import State, Touch
+from sdfsim.dynamics.rest import Rest
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.simulator import Simulator, join
-from sdfsim.dynamics.sleep import Rest
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_arrays, read_json, write_arrays
-from sdfsim.shape.bank import SdfBank
 
 CHECKPOINT = "checkpoint"  # folder in that of the run
 EVERY = 30.0  # s between two checkpoints

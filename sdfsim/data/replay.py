@@ -11,12 +11,10 @@ from sdfsim.data.batching import merged
 from sdfsim.data.dataset import FLOOR, Trajectory
 from sdfsim.data.velocities import MARGIN
 from sdfsim.dynamics.bodies import Units
-from sdfsim.dynamics.energy import Guard
 from sdfsim.dynamics.graph import SUBSTEPS
 from sdfsim.dynamics.history import with_history
 from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.model import Model
-from sdfsim.dynamics.sleep import nobody_asleep
 from sdfsim.dynamics.step import FreeFlight, Rules, step
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.shape.asset import Shape
@@ -34,7 +32,6 @@ def roll_out(
     *,
     contact: bool = True,
     sleep: bool = False,
-    guard: Guard = "none",
     substeps: int = SUBSTEPS,
     as_teacher: bool = False,
     floor: tuple[float, float] = FLOOR,
@@ -51,7 +48,6 @@ def roll_out(
         free_flight: "exact", or "learned" for the *paper* network.
         contact: False leaves every body in free flight.
         sleep: freeze what has come to rest.
-        guard: "energy" holds back contact that makes energy.
         substeps: inner steps that the recording engine makes in one step.
         as_teacher: the solver takes on what the recording engine does without a law that asks for it: bodies are
             larger by `MARGIN` than their shapes, and what is pushed out adds to the speed of a rebound.
@@ -67,13 +63,11 @@ def roll_out(
     bodies, state = merged(group, [0] * len(group), shapes, units, device, floor)
     gravity = torch.tensor(group[0].gravity / units.acceleration, dtype=torch.float64, device=device)
     rules = Rules(
-        gravity, group[0].dt / units.time, model.inner or substeps, contact=contact, free_flight=free_flight, guard=guard,
-        margin=MARGIN / units.length if as_teacher else 0.0, adds=as_teacher,
+        gravity, group[0].dt / units.time, model.inner or substeps, contact=contact, free_flight=free_flight,
+        sleep=sleep, margin=MARGIN / units.length if as_teacher else 0.0, adds=as_teacher,
     )  # fmt: skip
     if model.kind == "paper":
         state = with_history(state, bodies, rules)
-    if sleep:
-        state = replace(state, sleep=nobody_asleep(bodies, gravity))
     states, memory = [state], Memory()
     for k in range(steps):
         state, _ = step(model, bodies, state, rules, memory)

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim.data.pybullet_sim import Teacher, TeacherBody
 from sdfsim.data.shape_assets import ShapeSource
-from sdfsim.dynamics.overlap import DEEPEST
+from sdfsim.dynamics.ranges import DEEPEST
 
 STARTS = ("still", "dropped", "nudged", "pressed")
 GAP = 2.5e-3  # m, under a body that is put down: around the engine's convex pieces are 1 mm, so 2 mm between two

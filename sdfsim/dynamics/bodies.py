@@ -14,7 +14,7 @@ from sdfsim.errors import SdfsimError
 from sdfsim.scene.pairs import contact_groups
 from sdfsim.scene.types import Scene
 from sdfsim.shape.asset import Shape
-from sdfsim.shape.bank import SdfBank
+from sdfsim.shape.sdf import Sdf
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Bodies:
     """N bodies with M surface nodes; lengths, times and masses in model units.
 
     Attributes:
-        shape: [N] int64 index into the SDF bank, -1 for a body that nothing may touch.
+        shape: [N] int64 index into `sdfs`, -1 for a body that nothing may touch.
         scale: [N] float64, shape metres -> model lengths.
         com: [N, 3] float64, centre of mass from the shape's origin (shape axes, scaled).
         mass: [N] float64 (0 unless dynamic).
@@ -66,7 +66,7 @@ class Bodies:
         group: [N] int64, what `collides_with` makes of a body.
         allowed: [G, G] bool, whether bodies of two groups may touch.
         world: [N] int64: bodies of two worlds never meet; -1 is in all of them.
-        bank: signed distances of the shapes that may be touched.
+        sdfs: signed distances of the shapes that may be touched.
         pieces: of each of these the vertices of its convex pieces, shape frame in m; none of most.
         tracks: the paths of kinematic bodies, None where there are none.
     """
@@ -88,7 +88,7 @@ class Bodies:
     group: Tensor
     allowed: Tensor
     world: Tensor
-    bank: SdfBank
+    sdfs: tuple[Sdf, ...]
     pieces: tuple[tuple[np.ndarray, ...], ...] = ()
     tracks: Tracks | None = None
 
@@ -104,27 +104,6 @@ class Bodies:
         one, other = self.world[a], self.world[b]
         together = (one == other) | (one < 0) | (other < 0)
         return together & (self.moves[a] | self.moves[b]) & self.allowed[self.group[a], self.group[b]]
-
-
-@dataclass(frozen=True)
-class Sleep:
-    """Which of N bodies are frozen, see `sdfsim.dynamics.sleep`.
-
-    Attributes:
-        quiet: [N] int64, for how many steps a body in contact has stayed near its anchor.
-        anchor: [N, 7] float64, position and orientation that it has stayed near.
-        island: [N] int64, a number shared by the bodies that fell asleep together; -1 for all that are awake.
-        link: [L, 2] int64, a sleeper and a body it rests on that is not dynamic.
-        held: [N, 13] float64, position, orientation and velocities of all bodies when the last of them fell asleep.
-        gravity: [3], what they fell asleep under.
-    """
-
-    quiet: Tensor
-    anchor: Tensor
-    island: Tensor
-    link: Tensor
-    held: Tensor
-    gravity: Tensor
 
 
 @dataclass(frozen=True)
@@ -166,8 +145,7 @@ class State:
         angular_velocity: [N, 3] float64, world frame.
         earlier_position, earlier_orientation: [2, N, 3] and [2, N, 4], the two poses before (oldest first),
             for the *paper* network; None where nobody needs them.
-        sleep: who is frozen; None where sleep is off, and for the solver.
-        touch: contacts and sleep of the solver; None before its first step.
+        touch: contacts and sleep of the solve; None before its first step.
         time: since the start.
     """
 
@@ -177,15 +155,13 @@ class State:
     angular_velocity: Tensor
     earlier_position: Tensor | None = None
     earlier_orientation: Tensor | None = None
-    sleep: Sleep | None = None
     touch: Touch | None = None
     time: float = 0.0
 
 
 def awake(bodies: Bodies, state: State) -> Tensor:
     """[A] int64, the dynamic bodies that are not asleep."""
-    of = state.touch or state.sleep
-    moves = bodies.moves if of is None else bodies.moves & (of.island < 0)
+    moves = bodies.moves if state.touch is None else bodies.moves & (state.touch.island < 0)
     return moves.nonzero()[:, 0]
 
 
@@ -241,7 +217,7 @@ def from_scene(
         group=tensor(group, torch.int64),
         allowed=tensor(allowed, torch.bool),
         world=torch.zeros(len(scene.bodies), dtype=torch.int64, device=device),
-        bank=SdfBank([scene.shapes[k].sdf for k in touched], device),
+        sdfs=tuple(scene.shapes[k].sdf for k in touched),
         pieces=tuple(scene.shapes[k].pieces for k in touched),
         tracks=from_paths(paths, com, length=units.length, time=units.time, device=device),
     )

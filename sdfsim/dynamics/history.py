@@ -41,6 +41,6 @@ def history_told(state: State, before: State, bodies: Bodies, rules: Rules) -> S
 def _flown_back(state: State, bodies: Bodies, rules: Rules) -> tuple[Tensor, Tensor]:
     """Positions [2, N, 3] and orientations [2, N, 4] two steps and one step before, in free flight."""
     back = replace(rules, dt=-rules.dt)
-    one = fly(bodies, replace(state, sleep=None), back)
+    one = fly(bodies, state, back)
     two = fly(bodies, one, back)
     return torch.stack([two.position, one.position]), torch.stack([two.orientation, one.orientation])

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
+import torch
 
-from sdfsim.dynamics.bodies import Units, largest_extent
-from sdfsim.dynamics.graph import SUBSTEPS
+from sdfsim.dynamics.bodies import Bodies, State, Units, largest_extent
+from sdfsim.dynamics.graph import SUBSTEPS, number_pairs
 from sdfsim.dynamics.model import SOLVER, Model
 from sdfsim.scene.types import Scene
 
@@ -20,6 +21,8 @@ LABELS = {
     "restitution": "restitution of two bodies, multiplied",
 }
 LONGEST = 0.01  # s, an inner step of the contact solve
+# Part of its largest side by which bodies start inside one another in the training data at most.
+DEEPEST = 0.16
 SLACK = 0.05  # relative: rounding, and fits that end a little beyond the solid
 
 
@@ -30,7 +33,7 @@ def outside_training(scenes: Sequence[Scene], model: Model, units: Units) -> lis
     not compared in size: what matters of it is the surface near a contact. The contact solve has seen no training; it
     is told where its inner step is longer than any that its laws were checked with.
     """
-    inner = model.dt * units.time / SUBSTEPS
+    inner = model.dt * units.time / (model.inner or SUBSTEPS)
     if model.kind == SOLVER and inner > LONGEST:
         return [f"inner step: {1e3 * inner:.3g} ms here, checked up to {1e3 * LONGEST:g} ms (small bodies shorten it)"]
     if not model.ranges:
@@ -84,3 +87,34 @@ def _products(scene: Scene, name: str) -> list[float]:
     # A product is extreme where both of its factors are, and two dynamic bodies cannot both be the same one.
     ends = moving[:2] + moving[2:][-2:]
     return [a * b for a, b in combinations(ends, 2)] + [a * b for a in ends for b in (*others[:1], *others[-1:])]
+
+
+def deep_starts(bodies: Bodies, state: State, names: Sequence[str], metres: float) -> list[str]:
+    """A line where pairs are deeper inside one another than any that models were trained on; empty where none is.
+
+    Args:
+        bodies: N bodies.
+        state: theirs.
+        names: [N] of the bodies.
+        metres: in a model unit.
+    """
+    from sdfsim.dynamics.contacts import find_contacts  # numba takes its time to load
+
+    nothing = torch.zeros(3, dtype=torch.float64, device=bodies.device)
+    inside = find_contacts(bodies, state, nothing, reach=0.0, dt=0.0)
+    if not len(inside):
+        return []
+    # Of the two the smaller one that moves is what the way out is long or short for.
+    size = torch.where(bodies.moves, bodies.size, torch.inf)
+    part = -inside.distance / torch.minimum(size[inside.owner], size[inside.body])
+    deep = part > DEEPEST
+    if not bool(deep.any()):
+        return []
+    pairs = number_pairs(inside.owner[deep], inside.body[deep], len(bodies))[1]
+    worst = int(part.argmax())
+    owner, body = (names[int(i[worst])] for i in (inside.owner, inside.body))
+    return [
+        f"pairs that start inside one another: {pairs} here, {owner!r} in {body!r} by "
+        f"{-float(inside.distance[worst]) * metres:.3g} m, {float(part[worst]):.0%} of a body's size; "
+        f"trained on up to {DEEPEST:.0%}"
+    ]

@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -16,20 +17,22 @@ import sdfsim
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State, awake, from_scene
 from sdfsim.dynamics.check import check_nodes, check_sizes, fault
-from sdfsim.dynamics.contacts import Contacts, distances
-from sdfsim.dynamics.energy import Guard, kinetic
 from sdfsim.dynamics.froude import scene_units
+from sdfsim.dynamics.graph import SUBSTEPS
 from sdfsim.dynamics.history import history_told, with_history
-from sdfsim.dynamics.memory import Memory, row_limit
-from sdfsim.dynamics.model import SOLVER, Model, load_model
-from sdfsim.dynamics.overlap import deep_starts
-from sdfsim.dynamics.ranges import outside_training
+from sdfsim.dynamics.memory import Memory
+from sdfsim.dynamics.model import Model, load_model
+from sdfsim.dynamics.ranges import deep_starts, outside_training
 from sdfsim.dynamics.rollout import Rollout, join
-from sdfsim.dynamics.sleep import nobody_asleep
 from sdfsim.dynamics.step import FreeFlight, Rules, step
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.scene.effects import plan
-from sdfsim.scene.types import Scene
+from sdfsim.scene.types import Limits, Scene
+
+if TYPE_CHECKING:
+    from sdfsim.dynamics.contacts import Contacts
+
+BYTES_AN_EDGE = 4096  # of the network, while it is worked on
 
 
 class SimulationError(SdfsimError):
@@ -57,7 +60,6 @@ class Simulator:
         seed: of torch's generator (nothing in a step draws from it today; it is recorded).
         dt: s, the step; None lets the size of the bodies decide (the model owns the step in its own units).
         free_flight: "exact", or "learned" for the *paper* network's own formulation.
-        guard: "energy" holds back contact that makes energy, see `sdfsim.dynamics.energy`.
 
     Attributes:
         state: bodies and how they move, model units. Give it another one to start from there, or to change a body:
@@ -80,7 +82,6 @@ class Simulator:
         *,
         dt: float | None = None,
         free_flight: FreeFlight = "exact",
-        guard: Guard = "none",
     ) -> None:
         self.scene = scene
         self.device = pick_device(device)
@@ -88,9 +89,9 @@ class Simulator:
         model = model if model is not None else scene.model
         asked = effects.contact.on or free_flight == "learned"
         self.model = model if isinstance(model, Model) else load_model(model, weights=asked)
-        if self.model.kind == SOLVER:
-            self.device = torch.device("cpu")  # the compiled step has no other
         self.model = self.model.to(self.device)
+        if self.model.kind != "paper":
+            self.device = torch.device("cpu")  # the compiled step has no other; a network on top may
         if free_flight == "learned" and self.model.kind != "paper":
             raise SdfsimError("free_flight 'learned' exists for the paper network only", "give a model of that kind")
         self.seed = scene.seed if seed is None else seed
@@ -107,21 +108,20 @@ class Simulator:
             restitution=effects.restitution.on,
             rotation=effects.rotation.on,
             free_flight=free_flight,
-            rows=row_limit(scene.limits),
-            guard=guard,
-            sleep=self.model.kind == SOLVER and effects.contact.on and scene.effects.sleep != "off",
+            substeps=self.model.inner or SUBSTEPS,
+            rows=_rows(scene.limits),
+            sleep=self.model.kind != "paper" and effects.contact.on and scene.effects.sleep != "off",
         )
         check_nodes(scene, self.model.nodes)
         self.bodies, self.state = from_scene(scene, self.units, self.device, self.model.nodes)
         self._names = tuple(b.name for b in scene.bodies)
         check_sizes(self.bodies, self._names, self.units.length)
         if effects.contact.on and self.model.ranges:
-            found = deep_starts(self.bodies, self.state, self._names, self.units.length, self.rules.rows)
-            self.outside_training += found
+            self.outside_training += deep_starts(self.bodies, self.state, self._names, self.units.length)
+        if self.outside_training:
+            self.rules = replace(self.rules, trust=0.0)
         if self.model.kind == "paper":
             self.state = with_history(self.state, self.bodies, self.rules)
-        if effects.sleep.on and self.model.kind != SOLVER:
-            self.state = replace(self.state, sleep=nobody_asleep(self.bodies, gravity))
         self.memory = Memory()
         self._dynamic = self.bodies.moves.nonzero()[:, 0]
         weight = self.bodies.mass[self._dynamic] * self.rules.gravity.norm()
@@ -236,19 +236,17 @@ class Simulator:
             points, pairs, depth = contact_points(self.state)
             points, depth, count = points * u.length, depth * u.length, len(points)
         if c is not None and count:
+            from sdfsim.dynamics.contacts import where
+
             # The edges were found at the start of the step; their points are told where this frame has the bodies.
-            place, turn = self.state.position, self.state.orientation
-            point = place[c.owner] + pose.rotate(turn[c.owner], c.point)
-            points = (point * u.length).cpu().numpy()
+            points = (where(self.state, self.bodies, c) * u.length).cpu().numpy()
             pairs = torch.stack([c.owner, c.body], -1).cpu().numpy()
-            local = pose.rotate(pose.conjugate(turn[c.body]), point - place[c.body])
-            depth = float((-distances(self.bodies, c.body, local)[0]).clamp_min(0.0).max()) * u.length
+            depth = float((-c.distance).clamp_min(0.0).max()) * u.length
         counters = {
             **self._energies(),
             "contacts": float(count),
             "worst_penetration": depth,
             **self.memory.counts,
-            "energy_gain": self.memory.counts["energy_gain"] * self.units.energy,
             "step_ms": milliseconds,
         }
         return Rollout(
@@ -269,7 +267,6 @@ class Simulator:
                 "device": str(self.device),
                 "outside_training": self.outside_training,
                 "free_flight": self.rules.free_flight,
-                "guard": self.rules.guard,
                 "lift_energy": self._lift,
                 "sdfsim": sdfsim.__version__,
                 "torch": torch.__version__,
@@ -281,10 +278,22 @@ class Simulator:
         """Kinetic and potential energy in joules of all dynamic bodies."""
         rows = self._dynamic
         s = self.state
-        moving = kinetic(self.bodies, rows, s.orientation[rows], (s.velocity[rows], s.angular_velocity[rows])).sum()
+        moving = kinetic(self.bodies, rows, s).sum()
         potential = -(self.bodies.mass[rows] * (s.position[rows] @ self.rules.gravity)).sum()
         joule = self.units.energy
         return {"kinetic_energy": float(moving) * joule, "potential_energy": float(potential) * joule}
+
+
+def kinetic(bodies: Bodies, rows: torch.Tensor, state: State) -> torch.Tensor:
+    """[R] kinetic energy of bodies `rows` [R] of a state."""
+    spin = pose.rotate(pose.conjugate(state.orientation[rows]), state.angular_velocity[rows])
+    turning = (spin * (bodies.inertia[rows] @ spin[..., None])[..., 0]).sum(-1)
+    return 0.5 * (bodies.mass[rows] * state.velocity[rows].square().sum(-1) + turning)
+
+
+def _rows(limits: Limits) -> int | None:
+    """How many edges a network may work on at once, so that a step keeps to its memory; None for all."""
+    return None if limits.memory_gib is None else max(1, int(limits.memory_gib * 2**30 / BYTES_AN_EDGE))
 
 
 def everybody(bodies: Bodies) -> torch.Tensor:

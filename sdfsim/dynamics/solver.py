@@ -292,7 +292,7 @@ def no_manifolds() -> compiled.Manifolds:
 
 def compiled_shapes(bodies: Bodies) -> kinds.Shapes:
     """The shapes of a scene, baked where they have no closed form."""
-    sdfs: Sequence[Sdf] = bodies.bank.sdfs
+    sdfs: Sequence[Sdf] = bodies.sdfs
     count = len(sdfs)
     table = np.zeros((count, kinds.FIELDS))
     table[:, kinds.THICKNESS], table[:, kinds.CELL], table[:, kinds.PATCH] = np.inf, 1.0, -1.0

@@ -1,4 +1,4 @@
-"""One step of simulation, top to bottom as in the paper: find contacts, fly, let the network act, move.
+"""One step of simulation, top to bottom: lead what is scripted, solve contacts, let the network correct, move.
 
 Each stage sees only what is in play: an effect that is off is not computed, a body without contact is not in the
 network's graph, and what sleeps is not looked at until something moves beside it.
@@ -14,17 +14,13 @@ from torch import Tensor
 
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State, awake
-from sdfsim.dynamics.contacts import Contacts, find_contacts, no_contacts
-from sdfsim.dynamics.energy import Guard, hold_back
 from sdfsim.dynamics.freeflight import ballistic, torque_free
 from sdfsim.dynamics.graph import SUBSTEPS, ContactGraph, number_pairs
 from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.model import Model
-from sdfsim.dynamics.overlap import parting
-from sdfsim.dynamics.sleep import settle, stir, touched, wake
-from sdfsim.dynamics.surfaces import compact, predict
 
 if TYPE_CHECKING:
+    from sdfsim.dynamics.contacts import Contacts
     from sdfsim.dynamics.solver import Acts
 
 FreeFlight = Literal["exact", "learned"]
@@ -38,17 +34,16 @@ class Rules:
     Attributes:
         gravity: [3] float64.
         dt: the step.
-        substeps: inner steps of the engine whose motion is asked for.
+        substeps: inner steps of the solve in it.
         falls: False where gravity is zero: free flight without acceleration.
         contact: False leaves every body in free flight.
         friction: False computes no tangential impulse.
         restitution: False makes every contact one of restitution 0.
         rotation: False lets bodies translate only.
         free_flight: "exact", or "learned" where the *paper* network predicts all of every body's motion.
-        rows: how many nodes or edges to work on at once; None for all.
-        guard: "energy" holds back contact that makes energy.
-        sleep: whether the solver freezes what rests; networks have it in the state.
-        margin: by which all bodies but planes are larger for the solver than their distances say; adds: whether what
+        rows: how many edges a network works on at once; None for all.
+        sleep: whether the solve freezes what rests.
+        margin: by which all bodies but planes are larger for the solve than their distances say; adds: whether what
             it pushes out adds to the speed of a rebound. Both are habits of the teacher, for comparisons with it.
         trust: in what the network adds to the solve; 0 where a scene is beyond its training.
     """
@@ -63,7 +58,6 @@ class Rules:
     rotation: bool = True
     free_flight: FreeFlight = "exact"
     rows: int | None = None
-    guard: Guard = "none"
     sleep: bool = False
     margin: float = 0.0
     adds: bool = False
@@ -84,34 +78,18 @@ def step(
         memory: of the run; without one every step starts from nothing, with the same result.
 
     Returns:
-        The next state, and the contact edges that acted (None with contact off).
+        The next state, and the contact edges of the *paper* network, None for other models.
     """
     memory = memory or Memory()
-    edited = memory.begin(bodies, state)
-    state = stir(bodies, drive(bodies, state, rules), rules.gravity, edited=edited)
-    if model.kind != "paper" and rules.contact:
-        from sdfsim.dynamics.solver import held, solver_step  # numba takes its time to load
-
-        on_top = model.kind == "impulse" and rules.trust > 0.0
-        solved, acts = solver_step(bodies, state, rules, memory, note=on_top)
-        if on_top and len(acts):
-            with memory.timed("network_ms"):
-                solved = correct(model, bodies, state, solved, acts, rules, memory)
-                solved = replace(solved, touch=replace(solved.touch, held=held(solved)))
-        memory.end(bodies, solved)
-        return solved, None
-    contacts = None
-    if rules.contact:
-        state, contacts = meet(model, bodies, state, rules, memory)
-    with memory.timed("flight_ms"):
-        after = flown = fly(bodies, state, rules)
-    if contacts is not None or rules.free_flight == "learned":
-        with memory.timed("network_ms"):
-            after, contacts = respond(model, bodies, state, flown, contacts, rules, memory)
-            after = hold_back(bodies, state, flown, after, contacts, rules.gravity, rules.dt, rules.guard, memory)
-    if contacts is not None and after.sleep is not None:
-        with memory.timed("sleep_ms"):
-            after = settle(bodies, after, contacts, rules.gravity)
+    memory.begin(bodies)
+    state, contacts = drive(bodies, state, rules), None
+    if model.kind == "paper":
+        after, contacts = _paper_step(model, bodies, state, rules, memory)
+    elif rules.contact:
+        after = _solved_step(model, bodies, state, rules, memory)
+    else:
+        with memory.timed("flight_ms"):
+            after = fly(bodies, state, rules)
     memory.end(bodies, after)
     return after, contacts
 
@@ -129,15 +107,20 @@ def drive(bodies: Bodies, state: State, rules: Rules) -> State:
     )
 
 
-def meet(model: Model, bodies: Bodies, state: State, rules: Rules, memory: Memory) -> tuple[State, Contacts]:
-    """Contact edges; what sleeps beside something that moves wakes, and is looked at in turn."""
-    while True:
-        thin = model.kind == "impulse"
-        contacts = find_contacts(bodies, state, rules.gravity, model.reach, rules.dt, memory, rules.rows, thin=thin)
-        islands = touched(state, contacts)
-        if not len(islands):
-            return state, parting(bodies, state, contacts, memory)
-        state = wake(state, islands)
+def _solved_step(model: Model, bodies: Bodies, state: State, rules: Rules, memory: Memory) -> State:
+    """What the contact solve makes of the step, and on top of it the network, where the model is one."""
+    from sdfsim.dynamics.solver import held, solver_step  # numba takes its time to load
+
+    on_top = model.kind == "impulse" and rules.trust > 0.0
+    solved, acts = solver_step(bodies, state, rules, memory, note=on_top)
+    if not (on_top and len(acts)):
+        return solved
+    with memory.timed("network_ms"):
+        after = correct(model, bodies, state, solved, acts, rules)
+    memory.count(nodes=len(torch.unique(torch.cat([acts.first, acts.second]))), edges=len(acts))
+    # The solve takes poses and velocities that it did not leave behind for changes from outside.
+    assert after.touch is not None
+    return replace(after, touch=replace(after.touch, held=held(after)))
 
 
 def fly(bodies: Bodies, state: State, rules: Rules) -> State:
@@ -168,32 +151,13 @@ def fly(bodies: Bodies, state: State, rules: Rules) -> State:
     )
 
 
-def respond(
-    model: Model, bodies: Bodies, state: State, free: State, contacts: Contacts | None, rules: Rules, memory: Memory
-) -> tuple[State, Contacts]:
-    """What contacts make of free flight; only bodies with a contact edge are in the network's graph."""
-    contacts = no_contacts(bodies) if contacts is None else contacts
-    active = torch.cat([contacts.owner, contacts.body])
-    if rules.free_flight == "learned":
-        active = torch.cat([active, awake(bodies, state)])
-    active = torch.unique(active)
-    moved = int(bodies.moves[active].sum())
-    memory.count(active=moved)
-    if not moved:
-        return free, contacts
-    return _paper_step(model, bodies, state, free, contacts, active, rules, memory), contacts
-
-
-def correct(
-    model: Model, bodies: Bodies, state: State, solved: State, acts: Acts, rules: Rules, memory: Memory
-) -> State:
+def correct(model: Model, bodies: Bodies, state: State, solved: State, acts: Acts, rules: Rules) -> State:
     """What the network makes of the solve: only bodies that have met somebody are in its graph."""
     active, graph = contact_graph(bodies, state, solved, acts, rules, model.dt)
     device = next(model.network.parameters()).device
     predicted = model.network(graph.to(device), friction=rules.friction, rows=rules.rows, trust=rules.trust)
     # From the network's units of time and length back to those of the bodies.
     time = rules.dt / model.dt
-    memory.count(nodes=len(active), edges=len(acts))
     chosen = (graph.inverse_mass > 0).cpu()
     rows = active.cpu()[chosen]
 
@@ -264,32 +228,41 @@ def contact_graph(
 
 
 def _paper_step(
-    model: Model,
-    bodies: Bodies,
-    state: State,
-    free: State,
-    contacts: Contacts,
-    active: Tensor,
-    rules: Rules,
-    memory: Memory,
-) -> State:
-    """The published step of the bodies `active` [A] alone."""
+    model: Model, bodies: Bodies, state: State, rules: Rules, memory: Memory
+) -> tuple[State, Contacts | None]:
+    """The published step of the bodies that have a contact edge; free flight, or its learned form, for the others."""
+    from sdfsim.dynamics.contacts import find_contacts
+    from sdfsim.dynamics.surfaces import compact, predict
+
+    with memory.timed("flight_ms"):
+        free = fly(bodies, state, rules)
+    learned = rules.free_flight == "learned"
+    if not rules.contact and not learned:
+        return free, None
+    with memory.timed("contact_ms"):
+        reach = model.reach if rules.contact else -torch.inf
+        contacts = find_contacts(bodies, state, rules.gravity, reach, rules.dt, memory.compiled(bodies, state))
+    active = torch.cat([contacts.owner, contacts.body, *([awake(bodies, state)] if learned else [])])
+    active = torch.unique(active)
+    chosen = bodies.moves[active]
+    memory.count(active=int(chosen.sum()), contacts=len(contacts))
+    if not bool(chosen.any()):
+        return free, contacts
     if not rules.friction:
         bodies = replace(bodies, friction=torch.zeros_like(bodies.friction))
     if not rules.restitution:
         bodies = replace(bodies, restitution=torch.zeros_like(bodies.restitution))
-    some = compact(bodies, state, contacts, active)
+    with memory.timed("network_ms"):
+        some = compact(bodies, state, contacts, active)
+        predicted = predict(model.network, *some, rules.dt, rules.rows)  # type: ignore[arg-type]
     memory.count(nodes=len(active) + len(some[0].node), edges=2 * (len(some[0].node) + len(contacts)))
-    predicted = predict(model.network, *some, rules.dt, rules.rows)  # type: ignore[arg-type]
-    chosen = bodies.moves[active]
     rows = active[chosen]
     orientation, angular = predicted.orientation[chosen], predicted.angular_velocity[chosen]
     if not rules.rotation:
         orientation, angular = state.orientation[rows], torch.zeros_like(angular)
     now = {name: getattr(free, name) for name in _POSE}
-    return replace(
-        free, **_put(now, rows, (predicted.position[chosen], orientation, predicted.velocity[chosen], angular))
-    )
+    moved = (predicted.position[chosen], orientation, predicted.velocity[chosen], angular)
+    return replace(free, **_put(now, rows, moved)), contacts
 
 
 def _put(now: dict[str, Tensor], rows: Tensor, values: tuple[Tensor, ...]) -> dict[str, Tensor]:

@@ -9,12 +9,11 @@ from torch import Tensor
 
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State
-from sdfsim.dynamics.broad import expand
 from sdfsim.dynamics.contacts import Contacts
 from sdfsim.dynamics.matching import match_shapes
 from sdfsim.dynamics.paper import PaperNetwork, SurfaceGraph
 
-_NOT_PER_BODY = ("pieces", "node", "node_start", "allowed", "bank", "tracks")
+_NOT_PER_BODY = ("pieces", "node", "node_start", "allowed", "sdfs", "tracks")
 
 
 def node_owner(bodies: Bodies) -> Tensor:
@@ -27,7 +26,7 @@ def compact(bodies: Bodies, state: State, contacts: Contacts, rows: Tensor) -> t
     """The bodies `rows` [A] alone, in ascending order, with their states and all the contacts, which are among them."""
     if len(rows) == len(bodies):
         return bodies, state, contacts
-    owner, node = expand(bodies.node_start[rows], bodies.node_start[rows + 1])
+    owner, node = _expanded(bodies.node_start[rows], bodies.node_start[rows + 1])
     number = torch.full((len(bodies),), -1, dtype=torch.int64, device=bodies.device)
     number[rows] = torch.arange(len(rows), device=bodies.device)
     ends = torch.bincount(owner, minlength=len(rows)).cumsum(0)
@@ -45,6 +44,14 @@ def compact(bodies: Bodies, state: State, contacts: Contacts, rows: Tensor) -> t
     mine = number[contacts.owner]
     place = contacts.node - bodies.node_start[contacts.owner] + start[mine]
     return some, moved, replace(contacts, owner=mine, body=number[contacts.body], node=place)
+
+
+def _expanded(start: Tensor, stop: Tensor) -> tuple[Tensor, Tensor]:
+    """For ranges start[k] : stop[k], the range index and the value of every element, in order."""
+    count = stop - start
+    which = torch.repeat_interleave(torch.arange(len(count), device=count.device), count)
+    first = torch.repeat_interleave(count.cumsum(0) - count, count)
+    return which, start[which] + torch.arange(len(which), device=count.device) - first
 
 
 def surface_graph(bodies: Bodies, state: State, contacts: Contacts) -> SurfaceGraph:
@@ -93,9 +100,8 @@ def _contact_features(bodies: Bodies, state: State, contacts: Contacts) -> Tenso
     """
     c = contacts
     to_closest = -c.distance[:, None] * c.normal
-    seen = c.foot + 0.5 * c.distance[:, None] * c.normal
     bounded = bodies.size[c.body].isfinite()[:, None]
-    seen = torch.where(bounded, seen, -to_closest)
+    seen = torch.where(bounded, c.seen, -to_closest)
     closest = seen + to_closest
     lengths = [c.distance, seen.norm(dim=-1), closest.norm(dim=-1)]
     return torch.cat([to_closest, c.normal, seen, closest, torch.stack(lengths, -1)], -1)

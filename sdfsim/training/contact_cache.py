@@ -70,8 +70,8 @@ class ContactFrames:
         body_start, edge_start: [F + 1] int64, frame k owns rows body_start[k] : body_start[k + 1].
         orientation: [B, 4]; velocity, angular: [B, 3] at the start of the step.
         free_angular: [B, 3] rad/s at its end in free flight.
-        solved_velocity, solved_angular, solved_moved, solved_turned: [B, 3] what the solve makes of the step: velocities
-            at its end, and mean linear and angular velocity over it.
+        solved_velocity, solved_angular, solved_moved, solved_turned: [B, 3] what the solve makes of the step:
+            velocities at its end, and mean linear and angular velocity over it.
         end_velocity, end_angular, moved, turned: [B, 3] the same as recorded.
         mass: [B] kg, 0 for static bodies; inertia: [B, 3]; friction, restitution, size: [B].
         first, second: [E] int16, bodies within the frame.

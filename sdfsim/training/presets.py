@@ -19,7 +19,6 @@ class Preset:
         reach: m, contact radius D.
         strides: recorded steps in a step (impulse); several for a network of several step lengths.
         inner: inner steps of the solve in a step; 0 for those of the recording engine.
-        bf16: matrix products in bfloat16, see `dynamics.precision`.
         noise: m, standard deviation of pose noise of the *paper* network (None: none); *impulse* has its own.
     """
 
@@ -33,14 +32,20 @@ class Preset:
     matrix_rate: float | None = None
     strides: tuple[int, ...] = (1,)
     inner: int = 0
-    bf16: bool = False
 
 
 PRESETS = {
     "small": Preset("impulse", {"width": 32, "rounds": 4}, steps=16_000, batch=32, rate=2e-3, matrix_rate=0.01),
     "alone": Preset("impulse", {"width": 64, "rounds": 6, "alone": 1}, 16_000, batch=32, rate=2e-3, matrix_rate=0.01),
     "long": Preset(
-        "impulse", {"width": 32, "rounds": 4}, 16_000, batch=32, rate=2e-3, matrix_rate=0.01, strides=(1, 2), inner=1
+        "impulse",
+        {"width": 32, "rounds": 4},
+        steps=16_000,
+        batch=32,
+        rate=2e-3,
+        matrix_rate=0.01,
+        strides=(1, 2),
+        inner=1,
     ),
     "base": Preset("impulse", {"width": 128, "rounds": 8}, steps=100_000, batch=64, rate=1e-3, matrix_rate=0.01),
     "paper": Preset("paper", {"width": 128, "steps": 10}, steps=1_000_000, batch=8, rate=1e-3, noise=0.003),

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from sdfsim.dynamics.precision import in_bfloat16
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_arrays, write_arrays
 from sdfsim.training.distributed import ALONE, Team
@@ -62,7 +61,6 @@ class Run:
         self.network: nn.Module = new_network(plan.kind, plan.config).to(device)
         if hasattr(task, "prepare"):
             task.prepare(self.network, np.random.default_rng([seed, 1]))
-        self.computing = in_bfloat16(self.network) if plan.bf16 else self.network
         # Averaged are the trained weights; feature statistics are fixed before the first step.
         self.weights = dict(self.network.named_parameters())
         self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
@@ -73,10 +71,9 @@ class Run:
         """One optimiser step on a batch that depends on (seed, step) alone."""
         rng = np.random.default_rng([self.seed, 0, self.step])
         flipped = rng.integers(2)
-        task = self.task
-        batch = task.draw(rng, self.plan.batch, self.team)
-        loss = task.loss(self.computing, batch, mirrored=bool(flipped))
-        weight = task.weight_of(batch)
+        batch = self.task.draw(rng, self.plan.batch, self.team)
+        loss = self.task.loss(self.network, batch, mirrored=bool(flipped))
+        weight = self.task.weight_of(batch)
         loss = loss * (weight / max(1.0, self.team.total(weight, self.device)))
         self.optimiser.zero_grad()
         loss.backward()
