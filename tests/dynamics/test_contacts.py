@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from sdfsim.dynamics.bodies import Units, from_scene
-from sdfsim.dynamics.contacts import find_contacts, thin_contacts
+from sdfsim.dynamics.contacts import find_contacts
 from sdfsim.errors import SdfsimError
 from sdfsim.scene.types import Scene
 from sdfsim.shape.asset import analytic_shape
@@ -111,30 +111,6 @@ def test_fast_bodies_have_an_edge_before_they_arrive():
     ball = make_body("ball", 0, [0, 0, 0.8], velocity=np.array([0.0, 0.0, -20.0]))
     assert len(found(Scene(shapes, (floor, ball), GRAVITY, 1.0))[1]) > 0
     assert len(found(Scene(shapes, (floor, replace(ball, velocity=np.zeros(3))), GRAVITY, 1.0))[1]) == 0
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_thinning_keeps_the_deepest_and_the_corners(seed):
-    bodies, contacts = found(heap(seed))
-    thin = thin_contacts(bodies, contacts)
-    everything, kept = as_edges(bodies, contacts), as_edges(bodies, thin)
-    assert kept.items() <= everything.items()
-    pairs = {(i, j) for i, _, j in everything}
-    assert pairs == {(i, j) for i, _, j in kept}
-    for pair in pairs:
-        mine = (contacts.owner == pair[0]) & (contacts.body == pair[1])
-        ours = (thin.owner == pair[0]) & (thin.body == pair[1])
-        assert int(ours.sum()) <= 13
-        assert float(thin.ahead[ours].min()) == float(contacts.ahead[mine].min())
-
-
-def test_a_resting_box_keeps_its_four_corners():
-    shapes = (analytic_shape("box", size=(1.0, 0.8, 0.6)), analytic_shape("plane"))
-    floor = make_body("floor", 1, [0, 0, 0], motion="static", mass=0.0)
-    bodies, contacts = found(Scene(shapes, (floor, make_body("box", 0, [0, 0, 0.3])), GRAVITY, 1.0))
-    thin = thin_contacts(bodies, contacts)
-    low = {tuple(np.round(arm, 6)) for arm in thin.arm.numpy()}
-    assert {(x, y, -0.3) for x in (-0.5, 0.5) for y in (-0.4, 0.4)} <= low and len(thin) < len(contacts)
 
 
 def test_a_moving_body_needs_mass_and_nodes():

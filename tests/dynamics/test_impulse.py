@@ -7,8 +7,11 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from sdfsim.dynamics.graph import ContactGraph, EdgeFrames, edge_frames
+from sdfsim.dynamics.impulse import bounded, pushed
 from sdfsim.dynamics.simulator import Simulator
-from sdfsim.dynamics.step import contact_graph, find_contacts, fly
+from sdfsim.dynamics.solver import solver_step
+from sdfsim.dynamics.step import contact_graph
 from sdfsim.scene.types import Scene
 from sdfsim.shape.asset import analytic_shape
 from tests.dynamics.conftest import angle_between, make_body, random_model
@@ -24,28 +27,92 @@ def test_colliding_bodies_in_free_space_keep_linear_momentum(free_pair):
     touched = 0
     for _ in range(20):
         sim.run(steps=1)
-        touched += sim.contacts is not None and len(sim.contacts) > 0
+        touched += sim.memory.counts["edges"] > 0
         torch.testing.assert_close(linear_momentum(sim), before, rtol=0, atol=1e-5)
     assert touched > 2
 
 
+def first_graph(scene: Scene, steps: int = 30) -> tuple[Simulator, torch.Tensor, ContactGraph]:
+    """The first step in which contacts act: the simulator before it, the bodies in contact, and their graph."""
+    sim = Simulator(scene, random_model("impulse"))
+    for _ in range(steps):
+        solved, acts = solver_step(sim.bodies, sim.state, sim.rules, sim.memory, note=True)
+        if len(acts) and bool((acts.impulse != 0).any()):
+            return sim, *contact_graph(sim.bodies, sim.state, solved, acts, sim.rules, sim.model.dt)
+        sim.state = solved
+    raise AssertionError("nothing touched")
+
+
 def test_impulses_keep_angular_momentum_at_the_instant_they_act(free_pair):
-    sim = Simulator(free_pair, random_model("impulse"))
-    free = fly(sim.bodies, sim.state, sim.rules)
-    contacts = find_contacts(sim.bodies, sim.state, sim.rules.gravity, sim.model.reach, sim.rules.dt)
-    active, graph = contact_graph(sim.bodies, sim.state, free, contacts, sim.rules)
+    sim, active, graph = first_graph(free_pair)
     after = sim.model.network(graph)
     mass = 1.0 / graph.inverse_mass.double()
     inertia = torch.linalg.inv(graph.inverse_inertia.double())
     for end, start, spin_end, spin_start in (
-        (after.velocity, graph.free_velocity, after.angular, graph.free_angular),
+        (after.velocity, graph.solved_velocity, after.angular, graph.solved_angular),
         (after.mean_velocity, graph.mean_velocity, after.mean_angular, graph.mean_angular),
     ):
         push = mass[:, None] * (end - start).double()
         twist = (inertia @ (spin_end - spin_start).double()[..., None])[..., 0]
-        moment = twist + torch.linalg.cross(sim.state.position[active], push)
+        # Arms reach the contacts from where the centres are when they act, a little beside those of the step's start.
+        place = sim.state.position[active]
+        first, second = graph.first[0], graph.second[0]
+        place = place.index_copy(0, second[None], (place[first] + graph.arm_first[0] - graph.arm_second[0])[None])
+        moment = twist + torch.linalg.cross(place, push)
         assert push.norm(dim=-1).min() > 1e-3
         torch.testing.assert_close(moment.sum(0), torch.zeros(3, dtype=torch.float64), rtol=0, atol=1e-5)
+
+
+def pushes(graph: ContactGraph, strength: float, seed: int) -> tuple[EdgeFrames, torch.Tensor, torch.Tensor]:
+    """Frames of a graph, its solved twists, and random impulses of about `strength` times those of the solve."""
+    frames = edge_frames(graph)
+    end = torch.cat([graph.solved_velocity, graph.solved_angular], -1)
+    mean = torch.cat([graph.mean_velocity, graph.mean_angular], -1)
+    generator = torch.Generator().manual_seed(seed)
+    scale = strength * frames.solved.norm(dim=-1).max()
+    return frames, torch.stack([end, mean], -1), torch.randn(len(graph.gap), 3, 2, generator=generator) * scale
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("strength", [0.1, 3.0])
+@pytest.mark.parametrize("scene", ["dropped", "free_pair"])
+def test_the_trust_region_keeps_what_contact_can_do(scene, strength, seed, request):
+    _, _, graph = first_graph(request.getfixturevalue(scene))
+    frames, start, wild = pushes(graph, strength, seed)
+    kept = bounded(graph, frames, wild, start, 1.0)
+    assert kept.abs().max() > 1e-4
+    total = frames.solved + kept[..., 0]
+    normal, drag = total[:, 0], total[:, 1:].norm(dim=-1)
+    assert (normal >= -1e-6).all()
+    cone = torch.maximum(graph.friction * normal, frames.solved[:, 1:].norm(dim=-1))
+    assert (drag <= cone * (1 + 1e-5) + 1e-6).all()
+
+    def energy(twist: torch.Tensor) -> float:
+        moves = graph.inverse_mass > 0
+        inertia = torch.linalg.inv(graph.inverse_inertia[moves].double())
+        velocity, spin = twist[moves, :3].double(), twist[moves, 3:].double()
+        turning = (spin * (inertia @ spin[..., None])[..., 0]).sum()
+        return float(0.5 * (velocity.square().sum(-1) / graph.inverse_mass[moves]).sum() + 0.5 * turning)
+
+    free = torch.cat([graph.free_velocity, graph.free_angular], -1)
+    after = pushed(graph, frames, kept, start)[..., 0]
+    assert energy(after) <= max(energy(free), energy(start[..., 0])) * (1 + 1e-3)
+
+
+def test_surfaces_that_do_not_move_against_each_other_are_left_to_the_solve(box_shape):
+    resting = make_body("box", 0, [0.0, 0.0, 0.3])
+    floor = make_body("floor", 1, [0.0, 0.0, 0.0], motion="static", mass=0.0)
+    scene = Scene((box_shape, analytic_shape("plane")), (resting, floor), np.array([0.0, 0.0, -9.81]), duration=1.0)
+    alone, other = (Simulator(scene, m).run(steps=40) for m in ("solver", random_model("impulse")))
+    np.testing.assert_allclose(other.position, alone.position, atol=1e-4)
+    assert np.abs(other.velocity[-1]).max() < 1e-6
+
+
+def test_beyond_its_training_a_network_adds_nothing(dropped):
+    model = replace(random_model("impulse"), length=1.4, ranges={"size": [0.01, 0.02]})
+    sim = Simulator(dropped, model)
+    assert sim.outside_training and sim.rules.trust == 0.0
+    np.testing.assert_array_equal(sim.run(steps=20).position, Simulator(dropped, "solver").run(steps=20).position)
 
 
 def turned(scene, rotation: Rotation):
@@ -165,26 +232,36 @@ def test_without_friction_nothing_tangential_is_computed(dropped):
 
 def test_mirrored_frames_mirror_the_network_output(dropped):
     """A left-handed frame is what the mirror image shows: twice mirrored is the same, and it is a different input."""
-    sim = Simulator(dropped, random_model("impulse"))
-    free = fly(sim.bodies, sim.state, sim.rules)
-    contacts = find_contacts(sim.bodies, sim.state, sim.rules.gravity, sim.model.reach, sim.rules.dt)
-    _, graph = contact_graph(sim.bodies, sim.state, free, contacts, sim.rules)
+    sim, _, graph = first_graph(dropped)
 
     def mirror(v):
         return v * v.new_tensor([1.0, -1.0, 1.0])
 
-    vectors = ("velocity", "free_velocity", "mean_velocity", "normal", "arm_first", "arm_second")
-    pseudo = ("angular", "free_angular", "mean_angular")
+    vectors = ("velocity", "free_velocity", "solved_velocity", "mean_velocity", "normal", "arm_first", "arm_second")
+    pseudo = ("angular", "free_angular", "solved_angular", "mean_angular")
     flip = torch.diag(torch.tensor([1.0, -1.0, 1.0]))
     image = replace(
         graph,
-        **{k: mirror(getattr(graph, k)) for k in vectors},
+        **{k: mirror(getattr(graph, k)) for k in (*vectors, "impulse")},
         **{k: -mirror(getattr(graph, k)) for k in pseudo},
         inverse_inertia=flip @ graph.inverse_inertia @ flip,
     )
     straight, seen = sim.model.network(graph), sim.model.network(image, mirrored=True)
     torch.testing.assert_close(mirror(straight.velocity), seen.velocity, rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(-mirror(straight.angular), seen.angular, rtol=1e-4, atol=1e-5)
+
+
+def test_features_turn_with_the_scene(dropped) -> None:
+    _, _, graph = first_graph(dropped)
+    turn = torch.from_numpy(Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()).float()
+    names = ("velocity", "angular", "free_velocity", "free_angular", "solved_velocity", "solved_angular")
+    names += ("mean_velocity", "mean_angular", "normal", "arm_first", "arm_second", "impulse")
+    other = replace(
+        graph,
+        inverse_inertia=turn @ graph.inverse_inertia @ turn.T,
+        **{name: getattr(graph, name) @ turn.T for name in names},
+    )
+    torch.testing.assert_close(edge_frames(other).start, edge_frames(graph).start, atol=1e-4, rtol=1e-3)
 
 
 def test_a_crowd_denser_than_any_in_training_does_not_run_away():
