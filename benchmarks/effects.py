@@ -18,17 +18,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from sdfsim.dynamics.sleep import STEPS as SLEEP_STEPS
+from sdfsim.shape.shape import analytic_shape
 
 from sdfsim import Simulator, load_scene
 from sdfsim.dynamics.contacts import find_contacts
 from sdfsim.dynamics.model import load_model
 from sdfsim.dynamics.simulator import SimulationError
-from sdfsim.dynamics.sleep import STEPS as SLEEP_STEPS
 from sdfsim.dynamics.step import contact_graph, fly
 from sdfsim.errors import run_main
 from sdfsim.progress import columns
 from sdfsim.scene.types import Body, Effects, Limits, Scene
-from sdfsim.shape.asset import analytic_shape
 from sdfsim.training.contact_cache import contact_frames
 from sdfsim.training.impulse_task import ImpulseTask
 

@@ -15,6 +15,7 @@ from math import atan, cos, degrees, radians, sin, sqrt
 from pathlib import Path
 
 import numpy as np
+from sdfsim.shape.shape import Shape, analytic_shape
 
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.simulator import SimulationError, Simulator
@@ -22,7 +23,6 @@ from sdfsim.errors import run_main
 from sdfsim.files import write_text
 from sdfsim.progress import columns
 from sdfsim.scene.types import Body, Scene
-from sdfsim.shape.asset import Shape, analytic_shape
 
 G = 9.81  # m/s^2
 SIZES = (0.02, 0.1, 1.0)  # m

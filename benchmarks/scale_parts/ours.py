@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from sdfsim.shape.shape import analytic_shape
 
 from benchmarks.scale_parts.overlaps import overlaps
 from sdfsim import Simulator, load_scene
@@ -17,7 +18,6 @@ from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.simulator import SimulationError, join
 from sdfsim.dynamics.step import contact_graph, fly
 from sdfsim.scene.types import Body, Scene
-from sdfsim.shape.asset import analytic_shape
 
 COUNTS = ("pairs", "sdf_queries", "sdf_waiting", "nodes", "edges", "active")
 

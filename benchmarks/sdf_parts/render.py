@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from sdfsim.shape.far_field import BOX
 
-from sdfsim.shape.boxed import BOX
 from sdfsim.shape.mesh import Frame, Mesh
 from sdfsim.shape.sdf import Sdf
 

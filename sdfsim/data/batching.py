@@ -10,7 +10,7 @@ import torch
 from sdfsim.data.dataset import FLOOR, Trajectory
 from sdfsim.dynamics.bodies import Bodies, State, Units, from_scene
 from sdfsim.scene.types import Body, Scene
-from sdfsim.shape.asset import Shape, analytic_shape
+from sdfsim.shape.shape import Shape, analytic_shape
 
 
 def merged(

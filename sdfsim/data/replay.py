@@ -17,7 +17,7 @@ from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.model import Model
 from sdfsim.dynamics.step import FreeFlight, Rules, step
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
-from sdfsim.shape.asset import Shape
+from sdfsim.shape.shape import Shape
 
 BATCH = 50  # trajectories simulated side by side
 

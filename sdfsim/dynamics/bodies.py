@@ -11,10 +11,10 @@ from torch import Tensor
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.tracks import Tracks, from_paths
 from sdfsim.errors import SdfsimError
-from sdfsim.scene.pairs import contact_groups
-from sdfsim.scene.types import Scene
-from sdfsim.shape.asset import Shape
+from sdfsim.scene.collision_filter import contact_groups
+from sdfsim.scene.scene import Scene
 from sdfsim.shape.sdf import Sdf
+from sdfsim.shape.shape import Shape
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import torch
 from sdfsim.dynamics.bodies import Bodies, State, Units, largest_extent
 from sdfsim.dynamics.graph import SUBSTEPS, number_pairs
 from sdfsim.dynamics.model import SOLVER, Model
-from sdfsim.scene.types import Scene
+from sdfsim.scene.scene import Scene
 
 LABELS = {
     "size": "largest side of a body, m",

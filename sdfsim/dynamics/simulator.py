@@ -27,7 +27,7 @@ from sdfsim.dynamics.rollout import Rollout, join
 from sdfsim.dynamics.step import FreeFlight, Rules, step
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.scene.effects import plan
-from sdfsim.scene.types import Limits, Scene
+from sdfsim.scene.scene import Limits, Scene
 
 if TYPE_CHECKING:
     from sdfsim.dynamics.contacts import Contacts

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from sdfsim.shape.shape import analytic_shape
 from typer.testing import CliRunner
 
 import cli
@@ -24,8 +25,7 @@ from sdfsim.evaluation.hard_cases_ratchet import accepted, slipped_back
 from sdfsim.evaluation.hard_cases_tables import NO_TEACHER, columns, losses, markdown, rows
 from sdfsim.files import write_json
 from sdfsim.shape import primitives
-from sdfsim.shape.asset import analytic_shape
-from sdfsim.shape.storage import write_ply
+from sdfsim.shape.mesh import write_ply
 
 FEW = ("overlap-balls", "thin-5", "cuda")
 

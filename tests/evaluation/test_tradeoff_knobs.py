@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from sdfsim.shape.shape import analytic_shape, with_sdf
 
 from sdfsim.dynamics.graph import EDGE_FEATURES
 from sdfsim.dynamics.model import Model, new_network
@@ -17,7 +18,6 @@ from sdfsim.evaluation.tradeoff_knobs import (
     settings,
     threads_of,
 )
-from sdfsim.shape.asset import analytic_shape, with_sdf
 
 
 @pytest.fixture(scope="module")

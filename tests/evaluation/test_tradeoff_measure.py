@@ -33,8 +33,9 @@ CUBE = "".join(f"v {x} {y} {z}\n" for x, y, z in CORNERS) + "".join(
 def data(tmp_path_factory):
     """A dataset of three trajectories of cubes whose distances are a closed form."""
     pytest.importorskip("pybullet")
+    from sdfsim.shape.shape import analytic_shape
+
     from sdfsim.data.generate import make_dataset
-    from sdfsim.shape.asset import analytic_shape
 
     meshes, out = tmp_path_factory.mktemp("meshes"), tmp_path_factory.mktemp("data")
     (meshes / "cube").mkdir()

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from sdfsim.shape.shape import Shape, analytic_shape
 
 from pipeline.asset import fit_parts
 from pipeline.drop import LEVEL, Above, choose_drop, plate_on
@@ -16,9 +17,7 @@ from pipeline.scene_file import DENSITY, Found, scene_text, write_scene
 from sdfsim.errors import SdfsimError
 from sdfsim.files import write_json
 from sdfsim.scene.load import load_scene
-from sdfsim.shape.asset import Shape, analytic_shape
-from sdfsim.shape.mesh import Mesh
-from sdfsim.shape.storage import write_ply
+from sdfsim.shape.mesh import Mesh, write_ply
 from tests.pipeline.test_surface import cube, scenery
 
 PLACEMENT = Placement(1.0, np.eye(3), np.zeros(3), "plane", "assumed: widest side = 1 m")
