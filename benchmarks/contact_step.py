@@ -66,7 +66,7 @@ def timed(frames: Iterator, steps: int) -> float:
 
 def movi_b(data: Path) -> tuple[float, float]:
     """Milliseconds a step of PyBullet and of the solve, mean over trajectories."""
-    recorded = [Trajectory.load(f) for f in trajectory_files(data, "test")[:TRAJECTORIES]]
+    recorded = [Trajectory.load(f, as_recorded=True) for f in trajectory_files(data, "test")[:TRAJECTORIES]]
     names = {str(n) for t in recorded for n in t.shape}
     shapes, urdfs = load_shapes(data, names), {n: engine_file(data, n) for n in names}
     engine, ours = [], []

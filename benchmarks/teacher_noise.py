@@ -154,7 +154,8 @@ def main() -> None:
     parser.add_argument("--trajectories", type=int, default=100)
     parser.add_argument("--model", default="small", help="an impulse model")
     args = parser.parse_args()
-    recorded = [Trajectory.load(f) for f in trajectory_files(args.data, args.split)[: args.trajectories]]
+    files = trajectory_files(args.data, args.split)[: args.trajectories]
+    recorded = [Trajectory.load(f, as_recorded=True) for f in files]
     urdfs = {name: engine_file(args.data, name) for name in {str(n) for t in recorded for n in t.shape}}
     print("| each step | m, 50 steps | degrees | m, 100 steps | degrees |\n| --- | --- | --- | --- | --- |")
     for how in DISTURBANCES:

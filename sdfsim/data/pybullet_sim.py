@@ -62,6 +62,7 @@ ENGINE_SETTINGS = {
 BODY_SETTINGS = {"contactProcessingThreshold": 0.0}
 MAXIMAL = {"useMaximalCoordinates": True}
 FAR = (0.0, 0.0, -100.0)  # m, where bodies wait to be placed
+MARGIN = 1e-3  # m, around the convex pieces of every body that is loaded from a file (Bullet's default)
 APART = 1000.0  # m between bodies that are not to touch
 URDF_TEMPLATE = """<robot name="body"><link name="base">
 <inertial><origin xyz="0 0 0"/><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>

@@ -9,7 +9,7 @@ import torch
 
 from sdfsim.data.batching import merged
 from sdfsim.data.dataset import FLOOR, Trajectory
-from sdfsim.data.velocities import MARGIN
+from sdfsim.data.pybullet_sim import MARGIN
 from sdfsim.dynamics.bodies import Units
 from sdfsim.dynamics.energy import Guard
 from sdfsim.dynamics.graph import SUBSTEPS

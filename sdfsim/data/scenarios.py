@@ -6,13 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from sdfsim.data.dataset import FLOOR
 from sdfsim.data.pybullet_sim import Teacher, TeacherBody
 from sdfsim.data.shape_assets import ShapeSource
-from sdfsim.data.starts_moving import set_moving
-from sdfsim.data.starts_resting import STARTS, at_rest, upright
+from sdfsim.dynamics.overlap import DEEPEST
 
 REGION = ((-5.0, -5.0, 1.0), (5.0, 5.0, 5.0))  # m, holds every tossed body's bounds at the start
 COUNT = (3, 10)
@@ -57,6 +57,26 @@ SHARES = {
 }
 FEW = (1, 4)  # bodies in plain motion; head-on two or four
 BALL_SHARE = 0.5  # of the bodies in plain motion; all of those that roll
+
+# Starts at or near rest.
+STARTS = ("still", "dropped", "nudged", "pressed")
+GAP = 2.5e-3  # m, under a body that is put down: around the engine's convex pieces are 1 mm, so 2 mm between two
+DROP = 0.1  # m, at most, under one that is dropped
+NUDGE = 0.3  # m/s, at most, along x and along y
+PRESSED = 0.5 * DEEPEST  # of its extent: how far at most a body is moved into what is around it, along each axis
+FIELD = 3.0  # m, half the side of the square of floor that is used
+STACKED = 0.5  # part of the bodies that go on top of the one before
+STEADY = 0.03  # least distance of the centre of mass from the rim of the face it stands on, over the largest extent
+
+# Starts in plain motion.
+MOTIONS = ("rolling", "sliding", "spinning", "falling", "head-on")
+SPEEDS = (0.5, 4.0)  # m/s
+SPINS = (1.0, 10.0)  # rad/s, about the vertical
+HEIGHTS = (0.1, 2.0)  # m, under a body that falls
+MEETING = (0.1, 1.0)  # s, until the bodies of a pair touch
+ALOFT = 32.0  # m, the lowest pair: more than it falls in 2 s, with what a hit may add
+APART = 12.0  # m between the heights of pairs
+HALF = 0.5  # of the bodies: along x or y, of a spin that fits, or unturned; the others any way
 
 Placed = list[tuple[ShapeSource, TeacherBody]]
 
@@ -117,7 +137,7 @@ def bowl(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Placed:
     count = cast.bodies or int(rng.integers(BALLS[0], BALLS[1] + 1))
     inner = BALL * (ROOM * count / (4 * PACKED)) ** (1 / 3)
     vessel, ball = cast.scenery["bowl"], cast.scenery["ball"]
-    placed = [(vessel, _static(vessel, 2 * inner / (1 - WALL), *FLOOR))]
+    placed = [(vessel, _body(vessel, 2 * inner / (1 - WALL), 0.0, *FLOOR))]
     high = _stand(teacher, placed[0], np.zeros(2), Rotation.identity())
     for position in _layers(rng, count, max(0.75 * inner - 0.5 * BALL, 0.0)):
         placed.append((ball, _body(ball, BALL, *PLAIN)))
@@ -159,7 +179,7 @@ def varied(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Placed | N
     if start in ("tossed", "resting") and rng.random() < OBSTACLE_SHARE:
         source = cast.scenery[str(rng.choice(list(OBSTACLES)))]
         extent = rng.uniform(*OBSTACLE_EXTENTS)
-        placed.append((source, _static(source, extent, rng.uniform(*FRICTIONS), rng.uniform(*RESTITUTIONS))))
+        placed.append((source, _body(source, extent, 0.0, rng.uniform(*FRICTIONS), rng.uniform(*RESTITUTIONS))))
         _stand(teacher, placed[0], rng.uniform(-1.0, 1.0, 2), Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)))
     masses: list[float] = []
 
@@ -245,12 +265,8 @@ def _layers(rng: np.random.Generator, count: int, radius: float) -> np.ndarray:
 
 
 def _body(source: ShapeSource, extent: float, density: float, friction: float, restitution: float) -> TeacherBody:
-    """A body of a shape whose largest extent is 1 m at scale 1."""
+    """A body of a shape whose largest extent is 1 m at scale 1; density 0 makes it static."""
     return TeacherBody(source.urdf, extent, source.volume * density * extent**3, friction, restitution)
-
-
-def _static(source: ShapeSource, extent: float, friction: float, restitution: float) -> TeacherBody:
-    return TeacherBody(source.urdf, extent, 0.0, friction, restitution)
 
 
 def _stand(teacher: Teacher, one: tuple[ShapeSource, TeacherBody], place: np.ndarray, rotation: Rotation) -> float:
@@ -278,3 +294,165 @@ def _direction(rng: np.random.Generator) -> np.ndarray:
 
 def _closed(span: tuple[int, int]) -> tuple[int, int]:
     return span[0], span[1] + 1
+
+
+def at_rest(
+    teacher: Teacher, rng: np.random.Generator, bodies: list[tuple[ShapeSource, TeacherBody]], start: str, tries: int
+) -> bool:
+    """Put bodies down: all at rest, all dropped from `DROP` at most, all given a nudge, or pressed into one another.
+
+    Only the last overlap; from them is learned how bodies part.
+
+    Args:
+        teacher: the world; the bodies come after those that it has.
+        rng: what is drawn from.
+        bodies: shapes of largest extent 1 m at scale 1, and their bodies.
+        start: one of `STARTS`.
+        tries: places for one body.
+
+    Returns:
+        False when one found no room.
+    """
+    below, top = np.zeros(2), 0.0
+    placed = []
+    for number, (source, body) in enumerate(bodies):
+        index = teacher.add(body)
+        for _ in range(tries):
+            stacked = number > 0 and rng.random() < STACKED
+            place = below + rng.uniform(-0.1, 0.1, 2) * body.scale if stacked else rng.uniform(-FIELD, FIELD, 2)
+            gap = rng.uniform(GAP, DROP) if start == "dropped" else GAP
+            rotation = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)) * standing(source.vertices, rng)
+            position, high = upright(source, body, place, (top if stacked else 0.0) + gap, rotation)
+            teacher.place(index, position, rotation.as_quat())
+            if not teacher.overlaps(index):
+                break
+        else:
+            return False
+        placed.append((index, position, rotation.as_quat()))
+        below, top = position[:2], high
+        if start == "nudged":
+            teacher.push(index, np.array([*rng.uniform(-NUDGE, NUDGE, 2), 0.0]), np.zeros(3))
+    if start == "pressed":
+        for (_, body), (index, position, quat) in zip(bodies, placed, strict=True):
+            teacher.place(index, position + rng.uniform(-PRESSED, PRESSED, 3) * body.scale, quat)
+    return True
+
+
+def upright(
+    source: ShapeSource, body: TeacherBody, place: np.ndarray, height: float, rotation: Rotation
+) -> tuple[np.ndarray, float]:
+    """Where [3] m the centre of mass is when the lowest point is at `height` m over `place` [2] m; and the top, m."""
+    heights = body.scale * rotation.apply(source.vertices)[:, 2]
+    position = np.array([*place, height - heights.min()])
+    return position, float(position[2] + heights.max())
+
+
+def standing(vertices: np.ndarray, rng: np.random.Generator) -> Rotation:
+    """A rotation in which a shape of `vertices` [V, 3] about its centre of mass stands flat.
+
+    It stands on a random one of its steady faces; any rotation where it has none.
+    """
+    faces = steady_faces(vertices)
+    if len(faces) == 0:
+        return Rotation.random(rng=rng)
+    return Rotation.align_vectors([[0.0, 0.0, -1.0]], faces[rng.integers(len(faces))][None])[0]
+
+
+def steady_faces(vertices: np.ndarray) -> np.ndarray:
+    """Outward unit normals [K, 3] of the faces of the convex hull on which a body stands without tipping over.
+
+    Args:
+        vertices: [V, 3] about the centre of mass.
+    """
+    hull = ConvexHull(vertices)
+    extent = float(np.ptp(vertices, axis=0).max())
+    corners = vertices[hull.vertices]
+    # Triangles of one face differ by rounding.
+    _, first = np.unique(hull.equations.round(3), axis=0, return_index=True)
+    steady = [plane[:3] for plane in hull.equations[first] if _margin(corners, plane, extent) >= STEADY * extent]
+    return np.array(steady).reshape(-1, 3)
+
+
+def _margin(corners: np.ndarray, plane: np.ndarray, extent: float) -> float:
+    """How far within the face on `plane` [4] (normal, offset) the origin's foot is; negative outside, -inf: no face."""
+    normal, offset = plane[:3], plane[3]
+    face = corners[np.abs(corners @ normal + offset) < 1e-3 * extent]
+    axes = np.linalg.svd(normal[None])[2][1:]
+    try:
+        rim = ConvexHull(face @ axes.T)
+    except (QhullError, ValueError):
+        return -np.inf
+    return float(-rim.equations[:, 2].max())
+
+
+def set_moving(
+    teacher: Teacher, rng: np.random.Generator, bodies: list[tuple[ShapeSource, TeacherBody]], motion: str, tries: int
+) -> bool:
+    """Put bodies into the world, all in one kind of motion.
+
+    Those that roll are to be balls: half go along x or y, half have the spin of their speed and the others any. Those
+    that slide do not turn at first. Those that spin or fall have no other velocity.
+
+    Args:
+        teacher: the world; the bodies come after those that it has.
+        rng: what is drawn from.
+        bodies: shapes of largest extent 1 m at scale 1, and their bodies; "head-on" takes two at a time.
+        motion: one of `MOTIONS`.
+        tries: places for one body.
+
+    Returns:
+        False when one found no room.
+    """
+    if motion == "head-on":
+        for k in range(0, len(bodies) - 1, 2):
+            _meet(teacher, rng, bodies[k : k + 2], ALOFT + APART * (k // 2))
+        return True
+    for one in bodies:
+        index = teacher.add(one[1])
+        for _ in range(tries):
+            gap = rng.uniform(*HEIGHTS) if motion == "falling" else GAP
+            if one[0].sphere or (motion == "falling" and rng.random() < HALF):
+                rotation = Rotation.random(rng=rng)
+            else:
+                rotation = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)) * standing(one[0].vertices, rng)
+            position, _ = upright(*one, rng.uniform(-FIELD, FIELD, 2), gap, rotation)
+            teacher.place(index, position, rotation.as_quat())
+            if not teacher.overlaps(index):
+                break
+        else:
+            return False
+        teacher.push(index, *_velocities(rng, motion, one[1].scale))
+    return True
+
+
+def _velocities(rng: np.random.Generator, motion: str, extent: float) -> tuple[np.ndarray, np.ndarray]:
+    """Linear [3] m/s and angular [3] rad/s velocity of a body on the floor or above it."""
+    up, still = np.array([0.0, 0.0, 1.0]), np.zeros(3)
+    if motion == "falling":
+        return still, still
+    if motion == "spinning":
+        return still, rng.choice((-1.0, 1.0)) * rng.uniform(*SPINS) * up
+    turn = 0.5 * np.pi * rng.integers(4) if rng.random() < HALF else rng.uniform(0.0, 2 * np.pi)
+    velocity = rng.uniform(*SPEEDS) * np.array([np.cos(turn), np.sin(turn), 0.0])
+    if motion == "sliding":
+        return velocity, still
+    spin = np.cross(up, velocity) / (0.5 * extent)
+    if rng.random() < HALF:
+        spin = Rotation.random(rng=rng).apply(rng.uniform(0.0, 2.0) * spin)
+    return velocity, spin
+
+
+def _meet(
+    teacher: Teacher, rng: np.random.Generator, pair: list[tuple[ShapeSource, TeacherBody]], height: float
+) -> None:
+    """Two bodies at `height` m that fly at each other along a level line."""
+    turn = rng.uniform(0.0, 2 * np.pi)
+    line = np.array([np.cos(turn), np.sin(turn), 0.0])
+    speeds, rotations = rng.uniform(*SPEEDS, 2), Rotation.random(2, rng=rng)
+    reach = [body.scale * np.linalg.norm(source.vertices, axis=1).max() for source, body in pair]
+    middle = np.array([*rng.uniform(-FIELD, FIELD, 2), height])
+    time = rng.uniform(*MEETING)
+    for k, side in enumerate((-1.0, 1.0)):
+        index = teacher.add(pair[k][1])
+        teacher.place(index, middle + side * (reach[k] + speeds[k] * time) * line, rotations[k].as_quat())
+        teacher.push(index, -side * speeds[k] * line, np.zeros(3))

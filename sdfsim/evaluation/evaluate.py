@@ -11,10 +11,9 @@ import numpy as np
 
 from sdfsim.data import metrics
 from sdfsim.data.batching import scene_of
-from sdfsim.data.dataset import Trajectory, load_shapes, trajectory_files
+from sdfsim.data.dataset import Trajectory, engine_substep, load_shapes, trajectory_files
 from sdfsim.data.metrics import FRAMES, HORIZONS
 from sdfsim.data.replay import batches, first_frames, model_units, roll_out
-from sdfsim.data.velocities import at_instants, engine_substep
 from sdfsim.dynamics.energy import Guard
 from sdfsim.dynamics.model import Model, load_model
 from sdfsim.dynamics.ranges import outside_training
@@ -106,7 +105,7 @@ def evaluate(
     again, floor_report = {}, {}
     if chaos_floor:
         tell(0.8, "teacher, from starts that differ slightly")
-        again, floor_report = _teacher_again(data, recorded)
+        again, floor_report = _teacher_again(data, split, longest)
     report = {
         "data": str(data),
         "split": split,
@@ -128,15 +127,14 @@ def evaluate(
     if not errors_only:
         tell(0.9, "penetration, energy and rest")
         solids = exact_solids(data, shapes)
-        # Energies compare at the instants of the positions; rest and penetration are told by positions alone.
-        report |= _quality(contenders["model"], [at_instants(t, substep) for t in recorded], solids)
+        report |= _quality(contenders["model"], recorded, solids)
     tell(1.0, "done")
     return report
 
 
-def _load(data: Path, split: str) -> tuple[Motions, dict[str, Shape]]:
+def _load(data: Path, split: str, *, as_recorded: bool = False) -> tuple[Motions, dict[str, Shape]]:
     """Trajectories in which something moves, those that can run together side by side, and their shapes."""
-    recorded = [Trajectory.load(f) for f in trajectory_files(data, split)]
+    recorded = [Trajectory.load(f, as_recorded=as_recorded) for f in trajectory_files(data, split)]
     recorded = [t for group in batches(recorded) for t in group if not t.static.all()]
     if not recorded:
         raise SdfsimError(f"{data}: nothing moves in any trajectory")
@@ -160,7 +158,7 @@ def _simulate(
     place, longest = pick_device(device), len(recorded[0].position) - 1
     motions: dict[str, Motions] = {"model": [], "ballistic": []}
     seconds = 0.0
-    groups, inner = batches([at_instants(t, substep) for t in recorded]), inner_steps(recorded[0].dt, substep)
+    groups, inner = batches(recorded), inner_steps(recorded[0].dt, substep)
     for k, group in enumerate(groups):
         tell(0.8 * k / len(groups), f"{model.name}: batch {k + 1} of {len(groups)}, {longest} steps")
         started = time.perf_counter()
@@ -178,10 +176,11 @@ def _outside(model: Model, recorded: Motions, shapes: dict[str, Shape]) -> list[
     return outside_training(scenes, model, model_units(model, recorded[0]))
 
 
-def _teacher_again(data: Path, recorded: Motions) -> tuple[dict[str, Motions], dict]:
+def _teacher_again(data: Path, split: str, steps: int) -> tuple[dict[str, Motions], dict]:
     """The teacher's motions from perturbed starts by "teacher NAME", and what the report says of them."""
+    recorded = [first_frames(t, steps + 1) for t in _load(data, split, as_recorded=True)[0]]
     try:
-        again = baselines.chaos_floor(data, recorded, len(recorded[0].position) - 1)
+        again = baselines.chaos_floor(data, recorded, steps)
     except SdfsimError as error:
         why = f"{error.message} ({error.hint})" if error.hint else error.message
         return {}, {"chaos_floor": {"left_out": why}}

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sdfsim.data.convex_pieces import decompose, wavefront
 from sdfsim.data.pybullet_sim import DT, Teacher, TeacherBody, write_form_urdf, write_urdf
+from sdfsim.data.shape_assets import decompose, wavefront
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.hard_cases_scenes import body_inertia

@@ -23,7 +23,6 @@ from sdfsim.data.dataset import (
     trajectory_files,
 )
 from sdfsim.data.replay import first_frames
-from sdfsim.data.velocities import at_instants, engine_substep
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.baselines import engine_file
 from sdfsim.evaluation.penetration import Solid, engine_pieces, exact_solids
@@ -130,13 +129,13 @@ def load_cases(data: Path, scratch: Path, *, quick: bool) -> Cases:
         SdfsimError: no or unreadable trajectories or shapes, or recordings of different steps or gravities.
     """
     files = trajectory_files(data, "test")[: MOST_QUICK if quick else MOST]
-    recorded = [t for t in map(Trajectory.load, files) if not t.static.all()]
+    recorded = [t for f in files if not (t := Trajectory.load(f, as_recorded=True)).static.all()]
+    starts = [t for t in map(Trajectory.load, files) if not t.static.all()]
     if not recorded:
         raise SdfsimError(f"{data}: nothing moves in any trajectory")
     check_alike(str(data), recorded)
     longest = min(50 if quick else STEPS, *(len(t.position) - 1 for t in recorded))
     recorded = [first_frames(t, longest + 1) for t in recorded]
-    substep = engine_substep(data)
     shapes = load_shapes(data, {str(n) for t in recorded for n in t.shape})
     order = np.argsort([t.position.shape[1] for t in recorded], kind="stable")
     places = (2,) if quick else (1, 3)  # quarters of the scenes by their bodies
@@ -145,7 +144,7 @@ def load_cases(data: Path, scratch: Path, *, quick: bool) -> Cases:
         data=data,
         scratch=scratch,
         recorded=recorded,
-        starts=[at_instants(t, substep) for t in recorded],
+        starts=[first_frames(t, longest + 1) for t in starts],
         shapes={name: replace(shape, com=np.zeros(3)) for name, shape in shapes.items()},
         urdfs=_engine_files(data, shapes),
         pieces={name: engine_pieces(data, name) for name in shapes},

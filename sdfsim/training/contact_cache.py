@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from sdfsim.data.dataset import Trajectory, check_alike, load_shapes, trajectory_files
-from sdfsim.data.velocities import at_instants, engine_substep
+from sdfsim.data.dataset import Trajectory, check_alike, engine_substep, load_shapes, trajectory_files
 from sdfsim.dynamics.freeflight import torque_free
 from sdfsim.dynamics.graph import SUBSTEPS
 from sdfsim.dynamics.pose import conjugate, multiply, to_rotvec
@@ -197,9 +196,8 @@ def _shape(folder: Path, name: str):
 def _of_file(path: Path, reach: float) -> dict[str, np.ndarray]:
     from sdfsim.data.batching import find_edges  # needs the SDFs, hence more than torch and numpy
 
-    substep = engine_substep(path.parent)
-    trajectory = at_instants(Trajectory.load(path), substep)
-    substeps = inner_steps(trajectory.dt, substep)
+    trajectory = Trajectory.load(path)
+    substeps = inner_steps(trajectory.dt, engine_substep(path.parent))
     trajectory = in_steps_of(trajectory, STEP)
     shapes = {str(n): _shape(path.parent, str(n)) for n in trajectory.shape}
     return _of_trajectory(trajectory, find_edges(trajectory, shapes, reach), shapes, substeps)
