@@ -26,8 +26,8 @@ def merged(
 ) -> tuple[Bodies, State]:
     """Bodies of all trajectories, each at its frame, then one floor they share; worlds do not touch each other.
 
-    Masses and inertias are told relative to the mean mass of what moves in the trajectory, as `Simulator` has them:
-    the *paper* network is given inverse masses as they are.
+    Masses and inertias are relative to the mean mass of the bodies that move in the trajectory, as in `Simulator`:
+    inverse masses are inputs of the *paper* network.
 
     Args:
         trajectories: W of them.
@@ -37,7 +37,9 @@ def merged(
         device: of the tensors.
         floor: its friction and restitution.
     """
-    scene, world = scene_of([_relative(t) for t in trajectories], frames, shapes, floor)
+    means = [1.0 if t.static.all() else float(t.mass[~t.static].mean()) for t in trajectories]
+    relative = [replace(t, mass=t.mass / m, inertia=t.inertia / m) for t, m in zip(trajectories, means, strict=True)]
+    scene, world = scene_of(relative, frames, shapes, floor)
     tensors, state = from_scene(scene, units, device)
     return replace(tensors, world=torch.tensor(world, device=device)), state
 
@@ -51,15 +53,26 @@ def scene_of(
     bodies, world = [], []
     for w, (t, frame) in enumerate(zip(trajectories, frames, strict=True)):
         for i, name in enumerate(t.shape):
-            bodies.append(_body(t, frame, i, names.index(str(name)), f"{w}/{i}"))
+            body = Body(
+                name=f"{w}/{i}",
+                shape=names.index(str(name)),
+                motion="static" if t.static[i] else "dynamic",
+                scale=float(t.scale[i]),
+                position=t.position[frame, i],
+                quat_xyzw=t.quat_xyzw[frame, i],
+                velocity=t.velocity[frame, i],
+                angular_velocity=t.angular_velocity[frame, i],
+                mass=float(t.mass[i]),
+                inertia=np.diag(t.inertia[i]),
+                friction=float(t.friction[i]),
+                restitution=float(t.restitution[i]),
+            )
+            bodies.append(body)
             world.append(w)
-    bodies.append(_floor(len(names), floor))
-    scene = Scene(
-        shapes=(*centred, analytic_shape("plane")),
-        bodies=tuple(bodies),
-        gravity=trajectories[0].gravity,
-        duration=1.0,
-    )
+    zero, unturned = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
+    bodies.append(Body("floor", len(names), "static", 1.0, zero, unturned, zero, zero, 0.0, *floor))
+    plane = analytic_shape("plane")
+    scene = Scene(shapes=(*centred, plane), bodies=tuple(bodies), gravity=trajectories[0].gravity, duration=1.0)
     return scene, [*world, -1]
 
 
@@ -97,42 +110,3 @@ def _edges(t: Trajectory, frames: list[int], shapes: dict[str, Shape], reach: fl
         "normal": contacts.normal[order].numpy(),
         "gap": contacts.distance[order].numpy(),
     }
-
-
-def _relative(t: Trajectory) -> Trajectory:
-    """The trajectory with masses and inertias in units of the mean mass of the bodies that move."""
-    mean = 1.0 if t.static.all() else float(t.mass[~t.static].mean())
-    return replace(t, mass=t.mass / mean, inertia=t.inertia / mean)
-
-
-def _body(t: Trajectory, frame: int, i: int, shape: int, name: str) -> Body:
-    return Body(
-        name=name,
-        shape=shape,
-        motion="static" if t.static[i] else "dynamic",
-        scale=float(t.scale[i]),
-        position=t.position[frame, i],
-        quat_xyzw=t.quat_xyzw[frame, i],
-        velocity=t.velocity[frame, i],
-        angular_velocity=t.angular_velocity[frame, i],
-        mass=float(t.mass[i]),
-        inertia=np.diag(t.inertia[i]),
-        friction=float(t.friction[i]),
-        restitution=float(t.restitution[i]),
-    )
-
-
-def _floor(shape: int, surface: tuple[float, float]) -> Body:
-    return Body(
-        name="floor",
-        shape=shape,
-        motion="static",
-        scale=1.0,
-        position=np.zeros(3),
-        quat_xyzw=np.array([0.0, 0.0, 0.0, 1.0]),
-        velocity=np.zeros(3),
-        angular_velocity=np.zeros(3),
-        mass=0.0,
-        friction=surface[0],
-        restitution=surface[1],
-    )

@@ -60,10 +60,10 @@ def make_dataset(
         why).
 
     Raises:
-        SdfsimError: unknown recipe, split or rate, an option that the recipe has no use for, no usable shapes, PyBullet
+        SdfsimError: unknown recipe or rate, an option that the recipe has no use for, no usable shapes, PyBullet
             absent, another dataset in `out`, or another run writing to it.
     """
-    plan = _checked(recipe, split, trajectories, shapes, random_solids, bodies, fps)
+    plan = _checked(recipe, shapes, random_solids, bodies, fps)
     tell = on_progress or (lambda fraction, message: None)
     engine = import_pybullet()
     given = _origins(plan, shapes, random_solids)
@@ -163,35 +163,22 @@ def _make_one(recipe: str, cast: Cast, fps: int, seed: int, split: str, index: i
     make_trajectory(recipe, np.random.default_rng([seed, SPLITS.index(split), index]), cast, fps).save(path)
 
 
-def _checked(
-    recipe: str,
-    split: str,
-    trajectories: int,
-    shapes: Path | None,
-    random_solids: int,
-    bodies: int | None,
-    fps: int,
-) -> Recipe:
+def _checked(recipe: str, shapes: Path | None, random_solids: int, bodies: int | None, fps: int) -> Recipe:
     """The recipe, when everything goes with it."""
     if recipe not in RECIPES:
         raise SdfsimError(f"unknown recipe {recipe!r}", f"known: {', '.join(RECIPES)}")
-    if split not in SPLITS:
-        raise SdfsimError(f"unknown split {split!r}", f"known: {', '.join(SPLITS)}")
     if fps not in RATES:
         raise SdfsimError(f"--fps must be {' or '.join(map(str, RATES))} (got {fps})")
-    if trajectories < 1:
-        raise SdfsimError("--trajectories must be at least 1")
     plan = RECIPES[recipe]
     if bodies is not None and not (plan.counted and 1 <= bodies <= MOST_BODIES):
         counted = " and ".join(name for name, r in RECIPES.items() if r.counted)
         raise SdfsimError(f"--bodies goes with {counted}, and is 1 to {MOST_BODIES} (got {bodies} for {recipe})")
     if plan.given and shapes is None and (plan.kubasic or not random_solids):
-        raise SdfsimError(
-            f"{recipe} needs shapes", f"--shapes{'' if plan.kubasic else ' or --random-solids'} gives some"
-        )
-    if (plan.kubasic or not plan.given) and random_solids:
+        also = "" if plan.kubasic else " or --random-solids N"
+        raise SdfsimError(f"{recipe} needs shapes", f"give --shapes FOLDER{also}")
+    if random_solids and (plan.kubasic or not plan.given):
         raise SdfsimError(f"{recipe} has no use for --random-solids")
-    if not plan.given and shapes is not None:
+    if shapes is not None and not plan.given:
         raise SdfsimError(f"{recipe} brings its own shapes", "leave out --shapes")
     return plan
 
@@ -207,12 +194,5 @@ def _origins(plan: Recipe, shapes: Path | None, random_solids: int) -> list[Orig
 def _check_same(out: Path, info: dict) -> None:
     """Raises SdfsimError when the folder holds a dataset of which anything in `info` is not true."""
     there = read_info(out) if (out / INFO).exists() else info
-    if there.get("fps") != info["fps"]:
-        raise SdfsimError(
-            f"{out} holds a dataset of {there.get('fps')} frames a second, not {info['fps']}",
-            "give the same --fps, or choose another -o",
-        )
-    if any(there.get(key) != value for key, value in info.items()):
-        raise SdfsimError(
-            f"{out} holds a dataset of another recipe, seed, engine, count or set of shapes", "choose another -o"
-        )
+    if other := [key for key, value in info.items() if there.get(key) != value]:
+        raise SdfsimError(f"{out} holds a dataset with another {other[0]}", "choose another -o")

@@ -123,10 +123,10 @@ def test_the_shares_of_varied_starts_are_those_that_are_told(cast, monkeypatch):
     monkeypatch.setattr(scenarios, "set_moving", lambda *args: drawn.append(args[3]))
     rng = np.random.default_rng(0)
     with Teacher(np.array(GRAVITY)) as teacher:
-        for _ in range(1000):
+        for _ in range(400):
             assert RECIPES["varied"].spawn(teacher, rng, cast) is None
     assert set(SHARES) == {"tossed", "resting", *MOTIONS} and sum(SHARES.values()) == pytest.approx(1.0)
-    assert {name: drawn.count(name) / 1000 for name in SHARES} == pytest.approx(SHARES, abs=0.04)
+    assert {name: drawn.count(name) / 400 for name in SHARES} == pytest.approx(SHARES, abs=0.06)
 
 
 def in_motion(motion: str, seed: int, cast: Cast, steps: int, count: int = 2):
@@ -134,7 +134,7 @@ def in_motion(motion: str, seed: int, cast: Cast, steps: int, count: int = 2):
     sources = [cast.scenery["ball"]] if motion == "rolling" else [cast.scenery["ball"], *cast.shapes]
     with Teacher(np.array(GRAVITY)) as teacher:
         bodies = [(s, TeacherBody(s.urdf, 1.0, 2.0, 0.8, 0.5)) for s in (sources * count)[:count]]
-        assert set_moving(teacher, np.random.default_rng(seed), bodies, motion, 100)
+        assert set_moving(teacher, np.random.default_rng(seed), bodies, motion)
         assert not any(teacher.overlaps(i) for i in range(count))
         return teacher.run(steps)
 
@@ -197,7 +197,7 @@ def test_resting_starts_are_low_and_slow_and_still_cubes_stay(cast, start):
     with Teacher(np.array(GRAVITY)) as teacher:
         bodies = [(cube, TeacherBody(cube.urdf, 0.8 + 0.05 * k, 1.0, 0.5, 0.2)) for k in range(6)]
         # Smaller ones on top: a cube that hangs over may fall.
-        assert at_rest(teacher, np.random.default_rng(1), bodies[::-1], start, 100)
+        assert at_rest(teacher, np.random.default_rng(1), bodies[::-1], start)
         motion = teacher.run(50)
     lowest = motion["position"][0, :, 2] - 0.5 * np.array([b.scale for _, b in bodies[::-1]])
     pressed = PRESSED if start == "pressed" else 0.0
@@ -241,11 +241,9 @@ def test_a_dataset_goes_on_where_it_was_and_refuses_another(cube_meshes, tmp_pat
     again = make_dataset("pile", tmp_path, trajectories=2, shapes=cube_meshes, bodies=4)
     assert report["made_now"] == 2 and again["made_now"] == 1
     np.testing.assert_array_equal(Trajectory.load(files[1]).position, before[1])
-    with pytest.raises(SdfsimError, match="a dataset of 50 frames a second, not 60"):
+    with pytest.raises(SdfsimError, match="a dataset with another fps"):
         make_dataset("pile", tmp_path, trajectories=2, shapes=cube_meshes, bodies=4, fps=60)
-    with pytest.raises(SdfsimError, match="--fps must be 50 or 60"):
-        make_dataset("pile", tmp_path, trajectories=2, shapes=cube_meshes, bodies=4, fps=30)
-    with pytest.raises(SdfsimError, match="another recipe, seed, engine, count"):
+    with pytest.raises(SdfsimError, match="a dataset with another bodies"):
         make_dataset("pile", tmp_path, trajectories=2, shapes=cube_meshes, bodies=5)
 
 

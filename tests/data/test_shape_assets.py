@@ -143,7 +143,7 @@ def test_another_shape_of_the_same_name_leaves_a_dataset_as_it_is(tmp_path, monk
     make_dataset(recipe, out, shapes=tmp_path / "first", trajectories=1)
     engine = out / "shapes" / "engine" / "block.obj"
     before = engine.read_bytes()
-    with pytest.raises(SdfsimError, match="another recipe, seed, engine, count or set of shapes"):
+    with pytest.raises(SdfsimError, match="a dataset with another made_from"):
         make_dataset(recipe, out, shapes=tmp_path / "second", trajectories=2)
     assert engine.read_bytes() == before
     with locked(out), pytest.raises(SdfsimError, match="another run"):
@@ -156,7 +156,7 @@ def test_another_shape_of_the_same_name_leaves_a_dataset_as_it_is(tmp_path, monk
     [
         ("movi-z", {}, "unknown recipe"),
         ("movi-b", {}, "movi-b needs shapes"),
-        ("movi-c", {"split": "dev"}, "unknown split"),
+        ("movi-c", {"fps": 30}, "--fps must be 50 or 60"),
         ("movi-c", {"random_solids": 3, "bodies": 5}, "--bodies goes with bowl and pile"),
         ("pile", {"random_solids": 3, "bodies": 513}, "is 1 to 512"),
         ("bowl", {"random_solids": 3}, "no use for --random-solids"),
