@@ -191,10 +191,8 @@ def read_info(folder: Path) -> dict:
         raise SdfsimError(f"{folder / INFO}: must be a JSON object")
     ours = info.get("engine") == "pybullet" and {"recipe", "engine_settings"} <= set(info)
     if ours and (version := info.get("teacher", 1)) != TEACHER_VERSION:
-        raise SdfsimError(
-            f"{folder}: made by version {version!r} of the teacher, not by {TEACHER_VERSION}",
-            "make it again with `sdfsim dataset`",
-        )
+        told = f"{folder}: made by version {version!r} of the teacher, not by {TEACHER_VERSION}"
+        raise SdfsimError(told, "make it again with `sdfsim dataset`")
     return info
 
 

@@ -174,11 +174,7 @@ def _prepare_one(origin: Origin, engine: Path) -> dict[str, Any]:
     except SdfsimError as error:
         if origin.as_is:
             raise
-        # A record is the same wherever the meshes lie.
-        reason = error.message
-        for path in (origin.mesh, origin.pieces):
-            reason = reason.replace(str(path), path.name) if path else reason
-        record = {"sha256": digest, "left_out": reason}
+        record = {"sha256": digest, "left_out": error.message}
     write_json(file, record)
     return record
 
