@@ -25,7 +25,7 @@ def chaos_floor(data: Path, trajectories: list[Trajectory], steps: int, seed: in
 
     Args:
         data: dataset folder (or one split of it) whose `shapes/engine` holds a URDF for every shape.
-        trajectories: recorded ones.
+        trajectories: recorded ones, with velocities as recorded.
         steps: how far.
         seed: of the directions of the perturbations.
 

@@ -58,7 +58,7 @@ def test_free_fall_keeps_a_perturbation_as_it_is(falling):
 
 
 def test_perturbations_repeat_and_have_the_size_they_are_named_by(cube_data):
-    trajectories = [Trajectory.load(f) for f in trajectory_files(cube_data, "test")]
+    trajectories = [Trajectory.load(f, as_recorded=True) for f in trajectory_files(cube_data, "test")]
     one, two = (chaos_floor(cube_data, trajectories, 20) for _ in range(2))
     for a, b, t in zip(one["1e-3"], two["1e-3"], trajectories, strict=True):
         np.testing.assert_array_equal(a.position, b.position)
@@ -80,7 +80,7 @@ def test_recordings_of_60_frames_a_second_come_back_too(cube_data, cube_meshes, 
     (tmp_path / "shapes" / "cube").symlink_to(cube_data / "shapes" / "cube")
     make_dataset("movi-b", tmp_path, shapes=cube_meshes, trajectories=1, split="test", fps=60)
     assert read_info(tmp_path)["engine_settings"]["timeStep"] == pytest.approx(1 / 240)
-    recorded = Trajectory.load(tmp_path / "test" / "00000.npz")
+    recorded = Trajectory.load(tmp_path / "test" / "00000.npz", as_recorded=True)
     assert len(recorded.position) == 101 and recorded.dt == pytest.approx(1 / 60)
     again = chaos_floor(tmp_path, [recorded], 30)["0"][0]
     np.testing.assert_allclose(again.position, recorded.position[:31], atol=1e-4)
