@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,6 @@ from typing import Any
 import numpy as np
 import yaml
 
-from pipeline.wishes import Known, Wishes
 from sdfsim.errors import SdfsimError
 from sdfsim.files import CONFIG, write_text
 
@@ -130,3 +130,42 @@ def read_config(folder: Path) -> Options:
         return Options(**data)
     except (OSError, yaml.YAMLError, TypeError, AttributeError) as error:
         raise SdfsimError(f"{folder}: not the folder of a reconstruction", "run `sdfsim reconstruct` first") from error
+
+
+@dataclass(frozen=True)
+class Known:
+    """A distance that a person knows.
+
+    Attributes:
+        start: `photo.jpg:x,y`, the point of the surface that this pixel shows; or `photo.jpg`, the camera itself.
+        end: likewise.
+        metres: between them.
+    """
+
+    start: str
+    end: str
+    metres: float
+
+    def check(self) -> None:
+        """Raises SdfsimError where it makes no sense."""
+        if not 1e-4 <= self.metres <= 1e5:
+            raise SdfsimError(f"distance: must be between 0.0001 and 100000 m (got {self.metres:g})")
+        if self.start == self.end:
+            raise SdfsimError(f"distance: both ends are {self.start}", "give two places that are some way apart")
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """What a person asks of the meshes.
+
+    Attributes:
+        size: widest side of the visible surface, m.
+        distance: a distance known in the scene; with it `size` is not used.
+        crop: [2, 3] m corners of the box outside which all is cut off, in the axes of the result.
+        keep: pieces to keep that would be left out, by name.
+    """
+
+    size: float | None = None
+    distance: Known | None = None
+    crop: np.ndarray | None = None
+    keep: Collection[str] = ()

@@ -166,7 +166,7 @@ def tiny_simulate() -> None:
 def tiny_reconstruct() -> None:
     """Poses that are given, 12 steps of training, a checkpoint after each, and a tiny fit of the ball it began as."""
     from pipeline import distill, recipe, stages
-    from pipeline.field import FieldSize
+    from pipeline.field.grid_field import FieldSize
 
     small = FieldSize((8, 16), (2, 2), 16, 8)
     recipe.PRESETS["quick"] = replace(
@@ -181,7 +181,7 @@ def tiny_reconstruct() -> None:
 def _given_poses(run: Any, work: Path) -> dict:
     """Four cameras around the origin, in place of structure from motion."""
     from pipeline.cameras import View, save_views
-    from pipeline.photos import load_photos
+    from pipeline.inputs.photos import load_photos
     from sdfsim.files import write_arrays
 
     views, rng = [], np.random.default_rng(0)

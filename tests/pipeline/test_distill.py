@@ -8,9 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from pipeline import distill
-from pipeline.distill import train
-from pipeline.recipe import PRESETS
-from pipeline.trainer import Trainer
+from pipeline.field.training import PRESETS, Trainer, train
 from sdfsim.errors import SdfsimError
 from tests.pipeline.test_field import SMALL, posed_noise
 
@@ -30,7 +28,7 @@ def clock(monkeypatch) -> SimpleNamespace:
     monkeypatch.setattr(distill, "time", SimpleNamespace(monotonic=lambda: clock.now))
     monkeypatch.setattr(Trainer, "step", timed)
     monkeypatch.setattr(distill, "calibrate", lambda probe, threads: 1.0)
-    monkeypatch.setattr("pipeline.trainer.CACHE", 9)
+    monkeypatch.setattr("pipeline.field.training.CACHE", 9)
     return clock
 
 

@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.asset import fit_parts
-from pipeline.drop import LEVEL, Above, choose_drop, plate_on
-from pipeline.placement import Placement
-from pipeline.scene_file import DENSITY, Found, scene_text, write_scene
+from pipeline.export import DENSITY, LEVEL, Above, Found, choose_drop, fit_parts, plate_on, scene_text, write_scene
+from pipeline.mesh.placement import Placement
 from sdfsim.errors import SdfsimError
 from sdfsim.files import write_json
 from sdfsim.scene.load import load_scene

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.error_bound import EPSILON, bounded_samples, draw, nearest, opacity_bound, worst
-from pipeline.field import laplace_density
+from pipeline.field.grid_field import laplace_density
+from pipeline.field.rendering import EPSILON, bounded_samples, draw, nearest, opacity_bound, worst
 
 DOUBLE = torch.float64
 

@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from pipeline.cameras import Sparse, View
-from pipeline.distill import save_field, train
-from pipeline.field import (
+from pipeline.field.grid_field import (
     FieldSize,
     GridField,
     contract,
@@ -20,13 +19,11 @@ from pipeline.field import (
     render_weights,
     stencil,
 )
-from pipeline.landmarks import find_landmarks
-from pipeline.normalise import Normalisation
-from pipeline.photos import save_photos
-from pipeline.rays import Rays, camera_rays, load_rays
-from pipeline.recipe import PRESETS
-from pipeline.render import choose_samples, sdf_cache, sphere_interval
-from pipeline.trainer import Trainer
+from pipeline.field.rays import Rays, camera_rays, load_rays
+from pipeline.field.rendering import choose_samples, sdf_cache, sphere_interval
+from pipeline.field.training import PRESETS, Trainer, save_field, train
+from pipeline.inputs.photos import save_photos
+from pipeline.sfm.supervision import Normalisation, find_landmarks
 from sdfsim.errors import SdfsimError
 
 SMALL = FieldSize((8, 16), (2, 2), 16, 8)
@@ -212,7 +209,7 @@ def posed_noise(folder: Path) -> tuple[list[View], Sparse]:
 
 
 def test_train_writes_and_reads_back(tmp_path):
-    from pipeline.distill import load_field
+    from pipeline.field.training import load_field
 
     views, sparse = posed_noise(tmp_path)
     recipe = replace(PRESETS["quick"], size=SMALL, rays=32, iterations=6, surface_points=16)

@@ -12,11 +12,10 @@ import torch
 from PIL import Image
 
 from pipeline.cameras import Sparse, View
-from pipeline.distill import FEWEST_STEPS, paced, train
-from pipeline.held_out import FOLDER, HeldOut, score
-from pipeline.photos import save_photos
-from pipeline.recipe import PRESETS
-from pipeline.render import sdf_cache
+from pipeline.field.held_out import FOLDER, HeldOut, score
+from pipeline.field.rendering import sdf_cache
+from pipeline.field.training import FEWEST_STEPS, PRESETS, paced, train
+from pipeline.inputs.photos import save_photos
 from tests.pipeline.test_field import SMALL
 from tests.pipeline.test_verdict import photo
 

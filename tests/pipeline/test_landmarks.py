@@ -7,10 +7,9 @@ import pytest
 import torch
 
 from pipeline.cameras import Sparse
-from pipeline.field import FieldSize, GridField
-from pipeline.landmarks import CLEARANCE, FILLED, GAP, JUST_EMPTY, SLOPE, FreeSpace, find_landmarks
-from pipeline.normalise import Normalisation
-from pipeline.render import sdf_cache
+from pipeline.field.grid_field import FieldSize, GridField
+from pipeline.field.rendering import sdf_cache
+from pipeline.sfm.supervision import CLEARANCE, FILLED, GAP, JUST_EMPTY, SLOPE, FreeSpace, Normalisation, find_landmarks
 from tests.pipeline.test_surface import ring
 
 

@@ -12,12 +12,12 @@ from PIL import Image
 
 from pipeline import meshing
 from pipeline.cameras import Sparse, View, save_views
-from pipeline.distill import Trained
-from pipeline.meshing import make_meshes, read_parts, rounded
-from pipeline.normalise import Normalisation
-from pipeline.photos import Photo, save_photos
-from pipeline.placement import load_placement
-from pipeline.wishes import Known, Wishes
+from pipeline.field.training import Trained
+from pipeline.inputs.photos import Photo, save_photos
+from pipeline.mesh.meshing import make_meshes, read_parts, rounded
+from pipeline.mesh.placement import load_placement
+from pipeline.options import Known, Wishes
+from pipeline.sfm.supervision import Normalisation
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.mesh import is_closed, load_mesh, signed_volume
 from tests.pipeline.test_objects import TABLE, TOP, both, box

@@ -9,14 +9,10 @@ import pytest
 import torch
 
 from pipeline.cameras import Sparse
-from pipeline.distill import load_field, save_field
-from pipeline.landmarks import find_landmarks
-from pipeline.mlp_field import MlpField, MlpSize, encoded
-from pipeline.mlp_trainer import MlpTrainer, trainer_for
-from pipeline.normalise import Normalisation
-from pipeline.recipe import PRESETS
-from pipeline.render import sdf_cache
-from pipeline.trainer import Trainer
+from pipeline.field.mlp_field import MlpField, MlpSize, encoded
+from pipeline.field.rendering import sdf_cache
+from pipeline.field.training import PRESETS, MlpTrainer, Trainer, load_field, save_field, trainer_for
+from pipeline.sfm.supervision import Normalisation, find_landmarks
 from tests.pipeline.test_field import one_thread, toy_rays  # noqa: F401  a fixture
 
 TINY = MlpSize(depth=4, width=32, frequencies=3, color_depth=2, view_frequencies=2, background=8)

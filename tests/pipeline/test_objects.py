@@ -8,10 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.objects import find_levels
-from pipeline.parts import Parts, split
-from pipeline.surface import EXTENT, Surface, ball
-from pipeline.volume import sample_volume
+from pipeline.mesh.bodies import Parts, find_levels, split
+from pipeline.mesh.extraction import EXTENT, Surface, ball, sample_volume
 from sdfsim.shape.bvh import Winding
 from sdfsim.shape.mass import mass_properties
 from sdfsim.shape.mesh import Mesh, is_closed, signed_volume

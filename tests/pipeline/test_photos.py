@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image, ImageOps
 
-from pipeline.photo_file import TURNS, read_photo
-from pipeline.photos import load_photos, prepare_photos
+from pipeline.inputs.images import TURNS, read_photo
+from pipeline.inputs.photos import load_photos, prepare_photos
 from sdfsim.errors import EXIT_ERROR, SdfsimError
 
 

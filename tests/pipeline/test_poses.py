@@ -10,8 +10,8 @@ import pytest
 
 from pipeline import poses
 from pipeline.cameras import load_sparse
-from pipeline.photos import prepare_photos
-from pipeline.poses import LADDER, ORDINARY, run_worker, size_groups, solve
+from pipeline.inputs.photos import prepare_photos
+from pipeline.sfm.poses import LADDER, ORDINARY, run_worker, size_groups, solve
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.files import write_arrays, write_json
 from tests.pipeline.test_verdict import photo, result
@@ -158,7 +158,7 @@ def test_the_leavings_of_another_job_go(tmp_path, monkeypatch):
 
 def test_epipolar_errors_are_those_of_projected_points():
     """Matches of points that two cameras see have no error; moved off their lines by 3 px they have 3 / sqrt(2)."""
-    from pipeline.pair_checks import epipolar_errors
+    from pipeline.sfm.worker import epipolar_errors
 
     views = result(10, 10)["views"]
     for view in views[:2]:
@@ -172,7 +172,7 @@ def test_epipolar_errors_are_those_of_projected_points():
 
 
 def test_turning_on_the_spot_is_told_from_walking():
-    from pipeline.pair_checks import turn_only
+    from pipeline.sfm.worker import turn_only
 
     rng = np.random.default_rng(0)
     size = {"width": 640, "height": 480}

@@ -14,8 +14,8 @@ from PIL import Image
 from pipeline import stages
 from pipeline.cameras import save_views
 from pipeline.report import improvements
-from pipeline.report_plots import camera_plot, turntable_uri
-from pipeline.verdict import judge, views_of
+from pipeline.report_page import camera_plot, turntable_uri
+from pipeline.sfm.pose_checks import judge, views_of
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.files import write_arrays
 from sdfsim.shape.mesh import Mesh

@@ -10,12 +10,12 @@ import pytest
 from PIL import ExifTags, Image
 
 from pipeline.cameras import View
-from pipeline.cleaning import joined
-from pipeline.photos import Photo
-from pipeline.rectify import Lens
-from pipeline.scale import GPS_ERROR, check_places, measured, of_exif
-from pipeline.visibility import Caster
-from pipeline.wishes import Known
+from pipeline.inputs.known_cameras import Lens
+from pipeline.inputs.photos import Photo
+from pipeline.mesh.cleaning import joined
+from pipeline.mesh.placement import GPS_ERROR, check_places, measured, of_exif
+from pipeline.mesh.visibility import Caster
+from pipeline.options import Known
 from sdfsim.errors import SdfsimError
 from tests.pipeline.test_surface import cube, ring
 

@@ -11,9 +11,9 @@ import pytest
 from PIL import Image
 
 from pipeline.cameras import load_view_file
-from pipeline.given import read_given
-from pipeline.photos import GIVEN, load_photos, prepare_photos
-from pipeline.sources import find_source
+from pipeline.inputs.known_cameras import read_given
+from pipeline.inputs.photos import GIVEN, load_photos, prepare_photos
+from pipeline.inputs.sources import find_source
 from sdfsim.errors import SdfsimError
 
 SIZE = (120, 90)

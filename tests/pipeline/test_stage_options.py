@@ -113,7 +113,7 @@ def test_from_a_stage_after_the_last_one_is_refused(photos, tmp_path, calls):
 
 
 def test_poses_of_a_folder_in_work_keep_its_other_options(photos, tmp_path, calls, monkeypatch):
-    monkeypatch.setattr("pipeline.recording.record", lambda folder: None)
+    monkeypatch.setattr("pipeline.report.record", lambda folder: None)
     out = tmp_path / "out"
     assert command("poses", photos, "-o", out).exit_code == 0
     assert read_config(out) == Options(str(photos))
@@ -129,7 +129,7 @@ def test_poses_of_a_folder_in_work_keep_its_other_options(photos, tmp_path, call
 def test_a_place_that_is_not_in_the_photos_is_refused_before_the_poses(photos, tmp_path, calls, monkeypatch):
     for stage in ("photos", "poses"):
         monkeypatch.setitem(stages.ACTIONS, stage, ACTIONS[stage])
-    monkeypatch.setattr("pipeline.poses.solve", lambda *places, **options: calls.append("solved") or {})
+    monkeypatch.setattr("pipeline.sfm.poses.solve", lambda *places, **options: calls.append("solved") or {})
     with pytest.raises(SdfsimError, match=r"distance: no photo is called 'cup\.png'"):
         stages.reconstruct(photos, tmp_path / "out", distance=["0.png:3,4", "cup.png:1,1", 0.1])
     assert calls == []

@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 
 from pipeline.cameras import Sparse, View
-from pipeline.cleaning import components, islands, joined, judge, keep_faces, vertex_normals
-from pipeline.normalise import CAREFUL, UNKNOWN, camera_up, find_normalisation, nearest_to_axes, plane_up
-from pipeline.placement import Placement, find_up, place, resting_height
-from pipeline.scale import Scale
-from pipeline.surface import trusted_vertices
-from pipeline.visibility import Caster, Visibility, bilinear, spread_colors
-from pipeline.volume import Volume, sample_box, sample_volume
+from pipeline.mesh.cleaning import components, islands, joined, judge, keep_faces, vertex_normals
+from pipeline.mesh.extraction import Volume, sample_box, sample_volume, trusted_vertices
+from pipeline.mesh.placement import Placement, Scale, find_up, place, resting_height
+from pipeline.mesh.visibility import Caster, Visibility, bilinear, spread_colors
+from pipeline.sfm.supervision import CAREFUL, UNKNOWN, camera_up, find_normalisation, nearest_to_axes, plane_up
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.shape.mesh import Mesh, is_closed, signed_volume
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from pipeline.trilinear import interpolate
+from pipeline.field.interpolation import interpolate
 
 
 def twin(grid: Tensor, points: Tensor) -> Tensor:

@@ -7,9 +7,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from pipeline.photos import Photo
-from pipeline.verdict import failure_hint, failure_message, find, judge, views_of
-from pipeline.viewpoints import view_span
+from pipeline.cameras import view_span
+from pipeline.inputs.photos import Photo
+from pipeline.sfm.pose_checks import failure_hint, failure_message, find, judge, views_of
 
 
 def photo(index: int, width: int = 640, height: int = 480, focal: float | None = None, fault: str = "") -> Photo:
