@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -15,8 +16,10 @@ from torch import Tensor
 from pipeline.cameras import View
 from pipeline.field.rays import load_rays
 from pipeline.field.rendering import render
-from pipeline.field.training import Trainer
 from pipeline.inputs.images import BACKDROP
+
+if TYPE_CHECKING:
+    from pipeline.field.training import Trainer
 
 Progress = Callable[[float, str], None]
 
@@ -56,7 +59,7 @@ class HeldOut:
 
     def __init__(self, views: list[View], photos_folder: Path, trainer: Trainer, *, masked: bool) -> None:
         self.views, self.trainer, self.masked = views, trainer, masked
-        longest = max(100, trainer.recipe.long_side // 3)
+        longest = max(100, trainer.settings.long_side // 3)
         self.rays = load_rays(views, photos_folder, longest, masks=masked).to(trainer.device)
         self.shown: list[int] = self.rays.view.unique().tolist()
         self.backdrop = torch.full((3,), BACKDROP, device=trainer.device) if masked else None
@@ -72,7 +75,7 @@ class HeldOut:
             origins, directions = rays.at(part)
             parts.append(
                 render(trainer.field, trainer.cache, origins, directions, trainer.beta,
-                       samples=trainer.recipe.samples, backdrop=self.backdrop)
+                       samples=trainer.settings.samples, backdrop=self.backdrop)
             )  # fmt: skip
         rgb, opacity = (torch.cat([part[key] for part in parts]) for key in ("rgb", "opacity"))
         error = float(((rgb - rays.rgb[index].float() / 255) ** 2).mean())

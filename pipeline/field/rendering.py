@@ -1,4 +1,7 @@
-"""Rays through the field: where along them it is asked, and the colour that comes out."""
+"""Volume rendering: where along rays the field is asked, and the colour that comes out.
+
+The grids choose samples from a cached SDF; the MLP bounds the error of the opacity as VolSDF does (sections 3.3, 3.4).
+"""
 
 from __future__ import annotations
 
@@ -88,7 +91,6 @@ def choose_samples(
         uniforms: [R, S] random in 0..1, S = number of samples.
         bins: even steps at which the cache is read.
         plain: how many of the S samples are evenly spread.
-
     """
     enter, leave = sphere_interval(origins, directions)
     length = (leave - enter)[:, None]
@@ -98,21 +100,20 @@ def choose_samples(
     # The cache knows the surface only to a fraction of its cell: no narrower than that.
     broad = max(beta, 0.6 / cache.shape[0])
     weights, _ = render_weights(laplace_density(sdf, broad), (length / bins).expand(-1, bins))
-    cumulative = torch.cumsum(weights + 1e-4, 1)
-    cumulative = cumulative / cumulative[:, -1:]
     count = uniforms.shape[1] - plain
-    device = cache.device
-    wanted = (torch.arange(count, device=device) + uniforms[:, :count]) / count * 0.9999
-    index = torch.searchsorted(cumulative, wanted.contiguous()).clamp_max(bins - 1)
-    low = torch.where(index > 0, cumulative.gather(1, (index - 1).clamp_min(0)), torch.zeros_like(wanted))
-    inside = ((wanted - low) / (cumulative.gather(1, index) - low).clamp_min(1e-9)).clamp(0, 1)
-    importance = (index + inside) / bins
-    even = (torch.arange(plain, device=device) + uniforms[:, count:]) / plain
+    edges = torch.linspace(0, 1, bins + 1, device=cache.device).expand(len(origins), -1)
+    importance = draw(edges, weights + 9e-5, uniforms[:, :count])
+    even = (torch.arange(plain, device=cache.device) + uniforms[:, count:]) / plain
     position, order = torch.cat([importance, even], 1).sort(1)
-    distance = enter[:, None] + length * position
+    return samples_at(enter[:, None] + length * position, enter, leave, origins, directions, order < count)
+
+
+def samples_at(distance: Tensor, enter: Tensor, leave: Tensor, origins: Tensor, directions: Tensor,
+               near_surface: Tensor) -> Samples:  # fmt: skip
+    """Samples at distances [R, S], in order, along rays that enter and leave the sphere at distances [R]."""
     edge = torch.cat([enter[:, None], (distance[:, 1:] + distance[:, :-1]) / 2, leave[:, None]], 1)
     points = origins[:, None] + distance[..., None] * directions[:, None]
-    return Samples(distance, edge[:, 1:] - edge[:, :-1], points, directions, order < count)
+    return Samples(distance, edge[:, 1:] - edge[:, :-1], points, directions, near_surface)
 
 
 def composite(

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from pipeline.cameras import View
+from pipeline.cameras import View, frame_of
 from pipeline.mesh.cleaning import components, face_normals, islands, keep_faces
 from pipeline.mesh.extraction import FLOATER, RIM, Distance, Surface, Volume, sample, sample_box
 from pipeline.mesh.visibility import Caster, Visibility, look, spread_colors, to_bytes
@@ -63,7 +63,6 @@ class Body:
         low: [3] position of the first of these samples.
         cell: between them.
         layer: thickness of the contact layer, in which the field cannot tell body and plane apart.
-        crumbs: how many crumbs beside it count as its own.
         hollow: [A, B] bool on the plane: places that the body goes around at the top of the contact layer.
         corner: [2] of the first of these, in the axes of `frame_of` the plane.
     """
@@ -75,7 +74,6 @@ class Body:
     low: np.ndarray
     cell: float
     layer: float
-    crumbs: int
     hollow: np.ndarray
     corner: np.ndarray
 
@@ -191,7 +189,7 @@ def find_bodies(surface: Surface, levels: list[Level], layer: float, smallest: f
             mine = np.isin(label[box], [number, *crumbs])
             taken[box] |= mine
             standing = solid & (height > layer)
-            found.append(_body(volume, standing, box, mine, level, layer, len(crumbs), float(sides.max())))
+            found.append(_body(volume, standing, box, mine, level, layer, float(sides.max())))
     found.sort(key=lambda body: -body.size)
     return [replace(body, name=f"object{number}") for number, body in enumerate(found, start=1)]
 
@@ -250,7 +248,7 @@ def _share_seen(place: Volume, vertices: np.ndarray, seen: np.ndarray) -> float:
 
 
 def _body(volume: Volume, standing: np.ndarray, box: tuple[slice, ...], mine: np.ndarray, level: Level, layer: float,
-          crumbs: int, size: float) -> Body:  # fmt: skip
+          size: float) -> Body:  # fmt: skip
     """The body of one component: all samples around it that are nearer to it than to what else is on the plane."""
     margin = int(np.ceil((FILLET + 1) * layer / volume.cell)) + 1
     start = [max(part.start - margin, 0) for part in box]
@@ -262,7 +260,7 @@ def _body(volume: Volume, standing: np.ndarray, box: tuple[slice, ...], mine: np
     ndimage.distance_transform_edt(label == 0, return_indices=True, distances=away, indices=nearest)
     own = (label[tuple(nearest)] == 2) & (away * volume.cell <= FILLET * layer)
     corner = volume.low + volume.cell * np.array(start)
-    body = Body("", level, size, own, corner, volume.cell, layer, crumbs, np.zeros((0, 0), bool), np.zeros(2))
+    body = Body("", level, size, own, corner, volume.cell, layer, np.zeros((0, 0), bool), np.zeros(2))
     frame = frame_of(level.normal)
     flat = (corner + volume.cell * np.argwhere(own)) @ frame[:2].T
     a, b = (np.arange(low, high, 0.5 * volume.cell) for low, high in zip(flat.min(0), flat.max(0), strict=True))
@@ -286,13 +284,6 @@ def body_mesh(body: Body, field: Distance, cell: float) -> Mesh:
     label = components(mesh)
     area = np.bincount(label, face_normals(mesh)[1])
     return keep_faces(mesh, (area > 0.02 * area.max())[label])
-
-
-def frame_of(normal: np.ndarray) -> np.ndarray:
-    """A right-handed rotation [3, 3] whose last row is a normal."""
-    side = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    side /= np.linalg.norm(side)
-    return np.stack([side, np.cross(normal, side), normal])
 
 
 def without_bodies(volume: Volume, bodies: list[Body], field: Distance) -> Volume:
@@ -339,16 +330,12 @@ class Parts:
         shown: what is displayed of it: its visible surface, and the places where bodies stood; None like `solid`.
         bodies: closed mesh of each body by name, with colours; the largest first.
         smallest: what rises less than this above its plane stayed part of the scenery.
-        levels: the level planes, largest first.
-        crumbs: how many crumbs beside bodies went where these went.
     """
 
     solid: Mesh | None
     shown: Mesh | None
     bodies: dict[str, Mesh]
     smallest: float
-    levels: list[Level]
-    crumbs: int = 0
 
 
 def split(surface: Surface, distance: Distance, finest: float, views: list[View], photos_folder: Path, up: np.ndarray,
@@ -366,11 +353,11 @@ def split(surface: Surface, distance: Distance, finest: float, views: list[View]
     """
     smallest = max(SMALLEST, SMALLEST_CELLS * finest)
     if alone:
-        return Parts(None, None, whole_bodies(surface), smallest, [])
+        return Parts(None, None, whole_bodies(surface), smallest)
     levels = find_levels(surface.visible, up, finest)
     bodies = find_bodies(surface, levels, LAYER * finest, smallest)
     if not bodies:
-        return Parts(surface.solid, surface.visible, {}, smallest, levels)
+        return Parts(surface.solid, surface.visible, {}, smallest)
     blocking = Caster(surface.raw)
     meshes = {}
     for body in bodies:
@@ -380,7 +367,7 @@ def split(surface: Surface, distance: Distance, finest: float, views: list[View]
         found = look(Visibility(mesh, 0.75 * surface.volume.cell, blocking), views, photos_folder)
         meshes[body.name] = colored(mesh, found.color, found.weight > 0)
     solid, shown = scenery(surface, bodies, distance)
-    return Parts(solid, shown, meshes, smallest, levels, sum(body.crumbs for body in bodies))
+    return Parts(solid, shown, meshes, smallest)
 
 
 def whole_bodies(surface: Surface) -> dict[str, Mesh]:

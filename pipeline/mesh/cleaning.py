@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 
-from sdfsim.errors import SdfsimError
 from sdfsim.shape.mesh import Mesh
 
 # A component of whose area photos show less than this share is matter behind the scenery.
@@ -57,41 +55,7 @@ def components(mesh: Mesh) -> np.ndarray:
     return connected_components(graph, directed=False)[1][mesh.faces[:, 0]]
 
 
-@dataclass(frozen=True)
-class Piece:
-    """A connected component that does not belong.
-
-    Attributes:
-        name: piece1, piece2 ... from the largest down; the same again for the same mesh.
-        faces: [K] indices of its faces.
-        size: the longest side of its bounding box.
-        middle: [3] of that box.
-        why: it was left out, in words.
-    """
-
-    name: str
-    faces: np.ndarray
-    size: float
-    middle: np.ndarray
-    why: str
-
-
-@dataclass(frozen=True)
-class Judged:
-    """Which components of a mesh belong.
-
-    Attributes:
-        kept: [F] bool.
-        pieces: what has a name and does not belong, kept all the same or not.
-        counts: for the report.
-    """
-
-    kept: np.ndarray
-    pieces: tuple[Piece, ...]
-    counts: dict
-
-
-def judge(mesh: Mesh, seen: np.ndarray, share: float, speck: float, keep: Collection[str] = ()) -> Judged:
+def belonging(mesh: Mesh, seen: np.ndarray, share: float, speck: float) -> tuple[np.ndarray, list[float], dict]:
     """Which connected components of a closed mesh belong: those that photos show and that are not floaters.
 
     Args:
@@ -99,10 +63,9 @@ def judge(mesh: Mesh, seen: np.ndarray, share: float, speck: float, keep: Collec
         seen: [F] bool, faces that photos show.
         share: a component with less than this share of all the area is a floater.
         speck: components shorter than this are only counted.
-        keep: names of components to keep all the same; "all" keeps every one that has a name.
 
-    Raises:
-        SdfsimError: no component has a name that is to be kept.
+    Returns:
+        The faces that belong [F] bool, the longest sides of the others from the largest down, and counts of these.
     """
     label = components(mesh)
     _, area = face_normals(mesh)
@@ -117,26 +80,12 @@ def judge(mesh: Mesh, seen: np.ndarray, share: float, speck: float, keep: Collec
     np.maximum.at(high, label, corner.max(1))
     size = (high - low).max(1)
     # A cavity is a flaw of the piece around it and no piece of its own.
-    dropped = np.flatnonzero((small | unseen) & ~inward)
-    named = dropped[(size[dropped] >= speck)]
-    pieces = tuple(
-        Piece(f"piece{n}", np.flatnonzero(label == k), float(size[k]), (low[k] + high[k]) / 2,
-              "no photo shows it" if unseen[k] else f"less than {share:.2%} of the surface")
-        for n, k in enumerate(named[np.argsort(-size[named], kind="stable")], start=1)
-    )  # fmt: skip
-    wrong = sorted(set(keep) - {"all"} - {piece.name for piece in pieces})
-    if wrong:
-        names = ", ".join(piece.name for piece in pieces) or "nothing was left out"
-        raise SdfsimError(f"keep: no piece is called {', '.join(wrong)}", f"left out: {names}")
-    belongs = ~(small | unseen)[label]
-    for piece in pieces:
-        if "all" in keep or piece.name in keep:
-            belongs[piece.faces] = True
+    left_out = size[(small | unseen) & ~inward & (size >= speck)]
     counts = {
         "components": len(total), "dropped_small": int((small & ~unseen).sum()), "dropped_unseen": int(unseen.sum()),
         "dropped_area_share": round(float(total[small | unseen].sum() / total.sum()), 4),
     }  # fmt: skip
-    return Judged(belongs, pieces, counts)
+    return ~(small | unseen)[label], sorted(left_out.tolist(), reverse=True), counts
 
 
 def islands(mesh: Mesh, faces: np.ndarray, share: float) -> np.ndarray:

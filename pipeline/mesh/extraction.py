@@ -1,8 +1,8 @@
-"""Signed distances sampled on a regular grid, finely only near the surface, and the mesh of their zero surface."""
+"""Field -> surface: signed distances on a grid, marching cubes, and which part of the closed mesh the photos show."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import torch
 
 from pipeline.cameras import View
 from pipeline.field.grid_field import Field
-from pipeline.mesh.cleaning import Piece, face_normals, islands, judge, keep_faces, vertex_normals
+from pipeline.mesh.cleaning import belonging, face_normals, islands, keep_faces, vertex_normals
 from pipeline.mesh.visibility import Visibility, look, to_bytes
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.shape.mesh import Mesh
@@ -135,17 +135,16 @@ def sample_box(distance: Distance, low: np.ndarray, high: np.ndarray, cell: floa
     return replace(empty, values=sample(distance, empty.points().reshape(-1, 3)).reshape(counts))
 
 
-
 # The solid ends at this radius of normalised space: beyond it the field was never trained.
 RIM = 0.99
-EXTENT = 1.02
+EXTENT = 1.02  # half the side of the sampled cube
 MIN_SEEN = 2
 # Farther than this from every point of structure-from-motion (normalised units) a surface is a guess: on the rendered
 # set the median error there is ten times that within.
 MAX_FROM_POINTS = 0.1
 # A patch of the visible surface smaller than this share of it says nothing; of the closed solid a quarter of that.
 FLOATER = 0.01
-# What is left out is named from this size on, normalised units.
+# What is left out is reported from this size on, normalised units.
 SPECK = 0.02
 PRESET_RESOLUTION = {"quick": 192, "standard": 288, "fine": 448, "paper": 448}
 
@@ -160,7 +159,6 @@ class Surface:
         seen: [V] bool, vertices of it that photos show well enough.
         kept: [F] bool, faces of it that belong.
         shown: [F] bool, faces of it that belong and that photos show.
-        pieces: components that do not belong.
         report: counts of what was left out, and why.
     """
 
@@ -169,7 +167,6 @@ class Surface:
     seen: np.ndarray
     kept: np.ndarray
     shown: np.ndarray
-    pieces: tuple[Piece, ...]
     report: dict
 
     @property
@@ -221,45 +218,23 @@ def trusted_vertices(mesh: Mesh, count: np.ndarray, at_limit: np.ndarray) -> np.
     return trusted
 
 
-def extract(
-    field: Field, views: list[View], points: np.ndarray, photos_folder: Path, *, resolution: int = 192,
+def surface_of(
+    volume: Volume, field: Field, views: list[View], points: np.ndarray, photos_folder: Path, limit: Distance, *,
     on_progress: Progress | None = None,
 ) -> Surface:  # fmt: skip
-    """Extracts the solid and its visible surface from a trained field.
+    """The solid of a sampled field and its visible surface.
 
     Args:
+        volume: samples of the field within `limit`.
         field: trained.
         views: cameras in normalised space.
         points: [P, 3] sparse points in normalised space.
         photos_folder: of the photos stage.
-        resolution: samples a side over the unit sphere.
+        limit: distance [P] from the body that the solid was cut off at.
         on_progress: called with (fraction, message).
 
     Raises:
         SdfsimError: (exit code 3) the field has no surface, or hardly any of it is in the photos.
-    """
-
-    def tell(start: float, share: float) -> Progress:
-        return lambda fraction, message: on_progress(start + share * fraction, message) if on_progress else None
-
-    inner = field_distance(field)
-    volume = sample_volume(
-        lambda p: np.maximum(inner(p), ball(p)), resolution, extent=EXTENT, on_progress=tell(0.0, 0.5)
-    )
-    return of_volume(volume, field, views, points, photos_folder, ball, on_progress=tell(0.5, 0.5))
-
-
-def of_volume(
-    volume: Volume, field: Field, views: list[View], points: np.ndarray, photos_folder: Path, limit: Distance, *,
-    keep: Collection[str] = (), on_progress: Progress | None = None,
-) -> Surface:  # fmt: skip
-    """The surface of a volume already sampled.
-
-    Args:
-        volume: within `limit`.
-        field, views, points, photos_folder, on_progress: see `extract`.
-        limit: distance [P] from the body that the solid was cut off at.
-        keep: names of pieces to keep, see `judge`.
     """
     from scipy.spatial import KDTree
 
@@ -270,8 +245,8 @@ def of_volume(
     shown_at_all = trusted_vertices(raw, found.count, np.abs(limit(raw.vertices)) < 1.5 * cell)
     seen = shown_at_all & ~far
     faces_seen = seen[raw.faces].sum(1) >= 2
-    judged = judge(raw, faces_seen, FLOATER / 4, SPECK, keep)
-    shown = islands(raw, faces_seen & judged.kept, FLOATER)
+    kept, left_out, counts = belonging(raw, faces_seen, FLOATER / 4, SPECK)
+    shown = islands(raw, faces_seen & kept, FLOATER)
     if shown.sum() < 100:
         raise SdfsimError(
             "mesh: hardly any of the surface is visible in the photos", "check the poses; try --preset standard",
@@ -280,12 +255,12 @@ def of_volume(
     rgb = np.where(found.weight[:, None] > 0, found.color, 255 * field_colors(field, raw))
     area = face_normals(raw)[1]
     report = {
-        "resolution": max(volume.values.shape), "cell": cell, "solid_faces": int(judged.kept.sum()),
-        "shown_faces": int(shown.sum()), "solid": {**judged.counts, "smallest_share_kept": FLOATER / 4},
+        "resolution": max(volume.values.shape), "cell": cell, "solid_faces": int(kept.sum()),
+        "left_out": left_out, "shown_faces": int(shown.sum()), "solid": {**counts, "smallest_share_kept": FLOATER / 4},
         "dropped_far_from_points_share": round(float((shown_at_all & far).sum() / max(shown_at_all.sum(), 1)), 4),
-        "unseen_share": round(float(1 - area[shown].sum() / area[judged.kept].sum()), 4),
+        "unseen_share": round(float(1 - area[shown].sum() / area[kept].sum()), 4),
     }  # fmt: skip
-    return Surface(volume, replace(raw, colors=to_bytes(rgb)), seen, judged.kept, shown, judged.pieces, report)
+    return Surface(volume, replace(raw, colors=to_bytes(rgb)), seen, kept, shown, report)
 
 
 @torch.no_grad()

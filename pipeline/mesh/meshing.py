@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import colorsys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
 from pipeline.cameras import View, load_sparse, load_views
-from pipeline.field.grid_field import Field
 from pipeline.field.training import load_field
 from pipeline.inputs.photos import load_photos
 from pipeline.mesh.bodies import Parts, split
-from pipeline.mesh.cleaning import keep_faces
-from pipeline.mesh.extraction import PRESET_RESOLUTION, Distance, Surface, ball, extract, field_distance, of_volume
-from pipeline.mesh.labels import Named, draw_names
-from pipeline.mesh.placement import Placement, Scale, measured, of_exif, place
+from pipeline.mesh.cleaning import joined
+from pipeline.mesh.extraction import EXTENT, ball, field_distance, sample_volume, surface_of
+from pipeline.mesh.placement import Placement, measured_scale, place
 from pipeline.mesh.visibility import Caster
-from pipeline.options import Wishes
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, replacing, write_json
 from sdfsim.shape.mesh import Mesh
@@ -27,10 +25,16 @@ from sdfsim.shape.storage import write_ply
 
 Progress = Callable[[float, str], None]
 SCENERY = "scene"
+RESOLUTION = {"quick": 192, "standard": 288, "fine": 448, "paper": 448}  # samples a side, by preset
+# The picture of names: at most so many photos, their width while they are chosen and in the picture, px, and the tint.
+PICTURES, THUMB, WIDE, TINT = 4, 80, 720, 0.45
 
 
-def make_meshes(distill: Path, poses: Path, photos: Path, source: Path, out: Path, *, preset: str, wishes: Wishes,
-                device: str = "cpu", on_progress: Progress | None = None) -> dict:  # fmt: skip
+def make_meshes(
+    distill: Path, poses: Path, photos: Path, out: Path, *, preset: str, size: float | None = None,
+    distance: Sequence | None = None, crop: Sequence[float] | None = None, device: str = "cpu",
+    on_progress: Progress | None = None,
+) -> dict:  # fmt: skip
     """Extracts surfaces and writes them to `out`.
 
     Writes `mesh.ply` (all that photos show), of the scenery `solid.ply` (closed) and `shown.ply` (what is displayed),
@@ -40,10 +44,11 @@ def make_meshes(distill: Path, poses: Path, photos: Path, source: Path, out: Pat
         distill: folder of that stage.
         poses: folder of that stage.
         photos: folder of that stage.
-        source: the user's photos, see `Source.folder`.
         out: an existing folder.
         preset: quick, standard or fine.
-        wishes: what a person asks for.
+        size: see `Options`; so are `distance` and `crop`.
+        distance: sets the scale in place of `size`.
+        crop: [6] m.
         device: where the field is sampled.
         on_progress: called with (fraction, message).
 
@@ -51,81 +56,57 @@ def make_meshes(distill: Path, poses: Path, photos: Path, source: Path, out: Pat
         The stage's report.
 
     Raises:
-        SdfsimError: (exit code 3) no surface worth the name; (exit code 1) wishes that cannot be met.
+        SdfsimError: (exit code 3) no surface worth the name; (exit code 1) a distance or box that makes no sense.
     """
 
     def tell(start: float, share: float) -> Progress:
         return lambda fraction, message: on_progress(start + share * fraction, message) if on_progress else None
 
     trained = load_field(distill)
-    field = trained.field.to(device)
-    views = trained.normalisation.views(load_views(poses))
-    points = trained.normalisation.apply(load_sparse(poses).xyz)
-    masked = bool(trained.report["masked"])
-    surface = extract(field, views, points, photos, resolution=PRESET_RESOLUTION[preset], on_progress=tell(0.0, 0.5))
-    placement = upright(surface, views, photos, source, wishes, masked=masked)
-    limit = ball if wishes.crop is None else box_of(placement, wishes.crop)
-    if wishes.crop is not None or wishes.keep:
-        surface = again(surface, field, views, points, photos, wishes, limit, tell(0.5, 0.2))
-    # Where a person has cut the surroundings away, what is left is what they want to move.
-    alone = masked or (wishes.crop is not None and not surface.reaches_rim)
-    if on_progress:
-        on_progress(0.7, "looking for bodies")
-    finest = field.finest
-    up = placement.rotation[2]
-    inner = field_distance(field)
-    parts = split(surface, lambda p: np.maximum(inner(p), limit(p)), finest, views, photos, up, alone=alone)
-    write_parts(parts, surface, placement, wishes, out)
-    if on_progress:
-        on_progress(0.95, "drawing objects.png")
-    picture(parts, surface, placement, views, photos).save(out / "objects.png")
-    shown = placement.mesh(surface.visible)
+    field, to_unit = trained.field.to(device), trained.to_unit
+    views = [to_unit.view(view) for view in load_views(poses)]
+    points = to_unit.points(load_sparse(poses).xyz)
+    alone = bool(trained.report["masked"])
+    inner, limit = field_distance(field), ball
+    volume = sample_volume(
+        lambda p: np.maximum(inner(p), ball(p)), RESOLUTION[preset], extent=EXTENT, on_progress=tell(0.0, 0.25)
+    )
+    surface = surface_of(volume, field, views, points, photos, limit, on_progress=tell(0.25, 0.25))
+    scale = measured_scale(distance, views, load_photos(photos), Caster(surface.raw)) if distance else None
+    placement = place(surface.visible, views, scale, size=size, alone=alone)
+    if crop is not None:
+        limit = box_of(placement, np.reshape(crop, (2, 3)))
+        volume = volume.limited(limit)
+        if not (volume.values < 0).any():
+            raise SdfsimError("crop: the box holds nothing", "corners are in metres, as in a mesh/mesh.ply without it")
+        surface = surface_of(volume, field, views, points, photos, limit, on_progress=tell(0.5, 0.2))
+        # Where a person has cut the surroundings away, what is left is what they want to move.
+        alone = alone or not surface.reaches_rim
+    tell(0.7, 0.0)(0.0, "looking for bodies")
+    cut = lambda p: np.maximum(inner(p), limit(p))  # noqa: E731
+    parts = split(surface, cut, field.finest, views, photos, placement.to_metres.rotation[2], alone=alone)
+    write_parts(parts, surface.visible, placement, out)
+    tell(0.95, 0.0)(0.0, "drawing objects.png")
+    draw_names(parts, views, photos).save(out / "objects.png")
+    metres = placement.to_metres.scale
     return {
-        **surface.report, "extent_m": rounded(np.ptp(shown.vertices, axis=0)).tolist(), "up_from": placement.up_from,
-        "up_within_degrees": round(placement.up_within, 2), "up_confidence": placement.up_confidence,
-        "size": placement.size_from, "objects": list(parts.bodies),
-        "smallest_object_m": float(rounded(parts.smallest * placement.scale)),
-        "crumbs": parts.crumbs,
-        "left_out": [entry for entry in read_parts(out)["left_out"] if not entry["kept"]],
+        **surface.report, "left_out_m": [float(rounded(length * metres)) for length in surface.report["left_out"]],
+        "extent_m": rounded(np.ptp(placement.mesh(surface.visible).vertices, axis=0)).tolist(),
+        "up_from": placement.up_from, "up_within_degrees": round(placement.up_within, 2),
+        "up_confidence": placement.up_confidence, "size": placement.size_from, "objects": list(parts.bodies),
+        "smallest_object_m": float(rounded(parts.smallest * metres)),
     }  # fmt: skip
 
 
-def upright(
-    surface: Surface, views: list[View], photos: Path, source: Path, wishes: Wishes, *, masked: bool
-) -> Placement:
-    """Up and scale: a known distance first, then a known size, then what EXIF says."""
-    caster = Caster(surface.raw)
-    scale: Scale | None = None
-    if wishes.distance is not None:
-        scale = measured(wishes.distance, views, load_photos(photos), caster)
-    placement = place(surface.visible, views, scale, size=wishes.size, alone=masked)
-    if scale is None and wishes.size is None:
-        found = of_exif(views, source, caster, placement.rotation[2])
-        if found is not None:
-            return place(surface.visible, views, found, alone=masked)
-    return placement
-
-
-def box_of(placement: Placement, corners: np.ndarray) -> Distance:
+def box_of(placement: Placement, corners: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     """Distance from what is left after cropping: the trained ball within a box with corners [2, 3] m."""
     middle, half = corners.mean(0), np.ptp(corners, axis=0) / 2
 
     def distance(points: np.ndarray) -> np.ndarray:
-        beyond = np.abs(placement.points(points) - middle) - half
-        return np.maximum(ball(points), beyond.max(1) / placement.scale)
+        beyond = np.abs(placement.to_metres.points(points) - middle) - half
+        return np.maximum(ball(points), beyond.max(1) / placement.to_metres.scale)
 
     return distance
-
-
-def again(surface: Surface, field: Field, views: list[View], points: np.ndarray, photos: Path, wishes: Wishes,
-          limit: Distance, on_progress: Progress) -> Surface:  # fmt: skip
-    """The surface once more, within a limit and with the pieces that a person wants to keep."""
-    volume = surface.volume.limited(limit)
-    if not (volume.values < 0).any():
-        raise SdfsimError(
-            "crop: the box holds nothing", "corners are in metres, as in mesh/mesh.ply of a run without it"
-        )
-    return of_volume(volume, field, views, points, photos, limit, keep=wishes.keep, on_progress=on_progress)
 
 
 def rounded(values: ArrayLike) -> np.ndarray:
@@ -135,7 +116,7 @@ def rounded(values: ArrayLike) -> np.ndarray:
     return values.round(5 - int(np.floor(np.log10(largest)))) if largest > 0 else values
 
 
-def write_parts(parts: Parts, surface: Surface, placement: Placement, wishes: Wishes, out: Path) -> None:
+def write_parts(parts: Parts, visible: Mesh, placement: Placement, out: Path) -> None:
     """Writes meshes in metres, `placement.json` and `parts.json`."""
 
     def write(name: str, mesh: Mesh) -> Mesh:
@@ -144,7 +125,7 @@ def write_parts(parts: Parts, surface: Surface, placement: Placement, wishes: Wi
             partial.write_bytes(write_ply(moved))
         return moved
 
-    write("mesh.ply", surface.visible)
+    write("mesh.ply", visible)
     if parts.solid is not None and parts.shown is not None:
         write("solid.ply", parts.solid)
         write("shown.ply", parts.shown)
@@ -154,20 +135,8 @@ def write_parts(parts: Parts, surface: Surface, placement: Placement, wishes: Wi
         moved = write(f"objects/{name}.ply", mesh)
         low, high = moved.vertices.min(0), moved.vertices.max(0)
         objects.append({"name": name, "low": rounded(low).tolist(), "high": rounded(high).tolist()})
-    left = [
-        {
-            "name": piece.name, "size_m": float(rounded(piece.size * placement.scale)), "why": piece.why,
-            "at": rounded(placement.points(piece.middle[None])[0]).tolist(),
-            "kept": "all" in wishes.keep or piece.name in wishes.keep,
-        }
-        for piece in surface.pieces
-    ]  # fmt: skip
-    write_json(
-        out / "parts.json",
-        {"version": 1, "scenery": parts.solid is not None, "objects": objects, "left_out": left,
-         "crumbs": parts.crumbs, "smallest_m": float(rounded(parts.smallest * placement.scale))},
-    )  # fmt: skip
-    write_json(out / "placement.json", placement.to_dict())
+    write_json(out / "parts.json", {"version": 1, "scenery": parts.solid is not None, "objects": objects})
+    placement.save(out)
 
 
 def read_parts(mesh_folder: Path) -> dict:
@@ -179,15 +148,58 @@ def read_parts(mesh_folder: Path) -> dict:
     return read_json(Path(mesh_folder) / "parts.json", "run the mesh stage first")
 
 
-def picture(parts: Parts, surface: Surface, placement: Placement, views: list[View], photos: Path) -> Image.Image:
-    """The picture with the names of bodies and of what was left out."""
-    items = [
-        Named(name, f"{np.ptp(mesh.vertices, axis=0).max() * placement.scale:.2g} m", mesh)
-        for name, mesh in parts.bodies.items()
-    ]
-    for piece in surface.pieces:
-        chosen = np.zeros(len(surface.raw.faces), bool)
-        chosen[piece.faces] = True
-        items.append(Named(piece.name, piece.why, keep_faces(surface.raw, chosen), left_out=True))
-    rest = parts.solid if parts.solid is not None else Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
-    return draw_names(items, rest, views, photos)
+def draw_names(parts: Parts, views: list[View], photos_folder: Path) -> Image.Image:
+    """A picture that tells which body has which name: the photos that show them best, each body tinted and labelled.
+
+    Args:
+        parts: in the space of the views.
+        views: cameras.
+        photos_folder: of the photos stage.
+    """
+    meshes = list(parts.bodies.values())
+    caster = Caster(joined(meshes if parts.solid is None else [*meshes, parts.solid]))
+    borders = np.cumsum([len(mesh.faces) for mesh in meshes])
+
+    def seen(view: View, longest: int) -> np.ndarray:
+        """Which body each pixel [H, W] shows; the number of bodies for none."""
+        scale = longest / max(view.width, view.height)
+        size = max(1, round(view.height * scale)), max(1, round(view.width * scale))
+        row, column = (axis.ravel() for axis in np.indices(size))
+        away, face = caster.hits(view.center, view.rays((column + 0.5) / scale, (row + 0.5) / scale))
+        number = np.searchsorted(borders, face, side="right")
+        return np.where(np.isfinite(away), number, len(meshes)).reshape(size)
+
+    pixels = np.array([np.bincount(seen(v, THUMB).ravel(), minlength=len(meshes) + 1)[:-1] for v in views], float)
+    share = pixels / np.maximum(pixels.max(0), 1)
+    chosen: list[int] = []
+    best = np.zeros(len(meshes))
+    while len(chosen) < min(PICTURES, len(views)):  # Each next photo shows most of what the earlier ones show worst.
+        gain = np.maximum(share - best, 0).sum(1)
+        if chosen and gain.max() < 0.3:
+            break
+        chosen.append(int(gain.argmax()))
+        best = np.maximum(best, share[chosen[-1]])
+    tiles = [_tile(views[k], seen(views[k], WIDE), list(parts.bodies), photos_folder) for k in chosen]
+    sheet = Image.new("RGB", (sum(t.width for t in tiles), max(t.height for t in tiles)), (255, 255, 255))
+    left = 0
+    for tile in tiles:
+        sheet.paste(tile, (left, 0))
+        left += tile.width
+    return sheet
+
+
+def _tile(view: View, seen: np.ndarray, names: list[str], photos_folder: Path) -> Image.Image:
+    with Image.open(Path(photos_folder) / "images" / view.name) as photo:
+        pixels = np.asarray(photo.convert("RGB").resize(seen.shape[::-1]), float)
+    for number in range(len(names)):  # Hues a golden section apart, so that neighbours differ.
+        color = 255 * np.array(colorsys.hsv_to_rgb(number * 0.618 % 1, 0.85, 1.0))
+        pixels[seen == number] += TINT * (color - pixels[seen == number])
+    tile = Image.fromarray(pixels.astype(np.uint8))
+    draw = ImageDraw.Draw(tile)
+    style = {"fill": (255, 255, 255), "stroke_width": 2, "stroke_fill": (0, 0, 0), "font": ImageFont.load_default(18)}
+    for number, name in enumerate(names):
+        rows, columns = np.nonzero(seen == number)
+        if len(rows) >= 12:
+            draw.text((float(np.median(columns)), float(np.median(rows))), name, anchor="mm", **style)
+    draw.text((6, 4), view.source, **style)
+    return tile
