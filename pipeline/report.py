@@ -17,7 +17,8 @@ from sdfsim.files import read_json, write_json, write_text
 # What a person looks for, and the stage that writes it.
 RESULTS = {
     "scene": ("scene.yaml", "scene"), "shape": ("assets/scene", "fit"), "mesh": ("mesh/mesh.ply", "mesh"),
-    "names": ("mesh/objects.png", "mesh"), "cameras": ("poses/cameras.json", "poses"), "report": ("report.md", "photos"),
+    "names": ("mesh/objects.png", "mesh"), "cameras": ("poses/cameras.json", "poses"),
+    "report": ("report.md", "photos"),
 }  # fmt: skip
 RECORDING = "reconstruction.rrd"
 NAMED = 10  # photos that a note names one by one

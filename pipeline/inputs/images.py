@@ -1,4 +1,4 @@
-"""One photo file -> upright pixels, its mask, and what EXIF says about the lens."""
+"""One image file -> upright pixels, its mask, what EXIF says about the lens, and whether it is sharp and well lit."""
 
 from __future__ import annotations
 
@@ -18,12 +18,6 @@ MAX_PIXELS = 200_000_000
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP")
 # Photos with a mask are shown on this grey; it has no texture, so it adds no features.
 BACKDROP = 0.5
-# What turns stored pixels upright, by EXIF orientation.
-TURNS = {
-    2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180, 4: Image.Transpose.FLIP_TOP_BOTTOM,
-    5: Image.Transpose.TRANSPOSE, 6: Image.Transpose.ROTATE_270, 7: Image.Transpose.TRANSVERSE,
-    8: Image.Transpose.ROTATE_90,
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -89,10 +83,9 @@ def read_photo(path: Path, long_side: int, mask: Path | None = None, shape: floa
         SdfsimError: not an image, truncated, too small or too large; the message names the file.
     """
     image, original, focal, camera = _decoded(path, long_side)
-    turn = TURNS.get(image.getexif().get(ExifTags.Base.Orientation, 1))
-    turned = _turned(image, turn)
+    turned = ImageOps.exif_transpose(image)
     if shape is not None and _off(turned, shape) > _off(image, shape):
-        turn, turned = None, image
+        turned = image
     if turned.size != image.size:
         original = original[1], original[0]
     upright = _eight_bits(turned)
@@ -104,7 +97,7 @@ def read_photo(path: Path, long_side: int, mask: Path | None = None, shape: floa
         upright = upright.resize(size, Image.Resampling.LANCZOS)
     pixels, inside = np.asarray(upright), None
     if mask is not None:
-        inside = read_mask(mask, upright.size, turn)
+        inside = read_mask(mask, upright.size)
     elif has_alpha and pixels[..., 3].min() < 128:
         inside = pixels[..., 3]
     if inside is not None:
@@ -116,26 +109,20 @@ def read_photo(path: Path, long_side: int, mask: Path | None = None, shape: floa
     )  # fmt: skip
 
 
-def read_mask(path: Path, size: tuple[int, int], turn: Image.Transpose | None) -> np.ndarray:
-    """A mask [H, W] uint8 at the size (width, height) of its photo.
-
-    Args:
-        path: grey or with alpha; white is the object.
-        size: px.
-        turn: what the photo's stored pixels were turned by; a mask that does not fit upright was made for those, and
-            is turned likewise.
+def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
+    """A mask [H, W] uint8, grey or with alpha, white is the object, at the size (width, height) of its upright photo.
 
     Raises:
         SdfsimError: it cannot be read, or is not shaped like the photo.
     """
-    image, _, _, _ = _decoded(path, max(size))
-    for form in (ImageOps.exif_transpose(image), _turned(image, turn)):
-        if abs(form.width * size[1] / (form.height * size[0]) - 1) < 0.02:
-            grey = form.getchannel("A") if form.mode == "RGBA" else form.convert("L")
+    stored, _, _, _ = _decoded(path, max(size))
+    for image in (ImageOps.exif_transpose(stored), stored):
+        if _off(image, size[0] / size[1]) < 0.02:
+            grey = image.getchannel("A") if image.mode == "RGBA" else image.convert("L")
             return np.asarray(grey.resize(size, Image.Resampling.BOX))
     raise SdfsimError(
-        f"{path}: a mask of {image.width} x {image.height} does not fit its photo, shaped {size[0]} x {size[1]}",
-        "masks have to be as large as their photos",
+        f"{path}: a mask of {stored.width} x {stored.height} does not fit its photo, shaped {size[0]} x {size[1]}",
+        "masks have to be as large as their photos, and upright",
     )
 
 
@@ -184,10 +171,6 @@ def _decoded(path: Path, long_side: int) -> tuple[Image.Image, tuple[int, int], 
 def _off(image: Image.Image, shape: float) -> float:
     """By what share an image is wider or narrower than a shape, width over height."""
     return abs(image.width / image.height / shape - 1)
-
-
-def _turned(image: Image.Image, turn: Image.Transpose | None) -> Image.Image:
-    return image if turn is None else image.transpose(turn)
 
 
 def _eight_bits(image: Image.Image) -> Image.Image:

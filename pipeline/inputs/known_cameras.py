@@ -27,7 +27,7 @@ MODELS = {
 
 
 @dataclass(frozen=True)
-class Given:
+class KnownCamera:
     """A camera that was found elsewhere.
 
     Attributes:
@@ -53,7 +53,7 @@ class Given:
     mask: str | None = None
 
 
-def read_given(path: Path) -> list[Given]:
+def read_cameras(path: Path) -> list[KnownCamera]:
     """The cameras of a transforms.json or of a COLMAP model's folder, in the order of their names.
 
     Raises:
@@ -66,7 +66,7 @@ def read_given(path: Path) -> list[Given]:
         raise SdfsimError(f"{path}: cannot be read as cameras: {error!r}", "write it again") from error
 
 
-def read_transforms(path: Path) -> list[Given]:
+def read_transforms(path: Path) -> list[KnownCamera]:
     """Cameras of a transforms.json: camera-to-world matrices with OpenGL axes; intrinsics for all or in each frame."""
     about = json.loads(path.read_text(encoding="utf-8"))
     flip = np.diag([1.0, -1, -1])
@@ -98,7 +98,7 @@ def read_transforms(path: Path) -> list[Given]:
         names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
         lens = tuple(float(values.get(name, 0.0)) for name in names)
         found.append(
-            Given(str(frame["file_path"]), width, height, _matrix(fx, fy, cx, cy), lens, fisheye,
+            KnownCamera(str(frame["file_path"]), width, height, _matrix(fx, fy, cx, cy), lens, fisheye,
                   rotation, -rotation @ pose[:3, 3], frame.get("mask_path"))
         )  # fmt: skip
     return found
@@ -111,7 +111,7 @@ def _check_lens(values: dict, where: str) -> None:
         raise SdfsimError(f"{where}: camera_model: {model!r} is not read", f"allowed: {', '.join(LENSES)}")
 
 
-def read_model(folder: Path) -> list[Given]:
+def read_model(folder: Path) -> list[KnownCamera]:
     """Cameras of a COLMAP model (its documentation, "Output Format")."""
     binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
     cameras = dict((_cameras_binary if binary else _cameras_text)(folder))
@@ -124,7 +124,7 @@ def read_model(folder: Path) -> list[Given]:
         names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
         lens = tuple(known.get(key, 0.0) for key in names)
         found.append(
-            Given(name, width, height, _matrix(fx, known.get("fy", fx), known["cx"], known["cy"]),
+            KnownCamera(name, width, height, _matrix(fx, known.get("fy", fx), known["cx"], known["cy"]),
                   lens, fisheye, _rotation(quaternion), np.array(translation))
         )  # fmt: skip
     return found
@@ -204,8 +204,8 @@ class Lens:
 
     Attributes:
         matrix: rows of the intrinsics [3, 3] for the prepared photo's size, pixel centres at +0.5.
-        distortion: see `Given`.
-        fisheye: see `Given`.
+        distortion: see `KnownCamera`.
+        fisheye: see `KnownCamera`.
     """
 
     matrix: tuple[tuple[float, ...], ...]
@@ -223,15 +223,15 @@ class Lens:
         return undistort(points, np.array(self.matrix), np.array(self.distortion), P=new, criteria=until)[:, 0]
 
 
-def scaled(given: Given, width: int, height: int) -> np.ndarray:
+def scaled(known: KnownCamera, width: int, height: int) -> np.ndarray:
     """The camera's matrix [3, 3] for its photo at another size, px."""
-    if not given.height:  # Only a field of view is known.
-        return np.array([[given.matrix[0, 0] * width, 0, width / 2], [0, given.matrix[1, 1] * width, height / 2],
+    if not known.height:  # Only a field of view is known.
+        return np.array([[known.matrix[0, 0] * width, 0, width / 2], [0, known.matrix[1, 1] * width, height / 2],
                          [0, 0, 1]])  # fmt: skip
-    return np.diag([width / given.width, height / given.height, 1.0]) @ given.matrix
+    return np.diag([width / known.width, height / known.height, 1.0]) @ known.matrix
 
 
-def rectified(picture: Picture, given: Given, name: str, source: str) -> tuple[Picture, View, Lens | None]:
+def rectified(picture: Picture, known: KnownCamera, name: str, source: str) -> tuple[Picture, View, Lens | None]:
     """A photo as a pinhole camera in the same place would have taken it, that camera, and the lens it was freed from.
 
     Nothing is resampled where the lens has no distortion: then there is no lens. Elsewhere the photo is cut to what the
@@ -239,28 +239,28 @@ def rectified(picture: Picture, given: Given, name: str, source: str) -> tuple[P
 
     Args:
         picture: upright, sized.
-        given: its camera, intrinsics at any size.
+        known: its camera, intrinsics at any size.
         name: of the prepared photo.
         source: the user's name of it.
     """
     height, width = picture.pixels.shape[:2]
-    matrix, lens = scaled(given, width, height), None
+    matrix, lens = scaled(known, width, height), None
     pixels, mask = picture.pixels, picture.mask
     # A fisheye bends also where all its coefficients are 0.
-    if given.fisheye or any(given.distortion) or abs(matrix[0, 0] / matrix[1, 1] - 1) > SQUARE:
+    if known.fisheye or any(known.distortion) or abs(matrix[0, 0] / matrix[1, 1] - 1) > SQUARE:
         import cv2
 
-        lens = Lens(tuple(map(tuple, matrix.tolist())), given.distortion, given.fisheye)
-        bent, size = np.array(given.distortion), (width, height)
+        lens = Lens(tuple(map(tuple, matrix.tolist())), known.distortion, known.fisheye)
+        bent, size = np.array(known.distortion), (width, height)
         old = matrix - CENTRE
-        if given.fisheye:
+        if known.fisheye:
             new = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(old, bent, size, np.eye(3), balance=0.0)
         else:
             new, _ = cv2.getOptimalNewCameraMatrix(old, bent, size, 0.0)
         new = np.array(new, float)
         new[0, 0] = new[1, 1] = max(new[0, 0], new[1, 1])
         new[0, 1] = 0.0
-        make = cv2.fisheye.initUndistortRectifyMap if given.fisheye else cv2.initUndistortRectifyMap
+        make = cv2.fisheye.initUndistortRectifyMap if known.fisheye else cv2.initUndistortRectifyMap
         x, y = make(old, bent, np.eye(3), new, size, cv2.CV_32FC1)
         pixels = cv2.remap(pixels, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         if mask is not None:
@@ -268,5 +268,5 @@ def rectified(picture: Picture, given: Given, name: str, source: str) -> tuple[P
         matrix = new + CENTRE
     focal = float(matrix[0, 0])
     view = View(name, source, width, height, focal, float(matrix[0, 2]), float(matrix[1, 2]), 0.0,
-                given.rotation, given.translation)  # fmt: skip
+                known.rotation, known.translation)  # fmt: skip
     return replace(picture, pixels=pixels, mask=mask, focal=focal), view, lens

@@ -17,7 +17,7 @@ from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, write_json
 
 LONG_SIDE = 1600  # px; what reads the photos takes them as small as it needs
-GIVEN = "given.json"  # cameras that came with the photos
+KNOWN_CAMERAS = "known_cameras.json"  # cameras that came with the photos
 NAMED = 8  # photos named one by one in a note
 
 
@@ -63,8 +63,8 @@ def prepare_photos(
 ) -> tuple[list[Photo], list[str]]:
     """Reads every photo and writes upright, sized copies to `out`.
 
-    Writes `images/NNNN.jpg`, for photos with a mask `masks/NNNN.jpg.png`, `photos.json`, and `given.json` where the
-    cameras are known.
+    Writes `images/NNNN.jpg`, for photos with a mask `masks/NNNN.jpg.png`, `photos.json`, and, where the cameras are
+    known, `known_cameras.json`.
 
     Args:
         given: what the user gave, see `find_source`; never written to.
@@ -107,7 +107,7 @@ def prepare_photos(
         for p, share in zip(photos, shares, strict=True)
     ]
     if views:
-        save_views(views, out / GIVEN)
+        save_views(views, out / KNOWN_CAMERAS)
     save_photos(photos, out)
     return photos, [*source.notes, *notes_on(photos, len(source.masks))]
 
@@ -124,9 +124,9 @@ def _pictures(source: Source, long_side: int) -> Iterator[tuple[str, Picture, Vi
         return
     cameras = {}
     if source.cameras:
-        from pipeline.inputs.known_cameras import read_given
+        from pipeline.inputs.known_cameras import read_cameras
 
-        cameras = {camera.name: camera for camera in read_given(source.cameras)}
+        cameras = {camera.name: camera for camera in read_cameras(source.cameras)}
     masks = _masks_that_count(source, long_side)
     for index, path in enumerate(source.photos):
         camera = cameras.get(source.frames.get(path, ""))

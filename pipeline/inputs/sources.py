@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -145,9 +144,9 @@ def _unused(folder: Path) -> list[str]:
 
 def _with_cameras(cameras: Path) -> Source:
     """The photos that known cameras belong to."""
-    from pipeline.inputs.known_cameras import read_given
+    from pipeline.inputs.known_cameras import read_cameras
 
-    frames = read_given(cameras)
+    frames = read_cameras(cameras)
     photos, masks, names, missing = [], {}, {}, []
     for frame in frames:
         photo = _photo_of(frame.name, cameras)
@@ -180,19 +179,4 @@ def _photo_of(name: str, cameras: Path) -> Path | None:
             for suffix in suffixes:
                 if place.with_name(place.name + suffix).is_file():
                     return place.with_name(place.name + suffix)
-    return _alike(Path(name).stem, roots)
-
-
-def _alike(stem: str, roots: list[Path]) -> Path | None:
-    """A photo in a folder `images` whose name differs only in how its numbers are padded; None unless it is one."""
-
-    def plain(text: str) -> str:
-        return re.sub(r"\d+", lambda number: str(int(number[0])), text)
-
-    for root in roots:
-        found = [
-            p for p in (root / "images").glob("*") if p.suffix.lower() in SUFFIXES and plain(p.stem) == plain(stem)
-        ]
-        if len(found) == 1:
-            return found[0]
     return None

@@ -88,7 +88,7 @@ def views_of(result: dict, photos: list[Photo]) -> list[View]:
     ]  # fmt: skip
 
 
-def judge(result: dict, photos: list[Photo], ordinary: dict | None = None) -> dict:
+def check(result: dict, photos: list[Photo], ordinary: dict | None = None) -> dict:
     """Decides whether a reconstruction can be trusted.
 
     "All registered" is not "right": repeating textures give complete but wrong reconstructions, which show in the
@@ -257,21 +257,21 @@ def disagreeing(result: dict, found: Findings) -> bool:
     return len(linked) >= 6 and len(posed & set(linked)) < len(linked) / 2
 
 
-def failure_message(verdict: dict) -> str:
-    """The verdict's failures, causes and photos left out, in one line."""
-    message = "camera poses: " + "; ".join(verdict["failures"])
-    if verdict["causes"]:
-        message += ". Probably " + "; and ".join(verdict["causes"])
-    left = verdict["left_out"]
+def failure_message(checks: dict) -> str:
+    """The failures, causes and photos left out, in one line."""
+    message = "camera poses: " + "; ".join(checks["failures"])
+    if checks["causes"]:
+        message += ". Probably " + "; and ".join(checks["causes"])
+    left = checks["left_out"]
     if left:
         named = [f"{entry['photo']}: {entry['why']}" for entry in left[:4]]
         message += ". Left out: " + "; ".join(named) + (f"; and {len(left) - 4} more" if len(left) > 4 else "")
     return message
 
 
-def failure_hint(verdict: dict) -> str:
+def failure_hint(checks: dict) -> str:
     """What to try, from the commonest reason."""
-    reasons = " ".join(entry["why"] for entry in verdict["left_out"])
+    reasons = " ".join(entry["why"] for entry in checks["left_out"])
     if reasons.count("features") > reasons.count("overlap"):
         return "take sharper photos in better light, or put something textured under the object"
     return "take 20 to 60 photos in small steps around the object, each overlapping the one before by two thirds"

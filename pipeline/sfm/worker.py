@@ -45,7 +45,6 @@ def features(pycolmap, job: dict, database: Path) -> None:
     extraction.max_image_size = job["pixels"]
     extraction.sift.max_num_features = job["max_features"]
     extraction.sift.peak_threshold = job["peak_threshold"]
-    extraction.sift.estimate_affine_shape = job["affine"]
     pycolmap.Database.open(database).close()  # makes it
     for group in job["groups"]:
         reader = pycolmap.ImageReaderOptions()
@@ -94,19 +93,13 @@ def matches(pycolmap, job: dict, database: Path) -> None:
 
 
 def mapping(pycolmap, job: dict, database: Path, out: Path):
-    """Reconstructions [..] from the matches: incremental or global mapping, or triangulation from known cameras."""
+    """Reconstructions from the matches: incremental mapping, or triangulation from known cameras."""
     shutil.rmtree(out / "colmap", ignore_errors=True)
     (out / "colmap").mkdir()
     options = incremental_options(pycolmap, job)
-    if job["given"]:
-        known = given_cameras(pycolmap, job, database)
+    if job["known_cameras"]:
+        known = known_cameras(pycolmap, job, database)
         return [pycolmap.triangulate_points(known, database, job["images"], out / "colmap", options=options)]
-    if job["mapper"] == "global":
-        settings = pycolmap.GlobalPipelineOptions()
-        settings.num_threads, settings.random_seed = 1, job["seed"]
-        settings.min_num_matches = job["min_inliers"]
-        pycolmap.calibrate_view_graph(database, pycolmap.ViewGraphCalibrationOptions(random_seed=job["seed"]))
-        return list(pycolmap.global_mapping(database, job["images"], out / "colmap", options=settings).values())
     done = 0
 
     def count() -> None:
@@ -133,14 +126,12 @@ def incremental_options(pycolmap, job: dict):
     options.mapper.init_min_num_inliers = min(100, job["init_inliers"])
     options.mapper.init_min_tri_angle = job["init_angle"]
     options.mapper.abs_pose_min_num_inliers = job["pose_inliers"]
-    options.ba_refine_focal_length = not job["hold_focal"]
-    options.mapper.abs_pose_refine_focal_length = not job["hold_focal"]
     return options
 
 
-def given_cameras(pycolmap, job: dict, database: Path):
+def known_cameras(pycolmap, job: dict, database: Path):
     """A reconstruction without points, of the known cameras of the job."""
-    views = json.loads(Path(job["given"]).read_text(encoding="utf-8"))["views"]
+    views = json.loads(Path(job["known_cameras"]).read_text(encoding="utf-8"))["views"]
     model = pycolmap.Reconstruction()
     with pycolmap.Database.open(database) as opened:
         images = {image.name: image for image in opened.read_all_images()}
@@ -194,44 +185,6 @@ def collect(reconstruction, out: Path) -> list[dict]:
     }
     write_arrays(out / "sparse.npz", arrays, compressed=False)
     return views
-
-
-def main(job_path: str) -> None:
-    """Runs one job file and writes `result.json` and `sparse.npz` beside it."""
-    import pycolmap
-
-    watch_parent()
-    job = json.loads(Path(job_path).read_text(encoding="utf-8"))
-    out = Path(job_path).parent
-    database = out / "database.db"
-    pycolmap.set_random_seed(job["seed"])
-    if job["matches_of"]:
-        shutil.copyfile(job["matches_of"], database)
-    else:
-        say("phase features")
-        features(pycolmap, job, database)
-        say("phase matches")
-        matches(pycolmap, job, database)
-    say("phase mapping")
-    result: dict[str, Any] = {"views": [], "models": []}
-    result["counts"], result["pairs"], result["turn_only"] = counts(pycolmap, job, database)
-    result["focal_of_pairs"] = {} if job["given"] else focal_of_pairs(pycolmap, job, database, out)
-    models = sorted(mapping(pycolmap, job, database, out), key=lambda r: (-r.num_reg_images(), -r.num_points3D()))
-    for model in models:
-        result["models"].append(sorted(image.name for image in model.images.values() if image.has_pose))
-    if models:
-        best = models[0]
-        result["views"] = collect(best, out)
-        result["contradictions"] = contradictions(pycolmap, database, result["views"])
-        result["mean_error"] = float(best.compute_mean_reprojection_error())
-        result["points"] = int(best.num_points3D())
-        result["track_length"] = float(best.compute_mean_track_length())
-    write_json(out / "result.json", result)
-    say("phase done")
-
-
-if __name__ == "__main__":
-    main(sys.argv[1])
 
 
 def counts(pycolmap, job: dict, database: Path) -> tuple[dict[str, dict], list[dict], float]:
@@ -354,3 +307,38 @@ def focal_of_pairs(pycolmap, job: dict, database: Path, out: Path) -> dict[str, 
             }  # fmt: skip
     finally:
         copy.unlink(missing_ok=True)
+
+
+def main(job_path: str) -> None:
+    """Runs one job file and writes `result.json` and `sparse.npz` beside it."""
+    import pycolmap
+
+    watch_parent()
+    job = json.loads(Path(job_path).read_text(encoding="utf-8"))
+    out = Path(job_path).parent
+    database = out / "database.db"
+    pycolmap.set_random_seed(job["seed"])
+    say("phase features")
+    features(pycolmap, job, database)
+    say("phase matches")
+    matches(pycolmap, job, database)
+    say("phase mapping")
+    result: dict[str, Any] = {"views": [], "models": []}
+    result["counts"], result["pairs"], result["turn_only"] = counts(pycolmap, job, database)
+    result["focal_of_pairs"] = {} if job["known_cameras"] else focal_of_pairs(pycolmap, job, database, out)
+    models = sorted(mapping(pycolmap, job, database, out), key=lambda r: (-r.num_reg_images(), -r.num_points3D()))
+    for model in models:
+        result["models"].append(sorted(image.name for image in model.images.values() if image.has_pose))
+    if models:
+        best = models[0]
+        result["views"] = collect(best, out)
+        result["contradictions"] = contradictions(pycolmap, database, result["views"])
+        result["mean_error"] = float(best.compute_mean_reprojection_error())
+        result["points"] = int(best.num_points3D())
+        result["track_length"] = float(best.compute_mean_track_length())
+    write_json(out / "result.json", result)
+    say("phase done")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -128,11 +128,11 @@ def test_known_cameras_are_kept_and_checked(tmp_path):
     wrong.mkdir()
     views = load_views(work)
     from pipeline.cameras import save_views
-    from pipeline.inputs.photos import GIVEN
+    from pipeline.inputs.photos import KNOWN_CAMERAS
 
     (wrong / "images").symlink_to(work / "images")
     moved = [type(v)(**{**v.__dict__, "name": o.name}) for v, o in zip(views, views[3:] + views[:3], strict=True)]
-    save_views(moved, wrong / GIVEN)
+    save_views(moved, wrong / KNOWN_CAMERAS)
     with pytest.raises(SdfsimError, match="the known cameras do not fit the photos"):
         solve(load_photos(work), wrong, wrong)
 
