@@ -6,7 +6,6 @@ import hashlib
 import itertools
 import os
 import shutil
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from pipeline.mesh.cleaning import joined
 from pipeline.mesh.meshing import SCENERY, read_parts, rounded
 from pipeline.mesh.placement import Placement, load_placement
 from pipeline.mesh.visibility import Caster
+from pipeline.progress import Progress, quiet
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.files import write_text
 from sdfsim.shape.mesh import Mesh, load_mesh
@@ -34,7 +34,7 @@ GAP = 0.3  # of the fall, as a share of the side
 
 
 def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str = "default", seed: int = 0,
-              device: str = "cpu", on_progress: Callable[[float, str], None] | None = None) -> dict:  # fmt: skip
+              device: str = "cpu", on_progress: Progress = quiet) -> dict:  # fmt: skip
     """Fits a compact SDF to the scenery and to every body, each a Shape folder in `out` that goes by its name.
 
     The scenery's solid is closed (capped where the trained space ends), so the sign of its distance is right
@@ -48,7 +48,6 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
         recipe: of the fits.
         seed: of the fits.
         device: where to compute.
-        on_progress: called with (fraction, message).
 
     Returns:
         `shapes`: a certificate each; `passed`, `reason` and `caveats` (a line each) for all of them.
@@ -66,8 +65,7 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
     for name, share in shares.items():
 
         def tell(fraction: float, message: str, name: str = name, before: float = done, share: float = share) -> None:
-            if on_progress:
-                on_progress(before + share * fraction, f"{name}: {message}")
+            on_progress(before + share * fraction, f"{name}: {message}")
 
         done += share
         folder = out / name
@@ -86,7 +84,7 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
 
 
 def fit_one(solid: Mesh, shown: Mesh, out: Path, name: str, *, budget: float | None, recipe: str, seed: int,
-            device: str, on_progress: Callable[[float, str], None]) -> dict:  # fmt: skip
+            device: str, on_progress: Progress) -> dict:  # fmt: skip
     """Fits one shape, saves it as the folder `out`/`name`, and returns its certificate."""
     from sdfsim.shape.fit import fit_mesh
 

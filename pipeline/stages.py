@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.options import COMMAND, Options, read_config, write_config
+from pipeline.progress import Progress
 from pipeline.report import write_report
 from sdfsim.errors import SdfsimError
 from sdfsim.files import CONFIG, check_own, locked, write_json
@@ -45,8 +46,8 @@ class Run:
     own_budget: float | None = None
     started: float = field(default_factory=time.monotonic)
 
-    def tell(self, stage: str) -> Callable[[float, str], None]:
-        """The progress callback of one stage."""
+    def tell(self, stage: str) -> Progress:
+        """What one stage tells its progress to."""
         return lambda fraction, message: self.progress(stage, fraction, message) if self.progress else None
 
     def place(self, stage: str) -> Path:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,14 +16,13 @@ from pipeline.cameras import View
 from pipeline.field.rays import load_rays
 from pipeline.field.rendering import render
 from pipeline.inputs.images import BACKDROP
+from pipeline.progress import Progress, quiet
 
 if TYPE_CHECKING:
     from pipeline.field.training import Trainer
 
-Progress = Callable[[float, str], None]
-
 FOLDER = "held_out"
-EMPTY = 0.9  # grey of pixels whose ray misses the trained sphere
+EMPTY = 0.9  # grey of pixels whose ray misses the trained spherefrom pipeline.progress import Progress, quiet
 
 
 @dataclass(frozen=True)
@@ -93,13 +91,12 @@ class HeldOut:
         return (255 * picture.clip(0, 1) + 0.5).astype(np.uint8)
 
 
-def score(held: HeldOut, out: Path, on_progress: Progress | None = None) -> dict:
+def score(held: HeldOut, out: Path, on_progress: Progress = quiet) -> dict:
     """PSNR (and, with masks, overlap of silhouettes) of the held-out views; writes the renders to `out`/held_out.
 
     Args:
         held: the views.
         out: folder of the stage.
-        on_progress: called with (fraction, message).
 
     Returns:
         For the report; empty where no view shows anything of the unit sphere.
@@ -111,8 +108,7 @@ def score(held: HeldOut, out: Path, on_progress: Progress | None = None) -> dict
     for count, number in enumerate(held.shown, 1):
         found.append(held.compare(number))
         Image.fromarray(found[-1].picture).save(out / FOLDER / held.views[number].name, quality=92)
-        if on_progress:
-            on_progress(count / len(held.shown), f"held-out view {count} of {len(held.shown)}")
+        on_progress(count / len(held.shown), f"held-out view {count} of {len(held.shown)}")
     psnr = [one.psnr for one in found]
     report = {
         "held_out_photos": [held.views[number].source for number in held.shown],

@@ -43,11 +43,7 @@ class Rays:
 
     def to(self, device: str) -> Rays:
         """The same rays on another device."""
-        mask = None if self.mask is None else self.mask.to(device)
-        return Rays(
-            self.rgb.to(device), mask, self.view.to(device), self.pixel.to(device), self.intrinsics.to(device),
-            self.rotation.to(device), self.center.to(device), self.sizes.to(device),
-        )  # fmt: skip
+        return Rays(**{name: None if part is None else part.to(device) for name, part in vars(self).items()})
 
     def at(self, index: Tensor) -> tuple[Tensor, Tensor]:
         """Origins and unit directions [R, 3] of the rays with these indices [R]."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -31,6 +30,7 @@ from pipeline.field.rendering import (
 )
 from pipeline.inputs.images import BACKDROP
 from pipeline.inputs.photos import load_photos
+from pipeline.progress import Progress, quiet, share_of
 from pipeline.sfm.supervision import FreeSpace, Supervision, supervision_of, unit_sphere_of
 from sdfsim.errors import SdfsimError
 from sdfsim.files import replacing, write_json
@@ -375,7 +375,7 @@ class Trained:
 def train(
     views: list[View], sparse: Sparse, photos_folder: Path, out: Path, *, settings: Settings,
     budget: float | None = None, seed: int = 0, device: str = "cpu", threads: int | None = None,
-    checkpoint_every: float = 20.0, on_progress: Callable[[float, str], None] | None = None,
+    checkpoint_every: float = 20.0, on_progress: Progress = quiet,
 ) -> Trained:  # fmt: skip
     """Trains a field and writes `field.safetensors` and `field.json` to `out`; resumes from `checkpoint.safetensors`.
 
@@ -392,7 +392,6 @@ def train(
         threads: of the CPU; None takes what is fastest now (a second thread only slows things down where another
             program uses the core).
         checkpoint_every: s.
-        on_progress: called with (fraction, message).
 
     Raises:
         SdfsimError: the loss is no longer finite.
@@ -431,7 +430,7 @@ def train(
         if now - saved > checkpoint_every:
             trainer.save(checkpoint)
             saved = now
-        if on_progress and trainer.iteration % 10 == 0:
+        if trainer.iteration % 10 == 0:
             on_progress(0.92 * trainer.fraction, f"step {trainer.iteration} of {trainer.iterations}, "
                         f"colour error {smooth['color']:.4f}")  # fmt: skip
     trainer.save(checkpoint)
@@ -439,7 +438,7 @@ def train(
     scores = {}
     if test:
         held = HeldOut([local[i] for i in test], photos_folder, trainer, masked=masked)
-        scores = score(held, out, lambda part, text: on_progress(0.92 + 0.08 * part, text) if on_progress else None)
+        scores = score(held, out, share_of(on_progress, 0.92, 0.08))
     report = {
         "iterations": trainer.iterations, "rays": len(rays), "train_seconds": round(trainer.seconds, 1),
         "seconds_before": round(before, 1), "resumed": resumed, "masked": masked, "beta": trainer.beta,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from pipeline.cameras import View, save_views
 from pipeline.inputs.images import Picture, exposure, fault, read_photo, sharpness
 from pipeline.inputs.known_cameras import Lens, rectified
 from pipeline.inputs.sources import Source, find_source
+from pipeline.progress import Progress, quiet
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, write_json
 
@@ -59,7 +60,7 @@ class Photo:
 
 
 def prepare_photos(
-    given: Path, out: Path, *, long_side: int = LONG_SIDE, on_progress: Callable[[float, str], None] | None = None
+    given: Path, out: Path, *, long_side: int = LONG_SIDE, on_progress: Progress = quiet
 ) -> tuple[list[Photo], list[str]]:
     """Reads every photo and writes upright, sized copies to `out`.
 
@@ -70,7 +71,6 @@ def prepare_photos(
         given: what the user gave, see `find_source`; never written to.
         out: an existing folder.
         long_side: limit of the longer side, px.
-        on_progress: called with (fraction, message).
 
     Returns:
         The photos in order, and notes for the report.
@@ -99,8 +99,7 @@ def prepare_photos(
             Photo(name, origin, width, height, picture.original, lens, focal, picture.camera,
                   picture.mask is not None, sharp)
         )  # fmt: skip
-        if on_progress:
-            on_progress(fraction, f"{len(photos)} photos")
+        on_progress(fraction, f"{len(photos)} photos")
     typical = float(np.quantile([p.sharpness for p in photos], 0.75))
     photos = [
         replace(p, fault=fault(p.sharpness, *share, typical=typical, masked=p.mask))

@@ -13,10 +13,10 @@ from pipeline.cameras import View
 from pipeline.field.grid_field import Field
 from pipeline.mesh.cleaning import belonging, face_normals, islands, keep_faces, vertex_normals
 from pipeline.mesh.visibility import Visibility, look, to_bytes
+from pipeline.progress import Progress, quiet
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.shape.mesh import Mesh
 
-Progress = Callable[[float, str], None]
 Distance = Callable[[np.ndarray], np.ndarray]
 
 BATCH = 1 << 17  # points a query
@@ -87,7 +87,7 @@ def sample(distance: Distance, points: np.ndarray) -> np.ndarray:
 
 
 def sample_volume(
-    distance: Distance, resolution: int, *, extent: float = 1.02, coarse: int = 4, on_progress: Progress | None = None
+    distance: Distance, resolution: int, *, extent: float = 1.02, coarse: int = 4, on_progress: Progress = quiet
 ) -> Volume:
     """Samples over [-extent, extent]^3, fine only near the surface.
 
@@ -100,7 +100,6 @@ def sample_volume(
         resolution: samples a side, rounded up to a multiple of `coarse` plus 1.
         extent: half the side.
         coarse: see above.
-        on_progress: called with (fraction, message).
     """
     from scipy.ndimage import zoom
 
@@ -123,7 +122,7 @@ def sample_volume(
     for number, part in enumerate(parts):
         index = (part[:, None] * coarse + local).reshape(-1, 3)
         volume[tuple(index.T)] = distance(line[index])
-        if on_progress and number % 4 == 0:
+        if number % 4 == 0:
             on_progress((number + 1) / len(parts), f"sampling the field, {number + 1} of {len(parts)} parts")
     return Volume(volume, np.full(3, -extent), 2 * extent / (n - 1))
 
@@ -220,7 +219,7 @@ def trusted_vertices(mesh: Mesh, count: np.ndarray, at_limit: np.ndarray) -> np.
 
 def surface_of(
     volume: Volume, field: Field, views: list[View], points: np.ndarray, photos_folder: Path, limit: Distance, *,
-    on_progress: Progress | None = None,
+    on_progress: Progress = quiet,
 ) -> Surface:  # fmt: skip
     """The solid of a sampled field and its visible surface.
 
@@ -231,7 +230,6 @@ def surface_of(
         points: [P, 3] sparse points in normalised space.
         photos_folder: of the photos stage.
         limit: distance [P] from the body that the solid was cut off at.
-        on_progress: called with (fraction, message).
 
     Raises:
         SdfsimError: (exit code 3) the field has no surface, or hardly any of it is in the photos.

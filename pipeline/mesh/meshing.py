@@ -18,12 +18,12 @@ from pipeline.mesh.cleaning import joined
 from pipeline.mesh.extraction import EXTENT, ball, field_distance, sample_volume, surface_of
 from pipeline.mesh.placement import Placement, measured_scale, place
 from pipeline.mesh.visibility import Caster
+from pipeline.progress import Progress, quiet, share_of
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, replacing, write_json
 from sdfsim.shape.mesh import Mesh
 from sdfsim.shape.storage import write_ply
 
-Progress = Callable[[float, str], None]
 SCENERY = "scene"
 RESOLUTION = {"quick": 192, "standard": 288, "fine": 448, "paper": 448}  # samples a side, by preset
 # The picture of names: at most so many photos, their width while they are chosen and in the picture, px, and the tint.
@@ -33,7 +33,7 @@ PICTURES, THUMB, WIDE, TINT = 4, 80, 720, 0.45
 def make_meshes(
     distill: Path, poses: Path, photos: Path, out: Path, *, preset: str, size: float | None = None,
     distance: Sequence | None = None, crop: Sequence[float] | None = None, device: str = "cpu",
-    on_progress: Progress | None = None,
+    on_progress: Progress = quiet,
 ) -> dict:  # fmt: skip
     """Extracts surfaces and writes them to `out`.
 
@@ -50,7 +50,6 @@ def make_meshes(
         distance: sets the scale in place of `size`.
         crop: [6] m.
         device: where the field is sampled.
-        on_progress: called with (fraction, message).
 
     Returns:
         The stage's report.
@@ -59,9 +58,6 @@ def make_meshes(
         SdfsimError: (exit code 3) no surface worth the name; (exit code 1) a distance or box that makes no sense.
     """
 
-    def tell(start: float, share: float) -> Progress:
-        return lambda fraction, message: on_progress(start + share * fraction, message) if on_progress else None
-
     trained = load_field(distill)
     field, to_unit = trained.field.to(device), trained.to_unit
     views = [to_unit.view(view) for view in load_views(poses)]
@@ -69,9 +65,12 @@ def make_meshes(
     alone = bool(trained.report["masked"])
     inner, limit = field_distance(field), ball
     volume = sample_volume(
-        lambda p: np.maximum(inner(p), ball(p)), RESOLUTION[preset], extent=EXTENT, on_progress=tell(0.0, 0.25)
+        lambda p: np.maximum(inner(p), ball(p)),
+        RESOLUTION[preset],
+        extent=EXTENT,
+        on_progress=share_of(on_progress, 0.0, 0.25),
     )
-    surface = surface_of(volume, field, views, points, photos, limit, on_progress=tell(0.25, 0.25))
+    surface = surface_of(volume, field, views, points, photos, limit, on_progress=share_of(on_progress, 0.25, 0.25))
     scale = measured_scale(distance, views, load_photos(photos), Caster(surface.raw)) if distance else None
     placement = place(surface.visible, views, scale, size=size, alone=alone)
     if crop is not None:
@@ -79,14 +78,14 @@ def make_meshes(
         volume = volume.limited(limit)
         if not (volume.values < 0).any():
             raise SdfsimError("crop: the box holds nothing", "corners are in metres, as in a mesh/mesh.ply without it")
-        surface = surface_of(volume, field, views, points, photos, limit, on_progress=tell(0.5, 0.2))
+        surface = surface_of(volume, field, views, points, photos, limit, on_progress=share_of(on_progress, 0.5, 0.2))
         # Where a person has cut the surroundings away, what is left is what they want to move.
         alone = alone or not surface.reaches_rim
-    tell(0.7, 0.0)(0.0, "looking for bodies")
+    on_progress(0.7, "looking for bodies")
     cut = lambda p: np.maximum(inner(p), limit(p))  # noqa: E731
     parts = split(surface, cut, field.finest, views, photos, placement.to_metres.rotation[2], alone=alone)
     write_parts(parts, surface.visible, placement, out)
-    tell(0.95, 0.0)(0.0, "drawing objects.png")
+    on_progress(0.95, "drawing objects.png")
     draw_names(parts, views, photos).save(out / "objects.png")
     metres = placement.to_metres.scale
     return {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,9 +11,8 @@ from PIL import Image
 
 from pipeline.cameras import View
 from pipeline.mesh.cleaning import vertex_normals
+from pipeline.progress import Progress, quiet
 from sdfsim.shape.mesh import Mesh
-
-Progress = Callable[[float, str], None]
 
 # A point seen at a flatter angle than this (cosine) does not count as seen.
 FLATTEST = 0.08
@@ -85,7 +83,7 @@ class Visibility:
         return index, pixels[index], cosine[index]
 
 
-def look(sight: Visibility, views: list[View], photos_folder: Path, on_progress: Progress | None = None) -> Look:
+def look(sight: Visibility, views: list[View], photos_folder: Path, on_progress: Progress = quiet) -> Look:
     """How many views see each vertex, and its colour in their photos."""
     vertices = sight.vertices
     count = np.zeros(len(vertices), np.int32)
@@ -98,19 +96,16 @@ def look(sight: Visibility, views: list[View], photos_folder: Path, on_progress:
         share = cosine**2 / np.linalg.norm(view.center - vertices[index], axis=1) ** 2
         color[index] += share[:, None] * bilinear(photo, pixels - 0.5)
         weight[index] += share
-        if on_progress:
-            on_progress((number + 1) / len(views), f"looking from photo {number + 1} of {len(views)}")
+        on_progress((number + 1) / len(views), f"looking from photo {number + 1} of {len(views)}")
     return Look(count, color / np.maximum(weight, 1e-12)[:, None], weight)
 
 
 def bilinear(image: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Values [P, C] of an image [H, W, C] at pixel positions [P, 2] (column, row; centres at whole numbers)."""
-    limit = np.array([image.shape[1] - 2, image.shape[0] - 2])
-    low = np.clip(np.floor(at).astype(int), 0, limit)
-    part = np.clip(at - low, 0, 1)
-    (x, y), (u, v) = low.T, part.T[..., None]
-    top = image[y, x] * (1 - u) + image[y, x + 1] * u
-    return top * (1 - v) + (image[y + 1, x] * (1 - u) + image[y + 1, x + 1] * u) * v
+    from scipy.ndimage import map_coordinates
+
+    channels = [map_coordinates(image[..., c], at.T[::-1], order=1, mode="nearest") for c in range(image.shape[2])]
+    return np.stack(channels, -1)
 
 
 def spread_colors(points: np.ndarray, known: np.ndarray, colors: np.ndarray) -> np.ndarray:

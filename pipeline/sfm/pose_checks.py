@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,18 +11,14 @@ from pipeline.inputs.photos import Photo
 
 # Field of view of the longer side, degrees: from a short telephoto to a wide angle lens.
 FOV_RANGE = (18.0, 110.0)
-MAX_MEAN_ERROR = 2.0
-MIN_TRIANGULATION = 1.5
-FEW_FEATURES = 150
-FEW_MATCHES = 30
-FEW_POINTS = 30
-FEW_PHOTOS = 6
+MAX_MEAN_ERROR = 2.0  # px
+MIN_TRIANGULATION = 1.5  # degrees
+FEW_FEATURES, FEW_MATCHES, FEW_POINTS, FEW_PHOTOS = 150, 30, 30, 6
 # A focal length off by more than this is another lens. What the pairs say on their own is less exact: from a dozen
 # photos it was off by 1.36.
 FOCAL_OFF, PAIRS_OFF = 1.5, 1.7
-# A pair contradicts the poses where its matches lie farther from their lines; right poses have 0 to 3 % of such pairs.
-CONTRADICTION = 4.0
-MANY_CONTRADICTIONS = 0.25
+# A pair contradicts the poses where its matches lie farther (px) from their lines; right poses have 0 to 3 % of these.
+CONTRADICTION, MANY_CONTRADICTIONS = 4.0, 0.25
 STILL = 0.5  # of a pair's matches not moving: the background stands still
 ONE_SIDE = 150.0  # degrees of view points around the scene below which it is seen from one side only
 COMPONENT_NAMED = 3
@@ -39,10 +35,10 @@ class Findings:
         rotation_only: share of linked pairs that a turn of the camera, without a step, explains.
     """
 
-    components: list[list[str]] = field(default_factory=list)
-    textureless: float = 0.0
-    still: float = 0.0
-    rotation_only: float = 0.0
+    components: list[list[str]]
+    textureless: float
+    still: float
+    rotation_only: float
 
 
 def find(result: dict, photos: list[Photo]) -> Findings:
@@ -50,31 +46,23 @@ def find(result: dict, photos: list[Photo]) -> Findings:
 
     Blurred photos match each other, for want of anything finer; a group of nothing else is no group.
     """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
     sound = {photo.name for photo in photos if not photo.fault}
-    counts, pairs = result["counts"], result.get("pairs", [])
-    group = {name: name for name in counts}
-
-    def root(name: str) -> str:
-        while group[name] != name:
-            group[name] = group[group[name]]
-            name = group[name]
-        return name
-
-    for pair in pairs:
-        if pair["matches"] >= FEW_MATCHES:
-            group[root(pair["a"])] = root(pair["b"])
-    members: dict[str, list[str]] = {}
-    for name in sorted(counts):
-        members.setdefault(root(name), []).append(name)
-    groups = [names for names in members.values() if sound.intersection(names)]
-    groups += [[name] for names in members.values() for name in names if not sound.intersection(names)]
-    linked = [pair for pair in pairs if pair["matches"] >= FEW_MATCHES]
-    share = 1 / max(1, len(linked))
+    counts, names = result["counts"], sorted(result["counts"])
+    linked = [pair for pair in result["pairs"] if pair["matches"] >= FEW_MATCHES]
+    ends = np.array([(names.index(pair["a"]), names.index(pair["b"])) for pair in linked], int).reshape(-1, 2)
+    graph = coo_matrix((np.ones(len(ends)), ends.T), shape=(len(names), len(names)))
+    label = connected_components(graph, directed=False)[1]
+    members = [[name for name, number in zip(names, label, strict=True) if number == k] for k in np.unique(label)]
+    groups = [group for group in members if sound.intersection(group)]
+    groups += [[name] for group in members for name in group if not sound.intersection(group)]
     return Findings(
         sorted(groups, key=lambda names: (-len(names), names[0])),
         sum(entry["features"] < FEW_FEATURES for entry in counts.values()) / max(1, len(counts)),
-        share * sum(pair["still"] > STILL for pair in linked),
-        result.get("turn_only", 0.0),
+        sum(pair["still"] > STILL for pair in linked) / max(1, len(linked)),
+        result["turn_only"],
     )
 
 
@@ -111,49 +99,47 @@ def check(result: dict, photos: list[Photo], ordinary: dict | None = None) -> di
         found = replace(
             found, still=max(found.still, first.still), rotation_only=max(found.rotation_only, first.rotation_only)
         )
-    needed = needed_photos(len(photos), found)
+    together = len(found.components[0]) if found.components else len(photos)
+    needed = max(3, -(-together // 2), -(-len(photos) // 3))
     left_out = [{"photo": p.source, "why": left_out_reason(p, result, found)} for p in photos if p.name not in posed]
+    angle, around = (spread_angle(views), view_span(views)) if views else (0.0, 0.0)
     failures, warnings = [], []
     if len(posed) < needed:
         failures.append(f"only {len(posed)} of {len(photos)} photos could be posed ({needed} are needed)")
-    elif left_out:
-        warnings.append(f"{len(left_out)} of {len(photos)} photos were left out")
-    if len(views) >= needed:
-        for check in (check_focal, check_errors, check_spread):
-            failed, warned = check(result, views, photos)
-            failures += failed
-            warnings += warned
-    causes = diagnose(result, found, failures)
-    angle, around = (spread_angle(views), view_span(views)) if views else (0.0, 0.0)
-    focal = sorted({round(view.focal, 2) for view in views})
+    else:
+        if left_out:
+            warnings.append(f"{len(left_out)} of {len(photos)} photos were left out")
+        check_focal(result, views, photos, failures, warnings)
+        check_errors(result, failures, warnings)
+        if angle < MIN_TRIANGULATION:
+            failures.append(f"the cameras stand too close together ({angle:.1f} degrees apart as seen from the scene)")
+        elif around < ONE_SIDE:
+            warnings.append(f"the photos show the scene from one side ({around:.0f} degrees around it): what they do "
+                            "not show is guessed, so a closed object cannot come of it")  # fmt: skip
     return {
         "photos": len(photos), "posed": len(posed), "needed": needed, "left_out": left_out,
         "mean_error": round(result.get("mean_error", 0.0), 4), "points": result.get("points", 0),
         "track_length": round(result.get("track_length", 0.0), 2), "models": [len(m) for m in result["models"]],
-        "field_of_view": sorted({round(view.fov, 2) for view in views}), "focal": focal,
+        "field_of_view": sorted({round(view.fov, 2) for view in views}),
+        "focal": sorted({round(view.focal, 2) for view in views}),
         "spread_angle": round(angle, 2), "span_degrees": round(around, 1),
         "contradictions": round(contradicting(result), 4), "components": [len(c) for c in found.components],
         "still_pairs": round(found.still, 3), "turn_only_pairs": round(found.rotation_only, 3),
-        "causes": causes, "failures": failures, "warnings": warnings,
+        "causes": diagnose(result, found, failures), "failures": failures, "warnings": warnings,
     }  # fmt: skip
 
 
-def needed_photos(count: int, found: Findings) -> int:
-    """Photos that have to be posed: half of those that belong together, and a third of all."""
-    together = len(found.components[0]) if found.components else count
-    return max(3, -(-together // 2), -(-count // 3))
-
-
-def check_focal(result: dict, views: list[View], photos: list[Photo]) -> tuple[list[str], list[str]]:
-    """Field of view, and the focal length against EXIF and against what the pairs say on their own."""
-    failures, warnings = [], []
+def check_focal(result: dict, views: list[View], photos: list[Photo], failures: list[str], warnings: list[str]) -> None:
+    """Checks the field of view, and the focal length against EXIF and against what the pairs say on their own."""
     off = sorted(view.fov for view in views if not FOV_RANGE[0] <= view.fov <= FOV_RANGE[1])
     if off:
         failures.append(f"implausible field of view of {off[0]:.0f} degrees: the poses are probably wrong")
-    prior = {p.name: p.focal for p in photos}
-    pairs = result.get("focal_of_pairs", {})
-    to_exif = median_ratio([(v.focal, prior[v.name]) for v in views])
-    to_pairs = median_ratio([(v.focal, pairs.get(v.name)) for v in views])
+
+    def ratio(known: dict) -> float | None:
+        ratios = [view.focal / known[view.name] for view in views if known.get(view.name)]
+        return float(np.median(ratios)) if ratios else None
+
+    to_exif, to_pairs = ratio({p.name: p.focal for p in photos}), ratio(result["focal_of_pairs"])
     agree = to_pairs is not None and 1 / PAIRS_OFF < to_pairs < PAIRS_OFF
     if to_exif is not None and not 1 / FOCAL_OFF < to_exif < FOCAL_OFF:
         # Photos that were cropped carry the focal length of the whole photo.
@@ -166,46 +152,25 @@ def check_focal(result: dict, views: list[View], photos: list[Photo]) -> tuple[l
         failures.append(
             f"focal length is {to_pairs:.2f} times what the pairs of photos say: the poses are probably wrong"
         )
-    return failures, warnings
 
 
-def median_ratio(pairs: list[tuple[float, float | None]]) -> float | None:
-    """Median of first / second where there is a second."""
-    ratios = [first / second for first, second in pairs if second]
-    return float(np.median(ratios)) if ratios else None
-
-
-def check_errors(result: dict, views: list[View], photos: list[Photo]) -> tuple[list[str], list[str]]:
-    """Reprojection error, points, and pairs that contradict the poses."""
-    failures, warnings = [], []
-    error = result.get("mean_error", 0.0)
+def check_errors(result: dict, failures: list[str], warnings: list[str]) -> None:
+    """Checks the reprojection error, the points, and the pairs that contradict the poses."""
+    error, points, against = result.get("mean_error", 0.0), result.get("points", 0), contradicting(result)
     if error > MAX_MEAN_ERROR:
         failures.append(f"mean reprojection error of {error:.1f} px (at most {MAX_MEAN_ERROR})")
-    if result.get("points", 0) < FEW_POINTS:
-        failures.append(f"only {result.get('points', 0)} points in common")
-    against = contradicting(result)
+    if points < FEW_POINTS:
+        failures.append(f"only {points} points in common")
     if against > MANY_CONTRADICTIONS:
         failures.append(f"{against:.0%} of the pairs of photos contradict the poses")
     elif against > MANY_CONTRADICTIONS / 3:
         warnings.append(f"{against:.0%} of the pairs of photos contradict the poses: a texture may repeat")
-    return failures, warnings
 
 
 def contradicting(result: dict) -> float:
     """Share of pairs of posed photos that contradict the poses."""
     pairs = result.get("contradictions", [])
     return sum(pair["error"] > CONTRADICTION for pair in pairs) / len(pairs) if pairs else 0.0
-
-
-def check_spread(result: dict, views: list[View], photos: list[Photo]) -> tuple[list[str], list[str]]:
-    """Whether the cameras stand far enough apart, and on how many sides of the scene."""
-    angle, around = spread_angle(views), view_span(views)
-    if angle < MIN_TRIANGULATION:
-        return [f"the cameras stand too close together ({angle:.1f} degrees apart as seen from the scene)"], []
-    if around < ONE_SIDE:
-        return [], [f"the photos show the scene from one side ({around:.0f} degrees around it): what they do not show "
-                    "is guessed, so a closed object cannot come of it"]  # fmt: skip
-    return [], []
 
 
 def left_out_reason(photo: Photo, result: dict, found: Findings) -> str:
@@ -236,25 +201,21 @@ def diagnose(result: dict, found: Findings, failures: list[str]) -> list[str]:
                       f"{', '.join(str(len(c)) for c in larger)} photos); the largest is used")  # fmt: skip
     if not failures:
         return causes
-    if found.textureless <= 0.5 and len(result["counts"]) < FEW_PHOTOS:
-        causes.append(f"{len(result['counts'])} photos are too few to be certain of anything")
-    elif found.textureless > 0.5:
-        causes.append("there is too little to see: blurred, dark, or without texture, like a blank wall")
-    elif found.rotation_only > 0.5 and found.still <= 0.5:
-        causes.append("the photos seem to be taken from one spot: step sideways between photos, do not just turn")
-    elif contradicting(result) > MANY_CONTRADICTIONS / 3 or disagreeing(result, found):
-        causes.append("a texture that repeats makes different places look the same: cover it, or lay something unlike "
-                      "on it")  # fmt: skip
-    elif found.components and len(found.components[0]) < len(result["counts"]) / 2:
-        causes.append("most photos overlap too little with the others")
-    return causes
-
-
-def disagreeing(result: dict, found: Findings) -> bool:
-    """Whether most photos that match others well could not be posed with them."""
     linked = found.components[0] if found.components else []
     posed = {view["name"] for view in result["views"]}
-    return len(linked) >= 6 and len(posed & set(linked)) < len(linked) / 2
+    unposed = len(linked) >= 6 and len(posed & set(linked)) < len(linked) / 2  # of photos that match others well
+    if found.textureless > 0.5:
+        causes.append("there is too little to see: blurred, dark, or without texture, like a blank wall")
+    elif len(result["counts"]) < FEW_PHOTOS:
+        causes.append(f"{len(result['counts'])} photos are too few to be certain of anything")
+    elif found.rotation_only > 0.5 and found.still <= 0.5:
+        causes.append("the photos seem to be taken from one spot: step sideways between photos, do not just turn")
+    elif contradicting(result) > MANY_CONTRADICTIONS / 3 or unposed:
+        causes.append("a texture that repeats makes different places look the same: cover it, or lay something unlike "
+                      "on it")  # fmt: skip
+    elif len(linked) < len(result["counts"]) / 2:
+        causes.append("most photos overlap too little with the others")
+    return causes
 
 
 def failure_message(checks: dict) -> str:

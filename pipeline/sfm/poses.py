@@ -9,7 +9,6 @@ import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +16,10 @@ import numpy as np
 
 from pipeline.cameras import load_views, save_views
 from pipeline.inputs.photos import KNOWN_CAMERAS, Photo
+from pipeline.progress import Progress, quiet
 from pipeline.sfm.pose_checks import check, failure_hint, failure_message, views_of
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.files import read_json, replacing, write_json
-
-Progress = Callable[[float, str], None]
 
 ORDINARY: dict[str, Any] = {
     "pixels": 1000, "max_features": 3000, "peak_threshold": 0.0066667, "max_ratio": 0.8, "guided": False,
@@ -60,7 +58,7 @@ def size_groups(photos: list[Photo]) -> list[dict]:
 
 
 def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0, timeout: float = 1800.0,
-          exhaustive_up_to: int = 150, on_progress: Progress | None = None) -> dict:  # fmt: skip
+          exhaustive_up_to: int = 150, on_progress: Progress = quiet) -> dict:  # fmt: skip
     """Finds the poses of `photos` and writes `cameras.json`, `sparse.npz`, `checks.json` to `out`.
 
     Makes `ATTEMPTS` until poses can be trusted; each has a folder of its own, in which a killed run goes on. Where the
@@ -73,7 +71,6 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
         seed: of every random choice in matching and mapping.
         timeout: s for each attempt.
         exhaustive_up_to: with more photos than this only neighbours in name order are matched.
-        on_progress: called with (fraction, message).
 
     Returns:
         The checks (also in checks.json): posed, left_out with reasons, mean_error px, warnings, and the attempts.
@@ -95,8 +92,7 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
             continue
 
         def report(fraction: float, message: str, name: str = name, again: bool = bool(tries)) -> None:
-            if on_progress:
-                on_progress(fraction, (f"again, {name}: " if again else "") + message)
+            on_progress(fraction, (f"again, {name}: " if again else "") + message)
 
         folder = out / f"try_{name.replace(' ', '_')}"
         try:

@@ -187,34 +187,37 @@ def collect(reconstruction, out: Path) -> list[dict]:
     return views
 
 
-def counts(pycolmap, job: dict, database: Path) -> tuple[dict[str, dict], list[dict], float]:
-    """Features of each photo with its verified matches, every verified pair, and the share of `turn_only` pairs.
-
-    A pair holds the names, the number of matches, and the share of them that did not move between the photos.
-    """
-    pairs, moving = [], []
-    sizes = {name: group for group in job["groups"] for name in group["names"]}
+def read_pairs(pycolmap, database: Path) -> tuple[dict[str, int], list[tuple[str, str, np.ndarray, np.ndarray]]]:
+    """Features of each photo, and every verified pair: two names and their matched pixels [M, 2]."""
+    pairs = []
     with pycolmap.Database.open(database) as opened:
         images = {image.image_id: image.name for image in opened.read_all_images()}
         points = {key: opened.read_keypoints(key)[:, :2] for key in images}
-        result = {name: {"features": len(points[key]), "best_matches": 0, "partners": 0}
-                  for key, name in images.items()}  # fmt: skip
         for pair, geometry in zip(*opened.read_two_view_geometries(), strict=True):
             matched = np.asarray(geometry.inlier_matches, int).reshape(-1, 2)
-            if not len(matched):
-                continue
-            first, second = pycolmap.pair_id_to_image_pair(pair)
-            moved = np.linalg.norm(points[first][matched[:, 0]] - points[second][matched[:, 1]], axis=1)
-            still = float((moved < 2.0).mean())
-            pairs.append({"a": images[first], "b": images[second], "matches": len(matched), "still": round(still, 3)})
-            if len(matched) >= 30 and still < 0.5 and sizes[images[first]] is sizes[images[second]]:
-                moving.append((sizes[images[first]], points[first][matched[:, 0]], points[second][matched[:, 1]]))
-            for key in (first, second):
-                entry = result[images[key]]
-                entry["best_matches"] = max(entry["best_matches"], len(matched))
-                entry["partners"] += 1
+            if len(matched):
+                a, b = pycolmap.pair_id_to_image_pair(pair)
+                pairs.append((images[a], images[b], points[a][matched[:, 0]], points[b][matched[:, 1]]))
+    return {name: len(points[key]) for key, name in images.items()}, pairs
+
+
+def findings(job: dict, features: dict[str, int], pairs: list) -> dict:
+    """What the matches say whatever the poses: `counts` of each photo, `pairs`, and the share of `turn_only` pairs.
+
+    A pair holds the names, the number of matches, and the share of them that did not move between the photos.
+    """
+    result = {name: {"features": count, "best_matches": 0} for name, count in features.items()}
+    sizes = {name: group for group in job["groups"] for name in group["names"]}
+    told, moving = [], []
+    for a, b, first, second in pairs:
+        still = float((np.linalg.norm(first - second, axis=1) < 2.0).mean())
+        told.append({"a": a, "b": b, "matches": len(first), "still": round(still, 3)})
+        if len(first) >= 30 and still < 0.5 and sizes[a] is sizes[b]:
+            moving.append((sizes[a], first, second))
+        for name in (a, b):
+            result[name]["best_matches"] = max(result[name]["best_matches"], len(first))
     some = moving[:: max(1, len(moving) // 200)]
-    return result, pairs, round(turn_only(some), 3)
+    return {"counts": result, "pairs": told, "turn_only": round(turn_only(some), 3)}
 
 
 def turn_only(pairs: list[tuple[dict, np.ndarray, np.ndarray]], least: float = 2.0) -> float:
@@ -242,7 +245,7 @@ def turn_only(pairs: list[tuple[dict, np.ndarray, np.ndarray]], least: float = 2
     return best
 
 
-def contradictions(pycolmap, database: Path, views: list[dict]) -> list[dict]:
+def contradictions(pairs: list, views: list[dict]) -> list[dict]:
     """Pairs of posed photos, with how far their matches are from the lines that the poses put them on.
 
     Each pair was matched and verified on its own. Where poses are right nearly all pairs agree with them; photos of
@@ -250,18 +253,10 @@ def contradictions(pycolmap, database: Path, views: list[dict]) -> list[dict]:
     """
     posed = {view["name"]: view for view in views}
     found = []
-    with pycolmap.Database.open(database) as opened:
-        images = {image.image_id: image.name for image in opened.read_all_images()}
-        points = {key: opened.read_keypoints(key)[:, :2] for key in images}
-        for pair, geometry in zip(*opened.read_two_view_geometries(), strict=True):
-            first, second = pycolmap.pair_id_to_image_pair(pair)
-            matched = np.asarray(geometry.inlier_matches, int).reshape(-1, 2)
-            if len(matched) < 30 or images[first] not in posed or images[second] not in posed:
-                continue
-            a, b = posed[images[first]], posed[images[second]]
-            error = epipolar_errors(a, b, points[first][matched[:, 0]], points[second][matched[:, 1]])
-            found.append({"a": images[first], "b": images[second], "matches": len(matched),
-                          "error": round(float(np.median(error)), 3)})  # fmt: skip
+    for a, b, first, second in pairs:
+        if len(first) >= 30 and a in posed and b in posed:
+            error = float(np.median(epipolar_errors(posed[a], posed[b], first, second)))
+            found.append({"a": a, "b": b, "matches": len(first), "error": round(error, 3)})
     return found
 
 
@@ -323,8 +318,8 @@ def main(job_path: str) -> None:
     say("phase matches")
     matches(pycolmap, job, database)
     say("phase mapping")
-    result: dict[str, Any] = {"views": [], "models": []}
-    result["counts"], result["pairs"], result["turn_only"] = counts(pycolmap, job, database)
+    counts, pairs = read_pairs(pycolmap, database)
+    result: dict[str, Any] = {"views": [], "models": [], **findings(job, counts, pairs)}
     result["focal_of_pairs"] = {} if job["known_cameras"] else focal_of_pairs(pycolmap, job, database, out)
     models = sorted(mapping(pycolmap, job, database, out), key=lambda r: (-r.num_reg_images(), -r.num_points3D()))
     for model in models:
@@ -332,7 +327,7 @@ def main(job_path: str) -> None:
     if models:
         best = models[0]
         result["views"] = collect(best, out)
-        result["contradictions"] = contradictions(pycolmap, database, result["views"])
+        result["contradictions"] = contradictions(pairs, result["views"])
         result["mean_error"] = float(best.compute_mean_reprojection_error())
         result["points"] = int(best.num_points3D())
         result["track_length"] = float(best.compute_mean_track_length())

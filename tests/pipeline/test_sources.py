@@ -96,9 +96,9 @@ def test_the_same_cameras_come_out_of_every_format(tmp_path, kind):
         assert (view.focal, view.cx, view.cy, view.k) == pytest.approx((100, 60, 45, 0))
 
 
-def test_intrinsics_of_another_size_are_scaled_and_numbers_may_be_padded(tmp_path):
+def test_intrinsics_of_another_size_are_scaled(tmp_path):
     photos(tmp_path / "images", ["r_000.png", "r_001.png", "r_010.png"])
-    about = json.loads(write_transforms(tmp_path, ["./train/r_0", "./train/r_1", "./train/r_10"]).read_text())
+    about = json.loads(write_transforms(tmp_path, ["./train/r_000", "./train/r_001", "./train/r_010"]).read_text())
     for key in ("w", "h", "fl_x"):
         del about[key]
     (tmp_path / "transforms.json").write_text(json.dumps({**about, "camera_angle_x": 2 * np.arctan(0.5 * 120 / 100)}))
