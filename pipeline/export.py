@@ -24,12 +24,11 @@ from sdfsim.shape.mesh import Mesh, load_mesh
 SCENERY_SHARE = 2  # Of a budget the scenery gets as much as this many bodies: it has more to it.
 DENSITY = 400.0  # kg/m^3, wood: no photo tells what a thing is made of
 SURFACE = "friction: 0.8, restitution: 0.4"
-# Sides of the dropped slab as shares of the scenery's widest side: the largest that finds a level place is taken.
-SLAB_SHARES = (0.09, 0.06, 0.045)
+SIDE = 0.06  # of the dropped slab, as a share of the scenery's widest side
 THICKNESS = 0.5  # of the slab, as a share of its side; a cube tips over more easily
 LEVEL = 10.0  # degrees; far below what friction holds, as learned contacts creep on slopes
 BUMP = 0.06  # how far a level place may stick out of its plane, as a share of the side
-SEEN = 0.9  # share of the slab's footprint that photos must show
+UNSEEN = 0.1  # share of the slab's footprint that photos may leave out
 GAP = 0.3  # of the fall, as a share of the side
 
 
@@ -258,7 +257,7 @@ class Above:
 
 
 def choose_slab(shown: Mesh, solid: Mesh) -> Slab:
-    """Chooses a slab and a place for it from geometry alone: level, seen in the photos, high and central.
+    """Chooses a place for a slab from geometry alone: level, flat, seen in the photos, high and central.
 
     Args:
         shown: visible surface, metres, z up; the slab has to land on it.
@@ -267,43 +266,32 @@ def choose_slab(shown: Mesh, solid: Mesh) -> Slab:
     Raises:
         SdfsimError: (exit code 3) there is no place at all.
     """
-    bounds = np.stack([shown.vertices.min(0), shown.vertices.max(0)])
-    widest = float((bounds[1] - bounds[0]).max())
-    above, below = Above(shown), Above(solid)
-    for seen in (SEEN, 0.5, 0.0):
-        found = [_best_slab(above, below, bounds, share * widest, seen) for share in SLAB_SHARES]
-        slabs = [slab for slab in found if slab is not None]
-        if slabs:
-            return next((slab for slab in slabs if slab.slope <= LEVEL), min(slabs, key=lambda slab: slab.slope))
-    raise SdfsimError("scene: no place to drop a body onto", "look at mesh/mesh.ply", exit_code=EXIT_QUALITY)
-
-
-def _best_slab(shown: Above, solid: Above, bounds: np.ndarray, side: float, seen: float) -> Slab | None:
-    """The best place for a slab of one side, m, on a grid of a quarter of it: a level one if there is one."""
-    low, high = bounds
+    low, high = shown.vertices.min(0), shown.vertices.max(0)
+    side = SIDE * float((high - low).max())
     axes = [np.arange(low[k], high[k] + side / 8, side / 4) for k in range(2)]
     places = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
     # Wider than the slab: what stands beside it must not be in its way on the way down.
     line = np.linspace(-0.7, 0.7, 15) * side
     around = np.stack(np.meshgrid(line, line, indexing="ij"), -1).reshape(-1, 2)
     under = (np.abs(around) <= 0.5 * side + 1e-9).all(1)
-    visible = shown.heights(places[:, None] + around[under])
-    top = solid.heights(places[:, None] + around)
+    visible = Above(shown).heights(places[:, None] + around[under])
+    top = Above(solid).heights(places[:, None] + around)
     top[:, under] = np.fmax(top[:, under], visible)
-    good = np.isfinite(top[:, under]).all(1) & ((visible > top[:, under] - 0.2 * side).mean(1) >= seen)
-    if not good.any():
-        return None
-    places, top = places[good], top[good]
+    whole = np.isfinite(top[:, under]).all(1)
+    if not whole.any():
+        raise SdfsimError("scene: no place to drop a body onto", "look at mesh/mesh.ply", exit_code=EXIT_QUALITY)
+    places, visible, top = places[whole], visible[whole], top[whole]
     design = np.c_[around[under], np.ones(under.sum())]
     plane = top[:, under] @ np.linalg.pinv(design).T  # [P, 3]: slopes along x and y, height of the middle
-    bump = np.abs(top[:, under] - plane @ design.T).max(1) / side
     slope = np.degrees(np.arctan(np.hypot(plane[:, 0], plane[:, 1])))
-    obstacle = np.nanmax(top, 1) - top[:, under].max(1)
+    bump = np.abs(top[:, under] - plane @ design.T).max(1) / side
+    unseen = 1 - (visible > top[:, under] - 0.2 * side).mean(1)
+    obstacle = (np.nanmax(top, 1) - top[:, under].max(1)) / side
     central = np.linalg.norm((places - (low + high)[:2] / 2) / np.maximum(high - low, 1e-9)[:2], axis=1)
-    score = (plane[:, 2] - low[2]) / max(high[2] - low[2], 1e-9) - 1.2 * central - slope / LEVEL - obstacle / side
-    # A place that is not level, or not flat, is taken where there is no other.
-    score -= 100 * (slope > LEVEL) + 10 * (bump > BUMP) + 1000 * (slope > LEVEL) * slope / 90
-    best = int(score.argmax())
+    good = (plane[:, 2] - low[2]) / max(high[2] - low[2], side) - 1.2 * central - slope / LEVEL - obstacle
+    # What is not level, not flat, or not in the photos is taken only where there is nothing else, the flattest first.
+    bad = np.maximum(slope / LEVEL - 1, 0) + 10 * np.maximum(bump - BUMP, 0) + 10 * np.maximum(unseen - UNSEEN, 0)
+    best = int((good - 100 * bad).argmax())
     thickness = THICKNESS * side
     height = float(np.nanmax(top[best])) + 0.5 * thickness + GAP * side
     return Slab(side, thickness, (float(places[best, 0]), float(places[best, 1]), height), float(slope[best]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -43,7 +44,8 @@ class Rays:
 
     def to(self, device: str) -> Rays:
         """The same rays on another device."""
-        return Rays(**{name: None if part is None else part.to(device) for name, part in vars(self).items()})
+        moved: dict[str, Any] = {name: None if part is None else part.to(device) for name, part in vars(self).items()}
+        return Rays(**moved)
 
     def at(self, index: Tensor) -> tuple[Tensor, Tensor]:
         """Origins and unit directions [R, 3] of the rays with these indices [R]."""
