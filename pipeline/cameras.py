@@ -11,6 +11,9 @@ import numpy as np
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_arrays, read_json, write_json
 
+# People hold cameras level to about this; where photos are turned, or all from one place, next to nothing is known.
+CAREFUL, UNKNOWN = 2.0, 30.0  # degrees
+
 
 @dataclass(frozen=True)
 class View:
@@ -199,10 +202,6 @@ class CameraUp(NamedTuple):
 
     normal: np.ndarray
     within: float
-
-
-# People hold cameras level to about this; where photos are turned, or all from one place, next to nothing is known.
-CAREFUL, UNKNOWN = 2.0, 30.0  # degrees
 
 
 def camera_up(views: list[View]) -> CameraUp:

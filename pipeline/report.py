@@ -83,7 +83,7 @@ def photo_rows(folder: Path, stages: dict[str, dict], poses: dict) -> list[dict]
         name = photo["source"]
         state = "left out" if name in why else "held out" if name in held else "posed" if poses else "prepared"
         rows.append({
-            "photo": name, "file": photo["name"], "verdict": state, "why": why.get(name, ""), "fault": photo["fault"],
+            "photo": name, "file": photo["name"], "state": state, "why": why.get(name, ""), "fault": photo["fault"],
             "sharpness": photo["sharpness"], "mask": photo["mask"], "size": [photo["width"], photo["height"]],
             "focal_exif": photo["focal"], "psnr": held.get(name),
         })  # fmt: skip
@@ -188,7 +188,7 @@ def page(report: dict, folder: Path) -> str:
         lines += ["## Photos that were not trained on: photo and render", ""]
         lines += [f"![{name}](photos/images/{files[name]}) ![render](distill/held_out/{files[name]})" for name in held]
     lines += ["", "## Photos", "", "| photo | | | |", "| --- | --- | --- | --- |"]
-    lines += [f"| {row['photo']} | {row['verdict']} | {row['why']} | {row['fault']} |" for row in report["photos"]]
+    lines += [f"| {row['photo']} | {row['state']} | {row['why']} | {row['fault']} |" for row in report["photos"]]
     return "\n".join(lines) + "\n"
 
 

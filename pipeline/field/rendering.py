@@ -15,6 +15,10 @@ from torch.nn import functional
 from pipeline.field.grid_field import BACKGROUND_SAMPLES, Field, laplace_density, render_weights
 from pipeline.field.interpolation import interpolate
 
+EPSILON = 0.1  # of opacity
+START = 128  # samples of every ray at first, and added to those that need more
+ROUNDS, BISECTIONS = 5, 10
+
 
 @torch.no_grad()
 def sdf_cache(field: Field, resolution: int, coarse: int = 4) -> Tensor:
@@ -173,11 +177,6 @@ def render(
     if behind is None:
         behind = field.background_along(origins, directions, middle[:, :BACKGROUND_SAMPLES])
     return composite(field, chosen, field.geometry_at(chosen.points.view(-1, 3)), beta, behind)
-
-
-EPSILON = 0.1  # of opacity
-START = 128  # samples of every ray at first, and added to those that need more
-ROUNDS, BISECTIONS = 5, 10
 
 
 def nearest(sdf: Tensor, delta: Tensor) -> Tensor:

@@ -24,6 +24,9 @@ MODELS = {
     7: ("FOV", ""), 8: ("SIMPLE_RADIAL_FISHEYE", "f cx cy k1"), 9: ("RADIAL_FISHEYE", "f cx cy k1 k2"),
     10: ("THIN_PRISM_FISHEYE", ""),
 }  # fmt: skip
+SQUARE = 1e-3  # pixels that differ from squares by less are squares
+# OpenCV counts pixel centres from 0.
+CENTRE = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 
 
 @dataclass(frozen=True)
@@ -191,11 +194,6 @@ def _images_binary(folder: Path) -> Iterator[tuple[str, int, tuple[float, ...], 
         (points,) = struct.unpack_from("<Q", data, end + 1)
         at = end + 9 + 24 * points
         yield name, values[8], values[1:5], values[5:8]
-
-
-SQUARE = 1e-3  # pixels that differ from squares by less are squares
-# OpenCV counts pixel centres from 0.
-CENTRE = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 
 
 @dataclass(frozen=True)

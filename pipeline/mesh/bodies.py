@@ -30,6 +30,12 @@ STANDS = 0.3
 CRUMB = 0.05
 # How far sideways, in contact layers, what is around a body's foot is taken away together with it.
 FILLET = 3.0
+# Thickness of the layer in which a field cannot tell a body from what it stands on, in cells of its finest grid.
+LAYER = 1.5
+# What rises less than this (normalised units, or this many cells of the finest grid) stays part of what it stands on.
+SMALLEST, SMALLEST_CELLS = 0.04, 4.0
+# Samples of a body are so much closer than the cells of the field's finest grid.
+FINER = 3.0
 
 
 @dataclass(frozen=True)
@@ -311,14 +317,6 @@ def without_bodies(volume: Volume, bodies: list[Body], field: Distance) -> Volum
         inside[foot] = np.minimum(inside[foot], height[foot])
         values[part] = inside.reshape(shape)
     return replace(volume, values=values)
-
-
-# Thickness of the layer in which a field cannot tell a body from what it stands on, in cells of its finest grid.
-LAYER = 1.5
-# What rises less than this (normalised units, or this many cells of the finest grid) stays part of what it stands on.
-SMALLEST, SMALLEST_CELLS = 0.04, 4.0
-# Samples of a body are so much closer than the cells of the field's finest grid.
-FINER = 3.0
 
 
 @dataclass(frozen=True)

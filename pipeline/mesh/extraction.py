@@ -20,6 +20,17 @@ from sdfsim.shape.mesh import Mesh
 Distance = Callable[[np.ndarray], np.ndarray]
 
 BATCH = 1 << 17  # points a query
+# The solid ends at this radius of normalised space: beyond it the field was never trained.
+RIM = 0.99
+EXTENT = 1.02  # half the side of the sampled cube
+MIN_SEEN = 2
+# Farther than this from every point of structure-from-motion (normalised units) a surface is a guess: on the rendered
+# set the median error there is ten times that within.
+MAX_FROM_POINTS = 0.1
+# A patch of the visible surface smaller than this share of it says nothing; of the closed solid a quarter of that.
+FLOATER = 0.01
+# What is left out is reported from this size on, normalised units.
+SPECK = 0.02
 
 
 @dataclass(frozen=True)
@@ -132,20 +143,6 @@ def sample_box(distance: Distance, low: np.ndarray, high: np.ndarray, cell: floa
     counts = np.ceil((np.asarray(high) - low) / cell).astype(int) + 1
     empty = Volume(np.empty(counts, np.float32), np.asarray(low, float), cell)
     return replace(empty, values=sample(distance, empty.points().reshape(-1, 3)).reshape(counts))
-
-
-# The solid ends at this radius of normalised space: beyond it the field was never trained.
-RIM = 0.99
-EXTENT = 1.02  # half the side of the sampled cube
-MIN_SEEN = 2
-# Farther than this from every point of structure-from-motion (normalised units) a surface is a guess: on the rendered
-# set the median error there is ten times that within.
-MAX_FROM_POINTS = 0.1
-# A patch of the visible surface smaller than this share of it says nothing; of the closed solid a quarter of that.
-FLOATER = 0.01
-# What is left out is reported from this size on, normalised units.
-SPECK = 0.02
-PRESET_RESOLUTION = {"quick": 192, "standard": 288, "fine": 448, "paper": 448}
 
 
 @dataclass(frozen=True)

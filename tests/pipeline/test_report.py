@@ -32,7 +32,7 @@ def test_the_page_names_every_photo_and_the_recording_shows_the_cameras(photos, 
     text = (out / "report.md").read_text()
     assert "| 0.png | posed |" in text and "| 2.png | left out | too few matches |" in text
     assert report["paths"]["report"] == str(out / "report.md")
-    assert [row["verdict"] for row in report["photos"]] == ["posed", "posed", "left out"]
+    assert [row["state"] for row in report["photos"]] == ["posed", "posed", "left out"]
     made = write_recording(out, report["stages"])
     assert made is not None and made.read_bytes()[:3] == b"RRF"
 
