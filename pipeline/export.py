@@ -268,10 +268,10 @@ def choose_slab(shown: Mesh, solid: Mesh) -> Slab:
     """
     low, high = shown.vertices.min(0), shown.vertices.max(0)
     side = SIDE * float((high - low).max())
-    axes = [np.arange(low[k], high[k] + side / 8, side / 4) for k in range(2)]
+    axes = [np.arange(low[k], high[k] + side / 4, side / 2) for k in range(2)]
     places = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
     # Wider than the slab: what stands beside it must not be in its way on the way down.
-    line = np.linspace(-0.7, 0.7, 15) * side
+    line = np.linspace(-0.75, 0.75, 13) * side
     around = np.stack(np.meshgrid(line, line, indexing="ij"), -1).reshape(-1, 2)
     under = (np.abs(around) <= 0.5 * side + 1e-9).all(1)
     visible = Above(shown).heights(places[:, None] + around[under])

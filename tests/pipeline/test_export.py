@@ -152,7 +152,7 @@ def test_a_checkpoint_that_a_kill_left_beside_its_shape_goes(meshes, tmp_path, m
     assert sorted(p.name for p in out.iterdir()) == ["object1", "scene"]
 
 
-@pytest.mark.parametrize("scale", [1e-4, 1e-2, 1.0, 1e5])
+@pytest.mark.parametrize("scale", [1e-4, 1e5])
 @pytest.mark.parametrize("shape", ["box", "ball"])
 def test_a_scene_of_any_size_that_is_allowed_is_the_same_scene(tmp_path, scale, shape):
     """Lengths are those of the scene of 1 m times its size, to six digits, and the file can be loaded."""
