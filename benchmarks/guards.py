@@ -91,7 +91,7 @@ GUARDS = (
     Guard("scene files do not swell", "sdfsim/scene/source.py", "if grown > max(", "if 0 > max(", SECURE),
     Guard("paths stay in the scene's folder", "sdfsim/scene/schema.py", "if not self.allow_outside and not all(",
           "if False and not all(", SECURE),
-    Guard("photos of absurd size", "pipeline/photo_file.py", "if width * height > MAX_PIXELS:", "if False:",
+    Guard("photos of absurd size", "pipeline/inputs/images.py", "if width * height > MAX_PIXELS:", "if False:",
           SECURE + " tests/pipeline/test_photos.py"),
     Guard("viewer listens to this machine only", "sdfsim/viewer.py", 'LOOPBACK = "127.0.0.1"', 'LOOPBACK = "0.0.0.0"',
           SECURE),

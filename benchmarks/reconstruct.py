@@ -20,9 +20,9 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from pipeline.cameras import View, load_views
-from pipeline.distill import load_field
-from pipeline.meshing import read_parts
-from pipeline.placement import load_placement
+from pipeline.field.training import load_field
+from pipeline.mesh.meshing import read_parts
+from pipeline.mesh.placement import load_placement
 from sdfsim.errors import run_main
 
 
@@ -75,15 +75,15 @@ def surface_errors(folder: Path, photos: Path, move: tuple[float, np.ndarray, np
 
     _, about = true_cameras(photos)
     width = about["table_width"]
-    place = load_placement(folder / "mesh")
-    normal = load_field(folder / "distill").normalisation
+    place = load_placement(folder / "mesh").to_metres
+    from_unit = load_field(folder / "distill").to_unit.inverse()
     scale, rotation, translation = move
 
     def read(name: str):
         """A mesh of the mesh stage on the true cameras."""
         mesh = o3d.io.read_triangle_mesh(str(folder / "mesh" / name))
-        points = (np.asarray(mesh.vertices) - place.translation) @ place.rotation / place.scale
-        points = (points * normal.radius + normal.center) * scale @ rotation.T + translation
+        points = from_unit.points(place.inverse().points(np.asarray(mesh.vertices)))
+        points = scale * points @ rotation.T + translation
         mesh.vertices = o3d.utility.Vector3dVector(points)
         return mesh
 
@@ -125,7 +125,7 @@ def surface_errors(folder: Path, photos: Path, move: tuple[float, np.ndarray, np
     return {
         "surface": summary(errors), "object": summary(errors[near]), "missing": summary(missing),
         "complete_percent": 100 * float((missing < 0.01 * width).mean()),
-        "scale_error_percent": 100 * abs(place.scale / (normal.radius * scale) - 1),
+        "scale_error_percent": 100 * abs(place.scale / (from_unit.scale * scale) - 1),
         "vase": vase_errors({name: read(f"objects/{name}.ply") for name in objects}, truth),
         "up_error_degrees": float(np.degrees(np.arccos(np.clip((rotation @ place.rotation.T @ [0, 0, 1])[2], -1, 1)))),
     }  # fmt: skip

@@ -165,23 +165,24 @@ def tiny_simulate() -> None:
 
 def tiny_reconstruct() -> None:
     """Poses that are given, 12 steps of training, a checkpoint after each, and a tiny fit of the ball it began as."""
-    from pipeline import distill, recipe, stages
-    from pipeline.field import FieldSize
+    from pipeline import stages
+    from pipeline.field import training
+    from pipeline.field.grid_field import FieldSize
 
     small = FieldSize((8, 16), (2, 2), 16, 8)
-    recipe.PRESETS["quick"] = replace(
-        recipe.PRESETS["quick"], size=small, rays=32, iterations=12, surface_points=16, long_side=64
+    training.PRESETS["quick"] = replace(
+        training.PRESETS["quick"], size=small, rays=32, iterations=12, surface_points=16, long_side=64
     )
     # One thread: its sums do not depend on how busy the machine is.
-    distill.train.__kwdefaults__ |= {"checkpoint_every": 0.0, "threads": 1}
-    stages.ACTIONS["poses"] = _given_poses
+    training.train.__kwdefaults__ |= {"checkpoint_every": 0.0, "threads": 1}
+    stages.STAGES["poses"] = replace(stages.STAGES["poses"], run=_given_poses)
     tiny_fit()
 
 
 def _given_poses(run: Any, work: Path) -> dict:
     """Four cameras around the origin, in place of structure from motion."""
     from pipeline.cameras import View, save_views
-    from pipeline.photos import load_photos
+    from pipeline.inputs.photos import load_photos
     from sdfsim.files import write_arrays
 
     views, rng = [], np.random.default_rng(0)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from safetensors.torch import load_file, save_file
 
-from pipeline.photos import read_photo
+from pipeline.inputs.images import read_photo
 from sdfsim import SdfsimError, files, load_shape
 from sdfsim.dynamics.model import Model, load_model, new_network
 from sdfsim.files import read_arrays
