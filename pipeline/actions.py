@@ -109,7 +109,7 @@ def do_mesh(run: Run, work: Path) -> dict:
 def do_fit(run: Run, work: Path) -> dict:
     """Fit stage."""
     from pipeline.asset import fit_parts
-    from sdfsim.threads import choose_threads, network_work
+    from sdfsim.parallel import choose_threads, network_work
 
     choose_threads(network_work, repeat=10)
     budget = run.own_budget

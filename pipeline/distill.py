@@ -28,7 +28,7 @@ from pipeline.snapshots import Snapshots
 from pipeline.trainer import Trainer
 from sdfsim.errors import SdfsimError
 from sdfsim.files import replacing, write_json
-from sdfsim.threads import choose_threads
+from sdfsim.parallel import choose_threads
 
 Progress = Callable[[float, str], None]
 

@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.cameras import View, load_sparse, load_views
 from pipeline.normalise import camera_up
 from pipeline.report import current
-from sdfsim.playback import PosedPhoto, save_reconstruction
+from sdfsim.recording import PosedPhoto, save_reconstruction
 from sdfsim.shape.mesh import load_mesh
 
 NAME = "reconstruction.rrd"

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline import report_plots as plots
+from sdfsim.console import duration
 from sdfsim.files import write_text
-from sdfsim.progress import duration
 
 NAME = "report.html"
 STYLE = """

@@ -77,7 +77,7 @@ def camera_plot(views: list[View], points: np.ndarray, colors: np.ndarray, held_
 def turntable_uri(mesh: Mesh) -> str:
     """A mesh (z up) turning once, as the data URI of an animated WebP."""
     from pipeline.visibility import Caster
-    from sdfsim.shading import with_normals
+    from sdfsim.recording import with_normals
 
     shaded, normals = with_normals(mesh)
     caster = Caster(shaded)

@@ -9,16 +9,15 @@ from typing import Any
 
 import numpy as np
 
+from sdfsim.console import duration
 from sdfsim.dynamics.memory import peak_bytes
 from sdfsim.dynamics.model import load_model
 from sdfsim.dynamics.ranges import constant_in_training
 from sdfsim.dynamics.simulator import Simulator, pick_device
-from sdfsim.progress import duration
 from sdfsim.scene.effects import Plan, plan
-from sdfsim.scene.load import load_scene
+from sdfsim.scene.scene import Effects, Scene
+from sdfsim.scene.scene_file import load_scene
 from sdfsim.scene.schema import DEFAULT_DURATION, DEFAULT_GRAVITY
-from sdfsim.scene.thin import may_pass_through
-from sdfsim.scene.types import Effects, Scene
 from sdfsim.shape.mlp import MlpSdf
 
 TRIAL_STEPS = 5
@@ -72,7 +71,6 @@ def describe(
         "units": {"length_m": units.length, "time_s": units.time, "mass_kg": units.mass},
         "outside_training": simulator.outside_training,
         "constant_in_training": constant_in_training(simulator.model),
-        "may_pass_through": may_pass_through(scene, simulator.dt),
         "not_default": _not_default(scene, model),
         "failed_checks": [f"fit of shape {told}" for told in scene.missed],
     }
@@ -142,6 +140,5 @@ def plan_lines(report: dict[str, Any]) -> list[str]:
         f"its kilogram {units['mass_kg']:.4g} kg",
         *(f"outside the model's training: {line}" for line in report["outside_training"]),
         *(f"constant in the model's training, so not learned: {name}" for name in report["constant_in_training"]),
-        *(f"may pass through: {line}" for line in report["may_pass_through"]),
         *(f"not the default: {name}: {said}" for name, said in report["not_default"].items()),
     ]

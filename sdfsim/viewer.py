@@ -19,7 +19,7 @@ from typing import Literal
 from urllib.parse import quote
 
 from sdfsim.errors import SdfsimError
-from sdfsim.playback import Playback
+from sdfsim.recording import Playback
 
 WINDOW = "1600x900"
 LOOPBACK = "127.0.0.1"

@@ -6,12 +6,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sdfsim import load_scene
-from sdfsim.crowds import COLORS, MANY
 from sdfsim.dynamics.rollout import Rollout
-from sdfsim.playback import PLOTS, save_rollout
+from sdfsim.recording import COLORS, MANY, PLOTS, save_rollout
 from sdfsim.shape.mesh import Mesh
 from sdfsim.shape.primitives import sphere
-from tests.test_playback import read
+from tests.test_recording import read
 
 
 def crowd(tmp_path, count: int, frames: int, name: str = "ball"):

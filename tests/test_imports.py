@@ -26,12 +26,11 @@ HEAVY = (
 )
 
 # A room may import itself and rooms further down. Rooms of one level may not import each other,
-# but the rooms of the top level share what they have to (a run plays back, a viewer shows a playback).
+# but the rooms of the top level share what they have to (a run writes a recording, a viewer shows one).
 LEVELS = {
     "errors": 0,
     "files": 1,
-    "threads": 1,
-    "parallel": 2,
+    "parallel": 1,
     "shape": 2,
     "scene": 3,
     "dynamics": 4,
@@ -40,7 +39,7 @@ LEVELS = {
     "evaluation": 7,
     "commands": 9,
 }
-TOP = 8  # playback and the other modules directly in sdfsim
+TOP = 8  # run, recording and the other modules directly in sdfsim
 
 
 def room(module: str) -> tuple[str, int]:

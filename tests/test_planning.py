@@ -17,7 +17,7 @@ from sdfsim.dynamics.memory import COUNTS, PHASES
 from sdfsim.dynamics.model import Model, load_model, new_network
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.planning import describe, plan_lines
-from sdfsim.playback import PLOTS, VIEWS
+from sdfsim.recording import PLOTS, VIEWS
 from sdfsim.run import cost_lines
 from sdfsim.scene.effects import EFFECTS
 

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from sdfsim.commands.arguments import Cluster, Device, Json, Model, Out, Verbose, check_device
-from sdfsim.progress import Session
+from sdfsim.console import Session
 
 
 def dataset(

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sdfsim.scene.document import Section, Value, nearest
-from sdfsim.scene.types import Motion, Waypoints
+from sdfsim.scene.scene import Motion, Waypoints
 
 DEFAULT_DENSITY = 1000.0  # kg/m^3, of a dynamic body that gives neither mass nor density
 DEFAULT_FRICTION = 0.5

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sdfsim.scene.pairs import Pairs, count_pairs
-from sdfsim.scene.types import Scene
+from sdfsim.scene.collision_filter import Pairs, count_pairs
+from sdfsim.scene.scene import Scene
 
 
 @dataclass(frozen=True)

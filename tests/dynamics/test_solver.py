@@ -8,7 +8,7 @@ import torch
 
 from sdfsim import Simulator
 from sdfsim.dynamics.rollout import Rollout
-from sdfsim.scene.types import Scene
+from sdfsim.scene.scene import Scene
 from sdfsim.shape.asset import analytic_shape
 from tests.dynamics.test_laws import ball, body, cube
 from tests.hard_cases import gates

@@ -11,7 +11,7 @@ import pytest
 
 import sdfsim
 from sdfsim.dynamics.simulator import Simulator
-from sdfsim.scene.types import Effects
+from sdfsim.scene.scene import Effects
 from tests.dynamics.conftest import make_body
 from tests.hard_cases import gates
 

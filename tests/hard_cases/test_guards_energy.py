@@ -20,7 +20,7 @@ from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.rollout import energy_from_nothing
 from sdfsim.dynamics.simulator import SimulationError, Simulator
 from sdfsim.dynamics.step import drive, fly
-from sdfsim.scene.types import Waypoints
+from sdfsim.scene.scene import Waypoints
 from tests.dynamics.conftest import make_body, random_model
 from tests.hard_cases import gates
 

@@ -218,7 +218,7 @@ def listening(port: int) -> list[str]:
 @pytest.mark.skipif(sys.platform != "linux", reason="/proc/net, which tells who listens where, exists on Linux only")
 def test_the_live_viewer_listens_on_this_machine_only(home, monkeypatch):
     from sdfsim import viewer
-    from sdfsim.playback import Playback
+    from sdfsim.recording import Playback
 
     monkeypatch.setattr(viewer, "_has_screen", lambda: False)
     playback = Playback(load_scene(scene_in(home, "")))

@@ -15,7 +15,7 @@ from pipeline.placement import Placement
 from pipeline.scene_file import DENSITY, Found, scene_text, write_scene
 from sdfsim.errors import SdfsimError
 from sdfsim.files import write_json
-from sdfsim.scene.load import load_scene
+from sdfsim.scene.scene_file import load_scene
 from sdfsim.shape.asset import Shape, analytic_shape
 from sdfsim.shape.mesh import Mesh
 from sdfsim.shape.storage import write_ply

@@ -24,7 +24,7 @@ def asked(monkeypatch) -> dict[str, dict]:
     note(distill, "train", "distill", distill.Trained(None, 0.0, None, {}))  # type: ignore[arg-type]
     note(meshing, "make_meshes", "mesh", {})
     note(asset, "fit_parts", "fit", {})
-    monkeypatch.setattr("sdfsim.threads.choose_threads", lambda work, repeat: 0.0)
+    monkeypatch.setattr("sdfsim.parallel.choose_threads", lambda work, repeat: 0.0)
     monkeypatch.setattr("pipeline.cameras.load_views", lambda folder: [])
     monkeypatch.setattr("pipeline.cameras.load_sparse", lambda folder: None)
     return found

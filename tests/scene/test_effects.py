@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from sdfsim import SceneError, load_scene
+from sdfsim.scene.collision_filter import contact_groups, count_pairs
 from sdfsim.scene.effects import EFFECTS, plan
-from sdfsim.scene.pairs import contact_groups, count_pairs
-from sdfsim.scene.types import Body, Effects, Limits
+from sdfsim.scene.scene import Body, Effects, Limits
 
 TEXT = """
 version: 1

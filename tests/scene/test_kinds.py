@@ -11,7 +11,7 @@ import torch
 from sdfsim import Simulator
 from sdfsim.dynamics.bodies import Units, from_scene
 from sdfsim.dynamics.contacts import find_contacts
-from sdfsim.scene.types import Scene
+from sdfsim.scene.scene import Scene
 from sdfsim.shape.analytic import BoxSdf
 from sdfsim.shape.asset import analytic_shape, with_sdf
 from sdfsim.shape.exact import MeshSdf

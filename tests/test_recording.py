@@ -11,8 +11,17 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim import SdfsimError, load_scene
 from sdfsim.dynamics.rollout import Rollout
-from sdfsim.playback import FARTHEST, PLOTS, Playback, PosedPhoto, framed, save_reconstruction, save_rollout
-from sdfsim.shading import distinct_colors, with_normals
+from sdfsim.recording import (
+    FARTHEST,
+    PLOTS,
+    Playback,
+    PosedPhoto,
+    distinct_colors,
+    framed,
+    save_reconstruction,
+    save_rollout,
+    with_normals,
+)
 from sdfsim.shape.mesh import Mesh
 from sdfsim.shape.primitives import box, sphere
 

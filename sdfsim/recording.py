@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+import colorsys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sdfsim.crowds import crowds
 from sdfsim.dynamics.memory import PHASES
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.files import replacing
-from sdfsim.scene.types import Body, Scene
-from sdfsim.shading import distinct_colors, sheet, with_normals
+from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.mesh import Mesh
 
 if TYPE_CHECKING:
@@ -53,6 +53,10 @@ _STATIC_COLOR = (150, 150, 155)
 _NODE_COLOR = (20, 20, 20)
 _CONTACT_COLOR = (255, 40, 40)
 _PHOTO_PIXELS = 320
+MANY = 24  # bodies of one shape that do not stay put, from which on they are a crowd
+COLORS = 4  # copies share their mesh's colour, so a crowd is split to be told apart
+_CREASE = np.cos(np.radians(40.0))
+_MOST_CORNER_PAIRS = 1_000_000  # more, about 10,000 vertices, and a mesh counts as smooth: splitting triples its size
 FARTHEST = 1.0  # what leaves the scene for good must not make it a dot
 
 
@@ -158,6 +162,55 @@ class Playback:
             if key in chunk.counters:
                 values = np.asarray(chunk.counters[key], dtype=np.float64)
                 self.stream.send_columns(f"plots/{key}", times, rr.Scalars.columns(scalars=values))
+
+
+@dataclass(frozen=True)
+class Crowd:
+    """Bodies drawn as copies of one mesh.
+
+    Attributes:
+        path: entity path below the world.
+        shape: index into `Scene.shapes`.
+        bodies: [C] int64, which.
+        scale: [C] of each.
+    """
+
+    path: str
+    shape: int
+    bodies: np.ndarray
+    scale: np.ndarray
+
+    def log_scale(self, stream: rr.RecordingStream, rr: Any) -> None:
+        """What never changes."""
+        stream.log(self.path, rr.InstancePoses3D.from_fields(scales=np.repeat(self.scale[:, None], 3, 1)), static=True)
+
+    def log_steps(self, stream: rr.RecordingStream, rr: Any, times: list, chunk: Rollout) -> None:
+        """Where all of them are in the frames of `chunk`."""
+        places, turns = (getattr(chunk, k)[:, self.bodies] for k in ("position", "orientation"))
+        poses = rr.InstancePoses3D.columns(
+            translations=places.reshape(-1, 3).astype(np.float32), quaternions=turns.reshape(-1, 4).astype(np.float32)
+        )
+        stream.send_columns(self.path, times, poses.partition(np.full(len(chunk.time), len(self.bodies))))
+
+
+def crowds(scene: Scene, world: str) -> list[Crowd]:
+    """The crowds of a scene; bodies in none of them are drawn one by one.
+
+    Args:
+        scene: bodies and shapes.
+        world: the entity path that theirs begin with.
+    """
+    import rerun as rr
+
+    found = []
+    shape = np.array([b.shape if b.motion != "static" else -1 for b in scene.bodies])
+    scale = np.array([b.scale for b in scene.bodies])
+    for number, name in enumerate(s.name for s in scene.shapes):
+        members = np.flatnonzero(shape == number)
+        for k in range(COLORS if len(members) >= MANY else 0):
+            some, called = members[k::COLORS], rr.escape_entity_path_part(f"{number}_{name}")
+            found.append(Crowd(f"{world}/crowds/{called}/{k}", number, some, scale[some]))
+    return found
 
 
 def save_rollout(scene: Scene, rollout: Rollout, path: Path) -> None:
@@ -327,3 +380,67 @@ def _shaded(rr: Any, mesh: Mesh, color: tuple[int, ...]) -> rr.Mesh3D:
         vertex_colors=mesh.colors,
         albedo_factor=color if mesh.colors is None else None,
     )
+
+
+def sheet(half: float) -> Mesh:
+    """A square of z = 0, `half` m to each side, shown for an infinite plane."""
+    vertices = np.array([[-half, -half, 0.0], [half, -half, 0.0], [half, half, 0.0], [-half, half, 0.0]])
+    return Mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+def distinct_colors(count: int) -> Iterator[tuple[int, ...]]:
+    """`count` RGB colours (0 to 255) whose hues are a golden angle from each other."""
+    for i in range(count):
+        rgb = colorsys.hsv_to_rgb((0.58 + i * 0.61803398875) % 1.0, 0.62, 0.9 if i % 2 == 0 else 0.75)
+        yield tuple(round(255 * c) for c in rgb)
+
+
+def with_normals(mesh: Mesh) -> tuple[Mesh, np.ndarray]:
+    """The mesh with normals [V, 3]: smooth, its vertices split along creases so that boxes keep their edges."""
+    normals = _corner_normals(mesh.vertices, mesh.faces)
+    if normals is None:
+        return mesh, _smooth_normals(mesh.vertices, mesh.faces)
+    colors = None if mesh.colors is None else mesh.colors[mesh.faces].reshape(-1, 3)
+    vertices = mesh.vertices[mesh.faces].reshape(-1, 3)
+    return Mesh(vertices, np.arange(len(vertices)).reshape(-1, 3), colors), normals
+
+
+def _face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """[F, 3], twice the area long."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return np.cross(b - a, c - a)
+
+
+def _smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """[V, 3] area-weighted means of the faces around each vertex."""
+    total = np.zeros_like(vertices)
+    normal = _face_normals(vertices, faces)
+    for k in range(3):
+        np.add.at(total, faces[:, k], normal)
+    return _normalise(total)
+
+
+def _corner_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
+    """[3 F, 3] for every face corner the mean of the faces at its vertex that bend less than the crease angle.
+
+    None for a mesh so fine that it may pass as smooth.
+    """
+    owner = faces.reshape(-1)
+    order = np.argsort(owner, kind="stable")
+    valence = np.bincount(owner, minlength=len(vertices))
+    if (valence**2).sum() > _MOST_CORNER_PAIRS:
+        return None
+    start = np.cumsum(valence) - valence
+    repeats = valence[owner]
+    first = np.repeat(np.arange(len(owner)), repeats)
+    second = order[np.repeat(start[owner] - (np.cumsum(repeats) - repeats), repeats) + np.arange(repeats.sum())]
+    normal = _face_normals(vertices, faces)
+    unit = _normalise(normal)
+    near = (unit[first // 3] * unit[second // 3]).sum(1) >= _CREASE
+    total = np.zeros((len(owner), 3))
+    np.add.at(total, first[near], normal[second[near] // 3])
+    return _normalise(total)
+
+
+def _normalise(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)
