@@ -14,7 +14,7 @@ from sdfsim.dynamics.simulator import pick_device
 from sdfsim.errors import SdfsimError
 from sdfsim.files import check_writable, locked, read_json
 from sdfsim.parallel import parallel
-from sdfsim.scene.schema import UNITS
+from sdfsim.scene.scene_file import UNITS
 from sdfsim.shape.asset import RECORD_FILE, Shape
 from sdfsim.shape.distance import MeshDistance
 from sdfsim.shape.fit import FIT_VERSION, Recipe, fit_mesh, fit_solids

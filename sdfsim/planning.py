@@ -16,8 +16,7 @@ from sdfsim.dynamics.ranges import constant_in_training
 from sdfsim.dynamics.simulator import Simulator, pick_device
 from sdfsim.scene.effects import Plan, plan
 from sdfsim.scene.scene import Effects, Scene
-from sdfsim.scene.scene_file import load_scene
-from sdfsim.scene.schema import DEFAULT_DURATION, DEFAULT_GRAVITY
+from sdfsim.scene.scene_file import DEFAULT_DURATION, DEFAULT_GRAVITY, load_scene
 from sdfsim.shape.mlp import MlpSdf
 
 TRIAL_STEPS = 5

@@ -127,7 +127,7 @@ def test_bodies_by_how_they_move(scene):
     [
         ("motion: kinematic", "bodies[1].path: is required"),
         ("path: []", "bodies[1].path: goes with motion: kinematic only"),
-        ("motion: kinematic, path: []", "bodies[1].path: must hold at least one pose (got 0)"),
+        ("motion: kinematic, path: []", "bodies[1].path: must hold at least one entry (got 0)"),
         (PATH + ", mass: 1", "bodies[1].mass: does not go with motion: kinematic"),
         (PATH.replace("time: 2", "time: 0"), "bodies[1].path[1]: must be later than the pose before it"),
         (PATH.replace("time: 2, ", ""), "bodies[1].path[1].time: is required"),
