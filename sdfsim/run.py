@@ -1,4 +1,4 @@
-"""What the commands simulate, evaluate and info do or tell: a scene file becomes a run folder."""
+"""What the commands simulate and info do or tell: a scene file becomes a run folder."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from sdfsim.dynamics.model import Model, load_model
 from sdfsim.dynamics.rollout import Rollout, energy_from_nothing
 from sdfsim.dynamics.simulator import SimulationError, Simulator, check_seconds, join, pick_device
 from sdfsim.errors import SdfsimError
-from sdfsim.evaluation import tables
 from sdfsim.files import CONFIG, check_own, check_writable, locked, write_json, write_text
 from sdfsim.playback import Playback, save_rollout
 from sdfsim.progress import columns
@@ -263,24 +262,6 @@ def cost_lines(report: dict[str, Any]) -> list[str]:
 
 def _number(value: Any) -> float | None:
     return float(value) if np.isfinite(value) else None
-
-
-def evaluation_lines(report: dict[str, Any]) -> list[str]:
-    """`evaluate`'s report for people: errors at every horizon, then the quality of the motion."""
-    names = {"name": report["model_name"], "ballistic": "ballistic"}
-    return [
-        "Translation RMSE and mean rotation error up to each horizon (95 % intervals over trajectories)",
-        *columns(tables.error_rows(report, **names)),
-        "",
-        "Errors at a frame alone: translation is the mean over trajectories of the RMSE over bodies",
-        *columns(tables.error_rows(report, **names, at_frame=True, intervals=False)),
-        "",
-        *columns(tables.quality_rows(report, **names)),
-        "",
-        *tables.notes(report),
-        f"{report['trajectories']} trajectories, {report['bodies']} bodies, "
-        f"{report['ms_per_step_per_trajectory']:.2f} ms per step and trajectory",
-    ]
 
 
 def environment() -> dict[str, Any]:

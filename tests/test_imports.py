@@ -37,8 +37,8 @@ LEVELS = {
     "dynamics": 4,
     "data": 5,
     "training": 6,
-    "evaluation": 7,
-    "commands": 9,
+    "evaluation": 9,
+    "commands": 10,
 }
 TOP = 8  # playback and the other modules directly in sdfsim
 
