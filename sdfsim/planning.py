@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -45,11 +46,7 @@ def describe(
     pick_device(device)
     if model:
         load_model(model, weights=False)
-
-    def tell(fraction: float, message: str) -> None:
-        on_progress("shapes", fraction, message)
-
-    scene = load_scene(scene_file, tell, allow_outside=allow_outside)
+    scene = load_scene(scene_file, partial(on_progress, "shapes"), allow_outside=allow_outside)
     decided = plan(scene)
     simulator = Simulator(scene, model=model, device=device)
     units, steps = simulator.units, simulator.steps_in(scene.duration)

@@ -7,6 +7,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import fields, is_dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,7 +24,6 @@ from sdfsim.dynamics.rollout import Rollout, energy_from_nothing
 from sdfsim.dynamics.simulator import SimulationError, Simulator, check_seconds, join, pick_device
 from sdfsim.dynamics.sleep import Rest
 from sdfsim.errors import SdfsimError
-from sdfsim.evaluation import tables
 from sdfsim.files import (
     CONFIG,
     check_own,
@@ -36,7 +36,6 @@ from sdfsim.files import (
     write_text,
 )
 from sdfsim.recording import Playback, save_rollout
-from sdfsim.scene.scene import Scene
 from sdfsim.scene.scene_file import load_scene
 from sdfsim.shape.bank import SdfBank
 
@@ -109,7 +108,7 @@ def simulate(
         from sdfsim.viewer import check_screen
 
         check_screen(viewer)
-    scene = _load(scene_file, on_progress, allow_outside)
+    scene = load_scene(scene_file, partial(on_progress, "shapes"), allow_outside=allow_outside)
     simulator = Simulator(scene, model=model, device=device, seed=seed, guard=guard)
     length = scene.duration if seconds is None else seconds
     config = {
@@ -185,13 +184,6 @@ def simulate(
         if broken is not None:
             raise broken
         return report
-
-
-def _load(scene_file: Path, on_progress: Progress, allow_outside: bool) -> Scene:
-    def tell(fraction: float, message: str) -> None:
-        on_progress("shapes", fraction, message)
-
-    return load_scene(scene_file, tell, allow_outside=allow_outside)
 
 
 def _repeatable(asked: str | None, model: Model) -> str:
@@ -273,24 +265,6 @@ def cost_lines(report: dict[str, Any]) -> list[str]:
 
 def _number(value: Any) -> float | None:
     return float(value) if np.isfinite(value) else None
-
-
-def evaluation_lines(report: dict[str, Any]) -> list[str]:
-    """`evaluate`'s report for people: errors at every horizon, then the quality of the motion."""
-    names = {"name": report["model_name"], "ballistic": "ballistic"}
-    return [
-        "Translation RMSE and mean rotation error up to each horizon (95 % intervals over trajectories)",
-        *columns(tables.error_rows(report, **names)),
-        "",
-        "Errors at a frame alone: translation is the mean over trajectories of the RMSE over bodies",
-        *columns(tables.error_rows(report, **names, at_frame=True, intervals=False)),
-        "",
-        *columns(tables.quality_rows(report, **names)),
-        "",
-        *tables.notes(report),
-        f"{report['trajectories']} trajectories, {report['bodies']} bodies, "
-        f"{report['ms_per_step_per_trajectory']:.2f} ms per step and trajectory",
-    ]
 
 
 class Checkpoint:

@@ -34,12 +34,12 @@ LEVELS = {
     "shape": 2,
     "scene": 3,
     "dynamics": 4,
-    "data": 5,
-    "training": 6,
-    "evaluation": 7,
+    "data": 6,
+    "training": 7,
+    "evaluation": 8,
     "commands": 9,
 }
-TOP = 8  # run, recording and the other modules directly in sdfsim
+TOP = 5  # run, recording and the other modules directly in sdfsim
 
 
 def room(module: str) -> tuple[str, int]:
