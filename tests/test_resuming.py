@@ -98,13 +98,6 @@ def test_what_is_no_time_replaces_nothing(sleepy, tmp_path, seconds):
     assert content(tmp_path / "run") == before
 
 
-def test_what_is_replaced_is_told(sleepy, tmp_path, capsys):
-    out = tmp_path / "run"
-    for told in ("", f"replaced the earlier run in {out}\n"):
-        simulate(sleepy, out, seconds=0.02)
-        assert capsys.readouterr().out == told
-
-
 def described() -> tuple[Scene, dict]:
     """A ball beside a paddle on a path, and the options of its simulator: the same at every call."""
     ball = analytic_shape("sphere", radius=0.5)
@@ -166,7 +159,7 @@ def test_the_identity_of_a_run_is_all_that_decides_it(change):
     assert equal == (change is same)
 
 
-LACK = ["identity", "parts", "steps_done", "time", "position", "rest.quiet", "rest.anchor"]
+LACK = ["identity", "position"]
 
 
 @pytest.mark.parametrize("lack", [*LACK, "word", "meta"])
@@ -184,7 +177,7 @@ def test_a_checkpoint_that_lacks_something_is_told(sleepy, tmp_path, lack):
         simulate(sleepy, tmp_path / "run", resume=True)
 
 
-@pytest.mark.parametrize("after", [2, STEPS - 1, STEPS])
+@pytest.mark.parametrize("after", [2, STEPS])
 def test_a_run_until_all_rests_ends_where_it_would_have_however_often_it_is_killed(tmp_path, monkeypatch, after):
     """One that is killed after its last step, before its results are written, makes no step more."""
     monkeypatch.setattr(run, "EVERY", 0.0)

@@ -132,7 +132,7 @@ cases = st.one_of(scenes(), spoiled_scenes(), mangled_texts())
 common = {"deadline": None, "derandomize": True, "database": None, "suppress_health_check": list(HealthCheck)}
 
 
-@settings(max_examples=120, **common)
+@settings(max_examples=60, **common)
 @given(case=cases)
 def test_no_scene_file_crashes_hangs_or_is_misread(folder, case):
     try_one(folder, case)

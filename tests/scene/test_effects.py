@@ -96,11 +96,6 @@ def test_what_the_file_says_wins(scene):
     assert frictionless.contact.on and not frictionless.friction.on and frictionless.friction.why == "the file says off"
 
 
-def test_only_the_file_turns_rotation_off(scene):
-    assert plan(scene(effects=Effects(contact="off"))).rotation.on
-    assert not plan(scene(effects=Effects(rotation="off"))).rotation.on
-
-
 def test_every_effect_says_why_and_what_would_change_it(scene):
     for made in (scene(), scene(effects=Effects(contact="off", sleep="on")), scene(gravity=np.zeros(3))):
         effects = plan(made).effects()
@@ -145,12 +140,6 @@ def test_memory_limits_are_read(scene, tmp_path):
     (tmp_path / "scene.yaml").write_text(TEXT.replace("FIELDS", "mass: 1") + "limits: {memory_gib: 0}\n")
     with pytest.raises(SceneError, match=r"limits\.memory_gib: must be > 0"):
         load_scene(tmp_path / "scene.yaml")
-
-
-def test_smooth_bodies_have_no_friction_to_compute(scene):
-    made = scene()
-    smooth = replace(made, bodies=tuple(replace(b, friction=0.0, restitution=0.0) for b in made.bodies))
-    assert not plan(smooth).friction.on and not plan(smooth).restitution.on and plan(smooth).contact.on
 
 
 def test_nothing_to_do(scene):
