@@ -98,20 +98,15 @@ def _costs(simulator: Simulator, decided: Plan, steps: int) -> dict[str, Any]:
 
 def _not_default(scene: Scene, model: str | None) -> dict[str, Any]:
     """What the file or the command says that is not the default."""
-    found: dict[str, Any] = {
-        f"effects.{name}": said for name, said in vars(scene.effects).items() if said != getattr(Effects(), name)
+    said: dict[str, tuple[Any, Any]] = {
+        **{f"effects.{name}": (value, getattr(Effects(), name)) for name, value in vars(scene.effects).items()},
+        "limits.memory_gib": (scene.limits.memory_gib, None),
+        "model": (model or scene.model, None),
+        "seed": (scene.seed, 0),
+        "gravity": (scene.gravity.tolist(), list(DEFAULT_GRAVITY)),
+        "duration": (scene.duration, DEFAULT_DURATION),
     }
-    if scene.limits.memory_gib is not None:
-        found["limits.memory_gib"] = scene.limits.memory_gib
-    if model or scene.model:
-        found["model"] = model or scene.model
-    if scene.seed:
-        found["seed"] = scene.seed
-    if not np.array_equal(scene.gravity, DEFAULT_GRAVITY):
-        found["gravity"] = scene.gravity.tolist()
-    if scene.duration != DEFAULT_DURATION:
-        found["duration"] = scene.duration
-    return found
+    return {name: value for name, (value, default) in said.items() if value != default}
 
 
 def plan_lines(report: dict[str, Any]) -> list[str]:
