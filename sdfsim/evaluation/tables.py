@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from sdfsim.data import metrics
-from sdfsim.progress import columns
+from sdfsim.console import columns
 
 SURVIVED = "0.25"  # m, the limit whose median survival time is shown
 NOTHING = "-"
