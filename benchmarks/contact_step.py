@@ -30,8 +30,8 @@ from sdfsim.dynamics.simulator import Simulator
 from sdfsim.dynamics.solver import Compiled, compiled_rules, taken_up
 from sdfsim.errors import run_main
 from sdfsim.evaluation.baselines import engine_file, started
-from sdfsim.scene.load import load_scene
-from sdfsim.scene.types import Scene
+from sdfsim.scene.scene import Scene
+from sdfsim.scene.scene_file import load_scene
 
 TRAJECTORIES, STEPS = 10, 100
 BALLS, FALL = (16, 512), 200

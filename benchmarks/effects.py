@@ -20,14 +20,14 @@ import numpy as np
 import torch
 
 from sdfsim import Simulator, load_scene
+from sdfsim.console import columns
 from sdfsim.dynamics.contacts import find_contacts
 from sdfsim.dynamics.model import load_model
 from sdfsim.dynamics.simulator import SimulationError
 from sdfsim.dynamics.sleep import STEPS as SLEEP_STEPS
 from sdfsim.dynamics.step import contact_graph, fly
 from sdfsim.errors import run_main
-from sdfsim.progress import columns
-from sdfsim.scene.types import Body, Effects, Limits, Scene
+from sdfsim.scene.scene import Body, Effects, Limits, Scene
 from sdfsim.shape.asset import analytic_shape
 from sdfsim.training.contact_cache import contact_frames
 from sdfsim.training.impulse_task import ImpulseTask

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from sdfsim.console import Session
 from sdfsim.evaluation.hard_cases_page import write_report
 from sdfsim.evaluation.hard_cases_plots import group_picture
 from sdfsim.evaluation.hard_cases_ratchet import accepted
@@ -19,8 +20,7 @@ from sdfsim.evaluation.hard_cases_results import Study
 from sdfsim.evaluation.hard_cases_run import stress
 from sdfsim.evaluation.hard_cases_tables import LEGEND, losses, markdown
 from sdfsim.files import replacing, write_json, write_text
-from sdfsim.playback import save_rollout
-from sdfsim.progress import Session
+from sdfsim.recording import save_rollout
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENT = ROOT / "docs" / "stability.md"

@@ -16,12 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
+from sdfsim.console import columns
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.simulator import SimulationError, Simulator
 from sdfsim.errors import run_main
 from sdfsim.files import write_text
-from sdfsim.progress import columns
-from sdfsim.scene.types import Body, Scene
+from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.asset import Shape, analytic_shape
 
 G = 9.81  # m/s^2

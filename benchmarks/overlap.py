@@ -9,10 +9,10 @@ import argparse
 
 import numpy as np
 
+from sdfsim.console import columns
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.errors import run_main
-from sdfsim.progress import columns
-from sdfsim.scene.types import Body, Scene
+from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.asset import analytic_shape
 
 SHAPES = {"ball": analytic_shape("sphere", radius=0.5), "cube": analytic_shape("box", size=(1.0, 1.0, 1.0))}

@@ -21,11 +21,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from sdfsim.console import columns
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.errors import run_main
 from sdfsim.files import write_json
-from sdfsim.progress import columns
-from sdfsim.scene.types import Body, Scene
+from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.analytic import BoxSdf
 from sdfsim.shape.asset import Shape, analytic_shape
 from sdfsim.shape.certificate import EXACT, USABLE, certify

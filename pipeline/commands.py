@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal
 import typer
 
 from sdfsim.commands.arguments import Budget, Cluster, Device, Json, Out, Verbose, tell_failed
+from sdfsim.console import Session, duration
 from sdfsim.errors import EXIT_ERROR
-from sdfsim.progress import Session, duration
 
 Preset = Annotated[
     Literal["quick", "standard", "fine", "paper"],

@@ -207,7 +207,7 @@ def write_recording(folder: Path, done: Collection[str]) -> Path | None:
     Raises:
         SdfsimError: a stage's folder is damaged, or the file cannot be written.
     """
-    from sdfsim.playback import PosedPhoto, save_reconstruction
+    from sdfsim.recording import PosedPhoto, save_reconstruction
     from sdfsim.shape.mesh import load_mesh
 
     if "poses" not in done:

@@ -22,7 +22,7 @@ from pipeline.export import Above
 from pipeline.mesh.meshing import SCENERY, rounded
 from sdfsim.errors import run_main
 from sdfsim.files import write_text
-from sdfsim.scene.load import load_scene
+from sdfsim.scene.scene_file import load_scene
 from sdfsim.shape.asset import Shape, load_shape
 
 GRAVITY = 9.81  # m/s^2

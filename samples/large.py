@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.errors import run_main
 from sdfsim.files import write_text
-from sdfsim.scene.load import load_scene
+from sdfsim.scene.scene_file import load_scene
 from sdfsim.shape.asset import Shape, analytic_shape, load_shape, scaled
 from sdfsim.shape.cache import shape_from_primitive
 from sdfsim.shape.nodes import sample_nodes, thin

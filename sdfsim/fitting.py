@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from sdfsim.console import columns, duration
 from sdfsim.dynamics.bodies import largest_extent
 from sdfsim.dynamics.simulator import pick_device
 from sdfsim.errors import SdfsimError
 from sdfsim.files import check_writable, locked, read_json
 from sdfsim.parallel import parallel
-from sdfsim.progress import columns, duration
-from sdfsim.scene.schema import UNITS
+from sdfsim.scene.scene_file import UNITS
 from sdfsim.shape.asset import RECORD_FILE, Shape
 from sdfsim.shape.distance import MeshDistance
 from sdfsim.shape.fit import FIT_VERSION, Recipe, fit_mesh, fit_solids

@@ -5,7 +5,6 @@ import shutil
 from pathlib import Path
 
 import pytest
-
 from sdfsim.scene.load import load_scene
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -15,7 +15,7 @@ from sdfsim import fitting
 from sdfsim.errors import SdfsimError
 from sdfsim.fitting import Options, fit_many, named_meshes
 from sdfsim.parallel import cluster, parallel
-from sdfsim.scene.schema import UNITS
+from sdfsim.scene.scene_file import UNITS
 from sdfsim.shape import primitives
 from sdfsim.shape.asset import load_shape, scaled
 from sdfsim.shape.mesh import Mesh

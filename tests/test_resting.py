@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sdfsim import Simulator, load_shape
-from sdfsim.scene.types import Body, Scene
+from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.asset import analytic_shape
 
 EARTH = np.array([0.0, 0.0, -9.81])

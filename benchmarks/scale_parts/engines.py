@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.scale_parts.ours import memory, peak_from_here
 from sdfsim import load_scene
 from sdfsim.data.pybullet_sim import BODY_SETTINGS, ENGINE_SETTINGS, MAXIMAL, import_pybullet
-from sdfsim.scene.types import Body, Scene
+from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.analytic import PlaneSdf, SphereSdf
 from sdfsim.shape.mesh import Mesh
 from sdfsim.shape.primitives import convex_pieces

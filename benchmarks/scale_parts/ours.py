@@ -16,7 +16,7 @@ from sdfsim.dynamics.memory import PHASES
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.simulator import SimulationError, join
 from sdfsim.dynamics.step import contact_graph, fly
-from sdfsim.scene.types import Body, Scene
+from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.asset import analytic_shape
 
 COUNTS = ("pairs", "sdf_queries", "sdf_waiting", "nodes", "edges", "active")

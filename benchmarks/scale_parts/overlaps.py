@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sdfsim.scene.types import Scene
+from sdfsim.scene.scene import Scene
 
 WALL = 0.12  # of the bowl primitive, relative to its outer radius
 TOUCH = 0.01  # of a diameter

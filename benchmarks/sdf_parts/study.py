@@ -17,6 +17,7 @@ import torch
 
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, write_json
+from sdfsim.parallel import limit_threads
 from sdfsim.shape.asset import RECORD_FILE, Shape, load_shape
 from sdfsim.shape.certificate import EXACT
 from sdfsim.shape.distance import MeshDistance
@@ -24,7 +25,6 @@ from sdfsim.shape.fit import FIT_VERSION, fit_mesh
 from sdfsim.shape.mesh import load_mesh
 from sdfsim.shape.plans import PLANS
 from sdfsim.shape.solid import solidify
-from sdfsim.threads import limit_threads
 
 RESULTS = "sdf.json"
 ERRORS = tuple(key for key, _ in EXACT)

@@ -34,7 +34,7 @@ from pipeline.progress import Progress, quiet, share_of
 from pipeline.sfm.supervision import FreeSpace, Supervision, supervision_of, unit_sphere_of
 from sdfsim.errors import SdfsimError
 from sdfsim.files import replacing, write_json
-from sdfsim.threads import choose_threads
+from sdfsim.parallel import choose_threads
 
 # Steps between updates of the cached SDF, fewer at first; a multiple, so that both fall on the same steps.
 EARLY, EARLY_PERIOD, PERIOD = 288, 16, 48

@@ -8,7 +8,12 @@ from typing import Annotated, Literal
 import typer
 
 from sdfsim.commands.arguments import Bind, Device, Json, Model, Out, Outside, Verbose, check_device, tell_failed
-from sdfsim.progress import Session, duration
+from sdfsim.console import Session, duration
+
+_PACKAGES = (
+    *("torch", "numpy", "scipy", "open3d", "trimesh", "pycolmap", "opencv-python-headless", "rerun-sdk"),
+    *("pydantic", "pybullet"),
+)
 
 
 def simulate(
@@ -121,7 +126,27 @@ def view(
 def info(as_json: Json = False, device: Device = "auto", verbose: Verbose = False) -> None:
     """Versions, devices and bundled models."""
     with Session(as_json=as_json, verbose=verbose) as session:
-        from sdfsim import run
+        import platform
+        from importlib import metadata
+
+        import torch
+
+        import sdfsim
+        from sdfsim.dynamics.model import model_names
 
         check_device(device)
-        session.report(run.environment())
+        versions = {"sdfsim": sdfsim.__version__, "python": platform.python_version()}
+        for name in _PACKAGES:
+            try:
+                versions[name] = metadata.version(name)
+            except metadata.PackageNotFoundError:
+                versions[name] = "missing"
+        gpus = [f"cuda:{i} {torch.cuda.get_device_name(i)}" for i in range(torch.cuda.device_count())]
+        session.report(
+            {
+                "versions": versions,
+                "devices": ["cpu", *gpus],
+                "cpu_threads": torch.get_num_threads(),
+                "models": model_names(),
+            }
+        )

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from sdfsim.commands.arguments import Device, Json, Out, Verbose, folder_of, tell_failed
-from sdfsim.progress import Session, columns
+from sdfsim.console import Session, columns
 
 
 def tradeoff(
@@ -66,7 +66,7 @@ def stress(
         from sdfsim.evaluation import hard_cases_run
         from sdfsim.evaluation.hard_cases_page import report_notes, report_table, write_report
         from sdfsim.evaluation.hard_cases_plots import check_matplotlib
-        from sdfsim.playback import save_rollout
+        from sdfsim.recording import save_rollout
 
         check_matplotlib()
         study = hard_cases_run.stress(

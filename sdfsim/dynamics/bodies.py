@@ -11,8 +11,8 @@ from torch import Tensor
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.tracks import Tracks, from_paths
 from sdfsim.errors import SdfsimError
-from sdfsim.scene.pairs import contact_groups
-from sdfsim.scene.types import Scene
+from sdfsim.scene.collision_filter import contact_groups
+from sdfsim.scene.scene import Scene
 from sdfsim.shape.asset import Shape
 from sdfsim.shape.bank import SdfBank
 

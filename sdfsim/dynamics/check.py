@@ -10,7 +10,7 @@ import torch
 from sdfsim.dynamics.bodies import Bodies, State, Units
 from sdfsim.dynamics.freeflight import MOST_TURN
 from sdfsim.errors import SdfsimError
-from sdfsim.scene.types import Scene
+from sdfsim.scene.scene import Scene
 
 # Of |q|^2 - 1. The matrix R of a quaternion that keeps to it has |R'R - I| below 1e-5, and a positive determinant.
 UNIT = 2e-6

@@ -7,7 +7,7 @@ import numpy as np
 from sdfsim.dynamics.bodies import Units, largest_extent
 from sdfsim.dynamics.model import SOLVER, Model
 from sdfsim.errors import SdfsimError
-from sdfsim.scene.types import Scene
+from sdfsim.scene.scene import Scene
 
 EARTH = 9.81  # m/s^2, sets the time scale of scenes without gravity
 # Times: how much wider a body may be than most that move. Their mean size sets the step, and one that is wider makes it

@@ -13,7 +13,7 @@ from torch import Tensor
 from sdfsim.dynamics.bodies import Bodies, State
 from sdfsim.dynamics.broad import Still, moving, swept_boxes
 from sdfsim.dynamics.clusters import Layer, layers
-from sdfsim.scene.types import Limits
+from sdfsim.scene.scene import Limits
 
 if TYPE_CHECKING:
     from sdfsim.dynamics.rounding import Curvature

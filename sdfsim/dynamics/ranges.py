@@ -10,7 +10,7 @@ import numpy as np
 from sdfsim.dynamics.bodies import Units, largest_extent
 from sdfsim.dynamics.graph import SUBSTEPS
 from sdfsim.dynamics.model import SOLVER, Model
-from sdfsim.scene.types import Scene
+from sdfsim.scene.scene import Scene
 
 LABELS = {
     "size": "largest side of a body, m",

@@ -29,7 +29,7 @@ from sdfsim.dynamics.sleep import nobody_asleep
 from sdfsim.dynamics.step import FreeFlight, Rules, step
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.scene.effects import plan
-from sdfsim.scene.types import Scene
+from sdfsim.scene.scene import Scene
 
 
 class SimulationError(SdfsimError):

@@ -103,7 +103,7 @@ class Compiled:
 def warm() -> None:
     """Have the step compiled now, so that nobody waits for it later."""
     from sdfsim.dynamics.bodies import Units, from_scene
-    from sdfsim.scene.types import Body, Scene
+    from sdfsim.scene.scene import Body, Scene
     from sdfsim.shape.asset import analytic_shape
 
     still = np.zeros(3)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from sdfsim.dynamics import pose
-from sdfsim.scene.types import Waypoints
+from sdfsim.scene.scene import Waypoints
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from sdfsim.evaluation.hard_cases_measures import Measure
-from sdfsim.scene.types import Scene
+from sdfsim.scene.scene import Scene
 
 Variant = Literal["float32", "bfloat16", "cuda"]
 

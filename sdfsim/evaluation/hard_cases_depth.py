@@ -7,7 +7,7 @@ import numpy as np
 from sdfsim.data.dataset import Trajectory
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.evaluation.penetration import Solid, deepest
-from sdfsim.scene.types import Scene
+from sdfsim.scene.scene import Scene
 from sdfsim.shape.analytic import PlaneSdf
 from sdfsim.shape.asset import Shape, with_sdf
 from sdfsim.shape.exact import MeshSdf

@@ -12,7 +12,7 @@ from sdfsim.errors import SdfsimError
 from sdfsim.evaluation import hard_cases_measures as measure
 from sdfsim.evaluation import hard_cases_scenes as scenes
 from sdfsim.evaluation.hard_cases import Case, Figure
-from sdfsim.scene.types import Scene
+from sdfsim.scene.scene import Scene
 from sdfsim.shape.asset import Shape
 from sdfsim.shape.cache import shape_from_mesh, shape_from_primitive
 from sdfsim.shape.mesh import MESH_SUFFIXES

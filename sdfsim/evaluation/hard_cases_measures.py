@@ -12,7 +12,7 @@ from sdfsim.dynamics.bodies import largest_extent
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.evaluation.hard_cases_depth import penetration
 from sdfsim.evaluation.hard_cases_scenes import UP, WALL, body_inertia
-from sdfsim.scene.types import Scene
+from sdfsim.scene.scene import Scene
 
 FALLEN = 0.25  # of a body's height at the start: what has sunk by more has fallen
 GAIN = 0.01  # of the energy at the start: a step that adds more is counted

@@ -12,7 +12,7 @@ from sdfsim.dynamics.simulator import SimulationError, Simulator
 from sdfsim.evaluation.hard_cases import Case, Variant
 from sdfsim.evaluation.hard_cases_measures import Run, ran_away
 from sdfsim.evaluation.hard_cases_teacher import teach
-from sdfsim.scene.types import Scene
+from sdfsim.scene.scene import Scene
 
 
 def simulated(case: Case, scenes: list[Scene], model: Model, device: str) -> list[Run]:

@@ -26,7 +26,7 @@ from sdfsim.evaluation.hard_cases_results import NO_CUDA, TEACHER, Part, Result,
 from sdfsim.evaluation.hard_cases_teacher import engine_file
 from sdfsim.files import locked, read_json, write_json
 from sdfsim.parallel import parallel
-from sdfsim.scene.types import Scene
+from sdfsim.scene.scene import Scene
 from sdfsim.shape.analytic import PlaneSdf
 
 VERSION = 1  # counts up when what is measured changes, so that kept results are measured again

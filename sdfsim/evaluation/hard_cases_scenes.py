@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sdfsim.data.scenarios import steady_faces
-from sdfsim.scene.types import Body, Effects, Scene
+from sdfsim.scene.scene import Body, Effects, Scene
 from sdfsim.shape.asset import Shape, analytic_shape
 from sdfsim.shape.cache import shape_from_primitive
 

@@ -13,7 +13,7 @@ from sdfsim.dynamics.rollout import Rollout
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.hard_cases_scenes import body_inertia
 from sdfsim.files import replacing, write_text
-from sdfsim.scene.types import Body, Scene
+from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.analytic import BoxSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.asset import Shape
 from sdfsim.shape.mesh import Mesh

@@ -4,11 +4,30 @@ from __future__ import annotations
 
 from typing import Any
 
+from sdfsim.console import columns
 from sdfsim.data import metrics
 
 SURVIVED = "0.25"  # m, the limit whose median survival time is shown
 NOTHING = "-"
 Rows = list[tuple[str, ...]]
+
+
+def report_lines(report: dict[str, Any]) -> list[str]:
+    """`evaluate`'s report for people: errors at every horizon, then the quality of the motion."""
+    names = {"name": report["model_name"], "ballistic": "ballistic"}
+    return [
+        "Translation RMSE and mean rotation error up to each horizon (95 % intervals over trajectories)",
+        *columns(error_rows(report, **names)),
+        "",
+        "Errors at a frame alone: translation is the mean over trajectories of the RMSE over bodies",
+        *columns(error_rows(report, **names, at_frame=True, intervals=False)),
+        "",
+        *columns(quality_rows(report, **names)),
+        "",
+        *notes(report),
+        f"{report['trajectories']} trajectories, {report['bodies']} bodies, "
+        f"{report['ms_per_step_per_trajectory']:.2f} ms per step and trajectory",
+    ]
 
 
 def error_rows(

@@ -27,7 +27,7 @@ from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.baselines import engine_file
 from sdfsim.evaluation.penetration import Solid, engine_pieces, exact_solids
 from sdfsim.evaluation.tradeoff_shapes import digest_of
-from sdfsim.scene.types import Scene
+from sdfsim.scene.scene import Scene
 from sdfsim.shape.asset import Shape
 from sdfsim.shape.distance import PiecesDistance
 from sdfsim.shape.mesh import Mesh

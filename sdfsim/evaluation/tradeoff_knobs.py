@@ -17,7 +17,7 @@ from torch import nn
 from sdfsim.dynamics.model import Model
 from sdfsim.dynamics.precision import in_bfloat16
 from sdfsim.errors import SdfsimError
-from sdfsim.scene.types import Scene
+from sdfsim.scene.scene import Scene
 from sdfsim.shape.asset import Shape, with_nodes, with_sdf
 from sdfsim.shape.grid import GridSdf, sample_grid
 from sdfsim.shape.mlp import MlpSdf

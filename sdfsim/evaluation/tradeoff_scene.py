@@ -19,8 +19,8 @@ from sdfsim.evaluation.baselines import collision_mesh, run_again
 from sdfsim.evaluation.hard_cases_teacher import engine_file
 from sdfsim.evaluation.penetration import exact_solids
 from sdfsim.evaluation.tradeoff_cases import STEPS, TIMED_STEPS, Cases
-from sdfsim.scene.load import load_scene
-from sdfsim.scene.types import Body, Scene
+from sdfsim.scene.scene import Body, Scene
+from sdfsim.scene.scene_file import load_scene
 from sdfsim.shape.analytic import PlaneSdf
 from sdfsim.shape.asset import Shape
 from sdfsim.shape.exact import MeshSdf

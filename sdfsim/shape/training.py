@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from sdfsim.parallel import choose_threads
 from sdfsim.shape.checkpoint import Checkpoint
 from sdfsim.shape.distance import DistanceOracle
 from sdfsim.shape.mlp import MlpSdf
@@ -19,7 +20,6 @@ from sdfsim.shape.plans import Plan
 from sdfsim.shape.sampling import CHECKED, Subject, stack
 from sdfsim.shape.soap import Adam, Soap
 from sdfsim.shape.sweep import Activation, Tape, value_and_gradient
-from sdfsim.threads import choose_threads
 
 WARMUP = 50
 CHECK = 100

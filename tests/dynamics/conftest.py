@@ -8,7 +8,7 @@ import torch
 
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.model import Model, new_network
-from sdfsim.scene.types import Body, Scene
+from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.asset import analytic_shape
 
 

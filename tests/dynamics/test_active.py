@@ -13,7 +13,7 @@ from sdfsim.dynamics.memory import COUNTS, PHASES
 from sdfsim.dynamics.model import Unread
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.dynamics.surfaces import compact, predict
-from sdfsim.scene.types import Effects, Scene, Waypoints
+from sdfsim.scene.scene import Effects, Scene, Waypoints
 from sdfsim.shape import bank
 from sdfsim.shape.asset import analytic_shape
 from tests.dynamics.conftest import make_body, random_model

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from sdfsim.dynamics.bodies import Units, from_scene
 from sdfsim.dynamics.broad import Still, near_pairs, swept_boxes
 from sdfsim.dynamics.memory import Memory
-from sdfsim.scene.types import Scene
+from sdfsim.scene.scene import Scene
 from sdfsim.shape.asset import analytic_shape
 from tests.dynamics.conftest import make_body
 

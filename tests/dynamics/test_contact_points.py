@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sdfsim import Simulator
-from sdfsim.scene.types import Scene
+from sdfsim.scene.scene import Scene
 from sdfsim.shape.asset import analytic_shape
 from tests.dynamics.conftest import make_body, random_model
 

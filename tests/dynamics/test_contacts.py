@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from sdfsim.dynamics.bodies import Units, from_scene
 from sdfsim.dynamics.contacts import find_contacts, thin_contacts
 from sdfsim.errors import SdfsimError
-from sdfsim.scene.types import Scene
+from sdfsim.scene.scene import Scene
 from sdfsim.shape.asset import analytic_shape
 from tests.dynamics.conftest import make_body
 

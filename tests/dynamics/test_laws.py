@@ -9,7 +9,7 @@ import torch
 
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.simulator import Simulator
-from sdfsim.scene.types import Body, Scene
+from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.asset import Shape, analytic_shape
 
 G = 9.81  # m/s^2

@@ -7,7 +7,7 @@ import torch
 
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.dynamics.surfaces import advance, node_owner
-from sdfsim.scene.types import Effects
+from sdfsim.scene.scene import Effects
 from tests.dynamics.conftest import angle_between, random_model
 
 

@@ -9,7 +9,7 @@ import torch
 from sdfsim.dynamics.ranges import _products
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.errors import SdfsimError
-from sdfsim.scene.types import Scene
+from sdfsim.scene.scene import Scene
 from tests.dynamics.conftest import make_body, random_model
 
 RANGES = {

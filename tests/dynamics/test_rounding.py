@@ -11,7 +11,7 @@ from sdfsim.dynamics.contacts import ARRAYS, Contacts, find_contacts
 from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.rounding import curvature
 from sdfsim.dynamics.simulator import Simulator
-from sdfsim.scene.types import Scene
+from sdfsim.scene.scene import Scene
 from sdfsim.shape.asset import analytic_shape
 from sdfsim.shape.exact import MeshSdf
 from sdfsim.shape.mesh import Mesh

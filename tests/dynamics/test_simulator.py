@@ -10,7 +10,7 @@ import torch
 
 from sdfsim import SdfsimError, Simulator
 from sdfsim.dynamics.simulator import SimulationError
-from sdfsim.scene.types import Scene
+from sdfsim.scene.scene import Scene
 from tests.dynamics.conftest import make_body, random_model
 
 

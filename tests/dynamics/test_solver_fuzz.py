@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sdfsim import Rollout, Simulator
-from sdfsim.scene.types import Scene
+from sdfsim.scene.scene import Scene
 from sdfsim.shape.asset import Shape, analytic_shape, load_shape
 from tests.dynamics.test_laws import body
 from tests.dynamics.test_waits import SHAPES

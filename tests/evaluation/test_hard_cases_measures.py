@@ -14,7 +14,7 @@ from sdfsim.evaluation import hard_cases_measures as measure
 from sdfsim.evaluation import hard_cases_scenes as scenes
 from sdfsim.evaluation.hard_cases_depth import penetration
 from sdfsim.evaluation.hard_cases_measures import Run
-from sdfsim.scene.types import Effects, Scene
+from sdfsim.scene.scene import Effects, Scene
 
 DT = 0.01
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim.evaluation import hard_cases_scenes as scenes
 from sdfsim.evaluation.hard_cases_list import SPEEDS, cases
-from sdfsim.scene.types import Body, Scene
+from sdfsim.scene.scene import Body, Scene
 
 
 def moving(scene: Scene) -> list[Body]:

@@ -158,9 +158,9 @@ def tiny_train() -> None:
 
 def tiny_simulate() -> None:
     """A checkpoint after every step."""
-    from sdfsim import resuming
+    from sdfsim import run
 
-    resuming.EVERY = 0.0
+    run.EVERY = 0.0
 
 
 def tiny_reconstruct() -> None:

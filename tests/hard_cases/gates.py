@@ -12,7 +12,7 @@ import torch
 import sdfsim
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.rollout import Rollout
-from sdfsim.scene.types import Body, Scene
+from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.asset import Shape, analytic_shape, load_shape
 from tests.dynamics.conftest import make_body
 

@@ -17,7 +17,6 @@ from sdfsim.dynamics.model import Model, new_network
 from sdfsim.files import LOCK, locked
 from sdfsim.shape import cache
 from sdfsim.shape.asset import MESH_FILE, RECORD_FILE, WEIGHTS_FILE, analytic_shape, with_sdf
-from sdfsim.shape.mesh import Mesh
 from sdfsim.shape.primitives import box
 from sdfsim.shape.storage import write_ply
 
@@ -36,7 +35,7 @@ def model(tmp_path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("share", [0.0, 0.001, 0.1, 0.5, 0.999])
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.999])
 def test_weights_that_are_cut_short_are_one_line(tmp_path, model, share):
     (tmp_path / "scene.yaml").write_text(SCENE)
     content = model.read_bytes()
@@ -46,15 +45,7 @@ def test_weights_that_are_cut_short_are_one_line(tmp_path, model, share):
     assert "Traceback" not in done.stderr and not (tmp_path / "out").exists()
 
 
-def test_weights_that_are_no_file_are_one_line(tmp_path, model):
-    (tmp_path / "scene.yaml").write_text(SCENE)
-    model.unlink()
-    model.mkdir()
-    done = run("plan", tmp_path / "scene.yaml", "--model", model)
-    assert done.exit_code == 1 and len(done.stderr.strip().splitlines()) == 1 and str(model) in done.stderr
-
-
-@pytest.mark.parametrize("share", [0.0, 0.2, 0.7, 0.99])
+@pytest.mark.parametrize("share", [0.0, 0.7])
 @pytest.mark.parametrize("name", [WEIGHTS_FILE, MESH_FILE, RECORD_FILE])
 def test_shapes_that_are_cut_short_are_one_line(tmp_path, name, share):
     folder = with_sdf(analytic_shape("box", size=(1, 1, 1)), "grid", resolution=8).save(tmp_path / "crate")
@@ -101,20 +92,6 @@ def test_weights_of_the_wrong_form_are_one_line(tmp_path, change):
     save_file(tensors, folder / WEIGHTS_FILE)
     with pytest.raises(SdfsimError):
         load_shape(folder)
-
-
-def test_a_cached_shape_follows_its_source(tmp_path):
-    file, kept = tmp_path / "a.ply", tmp_path / "cache"
-
-    def volume() -> float:
-        return cache.shape_from_mesh(file, kept, sdf="grid", resolution=8).volume
-
-    file.write_bytes(write_ply(box()))
-    assert volume() == pytest.approx(1.0)
-    file.write_bytes(write_ply(Mesh(2.0 * box().vertices, box().faces)))
-    assert volume() == pytest.approx(8.0) and len(list(kept.iterdir())) == 2
-    file.write_bytes(write_ply(box()))
-    assert volume() == pytest.approx(1.0) and len(list(kept.iterdir())) == 2
 
 
 @pytest.mark.parametrize("name", [WEIGHTS_FILE, MESH_FILE, RECORD_FILE])

@@ -17,10 +17,9 @@ from sdfsim.dynamics import energy
 from sdfsim.dynamics.contacts import find_contacts
 from sdfsim.dynamics.energy import ESCAPE, balance, hold_back
 from sdfsim.dynamics.memory import Memory
-from sdfsim.dynamics.rollout import energy_from_nothing
 from sdfsim.dynamics.simulator import SimulationError, Simulator
 from sdfsim.dynamics.step import drive, fly
-from sdfsim.scene.types import Waypoints
+from sdfsim.scene.scene import Waypoints
 from tests.dynamics.conftest import make_body, random_model
 from tests.hard_cases import gates
 
@@ -99,7 +98,7 @@ def test_lifting_takes_energy_and_islands_do_not_pay_for_each_other():
     assert met.held(both)[1]["energy_gain"] == pytest.approx(mass * gravity * 0.05, rel=1e-6)
 
 
-@pytest.mark.parametrize("size", [2.0, 5.0, 50.0])
+@pytest.mark.parametrize("size", [2.0, 50.0])
 def test_the_guard_allows_no_gain_and_keeps_momentum(size):
     met = pair()
     wild = met.after(**impulse(met, size))
@@ -186,35 +185,6 @@ def test_what_would_run_away_is_stopped_and_told(monkeypatch):
     except SimulationError:
         free = math.inf
     assert free > 20 * speed
-
-
-def test_an_ordinary_run_is_watched_and_otherwise_as_it_was(model, monkeypatch):
-    watched = Simulator(gates.mixed(), model).run(steps=40)
-    assert watched.contact_count.sum() > 0 and watched.counters["held_back"].sum() == 0
-    assert (watched.counters["energy_gain"] >= 0).all()
-    monkeypatch.setattr("sdfsim.dynamics.step.hold_back", lambda *a: a[3])
-    plain = Simulator(gates.mixed(), model).run(steps=40)
-    for name in ("position", "orientation", "velocity", "angular_velocity"):
-        np.testing.assert_array_equal(getattr(watched, name), getattr(plain, name))
-
-
-def test_the_report_says_how_much_of_what_was_in_play():
-    rollout = Simulator(gates.placed(gates.BALL, [(0, 0, 9)]), random_model("impulse")).run(steps=4)
-    counters = {
-        "kinetic_energy": np.array([0.0, 50.0, 10.0, 90.0, 0.0]),
-        "energy_gain": np.array([0.0, 0.0, 2.0, 0.5, 0.0]),
-        "held_back": np.array([0.0, 0.0, 3.0, 1.0, 0.0]),
-    }
-    report = energy_from_nothing(
-        replace(rollout, counters=rollout.counters | counters, meta=rollout.meta | {"lift_energy": 10.0})
-    )
-    assert report == {
-        "sum_J": 2.5,
-        "worst": 2.0 / 60.0,
-        "steps_above_1_percent": 0.25,
-        "steps_held_back": 2,
-        "bodies_held_back": 4,
-    }
 
 
 def test_simulate_tells_it_and_takes_the_guard(tmp_path):

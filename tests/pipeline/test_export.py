@@ -13,7 +13,7 @@ from pipeline.cameras import Similarity
 from pipeline.export import DENSITY, LEVEL, Above, choose_slab, fit_parts, scene_text, write_scene
 from pipeline.mesh.placement import Placement
 from sdfsim.files import write_json
-from sdfsim.scene.load import load_scene
+from sdfsim.scene.scene_file import load_scene
 from sdfsim.shape.asset import Shape, analytic_shape
 from sdfsim.shape.mesh import Mesh
 from sdfsim.shape.storage import write_ply

@@ -76,7 +76,7 @@ def test_the_compiled_distance_is_that_of_the_shape(kind, block):
     import torch
 
     from sdfsim.dynamics.bodies import Units, from_scene
-    from sdfsim.scene.types import Scene
+    from sdfsim.scene.scene import Scene
     from tests.dynamics.test_laws import body
 
     shape = {

@@ -41,7 +41,10 @@ class Session:
         self._bar = _Bar()
 
     def __enter__(self) -> Session:
-        self._hear()
+        default = signal.default_int_handler
+        if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is default:
+            signal.signal(signal.SIGINT, self._press)
+            self._clean_up.callback(signal.signal, signal.SIGINT, default)
         if self.as_json:
             sys.stdout.flush()
             real = os.dup(1)  # native libraries write to the descriptor, past sys.stdout
@@ -50,6 +53,10 @@ class Session:
             self._clean_up.callback(os.dup2, real, 1)
             self._clean_up.enter_context(contextlib.redirect_stdout(sys.stderr))
         return self
+
+    def _press(self, number: int, frame: FrameType | None) -> None:
+        self._pressed = True  # remembered, whatever becomes of the exception
+        raise KeyboardInterrupt
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -69,36 +76,21 @@ class Session:
 
     def _explain(self, error: BaseException) -> int | None:
         """Tell the error; None lets it through (it is not ours to handle)."""
-        if isinstance(error, KeyboardInterrupt):
-            return self._fail("interrupted; what was finished is kept", "", EXIT_INTERRUPTED)
-        if isinstance(error, SceneError):
-            return self._fail(error.message, error.hint, error.exit_code, problems=error.problems)
         if isinstance(error, SdfsimError):
-            return self._fail(error.message, error.hint, error.exit_code)
+            problems = {"problems": error.problems} if isinstance(error, SceneError) else {}
+            return self._fail(error.message, error.hint, error.exit_code, **problems)
         if isinstance(error, BrokenPipeError):
             return self._lost_output(error)
+        # A library that was interrupted while it was being imported fails in its own way.
+        if isinstance(error, KeyboardInterrupt) or (self._pressed and not isinstance(error, OSError)):
+            return self._fail("interrupted; what was finished is kept", "", EXIT_INTERRUPTED)
         if isinstance(error, OSError):
             where = f"{error.filename}: " if error.filename else ""
             return self._fail(f"{where}{error.strerror or error}", "", EXIT_ERROR)
-        if self._pressed:  # a library that was interrupted while it was being imported fails in its own way
-            return self._fail("interrupted; what was finished is kept", "", EXIT_INTERRUPTED)
         if isinstance(error, Exception):
             hint = "" if self.verbose else "this is a fault of sdfsim; -v shows where"
             return self._fail(f"internal error: {type(error).__name__}: {error}", hint, EXIT_ERROR)
         return None
-
-    def _hear(self) -> None:
-        """Remember that Ctrl-C was pressed, whatever becomes of the exception it raises."""
-        default = signal.default_int_handler
-        if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) is not default:
-            return
-
-        def pressed(number: int, frame: FrameType | None) -> None:
-            self._pressed = True
-            raise KeyboardInterrupt
-
-        signal.signal(signal.SIGINT, pressed)
-        self._clean_up.callback(signal.signal, signal.SIGINT, default)
 
     def _lost_output(self, error: OSError) -> int:
         """The report cannot be written. Whoever read it and closed the pipe, such as `head`, has seen enough."""
@@ -123,21 +115,20 @@ class Session:
     def report(self, result: dict[str, Any], lines: list[str] | None = None) -> None:
         """The outcome: `result` for --json, `lines` (or the entries of `result`) for people."""
         self._result = result
-        if not self.as_json:
-            self._bar.close()
-            try:
-                print("\n".join(lines if lines is not None else _as_lines(result)), flush=True)
-            except OSError as error:
-                self.exit_code = self._lost_output(error)
+        if self.as_json:
+            return
+        self._bar.close()
+        try:
+            print("\n".join(_as_lines(_plain(result)) if lines is None else lines), flush=True)
+        except OSError as error:
+            self.exit_code = self._lost_output(error)
 
     def hold(self, why: str) -> None:
         """Wait for Ctrl-C, if a person is there to press it."""
-        if self.as_json or not sys.stdin.isatty():
-            return
-        self.say(why)
-        with contextlib.suppress(KeyboardInterrupt):
-            while True:
-                time.sleep(1.0)
+        if not self.as_json and sys.stdin.isatty():
+            self.say(why)
+            with contextlib.suppress(KeyboardInterrupt):
+                threading.Event().wait()
 
     def progress(self, fraction: float, message: str) -> None:
         """`fraction` (0 to 1) of the work is done."""
@@ -152,7 +143,6 @@ class _Bar:
     """A bar with an ETA on a terminal; elsewhere a line now and then."""
 
     def __init__(self) -> None:
-        self._on_terminal = sys.stderr.isatty()
         self._progress: Any = None
         self._task: Any = None
         self._stage: str | None = None
@@ -160,16 +150,21 @@ class _Bar:
         self._ended = False
 
     def update(self, stage: str, fraction: float, message: str) -> None:
-        fraction = min(max(fraction, 0.0), 1.0)
+        fraction, now = min(max(fraction, 0.0), 1.0), time.monotonic()
         title = f"{stage}: {message}" if stage and message else stage or message
         fresh = stage != self._stage
-        if fresh:
-            self._stage, self._started, self._ended = stage, time.monotonic(), False
-            self._from = fraction  # work that is gone on with begins in the middle
-        if self._on_terminal:
+        if fresh:  # work that is gone on with begins in the middle
+            self._stage, self._started, self._from, self._ended = stage, now, fraction, False
+        if sys.stderr.isatty():
             self._draw(fresh, fraction, title)
-        else:
-            self._tell(fresh, fraction, title)
+            return
+        end = fraction >= 1 and not self._ended
+        if fresh or end or (fraction < 1 and now - self._told >= _PLAIN_SECONDS):
+            self._told, self._ended = now, fraction >= 1
+            elapsed, done = now - self._started, fraction - self._from
+            known = done > 0.01 and fraction < 1
+            left = f", about {duration(elapsed * (1 - fraction) / done)} left" if known else ""
+            self.say(f"[{fraction:4.0%}] {title} ({duration(elapsed)}{left})")
 
     def _draw(self, fresh: bool, fraction: float, title: str) -> None:
         from rich.console import Console
@@ -178,23 +173,12 @@ class _Bar:
 
         if self._progress is None:
             texts = TextColumn("{task.description}", markup=False)
-            columns = (BarColumn(24), TaskProgressColumn(), TimeElapsedColumn(), "left:", Eta(), texts)
-            self._progress = Progress(*columns, console=Console(stderr=True))
+            parts = (BarColumn(24), TaskProgressColumn(), TimeElapsedColumn(), "left:", Eta(), texts)
+            self._progress = Progress(*parts, console=Console(stderr=True))
             self._progress.start()
         if fresh:
             self._task = self._progress.add_task(title, total=1.0)
         self._progress.update(self._task, completed=fraction, description=title)
-
-    def _tell(self, fresh: bool, fraction: float, title: str) -> None:
-        now = time.monotonic()
-        end = fraction >= 1 and not self._ended
-        if not (fresh or end or (fraction < 1 and now - self._told >= _PLAIN_SECONDS)):
-            return
-        self._told, self._ended = now, fraction >= 1
-        elapsed = now - self._started
-        done = fraction - self._from
-        left = f", about {duration(elapsed * (1 - fraction) / done)} left" if done > 0.01 and fraction < 1 else ""
-        print(f"[{fraction:4.0%}] {title} ({duration(elapsed)}{left})", file=sys.stderr, flush=True)
 
     def say(self, text: str) -> None:
         if self._progress is not None:
@@ -211,17 +195,15 @@ class _Bar:
 
 def duration(seconds: float) -> str:
     """`42 s`, `3 min 20 s`, `1 h 5 min`."""
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60} s"
-    return f"{whole // 3600} h {whole % 3600 // 60} min"
+    minutes, rest = divmod(round(seconds), 60)
+    if not minutes:
+        return f"{rest} s"
+    return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
 
 
 def columns(rows: Sequence[Sequence[str]]) -> list[str]:
     """The rows of a table as lines, their cells below each other."""
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
@@ -243,8 +225,6 @@ def _as_lines(result: dict[str, Any], indent: str = "") -> list[str]:
     for key, value in result.items():
         if isinstance(value, dict):
             lines += [f"{indent}{key}:", *_as_lines(value, indent + "  ")]
-        elif isinstance(value, float):
-            lines.append(f"{indent}{key}: {value:.6g}")
         else:
-            lines.append(f"{indent}{key}: {value}")
+            lines.append(f"{indent}{key}: {f'{value:.6g}' if isinstance(value, float) else value}")
     return lines

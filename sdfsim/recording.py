@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import colorsys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import torch
 
-from sdfsim.crowds import crowds
+from sdfsim.dynamics import pose
 from sdfsim.dynamics.memory import PHASES
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.files import replacing
-from sdfsim.scene.types import Body, Scene
-from sdfsim.shading import distinct_colors, sheet, with_normals
+from sdfsim.scene.scene import Scene
 from sdfsim.shape.mesh import Mesh
 
 if TYPE_CHECKING:
@@ -22,37 +24,26 @@ if TYPE_CHECKING:
 
 WORLD = "world"
 CONTACTS = "world/contacts"
-PLOTS = {
-    "kinetic_energy": "kinetic energy (J)",
-    "energy_gain": "energy from nothing (J)",
-    "worst_penetration": "worst penetration (m)",
-    "contacts": "contacts",
-    "pairs": "near pairs of bodies",
-    "free": "free",
-    "active": "active",
-    "asleep": "asleep",
-    "held_back": "held back",
-    "sdf_queries": "asked",
-    "sdf_waiting": "waiting",
-    "nodes": "nodes",
-    "edges": "edges",
-    "step_ms": "step",
-    **PHASES,
-}
+# What is plotted: the counters of a view by their legends.
 VIEWS = {
-    "kinetic energy (J)": ("kinetic_energy",),
-    "energy from nothing (J)": ("energy_gain",),
-    "worst penetration (m)": ("worst_penetration",),
-    "contacts": ("contacts", "pairs"),
-    "bodies": ("free", "active", "asleep", "held_back"),
-    "signed distances": ("sdf_queries", "sdf_waiting"),
-    "network": ("nodes", "edges"),
-    "milliseconds": ("step_ms", *PHASES),
+    "kinetic energy (J)": {"kinetic_energy": "kinetic energy (J)"},
+    "energy from nothing (J)": {"energy_gain": "energy from nothing (J)"},
+    "worst penetration (m)": {"worst_penetration": "worst penetration (m)"},
+    "contacts": {"contacts": "contacts", "pairs": "near pairs of bodies"},
+    "bodies": {"free": "free", "active": "active", "asleep": "asleep", "held_back": "held back"},
+    "signed distances": {"sdf_queries": "asked", "sdf_waiting": "waiting"},
+    "network": {"nodes": "nodes", "edges": "edges"},
+    "milliseconds": {"step_ms": "step", **PHASES},
 }
+PLOTS = {key: legend for view in VIEWS.values() for key, legend in view.items()}
 _STATIC_COLOR = (150, 150, 155)
 _NODE_COLOR = (20, 20, 20)
 _CONTACT_COLOR = (255, 40, 40)
 _PHOTO_PIXELS = 320
+MANY = 24  # bodies of one shape that do not stay put, from which on they are a crowd
+COLORS = 4  # copies share their mesh's colour, so a crowd is split to be told apart
+_CREASE = np.cos(np.radians(40.0))
+_MOST_CORNER_PAIRS = 1_000_000  # more, about 10,000 vertices, and a mesh counts as smooth: splitting triples its size
 FARTHEST = 1.0  # what leaves the scene for good must not make it a dot
 
 
@@ -72,9 +63,10 @@ class Playback:
         self._framed = framed(scene, motion)
         self._step = 0
         self._com = [b.scale * scene.shapes[b.shape].com for b in scene.bodies]
-        self._crowds = crowds(scene, WORLD)
+        self._crowds = _crowds(scene)
         crowded = {int(k) for crowd in self._crowds for k in crowd.bodies}
-        self._alone = [(k, path) for k, path in enumerate(body_paths(scene)) if k not in crowded]
+        paths = [f"{WORLD}/{rr.escape_entity_path_part(body.name)}" for body in scene.bodies]
+        self._alone = [(k, path) for k, path in enumerate(paths) if k not in crowded]
         self.stream = rr.RecordingStream("sdfsim")
 
     def blueprint(self) -> rrb.Blueprint:
@@ -113,7 +105,8 @@ class Playback:
             shape = scene.shapes[crowd.shape]
             mesh = Mesh(shape.mesh.vertices - shape.com, shape.mesh.faces, shape.mesh.colors)
             self.stream.log(crowd.path, _shaded(rr, mesh, next(hues)), static=True)
-            crowd.log_scale(self.stream, rr)
+            scales = np.repeat([[scene.bodies[k].scale] for k in crowd.bodies], 3, 1)
+            self.stream.log(crowd.path, rr.InstancePoses3D.from_fields(scales=scales), static=True)
         for k, path in self._alone:
             body, com = scene.bodies[k], self._com[k]
             shape = scene.shapes[body.shape]
@@ -125,20 +118,14 @@ class Playback:
             if len(shape.nodes):
                 nodes = rr.Points3D(shape.nodes * body.scale - com, colors=_NODE_COLOR, radii=rr.Radius.ui_points(2))
                 self.stream.log(f"{path}/nodes", nodes, static=True)
-            self._log_pose(path, body, com)
+            if body.motion == "static":  # it has one pose for good
+                centre = body.position + _turned(com, body.quat_xyzw)
+                pose = rr.Transform3D(translation=centre, quaternion=rr.Quaternion(xyzw=body.quat_xyzw))
+                self.stream.log(path, pose, static=True)
         style = rr.Points3D.from_fields(colors=_CONTACT_COLOR, radii=rr.Radius.ui_points(4))
         self.stream.log(CONTACTS, style, static=True)
         for key, name in PLOTS.items():
             self.stream.log(f"plots/{key}", rr.SeriesLines(names=name), static=True)
-
-    def _log_pose(self, path: str, body: Body, com: np.ndarray) -> None:
-        """Static bodies have one pose for good."""
-        if body.motion == "static":
-            from scipy.spatial.transform import Rotation
-
-            centre = body.position + Rotation.from_quat(body.quat_xyzw).apply(com)
-            pose = self._rr.Transform3D(translation=centre, quaternion=self._rr.Quaternion(xyzw=body.quat_xyzw))
-            self.stream.log(path, pose, static=True)
 
     def log_steps(self, chunk: Rollout) -> None:
         """Poses, contact points and counters of the frames of `chunk`, which follow the frames logged before."""
@@ -147,17 +134,50 @@ class Playback:
         self._step += frames
         times = [rr.TimeColumn("time", duration=chunk.time), rr.TimeColumn("step", sequence=steps)]
         for crowd in self._crowds:
-            crowd.log_steps(self.stream, rr, times, chunk)
+            places, turns = (getattr(chunk, k)[:, crowd.bodies] for k in ("position", "orientation"))
+            poses = rr.InstancePoses3D.columns(
+                translations=places.reshape(-1, 3).astype(np.float32),
+                quaternions=turns.reshape(-1, 4).astype(np.float32),
+            )
+            self.stream.send_columns(crowd.path, times, poses.partition(np.full(frames, len(crowd.bodies))))
         for i, path in self._alone:
             if self._scene.bodies[i].motion != "static":
-                poses = rr.Transform3D.columns(translation=chunk.position[:, i], quaternion=chunk.orientation[:, i])
-                self.stream.send_columns(path, times, poses)
+                motion = rr.Transform3D.columns(translation=chunk.position[:, i], quaternion=chunk.orientation[:, i])
+                self.stream.send_columns(path, times, motion)
         points = rr.Points3D.columns(positions=chunk.contact_point).partition(chunk.contact_count)
         self.stream.send_columns(CONTACTS, times, points)
         for key in PLOTS:
             if key in chunk.counters:
                 values = np.asarray(chunk.counters[key], dtype=np.float64)
                 self.stream.send_columns(f"plots/{key}", times, rr.Scalars.columns(scalars=values))
+
+
+class Crowd(NamedTuple):
+    """Bodies drawn as copies of one mesh, whose poses at a step are one row.
+
+    Attributes:
+        path: entity path.
+        shape: index into `Scene.shapes`.
+        bodies: [C] int64, which.
+    """
+
+    path: str
+    shape: int
+    bodies: np.ndarray
+
+
+def _crowds(scene: Scene) -> list[Crowd]:
+    """The crowds of a scene; bodies in none of them are drawn one by one."""
+    import rerun as rr
+
+    found = []
+    shape = np.array([b.shape if b.motion != "static" else -1 for b in scene.bodies])
+    for number, name in enumerate(s.name for s in scene.shapes):
+        members = np.flatnonzero(shape == number)
+        for k in range(COLORS if len(members) >= MANY else 0):
+            called = rr.escape_entity_path_part(f"{number}_{name}")
+            found.append(Crowd(f"{WORLD}/crowds/{called}/{k}", number, members[k::COLORS]))
+    return found
 
 
 def save_rollout(scene: Scene, rollout: Rollout, path: Path) -> None:
@@ -171,13 +191,6 @@ def save_rollout(scene: Scene, rollout: Rollout, path: Path) -> None:
     playback.log_static()
     playback.log_steps(rollout)
     _write(path, encoded)
-
-
-def body_paths(scene: Scene) -> list[str]:
-    """Entity path of every body, in order."""
-    import rerun as rr
-
-    return [f"{WORLD}/{rr.escape_entity_path_part(body.name)}" for body in scene.bodies]
 
 
 @dataclass(frozen=True)
@@ -288,22 +301,22 @@ def framed(scene: Scene, motion: Rollout | None = None) -> tuple[np.ndarray, flo
     nothing falls there; and, where the motion is known, their way. What flies farther than `FARTHEST` times the size
     of all this is followed so far only.
     """
-    from scipy.spatial.transform import Rotation
-
     boxes: dict[int, np.ndarray] = {}
     planes = []
     for k, body in enumerate(scene.bodies):
-        shape, turn = scene.shapes[body.shape], Rotation.from_quat(body.quat_xyzw)
+        shape = scene.shapes[body.shape]
         if not np.all(np.isfinite(shape.sdf.bounds)):
-            planes.append((body.position, turn.apply([0.0, 0.0, 1.0])))
+            planes.append((body.position, _turned(np.array([0.0, 0.0, 1.0]), body.quat_xyzw)))
         elif len(shape.mesh.vertices):
             box = np.stack([shape.mesh.vertices.min(0), shape.mesh.vertices.max(0)]) * body.scale
-            boxes[k] = body.position + turn.apply(np.stack(np.meshgrid(*box.T), -1).reshape(-1, 3))
+            corners = np.stack(np.meshgrid(*box.T), -1).reshape(-1, 3)
+            boxes[k] = body.position + _turned(corners, body.quat_xyzw)
     if not boxes:
         return np.zeros(3), 1.0
     start = np.concatenate(list(boxes.values()))
     below = [start - ((start - at) @ normal)[:, None] * normal for at, normal in planes]
-    low, high = _bounds(np.concatenate([start, *below]))
+    shown = np.concatenate([start, *below])
+    low, high = shown.min(0), shown.max(0)
     if motion is not None:
         size = float((high - low).max())
         for k, corners in boxes.items():
@@ -313,8 +326,9 @@ def framed(scene: Scene, motion: Rollout | None = None) -> tuple[np.ndarray, flo
     return (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
 
 
-def _bounds(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return points.min(0), points.max(0)
+def _turned(vectors: np.ndarray, quat_xyzw: np.ndarray) -> np.ndarray:
+    """Vectors [..., 3] turned by a unit quaternion [4]."""
+    return vectors @ pose.to_matrix(torch.from_numpy(quat_xyzw)).numpy().T
 
 
 def _shaded(rr: Any, mesh: Mesh, color: tuple[int, ...]) -> rr.Mesh3D:
@@ -327,3 +341,67 @@ def _shaded(rr: Any, mesh: Mesh, color: tuple[int, ...]) -> rr.Mesh3D:
         vertex_colors=mesh.colors,
         albedo_factor=color if mesh.colors is None else None,
     )
+
+
+def sheet(half: float) -> Mesh:
+    """A square of z = 0, `half` m to each side, shown for an infinite plane."""
+    vertices = np.array([[-half, -half, 0.0], [half, -half, 0.0], [half, half, 0.0], [-half, half, 0.0]])
+    return Mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+def distinct_colors(count: int) -> Iterator[tuple[int, ...]]:
+    """`count` RGB colours (0 to 255) whose hues are a golden angle from each other."""
+    for i in range(count):
+        rgb = colorsys.hsv_to_rgb((0.58 + i * 0.61803398875) % 1.0, 0.62, 0.9 if i % 2 == 0 else 0.75)
+        yield tuple(round(255 * c) for c in rgb)
+
+
+def with_normals(mesh: Mesh) -> tuple[Mesh, np.ndarray]:
+    """The mesh with normals [V, 3]: smooth, its vertices split along creases so that boxes keep their edges."""
+    normals = _corner_normals(mesh.vertices, mesh.faces)
+    if normals is None:
+        return mesh, _smooth_normals(mesh.vertices, mesh.faces)
+    colors = None if mesh.colors is None else mesh.colors[mesh.faces].reshape(-1, 3)
+    vertices = mesh.vertices[mesh.faces].reshape(-1, 3)
+    return Mesh(vertices, np.arange(len(vertices)).reshape(-1, 3), colors), normals
+
+
+def _face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """[F, 3], twice the area long."""
+    a, b, c = vertices[faces.T]
+    return np.cross(b - a, c - a)
+
+
+def _smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """[V, 3] area-weighted means of the faces around each vertex."""
+    total = np.zeros_like(vertices)
+    normal = _face_normals(vertices, faces)
+    for k in range(3):
+        np.add.at(total, faces[:, k], normal)
+    return _normalise(total)
+
+
+def _corner_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
+    """[3 F, 3] for every face corner the mean of the faces at its vertex that bend less than the crease angle.
+
+    None for a mesh so fine that it may pass as smooth.
+    """
+    owner = faces.reshape(-1)
+    order = np.argsort(owner, kind="stable")
+    valence = np.bincount(owner, minlength=len(vertices))
+    if (valence**2).sum() > _MOST_CORNER_PAIRS:
+        return None
+    start = np.cumsum(valence) - valence
+    repeats = valence[owner]
+    first = np.repeat(np.arange(len(owner)), repeats)
+    second = order[np.repeat(start[owner] - (np.cumsum(repeats) - repeats), repeats) + np.arange(repeats.sum())]
+    normal = _face_normals(vertices, faces)
+    unit = _normalise(normal)
+    near = (unit[first // 3] * unit[second // 3]).sum(1) >= _CREASE
+    total = np.zeros((len(owner), 3))
+    np.add.at(total, first[near], normal[second[near] // 3])
+    return _normalise(total)
+
+
+def _normalise(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)

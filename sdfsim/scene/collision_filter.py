@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sdfsim.scene.types import Body
+from sdfsim.scene.scene import Body
 
 
 @dataclass(frozen=True)
