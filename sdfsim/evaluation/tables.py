@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from sdfsim.data import metrics
 from sdfsim.console import columns
+from sdfsim.data import metrics
 
 SURVIVED = "0.25"  # m, the limit whose median survival time is shown
 NOTHING = "-"
