@@ -19,7 +19,6 @@ from tests.scene.test_load import problems_of
 CRATE = {
     "box": "{box: {size: [0.4, 0.4, 0.4]}}",
     "grid": "{primitive: {name: box, size: 0.4}, sdf: grid, resolution: 64}",
-    "mesh": "{primitive: {name: box, size: 0.4}, sdf: mesh}",
     "asset": "{asset: crate, sdf: grid}",
     "file": "{mesh: crate.ply, units: cm, sdf: mesh}",
 }
@@ -56,7 +55,7 @@ def test_a_ball_bounces_alike_off_a_box_a_grid_and_a_mesh(load, tmp_path, no_fit
     (tmp_path / "crate.ply").write_bytes(write_ply(larger))
     scenes = {key: load(falling_ball(shape)) for key, shape in CRATE.items()}
     kinds = {key: type(scene.shapes[1].sdf) for key, scene in scenes.items()}
-    assert kinds == {"box": BoxSdf, "grid": GridSdf, "mesh": MeshSdf, "asset": GridSdf, "file": MeshSdf}
+    assert kinds == {"box": BoxSdf, "grid": GridSdf, "asset": GridSdf, "file": MeshSdf}
     assert all(scene.missed == () for scene in scenes.values())
     expected = heights(scenes["box"])
     # Without the crate it would be half a metre lower by now.
