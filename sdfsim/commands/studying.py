@@ -61,15 +61,14 @@ def stress(
     device: Device = "auto",
     verbose: Verbose = False,
 ) -> None:
-    """The hard cases, with every model and the teacher: a table, a page, and recordings of what went wrong."""
+    """The hard cases, with every model and the teacher: a table, plots, and recordings of what went wrong."""
     with Session(as_json=as_json, verbose=verbose) as session:
-        from sdfsim.evaluation import hard_cases_run
-        from sdfsim.evaluation.hard_cases_page import report_notes, report_table, write_report
-        from sdfsim.evaluation.hard_cases_plots import check_matplotlib
+        from sdfsim.evaluation import stress as study
+        from sdfsim.evaluation.harness import check_matplotlib
         from sdfsim.playback import save_rollout
 
         check_matplotlib()
-        study = hard_cases_run.stress(
+        found = study.stress(
             out,
             models=model or [],
             quick=quick,
@@ -78,6 +77,10 @@ def stress(
             record=save_rollout,
             on_progress=session.progress,
         )
-        report = write_report(study, out)
+        report = study.write_report(found, out)
         tell_failed(session, report)
-        session.report(report, [*columns(report_table(study)), *report_notes(report)])
+        lost = [
+            f"{who}: {', '.join(f'{n} {what}' for what, n in lost.items())}" for who, lost in report["models"].items()
+        ]
+        table = columns(study.rows(found, {"missed": "!", "behind": "<"}))
+        session.report(report, [*table, "! beyond what is wanted, < worse than the teacher", *lost, f"wrote {out}"])

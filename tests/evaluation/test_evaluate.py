@@ -16,7 +16,7 @@ from tests.recordings import bouncing
 
 @pytest.fixture
 def replayed(monkeypatch):
-    """The model, and the baseline, do what was recorded."""
+    """The model does what was recorded."""
 
     def replay(model, group, shapes, steps, *_, **__):
         return group
