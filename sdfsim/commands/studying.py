@@ -14,14 +14,11 @@ from sdfsim.progress import Session, columns
 def tradeoff(
     out: Out,
     source: Annotated[
-        Path,
-        typer.Argument(
-            metavar="DATA|SCENE|MESHES", help="Dataset or scene.yaml: error against time. Meshes: the same of fits."
-        ),
-    ],
+        Path | None,
+        typer.Argument(metavar="SCENE|DATA_DIR", help="scene.yaml or dataset folder (default: a random scene)."),
+    ] = None,
     model: Annotated[
-        list[str] | None,
-        typer.Option(help="Bundled models or paths, the one to turn knobs on first (default: all)."),
+        list[str] | None, typer.Option(help="Bundled model or path; may be given again (default: all bundled ones).")
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="A few settings, in minutes.")] = False,
     as_json: Json = False,
@@ -31,17 +28,13 @@ def tradeoff(
     """What accuracy costs in time: knobs, models and engines on the same scenes; what is measured is kept in -o."""
     with Session(as_json=as_json, verbose=verbose) as session:
         from sdfsim.evaluation import tradeoff as study
-        from sdfsim.evaluation.hard_cases_plots import check_matplotlib
+        from sdfsim.evaluation.harness import check_matplotlib
 
         check_matplotlib()
-        report, rows, notes = study.run(
-            source,
-            out,
-            models=model or [],
-            quick=quick,
-            device=device,
-            on_progress=session.stage_progress,
+        report = study.tradeoff(
+            source, out, models=model or [], quick=quick, device=device, on_progress=session.stage_progress
         )
+        rows, notes = study.told(report)
         session.report(report, [*columns(rows), *notes])
 
 
