@@ -13,7 +13,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "samples"))
 import large
 
 
-
 def test_balls_start_inside_the_bowl_without_touching():
     inner = large.BALL * (large.ROOM * large.MOST_BALLS / (4 * large.PACKED)) ** (1 / 3)
     places = large.ball_places(large.MOST_BALLS, inner)
