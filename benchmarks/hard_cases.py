@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from sdfsim.evaluation.hard_cases import GROUPS
 from sdfsim.evaluation.stress import Study, accepted, draw_group, stress, table, write_report
 from sdfsim.files import write_json, write_text
 from sdfsim.playback import save_rollout
@@ -27,7 +28,7 @@ PICTURES = {"stack": "stability_stacks.png", "bounce": "stability_bounces.png", 
 def write_document(study: Study) -> None:
     """Replace the table of the document and its pictures."""
     form = "Short form, `sdfsim stress --quick`:" if study.quick else "Long form, `sdfsim stress`:"
-    pictures = "\n".join(f"![{group}](images/{name})" for group, name in PICTURES.items())
+    pictures = "\n".join(f"![{GROUPS[group].title}](images/{name})" for group, name in PICTURES.items())
     before, rest = DOCUMENT.read_text(encoding="utf-8").split(BEGIN)
     shown = f"{BEGIN}\n\n{form}\n\n{table(study)}\n{pictures}\n\n{END}"
     write_text(DOCUMENT, before + shown + rest.split(END)[1])

@@ -296,6 +296,17 @@ def _save(pyplot: Any, figure: Any, path: Path, dpi: int) -> None:
 
 
 @contextmanager
+def one_thread() -> Iterator[None]:
+    """torch computes in one thread inside the block, whose time is then the processor's."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextmanager
 def peak_memory() -> Iterator[dict[str, float | None]]:
     """Puts under "mib" by how much the process grew inside the block at most; None where Linux does not tell."""
     told: dict[str, float | None] = {"mib": None}

@@ -253,7 +253,7 @@ def cell(study: Study, case: Case, figure: Figure, who: str) -> tuple[str, str]:
     if result is None:
         return "-", "told"
     now, spread = value(result, figure), noise(result, figure)
-    shown = f"{now:.{figure.digits}f}"
+    shown = f"{round(now, figure.digits) + 0.0:.{figure.digits}f}"  # no minus before a zero
     if float(f"{spread:.{figure.digits}f}") > 0:
         shown += f" ± {spread:.{figure.digits}f}"
     shown += f" {figure.unit}"

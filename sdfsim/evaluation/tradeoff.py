@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import csv
 import io
-import os
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 import sdfsim
 from sdfsim.data.batching import scene_of
@@ -49,6 +46,7 @@ from sdfsim.evaluation.harness import (
     machine,
     measure,
     number,
+    one_thread,
     peak_memory,
 )
 from sdfsim.evaluation.penetration import Solid, exact_solids, penetration
@@ -218,7 +216,6 @@ class Setting:
         bf16: matrix products of the network are rounded to bfloat16.
         learned_flight: the paper network predicts free flight too.
         sleep: freeze what has come to rest.
-        threads: of the processor.
         device: "cpu" or "cuda".
         contact: off is the ballistic baseline.
     """
@@ -232,7 +229,6 @@ class Setting:
     bf16: bool = False
     learned_flight: bool = False
     sleep: bool = False
-    threads: int = 1
     device: str = "cpu"
     contact: bool = True
 
@@ -265,7 +261,6 @@ def settings(models: Sequence[str], *, quick: bool, cuda: bool) -> list[Setting]
             if not quick:
                 knobs += [{"sdf": "grid 32"}, {"sdf": "grid 128"}, {"reach": 0.5}, {"reach": 2.0}, {"sleep": True}]
             knobs += [{"device": "cuda"}] if cuda else []
-            knobs += [{"threads": 2}] if (os.cpu_count() or 1) > 1 and not quick else []
         else:
             knobs = []
         if kinds[name] == "paper":
@@ -304,23 +299,12 @@ def _arranged_shape(setting: Setting, shape: Shape, most: int | None) -> Shape:
     return replace(shape, nodes=shape.nodes[:most])
 
 
-@contextmanager
-def threads(count: int) -> Iterator[None]:
-    """Computes with so many threads inside the block."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
 # --- measuring ---
 
 
 def measure_ours(setting: Setting, cases: Cases) -> dict[str, Any]:
     """Errors and times of our simulator in one setting: see `_judged` and `_times`."""
-    with threads(setting.threads), peak_memory() as memory:
+    with peak_memory() as memory:
         began = time.perf_counter()
         model, shapes = arranged(setting, cases)
         prepared = time.perf_counter() - began
@@ -333,9 +317,8 @@ def measure_ours(setting: Setting, cases: Cases) -> dict[str, Any]:
     result = _judged(motions, cases) | {"prepare_s": prepared, "peak_mib": memory["mib"]}
     if result["exploded"]:
         return result
-    with threads(setting.threads):
-        return result | _times([_time_simulator(setting, model, shapes, cases) for _ in range(REPEATS)], cases,
-                               one_core=setting.threads == 1 and device.type == "cpu")  # fmt: skip
+    repeats = [_time_simulator(setting, model, shapes, cases) for _ in range(REPEATS)]
+    return result | _times(repeats, cases, one_core=device.type == "cpu")
 
 
 def _time_simulator(setting: Setting, model: Model, shapes: dict[str, Shape], cases: Cases) -> Timing:
@@ -393,7 +376,7 @@ def _judged(motions: list[Trajectory], cases: Cases) -> dict[str, Any]:
 def _times(repeats: list[Timing], cases: Cases, *, one_core: bool) -> dict[str, Any]:
     """Milliseconds of computing per simulated second.
 
-    What works in one thread is timed by the processor's clock: on a shared core the wall shows what others do.
+    All work in one thread, and are timed by the processor's clock: on a shared core the wall shows what others do.
     """
     per_second = 1.0 / (cases.recorded[0].dt * cases.time)
     taken = np.array([r.cpu_ms if one_core else r.wall_ms for r in repeats]) * per_second
@@ -439,7 +422,7 @@ def tradeoff(
         raise SdfsimError(f"{source}: no such file or folder", "give a dataset or a scene.yaml")
     cuda = pick_device(device).type == "cuda"
     names = list(models) or model_names()
-    with locked(out):
+    with locked(out), one_thread():
         on_progress("scenes", 0.0, "reading scenes and shapes")
         if source and source.is_dir():
             cases = load_cases(source, quick=quick)
