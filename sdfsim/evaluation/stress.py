@@ -91,44 +91,32 @@ def stress(
     if twice := {name for name in who if who.count(name) > 1}:
         raise SdfsimError(f"two models are called {min(twice)!r}", "rename a file: results are kept by name")
     found = cases(quick=quick, shapes=shapes)
-    taught = _teacher_is_here()
-    jobs = []
+    with_teacher = _teacher_is_here()
+    jobs, cut = [], {}
     for case in found:
         repeats = [case.scenes(repeat) for repeat in range(case.repeats)]
         weight = _weight(case, repeats)
         content = [VERSION, case.seconds, case.steps, case.variant, [figure.name for figure in case.figures], repeats]
         for model in tested:
+            arguments = (case, model, device, out, record)
             if _takes_part(case, model):
-                jobs.append(
-                    Job(
-                        case.name,
-                        model.name,
-                        [content, model, device],
-                        _tried,
-                        (case, model, device, out, record),
-                        weight,
-                    )
-                )
-        if taught and case.teacher:
-            settings = [TEACHER_VERSION, engine_settings(DT, SUBSTEPS)]
-            jobs.append(
-                Job(case.name, TEACHER, [content, settings], _tried, (case, None, "", out, None), 0.05 * weight)
-            )
+                jobs.append(Job(case.name, model.name, [content, model, device], _tried, arguments, weight))
+        if with_teacher and case.teacher:
+            settings, arguments = [TEACHER_VERSION, engine_settings(DT, SUBSTEPS)], (case, None, "", out, None)
+            jobs.append(Job(case.name, TEACHER, [content, settings], _tried, arguments, 0.05 * weight))
+            cut |= {id(shape): shape for scene in repeats[0] for shape in scene.shapes}
     with locked(out):
-        if taught:  # before the work is split up, so that no two processes cut one mesh into pieces
-            for shape in {
-                id(s): s for case in found if case.teacher for scene in case.scenes(0) for s in scene.shapes
-            }.values():
-                if not isinstance(shape.sdf, PlaneSdf):
-                    shape_urdf(shape, out / "engine")
+        for shape in cut.values():  # before the work is split up, so that no two processes cut one mesh into pieces
+            if not isinstance(shape.sdf, PlaneSdf):
+                shape_urdf(shape, out / "engine")
         results = measure(jobs, out / "results", where="cores", on_progress=on_progress)
     if failed := [f"{case} with {one}: {r['failed']}" for (case, one), r in results.items() if "failed" in r]:
         raise SdfsimError(failed[0])
-    return Study(found, [*who, TEACHER] if taught else who, results, quick)
+    return Study(found, [*who, TEACHER] if with_teacher else who, results, quick)
 
 
 def _takes_part(case: Case, model: Model) -> bool:
-    """Other arithmetic is for networks; the solver has one, and no other device than the CPU."""
+    """Other arithmetic is for networks: the solver has none, and no other device than the CPU."""
     if case.variant == "float32":
         return True
     return model.kind != SOLVER and (case.variant != "cuda" or torch.cuda.is_available())
