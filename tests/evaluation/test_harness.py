@@ -40,7 +40,7 @@ def noted(file: Path, value: float) -> dict:
     return {"value": value, "pair": (value, value)}
 
 
-@pytest.mark.parametrize("where", ["here", "cores", "fresh"])
+@pytest.mark.parametrize("where", ["here", "cores", pytest.param("fresh", marks=pytest.mark.slow)])
 def test_results_are_made_once_and_again_when_their_content_changes(tmp_path, where):
     ran = tmp_path / "ran"
     jobs = [Job(f"case {k}", "method", [k], noted, (ran, float(k))) for k in range(2)]
