@@ -5,7 +5,8 @@ import shutil
 from pathlib import Path
 
 import pytest
-from sdfsim.scene.load import load_scene
+
+from sdfsim.scene.scene_file import load_scene
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]

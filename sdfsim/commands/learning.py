@@ -94,7 +94,7 @@ def evaluate(
     """Errors of a model's rollouts on recorded trajectories, and the quality of its motion."""
     with Session(as_json=as_json, verbose=verbose) as session:
         from sdfsim.evaluation.evaluate import evaluate as run_evaluation
-        from sdfsim.evaluation.tables import report_lines
+        from sdfsim.evaluation.evaluate import report_lines
 
         report = run_evaluation(
             data,

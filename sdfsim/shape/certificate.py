@@ -25,7 +25,7 @@ EXACT: tuple[tuple[str, float], ...] = (
     ("sign_errors", 1.0e-3),
 )
 # With larger errors than these bodies rest at another height than they should by 5 % of their size, creep, or leave a
-# straight hit more than 6 degrees aside: benchmarks/usable_fields.py derives the limits. Distances farther away only
+# straight hit more than 6 degrees aside: docs/sdf.md tells how the limits were found. Distances farther away only
 # decide where contacts are searched for, and 0.8 of them is trusted.
 USABLE: tuple[tuple[str, float], ...] = (
     ("error_within_0.01", 3.2e-3),

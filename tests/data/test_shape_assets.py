@@ -14,7 +14,7 @@ from sdfsim.data.generate import make_dataset
 from sdfsim.data.pybullet_sim import Teacher, TeacherBody
 from sdfsim.data.shape_assets import COLLISION, VISUAL, decompose, origins, prepare, split_of, wavefront
 from sdfsim.errors import SdfsimError
-from sdfsim.evaluation.baselines import engine_file
+from sdfsim.evaluation.engines import dataset_urdf
 from sdfsim.files import locked
 from sdfsim.shape import primitives
 from sdfsim.shape.mesh import Mesh, signed_volume
@@ -102,7 +102,7 @@ def test_engine_files_can_be_moved(tmp_path, monkeypatch):
     for kind in ("own", "kubric"):
         for start in (Path(), tmp_path):
             urdf = start / "second" / "shapes" / "engine" / kind / "block.urdf"
-            assert engine_file(tmp_path / "second", f"{kind}/block").samefile(urdf)
+            assert dataset_urdf(tmp_path / "second", f"{kind}/block").samefile(urdf)
             with Teacher(np.array([0.0, 0.0, -10.0])) as teacher:
                 teacher.add(TeacherBody(urdf, 1.0, 6.0, 0.5, 0.0), (0.0, 0.0, 2.0))
                 assert teacher.inertia(0) == pytest.approx([1.0, 1.0, 1.0], rel=0.1)

@@ -7,7 +7,7 @@ import pytest
 
 from sdfsim.data.pybullet_sim import write_urdf
 from sdfsim.errors import SdfsimError
-from sdfsim.evaluation.baselines import collision_mesh
+from sdfsim.evaluation.engines import collision_mesh
 from sdfsim.evaluation.penetration import Solid, deepest, exact_solids, penetration
 from sdfsim.shape import primitives
 from sdfsim.shape.asset import analytic_shape, with_sdf
