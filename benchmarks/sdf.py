@@ -17,19 +17,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from sdfsim.shape.fit_metrics import EXACT
+from sdfsim.shape.mlp_sdf import MlpSdf
+from sdfsim.shape.shape import load_shape
+from sdfsim.shape.watertight import solidify
 
 from sdfsim.errors import SdfsimError, run_main
 from sdfsim.evaluation.harness import Job, Line, Panel, Results, draw, machine, markdown, measure, number
 from sdfsim.files import write_text
-from sdfsim.shape.asset import load_shape
-from sdfsim.shape.certificate import EXACT
-from sdfsim.shape.exact import MeshSdf
-from sdfsim.shape.fit import FIT_VERSION, Recipe, fit_mesh
-from sdfsim.shape.grid import sample_grid
+from sdfsim.shape.fit import FIT_VERSION, PLANS, Recipe, fit_mesh
 from sdfsim.shape.mesh import load_mesh
-from sdfsim.shape.mlp import MlpSdf
-from sdfsim.shape.plans import PLANS
-from sdfsim.shape.solid import solidify
+from sdfsim.shape.sdf import MeshSdf, sample_grid
 
 WIDTHS, BUDGETS = (32, 128), (5.0, 10.0, 20.0)  # s
 GRID, POINTS, REPEATS, CHUNK = 64, 250_000, 5, 16_384

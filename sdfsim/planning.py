@@ -18,7 +18,7 @@ from sdfsim.dynamics.simulator import Simulator, pick_device
 from sdfsim.scene.effects import Plan, plan
 from sdfsim.scene.scene import Effects, Scene
 from sdfsim.scene.scene_file import DEFAULT_DURATION, DEFAULT_GRAVITY, load_scene
-from sdfsim.shape.mlp import MlpSdf
+from sdfsim.shape.mlp_sdf import MlpSdf
 
 TRIAL_STEPS = 5
 

@@ -37,7 +37,7 @@ from sdfsim.files import (
 )
 from sdfsim.recording import Playback, save_rollout
 from sdfsim.scene.scene_file import load_scene
-from sdfsim.shape.bank import SdfBank
+from sdfsim.shape.sdf_batch import SdfBank
 
 Viewer = Literal["none", "file", "native", "web"]
 Progress = Callable[[str, float, str], None]  # stage, fraction of it that is done, message

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from sdfsim.shape.shape import load_shape, scaled
 from typer.testing import CliRunner
 
 import cli
@@ -17,9 +18,7 @@ from sdfsim.fitting import Options, fit_many, named_meshes
 from sdfsim.parallel import cluster, parallel
 from sdfsim.scene.scene_file import UNITS
 from sdfsim.shape import primitives
-from sdfsim.shape.asset import load_shape, scaled
-from sdfsim.shape.mesh import Mesh
-from sdfsim.shape.storage import write_ply
+from sdfsim.shape.mesh import Mesh, write_ply
 
 QUICK = Options(budget=1.0)
 

@@ -21,8 +21,7 @@ from pipeline.mesh.visibility import Caster
 from pipeline.progress import Progress, quiet, share_of
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, replacing, write_json
-from sdfsim.shape.mesh import Mesh
-from sdfsim.shape.storage import write_ply
+from sdfsim.shape.mesh import Mesh, write_ply
 
 SCENERY = "scene"
 RESOLUTION = {"quick": 192, "standard": 288, "fine": 448, "paper": 448}  # samples a side, by preset

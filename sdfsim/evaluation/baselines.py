@@ -18,7 +18,7 @@ from sdfsim.dynamics.model import Model
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.engines import Start, bullet, dataset_urdf
 from sdfsim.parallel import parallel
-from sdfsim.shape.asset import Shape
+from sdfsim.shape.shape import Shape
 
 # m/s; 0 tells what the recording alone does not bring back: an engine's state is more than its recorded frames.
 PERTURBATIONS = {"0": 0.0, "1e-6": 1e-6, "1e-3": 1e-3}

@@ -20,10 +20,10 @@ from sdfsim.dynamics.bodies import Units
 from sdfsim.errors import SdfsimError
 from sdfsim.files import replacing, write_text
 from sdfsim.scene.scene import Body, Scene
-from sdfsim.shape.analytic import BoxSdf, PlaneSdf, SphereSdf
-from sdfsim.shape.asset import Shape
 from sdfsim.shape.mesh import Mesh, convex_hull, load_pieces
 from sdfsim.shape.primitives import PRIMITIVES, convex_pieces
+from sdfsim.shape.sdf import BoxSdf, PlaneSdf, SphereSdf
+from sdfsim.shape.shape import Shape
 
 SAME_INERTIA = 1e-3  # relative
 SOFTEST = 3.0  # MuJoCo: time constant of a contact over the engine's step, at least 2 for it to be stable

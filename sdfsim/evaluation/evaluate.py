@@ -24,7 +24,7 @@ from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.baselines import ballistic, chaos_floor
 from sdfsim.evaluation.harness import Progress
 from sdfsim.evaluation.penetration import EVERY, Solid, exact_solids, penetration
-from sdfsim.shape.asset import Shape
+from sdfsim.shape.shape import Shape
 from sdfsim.training.contact_cache import inner_steps
 
 LIMITS = (0.1, 0.25, 0.5)  # m, translation errors that a body survives

@@ -24,9 +24,8 @@ from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.engines import body_inertia
 from sdfsim.evaluation.penetration import rollout_penetration
 from sdfsim.scene.scene import Body, Effects, Scene
-from sdfsim.shape.asset import Shape, analytic_shape
-from sdfsim.shape.cache import shape_from_mesh, shape_from_primitive
 from sdfsim.shape.mesh import MESH_SUFFIXES
+from sdfsim.shape.shape import Shape, analytic_shape, shape_from_mesh, shape_from_primitive
 
 G = 10.0  # m/s^2
 FRICTION, RESTITUTION = 0.8, 0.5  # of a body

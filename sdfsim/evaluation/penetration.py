@@ -15,12 +15,10 @@ from sdfsim.dynamics.rollout import Rollout
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.engines import dataset_urdf, pieces_of
 from sdfsim.scene.scene import Scene
-from sdfsim.shape.analytic import PlaneSdf
-from sdfsim.shape.asset import Shape, with_sdf
 from sdfsim.shape.distance import PiecesDistance
-from sdfsim.shape.exact import MeshSdf
-from sdfsim.shape.grid import GridSdf
-from sdfsim.shape.mlp import MlpSdf
+from sdfsim.shape.mlp_sdf import MlpSdf
+from sdfsim.shape.sdf import GridSdf, MeshSdf, PlaneSdf
+from sdfsim.shape.shape import Shape, with_sdf
 
 TOUCH = 0.01  # mean sizes of the moving bodies; a node this near to another surface is in contact
 EVERY = 10  # frames between two that are looked at

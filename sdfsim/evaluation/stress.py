@@ -24,7 +24,7 @@ from sdfsim.evaluation.hard_cases import GROUPS, Case, Figure, Run, cases, ran_a
 from sdfsim.evaluation.harness import Job, Line, Panel, Progress, Results, check_matplotlib, draw, markdown, measure
 from sdfsim.files import locked, read_json, write_json, write_text
 from sdfsim.scene.scene import Scene
-from sdfsim.shape.analytic import PlaneSdf
+from sdfsim.shape.sdf import PlaneSdf
 
 VERSION = 2  # counts up when what is measured changes, so that kept results are measured again
 TEACHER = "teacher"

@@ -52,11 +52,10 @@ from sdfsim.evaluation.penetration import Solid, exact_solids, penetration
 from sdfsim.files import locked, write_json, write_text
 from sdfsim.scene.scene import Scene
 from sdfsim.scene.scene_file import load_scene
-from sdfsim.shape.asset import Shape, with_nodes
-from sdfsim.shape.exact import MeshSdf
-from sdfsim.shape.grid import GridSdf, sample_grid
-from sdfsim.shape.mlp import MlpSdf
-from sdfsim.shape.nodes import hull_nodes
+from sdfsim.shape.mlp_sdf import MlpSdf
+from sdfsim.shape.sdf import GridSdf, MeshSdf, sample_grid
+from sdfsim.shape.shape import Shape, with_nodes
+from sdfsim.shape.surface_nodes import hull_nodes
 
 VERSION = 1  # counts up when what is measured changes, so that kept results are measured again
 REPEATS = 5

@@ -23,7 +23,8 @@ from pydantic_core import InitErrorDetails, PydanticCustomError, core_schema
 
 from sdfsim.errors import SceneError, SdfsimError
 from sdfsim.scene.scene import Body, Effects, Limits, Motion, Scene, Waypoints
-from sdfsim.shape.asset import (
+from sdfsim.shape.primitives import PRIMITIVES
+from sdfsim.shape.shape import (
     DEFAULT_RESOLUTION,
     MESH_FILE,
     RECORD_FILE,
@@ -32,11 +33,11 @@ from sdfsim.shape.asset import (
     Shape,
     analytic_shape,
     load_shape,
+    shape_from_mesh,
+    shape_from_primitive,
     with_nodes,
     with_sdf,
 )
-from sdfsim.shape.cache import shape_from_mesh, shape_from_primitive
-from sdfsim.shape.primitives import PRIMITIVES
 
 VERSION = 1
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}

@@ -12,23 +12,11 @@ import torch
 
 from sdfsim.errors import SdfsimError
 from sdfsim.files import write_json
-from sdfsim.shape.analytic import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.distance import MeshDistance
-from sdfsim.shape.exact import MeshSdf
-from sdfsim.shape.grid import GridSdf, sample_grid
-from sdfsim.shape.mesh import Frame, Mesh, convex_hull
-from sdfsim.shape.mlp import MlpSdf
-from sdfsim.shape.sdf import Sdf
-from sdfsim.shape.storage import (
-    FORMAT_VERSION,
-    finite,
-    read_mesh,
-    read_record,
-    sdf_from_file,
-    sdf_to_file,
-    write,
-    write_ply,
-)
+from sdfsim.shape.mesh import Frame, Mesh, convex_hull, read_mesh, write_ply
+from sdfsim.shape.mlp_sdf import MlpSdf
+from sdfsim.shape.sdf import BoxSdf, CapsuleSdf, CylinderSdf, GridSdf, MeshSdf, PlaneSdf, Sdf, SphereSdf, sample_grid
+from sdfsim.shape.shape import FORMAT_VERSION, finite, read_record, sdf_from_file, sdf_to_file, write
 
 SdfKind = Literal["mlp", "grid", "mesh"]
 
@@ -226,7 +214,7 @@ def with_nodes(shape: Shape, grid: int) -> Shape:
     Raises:
         SdfsimError: the SDF has no end, or no point of the grid reached its surface.
     """
-    from sdfsim.shape.nodes import sample_nodes
+    from sdfsim.shape.surface_nodes import sample_nodes
 
     nodes = sample_nodes(shape.sdf, grid=grid)
     # What was measured of the former nodes does not hold for these.

@@ -8,24 +8,24 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 
-from sdfsim.shape import grid, mlp
-from sdfsim.shape.analytic import (
+from sdfsim.shape import mlp_sdf, sdf
+from sdfsim.shape.far_field import everywhere, half_extents
+from sdfsim.shape.mlp_sdf import Activation, MlpSdf, sides, value_and_gradient
+from sdfsim.shape.sdf import (
     BoxSdf,
     CapsuleSdf,
     CylinderSdf,
+    GridSdf,
     PlaneSdf,
+    Sdf,
     SphereSdf,
     box_distance,
     capsule_distance,
     cylinder_distance,
     plane_distance,
     sphere_distance,
+    trilinear,
 )
-from sdfsim.shape.boxed import everywhere, half_extents
-from sdfsim.shape.grid import GridSdf, trilinear
-from sdfsim.shape.mlp import MlpSdf, sides
-from sdfsim.shape.sdf import Sdf
-from sdfsim.shape.sweep import Activation, value_and_gradient
 
 FITTED_TRUST = 0.8  # of a fitted or sampled distance: its errors are far smaller, and grow with the distance
 

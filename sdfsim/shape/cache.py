@@ -13,10 +13,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from sdfsim.errors import SdfsimError
-from sdfsim.shape.asset import DEFAULT_RESOLUTION, SdfKind, Shape, load_shape, scaled, sdf_of_mesh
 from sdfsim.shape.mesh import Mesh, load_mesh
-from sdfsim.shape.nodes import DEFAULT_COUNT
-from sdfsim.shape.storage import FORMAT_VERSION
+from sdfsim.shape.shape import DEFAULT_RESOLUTION, FORMAT_VERSION, SdfKind, Shape, load_shape, scaled, sdf_of_mesh
+from sdfsim.shape.surface_nodes import DEFAULT_COUNT
 
 Progress = Callable[[float, str], None]
 
@@ -131,7 +130,7 @@ def mesh_shape(
         SdfsimError: the mesh cannot be used.
     """
     from sdfsim.shape.fit import surface_nodes
-    from sdfsim.shape.solid import solidify
+    from sdfsim.shape.watertight import solidify
 
     solid = solidify(mesh, name=name, cap=closing.cap, thicken=closing.thicken)
     sdf, note = sdf_of_mesh(solid.surface, kind, resolution, on_progress)

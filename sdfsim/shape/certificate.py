@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sdfsim.shape.boxed import BOX
-from sdfsim.shape.coverage import coverage, hausdorff, outward_samples
 from sdfsim.shape.distance import DistanceOracle
+from sdfsim.shape.far_field import BOX
+from sdfsim.shape.fit_metrics import coverage, hausdorff, outward_samples
 from sdfsim.shape.mesh import Frame, normal_frame, sample_surface
 from sdfsim.shape.sdf import Sdf
 

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 
-from sdfsim.shape.boxed import BOX
 from sdfsim.shape.bvh import ClosestPoint
 from sdfsim.shape.distance import DistanceOracle, MeshDistance
+from sdfsim.shape.far_field import BOX
 from sdfsim.shape.mesh import Frame, Mesh, normal_frame, sample_surface, signed_volume
-from sdfsim.shape.nodes import project
 from sdfsim.shape.sdf import Sdf
+from sdfsim.shape.surface_nodes import project
 
 # Lengths are relative to the shape's largest extent.
 FAR_FROM_A_NODE = 0.1

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sdfsim.shape.repair import face_normals
+from sdfsim.shape.watertight import face_normals
 
 # [P, 3] points of faces and the unit normals there -> [P] int: 0 where that is no boundary, else of how many layers in
 # the same place, negative where it is wound inwards.

@@ -13,17 +13,17 @@ import numpy as np
 import torch
 
 from sdfsim.errors import SdfsimError
-from sdfsim.shape import training
-from sdfsim.shape.asset import Shape
-from sdfsim.shape.certificate import certify
+from sdfsim.shape import fit
 from sdfsim.shape.distance import DistanceOracle, MeshDistance, PiecesDistance
+from sdfsim.shape.fit import PLANS
+from sdfsim.shape.fit_metrics import certify
 from sdfsim.shape.mass import mass_properties, mass_properties_of_sdf
 from sdfsim.shape.mesh import Mesh, clean, is_closed
-from sdfsim.shape.mlp import MlpSdf
-from sdfsim.shape.nodes import DEFAULT_COUNT, edge_nodes, hull_nodes, sample_nodes, thin
-from sdfsim.shape.plans import PLANS
+from sdfsim.shape.mlp_sdf import MlpSdf
 from sdfsim.shape.sdf import Sdf, accepts_numpy
-from sdfsim.shape.solid import solidify
+from sdfsim.shape.shape import Shape
+from sdfsim.shape.surface_nodes import DEFAULT_COUNT, edge_nodes, hull_nodes, sample_nodes, thin
+from sdfsim.shape.watertight import solidify
 
 Recipe = Literal["quick", "default", "paper"]
 Progress = Callable[[float, str], None]

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from sdfsim.errors import SdfsimError
-from sdfsim.shape.boxed import BOX, everywhere, half_extents
+from sdfsim.shape.far_field import BOX, everywhere, half_extents
 from sdfsim.shape.mesh import Frame, normal_frame
 from sdfsim.shape.sdf import accepts_numpy
 

@@ -12,10 +12,8 @@ from typing import Any
 import numpy as np
 
 from sdfsim.errors import SdfsimError
-from sdfsim.shape.gltf import check_gltf
-from sdfsim.shape.repair import without_doubles
-from sdfsim.shape.rows import check_rows
-from sdfsim.shape.wavefront import counted_forwards
+from sdfsim.shape.mesh import check_gltf, check_rows, counted_forwards
+from sdfsim.shape.watertight import without_doubles
 
 # Its readers log what they pass over, some with tracebacks; who wants to see that can still listen.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())

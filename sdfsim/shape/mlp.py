@@ -8,10 +8,10 @@ from functools import cached_property
 import numpy as np
 import torch
 
-from sdfsim.shape.boxed import everywhere, half_extents
+from sdfsim.shape.far_field import everywhere, half_extents
 from sdfsim.shape.mesh import Frame
+from sdfsim.shape.mlp_sdf import Activation, value_and_gradient
 from sdfsim.shape.sdf import accepts_numpy
-from sdfsim.shape.sweep import Activation, value_and_gradient
 
 # Points prepared and finished at once, a few hundred bytes each.
 CHUNK = 131_072

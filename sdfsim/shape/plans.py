@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from sdfsim.shape.sweep import Activation
+from sdfsim.shape.mlp_sdf import Activation
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from sdfsim.shape.boxed import BOX
 from sdfsim.shape.distance import DistanceOracle
+from sdfsim.shape.far_field import BOX
+from sdfsim.shape.fit import Plan
 from sdfsim.shape.mesh import Frame, normal_frame, sample_surface
-from sdfsim.shape.plans import Plan
 
 # Points are drawn from a little beyond the box that is used: at the very edge of its data a network's slope is poor.
 MARGIN = 1.15

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from sdfsim.errors import SdfsimError
-from sdfsim.shape import repair
+from sdfsim.shape import watertight
 from sdfsim.shape.bvh import ClosestPoint, Winding
-from sdfsim.shape.cutting import centres_and_normals, exposed, no_longer_than
 from sdfsim.shape.mass import integrals
 from sdfsim.shape.mesh import Frame, Mesh, clean, is_closed, normal_frame
+from sdfsim.shape.watertight import centres_and_normals, exposed, no_longer_than
 
 # Openings are closed unasked up to this fraction of the surface, smallest first.
 SMALL = 0.02

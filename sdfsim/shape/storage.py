@@ -10,13 +10,9 @@ import torch
 
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, replacing
-from sdfsim.shape.analytic import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, SphereSdf
-from sdfsim.shape.exact import MeshSdf
-from sdfsim.shape.grid import GridSdf
 from sdfsim.shape.mesh import Frame, Mesh
-from sdfsim.shape.mlp import MlpSdf
-from sdfsim.shape.sdf import Sdf
-from sdfsim.shape.sweep import ACTIVATIONS
+from sdfsim.shape.mlp_sdf import ACTIVATIONS, MlpSdf
+from sdfsim.shape.sdf import BoxSdf, CapsuleSdf, CylinderSdf, GridSdf, MeshSdf, PlaneSdf, Sdf, SphereSdf
 
 FORMAT_VERSION = 1
 

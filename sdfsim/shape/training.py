@@ -15,11 +15,9 @@ import torch
 from sdfsim.parallel import choose_threads
 from sdfsim.shape.checkpoint import Checkpoint
 from sdfsim.shape.distance import DistanceOracle
-from sdfsim.shape.mlp import MlpSdf
-from sdfsim.shape.plans import Plan
-from sdfsim.shape.sampling import CHECKED, Subject, stack
+from sdfsim.shape.fit import CHECKED, Plan, Subject, stack
+from sdfsim.shape.mlp_sdf import Activation, MlpSdf, Tape, value_and_gradient
 from sdfsim.shape.soap import Adam, Soap
-from sdfsim.shape.sweep import Activation, Tape, value_and_gradient
 
 WARMUP = 50
 CHECK = 100

@@ -6,11 +6,11 @@ import json
 from dataclasses import replace
 
 import pytest
+from sdfsim.shape.shape import load_shape
 
-from sdfsim.shape import plans, primitives
-from sdfsim.shape.asset import load_shape
+from sdfsim.shape import fit, primitives
 from sdfsim.shape.checkpoint import Checkpoint
-from sdfsim.shape.storage import write_ply
+from sdfsim.shape.mesh import write_ply
 from tests.cli.conftest import run
 
 

@@ -8,6 +8,8 @@ import torch
 
 pytest.importorskip("pybullet")
 
+from sdfsim.shape.shape import Shape, analytic_shape, sdf_of_mesh
+
 from sdfsim.data import batching, generate, scenarios
 from sdfsim.data.dataset import SPLITS, Trajectory, load_shapes, trajectory_files
 from sdfsim.data.generate import GRAVITY, make_dataset, make_trajectory
@@ -33,7 +35,6 @@ from sdfsim.data.scenarios import (
 from sdfsim.data.shape_assets import Origin, prepare
 from sdfsim.errors import SdfsimError
 from sdfsim.shape import primitives
-from sdfsim.shape.asset import Shape, analytic_shape, sdf_of_mesh
 from sdfsim.shape.mass import mass_properties
 from sdfsim.training.contact_cache import contact_frames
 from sdfsim.training.impulse_task import ImpulseTask

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from sdfsim.shape.shape import analytic_shape
 
 from sdfsim.dynamics import freeflight, surfaces
 from sdfsim.dynamics import step as step_module
@@ -14,8 +15,7 @@ from sdfsim.dynamics.model import Unread
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.dynamics.surfaces import compact, predict
 from sdfsim.scene.scene import Effects, Scene, Waypoints
-from sdfsim.shape import bank
-from sdfsim.shape.asset import analytic_shape
+from sdfsim.shape import sdf_batch
 from tests.dynamics.conftest import make_body, random_model
 from tests.dynamics.test_paper import paper_model
 

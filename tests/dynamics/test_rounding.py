@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from sdfsim.shape.shape import analytic_shape
 
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.contacts import ARRAYS, Contacts, find_contacts
@@ -12,9 +13,8 @@ from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.rounding import curvature
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.scene.scene import Scene
-from sdfsim.shape.asset import analytic_shape
-from sdfsim.shape.exact import MeshSdf
 from sdfsim.shape.mesh import Mesh
+from sdfsim.shape.sdf import MeshSdf
 from tests.dynamics.conftest import make_body, random_model
 
 REACH = 0.1

@@ -9,6 +9,8 @@ import pytest
 
 pytest.importorskip("pybullet")
 
+from sdfsim.shape.shape import analytic_shape, shape_from_primitive
+
 from sdfsim.data.pybullet_sim import Teacher, TeacherBody
 from sdfsim.dynamics.froude import scene_units
 from sdfsim.dynamics.model import load_model
@@ -17,8 +19,6 @@ from sdfsim.evaluation import hard_cases
 from sdfsim.evaluation.engines import bullet, mujoco, shape_urdf, start_of_scene
 from sdfsim.evaluation.stress import taught
 from sdfsim.scene.scene_file import load_scene
-from sdfsim.shape.asset import analytic_shape
-from sdfsim.shape.cache import shape_from_primitive
 from sdfsim.shape.mesh import load_pieces
 
 SCENE = """

@@ -10,6 +10,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from sdfsim.shape.shape import analytic_shape, with_sdf
 
 from sdfsim.dynamics.model import new_network
 from sdfsim.errors import SdfsimError
@@ -27,7 +28,6 @@ from sdfsim.evaluation.harness import (
     number,
     peak_memory,
 )
-from sdfsim.shape.asset import analytic_shape, with_sdf
 from tests.recordings import trajectory
 
 

@@ -22,7 +22,7 @@ from sdfsim.evaluation.hard_cases import cases
 from sdfsim.evaluation.stress import accepted, losses, rows, simulated, slipped_back, table, write_report
 from sdfsim.files import write_json
 from sdfsim.shape import primitives
-from sdfsim.shape.storage import write_ply
+from sdfsim.shape.mesh import write_ply
 
 FEW = ("overlap-balls", "thin-5", "cuda")
 

@@ -113,7 +113,7 @@ def whole(folder: Path) -> None:
     """That every file under its final name can be read to its end; hidden ones are nobody's results."""
     from safetensors.numpy import load_file
 
-    from sdfsim.shape.storage import read_mesh
+    from sdfsim.shape.mesh import read_mesh
 
     for path in folder.rglob("*"):
         hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
@@ -141,7 +141,7 @@ def litter(folder: Path) -> list[str]:
 
 def tiny_fit() -> None:
     """Fits of 120 steps, with a checkpoint every 40."""
-    from sdfsim.shape import plans, training
+    from sdfsim.shape import fit
 
     plan = replace(plans.PLANS["default"], width=8, layers=3, steps=120, batch=64, pool=1000, goal=None)
     plans.PLANS["default"] = plans.PLANS["quick"] = plan

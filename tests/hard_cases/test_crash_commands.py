@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from sdfsim.shape.shape import analytic_shape
 
 from sdfsim.data.dataset import Trajectory
 from sdfsim.dynamics.model import Model, new_network
-from sdfsim.shape.asset import analytic_shape
+from sdfsim.shape.mesh import write_ply
 from sdfsim.shape.primitives import box
-from sdfsim.shape.storage import write_ply
 from tests.hard_cases import crashing
 from tests.hard_cases.crashing import NEVER, Ended, Moment, litter, whole
 

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
+from sdfsim.shape.shape import MESH_FILE, RECORD_FILE, WEIGHTS_FILE, analytic_shape, with_sdf
 from typer.testing import CliRunner
 
 import cli
 from sdfsim import SdfsimError, load_shape
 from sdfsim.dynamics.model import Model, new_network
 from sdfsim.files import LOCK, locked
-from sdfsim.shape import cache
-from sdfsim.shape.asset import MESH_FILE, RECORD_FILE, WEIGHTS_FILE, analytic_shape, with_sdf
+from sdfsim.shape import shape
+from sdfsim.shape.mesh import write_ply
 from sdfsim.shape.primitives import box
-from sdfsim.shape.storage import write_ply
 
 SCENE = "version: 1\nduration: 0.04\nbodies: [{name: floor, plane: {}}]\n"
 

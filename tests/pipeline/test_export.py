@@ -8,15 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from sdfsim.shape.shape import Shape, analytic_shape
 
 from pipeline.cameras import Similarity
 from pipeline.export import DENSITY, LEVEL, Above, choose_slab, fit_parts, scene_text, write_scene
 from pipeline.mesh.placement import Placement
 from sdfsim.files import write_json
 from sdfsim.scene.scene_file import load_scene
-from sdfsim.shape.asset import Shape, analytic_shape
-from sdfsim.shape.mesh import Mesh
-from sdfsim.shape.storage import write_ply
+from sdfsim.shape.mesh import Mesh, write_ply
 from tests.pipeline.test_surface import cube, scenery
 
 PLACEMENT = Placement(Similarity(1.0, np.eye(3), np.zeros(3)), "plane", "assumed: widest side = 1 m")

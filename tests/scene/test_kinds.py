@@ -6,14 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from sdfsim.shape.shape import analytic_shape, with_sdf
 
 from sdfsim import Simulator
 from sdfsim.scene.scene import Scene
-from sdfsim.shape.analytic import BoxSdf
-from sdfsim.shape.asset import analytic_shape, with_sdf
-from sdfsim.shape.exact import MeshSdf
-from sdfsim.shape.grid import GridSdf
-from sdfsim.shape.storage import write_ply
+from sdfsim.shape.mesh import write_ply
+from sdfsim.shape.sdf import BoxSdf, GridSdf, MeshSdf
 from tests.scene.test_load import problems_of
 
 CRATE = {

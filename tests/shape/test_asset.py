@@ -9,18 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-
-from sdfsim.errors import SdfsimError
-from sdfsim.shape import asset, primitives
-from sdfsim.shape.analytic import BoxSdf, PlaneSdf, SphereSdf
-from sdfsim.shape.asset import (
+from sdfsim.shape.mlp_sdf import MlpSdf
+from sdfsim.shape.shape import (
     Shape,
     analytic_shape,
     load_shape,
     scaled,
 )
+
+from sdfsim.errors import SdfsimError
+from sdfsim.shape import primitives, shape
 from sdfsim.shape.mesh import Frame, Mesh
-from sdfsim.shape.mlp import MlpSdf
+from sdfsim.shape.sdf import BoxSdf, PlaneSdf, SphereSdf
 
 
 def fitted() -> Shape:

@@ -3,15 +3,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from sdfsim.shape.sdf_batch import SdfBank, _GridGroup
 
-from sdfsim.shape import grid
-from sdfsim.shape.analytic import BoxSdf, PlaneSdf, SphereSdf
-from sdfsim.shape.bank import SdfBank, _GridGroup
-from sdfsim.shape.exact import MeshSdf
-from sdfsim.shape.grid import GridSdf, sample_grid
+from sdfsim.shape import sdf
 from sdfsim.shape.mesh import Frame
 from sdfsim.shape.primitives import box
-from sdfsim.shape.sdf import Sdf
+from sdfsim.shape.sdf import BoxSdf, GridSdf, MeshSdf, PlaneSdf, Sdf, SphereSdf, sample_grid
 from tests.shape.test_mlp import network
 
 
@@ -103,7 +100,7 @@ def test_grids_of_one_resolution_share_a_gather_of_bounded_size(monkeypatch: pyt
         seen.append(len(points))
         return inner(values, slot, points)
 
-    monkeypatch.setattr("sdfsim.shape.bank.trilinear", counted)
+    monkeypatch.setattr("sdfsim.shape.sdf_batch.trilinear", counted)
     monkeypatch.setattr(grid, "CHUNK", chunk)
     sdfs = [voxels(seed, 8) for seed in range(4)]
     index = torch.randint(4, (1000,))

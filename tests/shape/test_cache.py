@@ -7,14 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sdfsim.shape.shape import (
+    load_shape,
+    shape_from_mesh,
+    shape_from_primitive,
+)
 
 from sdfsim.errors import SdfsimError
-from sdfsim.shape import asset, plans, primitives
-from sdfsim.shape.asset import (
-    load_shape,
-)
-from sdfsim.shape.cache import shape_from_mesh, shape_from_primitive
-from sdfsim.shape.storage import write_ply
+from sdfsim.shape import fit, primitives, shape
+from sdfsim.shape.mesh import write_ply
 
 
 @pytest.fixture

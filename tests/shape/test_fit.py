@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from sdfsim.shape.mlp_sdf import MlpSdf
+from sdfsim.shape.shape import Shape
+from sdfsim.shape.watertight import solidify
 
 from sdfsim.errors import SdfsimError
-from sdfsim.shape import plans, primitives, training
-from sdfsim.shape.asset import Shape
+from sdfsim.shape import fit, primitives
 from sdfsim.shape.distance import MeshDistance
 from sdfsim.shape.fit import fit_mesh, fit_pieces, fit_solids
 from sdfsim.shape.mass import mass_properties, mass_properties_of_sdf
 from sdfsim.shape.mesh import Mesh, load_mesh, load_pieces
-from sdfsim.shape.mlp import MlpSdf
-from sdfsim.shape.solid import solidify
 
 
 @pytest.fixture

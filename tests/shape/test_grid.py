@@ -3,17 +3,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from sdfsim.shape.far_field import BOX, CAUTION
+from sdfsim.shape.surface_nodes import project
 
 from sdfsim.errors import SdfsimError
-from sdfsim.shape import grid
-from sdfsim.shape.analytic import BoxSdf, SphereSdf
-from sdfsim.shape.boxed import BOX, CAUTION
+from sdfsim.shape import sdf
 from sdfsim.shape.distance import MeshDistance
-from sdfsim.shape.grid import GridSdf, sample_grid, trilinear
 from sdfsim.shape.mesh import Frame, Mesh
-from sdfsim.shape.nodes import project
 from sdfsim.shape.primitives import box
-from sdfsim.shape.sdf import Sdf
+from sdfsim.shape.sdf import BoxSdf, GridSdf, Sdf, SphereSdf, sample_grid, trilinear
 
 BOUNDS = np.array([[-0.5] * 3, [0.5] * 3])
 

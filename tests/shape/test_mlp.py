@@ -6,12 +6,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
+from sdfsim.shape.far_field import BOX
+from sdfsim.shape.mlp_sdf import Activation, MlpSdf, Tape, value_and_gradient
 
-from sdfsim.shape import boxed, mlp, sweep
-from sdfsim.shape.boxed import BOX
+from sdfsim.shape import far_field, mlp_sdf
 from sdfsim.shape.mesh import Frame
-from sdfsim.shape.mlp import MlpSdf
-from sdfsim.shape.sweep import Activation, Tape, value_and_gradient
 
 
 def network(seed: int, activation: Activation, width: int = 64, layers: int = 8) -> MlpSdf:
