@@ -28,7 +28,7 @@ from sdfsim.dynamics.step import contact_graph, fly
 from sdfsim.errors import run_main
 from sdfsim.progress import columns
 from sdfsim.scene.types import Body, Effects, Limits, Scene
-from sdfsim.shape.asset import analytic_shape
+from sdfsim.shape.shape import analytic_shape
 from sdfsim.training.contact_cache import contact_frames
 from sdfsim.training.impulse_task import ImpulseTask
 

@@ -22,7 +22,7 @@ from sdfsim.errors import run_main
 from sdfsim.files import write_text
 from sdfsim.progress import columns
 from sdfsim.scene.types import Body, Scene
-from sdfsim.shape.asset import Shape, analytic_shape
+from sdfsim.shape.shape import Shape, analytic_shape
 
 G = 9.81  # m/s^2
 SIZES = (0.02, 0.1, 1.0)  # m

@@ -13,7 +13,7 @@ from sdfsim.dynamics.simulator import Simulator
 from sdfsim.errors import run_main
 from sdfsim.progress import columns
 from sdfsim.scene.types import Body, Scene
-from sdfsim.shape.asset import analytic_shape
+from sdfsim.shape.shape import analytic_shape
 
 SHAPES = {"ball": analytic_shape("sphere", radius=0.5), "cube": analytic_shape("box", size=(1.0, 1.0, 1.0))}
 FLOOR = analytic_shape("plane")

@@ -25,9 +25,9 @@ from sdfsim.data.dataset import read_info, trajectory_files
 from sdfsim.errors import run_main
 from sdfsim.evaluation.evaluate import evaluate
 from sdfsim.files import read_json, write_json, write_text
-from sdfsim.shape.asset import Shape, load_shape
 from sdfsim.shape.fit import fit_mesh
 from sdfsim.shape.mesh import load_mesh
+from sdfsim.shape.shape import Shape, load_shape
 from sdfsim.training.contact_cache import contact_frames
 from sdfsim.training.impulse_task import ImpulseTask, Noise
 from sdfsim.training.presets import PRESETS, Preset

@@ -26,12 +26,11 @@ from sdfsim.errors import run_main
 from sdfsim.files import write_json
 from sdfsim.progress import columns
 from sdfsim.scene.types import Body, Scene
-from sdfsim.shape.analytic import BoxSdf
-from sdfsim.shape.asset import Shape, analytic_shape
-from sdfsim.shape.certificate import EXACT, USABLE, certify
 from sdfsim.shape.distance import MeshDistance
 from sdfsim.shape.fit import surface_nodes
-from sdfsim.shape.sdf import accepts_numpy
+from sdfsim.shape.fit_metrics import EXACT, USABLE, certify
+from sdfsim.shape.sdf import BoxSdf, accepts_numpy
+from sdfsim.shape.shape import Shape, analytic_shape
 
 SIZE = (2.0, 2.0, 0.3)  # m, of the table
 EXTENT = max(SIZE)

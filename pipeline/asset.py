@@ -41,7 +41,7 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
     Raises:
         SdfsimError: the mesh stage has not run, or a mesh cannot be used.
     """
-    from sdfsim.shape.asset import load_shape
+    from sdfsim.shape.shape import load_shape
 
     parts = read_parts(mesh_folder)
     weights = {SCENERY: SCENERY_SHARE} if parts["scenery"] else {}

@@ -24,8 +24,7 @@ from pipeline.volume import Distance
 from pipeline.wishes import Wishes
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, replacing, write_json
-from sdfsim.shape.mesh import Mesh
-from sdfsim.shape.storage import write_ply
+from sdfsim.shape.mesh import Mesh, write_ply
 
 Progress = Callable[[float, str], None]
 SCENERY = "scene"

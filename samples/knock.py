@@ -23,7 +23,7 @@ from pipeline.meshing import SCENERY, rounded
 from sdfsim.errors import run_main
 from sdfsim.files import write_text
 from sdfsim.scene.load import load_scene
-from sdfsim.shape.asset import Shape, load_shape
+from sdfsim.shape.shape import Shape, load_shape
 
 GRAVITY = 9.81  # m/s^2
 HEAVIER = 2.0  # the ball's mass over the body's

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sdfsim.shape.cache import shape_from_primitive
+from sdfsim.shape.shape import shape_from_primitive
 
 SHAPES = {"bowl": ("bowl", 0.6), "ring": ("torus", 0.22), "can": ("cylinder", 0.14), "cone": ("cone", 0.16)}  # m
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from sdfsim.dynamics.simulator import Simulator
     from sdfsim.errors import SceneError, SdfsimError
     from sdfsim.scene.load import load_scene
-    from sdfsim.shape.asset import Shape, load_shape
+    from sdfsim.shape.shape import Shape, load_shape
 
 # Threads of torch wait for one another by spinning, and beside other programs they take the processor from those they
 # wait for: a step then takes ten times as long. So they spin for some 10 microseconds only, which costs nothing on a
@@ -28,10 +28,10 @@ _HOME = {
     "Rollout": "sdfsim.dynamics.rollout",
     "SceneError": "sdfsim.errors",
     "SdfsimError": "sdfsim.errors",
-    "Shape": "sdfsim.shape.asset",
+    "Shape": "sdfsim.shape.shape",
     "Simulator": "sdfsim.dynamics.simulator",
     "load_scene": "sdfsim.scene.load",
-    "load_shape": "sdfsim.shape.asset",
+    "load_shape": "sdfsim.shape.shape",
 }
 
 

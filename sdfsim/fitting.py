@@ -15,11 +15,11 @@ from sdfsim.files import check_writable, locked, read_json
 from sdfsim.parallel import parallel
 from sdfsim.progress import columns, duration
 from sdfsim.scene.schema import UNITS
-from sdfsim.shape.asset import RECORD_FILE, Shape
 from sdfsim.shape.distance import MeshDistance
 from sdfsim.shape.fit import FIT_VERSION, Recipe, fit_mesh, fit_solids
 from sdfsim.shape.mesh import MESH_SUFFIXES, Mesh, load_mesh
-from sdfsim.shape.solid import solidify
+from sdfsim.shape.shape import RECORD_FILE, Shape
+from sdfsim.shape.watertight import solidify
 
 Progress = Callable[[float, str], None]
 
@@ -245,7 +245,7 @@ def _request(mesh: Mesh, options: Options) -> str:
 
 def _kept(file: Path, folder: Path, options: Options) -> dict[str, Any] | None:
     """The report of a shape folder that holds just what this fit would make, or None."""
-    from sdfsim.shape.asset import load_shape
+    from sdfsim.shape.shape import load_shape
 
     try:
         made_for = read_json(folder / RECORD_FILE)["source"]["request"]

@@ -19,7 +19,7 @@ from sdfsim.scene.load import load_scene
 from sdfsim.scene.schema import DEFAULT_DURATION, DEFAULT_GRAVITY
 from sdfsim.scene.thin import may_pass_through
 from sdfsim.scene.types import Effects, Scene
-from sdfsim.shape.mlp import MlpSdf
+from sdfsim.shape.mlp_sdf import MlpSdf
 
 TRIAL_STEPS = 5
 

@@ -19,7 +19,7 @@ from sdfsim.dynamics.simulator import Simulator, join
 from sdfsim.dynamics.sleep import Rest
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_arrays, read_json, write_arrays
-from sdfsim.shape.bank import SdfBank
+from sdfsim.shape.sdf_batch import SdfBank
 
 CHECKPOINT = "checkpoint"  # folder in that of the run
 EVERY = 30.0  # s between two checkpoints

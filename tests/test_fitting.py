@@ -17,9 +17,8 @@ from sdfsim.fitting import Options, fit_many, named_meshes
 from sdfsim.parallel import cluster, parallel
 from sdfsim.scene.schema import UNITS
 from sdfsim.shape import primitives
-from sdfsim.shape.asset import load_shape, scaled
-from sdfsim.shape.mesh import Mesh
-from sdfsim.shape.storage import write_ply
+from sdfsim.shape.mesh import Mesh, write_ply
+from sdfsim.shape.shape import load_shape, scaled
 
 QUICK = Options(budget=1.0)
 

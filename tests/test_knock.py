@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from sdfsim.scene.load import load_scene
-from sdfsim.shape.asset import analytic_shape
+from sdfsim.shape.shape import analytic_shape
 
 SCRIPT = Path(__file__).resolve().parents[1] / "samples" / "knock.py"
 

@@ -11,8 +11,8 @@ from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.sleep import STEPS
 from sdfsim.files import read_arrays, write_arrays
 from sdfsim.scene.types import Scene, Waypoints
-from sdfsim.shape.asset import analytic_shape
-from sdfsim.shape.grid import sample_grid
+from sdfsim.shape.sdf import sample_grid
+from sdfsim.shape.shape import analytic_shape
 from tests.dynamics.conftest import make_body, random_model
 
 TOWER = Path(__file__).resolve().parents[1] / "samples" / "tower.yaml"

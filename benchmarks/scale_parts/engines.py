@@ -14,9 +14,9 @@ from benchmarks.scale_parts.ours import memory, peak_from_here
 from sdfsim import load_scene
 from sdfsim.data.pybullet_sim import BODY_SETTINGS, ENGINE_SETTINGS, MAXIMAL, import_pybullet
 from sdfsim.scene.types import Body, Scene
-from sdfsim.shape.analytic import PlaneSdf, SphereSdf
 from sdfsim.shape.mesh import Mesh
 from sdfsim.shape.primitives import convex_pieces
+from sdfsim.shape.sdf import PlaneSdf, SphereSdf
 
 SUBSTEPS = 5
 PRIMITIVE = {"can": "cylinder", "ring": "torus"}  # what the shapes of the samples are

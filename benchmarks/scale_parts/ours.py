@@ -17,7 +17,7 @@ from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.simulator import SimulationError, join
 from sdfsim.dynamics.step import contact_graph, fly
 from sdfsim.scene.types import Body, Scene
-from sdfsim.shape.asset import analytic_shape
+from sdfsim.shape.shape import analytic_shape
 
 COUNTS = ("pairs", "sdf_queries", "sdf_waiting", "nodes", "edges", "active")
 

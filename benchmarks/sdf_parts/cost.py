@@ -13,11 +13,10 @@ import torch
 from benchmarks.sdf_parts.recipes import weight_bytes
 from benchmarks.sdf_parts.study import Study, interleaved, say
 from benchmarks.sdf_parts.tables import number, table
-from sdfsim.shape.boxed import BOX
-from sdfsim.shape.exact import MeshSdf
-from sdfsim.shape.grid import sample_grid
+from sdfsim.shape.far_field import BOX
+from sdfsim.shape.fit import PLANS
 from sdfsim.shape.mesh import normal_frame, sample_surface
-from sdfsim.shape.plans import PLANS
+from sdfsim.shape.sdf import MeshSdf, sample_grid
 
 GRIDS = (32, 64, 128)
 SHAPE = ("suzanne",)

@@ -11,8 +11,8 @@ import torch
 
 from benchmarks.sdf_parts.study import ERRORS, Study, interleaved, say
 from benchmarks.sdf_parts.tables import OURS, THEIRS, factor, number, plain_ticks, ratio, save_chart, table
-from sdfsim.shape.boxed import BOX
-from sdfsim.shape.plans import PLANS
+from sdfsim.shape.far_field import BOX
+from sdfsim.shape.fit import PLANS
 from sdfsim.shape.sdf import Sdf
 
 WIDTHS = (32, 64, 128)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sdfsim.shape.boxed import BOX
+from sdfsim.shape.far_field import BOX
 from sdfsim.shape.mesh import Frame, Mesh
 from sdfsim.shape.sdf import Sdf
 

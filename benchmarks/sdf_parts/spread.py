@@ -9,8 +9,8 @@ import numpy as np
 from benchmarks.sdf_parts.study import Study, say
 from benchmarks.sdf_parts.tables import number, plain_ticks, save_chart, table
 from sdfsim.errors import SdfsimError
-from sdfsim.shape.coverage import coverage
-from sdfsim.shape.nodes import sample_nodes
+from sdfsim.shape.fit_metrics import coverage
+from sdfsim.shape.surface_nodes import sample_nodes
 
 GRIDS = tuple(range(5, 17))
 CHOSEN = "chosen"

@@ -7,8 +7,8 @@ import numpy as np
 from benchmarks.sdf_parts.render import level, shaded
 from benchmarks.sdf_parts.study import Study, say
 from benchmarks.sdf_parts.tables import number, save_chart, table
-from sdfsim.shape.exact import MeshSdf
 from sdfsim.shape.mesh import normal_frame
+from sdfsim.shape.sdf import MeshSdf
 
 SHAPES = ("suzanne", "sponge", "torus")
 UPDATES = (100, 200, 400, 800)

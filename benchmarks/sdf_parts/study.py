@@ -17,13 +17,12 @@ import torch
 
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, write_json
-from sdfsim.shape.asset import RECORD_FILE, Shape, load_shape
-from sdfsim.shape.certificate import EXACT
 from sdfsim.shape.distance import MeshDistance
-from sdfsim.shape.fit import FIT_VERSION, fit_mesh
+from sdfsim.shape.fit import FIT_VERSION, PLANS, fit_mesh
+from sdfsim.shape.fit_metrics import EXACT
 from sdfsim.shape.mesh import load_mesh
-from sdfsim.shape.plans import PLANS
-from sdfsim.shape.solid import solidify
+from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape
+from sdfsim.shape.watertight import solidify
 from sdfsim.threads import limit_threads
 
 RESULTS = "sdf.json"

@@ -11,7 +11,7 @@ from sdfsim.data.dataset import FLOOR, Trajectory
 from sdfsim.dynamics.bodies import Bodies, State, Units, from_scene
 from sdfsim.dynamics.contacts import find_contacts
 from sdfsim.scene.types import Body, Scene
-from sdfsim.shape.asset import Shape, analytic_shape
+from sdfsim.shape.shape import Shape, analytic_shape
 
 TOGETHER = 4000  # bodies whose contacts are found in one call
 

@@ -15,7 +15,7 @@ from sdfsim.errors import SdfsimError
 from sdfsim.files import read_arrays, read_json, write_arrays, write_json
 
 if TYPE_CHECKING:
-    from sdfsim.shape.asset import Shape
+    from sdfsim.shape.shape import Shape
 
 
 SPLITS = ("train", "validation", "test")
@@ -204,7 +204,7 @@ def trajectory_files(folder: Path, split: str) -> list[Path]:
 def load_shapes(folder: Path, names: set[str]) -> dict[str, Shape]:
     """The Shape folders `shapes/NAME` of a dataset (its own, or its parent's for a split folder)."""
     # Here and not above: training from cached contact frames runs where only torch and numpy are installed.
-    from sdfsim.shape.asset import load_shape
+    from sdfsim.shape.shape import load_shape
 
     home = shapes_folder(folder)
     return {name: load_shape(home / name) for name in sorted(names)}

@@ -19,7 +19,7 @@ from sdfsim.dynamics.model import SOLVER, Model
 from sdfsim.dynamics.sleep import nobody_asleep
 from sdfsim.dynamics.step import FreeFlight, Rules, step
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
-from sdfsim.shape.asset import Shape
+from sdfsim.shape.shape import Shape
 
 BATCH = 50  # trajectories simulated side by side
 

@@ -17,12 +17,12 @@ from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, write_json, write_text
 from sdfsim.parallel import parallel
 from sdfsim.shape import primitives
-from sdfsim.shape.asset import analytic_shape
 from sdfsim.shape.distance import PiecesDistance
 from sdfsim.shape.fit import fit_pieces
 from sdfsim.shape.mass import mass_properties, mass_properties_of_sdf
 from sdfsim.shape.mesh import MESH_SUFFIXES, Mesh, convex_hull, is_closed, load_mesh, load_pieces
-from sdfsim.shape.solid import solidify
+from sdfsim.shape.shape import analytic_shape
+from sdfsim.shape.watertight import solidify
 
 NODES = 512  # surface nodes a shape: the vertices and edges of the pieces first, since those are what really touches
 THINNEST = 0.02  # thickness over largest extent below which a mesh is left out: no fit resolves it

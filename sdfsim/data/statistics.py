@@ -11,7 +11,7 @@ from sdfsim.data.batching import merged
 from sdfsim.data.dataset import Trajectory, load_shapes, read_info, trajectory_files
 from sdfsim.dynamics.bodies import Units
 from sdfsim.dynamics.contacts import find_contacts
-from sdfsim.shape.asset import Shape
+from sdfsim.shape.shape import Shape
 
 REACH = 0.1  # m, contact radius at which contacts are counted
 SAMPLE, STRIDE = 10, 5  # trajectories whose contacts are counted, and every which step of them

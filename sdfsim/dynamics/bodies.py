@@ -13,8 +13,8 @@ from sdfsim.dynamics.tracks import Tracks, from_paths
 from sdfsim.errors import SdfsimError
 from sdfsim.scene.pairs import contact_groups
 from sdfsim.scene.types import Scene
-from sdfsim.shape.asset import Shape
-from sdfsim.shape.bank import SdfBank
+from sdfsim.shape.sdf_batch import SdfBank
+from sdfsim.shape.shape import Shape
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,9 @@ from sdfsim.dynamics.bodies import Bodies, State, Touch
 from sdfsim.dynamics.kernels import distance as kinds
 from sdfsim.dynamics.kernels import world as compiled
 from sdfsim.dynamics.kernels.step import step as compiled_step
-from sdfsim.shape.analytic import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, SphereSdf
-from sdfsim.shape.baked import BakedGrid, baked, inwards
-from sdfsim.shape.patches import Surface, surface_of
-from sdfsim.shape.sdf import Sdf
+from sdfsim.shape.baked_grid import BakedGrid, baked, inwards
+from sdfsim.shape.sdf import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, Sdf, SphereSdf
+from sdfsim.shape.surface_nodes import Surface, surface_of
 
 if TYPE_CHECKING:
     from sdfsim.dynamics.memory import Memory
@@ -104,7 +103,7 @@ def warm() -> None:
     """Have the step compiled now, so that nobody waits for it later."""
     from sdfsim.dynamics.bodies import Units, from_scene
     from sdfsim.scene.types import Body, Scene
-    from sdfsim.shape.asset import analytic_shape
+    from sdfsim.shape.shape import analytic_shape
 
     still = np.zeros(3)
     ball = Body("ball", 0, "dynamic", 1.0, still, np.array([0.0, 0.0, 0.0, 1.0]), still, still, 1.0, 0.5, 0.5)

@@ -23,7 +23,7 @@ from sdfsim.dynamics.step import FreeFlight
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation import baselines
 from sdfsim.evaluation.penetration import EVERY, Solid, exact_solids, penetration
-from sdfsim.shape.asset import Shape
+from sdfsim.shape.shape import Shape
 from sdfsim.training.contact_cache import inner_steps
 
 LIMITS = (0.1, 0.25, 0.5)  # m, translation errors that a body survives

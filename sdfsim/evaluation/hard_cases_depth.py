@@ -8,11 +8,9 @@ from sdfsim.data.dataset import Trajectory
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.evaluation.penetration import Solid, deepest
 from sdfsim.scene.types import Scene
-from sdfsim.shape.analytic import PlaneSdf
-from sdfsim.shape.asset import Shape, with_sdf
-from sdfsim.shape.exact import MeshSdf
-from sdfsim.shape.grid import GridSdf
-from sdfsim.shape.mlp import MlpSdf
+from sdfsim.shape.mlp_sdf import MlpSdf
+from sdfsim.shape.sdf import GridSdf, MeshSdf, PlaneSdf
+from sdfsim.shape.shape import Shape, with_sdf
 
 
 def penetration(scene: Scene, motion: Rollout, every: int = 5) -> np.ndarray:

@@ -13,9 +13,8 @@ from sdfsim.evaluation import hard_cases_measures as measure
 from sdfsim.evaluation import hard_cases_scenes as scenes
 from sdfsim.evaluation.hard_cases import Case, Figure
 from sdfsim.scene.types import Scene
-from sdfsim.shape.asset import Shape
-from sdfsim.shape.cache import shape_from_mesh, shape_from_primitive
 from sdfsim.shape.mesh import MESH_SUFFIXES
+from sdfsim.shape.shape import Shape, shape_from_mesh, shape_from_primitive
 
 FEWEST = 2  # repetitions: there is no spread of one
 YAWS = (0.0, 37.0, 121.0, 245.0)  # degrees

@@ -27,7 +27,7 @@ from sdfsim.evaluation.hard_cases_teacher import engine_file
 from sdfsim.files import locked, read_json, write_json
 from sdfsim.parallel import parallel
 from sdfsim.scene.types import Scene
-from sdfsim.shape.analytic import PlaneSdf
+from sdfsim.shape.sdf import PlaneSdf
 
 VERSION = 1  # counts up when what is measured changes, so that kept results are measured again
 WATCHED = 10.0  # s of a recording

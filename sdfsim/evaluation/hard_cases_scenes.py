@@ -17,8 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim.data.starts_resting import steady_faces
 from sdfsim.scene.types import Body, Effects, Scene
-from sdfsim.shape.asset import Shape, analytic_shape
-from sdfsim.shape.cache import shape_from_primitive
+from sdfsim.shape.shape import Shape, analytic_shape, shape_from_primitive
 
 G = 10.0  # m/s^2
 FRICTION, RESTITUTION = 0.8, 0.5  # of a body

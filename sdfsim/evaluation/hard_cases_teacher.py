@@ -14,10 +14,10 @@ from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.hard_cases_scenes import body_inertia
 from sdfsim.files import replacing, write_text
 from sdfsim.scene.types import Body, Scene
-from sdfsim.shape.analytic import BoxSdf, PlaneSdf, SphereSdf
-from sdfsim.shape.asset import Shape
 from sdfsim.shape.mesh import Mesh
 from sdfsim.shape.primitives import PRIMITIVES, convex_pieces
+from sdfsim.shape.sdf import BoxSdf, PlaneSdf, SphereSdf
+from sdfsim.shape.shape import Shape
 
 
 def engine_file(shape: Shape, folder: Path) -> Path:

@@ -13,12 +13,11 @@ from scipy.spatial.transform import Rotation
 from sdfsim.data.dataset import Trajectory
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.baselines import collision_mesh, engine_file, is_sphere
-from sdfsim.shape.asset import Shape, with_sdf
 from sdfsim.shape.distance import PiecesDistance
-from sdfsim.shape.exact import MeshSdf
-from sdfsim.shape.grid import GridSdf
 from sdfsim.shape.mesh import Mesh, load_pieces
-from sdfsim.shape.mlp import MlpSdf
+from sdfsim.shape.mlp_sdf import MlpSdf
+from sdfsim.shape.sdf import GridSdf, MeshSdf
+from sdfsim.shape.shape import Shape, with_sdf
 
 TOUCH = 0.01  # mean sizes of the moving bodies; a node this near to another surface is in contact
 EVERY = 10  # frames between two that are looked at

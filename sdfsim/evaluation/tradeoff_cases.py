@@ -29,10 +29,10 @@ from sdfsim.evaluation.baselines import engine_file
 from sdfsim.evaluation.penetration import Solid, engine_pieces, exact_solids
 from sdfsim.evaluation.tradeoff_shapes import digest_of
 from sdfsim.scene.types import Scene
-from sdfsim.shape.asset import Shape
 from sdfsim.shape.distance import PiecesDistance
 from sdfsim.shape.mesh import Mesh
 from sdfsim.shape.sdf import accepts_numpy
+from sdfsim.shape.shape import Shape
 
 MOST, MOST_QUICK = 20, 8  # trajectories
 STEPS, TIMED_STEPS = 100, 80

@@ -22,10 +22,10 @@ from sdfsim.evaluation.tradeoff_cases import Cases, PiecesSdf
 from sdfsim.evaluation.tradeoff_knobs import Setting, arranged_model, arranged_scene, arranged_shape, threads_of
 from sdfsim.evaluation.tradeoff_shapes import refitted, sampled
 from sdfsim.scene.types import Effects, Scene
-from sdfsim.shape.asset import Shape
 from sdfsim.shape.distance import MeshDistance, PiecesDistance
-from sdfsim.shape.mlp import MlpSdf
-from sdfsim.shape.solid import solidify
+from sdfsim.shape.mlp_sdf import MlpSdf
+from sdfsim.shape.shape import Shape
+from sdfsim.shape.watertight import solidify
 
 
 @dataclass(frozen=True)

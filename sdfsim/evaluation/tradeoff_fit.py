@@ -11,10 +11,9 @@ from typing import Any
 
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, replacing, write_json, write_text
-from sdfsim.shape.certificate import EXACT
-from sdfsim.shape.fit import FIT_VERSION, fit_mesh
+from sdfsim.shape.fit import FIT_VERSION, fit_mesh, training_share
+from sdfsim.shape.fit_metrics import EXACT
 from sdfsim.shape.mesh import Mesh, load_mesh
-from sdfsim.shape.training import training_share
 
 BUDGETS = (5.0, 10.0, 20.0, 40.0, 60.0, 120.0)  # s
 QUICK_BUDGETS, QUICK_MESHES = (5.0, 10.0, 20.0), 2

@@ -18,11 +18,10 @@ from sdfsim.dynamics.model import Model
 from sdfsim.dynamics.precision import in_bfloat16
 from sdfsim.errors import SdfsimError
 from sdfsim.scene.types import Scene
-from sdfsim.shape.asset import Shape, with_nodes, with_sdf
-from sdfsim.shape.grid import GridSdf, sample_grid
-from sdfsim.shape.mlp import MlpSdf
-from sdfsim.shape.nodes import hull_nodes
-from sdfsim.shape.sdf import Sdf
+from sdfsim.shape.mlp_sdf import MlpSdf
+from sdfsim.shape.sdf import GridSdf, Sdf, sample_grid
+from sdfsim.shape.shape import Shape, with_nodes, with_sdf
+from sdfsim.shape.surface_nodes import hull_nodes
 
 
 @dataclass(frozen=True)

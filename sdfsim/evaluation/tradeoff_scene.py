@@ -21,12 +21,10 @@ from sdfsim.evaluation.penetration import exact_solids
 from sdfsim.evaluation.tradeoff_cases import STEPS, TIMED_STEPS, Cases
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.types import Body, Scene
-from sdfsim.shape.analytic import PlaneSdf
-from sdfsim.shape.asset import Shape
-from sdfsim.shape.exact import MeshSdf
-from sdfsim.shape.grid import GridSdf
 from sdfsim.shape.mesh import Mesh, convex_hull, load_pieces
-from sdfsim.shape.mlp import MlpSdf
+from sdfsim.shape.mlp_sdf import MlpSdf
+from sdfsim.shape.sdf import GridSdf, MeshSdf, PlaneSdf
+from sdfsim.shape.shape import Shape
 
 PHYSICAL = ("contact", "friction", "restitution", "rotation")  # effects that the teacher always has
 

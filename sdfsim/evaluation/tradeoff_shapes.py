@@ -11,14 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from sdfsim.shape.asset import RECORD_FILE, Shape, load_shape
 from sdfsim.shape.distance import DistanceOracle
-from sdfsim.shape.exact import MeshSdf
-from sdfsim.shape.grid import GridSdf, sample_grid
-from sdfsim.shape.mlp import MlpSdf
-from sdfsim.shape.plans import PLANS
-from sdfsim.shape.sdf import Sdf
-from sdfsim.shape.training import train
+from sdfsim.shape.fit import PLANS, train
+from sdfsim.shape.mlp_sdf import MlpSdf
+from sdfsim.shape.sdf import GridSdf, MeshSdf, Sdf, sample_grid
+from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape
 
 FIT_SECONDS = 60.0  # at most, for a network of another width
 

@@ -13,8 +13,16 @@ from sdfsim.errors import SdfsimError
 from sdfsim.scene.bodies import BodySpec
 from sdfsim.scene.schema import SceneSpec, ShapeSpec, read_scene
 from sdfsim.scene.types import Body, Scene
-from sdfsim.shape.asset import SdfKind, Shape, analytic_shape, load_shape, with_nodes, with_sdf
-from sdfsim.shape.cache import shape_from_mesh, shape_from_primitive
+from sdfsim.shape.shape import (
+    SdfKind,
+    Shape,
+    analytic_shape,
+    load_shape,
+    shape_from_mesh,
+    shape_from_primitive,
+    with_nodes,
+    with_sdf,
+)
 
 Progress = Callable[[float, str], None]
 

@@ -12,7 +12,7 @@ from sdfsim.scene.bodies import BodySpec, read_bodies
 from sdfsim.scene.document import Problems, Section, Value, nearest
 from sdfsim.scene.source import read_document
 from sdfsim.scene.types import Effects, Limits
-from sdfsim.shape.asset import DEFAULT_RESOLUTION, MESH_FILE, RECORD_FILE, WEIGHTS_FILE
+from sdfsim.shape.shape import DEFAULT_RESOLUTION, MESH_FILE, RECORD_FILE, WEIGHTS_FILE
 
 VERSION = 1
 DEFAULT_DURATION = 4.0  # s

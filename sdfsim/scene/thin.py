@@ -6,8 +6,8 @@ import numpy as np
 
 from sdfsim.scene.pairs import contact_groups
 from sdfsim.scene.types import Scene
-from sdfsim.shape.analytic import PlaneSdf
-from sdfsim.shape.asset import Shape
+from sdfsim.shape.sdf import PlaneSdf
+from sdfsim.shape.shape import Shape
 
 POINTS = 4096  # looked at for the place of a shape that is deepest inside
 

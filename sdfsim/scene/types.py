@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from sdfsim.shape.asset import Shape
+from sdfsim.shape.shape import Shape
 
 Motion = Literal["static", "dynamic", "kinematic"]
 

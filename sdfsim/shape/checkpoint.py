@@ -8,8 +8,8 @@ from pathlib import Path
 import torch
 
 from sdfsim.shape.mesh import Mesh
+from sdfsim.shape.shape import write
 from sdfsim.shape.soap import Adam
-from sdfsim.shape.storage import write
 
 VERSION = 3  # of the file's tensors
 

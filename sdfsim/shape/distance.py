@@ -8,9 +8,8 @@ import numpy as np
 
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.bvh import ClosestPoint, Winding
-from sdfsim.shape.cutting import exposed
 from sdfsim.shape.mesh import Mesh
-from sdfsim.shape.solid import Solid, as_it_is
+from sdfsim.shape.watertight import Solid, as_it_is, exposed
 
 # The paper trusts a sign only where the offset to the surface is less than 75 degrees from the normal's line.
 TRUSTED_COSINE = float(np.cos(np.radians(75.0)))

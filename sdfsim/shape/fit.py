@@ -1,11 +1,13 @@
-"""Mesh -> SDF network, with a certificate from held-out points."""
+"""The recipes that `fit` can follow."""
 
 from __future__ import annotations
 
 import hashlib
+import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal, TypeVar
 
@@ -13,17 +15,507 @@ import numpy as np
 import torch
 
 from sdfsim.errors import SdfsimError
-from sdfsim.shape import training
-from sdfsim.shape.asset import Shape
-from sdfsim.shape.certificate import certify
+from sdfsim.shape.checkpoint import Checkpoint
 from sdfsim.shape.distance import DistanceOracle, MeshDistance, PiecesDistance
+from sdfsim.shape.far_field import BOX
+from sdfsim.shape.fit_metrics import certify
 from sdfsim.shape.mass import mass_properties, mass_properties_of_sdf
-from sdfsim.shape.mesh import Mesh, clean, is_closed
-from sdfsim.shape.mlp import MlpSdf
-from sdfsim.shape.nodes import DEFAULT_COUNT, edge_nodes, hull_nodes, sample_nodes, thin
-from sdfsim.shape.plans import PLANS
+from sdfsim.shape.mesh import Frame, Mesh, clean, is_closed, normal_frame, sample_surface
+from sdfsim.shape.mlp_sdf import Activation, MlpSdf, Tape, value_and_gradient
 from sdfsim.shape.sdf import Sdf, accepts_numpy
-from sdfsim.shape.solid import solidify
+from sdfsim.shape.shape import Shape
+from sdfsim.shape.soap import Adam, Soap
+from sdfsim.shape.surface_nodes import DEFAULT_COUNT, edge_nodes, hull_nodes, sample_nodes, thin
+from sdfsim.shape.watertight import solidify
+from sdfsim.threads import choose_threads
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One recipe. Lengths are relative to the shape's largest extent.
+
+    Attributes:
+        activation: of the hidden layers ("wave" or "relu").
+        width: of the hidden layers.
+        layers: linear layers, the last one included.
+        first: first-layer weights are uniform in +-first (periodic; it sets the finest scale the fit starts with).
+        optimiser: "soap" or "adam".
+        lr: step size.
+        decay: the part of the steps over which it falls to zero, at the end (0: constant).
+        steps: updates.
+        batch: points an update.
+        sigmas: points lie this far from the surface (standard deviation, log-uniform between the two).
+        near: fraction of points near the surface; the others are uniform in the box.
+        resample: updates between fresh pools of points (0: one pool).
+        pool: points in a pool.
+        soften: errors count with soften / (|distance| + soften); None counts all alike.
+        sign_everywhere: use the parity sign everywhere on closed surfaces, not only where the paper's rule trusts it.
+        goal: errors of the averaged weights at which the decay begins early, which halves them: of the distance (means
+            within 0.01 and in the box), of the gradient (median cosine distance within 0.1) and of the sign (fraction
+            wrong farther than 0.002). None never stops early.
+        settle: steps of an early decay.
+        fold: fit a solid that is its own mirror image on one side only.
+    """
+
+    activation: Activation
+    width: int
+    layers: int
+    first: float
+    optimiser: Literal["soap", "adam"]
+    lr: float
+    decay: float
+    steps: int
+    batch: int
+    sigmas: tuple[float, float]
+    near: float
+    resample: int
+    pool: int
+    soften: float | None
+    sign_everywhere: bool
+    goal: tuple[float, float, float, float] | None
+    settle: int
+    fold: bool
+
+
+PLANS = {
+    # Chosen by measurement on scanned and thin-walled shapes. The box gets its share of points and the loss stays soft
+    # up to some hundredths of the size, without which the far field is off by as much.
+    "default": Plan(
+        activation="wave",
+        width=64,
+        layers=6,
+        first=8.0,
+        optimiser="soap",
+        lr=1e-2,
+        decay=0.5,
+        steps=5000,
+        batch=4096,
+        sigmas=(0.002, 0.15),
+        near=0.8,
+        resample=0,
+        pool=400_000,
+        soften=0.04,
+        sign_everywhere=True,
+        goal=(7e-4, 6e-3, 4e-3, 1.3e-3),
+        settle=1000,
+        fold=True,
+    ),
+    # Rubanova et al. 2024, section 3.1 and appendix: 400k updates at 1e-5, noise 0.1 drawn again every 100 updates.
+    "paper": Plan(
+        activation="relu",
+        width=128,
+        layers=8,
+        first=0.0,
+        optimiser="adam",
+        lr=1e-5,
+        decay=0.0,
+        steps=400_000,
+        batch=4096,
+        sigmas=(0.1, 0.1),
+        near=1.0,
+        resample=100,
+        pool=65_536,
+        soften=None,
+        sign_everywhere=False,
+        goal=None,
+        settle=0,
+        fold=False,
+    ),
+}
+# A surface from a few minutes of training is not known as exactly as a full fit would follow it.
+PLANS["quick"] = replace(PLANS["default"], steps=2000, settle=600)
+
+
+# Points are drawn from a little beyond the box that is used: at the very edge of its data a network's slope is poor.
+MARGIN = 1.15
+# A solid whose distances agree with their mirror images' to this, relative to its size, is fitted on one side only.
+SAME = 1e-4
+# A fit is checked on the way on this many points of three kinds: with these spreads around the surface, and in the box.
+CHECKED = 4000
+CHECKED_SIGMAS = (0.006, 0.06)
+
+
+@dataclass(frozen=True)
+class Pool:
+    """Points of S shapes, P each, normalised.
+
+    Attributes:
+        points: [S, P, 3].
+        distance: [S, P] signed.
+        signed: [S, P] bool, whether the sign of the distance counts.
+        direction: [S, P, 3] unit, from the surface outwards; zero on the surface itself.
+    """
+
+    points: torch.Tensor
+    distance: torch.Tensor
+    signed: torch.Tensor
+    direction: torch.Tensor
+
+    def rows(self, kept: torch.Tensor) -> Pool:
+        """Those of the shapes `kept` [S'] only."""
+        return Pool(self.points[kept], self.distance[kept], self.signed[kept], self.direction[kept])
+
+    def to(self, device: torch.device) -> Pool:
+        """The same on `device`."""
+        return Pool(*(part.to(device) for part in (self.points, self.distance, self.signed, self.direction)))
+
+
+def stack(pools: list[Pool]) -> Pool:
+    """Pools of equal size as one."""
+    return Pool(
+        torch.cat([pool.points for pool in pools]),
+        torch.cat([pool.distance for pool in pools]),
+        torch.cat([pool.signed for pool in pools]),
+        torch.cat([pool.direction for pool in pools]),
+    )
+
+
+class Subject:
+    """One solid to be fitted: its frame, its mirror planes, and samples of it.
+
+    Args:
+        oracle: true distances, metres.
+        plan: the recipe.
+        seed: of the points.
+    """
+
+    def __init__(self, oracle: DistanceOracle, plan: Plan, seed: int) -> None:
+        self.oracle, self._plan, self._seed = oracle, plan, seed
+        self.frame = normal_frame(oracle.bounds)
+        self.mirrors = _mirrors(oracle, self.frame) if plan.fold else (False, False, False)
+
+    def pool(self, step: int = 0) -> Pool:
+        """Points to learn from, of one shape, as drawn before update `step`."""
+        plan = self._plan
+        rng = np.random.default_rng([self._seed, 0, step] if step else [self._seed, 0])
+        near = int(plan.pool * plan.near)
+        low, high = np.log(plan.sigmas)
+        sigma = np.exp(rng.uniform(low, high, (near, 1)))
+        return self._sample(sigma, plan.pool - near, rng)
+
+    def check(self) -> Pool:
+        """Points to judge by on the way: `CHECKED` of each of three kinds."""
+        sigma = np.repeat(CHECKED_SIGMAS, CHECKED)[:, None]
+        return self._sample(sigma, CHECKED, np.random.default_rng([self._seed, 1]))
+
+    def _sample(self, sigma: np.ndarray, elsewhere: int, rng: np.random.Generator) -> Pool:
+        """Points with normal noise of `sigma` [N, 1] around the surface, then `elsewhere` points all over the box."""
+        local = self.frame.inward(sample_surface(self.oracle.surface, len(sigma), rng)[0])
+        around = local + sigma * rng.standard_normal((len(sigma), 3))
+        local = np.concatenate([around, rng.uniform(-MARGIN * BOX, MARGIN * BOX, (elsewhere, 3))])
+        local = np.clip(local, -MARGIN * BOX, MARGIN * BOX)
+        truth = self.oracle(self.frame.outward(local))
+        distance = truth.distance / self.frame.scale
+        signed = truth.trusted | (self.oracle.closed and self._plan.sign_everywhere)
+        # So close to the surface the direction from it is rounding.
+        clear = np.abs(distance) > 1e-4
+        offset = local - self.frame.inward(truth.closest)
+        direction = np.where(clear[:, None], offset / np.where(clear, distance, 1.0)[:, None], 0.0)
+        # What lies on the other side of a mirror plane is learned from its image.
+        side = np.where(np.asarray(self.mirrors) & (local < 0), -1.0, 1.0)
+        return Pool(
+            torch.from_numpy(local * side).float()[None],
+            torch.from_numpy(distance).float()[None],
+            torch.from_numpy(signed)[None],
+            torch.from_numpy(direction * side).float()[None],
+        )
+
+
+def _mirrors(oracle: DistanceOracle, frame: Frame) -> tuple[bool, bool, bool]:
+    """Across which planes of its frame the solid is its own mirror image, as far as sampled distances tell."""
+    rng = np.random.default_rng(0)
+    local = frame.inward(sample_surface(oracle.surface, 2000, rng)[0])
+    local = np.concatenate([local, local + rng.normal(0.0, 0.05, local.shape)])
+    truth = oracle(frame.outward(local)).distance
+    same = []
+    for axis in range(3):
+        image = local.copy()
+        image[:, axis] *= -1.0
+        same.append(bool(np.abs(oracle(frame.outward(image)).distance - truth).max() < SAME * frame.scale))
+    return same[0], same[1], same[2]
+
+
+WARMUP = 50
+CHECK_EVERY = 100
+# Seconds that the certificate takes of a budget, beside a tenth.
+RESERVE = 2.0
+SIGN_FROM = 0.002  # nearer to the surface a wrong sign is no more than an error of the distance
+CPU = torch.device("cpu")
+
+# Weights and biases per layer, [S, out, in] and [S, out].
+Layers = tuple[list[torch.Tensor], list[torch.Tensor]]
+
+
+def train(
+    oracles: Sequence[DistanceOracle],
+    plan: Plan,
+    *,
+    budget: float | None,
+    seed: int,
+    tell: Callable[[float, str], None],
+    checkpoint: Path | None = None,
+    device: torch.device = CPU,
+) -> list[tuple[MlpSdf, int]]:
+    """Run a plan for several solids in one batched optimiser; each comes out as it would alone, up to rounding.
+
+    Args:
+        oracles: true distances to each solid, metres.
+        plan: the recipe.
+        budget: seconds for all at most; the decay begins early enough to end within them.
+        seed: of points and weights.
+        tell: called with (fraction done, message).
+        checkpoint: of a single solid; resumed from when it belongs to this very fit. The caller removes it once what
+            came of the fit is safe.
+        device: to train on.
+
+    Returns:
+        per solid its network, on the CPU, and the number of updates made.
+    """
+    started = time.monotonic()
+    run = _Run(oracles, plan, seed, tell, device)
+    if checkpoint is not None and len(oracles) > 1:
+        raise ValueError("a checkpoint belongs to a single solid")
+    saved = Checkpoint(checkpoint, f"{asdict(plan)}|{seed}", oracles[0].surface) if checkpoint is not None else None
+    if saved is not None:
+        run.restore(saved)
+    if device.type == "cpu":
+        choose_threads(partial(run.differentiate, torch.arange(plan.batch) % plan.pool))
+    before, looping = run.step, time.monotonic()
+
+    while run.step < run.stop.max():
+        run.update()
+        if run.step % CHECK_EVERY:
+            continue
+        run.repair()
+        near, far = run.judge()
+        if budget is not None:
+            pace = (time.monotonic() - looping) / (run.step - before)
+            run.hurry(run.step + int((training_share(budget) - (time.monotonic() - started)) / pace))
+        run.retire()
+        last = max(int(run.stop.max()), 1)
+        errors = f"error {near:.2g} near, {far:.2g} in the box"
+        tell(0.97 * run.step / last, f"step {run.step} of {last}, {errors}")
+        if saved is not None and run.step % (2 * CHECK_EVERY) == 0:
+            run.save(saved)
+    return run.results()
+
+
+def training_share(budget: float) -> float:
+    """Seconds of a budget that the training may take; the rest is the certificate's."""
+    return budget - min(0.1 * budget + RESERVE, 0.5 * budget)
+
+
+class _Run:
+    """S networks in training; those that are done leave the stack.
+
+    Attributes:
+        step: updates made.
+        turn: [S] the update at which each one's decay begins; an early stop or a short budget moves it forward.
+        stop: [S] the update at which each one ends.
+    """
+
+    def __init__(
+        self,
+        oracles: Sequence[DistanceOracle],
+        plan: Plan,
+        seed: int,
+        tell: Callable[[float, str], None],
+        device: torch.device,
+    ) -> None:
+        self.plan, self.device = plan, device
+        self.subjects, pools, checks = [], [], []
+        for done, oracle in enumerate(oracles):
+            tell(0.0, "sampling distances" + (f" of {done + 1} of {len(oracles)}" if len(oracles) > 1 else ""))
+            subject = Subject(oracle, plan, seed)
+            self.subjects.append(subject)
+            pools.append(subject.pool())
+            checks.append(subject.check())
+        self.pool, self.check = stack(pools).to(device), stack(checks).to(device)
+        # Drawn on the CPU, so that points and first weights do not depend on the device.
+        self.generator = torch.Generator().manual_seed(seed)
+        self._take([p.to(device) for p in _initial(plan, len(oracles), self.generator)])
+        self.average = [parameter.clone() for parameter in self.parameters]
+        self.optimiser = (Soap if plan.optimiser == "soap" else Adam)(self.parameters, plan.lr)
+        self.step = 0
+        self.turn = np.full(len(oracles), int(plan.steps * (1.0 - plan.decay)))
+        self.stop = np.full(len(oracles), plan.steps)
+        self.rate = np.ones(len(oracles))  # of the step size, lower after a fresh start
+        self.places = np.arange(len(oracles))  # in the results
+        self.done: dict[int, tuple[MlpSdf, int]] = {}
+        self._tape = Tape(plan.activation, plan.width, plan.layers, self.parameters[0])
+
+    def _take(self, parameters: list[torch.Tensor]) -> None:
+        self.parameters = parameters
+        for parameter in parameters:
+            parameter.grad = torch.zeros_like(parameter)
+
+    def update(self) -> None:
+        """One step of the optimiser for all that are not done."""
+        plan = self.plan
+        if plan.resample and self.step and self.step % plan.resample == 0:
+            self.pool = stack([subject.pool(self.step) for subject in self.subjects]).to(self.device)
+        self.differentiate(torch.randint(plan.pool, (plan.batch,), generator=self.generator))
+        factor = min(1.0, (self.step + 1) / WARMUP) * self.rate
+        if plan.decay:
+            late = np.clip((self.step - self.turn) / np.maximum(self.stop - self.turn, 1), 0.0, 1.0)
+            factor = factor * 0.5 * (1.0 + np.cos(math.pi * late))
+        factor = np.where(self.step < self.stop, factor, 0.0)
+        self.optimiser.step(torch.from_numpy(factor).to(self.parameters[0]))
+        self.step += 1
+        for mean, parameter in zip(self.average, self.parameters, strict=True):
+            mean.lerp_(parameter, 0.02)
+
+    def differentiate(self, chosen: torch.Tensor) -> None:
+        """Weighted L1 of the signed distance, and of the unsigned one where the sign is not known; fills the gradients.
+
+        Args:
+            chosen: [T] points of each pool.
+        """
+        chosen = chosen.to(self.device)
+        points, distance, signed = (
+            self.pool.points[:, chosen],
+            self.pool.distance[:, chosen],
+            self.pool.signed[:, chosen],
+        )
+        weights, biases = _layers(self.parameters, self.plan.activation)
+        value = self._tape.forward(weights, biases, points)
+        error = torch.where(signed, value - distance, value.abs() - distance.abs())
+        slope = error.sign() * torch.where(signed, 1.0, value.sign()) / len(chosen)
+        if self.plan.soften is not None:
+            slope = slope * (self.plan.soften / (distance.abs() + self.plan.soften))
+        gradients = [parameter.grad for parameter in self.parameters if parameter.grad is not None]
+        self._tape.parameter_gradients(weights, points, slope, *_split(gradients))
+        for gradient, scale in zip(gradients, _SCALES[self.plan.activation], strict=True):
+            gradient.mul_(scale)
+
+    def repair(self) -> None:
+        """A fresh start, from new weights and with a quarter of the step size, for what is not finite."""
+        finite = torch.stack([p.isfinite().all(-1).all(-1).all(0) for p in self.parameters]).all(0)
+        if bool(finite.all()):
+            return
+        broken = ~finite
+        fresh = _initial(self.plan, len(finite), torch.Generator().manual_seed(1))
+        for mean, parameter, start in zip(self.average, self.parameters, fresh, strict=True):
+            parameter[:, broken] = start.to(self.device)[:, broken]
+            mean[:, broken] = parameter[:, broken]
+        self.optimiser.forget(broken)
+        self.rate[broken.cpu().numpy()] /= 4
+
+    def judge(self) -> tuple[float, float]:
+        """Begin the decay of those that meet the goal. Returns mean errors near the surface and in the box, of all."""
+        layers = _layers(self.average, self.plan.activation)
+        value, gradient = value_and_gradient(*layers, self.plan.activation, self.check.points)
+        distance, signed = self.check.distance, self.check.signed
+        error = torch.where(signed, value - distance, value.abs() - distance.abs()).abs()
+        near, far = error[:, :CHECKED].mean(1), error[:, 2 * CHECKED :].mean(1)
+        if self.plan.goal is not None:
+            cosine = torch.nn.functional.cosine_similarity(gradient, self.check.direction, dim=-1)
+            turned = 1.0 - cosine[:, CHECKED : 2 * CHECKED].median(1).values
+            clear = signed & (distance.abs() > SIGN_FROM)
+            wrong = (clear & (value * distance <= 0)).sum(1) / clear.sum(1).clamp_min(1)
+            errors = torch.stack([near, far, turned, wrong], -1)
+            met = (errors <= errors.new_tensor(self.plan.goal)).all(-1)
+            early = met.cpu().numpy() & (self.step < self.turn)
+            self.turn = np.where(early, self.step, self.turn)
+            self.stop = np.where(early, np.minimum(self.stop, self.step + self.plan.settle), self.stop)
+        return float(near.mean()), float(far.mean())
+
+    def hurry(self, possible: int) -> None:
+        """Place decay and end so that `possible` updates in all suffice.
+
+        Until the decay has begun the end moves both ways, since the first steps of a busy machine tell little; after
+        that it only comes nearer.
+        """
+        possible = max(possible, self.step)
+        begun = self.step >= self.turn
+        self.stop = np.minimum(np.where(begun, self.stop, self.plan.steps), possible)
+        open_ended = np.maximum(self.step, (self.stop * (1.0 - self.plan.decay)).astype(int))
+        self.turn = np.where(begun, self.turn, open_ended)
+
+    def retire(self) -> None:
+        """Put aside the networks that are done, once they are half of the stack."""
+        going = self.step < self.stop
+        if 2 * going.sum() > len(going) or not going.any():
+            return
+        self._finish(~going)
+        kept = torch.from_numpy(np.flatnonzero(going)).to(self.device)
+        self._take([parameter[:, kept] for parameter in self.parameters])
+        self.average = [mean[:, kept] for mean in self.average]
+        self.optimiser.keep(kept, self.parameters)
+        self.pool, self.check = self.pool.rows(kept), self.check.rows(kept)
+        self.subjects = [subject for subject, stays in zip(self.subjects, going, strict=True) if stays]
+        self.turn, self.stop, self.rate = self.turn[going], self.stop[going], self.rate[going]
+        self.places = self.places[going]
+
+    def _finish(self, chosen: np.ndarray) -> None:
+        weights, biases = _layers(self.parameters, self.plan.activation)
+        for row in np.flatnonzero(chosen):
+            subject = self.subjects[row]
+            sdf = MlpSdf(
+                tuple(weight[row].cpu().clone() for weight in weights),
+                tuple(bias[row].cpu().clone() for bias in biases),
+                self.plan.activation,
+                subject.frame,
+                subject.oracle.bounds.copy(),
+                subject.mirrors,
+            )
+            self.done[int(self.places[row])] = sdf, int(min(self.step, self.stop[row]))
+
+    def results(self) -> list[tuple[MlpSdf, int]]:
+        """Every network and its updates, in the order of the solids."""
+        self._finish(np.ones(len(self.subjects), dtype=bool))
+        return [self.done[place] for place in sorted(self.done)]
+
+    def save(self, saved: Checkpoint) -> None:
+        """Write the state of a single network's training."""
+        progress = (self.step, int(self.turn[0]), int(self.stop[0]), float(self.rate[0]))
+        saved.save(self.parameters, self.average, self.optimiser, self.generator, progress)
+
+    def restore(self, saved: Checkpoint) -> None:
+        """Go on from what `save` wrote, if it is there."""
+        progress = saved.load(self.parameters, self.average, self.optimiser, self.generator)
+        if progress is not None:
+            self.step = int(progress[0])
+            self.turn, self.stop = np.array([int(progress[1])]), np.array([int(progress[2])])
+            self.rate = np.array([progress[3]])
+
+
+def _initial(plan: Plan, count: int, generator: torch.Generator) -> list[torch.Tensor]:
+    """First [1, S, W, 3], hidden [L - 2, S, W, W] and last [1, S, 1, W] weights; biases [L - 1, S, W, 1], [1, S, 1, 1].
+
+    All `count` networks start alike. Equal layers are stacked for the optimiser. Periodic layers start with phases all
+    around and the spread of inputs that sine layers have (Sitzmann et al. 2020); ReLU layers with He's variance.
+    """
+    width, hidden = plan.width, plan.layers - 2
+
+    def uniform(bound: float, layers: int, *shape: int) -> torch.Tensor:
+        one = (2.0 * torch.rand((layers, 1, *shape), generator=generator) - 1.0) * bound
+        return one.repeat(1, count, 1, 1)
+
+    periodic = plan.activation == "wave"
+    return [
+        uniform(plan.first if periodic else math.sqrt(2.0), 1, width, 3),
+        uniform(math.sqrt(6.0 / width), hidden, width, width),
+        uniform(math.sqrt(6.0 / width) / (10.0 if periodic else 1.0), 1, 1, width),
+        uniform(math.pi if periodic else 0.05, plan.layers - 1, width, 1),
+        uniform(0.05, 1, 1, 1),
+    ]
+
+
+# A wave of period 1 with the parameters of a sine of period 2 pi: they are trained at the sine's scale, on which
+# equal steps of the optimiser suit all layers, and multiplied by these before every use. Its height is 1/8.
+_SCALES = {"wave": (0.5 / math.pi, 4.0 / math.pi, 8.0, 0.5 / math.pi, 1.0), "relu": (1.0,) * 5}
+
+
+def _layers(parameters: list[torch.Tensor], activation: Activation) -> Layers:
+    """What the networks compute with."""
+    return _split([parameter * scale for parameter, scale in zip(parameters, _SCALES[activation], strict=True)])
+
+
+def _split(parts: list[torch.Tensor]) -> Layers:
+    first, hidden, last, biases, end = parts
+    return [first[0], *hidden.unbind(), last[0]], [*biases[..., 0].unbind(), end[0, ..., 0]]
+
 
 Recipe = Literal["quick", "default", "paper"]
 Progress = Callable[[float, str], None]
@@ -203,7 +695,7 @@ def _train(
         raise SdfsimError(f"the budget of a fit must be > 0 seconds (got {budget})")
     started = time.monotonic()
     tell = on_progress or (lambda fraction, message: None)
-    fitted = training.train(
+    fitted = train(
         oracles,
         PLANS[recipe],
         budget=budget,

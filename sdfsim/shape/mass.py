@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.mesh import Mesh, is_closed
-from sdfsim.shape.sdf import Sdf
+
+if TYPE_CHECKING:  # sdf.py measures meshes, and so imports this file
+    from sdfsim.shape.sdf import Sdf
 
 
 def mass_properties(mesh: Mesh) -> tuple[float, np.ndarray, np.ndarray]:

@@ -23,7 +23,7 @@ from sdfsim.training.contact_cache import inner_steps
 from sdfsim.training.run import Run
 
 if TYPE_CHECKING:
-    from sdfsim.shape.asset import Shape
+    from sdfsim.shape.shape import Shape
 
 WATCHED = 10  # held-out trajectories that are rolled out
 STEPS = 50

@@ -18,7 +18,7 @@ import cli
 from sdfsim import Rollout, load_scene
 from sdfsim.commands.arguments import seconds_of
 from sdfsim.shape import primitives
-from sdfsim.shape.storage import write_ply
+from sdfsim.shape.mesh import write_ply
 from tests.cli.conftest import SCENE, run
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -7,16 +7,17 @@ from dataclasses import replace
 
 import pytest
 
-from sdfsim.shape import plans, primitives
-from sdfsim.shape.asset import load_shape
+from sdfsim.shape import fit as fit_module
+from sdfsim.shape import primitives
 from sdfsim.shape.checkpoint import Checkpoint
-from sdfsim.shape.storage import write_ply
+from sdfsim.shape.mesh import write_ply
+from sdfsim.shape.shape import load_shape
 from tests.cli.conftest import run
 
 
 def test_fitting_a_mesh_goes_on_where_it_was_interrupted(tmp_path, monkeypatch):
-    plan = replace(plans.PLANS["default"], width=16, layers=4, steps=400, batch=256, pool=4000, goal=None)
-    monkeypatch.setitem(plans.PLANS, "default", plan)
+    plan = replace(fit_module.PLANS["default"], width=16, layers=4, steps=400, batch=256, pool=4000, goal=None)
+    monkeypatch.setitem(fit_module.PLANS, "default", plan)
     (tmp_path / "box.ply").write_bytes(write_ply(primitives.box()))
     save, calls = Checkpoint.save, []
 

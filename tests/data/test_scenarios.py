@@ -19,8 +19,8 @@ from sdfsim.data.starts_resting import DROP, NUDGE, PRESSED, STARTS, at_rest, st
 from sdfsim.data.statistics import statistics, statistics_lines
 from sdfsim.errors import SdfsimError
 from sdfsim.shape import primitives
-from sdfsim.shape.asset import Shape, analytic_shape, sdf_of_mesh
 from sdfsim.shape.mass import mass_properties
+from sdfsim.shape.shape import Shape, analytic_shape, sdf_of_mesh
 from sdfsim.training.contact_cache import contact_frames
 from sdfsim.training.impulse_task import ImpulseTask
 

@@ -18,8 +18,7 @@ from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.baselines import engine_file
 from sdfsim.files import locked
 from sdfsim.shape import primitives
-from sdfsim.shape.mesh import Mesh, signed_volume
-from sdfsim.shape.storage import write_ply
+from sdfsim.shape.mesh import Mesh, signed_volume, write_ply
 from tests.recordings import CUBE
 
 NAMES = [f"shape {k}" for k in range(2000)]

@@ -9,7 +9,7 @@ import torch
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.model import Model, new_network
 from sdfsim.scene.types import Body, Scene
-from sdfsim.shape.asset import analytic_shape
+from sdfsim.shape.shape import analytic_shape
 
 
 def make_body(name: str, shape: int, position, **fields) -> Body:

@@ -12,7 +12,7 @@ from sdfsim.dynamics.bodies import Units, from_scene
 from sdfsim.dynamics.broad import Still, near_pairs, swept_boxes
 from sdfsim.dynamics.memory import Memory
 from sdfsim.scene.types import Scene
-from sdfsim.shape.asset import analytic_shape
+from sdfsim.shape.shape import analytic_shape
 from tests.dynamics.conftest import make_body
 
 GRAVITY = torch.tensor([0.0, 0.0, -10.0], dtype=torch.float64)

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim import Simulator
 from sdfsim.scene.types import Scene
-from sdfsim.shape.asset import analytic_shape
+from sdfsim.shape.shape import analytic_shape
 from tests.dynamics.conftest import make_body, random_model
 
 RADIUS = 0.5

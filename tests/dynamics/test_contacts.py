@@ -11,7 +11,7 @@ from sdfsim.dynamics.bodies import Units, from_scene
 from sdfsim.dynamics.contacts import find_contacts, thin_contacts
 from sdfsim.errors import SdfsimError
 from sdfsim.scene.types import Scene
-from sdfsim.shape.asset import analytic_shape
+from sdfsim.shape.shape import analytic_shape
 from tests.dynamics.conftest import make_body
 
 CPU = torch.device("cpu")

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.dynamics.step import contact_graph, find_contacts, fly
 from sdfsim.scene.types import Scene
-from sdfsim.shape.asset import analytic_shape
+from sdfsim.shape.shape import analytic_shape
 from tests.dynamics.conftest import angle_between, make_body, random_model
 
 

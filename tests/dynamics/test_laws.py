@@ -10,7 +10,7 @@ import torch
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.scene.types import Body, Scene
-from sdfsim.shape.asset import Shape, analytic_shape
+from sdfsim.shape.shape import Shape, analytic_shape
 
 G = 9.81  # m/s^2
 STARTS = (0.95, 0.98, 1.0, 1.03, 1.07)

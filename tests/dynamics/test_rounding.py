@@ -12,9 +12,9 @@ from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.rounding import curvature
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.scene.types import Scene
-from sdfsim.shape.asset import analytic_shape
-from sdfsim.shape.exact import MeshSdf
 from sdfsim.shape.mesh import Mesh
+from sdfsim.shape.sdf import MeshSdf
+from sdfsim.shape.shape import analytic_shape
 from tests.dynamics.conftest import make_body, random_model
 
 REACH = 0.1

@@ -15,7 +15,7 @@ from sdfsim.dynamics.contacts import ARRAYS, find_contacts, thin_contacts
 from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.sleep import STEPS, STRAY, Rest
 from sdfsim.scene.types import Scene
-from sdfsim.shape.asset import analytic_shape, load_shape
+from sdfsim.shape.shape import analytic_shape, load_shape
 from tests.dynamics.conftest import make_body
 from tests.dynamics.test_contacts import heap
 

@@ -9,7 +9,7 @@ import torch
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.dynamics.sleep import STEPS
 from sdfsim.scene.types import Effects, Scene, Waypoints
-from sdfsim.shape.asset import analytic_shape
+from sdfsim.shape.shape import analytic_shape
 from tests.dynamics.conftest import make_body, random_model
 
 BOX = analytic_shape("box", size=(1.0, 1.0, 1.0))

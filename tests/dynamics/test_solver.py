@@ -9,7 +9,7 @@ import torch
 from sdfsim import Simulator
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.scene.types import Scene
-from sdfsim.shape.asset import analytic_shape
+from sdfsim.shape.shape import analytic_shape
 from tests.dynamics.test_laws import ball, body, cube
 from tests.hard_cases import gates
 from tests.test_resuming import Killed, simulate

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim import Rollout, Simulator
 from sdfsim.scene.types import Scene
-from sdfsim.shape.asset import Shape, analytic_shape, load_shape
+from sdfsim.shape.shape import Shape, analytic_shape, load_shape
 from tests.dynamics.test_laws import body
 from tests.dynamics.test_waits import SHAPES
 

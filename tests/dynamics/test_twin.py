@@ -11,8 +11,8 @@ from sdfsim.dynamics.bodies import Units, from_scene
 from sdfsim.dynamics.kernels.distance import distance as kernel_distance
 from sdfsim.dynamics.solver import Compiled, compiled_rules, no_manifolds, taken_up
 from sdfsim.scene.types import Scene
-from sdfsim.shape.asset import analytic_shape, load_shape
 from sdfsim.shape.primitives import convex_pieces
+from sdfsim.shape.shape import analytic_shape, load_shape
 from tests.dynamics.test_laws import ball, body, cube
 from tests.dynamics.test_solver import heap
 from tests.dynamics.test_waits import SHAPES

@@ -13,7 +13,7 @@ from sdfsim.dynamics.contacts import ARRAYS, find_contacts
 from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.scene.types import Limits, Scene
-from sdfsim.shape.asset import load_shape, with_sdf
+from sdfsim.shape.shape import load_shape, with_sdf
 from tests.dynamics.conftest import make_body, random_model
 from tests.dynamics.test_contacts import heap
 

@@ -24,8 +24,8 @@ from sdfsim.evaluation.hard_cases_ratchet import accepted, slipped_back
 from sdfsim.evaluation.hard_cases_tables import NO_TEACHER, columns, losses, markdown, rows
 from sdfsim.files import write_json
 from sdfsim.shape import primitives
-from sdfsim.shape.asset import analytic_shape
-from sdfsim.shape.storage import write_ply
+from sdfsim.shape.mesh import write_ply
+from sdfsim.shape.shape import analytic_shape
 
 FEW = ("overlap-balls", "thin-5", "cuda")
 

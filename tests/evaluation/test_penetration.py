@@ -10,7 +10,7 @@ from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.baselines import collision_mesh
 from sdfsim.evaluation.penetration import Solid, deepest, exact_solids, penetration
 from sdfsim.shape import primitives
-from sdfsim.shape.asset import analytic_shape, with_sdf
+from sdfsim.shape.shape import analytic_shape, with_sdf
 from tests.recordings import CUBE, balls
 
 POLES = np.concatenate([np.eye(3), -np.eye(3)])

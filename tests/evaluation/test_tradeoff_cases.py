@@ -11,12 +11,12 @@ import pytest
 from sdfsim.evaluation import tradeoff_shapes
 from sdfsim.evaluation.tradeoff_cases import Cases
 from sdfsim.evaluation.tradeoff_shapes import digest_of, refitted, sampled
-from sdfsim.shape.asset import analytic_shape, with_sdf
 from sdfsim.shape.distance import PiecesDistance
-from sdfsim.shape.grid import GridSdf
-from sdfsim.shape.mlp import MlpSdf
-from sdfsim.shape.plans import PLANS
+from sdfsim.shape.fit import PLANS
+from sdfsim.shape.mlp_sdf import MlpSdf
 from sdfsim.shape.primitives import convex_pieces
+from sdfsim.shape.sdf import GridSdf
+from sdfsim.shape.shape import analytic_shape, with_sdf
 from tests.recordings import trajectory
 
 

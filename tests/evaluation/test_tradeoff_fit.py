@@ -11,7 +11,7 @@ from sdfsim.evaluation import tradeoff_fit
 from sdfsim.evaluation.tradeoff import run
 from sdfsim.evaluation.tradeoff_fit import ERRORS, QUICK_BUDGETS, fit_tradeoff, told
 from sdfsim.shape import primitives
-from sdfsim.shape.training import training_share
+from sdfsim.shape.fit import training_share
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from sdfsim.evaluation.tradeoff_knobs import (
     settings,
     threads_of,
 )
-from sdfsim.shape.asset import analytic_shape, with_sdf
+from sdfsim.shape.shape import analytic_shape, with_sdf
 
 
 @pytest.fixture(scope="module")

@@ -34,7 +34,7 @@ def data(tmp_path_factory):
     """A dataset of three trajectories of cubes whose distances are a closed form."""
     pytest.importorskip("pybullet")
     from sdfsim.data.generate import make_dataset
-    from sdfsim.shape.asset import analytic_shape
+    from sdfsim.shape.shape import analytic_shape
 
     meshes, out = tmp_path_factory.mktemp("meshes"), tmp_path_factory.mktemp("data")
     (meshes / "cube").mkdir()

@@ -8,7 +8,7 @@ from sdfsim.data.convex_pieces import wavefront
 from sdfsim.data.generate import make_dataset
 from sdfsim.evaluation.evaluate import evaluate
 from sdfsim.shape import primitives
-from sdfsim.shape.asset import analytic_shape
+from sdfsim.shape.shape import analytic_shape
 
 TRAJECTORIES = 30
 

@@ -113,7 +113,7 @@ def whole(folder: Path) -> None:
     """That every file under its final name can be read to its end; hidden ones are nobody's results."""
     from safetensors.numpy import load_file
 
-    from sdfsim.shape.storage import read_mesh
+    from sdfsim.shape.mesh import read_mesh
 
     for path in folder.rglob("*"):
         hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
@@ -141,11 +141,11 @@ def litter(folder: Path) -> list[str]:
 
 def tiny_fit() -> None:
     """Fits of 120 steps, with a checkpoint every 40."""
-    from sdfsim.shape import plans, training
+    from sdfsim.shape import fit as fit_module
 
-    plan = replace(plans.PLANS["default"], width=8, layers=3, steps=120, batch=64, pool=1000, goal=None)
-    plans.PLANS["default"] = plans.PLANS["quick"] = plan
-    training.CHECK = 20
+    plan = replace(fit_module.PLANS["default"], width=8, layers=3, steps=120, batch=64, pool=1000, goal=None)
+    fit_module.PLANS["default"] = fit_module.PLANS["quick"] = plan
+    fit_module.CHECK_EVERY = 20
 
 
 def tiny_train() -> None:

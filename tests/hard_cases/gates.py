@@ -13,7 +13,7 @@ import sdfsim
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.scene.types import Body, Scene
-from sdfsim.shape.asset import Shape, analytic_shape, load_shape
+from sdfsim.shape.shape import Shape, analytic_shape, load_shape
 from tests.dynamics.conftest import make_body
 
 SAMPLES = Path(__file__).resolve().parents[2] / "samples"
@@ -38,7 +38,7 @@ def ground(shape: int) -> Body:
 
 def ring() -> Shape:
     """A fitted network, 1 m across."""
-    from sdfsim.shape.asset import scaled
+    from sdfsim.shape.shape import scaled
 
     shape = load_shape(SAMPLES / "shapes" / "ring")
     return scaled(shape, 1.0 / float(np.ptp(shape.sdf.bounds, axis=0).max()))

@@ -15,8 +15,8 @@ from pipeline.photos import read_photo
 from sdfsim import SdfsimError, files, load_shape
 from sdfsim.dynamics.model import Model, load_model, new_network
 from sdfsim.files import read_arrays
-from sdfsim.shape.asset import analytic_shape
 from sdfsim.shape.mesh import load_mesh
+from sdfsim.shape.shape import analytic_shape
 from tests.hard_cases.strangers import time_limit
 
 

@@ -16,9 +16,9 @@ from PIL import Image
 
 from sdfsim.data.dataset import Trajectory
 from sdfsim.dynamics.model import Model, new_network
-from sdfsim.shape.asset import analytic_shape
+from sdfsim.shape.mesh import write_ply
 from sdfsim.shape.primitives import box
-from sdfsim.shape.storage import write_ply
+from sdfsim.shape.shape import analytic_shape
 from tests.hard_cases import crashing
 from tests.hard_cases.crashing import NEVER, Ended, Moment, litter, whole
 

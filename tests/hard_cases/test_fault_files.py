@@ -15,11 +15,10 @@ import cli
 from sdfsim import SdfsimError, load_shape
 from sdfsim.dynamics.model import Model, new_network
 from sdfsim.files import LOCK, locked
-from sdfsim.shape import cache
-from sdfsim.shape.asset import MESH_FILE, RECORD_FILE, WEIGHTS_FILE, analytic_shape, with_sdf
-from sdfsim.shape.mesh import Mesh
+from sdfsim.shape import shape as shape_module
+from sdfsim.shape.mesh import Mesh, write_ply
 from sdfsim.shape.primitives import box
-from sdfsim.shape.storage import write_ply
+from sdfsim.shape.shape import MESH_FILE, RECORD_FILE, WEIGHTS_FILE, analytic_shape, with_sdf
 
 SCENE = "version: 1\nduration: 0.04\nbodies: [{name: floor, plane: {}}]\n"
 
@@ -107,7 +106,7 @@ def test_a_cached_shape_follows_its_source(tmp_path):
     file, kept = tmp_path / "a.ply", tmp_path / "cache"
 
     def volume() -> float:
-        return cache.shape_from_mesh(file, kept, sdf="grid", resolution=8).volume
+        return shape_module.shape_from_mesh(file, kept, sdf="grid", resolution=8).volume
 
     file.write_bytes(write_ply(box()))
     assert volume() == pytest.approx(1.0)
@@ -121,11 +120,11 @@ def test_a_cached_shape_follows_its_source(tmp_path):
 def test_a_damaged_cache_entry_is_made_again(tmp_path, name):
     file, kept = tmp_path / "a.ply", tmp_path / "cache"
     file.write_bytes(write_ply(box()))
-    cache.shape_from_mesh(file, kept, sdf="grid", resolution=8)
+    shape_module.shape_from_mesh(file, kept, sdf="grid", resolution=8)
     (entry,) = kept.iterdir()
     whole = (entry / name).read_bytes()
     (entry / name).write_bytes(whole[: len(whole) // 2])
-    assert cache.shape_from_mesh(file, kept, sdf="grid", resolution=8).volume == pytest.approx(1.0)
+    assert shape_module.shape_from_mesh(file, kept, sdf="grid", resolution=8).volume == pytest.approx(1.0)
     assert list(kept.iterdir()) == [entry] and (entry / name).read_bytes() == whole
 
 

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim.dynamics.bodies import State
 from sdfsim.dynamics.simulator import Simulator
-from sdfsim.shape.asset import analytic_shape
+from sdfsim.shape.shape import analytic_shape
 from tests.hard_cases import gates
 
 ROOT = Path(__file__).resolve().parents[2]

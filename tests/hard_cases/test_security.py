@@ -16,10 +16,9 @@ from typer.testing import CliRunner
 import cli
 from sdfsim import SceneError, SdfsimError, load_scene
 from sdfsim.dynamics.model import Model, new_network
-from sdfsim.shape.asset import analytic_shape
-from sdfsim.shape.mesh import load_mesh
+from sdfsim.shape.mesh import load_mesh, write_ply
 from sdfsim.shape.primitives import box
-from sdfsim.shape.storage import write_ply
+from sdfsim.shape.shape import analytic_shape
 from tests.hard_cases.strangers import time_limit
 
 ROOT = Path(__file__).resolve().parents[2]

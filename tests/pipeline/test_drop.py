@@ -16,9 +16,8 @@ from pipeline.scene_file import DENSITY, Found, scene_text, write_scene
 from sdfsim.errors import SdfsimError
 from sdfsim.files import write_json
 from sdfsim.scene.load import load_scene
-from sdfsim.shape.asset import Shape, analytic_shape
-from sdfsim.shape.mesh import Mesh
-from sdfsim.shape.storage import write_ply
+from sdfsim.shape.mesh import Mesh, write_ply
+from sdfsim.shape.shape import Shape, analytic_shape
 from tests.pipeline.test_surface import cube, scenery
 
 PLACEMENT = Placement(1.0, np.eye(3), np.zeros(3), "plane", "assumed: widest side = 1 m")

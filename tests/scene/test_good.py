@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sdfsim.shape.mesh import Mesh
+from sdfsim.shape.mesh import Mesh, write_ply
 from sdfsim.shape.primitives import box
-from sdfsim.shape.storage import write_ply
 from tests.scene.conftest import HEAD, problems_of
 
 

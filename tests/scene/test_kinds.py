@@ -12,11 +12,9 @@ from sdfsim import Simulator
 from sdfsim.dynamics.bodies import Units, from_scene
 from sdfsim.dynamics.contacts import find_contacts
 from sdfsim.scene.types import Scene
-from sdfsim.shape.analytic import BoxSdf
-from sdfsim.shape.asset import analytic_shape, with_sdf
-from sdfsim.shape.exact import MeshSdf
-from sdfsim.shape.grid import GridSdf
-from sdfsim.shape.storage import write_ply
+from sdfsim.shape.mesh import write_ply
+from sdfsim.shape.sdf import BoxSdf, GridSdf, MeshSdf
+from sdfsim.shape.shape import analytic_shape, with_sdf
 from tests.scene.test_load import problems_of
 
 CRATE = {

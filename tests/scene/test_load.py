@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sdfsim import SceneError, load_scene
-from sdfsim.shape.asset import analytic_shape
+from sdfsim.shape.shape import analytic_shape
 from tests.scene.conftest import HEAD, problems_of
 
 BODY = [

@@ -10,8 +10,7 @@ import pytest
 from sdfsim.planning import describe, plan_lines
 from sdfsim.scene.thin import may_pass_through, thickness
 from sdfsim.scene.types import Body, Scene
-from sdfsim.shape.asset import analytic_shape
-from sdfsim.shape.cache import shape_from_primitive
+from sdfsim.shape.shape import analytic_shape, shape_from_primitive
 
 DT = 0.02
 

@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from sdfsim.errors import SdfsimError
-from sdfsim.shape.analytic import BoxSdf, PlaneSdf, SphereSdf
-from sdfsim.shape.sdf import Sdf
+from sdfsim.shape.sdf import BoxSdf, PlaneSdf, Sdf, SphereSdf
 
 ALL = [PlaneSdf(), SphereSdf(0.4), BoxSdf((0.3, 0.5, 0.2))]
 

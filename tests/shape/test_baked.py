@@ -5,10 +5,10 @@ import pytest
 
 from sdfsim.dynamics.kernels.distance import GRID, distance
 from sdfsim.dynamics.solver import compiled_shapes
-from sdfsim.shape import baked as module
-from sdfsim.shape.asset import analytic_shape, with_sdf
-from sdfsim.shape.baked import bake, baked, wall_thickness
-from sdfsim.shape.patches import surface_of
+from sdfsim.shape import baked_grid as module
+from sdfsim.shape.baked_grid import bake, baked, wall_thickness
+from sdfsim.shape.shape import analytic_shape, with_sdf
+from sdfsim.shape.surface_nodes import surface_of
 
 
 @pytest.fixture(scope="module")

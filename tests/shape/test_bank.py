@@ -4,14 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from sdfsim.shape import grid
-from sdfsim.shape.analytic import BoxSdf, PlaneSdf, SphereSdf
-from sdfsim.shape.bank import SdfBank, _GridGroup
-from sdfsim.shape.exact import MeshSdf
-from sdfsim.shape.grid import GridSdf, sample_grid
+from sdfsim.shape import sdf as sdf_module
 from sdfsim.shape.mesh import Frame
 from sdfsim.shape.primitives import box
-from sdfsim.shape.sdf import Sdf
+from sdfsim.shape.sdf import BoxSdf, GridSdf, MeshSdf, PlaneSdf, Sdf, SphereSdf, sample_grid
+from sdfsim.shape.sdf_batch import SdfBank, _GridGroup
 from tests.shape.test_mlp import network
 
 
@@ -96,15 +93,15 @@ def test_order_of_questions_does_not_matter() -> None:
 @pytest.mark.parametrize("chunk", [1, 37, 1000, 5000])
 def test_grids_of_one_resolution_share_a_gather_of_bounded_size(monkeypatch: pytest.MonkeyPatch, chunk: int) -> None:
     seen: list[int] = []
-    inner = grid.trilinear
+    inner = sdf_module.trilinear
 
     def counted(values: torch.Tensor, slot: torch.Tensor | None, points: torch.Tensor):
         assert values.shape == (4, 8, 8, 8)
         seen.append(len(points))
         return inner(values, slot, points)
 
-    monkeypatch.setattr("sdfsim.shape.bank.trilinear", counted)
-    monkeypatch.setattr(grid, "CHUNK", chunk)
+    monkeypatch.setattr("sdfsim.shape.sdf_batch.trilinear", counted)
+    monkeypatch.setattr(sdf_module, "CHUNK", chunk)
     sdfs = [voxels(seed, 8) for seed in range(4)]
     index = torch.randint(4, (1000,))
     local = torch.rand(1000, 3, dtype=torch.float64) * 1.38 - 0.69

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from sdfsim.shape.boxed import BOX, CAUTION, FADE, SLOPE, everywhere
+from sdfsim.shape.far_field import BOX, CAUTION, FADE, SLOPE, everywhere
 
 
 def ball(points: torch.Tensor, centre: tuple[float, float, float] = (0, 0, 0), radius: float = 0.5) -> torch.Tensor:

@@ -8,14 +8,12 @@ import pytest
 from scipy.spatial import cKDTree
 
 from sdfsim.shape import primitives
-from sdfsim.shape.analytic import BoxSdf, SphereSdf
-from sdfsim.shape.certificate import EXACT, USABLE, certify, thin_share, verdict
-from sdfsim.shape.coverage import coverage, hausdorff, zero_level
 from sdfsim.shape.distance import MeshDistance, PiecesDistance
+from sdfsim.shape.fit_metrics import EXACT, USABLE, certify, coverage, hausdorff, thin_share, verdict, zero_level
 from sdfsim.shape.mass import mass_properties
 from sdfsim.shape.mesh import Mesh, is_closed, normal_frame, sample_surface
-from sdfsim.shape.nodes import sample_nodes, thin
-from sdfsim.shape.sdf import Sdf
+from sdfsim.shape.sdf import BoxSdf, Sdf, SphereSdf
+from sdfsim.shape.surface_nodes import sample_nodes, thin
 
 CUBE = BoxSdf((0.5, 0.5, 0.5))
 

@@ -5,9 +5,9 @@ import pytest
 
 from sdfsim.errors import SdfsimError
 from sdfsim.shape import distance, primitives
-from sdfsim.shape.analytic import BoxSdf
 from sdfsim.shape.distance import MeshDistance, PiecesDistance
 from sdfsim.shape.mesh import Mesh
+from sdfsim.shape.sdf import BoxSdf
 
 
 def points_in(half: float, count: int = 4000) -> np.ndarray:

@@ -9,12 +9,10 @@ import pytest
 import torch
 
 from sdfsim.errors import SdfsimError
-from sdfsim.shape.analytic import BoxSdf, SphereSdf
-from sdfsim.shape.asset import analytic_shape, with_sdf
-from sdfsim.shape.exact import MeshSdf
 from sdfsim.shape.mesh import Mesh
 from sdfsim.shape.primitives import box, sphere, torus
-from sdfsim.shape.sdf import Sdf
+from sdfsim.shape.sdf import BoxSdf, MeshSdf, Sdf, SphereSdf
+from sdfsim.shape.shape import analytic_shape, with_sdf
 
 SIZE = (1.0, 0.6, 0.8)
 HALF = np.array(SIZE) / 2

@@ -5,15 +5,13 @@ import pytest
 import torch
 
 from sdfsim.errors import SdfsimError
-from sdfsim.shape import grid
-from sdfsim.shape.analytic import BoxSdf, SphereSdf
-from sdfsim.shape.boxed import BOX, CAUTION
+from sdfsim.shape import sdf as sdf_module
 from sdfsim.shape.distance import MeshDistance
-from sdfsim.shape.grid import GridSdf, sample_grid, trilinear
+from sdfsim.shape.far_field import BOX, CAUTION
 from sdfsim.shape.mesh import Frame, Mesh
-from sdfsim.shape.nodes import project
 from sdfsim.shape.primitives import box
-from sdfsim.shape.sdf import Sdf
+from sdfsim.shape.sdf import BoxSdf, GridSdf, Sdf, SphereSdf, sample_grid, trilinear
+from sdfsim.shape.surface_nodes import project
 
 BOUNDS = np.array([[-0.5] * 3, [0.5] * 3])
 
@@ -154,7 +152,7 @@ def test_an_oracle_and_an_sdf_can_be_sampled(monkeypatch: pytest.MonkeyPatch) ->
     again = BoxSdf((0.1, 0.1, 0.1))
     whole = sample_grid(again, again.bounds, 20).values
     for sampled in (1, 800, 2900):
-        monkeypatch.setattr(grid, "SAMPLED", sampled)
+        monkeypatch.setattr(sdf_module, "SAMPLED", sampled)
         assert torch.equal(sample_grid(again, again.bounds, 20).values, whole)
     np.testing.assert_allclose(whole.numpy(), sdf.values.numpy(), atol=1e-6)
 
@@ -165,7 +163,7 @@ def test_empty_chunked_and_numpy_questions(monkeypatch: pytest.MonkeyPatch) -> N
     points = torch.rand(1000, 3) * 2 - 1
     whole = sdf(points)
     for chunk in (37, 500, 1000):
-        monkeypatch.setattr(grid, "CHUNK", chunk)
+        monkeypatch.setattr(sdf_module, "CHUNK", chunk)
         for one, other in zip(whole, sdf(points), strict=True):
             assert torch.equal(one, other)
     assert sdf(points.double().numpy())[0].dtype == np.float64

@@ -7,7 +7,6 @@ import pytest
 
 from sdfsim.errors import SdfsimError
 from sdfsim.shape import primitives
-from sdfsim.shape.analytic import BoxSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.mass import mass_properties, mass_properties_of_sdf
 from sdfsim.shape.mesh import (
     Mesh,
@@ -19,8 +18,9 @@ from sdfsim.shape.mesh import (
     normal_frame,
     sample_surface,
     signed_volume,
+    write_ply,
 )
-from sdfsim.shape.storage import write_ply
+from sdfsim.shape.sdf import BoxSdf, PlaneSdf, SphereSdf
 
 TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 

@@ -6,9 +6,9 @@ from scipy.spatial import cKDTree
 
 from sdfsim.errors import SdfsimError
 from sdfsim.shape import primitives
-from sdfsim.shape.analytic import BoxSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.mesh import sample_surface
-from sdfsim.shape.nodes import edge_nodes, hull_nodes, sample_nodes, thin
+from sdfsim.shape.sdf import BoxSdf, PlaneSdf, SphereSdf
+from sdfsim.shape.surface_nodes import edge_nodes, hull_nodes, sample_nodes, thin
 
 
 @pytest.mark.parametrize("scale", [0.01, 1.0, 300.0])

@@ -11,19 +11,18 @@ import pytest
 
 from sdfsim.errors import SdfsimError
 from sdfsim.shape import primitives
-from sdfsim.shape.analytic import BoxSdf
-from sdfsim.shape.asset import (
+from sdfsim.shape.mass import mass_properties_of_sdf
+from sdfsim.shape.mesh import Mesh, write_ply
+from sdfsim.shape.sdf import BoxSdf, GridSdf, MeshSdf
+from sdfsim.shape.shape import (
     analytic_shape,
     load_shape,
+    mesh_shape,
     scaled,
+    shape_from_mesh,
+    shape_from_primitive,
     with_sdf,
 )
-from sdfsim.shape.cache import mesh_shape, shape_from_mesh, shape_from_primitive
-from sdfsim.shape.exact import MeshSdf
-from sdfsim.shape.grid import GridSdf
-from sdfsim.shape.mass import mass_properties_of_sdf
-from sdfsim.shape.mesh import Mesh
-from sdfsim.shape.storage import write_ply
 from tests.shape.test_asset import edit, fitted
 
 OTHERS = [("grid", GridSdf), ("mesh", MeshSdf)]
@@ -115,7 +114,7 @@ def test_grids_are_cached_by_resolution_and_exact_meshes_not(tmp_path: Path, mon
     path.write_bytes(write_ply(primitives.cone(segments=12)))
     assert isinstance(shape_from_mesh(path, tmp_path / "none", units=0.01, sdf="mesh").sdf, MeshSdf)
     assert not (tmp_path / "none").exists()
-    monkeypatch.setattr("sdfsim.shape.cache.mesh_shape", lambda *args, **kwargs: pytest.fail("sampled again"))
+    monkeypatch.setattr("sdfsim.shape.shape.mesh_shape", lambda *args, **kwargs: pytest.fail("sampled again"))
     assert shape_from_primitive("torus", 0.6, tmp_path, sdf="grid", resolution=8).volume > 0
 
 

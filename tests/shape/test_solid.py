@@ -8,10 +8,10 @@ import pytest
 
 from sdfsim.errors import SdfsimError
 from sdfsim.shape import primitives
-from sdfsim.shape.analytic import BoxSdf
 from sdfsim.shape.distance import MeshDistance, merge
 from sdfsim.shape.mesh import Mesh, is_closed, load_mesh, sample_surface, signed_volume
-from sdfsim.shape.solid import solidify
+from sdfsim.shape.sdf import BoxSdf
+from sdfsim.shape.watertight import solidify
 
 CUBE = primitives.box()
 BALL = primitives.sphere(0.5, subdivisions=4)

@@ -18,10 +18,9 @@ import torch
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_arrays, write_arrays
 from sdfsim.shape.distance import PiecesDistance
-from sdfsim.shape.grid import GridSdf
 from sdfsim.shape.mesh import convex_hull
-from sdfsim.shape.mlp import MlpSdf
-from sdfsim.shape.sdf import Sdf
+from sdfsim.shape.mlp_sdf import MlpSdf
+from sdfsim.shape.sdf import GridSdf, Sdf
 
 BAKE_VERSION = 1
 SIDE = 8  # cells of a brick along each side

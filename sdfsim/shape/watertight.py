@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from sdfsim.errors import SdfsimError
-from sdfsim.shape import repair
 from sdfsim.shape.bvh import ClosestPoint, Winding
-from sdfsim.shape.cutting import centres_and_normals, exposed, no_longer_than
 from sdfsim.shape.mass import integrals
-from sdfsim.shape.mesh import Frame, Mesh, clean, is_closed, normal_frame
+from sdfsim.shape.mesh import Frame, Mesh, clean, components, directed_edges, is_closed, normal_frame
 
 # Openings are closed unasked up to this fraction of the surface, smallest first.
 SMALL = 0.02
@@ -67,7 +67,7 @@ class Solid:
 def as_it_is(mesh: Mesh) -> Solid:
     """`mesh` (metres, with faces) without any repair or refusal; a sheet has no inside then."""
     closed = is_closed(mesh)
-    return Solid(mesh, mesh, closed=closed, simple=closed and repair.components(mesh.faces).max() == 0)
+    return Solid(mesh, mesh, closed=closed, simple=closed and components(mesh.faces).max() == 0)
 
 
 def solidify(mesh: Mesh, *, name: str = "mesh", cap: bool = False, thicken: float | None = None) -> Solid:
@@ -95,19 +95,19 @@ def solidify(mesh: Mesh, *, name: str = "mesh", cap: bool = False, thicken: floa
     if mesh.colors is not None:
         vertices = np.concatenate([vertices, mesh.colors], axis=1)
     before = mesh.faces
-    faces, patch = repair.consistent(vertices, before)
+    faces, patch = consistent(vertices, before)
     faces = _outwards(vertices, faces, patch)
     turned = int(_differ(before, faces).sum())
     if turned:
         notes.append(f"{turned} of {len(before)} faces turned round, to be wound alike and outwards")
 
-    area = repair.face_areas(vertices[faces]).sum()
+    area = face_areas(vertices[faces]).sum()
     vertices, faces = _close(vertices, faces, SMALL * area, area, frame.scale, notes)
-    if repair.leaking(faces).any():
+    if leaking(faces).any():
         faces = _without_sheets(vertices, faces, area, notes)
         vertices, faces = _close(vertices, faces, np.inf if cap else SMALL * area, area, frame.scale, notes)
-        faces = _outwards(vertices, *repair.consistent(vertices, faces))
-    closed = not repair.leaking(faces).any()
+        faces = _outwards(vertices, *consistent(vertices, faces))
+    closed = not leaking(faces).any()
     winding = Winding(_plain(vertices, faces))
     if not closed:
         _require_tight(vertices, faces, winding, area, frame.scale, name)
@@ -122,14 +122,14 @@ def solidify(mesh: Mesh, *, name: str = "mesh", cap: bool = False, thicken: floa
     # First a look at every 0.05 of the surface; only what crosses itself is cut, and that finely.
     probes = no_longer_than(corners, 0.05)
     boundary = side(*centres_and_normals(probes))
-    weights = repair.face_areas(probes)
+    weights = face_areas(probes)
     odd = float(weights[boundary != 1].sum() / weights.sum())
     surface, layers = body, None
     if odd > TRIFLE:
         kept, layers = exposed(corners, side)
         if len(kept):
             surface = _mesh(*_joined(kept), frame, mesh.colors)
-        left = 1.0 - float((repair.face_areas(kept) / layers).sum() / repair.face_areas(corners).sum())
+        left = 1.0 - float((face_areas(kept) / layers).sum() / face_areas(corners).sum())
         if left > 5e-4:
             notes.append(f"faces that do not bound the solid left out ({left:.1%} of the area)")
     solid = Solid(surface, body, tuple(notes), closed=closed, simple=closed and odd == 0.0, layers=layers)
@@ -167,7 +167,7 @@ def _differ(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 
 def _outwards(vertices: np.ndarray, faces: np.ndarray, patch: np.ndarray) -> np.ndarray:
     """Turn bodies that are inside out, except shells in others that are so by the winding of the whole: cavities."""
-    label = repair.bodies(faces, patch)
+    label = bodies(faces, patch)
     middle = np.stack([np.bincount(label, weights=vertices[faces, k].mean(1)) for k in range(3)], axis=1)
     middle /= np.bincount(label)[:, None]
     corners = vertices[faces][..., :3] - middle[label][:, None]
@@ -191,7 +191,7 @@ def _close(
     vertices: np.ndarray, faces: np.ndarray, limit: float, area: float, scale: float, notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Close openings up to `limit` in all (normalised area) and say so."""
-    vertices, faces, closed = repair.fill(vertices, faces, limit)
+    vertices, faces, closed = fill(vertices, faces, limit)
     if len(closed):
         largest = (
             f", the largest about {2 * np.sqrt(closed.max() / np.pi) * scale:.3g} m across" if limit > area else ""
@@ -204,14 +204,14 @@ def _close(
 
 def _without_sheets(vertices: np.ndarray, faces: np.ndarray, area: float, notes: list[str]) -> np.ndarray:
     """Leave out patches that are open and have the same on both sides: fins, partitions, sheets that float beside."""
-    faces, patch = repair.consistent(vertices, faces)
-    suspects = np.unique(patch[repair.leaking(faces)])
+    faces, patch = consistent(vertices, faces)
+    suspects = np.unique(patch[leaking(faces)])
     among = np.flatnonzero(np.isin(patch, suspects))
     centres, normals = centres_and_normals(vertices[faces[among]])
     winding = Winding(_plain(vertices, faces))
     # The mean of both sides is what all other faces make of the place; at a boundary it is a half.
     middle = 0.5 * (winding(centres + STEP * normals) + winding(centres - STEP * normals))
-    areas = repair.face_areas(vertices[faces])
+    areas = face_areas(vertices[faces])
     loose = np.bincount(patch[among], weights=areas[among] * (np.abs(middle - 0.5) > 0.25))
     sheets = np.flatnonzero(loose > 0.5 * np.bincount(patch, weights=areas)[: len(loose)])
     out = np.isin(patch, sheets)
@@ -228,14 +228,14 @@ def _require_tight(
 ) -> None:
     """Refuse a surface whose openings let the outside be seen from within."""
     centres, normals = centres_and_normals(no_longer_than(vertices[faces], 0.05))
-    weights = repair.face_areas(no_longer_than(vertices[faces], 0.05))
+    weights = face_areas(no_longer_than(vertices[faces], 0.05))
     if len(centres) > 4000:
         some = np.random.default_rng(0).choice(len(centres), 4000, p=weights / weights.sum())
         centres, normals, weights = centres[some], normals[some], np.ones(4000)
     middle = 0.5 * (winding(centres + STEP * normals) + winding(centres - STEP * normals)) - 0.5
     if np.average(np.abs(middle - np.round(middle)), weights=weights) <= LEAK:
         return
-    loops = [vertices[loop, :3] for loop in repair.openings(faces)]
+    loops = [vertices[loop, :3] for loop in openings(faces)]
     across = max(float(np.ptp(loop, axis=0).max()) for loop in loops) * scale
     count = "an opening" if len(loops) == 1 else f"{len(loops)} openings, the largest"
     raise SdfsimError(f"{name}: not a solid: the surface has {count} {across:.3g} m across", HINT)
@@ -287,3 +287,179 @@ def _thickened(mesh: Mesh, frame: Frame, name: str, thickness: float) -> Solid:
     solid = Solid(Mesh(vertices, faces.astype(np.int64)), mesh, (f"thickened to {thickness:g} m",), thickness)
     solid.mass_properties()
     return solid
+
+
+def consistent(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Wind neighbours alike within each patch (faces joined by edges of two faces), as most of its area was wound.
+
+    Returns:
+        faces [F, 3] and the patch [F] of each.
+    """
+    import igl
+
+    oriented: tuple[Any, Any] = igl.bfs_orient(np.ascontiguousarray(faces, dtype=np.int64))
+    turned, patch = oriented
+    same = np.zeros(len(faces), dtype=bool)
+    for k in range(3):
+        same |= (faces[:, k] == turned[:, 0]) & (faces[:, (k + 1) % 3] == turned[:, 1])
+    area = face_areas(vertices[faces])
+    minority = np.bincount(patch, weights=area * same) < 0.5 * np.bincount(patch, weights=area)
+    wrong = same == minority[patch]
+    return np.where(wrong[:, None], faces[:, ::-1], faces), patch
+
+
+def bodies(faces: np.ndarray, patch: np.ndarray) -> np.ndarray:
+    """[F] labels of what can be turned on its own: closed patches, and components of all the other faces."""
+    edge, sign = directed_edges(faces)
+    owner = np.tile(patch, 3)
+    _, pair = np.unique(edge * (int(patch.max()) + 1) + owner, return_inverse=True)
+    leaks = np.bincount(owner, weights=np.bincount(pair, weights=sign)[pair] != 0) > 0
+    label, rest = patch.copy(), leaks[patch]
+    if rest.any():
+        label[rest] = patch.max() + 1 + components(faces[rest])
+    _, label = np.unique(label, return_inverse=True)
+    return label
+
+
+def leaking(faces: np.ndarray) -> np.ndarray:
+    """[F] bool: faces with an edge at which the surface ends. None: it is a cycle, winding numbers are whole."""
+    edge, sign = directed_edges(faces)
+    open_ = np.bincount(edge, weights=sign)[edge] != 0
+    return open_.reshape(3, -1).any(0)
+
+
+def openings(faces: np.ndarray) -> list[np.ndarray]:
+    """Loops of vertices [N] around which the surface ends, in the direction of its faces' edges."""
+    edge, sign = directed_edges(faces)
+    net = np.bincount(edge, weights=sign).astype(np.int64)
+    _, first = np.unique(edge, return_index=True)
+    starts = np.concatenate([faces[:, 0], faces[:, 1], faces[:, 2]])[first]
+    ends = np.concatenate([faces[:, 1], faces[:, 2], faces[:, 0]])[first]
+    # The direction in which there are too many of them.
+    forward = net * sign[first] > 0
+    starts, ends = np.where(forward, starts, ends), np.where(forward, ends, starts)
+    leaving: dict[int, list[int]] = {}
+    for start, end, count in zip(starts.tolist(), ends.tolist(), np.abs(net).tolist(), strict=True):
+        if count:
+            leaving.setdefault(start, []).extend([end] * count)
+    loops = []
+    # As many edges come to a vertex as leave it, so a walk can only end where it began.
+    for origin in list(leaving):
+        path, place = [origin], {origin: 0}
+        while leaving.get(path[-1]):
+            vertex = leaving[path[-1]].pop()
+            if vertex in place:
+                cut = place[vertex]
+                loops.append(np.array(path[cut:]))
+                for gone in path[cut + 1 :]:
+                    del place[gone]
+                del path[cut + 1 :]
+            else:
+                place[vertex] = len(path)
+                path.append(vertex)
+    return loops
+
+
+def fill(vertices: np.ndarray, faces: np.ndarray, limit: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Close openings by fans around their middle, smallest first, while the fans' area is below `limit` in all.
+
+    A fan is right for any flat loop, though it may lie over itself: what it covers twice cancels in winding numbers.
+
+    Returns:
+        vertices, faces, and the areas [H] of the openings that were closed.
+    """
+    fans, points = [], []
+    for loop in openings(faces):
+        ring = vertices[loop]
+        after = np.roll(ring, -1, axis=0)
+        length = np.linalg.norm((after - ring)[:, :3], axis=1, keepdims=True)
+        middle = (0.5 * (ring + after) * length).sum(0) / max(length.sum(), 1e-300)
+        area = face_areas(np.stack([after, ring, np.broadcast_to(middle, ring.shape)], axis=1)).sum()
+        fans.append((area, loop, middle))
+    fans.sort(key=lambda fan: fan[0])
+    areas = np.array([fan[0] for fan in fans])
+    closed = int((np.cumsum(areas) <= limit).sum())
+    added = [faces]
+    for _, loop, middle in fans[:closed]:
+        if len(loop) == 3:
+            added.append(loop[None, ::-1])
+            continue
+        centre = np.full(len(loop), len(vertices) + len(points))
+        points.append(middle)
+        added.append(np.stack([np.roll(loop, -1), loop, centre], axis=1))
+    return np.concatenate([vertices, *[point[None] for point in points]]), np.concatenate(added), areas[:closed]
+
+
+def face_areas(corners: np.ndarray) -> np.ndarray:
+    """[F] areas of triangles [F, 3, 3 + K]."""
+    return 0.5 * np.linalg.norm(face_normals(corners), axis=1)
+
+
+def face_normals(corners: np.ndarray) -> np.ndarray:
+    """[F, 3] normals of triangles [F, 3, 3 + K], as long as twice their area."""
+    points = corners[..., :3]
+    return np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
+
+
+# [P, 3] points of faces and the unit normals there -> [P] int: 0 where that is no boundary, else of how many layers in
+# the same place, negative where it is wound inwards.
+Side = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def exposed(
+    corners: np.ndarray, side: Side, *, fine: float = 0.008, coarse: float = 0.1
+) -> tuple[np.ndarray, np.ndarray]:
+    """The parts of triangles [F, 3, 3 + K] that are boundary, [F', 3, 3 + K] wound outwards, and their layers [F'].
+
+    Lengths are relative to the size: faces longer than `coarse` may hide something between the points at which they
+    are tested, and are cut before they are judged; those shorter than `fine` go by their centroid, which is wrong by
+    a fraction of their size, along seams only.
+    """
+    weights = np.array([[30, 1, 1], [1, 30, 1], [1, 1, 30], [15, 15, 1], [15, 1, 15], [1, 15, 15]], dtype=np.float64)
+    weights /= weights.sum(1, keepdims=True)
+    kept, layers = [corners[:0]], [np.zeros(0, dtype=np.int64)]
+    corners = no_longer_than(corners, coarse)
+    while len(corners):
+        centres, normals = centres_and_normals(corners)
+        verdict = side(centres, normals)
+        decided = np.ones(len(corners), dtype=bool)
+        large = np.flatnonzero(_longest(corners) > fine)
+        tests = np.einsum("kc,fci->fki", weights, corners[large, :, :3])
+        others = side(tests.reshape(-1, 3), np.repeat(normals[large], len(weights), axis=0))
+        decided[large] = (others.reshape(-1, len(weights)) == verdict[large, None]).all(1)
+        outward, inward = decided & (verdict > 0), decided & (verdict < 0)
+        kept += [corners[outward], corners[inward][:, ::-1]]
+        layers += [verdict[outward], -verdict[inward]]
+        corners = _halved(corners[~decided])
+    return np.concatenate(kept), np.concatenate(layers)
+
+
+def centres_and_normals(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centroids and unit normals [F, 3] of triangles [F, 3, 3 + K]."""
+    normals = face_normals(corners)
+    return corners[..., :3].mean(1), normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+
+
+def _longest(corners: np.ndarray) -> np.ndarray:
+    """[F] longest edges of triangles [F, 3, 3 + K]."""
+    points = corners[..., :3]
+    return np.linalg.norm(points - np.roll(points, 1, axis=1), axis=2).max(1)
+
+
+def no_longer_than(corners: np.ndarray, length: float) -> np.ndarray:
+    """The triangles, halved until no edge is longer than `length`."""
+    done = []
+    while len(corners):
+        short = _longest(corners) <= length
+        done.append(corners[short])
+        corners = _halved(corners[~short])
+    return np.concatenate(done)
+
+
+def _halved(corners: np.ndarray) -> np.ndarray:
+    """Cut triangles [F, 3, 3 + K] across their longest edge, so that slivers do not become many: [2 F, 3, 3 + K]."""
+    lengths = np.linalg.norm(np.roll(corners, -1, axis=1)[..., :3] - corners[..., :3], axis=2)
+    turn = (lengths.argmax(1)[:, None] + np.arange(3)) % 3
+    a, b, c = np.moveaxis(np.take_along_axis(corners, turn[..., None], axis=1), 1, 0)
+    middle = (a + b) / 2
+    return np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])

@@ -2,33 +2,24 @@
 
 from __future__ import annotations
 
+import logging
+import os
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 
 from sdfsim.errors import SdfsimError
-from sdfsim.files import write_json
-from sdfsim.shape.analytic import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, SphereSdf
+from sdfsim.files import read_json, replacing, write_json
 from sdfsim.shape.distance import MeshDistance
-from sdfsim.shape.exact import MeshSdf
-from sdfsim.shape.grid import GridSdf, sample_grid
-from sdfsim.shape.mesh import Frame, Mesh, convex_hull
-from sdfsim.shape.mlp import MlpSdf
-from sdfsim.shape.sdf import Sdf
-from sdfsim.shape.storage import (
-    FORMAT_VERSION,
-    finite,
-    read_mesh,
-    read_record,
-    sdf_from_file,
-    sdf_to_file,
-    write,
-    write_ply,
-)
+from sdfsim.shape.mesh import Frame, Mesh, convex_hull, load_mesh, read_mesh, write_ply
+from sdfsim.shape.mlp_sdf import ACTIVATIONS, MlpSdf
+from sdfsim.shape.sdf import BoxSdf, CapsuleSdf, CylinderSdf, GridSdf, MeshSdf, PlaneSdf, Sdf, SphereSdf, sample_grid
+from sdfsim.shape.surface_nodes import DEFAULT_COUNT
 
 SdfKind = Literal["mlp", "grid", "mesh"]
 
@@ -226,7 +217,7 @@ def with_nodes(shape: Shape, grid: int) -> Shape:
     Raises:
         SdfsimError: the SDF has no end, or no point of the grid reached its surface.
     """
-    from sdfsim.shape.nodes import sample_nodes
+    from sdfsim.shape.surface_nodes import sample_nodes
 
     nodes = sample_nodes(shape.sdf, grid=grid)
     # What was measured of the former nodes does not hold for these.
@@ -361,3 +352,306 @@ def _box_nodes(half: np.ndarray) -> np.ndarray:
     sides = (np.abs(lattice) == 1.0).sum(1)
     order = np.argsort(-sides, kind="stable")
     return (lattice * half)[order[sides[order] > 0]]
+
+
+FORMAT_VERSION = 1
+
+
+def sdf_to_file(sdf: Sdf, mesh: Mesh) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    """Tensors and a description (for JSON) of an SDF.
+
+    Args:
+        sdf: what is to be written.
+        mesh: what the folder's mesh.ply will hold; an exact SDF is that mesh and has nothing of its own to write.
+
+    Raises:
+        SdfsimError: an SDF of a kind that has no file format, or the exact SDF of another mesh.
+    """
+    if isinstance(sdf, MlpSdf):
+        tensors = {}
+        for layer, (weight, bias) in enumerate(zip(sdf.weights, sdf.biases, strict=True)):
+            tensors[f"layer{layer}.weight"] = weight.cpu().contiguous()
+            tensors[f"layer{layer}.bias"] = bias.cpu().contiguous()
+        return tensors, {
+            "kind": "mlp",
+            "activation": sdf.activation,
+            "mirrors": list(sdf.mirrors),
+            "layers": len(sdf.weights),
+            "centre": np.asarray(sdf.frame.centre).tolist(),
+            "scale": float(sdf.frame.scale),
+        }
+    if isinstance(sdf, GridSdf):
+        return {"grid": sdf.values.cpu().contiguous()}, {
+            "kind": "grid",
+            "resolution": sdf.resolution,
+            "centre": np.asarray(sdf.frame.centre).tolist(),
+            "scale": float(sdf.frame.scale),
+        }
+    if isinstance(sdf, MeshSdf):
+        if not all(np.array_equal(getattr(sdf.mesh, key), getattr(mesh, key)) for key in ("vertices", "faces")):
+            raise SdfsimError("an exact SDF of another mesh than the shape's own cannot be saved")
+        return {}, {"kind": "mesh"}
+    if isinstance(sdf, SphereSdf):
+        return {}, {"kind": "sphere", "radius": sdf.radius}
+    if isinstance(sdf, CapsuleSdf | CylinderSdf):
+        kind = "capsule" if isinstance(sdf, CapsuleSdf) else "cylinder"
+        return {}, {"kind": kind, "radius": sdf.radius, "half": sdf.half}
+    if isinstance(sdf, BoxSdf):
+        return {}, {"kind": "box", "half": list(sdf.half)}
+    if isinstance(sdf, PlaneSdf):
+        return {}, {"kind": "plane"}
+    raise SdfsimError(f"an SDF of type {type(sdf).__name__} cannot be saved", "fit it first")
+
+
+def sdf_from_file(description: dict[str, Any], tensors: dict[str, torch.Tensor], mesh: Mesh) -> Sdf:
+    """The SDF that `sdf_to_file` described, beside the folder's `mesh`.
+
+    Raises:
+        KeyError, TypeError, ValueError: the description or the tensors are not what it writes.
+    """
+    kind = description["kind"]
+    if kind in ("mlp", "grid") and not all(tensor.is_floating_point() for tensor in tensors.values()):
+        raise ValueError("weights that are not floating-point numbers")
+    if kind == "mlp":
+        layers = range(int(description["layers"]))
+        if description["activation"] not in ACTIVATIONS:
+            raise ValueError(f"unknown activation {description['activation']!r}")
+        weights = tuple(tensors[f"layer{layer}.weight"].float() for layer in layers)
+        sizes = [3, *(weight.shape[0] for weight in weights)]
+        if sizes[-1] != 1 or any(weight.shape[1] != size for weight, size in zip(weights, sizes, strict=False)):
+            raise ValueError("the layers do not fit together")
+        if any(tuple(tensors[f"layer{layer}.bias"].shape) != (sizes[layer + 1],) for layer in layers):
+            raise ValueError("the layers do not fit together")
+        x, y, z = (bool(mirror) for mirror in description.get("mirrors", (False, False, False)))
+        return MlpSdf(
+            weights,
+            tuple(tensors[f"layer{layer}.bias"].float() for layer in layers),
+            description["activation"],
+            _frame(description),
+            finite(tensors["bounds"].numpy(), "bounds", 2, 3),
+            (x, y, z),
+        )
+    if kind == "grid":
+        if tensors["grid"].ndim != 3 or len(set(tensors["grid"].shape)) != 1 or len(tensors["grid"]) < 2:
+            raise ValueError(f"a grid of {list(tensors['grid'].shape)} samples")
+        return GridSdf(tensors["grid"].float(), _frame(description), finite(tensors["bounds"].numpy(), "bounds", 2, 3))
+    if kind == "mesh":
+        return MeshSdf(mesh)
+    if kind == "sphere":
+        return SphereSdf(positive(description["radius"], "radius"))
+    if kind in ("capsule", "cylinder"):
+        make = CapsuleSdf if kind == "capsule" else CylinderSdf
+        return make(positive(description["radius"], "radius"), positive(description["half"], "half"))
+    if kind == "box":
+        x, y, z = description["half"]
+        return BoxSdf((positive(x, "half"), positive(y, "half"), positive(z, "half")))
+    if kind == "plane":
+        return PlaneSdf()
+    raise ValueError(f"unknown SDF kind {kind!r}")
+
+
+def _frame(description: dict[str, Any]) -> Frame:
+    return Frame(finite(description["centre"], "centre", 3), positive(description["scale"], "scale"))
+
+
+def finite(value: Any, what: str, *shape: int) -> np.ndarray:
+    """Finite numbers [*shape] out of JSON. Raises TypeError or ValueError otherwise."""
+    numbers = np.array(value, dtype=np.float64).reshape(shape)
+    if not np.isfinite(numbers).all():
+        raise ValueError(f"{what} is not finite")
+    return numbers
+
+
+def positive(value: Any, what: str) -> float:
+    """A finite number above 0 out of JSON. Raises TypeError or ValueError otherwise."""
+    number = float(finite(value, what))
+    if number <= 0:
+        raise ValueError(f"{what} must be > 0 (got {number:g})")
+    return number
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """The content of a shape.json.
+
+    Raises:
+        SdfsimError: not readable, or of another format version.
+    """
+    record = read_json(path, "fit the mesh again")
+    if not isinstance(record, dict) or record.get("version") != FORMAT_VERSION:
+        found = record.get("version") if isinstance(record, dict) else None
+        raise SdfsimError(
+            f"{path}: shape format version {found!r}, this program reads {FORMAT_VERSION}", "fit the mesh again"
+        )
+    return record
+
+
+def write(path: Path, content: bytes) -> None:
+    """Put `content` at `path` in one step: what was there before, or all of it, even when interrupted.
+
+    Raises:
+        SdfsimError: the file cannot be written.
+    """
+    with replacing(path) as partial:
+        partial.write_bytes(content)
+
+
+Progress = Callable[[float, str], None]
+
+_log = logging.getLogger(__name__)
+
+
+class Closing(NamedTuple):
+    """What is done to a mesh that is open, as in `solidify`: openings closed, or a thickness in the mesh's units."""
+
+    cap: bool = False
+    thicken: float | None = None
+
+    @property
+    def variant(self) -> str:
+        """For a cache key."""
+        return ("-cap" if self.cap else "") + (f"-thick{self.thicken:g}" if self.thicken is not None else "")
+
+
+AS_IT_IS = Closing()
+
+
+def shape_from_mesh(
+    path: str | Path,
+    cache_dir: str | Path | None = None,
+    *,
+    name: str | None = None,
+    units: float = 1.0,
+    cap: bool = False,
+    thicken: float | None = None,
+    sdf: SdfKind = "mlp",
+    resolution: int = DEFAULT_RESOLUTION,
+    on_progress: Progress | None = None,
+) -> Shape:
+    """The shape of a mesh file: made on first use, then taken from a cache keyed by what the file describes.
+
+    Args:
+        path: a mesh file.
+        cache_dir: where shapes are kept; by default `sdfsim/shapes` in the user's cache folder.
+        name: by default the file's.
+        units: metres per unit of the file.
+        cap: close openings of any size.
+        thicken: m; a thickness for an open sheet.
+        sdf: "mlp" fits the network; "grid" and "mesh" fit nothing (see `mesh_shape`).
+        resolution: of a grid, samples along each side.
+        on_progress: called with (fraction done, message) while fitting or sampling.
+
+    Raises:
+        SdfsimError: the mesh cannot be used.
+    """
+    path = Path(path)
+    mesh = load_mesh(path)
+    # Not of the file's bytes: a glTF keeps its vertices, and an OBJ its colours, in files beside it.
+    key = mesh.digest()
+    closing = Closing(cap, None if thicken is None else thicken / units)
+    shape = _cached(mesh, key, path.stem, closing, sdf, resolution, cache_dir, on_progress)
+    shape = replace(shape, name=name or path.stem, source={**shape.source, "file": path.name, "sha256": key})
+    return scaled(shape, units)
+
+
+def shape_from_primitive(
+    kind: str,
+    size: float = 1.0,
+    cache_dir: str | Path | None = None,
+    *,
+    name: str | None = None,
+    sdf: SdfKind = "mlp",
+    resolution: int = DEFAULT_RESOLUTION,
+    on_progress: Progress | None = None,
+) -> Shape:
+    """The shape of a procedural mesh of `primitives.PRIMITIVES`, made on first use and cached.
+
+    Args:
+        kind: name in `PRIMITIVES`.
+        size: its largest extent, m.
+        cache_dir, name, sdf, resolution, on_progress: as for `shape_from_mesh`.
+
+    Raises:
+        SdfsimError: no such primitive.
+    """
+    from sdfsim.shape.primitives import PRIMITIVES
+
+    if kind not in PRIMITIVES:
+        raise SdfsimError(f"no primitive called {kind!r}", "there are " + ", ".join(PRIMITIVES))
+    mesh = PRIMITIVES[kind]()
+    unit = Mesh(mesh.vertices / float(np.ptp(mesh.vertices, axis=0).max()), mesh.faces)
+    # Rounded, since sines and cosines differ in their last digit from machine to machine.
+    key = Mesh(unit.vertices.round(9), unit.faces).digest()
+    shape = _cached(unit, key, kind, AS_IT_IS, sdf, resolution, cache_dir, on_progress)
+    return scaled(replace(shape, name=name or kind, source={**shape.source, "primitive": kind}), size)
+
+
+def mesh_shape(
+    mesh: Mesh,
+    *,
+    name: str,
+    kind: Literal["grid", "mesh"],
+    closing: Closing = AS_IT_IS,
+    resolution: int = DEFAULT_RESOLUTION,
+    on_progress: Progress | None = None,
+) -> Shape:
+    """The shape of a mesh without any fit: its exact SDF or a grid of it, nodes and mass properties as a fit has them.
+
+    Args:
+        mesh: metres.
+        name: of the shape.
+        kind: "mesh" (the exact distance) or "grid" (samples of it).
+        closing: of an open mesh.
+        resolution: of a grid, samples along each side.
+        on_progress: called with (fraction done, message) while a grid is sampled.
+
+    Raises:
+        SdfsimError: the mesh cannot be used.
+    """
+    from sdfsim.shape.fit import surface_nodes
+    from sdfsim.shape.watertight import solidify
+
+    solid = solidify(mesh, name=name, cap=closing.cap, thicken=closing.thicken)
+    sdf, note = sdf_of_mesh(solid.surface, kind, resolution, on_progress)
+    nodes = surface_nodes(sdf, solid.surface, DEFAULT_COUNT)
+    return Shape(name, solid.surface, sdf, nodes, *solid.mass_properties(), source={"kind": "mesh"} | note)
+
+
+def _cached(
+    mesh: Mesh,
+    key: str,
+    label: str,
+    closing: Closing,
+    kind: SdfKind,
+    resolution: int,
+    cache_dir: str | Path | None,
+    on_progress: Progress | None,
+) -> Shape:
+    if kind == "mesh":  # made as fast as it is read
+        return mesh_shape(mesh, name=label, kind=kind, closing=closing)
+    # Only here is anything fitted: reading a shape folder needs no open3d and no optimiser.
+    from sdfsim.shape.fit import FIT_VERSION, fit_mesh
+
+    if cache_dir is None:
+        cache_dir = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sdfsim" / "shapes"
+    variant = closing.variant + (f"-grid{resolution}" if kind == "grid" else "")
+    folder = Path(cache_dir) / f"{key[:24]}{variant}-{FIT_VERSION}.{FORMAT_VERSION}"
+    if folder.is_dir():
+        try:
+            return load_shape(folder)
+        except SdfsimError:
+            shutil.rmtree(folder, ignore_errors=True)  # a damaged entry is only a cache miss
+    if kind == "grid":
+        shape = mesh_shape(mesh, name=label, kind=kind, closing=closing, resolution=resolution, on_progress=on_progress)
+    else:
+        shape = fit_mesh(mesh, name=label, cap=closing.cap, thicken=closing.thicken, on_progress=on_progress)
+    # A folder of its own first, so that processes fitting the same mesh never see each other's half.
+    partial = folder.with_name(f"{folder.name}.{os.getpid()}.partial")
+    try:
+        shape.save(partial)
+        if not folder.is_dir():  # else another process was first: its entry is as good
+            partial.rename(folder)
+    except (SdfsimError, OSError) as error:
+        _log.warning("the shape %s is not kept for the next time: %s", label, error)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return shape

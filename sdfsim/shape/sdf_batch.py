@@ -8,24 +8,25 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 
-from sdfsim.shape import grid, mlp
-from sdfsim.shape.analytic import (
+from sdfsim.shape import mlp_sdf
+from sdfsim.shape import sdf as sdf_module
+from sdfsim.shape.far_field import everywhere, half_extents
+from sdfsim.shape.mlp_sdf import Activation, MlpSdf, sides, value_and_gradient
+from sdfsim.shape.sdf import (
     BoxSdf,
     CapsuleSdf,
     CylinderSdf,
+    GridSdf,
     PlaneSdf,
+    Sdf,
     SphereSdf,
     box_distance,
     capsule_distance,
     cylinder_distance,
     plane_distance,
     sphere_distance,
+    trilinear,
 )
-from sdfsim.shape.boxed import everywhere, half_extents
-from sdfsim.shape.grid import GridSdf, trilinear
-from sdfsim.shape.mlp import MlpSdf, sides
-from sdfsim.shape.sdf import Sdf
-from sdfsim.shape.sweep import Activation, value_and_gradient
 
 FITTED_TRUST = 0.8  # of a fitted or sampled distance: its errors are far smaller, and grow with the distance
 
@@ -166,7 +167,7 @@ class _GridGroup(_FramedGroup):
     """Grids of one resolution."""
 
     def __init__(self, sdfs: list[GridSdf], device: torch.device) -> None:
-        super().__init__(sdfs, device, grid.CHUNK)
+        super().__init__(sdfs, device, sdf_module.CHUNK)
         # One grid alone is not copied: at 512 samples a side it is half a gigabyte.
         alone = len(sdfs) == 1
         self._values = sdfs[0].values.to(device)[None] if alone else torch.stack([s.values.to(device) for s in sdfs])
@@ -181,7 +182,7 @@ class _MlpGroup(_FramedGroup):
     TILES = (8, 16, 32, 64, 128, 256, 512, 1024)
 
     def __init__(self, sdfs: list[MlpSdf], device: torch.device) -> None:
-        super().__init__(sdfs, device, mlp.CHUNK)
+        super().__init__(sdfs, device, mlp_sdf.PREPARED)
         layers = range(len(sdfs[0].weights))
         self._weights = [torch.stack([sdf.weights[layer] for sdf in sdfs]).to(device) for layer in layers]
         self._biases = [torch.stack([sdf.biases[layer] for sdf in sdfs]).to(device) for layer in layers]
