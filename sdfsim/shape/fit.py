@@ -25,7 +25,7 @@ from sdfsim.shape.mlp_sdf import Activation, MlpSdf, Tape, value_and_gradient
 from sdfsim.shape.sdf import Sdf, accepts_numpy
 from sdfsim.shape.shape import Shape
 from sdfsim.shape.soap import Adam, Soap
-from sdfsim.shape.surface_nodes import DEFAULT_COUNT, edge_nodes, hull_nodes, sample_nodes, thin
+from sdfsim.shape.surface_nodes import DEFAULT_COUNT, edge_nodes, hull_nodes, sample_nodes, surface_nodes, thin
 from sdfsim.shape.watertight import solidify
 from sdfsim.threads import choose_threads
 
@@ -620,12 +620,6 @@ def fit_solids(
     return shapes
 
 
-def surface_nodes(sdf: Sdf, surface: Mesh, count: int) -> np.ndarray:
-    """Nodes for contact, at most `count` [K, 3] m: first corners of the convex hull, then points all over `sdf`."""
-    corners = thin(surface.vertices[_outer(surface.vertices)], count // 3)
-    return thin(sample_nodes(sdf), count, keep=corners)
-
-
 def fit_pieces(
     pieces: list[Mesh],
     *,
@@ -719,16 +713,6 @@ def _train(
         tell(0.98 + 0.02 * done / len(oracles), told)
         results.append((sdf, nodes, certificate))
     return results
-
-
-def _outer(vertices: np.ndarray) -> np.ndarray:
-    """Indices of the convex hull's vertices; all of them when the vertices lie in a plane."""
-    from scipy.spatial import ConvexHull, QhullError
-
-    try:
-        return np.sort(ConvexHull(vertices).vertices)
-    except QhullError:
-        return np.arange(len(vertices))
 
 
 def _source(kind: str, recipe: Recipe, meshes: list[Mesh]) -> dict:

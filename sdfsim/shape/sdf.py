@@ -1,28 +1,44 @@
-"""The signed-distance protocol that every shape's geometry speaks."""
+"""Signed distances: the protocol, closed forms, samples on a grid, and the exact distance of a mesh."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, wraps
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 
 import numpy as np
 import torch
 
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.distance import MeshDistance
-from sdfsim.shape.far_field import BOX, everywhere, half_extents
+from sdfsim.shape.far_field import BOX, BoxedStack
 from sdfsim.shape.mesh import Frame, Mesh, normal_frame
+
+# Points of a grid evaluated at once: eight indices and corners with what is made of them, about 250 bytes a point.
+CHUNK = 262_144
+# Distances asked for at once while a grid is sampled.
+SAMPLED = 200_000
+# All lengths of `MeshSdf` are relative to the mesh's largest extent. The hierarchy works in float32, so closest points
+# are off by some 1e-7: nearer than this the offset to them says little about the direction, and differences over the
+# step say it better.
+NEAR = 1e-5
+STEP = 1e-4
+# Farther out float32 runs out of range (at 1e19), so such points ask for the point on this box in their place. What
+# is nearest to that one is as near as makes no difference.
+FAR = 1e3
+# A difference quotient shorter than this is no direction: a crack, a sheet without thickness.
+FLAT = 0.05
+UP = (0.0, 0.0, 1.0)
 
 
 @runtime_checkable
 class Sdf(Protocol):
     """A signed distance with its gradient: positive outside, negative inside, metres, the shape's own frame.
 
-    Its members: `MlpSdf` (a fitted network), the closed forms `PlaneSdf`, `SphereSdf`,
-    `CapsuleSdf`, `CylinderSdf` and `BoxSdf`, `GridSdf` (samples)
-    and `MeshSdf` (the exact mesh); `SdfBank` asks many of them at once.
+    Its members: `MlpSdf` (a fitted network), the closed forms `PlaneSdf`, `SphereSdf`, `CapsuleSdf`, `CylinderSdf` and
+    `BoxSdf`, `GridSdf` (samples) and `MeshSdf` (the exact mesh). `SdfBank` asks many of them at once. Those members
+    also have `to(device)` and `scaled(factor)`.
 
     Attributes:
         bounds: [2, 3] float64 m, the axis-aligned box that holds the solid (infinite for a plane).
@@ -67,188 +83,140 @@ def accepts_numpy(call: Callable[..., tuple[torch.Tensor, torch.Tensor]]) -> Cal
     return wrapper
 
 
-def plane_distance(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Distance [P] to z = 0 and its gradient [P, 3], at `points` [P, 3]."""
-    gradient = torch.zeros_like(points)
-    gradient[:, 2] = 1.0
-    return points[:, 2].clone(), gradient
+class ClosedForm:
+    """A solid about the origin with an exact distance; `measure` asks many of one kind at once.
 
+    Attributes:
+        KIND: its name in files.
+        COUNT: how many sizes it has.
 
-def sphere_distance(points: torch.Tensor, radius: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Distance [P] to a sphere about the origin and its gradient [P, 3]; up (+z) at the centre.
-
-    Args:
-        points: [P, 3] m.
-        radius: [P] or [1] m.
+    Raises:
+        SdfsimError: a size is not a positive finite number.
     """
-    length = points.norm(dim=1)
-    up = torch.zeros_like(points)
-    up[:, 2] = 1.0
-    tiny = torch.finfo(points.dtype).tiny
-    gradient = torch.where((length > tiny)[:, None], points / length.clamp_min(tiny)[:, None], up)
-    return length - radius, gradient
 
+    KIND: ClassVar[str]
+    COUNT: ClassVar[int]
 
-def box_distance(points: torch.Tensor, half: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Distance [P] to an axis-aligned box about the origin and its gradient [P, 3].
+    def __post_init__(self) -> None:
+        sizes = np.array(self.sizes, dtype=np.float64)
+        if sizes.shape != (self.COUNT,) or not (np.isfinite(sizes) & (sizes > 0)).all():
+            told = ", ".join(f"{name} {value}" for name, value in vars(self).items())
+            raise SdfsimError(f"the sizes of a {self.KIND} must be > 0 (got {told})")
 
-    Inside, the gradient points to the nearest face: the first of equally near ones, and the positive side of an
-    axis at its middle.
+    @property
+    def sizes(self) -> tuple[float, ...]:
+        """[COUNT] m."""
+        raise NotImplementedError
 
-    Args:
-        points: [P, 3] m.
-        half: [P, 3] or [1, 3] half extents, m.
-    """
-    side = torch.where(points < 0, -1.0, 1.0).to(points.dtype)
-    excess = points.abs() - half
-    beyond = excess.clamp_min(0)
-    length = beyond.norm(dim=1)
-    deepest, axis = excess.max(dim=1)
-    inward = torch.nn.functional.one_hot(axis, 3).to(points.dtype)
-    tiny = torch.finfo(points.dtype).tiny
-    outside = length > tiny
-    gradient = torch.where(outside[:, None], beyond / length.clamp_min(tiny)[:, None], inward)
-    return torch.where(outside, length, deepest), side * gradient
+    @staticmethod
+    def measure(points: torch.Tensor, sizes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Distance [P] m and gradient [P, 3] at `points` [P, 3] m of solids with `sizes` [P or 1, COUNT] m."""
+        raise NotImplementedError
 
+    def to(self, device: torch.device | str) -> Self:
+        """Itself: it holds no tensors."""
+        return self
 
-def capsule_distance(
-    points: torch.Tensor, radius: torch.Tensor, half: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Distance [P] to all within `radius` [P] or [1] of the segment |z| <= `half` [P] or [1], and its gradient [P, 3].
+    def scaled(self, factor: float) -> Self:
+        """The solid `factor` times as large."""
+        values = vars(self).values()
+        return type(self)(*(tuple(x * factor for x in v) if isinstance(v, tuple) else v * factor for v in values))
 
-    Args:
-        points: [P, 3] m.
-        radius, half: m.
-    """
-    up = torch.zeros_like(points)
-    up[:, 2] = torch.minimum(torch.maximum(points[:, 2], -half), half)
-    return sphere_distance(points - up, radius)
-
-
-def cylinder_distance(
-    points: torch.Tensor, radius: torch.Tensor, half: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Distance [P] to a cylinder about z of half height `half` [P] or [1], and its gradient [P, 3].
-
-    Inside, the gradient points to the nearer of side and end; of equally near ones to the end.
-    """
-    tiny = torch.finfo(points.dtype).tiny
-    away = points[:, :2].norm(dim=1)
-    outward = torch.zeros_like(points)
-    outward[:, 0] = 1.0
-    outward[:, :2] = torch.where((away > tiny)[:, None], points[:, :2] / away.clamp_min(tiny)[:, None], outward[:, :2])
-    end = torch.zeros_like(points)
-    end[:, 2] = torch.where(points[:, 2] < 0, -1.0, 1.0).to(points.dtype)
-    aside, above = away - radius, points[:, 2].abs() - half
-    corner = (aside > 0) & (above > 0)
-    length = torch.sqrt(aside.clamp_min(0) ** 2 + above.clamp_min(0) ** 2)
-    slanted = (aside[:, None] * outward + above[:, None] * end) / length.clamp_min(tiny)[:, None]
-    side = aside > above
-    distance = torch.where(corner, length, torch.maximum(aside, above))
-    gradient = torch.where(corner[:, None], slanted, torch.where(side[:, None], outward, end))
-    return distance, gradient
+    @accepts_numpy
+    def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Distance [P] m and unit gradient [P, 3] at `points` [P, 3] m."""
+        return self.measure(points, torch.tensor([self.sizes], dtype=points.dtype, device=points.device))
 
 
 @dataclass(frozen=True, eq=False)
-class PlaneSdf:
+class PlaneSdf(ClosedForm):
     """The half space below z = 0 is solid; the normal is +z. Infinite."""
+
+    KIND, COUNT = "plane", 0
+
+    @property
+    def sizes(self) -> tuple[float, ...]:
+        return ()
 
     @property
     def bounds(self) -> np.ndarray:
         """[2, 3] m: infinite but for the top."""
         return np.array([[-np.inf] * 3, [np.inf, np.inf, 0.0]])
 
-    def to(self, device: torch.device | str) -> PlaneSdf:
-        """Itself: it holds no tensors."""
-        return self
-
-    @accepts_numpy
-    def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Distance [P] m and unit gradient [P, 3] at `points` [P, 3] m."""
-        return plane_distance(points)
+    @staticmethod
+    def measure(points: torch.Tensor, sizes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return points[:, 2].clone(), _up(points)
 
 
 @dataclass(frozen=True, eq=False)
-class SphereSdf:
-    """A ball about the origin.
+class SphereSdf(ClosedForm):
+    """A ball of `radius` m. The gradient at the centre points up."""
 
-    Attributes:
-        radius: m, > 0.
-
-    Raises:
-        SdfsimError: the radius is not a positive finite number.
-    """
-
+    KIND, COUNT = "sphere", 1
     radius: float
 
-    def __post_init__(self) -> None:
-        if not (np.isfinite(self.radius) and self.radius > 0):
-            raise SdfsimError(f"sphere radius must be > 0 (got {self.radius})")
+    @property
+    def sizes(self) -> tuple[float, ...]:
+        return (self.radius,)
 
     @property
     def bounds(self) -> np.ndarray:
         """[2, 3] m."""
         return np.array([[-self.radius] * 3, [self.radius] * 3], dtype=np.float64)
 
-    def to(self, device: torch.device | str) -> SphereSdf:
-        """Itself: it holds no tensors."""
-        return self
-
-    @accepts_numpy
-    def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Distance [P] m and unit gradient [P, 3] at `points` [P, 3] m."""
-        return sphere_distance(points, torch.tensor([self.radius], dtype=points.dtype, device=points.device))
+    @staticmethod
+    def measure(points: torch.Tensor, sizes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        length = points.norm(dim=1)
+        tiny = torch.finfo(points.dtype).tiny
+        unit = points / length.clamp_min(tiny)[:, None]
+        return length - sizes[:, 0], torch.where((length > tiny)[:, None], unit, _up(points))
 
 
 @dataclass(frozen=True, eq=False)
-class BoxSdf:
-    """An axis-aligned box about the origin.
+class BoxSdf(ClosedForm):
+    """An axis-aligned box with half extents `half` (x, y, z) m.
 
-    Attributes:
-        half: (x, y, z) half extents m, > 0.
-
-    Raises:
-        SdfsimError: a half extent is not a positive finite number.
+    Inside, the gradient points to the nearest face: the first of equally near ones, and the positive side of an
+    axis at its middle.
     """
 
+    KIND, COUNT = "box", 3
     half: tuple[float, float, float]
 
-    def __post_init__(self) -> None:
-        if len(self.half) != 3 or not all(np.isfinite(value) and value > 0 for value in self.half):
-            raise SdfsimError(f"box half extents must be three numbers > 0 (got {self.half})")
+    @property
+    def sizes(self) -> tuple[float, ...]:
+        return self.half
 
     @property
     def bounds(self) -> np.ndarray:
         """[2, 3] m."""
         return np.array([[-value for value in self.half], list(self.half)], dtype=np.float64)
 
-    def to(self, device: torch.device | str) -> BoxSdf:
-        """Itself: it holds no tensors."""
-        return self
-
-    @accepts_numpy
-    def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Distance [P] m and unit gradient [P, 3] at `points` [P, 3] m."""
-        return box_distance(points, torch.tensor([self.half], dtype=points.dtype, device=points.device))
+    @staticmethod
+    def measure(points: torch.Tensor, sizes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        side = torch.where(points < 0, -1.0, 1.0).to(points.dtype)
+        excess = points.abs() - sizes
+        beyond = excess.clamp_min(0)
+        length = beyond.norm(dim=1)
+        deepest, axis = excess.max(dim=1)
+        inward = torch.nn.functional.one_hot(axis, 3).to(points.dtype)
+        tiny = torch.finfo(points.dtype).tiny
+        outside = length > tiny
+        gradient = torch.where(outside[:, None], beyond / length.clamp_min(tiny)[:, None], inward)
+        return torch.where(outside, length, deepest), side * gradient
 
 
 @dataclass(frozen=True, eq=False)
-class CapsuleSdf:
-    """All within a radius of a segment along z whose middle is the origin.
+class CapsuleSdf(ClosedForm):
+    """All within `radius` m of the segment |z| <= `half` m."""
 
-    Attributes:
-        radius: m, > 0.
-        half: m, > 0, half the length of the segment.
-
-    Raises:
-        SdfsimError: one of them is not a positive finite number.
-    """
-
+    KIND, COUNT = "capsule", 2
     radius: float
     half: float
 
-    def __post_init__(self) -> None:
-        _check_round("capsule", self.radius, self.half)
+    @property
+    def sizes(self) -> tuple[float, ...]:
+        return self.radius, self.half
 
     @property
     def bounds(self) -> np.ndarray:
@@ -256,33 +224,27 @@ class CapsuleSdf:
         high = np.array([self.radius, self.radius, self.half + self.radius])
         return np.stack([-high, high])
 
-    def to(self, device: torch.device | str) -> CapsuleSdf:
-        """Itself: it holds no tensors."""
-        return self
-
-    @accepts_numpy
-    def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Distance [P] m and unit gradient [P, 3] at `points` [P, 3] m."""
-        return capsule_distance(points, points.new_tensor([self.radius]), points.new_tensor([self.half]))
+    @staticmethod
+    def measure(points: torch.Tensor, sizes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        axis = torch.zeros_like(points)
+        axis[:, 2] = torch.minimum(torch.maximum(points[:, 2], -sizes[:, 1]), sizes[:, 1])
+        return SphereSdf.measure(points - axis, sizes)
 
 
 @dataclass(frozen=True, eq=False)
-class CylinderSdf:
-    """A cylinder about z whose middle is the origin.
+class CylinderSdf(ClosedForm):
+    """A cylinder about z of `radius` m and half height `half` m.
 
-    Attributes:
-        radius: m, > 0.
-        half: m, > 0, half its height.
-
-    Raises:
-        SdfsimError: one of them is not a positive finite number.
+    Inside, the gradient points to the nearer of side and end; of equally near ones to the end.
     """
 
+    KIND, COUNT = "cylinder", 2
     radius: float
     half: float
 
-    def __post_init__(self) -> None:
-        _check_round("cylinder", self.radius, self.half)
+    @property
+    def sizes(self) -> tuple[float, ...]:
+        return self.radius, self.half
 
     @property
     def bounds(self) -> np.ndarray:
@@ -290,26 +252,33 @@ class CylinderSdf:
         high = np.array([self.radius, self.radius, self.half])
         return np.stack([-high, high])
 
-    def to(self, device: torch.device | str) -> CylinderSdf:
-        """Itself: it holds no tensors."""
-        return self
+    @staticmethod
+    def measure(points: torch.Tensor, sizes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        tiny = torch.finfo(points.dtype).tiny
+        away = points[:, :2].norm(dim=1)
+        outward = torch.zeros_like(points)
+        outward[:, 0] = 1.0
+        unit = points[:, :2] / away.clamp_min(tiny)[:, None]
+        outward[:, :2] = torch.where((away > tiny)[:, None], unit, outward[:, :2])
+        end = torch.zeros_like(points)
+        end[:, 2] = torch.where(points[:, 2] < 0, -1.0, 1.0).to(points.dtype)
+        aside, above = away - sizes[:, 0], points[:, 2].abs() - sizes[:, 1]
+        corner = (aside > 0) & (above > 0)
+        length = torch.sqrt(aside.clamp_min(0) ** 2 + above.clamp_min(0) ** 2)
+        slanted = (aside[:, None] * outward + above[:, None] * end) / length.clamp_min(tiny)[:, None]
+        side = aside > above
+        distance = torch.where(corner, length, torch.maximum(aside, above))
+        gradient = torch.where(corner[:, None], slanted, torch.where(side[:, None], outward, end))
+        return distance, gradient
 
-    @accepts_numpy
-    def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Distance [P] m and unit gradient [P, 3] at `points` [P, 3] m."""
-        return cylinder_distance(points, points.new_tensor([self.radius]), points.new_tensor([self.half]))
+
+CLOSED_FORMS = {kind.KIND: kind for kind in (PlaneSdf, SphereSdf, BoxSdf, CapsuleSdf, CylinderSdf)}
 
 
-def _check_round(kind: str, radius: float, half: float) -> None:
-    for name, value in (("radius", radius), ("half height", half)):
-        if not (np.isfinite(value) and value > 0):
-            raise SdfsimError(f"{kind} {name} must be > 0 (got {value})")
-
-
-# Points evaluated at once: eight indices and corners with what is made of them, about 250 bytes a point, is 65 MB.
-CHUNK = 262_144
-# Distances asked for at once while a grid is sampled.
-SAMPLED = 200_000
+def _up(points: torch.Tensor) -> torch.Tensor:
+    up = torch.zeros_like(points)
+    up[:, 2] = 1.0
+    return up
 
 
 def trilinear(
@@ -389,22 +358,35 @@ class GridSdf:
         """The same grid on `device`."""
         return replace(self, values=self.values.to(device))
 
+    def scaled(self, factor: float) -> GridSdf:
+        """The solid `factor` times as large."""
+        frame = Frame(self.frame.centre * factor, self.frame.scale * factor)
+        return replace(self, frame=frame, bounds=self.bounds * factor)
+
+    @cached_property
+    def _stack(self) -> GridStack:
+        return GridStack([self], self.device)
+
     @accepts_numpy
     def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Distance [P] m and gradient [P, 3] at `points` [P, 3] m; interpolated in float32, cast back.
 
         Near the solid the gradient is the interpolant's own (see `trilinear`); see `everywhere` for what is far.
         """
-        centre = torch.as_tensor(self.frame.centre, dtype=points.dtype, device=points.device)
-        half = half_extents(self.frame, self.bounds).to(points.device)
-        distance, gradient = [], []
-        for part in points.split(CHUNK) if len(points) else (points,):
-            # The centre leaves in the precision of the points, before the cast.
-            local = ((part - centre) / self.frame.scale).float()
-            value, slope = everywhere(lambda rows, inside: trilinear(self.values, None, inside), local, half)
-            distance.append(value.to(points.dtype) * self.frame.scale)
-            gradient.append(slope.to(points.dtype))
-        return torch.cat(distance), torch.cat(gradient)
+        return self._stack.alone(points)
+
+
+class GridStack(BoxedStack):
+    """Grids of one resolution, asked together."""
+
+    def __init__(self, sdfs: list[GridSdf], device: torch.device) -> None:
+        super().__init__(sdfs, device, CHUNK)
+        # One grid alone is not copied: at 512 samples a side it is half a gigabyte.
+        alone = len(sdfs) == 1
+        self._values = sdfs[0].values.to(device)[None] if alone else torch.stack([s.values.to(device) for s in sdfs])
+
+    def _inside(self, slot: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return trilinear(self._values, slot if self._count > 1 else None, points)
 
 
 def sample_grid(
@@ -441,19 +423,6 @@ def sample_grid(
         values[start : start + layers] = (found / frame.scale).reshape(len(some), resolution, resolution)
     tell(1.0, "sampled")
     return GridSdf(torch.from_numpy(values), frame, np.asarray(bounds, dtype=np.float64))
-
-
-# All lengths below are relative to the mesh's largest extent. The hierarchy works in float32, so closest points are off
-# by some 1e-7: nearer than this the offset to them says little about the direction, and differences over the
-# step say it better.
-NEAR = 1e-5
-STEP = 1e-4
-# Farther out float32 runs out of range (at 1e19), so such points ask for the point on this box in their place. What
-# is nearest to that one is as near as makes no difference.
-FAR = 1e3
-# A difference quotient shorter than this is no direction: a crack, a sheet without thickness.
-FLAT = 0.05
-UP = (0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -494,6 +463,10 @@ class MeshSdf:
     def to(self, device: torch.device | str) -> MeshSdf:
         """Itself: it is asked on the CPU wherever the points are."""
         return self
+
+    def scaled(self, factor: float) -> MeshSdf:
+        """The solid `factor` times as large."""
+        return MeshSdf(replace(self.mesh, vertices=self.mesh.vertices * factor))
 
     @accepts_numpy
     def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.distance import PiecesDistance
-from sdfsim.shape.mesh import convex_hull, normal_frame
+from sdfsim.shape.mesh import Mesh, convex_hull, normal_frame
 from sdfsim.shape.sdf import Sdf
 
 # The paper's sampling (section 3 and appendix): a grid over this half extent of the normalised frame, projected onto
@@ -215,3 +215,19 @@ def _nearest_piece(pieces: Sequence[np.ndarray], places: np.ndarray) -> np.ndarr
         nearest[far < least] = k
         np.minimum(least, far, out=least)
     return nearest
+
+
+def surface_nodes(sdf: Sdf, surface: Mesh, count: int) -> np.ndarray:
+    """Nodes for contact, at most `count` [K, 3] m: first corners of the convex hull, then points all over `sdf`."""
+    corners = thin(surface.vertices[_outer(surface.vertices)], count // 3)
+    return thin(sample_nodes(sdf), count, keep=corners)
+
+
+def _outer(vertices: np.ndarray) -> np.ndarray:
+    """Indices of the convex hull's vertices; all of them when the vertices lie in a plane."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        return np.sort(ConvexHull(vertices).vertices)
+    except QhullError:
+        return np.arange(len(vertices))
