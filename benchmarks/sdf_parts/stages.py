@@ -31,10 +31,10 @@ def tables(study: Study) -> str:
         for place, variant in enumerate(_variants()):
             fit = study.results["fits"][variant][name]
             recipe = {"paper": "paper", "default": "ours, whole"}.get(variant, "ours")
-            errors = [fit["errors"]["error_within_0.01"], fit["errors"]["error_in_box"], fit["hausdorff"]]
+            errors = [fit["errors"]["error_within_0.01"], fit["errors"]["error_in_box"]]
             cells = [recipe, str(fit["updates"]), number(fit["training"]), *(number(error) for error in errors)]
             rows.append(["" if place else name, *cells])
-    head = ["shape", "recipe", "updates", "training, s", "error within 0.01", "in box", "Hausdorff"]
+    head = ["shape", "recipe", "updates", "training, s", "error within 0.01", "in box"]
     return table(head, rows) if rows else ""
 
 

@@ -140,7 +140,6 @@ class Study:
             "errors": {key: certificate[key] for key in ERRORS},
             "passed": certificate["passed"] and not certificate["caveat"],
             "reason": certificate["reason"] or certificate["caveat"],
-            "hausdorff": certificate["hausdorff"],
             "updates": certificate["steps"],
             "seconds": round(time.monotonic() - started, 2),
             "training": round(trained, 2),

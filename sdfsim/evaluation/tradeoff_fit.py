@@ -74,7 +74,7 @@ def _fitted(name: str, mesh: Mesh, budget: float, folder: Path) -> dict[str, Any
     wall, cpu = time.monotonic(), time.process_time()
     try:
         certificate = fit_mesh(mesh, name=name, budget=budget).certificate
-        point |= {key: certificate[key] for key in (*ERRORS, "hausdorff", "steps")}
+        point |= {key: certificate[key] for key in (*ERRORS, "steps")}
         point["reason"] = certificate["reason"] or certificate["caveat"]
         point["passed"] = not point["reason"]
     except SdfsimError as error:

@@ -1,4 +1,4 @@
-"""The recipes that `fit` can follow."""
+"""Mesh -> SDF network: recipes, the points a fit learns from, the training loop, and a certificate at its end."""
 
 from __future__ import annotations
 
@@ -6,33 +6,60 @@ import hashlib
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 import torch
 
 from sdfsim.errors import SdfsimError
-from sdfsim.shape.checkpoint import Checkpoint
 from sdfsim.shape.distance import DistanceOracle, MeshDistance, PiecesDistance
 from sdfsim.shape.far_field import BOX
-from sdfsim.shape.fit_metrics import certify
+from sdfsim.shape.fit_metrics import SIGN_FROM, certify
 from sdfsim.shape.mass import mass_properties, mass_properties_of_sdf
-from sdfsim.shape.mesh import Frame, Mesh, clean, is_closed, normal_frame, sample_surface
+from sdfsim.shape.mesh import Mesh, clean, is_closed, normal_frame, sample_surface
 from sdfsim.shape.mlp_sdf import Activation, MlpSdf, Tape, value_and_gradient
-from sdfsim.shape.sdf import Sdf, accepts_numpy
+from sdfsim.shape.sdf import Sdf
 from sdfsim.shape.shape import Shape
-from sdfsim.shape.soap import Adam, Soap
+from sdfsim.shape.soap import Soap
 from sdfsim.shape.surface_nodes import DEFAULT_COUNT, edge_nodes, hull_nodes, sample_nodes, surface_nodes, thin
 from sdfsim.shape.watertight import solidify
 from sdfsim.threads import choose_threads
 
+Recipe = Literal["quick", "default", "paper"]
+Progress = Callable[[float, str], None]
+Oracle = TypeVar("Oracle", bound=DistanceOracle)
+# Weights and biases per layer, [S, out, in] and [S, out].
+Layers = tuple[list[torch.Tensor], list[torch.Tensor]]
+
+# Changes whenever the same mesh would come out differently; part of every cache key.
+FIT_VERSION = 6
+
+# Points are drawn from a little beyond the box that is used: at the very edge of its data a network's slope is poor.
+MARGIN = 1.15
+# A solid whose distances agree with their mirror images' to this, relative to its size, is fitted on one side only.
+SAME = 1e-4
+# A fit is checked on the way on this many points of three kinds: with these spreads around the surface, and in the box.
+CHECKED = 4000
+CHECKED_SIGMAS = (0.006, 0.06)
+WARMUP = 50  # updates
+CHECK_EVERY = 100  # updates
+# Seconds that the certificate takes of a budget, beside a tenth.
+RESERVE = 2.0
+# Of the nodes of convex pieces: the pieces' vertices are at most this part, with points on their edges at most that.
+OWN_SHARE, EDGE_SHARE = 0.6, 0.85
+# Between points on the edges of convex pieces, relative to the size of the whole.
+EDGE_SPACING = 0.06
+CPU = torch.device("cpu")
+
 
 @dataclass(frozen=True)
 class Plan:
-    """One recipe. Lengths are relative to the shape's largest extent.
+    """One recipe; the defaults were chosen by measurement on scanned and thin-walled shapes.
+
+    Lengths are relative to the shape's largest extent. The box gets its share of points and the loss stays soft up to
+    some hundredths of the size, without which the far field is off by as much.
 
     Attributes:
         activation: of the hidden layers ("wave" or "relu").
@@ -57,49 +84,30 @@ class Plan:
         fold: fit a solid that is its own mirror image on one side only.
     """
 
-    activation: Activation
-    width: int
-    layers: int
-    first: float
-    optimiser: Literal["soap", "adam"]
-    lr: float
-    decay: float
-    steps: int
-    batch: int
-    sigmas: tuple[float, float]
-    near: float
-    resample: int
-    pool: int
-    soften: float | None
-    sign_everywhere: bool
-    goal: tuple[float, float, float, float] | None
-    settle: int
-    fold: bool
+    activation: Activation = "wave"
+    width: int = 64
+    layers: int = 6
+    first: float = 8.0
+    optimiser: Literal["soap", "adam"] = "soap"
+    lr: float = 1e-2
+    decay: float = 0.5
+    steps: int = 5000
+    batch: int = 4096
+    sigmas: tuple[float, float] = (0.002, 0.15)
+    near: float = 0.8
+    resample: int = 0
+    pool: int = 400_000
+    soften: float | None = 0.04
+    sign_everywhere: bool = True
+    goal: tuple[float, float, float, float] | None = (7e-4, 6e-3, 4e-3, 1.3e-3)
+    settle: int = 1000
+    fold: bool = True
 
 
 PLANS = {
-    # Chosen by measurement on scanned and thin-walled shapes. The box gets its share of points and the loss stays soft
-    # up to some hundredths of the size, without which the far field is off by as much.
-    "default": Plan(
-        activation="wave",
-        width=64,
-        layers=6,
-        first=8.0,
-        optimiser="soap",
-        lr=1e-2,
-        decay=0.5,
-        steps=5000,
-        batch=4096,
-        sigmas=(0.002, 0.15),
-        near=0.8,
-        resample=0,
-        pool=400_000,
-        soften=0.04,
-        sign_everywhere=True,
-        goal=(7e-4, 6e-3, 4e-3, 1.3e-3),
-        settle=1000,
-        fold=True,
-    ),
+    "default": Plan(),
+    # A surface from a few minutes of training is not known as exactly as a full fit would follow it.
+    "quick": Plan(steps=2000, settle=600),
     # Rubanova et al. 2024, section 3.1 and appendix: 400k updates at 1e-5, noise 0.1 drawn again every 100 updates.
     "paper": Plan(
         activation="relu",
@@ -110,7 +118,6 @@ PLANS = {
         lr=1e-5,
         decay=0.0,
         steps=400_000,
-        batch=4096,
         sigmas=(0.1, 0.1),
         near=1.0,
         resample=100,
@@ -122,21 +129,175 @@ PLANS = {
         fold=False,
     ),
 }
-# A surface from a few minutes of training is not known as exactly as a full fit would follow it.
-PLANS["quick"] = replace(PLANS["default"], steps=2000, settle=600)
 
 
-# Points are drawn from a little beyond the box that is used: at the very edge of its data a network's slope is poor.
-MARGIN = 1.15
-# A solid whose distances agree with their mirror images' to this, relative to its size, is fitted on one side only.
-SAME = 1e-4
-# A fit is checked on the way on this many points of three kinds: with these spreads around the surface, and in the box.
-CHECKED = 4000
-CHECKED_SIGMAS = (0.006, 0.06)
+def fit_mesh(
+    mesh: Mesh | MeshDistance,
+    *,
+    name: str,
+    recipe: Recipe = "default",
+    budget: float | None = None,
+    seed: int = 0,
+    cap: bool = False,
+    thicken: float | None = None,
+    on_progress: Progress | None = None,
+    device: torch.device | str = "cpu",
+) -> Shape:
+    """Fit the compact SDF network to the solid that a triangle mesh bounds (see `solidify`).
+
+    The result depends on the mesh, the recipe and the seed only (up to rounding, which the number of threads and the
+    device change), unless the budget cuts the training short.
+
+    Args:
+        mesh: metres; or its distance oracle, when there is one already.
+        name: of the shape.
+        recipe: "default" (waves, 64 wide, SOAP, seconds), "quick" (the same in 2,000 steps at most, not 5,000) or
+            "paper" (ReLU, 128 wide, Adam 1e-5, 400k steps).
+        budget: seconds of training at most; the schedule is shortened to fit.
+        seed: of sampling and initialisation.
+        cap: close openings of any size.
+        thicken: m; the solid is all within half of this distance from the mesh instead.
+        on_progress: called with (fraction done, message).
+        device: to train on.
+
+    Returns:
+        Shape whose `certificate` tells the errors and whether it is usable (`passed`); what was done to the mesh is
+        in `source["notes"]`.
+
+    Raises:
+        SdfsimError: the mesh cannot be used, or bounds no solid.
+    """
+    if isinstance(mesh, Mesh):
+        mesh = MeshDistance(solidify(mesh, name=name, cap=cap, thicken=thicken))
+    options = {"recipe": recipe, "budget": budget, "seed": seed, "on_progress": on_progress, "device": device}
+    return fit_solids({name: mesh}, **options)[0]
 
 
-@dataclass(frozen=True)
-class Pool:
+def fit_solids(
+    solids: dict[str, MeshDistance],
+    *,
+    recipe: Recipe = "default",
+    budget: float | None = None,
+    seed: int = 0,
+    on_progress: Progress | None = None,
+    device: torch.device | str = "cpu",
+) -> list[Shape]:
+    """Fit several solids side by side in one batched optimiser, which is what a GPU is good at.
+
+    Args:
+        solids: by name, from `MeshDistance(solidify(mesh))`.
+        budget: seconds of training for all of them.
+        recipe, seed, on_progress, device: as for `fit_mesh`.
+
+    Returns:
+        Shapes in the order of `solids`, as `fit_mesh` gives them.
+    """
+
+    def pick(sdf: Sdf, oracle: MeshDistance) -> np.ndarray:
+        return surface_nodes(sdf, oracle.surface, DEFAULT_COUNT)
+
+    fitted = _fit(list(solids.values()), recipe, budget, seed, pick, on_progress, device)
+    shapes = []
+    for (name, oracle), (sdf, points, certificate) in zip(solids.items(), fitted, strict=True):
+        solid = oracle.solid
+        source = _source("mesh", recipe, [solid.surface]) | ({"notes": list(solid.notes)} if solid.notes else {})
+        shapes.append(Shape(name, solid.surface, sdf, points, *solid.mass_properties(), certificate, source))
+    return shapes
+
+
+def fit_pieces(
+    pieces: list[Mesh],
+    *,
+    name: str,
+    display: Mesh | None = None,
+    recipe: Recipe = "default",
+    budget: float | None = None,
+    seed: int = 0,
+    nodes: int = DEFAULT_COUNT,
+    on_progress: Progress | None = None,
+) -> Shape:
+    """Fit the compact SDF network to the union of convex pieces: the body that a rigid-body engine collides.
+
+    Nodes are the pieces' own vertices first (without repetitions and those inside another piece), because contact
+    with a flat floor is exact only there; then points along their sharp edges, then points all over the surface.
+
+    Args:
+        pieces: convex closed meshes, metres (see `load_pieces`).
+        display: the mesh to show; by default the boundary of the union.
+        nodes: surface nodes at most.
+        name, recipe, budget, seed, on_progress: as for `fit_mesh`.
+
+    Returns:
+        Shape; its mass properties are those of the union.
+
+    Raises:
+        SdfsimError: no pieces.
+    """
+    oracle = PiecesDistance(pieces)
+    size = float(np.ptp(oracle.bounds, axis=0).max())
+
+    def bare(points: np.ndarray) -> np.ndarray:
+        _, first = np.unique(np.round(points / (1e-4 * size)), axis=0, return_index=True)
+        points = points[np.sort(first)]
+        # Measured from the boundary of the union: a point on the seam of two pieces is deep in neither.
+        return points[oracle(points).distance >= -1e-3 * size]
+
+    vertices = bare(np.concatenate([piece.vertices for piece in pieces]))
+    edges = bare(np.concatenate([edge_nodes(piece.vertices, EDGE_SPACING * size) for piece in pieces]))
+
+    def pick(sdf: Sdf, oracle: PiecesDistance) -> np.ndarray:
+        own = hull_nodes(vertices, round(OWN_SHARE * nodes))
+        return thin(sample_nodes(sdf), nodes, keep=thin(edges, round(EDGE_SHARE * nodes), keep=own))
+
+    sdf, points, certificate = _fit([oracle], recipe, budget, seed, pick, on_progress, "cpu")[0]
+    single = len(pieces) == 1 and is_closed(pieces[0])
+    volume, com, inertia = mass_properties(pieces[0]) if single else mass_properties_of_sdf(oracle)
+    mesh = display if display is not None else clean(oracle.surface, name=name)
+    source = _source("pieces", recipe, pieces)
+    hulls = tuple(piece.vertices for piece in pieces)
+    return Shape(name, mesh, sdf, points, volume, com, inertia, certificate, source, hulls)
+
+
+def _fit(
+    oracles: Sequence[Oracle],
+    recipe: Recipe,
+    budget: float | None,
+    seed: int,
+    pick: Callable[[Sdf, Oracle], np.ndarray],
+    on_progress: Progress | None,
+    device: torch.device | str,
+) -> list[tuple[MlpSdf, np.ndarray, dict]]:
+    """Per oracle the network, nodes [K, 3] m as `pick` takes them from it, and the certificate."""
+    if budget is not None and not budget > 0:
+        raise SdfsimError(f"the budget of a fit must be > 0 seconds (got {budget})")
+    started = time.monotonic()
+    tell = on_progress or (lambda fraction, message: None)
+    fitted = train(oracles, PLANS[recipe], budget=budget, seed=seed, tell=tell, device=torch.device(device))
+    trained = time.monotonic() - started
+    results = []
+    for done, (oracle, (sdf, steps)) in enumerate(zip(oracles, fitted, strict=True), start=1):
+        tell(0.98 + 0.02 * (done - 1) / len(oracles), "measuring")
+        measuring = time.monotonic()
+        nodes = pick(sdf, oracle)
+        certificate = certify(sdf, oracle, nodes=nodes)
+        # Its share of the training that it had with others, and its own measuring.
+        seconds = trained / len(oracles) + time.monotonic() - measuring
+        certificate.update(recipe=recipe, seed=seed, steps=steps, seconds=round(seconds, 2))
+        but = certificate["reason"] or certificate["caveat"]
+        tell(0.98 + 0.02 * done / len(oracles), f"fitted, but {but}" if but else "fitted")
+        results.append((sdf, nodes, certificate))
+    return results
+
+
+def _source(kind: str, recipe: Recipe, meshes: list[Mesh]) -> dict:
+    digest = hashlib.sha256()
+    for mesh in meshes:
+        digest.update(np.ascontiguousarray(mesh.vertices).tobytes())
+        digest.update(np.ascontiguousarray(mesh.faces).tobytes())
+    return {"kind": kind, "geometry_sha256": digest.hexdigest(), "recipe": recipe, "fit_version": FIT_VERSION}
+
+
+class Pool(NamedTuple):
     """Points of S shapes, P each, normalised.
 
     Attributes:
@@ -151,24 +312,6 @@ class Pool:
     signed: torch.Tensor
     direction: torch.Tensor
 
-    def rows(self, kept: torch.Tensor) -> Pool:
-        """Those of the shapes `kept` [S'] only."""
-        return Pool(self.points[kept], self.distance[kept], self.signed[kept], self.direction[kept])
-
-    def to(self, device: torch.device) -> Pool:
-        """The same on `device`."""
-        return Pool(*(part.to(device) for part in (self.points, self.distance, self.signed, self.direction)))
-
-
-def stack(pools: list[Pool]) -> Pool:
-    """Pools of equal size as one."""
-    return Pool(
-        torch.cat([pool.points for pool in pools]),
-        torch.cat([pool.distance for pool in pools]),
-        torch.cat([pool.signed for pool in pools]),
-        torch.cat([pool.direction for pool in pools]),
-    )
-
 
 class Subject:
     """One solid to be fitted: its frame, its mirror planes, and samples of it.
@@ -182,9 +325,9 @@ class Subject:
     def __init__(self, oracle: DistanceOracle, plan: Plan, seed: int) -> None:
         self.oracle, self._plan, self._seed = oracle, plan, seed
         self.frame = normal_frame(oracle.bounds)
-        self.mirrors = _mirrors(oracle, self.frame) if plan.fold else (False, False, False)
+        self.mirrors = self._mirrors() if plan.fold else (False, False, False)
 
-    def pool(self, step: int = 0) -> Pool:
+    def pool(self, step: int) -> Pool:
         """Points to learn from, of one shape, as drawn before update `step`."""
         plan = self._plan
         rng = np.random.default_rng([self._seed, 0, step] if step else [self._seed, 0])
@@ -220,30 +363,18 @@ class Subject:
             torch.from_numpy(direction * side).float()[None],
         )
 
+    def _mirrors(self) -> tuple[bool, bool, bool]:
+        """Across which planes of its frame the solid is its own mirror image, as far as sampled distances tell."""
+        rng = np.random.default_rng(0)
+        local = self.frame.inward(sample_surface(self.oracle.surface, 2000, rng)[0])
+        local = np.concatenate([local, local + rng.normal(0.0, 0.05, local.shape)])
+        truth = self.oracle(self.frame.outward(local)).distance
 
-def _mirrors(oracle: DistanceOracle, frame: Frame) -> tuple[bool, bool, bool]:
-    """Across which planes of its frame the solid is its own mirror image, as far as sampled distances tell."""
-    rng = np.random.default_rng(0)
-    local = frame.inward(sample_surface(oracle.surface, 2000, rng)[0])
-    local = np.concatenate([local, local + rng.normal(0.0, 0.05, local.shape)])
-    truth = oracle(frame.outward(local)).distance
-    same = []
-    for axis in range(3):
-        image = local.copy()
-        image[:, axis] *= -1.0
-        same.append(bool(np.abs(oracle(frame.outward(image)).distance - truth).max() < SAME * frame.scale))
-    return same[0], same[1], same[2]
+        def same(axis: int) -> bool:
+            image = self.frame.outward(local * np.where(np.arange(3) == axis, -1.0, 1.0))
+            return bool(np.abs(self.oracle(image).distance - truth).max() < SAME * self.frame.scale)
 
-
-WARMUP = 50
-CHECK_EVERY = 100
-# Seconds that the certificate takes of a budget, beside a tenth.
-RESERVE = 2.0
-SIGN_FROM = 0.002  # nearer to the surface a wrong sign is no more than an error of the distance
-CPU = torch.device("cpu")
-
-# Weights and biases per layer, [S, out, in] and [S, out].
-Layers = tuple[list[torch.Tensor], list[torch.Tensor]]
+        return same(0), same(1), same(2)
 
 
 def train(
@@ -252,8 +383,7 @@ def train(
     *,
     budget: float | None,
     seed: int,
-    tell: Callable[[float, str], None],
-    checkpoint: Path | None = None,
+    tell: Progress,
     device: torch.device = CPU,
 ) -> list[tuple[MlpSdf, int]]:
     """Run a plan for several solids in one batched optimiser; each comes out as it would alone, up to rounding.
@@ -264,8 +394,6 @@ def train(
         budget: seconds for all at most; the decay begins early enough to end within them.
         seed: of points and weights.
         tell: called with (fraction done, message).
-        checkpoint: of a single solid; resumed from when it belongs to this very fit. The caller removes it once what
-            came of the fit is safe.
         device: to train on.
 
     Returns:
@@ -273,30 +401,19 @@ def train(
     """
     started = time.monotonic()
     run = _Run(oracles, plan, seed, tell, device)
-    if checkpoint is not None and len(oracles) > 1:
-        raise ValueError("a checkpoint belongs to a single solid")
-    saved = Checkpoint(checkpoint, f"{asdict(plan)}|{seed}", oracles[0].surface) if checkpoint is not None else None
-    if saved is not None:
-        run.restore(saved)
     if device.type == "cpu":
         choose_threads(partial(run.differentiate, torch.arange(plan.batch) % plan.pool))
-    before, looping = run.step, time.monotonic()
-
+    looping = time.monotonic()
     while run.step < run.stop.max():
         run.update()
         if run.step % CHECK_EVERY:
             continue
-        run.repair()
         near, far = run.judge()
         if budget is not None:
-            pace = (time.monotonic() - looping) / (run.step - before)
+            pace = (time.monotonic() - looping) / run.step
             run.hurry(run.step + int((training_share(budget) - (time.monotonic() - started)) / pace))
-        run.retire()
         last = max(int(run.stop.max()), 1)
-        errors = f"error {near:.2g} near, {far:.2g} in the box"
-        tell(0.97 * run.step / last, f"step {run.step} of {last}, {errors}")
-        if saved is not None and run.step % (2 * CHECK_EVERY) == 0:
-            run.save(saved)
+        tell(0.97 * run.step / last, f"step {run.step} of {last}, error {near:.2g} near, {far:.2g} in the box")
     return run.results()
 
 
@@ -306,7 +423,7 @@ def training_share(budget: float) -> float:
 
 
 class _Run:
-    """S networks in training; those that are done leave the stack.
+    """S networks in training.
 
     Attributes:
         step: updates made.
@@ -315,52 +432,48 @@ class _Run:
     """
 
     def __init__(
-        self,
-        oracles: Sequence[DistanceOracle],
-        plan: Plan,
-        seed: int,
-        tell: Callable[[float, str], None],
-        device: torch.device,
+        self, oracles: Sequence[DistanceOracle], plan: Plan, seed: int, tell: Progress, device: torch.device
     ) -> None:
         self.plan, self.device = plan, device
         self.subjects, pools, checks = [], [], []
-        for done, oracle in enumerate(oracles):
-            tell(0.0, "sampling distances" + (f" of {done + 1} of {len(oracles)}" if len(oracles) > 1 else ""))
+        for done, oracle in enumerate(oracles, start=1):
+            tell(0.0, "sampling distances" + (f" of {done} of {len(oracles)}" if len(oracles) > 1 else ""))
             subject = Subject(oracle, plan, seed)
             self.subjects.append(subject)
-            pools.append(subject.pool())
+            pools.append(subject.pool(0))
             checks.append(subject.check())
-        self.pool, self.check = stack(pools).to(device), stack(checks).to(device)
+        self.pool, self.check = self._stacked(pools), self._stacked(checks)
         # Drawn on the CPU, so that points and first weights do not depend on the device.
         self.generator = torch.Generator().manual_seed(seed)
-        self._take([p.to(device) for p in _initial(plan, len(oracles), self.generator)])
+        self.parameters = [p.to(device) for p in _initial(plan, len(oracles), self.generator)]
+        for parameter in self.parameters:
+            parameter.grad = torch.zeros_like(parameter)
         self.average = [parameter.clone() for parameter in self.parameters]
-        self.optimiser = (Soap if plan.optimiser == "soap" else Adam)(self.parameters, plan.lr)
+        self.optimiser = (Soap if plan.optimiser == "soap" else torch.optim.Adam)(self.parameters, plan.lr)
         self.step = 0
         self.turn = np.full(len(oracles), int(plan.steps * (1.0 - plan.decay)))
         self.stop = np.full(len(oracles), plan.steps)
-        self.rate = np.ones(len(oracles))  # of the step size, lower after a fresh start
-        self.places = np.arange(len(oracles))  # in the results
-        self.done: dict[int, tuple[MlpSdf, int]] = {}
         self._tape = Tape(plan.activation, plan.width, plan.layers, self.parameters[0])
 
-    def _take(self, parameters: list[torch.Tensor]) -> None:
-        self.parameters = parameters
-        for parameter in parameters:
-            parameter.grad = torch.zeros_like(parameter)
+    def _stacked(self, pools: list[Pool]) -> Pool:
+        return Pool(*(torch.cat(parts).to(self.device) for parts in zip(*pools, strict=True)))
 
     def update(self) -> None:
         """One step of the optimiser for all that are not done."""
         plan = self.plan
         if plan.resample and self.step and self.step % plan.resample == 0:
-            self.pool = stack([subject.pool(self.step) for subject in self.subjects]).to(self.device)
+            self.pool = self._stacked([subject.pool(self.step) for subject in self.subjects])
         self.differentiate(torch.randint(plan.pool, (plan.batch,), generator=self.generator))
-        factor = min(1.0, (self.step + 1) / WARMUP) * self.rate
+        factor = np.full(len(self.subjects), min(1.0, (self.step + 1) / WARMUP))
         if plan.decay:
             late = np.clip((self.step - self.turn) / np.maximum(self.stop - self.turn, 1), 0.0, 1.0)
             factor = factor * 0.5 * (1.0 + np.cos(math.pi * late))
         factor = np.where(self.step < self.stop, factor, 0.0)
-        self.optimiser.step(torch.from_numpy(factor).to(self.parameters[0]))
+        if isinstance(self.optimiser, Soap):
+            self.optimiser.step(torch.from_numpy(factor).to(self.parameters[0]))
+        else:  # without an early stop the schedule of all networks is one
+            self.optimiser.param_groups[0]["lr"] = plan.lr * float(factor.max())
+            self.optimiser.step()
         self.step += 1
         for mean, parameter in zip(self.average, self.parameters, strict=True):
             mean.lerp_(parameter, 0.02)
@@ -387,19 +500,6 @@ class _Run:
         self._tape.parameter_gradients(weights, points, slope, *_split(gradients))
         for gradient, scale in zip(gradients, _SCALES[self.plan.activation], strict=True):
             gradient.mul_(scale)
-
-    def repair(self) -> None:
-        """A fresh start, from new weights and with a quarter of the step size, for what is not finite."""
-        finite = torch.stack([p.isfinite().all(-1).all(-1).all(0) for p in self.parameters]).all(0)
-        if bool(finite.all()):
-            return
-        broken = ~finite
-        fresh = _initial(self.plan, len(finite), torch.Generator().manual_seed(1))
-        for mean, parameter, start in zip(self.average, self.parameters, fresh, strict=True):
-            parameter[:, broken] = start.to(self.device)[:, broken]
-            mean[:, broken] = parameter[:, broken]
-        self.optimiser.forget(broken)
-        self.rate[broken.cpu().numpy()] /= 4
 
     def judge(self) -> tuple[float, float]:
         """Begin the decay of those that meet the goal. Returns mean errors near the surface and in the box, of all."""
@@ -432,25 +532,11 @@ class _Run:
         open_ended = np.maximum(self.step, (self.stop * (1.0 - self.plan.decay)).astype(int))
         self.turn = np.where(begun, self.turn, open_ended)
 
-    def retire(self) -> None:
-        """Put aside the networks that are done, once they are half of the stack."""
-        going = self.step < self.stop
-        if 2 * going.sum() > len(going) or not going.any():
-            return
-        self._finish(~going)
-        kept = torch.from_numpy(np.flatnonzero(going)).to(self.device)
-        self._take([parameter[:, kept] for parameter in self.parameters])
-        self.average = [mean[:, kept] for mean in self.average]
-        self.optimiser.keep(kept, self.parameters)
-        self.pool, self.check = self.pool.rows(kept), self.check.rows(kept)
-        self.subjects = [subject for subject, stays in zip(self.subjects, going, strict=True) if stays]
-        self.turn, self.stop, self.rate = self.turn[going], self.stop[going], self.rate[going]
-        self.places = self.places[going]
-
-    def _finish(self, chosen: np.ndarray) -> None:
+    def results(self) -> list[tuple[MlpSdf, int]]:
+        """Every network and its updates, in the order of the solids."""
         weights, biases = _layers(self.parameters, self.plan.activation)
-        for row in np.flatnonzero(chosen):
-            subject = self.subjects[row]
+        found = []
+        for row, subject in enumerate(self.subjects):
             sdf = MlpSdf(
                 tuple(weight[row].cpu().clone() for weight in weights),
                 tuple(bias[row].cpu().clone() for bias in biases),
@@ -459,25 +545,8 @@ class _Run:
                 subject.oracle.bounds.copy(),
                 subject.mirrors,
             )
-            self.done[int(self.places[row])] = sdf, int(min(self.step, self.stop[row]))
-
-    def results(self) -> list[tuple[MlpSdf, int]]:
-        """Every network and its updates, in the order of the solids."""
-        self._finish(np.ones(len(self.subjects), dtype=bool))
-        return [self.done[place] for place in sorted(self.done)]
-
-    def save(self, saved: Checkpoint) -> None:
-        """Write the state of a single network's training."""
-        progress = (self.step, int(self.turn[0]), int(self.stop[0]), float(self.rate[0]))
-        saved.save(self.parameters, self.average, self.optimiser, self.generator, progress)
-
-    def restore(self, saved: Checkpoint) -> None:
-        """Go on from what `save` wrote, if it is there."""
-        progress = saved.load(self.parameters, self.average, self.optimiser, self.generator)
-        if progress is not None:
-            self.step = int(progress[0])
-            self.turn, self.stop = np.array([int(progress[1])]), np.array([int(progress[2])])
-            self.rate = np.array([progress[3]])
+            found.append((sdf, int(min(self.step, self.stop[row]))))
+        return found
 
 
 def _initial(plan: Plan, count: int, generator: torch.Generator) -> list[torch.Tensor]:
@@ -515,227 +584,3 @@ def _layers(parameters: list[torch.Tensor], activation: Activation) -> Layers:
 def _split(parts: list[torch.Tensor]) -> Layers:
     first, hidden, last, biases, end = parts
     return [first[0], *hidden.unbind(), last[0]], [*biases[..., 0].unbind(), end[0, ..., 0]]
-
-
-Recipe = Literal["quick", "default", "paper"]
-Progress = Callable[[float, str], None]
-Oracle = TypeVar("Oracle", bound=DistanceOracle)
-
-# Of the nodes of convex pieces: the pieces' vertices are at most this part, with points on their edges at most that.
-OWN_SHARE, EDGE_SHARE = 0.6, 0.85
-# Between points on the edges of convex pieces, relative to the size of the whole.
-EDGE_SPACING = 0.06
-
-# Changes whenever the same mesh would come out differently; part of every cache key.
-FIT_VERSION = 6
-
-
-def fit_mesh(
-    mesh: Mesh | MeshDistance,
-    *,
-    name: str,
-    recipe: Recipe = "default",
-    budget: float | None = None,
-    seed: int = 0,
-    nodes: int = DEFAULT_COUNT,
-    cap: bool = False,
-    thicken: float | None = None,
-    on_progress: Progress | None = None,
-    checkpoint: str | Path | None = None,
-    device: torch.device | str = "cpu",
-) -> Shape:
-    """Fit the compact SDF network to the solid that a triangle mesh bounds (see `solidify`).
-
-    The result depends on the mesh, the recipe and the seed only (up to rounding, which the number of threads and the
-    device change), unless the budget cuts the training short.
-
-    Args:
-        mesh: metres; or its distance oracle, when there is one already.
-        name: of the shape.
-        recipe: "default" (waves, 64 wide, SOAP, seconds), "quick" (the same in 2,000 steps at most, not 5,000) or
-            "paper" (ReLU, 128 wide, Adam 1e-5, 400k steps).
-        budget: seconds of training at most; the schedule is shortened to fit.
-        seed: of sampling and initialisation.
-        nodes: surface nodes at most.
-        cap: close openings of any size.
-        thicken: m; the solid is all within half of this distance from the mesh instead.
-        on_progress: called with (fraction done, message).
-        checkpoint: a file to resume from when it exists and belongs to the same fit, and to write on the way; to be
-            removed by the caller once the shape is safe.
-        device: to train on.
-
-    Returns:
-        Shape whose `certificate` tells the errors and whether it is usable (`passed`); what was done to the mesh is
-        in `source["notes"]`.
-
-    Raises:
-        SdfsimError: the mesh cannot be used, or bounds no solid.
-    """
-    if isinstance(mesh, Mesh):
-        mesh = MeshDistance(solidify(mesh, name=name, cap=cap, thicken=thicken))
-    return fit_solids(
-        {name: mesh},
-        recipe=recipe,
-        budget=budget,
-        seed=seed,
-        nodes=nodes,
-        on_progress=on_progress,
-        checkpoint=checkpoint,
-        device=device,
-    )[0]
-
-
-def fit_solids(
-    solids: dict[str, MeshDistance],
-    *,
-    recipe: Recipe = "default",
-    budget: float | None = None,
-    seed: int = 0,
-    nodes: int = DEFAULT_COUNT,
-    on_progress: Progress | None = None,
-    checkpoint: str | Path | None = None,
-    device: torch.device | str = "cpu",
-) -> list[Shape]:
-    """Fit several solids side by side in one batched optimiser, which is what a GPU is good at.
-
-    Args:
-        solids: by name, from `MeshDistance(solidify(mesh))`.
-        budget: seconds of training for all of them.
-        recipe, seed, nodes, on_progress, checkpoint, device: as for `fit_mesh`; the checkpoint for a single solid only.
-
-    Returns:
-        Shapes in the order of `solids`, as `fit_mesh` gives them.
-    """
-
-    def pick(sdf: Sdf, oracle: MeshDistance) -> np.ndarray:
-        return surface_nodes(sdf, oracle.surface, nodes)
-
-    oracles = list(solids.values())
-    shapes = []
-    fitted = _train(oracles, recipe, budget, seed, pick, on_progress, checkpoint, device)
-    for (name, oracle), (sdf, points, certificate) in zip(solids.items(), fitted, strict=True):
-        solid = oracle.solid
-        source = _source("mesh", recipe, [solid.surface]) | ({"notes": list(solid.notes)} if solid.notes else {})
-        shapes.append(Shape(name, solid.surface, sdf, points, *solid.mass_properties(), certificate, source))
-    return shapes
-
-
-def fit_pieces(
-    pieces: list[Mesh],
-    *,
-    name: str,
-    display: Mesh | None = None,
-    recipe: Recipe = "default",
-    budget: float | None = None,
-    seed: int = 0,
-    nodes: int = DEFAULT_COUNT,
-    on_progress: Progress | None = None,
-    checkpoint: str | Path | None = None,
-) -> Shape:
-    """Fit the compact SDF network to the union of convex pieces: the body that a rigid-body engine collides.
-
-    Nodes are the pieces' own vertices first (without repetitions and those inside another piece), because contact
-    with a flat floor is exact only there; then points along their sharp edges, then points all over the surface.
-
-    Args:
-        pieces: convex closed meshes, metres (see `load_pieces`).
-        display: the mesh to show; by default the boundary of the union.
-        name, recipe, budget, seed, nodes, on_progress, checkpoint: as for `fit_mesh`.
-
-    Returns:
-        Shape; its mass properties are those of the union.
-
-    Raises:
-        SdfsimError: no pieces.
-    """
-    oracle = PiecesDistance(pieces)
-    size = float(np.ptp(oracle.bounds, axis=0).max())
-    vertices = np.concatenate([piece.vertices for piece in pieces])
-    edges = np.concatenate([edge_nodes(piece.vertices, EDGE_SPACING * size) for piece in pieces])
-
-    def bare(points: np.ndarray) -> np.ndarray:
-        _, first = np.unique(np.round(points / (1e-4 * size)), axis=0, return_index=True)
-        points = points[np.sort(first)]
-        # Measured from the boundary of the union: a point on the seam of two pieces is deep in neither.
-        return points[oracle(points).distance >= -1e-3 * size]
-
-    vertices, edges = bare(vertices), bare(edges)
-
-    def pick(sdf: Sdf, oracle: PiecesDistance) -> np.ndarray:
-        own = hull_nodes(vertices, round(OWN_SHARE * nodes))
-        return thin(sample_nodes(sdf), nodes, keep=thin(edges, round(EDGE_SHARE * nodes), keep=own))
-
-    sdf, points, certificate = _train([oracle], recipe, budget, seed, pick, on_progress, checkpoint, "cpu")[0]
-    single = len(pieces) == 1 and is_closed(pieces[0])
-    volume, com, inertia = mass_properties(pieces[0]) if single else mass_properties_of_sdf(_OracleSdf(oracle))
-    mesh = display if display is not None else clean(oracle.surface, name=name)
-    source = _source("pieces", recipe, pieces)
-    hulls = tuple(piece.vertices for piece in pieces)
-    return Shape(name, mesh, sdf, points, volume, com, inertia, certificate, source, hulls)
-
-
-def _train(
-    oracles: Sequence[Oracle],
-    recipe: Recipe,
-    budget: float | None,
-    seed: int,
-    pick: Callable[[Sdf, Oracle], np.ndarray],
-    on_progress: Progress | None,
-    checkpoint: str | Path | None,
-    device: torch.device | str,
-) -> list[tuple[MlpSdf, np.ndarray, dict]]:
-    """Per oracle the network, nodes [K, 3] m as `pick` takes them from it, and the certificate."""
-    if budget is not None and not budget > 0:
-        raise SdfsimError(f"the budget of a fit must be > 0 seconds (got {budget})")
-    started = time.monotonic()
-    tell = on_progress or (lambda fraction, message: None)
-    fitted = train(
-        oracles,
-        PLANS[recipe],
-        budget=budget,
-        seed=seed,
-        tell=tell,
-        checkpoint=Path(checkpoint) if checkpoint else None,
-        device=torch.device(device),
-    )
-    trained = time.monotonic() - started
-    results = []
-    for done, (oracle, (sdf, steps)) in enumerate(zip(oracles, fitted, strict=True), start=1):
-        tell(0.98 + 0.02 * (done - 1) / len(oracles), "measuring")
-        measuring = time.monotonic()
-        nodes = pick(sdf, oracle)
-        certificate = certify(sdf, oracle, nodes=nodes)
-        # Its share of the training that it had with others, and its own measuring.
-        seconds = trained / len(oracles) + time.monotonic() - measuring
-        certificate.update(recipe=recipe, seed=seed, steps=steps, seconds=round(seconds, 2))
-        but = certificate["reason"] or certificate["caveat"]
-        told = f"fitted, but {but}" if but else "fitted"
-        tell(0.98 + 0.02 * done / len(oracles), told)
-        results.append((sdf, nodes, certificate))
-    return results
-
-
-def _source(kind: str, recipe: Recipe, meshes: list[Mesh]) -> dict:
-    digest = hashlib.sha256()
-    for mesh in meshes:
-        digest.update(np.ascontiguousarray(mesh.vertices).tobytes())
-        digest.update(np.ascontiguousarray(mesh.faces).tobytes())
-    return {"kind": kind, "geometry_sha256": digest.hexdigest(), "recipe": recipe, "fit_version": FIT_VERSION}
-
-
-@dataclass(frozen=True, eq=False)
-class _OracleSdf:
-    """Reference distances in the clothes of an Sdf, for integrals; its gradient is the direction to the surface."""
-
-    oracle: DistanceOracle
-
-    @property
-    def bounds(self) -> np.ndarray:
-        return self.oracle.bounds
-
-    @accepts_numpy
-    def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        truth = self.oracle(points.double().cpu().numpy())
-        offset = points.double().cpu().numpy() - truth.closest
-        direction = offset / np.where(np.abs(truth.distance) < 1e-12, 1e-12, truth.distance)[:, None]
-        return torch.from_numpy(truth.distance).to(points), torch.from_numpy(direction).to(points)

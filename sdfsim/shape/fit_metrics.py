@@ -1,19 +1,16 @@
-"""How good a fitted SDF is, measured on points that it was not fitted to."""
+"""How good a fitted SDF is on points that it was not fitted to, and how well nodes stand for a surface."""
 
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from sdfsim.shape.bvh import ClosestPoint
 from sdfsim.shape.distance import DistanceOracle, MeshDistance
 from sdfsim.shape.far_field import BOX
 from sdfsim.shape.mesh import Frame, Mesh, normal_frame, sample_surface, signed_volume
 from sdfsim.shape.sdf import Sdf
-from sdfsim.shape.surface_nodes import project
 
 # Lengths are fractions of the shape's largest extent. EXACT is what good fits of clean meshes reach.
 EXACT: tuple[tuple[str, float], ...] = (
@@ -39,17 +36,16 @@ SIGN_FROM = 0.002
 FAR_FROM = 0.1
 # Half extent of the cube in which the far field is tested.
 FAR_HALF = 2.0
-# Signed distances between which the errors are also told apart, and how many points make a bin worth telling.
-EDGES = (
-    *(-0.3, -0.2, -0.1, -0.05, -0.02, -0.01, -0.005, -0.002, 0.0),
-    *(0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7),
-)
-BIN_POINTS = 20
 # A wall counts as thin below this, and thin walls explain a miss when this much of the surface has them. What is
 # measured from 0.1 away also suffers from walls through whose middle, where the gradient turns over, it looks.
 THIN = 0.02
 THIN_FROM_AFAR = 0.1
 THIN_SHARE = 0.02
+
+
+FAR_FROM_A_NODE = 0.1
+# A surface sample is hidden where this far along its normal is inside.
+EXPOSED_STEP = 5e-4
 
 
 class _Measured(NamedTuple):
@@ -69,19 +65,9 @@ class _Measured(NamedTuple):
     norm: np.ndarray
     projected: np.ndarray
 
-    def where(self, chosen: np.ndarray) -> _Measured:
-        """The `chosen` [P] bool of the points."""
-        return _Measured(*(part[chosen] for part in self))
-
-    @property
-    def error(self) -> np.ndarray:
-        """[P] absolute error of the distance."""
-        return np.abs(self.value - self.true)
-
-    @property
-    def wrong(self) -> np.ndarray:
-        """[P] whether the sign is wrong."""
-        return self.value * self.true <= 0
+    def within(self, limit: float) -> _Measured:
+        """Those no farther than `limit` from the surface."""
+        return _Measured(*(part[np.abs(self.true) <= limit] for part in self))
 
 
 def certify(
@@ -110,16 +96,7 @@ def certify(
         is wrong; `far_field_ratio`, the largest f / true distance farther than 0.1, out to [-2, 2]^3 (a step as
         long as f goes through the surface where it is above 1).
 
-        `hausdorff`, `hausdorff_from_mesh`, `hausdorff_from_level`, `hausdorff_p99` and `stray_extent` as in
-        `coverage.hausdorff`.
-
-        `curve`, all by signed distance as in the supplementary figure of Rubanova et al. 2024: `distance` (B + 1 bin
-        edges), and B values each of `count`, `error` and `error_p95`, `sign_errors` (fraction), `gradient_direction`
-        (median 1 - cosine), `gradient_norm` (median) with `gradient_norm_p5` and `gradient_norm_p95`, and
-        `projected` (mean); None in bins of fewer than 20 points.
-
-        `coverage` of the nodes as in `coverage.coverage`, if there are any; and `passed`, `reason` and `caveat` of
-        `verdict`.
+        `coverage` of the nodes as in `coverage`, if there are any; and `passed`, `reason` and `caveat` of `verdict`.
     """
     # A stream of its own, so that no seed of the fit draws these points.
     rng = np.random.default_rng([seed, 0xCE47])
@@ -134,8 +111,8 @@ def certify(
             local = rng.uniform(-BOX, BOX, (points, 3))
         got = _measure(sdf, oracle, frame, local)
         measured.append(got)
-        got = got.where(np.abs(got.true) <= limit)
-        result[f"error_{key}"] = _mean(got.error)
+        got = got.within(limit)
+        result[f"error_{key}"] = _mean(np.abs(got.value - got.true))
         if width:
             result[f"projected_from_{limit:g}"] = _mean(got.projected)
         if limit == 0.1:
@@ -144,12 +121,9 @@ def certify(
             result["gradient_norm"] = np.quantile(got.norm, (0.01, 0.99)).tolist() if len(got.norm) else None
     near, wide, box = measured
     # The three kinds as they are defined: what lies beyond a kind's limit does not count.
-    counted = _join([near.where(np.abs(near.true) <= 0.01), wide.where(np.abs(wide.true) <= 0.1), box])
-    result["sign_errors"] = _mean(counted.wrong[np.abs(counted.true) > SIGN_FROM])
-    everything = _join(measured)
-    result["far_field_ratio"] = _far_field_ratio(sdf, oracle, frame, everything, rng.uniform(-1, 1, (points, 3)))
-    result.update(hausdorff(sdf, oracle, points=points, seed=seed))
-    result["curve"] = _curve(everything)
+    counted = _join([near.within(0.01), wide.within(0.1), box])
+    result["sign_errors"] = _mean((counted.value * counted.true <= 0)[np.abs(counted.true) > SIGN_FROM])
+    result["far_field_ratio"] = _far_field_ratio(sdf, oracle, frame, _join(measured), rng.uniform(-1, 1, (points, 3)))
     if nodes is not None:
         result["coverage"] = coverage(nodes, oracle, seed=seed)
     result.update(verdict(result))
@@ -213,80 +187,6 @@ def thin_share(oracle: DistanceOracle, thin: float = THIN, *, points: int = 2000
     return float(left.mean())
 
 
-def _measure(sdf: Sdf, oracle: DistanceOracle, frame: Frame, local: np.ndarray) -> _Measured:
-    """`sdf` against the truth at normalised points, but for those of an open mesh whose sign is not known."""
-    metres = frame.outward(local)
-    truth = oracle(metres)
-    usable = truth.trusted if not oracle.closed else np.ones(len(local), dtype=bool)
-    metres, true, closest = metres[usable], truth.distance[usable], truth.closest[usable]
-    value, gradient = (np.asarray(part) for part in sdf(metres))
-    squared = np.maximum(np.square(gradient).sum(1), 1e-6)
-    foot = oracle(metres - (value / squared)[:, None] * gradient)
-    # So close to the surface the direction from it is rounding.
-    true_direction = (metres - closest) / np.where(np.abs(true) > 1e-4 * frame.scale, true, np.nan)[:, None]
-    return _Measured(
-        true=true / frame.scale,
-        value=value / frame.scale,
-        turned=1.0 - (true_direction * gradient).sum(1) / np.sqrt(squared),
-        norm=np.linalg.norm(gradient, axis=1),
-        projected=np.abs(foot.distance) / frame.scale,
-    )
-
-
-def _join(parts: list[_Measured]) -> _Measured:
-    return _Measured(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-
-
-def _mean(values: np.ndarray) -> float:
-    return float(values.mean()) if len(values) else math.nan
-
-
-def _far_field_ratio(sdf: Sdf, oracle: DistanceOracle, frame: Frame, inner: _Measured, cube: np.ndarray) -> float:
-    """Largest f / true distance farther than 0.1, of points already measured and of `cube` [P, 3] in [-1, 1]^3."""
-    metres = frame.outward(FAR_HALF * cube)
-    truth = oracle(metres)
-    true = np.concatenate([inner.true, truth.distance / frame.scale])
-    value = np.concatenate([inner.value, np.asarray(sdf(metres)[0]) / frame.scale])
-    trusted = np.concatenate([np.ones(len(inner.true), dtype=bool), truth.trusted | oracle.closed])
-    far = trusted & (np.abs(true) > FAR_FROM)
-    return float((value[far] / true[far]).max()) if far.any() else math.nan
-
-
-def _curve(measured: _Measured) -> dict:
-    """Errors by signed distance, for `certify`."""
-    bins: list[dict] = []
-    for low, high in pairwise(EDGES):
-        part = measured.where((measured.true >= low) & (measured.true < high))
-        turned = part.turned[np.isfinite(part.turned)]
-        enough = len(part.true) >= BIN_POINTS
-        least, middle, most = np.quantile(part.norm, (0.05, 0.5, 0.95)) if enough else (None, None, None)
-        values = {
-            "error": part.error.mean() if enough else None,
-            "error_p95": np.quantile(part.error, 0.95) if enough else None,
-            "sign_errors": part.wrong.mean() if enough else None,
-            "gradient_direction": np.median(turned) if len(turned) >= BIN_POINTS else None,
-            "gradient_norm": middle,
-            "gradient_norm_p5": least,
-            "gradient_norm_p95": most,
-            "projected": part.projected.mean() if enough else None,
-        }
-        # Four digits are more than the samples are worth, and the curve is read by people too.
-        rounded = {key: None if value is None else float(f"{value:.4g}") for key, value in values.items()}
-        bins.append({"count": len(part.true), **rounded})
-    return {"distance": list(EDGES), **{key: [entry[key] for entry in bins] for key in bins[0]}}
-
-
-# Lengths are relative to the shape's largest extent.
-FAR_FROM_A_NODE = 0.1
-# The zero level is looked for on this many cells a side, halved REFINEMENTS times where it passes.
-LEVEL_CELLS = 24
-REFINEMENTS = 2
-# A component counts as stray when most of it is farther than this from the surface.
-STRAY_FROM = 0.01
-# A sample is exposed when this far along its normal is outside; a zero crossing shows within as much to both sides.
-EXPOSED_STEP = 5e-4
-
-
 def coverage(nodes: np.ndarray, surface: DistanceOracle | Mesh, *, points: int = 20_000, seed: int = 1) -> dict:
     """How evenly nodes stand for a surface, by straight distances from surface samples to their nearest node.
 
@@ -342,116 +242,40 @@ def bare_samples(oracle: DistanceOracle, count: int, rng: np.random.Generator) -
     return (points[outside], normal[outside]) if outside.any() else (points, normal)
 
 
-def hausdorff(sdf: Sdf, oracle: DistanceOracle, *, points: int = 10_000, seed: int = 1) -> dict:
-    """Distances between the zero level of an SDF and the true surface, both ways.
-
-    The level is found by marching cubes on [-0.7, 0.7]^3 of the normalised frame with cells of 0.015, its vertices
-    moved onto it by a projection step. That grid is too coarse at edges and thin walls, so surface samples are
-    also projected onto the level themselves, and count where the SDF does change its sign there.
-
-    Args:
-        sdf: metres.
-        oracle: the truth, in the same frame.
-        points: samples of the true surface.
-        seed: of the samples.
-
-    Returns:
-        dict of lengths relative to the largest extent: `hausdorff`, the larger of `hausdorff_from_mesh` (a point of
-        the surface, to the level) and `hausdorff_from_level` (the other way; where a mesh has holes the level that
-        closes them counts); `stray_extent`, the largest extent of a component of the level most of which is
-        farther than 0.01 from the surface, other than the largest component (0.0: there is none); `hausdorff_p99`,
-        the larger way for the nearest 99 % of the samples, which a narrow crevice that the fit fills does not show
-        in. Distances are infinite when the SDF has no zero level.
-    """
-    frame = normal_frame(oracle.bounds)
-    samples, normal = bare_samples(oracle, points, np.random.default_rng([seed, 0x4A05]))
-    feet, met = _onto_level(sdf, samples, normal, frame)
-    to_level = np.where(met, np.linalg.norm(feet - samples, axis=1), np.inf)
-    to_mesh = np.abs(oracle(feet[met]).distance)
-    level = zero_level(sdf, frame)
-    stray = 0.0
-    if len(level.faces):
-        nearest = ClosestPoint(level)(samples)[0]
-        to_level = np.minimum(to_level, np.linalg.norm(nearest - samples, axis=1))
-        off = np.abs(oracle(level.vertices).distance)
-        stray = _stray_extent(level, off / frame.scale) / frame.scale
-        to_mesh = np.concatenate([to_mesh, off])
-    if len(to_mesh) == 0:
-        to_mesh = np.array([math.inf])
-    ways = {
-        "hausdorff_from_mesh": float(to_level.max() / frame.scale),
-        "hausdorff_from_level": float(to_mesh.max() / frame.scale),
-    }
-    # Without interpolation, for infinite distances have no differences.
-    usual = max(float(np.quantile(way, 0.99, method="lower") / frame.scale) for way in (to_level, to_mesh))
-    return {"hausdorff": max(ways.values()), **ways, "hausdorff_p99": usual, "stray_extent": stray}
+def _measure(sdf: Sdf, oracle: DistanceOracle, frame: Frame, local: np.ndarray) -> _Measured:
+    """`sdf` against the truth at normalised points, but for those of an open mesh whose sign is not known."""
+    metres = frame.outward(local)
+    truth = oracle(metres)
+    usable = truth.trusted if not oracle.closed else np.ones(len(local), dtype=bool)
+    metres, true, closest = metres[usable], truth.distance[usable], truth.closest[usable]
+    value, gradient = (np.asarray(part) for part in sdf(metres))
+    squared = np.maximum(np.square(gradient).sum(1), 1e-6)
+    foot = oracle(metres - (value / squared)[:, None] * gradient)
+    # So close to the surface the direction from it is rounding.
+    true_direction = (metres - closest) / np.where(np.abs(true) > 1e-4 * frame.scale, true, np.nan)[:, None]
+    return _Measured(
+        true=true / frame.scale,
+        value=value / frame.scale,
+        turned=1.0 - (true_direction * gradient).sum(1) / np.sqrt(squared),
+        norm=np.linalg.norm(gradient, axis=1),
+        projected=np.abs(foot.distance) / frame.scale,
+    )
 
 
-def zero_level(sdf: Sdf, frame: Frame) -> Mesh:
-    """The zero level within [-0.7, 0.7]^3 of a normalised frame, as triangles in metres (none: no sign change).
-
-    Values far from the level are interpolated from a coarser grid: an SDF that climbs no faster than 1.5 has no
-    level there.
-    """
-    from skimage.measure import marching_cubes
-
-    cells = LEVEL_CELLS
-    field = _values(sdf, frame, np.indices((cells + 1,) * 3).reshape(3, -1).T, cells).reshape((cells + 1,) * 3)
-    for _ in range(REFINEMENTS):
-        reach = 1.3 * 2 * BOX / cells
-        for axis in range(3):
-            field = np.moveaxis(field, axis, 0)
-            finer = np.empty((2 * cells + 1, *field.shape[1:]))
-            finer[::2], finer[1::2] = field, 0.5 * (field[1:] + field[:-1])
-            field = np.moveaxis(finer, 0, axis)
-        cells *= 2
-        near = np.argwhere(np.abs(field) <= reach)
-        near = near[(near % 2).any(1)]
-        field[tuple(near.T)] = _values(sdf, frame, near, cells)
-    if not field.min() < 0 < field.max():
-        return Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
-    cell = 2 * BOX / cells
-    vertices, faces, _, _ = marching_cubes(field, 0.0, spacing=(cell,) * 3)
-    vertices = frame.outward(vertices.astype(np.float64) - BOX)
-    moved = project(sdf, vertices, steps=1)
-    # Across a jump of the SDF its slope says nothing about where the level is.
-    better = np.linalg.norm(moved - vertices, axis=1) <= cell * frame.scale
-    better &= np.abs(sdf(moved)[0]) <= np.abs(sdf(vertices)[0])
-    return Mesh(np.where(better[:, None], moved, vertices), faces.astype(np.int64))
+def _join(parts: list[_Measured]) -> _Measured:
+    return _Measured(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def _values(sdf: Sdf, frame: Frame, index: np.ndarray, cells: int) -> np.ndarray:
-    """Normalised values [P] at the grid points `index` [P, 3] of a grid with `cells` a side over the box."""
-    return np.asarray(sdf(frame.outward(index * (2 * BOX / cells) - BOX))[0]) / frame.scale
+def _mean(values: np.ndarray) -> float:
+    return float(values.mean()) if len(values) else math.nan
 
 
-def _onto_level(sdf: Sdf, points: np.ndarray, normal: np.ndarray, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-    """Surface points [P, 3] m projected onto the level, and whether they arrived [P] where the sign really changes.
-
-    An unsigned fit of a thin wall has a zero but no change of sign. It is looked for along the true `normal` [P, 3]:
-    at the level itself the gradient of a distance may be anything.
-    """
-    feet = project(sdf, points)
-    step = EXPOSED_STEP * frame.scale * normal
-    crossed = np.asarray(sdf(feet + step)[0]) * np.asarray(sdf(feet - step)[0]) < 0
-    return feet, crossed & (np.abs(sdf(feet)[0]) <= 0.2 * EXPOSED_STEP * frame.scale)
-
-
-def _stray_extent(level: Mesh, off: np.ndarray) -> float:
-    """Largest extent, m, of a stray component; `off` [V] is each vertex' normalised distance from the surface."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    count = len(level.vertices)
-    ends = np.concatenate([level.faces[:, [0, 1]], level.faces[:, [1, 2]]])
-    number, label = connected_components(coo_matrix((np.ones(len(ends)), tuple(ends.T)), shape=(count, count)))
-    if number == 1:
-        return 0.0
-    low, high = np.full((number, 3), np.inf), np.full((number, 3), -np.inf)
-    np.minimum.at(low, label, level.vertices)
-    np.maximum.at(high, label, level.vertices)
-    extent = (high - low).max(1)
-    away = np.bincount(label, off > STRAY_FROM, number) > 0.5 * np.bincount(label, minlength=number)
-    # A level that is off as a whole is a poor fit, not a stray.
-    away[extent.argmax()] = False
-    return float(extent[away].max(initial=0.0))
+def _far_field_ratio(sdf: Sdf, oracle: DistanceOracle, frame: Frame, inner: _Measured, cube: np.ndarray) -> float:
+    """Largest f / true distance farther than 0.1, of points already measured and of `cube` [P, 3] in [-1, 1]^3."""
+    metres = frame.outward(FAR_HALF * cube)
+    truth = oracle(metres)
+    true = np.concatenate([inner.true, truth.distance / frame.scale])
+    value = np.concatenate([inner.value, np.asarray(sdf(metres)[0]) / frame.scale])
+    trusted = np.concatenate([np.ones(len(inner.true), dtype=bool), truth.trusted | oracle.closed])
+    far = trusted & (np.abs(true) > FAR_FROM)
+    return float((value[far] / true[far]).max()) if far.any() else math.nan

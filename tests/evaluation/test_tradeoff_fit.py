@@ -37,7 +37,7 @@ def fits(monkeypatch):
             raise SdfsimError("no inside")
         errors = dict.fromkeys(ERRORS, 0.01 / min(budget, 6.0))
         told = {"reason": "" if budget > 6 else "x", "caveat": ""}
-        return SimpleNamespace(certificate=errors | told | {"hausdorff": 0.1, "steps": 9})
+        return SimpleNamespace(certificate=errors | told | {"steps": 9})
 
     monkeypatch.setattr(tradeoff_fit, "fit_mesh", fit_mesh)
     monkeypatch.setattr(tradeoff_fit.time, "monotonic", lambda: clock.now)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -156,23 +155,6 @@ def test_every_part_is_fitted_in_its_own_frame_and_kept_when_killed(meshes, tmp_
     np.testing.assert_allclose(fits[1][1].vertices.min(0), [-0.1, -0.1, 0.0], atol=1e-6)
     assert report["passed"] is False and report["reason"] == "object1: too thin"
     assert fit_parts(meshes, out, budget=30.0) == report and len(fits) == 2
-
-
-def test_a_checkpoint_that_a_kill_left_beside_its_shape_goes(meshes, tmp_path, monkeypatch):
-    def fit_mesh(solid: Mesh, *, name: str, checkpoint: Path, device: str, **options) -> Shape:
-        checkpoint.write_text("state")
-        certificate = {"passed": True, "reason": "", "caveat": "rough"}
-        return replace(analytic_shape("box", size=(0.2, 0.2, 0.2), name=name), mesh=solid, certificate=certificate)
-
-    monkeypatch.setattr("sdfsim.shape.fit.fit_mesh", fit_mesh)
-    out = tmp_path / "assets"
-    out.mkdir()
-    report = fit_parts(meshes, out, budget=None)
-    assert report["passed"] and report["caveats"] == ["scene: rough", "object1: rough"]
-    assert sorted(p.name for p in out.iterdir()) == ["object1", "scene"]
-    (out / "object1.checkpoint").write_text("state")  # It ended between the shape's last step and this file's removal.
-    fit_parts(meshes, out, budget=None)
-    assert sorted(p.name for p in out.iterdir()) == ["object1", "scene"]
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1e-2, 1.0, 1e5])
