@@ -45,7 +45,7 @@ def test_a_folder_of_meshes_becomes_a_folder_of_shapes(meshes: Path, tmp_path: P
     assert "failed" not in lines["box"] + lines["ball"]
     assert "holed: " in done.stdout and "open" in done.stdout
     assert load_shape(out / "box").volume == pytest.approx(1.0)
-    assert not (out / "holed").exists() and not list(out.rglob("*.checkpoint"))
+    assert not (out / "holed").exists()
 
     # Again: what is there is kept, the others are tried once more; with what was missing they succeed.
     (meshes / "torn.obj").unlink()

@@ -1,4 +1,8 @@
-"""Any triangle mesh -> the solid it stands for, or one line saying why it stands for none."""
+"""Any triangle mesh -> the solid it stands for, or one line saying why it stands for none.
+
+Vertices [V, 3 + K] and corners of triangles [F, 3, 3 + K] hold coordinates, and K columns (colours) that new vertices
+get by the same averages.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +19,6 @@ from sdfsim.shape.mesh import Frame, Mesh, clean, components, directed_edges, is
 
 # Openings are closed unasked up to this fraction of the surface, smallest first.
 SMALL = 0.02
-# Sheets that stick out of a solid, or float beside it, are left out up to this fraction of the surface.
-LOOSE = 0.25
 # Mean of how far winding numbers at the surface are from those of a closed one. A sphere with an opening of the
 # fraction a has a / 2; cracks of no width have nearly nothing, however long they are.
 LEAK = 0.01
@@ -28,6 +30,9 @@ TRIFLE = 1e-3
 THINNEST = 0.01
 THICKEST = 2.0  # likewise, of what is thickened
 HINT = "--cap (cap: on) closes openings of any size, --thicken METRES (thicken: METRES) gives a sheet a thickness"
+# [P, 3] points of faces and the unit normals there -> [P] int: 0 where that is no boundary, else of how many layers in
+# the same place, negative where it is wound inwards.
+Side = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -75,7 +80,7 @@ def solidify(mesh: Mesh, *, name: str = "mesh", cap: bool = False, thicken: floa
 
     Inside is what the surface goes around, once or more (winding number above one half): overlapping parts are one
     body, shells inside it do not count unless they are wound the other way (cavities). Windings are made consistent,
-    small openings closed, loose sheets and everything within the solid left out.
+    small openings closed, and everything within the solid left out.
 
     Args:
         mesh: metres, of any kind.
@@ -103,14 +108,13 @@ def solidify(mesh: Mesh, *, name: str = "mesh", cap: bool = False, thicken: floa
 
     area = face_areas(vertices[faces]).sum()
     vertices, faces = _close(vertices, faces, SMALL * area, area, frame.scale, notes)
-    if leaking(faces).any():
-        faces = _without_sheets(vertices, faces, area, notes)
-        vertices, faces = _close(vertices, faces, np.inf if cap else SMALL * area, area, frame.scale, notes)
+    if cap and leaking(faces).any():
+        vertices, faces = _close(vertices, faces, np.inf, area, frame.scale, notes)
         faces = _outwards(vertices, *consistent(vertices, faces))
     closed = not leaking(faces).any()
     winding = Winding(_plain(vertices, faces))
     if not closed:
-        _require_tight(vertices, faces, winding, area, frame.scale, name)
+        _require_tight(vertices, faces, winding, frame.scale, name)
 
     def side(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         within, without = winding(points - STEP * normals), winding(points + STEP * normals)
@@ -190,45 +194,44 @@ def _outwards(vertices: np.ndarray, faces: np.ndarray, patch: np.ndarray) -> np.
 def _close(
     vertices: np.ndarray, faces: np.ndarray, limit: float, area: float, scale: float, notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Close openings up to `limit` in all (normalised area) and say so."""
-    vertices, faces, closed = fill(vertices, faces, limit)
-    if len(closed):
-        largest = (
-            f", the largest about {2 * np.sqrt(closed.max() / np.pi) * scale:.3g} m across" if limit > area else ""
-        )
-        kind = "opening" if limit > area else "small hole"
-        plural = "" if len(closed) == 1 else "s"
-        notes.append(f"{len(closed)} {kind}{plural} closed ({closed.sum() / area:.1%} of the surface{largest})")
-    return vertices, faces
+    """Close openings by fans around their middle, smallest first, up to `limit` in all (normalised area), and say so.
+
+    A fan is right for any flat loop, though it may lie over itself: what it covers twice cancels in winding numbers.
+    """
+    fans = []
+    for loop in openings(faces):
+        ring = vertices[loop]
+        after = np.roll(ring, -1, axis=0)
+        length = np.linalg.norm((after - ring)[:, :3], axis=1, keepdims=True)
+        middle = (0.5 * (ring + after) * length).sum(0) / max(length.sum(), 1e-300)
+        size = face_areas(np.stack([after, ring, np.broadcast_to(middle, ring.shape)], axis=1)).sum()
+        fans.append((size, loop, middle))
+    fans.sort(key=lambda fan: fan[0])
+    areas = np.array([fan[0] for fan in fans])
+    areas = areas[np.cumsum(areas) <= limit]
+    if not len(areas):
+        return vertices, faces
+    points, added = [vertices], [faces]
+    count = len(vertices)
+    for _, loop, middle in fans[: len(areas)]:
+        if len(loop) == 3:
+            added.append(loop[None, ::-1])
+            continue
+        points.append(middle[None])
+        added.append(np.stack([np.roll(loop, -1), loop, np.full(len(loop), count)], axis=1))
+        count += 1
+    capped = np.isinf(limit)
+    largest = f", the largest about {2 * np.sqrt(areas.max() / np.pi) * scale:.3g} m across" if capped else ""
+    kind = ("opening" if capped else "small hole") + ("" if len(areas) == 1 else "s")
+    notes.append(f"{len(areas)} {kind} closed ({areas.sum() / area:.1%} of the surface{largest})")
+    return np.concatenate(points), np.concatenate(added)
 
 
-def _without_sheets(vertices: np.ndarray, faces: np.ndarray, area: float, notes: list[str]) -> np.ndarray:
-    """Leave out patches that are open and have the same on both sides: fins, partitions, sheets that float beside."""
-    faces, patch = consistent(vertices, faces)
-    suspects = np.unique(patch[leaking(faces)])
-    among = np.flatnonzero(np.isin(patch, suspects))
-    centres, normals = centres_and_normals(vertices[faces[among]])
-    winding = Winding(_plain(vertices, faces))
-    # The mean of both sides is what all other faces make of the place; at a boundary it is a half.
-    middle = 0.5 * (winding(centres + STEP * normals) + winding(centres - STEP * normals))
-    areas = face_areas(vertices[faces])
-    loose = np.bincount(patch[among], weights=areas[among] * (np.abs(middle - 0.5) > 0.25))
-    sheets = np.flatnonzero(loose > 0.5 * np.bincount(patch, weights=areas)[: len(loose)])
-    out = np.isin(patch, sheets)
-    fraction = areas[out].sum() / area
-    if len(sheets) == 0 or fraction > LOOSE:
-        return faces
-    plural = "" if len(sheets) == 1 else "s"
-    notes.append(f"{len(sheets)} loose sheet{plural} left out ({fraction:.1%} of the surface)")
-    return faces[~out]
-
-
-def _require_tight(
-    vertices: np.ndarray, faces: np.ndarray, winding: Winding, area: float, scale: float, name: str
-) -> None:
+def _require_tight(vertices: np.ndarray, faces: np.ndarray, winding: Winding, scale: float, name: str) -> None:
     """Refuse a surface whose openings let the outside be seen from within."""
-    centres, normals = centres_and_normals(no_longer_than(vertices[faces], 0.05))
-    weights = face_areas(no_longer_than(vertices[faces], 0.05))
+    probes = no_longer_than(vertices[faces], 0.05)
+    centres, normals = centres_and_normals(probes)
+    weights = face_areas(probes)
     if len(centres) > 4000:
         some = np.random.default_rng(0).choice(len(centres), 4000, p=weights / weights.sum())
         centres, normals, weights = centres[some], normals[some], np.ones(4000)
@@ -360,36 +363,6 @@ def openings(faces: np.ndarray) -> list[np.ndarray]:
     return loops
 
 
-def fill(vertices: np.ndarray, faces: np.ndarray, limit: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Close openings by fans around their middle, smallest first, while the fans' area is below `limit` in all.
-
-    A fan is right for any flat loop, though it may lie over itself: what it covers twice cancels in winding numbers.
-
-    Returns:
-        vertices, faces, and the areas [H] of the openings that were closed.
-    """
-    fans, points = [], []
-    for loop in openings(faces):
-        ring = vertices[loop]
-        after = np.roll(ring, -1, axis=0)
-        length = np.linalg.norm((after - ring)[:, :3], axis=1, keepdims=True)
-        middle = (0.5 * (ring + after) * length).sum(0) / max(length.sum(), 1e-300)
-        area = face_areas(np.stack([after, ring, np.broadcast_to(middle, ring.shape)], axis=1)).sum()
-        fans.append((area, loop, middle))
-    fans.sort(key=lambda fan: fan[0])
-    areas = np.array([fan[0] for fan in fans])
-    closed = int((np.cumsum(areas) <= limit).sum())
-    added = [faces]
-    for _, loop, middle in fans[:closed]:
-        if len(loop) == 3:
-            added.append(loop[None, ::-1])
-            continue
-        centre = np.full(len(loop), len(vertices) + len(points))
-        points.append(middle)
-        added.append(np.stack([np.roll(loop, -1), loop, centre], axis=1))
-    return np.concatenate([vertices, *[point[None] for point in points]]), np.concatenate(added), areas[:closed]
-
-
 def face_areas(corners: np.ndarray) -> np.ndarray:
     """[F] areas of triangles [F, 3, 3 + K]."""
     return 0.5 * np.linalg.norm(face_normals(corners), axis=1)
@@ -399,11 +372,6 @@ def face_normals(corners: np.ndarray) -> np.ndarray:
     """[F, 3] normals of triangles [F, 3, 3 + K], as long as twice their area."""
     points = corners[..., :3]
     return np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
-
-
-# [P, 3] points of faces and the unit normals there -> [P] int: 0 where that is no boundary, else of how many layers in
-# the same place, negative where it is wound inwards.
-Side = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def exposed(
@@ -440,12 +408,6 @@ def centres_and_normals(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return corners[..., :3].mean(1), normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
 
 
-def _longest(corners: np.ndarray) -> np.ndarray:
-    """[F] longest edges of triangles [F, 3, 3 + K]."""
-    points = corners[..., :3]
-    return np.linalg.norm(points - np.roll(points, 1, axis=1), axis=2).max(1)
-
-
 def no_longer_than(corners: np.ndarray, length: float) -> np.ndarray:
     """The triangles, halved until no edge is longer than `length`."""
     done = []
@@ -463,3 +425,9 @@ def _halved(corners: np.ndarray) -> np.ndarray:
     a, b, c = np.moveaxis(np.take_along_axis(corners, turn[..., None], axis=1), 1, 0)
     middle = (a + b) / 2
     return np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
+
+
+def _longest(corners: np.ndarray) -> np.ndarray:
+    """[F] longest edges of triangles [F, 3, 3 + K]."""
+    points = corners[..., :3]
+    return np.linalg.norm(points - np.roll(points, 1, axis=1), axis=2).max(1)

@@ -77,62 +77,6 @@ def test_the_same_seed_gives_the_same_weights(tiny: None) -> None:
     np.testing.assert_array_equal(first.nodes, second.nodes)
 
 
-def test_an_interrupted_fit_resumes_to_the_same_result(tiny: None, tmp_path: Path) -> None:
-    mesh, path = primitives.cone(segments=16), tmp_path / "fit.checkpoint"
-    whole = fit_mesh(mesh, name="cone")
-    messages: list[str] = []
-
-    def interrupt(fraction: float, message: str) -> None:
-        if message.startswith("step 300"):
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        fit_mesh(mesh, name="cone", checkpoint=path, on_progress=interrupt)
-    assert path.is_file()
-    resumed = fit_mesh(mesh, name="cone", checkpoint=path, on_progress=lambda _, message: messages.append(message))
-    assert not any(message.startswith("step 100 ") for message in messages)
-    assert any(message.startswith("step 600 ") for message in messages)
-    assert all(torch.equal(a, b) for a, b in zip(weights(whole), weights(resumed), strict=True))
-
-
-def test_the_paper_recipe_resumes_too(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    plan = replace(fit_module.PLANS["paper"], width=16, layers=4, steps=400, batch=64, pool=2000, lr=1e-3)
-    monkeypatch.setitem(fit_module.PLANS, "paper", plan)
-    mesh, path = primitives.cone(segments=16), tmp_path / "fit.checkpoint"
-    whole = fit_mesh(mesh, name="cone", recipe="paper")
-
-    def interrupt(fraction: float, message: str) -> None:
-        if message.startswith("step 300"):
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        fit_mesh(mesh, name="cone", recipe="paper", checkpoint=path, on_progress=interrupt)
-    messages: list[str] = []
-    resumed = fit_mesh(
-        mesh, name="cone", recipe="paper", checkpoint=path, on_progress=lambda _, message: messages.append(message)
-    )
-    assert not any(message.startswith("step 200 ") for message in messages)
-    assert all(torch.equal(a, b) for a, b in zip(weights(whole), weights(resumed), strict=True))
-
-
-@pytest.mark.parametrize("spoil", ["other", "cut"])
-def test_a_checkpoint_of_something_else_is_not_used(tiny: None, tmp_path: Path, spoil: str) -> None:
-    path = tmp_path / "fit.checkpoint"
-
-    def interrupt(fraction: float, message: str) -> None:
-        if message.startswith("step 300"):
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        fit_mesh(primitives.cone(), name="cone", checkpoint=path, on_progress=interrupt)
-    mesh = primitives.cone() if spoil == "cut" else primitives.box()
-    if spoil == "cut":
-        path.write_bytes(path.read_bytes()[:200])
-    messages: list[str] = []
-    fit_mesh(mesh, name="box", checkpoint=path, on_progress=lambda _, message: messages.append(message))
-    assert any(message.startswith("step 100 ") for message in messages)
-
-
 def test_a_budget_is_kept_and_still_ends_in_a_decay(monkeypatch: pytest.MonkeyPatch) -> None:
     plan = replace(fit_module.PLANS["default"], width=16, layers=4, batch=256, pool=5000, goal=None, steps=10**6)
     monkeypatch.setitem(fit_module.PLANS, "default", plan)
@@ -152,12 +96,11 @@ def test_a_goal_that_is_met_ends_the_fit_early(monkeypatch: pytest.MonkeyPatch) 
     assert fit_mesh(primitives.box(), name="box").certificate["steps"] == 200
 
 
-def test_an_update_that_is_not_finite_is_survived(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fit_that_diverges_ends_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     plan = replace(fit_module.PLANS["default"], width=16, layers=4, batch=64, pool=2000, goal=None, steps=300, lr=1e38)
     monkeypatch.setitem(fit_module.PLANS, "default", plan)
-    shape = fit_mesh(primitives.box(), name="box")
-    for part in shape.sdf(np.random.default_rng(0).normal(size=(50, 3))):
-        assert np.isfinite(part).all()
+    with pytest.raises(SdfsimError, match="no zero level"):
+        fit_mesh(primitives.box(), name="box")
 
 
 def test_paper_recipe_learns(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -225,8 +168,8 @@ def test_a_shape_with_mirror_planes_is_fitted_on_one_side(tiny: None) -> None:
 
 
 def test_side_by_side_is_each_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    # The goals are met at different updates, so that some leave the stack before the others; and early, since rounding,
-    # which differs with the size of the stack, grows from update to update.
+    # The goals are met at different updates, and early, since rounding, which differs with the size of the stack, grows
+    # from update to update.
     plan = replace(
         fit_module.PLANS["default"],
         width=16,
@@ -257,26 +200,6 @@ def test_side_by_side_is_each_alone(monkeypatch: pytest.MonkeyPatch) -> None:
         torch.testing.assert_close(shape.sdf(points)[0], alone.sdf(points)[0], rtol=0, atol=1e-5)
 
 
-def test_one_that_breaks_does_not_spoil_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    plan = replace(fit_module.PLANS["default"], width=16, layers=4, batch=64, pool=2000, goal=None, steps=200)
-    oracles = [MeshDistance(solidify(mesh, name="it")) for mesh in (primitives.box(), primitives.cone())]
-    real = fit_module._Run.differentiate
-
-    def poisoned(self, chosen: torch.Tensor) -> None:
-        real(self, chosen)
-        if self.step == 50:
-            self.parameters[1].grad[:, 0] = torch.nan
-
-    options = {"budget": None, "seed": 0, "tell": lambda fraction, message: None}
-    good = fit_module.train(oracles, plan, **options)
-    monkeypatch.setattr(fit_module._Run, "differentiate", poisoned)
-    bad = fit_module.train(oracles, plan, **options)
-    for one, other in zip(good[1][0].weights, bad[1][0].weights, strict=True):
-        torch.testing.assert_close(one, other, rtol=0, atol=1e-5)
-    assert all(weight.isfinite().all() for weight in bad[0][0].weights)
-    assert not torch.equal(bad[0][0].weights[1], good[0][0].weights[1])
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["suzanne", "sponge", "cube", "spot"])
 def test_real_shapes_within_the_default_recipe(data_dir: Path, name: str) -> None:
@@ -286,7 +209,6 @@ def test_real_shapes_within_the_default_recipe(data_dir: Path, name: str) -> Non
     assert got["passed"], got["reason"]
     assert got["error_within_0.01"] < (1e-3 if name == "sponge" else 5e-4)
     assert got["projected_from_0.01"] < 5e-4
-    assert got["hausdorff"] < 0.01
 
 
 @pytest.mark.slow
