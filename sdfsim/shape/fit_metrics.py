@@ -36,10 +36,8 @@ SIGN_FROM = 0.002
 FAR_FROM = 0.1
 # Half extent of the cube in which the far field is tested.
 FAR_HALF = 2.0
-# A wall counts as thin below this, and thin walls explain a miss when this much of the surface has them. What is
-# measured from 0.1 away also suffers from walls through whose middle, where the gradient turns over, it looks.
+# A wall counts as thin below this, and thin walls explain a miss when this much of the surface has them.
 THIN = 0.02
-THIN_FROM_AFAR = 0.1
 THIN_SHARE = 0.02
 
 
@@ -129,8 +127,7 @@ def certify(
     result.update(verdict(result))
     for told in ("reason", "caveat"):
         if result[told]:
-            from_afar = result[told].startswith("projected_from_0.1 ")
-            result[told] += f": {cause(oracle, THIN_FROM_AFAR if from_afar else THIN, seed=seed)}"
+            result[told] += f": {cause(oracle, seed=seed)}"
     # None for what could not be measured: JSON has no NaN.
     unknown = [key for key, value in result.items() if isinstance(value, float) and not math.isfinite(value)]
     return result | dict.fromkeys(unknown)
@@ -157,19 +154,13 @@ def verdict(errors: dict) -> dict:
     return {"passed": True, "reason": "", "caveat": ""}
 
 
-def cause(oracle: DistanceOracle, thin: float = THIN, *, seed: int = 1) -> str:
-    """What about a geometry makes it hard to fit, as far as it can be measured: holes, thin walls, else its detail.
-
-    Args:
-        oracle: of the geometry.
-        thin: walls below this fraction of the largest extent are to blame.
-        seed: of the surface samples.
-    """
+def cause(oracle: DistanceOracle, *, seed: int = 1) -> str:
+    """What about a geometry makes it hard to fit, as far as it can be measured: holes, thin walls, else its detail."""
     if not oracle.closed:
         return "open mesh, so its inside is not clear"
-    share = thin_share(oracle, thin, seed=seed)
+    share = thin_share(oracle, seed=seed)
     if share >= THIN_SHARE:
-        return f"thin walls ({100 * share:.0f} % of the surface is thinner than {thin:g})"
+        return f"thin walls ({100 * share:.0f} % of the surface is thinner than {THIN:g})"
     return "fine detail, or too short a fit"
 
 

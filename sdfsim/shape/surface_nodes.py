@@ -115,9 +115,7 @@ def hull_nodes(vertices: np.ndarray, count: int) -> np.ndarray:
     The vertices of the convex hull of all come first, for only they can touch a flat floor; the others follow
     farthest first.
     """
-    from scipy.spatial import ConvexHull
-
-    outer = np.sort(ConvexHull(vertices).vertices)
+    outer = _outer(vertices)
     rest = np.delete(vertices, outer, axis=0)
     return thin(rest, count, keep=vertices[outer])
 

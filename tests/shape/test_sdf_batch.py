@@ -9,7 +9,7 @@ from sdfsim.shape.mesh import Frame
 from sdfsim.shape.primitives import box
 from sdfsim.shape.sdf import BoxSdf, GridSdf, GridStack, MeshSdf, PlaneSdf, Sdf, SphereSdf, sample_grid
 from sdfsim.shape.sdf_batch import SdfBank
-from tests.shape.test_mlp import network
+from tests.shape.test_mlp_sdf import network
 
 
 def voxels(seed: int, resolution: int) -> GridSdf:

@@ -23,7 +23,7 @@ from sdfsim.shape.shape import (
     shape_from_primitive,
     with_sdf,
 )
-from tests.shape.test_asset import edit, fitted
+from tests.shape.test_shape import edit, fitted
 
 OTHERS = [("grid", GridSdf), ("mesh", MeshSdf)]
 
