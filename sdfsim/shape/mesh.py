@@ -135,7 +135,7 @@ def _check_gltf(path: Path) -> None:
             raise ValueError("compressed or sparse geometry: export it without either")
         view = views[accessor["bufferView"]]
         if not (0 < accessor["count"] <= view["byteLength"] and 4 <= view.get("byteStride", 4) <= 252):
-            raise ValueError("an accessor is longer than its buffer")
+            raise ValueError("an accessor does not fit its buffer")
 
 
 def _check_obj(path: Path) -> None:

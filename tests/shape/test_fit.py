@@ -80,9 +80,9 @@ def test_the_same_seed_gives_the_same_weights(tiny: None) -> None:
 def test_a_budget_is_kept_and_still_ends_in_a_decay(monkeypatch: pytest.MonkeyPatch) -> None:
     plan = replace(fit_module.PLANS["default"], width=16, layers=4, batch=256, pool=5000, goal=None, steps=10**6)
     monkeypatch.setitem(fit_module.PLANS, "default", plan)
-    started = time.monotonic()
+    started = time.process_time()  # a busy machine does not count
     shape = fit_mesh(primitives.box(), name="box", budget=2.0)
-    assert time.monotonic() - started < 6.0
+    assert time.process_time() - started < 6.0
     assert shape.certificate["steps"] < 10**5
     with pytest.raises(SdfsimError, match="budget"):
         fit_mesh(primitives.box(), name="box", budget=0.0)
