@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from sdfsim.shape.shape import load_shape
 from torch import Tensor
 
 from sdfsim.data.dataset import read_info, trajectory_files
@@ -24,6 +23,7 @@ from sdfsim.errors import run_main
 from sdfsim.evaluation.evaluate import evaluate
 from sdfsim.evaluation.harness import Job, markdown, measure, number
 from sdfsim.files import write_text
+from sdfsim.shape.shape import load_shape
 from sdfsim.training.contact_cache import contact_frames
 from sdfsim.training.impulse_task import ImpulseTask, Noise
 from sdfsim.training.presets import PRESETS, Preset

@@ -15,7 +15,6 @@ from math import atan, cos, degrees, radians, sin, sqrt
 from typing import Any
 
 import numpy as np
-from sdfsim.shape.shape import Shape, analytic_shape
 
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.simulator import SimulationError, Simulator
@@ -24,6 +23,7 @@ from sdfsim.evaluation import hard_cases
 from sdfsim.evaluation.hard_cases import on_floor
 from sdfsim.evaluation.harness import markdown
 from sdfsim.scene.scene import Body, Effects
+from sdfsim.shape.shape import Shape, analytic_shape
 
 G = 9.81  # m/s^2
 SIZES = (0.02, 0.1, 1.0)  # m

@@ -17,17 +17,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from sdfsim.shape.fit_metrics import EXACT
-from sdfsim.shape.mlp_sdf import MlpSdf
-from sdfsim.shape.shape import load_shape
-from sdfsim.shape.watertight import solidify
 
 from sdfsim.errors import SdfsimError, run_main
 from sdfsim.evaluation.harness import Job, Line, Panel, Results, draw, machine, markdown, measure, number
 from sdfsim.files import write_text
 from sdfsim.shape.fit import FIT_VERSION, PLANS, Recipe, fit_mesh
+from sdfsim.shape.fit_metrics import EXACT
 from sdfsim.shape.mesh import load_mesh
+from sdfsim.shape.mlp_sdf import MlpSdf
 from sdfsim.shape.sdf import MeshSdf, sample_grid
+from sdfsim.shape.shape import load_shape
+from sdfsim.shape.watertight import solidify
 
 WIDTHS, BUDGETS = (32, 128), (5.0, 10.0, 20.0)  # s
 GRID, POINTS, REPEATS, CHUNK = 64, 250_000, 5, 16_384
@@ -44,7 +44,7 @@ def fit(file: Path, folder: Path, recipe: Recipe, budget: float, width: int | No
     finally:
         PLANS[recipe] = usual
     shape.save(folder)
-    told = {name: shape.certificate[name] for name in (*ERRORS, "hausdorff", "steps")}
+    told = {name: shape.certificate[name] for name in (*ERRORS, "steps")}
     reason = shape.certificate["reason"] or shape.certificate["caveat"]
     return told | {"seconds": time.monotonic() - began, "reason": reason}
 
@@ -124,9 +124,9 @@ def main() -> None:
 
 def table(fits: Results) -> str:
     """A row a fit: errors relative to the largest extent, and what of the certificate it missed."""
-    rows: list[tuple[str, ...]] = [("shape", "fit", *ERRORS, "Hausdorff", "updates", "s", "missed")]
+    rows: list[tuple[str, ...]] = [("shape", "fit", *ERRORS, "updates", "s", "missed")]
     for (name, method), found in fits.items():
-        cells = (number(found.get(key)) for key in (*ERRORS, "hausdorff", "steps", "seconds"))
+        cells = (number(found.get(key)) for key in (*ERRORS, "steps", "seconds"))
         rows.append((name, method, *cells, found.get("failed") or found["reason"]))
     return markdown(rows)
 

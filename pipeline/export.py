@@ -69,7 +69,6 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
         done += share
         folder = out / name
         if (folder / "shape.json").exists():
-            checkpoint_of(out, name).unlink(missing_ok=True)
             certificates[name] = load_shape(folder).certificate
             continue
         solid, shown = meshes_of(mesh_folder, name)
@@ -87,23 +86,16 @@ def fit_one(solid: Mesh, shown: Mesh, out: Path, name: str, *, budget: float | N
     """Fits one shape, saves it as the folder `out`/`name`, and returns its certificate."""
     from sdfsim.shape.fit import fit_mesh
 
-    checkpoint = checkpoint_of(out, name)
     shape = fit_mesh(
         solid, name=name, recipe=recipe, budget=budget, seed=seed, cap=True,  # type: ignore[arg-type]
-        on_progress=on_progress, checkpoint=checkpoint, device=device,
+        on_progress=on_progress, device=device,
     )  # fmt: skip
     # The folder appears complete or not at all: a run that goes on keeps those that are there.
     partial = out / f".{name}.part"
     shutil.rmtree(partial, ignore_errors=True)
     replace(shape, mesh=shown).save(partial)
     partial.rename(out / name)
-    checkpoint.unlink(missing_ok=True)
     return shape.certificate
-
-
-def checkpoint_of(out: Path, name: str) -> Path:
-    """Where the fit of a shape goes on from."""
-    return out / f"{name}.checkpoint"
 
 
 def meshes_of(mesh_folder: Path, name: str) -> tuple[Mesh, Mesh]:

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sdfsim.shape.shape import analytic_shape
 
 from sdfsim import SdfsimError, Simulator, console, load_scene, run
 from sdfsim.dynamics.rollout import Rollout
@@ -13,6 +12,7 @@ from sdfsim.dynamics.sleep import STEPS
 from sdfsim.files import read_arrays, write_arrays
 from sdfsim.scene.scene import Scene, Waypoints
 from sdfsim.shape.sdf import sample_grid
+from sdfsim.shape.shape import analytic_shape
 from tests.dynamics.conftest import make_body, random_model
 
 TOWER = Path(__file__).resolve().parents[1] / "samples" / "tower.yaml"

@@ -8,8 +8,6 @@ import torch
 
 pytest.importorskip("pybullet")
 
-from sdfsim.shape.shape import Shape, analytic_shape, sdf_of_mesh
-
 from sdfsim.data import batching, generate, scenarios
 from sdfsim.data.dataset import SPLITS, Trajectory, load_shapes, trajectory_files
 from sdfsim.data.generate import GRAVITY, make_dataset, make_trajectory
@@ -36,6 +34,7 @@ from sdfsim.data.shape_assets import Origin, prepare
 from sdfsim.errors import SdfsimError
 from sdfsim.shape import primitives
 from sdfsim.shape.mass import mass_properties
+from sdfsim.shape.shape import Shape, analytic_shape, sdf_of_mesh
 from sdfsim.training.contact_cache import contact_frames
 from sdfsim.training.impulse_task import ImpulseTask
 

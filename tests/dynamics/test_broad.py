@@ -7,12 +7,12 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
-from sdfsim.shape.shape import analytic_shape
 
 from sdfsim.dynamics.bodies import Units, from_scene
 from sdfsim.dynamics.broad import Still, near_pairs, swept_boxes
 from sdfsim.dynamics.memory import Memory
 from sdfsim.scene.scene import Scene
+from sdfsim.shape.shape import analytic_shape
 from tests.dynamics.conftest import make_body
 
 GRAVITY = torch.tensor([0.0, 0.0, -10.0], dtype=torch.float64)

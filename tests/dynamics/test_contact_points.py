@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from sdfsim.shape.shape import analytic_shape
 
 from sdfsim import Simulator
 from sdfsim.scene.scene import Scene
+from sdfsim.shape.shape import analytic_shape
 from tests.dynamics.conftest import make_body, random_model
 
 RADIUS = 0.5

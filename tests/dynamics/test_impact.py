@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from sdfsim.shape.shape import analytic_shape
 
 from sdfsim.dynamics.contacts import ARRAYS, find_contacts
 from sdfsim.dynamics.impact import at_impact
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.scene.scene import Scene
+from sdfsim.shape.shape import analytic_shape
 from tests.dynamics.conftest import make_body, random_model
 
 RADIUS, REACH = 0.5, 0.1

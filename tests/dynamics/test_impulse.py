@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from sdfsim.shape.shape import analytic_shape
 
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.dynamics.step import contact_graph, find_contacts, fly
 from sdfsim.scene.scene import Scene
+from sdfsim.shape.shape import analytic_shape
 from tests.dynamics.conftest import angle_between, make_body, random_model
 
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from sdfsim.shape.shape import analytic_shape
 
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.contacts import ARRAYS, Contacts, find_contacts
@@ -15,6 +14,7 @@ from sdfsim.dynamics.simulator import Simulator
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.mesh import Mesh
 from sdfsim.shape.sdf import MeshSdf
+from sdfsim.shape.shape import analytic_shape
 from tests.dynamics.conftest import make_body, random_model
 
 REACH = 0.1

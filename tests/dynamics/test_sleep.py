@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from sdfsim.shape.shape import analytic_shape
 
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.dynamics.sleep import STEPS
 from sdfsim.scene.scene import Effects, Scene, Waypoints
+from sdfsim.shape.shape import analytic_shape
 from tests.dynamics.conftest import make_body, random_model
 
 BOX = analytic_shape("box", size=(1.0, 1.0, 1.0))

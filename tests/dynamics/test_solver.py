@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from sdfsim.shape.shape import analytic_shape
 
 from sdfsim import Simulator
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.scene.scene import Scene
+from sdfsim.shape.shape import analytic_shape
 from tests.dynamics.test_laws import ball, body, cube
 from tests.hard_cases import gates
 from tests.test_resuming import Killed, simulate

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from sdfsim.shape.shape import load_shape, with_sdf
 
 from sdfsim import load_scene
 from sdfsim.dynamics.bodies import Units, from_scene
@@ -14,6 +13,7 @@ from sdfsim.dynamics.contacts import ARRAYS, find_contacts
 from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.scene.scene import Limits, Scene
+from sdfsim.shape.shape import load_shape, with_sdf
 from tests.dynamics.conftest import make_body, random_model
 from tests.dynamics.test_contacts import heap
 

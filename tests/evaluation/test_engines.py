@@ -9,8 +9,6 @@ import pytest
 
 pytest.importorskip("pybullet")
 
-from sdfsim.shape.shape import analytic_shape, shape_from_primitive
-
 from sdfsim.data.pybullet_sim import Teacher, TeacherBody
 from sdfsim.dynamics.froude import scene_units
 from sdfsim.dynamics.model import load_model
@@ -20,6 +18,7 @@ from sdfsim.evaluation.engines import bullet, mujoco, shape_urdf, start_of_scene
 from sdfsim.evaluation.stress import taught
 from sdfsim.scene.scene_file import load_scene
 from sdfsim.shape.mesh import load_pieces
+from sdfsim.shape.shape import analytic_shape, shape_from_primitive
 
 SCENE = """
 version: 1

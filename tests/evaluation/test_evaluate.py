@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sdfsim.shape.shape import analytic_shape, with_sdf
 
 from sdfsim.data.dataset import Trajectory, trajectory_files
 from sdfsim.evaluation import evaluate as evaluate_module
 from sdfsim.evaluation.evaluate import evaluate
 from sdfsim.shape import primitives
+from sdfsim.shape.shape import analytic_shape, with_sdf
 from tests.dynamics.conftest import random_model
 from tests.recordings import bouncing
 

@@ -10,7 +10,6 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from sdfsim.shape.shape import analytic_shape, with_sdf
 
 from sdfsim.dynamics.model import new_network
 from sdfsim.errors import SdfsimError
@@ -28,6 +27,7 @@ from sdfsim.evaluation.harness import (
     number,
     peak_memory,
 )
+from sdfsim.shape.shape import analytic_shape, with_sdf
 from tests.recordings import trajectory
 
 

@@ -124,7 +124,7 @@ def whole(folder: Path) -> None:
         elif path.suffix == ".npz":
             with np.load(path, allow_pickle=False) as data:
                 assert all(data[name] is not None for name in data.files)
-        elif path.suffix in (".safetensors", ".checkpoint"):
+        elif path.suffix == ".safetensors":
             load_file(path)
         elif path.suffix == ".ply":
             read_mesh(path)
@@ -136,16 +136,16 @@ def whole(folder: Path) -> None:
 
 def litter(folder: Path) -> list[str]:
     """Files that only a killed process can have left."""
-    return [p.name for p in folder.rglob("*") if p.name.endswith((".part", ".partial", ".lock", "fit.checkpoint"))]
+    return [p.name for p in folder.rglob("*") if p.name.endswith((".part", ".partial", ".lock"))]
 
 
 def tiny_fit() -> None:
-    """Fits of 120 steps, with a checkpoint every 40."""
-    from sdfsim.shape import fit
+    """Fits of 120 steps."""
+    from sdfsim.shape import fit as fit_module
 
-    plan = replace(plans.PLANS["default"], width=8, layers=3, steps=120, batch=64, pool=1000, goal=None)
-    plans.PLANS["default"] = plans.PLANS["quick"] = plan
-    training.CHECK = 20
+    plan = replace(fit_module.PLANS["default"], width=8, layers=3, steps=120, batch=64, pool=1000, goal=None)
+    fit_module.PLANS["default"] = fit_module.PLANS["quick"] = plan
+    fit_module.CHECK_EVERY = 20
 
 
 def tiny_train() -> None:

@@ -10,13 +10,13 @@ import zlib
 import numpy as np
 import pytest
 from safetensors.torch import load_file, save_file
-from sdfsim.shape.shape import analytic_shape
 
 from pipeline.inputs.images import read_photo
 from sdfsim import SdfsimError, files, load_shape
 from sdfsim.dynamics.model import Model, load_model, new_network
 from sdfsim.files import read_arrays
 from sdfsim.shape.mesh import load_mesh
+from sdfsim.shape.shape import analytic_shape
 from tests.hard_cases.strangers import time_limit
 
 

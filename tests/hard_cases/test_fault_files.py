@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from sdfsim.shape.shape import MESH_FILE, RECORD_FILE, WEIGHTS_FILE, analytic_shape, with_sdf
 from typer.testing import CliRunner
 
 import cli
 from sdfsim import SdfsimError, load_shape
 from sdfsim.dynamics.model import Model, new_network
 from sdfsim.files import LOCK, locked
-from sdfsim.shape import shape
+from sdfsim.shape import shape as shape_module
 from sdfsim.shape.mesh import write_ply
 from sdfsim.shape.primitives import box
+from sdfsim.shape.shape import MESH_FILE, RECORD_FILE, WEIGHTS_FILE, analytic_shape, with_sdf
 
 SCENE = "version: 1\nduration: 0.04\nbodies: [{name: floor, plane: {}}]\n"
 
@@ -98,11 +98,11 @@ def test_weights_of_the_wrong_form_are_one_line(tmp_path, change):
 def test_a_damaged_cache_entry_is_made_again(tmp_path, name):
     file, kept = tmp_path / "a.ply", tmp_path / "cache"
     file.write_bytes(write_ply(box()))
-    cache.shape_from_mesh(file, kept, sdf="grid", resolution=8)
+    shape_module.shape_from_mesh(file, kept, sdf="grid", resolution=8)
     (entry,) = kept.iterdir()
     whole = (entry / name).read_bytes()
     (entry / name).write_bytes(whole[: len(whole) // 2])
-    assert cache.shape_from_mesh(file, kept, sdf="grid", resolution=8).volume == pytest.approx(1.0)
+    assert shape_module.shape_from_mesh(file, kept, sdf="grid", resolution=8).volume == pytest.approx(1.0)
     assert list(kept.iterdir()) == [entry] and (entry / name).read_bytes() == whole
 
 

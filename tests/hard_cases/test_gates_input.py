@@ -1,6 +1,6 @@
 """Row 10: bad input is told in one line a fault, with exit code 1 or 2, and nothing is written.
 
-Meshes that are inverted or doubled are no faults: they become the solids they bound (tests/shape/test_solid.py). Every
+Meshes that are inverted or doubled are no faults: they become the solids they bound (see tests/shape/). Every
 field's own range is tested in tests/scene/test_load.py, and what strangers write in test_fuzz_*.py.
 """
 

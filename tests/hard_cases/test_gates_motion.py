@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from sdfsim.shape.shape import analytic_shape
 
 from sdfsim.dynamics.bodies import State
 from sdfsim.dynamics.simulator import Simulator
+from sdfsim.shape.shape import analytic_shape
 from tests.hard_cases import gates
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from sdfsim.shape.shape import analytic_shape
 from typer.testing import CliRunner
 
 import cli
@@ -19,6 +18,7 @@ from sdfsim import SceneError, SdfsimError, load_scene
 from sdfsim.dynamics.model import Model, new_network
 from sdfsim.shape.mesh import load_mesh, write_ply
 from sdfsim.shape.primitives import box
+from sdfsim.shape.shape import analytic_shape
 from tests.hard_cases.strangers import time_limit
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sdfsim.shape.shape import analytic_shape, with_sdf
 
 from sdfsim import Simulator
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.mesh import write_ply
 from sdfsim.shape.sdf import BoxSdf, GridSdf, MeshSdf
+from sdfsim.shape.shape import analytic_shape, with_sdf
 from tests.scene.test_load import problems_of
 
 CRATE = {

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sdfsim.shape.shape import analytic_shape
 
 from sdfsim import SceneError, load_scene
+from sdfsim.shape.shape import analytic_shape
 from tests.scene.conftest import HEAD, problems_of
 
 BODY = [

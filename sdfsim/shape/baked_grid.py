@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -56,9 +56,6 @@ class BakedGrid:
     error: float
 
 
-Distances = Callable[[np.ndarray], np.ndarray]
-
-
 def baked(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = (), cache_dir: Path | None = None) -> BakedGrid:
     """The grid of an SDF, baked on first use and then taken from the cache.
 
@@ -89,7 +86,13 @@ def baked(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = (), cache_
 
 def bake(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = ()) -> BakedGrid:
     """Sample an SDF: `CELLS` along the largest extent, more where walls are thin, up to `FINEST`."""
-    ask = _of_pieces(pieces) if len(pieces) else _of(sdf)
+    union = PiecesDistance([convex_hull(piece) for piece in pieces]) if len(pieces) else None
+
+    def ask(points: np.ndarray) -> np.ndarray:
+        parts = np.array_split(points, -(-len(points) // CHUNK))
+        found = [union(part).distance if union else _ask(sdf, part)[0] for part in parts]
+        return np.concatenate(found).astype(np.float32)
+
     extent = float(np.ptp(sdf.bounds, axis=0).max())
     thickness = wall_thickness(sdf, nodes)
     cells = CELLS
@@ -100,17 +103,22 @@ def bake(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = ()) -> Bake
     count = np.ceil((high - low) / (SIDE * cell)).astype(int)
     low = 0.5 * (low + high) - 0.5 * count * SIDE * cell
     corners = _places(low, SIDE * cell, [np.arange(n + 1) for n in count])
-    coarse = _distances(ask, corners).reshape(count + 1)
+    coarse = ask(corners).reshape(count + 1)
     middles = _places(low, SIDE * cell, [np.arange(n) + 0.5 for n in count])
     # Distances change by no more than the way gone; two cells are for contacts that have not quite been made.
-    near = np.abs(_distances(ask, middles)) <= (0.5 * np.sqrt(3.0) * SIDE + 2.0) * cell
+    near = np.abs(ask(middles)) <= (0.5 * np.sqrt(3.0) * SIDE + 2.0) * cell
     brick = np.full(len(middles), -1, dtype=np.int32)
     brick[near] = np.arange(near.sum())
     steps = (np.arange(SIDE + 1) - 0.5 * SIDE) * cell
     offsets = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(1, -1, 3)
-    fine = _distances(ask, (middles[near][:, None] + offsets).reshape(-1, 3)).reshape(-1, *(SIDE + 1,) * 3)
+    fine = ask((middles[near][:, None] + offsets).reshape(-1, 3)).reshape(-1, *(SIDE + 1,) * 3)
     grid = BakedGrid(low, cell, coarse, brick.reshape(count), fine, thickness, 0.0)
-    return replace(grid, error=_error(ask, grid, middles[near]))
+    generator = np.random.default_rng(0)
+    some = middles[near][generator.integers(near.sum(), size=20_000)]
+    points = some + generator.uniform(-0.5, 0.5, some.shape) * SIDE * cell
+    exact = ask(points)
+    close = np.abs(exact) <= 2.0 * cell
+    return replace(grid, error=float(np.abs(interpolated(grid, points) - exact)[close].max(initial=0.0)))
 
 
 def inwards(sdf: Sdf, nodes: np.ndarray) -> np.ndarray:
@@ -160,30 +168,8 @@ def interpolated(grid: BakedGrid, points: np.ndarray) -> np.ndarray:
     return total
 
 
-def _error(ask: Distances, grid: BakedGrid, middles: np.ndarray) -> float:
-    generator = np.random.default_rng(0)
-    some = middles[generator.integers(len(middles), size=20_000)]
-    points = some + generator.uniform(-0.5, 0.5, some.shape) * SIDE * grid.cell
-    exact = _distances(ask, points)
-    close = np.abs(exact) <= 2.0 * grid.cell
-    return float(np.abs(interpolated(grid, points) - exact)[close].max(initial=0.0))
-
-
 def _places(low: np.ndarray, spacing: float, axes: list[np.ndarray]) -> np.ndarray:
     return low + spacing * np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-
-
-def _distances(ask: Distances, points: np.ndarray) -> np.ndarray:
-    return np.concatenate([ask(part) for part in np.array_split(points, -(-len(points) // CHUNK))]).astype(np.float32)
-
-
-def _of(sdf: Sdf) -> Distances:
-    return lambda points: _ask(sdf, points)[0]
-
-
-def _of_pieces(pieces: Sequence[np.ndarray]) -> Distances:
-    exact = PiecesDistance([convex_hull(piece) for piece in pieces])
-    return lambda points: exact(points).distance
 
 
 def _ask(sdf: Sdf, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

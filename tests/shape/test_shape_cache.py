@@ -7,22 +7,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from sdfsim.errors import SdfsimError
+from sdfsim.shape import fit, primitives
+from sdfsim.shape import fit as fit_module
+from sdfsim.shape import shape as shape_module
+from sdfsim.shape.mesh import write_ply
 from sdfsim.shape.shape import (
     load_shape,
     shape_from_mesh,
     shape_from_primitive,
 )
 
-from sdfsim.errors import SdfsimError
-from sdfsim.shape import fit, primitives, shape
-from sdfsim.shape.mesh import write_ply
-
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """A recipe of a second, for tests of what is around the fit."""
-    plan = replace(plans.PLANS["default"], width=16, layers=4, steps=100, batch=256, pool=4000)
-    monkeypatch.setitem(plans.PLANS, "default", plan)
+    plan = replace(fit_module.PLANS["default"], width=16, layers=4, steps=100, batch=256, pool=4000)
+    monkeypatch.setitem(fit_module.PLANS, "default", plan)
 
 
 def test_a_mesh_is_fitted_once_whatever_it_is_called(
@@ -36,8 +38,6 @@ def test_a_mesh_is_fitted_once_whatever_it_is_called(
     assert told[0] == 0.0
     assert told == sorted(told)
     assert told[-1] == 1.0
-
-    from sdfsim.shape import fit
 
     monkeypatch.setattr(fit, "fit_mesh", lambda *args, **kwargs: pytest.fail("fitted again"))
     two = shape_from_mesh(second, tmp_path / "cache", units=0.01, name="Mug")
@@ -86,7 +86,7 @@ def test_a_cache_that_cannot_be_written_does_not_lose_the_fit(
     def full(path: Path, content: bytes) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(asset, "write", full)
+    monkeypatch.setattr(shape_module, "write", full)
     assert shape_from_primitive("box", 0.5, tmp_path / "cache").name == "box"
     assert "No space left" in caplog.text
     assert list((tmp_path / "cache").iterdir()) == []

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from sdfsim.shape.baked_grid import bake, baked, wall_thickness
-from sdfsim.shape.shape import analytic_shape, with_sdf
-from sdfsim.shape.surface_nodes import surface_of
 
 from sdfsim.dynamics.kernels.distance import GRID, distance
 from sdfsim.dynamics.solver import compiled_shapes
 from sdfsim.shape import baked_grid as module
+from sdfsim.shape.baked_grid import bake, baked, wall_thickness
+from sdfsim.shape.shape import analytic_shape, with_sdf
+from sdfsim.shape.surface_nodes import surface_of
 
 
 @pytest.fixture(scope="module")

@@ -3,13 +3,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from sdfsim.shape.sdf_batch import SdfBank, _GridGroup
 
-from sdfsim.shape import sdf
+from sdfsim.shape import sdf as sdf_module
 from sdfsim.shape.mesh import Frame
 from sdfsim.shape.primitives import box
-from sdfsim.shape.sdf import BoxSdf, GridSdf, MeshSdf, PlaneSdf, Sdf, SphereSdf, sample_grid
-from tests.shape.test_mlp import network
+from sdfsim.shape.sdf import BoxSdf, GridSdf, GridStack, MeshSdf, PlaneSdf, Sdf, SphereSdf, sample_grid
+from sdfsim.shape.sdf_batch import SdfBank
+from tests.shape.test_mlp_sdf import network
 
 
 def voxels(seed: int, resolution: int) -> GridSdf:
@@ -93,21 +93,22 @@ def test_order_of_questions_does_not_matter() -> None:
 @pytest.mark.parametrize("chunk", [1, 37, 1000, 5000])
 def test_grids_of_one_resolution_share_a_gather_of_bounded_size(monkeypatch: pytest.MonkeyPatch, chunk: int) -> None:
     seen: list[int] = []
-    inner = grid.trilinear
+    inner = sdf_module.trilinear
 
     def counted(values: torch.Tensor, slot: torch.Tensor | None, points: torch.Tensor):
         assert values.shape == (4, 8, 8, 8)
         seen.append(len(points))
         return inner(values, slot, points)
 
-    monkeypatch.setattr("sdfsim.shape.sdf_batch.trilinear", counted)
-    monkeypatch.setattr(grid, "CHUNK", chunk)
+    monkeypatch.setattr("sdfsim.shape.sdf.trilinear", counted)
+    monkeypatch.setattr(sdf_module, "CHUNK", chunk)
     sdfs = [voxels(seed, 8) for seed in range(4)]
     index = torch.randint(4, (1000,))
     local = torch.rand(1000, 3, dtype=torch.float64) * 1.38 - 0.69
     frames = [sdfs[i].frame for i in index]
     points = torch.stack([torch.from_numpy(f.outward(x[None].numpy())[0]) for f, x in zip(frames, local, strict=True)])
     distance, gradient = SdfBank(sdfs)(index, points)
+    monkeypatch.undo()
     assert max(seen) <= chunk and sum(seen) == 1000 and len(seen) == -(-1000 // chunk)
     for number, sdf in enumerate(sdfs):
         alone = sdf(points[index == number])
@@ -121,7 +122,7 @@ def test_a_grid_alone_is_not_copied() -> None:
     assert not bank._groups  # nothing is loaded before it is asked for
     bank(torch.zeros(1, dtype=torch.int64), torch.zeros(1, 3))
     (group,) = bank._groups.values()
-    assert isinstance(group, _GridGroup)
+    assert isinstance(group, GridStack)
     assert group._values.data_ptr() == sdf.values.data_ptr()
 
 

@@ -6,11 +6,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from sdfsim.shape.far_field import BOX
-from sdfsim.shape.mlp_sdf import Activation, MlpSdf, Tape, value_and_gradient
 
 from sdfsim.shape import far_field, mlp_sdf
+from sdfsim.shape.far_field import BOX
 from sdfsim.shape.mesh import Frame
+from sdfsim.shape.mlp_sdf import Activation, MlpSdf, Tape, value_and_gradient
 
 
 def network(seed: int, activation: Activation, width: int = 64, layers: int = 8) -> MlpSdf:
@@ -86,7 +86,7 @@ def test_the_hand_written_training_sweep_is_autograd(activation: Activation, wid
 def test_memory_that_stays_does_not_leak_between_calls(monkeypatch: pytest.MonkeyPatch) -> None:
     net, points = network(1, "wave"), torch.rand(1000, 3, dtype=torch.float64) - 0.5
     whole = net(points)
-    monkeypatch.setitem(sweep.CHUNK, "cpu", 64)
+    monkeypatch.setitem(mlp_sdf.SWEPT, "cpu", 64)
     parts = net(points)
     again = [net(points[start : start + 100]) for start in range(0, 1000, 100)]
     for i in range(2):
@@ -112,8 +112,8 @@ def test_gradients_keep_their_length_within_bounds() -> None:
     net = network(2, "wave")
     _, gradient = net(net.frame.outward(np.random.default_rng(0).uniform(-3, 3, (3000, 3))))
     norm = np.linalg.norm(gradient, axis=1)
-    assert norm.min() > boxed.SLOPE[0] - 1e-4
-    assert norm.max() < boxed.SLOPE[1] + 1e-4
+    assert norm.min() > far_field.SLOPE[0] - 1e-4
+    assert norm.max() < far_field.SLOPE[1] + 1e-4
 
 
 def test_where_the_slope_vanishes_a_gradient_still_points_somewhere() -> None:
@@ -125,7 +125,7 @@ def test_where_the_slope_vanishes_a_gradient_still_points_somewhere() -> None:
         np.array([[-0.5] * 3, [0.5] * 3]),
     )
     _, gradient = flat(np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]))
-    np.testing.assert_allclose(gradient, [[0, 0, boxed.SLOPE[0]], [boxed.SLOPE[0], 0, 0]], atol=1e-4)
+    np.testing.assert_allclose(gradient, [[0, 0, far_field.SLOPE[0]], [far_field.SLOPE[0], 0, 0]], atol=1e-4)
 
 
 def test_metres_and_normalised_frame() -> None:
@@ -138,7 +138,7 @@ def test_metres_and_normalised_frame() -> None:
     assert distance.dtype == torch.float64
     torch.testing.assert_close(distance.float(), value[0] * net.frame.scale, rtol=1e-4, atol=1e-4)
     norm = gradient[0].norm(dim=1, keepdim=True)
-    torch.testing.assert_close(slope.float(), gradient[0] / norm * norm.clamp(*boxed.SLOPE), rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(slope.float(), gradient[0] / norm * norm.clamp(*far_field.SLOPE), rtol=1e-3, atol=1e-3)
 
 
 def test_large_coordinates_leave_before_the_cast() -> None:
@@ -174,8 +174,8 @@ def test_empty_chunked_and_numpy_questions(monkeypatch: pytest.MonkeyPatch) -> N
     assert sdf(torch.zeros(0, 3))[1].shape == (0, 3)
     points = torch.rand(1000, 3)
     whole = sdf(points)
-    monkeypatch.setattr(mlp, "CHUNK", 37)
-    for one, other in zip(whole, sdf(points), strict=True):
+    monkeypatch.setattr(mlp_sdf, "PREPARED", 37)
+    for one, other in zip(whole, replace(sdf)(points), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)
     array, _ = sdf(points.double().numpy())
     assert array.dtype == np.float64

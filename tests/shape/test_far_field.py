@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+
 from sdfsim.shape.far_field import BOX, CAUTION, FADE, SLOPE, everywhere
 
 

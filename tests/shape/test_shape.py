@@ -9,18 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+
+from sdfsim.errors import SdfsimError
+from sdfsim.shape import primitives
+from sdfsim.shape import shape as shape_module
+from sdfsim.shape.mesh import Frame, Mesh
 from sdfsim.shape.mlp_sdf import MlpSdf
+from sdfsim.shape.sdf import BoxSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.shape import (
     Shape,
     analytic_shape,
     load_shape,
     scaled,
 )
-
-from sdfsim.errors import SdfsimError
-from sdfsim.shape import primitives, shape
-from sdfsim.shape.mesh import Frame, Mesh
-from sdfsim.shape.sdf import BoxSdf, PlaneSdf, SphereSdf
 
 
 def fitted() -> Shape:
@@ -159,7 +160,7 @@ def test_a_failed_write_leaves_no_complete_looking_folder(tmp_path: Path, monkey
     def full(path: Path, content: bytes) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(asset, "write", full)
+    monkeypatch.setattr(shape_module, "write", full)
     with pytest.raises(SdfsimError, match="No space left"):
         fitted().save(tmp_path)
     with pytest.raises(SdfsimError, match=r"shape\.json is missing"):

@@ -2,13 +2,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
-from sdfsim.shape.surface_nodes import edge_nodes, hull_nodes, sample_nodes, thin
+from scipy.spatial import KDTree
 
 from sdfsim.errors import SdfsimError
 from sdfsim.shape import primitives
 from sdfsim.shape.mesh import sample_surface
 from sdfsim.shape.sdf import BoxSdf, PlaneSdf, SphereSdf
+from sdfsim.shape.surface_nodes import edge_nodes, hull_nodes, sample_nodes, thin
 
 
 @pytest.mark.parametrize("scale", [0.01, 1.0, 300.0])
@@ -17,11 +17,11 @@ def test_nodes_lie_on_the_surface_and_cover_it(scale: float) -> None:
     nodes = sample_nodes(sdf)
     assert np.abs(sdf(nodes)[0]).max() < 1e-6 * scale
     surface, _ = sample_surface(primitives.sphere(0.5 * scale, 4), 5000, np.random.default_rng(0))
-    assert cKDTree(nodes).query(surface)[0].max() < 0.06 * scale
+    assert KDTree(nodes).query(surface)[0].max() < 0.06 * scale
     few = thin(nodes, 128)
     assert len(few) == 128
     # 128 even caps of a sphere have a radius near 0.09 of its diameter.
-    assert cKDTree(few).query(surface)[0].max() < 0.13 * scale
+    assert KDTree(few).query(surface)[0].max() < 0.13 * scale
 
 
 def test_one_node_a_voxel_and_the_same_every_time() -> None:
@@ -67,7 +67,7 @@ def test_thinning_keeps_what_it_must_and_spreads_the_rest() -> None:
     few = thin(points, 60, keep=keep)
     assert few.shape == (60, 3)
     np.testing.assert_array_equal(few[:10], keep)
-    gaps = cKDTree(few[10:]).query(few[10:], k=2)[0][:, 1]
+    gaps = KDTree(few[10:]).query(few[10:], k=2)[0][:, 1]
     assert gaps.min() > 0.15
     np.testing.assert_array_equal(few, thin(points, 60, keep=keep))
     assert len(thin(points, 5, keep=keep)) == 5

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from sdfsim.shape.shape import analytic_shape, with_sdf
 
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.mesh import Mesh
 from sdfsim.shape.primitives import box, sphere, torus
 from sdfsim.shape.sdf import BoxSdf, MeshSdf, Sdf, SphereSdf
+from sdfsim.shape.shape import analytic_shape, with_sdf
 
 SIZE = (1.0, 0.6, 0.8)
 HALF = np.array(SIZE) / 2

@@ -62,5 +62,5 @@ def test_the_answer_has_the_type_of_the_question(sdf: Sdf, dtype: torch.dtype) -
 def test_bad_sizes_are_refused() -> None:
     with pytest.raises(SdfsimError, match="radius"):
         SphereSdf(0.0)
-    with pytest.raises(SdfsimError, match="half extents"):
+    with pytest.raises(SdfsimError, match="box must be > 0"):
         BoxSdf((1.0, float("nan"), 1.0))

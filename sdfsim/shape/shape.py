@@ -1,28 +1,49 @@
-"""A `Shape`: geometry, SDF (learned, sampled or exact), surface nodes, mass properties; and the folder it lives in."""
+"""A `Shape` (geometry, SDF, surface nodes, mass properties), the folder that holds it, and the cache of fitted ones."""
 
 from __future__ import annotations
 
+import logging
+import os
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
 
 from sdfsim.errors import SdfsimError
-from sdfsim.files import write_json
+from sdfsim.files import read_json, replacing, write_json
+from sdfsim.shape import primitives
 from sdfsim.shape.distance import MeshDistance
-from sdfsim.shape.mesh import Frame, Mesh, convex_hull, read_mesh, write_ply
-from sdfsim.shape.mlp_sdf import MlpSdf
-from sdfsim.shape.sdf import BoxSdf, CapsuleSdf, CylinderSdf, GridSdf, MeshSdf, PlaneSdf, Sdf, SphereSdf, sample_grid
-from sdfsim.shape.shape import FORMAT_VERSION, finite, read_record, sdf_from_file, sdf_to_file, write
+from sdfsim.shape.mesh import Frame, Mesh, convex_hull, load_mesh, read_mesh, write_ply
+from sdfsim.shape.mlp_sdf import ACTIVATIONS, MlpSdf
+from sdfsim.shape.sdf import (
+    CLOSED_FORMS,
+    BoxSdf,
+    CapsuleSdf,
+    ClosedForm,
+    CylinderSdf,
+    GridSdf,
+    MeshSdf,
+    PlaneSdf,
+    Sdf,
+    SphereSdf,
+    sample_grid,
+)
+from sdfsim.shape.surface_nodes import DEFAULT_COUNT, sample_nodes, surface_nodes
+from sdfsim.shape.watertight import solidify
 
 SdfKind = Literal["mlp", "grid", "mesh"]
+Progress = Callable[[float, str], None]
 
+FORMAT_VERSION = 1
 # Samples along each side of a grid: its cells are then 0.022 of the solid's largest extent.
 DEFAULT_RESOLUTION = 64
 WEIGHTS_FILE, MESH_FILE, RECORD_FILE = "shape.safetensors", "mesh.ply", "shape.json"
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -65,8 +86,10 @@ class Shape:
             SdfsimError: the folder cannot be written, or the SDF has no file format: its kind has none, or it is exact
                 and not of this shape's mesh.
         """
+        from safetensors.torch import save as to_bytes
+
         folder = Path(folder)
-        tensors, description = sdf_to_file(self.sdf, self.mesh)
+        tensors, description = _sdf_to_file(self.sdf, self.mesh)
         tensors["nodes"] = torch.from_numpy(np.ascontiguousarray(self.nodes, dtype=np.float64))
         if self.pieces:
             tensors["pieces"] = torch.from_numpy(np.concatenate(self.pieces))
@@ -84,8 +107,6 @@ class Shape:
             "source": self.source,
             "pieces": [len(piece) for piece in self.pieces],
         }
-        from safetensors.torch import save as to_bytes
-
         try:
             folder.mkdir(parents=True, exist_ok=True)
             (folder / RECORD_FILE).unlink(missing_ok=True)
@@ -97,22 +118,32 @@ class Shape:
         return folder
 
 
+def write(path: Path, content: bytes) -> None:
+    """Put `content` at `path` in one step: what was there before, or all of it, even when interrupted."""
+    with replacing(path) as partial:
+        partial.write_bytes(content)
+
+
 def load_shape(folder: str | Path) -> Shape:
     """Read a folder written by `Shape.save` (or by `fit` or `reconstruct`).
 
     Raises:
         SdfsimError: a file is missing, cut short, of another version, or holds what it should not.
     """
+    from safetensors import SafetensorError
+    from safetensors.torch import load as from_bytes
+
     folder = Path(folder)
     if not folder.is_dir():
         raise SdfsimError(f"{folder}: no such shape folder")
     for name in (RECORD_FILE, WEIGHTS_FILE, MESH_FILE):
         if not (folder / name).is_file():
             raise SdfsimError(f"{folder}: {name} is missing, so this is no complete shape folder")
-    record = read_record(folder / RECORD_FILE)
-    from safetensors import SafetensorError
-    from safetensors.torch import load as from_bytes
-
+    record = read_json(folder / RECORD_FILE, "fit the mesh again")
+    version = record.get("version") if isinstance(record, dict) else None
+    if version != FORMAT_VERSION:
+        told = f"shape format version {version!r}, this program reads {FORMAT_VERSION}"
+        raise SdfsimError(f"{folder / RECORD_FILE}: {told}", "fit the mesh again")
     try:
         tensors = from_bytes((folder / WEIGHTS_FILE).read_bytes())
     except (SafetensorError, OSError) as error:
@@ -122,57 +153,107 @@ def load_shape(folder: str | Path) -> Shape:
             raise SdfsimError(f"{folder / WEIGHTS_FILE}: {name} is not finite")
     mesh = read_mesh(folder / MESH_FILE)
     try:
+        sizes = record.get("pieces", [])
         return Shape(
             name=str(record["name"]),
             mesh=mesh,
-            sdf=sdf_from_file(record["sdf"], tensors, mesh),
+            sdf=_sdf_from_file(record["sdf"], tensors, mesh),
             nodes=tensors["nodes"].numpy().reshape(-1, 3),
-            volume=float(finite(record["volume"], "volume")),
-            com=finite(record["com"], "com", 3),
-            inertia=finite(record["inertia"], "inertia", 3, 3),
+            volume=float(_finite(record["volume"], "volume")),
+            com=_finite(record["com"], "com", 3),
+            inertia=_finite(record["inertia"], "inertia", 3, 3),
             certificate=dict(record["certificate"]),
             source=dict(record["source"]),
-            pieces=_pieces(tensors, record.get("pieces", [])),
+            pieces=tuple(piece.numpy() for piece in tensors["pieces"].split(sizes)) if sizes else (),
         )
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+    except (SdfsimError, KeyError, TypeError, ValueError, RuntimeError) as error:
         reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
         raise SdfsimError(f"{folder}: not a valid shape folder ({reason})") from error
 
 
-def _pieces(tensors: dict[str, torch.Tensor], sizes: list[int]) -> tuple[np.ndarray, ...]:
-    return tuple(piece.numpy() for piece in tensors["pieces"].split(sizes)) if sizes else ()
+def _sdf_to_file(sdf: Sdf, mesh: Mesh) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    """Tensors and a description (for JSON) of an SDF, beside the folder's `mesh`."""
+    if isinstance(sdf, MlpSdf | GridSdf):
+        frame = {"centre": np.asarray(sdf.frame.centre).tolist(), "scale": float(sdf.frame.scale)}
+        if isinstance(sdf, GridSdf):
+            return {"grid": sdf.values.cpu().contiguous()}, {"kind": "grid", "resolution": sdf.resolution, **frame}
+        tensors = {}
+        for layer, (weight, bias) in enumerate(zip(sdf.weights, sdf.biases, strict=True)):
+            tensors[f"layer{layer}.weight"] = weight.cpu().contiguous()
+            tensors[f"layer{layer}.bias"] = bias.cpu().contiguous()
+        described = {"kind": "mlp", "activation": sdf.activation, "mirrors": list(sdf.mirrors)}
+        return tensors, {**described, "layers": len(sdf.weights), **frame}
+    if isinstance(sdf, MeshSdf):
+        if not all(np.array_equal(getattr(sdf.mesh, key), getattr(mesh, key)) for key in ("vertices", "faces")):
+            raise SdfsimError("an exact SDF of another mesh than the shape's own cannot be saved")
+        return {}, {"kind": "mesh"}
+    if isinstance(sdf, ClosedForm):
+        return {}, {"kind": sdf.KIND, **vars(sdf)}
+    raise SdfsimError(f"an SDF of type {type(sdf).__name__} cannot be saved", "fit it first")
+
+
+def _sdf_from_file(description: dict[str, Any], tensors: dict[str, torch.Tensor], mesh: Mesh) -> Sdf:
+    """The SDF that `_sdf_to_file` described. Raises KeyError, TypeError, ValueError or SdfsimError otherwise."""
+    kind = description["kind"]
+    if kind == "mesh":
+        return MeshSdf(mesh)
+    if kind in CLOSED_FORMS:
+        sizes = {
+            key: _finite(value, key, *np.shape(value)).tolist() for key, value in description.items() if key != "kind"
+        }
+        made: Any = CLOSED_FORMS[kind]
+        return made(**{key: tuple(v) if isinstance(v, list) else v for key, v in sizes.items()})
+    if kind not in ("mlp", "grid"):
+        raise ValueError(f"unknown SDF kind {kind!r}")
+    if not all(tensor.is_floating_point() for tensor in tensors.values()):
+        raise ValueError("weights that are not floating-point numbers")
+    frame = Frame(_finite(description["centre"], "centre", 3), float(_finite(description["scale"], "scale")))
+    if frame.scale <= 0:
+        raise ValueError(f"scale must be > 0 (got {frame.scale:g})")
+    bounds = _finite(tensors["bounds"].numpy(), "bounds", 2, 3)
+    if kind == "grid":
+        return GridSdf(tensors["grid"].float(), frame, bounds)
+    if description["activation"] not in ACTIVATIONS:
+        raise ValueError(f"unknown activation {description['activation']!r}")
+    weights, biases = (
+        tuple(tensors[f"layer{layer}.{part}"].float() for layer in range(int(description["layers"])))
+        for part in ("weight", "bias")
+    )
+    sizes = [3, *(len(weight) for weight in weights)]
+    if sizes[-1] != 1 or any(
+        tuple(weight.shape) != (rows, columns) or tuple(bias.shape) != (rows,)
+        for weight, bias, columns, rows in zip(weights, biases, sizes[:-1], sizes[1:], strict=True)
+    ):
+        raise ValueError("the layers do not fit together")
+    x, y, z = (bool(mirror) for mirror in description.get("mirrors", (False, False, False)))
+    return MlpSdf(weights, biases, description["activation"], frame, bounds, (x, y, z))
+
+
+def _finite(value: Any, what: str, *shape: int) -> np.ndarray:
+    """Finite numbers [*shape] out of JSON. Raises TypeError or ValueError otherwise."""
+    numbers = np.array(value, dtype=np.float64).reshape(shape)
+    if not np.isfinite(numbers).all():
+        raise ValueError(f"{what} is not finite")
+    return numbers
 
 
 def scaled(shape: Shape, factor: float) -> Shape:
     """The same shape `factor` times as large, about its own origin.
 
     Raises:
-        SdfsimError: the factor is not a positive finite number.
+        SdfsimError: the factor is not a positive finite number, or the SDF is of a kind that cannot be scaled.
     """
     if not (np.isfinite(factor) and factor > 0):
         raise SdfsimError(f"{shape.name}: scale must be > 0 (got {factor})")
     if factor == 1.0:
         return shape
-    sdf = shape.sdf
-    if isinstance(sdf, MlpSdf | GridSdf):
-        frame = Frame(sdf.frame.centre * factor, sdf.frame.scale * factor)
-        sdf = replace(sdf, frame=frame, bounds=sdf.bounds * factor)
-    elif isinstance(sdf, SphereSdf):
-        sdf = SphereSdf(sdf.radius * factor)
-    elif isinstance(sdf, CapsuleSdf | CylinderSdf):
-        sdf = replace(sdf, radius=sdf.radius * factor, half=sdf.half * factor)
-    elif isinstance(sdf, BoxSdf):
-        x, y, z = sdf.half
-        sdf = BoxSdf((x * factor, y * factor, z * factor))
-    elif isinstance(sdf, MeshSdf):
-        sdf = MeshSdf(replace(sdf.mesh, vertices=sdf.mesh.vertices * factor))
-    elif not isinstance(sdf, PlaneSdf):
-        raise SdfsimError(f"{shape.name}: an SDF of type {type(sdf).__name__} cannot be scaled")
+    if not isinstance(shape.sdf, MlpSdf | GridSdf | MeshSdf | ClosedForm):
+        raise SdfsimError(f"{shape.name}: an SDF of type {type(shape.sdf).__name__} cannot be scaled")
     return replace(
         shape,
         mesh=replace(shape.mesh, vertices=shape.mesh.vertices * factor),
         pieces=tuple(piece * factor for piece in shape.pieces),
-        sdf=sdf,
+        sdf=shape.sdf.scaled(factor),
         nodes=shape.nodes * factor,
         volume=shape.volume * factor**3,
         com=shape.com * factor,
@@ -214,8 +295,6 @@ def with_nodes(shape: Shape, grid: int) -> Shape:
     Raises:
         SdfsimError: the SDF has no end, or no point of the grid reached its surface.
     """
-    from sdfsim.shape.surface_nodes import sample_nodes
-
     nodes = sample_nodes(shape.sdf, grid=grid)
     # What was measured of the former nodes does not hold for these.
     certificate = {key: value for key, value in shape.certificate.items() if key != "coverage"}
@@ -226,7 +305,7 @@ def sdf_of_mesh(
     mesh: Mesh,
     kind: Literal["grid", "mesh"],
     resolution: int,
-    on_progress: Callable[[float, str], None] | None = None,
+    on_progress: Progress | None = None,
 ) -> tuple[Sdf, dict]:
     """A mesh's exact SDF or a grid of it, and what a shape's `source` says about it.
 
@@ -237,6 +316,146 @@ def sdf_of_mesh(
         return MeshSdf(mesh), {"sdf": "mesh"}
     oracle = MeshDistance(mesh)
     return sample_grid(oracle, oracle.bounds, resolution, on_progress), {"sdf": "grid", "resolution": resolution}
+
+
+def shape_from_mesh(
+    path: str | Path,
+    cache_dir: str | Path | None = None,
+    *,
+    name: str | None = None,
+    units: float = 1.0,
+    cap: bool = False,
+    thicken: float | None = None,
+    sdf: SdfKind = "mlp",
+    resolution: int = DEFAULT_RESOLUTION,
+    on_progress: Progress | None = None,
+) -> Shape:
+    """The shape of a mesh file: made on first use, then taken from a cache keyed by what the file describes.
+
+    Args:
+        path: a mesh file.
+        cache_dir: where shapes are kept; by default `sdfsim/shapes` in the user's cache folder.
+        name: by default the file's.
+        units: metres per unit of the file.
+        cap: close openings of any size.
+        thicken: m; a thickness for an open sheet.
+        sdf: "mlp" fits the network; "grid" and "mesh" fit nothing (see `mesh_shape`).
+        resolution: of a grid, samples along each side.
+        on_progress: called with (fraction done, message) while fitting or sampling.
+
+    Raises:
+        SdfsimError: the mesh cannot be used.
+    """
+    path = Path(path)
+    mesh = load_mesh(path)
+    # Not of the file's bytes: a glTF keeps its vertices, and an OBJ its colours, in files beside it.
+    key = mesh.digest()
+    thicken = None if thicken is None else thicken / units
+    shape = _cached(mesh, key, path.stem, cap, thicken, sdf, resolution, cache_dir, on_progress)
+    shape = replace(shape, name=name or path.stem, source={**shape.source, "file": path.name, "sha256": key})
+    return scaled(shape, units)
+
+
+def shape_from_primitive(
+    kind: str,
+    size: float = 1.0,
+    cache_dir: str | Path | None = None,
+    *,
+    name: str | None = None,
+    sdf: SdfKind = "mlp",
+    resolution: int = DEFAULT_RESOLUTION,
+    on_progress: Progress | None = None,
+) -> Shape:
+    """The shape of a procedural mesh of `primitives.PRIMITIVES`, made on first use and cached.
+
+    Args:
+        kind: name in `PRIMITIVES`.
+        size: its largest extent, m.
+        cache_dir, name, sdf, resolution, on_progress: as for `shape_from_mesh`.
+
+    Raises:
+        SdfsimError: no such primitive.
+    """
+    if kind not in primitives.PRIMITIVES:
+        raise SdfsimError(f"no primitive called {kind!r}", "there are " + ", ".join(primitives.PRIMITIVES))
+    mesh = primitives.PRIMITIVES[kind]()
+    unit = Mesh(mesh.vertices / float(np.ptp(mesh.vertices, axis=0).max()), mesh.faces)
+    # Rounded, since sines and cosines differ in their last digit from machine to machine.
+    key = Mesh(unit.vertices.round(9), unit.faces).digest()
+    shape = _cached(unit, key, kind, False, None, sdf, resolution, cache_dir, on_progress)
+    return scaled(replace(shape, name=name or kind, source={**shape.source, "primitive": kind}), size)
+
+
+def mesh_shape(
+    mesh: Mesh,
+    *,
+    name: str,
+    kind: Literal["grid", "mesh"],
+    cap: bool = False,
+    thicken: float | None = None,
+    resolution: int = DEFAULT_RESOLUTION,
+    on_progress: Progress | None = None,
+) -> Shape:
+    """The shape of a mesh without any fit: its exact SDF or a grid of it, nodes and mass properties as a fit has them.
+
+    Args:
+        mesh: metres.
+        name: of the shape.
+        kind: "mesh" (the exact distance) or "grid" (samples of it).
+        cap, thicken: as for `solidify`.
+        resolution: of a grid, samples along each side.
+        on_progress: called with (fraction done, message) while a grid is sampled.
+
+    Raises:
+        SdfsimError: the mesh cannot be used.
+    """
+    solid = solidify(mesh, name=name, cap=cap, thicken=thicken)
+    sdf, note = sdf_of_mesh(solid.surface, kind, resolution, on_progress)
+    nodes = surface_nodes(sdf, solid.surface, DEFAULT_COUNT)
+    return Shape(name, solid.surface, sdf, nodes, *solid.mass_properties(), source={"kind": "mesh"} | note)
+
+
+def _cached(
+    mesh: Mesh,
+    key: str,
+    label: str,
+    cap: bool,
+    thicken: float | None,
+    kind: SdfKind,
+    resolution: int,
+    cache_dir: str | Path | None,
+    on_progress: Progress | None,
+) -> Shape:
+    if kind == "mesh":  # made as fast as it is read
+        return mesh_shape(mesh, name=label, kind=kind, cap=cap, thicken=thicken)
+    from sdfsim.shape.fit import FIT_VERSION, fit_mesh
+
+    if cache_dir is None:
+        cache_dir = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sdfsim" / "shapes"
+    variant = ("-cap" if cap else "") + (f"-thick{thicken:g}" if thicken is not None else "")
+    variant += f"-grid{resolution}" if kind == "grid" else ""
+    folder = Path(cache_dir) / f"{key[:24]}{variant}-{FIT_VERSION}.{FORMAT_VERSION}"
+    if folder.is_dir():
+        try:
+            return load_shape(folder)
+        except SdfsimError:
+            shutil.rmtree(folder, ignore_errors=True)  # a damaged entry is only a cache miss
+    options: dict[str, Any] = {"name": label, "cap": cap, "thicken": thicken, "on_progress": on_progress}
+    if kind == "grid":
+        shape = mesh_shape(mesh, kind=kind, resolution=resolution, **options)
+    else:
+        shape = fit_mesh(mesh, **options)
+    # A folder of its own first, so that processes fitting the same mesh never see each other's half.
+    partial = folder.with_name(f"{folder.name}.{os.getpid()}.partial")
+    try:
+        shape.save(partial)
+        if not folder.is_dir():  # else another process was first: its entry is as good
+            partial.rename(folder)
+    except (SdfsimError, OSError) as error:
+        _log.warning("the shape %s is not kept for the next time: %s", label, error)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return shape
 
 
 def analytic_shape(
@@ -264,8 +483,6 @@ def analytic_shape(
     Raises:
         SdfsimError: unknown kind, or a size that is missing or not positive.
     """
-    from sdfsim.shape import primitives
-
     source = {"kind": kind}
     if kind == "plane":
         square = np.array([[-10, -10, 0], [10, -10, 0], [10, 10, 0], [-10, 10, 0]], dtype=np.float64)

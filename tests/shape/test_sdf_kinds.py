@@ -8,6 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from sdfsim.errors import SdfsimError
+from sdfsim.shape import primitives
+from sdfsim.shape.mass import mass_properties_of_sdf
+from sdfsim.shape.mesh import Mesh, write_ply
+from sdfsim.shape.sdf import BoxSdf, GridSdf, MeshSdf
 from sdfsim.shape.shape import (
     analytic_shape,
     load_shape,
@@ -17,13 +23,7 @@ from sdfsim.shape.shape import (
     shape_from_primitive,
     with_sdf,
 )
-
-from sdfsim.errors import SdfsimError
-from sdfsim.shape import primitives
-from sdfsim.shape.mass import mass_properties_of_sdf
-from sdfsim.shape.mesh import Mesh, write_ply
-from sdfsim.shape.sdf import BoxSdf, GridSdf, MeshSdf
-from tests.shape.test_asset import edit, fitted
+from tests.shape.test_shape import edit, fitted
 
 OTHERS = [("grid", GridSdf), ("mesh", MeshSdf)]
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -20,6 +22,59 @@ CAUTION, FADE = 0.03, 0.1
 
 # (rows of the points that are asked, or None for all; points [P, 3] in the box) -> value [P], gradient [P, 3].
 Inner = Callable[[torch.Tensor | None, torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
+
+
+class Boxed(Protocol):
+    """An SDF that is known on the box of its normalised frame; see `MlpSdf` and `GridSdf`."""
+
+    @property
+    def frame(self) -> Frame: ...
+
+    @property
+    def bounds(self) -> np.ndarray: ...
+
+
+class BoxedStack(ABC):
+    """Boxed SDFs of one kind, asked together; `_inside` knows them within the box.
+
+    Args:
+        sdfs: the SDFs; slots refer to them in this order.
+        device: where to compute.
+        chunk: points prepared and finished at once.
+    """
+
+    def __init__(self, sdfs: Sequence[Boxed], device: torch.device, chunk: int) -> None:
+        self._centre = torch.tensor(np.stack([sdf.frame.centre for sdf in sdfs]), device=device)
+        self._scale = torch.tensor([sdf.frame.scale for sdf in sdfs], dtype=torch.float64, device=device)
+        half = np.stack([np.abs(sdf.bounds - sdf.frame.centre).max(0) / sdf.frame.scale for sdf in sdfs])
+        self._half = torch.from_numpy(half).float().to(device)
+        self._chunk = chunk
+        self._count = len(sdfs)
+
+    def __call__(self, slot: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Distance [P] m and gradient [P, 3] of SDF `slot[p]` at `points[p]`; computed in float32, cast back."""
+        distance, gradient = [], []
+        for some, part in zip(slot.split(self._chunk), points.split(self._chunk), strict=True):
+            scale = self._scale.index_select(0, some).to(points.dtype)
+            centre, half = self._centre.index_select(0, some), self._half.index_select(0, some)
+            # The centre leaves in the precision of the points, before the cast.
+            local = ((part - centre.to(points.dtype)) / scale[:, None]).float()
+
+            def inner(rows: torch.Tensor | None, local: torch.Tensor, some: torch.Tensor = some):
+                return self._inside(some if rows is None else some[rows], local)
+
+            value, slope = everywhere(inner, local, half)
+            distance.append(value.to(points.dtype) * scale)
+            gradient.append(slope.to(points.dtype))
+        return torch.cat(distance), torch.cat(gradient)
+
+    def alone(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Distance and gradient of the first SDF."""
+        return self(torch.zeros(len(points), dtype=torch.int64, device=points.device), points)
+
+    @abstractmethod
+    def _inside(self, slot: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Normalised distance [P] and gradient [P, 3] of SDF `slot[p]` at `points[p]`, within the box."""
 
 
 def everywhere(inner: Inner, points: torch.Tensor, half: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -51,11 +106,6 @@ def everywhere(inner: Inner, points: torch.Tensor, half: torch.Tensor) -> tuple[
     short = (least > 0) & (least > value)
     straight = beyond.copysign(points) / least.clamp_min(1e-12)[:, None]
     return torch.where(short, least, value), torch.where(short[:, None], straight, gradient)
-
-
-def half_extents(frame: Frame, bounds: np.ndarray) -> torch.Tensor:
-    """[3] float32: how far a solid with `bounds` [2, 3] m reaches from the centre of its normalised frame."""
-    return torch.from_numpy(np.abs(bounds - frame.centre).max(0) / frame.scale).float()
 
 
 def _beyond(

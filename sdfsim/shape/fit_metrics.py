@@ -1,17 +1,15 @@
-"""How good a fitted SDF is, measured on points that it was not fitted to."""
+"""How good a fitted SDF is on points that it was not fitted to, and how well nodes stand for a surface."""
 
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from sdfsim.shape.distance import DistanceOracle
+from sdfsim.shape.distance import DistanceOracle, MeshDistance
 from sdfsim.shape.far_field import BOX
-from sdfsim.shape.fit_metrics import coverage, hausdorff, outward_samples
-from sdfsim.shape.mesh import Frame, normal_frame, sample_surface
+from sdfsim.shape.mesh import Frame, Mesh, normal_frame, sample_surface, signed_volume
 from sdfsim.shape.sdf import Sdf
 
 # Lengths are fractions of the shape's largest extent. EXACT is what good fits of clean meshes reach.
@@ -25,7 +23,7 @@ EXACT: tuple[tuple[str, float], ...] = (
     ("sign_errors", 1.0e-3),
 )
 # With larger errors than these bodies rest at another height than they should by 5 % of their size, creep, or leave a
-# straight hit more than 6 degrees aside: docs/sdf.md tells how the limits were found. Distances farther away only
+# straight hit more than 6 degrees aside: benchmarks/usable_fields.py derives the limits. Distances farther away only
 # decide where contacts are searched for, and 0.8 of them is trusted.
 USABLE: tuple[tuple[str, float], ...] = (
     ("error_within_0.01", 3.2e-3),
@@ -38,17 +36,14 @@ SIGN_FROM = 0.002
 FAR_FROM = 0.1
 # Half extent of the cube in which the far field is tested.
 FAR_HALF = 2.0
-# Signed distances between which the errors are also told apart, and how many points make a bin worth telling.
-EDGES = (
-    *(-0.3, -0.2, -0.1, -0.05, -0.02, -0.01, -0.005, -0.002, 0.0),
-    *(0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7),
-)
-BIN_POINTS = 20
-# A wall counts as thin below this, and thin walls explain a miss when this much of the surface has them. What is
-# measured from 0.1 away also suffers from walls through whose middle, where the gradient turns over, it looks.
+# A wall counts as thin below this, and thin walls explain a miss when this much of the surface has them.
 THIN = 0.02
-THIN_FROM_AFAR = 0.1
 THIN_SHARE = 0.02
+
+
+FAR_FROM_A_NODE = 0.1
+# A surface sample is hidden where this far along its normal is inside.
+EXPOSED_STEP = 5e-4
 
 
 class _Measured(NamedTuple):
@@ -68,19 +63,9 @@ class _Measured(NamedTuple):
     norm: np.ndarray
     projected: np.ndarray
 
-    def where(self, chosen: np.ndarray) -> _Measured:
-        """The `chosen` [P] bool of the points."""
-        return _Measured(*(part[chosen] for part in self))
-
-    @property
-    def error(self) -> np.ndarray:
-        """[P] absolute error of the distance."""
-        return np.abs(self.value - self.true)
-
-    @property
-    def wrong(self) -> np.ndarray:
-        """[P] whether the sign is wrong."""
-        return self.value * self.true <= 0
+    def within(self, limit: float) -> _Measured:
+        """Those no farther than `limit` from the surface."""
+        return _Measured(*(part[np.abs(self.true) <= limit] for part in self))
 
 
 def certify(
@@ -109,16 +94,7 @@ def certify(
         is wrong; `far_field_ratio`, the largest f / true distance farther than 0.1, out to [-2, 2]^3 (a step as
         long as f goes through the surface where it is above 1).
 
-        `hausdorff`, `hausdorff_from_mesh`, `hausdorff_from_level`, `hausdorff_p99` and `stray_extent` as in
-        `coverage.hausdorff`.
-
-        `curve`, all by signed distance as in the supplementary figure of Rubanova et al. 2024: `distance` (B + 1 bin
-        edges), and B values each of `count`, `error` and `error_p95`, `sign_errors` (fraction), `gradient_direction`
-        (median 1 - cosine), `gradient_norm` (median) with `gradient_norm_p5` and `gradient_norm_p95`, and
-        `projected` (mean); None in bins of fewer than 20 points.
-
-        `coverage` of the nodes as in `coverage.coverage`, if there are any; and `passed`, `reason` and `caveat` of
-        `verdict`.
+        `coverage` of the nodes as in `coverage`, if there are any; and `passed`, `reason` and `caveat` of `verdict`.
     """
     # A stream of its own, so that no seed of the fit draws these points.
     rng = np.random.default_rng([seed, 0xCE47])
@@ -133,8 +109,8 @@ def certify(
             local = rng.uniform(-BOX, BOX, (points, 3))
         got = _measure(sdf, oracle, frame, local)
         measured.append(got)
-        got = got.where(np.abs(got.true) <= limit)
-        result[f"error_{key}"] = _mean(got.error)
+        got = got.within(limit)
+        result[f"error_{key}"] = _mean(np.abs(got.value - got.true))
         if width:
             result[f"projected_from_{limit:g}"] = _mean(got.projected)
         if limit == 0.1:
@@ -143,19 +119,15 @@ def certify(
             result["gradient_norm"] = np.quantile(got.norm, (0.01, 0.99)).tolist() if len(got.norm) else None
     near, wide, box = measured
     # The three kinds as they are defined: what lies beyond a kind's limit does not count.
-    counted = _join([near.where(np.abs(near.true) <= 0.01), wide.where(np.abs(wide.true) <= 0.1), box])
-    result["sign_errors"] = _mean(counted.wrong[np.abs(counted.true) > SIGN_FROM])
-    everything = _join(measured)
-    result["far_field_ratio"] = _far_field_ratio(sdf, oracle, frame, everything, rng.uniform(-1, 1, (points, 3)))
-    result.update(hausdorff(sdf, oracle, points=points, seed=seed))
-    result["curve"] = _curve(everything)
+    counted = _join([near.within(0.01), wide.within(0.1), box])
+    result["sign_errors"] = _mean((counted.value * counted.true <= 0)[np.abs(counted.true) > SIGN_FROM])
+    result["far_field_ratio"] = _far_field_ratio(sdf, oracle, frame, _join(measured), rng.uniform(-1, 1, (points, 3)))
     if nodes is not None:
         result["coverage"] = coverage(nodes, oracle, seed=seed)
     result.update(verdict(result))
     for told in ("reason", "caveat"):
         if result[told]:
-            from_afar = result[told].startswith("projected_from_0.1 ")
-            result[told] += f": {cause(oracle, THIN_FROM_AFAR if from_afar else THIN, seed=seed)}"
+            result[told] += f": {cause(oracle, seed=seed)}"
     # None for what could not be measured: JSON has no NaN.
     unknown = [key for key, value in result.items() if isinstance(value, float) and not math.isfinite(value)]
     return result | dict.fromkeys(unknown)
@@ -182,19 +154,13 @@ def verdict(errors: dict) -> dict:
     return {"passed": True, "reason": "", "caveat": ""}
 
 
-def cause(oracle: DistanceOracle, thin: float = THIN, *, seed: int = 1) -> str:
-    """What about a geometry makes it hard to fit, as far as it can be measured: holes, thin walls, else its detail.
-
-    Args:
-        oracle: of the geometry.
-        thin: walls below this fraction of the largest extent are to blame.
-        seed: of the surface samples.
-    """
+def cause(oracle: DistanceOracle, *, seed: int = 1) -> str:
+    """What about a geometry makes it hard to fit, as far as it can be measured: holes, thin walls, else its detail."""
     if not oracle.closed:
         return "open mesh, so its inside is not clear"
-    share = thin_share(oracle, thin, seed=seed)
+    share = thin_share(oracle, seed=seed)
     if share >= THIN_SHARE:
-        return f"thin walls ({100 * share:.0f} % of the surface is thinner than {thin:g})"
+        return f"thin walls ({100 * share:.0f} % of the surface is thinner than {THIN:g})"
     return "fine detail, or too short a fit"
 
 
@@ -210,6 +176,61 @@ def thin_share(oracle: DistanceOracle, thin: float = THIN, *, points: int = 2000
     for depth in np.linspace(thin, 0.0, 4, endpoint=False):
         left |= oracle(surface - depth * scale * normal).distance > 0
     return float(left.mean())
+
+
+def coverage(nodes: np.ndarray, surface: DistanceOracle | Mesh, *, points: int = 20_000, seed: int = 1) -> dict:
+    """How evenly nodes stand for a surface, by straight distances from surface samples to their nearest node.
+
+    Args:
+        nodes: [K, 3] m.
+        surface: the true surface, in the same frame: its oracle (which also knows what is hidden inside) or a mesh.
+        points: samples, spread by area.
+        seed: of the samples.
+
+    Returns:
+        JSON-ready dict, lengths relative to the largest extent: `count` of nodes, `per_area` (nodes per unit of
+        normalised area), `largest_hole` and `mean_gap` (largest and mean distance to the nearest node), `uncovered`
+        (fraction of the surface farther than 0.1 from every node) and `off_surface` (the largest distance of a node
+        from the surface). Without nodes the distances are None.
+
+    Raises:
+        SdfsimError: the surface has no faces or no extent.
+    """
+    from scipy.spatial import KDTree
+
+    oracle = MeshDistance(surface) if isinstance(surface, Mesh) else surface
+    frame = normal_frame(oracle.bounds)
+    corners = frame.inward(oracle.surface.vertices)[oracle.surface.faces]
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
+    result = {"count": len(nodes), "per_area": float(len(nodes) / area)}
+    if len(nodes) == 0:
+        return result | {"largest_hole": None, "mean_gap": None, "uncovered": 1.0, "off_surface": None}
+    samples = frame.inward(bare_samples(oracle, points, np.random.default_rng([seed, 0xC0E4]))[0])
+    gap = KDTree(frame.inward(nodes)).query(samples)[0]
+    return result | {
+        "largest_hole": float(gap.max()),
+        "mean_gap": float(gap.mean()),
+        "uncovered": float((gap > FAR_FROM_A_NODE).mean()),
+        "off_surface": float(np.abs(oracle(nodes).distance).max() / frame.scale),
+    }
+
+
+def outward_samples(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """`sample_surface`, with the normals of a closed mesh pointing out also when its faces are inside out."""
+    points, normal = sample_surface(mesh, count, rng)
+    return points, -normal if signed_volume(mesh) < 0 else normal
+
+
+def bare_samples(oracle: DistanceOracle, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """At most `count` points [P, 3] m of a surface spread by area and their normals [P, 3], without hidden ones.
+
+    Overlapping parts hide faces, and so do the seams between convex pieces; of an open mesh nothing is left out.
+    """
+    points, normal = outward_samples(oracle.surface, count, rng)
+    if not oracle.closed:
+        return points, normal
+    outside = oracle(points + EXPOSED_STEP * normal_frame(oracle.bounds).scale * normal).distance > 0
+    return (points[outside], normal[outside]) if outside.any() else (points, normal)
 
 
 def _measure(sdf: Sdf, oracle: DistanceOracle, frame: Frame, local: np.ndarray) -> _Measured:
@@ -249,27 +270,3 @@ def _far_field_ratio(sdf: Sdf, oracle: DistanceOracle, frame: Frame, inner: _Mea
     trusted = np.concatenate([np.ones(len(inner.true), dtype=bool), truth.trusted | oracle.closed])
     far = trusted & (np.abs(true) > FAR_FROM)
     return float((value[far] / true[far]).max()) if far.any() else math.nan
-
-
-def _curve(measured: _Measured) -> dict:
-    """Errors by signed distance, for `certify`."""
-    bins: list[dict] = []
-    for low, high in pairwise(EDGES):
-        part = measured.where((measured.true >= low) & (measured.true < high))
-        turned = part.turned[np.isfinite(part.turned)]
-        enough = len(part.true) >= BIN_POINTS
-        least, middle, most = np.quantile(part.norm, (0.05, 0.5, 0.95)) if enough else (None, None, None)
-        values = {
-            "error": part.error.mean() if enough else None,
-            "error_p95": np.quantile(part.error, 0.95) if enough else None,
-            "sign_errors": part.wrong.mean() if enough else None,
-            "gradient_direction": np.median(turned) if len(turned) >= BIN_POINTS else None,
-            "gradient_norm": middle,
-            "gradient_norm_p5": least,
-            "gradient_norm_p95": most,
-            "projected": part.projected.mean() if enough else None,
-        }
-        # Four digits are more than the samples are worth, and the curve is read by people too.
-        rounded = {key: None if value is None else float(f"{value:.4g}") for key, value in values.items()}
-        bins.append({"count": len(part.true), **rounded})
-    return {"distance": list(EDGES), **{key: [entry[key] for entry in bins] for key in bins[0]}}
