@@ -1,7 +1,8 @@
-"""From scenes to motion: simulate, plan, view, info."""
+"""From scenes to motion and back: simulate, plan, view, identify, info."""
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -121,6 +122,27 @@ def view(
         else:
             viewer.show(recording, web=web, bind=bind)
             session.report({"recording": str(recording)})
+
+
+def identify(
+    recording: Annotated[
+        Path, typer.Argument(help="Run folder, rollout.npz or CSV of poses (docs/files.md).", show_default=False)
+    ],
+    scene: Annotated[Path | None, typer.Option(help="scene.yaml (default: that of the run folder).")] = None,
+    allow_outside: Outside = False,
+    as_json: Json = False,
+    device: Device = "auto",
+    verbose: Verbose = False,
+) -> None:
+    """Motion -> friction, restitution and mass ratios."""
+    with Session(as_json=as_json, verbose=verbose) as session:
+        from sdfsim import identify as room
+
+        check_device(device)
+        shapes, fit = partial(session.stage_progress, "shapes"), partial(session.stage_progress, "identify")
+        motion, known = room.load_recording(recording, scene, allow_outside=allow_outside, on_progress=shapes)
+        found = room.identify(motion, known, on_progress=fit)
+        session.report(found.report(), found.lines())
 
 
 def info(as_json: Json = False, device: Device = "auto", verbose: Verbose = False) -> None:
