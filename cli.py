@@ -1,4 +1,4 @@
-"""The command line. What a command takes and reports is told in the room it belongs to."""
+"""The command line: puts the commands of all rooms together."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import typer
 
 from pipeline.commands import distill, fit, mesh, poses, reconstruct
 from sdfsim.commands.learning import dataset, evaluate, train
-from sdfsim.commands.simulating import info, plan, simulate, view
+from sdfsim.commands.simulating import identify, info, plan, simulate, view
 from sdfsim.commands.studying import stress, tradeoff
 
 app = typer.Typer(
@@ -26,6 +26,7 @@ for command in (
     simulate,
     plan,
     view,
+    identify,
     dataset,
     train,
     evaluate,
@@ -34,3 +35,6 @@ for command in (
     info,
 ):
     app.command()(command)
+
+if __name__ == "__main__":
+    app()

@@ -1,156 +1,161 @@
-"""Question: what do large scenes cost, against nodes, bodies and contacts, beside the paper's network and two engines?
+"""What large scenes cost against bodies, nodes and contacts, beside the paper's network and two engines.
 
-    python benchmarks/scale.py -o runs/scale_study [--only growth,nodes,apart,network,engines,selection,accuracy]
+    python benchmarks/scale.py -o DIR [--paper PAPER.safetensors] [--largest 512]
 
-Every case runs in a process of its own on one thread and is kept as a JSON file in the folder; what is there is not
-measured again. Times are CPU times, so that other work on the machine does not count. At the end the tables go
-into docs/scale.md and the picture to docs/images/scale.png. The *paper* network is that of --paper, where given.
+Every case runs in a process of its own on one thread; what DIR holds is not measured again. Times are those of the
+processor. Writes DIR/table.md and DIR/scale.png. The *paper* network predicts all motion of all bodies, as published.
 """
 
 from __future__ import annotations
 
 import argparse
-import multiprocessing
 import sys
-from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
+import time
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+
+import numpy as np
+import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "samples"))
 
-import large
-
-from benchmarks.scale_parts import accuracy, engines, ours, page
-from sdfsim import Simulator, load_scene
+from samples.large import write_scene
+from sdfsim.dynamics.froude import scene_units
+from sdfsim.dynamics.model import load_model
+from sdfsim.dynamics.simulator import SimulationError, Simulator, join
 from sdfsim.errors import run_main
-from sdfsim.files import read_json, write_json
+from sdfsim.evaluation.engines import bullet, mujoco, start_of_scene
+from sdfsim.evaluation.hard_cases import body, box, on_floor
+from sdfsim.evaluation.harness import Job, Line, Panel, Results, draw, markdown, measure, number, peak_memory
+from sdfsim.evaluation.penetration import deepest, exact_solids, rollout_penetration
+from sdfsim.files import write_text
+from sdfsim.scene.scene import Scene
+from sdfsim.scene.scene_file import load_scene
 
-BOWLS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
-KNOTS = (8, 64, 270)
-Case = tuple[str, Callable[..., dict], tuple[Any, ...], dict[str, Any]]
-
-
-class Study:
-    """The cases and where they are kept.
-
-    Args:
-        folder: of the results and scenes.
-        paper: weights of a *paper* network, or None.
-    """
-
-    def __init__(self, folder: Path, paper: str | None) -> None:
-        self.folder, self.paper = folder, paper
-
-    def scene(self, name: str, count: int, nodes: int | None = 0) -> str:
-        """A scene file of samples/large.py, written on first use."""
-        folder = self.folder / "scenes" / f"{name}_{count}_{nodes}"
-        if not (folder / "scene.yaml").exists():
-            large.write_scene(name, folder, count, nodes)
-        return str(folder / "scene.yaml")
-
-    def growth(self) -> list[Case]:
-        """Whole runs of bowls with more and more spheres."""
-        return [
-            (f"growth_{nodes}_{count}", ours.run, (self.scene("bowl", count, nodes), 200), {})
-            for count in BOWLS
-            for nodes in (64, 512)
-        ]
-
-    def nodes(self) -> list[Case]:
-        """One bowl and one heap with more and more nodes a body."""
-        cases: list[Case] = []
-        for nodes in (64, 128, 256, 512, 1024):
-            cases.append((f"nodes_bowl_{nodes}", ours.run, (self.scene("bowl", 128, nodes), 100), {}))
-        for parts in (16, 8, 4, 2, 1):
-            file = self.scene("knots", 64, 2844)
-            cases.append((f"nodes_knots_{2844 // parts}", ours.run_cut, (file, 1 / parts, 100), {}))
-        return cases
-
-    def apart(self) -> list[Case]:
-        """Bodies that never meet."""
-        return [(f"apart_{count}", ours.run_apart, (count, 30), {}) for count in (125, 250, 500, 1000, 2000, 4000)]
-
-    def network(self) -> list[Case]:
-        """The *paper* network predicting all motion of all bodies, ours beside it from the same start."""
-        cases: list[Case] = []
-        for count in (16, 64, 256, 512):
-            file, steps = self.scene("bowl", count, 64), 10 if count <= 64 else 3
-            cases.append((f"network_ours_{count}", ours.run, (file, steps), {}))
-            if self.paper:
-                cases.append((f"network_paper_{count}", ours.run, (file, steps), {"model": self.paper, "always": True}))
-        return cases
-
-    def engines(self) -> list[Case]:
-        """PyBullet and MuJoCo on bowls and knots."""
-        cases: list[Case] = []
-        for name, counts in (("bowl", (16, 64, 256, 512)), ("knots", KNOTS)):
-            for count in counts:
-                file = self.scene(name, count)
-                dt = Simulator(load_scene(file)).dt
-                for engine in ("bullet", "bullet concave", "mujoco"):
-                    if name == "bowl" or engine != "bullet concave":
-                        key = f"engine_{name}_{engine.replace(' ', '_')}_{count}"
-                        cases.append((key, engines.run, (engine, file, dt, 200 if name == "bowl" else 40), {}))
-        return cases
-
-    def selection(self) -> list[Case]:
-        """What choosing edges changes."""
-        return [
-            (f"selection_{name}_{nodes}", ours.selection, (self.scene(name, 64, nodes), steps), {})
-            for name, nodes, steps in (("bowl", 64, 100), ("bowl", 512, 100), ("knots", 1422, 60))
-        ]
-
-    def accuracy(self) -> list[Case]:
-        """Bowls against the teacher."""
-        cases: list[Case] = []
-        for count in (16, 64, 140):
-            file = self.scene("bowl", count, 64)
-            cases.append((f"accuracy_small_{count}", accuracy.run, (file, 100), {}))
-            if self.paper and count <= 64:
-                settings = {"model": self.paper, "always": True}
-                cases.append((f"accuracy_paper_{count}", accuracy.run, (file, 100), settings))
-        return cases
-
-    def measure(self, parts: list[str]) -> None:
-        """Fill in what is missing."""
-        context = multiprocessing.get_context("spawn")
-        for part in parts:
-            for key, function, args, options in getattr(self, part)():
-                path = self.folder / f"{key}.json"
-                if path.exists():
-                    continue
-                with ProcessPoolExecutor(1, mp_context=context) as pool:  # a fresh process: its peak is the case's
-                    result = pool.submit(function, *args, **options).result()
-                write_json(path, result)
-                print(key, {k: v for k, v in result.items() if isinstance(v, int | float)}, flush=True)
-
-    def results(self) -> dict[str, dict]:
-        """Everything measured so far, by case."""
-        return {path.stem: read_json(path) for path in sorted(self.folder.glob("*.json"))}
+BOWLS = (1, 16, 64, 256, 512)
+APART = (125, 500, 2000)
+PARTS = (16, 4, 1)  # of the nodes of a knot
+COUNTS = ("pairs", "sdf_queries", "sdf_waiting", "edges")
+COLUMNS = {"ms": "ms a step", "peak_mib": "MiB", "contacts": "contacts", "depth_95": "deepest 95 %, mm", "lost": "lost"}
 
 
-PARTS = ("growth", "nodes", "apart", "network", "engines", "selection", "accuracy")
+def apart(count: int) -> Scene:
+    """Boxes of 1 m at rest on the floor, 3 m from each other; the floor is the last body."""
+    side = int(np.ceil(count**0.5))
+    places = [[3.0 * (k % side), 3.0 * (k // side), 0.5] for k in range(count)]
+    return on_floor([box(1.0)], [body(f"b{k}", 0, place) for k, place in enumerate(places)])
+
+
+def with_nodes_cut(scene: Scene, keep: float) -> Scene:
+    """The scene with a part of every shape's nodes only, the first of them: they are stored farthest first."""
+    shapes = tuple(replace(s, nodes=s.nodes[: max(1, round(keep * len(s.nodes)))]) for s in scene.shapes)
+    return replace(scene, shapes=shapes)
+
+
+def ours(source: Path | int, steps: int, model: str | None, keep: float = 1.0) -> dict:
+    """What a scene (its file, or so many boxes `apart`) costs with a model, and how deep bodies are in each other."""
+    torch.set_num_threads(1)
+    scene = apart(source) if isinstance(source, int) else with_nodes_cut(load_scene(source), keep)
+    frames, broken = [], None
+    with peak_memory() as memory:
+        paper = load_model(model, weights=False).kind == "paper"
+        simulator = Simulator(scene, model, free_flight="learned" if paper else "exact")
+        frames.extend(simulator.frames(1))  # not timed: it loads what is compiled
+        began = time.process_time()
+        try:
+            for frame in simulator.frames(steps - 1):
+                frames.append(frame)
+        except SimulationError as error:
+            broken = error.message
+        spent = time.process_time() - began
+    rollout = join(frames)
+    depth = rollout_penetration(scene, rollout)
+    return {
+        "bodies": int(simulator.bodies.moves.sum()),
+        "nodes": len(simulator.bodies.node),
+        "ms": 1e3 * spent / max(1, len(frames) - 1),
+        "counts": {name: float(rollout.counters[name].mean()) for name in COUNTS},
+        "contacts": float(rollout.counters["contacts"].mean()),
+        "depth_95": 1e3 * float(np.percentile(depth, 95)) if len(depth) else 0.0,
+        "lost": int((rollout.position[-1, :, 2] < -0.1).sum()),
+        "broken": broken,
+        "peak_mib": memory["mib"],
+    }
+
+
+def engine(name: str, file: Path, steps: int) -> dict:
+    """The same of PyBullet or MuJoCo; spheres are spheres there, everything else its convex pieces."""
+    scene = load_scene(file)
+    units = scene_units(scene, load_model("solver"))
+    start, _ = start_of_scene(scene, file.parent / "engine", units)
+    with peak_memory() as memory:
+        motion, timing = (bullet if name == "PyBullet" else mujoco)(start, steps)
+    shapes = {key: scene.shapes[int(key)] for key in start.urdfs}
+    centred = {key: replace(s, nodes=s.nodes - s.com) for key, s in shapes.items()}
+    distance = deepest(motion, exact_solids(file.parent, centred), every=5)
+    depth = np.maximum(0.0, -distance[np.isfinite(distance)])
+    return {
+        "bodies": int((~motion.static).sum()),
+        "ms": timing.cpu_ms,
+        "depth_95": 1e3 * units.length * float(np.percentile(depth, 95)) if len(depth) else 0.0,
+        "lost": int((units.length * motion.position[-1, :, 2] < -0.1).sum()),
+        "peak_mib": memory["mib"],
+    }
+
+
+def jobs_of(folder: Path, paper: str | None, largest: int) -> list[Job]:
+    """Everything that is measured; scene files are written on first use."""
+
+    def scene(name: str, count: int, nodes: int = 0) -> Path:
+        home = folder / "scenes" / f"{name}_{count}_{nodes}"
+        return home / "scene.yaml" if (home / "scene.yaml").exists() else write_scene(name, home, count, nodes)
+
+    jobs = []
+    for count in (n for n in BOWLS if n <= largest):
+        for nodes, model in ((64, "solver"), (512, "solver"), (64, "small"), (64, paper)):
+            if model:
+                steps = 200 if model != paper else 10
+                method = f"{Path(model).stem}, {nodes} nodes"
+                case = f"{count} spheres in a bowl"
+                jobs.append(Job(case, method, [steps], ours, (scene("bowl", count, nodes), steps, model)))
+        for name in ("PyBullet", "MuJoCo"):
+            jobs.append(Job(f"{count} spheres in a bowl", name, [200], engine, (name, scene("bowl", count, 64), 200)))
+    for model in ("solver", "small"):
+        jobs += [Job(f"{n} boxes far apart", model, [30], ours, (n, 30, model)) for n in APART if n <= 4 * largest]
+        for parts in PARTS:
+            arguments = (scene("knots", 64, 2844), 100, model, 1 / parts)
+            jobs.append(Job(f"64 knots of {2844 // parts} nodes", model, [100], ours, arguments))
+    return jobs
+
+
+def table(results: Results) -> str:
+    """A row a result, in Markdown."""
+    rows = [("case", "with", *COLUMNS.values(), "")]
+    for (case, method), found in results.items():
+        cells = (number(found.get(name)) for name in COLUMNS)
+        rows.append((case, method, *cells, found.get("broken") or found.get("failed") or ""))
+    return markdown(rows)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--out", type=Path, required=True)
-    parser.add_argument("--only", default=",".join(PARTS), help="parts, separated by commas")
     parser.add_argument("--paper", help="weights of a paper network")
+    parser.add_argument("--largest", type=int, default=512, help="bodies in the bowl")
     chosen = parser.parse_args()
-    parts = chosen.only.split(",")
-    if unknown := set(parts) - set(PARTS):
-        parser.error(f"no such part: {', '.join(sorted(unknown))}")
-    study = Study(chosen.out, chosen.paper)
-    chosen.out.mkdir(parents=True, exist_ok=True)
-    study.measure(parts)
-    results = study.results()
-    docs = Path(__file__).resolve().parents[1] / "docs"
-    page.insert(page.tables(results), docs / "scale.md")
-    page.draw(results, docs / "images/scale.png")
-    print(docs / "scale.md")
+    jobs = jobs_of(chosen.out, chosen.paper, chosen.largest)
+    results = measure(jobs, chosen.out / "results", where="fresh", on_progress=lambda _, message: print(message))
+    bowls = {key: found for key, found in results.items() if "bowl" in key[0] and "failed" not in found}
+    panels = []
+    for name in ("ms", "peak_mib"):
+        lines = []
+        for method in dict.fromkeys(method for _, method in bowls):
+            mine = [found for (_, one), found in bowls.items() if one == method]
+            lines.append(Line(method, [found["bodies"] for found in mine], [found[name] for found in mine]))
+        panels.append(Panel("spheres in a bowl", "spheres", COLUMNS[name], lines, "xy"))
+    draw(panels, chosen.out / "scale.png", dpi=110)
+    write_text(chosen.out / "table.md", table(results))
+    print(table(results))
 
 
 if __name__ == "__main__":

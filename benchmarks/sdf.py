@@ -1,111 +1,147 @@
-"""Question: how good, how fast and how large are our SDF networks, beside the paper's recipe and other representations?
+"""How good, how fast and how large our SDF networks are, beside the paper's recipe and other representations.
 
-    python benchmarks/sdf.py MESH_FOLDER -o runs/sdf [--parts 1,2,3,4,5,6] [--shapes cube,torus] [--seconds 60]
+    python benchmarks/sdf.py MESH_FOLDER -o DIR [--shapes cube,torus] [--seconds 60]
 
-MESH_FOLDER holds NAME/visual_geometry.obj for each shape. Parts: 1 our recipe against the paper's at equal wall time,
-2 widths of the network, 3 shapes on the way through training, 4 bytes, 5 query times, 6 nodes against coverage.
-Results go to sdf.json and, as markdown tables, to sdf.md in the folder, pictures to docs/images. A run that was
-interrupted goes on where it was: what sdf.json holds is not measured again.
+MESH_FOLDER holds NAME/visual_geometry.obj for each shape. Each is fitted with our recipe and the paper's at equal time,
+with other widths of the network, and with smaller budgets; then queries of one shape are timed. Fits that DIR holds are
+not made again. Writes DIR/table.md and DIR/sdf.png.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
+import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+import numpy as np
+import torch
 
-from benchmarks.sdf_parts import cost, recipes, spread, stages
-from benchmarks.sdf_parts.study import Study
 from sdfsim.errors import SdfsimError, run_main
+from sdfsim.evaluation.harness import Job, Line, Panel, Results, draw, machine, markdown, measure, number
 from sdfsim.files import write_text
+from sdfsim.shape.fit import FIT_VERSION, PLANS, Recipe, fit_mesh
+from sdfsim.shape.fit_metrics import EXACT
+from sdfsim.shape.mesh import load_mesh
+from sdfsim.shape.mlp_sdf import MlpSdf
+from sdfsim.shape.sdf import MeshSdf, sample_grid
+from sdfsim.shape.shape import load_shape
+from sdfsim.shape.watertight import solidify
 
-MESH = "visual_geometry.obj"
-
-
-class Part(NamedTuple):
-    """One part of the study.
-
-    Attributes:
-        title: of its section.
-        measure: fills what the results lack.
-        tables: markdown of what the results hold; empty where they hold nothing.
-        draw: writes its picture, if it has one.
-    """
-
-    title: str
-    measure: Callable[[Study], None]
-    tables: Callable[[Study], str]
-    draw: Callable[[Study], None] | None = None
+WIDTHS, BUDGETS = (32, 128), (5.0, 10.0, 20.0)  # s
+GRID, POINTS, REPEATS, CHUNK = 64, 250_000, 5, 16_384
+ERRORS = tuple(name for name, _ in EXACT)
 
 
-PARTS = {
-    1: Part("Our recipe and the paper's at equal time", recipes.measure_recipes, recipes.tables_of_recipes,
-            recipes.draw_recipes),
-    2: Part("Width of the network", recipes.measure_widths, recipes.tables_of_widths),
-    3: Part("Shapes on the way through training", stages.measure, stages.tables, stages.draw),
-    4: Part("Bytes", cost.measure_bytes, cost.tables_of_bytes),
-    5: Part("Query time", cost.measure_queries, cost.tables_of_queries),
-    6: Part("Nodes and coverage", spread.measure, spread.tables, spread.draw),
-}  # fmt: skip
+def fit(file: Path, folder: Path, recipe: Recipe, budget: float, width: int | None = None) -> dict:
+    """Fit a mesh, keep the shape, and tell the errors of its certificate, and the seconds that it took."""
+    usual = PLANS[recipe]
+    PLANS[recipe] = replace(usual, width=width or usual.width)
+    began = time.monotonic()
+    try:
+        shape = fit_mesh(load_mesh(file), name=file.parent.name, recipe=recipe, budget=budget)
+    finally:
+        PLANS[recipe] = usual
+    shape.save(folder)
+    told = {name: shape.certificate[name] for name in (*ERRORS, "steps")}
+    reason = shape.certificate["reason"] or shape.certificate["caveat"]
+    return told | {"seconds": time.monotonic() - began, "reason": reason}
 
 
-def report(study: Study, parts: list[int]) -> str:
-    """The sections of some parts, in markdown."""
-    sections = [(number, PARTS[number].tables(study)) for number in parts]
-    return "\n\n".join(f"## {PARTS[number].title}\n\n{text}" for number, text in sections if text) + "\n"
+def queries(file: Path, default: Path, paper: Path) -> dict:
+    """Seconds that value and gradient of a million points take, by representation; and the bytes of each."""
+    sdf, published, mesh = load_shape(default).sdf, load_shape(paper).sdf, solidify(load_mesh(file)).surface
+    grid, exact = sample_grid(sdf, sdf.bounds, GRID), MeshSdf(mesh)
+    assert isinstance(sdf, MlpSdf) and isinstance(published, MlpSdf)
+    metres = np.random.default_rng(0).uniform(sdf.bounds[0], sdf.bounds[1], (POINTS, 3))
+    points = torch.from_numpy(metres).float()
+    layers: list[torch.nn.Module] = []
+    for weight, bias in zip(published.weights, published.biases, strict=True):
+        linear = torch.nn.Linear(weight.shape[1], weight.shape[0])
+        linear.weight.data, linear.bias.data = weight.float(), bias.float()
+        layers += [linear, torch.nn.ReLU()]
+    network = torch.nn.Sequential(*layers[:-1]).requires_grad_(False)
 
+    def autograd() -> None:
+        for part in points.split(CHUNK):
+            asked = part.detach().requires_grad_()
+            torch.autograd.grad(network(asked).sum(), asked)
 
-def find_meshes(folder: Path) -> dict[str, Path]:
-    """Mesh file by shape name; folders without one are skipped.
+    def weights(of: MlpSdf) -> int:
+        return sum(4 * tensor.numel() for tensor in (*of.weights, *of.biases))
 
-    Raises:
-        SdfsimError: there is none at all.
-    """
-    found = {path.parent.name: path for path in sorted(folder.glob(f"*/{MESH}"))}
-    if not found:
-        raise SdfsimError(f"{folder}: holds no NAME/{MESH}")
-    return found
+    calls: dict[str, tuple[Callable[[], object], int]] = {
+        "our network": (lambda: sdf(points), weights(sdf)),
+        "paper's network by autograd": (autograd, weights(published)),
+        "paper's network by our sweeps": (lambda: published(points), weights(published)),
+        f"voxel grid {GRID}^3": (lambda: grid(points), 4 * GRID**3),
+        "exact mesh distance": (lambda: exact(metres), 12 * (len(mesh.vertices) + len(mesh.faces))),
+    }
+    taken: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(REPEATS + 1):  # in turns, so that whatever else the machine does hits all alike; the first is lost
+        for name, (call, _) in calls.items():
+            began = time.perf_counter()
+            call()
+            taken[name].append(time.perf_counter() - began)
+    return {
+        name: {"seconds": 1e6 / POINTS * float(np.median(took[1:])), "bytes": calls[name][1]}
+        for name, took in taken.items()
+    }
 
 
 def main() -> None:
-    """Measures what is missing, part by part, then prints the tables of the parts asked for."""
-    root = Path(__file__).resolve().parent.parent
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("meshes", type=Path, metavar="MESH_FOLDER")
-    parser.add_argument("-o", "--out", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--parts", default=",".join(map(str, PARTS)), help="numbers, separated by commas")
-    parser.add_argument("--shapes", help="names, separated by commas; by default what each part is meant for")
+    parser.add_argument("-o", "--out", type=Path, required=True)
+    parser.add_argument("--shapes", help="names, separated by commas (default: all)")
     parser.add_argument("--seconds", type=float, default=60.0, help="budget of a fit")
-    parser.add_argument("--threads", type=int, default=2, help="at most")
-    parser.add_argument("--points", type=int, default=250_000, help="in a timed query")
-    parser.add_argument("--pictures", type=Path, default=root / "docs" / "images", metavar="DIR")
-    arguments = parser.parse_args()
-    try:
-        parts = sorted({int(part) for part in arguments.parts.split(",")})
-    except ValueError:
-        parts = []
-    if not parts or not set(parts) <= set(PARTS):
-        parser.error(f"--parts takes numbers from 1 to {len(PARTS)}, separated by commas (got {arguments.parts})")
-    meshes = find_meshes(arguments.meshes)
-    chosen = tuple(arguments.shapes.split(",")) if arguments.shapes else None
-    unknown = sorted(set(chosen or ()) - set(meshes))
-    if unknown:
-        raise SdfsimError(f"no such shape: {', '.join(unknown)}", f"there are {', '.join(meshes)}")
-    study = Study(
-        meshes, arguments.out, arguments.pictures, arguments.seconds, arguments.threads, chosen, arguments.points
-    )
-    study.open()
-    for number in parts:
-        PARTS[number].measure(study)
-        draw = PARTS[number].draw
-        if draw is not None:
-            draw(study)
-        write_text(study.out / "sdf.md", report(study, list(PARTS)))
-    print(report(study, parts), end="")
+    chosen = parser.parse_args()
+    files = {file.parent.name: file for file in sorted(chosen.meshes.glob("*/visual_geometry.obj"))}
+    names = chosen.shapes.split(",") if chosen.shapes else list(files)
+    if not files or set(names) - set(files):
+        raise SdfsimError(f"{chosen.meshes}: no NAME/visual_geometry.obj of {', '.join(names) or 'any shape'}")
+    methods = {"ours": ("default", chosen.seconds), "paper's recipe": ("paper", chosen.seconds)}
+    methods |= {f"ours, {width} wide": ("default", chosen.seconds, width) for width in WIDTHS}
+    methods |= {f"ours, {budget:g} s": ("default", budget) for budget in BUDGETS}
+    jobs = []
+    for name in names:
+        for method, plan in methods.items():
+            content = [FIT_VERSION, load_mesh(files[name]), plan, PLANS[plan[0]], machine()]
+            jobs.append(Job(name, method, content, fit, (files[name], chosen.out / "shapes" / method / name, *plan)))
+    tell = lambda fraction, message: print(f"{fraction:4.0%} {message}", flush=True)  # noqa: E731
+    fits = measure(jobs, chosen.out / "results", on_progress=tell)
+    shapes = [chosen.out / "shapes" / method / names[0] for method in ("ours", "paper's recipe")]
+    asked = Job(names[0], "queries", [jobs[0].content], queries, (files[names[0]], *shapes))
+    timed = measure([asked], chosen.out / "results", on_progress=tell)[names[0], "queries"]
+    draw(panels(fits, names), chosen.out / "sdf.png", dpi=110)
+    rows = [("", f"s per million points of {names[0]}", "bytes")]
+    rows += [(name, number(found["seconds"]), f"{found['bytes']:,}") for name, found in timed.items()]
+    text = f"{table(fits)}\n{markdown(rows)}"
+    write_text(chosen.out / "table.md", text)
+    print(text)
+
+
+def table(fits: Results) -> str:
+    """A row a fit: errors relative to the largest extent, and what of the certificate it missed."""
+    rows: list[tuple[str, ...]] = [("shape", "fit", *ERRORS, "updates", "s", "missed")]
+    for (name, method), found in fits.items():
+        cells = (number(found.get(key)) for key in (*ERRORS, "steps", "seconds"))
+        rows.append((name, method, *cells, found.get("failed") or found["reason"]))
+    return markdown(rows)
+
+
+def panels(fits: Results, names: list[str]) -> list[Panel]:
+    """Errors against seconds of our fits, a line a shape."""
+    shown = []
+    for key, limit in (EXACT[0], EXACT[2]):
+        lines = []
+        for name in names:
+            mine = [fits[name, method] for method in (*(f"ours, {b:g} s" for b in BUDGETS), "ours")]
+            mine = [found for found in mine if "failed" not in found]
+            lines.append(Line(name, [found["seconds"] for found in mine], [found[key] for found in mine]))
+        shown.append(Panel(key.replace("_", " "), "seconds", "of the largest extent", lines, "xy", limit))
+    return shown
 
 
 if __name__ == "__main__":

@@ -1,14 +1,18 @@
-"""Posed cameras: intrinsics, poses, rays; and the file they live in."""
+"""Posed cameras and sparse points: their files, similarity transforms, and how cameras stand about a scene."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_arrays, read_json, write_json
+
+# People hold cameras level to about this; where photos are turned, or all from one place, next to nothing is known.
+CAREFUL, UNKNOWN = 2.0, 30.0  # degrees
 
 
 @dataclass(frozen=True)
@@ -70,11 +74,43 @@ class View:
         scale = self.focal * (1 + self.k * (xy**2).sum(1, keepdims=True))
         return scale * xy + [self.cx, self.cy], depth
 
-    def transformed(self, scale: float, rotation: np.ndarray, translation: np.ndarray) -> View:
-        """The view after the world moved by x -> scale R x + t."""
-        turned = self.rotation @ rotation.T
-        moved = scale * self.translation - turned @ translation
-        return View(**{**self.__dict__, "rotation": turned, "translation": moved})
+
+@dataclass(frozen=True)
+class Similarity:
+    """A change of scale, orientation and place: x -> scale * rotation x + translation.
+
+    Attributes:
+        scale: > 0.
+        rotation: [3, 3].
+        translation: [3].
+    """
+
+    scale: float
+    rotation: np.ndarray
+    translation: np.ndarray
+
+    def points(self, points: np.ndarray) -> np.ndarray:
+        """Points [P, 3], moved."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+    def inverse(self) -> Similarity:
+        """The way back."""
+        return Similarity(1 / self.scale, self.rotation.T, -(np.asarray(self.translation) @ self.rotation) / self.scale)
+
+    def view(self, view: View) -> View:
+        """A camera, moved with its world."""
+        turned = view.rotation @ self.rotation.T
+        moved = self.scale * view.translation - turned @ self.translation
+        return replace(view, rotation=turned, translation=moved)
+
+    def to_dict(self) -> dict:
+        """Plain values for JSON."""
+        return {"scale": self.scale, "rotation": self.rotation.tolist(), "translation": self.translation.tolist()}
+
+    @staticmethod
+    def from_dict(data: dict) -> Similarity:
+        """The inverse of `to_dict`."""
+        return Similarity(float(data["scale"]), np.array(data["rotation"]), np.array(data["translation"]))
 
 
 @dataclass(frozen=True)
@@ -106,21 +142,14 @@ def save_views(views: list[View], path: Path) -> None:
     write_json(path, data)
 
 
-def load_views(folder: Path) -> list[View]:
-    """Reads the views of a poses folder.
-
-    Raises:
-        SdfsimError: no readable `cameras.json`.
-    """
-    return load_view_file(Path(folder) / "cameras.json")
-
-
-def load_view_file(path: Path) -> list[View]:
-    """Reads the views that `save_views` wrote to a file.
+def load_views(path: Path) -> list[View]:
+    """Reads the views of a poses folder, or of a file that `save_views` wrote.
 
     Raises:
         SdfsimError: it is absent or damaged.
     """
+    path = Path(path)
+    path = path / "cameras.json" if path.is_dir() else path
     data = read_json(path, "run the poses stage first")
     try:
         return [
@@ -143,3 +172,76 @@ def load_sparse(folder: Path) -> Sparse:
         return Sparse(**{key: data[key] for key in ("xyz", "rgb", "error", "point_of", "view_of")})
     except KeyError as error:
         raise SdfsimError(f"{path}: damaged: no {error}", "run the poses stage again") from error
+
+
+def frame_of(normal: np.ndarray) -> np.ndarray:
+    """A right-handed rotation [3, 3] whose last row is a unit normal [3]."""
+    side = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    side /= np.linalg.norm(side)
+    return np.stack([side, np.cross(normal, side), normal])
+
+
+def nearest_to_axes(centers: np.ndarray, axes: np.ndarray, anchor: np.ndarray | None = None) -> np.ndarray:
+    """The point [3] nearest to all lines (centre + t axis) in the least-squares sense.
+
+    Args:
+        centers: [N, 3] points on the lines.
+        axes: [N, 3] unit directions.
+        anchor: [3] drawn to weakly, which settles the depth where the lines are nearly parallel.
+    """
+    projector = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    matrix, right = projector.sum(0), (projector @ centers[:, :, None]).sum(0)[:, 0]
+    weight = 1e-6 if anchor is None else 0.02
+    pull = centers.mean(0) + axes.mean(0) if anchor is None else anchor
+    matrix = matrix + weight * len(centers) * np.eye(3)
+    return np.linalg.solve(matrix, right + weight * len(centers) * pull)
+
+
+class CameraUp(NamedTuple):
+    """Up from the cameras alone: the unit vector [3], and degrees within which it can be trusted."""
+
+    normal: np.ndarray
+    within: float
+
+
+def camera_up(views: list[View]) -> CameraUp:
+    """Up from the cameras alone: people hold cameras level, so their right axes are horizontal.
+
+    The direction with the least spread of the right axes, with the sign of the mean image up. Where the right axes
+    span no plane (a single viewpoint, or photos turned by 90 degrees) the mean image up itself.
+    """
+    right = np.array([v.rotation[0] for v in views])
+    mean = -np.mean([v.rotation[1] for v in views], axis=0)
+    mean /= np.linalg.norm(mean) + 1e-12
+    values, vectors = np.linalg.eigh(right.T @ right / len(right))
+    up = vectors[:, 0] * np.sign(vectors[:, 0] @ mean or 1.0)
+    if values[1] < 0.05 or values[0] > 0.3 * values[1] or up @ mean < 0.5:
+        return CameraUp(mean, UNKNOWN)
+    # Where the right axes fan out little, a roll of each camera tilts the whole the more.
+    return CameraUp(up, float(np.hypot(CAREFUL, np.degrees(np.sqrt(max(values[0], 0) / values[1])))))
+
+
+def focus(views: list[View]) -> tuple[np.ndarray, np.ndarray]:
+    """Point [3] that the cameras look at, and unit directions [N, 3] from them to it."""
+    centers = np.array([v.center for v in views])
+    point = nearest_to_axes(centers, np.array([v.rotation[2] for v in views]))
+    rays = point - centers
+    return point, rays / (np.linalg.norm(rays, axis=1, keepdims=True) + 1e-12)
+
+
+def spread_angle(views: list[View]) -> float:
+    """Largest angle (degrees) between viewing rays to the centre of what the cameras look at."""
+    rays = focus(views)[1]
+    return float(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1, 1))))
+
+
+def view_span(views: list[View]) -> float:
+    """Degrees around the scene's upright axis from which it was photographed: 360 less the largest gap."""
+    rays, up = focus(views)[1], camera_up(views).normal
+    flat = rays - np.outer(rays @ up, up)
+    level = np.linalg.norm(flat, axis=1) > 0.1  # a photo from straight above has no side
+    if level.sum() < 2:
+        return 0.0
+    east = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    angle = np.sort(np.degrees(np.arctan2(flat[level] @ np.cross(up, east), flat[level] @ east)))
+    return 360.0 - float(np.diff(np.append(angle, angle[0] + 360)).max())

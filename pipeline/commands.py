@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal
 import typer
 
 from sdfsim.commands.arguments import Budget, Cluster, Device, Json, Out, Verbose, tell_failed
+from sdfsim.console import Session, duration
 from sdfsim.errors import EXIT_ERROR
-from sdfsim.progress import Session, duration
 
 Preset = Annotated[
     Literal["quick", "standard", "fine", "paper"],
@@ -32,14 +32,6 @@ Crop = Annotated[
         metavar="X,Y,Z X,Y,Z", help="Corners of the box to keep, metres, the lower one first.", show_default=False
     ),
 ]
-Keep = Annotated[
-    list[str] | None,
-    typer.Option(metavar="NAME", help="Keep a piece that would be left out; all keeps every one.", show_default=False),
-]
-Static = Annotated[
-    list[str] | None,
-    typer.Option(metavar="NAME", help="This body stays where it is (mesh/objects.png has names).", show_default=False),
-]
 DropShape = Annotated[Literal["box", "ball", "none"], typer.Option("--drop", help="What falls onto the scene.")]
 
 
@@ -55,8 +47,6 @@ def reconstruct(
     size: Size = None,
     distance: Distance = None,
     crop: Crop = None,
-    keep: Keep = None,
-    static: Static = None,
     drop: DropShape = "box",
     budget: Budget = None,
     as_json: Json = False,
@@ -75,8 +65,6 @@ def reconstruct(
             size=size,
             distance=list(distance) if distance else None,
             crop=corners,
-            keep=keep or [],
-            static=static or [],
             drop=drop,
             budget=budget,
             from_stage=first,
@@ -124,7 +112,6 @@ def mesh(
     size: Size = None,
     distance: Distance = None,
     crop: Crop = None,
-    keep: Keep = None,
     as_json: Json = False,
     device: Device = "auto",
     verbose: Verbose = False,
@@ -132,8 +119,7 @@ def mesh(
     """Field -> upright meshes of the scenery and of the bodies that stand on it."""
     known = list(distance) if distance else None
     _stage(
-        "mesh", folder, as_json, verbose, preset=preset, size=size, distance=known, crop=_corners(crop), keep=keep,
-        device=device,
+        "mesh", folder, as_json, verbose, preset=preset, size=size, distance=known, crop=_corners(crop), device=device,
     )  # fmt: skip
 
 
@@ -218,9 +204,10 @@ def _stage(name: str, folder: Path, as_json: bool, verbose: bool, *, then: Stage
 
 
 def _report_stages(session: Session, report: dict, folder: Path) -> None:
-    from pipeline import recording
+    from pipeline import report as reports
+    from pipeline import stages
 
-    if made := recording.record(folder):
+    if made := reports.write_recording(folder, stages.current(folder)):
         report["paths"]["recording"] = str(made)
     lines = [f"{stage:<8} {duration(seconds)}" for stage, seconds in report["seconds"].items()]
     lines += [f"{what}: {path}" for what, path in report["paths"].items()]

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from pipeline.wishes import Known, Wishes
 from sdfsim.errors import SdfsimError
 from sdfsim.files import CONFIG, write_text
 
-PRESETS = ("quick", "standard", "fine", "paper")
 COMMAND = "reconstruct"
-DROPS = ("box", "ball", "none")
-DEVICES = ("auto", "cpu", "cuda")
+ALLOWED = {
+    "preset": ("quick", "standard", "fine", "paper"),
+    "device": ("auto", "cpu", "cuda"),
+    "drop": ("box", "ball", "none"),
+}
+METRES = (1e-4, 1e5)  # smallest and largest length that can be given
 
 
 @dataclass
@@ -31,10 +33,9 @@ class Options:
         seed: of everything random.
         device: auto, cpu or cuda.
         recipe: of the fit; None: quick for the preset quick, else the default one.
-        distance: two places and the metres between them, see `Known`; None: size counts.
+        distance: two places and the metres between them; None: size counts. A place is `photo.jpg:x,y`, the point of
+            the surface that this pixel shows, or `photo.jpg`, the camera itself.
         crop: m, corners x, y, z, x, y, z of the box that is kept; None: everything.
-        keep: pieces to keep that would be left out, by name; "all" for every one.
-        static: bodies that are to stay where they are, by name.
         drop: what is dropped onto the scene: box, ball or none.
     """
 
@@ -47,68 +48,37 @@ class Options:
     recipe: str | None = None
     distance: list | None = None
     crop: list[float] | None = None
-    keep: list[str] = field(default_factory=list)
-    static: list[str] = field(default_factory=list)
     drop: str = "box"
 
     def check(self) -> None:
         """Raises SdfsimError where a value makes no sense."""
-        if self.preset not in PRESETS:
-            raise SdfsimError(f"preset: {self.preset!r} is not one of {', '.join(PRESETS)}")
-        if self.size is not None and not 1e-4 <= self.size <= 1e5:
-            raise SdfsimError(f"size: must be between 0.0001 and 100000 m (got {self.size:g})")
+        for name, allowed in ALLOWED.items():
+            if getattr(self, name) not in allowed:
+                raise SdfsimError(f"{name}: {getattr(self, name)!r} is not one of {', '.join(allowed)}")
+        lengths = {"size": self.size, "distance": self.distance[2] if self.distance else None}
+        for name, metres in lengths.items():
+            if metres is not None and not METRES[0] <= metres <= METRES[1]:
+                raise SdfsimError(f"{name}: must be between {METRES[0]:g} and {METRES[1]:g} m (got {metres:g})")
         if self.budget is not None and not self.budget > 0:
             raise SdfsimError(f"budget: must be > 0 s (got {self.budget:g})")
         if self.size is not None and self.distance is not None:
             raise SdfsimError("size and distance: both set the scale", "give one of them")
-        if self.device not in DEVICES:
-            raise SdfsimError(f"device: {self.device!r} is not one of {', '.join(DEVICES)}")
-        if self.drop not in DROPS:
-            raise SdfsimError(f"drop: {self.drop!r} is not one of {', '.join(DROPS)}")
+        if self.distance is not None and self.distance[0] == self.distance[1]:
+            raise SdfsimError(f"distance: both ends are {self.distance[0]}", "give two places that are some way apart")
         if self.crop is not None and not np.less(self.crop[:3], self.crop[3:]).all():
             raise SdfsimError(
                 f"crop: the second corner must lie beyond the first in x, y and z (got {self.crop})",
                 "corners are x,y,z in metres, the lower one first",
             )
-        self.wishes()
 
     def changed(self, changes: dict[str, Any]) -> Options:
-        """With other values; a new size takes the place of a known distance, and the other way round."""
+        """The options with other values; a new size takes the place of a known distance, and the other way round."""
         instead = {"size": "distance", "distance": "size"}
         return replace(self, **({instead[key]: None for key in changes if key in instead} | changes))
-
-    def wishes(self) -> Wishes:
-        """What a person asks of the meshes.
-
-        Raises:
-            SdfsimError: the distance makes no sense.
-        """
-        known = None
-        if self.distance is not None:
-            known = Known(str(self.distance[0]), str(self.distance[1]), float(self.distance[2]))
-            known.check()
-        crop = None if self.crop is None else np.reshape(self.crop, (2, 3))
-        return Wishes(self.size, known, crop, tuple(self.keep))
 
     def fit_recipe(self) -> str:
         """The recipe of the fit, see `fit_mesh`."""
         return self.recipe or ("quick" if self.preset == "quick" else "default")
-
-    def of_stage(self, stage: str) -> dict[str, Any]:
-        """The options that a stage's result depends on."""
-        common = {"preset": self.preset, "seed": self.seed}
-        if stage == "photos":
-            return {}
-        if stage == "poses":
-            return {"seed": self.seed}
-        if stage == "distill":
-            return {**common, "budget": self.budget}
-        if stage == "mesh":
-            keys = ("preset", "size", "distance", "crop", "keep")
-            return {key: getattr(self, key) for key in keys}
-        if stage == "fit":
-            return {"seed": self.seed, "budget": self.budget, "recipe": self.fit_recipe()}
-        return {"seed": self.seed, "drop": self.drop, "static": self.static}
 
 
 def write_config(options: Options, folder: Path) -> None:
@@ -125,8 +95,6 @@ def read_config(folder: Path) -> Options:
     """
     try:
         data = yaml.safe_load((folder / CONFIG).read_text(encoding="utf-8"))
-        data.pop("version", None)
-        data.pop("command", None)
-        return Options(**data)
+        return Options(**{key: value for key, value in data.items() if key not in ("version", "command")})
     except (OSError, yaml.YAMLError, TypeError, AttributeError) as error:
         raise SdfsimError(f"{folder}: not the folder of a reconstruction", "run `sdfsim reconstruct` first") from error

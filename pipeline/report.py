@@ -1,65 +1,55 @@
-"""Which stages of a run are current, and the report made from their records."""
+"""What a run reports: report.json, the same for people in report.md, and a rerun recording of cameras and surface."""
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
-from pipeline import record
+import numpy as np
+
+from pipeline.cameras import View, camera_up, frame_of, load_sparse, load_views
 from pipeline.options import Options
 from sdfsim.errors import SdfsimError
-from sdfsim.files import read_json, write_json
+from sdfsim.files import read_json, write_json, write_text
 
-STAGES = ("photos", "poses", "distill", "mesh", "fit", "scene")
 # What a person looks for, and the stage that writes it.
 RESULTS = {
     "scene": ("scene.yaml", "scene"), "shape": ("assets/scene", "fit"), "mesh": ("mesh/mesh.ply", "mesh"),
-    "names": ("mesh/objects.png", "mesh"),
-    "cameras": ("poses/cameras.json", "poses"), "report": ("report.html", "photos"),
+    "names": ("mesh/objects.png", "mesh"), "cameras": ("poses/cameras.json", "poses"),
+    "report": ("report.md", "photos"),
 }  # fmt: skip
-NAMED = 10  # photos left out that are named one by one
+RECORDING = "reconstruction.rrd"
+NAMED = 10  # photos that a note names one by one
 FEW_PHOTOS, LOW_PSNR, HIGH_ERROR = 20, 20.0, 1.0
 
 
-def place_of(folder: Path, stage: str) -> Path:
-    """Where a stage's result lies in the folder of a run."""
-    return folder / ("assets" if stage == "fit" else stage)
-
-
-def current(folder: Path) -> dict[str, dict]:
-    """Records by stage, up to the first stage that is missing or was made from another result of the one before."""
-    found: dict[str, dict] = {}
-    before = None
-    for stage in STAGES:
-        known = record.read(place_of(folder, stage))
-        if known is None or (before is not None and known["inputs"] != before["made"]):
-            break
-        found[stage] = before = known
-    return found
-
-
-def write_report(folder: Path, options: Options, failed: tuple[str, SdfsimError] | None = None) -> dict:
-    """Writes report.json from the records of the current stages; returns it.
+def write_report(
+    folder: Path, options: Options, records: dict[str, dict], failed: tuple[str, SdfsimError] | None = None
+) -> dict:
+    """Writes report.json and report.md; returns the former.
 
     Args:
         folder: of the run.
         options: of the run.
+        records: of the current stages.
         failed: the stage that ended in an error, and the error.
     """
-    records = current(folder)
     stages = {stage: known["report"] for stage, known in records.items()}
     seconds = {stage: round(known["seconds"], 1) for stage, known in records.items()}
     fit = stages.get("fit", {})
-    missed = [f"fit: {fit.get('reason') or 'certificate missed'}"] if fit.get("passed") is False else []
-    poses = stages.get("poses") or (unfinished(folder, "poses", "verdict.json") if failed else {})
-    report = {
+    poses = stages.get("poses", {})
+    if failed and not poses:
+        try:
+            poses = read_json(folder / ".poses.part" / "checks.json")
+        except SdfsimError:
+            poses = {}
+    report: dict[str, Any] = {
         "version": 1, "options": asdict(options), "seconds": seconds, "seconds_total": round(sum(seconds.values()), 1),
         "psnr": stages.get("distill", {}).get("psnr"), "stages": stages, "poses": poses, "notes": notes(stages),
-        "photos": photo_rows(folder, stages, poses), "failed_checks": missed,
-        "paths": {
-            name: str(folder / path) for name, (path, stage) in RESULTS.items()
-            if stage in stages and (folder / path).exists()
-        },
+        "photos": photo_rows(folder, stages, poses),
+        "failed_checks": [f"fit: {fit.get('reason') or 'certificate missed'}"] if fit.get("passed") is False else [],
     }  # fmt: skip
     if failed:
         stage, error = failed
@@ -70,16 +60,13 @@ def write_report(folder: Path, options: Options, failed: tuple[str, SdfsimError]
             "the shortest of fits take their time"
         )
     report["improve"] = improvements(report)
+    write_text(folder / "report.md", page(report, folder))
+    report["paths"] = {
+        name: str(folder / path) for name, (path, stage) in RESULTS.items()
+        if stage in stages and (folder / path).exists()
+    }  # fmt: skip
     write_json(folder / "report.json", report)
     return report
-
-
-def unfinished(folder: Path, stage: str, name: str) -> dict:
-    """A file that a stage left which did not finish; empty where there is none."""
-    try:
-        return read_json(folder / f".{stage}.part" / name)
-    except SdfsimError:
-        return {}
 
 
 def photo_rows(folder: Path, stages: dict[str, dict], poses: dict) -> list[dict]:
@@ -90,16 +77,15 @@ def photo_rows(folder: Path, stages: dict[str, dict], poses: dict) -> list[dict]
         photos = []
     why = {entry["photo"]: entry["why"] for entry in poses.get("left_out", [])}
     distill = stages.get("distill", {})
-    scores = distill.get("psnr_each", [])
-    held = dict(zip(distill.get("held_out_photos", []), scores, strict=False)) if scores else {}
+    held = dict(zip(distill.get("held_out_photos", []), distill.get("psnr_each", []), strict=False))
     rows = []
     for photo in photos:
         name = photo["source"]
-        verdict = "left out" if name in why else "held out" if name in held else "posed" if poses else "prepared"
+        state = "left out" if name in why else "held out" if name in held else "posed" if poses else "prepared"
         rows.append({
-            "photo": name, "file": photo["name"], "verdict": verdict, "why": why.get(name, ""),
-            "fault": photo.get("fault", ""), "sharpness": photo["sharpness"], "mask": photo["mask"],
-            "size": [photo["width"], photo["height"]], "focal_exif": photo["focal"], "psnr": held.get(name),
+            "photo": name, "file": photo["name"], "state": state, "why": why.get(name, ""), "fault": photo["fault"],
+            "sharpness": photo["sharpness"], "mask": photo["mask"], "size": [photo["width"], photo["height"]],
+            "focal_exif": photo["focal"], "psnr": held.get(name),
         })  # fmt: skip
     return rows
 
@@ -111,9 +97,8 @@ def improvements(report: dict) -> list[str]:
     for fault in ("blurred", "too dark", "burnt out"):
         names = [photo["photo"] for photo in report["photos"] if photo["fault"] == fault]
         if names:
-            lines.append(
-                f"take again what is {fault}: {', '.join(names[:NAMED])}{' ...' if len(names) > NAMED else ''}"
-            )
+            more = " ..." if len(names) > NAMED else ""
+            lines.append(f"take again what is {fault}: {', '.join(names[:NAMED])}{more}")
     if 0 < len(report["photos"]) < FEW_PHOTOS:
         lines.append(f"take more photos: {len(report['photos'])} are few, 20 to 60 are good")
     if poses and poses.get("span_degrees", 360) < 150 and not poses.get("failures"):
@@ -149,13 +134,110 @@ def notes(stages: dict[str, dict]) -> list[str]:
         lines.append(f"bodies of their own: {', '.join(mesh['objects'])} (mesh/objects.png shows which is which)")
     if "smallest_object_m" in mesh:
         lines.append(f"what rises less than {mesh['smallest_object_m']:.2g} m stays part of what it stands on")
-    if mesh.get("crumbs"):
-        lines.append(f"{mesh['crumbs']} loose crumbs beside bodies were taken away with them")
+    if mesh.get("left_out_m"):
+        largest = max(mesh["left_out_m"])
+        lines.append(f"{len(mesh['left_out_m'])} loose pieces were left out, the largest {largest:.2g} m long")
     lines += [f"usable, not exact: {caveat}" for caveat in stages.get("fit", {}).get("caveats", [])]
-    pieces = mesh.get("left_out", [])
-    for piece in pieces[:NAMED]:
-        name = piece["name"]
-        lines.append(f"left out: {name}, {piece['size_m']:.2g} m long: {piece['why']} (--keep {name} keeps it)")
-    if len(pieces) > NAMED:
-        lines.append(f"left out: {len(pieces) - NAMED} smaller pieces (--keep all keeps them)")
     return lines + stages.get("scene", {}).get("notes", [])
+
+
+def page(report: dict, folder: Path) -> str:
+    """The report as Markdown; its pictures are files of the run."""
+    poses, stages = report["poses"], report["stages"]
+    mesh, distill = stages.get("mesh", {}), stages.get("distill", {})
+    lines = [f"# Reconstruction of {Path(report['options']['photos']).name}", ""]
+    if "error" in report:
+        error = report["error"]
+        lines += [f"**It stopped in the {error['stage']} stage:** {error['message']}", "", error["hint"], ""]
+    elif report["failed_checks"]:
+        lines += [f"**It ran, but missed a check:** {'; '.join(report['failed_checks'])}", ""]
+    else:
+        lines += [f"**Done:** {', '.join(stages)}", ""]
+    for title, entries in (("What to know", report["notes"]), ("What to improve", report["improve"])):
+        if entries:
+            lines += [f"## {title}", "", *(f"- {entry}" for entry in entries), ""]
+    rows: list[tuple[str, object]] = []
+    if poses:
+        fov = ", ".join(f"{angle:.1f}°" for angle in poses["field_of_view"])
+        rows += [
+            ("photos with a pose", f"{poses['posed']} of {poses['photos']}"),
+            ("mean reprojection error", f"{poses['mean_error']:.2f} px, {poses['points']} points"),
+            ("field of view of the longer side", fov),
+            ("viewing directions", f"{poses.get('span_degrees', 0):.0f}° around"),
+            ("pairs of photos that contradict the poses", f"{poses.get('contradictions', 0):.1%}"),
+        ]
+        rows += [(f"attempt: {one['name']}", "; ".join(one["failures"]) or f"good, {one['posed']} posed")
+                 for one in poses.get("attempts", [])]  # fmt: skip
+    if report["psnr"] is not None:
+        rows.append(("photos that were not trained on", f"PSNR {report['psnr']:.1f} dB"))
+    if mesh:
+        rows += [
+            ("extent", " x ".join(f"{side:.3g}" for side in mesh["extent_m"]) + " m"), ("scale", mesh["size"]),
+            ("up", f"from the {mesh['up_from']}, within {mesh['up_within_degrees']:.1f}°"),
+        ]  # fmt: skip
+    for name, certificate in stages.get("fit", {}).get("shapes", {}).items():
+        bad = f"not usable: {certificate['reason']}"
+        rows.append((f"shape {name}", certificate["caveat"] or "exact" if certificate["passed"] else bad))
+    rows += [(f"seconds: {stage}", seconds) for stage, seconds in report["seconds"].items()]
+    lines += ["## Numbers", "", "| | |", "| --- | --- |", *(f"| {name} | {value} |" for name, value in rows), ""]
+    if (folder / "mesh" / "objects.png").exists() and mesh:
+        lines += ["## What was found", "", "![bodies by name](mesh/objects.png)", ""]
+    files = {photo["photo"]: photo["file"] for photo in report["photos"]}
+    held = [name for name in distill.get("held_out_photos", []) if name in files]
+    if held:
+        lines += ["## Photos that were not trained on: photo and render", ""]
+        lines += [f"![{name}](photos/images/{files[name]}) ![render](distill/held_out/{files[name]})" for name in held]
+    lines += ["", "## Photos", "", "| photo | | | |", "| --- | --- | --- | --- |"]
+    lines += [f"| {row['photo']} | {row['state']} | {row['why']} | {row['fault']} |" for row in report["photos"]]
+    return "\n".join(lines) + "\n"
+
+
+def write_recording(folder: Path, done: Collection[str]) -> Path | None:
+    """Writes `reconstruction.rrd`: cameras with their photos, sparse points, and the surface.
+
+    Before the mesh stage it is in the units of the camera poses, from then on in metres with z up.
+
+    Args:
+        folder: of the run.
+        done: the stages whose results are current.
+
+    Returns:
+        Its path, or None before the poses stage.
+
+    Raises:
+        SdfsimError: a stage's folder is damaged, or the file cannot be written.
+    """
+    from sdfsim.recording import PosedPhoto, save_reconstruction
+    from sdfsim.shape.mesh import load_mesh
+
+    if "poses" not in done:
+        return None
+    views, points, colors = _in_place(folder, done)
+    mesh = load_mesh(folder / "mesh" / "mesh.ply") if "mesh" in done else None
+    photos = []
+    for view in views:
+        image = folder / "photos" / "images" / view.name
+        photos.append(
+            PosedPhoto(view.source, image if image.is_file() else None, view.focal, (view.cx, view.cy),
+                       (view.width, view.height), view.rotation, view.translation)
+        )  # fmt: skip
+    save_reconstruction(folder / RECORDING, photos, points, colors, mesh)
+    return folder / RECORDING
+
+
+def _in_place(folder: Path, done: Collection[str]) -> tuple[list[View], np.ndarray, np.ndarray]:
+    """Cameras, sparse points [P, 3] and their colours [P, 3]: in metres with z up once there is a mesh.
+
+    Before the mesh stage they are in the units of the poses, turned so that z is up as far as the cameras tell.
+    """
+    views, sparse = load_views(folder / "poses"), load_sparse(folder / "poses")
+    if "mesh" in done:
+        from pipeline.field.training import load_field
+        from pipeline.mesh.placement import load_placement
+
+        to_unit, placed = load_field(folder / "distill").to_unit, load_placement(folder / "mesh").to_metres
+        return [placed.view(to_unit.view(v)) for v in views], placed.points(to_unit.points(sparse.xyz)), sparse.rgb
+    from pipeline.cameras import Similarity
+
+    turn = Similarity(1.0, frame_of(camera_up(views).normal), np.zeros(3))
+    return [turn.view(view) for view in views], turn.points(sparse.xyz), sparse.rgb

@@ -18,13 +18,12 @@ import yaml
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from sdfsim.shape.shape import Shape, load_shape
-
-from pipeline.drop import Above
-from pipeline.meshing import SCENERY, rounded
+from pipeline.export import Above
+from pipeline.mesh.meshing import SCENERY, rounded
 from sdfsim.errors import run_main
 from sdfsim.files import write_text
-from sdfsim.scene.load import load_scene
+from sdfsim.scene.scene_file import load_scene
+from sdfsim.shape.shape import Shape, load_shape
 
 GRAVITY = 9.81  # m/s^2
 HEAVIER = 2.0  # the ball's mass over the body's

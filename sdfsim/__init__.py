@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from sdfsim.dynamics.rollout import Rollout
     from sdfsim.dynamics.simulator import Simulator
     from sdfsim.errors import SceneError, SdfsimError
-    from sdfsim.scene.load import load_scene
+    from sdfsim.scene.scene_file import load_scene
     from sdfsim.shape.shape import Shape, load_shape
 
 # Threads of torch wait for one another by spinning, and beside other programs they take the processor from those they
@@ -30,7 +30,7 @@ _HOME = {
     "SdfsimError": "sdfsim.errors",
     "Shape": "sdfsim.shape.shape",
     "Simulator": "sdfsim.dynamics.simulator",
-    "load_scene": "sdfsim.scene.load",
+    "load_scene": "sdfsim.scene.scene_file",
     "load_shape": "sdfsim.shape.shape",
 }
 

@@ -8,17 +8,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from sdfsim.console import columns, duration
 from sdfsim.dynamics.bodies import largest_extent
 from sdfsim.dynamics.simulator import pick_device
 from sdfsim.errors import SdfsimError
 from sdfsim.files import check_writable, locked, read_json
 from sdfsim.parallel import parallel
-from sdfsim.progress import columns, duration
-from sdfsim.scene.schema import UNITS
+from sdfsim.scene.scene_file import UNITS
 from sdfsim.shape.distance import MeshDistance
 from sdfsim.shape.fit import FIT_VERSION, Recipe, fit_mesh, fit_solids
 from sdfsim.shape.mesh import MESH_SUFFIXES, Mesh, load_mesh
-from sdfsim.shape.shape import RECORD_FILE, Shape
+from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape
 from sdfsim.shape.watertight import solidify
 
 Progress = Callable[[float, str], None]
@@ -27,7 +27,7 @@ Progress = Callable[[float, str], None]
 STACK = 256
 # m, sizes that need no word.
 USUAL = (1e-3, 100.0)
-ERRORS = ("error_within_0.01", "error_within_0.1", "error_in_box", "projected_from_0.01", "hausdorff", "sign_errors")
+ERRORS = ("error_within_0.01", "error_within_0.1", "error_in_box", "projected_from_0.01", "sign_errors")
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Options:
 
 
 def fit(mesh_file: Path, out: Path, options: Options, *, device: str, on_progress: Progress) -> dict[str, Any]:
-    """Fit a mesh file and write the shape folder `out`; a fit that was cut off goes on where it was.
+    """Fit a mesh file and write the shape folder `out`.
 
     Args:
         mesh_file: to be fitted.
@@ -61,7 +61,6 @@ def fit(mesh_file: Path, out: Path, options: Options, *, device: str, on_progres
     mesh = _load(mesh_file, options)
     check_writable(out)
     with locked(out):
-        checkpoint = out / "fit.checkpoint"
         shape = fit_mesh(
             mesh,
             name=out.resolve().name,
@@ -70,11 +69,9 @@ def fit(mesh_file: Path, out: Path, options: Options, *, device: str, on_progres
             cap=options.cap,
             thicken=options.thicken,
             on_progress=on_progress,
-            checkpoint=checkpoint,
             device=pick_device(device),
         )
         report = _save(shape, _request(mesh, options), out)
-        checkpoint.unlink(missing_ok=True)
     missed = [] if shape.certificate["passed"] else [f"fit: {shape.certificate['reason']}"]
     return report | {"failed_checks": missed}
 
@@ -164,7 +161,7 @@ def fit_many(
 
 def batch_lines(report: dict[str, Any]) -> list[str]:
     """`fit_many`'s report for people: a row a mesh."""
-    heads = ("within 0.01", "within 0.1", "in box", "projected", "hausdorff", "signs")
+    heads = ("within 0.01", "within 0.1", "in box", "projected", "signs")
     rows: list[tuple[str, ...]] = [("", "", "seconds", "steps", *heads)]
     for name, found in report["shapes"].items():
         if "error" in found:
@@ -245,8 +242,6 @@ def _request(mesh: Mesh, options: Options) -> str:
 
 def _kept(file: Path, folder: Path, options: Options) -> dict[str, Any] | None:
     """The report of a shape folder that holds just what this fit would make, or None."""
-    from sdfsim.shape.shape import load_shape
-
     try:
         made_for = read_json(folder / RECORD_FILE)["source"]["request"]
         if made_for != _request(_load(file, options), options):

@@ -1,15 +1,20 @@
-"""Work on all cores, in processes that stop when the caller does; or, unchanged, on a cluster."""
+"""Work on all cores, in processes that stop when the caller does, or unchanged on a cluster; and how many threads."""
 
 from __future__ import annotations
 
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+import torch
+
 from sdfsim.errors import SdfsimError
+
+_most = torch.get_num_threads()  # Before anything here has changed it.
 
 
 def parallel(function: Callable[..., Any], jobs: Sequence[tuple]) -> Iterator[tuple[int, Any]]:
@@ -26,6 +31,15 @@ def parallel(function: Callable[..., Any], jobs: Sequence[tuple]) -> Iterator[tu
     calls = (delayed(_one)(function, index, job, os.getpid()) for index, job in enumerate(jobs))
     ended: Any = Parallel(n_jobs=-1, return_as="generator_unordered")(calls)
     yield from ended
+
+
+def _one(function: Callable[..., Any], index: int, job: tuple, caller: int) -> tuple[int, Any]:
+    """In a worker: one thread, and Ctrl-C is the caller's business. On a single core the caller works itself."""
+    if os.getpid() != caller:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+        limit_threads(1)
+    return index, function(*job)
 
 
 @contextmanager
@@ -56,12 +70,44 @@ def cluster(address: str | None) -> Iterator[None]:
         yield
 
 
-def _one(function: Callable[..., Any], index: int, job: tuple, caller: int) -> tuple[int, Any]:
-    """In a worker: one thread, and Ctrl-C is the caller's business. On a single core the caller works itself."""
-    from sdfsim.threads import limit_threads
+def limit_threads(count: int) -> None:
+    """Let torch use no more than `count` threads in this process from now on."""
+    global _most
+    _most = count
+    torch.set_num_threads(count)
 
-    if os.getpid() != caller:
-        if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGINT, signal.SIG_IGN)
-        limit_threads(1)
-    return index, function(*job)
+
+def choose_threads(work: Callable[[], object], threads: int | None = None, *, repeat: int = 3) -> float:
+    """Time `work` with one thread and with all, and leave torch set to the faster.
+
+    On a busy machine a second thread slows a computation down by up to ten times.
+
+    Args:
+        work: a typical piece of work, tens of milliseconds.
+        threads: take this number without comparing.
+        repeat: timed calls for each number, after one that is not timed.
+
+    Returns:
+        Seconds that one call takes with the chosen number.
+    """
+    took = {}
+    for count in sorted({threads} if threads else {1, _most}):
+        torch.set_num_threads(count)
+        work()
+        began = time.monotonic()
+        for _ in range(repeat):
+            work()
+        took[count] = (time.monotonic() - began) / repeat
+    best = min(took, key=lambda count: took[count])
+    torch.set_num_threads(best)
+    return took[best]
+
+
+def network_work() -> None:
+    """A training step of a small network, for `choose_threads`."""
+    rng = torch.Generator().manual_seed(0)
+    values = torch.rand(8192, 64, generator=rng)
+    weights = [torch.rand(64, 64, generator=rng, requires_grad=True) for _ in range(4)]
+    for weight in weights:
+        values = torch.sin(values @ weight)
+    torch.autograd.grad(values.sum(), weights)

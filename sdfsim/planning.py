@@ -4,21 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sdfsim.console import duration
 from sdfsim.dynamics.memory import peak_bytes
 from sdfsim.dynamics.model import load_model
 from sdfsim.dynamics.ranges import constant_in_training
 from sdfsim.dynamics.simulator import Simulator, pick_device
-from sdfsim.progress import duration
 from sdfsim.scene.effects import Plan, plan
-from sdfsim.scene.load import load_scene
-from sdfsim.scene.schema import DEFAULT_DURATION, DEFAULT_GRAVITY
-from sdfsim.scene.thin import may_pass_through
-from sdfsim.scene.types import Effects, Scene
+from sdfsim.scene.scene import Effects, Scene
+from sdfsim.scene.scene_file import DEFAULT_DURATION, DEFAULT_GRAVITY, load_scene
 from sdfsim.shape.mlp_sdf import MlpSdf
 
 TRIAL_STEPS = 5
@@ -47,11 +46,7 @@ def describe(
     pick_device(device)
     if model:
         load_model(model, weights=False)
-
-    def tell(fraction: float, message: str) -> None:
-        on_progress("shapes", fraction, message)
-
-    scene = load_scene(scene_file, tell, allow_outside=allow_outside)
+    scene = load_scene(scene_file, partial(on_progress, "shapes"), allow_outside=allow_outside)
     decided = plan(scene)
     simulator = Simulator(scene, model=model, device=device)
     units, steps = simulator.units, simulator.steps_in(scene.duration)
@@ -72,7 +67,6 @@ def describe(
         "units": {"length_m": units.length, "time_s": units.time, "mass_kg": units.mass},
         "outside_training": simulator.outside_training,
         "constant_in_training": constant_in_training(simulator.model),
-        "may_pass_through": may_pass_through(scene, simulator.dt),
         "not_default": _not_default(scene, model),
         "failed_checks": [f"fit of shape {told}" for told in scene.missed],
     }
@@ -104,20 +98,15 @@ def _costs(simulator: Simulator, decided: Plan, steps: int) -> dict[str, Any]:
 
 def _not_default(scene: Scene, model: str | None) -> dict[str, Any]:
     """What the file or the command says that is not the default."""
-    found: dict[str, Any] = {
-        f"effects.{name}": said for name, said in vars(scene.effects).items() if said != getattr(Effects(), name)
+    said: dict[str, tuple[Any, Any]] = {
+        **{f"effects.{name}": (value, getattr(Effects(), name)) for name, value in vars(scene.effects).items()},
+        "limits.memory_gib": (scene.limits.memory_gib, None),
+        "model": (model or scene.model, None),
+        "seed": (scene.seed, 0),
+        "gravity": (scene.gravity.tolist(), list(DEFAULT_GRAVITY)),
+        "duration": (scene.duration, DEFAULT_DURATION),
     }
-    if scene.limits.memory_gib is not None:
-        found["limits.memory_gib"] = scene.limits.memory_gib
-    if model or scene.model:
-        found["model"] = model or scene.model
-    if scene.seed:
-        found["seed"] = scene.seed
-    if not np.array_equal(scene.gravity, DEFAULT_GRAVITY):
-        found["gravity"] = scene.gravity.tolist()
-    if scene.duration != DEFAULT_DURATION:
-        found["duration"] = scene.duration
-    return found
+    return {name: value for name, (value, default) in said.items() if value != default}
 
 
 def plan_lines(report: dict[str, Any]) -> list[str]:
@@ -142,6 +131,5 @@ def plan_lines(report: dict[str, Any]) -> list[str]:
         f"its kilogram {units['mass_kg']:.4g} kg",
         *(f"outside the model's training: {line}" for line in report["outside_training"]),
         *(f"constant in the model's training, so not learned: {name}" for name in report["constant_in_training"]),
-        *(f"may pass through: {line}" for line in report["may_pass_through"]),
         *(f"not the default: {name}: {said}" for name, said in report["not_default"].items()),
     ]

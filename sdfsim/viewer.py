@@ -15,11 +15,11 @@ import webbrowser
 from ipaddress import ip_address
 from pathlib import Path
 from shutil import which
-from typing import Literal
+from typing import Any, Literal
 from urllib.parse import quote
 
 from sdfsim.errors import SdfsimError
-from sdfsim.playback import Playback
+from sdfsim.recording import Playback
 
 WINDOW = "1600x900"
 LOOPBACK = "127.0.0.1"
@@ -45,14 +45,12 @@ def stream_to_viewer(playback: Playback, kind: Literal["native", "web"], *, bind
     """
     check_screen(kind)
     serving = _Serving(bind)
-    if kind == "native":
-        viewer = _start([*serving.options, "--expect-data-soon", "--hide-welcome-screen"], serving)
-    else:
-        viewer = _start([*serving.options, *serving.page_options, "--serve-web"], serving)
-        atexit.register(_end, viewer)
+    web = [*serving.page_options, "--serve-web"]
+    viewer = _start(serving, web if kind == "web" else ["--expect-data-soon", "--hide-welcome-screen"])
     playback.stream.connect_grpc(f"rerun+http://{serving.near}:{serving.port}/proxy")
     if kind == "native":
         return ""
+    atexit.register(_end, viewer)
     if _has_screen():
         webbrowser.open(serving.page)
     return serving.page
@@ -83,11 +81,13 @@ class _Serving:
             self.page_options += ["--cors-allow-origin", f"http://{host}:{self.page_port}"]
 
 
-def _start(options: list[str], serving: _Serving) -> subprocess.Popen:
+def _launch(options: list[str], output: Any) -> subprocess.Popen:
     """A viewer in a group of its own: `rerun` is a script that starts the real one, and both have to go together."""
-    viewer = subprocess.Popen(
-        [_executable(), *options], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
-    )
+    return subprocess.Popen([_executable(), *options], stdout=output, stderr=output, start_new_session=True)
+
+
+def _start(serving: _Serving, options: list[str]) -> subprocess.Popen:
+    viewer = _launch([*serving.options, *options], subprocess.DEVNULL)
     started = time.monotonic()
     while time.monotonic() - started < _START_SECONDS and viewer.poll() is None:
         try:
@@ -144,11 +144,9 @@ def screenshot(recording: Path, picture: Path, *, at: float | None = None) -> No
     if not picture.parent.is_dir() or not os.access(picture.parent, os.W_OK):
         raise SdfsimError(f"{picture}: the folder is missing or not writable")
     port = _free_port(0)
-    command = [_executable(), "--headless", "--window-size", WINDOW, "--bind", LOOPBACK, "--port", str(port)]
-    command.append(str(recording.resolve()))
+    options = ["--headless", "--window-size", WINDOW, "--bind", LOOPBACK, "--port", str(port)]
     with tempfile.TemporaryFile() as log:
-        # A group of its own: `rerun` is a script that starts the real viewer, and both have to go.
-        viewer = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
+        viewer = _launch([*options, str(recording.resolve())], log)
         try:
             _picture(viewer, f"rerun+http://{LOOPBACK}:{port}/proxy", picture, at)
         except ConnectionError as error:
@@ -209,18 +207,18 @@ def _end(process: subprocess.Popen) -> None:
 
 
 def _existing(recording: Path) -> Path:
+    hint = "give a rollout.rrd that simulate has written"
     if not recording.is_file():
-        raise SdfsimError(f"{recording}: no such recording", "give a rollout.rrd that simulate has written")
+        raise SdfsimError(f"{recording}: no such recording", hint)
     with open(recording, "rb") as handle:
         if handle.read(3) != b"RRF":
-            raise SdfsimError(f"{recording}: not a rerun recording", "give a rollout.rrd that simulate has written")
+            raise SdfsimError(f"{recording}: not a rerun recording", hint)
     return recording
 
 
 def _executable() -> str:
     """The `rerun` of this environment, which may not be on the PATH."""
-    beside = which("rerun", path=sysconfig.get_path("scripts"))
-    found = beside or which("rerun")
+    found = which("rerun", path=sysconfig.get_path("scripts")) or which("rerun")
     if not found:
         raise SdfsimError("the rerun program is missing", "pip install rerun-sdk")
     return found

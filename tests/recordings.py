@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sdfsim.shape.shape import analytic_shape
 
 from sdfsim.data.dataset import Trajectory
+from sdfsim.shape.shape import analytic_shape
 from sdfsim.training import train as train_module
 from sdfsim.training.presets import Preset
 

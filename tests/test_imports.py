@@ -26,21 +26,20 @@ HEAVY = (
 )
 
 # A room may import itself and rooms further down. Rooms of one level may not import each other,
-# but the rooms of the top level share what they have to (a run plays back, a viewer shows a playback).
+# but the rooms of the top level share what they have to (a run writes a recording, a viewer shows one).
 LEVELS = {
     "errors": 0,
     "files": 1,
-    "threads": 1,
-    "parallel": 2,
+    "parallel": 1,
     "shape": 2,
     "scene": 3,
     "dynamics": 4,
-    "data": 5,
-    "training": 6,
-    "evaluation": 7,
+    "data": 6,
+    "training": 7,
+    "evaluation": 8,
     "commands": 9,
 }
-TOP = 8  # playback and the other modules directly in sdfsim
+TOP = 5  # run, recording and the other modules directly in sdfsim
 
 
 def room(module: str) -> tuple[str, int]:

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from sdfsim.shape.shape import analytic_shape
 
-from sdfsim.scene.load import load_scene
+from sdfsim.scene.scene_file import load_scene
+from sdfsim.shape.shape import analytic_shape
 
 SCRIPT = Path(__file__).resolve().parents[1] / "samples" / "knock.py"
 

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sdfsim.shape.shape import analytic_shape
 
 from sdfsim import Simulator, load_shape
-from sdfsim.scene.types import Body, Scene
+from sdfsim.scene.scene import Body, Scene
+from sdfsim.shape.shape import analytic_shape
 
 EARTH = np.array([0.0, 0.0, -9.81])
 DROP = 0.1  # m, for bodies of a metre

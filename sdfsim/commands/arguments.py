@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 
 import typer
 
+from sdfsim.console import Session
 from sdfsim.errors import EXIT_QUALITY
-from sdfsim.progress import Session
 
 
 def seconds_of(text: str) -> float:

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from sdfsim.commands.arguments import Cluster, Device, Json, Model, Out, Verbose, check_device
-from sdfsim.progress import Session
+from sdfsim.console import Session
 
 
 def dataset(
@@ -93,8 +93,8 @@ def evaluate(
 ) -> None:
     """Errors of a model's rollouts on recorded trajectories, and the quality of its motion."""
     with Session(as_json=as_json, verbose=verbose) as session:
-        from sdfsim import run
         from sdfsim.evaluation.evaluate import evaluate as run_evaluation
+        from sdfsim.evaluation.evaluate import report_lines
 
         report = run_evaluation(
             data,
@@ -106,4 +106,4 @@ def evaluate(
             chaos_floor=chaos_floor,
             on_progress=session.progress,
         )
-        session.report(report, run.evaluation_lines(report))
+        session.report(report, report_lines(report))

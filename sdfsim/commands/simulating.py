@@ -1,14 +1,20 @@
-"""From scenes to motion: simulate, plan, view, info."""
+"""From scenes to motion and back: simulate, plan, view, identify, info."""
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
 from sdfsim.commands.arguments import Bind, Device, Json, Model, Out, Outside, Verbose, check_device, tell_failed
-from sdfsim.progress import Session, duration
+from sdfsim.console import Session, duration
+
+_PACKAGES = (
+    *("torch", "numpy", "scipy", "open3d", "trimesh", "pycolmap", "opencv-python-headless", "rerun-sdk"),
+    *("pydantic", "pybullet"),
+)
 
 
 def simulate(
@@ -118,10 +124,51 @@ def view(
             session.report({"recording": str(recording)})
 
 
+def identify(
+    recording: Annotated[
+        Path, typer.Argument(help="Run folder, rollout.npz or CSV of poses (docs/files.md).", show_default=False)
+    ],
+    scene: Annotated[Path | None, typer.Option(help="scene.yaml (default: that of the run folder).")] = None,
+    allow_outside: Outside = False,
+    as_json: Json = False,
+    device: Device = "auto",
+    verbose: Verbose = False,
+) -> None:
+    """Motion -> friction, restitution and mass ratios."""
+    with Session(as_json=as_json, verbose=verbose) as session:
+        from sdfsim import identify as room
+
+        check_device(device)
+        shapes, fit = partial(session.stage_progress, "shapes"), partial(session.stage_progress, "identify")
+        motion, known = room.load_recording(recording, scene, allow_outside=allow_outside, on_progress=shapes)
+        found = room.identify(motion, known, on_progress=fit)
+        session.report(found.report(), found.lines())
+
+
 def info(as_json: Json = False, device: Device = "auto", verbose: Verbose = False) -> None:
     """Versions, devices and bundled models."""
     with Session(as_json=as_json, verbose=verbose) as session:
-        from sdfsim import run
+        import platform
+        from importlib import metadata
+
+        import torch
+
+        import sdfsim
+        from sdfsim.dynamics.model import model_names
 
         check_device(device)
-        session.report(run.environment())
+        versions = {"sdfsim": sdfsim.__version__, "python": platform.python_version()}
+        for name in _PACKAGES:
+            try:
+                versions[name] = metadata.version(name)
+            except metadata.PackageNotFoundError:
+                versions[name] = "missing"
+        gpus = [f"cuda:{i} {torch.cuda.get_device_name(i)}" for i in range(torch.cuda.device_count())]
+        session.report(
+            {
+                "versions": versions,
+                "devices": ["cpu", *gpus],
+                "cpu_threads": torch.get_num_threads(),
+                "models": model_names(),
+            }
+        )

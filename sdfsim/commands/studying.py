@@ -8,20 +8,17 @@ from typing import Annotated
 import typer
 
 from sdfsim.commands.arguments import Device, Json, Out, Verbose, folder_of, tell_failed
-from sdfsim.progress import Session, columns
+from sdfsim.console import Session, columns
 
 
 def tradeoff(
     out: Out,
     source: Annotated[
-        Path,
-        typer.Argument(
-            metavar="DATA|SCENE|MESHES", help="Dataset or scene.yaml: error against time. Meshes: the same of fits."
-        ),
-    ],
+        Path | None,
+        typer.Argument(metavar="SCENE|DATA_DIR", help="scene.yaml or dataset folder (default: a random scene)."),
+    ] = None,
     model: Annotated[
-        list[str] | None,
-        typer.Option(help="Bundled models or paths, the one to turn knobs on first (default: all)."),
+        list[str] | None, typer.Option(help="Bundled model or path; may be given again (default: all bundled ones).")
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="A few settings, in minutes.")] = False,
     as_json: Json = False,
@@ -31,17 +28,13 @@ def tradeoff(
     """What accuracy costs in time: knobs, models and engines on the same scenes; what is measured is kept in -o."""
     with Session(as_json=as_json, verbose=verbose) as session:
         from sdfsim.evaluation import tradeoff as study
-        from sdfsim.evaluation.hard_cases_plots import check_matplotlib
+        from sdfsim.evaluation.harness import check_matplotlib
 
         check_matplotlib()
-        report, rows, notes = study.run(
-            source,
-            out,
-            models=model or [],
-            quick=quick,
-            device=device,
-            on_progress=session.stage_progress,
+        report = study.tradeoff(
+            source, out, models=model or [], quick=quick, device=device, on_progress=session.stage_progress
         )
+        rows, notes = study.told(report)
         session.report(report, [*columns(rows), *notes])
 
 
@@ -61,15 +54,14 @@ def stress(
     device: Device = "auto",
     verbose: Verbose = False,
 ) -> None:
-    """The hard cases, with every model and the teacher: a table, a page, and recordings of what went wrong."""
+    """The hard cases, with every model and the teacher: a table, plots, and recordings of what went wrong."""
     with Session(as_json=as_json, verbose=verbose) as session:
-        from sdfsim.evaluation import hard_cases_run
-        from sdfsim.evaluation.hard_cases_page import report_notes, report_table, write_report
-        from sdfsim.evaluation.hard_cases_plots import check_matplotlib
-        from sdfsim.playback import save_rollout
+        from sdfsim.evaluation import stress as study
+        from sdfsim.evaluation.harness import check_matplotlib
+        from sdfsim.recording import save_rollout
 
         check_matplotlib()
-        study = hard_cases_run.stress(
+        found = study.stress(
             out,
             models=model or [],
             quick=quick,
@@ -78,6 +70,10 @@ def stress(
             record=save_rollout,
             on_progress=session.progress,
         )
-        report = write_report(study, out)
+        report = study.write_report(found, out)
         tell_failed(session, report)
-        session.report(report, [*columns(report_table(study)), *report_notes(report)])
+        lost = [
+            f"{who}: {', '.join(f'{n} {what}' for what, n in lost.items())}" for who, lost in report["models"].items()
+        ]
+        table = columns(study.rows(found, {"missed": "!", "behind": "<"}))
+        session.report(report, [*table, "! beyond what is wanted, < worse than the teacher", *lost, f"wrote {out}"])

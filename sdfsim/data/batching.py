@@ -9,8 +9,11 @@ import torch
 
 from sdfsim.data.dataset import FLOOR, Trajectory
 from sdfsim.dynamics.bodies import Bodies, State, Units, from_scene
-from sdfsim.scene.types import Body, Scene
+from sdfsim.dynamics.contacts import find_contacts
+from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.shape import Shape, analytic_shape
+
+TOGETHER = 4000  # bodies whose contacts are found in one call
 
 
 def merged(
@@ -23,8 +26,8 @@ def merged(
 ) -> tuple[Bodies, State]:
     """Bodies of all trajectories, each at its frame, then one floor they share; worlds do not touch each other.
 
-    Masses and inertias are told relative to the mean mass of what moves in the trajectory, as `Simulator` has them:
-    the *paper* network is given inverse masses as they are.
+    Masses and inertias are relative to the mean mass of the bodies that move in the trajectory, as in `Simulator`:
+    inverse masses are inputs of the *paper* network.
 
     Args:
         trajectories: W of them.
@@ -34,7 +37,9 @@ def merged(
         device: of the tensors.
         floor: its friction and restitution.
     """
-    scene, world = scene_of([_relative(t) for t in trajectories], frames, shapes, floor)
+    means = [1.0 if t.static.all() else float(t.mass[~t.static].mean()) for t in trajectories]
+    relative = [replace(t, mass=t.mass / m, inertia=t.inertia / m) for t, m in zip(trajectories, means, strict=True)]
+    scene, world = scene_of(relative, frames, shapes, floor)
     tensors, state = from_scene(scene, units, device)
     return replace(tensors, world=torch.tensor(world, device=device)), state
 
@@ -48,52 +53,60 @@ def scene_of(
     bodies, world = [], []
     for w, (t, frame) in enumerate(zip(trajectories, frames, strict=True)):
         for i, name in enumerate(t.shape):
-            bodies.append(_body(t, frame, i, names.index(str(name)), f"{w}/{i}"))
+            body = Body(
+                name=f"{w}/{i}",
+                shape=names.index(str(name)),
+                motion="static" if t.static[i] else "dynamic",
+                scale=float(t.scale[i]),
+                position=t.position[frame, i],
+                quat_xyzw=t.quat_xyzw[frame, i],
+                velocity=t.velocity[frame, i],
+                angular_velocity=t.angular_velocity[frame, i],
+                mass=float(t.mass[i]),
+                inertia=np.diag(t.inertia[i]),
+                friction=float(t.friction[i]),
+                restitution=float(t.restitution[i]),
+            )
+            bodies.append(body)
             world.append(w)
-    bodies.append(_floor(len(names), floor))
-    scene = Scene(
-        shapes=(*centred, analytic_shape("plane")),
-        bodies=tuple(bodies),
-        gravity=trajectories[0].gravity,
-        duration=1.0,
-    )
+    zero, unturned = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
+    bodies.append(Body("floor", len(names), "static", 1.0, zero, unturned, zero, zero, 0.0, *floor))
+    plane = analytic_shape("plane")
+    scene = Scene(shapes=(*centred, plane), bodies=tuple(bodies), gravity=trajectories[0].gravity, duration=1.0)
     return scene, [*world, -1]
 
 
-def _relative(t: Trajectory) -> Trajectory:
-    """The trajectory with masses and inertias in units of the mean mass of the bodies that move."""
-    mean = 1.0 if t.static.all() else float(t.mass[~t.static].mean())
-    return replace(t, mass=t.mass / mean, inertia=t.inertia / mean)
+def find_edges(trajectory: Trajectory, shapes: dict[str, Shape], reach: float) -> dict[str, np.ndarray]:
+    """Contact edges of every frame but the last, SI units, sorted by frame.
+
+    Returns:
+        frame, first, second (-1 = floor) [E]; arm, other, normal [E, 3]; gap [E].
+    """
+    steps = len(trajectory.position) - 1
+    # Every pair of bodies of all frames is looked at, at first.
+    together = max(1, TOGETHER // trajectory.position.shape[1])
+    parts = [
+        _edges(trajectory, list(range(start, min(start + together, steps))), shapes, reach)
+        for start in range(0, steps, together)
+    ]
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def _body(t: Trajectory, frame: int, i: int, shape: int, name: str) -> Body:
-    return Body(
-        name=name,
-        shape=shape,
-        motion="static" if t.static[i] else "dynamic",
-        scale=float(t.scale[i]),
-        position=t.position[frame, i],
-        quat_xyzw=t.quat_xyzw[frame, i],
-        velocity=t.velocity[frame, i],
-        angular_velocity=t.angular_velocity[frame, i],
-        mass=float(t.mass[i]),
-        inertia=np.diag(t.inertia[i]),
-        friction=float(t.friction[i]),
-        restitution=float(t.restitution[i]),
-    )
-
-
-def _floor(shape: int, surface: tuple[float, float]) -> Body:
-    return Body(
-        name="floor",
-        shape=shape,
-        motion="static",
-        scale=1.0,
-        position=np.zeros(3),
-        quat_xyzw=np.array([0.0, 0.0, 0.0, 1.0]),
-        velocity=np.zeros(3),
-        angular_velocity=np.zeros(3),
-        mass=0.0,
-        friction=surface[0],
-        restitution=surface[1],
-    )
+def _edges(t: Trajectory, frames: list[int], shapes: dict[str, Shape], reach: float) -> dict[str, np.ndarray]:
+    bodies, state = merged([t] * len(frames), frames, shapes, Units(1.0, 1.0, 1.0), torch.device("cpu"))
+    gravity = torch.from_numpy(np.asarray(t.gravity, dtype=np.float64))
+    # The engine's solids have facets, and touch at their corners: nodes.
+    contacts = find_contacts(bodies, state, gravity, reach, t.dt, thin=True, rounded=False)
+    per_world = t.position.shape[1]
+    floor = len(bodies) - 1
+    order = torch.argsort(contacts.owner // per_world, stable=True)
+    owner, other = contacts.owner[order], contacts.body[order]
+    return {
+        "frame": frames[0] + (owner // per_world).numpy(),
+        "first": (owner % per_world).numpy(),
+        "second": torch.where(other == floor, -1, other % per_world).numpy(),
+        "arm": contacts.arm[order].numpy(),
+        "other": (contacts.foot - contacts.arm)[order].numpy(),
+        "normal": contacts.normal[order].numpy(),
+        "gap": contacts.distance[order].numpy(),
+    }

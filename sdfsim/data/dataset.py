@@ -1,32 +1,39 @@
-"""The dataset format: one `.npz` a trajectory, `shapes/` with a Shape folder a name, and `dataset.json`."""
+"""The dataset format: one `.npz` a trajectory, `shapes/` with a Shape folder a name, and `dataset.json`.
+
+A file holds the velocities that its recording engine gave. A trajectory that is loaded has those at the instants of its
+positions, which is what every simulation starts from: see `at_instants`.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sdfsim.data.pybullet_sim import TEACHER_VERSION
 from sdfsim.errors import SdfsimError
-from sdfsim.files import read_arrays, read_json, write_arrays, write_json
+from sdfsim.files import read_arrays, read_json, write_arrays
 
 if TYPE_CHECKING:
     from sdfsim.shape.shape import Shape
 
-
 SPLITS = ("train", "validation", "test")
+INFO = "dataset.json"
 SOLID = "solid_"  # how the names of PyBullet's random solids begin
 FLOOR = (0.3, 0.5)  # friction and restitution of the recipes' floor, the plane z = 0
-
-
-def product_range(values: np.ndarray, floor: float) -> list[float]:
-    """[low, high] of the products of two bodies' coefficients, or of a body's and the floor's."""
-    low, high = float(values.min()), float(values.max())
-    return [low * min(low, floor), high * max(high, floor)]
+LONGEST_STEP = 10.0  # s, between recorded frames
+LONGEST_SUBSTEP = 1.0  # s, an engine's inner step
+EXACTLY = 1e-3  # part of what gravity adds in a step, by which a free flight may miss it
+_NAME = re.compile(r"(?!\.)[\w. -]+")  # of a folder beside others, never a path
+_AXES = {  # T frames, N bodies
+    "position": ("T", "N", 3), "quat_xyzw": ("T", "N", 4), "velocity": ("T", "N", 3), "angular_velocity": ("T", "N", 3),
+    "shape": ("N",), "scale": ("N",), "mass": ("N",), "inertia": ("N", 3), "friction": ("N",), "restitution": ("N",),
+    "static": ("N",), "dt": (), "gravity": (3,),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -64,33 +71,60 @@ class Trajectory:
     gravity: np.ndarray
 
     def save(self, path: Path) -> None:
-        """Write the file."""
+        """Write the file; its velocities are to be those that the engine recorded."""
         write_arrays(path, {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)})
 
     @classmethod
-    def load(cls, path: Path) -> Trajectory:
-        """Read and check one file. Raises SdfsimError naming the file and the field that is wrong."""
-        arrays: dict[str, Any] = read_arrays(path, "a trajectory")
-        missing = [f.name for f in fields(cls) if f.name not in arrays]
-        if missing:
+    def load(cls, path: Path, *, as_recorded: bool = False) -> Trajectory:
+        """Read and check one file.
+
+        Args:
+            path: of the file; the `dataset.json` beside it, or in the folder above, tells the engine's inner step.
+            as_recorded: leave velocities as the engine recorded them: it goes on from those when it is started again.
+
+        Raises:
+            SdfsimError: names the file and the field that is wrong.
+        """
+        arrays = read_arrays(path, "a trajectory")
+        if missing := [name for name in _AXES if name not in arrays]:
             raise SdfsimError(f"{path}: missing field(s) {', '.join(missing)}")
-        arrays = {f.name: _typed(path, f.name, arrays[f.name]) for f in fields(cls)}
+        arrays = {name: _typed(path, name, arrays[name]) for name in _AXES}
         _check(path, arrays)
-        arrays["dt"] = float(arrays["dt"])
-        return cls(**arrays)
+        recorded = cls(**{**arrays, "dt": float(arrays["dt"])})
+        return recorded if as_recorded else at_instants(recorded, engine_substep(path.parent))
 
 
-LONGEST_STEP = 10.0  # s
-_NAME = re.compile(r"(?!\.)[\w. -]+")  # of a folder beside others, never a path
-_TRAILING = {"position": (3,), "quat_xyzw": (4,), "velocity": (3,), "angular_velocity": (3,)}
-_PER_BODY = {"scale": (), "mass": (), "inertia": (3,), "friction": (), "restitution": (), "static": (), "shape": ()}
+def at_instants(recorded: Trajectory, substep: float) -> Trajectory:
+    """The trajectory with velocities at the instants of its positions.
+
+    The recording engine's position step already uses the new velocity (symplectic Euler). Its flights are exact
+    parabolas, but of bodies that are half an inner step `substep` s of gravity faster than recorded. Bodies that fly
+    before or after an instant get the velocity of their parabola; bodies that lie or slide keep the recorded one.
+    """
+    added = np.diff(recorded.velocity, axis=0) - recorded.gravity * recorded.dt
+    flies = np.linalg.norm(added, axis=-1) < EXACTLY * np.linalg.norm(recorded.gravity) * recorded.dt
+    airborne = np.zeros(recorded.velocity.shape[:2], dtype=bool)
+    airborne[:-1] |= flies
+    airborne[1:] |= flies
+    airborne &= ~recorded.static
+    return replace(recorded, velocity=recorded.velocity + 0.5 * substep * recorded.gravity * airborne[..., None])
 
 
-def check_names(where: str, names: Iterable[str]) -> None:
-    """Raises SdfsimError where one of the names cannot be that of a Shape folder of a dataset."""
-    for name in names:
-        if not _NAME.fullmatch(name):
-            raise SdfsimError(f"{where}: {name!r} is no name of a Shape folder", "letters, digits, spaces, . _ - only")
+def engine_substep(data: Path) -> float:
+    """The recording engine's inner step in s, where the dataset (a folder or one of its splits) tells it; 0 elsewhere.
+
+    Raises:
+        SdfsimError: the `dataset.json` holds something else there.
+    """
+    home = home_of(data)
+    if home is None:
+        return 0.0
+    settings = read_info(home).get("engine_settings") or {}
+    found = settings.get("timeStep", 0.0) if isinstance(settings, dict) else settings
+    if isinstance(found, bool) or not isinstance(found, int | float) or not 0.0 <= found <= LONGEST_SUBSTEP:
+        where = f"{home / INFO}: engine_settings.timeStep"
+        raise SdfsimError(f"{where}: must be 0 (unknown) to {LONGEST_SUBSTEP:g} s (got {found!r})")
+    return float(found)
 
 
 def _typed(path: Path, name: str, values: np.ndarray) -> np.ndarray:
@@ -100,40 +134,44 @@ def _typed(path: Path, name: str, values: np.ndarray) -> np.ndarray:
             return values.astype(str)
         numbers = values.astype(np.float64, casting="same_kind", copy=False)
     except (TypeError, ValueError) as error:
-        raise SdfsimError(
-            f"{path}: {name}: must be {'names' if name == 'shape' else 'real numbers'}: {error}"
-        ) from error
-    if name != "static":
-        return numbers
-    if not np.isin(numbers, (0.0, 1.0)).all():
+        wanted = "names" if name == "shape" else "real numbers"
+        raise SdfsimError(f"{path}: {name}: must be {wanted}: {error}") from error
+    if name == "static" and not np.isin(numbers, (0.0, 1.0)).all():
         raise SdfsimError(f"{path}: static: must be true or false (or 1 or 0)")
-    return numbers.astype(bool)
+    return numbers.astype(bool) if name == "static" else numbers
 
 
-def _check(path: Path, arrays: dict) -> None:
-    if arrays["position"].ndim != 3:
-        raise SdfsimError(f"{path}: position: must be [T, N, 3] (got {list(arrays['position'].shape)})")
-    frames, bodies = arrays["position"].shape[:2]
-    expected = {k: (frames, bodies, *t) for k, t in _TRAILING.items()}
-    expected |= {k: (bodies, *t) for k, t in _PER_BODY.items()} | {"gravity": (3,), "dt": ()}
-    for name, shape in expected.items():
-        if arrays[name].shape != shape:
-            raise SdfsimError(f"{path}: {name}: must be {list(shape)} (got {list(arrays[name].shape)})")
-        if name not in ("shape", "static") and not np.isfinite(arrays[name]).all():
+def _check(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    if arrays["position"].ndim != 3 or len(arrays["position"]) < 2:
+        found = list(arrays["position"].shape)
+        raise SdfsimError(f"{path}: position: must be [T, N, 3] with at least two frames (got {found})")
+    sizes = dict(zip("TN", arrays["position"].shape, strict=False))
+    for name, axes in _AXES.items():
+        if arrays[name].shape != (wanted := tuple(sizes.get(str(axis), axis) for axis in axes)):
+            raise SdfsimError(f"{path}: {name}: must be {list(wanted)} (got {list(arrays[name].shape)})")
+        if name != "shape" and not np.isfinite(arrays[name]).all():
             raise SdfsimError(f"{path}: {name}: has values that are not finite")
-    moving = ~arrays["static"]
-    for name in ("mass", "inertia"):
-        if not (arrays[name][moving] > 0).all():
-            raise SdfsimError(f"{path}: {name}: must be > 0 for bodies that move")
-    if frames < 2:
-        raise SdfsimError(f"{path}: position: needs at least two frames (got {frames})")
-    if np.abs(np.linalg.norm(arrays["quat_xyzw"], axis=-1) - 1.0).max(initial=0.0) > 1e-3:
-        raise SdfsimError(f"{path}: quat_xyzw: must be unit quaternions")
     check_names(f"{path}: shape", arrays["shape"].tolist())
-    if not (arrays["scale"] > 0).all() or not 0 < arrays["dt"] <= LONGEST_STEP:
-        raise SdfsimError(f"{path}: scale must be > 0, dt > 0 and at most {LONGEST_STEP:g} s")
-    if (arrays["friction"] < 0).any() or ((arrays["restitution"] < 0) | (arrays["restitution"] > 1)).any():
-        raise SdfsimError(f"{path}: friction must be >= 0, restitution from 0 to 1")
+    moving = ~arrays["static"]
+    rules = {
+        "mass: must be > 0 for bodies that move": arrays["mass"][moving] > 0,
+        "inertia: must be > 0 for bodies that move": arrays["inertia"][moving] > 0,
+        "quat_xyzw: must be unit quaternions": np.abs(np.linalg.norm(arrays["quat_xyzw"], axis=-1) - 1.0) <= 1e-3,
+        "scale: must be > 0": arrays["scale"] > 0,
+        f"dt: must be > 0 and at most {LONGEST_STEP:g} s": (arrays["dt"] > 0) & (arrays["dt"] <= LONGEST_STEP),
+        "friction: must be >= 0": arrays["friction"] >= 0,
+        "restitution: must be 0 to 1": (arrays["restitution"] >= 0) & (arrays["restitution"] <= 1),
+    }
+    for rule, kept in rules.items():
+        if not kept.all():
+            raise SdfsimError(f"{path}: {rule}")
+
+
+def check_names(where: str, names: Iterable[str]) -> None:
+    """Raises SdfsimError where one of the names cannot be that of a Shape folder of a dataset."""
+    for name in names:
+        if not _NAME.fullmatch(name):
+            raise SdfsimError(f"{where}: {name!r} is no name of a Shape folder", "letters, digits, spaces, . _ - only")
 
 
 def check_alike(where: str, trajectories: Iterable[Trajectory]) -> None:
@@ -142,47 +180,40 @@ def check_alike(where: str, trajectories: Iterable[Trajectory]) -> None:
         raise SdfsimError(f"{where}: its trajectories differ in step or gravity", "give a dataset of one recipe")
 
 
-def write_info(folder: Path, info: dict) -> None:
-    """Write `dataset.json` (recipe, seed, version of the teacher, engine with version and settings)."""
-    write_json(folder / "dataset.json", info)
-
-
 def read_info(folder: Path) -> dict:
     """`dataset.json` of a dataset folder.
 
     Raises:
         SdfsimError: absent, not a JSON object, or of `sdfsim dataset` with another version of the teacher.
     """
-    info = read_json(folder / "dataset.json", "a dataset folder is what `sdfsim dataset` writes")
+    info = read_json(folder / INFO, "a dataset folder is what `sdfsim dataset` writes")
     if not isinstance(info, dict):
-        raise SdfsimError(f"{folder / 'dataset.json'}: must be a JSON object")
+        raise SdfsimError(f"{folder / INFO}: must be a JSON object")
     ours = info.get("engine") == "pybullet" and {"recipe", "engine_settings"} <= set(info)
-    if ours and info.get("teacher") != TEACHER_VERSION:
-        raise SdfsimError(
-            f"{folder}: made by an earlier teacher whose contacts acted before surfaces touched"
-            if info.get("teacher", 1) == 1
-            else f"{folder}: made by version {info['teacher']!r} of the teacher, not by {TEACHER_VERSION}",
-            "make it again with `sdfsim dataset`",
-        )
+    if ours and (version := info.get("teacher", 1)) != TEACHER_VERSION:
+        told = f"{folder}: made by version {version!r} of the teacher, not by {TEACHER_VERSION}"
+        raise SdfsimError(told, "make it again with `sdfsim dataset`")
     return info
 
 
 def home_of(data: Path) -> Path | None:
-    """The folder with the `dataset.json` that tells of a dataset or of one of its splits; None without any."""
-    return next((folder for folder in (data, data.parent) if (folder / "dataset.json").exists()), None)
+    """The folder with the `dataset.json` of a dataset or of one of its splits; None without any."""
+    return next((folder for folder in (data, data.parent) if (folder / INFO).exists()), None)
 
 
 def floor_of(info: dict) -> tuple[float, float]:
-    """Friction and restitution of the floor that `dataset.json` tells, or the recipes' own.
-
-    Raises:
-        SdfsimError: what is told is neither.
-    """
+    """Friction and restitution of the floor in `dataset.json`, or the recipes' own. Raises SdfsimError for neither."""
     told = info.get("floor") or {"friction": FLOOR[0], "restitution": FLOOR[1]}
     try:
         return float(told["friction"]), float(told["restitution"])
     except (KeyError, TypeError, ValueError) as error:
-        raise SdfsimError(f"dataset.json: floor: must have friction and restitution (got {told!r})") from error
+        raise SdfsimError(f"{INFO}: floor: must have friction and restitution (got {told!r})") from error
+
+
+def product_range(values: np.ndarray, floor: float) -> list[float]:
+    """[low, high] of the products of two bodies' coefficients, or of a body's and the floor's."""
+    low, high = float(values.min()), float(values.max())
+    return [low * min(low, floor), high * max(high, floor)]
 
 
 def trajectory_files(folder: Path, split: str) -> list[Path]:
@@ -201,15 +232,14 @@ def trajectory_files(folder: Path, split: str) -> list[Path]:
     return files
 
 
+def shapes_folder(folder: Path) -> Path:
+    """Where the Shape folders of a dataset are: its own `shapes/`, or its parent's for a split folder."""
+    return folder / "shapes" if (folder / "shapes").is_dir() else folder.parent / "shapes"
+
+
 def load_shapes(folder: Path, names: set[str]) -> dict[str, Shape]:
     """The Shape folders `shapes/NAME` of a dataset (its own, or its parent's for a split folder)."""
     # Here and not above: training from cached contact frames runs where only torch and numpy are installed.
     from sdfsim.shape.shape import load_shape
 
-    home = shapes_folder(folder)
-    return {name: load_shape(home / name) for name in sorted(names)}
-
-
-def shapes_folder(folder: Path) -> Path:
-    """Where the Shape folders of a dataset are: its own `shapes/`, or its parent's for a split folder."""
-    return folder / "shapes" if (folder / "shapes").is_dir() else folder.parent / "shapes"
+    return {name: load_shape(shapes_folder(folder) / name) for name in sorted(names)}

@@ -3,29 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from sdfsim.data.dataset import FLOOR, SPLITS, Trajectory, read_info, write_info
+from sdfsim.data.dataset import FLOOR, INFO, SPLITS, Trajectory, read_info
 from sdfsim.data.pybullet_sim import FPS, RATES, TEACHER_VERSION, Teacher, engine_settings, import_pybullet
 from sdfsim.data.scenarios import RECIPES, Cast, Recipe
-from sdfsim.data.shape_assets import (
-    Origin,
-    ShapeSource,
-    find_shapes,
-    fit_shapes,
-    kubasic_origins,
-    made_from,
-    origins,
-    prepare,
-    split_of,
-)
-from sdfsim.data.statistics import statistics, statistics_lines
+from sdfsim.data.shape_assets import VHACD, Origin, fit_shapes, origins, prepare, split_of
 from sdfsim.errors import SdfsimError
-from sdfsim.files import locked
+from sdfsim.files import locked, write_json
 from sdfsim.parallel import parallel
 
 GRAVITY = (0.0, 0.0, -10.0)  # m/s^2
@@ -59,8 +47,7 @@ def make_dataset(
         recipe: a name in `RECIPES`.
         out: dataset folder.
         trajectories: how many.
-        shapes: folder of NAME/ folders, each with `visual_geometry.obj` and `collision_geometry.obj` (one convex
-            piece a group); all recipes but movi-b also take mesh files, which are cut into pieces by V-HACD.
+        shapes: folder of shapes (see `origins`); movi-b takes its NAME/ folders alone.
         random_solids: how many of PyBullet's random solids there are beside them.
         bodies: how many move, instead of the recipe's range (bowl and pile).
         fps: recorded frames a second, in `RATES`.
@@ -69,15 +56,14 @@ def make_dataset(
         on_progress: called with the fraction done and a message.
 
     Returns:
-        A report: paths, counts, and `statistics` of the split.
+        A report: dataset, split, trajectories, made_now, shapes (how many the split draws from), left_out (name ->
+        why).
 
     Raises:
-        SdfsimError: unknown recipe, split or rate, an option that the recipe has no use for, no usable shapes, PyBullet
+        SdfsimError: unknown recipe or rate, an option that the recipe has no use for, no usable shapes, PyBullet
             absent, another dataset in `out`, or another run writing to it.
     """
-    plan = _checked(recipe, split, trajectories, shapes, random_solids, bodies)
-    if fps not in RATES:
-        raise SdfsimError(f"--fps must be {' or '.join(map(str, RATES))} (got {fps})")
+    plan = _checked(recipe, shapes, random_solids, bodies, fps)
     tell = on_progress or (lambda fraction, message: None)
     engine = import_pybullet()
     given = _origins(plan, shapes, random_solids)
@@ -90,44 +76,53 @@ def make_dataset(
         "engine_version": str(engine.getAPIVersion()),
         "engine_settings": engine_settings(1.0 / fps, RATES[fps]),
         "floor": {"friction": FLOOR[0], "restitution": FLOOR[1]},
-        "made_from": made_from(given),
+        "made_from": {origin.name: {"pieces": origin.how, "sha256": origin.digest()} for origin in given},
     }
     if plan.counted:
         info["bodies"] = bodies
     with locked(out):
         # Before anything is written: engine files of another dataset's shapes must stay what they are.
         _check_same(out, info)
-        cast, found = _cast(plan, shapes, given, out / "shapes" / "engine", lambda f, m: tell(0.1 * f, m))
-        info |= found
+        found, left_out = prepare(given, out / "shapes" / "engine", lambda f, m: tell(0.1 * f, m))
+        info["shapes"] = [source.name for source in found]
+        if not plan.kubasic:
+            info |= {"left_out": left_out, "vhacd": VHACD}
         _check_same(out, info)
-        cast = replace(_of_split(plan, cast, split), bodies=bodies)
-        fit_shapes([*cast.shapes, *cast.scenery.values()], out / "shapes", lambda f, m: tell(0.1 + 0.4 * f, m))
-        write_info(out, info)
-        one = partial(_make_one, recipe, cast, fps, seed, split)
-        made_now = _make_all(one, out / split, trajectories, lambda f, m: tell(0.5 + 0.5 * f, m))
-        return {
-            "dataset": str(out),
-            "split": split,
-            "trajectories": trajectories,
-            "made_now": made_now,
-            "shapes": len(cast.shapes),
-            "left_out": info.get("left_out", {}),
-            "statistics": statistics(out, split),
-        }
+        scenery = {source.name: source for source in found if source.name in plan.scenery}
+        drawn = [source for source in found if source.name not in scenery]
+        mine = drawn if plan.kubasic else [source for source in drawn if split_of(source.name) == split]
+        if plan.given and not mine:
+            raise SdfsimError(f"none of the {len(drawn)} shapes belongs to the {split} split", "give more shapes")
+        fit_shapes([*mine, *scenery.values()], out / "shapes", lambda f, m: tell(0.1 + 0.4 * f, m))
+        write_json(out / INFO, info)
+        folder = out / split
+        folder.mkdir(parents=True, exist_ok=True)
+        files = [(k, folder / f"{k:05d}.npz") for k in range(trajectories)]
+        todo = [job for job in files if not job[1].exists()]
+        make_one = partial(_make_one, recipe, Cast(mine, scenery, bodies), fps, seed, split)
+        for done, _ in enumerate(parallel(make_one, todo), start=1):
+            tell(0.5 + 0.5 * done / len(todo), f"trajectory {done} of {len(todo)}")
+    return {
+        "dataset": str(out),
+        "split": split,
+        "trajectories": trajectories,
+        "made_now": len(todo),
+        "shapes": len(mine),
+        "left_out": left_out,
+    }
 
 
 def report_lines(report: dict) -> list[str]:
     """The report of `make_dataset` for people."""
-    lines = [
+    return [
         f"{report['dataset']}: {report['trajectories']} {report['split']} trajectories, {report['made_now']} made now; "
         f"{report['shapes']} shapes to draw from",
         *(f"left out: {name}: {why}" for name, why in report["left_out"].items()),
     ]
-    return lines + statistics_lines(report["statistics"])
 
 
 def make_trajectory(recipe: str, rng: np.random.Generator, cast: Cast, fps: int = FPS) -> Trajectory:
-    """One trajectory of `STEPS` steps.
+    """One trajectory of `STEPS` steps, with velocities as the engine gives them.
 
     Args:
         recipe: a name in `RECIPES`.
@@ -164,30 +159,16 @@ def make_trajectory(recipe: str, rng: np.random.Generator, cast: Cast, fps: int 
     )
 
 
-def _make_all(make_one: Callable[[int, Path], None], folder: Path, count: int, on_progress: Progress) -> int:
-    """Write the first `count` trajectories of a split that are not there yet; how many those were."""
-    folder.mkdir(parents=True, exist_ok=True)
-    todo = [k for k in range(count) if not (folder / f"{k:05d}.npz").exists()]
-    jobs = [(k, folder / f"{k:05d}.npz") for k in todo]
-    for done, _ in enumerate(parallel(make_one, jobs), start=1):
-        on_progress(done / len(todo), f"trajectory {done} of {len(todo)}")
-    return len(todo)
-
-
 def _make_one(recipe: str, cast: Cast, fps: int, seed: int, split: str, index: int, path: Path) -> None:
     make_trajectory(recipe, np.random.default_rng([seed, SPLITS.index(split), index]), cast, fps).save(path)
 
 
-def _checked(
-    recipe: str, split: str, trajectories: int, shapes: Path | None, random_solids: int, bodies: int | None
-) -> Recipe:
+def _checked(recipe: str, shapes: Path | None, random_solids: int, bodies: int | None, fps: int) -> Recipe:
     """The recipe, when everything goes with it."""
     if recipe not in RECIPES:
         raise SdfsimError(f"unknown recipe {recipe!r}", f"known: {', '.join(RECIPES)}")
-    if split not in SPLITS:
-        raise SdfsimError(f"unknown split {split!r}", f"known: {', '.join(SPLITS)}")
-    if trajectories < 1:
-        raise SdfsimError("--trajectories must be at least 1")
+    if fps not in RATES:
+        raise SdfsimError(f"--fps must be {' or '.join(map(str, RATES))} (got {fps})")
     plan = RECIPES[recipe]
     if bodies is not None and not (plan.counted and 1 <= bodies <= MOST_BODIES):
         counted = " and ".join(name for name, r in RECIPES.items() if r.counted)
@@ -195,61 +176,23 @@ def _checked(
     if plan.given and shapes is None and (plan.kubasic or not random_solids):
         also = "" if plan.kubasic else " or --random-solids N"
         raise SdfsimError(f"{recipe} needs shapes", f"give --shapes FOLDER{also}")
-    if (plan.kubasic or not plan.given) and random_solids:
+    if random_solids and (plan.kubasic or not plan.given):
         raise SdfsimError(f"{recipe} has no use for --random-solids")
-    if not plan.given and shapes is not None:
+    if shapes is not None and not plan.given:
         raise SdfsimError(f"{recipe} brings its own shapes", "leave out --shapes")
     return plan
 
 
-def _check_same(out: Path, info: dict) -> None:
-    """Raises SdfsimError when the folder holds a dataset of which anything in `info` is not true."""
-    if (out / "dataset.json").exists():
-        there = read_info(out)
-        if there.get("fps") != info["fps"]:
-            raise SdfsimError(
-                f"{out} holds a dataset of {there.get('fps')} frames a second, not {info['fps']}",
-                "give the same --fps, or choose another -o",
-            )
-        if any(there.get(key) != value for key, value in info.items()):
-            raise SdfsimError(
-                f"{out} holds a dataset of another recipe, seed, engine, count or set of shapes", "choose another -o"
-            )
-
-
 def _origins(plan: Recipe, shapes: Path | None, random_solids: int) -> list[Origin]:
     """Where the shapes of a recipe come from, its own scenery last."""
-    if plan.kubasic:
-        assert shapes is not None
-        return kubasic_origins(shapes)
-    given = origins(shapes, random_solids) if plan.given else []
+    given = origins(shapes, random_solids, as_is=plan.kubasic) if plan.given else []
     if taken := {o.name for o in given} & set(plan.scenery):
         raise SdfsimError(f"{shapes}: the recipe has a shape {min(taken)!r} of its own", "rename yours")
     return given + [Origin(name, primitive=kind) for name, kind in plan.scenery.items()]
 
 
-def _cast(
-    plan: Recipe, shapes: Path | None, given: list[Origin], engine: Path, on_progress: Progress
-) -> tuple[Cast, dict]:
-    """All shapes of a recipe, and what `dataset.json` says of them."""
-    if plan.kubasic:
-        assert shapes is not None
-        sources = find_shapes(shapes, engine)
-        return Cast(sources), {"shapes": [s.name for s in sources]}
-    found, info = prepare(given, engine, on_progress)
-    return _sorted_out(found, plan), info
-
-
-def _of_split(plan: Recipe, cast: Cast, split: str) -> Cast:
-    """The cast with the shapes of one split; Kubric's are in all."""
-    if plan.kubasic:
-        return cast
-    mine = [s for s in cast.shapes if split_of(s.name) == split]
-    if plan.given and not mine:
-        raise SdfsimError(f"none of the {len(cast.shapes)} shapes belongs to the {split} split", "give more shapes")
-    return replace(cast, shapes=mine)
-
-
-def _sorted_out(found: list[ShapeSource], plan: Recipe) -> Cast:
-    scenery = {s.name: s for s in found if s.name in plan.scenery}
-    return Cast([s for s in found if s.name not in plan.scenery], scenery)
+def _check_same(out: Path, info: dict) -> None:
+    """Raises SdfsimError when the folder holds a dataset of which anything in `info` is not true."""
+    there = read_info(out) if (out / INFO).exists() else info
+    if other := [key for key, value in info.items() if there.get(key) != value]:
+        raise SdfsimError(f"{out} holds a dataset with another {other[0]}", "choose another -o")

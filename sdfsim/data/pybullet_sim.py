@@ -62,7 +62,10 @@ ENGINE_SETTINGS = {
 BODY_SETTINGS = {"contactProcessingThreshold": 0.0}
 MAXIMAL = {"useMaximalCoordinates": True}
 FAR = (0.0, 0.0, -100.0)  # m, where bodies wait to be placed
+UNTURNED = (0.0, 0.0, 0.0, 1.0)
+MARGIN = 1e-3  # m, around the convex pieces of every body that is loaded from a file (Bullet's default)
 APART = 1000.0  # m between bodies that are not to touch
+Vector = np.ndarray | tuple[float, ...]
 URDF_TEMPLATE = """<robot name="body"><link name="base">
 <inertial><origin xyz="0 0 0"/><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
 <collision><origin xyz="{x} {y} {z}"/><geometry>{geometry}</geometry></collision>
@@ -99,10 +102,7 @@ def import_pybullet():
 
 
 def write_urdf(mesh: Path, com: np.ndarray, path: Path) -> Path:
-    """Write a URDF whose base frame sits at the centre of mass `com` [3] m of `mesh` (an OBJ).
-
-    A relative `mesh` is looked for from the folder of the URDF, so that both can be moved together.
-    """
+    """Write a URDF about the centre of mass `com` [3] m of `mesh` (an OBJ; a relative path starts at the URDF)."""
     write_text(path, URDF_TEMPLATE.format(geometry=f'<mesh filename="{mesh}"/>', x=-com[0], y=-com[1], z=-com[2]))
     return path
 
@@ -119,16 +119,11 @@ def engine_settings(step: float, substeps: int) -> dict:
 
 
 def substeps_of(step: float) -> int:
-    """Inner steps in a recorded step of `step` s.
-
-    Raises:
-        SdfsimError: the teacher records at no such rate.
-    """
+    """Inner steps in a recorded step of `step` s. Raises SdfsimError when the teacher records at no such rate."""
     for fps, substeps in RATES.items():
         if abs(step - 1.0 / fps) < 1e-9:
             return substeps
-    rates = " or ".join(str(fps) for fps in RATES)
-    raise SdfsimError(f"a recorded step of {step:g} s is none of this teacher's, which records at {rates} frames/s")
+    raise SdfsimError(f"a recorded step of {step:g} s: this teacher records {' or '.join(map(str, RATES))} frames/s")
 
 
 class Teacher:
@@ -142,17 +137,13 @@ class Teacher:
     """
 
     def __init__(
-        self,
-        gravity: np.ndarray,
-        floor: tuple[float, float] | None = (0.3, 0.5),
-        *,
-        step: float = DT,
+        self, gravity: np.ndarray, floor: tuple[float, float] | None = (0.3, 0.5), *, step: float = DT,
         substeps: int = SUBSTEPS,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.pb = import_pybullet()
         self.substeps = substeps
         self.client = self.pb.connect(self.pb.DIRECT)
-        self.bodies: list[int] = []
+        self.bodies: list[int] = []  # the engine's handles, by the index of a body
         self._floor: int | None = None
         self._settled = True
         self._gravity = gravity
@@ -168,31 +159,14 @@ class Teacher:
     def _call(self, name: str, *args, **kwargs):
         return getattr(self.pb, name)(*args, **kwargs, physicsClientId=self.client)
 
-    def add(
-        self,
-        body: TeacherBody,
-        position: np.ndarray | tuple[float, ...] = FAR,
-        quat: np.ndarray | tuple[float, ...] = (0.0, 0.0, 0.0, 1.0),
-    ) -> int:
+    def add(self, body: TeacherBody, position: Vector = FAR, quat: Vector = UNTURNED) -> int:
         """Add a body with its centre of mass at `position` [3] m, orientation `quat` [4] xyzw; returns its index."""
         handle = self._call(
-            "loadURDF",
-            str(body.urdf),
-            basePosition=list(position),
-            baseOrientation=list(quat),
-            globalScaling=body.scale,
-            useFixedBase=int(body.mass == 0),
-            **MAXIMAL,
-        )
-        self._call(
-            "changeDynamics",
-            handle,
-            -1,
-            mass=body.mass,
-            lateralFriction=body.friction,
-            restitution=body.restitution,
-            **BODY_SETTINGS,
-        )
+            "loadURDF", str(body.urdf), basePosition=list(position), baseOrientation=list(quat),
+            globalScaling=body.scale, useFixedBase=int(body.mass == 0), **MAXIMAL,
+        )  # fmt: skip
+        surface = {"lateralFriction": body.friction, "restitution": body.restitution}
+        self._call("changeDynamics", handle, -1, mass=body.mass, **surface, **BODY_SETTINGS)
         self.bodies.append(handle)
         self._settled = False
         return len(self.bodies) - 1
@@ -215,13 +189,11 @@ class Teacher:
         self._call("changeDynamics", handle, -1, mass=mass, localInertiaDiagonal=list(diagonal))
         self._settled = False
 
-    def place(self, index: int, position: np.ndarray | tuple[float, ...], quat: np.ndarray | tuple[float, ...]) -> None:
+    def place(self, index: int, position: Vector, quat: Vector) -> None:
         """Move body `index` to `position` [3] m, orientation `quat` [4] xyzw; its velocity becomes 0."""
         self._call("resetBasePositionAndOrientation", self.bodies[index], list(position), list(quat))
 
-    def push(
-        self, index: int, velocity: np.ndarray | tuple[float, ...], angular_velocity: np.ndarray | tuple[float, ...]
-    ) -> None:
+    def push(self, index: int, velocity: Vector, angular_velocity: Vector) -> None:
         """Set linear [3] m/s and angular [3] rad/s velocity, world frame."""
         self._call("resetBaseVelocity", self.bodies[index], list(velocity), list(angular_velocity))
 

@@ -9,7 +9,7 @@ import torch
 
 from sdfsim.data.batching import merged
 from sdfsim.data.dataset import FLOOR, Trajectory
-from sdfsim.data.velocities import MARGIN
+from sdfsim.data.pybullet_sim import MARGIN
 from sdfsim.dynamics.bodies import Units
 from sdfsim.dynamics.graph import SUBSTEPS
 from sdfsim.dynamics.history import with_history
@@ -40,17 +40,16 @@ def roll_out(
 
     Args:
         model: what simulates.
-        group: trajectories of one step and one gravity; only their first frames are used. Their velocities are those
-            at the instant of the positions (see `at_instants`).
-        shapes: of every name in use, with the nodes that the model is to have.
+        group: trajectories of one step and one gravity; only their first frames are used.
+        shapes: of every name in use, with the nodes that the model needs.
         steps: how many.
         device: where to compute.
         free_flight: "exact", or "learned" for the *paper* network.
         contact: False leaves every body in free flight.
         sleep: freeze what has come to rest.
         substeps: inner steps that the recording engine makes in one step.
-        as_teacher: the solver takes on what the recording engine does without a law that asks for it: bodies are
-            larger by `MARGIN` than their shapes, and what is pushed out adds to the speed of a rebound.
+        as_teacher: the solver takes over two habits of the teacher: bodies are larger by `MARGIN` than their shapes,
+            and what is pushed out adds to the speed of a rebound.
         floor: its friction and restitution.
 
     Returns:
@@ -79,20 +78,17 @@ def roll_out(
         np.stack([getattr(s, name).cpu().numpy() for s in states])
         for name in ("position", "orientation", "velocity", "angular_velocity")
     )
-    motions, at = [], 0
-    for t in group:
-        mine = slice(at, at + t.position.shape[1])
-        at = mine.stop
-        motions.append(
-            replace(
-                t,
-                position=position[:, mine] * units.length,
-                quat_xyzw=quat[:, mine],
-                velocity=velocity[:, mine] * units.velocity,
-                angular_velocity=angular[:, mine] / units.time,
-            )
+    ends = np.cumsum([t.position.shape[1] for t in group])
+    return [
+        replace(
+            t,
+            position=position[:, mine] * units.length,
+            quat_xyzw=quat[:, mine],
+            velocity=velocity[:, mine] * units.velocity,
+            angular_velocity=angular[:, mine] / units.time,
         )
-    return motions
+        for t, mine in zip(group, map(slice, [0, *ends[:-1]], ends), strict=True)
+    ]
 
 
 def batches(trajectories: list[Trajectory]) -> list[list[Trajectory]]:

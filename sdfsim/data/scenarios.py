@@ -6,21 +6,22 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from sdfsim.data.dataset import FLOOR
 from sdfsim.data.pybullet_sim import Teacher, TeacherBody
 from sdfsim.data.shape_assets import ShapeSource
-from sdfsim.data.starts_moving import set_moving
-from sdfsim.data.starts_resting import STARTS, at_rest, upright
+from sdfsim.dynamics.overlap import DEEPEST
 
+TRIES = 100  # places for one body before the scene is drawn again
+UP, STILL = np.array([0.0, 0.0, 1.0]), np.zeros(3)
+
+# Tossed bodies, as Kubric has them.
 REGION = ((-5.0, -5.0, 1.0), (5.0, 5.0, 5.0))  # m, holds every tossed body's bounds at the start
 COUNT = (3, 10)
-TRIES = 100  # places for one body before the scene is drawn again
-
 SIZES = (0.7, 1.4)
 MATERIALS = {"metal": (2.7, 0.4, 0.3), "rubber": (1.1, 0.8, 0.7)}  # density, friction, restitution
-
 # MOVi-C: largest extent in m; Kubric's coefficients. Meshes at hand have no true size, so none has a mass of its own:
 # all have rubber's density.
 EXTENTS_C = (0.75, 3.0)
@@ -29,7 +30,7 @@ PLAIN = (1.1, 0.5, 0.5)  # density, friction, restitution
 BALL = 0.52  # m, diameter
 BALLS = (1, 16)
 ROOM = 2.0  # a bowl's inside over the space that its balls fill
-PACKED = 0.6  # of which balls are so much
+PACKED = 0.6  # part of that space which balls fill
 WALL = 0.12  # of the bowl primitive, relative to its outer radius
 
 PILE = (5, 30)
@@ -55,10 +56,32 @@ SHARES = {
     "head-on": 0.05,
     "spinning": 0.03,
 }
-FEW = (1, 4)  # bodies in plain motion; head-on two or four
-BALL_SHARE = 0.5  # of the bodies in plain motion; all of those that roll
+FEW = (1, 4)  # bodies in one kind of motion; head-on two or four
+BALL_SHARE = 0.5  # of the bodies in one kind of motion; all of those that roll
 
-Placed = list[tuple[ShapeSource, TeacherBody]]
+# Starts at or near rest.
+STARTS = ("still", "dropped", "nudged", "pressed")
+GAP = 2.5e-3  # m, under a body that is put down: around the engine's convex pieces are 1 mm, so 2 mm between two
+DROP = 0.1  # m, at most, under one that is dropped
+NUDGE = 0.3  # m/s, at most, along x and along y
+PRESSED = 0.5 * DEEPEST  # of its extent: how far at most a body is moved into what is around it, along each axis
+FIELD = 3.0  # m, half the side of the square of floor that is used
+STACKED = 0.5  # part of the bodies that go on top of the one before
+STEADY = 0.03  # least distance of the centre of mass from the rim of the face it stands on, over the largest extent
+
+# Starts in one kind of motion.
+MOTIONS = ("rolling", "sliding", "spinning", "falling", "head-on")
+SPEEDS = (0.5, 4.0)  # m/s
+SPINS = (1.0, 10.0)  # rad/s, about the vertical
+HEIGHTS = (0.1, 2.0)  # m, under a body that falls
+MEETING = (0.1, 1.0)  # s, until the bodies of a pair touch
+ALOFT = 32.0  # m, the lowest pair: more than it falls in 2 s, with what a hit may add
+APART = 12.0  # m between the heights of pairs
+HALF = 0.5  # of the bodies: along x or y, of a spin that fits, or unturned; the others any way
+
+Bodies = list[tuple[ShapeSource, TeacherBody]]
+Draw = Callable[[ShapeSource], TeacherBody]
+Pose = tuple[np.ndarray, Rotation]  # [3] m of the centre of mass, and the orientation
 
 
 @dataclass(frozen=True)
@@ -81,7 +104,7 @@ class Recipe:
     """How scenes start.
 
     Attributes:
-        spawn: puts the bodies of a scene into the teacher's world and tells them in its order, those that are static
+        spawn: puts the bodies of a scene into the teacher's world and returns them in its order, those that are static
             with mass 0; None where one found no room.
         kubasic: takes NAME/ folders as they are, in all splits; otherwise shapes are split by name.
         given: draws bodies from shapes that the caller gives.
@@ -89,78 +112,95 @@ class Recipe:
         scenery: the recipe's own shapes, name -> primitive.
     """
 
-    spawn: Callable[[Teacher, np.random.Generator, Cast], Placed | None]
+    spawn: Callable[[Teacher, np.random.Generator, Cast], Bodies | None]
     kubasic: bool = False
     given: bool = True
     counted: bool = False
     scenery: dict[str, str] = field(default_factory=dict)
 
 
-def movi_b(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Placed | None:
+def movi_b(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies | None:
     """Kubric's `movi_ab_worker`, restated."""
 
     def draw(source: ShapeSource) -> TeacherBody:
         scale = rng.uniform(*SIZES)
-        density, friction, restitution = MATERIALS[str(rng.choice(list(MATERIALS)))]
-        return TeacherBody(source.urdf, scale, source.volume * density * scale**3, friction, restitution)
+        return _body(source, scale, *MATERIALS[str(rng.choice(list(MATERIALS)))])
 
     return _toss(teacher, rng, cast, draw)
 
 
-def movi_c(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Placed | None:
+def movi_c(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies | None:
     """Kubric's `movi_c_worker`, restated."""
     return _toss(teacher, rng, cast, lambda source: _body(source, rng.uniform(*EXTENTS_C), *PLAIN))
 
 
-def bowl(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Placed:
+def bowl(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies:
     """Balls in loose layers above a bowl that has room for them."""
     count = cast.bodies or int(rng.integers(BALLS[0], BALLS[1] + 1))
     inner = BALL * (ROOM * count / (4 * PACKED)) ** (1 / 3)
     vessel, ball = cast.scenery["bowl"], cast.scenery["ball"]
-    placed = [(vessel, _static(vessel, 2 * inner / (1 - WALL), *FLOOR))]
-    high = _stand(teacher, placed[0], np.zeros(2), Rotation.identity())
-    for position in _layers(rng, count, max(0.75 * inner - 0.5 * BALL, 0.0)):
-        placed.append((ball, _body(ball, BALL, *PLAIN)))
-        _put(teacher, placed[-1][1], position + np.array([0.0, 0.0, high]), Rotation.random(rng=rng))
-        teacher.push(len(placed) - 1, rng.uniform((-1.0, -1.0, 0.0), (1.0, 1.0, 0.0)), np.zeros(3))
-    return placed
+    bodies = [(vessel, _body(vessel, 2 * inner / (1 - WALL), 0.0, *FLOOR))]
+    position, high = upright(*bodies[0], np.zeros(2), 0.0, Rotation.identity())
+    _put(teacher, bodies[0][1], position, Rotation.identity())
+    for place in _layers(rng, count, max(0.75 * inner - 0.5 * BALL, 0.0)):
+        bodies.append((ball, _body(ball, BALL, *PLAIN)))
+        index = _put(teacher, bodies[-1][1], place + high * UP, Rotation.random(rng=rng))
+        teacher.push(index, rng.uniform((-1.0, -1.0, 0.0), (1.0, 1.0, 0.0)), STILL)
+    return bodies
 
 
-def pile(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Placed:
+def _layers(rng: np.random.Generator, count: int, radius: float) -> np.ndarray:
+    """[count, 3] m: centres of balls that do not touch, in layers from z = 0 within `radius` of the z axis."""
+    spacing, layers, found = 1.1 * BALL, [], 0
+    steps = np.arange(-np.ceil(radius / spacing) - 1, np.ceil(radius / spacing) + 2)
+    while found < count:
+        lattice = spacing * (np.stack(np.meshgrid(steps, steps), -1).reshape(-1, 2) + rng.random(2))
+        inside = lattice[np.linalg.norm(lattice, axis=1) <= radius]
+        if len(inside) == 0:
+            inside = radius * np.sqrt(rng.random()) * _direction(rng)[None, :2]
+        inside = rng.permutation(inside)[: count - found]
+        layers.append(np.column_stack([inside, np.full(len(inside), spacing * len(layers))]))
+        found += len(inside)
+    centres = np.concatenate(layers)
+    return centres + rng.uniform(-0.04, 0.04, centres.shape) * BALL
+
+
+def pile(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies:
     """Bodies of MOVi-B's materials at rest above each other in a column, dropped."""
     count = cast.bodies or int(rng.integers(PILE[0], PILE[1] + 1))
     radius = PILE_RADIUS * count ** (1 / 3)
-    placed, boxes = [], np.empty((0, 2, 3))
+    bodies, boxes = [], np.empty((0, 2, 3))
     for _ in range(count):
         source = cast.shapes[rng.integers(len(cast.shapes))]
         body = _body(source, rng.uniform(*PILE_EXTENTS), *MATERIALS[str(rng.choice(list(MATERIALS)))])
         rotation = Rotation.random(rng=rng)
         low, high = _box(source, body, rotation)
-        places = np.array([radius * np.sqrt(rng.random()) * _direction(rng) for _ in range(PILE_TRIES)])
+        places = np.array([radius * np.sqrt(rng.random()) * _direction(rng)[:2] for _ in range(PILE_TRIES)])
         below = [((boxes[:, 0, :2] < p + high[:2]) & (boxes[:, 1, :2] > p + low[:2])).all(1) for p in places]
         tops = [boxes[under, 1, 2].max(initial=0.0) for under in below]
         position = np.array([*places[np.argmin(tops)], min(tops) + rng.uniform(*PILE_GAPS) - low[2]])
         boxes = np.concatenate([boxes, [[position + low, position + high]]])
         _put(teacher, body, position, rotation)
-        placed.append((source, body))
-    return placed
+        bodies.append((source, body))
+    return bodies
 
 
-def varied(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Placed | None:
-    """Any friction, restitution and mass ratio, and starts of all kinds.
+def varied(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies | None:
+    """Any friction, restitution and mass ratio, and starts of all kinds, in the parts of `SHARES`.
 
-    Of the scenes, 35 % are tossed as in MOVi and 35 % are at or near rest (in equal parts the kinds of `STARTS`); an
-    obstacle is in 30 % of both. In the others one to four bodies, half of them balls, are in plain motion on an empty
-    floor: in 8 % balls roll, in 7 % bodies slide to a stop, in 7 % they fall straight, in 3 % they spin in place, and
-    in 5 % one or two pairs meet head-on in flight, far above the floor.
+    An obstacle is in 30 % of the scenes that are tossed or at rest (in equal parts the kinds of `STARTS`). In the
+    others one to four bodies, half of them balls, are in one kind of motion on an empty floor; pairs that meet head-on
+    do so in flight, far above it.
     """
     start = str(rng.choice(list(SHARES), p=list(SHARES.values())))
     placed = []
     if start in ("tossed", "resting") and rng.random() < OBSTACLE_SHARE:
         source = cast.scenery[str(rng.choice(list(OBSTACLES)))]
         extent = rng.uniform(*OBSTACLE_EXTENTS)
-        placed.append((source, _static(source, extent, rng.uniform(*FRICTIONS), rng.uniform(*RESTITUTIONS))))
-        _stand(teacher, placed[0], rng.uniform(-1.0, 1.0, 2), Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)))
+        obstacle = _body(source, extent, 0.0, rng.uniform(*FRICTIONS), rng.uniform(*RESTITUTIONS))
+        place, rotation = rng.uniform(-1.0, 1.0, 2), Rotation.from_euler("z", rng.uniform(0, 2 * np.pi))
+        _put(teacher, obstacle, upright(source, obstacle, place, 0.0, rotation)[0], rotation)
+        placed.append((source, obstacle))
     masses: list[float] = []
 
     def draw(source: ShapeSource) -> TeacherBody:
@@ -176,14 +216,14 @@ def varied(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Placed | N
         tossed = _toss(teacher, rng, cast, draw)
         return None if tossed is None else placed + tossed
     if start == "resting":
-        picked = [cast.shapes[k] for k in rng.integers(len(cast.shapes), size=rng.integers(*_closed(COUNT)))]
+        picked = [cast.shapes[k] for k in rng.integers(len(cast.shapes), size=rng.integers(COUNT[0], COUNT[1] + 1))]
         bodies = [(source, draw(source)) for source in picked]
-        return placed + bodies if at_rest(teacher, rng, bodies, str(rng.choice(STARTS)), TRIES) else None
-    count = 2 * int(rng.integers(1, 3)) if start == "head-on" else int(rng.integers(*_closed(FEW)))
+        return placed + bodies if at_rest(teacher, rng, bodies, str(rng.choice(STARTS))) else None
+    count = 2 * int(rng.integers(1, 3)) if start == "head-on" else int(rng.integers(FEW[0], FEW[1] + 1))
     balls = rng.random(count) < (1.0 if start == "rolling" else BALL_SHARE)
     picked = [cast.scenery["ball"] if ball else cast.shapes[rng.integers(len(cast.shapes))] for ball in balls]
     bodies = [(source, draw(source)) for source in picked]
-    return bodies if set_moving(teacher, rng, bodies, start, TRIES) else None
+    return bodies if set_moving(teacher, rng, bodies, start) else None
 
 
 RECIPES = {
@@ -195,73 +235,148 @@ RECIPES = {
 }
 
 
-def _toss(
-    teacher: Teacher, rng: np.random.Generator, cast: Cast, draw: Callable[[ShapeSource], TeacherBody]
-) -> Placed | None:
-    """Kubric's 3 to 10 bodies without overlaps, thrown across; None when one finds no room in `TRIES` tries."""
-    placed = []
-    for _ in range(rng.integers(*_closed(COUNT))):
-        source = cast.shapes[rng.integers(len(cast.shapes))]
-        body = draw(source)
-        index = teacher.add(body)
-        position = _free_place(teacher, rng, source, body, index)
-        if position is None:
-            return None
-        aim = rng.uniform((-4.0, -4.0, 0.0), (4.0, 4.0, 0.0))
-        teacher.push(index, aim - position * (1.0, 1.0, 0.0), np.zeros(3))
-        placed.append((source, body))
-    return placed
+def _toss(teacher: Teacher, rng: np.random.Generator, cast: Cast, draw: Draw) -> Bodies | None:
+    """Kubric's 3 to 10 bodies without overlaps, thrown across; None when one finds no room."""
 
-
-def _free_place(
-    teacher: Teacher, rng: np.random.Generator, source: ShapeSource, body: TeacherBody, index: int
-) -> np.ndarray | None:
-    for _ in range(TRIES):
+    def propose(source: ShapeSource, body: TeacherBody) -> Pose | None:
         rotation = Rotation.random(rng=rng)
         low, high = _box(source, body, rotation)
-        if (REGION[1] - high < REGION[0] - low).any():
+        fits = (REGION[1] - high >= REGION[0] - low).all()
+        return (rng.uniform(REGION[0] - low, REGION[1] - high), rotation) if fits else None
+
+    bodies = []
+    for index in range(len(teacher.bodies), len(teacher.bodies) + rng.integers(COUNT[0], COUNT[1] + 1)):
+        source = cast.shapes[rng.integers(len(cast.shapes))]
+        bodies.append((source, draw(source)))
+        if (pose := _find_room(teacher, bodies[-1], propose)) is None:
+            return None
+        aim = rng.uniform((-4.0, -4.0, 0.0), (4.0, 4.0, 0.0))
+        teacher.push(index, aim - pose[0] * (1.0, 1.0, 0.0), STILL)
+    return bodies
+
+
+def at_rest(teacher: Teacher, rng: np.random.Generator, bodies: Bodies, start: str) -> bool:
+    """Put bodies down: all at rest, all dropped from `DROP` at most, all given a nudge, or pressed into one another.
+
+    Only the last overlap; models learn from them how bodies part.
+
+    Args:
+        teacher: the world; the bodies come after those that it has.
+        rng: what is drawn from.
+        bodies: of shapes whose largest extent is 1 m at scale 1.
+        start: one of `STARTS`.
+
+    Returns:
+        False when one found no room.
+    """
+    first, below, top = len(teacher.bodies), np.zeros(2), 0.0
+    poses: list[Pose] = []
+
+    def propose(source: ShapeSource, body: TeacherBody) -> Pose:
+        stacked = len(poses) > 0 and rng.random() < STACKED
+        place = below + rng.uniform(-0.1, 0.1, 2) * body.scale if stacked else rng.uniform(-FIELD, FIELD, 2)
+        gap = rng.uniform(GAP, DROP) if start == "dropped" else GAP
+        rotation = _standing(source, rng)
+        return upright(source, body, place, (top if stacked else 0.0) + gap, rotation)[0], rotation
+
+    for index, (source, body) in enumerate(bodies, start=first):
+        if (pose := _find_room(teacher, (source, body), propose)) is None:
+            return False
+        poses.append(pose)
+        below, top = pose[0][:2], float(pose[0][2] + _box(source, body, pose[1])[1][2])
+        if start == "nudged":
+            teacher.push(index, np.array([*rng.uniform(-NUDGE, NUDGE, 2), 0.0]), STILL)
+    if start == "pressed":
+        for index, ((_, body), (position, rotation)) in enumerate(zip(bodies, poses, strict=True), start=first):
+            teacher.place(index, position + rng.uniform(-PRESSED, PRESSED, 3) * body.scale, rotation.as_quat())
+    return True
+
+
+def set_moving(teacher: Teacher, rng: np.random.Generator, bodies: Bodies, motion: str) -> bool:
+    """Put bodies into the world, all in one kind of motion.
+
+    Bodies that roll must be balls: half go along x or y, half have the spin of their speed and the others any. Bodies
+    that slide do not turn at first. Bodies that spin or fall have no other velocity.
+
+    Args:
+        teacher: the world; the bodies come after those that it has.
+        rng: what is drawn from.
+        bodies: of shapes whose largest extent is 1 m at scale 1; "head-on" takes two at a time.
+        motion: one of `MOTIONS`.
+
+    Returns:
+        False when one found no room.
+    """
+    if motion == "head-on":
+        for k in range(0, len(bodies) - 1, 2):
+            _meet(teacher, rng, bodies[k : k + 2], ALOFT + APART * (k // 2))
+        return True
+
+    def propose(source: ShapeSource, body: TeacherBody) -> Pose:
+        gap = rng.uniform(*HEIGHTS) if motion == "falling" else GAP
+        any_way = source.sphere or (motion == "falling" and rng.random() < HALF)
+        rotation = Rotation.random(rng=rng) if any_way else _standing(source, rng)
+        return upright(source, body, rng.uniform(-FIELD, FIELD, 2), gap, rotation)[0], rotation
+
+    for index, one in enumerate(bodies, start=len(teacher.bodies)):
+        if _find_room(teacher, one, propose) is None:
+            return False
+        teacher.push(index, *_velocities(rng, motion, one[1].scale))
+    return True
+
+
+def _velocities(rng: np.random.Generator, motion: str, extent: float) -> tuple[np.ndarray, np.ndarray]:
+    """Linear [3] m/s and angular [3] rad/s velocity of a body on the floor or above it."""
+    if motion == "falling":
+        return STILL, STILL
+    if motion == "spinning":
+        return STILL, rng.choice((-1.0, 1.0)) * rng.uniform(*SPINS) * UP
+    turn = 0.5 * np.pi * rng.integers(4) if rng.random() < HALF else rng.uniform(0.0, 2 * np.pi)
+    velocity = rng.uniform(*SPEEDS) * np.array([np.cos(turn), np.sin(turn), 0.0])
+    if motion == "sliding":
+        return velocity, STILL
+    spin = np.cross(UP, velocity) / (0.5 * extent)
+    if rng.random() < HALF:
+        spin = Rotation.random(rng=rng).apply(rng.uniform(0.0, 2.0) * spin)
+    return velocity, spin
+
+
+def _meet(teacher: Teacher, rng: np.random.Generator, pair: Bodies, height: float) -> None:
+    """Two bodies at `height` m that fly at each other along a level line."""
+    line = _direction(rng)
+    speeds, rotations = rng.uniform(*SPEEDS, 2), Rotation.random(2, rng=rng)
+    reach = [body.scale * np.linalg.norm(source.vertices, axis=1).max() for source, body in pair]
+    middle = np.array([*rng.uniform(-FIELD, FIELD, 2), height])
+    time = rng.uniform(*MEETING)
+    for k, side in enumerate((-1.0, 1.0)):
+        index = _put(teacher, pair[k][1], middle + side * (reach[k] + speeds[k] * time) * line, rotations[k])
+        teacher.push(index, -side * speeds[k] * line, STILL)
+
+
+def _find_room(
+    teacher: Teacher, one: tuple[ShapeSource, TeacherBody], propose: Callable[[ShapeSource, TeacherBody], Pose | None]
+) -> Pose | None:
+    """Add a body at the first of `TRIES` proposed poses where it overlaps nothing; that pose, None without any."""
+    index = teacher.add(one[1])
+    for _ in range(TRIES):
+        if (pose := propose(*one)) is None:
             continue
-        position = rng.uniform(REGION[0] - low, REGION[1] - high)
-        teacher.place(index, position, rotation.as_quat())
+        teacher.place(index, pose[0], pose[1].as_quat())
         if not teacher.overlaps(index):
-            return position
+            return pose
     return None
 
 
-def _layers(rng: np.random.Generator, count: int, radius: float) -> np.ndarray:
-    """[count, 3] m: centres of balls that do not touch, in layers from z = 0 within `radius` of the z axis."""
-    spacing, layers, found = 1.1 * BALL, [], 0
-    steps = np.arange(-np.ceil(radius / spacing) - 1, np.ceil(radius / spacing) + 2)
-    while found < count:
-        lattice = spacing * (np.stack(np.meshgrid(steps, steps), -1).reshape(-1, 2) + rng.random(2))
-        inside = lattice[np.linalg.norm(lattice, axis=1) <= radius]
-        if len(inside) == 0:
-            inside = radius * np.sqrt(rng.random()) * _direction(rng)[None]
-        inside = rng.permutation(inside)[: count - found]
-        layers.append(np.column_stack([inside, np.full(len(inside), spacing * len(layers))]))
-        found += len(inside)
-    centres = np.concatenate(layers)
-    return centres + rng.uniform(-0.04, 0.04, centres.shape) * BALL
+def _put(teacher: Teacher, body: TeacherBody, position: np.ndarray, rotation: Rotation) -> int:
+    """Add a body where it is to be; its index."""
+    index = teacher.add(body)
+    teacher.place(index, position, rotation.as_quat())
+    return index
 
 
 def _body(source: ShapeSource, extent: float, density: float, friction: float, restitution: float) -> TeacherBody:
-    """A body of a shape whose largest extent is 1 m at scale 1."""
+    """A body of a shape at scale `extent`; density 0 makes it static."""
     return TeacherBody(source.urdf, extent, source.volume * density * extent**3, friction, restitution)
-
-
-def _static(source: ShapeSource, extent: float, friction: float, restitution: float) -> TeacherBody:
-    return TeacherBody(source.urdf, extent, 0.0, friction, restitution)
-
-
-def _stand(teacher: Teacher, one: tuple[ShapeSource, TeacherBody], place: np.ndarray, rotation: Rotation) -> float:
-    """Put a body on the floor at `place` [2] m; the height of its top, m."""
-    position, top = upright(*one, place, 0.0, rotation)
-    _put(teacher, one[1], position, rotation)
-    return top
-
-
-def _put(teacher: Teacher, body: TeacherBody, position: np.ndarray, rotation: Rotation) -> None:
-    teacher.place(teacher.add(body), position, rotation.as_quat())
 
 
 def _box(source: ShapeSource, body: TeacherBody, rotation: Rotation) -> tuple[np.ndarray, np.ndarray]:
@@ -271,10 +386,51 @@ def _box(source: ShapeSource, body: TeacherBody, rotation: Rotation) -> tuple[np
 
 
 def _direction(rng: np.random.Generator) -> np.ndarray:
-    """A unit vector [2]."""
+    """A level unit vector [3]."""
     turn = rng.uniform(0.0, 2 * np.pi)
-    return np.array([np.cos(turn), np.sin(turn)])
+    return np.array([np.cos(turn), np.sin(turn), 0.0])
 
 
-def _closed(span: tuple[int, int]) -> tuple[int, int]:
-    return span[0], span[1] + 1
+def upright(
+    source: ShapeSource, body: TeacherBody, place: np.ndarray, height: float, rotation: Rotation
+) -> tuple[np.ndarray, float]:
+    """Where [3] m the centre of mass is when the lowest point is at `height` m over `place` [2] m; and the top, m."""
+    low, high = _box(source, body, rotation)
+    position = np.array([*place, height - low[2]])
+    return position, float(position[2] + high[2])
+
+
+def _standing(source: ShapeSource, rng: np.random.Generator) -> Rotation:
+    """A rotation in which a shape stands on a random one of its steady faces; any rotation where it has none."""
+    turn = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi))
+    faces = steady_faces(source.vertices)
+    if len(faces) == 0:
+        return turn * Rotation.random(rng=rng)
+    return turn * Rotation.align_vectors([-UP], faces[rng.integers(len(faces))][None])[0]
+
+
+def steady_faces(vertices: np.ndarray) -> np.ndarray:
+    """Outward unit normals [K, 3] of the faces of the convex hull on which a body stands without tipping over.
+
+    Args:
+        vertices: [V, 3] about the centre of mass.
+    """
+    hull = ConvexHull(vertices)
+    extent = float(np.ptp(vertices, axis=0).max())
+    corners = vertices[hull.vertices]
+    # Triangles of one face differ by rounding.
+    _, first = np.unique(hull.equations.round(3), axis=0, return_index=True)
+    steady = [plane[:3] for plane in hull.equations[first] if _margin(corners, plane, extent) >= STEADY * extent]
+    return np.array(steady).reshape(-1, 3)
+
+
+def _margin(corners: np.ndarray, plane: np.ndarray, extent: float) -> float:
+    """How far within the face on `plane` [4] (normal, offset) the origin's foot is; negative outside, -inf: no face."""
+    normal, offset = plane[:3], plane[3]
+    face = corners[np.abs(corners @ normal + offset) < 1e-3 * extent]
+    axes = np.linalg.svd(normal[None])[2][1:]
+    try:
+        rim = ConvexHull(face @ axes.T)
+    except (QhullError, ValueError):
+        return -np.inf
+    return float(-rim.equations[:, 2].max())

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from sdfsim.data.convex_pieces import VHACD, decompose, wavefront
 from sdfsim.data.dataset import SOLID, check_names
 from sdfsim.data.pybullet_sim import write_form_urdf, write_urdf
 from sdfsim.errors import SdfsimError
@@ -28,8 +29,48 @@ NODES = 512  # surface nodes a shape: the vertices and edges of the pieces first
 THINNEST = 0.02  # thickness over largest extent below which a mesh is left out: no fit resolves it
 VISUAL, COLLISION = "visual_geometry.obj", "collision_geometry.obj"  # the two files of a NAME/ folder
 SOLIDS = 1000  # in pybullet_data
+VHACD = {"resolution": 1_000_000, "concavity": 0.0025, "maxNumVerticesPerCH": 64}
+# In a process of its own: it prints to stdout, and on an odd mesh it aborts, or takes all the memory there is.
+VHACD_CALL = f"""
+import resource, sys, pybullet
+resource.setrlimit(resource.RLIMIT_AS, (4 << 30, 4 << 30))
+pybullet.vhacd(*sys.argv[1:], **{VHACD})
+"""
+VHACD_TIME = 600  # s
 
 Progress = Callable[[float, str], None]
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where a shape comes from.
+
+    Attributes:
+        name: of the Shape folder.
+        mesh: file of the solid, which is also what is shown.
+        pieces: OBJ with one convex piece a group; None: `mesh` is cut into pieces by V-HACD.
+        primitive: name of a primitive, in place of files.
+        as_is: keep size and origin of the files, as MOVi-B does. Other shapes get a largest extent of 1 m.
+    """
+
+    name: str
+    mesh: Path | None = None
+    pieces: Path | None = None
+    primitive: str = ""
+    as_is: bool = False
+
+    @property
+    def how(self) -> str:
+        """How its convex pieces come about."""
+        return "primitive" if self.primitive else "own" if self.pieces else "vhacd"
+
+    def digest(self) -> str:
+        """Changes with the geometry and how it is cut."""
+        digest = hashlib.sha256(f"{self.how} {self.primitive} {VHACD if self.how == 'vhacd' else ''}".encode())
+        for file in (self.mesh, self.pieces):
+            if file is not None:
+                digest.update(file.read_bytes())
+        return digest.hexdigest()[:16]
 
 
 @dataclass(frozen=True)
@@ -58,80 +99,33 @@ class ShapeSource:
     sphere: bool = False
 
 
-@dataclass(frozen=True)
-class Origin:
-    """Where a shape comes from: files (`pieces` None: to be decomposed), or the name of a primitive."""
-
-    name: str
-    mesh: Path | None = None
-    pieces: Path | None = None
-    primitive: str = ""
-
-    @property
-    def how(self) -> str:
-        """How its convex pieces come about."""
-        return "primitive" if self.primitive else "own" if self.pieces else "vhacd"
-
-    def digest(self) -> str:
-        """Changes with the geometry and how it is cut."""
-        digest = hashlib.sha256(f"{self.how} {self.primitive} {VHACD if self.how == 'vhacd' else ''}".encode())
-        for file in (self.mesh, self.pieces):
-            if file is not None:
-                digest.update(file.read_bytes())
-        return digest.hexdigest()[:16]
-
-
 def split_of(name: str) -> str:
     """The split whose trajectories may hold a shape: eight names of ten train, one validates, one tests."""
     tenth = int(hashlib.sha256(name.encode()).hexdigest(), 16) % 10
     return {8: "validation", 9: "test"}.get(tenth, "train")
 
 
-def find_shapes(shapes: Path, engine: Path) -> list[ShapeSource]:
-    """MOVi-B's shapes as they are, in name order, their engine files written under `engine`.
+def origins(shapes: Path | None, random_solids: int = 0, *, as_is: bool = False) -> list[Origin]:
+    """Shapes of a folder, then the first of PyBullet's random solids.
 
-    Raises:
-        SdfsimError: when the folder holds none.
-    """
-    engine.mkdir(parents=True, exist_ok=True)
-    found = []
-    for origin in kubasic_origins(shapes):
-        assert origin.mesh is not None and origin.pieces is not None
-        mesh = load_mesh(origin.mesh)
-        volume = mass_properties(mesh)[0]
-        # Kubric's assets have their centre of mass at the origin; their URDF says so and the engine takes it.
-        pieces = engine / f"{origin.name}.obj"
-        write_text(pieces, origin.pieces.read_text(encoding="utf-8"))
-        urdf = _engine_file(pieces)
-        found.append(ShapeSource(origin.name, urdf, volume, mesh.vertices, pieces, origin.mesh, np.zeros(3), 1.0))
-    return found
-
-
-def kubasic_origins(shapes: Path) -> list[Origin]:
-    """The NAME/ folders of a folder (see `find_shapes`), in name order.
-
-    Raises:
-        SdfsimError: there are none, or one of a name that no Shape folder can have.
-    """
-    found = [Origin(f.name, f / VISUAL, f / COLLISION) for f in _shape_folders(shapes)]
-    if not found:
-        raise SdfsimError(f"{shapes}: no shapes found", f"expected NAME/{VISUAL} and NAME/{COLLISION}")
-    check_names(f"{shapes}", [origin.name for origin in found])
-    return found
-
-
-def origins(shapes: Path | None, random_solids: int = 0) -> list[Origin]:
-    """Mesh files and NAME/ folders (see `find_shapes`) of a folder, then the first of PyBullet's random solids.
+    Args:
+        shapes: folder of NAME/ folders, each with `visual_geometry.obj` and `collision_geometry.obj`, and mesh files.
+        random_solids: how many of the solids.
+        as_is: take the NAME/ folders alone, in their own size (Kubric's assets have their centre of mass at 0).
 
     Raises:
         SdfsimError: no shapes, more solids than there are, one name twice, or one that no Shape folder can have.
     """
     found = []
     if shapes is not None:
-        found += [Origin(f.name, f / VISUAL, f / COLLISION) for f in _shape_folders(shapes)]
-        found += [Origin(f.stem, f) for f in sorted(shapes.glob("*")) if f.suffix.lower() in MESH_SUFFIXES]
+        # Kubric's `dome` is scenery, not one of its eleven bodies: it has no visual geometry.
+        folders = sorted(p.parent for p in shapes.glob(f"*/{COLLISION}") if (p.parent / VISUAL).exists())
+        found += [Origin(f.name, f / VISUAL, f / COLLISION, as_is=as_is) for f in folders]
+        if not as_is:
+            found += [Origin(f.stem, f) for f in sorted(shapes.glob("*")) if f.suffix.lower() in MESH_SUFFIXES]
         if not found:
-            raise SdfsimError(f"{shapes}: no shapes found", f"expected mesh files or NAME/{VISUAL} and {COLLISION}")
+            also = "" if as_is else ", or mesh files"
+            raise SdfsimError(f"{shapes}: no shapes found", f"expected NAME/{VISUAL} and NAME/{COLLISION}{also}")
     if not 0 <= random_solids <= SOLIDS:
         raise SdfsimError(f"--random-solids must be 0 to {SOLIDS} (got {random_solids})")
     if random_solids:
@@ -146,13 +140,8 @@ def origins(shapes: Path | None, random_solids: int = 0) -> list[Origin]:
     return found
 
 
-def made_from(found: list[Origin]) -> dict[str, dict[str, str]]:
-    """Name -> how its pieces come about and what changes with its geometry: what `dataset.json` is to say."""
-    return {origin.name: {"pieces": origin.how, "sha256": origin.digest()} for origin in found}
-
-
-def prepare(found: list[Origin], engine: Path, on_progress: Progress) -> tuple[list[ShapeSource], dict]:
-    """Engine files of all shapes, about their centres of mass and of largest extent 1 m; kept where they are there.
+def prepare(found: list[Origin], engine: Path, on_progress: Progress) -> tuple[list[ShapeSource], dict[str, str]]:
+    """Engine files of all shapes, about their centres of mass; files that are there already are kept.
 
     Args:
         found: from `origins`, or primitives.
@@ -160,8 +149,10 @@ def prepare(found: list[Origin], engine: Path, on_progress: Progress) -> tuple[l
         on_progress: called with the fraction done and a message.
 
     Returns:
-        The usable shapes in the order of `found`; and what `dataset.json` is to say: `shapes`, `left_out`
-        (name -> why) and `vhacd`.
+        The usable shapes in the order of `found`; and the others, name -> why.
+
+    Raises:
+        SdfsimError: a shape that is to be taken as it is cannot be used.
     """
     engine.mkdir(parents=True, exist_ok=True)
     records: list[dict[str, Any]] = [{}] * len(found)
@@ -170,82 +161,58 @@ def prepare(found: list[Origin], engine: Path, on_progress: Progress) -> tuple[l
         on_progress(done / len(found), f"pieces of {found[index].name}, {done} of {len(found)}")
     pairs = list(zip(found, records, strict=True))
     left_out = {o.name: r["left_out"] for o, r in pairs if "left_out" in r}
-    kept = [(o, r) for o, r in pairs if "left_out" not in r]
-    info = {
-        "shapes": [o.name for o, _ in kept],
-        "left_out": left_out,
-        "vhacd": VHACD,
-    }
-    return [_source(o, r, engine) for o, r in kept], info
+    return [_source(o, r, engine) for o, r in pairs if "left_out" not in r], left_out
 
 
-def fit_shapes(sources: list[ShapeSource], out: Path, on_progress: Progress) -> None:
-    """Fit a Shape folder `out/NAME` for every shape that has none yet.
-
-    The surface is that of the convex pieces, since that is what the teacher collides.
-    """
-    todo = [source for source in sources if not (out / source.name / "shape.json").exists()]
-    for done, (index, _) in enumerate(parallel(_fit_one, [(s, out / s.name) for s in todo]), start=1):
-        on_progress(done / len(todo), f"shape {todo[index].name} fitted, {done} of {len(todo)}")
-
-
-def _shape_folders(shapes: Path) -> list[Path]:
-    # `dome` is Kubric's scenery, not one of its eleven bodies: it has no visual geometry here.
-    return sorted(p.parent for p in shapes.glob(f"*/{COLLISION}") if (p.parent / VISUAL).exists())
-
-
-def _prepare_one(origin: Origin, engine: Path) -> dict:
-    """Write one shape's engine files; its record."""
+def _prepare_one(origin: Origin, engine: Path) -> dict[str, Any]:
+    """Write the pieces of one shape; its record."""
     file, digest = engine / f"{origin.name}.json", origin.digest()
     if file.exists() and (record := read_json(file)).get("sha256") == digest:
         return record
     try:
-        pieces = _pieces(origin, engine)
-        volume, com = _volume(pieces)
-        size = float(np.ptp(np.concatenate([piece.vertices for piece in pieces]), axis=0).max())
+        record = {"sha256": digest, **_write_pieces(origin, engine)}
     except SdfsimError as error:
-        # A record is the same wherever the meshes lie.
-        reason = error.message
-        for path in (origin.mesh, origin.pieces):
-            reason = reason.replace(str(path), path.name) if path else reason
-        record: dict[str, Any] = {"sha256": digest, "left_out": reason}
-    else:
-        if origin.primitive == "sphere":
-            volume, com, size = np.pi / 6.0, np.zeros(3), 1.0
-        moved = [Mesh((piece.vertices - com) / size, piece.faces) for piece in pieces]
-        write_text(engine / f"{origin.name}.obj", wavefront(moved))
-        record = {"sha256": digest, "volume": volume / size**3, "com": com.tolist(), "size": size}
+        if origin.as_is:
+            raise
+        record = {"sha256": digest, "left_out": error.message}
     write_json(file, record)
     return record
 
 
-def _pieces(origin: Origin, engine: Path) -> list[Mesh]:
+def _write_pieces(origin: Origin, engine: Path) -> dict[str, Any]:
+    """Write NAME.obj in the engine's frame; volume at scale 1, and centre of mass and size in the original's."""
+    file = engine / f"{origin.name}.obj"
+    if origin.as_is:
+        assert origin.mesh is not None and origin.pieces is not None
+        volume = mass_properties(load_mesh(origin.mesh))[0]
+        write_text(file, origin.pieces.read_text(encoding="utf-8"))
+        return {"volume": volume, "com": [0.0, 0.0, 0.0], "size": 1.0}
     if origin.primitive == "sphere":
-        return [convex_hull(primitives.sphere().vertices)]
+        write_text(file, wavefront([convex_hull(primitives.sphere().vertices)]))
+        return {"volume": np.pi / 6.0, "com": [0.0, 0.0, 0.0], "size": 1.0}
     if origin.primitive:
-        return primitives.convex_pieces(origin.primitive)
-    if origin.pieces is not None:
-        return load_pieces(origin.pieces)
-    assert origin.mesh is not None
-    solid = solidify(load_mesh(origin.mesh), name=origin.name)
-    extent = np.ptp(solid.surface.vertices, axis=0)
-    if extent.min() < THINNEST * extent.max():
-        raise SdfsimError(f"thinner than {THINNEST:g} of its largest extent")
-    return decompose(solid.surface, engine / origin.name)
-
-
-def _volume(pieces: list[Mesh]) -> tuple[float, np.ndarray]:
-    """Volume m^3 and centre of mass [3] m of the union."""
+        pieces = primitives.convex_pieces(origin.primitive)
+    elif origin.pieces is not None:
+        pieces = load_pieces(origin.pieces)
+    else:
+        assert origin.mesh is not None
+        solid = solidify(load_mesh(origin.mesh), name=origin.name)
+        extent = np.ptp(solid.surface.vertices, axis=0)
+        if extent.min() < THINNEST * extent.max():
+            raise SdfsimError(f"thinner than {THINNEST:g} of its largest extent")
+        pieces = decompose(solid.surface, engine / origin.name)
     if len(pieces) == 1 and is_closed(pieces[0]):
         volume, com, _ = mass_properties(pieces[0])
     else:
         volume, com, _ = mass_properties_of_sdf(_Union(PiecesDistance(pieces)), cells=48)
-    return volume, com
+    size = float(np.ptp(np.concatenate([piece.vertices for piece in pieces]), axis=0).max())
+    write_text(file, wavefront([Mesh((piece.vertices - com) / size, piece.faces) for piece in pieces]))
+    return {"volume": volume / size**3, "com": com.tolist(), "size": size}
 
 
 @dataclass(frozen=True)
 class _Union:
-    """Distances to a union of pieces as integrals over an SDF want them; without gradients."""
+    """Distances to a union of pieces in the form that integrals over an SDF take; without gradients."""
 
     oracle: PiecesDistance
 
@@ -257,22 +224,67 @@ class _Union:
         return self.oracle(points).distance, None
 
 
-def _source(origin: Origin, record: dict, engine: Path) -> ShapeSource:
-    pieces = engine / f"{origin.name}.obj"
-    vertices = np.concatenate([piece.vertices for piece in load_pieces(pieces)])
-    # A ball of facets would lose a third of its speed in 3 s of rolling.
+def _source(origin: Origin, record: dict[str, Any], engine: Path) -> ShapeSource:
+    pieces, urdf = engine / f"{origin.name}.obj", engine / f"{origin.name}.urdf"
     sphere = origin.primitive == "sphere"
-    ball = '<sphere radius="0.5"/>'
-    urdf = write_form_urdf(ball, pieces.with_suffix(".urdf")) if sphere else _engine_file(pieces)
+    if sphere:  # a ball of facets would lose a third of its speed in 3 s of rolling
+        write_form_urdf('<sphere radius="0.5"/>', urdf)
+    else:
+        # A path from the URDF on, so that a dataset can be moved. Not the bare name: the engine looks in the working
+        # directory first, where a mesh of that name may well lie.
+        write_urdf(Path("..", pieces.resolve().parent.name, pieces.name), np.zeros(3), urdf)
+    if origin.as_is:
+        assert origin.mesh is not None
+        vertices = load_mesh(origin.mesh).vertices
+    else:
+        vertices = np.concatenate([piece.vertices for piece in load_pieces(pieces)])
     com = np.array(record["com"])
     return ShapeSource(origin.name, urdf, record["volume"], vertices, pieces, origin.mesh, com, record["size"], sphere)
 
 
-def _engine_file(pieces: Path) -> Path:
-    """Write NAME.urdf beside NAME.obj, the pieces about their centre of mass: a dataset can be moved."""
-    # Not the bare name: the engine looks in the working directory first, where meshes of that name may well lie.
-    mesh = Path("..", pieces.resolve().parent.name, pieces.name)
-    return write_urdf(mesh, np.zeros(3), pieces.with_suffix(".urdf"))
+def decompose(mesh: Mesh, scratch: Path) -> list[Mesh]:
+    """Convex pieces of a solid by V-HACD.
+
+    Args:
+        mesh: the boundary of a solid, metres.
+        scratch: a path for its files, which are removed; gets endings.
+
+    Raises:
+        SdfsimError: V-HACD failed on it.
+    """
+    before, after, log = (scratch.with_name(f".{scratch.name}.{end}") for end in ("in.obj", "out.obj", "log"))
+    try:
+        write_text(before, wavefront([mesh]))
+        command = [sys.executable, "-c", VHACD_CALL, before, after, log]
+        quiet = subprocess.DEVNULL
+        subprocess.run(command, stdout=quiet, stderr=quiet, check=True, timeout=VHACD_TIME)
+        return load_pieces(after)
+    except subprocess.SubprocessError as error:
+        raise SdfsimError("V-HACD found no convex pieces", "give them in a NAME/ folder") from error
+    finally:
+        for file in (before, after, log):
+            file.unlink(missing_ok=True)
+
+
+def wavefront(pieces: list[Mesh]) -> str:
+    """Wavefront OBJ with one `o` group a piece."""
+    lines, before = [], 1
+    for number, piece in enumerate(pieces):
+        lines.append(f"o piece_{number}")
+        lines += ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in piece.vertices]
+        lines += ["f {} {} {}".format(*(face + before)) for face in piece.faces]
+        before += len(piece.vertices)
+    return "\n".join(lines) + "\n"
+
+
+def fit_shapes(sources: list[ShapeSource], out: Path, on_progress: Progress) -> None:
+    """Fit a Shape folder `out/NAME` for every shape that has none yet.
+
+    The surface is that of the convex pieces, since that is what the teacher collides.
+    """
+    todo = [source for source in sources if not (out / source.name / "shape.json").exists()]
+    for done, (index, _) in enumerate(parallel(_fit_one, [(s, out / s.name) for s in todo]), start=1):
+        on_progress(done / len(todo), f"shape {todo[index].name} fitted, {done} of {len(todo)}")
 
 
 def _fit_one(source: ShapeSource, out: Path) -> None:

@@ -1,55 +1,38 @@
-"""Rollouts against a recorded dataset: the numbers that models are compared by."""
+"""Rollouts against a recorded dataset: the numbers that models are compared by, and their tables."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from sdfsim.console import columns
 from sdfsim.data import metrics
 from sdfsim.data.batching import scene_of
-from sdfsim.data.dataset import Trajectory, load_shapes, trajectory_files
+from sdfsim.data.dataset import Trajectory, engine_substep, load_shapes, trajectory_files
 from sdfsim.data.metrics import FRAMES, HORIZONS
 from sdfsim.data.replay import batches, first_frames, model_units, roll_out
-from sdfsim.data.velocities import at_instants, engine_substep
 from sdfsim.dynamics.energy import Guard
 from sdfsim.dynamics.model import Model, load_model
 from sdfsim.dynamics.ranges import outside_training
 from sdfsim.dynamics.simulator import pick_device
 from sdfsim.dynamics.step import FreeFlight
 from sdfsim.errors import SdfsimError
-from sdfsim.evaluation import baselines
+from sdfsim.evaluation.baselines import ballistic, chaos_floor
+from sdfsim.evaluation.harness import Progress
 from sdfsim.evaluation.penetration import EVERY, Solid, exact_solids, penetration
 from sdfsim.shape.shape import Shape
 from sdfsim.training.contact_cache import inner_steps
 
 LIMITS = (0.1, 0.25, 0.5)  # m, translation errors that a body survives
-CURVE_EVERY = 5  # steps between two stored points of a survival curve
+SURVIVED = "0.25"  # m, the limit whose median survival time is shown
+NOTHING = "-"
 
-Progress = Callable[[float, str], None]
 Motions = list[Trajectory]
-
-
-@dataclass(frozen=True)
-class Score:
-    """One trajectory's errors.
-
-    Attributes:
-        bodies: how many bodies moved.
-        squared: horizon -> mean squared distance m^2 over bodies and steps.
-        angle: horizon -> mean rotation angle, degrees.
-        there: horizon -> root mean squared distance m over bodies, in the last of these steps alone.
-        turned: horizon -> mean rotation angle there, degrees.
-    """
-
-    bodies: int
-    squared: dict[int, float]
-    angle: dict[int, float]
-    there: dict[int, float]
-    turned: dict[int, float]
+Rows = list[tuple[str, ...]]
 
 
 def evaluate(
@@ -80,33 +63,44 @@ def evaluate(
         on_progress: called with the fraction done and a message.
 
     Returns:
-        A report; its errors are tables horizon -> seconds, translation_rmse m and rotation_error degrees over all
-        bodies and steps, with 95 % intervals over trajectories; and `at_frame`, the same two in the last of these steps
-        alone, translation as the mean over trajectories of the root mean square over bodies:
-        "model", "ballistic": errors.
+        A report:
+        "model", "ballistic": errors as `errors` gives them.
         "chaos_floor": "perturbations" -> name -> errors; or "left_out", why.
         "outside_training": what of the scenes the model has not seen, one line each.
-        "survival", "median_survival_s": of all of them, by limit in m.
+        "median_survival_s": of all of them, by limit in m: until half of the bodies are farther from the recording.
         "penetration" m, "energy_gain" (a fraction), "resting_speed" m/s: of the model and of the teacher's recording.
         "engine_substep": s, the recording engine's inner step; 0 where no dataset.json tells it.
-        Further counts, and milliseconds a step.
+        Further counts, and "ms_per_step_per_trajectory".
 
     Raises:
         SdfsimError: no or unreadable trajectories or shapes; exit code 3 when a rollout is not finite.
     """
     tell = on_progress or (lambda fraction, message: None)
-    used = (model if isinstance(model, Model) else load_model(model)).to(pick_device(device))
+    place = pick_device(device)
+    used = (model if isinstance(model, Model) else load_model(model)).to(place)
     if free_flight == "learned" and used.kind != "paper":
         raise SdfsimError("free_flight 'learned' exists for the paper network only", "give a model of that kind")
     recorded, shapes = _load(data, split)
     longest = min(steps, *(len(t.position) - 1 for t in recorded))
     recorded = [first_frames(t, longest + 1) for t in recorded]
     substep = engine_substep(data)
-    contenders, seconds = _simulate(used, recorded, shapes, substep, device, free_flight, guard, tell)
+    known = {name: replace(shape, nodes=shape.nodes[: used.nodes]) for name, shape in shapes.items()}
+    contenders: dict[str, Motions] = {"model": [], "ballistic": []}
+    groups = batches(recorded)
+    inner, seconds = inner_steps(recorded[0].dt, substep), 0.0
+    for k, group in enumerate(groups):
+        tell(0.8 * k / len(groups), f"{used.name}: batch {k + 1} of {len(groups)}, {longest} steps")
+        started = time.perf_counter()
+        contenders["model"] += roll_out(
+            used, group, known, longest, place, free_flight, guard=guard, substeps=inner, as_teacher=True
+        )
+        seconds += time.perf_counter() - started
+        contenders["ballistic"] += ballistic(used, group, known, longest)
     again, floor_report = {}, {}
     if chaos_floor:
         tell(0.8, "teacher, from starts that differ slightly")
-        again, floor_report = _teacher_again(data, recorded)
+        again, floor_report = _teacher_again(data, split, longest)
+    scenes = [scene_of([t], [0], shapes)[0] for t in recorded]
     report = {
         "data": str(data),
         "split": split,
@@ -119,24 +113,66 @@ def evaluate(
         "steps": longest,
         "steps_asked": steps,
         "engine_substep": substep,
-        "outside_training": _outside(used, recorded, shapes),
+        "outside_training": outside_training(scenes, used, model_units(used, recorded[0])),
         "ms_per_step_per_trajectory": 1e3 * seconds / longest / len(recorded),
-        **{who: _errors(motions, recorded) for who, motions in contenders.items()},
+        **{who: errors(motions, recorded) for who, motions in contenders.items()},
         **floor_report,
-        **_survival(contenders | again, recorded),
+        "median_survival_s": {who: _survival(motions, recorded) for who, motions in (contenders | again).items()},
     }
     if not errors_only:
         tell(0.9, "penetration, energy and rest")
         solids = exact_solids(data, shapes)
-        # Energies compare at the instants of the positions; rest and penetration are told by positions alone.
-        report |= _quality(contenders["model"], [at_instants(t, substep) for t in recorded], solids)
+        report |= _quality(contenders["model"], recorded, solids)
     tell(1.0, "done")
     return report
 
 
-def _load(data: Path, split: str) -> tuple[Motions, dict[str, Shape]]:
+def errors(motions: Motions, recorded: Motions) -> dict[str, dict]:
+    """Errors of motions, over the bodies that move.
+
+    Returns:
+        Horizon in steps -> seconds, translation_rmse m and rotation_error degrees over all bodies and steps up to
+        there, with 95 % intervals over trajectories, and `at_frame`: the same in the last of these steps alone, where
+        translation is the mean over trajectories of the root mean square over bodies.
+    """
+    longest = len(recorded[0].position) - 1
+    bodies = np.array([(~t.static).sum() for t in recorded])
+    share = bodies / bodies.mean()
+    report = {}
+    for h in sorted({h for h in (*HORIZONS, *FRAMES) if h <= longest} | {longest}):
+        upto, there = (
+            np.array([_compared(motion, truth, frames) for motion, truth in zip(motions, recorded, strict=True)])
+            for frames in (slice(1, h + 1), slice(h, h + 1))
+        )
+        squared, angle = upto[:, 0] ** 2 * share, upto[:, 1] * share
+        report[str(h)] = {
+            "seconds": h * recorded[0].dt,
+            "translation_rmse": float(np.sqrt(squared.mean())),
+            "translation_rmse_95": [float(np.sqrt(v)) for v in metrics.interval(squared)],
+            "rotation_error": float(angle.mean()),
+            "rotation_error_95": metrics.interval(angle),
+            "at_frame": {
+                "translation_rmse": float(there[:, 0].mean()),
+                "translation_rmse_95": metrics.interval(there[:, 0]),
+                "rotation_error": float((there[:, 1] * share).mean()),
+                "rotation_error_95": metrics.interval(there[:, 1] * share),
+            },
+        }
+    return report
+
+
+def _compared(motion: Trajectory, truth: Trajectory, frames: slice) -> tuple[float, float]:
+    """RMSE m and mean angle in degrees of one trajectory in some frames."""
+    moving = ~truth.static
+    return (
+        metrics.translation_rmse(motion.position[frames, moving], truth.position[frames, moving]),
+        metrics.rotation_error(motion.quat_xyzw[frames, moving], truth.quat_xyzw[frames, moving]),
+    )
+
+
+def _load(data: Path, split: str, *, as_recorded: bool = False) -> tuple[Motions, dict[str, Shape]]:
     """Trajectories in which something moves, those that can run together side by side, and their shapes."""
-    recorded = [Trajectory.load(f) for f in trajectory_files(data, split)]
+    recorded = [Trajectory.load(f, as_recorded=as_recorded) for f in trajectory_files(data, split)]
     recorded = [t for group in batches(recorded) for t in group if not t.static.all()]
     if not recorded:
         raise SdfsimError(f"{data}: nothing moves in any trajectory")
@@ -145,109 +181,26 @@ def _load(data: Path, split: str) -> tuple[Motions, dict[str, Shape]]:
     return recorded, load_shapes(data, {str(n) for t in recorded for n in t.shape})
 
 
-def _simulate(
-    model: Model,
-    recorded: Motions,
-    shapes: dict[str, Shape],
-    substep: float,
-    device: str,
-    free_flight: FreeFlight,
-    guard: Guard,
-    tell: Progress,
-) -> tuple[dict[str, Motions], float]:
-    """The model's and the ballistic motions from the recorded starts, and the seconds that the model took."""
-    known = {name: replace(shape, nodes=shape.nodes[: model.nodes]) for name, shape in shapes.items()}
-    place, longest = pick_device(device), len(recorded[0].position) - 1
-    motions: dict[str, Motions] = {"model": [], "ballistic": []}
-    seconds = 0.0
-    groups, inner = batches([at_instants(t, substep) for t in recorded]), inner_steps(recorded[0].dt, substep)
-    for k, group in enumerate(groups):
-        tell(0.8 * k / len(groups), f"{model.name}: batch {k + 1} of {len(groups)}, {longest} steps")
-        started = time.perf_counter()
-        motions["model"] += roll_out(
-            model, group, known, longest, place, free_flight, guard=guard, substeps=inner, as_teacher=True
-        )
-        seconds += time.perf_counter() - started
-        motions["ballistic"] += roll_out(model, group, known, longest, place, contact=False)
-    return motions, seconds
-
-
-def _outside(model: Model, recorded: Motions, shapes: dict[str, Shape]) -> list[str]:
-    """What of the scenes the model has not seen in training, one line each."""
-    scenes = [scene_of([t], [0], shapes)[0] for t in recorded]
-    return outside_training(scenes, model, model_units(model, recorded[0]))
-
-
-def _teacher_again(data: Path, recorded: Motions) -> tuple[dict[str, Motions], dict]:
+def _teacher_again(data: Path, split: str, steps: int) -> tuple[dict[str, Motions], dict]:
     """The teacher's motions from perturbed starts by "teacher NAME", and what the report says of them."""
+    recorded = [first_frames(t, steps + 1) for t in _load(data, split, as_recorded=True)[0]]
     try:
-        again = baselines.chaos_floor(data, recorded, len(recorded[0].position) - 1)
+        again = chaos_floor(data, recorded, steps)
     except SdfsimError as error:
         why = f"{error.message} ({error.hint})" if error.hint else error.message
         return {}, {"chaos_floor": {"left_out": why}}
     farthest = [float(_distance(one, truth).max()) for one, truth in zip(again["0"], recorded, strict=True)]
     report = {
-        "perturbations": {name: _errors(motions, recorded) for name, motions in again.items()},
+        "perturbations": {name: errors(motions, recorded) for name, motions in again.items()},
         "median_farthest_unperturbed_m": float(np.median(farthest)),
     }
     return {f"teacher {name}": motions for name, motions in again.items()}, {"chaos_floor": report}
 
 
-def _errors(motions: Motions, recorded: Motions) -> dict[str, dict]:
-    """Horizon in steps -> errors of all `motions` up to there."""
-    longest = len(recorded[0].position) - 1
-    horizons = sorted({h for h in (*HORIZONS, *FRAMES) if h <= longest} | {longest})
-    scores = [score(motion, truth, horizons) for motion, truth in zip(motions, recorded, strict=True)]
-    return {str(h): {"seconds": h * recorded[0].dt} | _summary(scores, h) for h in horizons}
-
-
-def score(motion: Trajectory, truth: Trajectory, horizons: list[int]) -> Score:
-    """Errors of a motion over the steps up to each horizon, and in the last of them, of the bodies that move."""
-    moving = ~truth.static
-    p, q = motion.position[1:, moving], motion.quat_xyzw[1:, moving]
-    truth_p, truth_q = truth.position[1:, moving], truth.quat_xyzw[1:, moving]
-    return Score(
-        bodies=int(moving.sum()),
-        squared={h: metrics.translation_rmse(p[:h], truth_p[:h]) ** 2 for h in horizons},
-        angle={h: metrics.rotation_error(q[:h], truth_q[:h]) for h in horizons},
-        there={h: metrics.translation_rmse(p[h - 1 : h], truth_p[h - 1 : h]) for h in horizons},
-        turned={h: metrics.rotation_error(q[h - 1 : h], truth_q[h - 1 : h]) for h in horizons},
-    )
-
-
-def _summary(scores: list[Score], horizon: int) -> dict:
-    """Errors over all bodies and steps, and 95 % intervals over trajectories."""
-    bodies = np.array([s.bodies for s in scores])
-    share = bodies / bodies.mean()
-    squared = np.array([s.squared[horizon] for s in scores]) * share
-    angle = np.array([s.angle[horizon] for s in scores]) * share
-    there = np.array([s.there[horizon] for s in scores])
-    turned = np.array([s.turned[horizon] for s in scores]) * share
-    return {
-        "translation_rmse": float(np.sqrt(squared.mean())),
-        "translation_rmse_95": [float(np.sqrt(v)) for v in metrics.interval(squared)],
-        "rotation_error": float(angle.mean()),
-        "rotation_error_95": metrics.interval(angle),
-        "at_frame": {
-            "translation_rmse": float(there.mean()),
-            "translation_rmse_95": metrics.interval(there),
-            "rotation_error": float(turned.mean()),
-            "rotation_error_95": metrics.interval(turned),
-        },
-    }
-
-
-def _survival(contenders: dict[str, Motions], recorded: Motions) -> dict:
-    """Shares of all bodies that stay near the recording, and the seconds until half of them have left it."""
-    curves: dict[str, dict] = {}
-    medians: dict[str, dict] = {}
-    for who, motions in contenders.items():
-        error = np.concatenate([_distance(m, t) for m, t in zip(motions, recorded, strict=True)], axis=1)
-        shares = {str(limit): metrics.survival(error, limit) for limit in LIMITS}
-        curves[who] = {limit: share[::CURVE_EVERY].tolist() for limit, share in shares.items()}
-        medians[who] = {limit: metrics.median_survival(share, recorded[0].dt) for limit, share in shares.items()}
-    steps = list(range(0, len(recorded[0].position), CURVE_EVERY))
-    return {"survival": {"steps": steps, **curves}, "median_survival_s": medians}
+def _survival(motions: Motions, recorded: Motions) -> dict[str, float | None]:
+    """Limit in m -> seconds until half of all bodies have been farther from the recording; None if they never are."""
+    error = np.concatenate([_distance(m, t) for m, t in zip(motions, recorded, strict=True)], axis=1)
+    return {str(limit): metrics.median_survival(metrics.survival(error, limit), recorded[0].dt) for limit in LIMITS}
 
 
 def _distance(motion: Trajectory, truth: Trajectory) -> np.ndarray:
@@ -263,13 +216,14 @@ def _quality(predicted: Motions, recorded: Motions, solids: dict[str, Solid]) ->
     return {
         "penetration": {who: penetration(motions, solids) for who, motions in sides.items()}
         | {"geometry": {name: solid.kind for name, solid in solids.items()}, "every": EVERY},
-        "energy_gain": {who: _gain(motions) for who, motions in sides.items()},
+        "energy_gain": {who: energy_gain(motions) for who, motions in sides.items()},
         "resting_speed": {who: _resting(motions, rest) for who, motions in sides.items()}
         | {"bodies": int(sum(r.sum() for r in rest))},
     }
 
 
-def _gain(motions: Motions) -> dict[str, float | None]:
+def energy_gain(motions: Motions) -> dict[str, float | None]:
+    """Mean and worst, over the trajectories, of the largest gain as a fraction of the energy at the start."""
     gains = [gain for motion in motions if (gain := metrics.energy_gain(motion)) is not None]
     return {"mean": float(np.mean(gains)) if gains else None, "worst": max(gains) if gains else None}
 
@@ -278,3 +232,124 @@ def _resting(motions: Motions, rest: list[np.ndarray]) -> float | None:
     """Median speed m/s in the last steps of the bodies [N] that rest in the recording; None without any."""
     found = [metrics.speeds(motion)[:, r].ravel() for motion, r in zip(motions, rest, strict=True)]
     return float(np.median(np.concatenate(found))) if any(len(f) for f in found) else None
+
+
+# --- tables ---
+
+
+def report_lines(report: dict[str, Any]) -> list[str]:
+    """The report for people: errors at every horizon, then the quality of the motion."""
+    name = report["model_name"]
+    return [
+        "Translation RMSE and mean rotation error up to each horizon (95 % intervals over trajectories)",
+        *columns(error_rows(report, name=name)),
+        "",
+        "Errors at a frame alone: translation is the mean over trajectories of the RMSE over bodies",
+        *columns(error_rows(report, name=name, at_frame=True, intervals=False)),
+        "",
+        *columns(quality_rows(report, name=name)),
+        "",
+        *notes(report),
+        f"{report['trajectories']} trajectories, {report['bodies']} bodies, "
+        f"{report['ms_per_step_per_trajectory']:.2f} ms per step and trajectory",
+    ]
+
+
+def error_rows(
+    report: dict[str, Any],
+    *,
+    name: str,
+    at_frame: bool = False,
+    intervals: bool = True,
+    extra: dict[str, dict] | None = None,
+) -> Rows:
+    """Errors at every horizon: the model, others, the teacher run again, and flight without contact. The head first.
+
+    Args:
+        report: of `evaluate`.
+        name: what the model is called.
+        at_frame: errors in a frame alone, at those of `metrics.FRAMES`; else over all steps up to a horizon.
+        intervals: with those of 95 %.
+        extra: errors of others by name.
+    """
+    again = {f"teacher, {size} m/s off": found for size, found in _perturbed(report).items()}
+    rows = {name: report["model"], **(extra or {}), **again, "ballistic": report["ballistic"]}
+    longest = max(map(int, report["model"]))
+    shown = [h for h in report["model"] if int(h) in (FRAMES if at_frame else (*HORIZONS, longest))]
+    head, table = [""], []
+    for steps in shown:
+        span = f"{f'frame {steps}' if at_frame else f'{steps} steps'} = {report['model'][steps]['seconds']:.3g} s"
+        head += [f"m, {span}", f"degrees, {span}"]
+    for who, horizons in rows.items():
+        cells = [who]
+        for steps in shown:
+            found = horizons[steps]["at_frame"] if at_frame else horizons[steps]
+            for what, digits in (("translation_rmse", 3), ("rotation_error", 1)):
+                low, high = (f"{end:.{digits}f}" for end in found[f"{what}_95"])
+                cells.append(f"{found[what]:.{digits}f}" + (f" ({low} to {high})" if intervals else ""))
+        table.append(tuple(cells))
+    return [tuple(head), *table]
+
+
+def quality_rows(report: dict[str, Any], *, name: str) -> Rows:
+    """Penetration, energy, rest and survival, with the teacher's recording beside the model."""
+    head = ("", "penetration 95 %", "worst", "energy gain", "worst", "resting speed", f"within {SURVIVED} m for")
+    length = max(found["seconds"] for found in report["model"].values())
+
+    def lasting(who: str) -> str:
+        seconds = report["median_survival_s"][who][SURVIVED]
+        return f"> {length:g} s" if seconds is None else f"{seconds:.2f} s"
+
+    others = {f"teacher, {size} m/s off": f"teacher {size}" for size in _perturbed(report)} | {"ballistic": "ballistic"}
+    return [
+        head,
+        (name, *_quality_cells(report, "model"), lasting("model")),
+        ("teacher, recorded", *_quality_cells(report, "teacher"), NOTHING),
+        *((who, *[NOTHING] * (len(head) - 2), lasting(key)) for who, key in others.items()),
+    ]
+
+
+def notes(report: dict[str, Any]) -> list[str]:
+    """What has to be known beside the tables, a line each."""
+    depth, floor = report["penetration"], report.get("chaos_floor", {})
+    frames = {who: depth[who]["steps_with_contact"] for who in ("model", "teacher")}
+    lines = [
+        f"Penetration: the deepest node in every {depth['every']}th frame, of {frames['model']} with contact "
+        f"(recorded: {frames['teacher']}).",
+        "Energy gain: the largest over the energy at the start; mean and worst of the trajectories.",
+        f"Resting speed: median of the {report['resting_speed']['bodies']} bodies that rest in the recording.",
+        f"Within {SURVIVED} m: how long it takes until half of the bodies have been farther from the recording.",
+    ]
+    if shown := sorted(name for name, kind in depth["geometry"].items() if kind == "shown mesh"):
+        lines.append(f"Without the engine's files, penetration is into the mesh that is shown of {', '.join(shown)}.")
+    if (steps := report["steps"]) < report["steps_asked"]:
+        lines.append(f"The shortest recording ends after {steps} steps; {report['steps_asked']} were asked for.")
+    lines += [f"Outside the model's training: {line}." for line in report["outside_training"]]
+    if not report["engine_substep"]:
+        lines.append("No dataset.json tells the engine's inner step: velocities count as at the positions' instants.")
+    if "left_out" in floor:
+        lines.append(f"The teacher's chaos floor is left out: {floor['left_out']}.")
+    elif floor:
+        lines.append(
+            "Run again unperturbed, the teacher departs from its recording by up to "
+            f"{floor['median_farthest_unperturbed_m']:.1g} m (median of the trajectories)."
+        )
+    return lines
+
+
+def _perturbed(report: dict[str, Any]) -> dict[str, dict]:
+    """Errors of the teacher run again, by perturbation, without the run that nothing perturbs: that one is a note."""
+    runs = report.get("chaos_floor", {}).get("perturbations", {})
+    return {size: found for size, found in runs.items() if size != "0"}
+
+
+def _quality_cells(report: dict[str, Any], who: str) -> list[str]:
+    depth, gain = report["penetration"][who], report["energy_gain"][who]
+    told = [
+        (depth["percentile_95"], "{:.4f} m"),
+        (depth["worst"], "{:.4f} m"),
+        (gain["mean"], "{:.2%}"),
+        (gain["worst"], "{:.2%}"),
+        (report["resting_speed"][who], "{:.4f} m/s"),
+    ]
+    return [NOTHING if value is None else form.format(value).replace("%", " %") for value, form in told]

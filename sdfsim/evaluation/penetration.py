@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sdfsim.data.dataset import Trajectory
+from sdfsim.dynamics.rollout import Rollout
 from sdfsim.errors import SdfsimError
-from sdfsim.evaluation.baselines import collision_mesh, engine_file, is_sphere
+from sdfsim.evaluation.engines import dataset_urdf, pieces_of
+from sdfsim.scene.scene import Scene
 from sdfsim.shape.distance import PiecesDistance
-from sdfsim.shape.mesh import Mesh, load_pieces
 from sdfsim.shape.mlp_sdf import MlpSdf
-from sdfsim.shape.sdf import GridSdf, MeshSdf
+from sdfsim.shape.sdf import GridSdf, MeshSdf, PlaneSdf
 from sdfsim.shape.shape import Shape, with_sdf
 
 TOUCH = 0.01  # mean sizes of the moving bodies; a node this near to another surface is in contact
@@ -118,31 +119,50 @@ def _near(position: np.ndarray, turn: np.ndarray, bounds: np.ndarray, moving: np
     return (gap <= 0).all(-1) & pairs
 
 
+def rollout_penetration(scene: Scene, motion: Rollout, every: int = 5) -> np.ndarray:
+    """[F] m, depth of the deepest node in those of every so many frames in which anything touches.
+
+    The only plane of the scene, if any, is the floor z = 0.
+    """
+    kept = [k for k, b in enumerate(scene.bodies) if not isinstance(scene.shapes[b.shape].sdf, PlaneSdf)]
+    bodies = [scene.bodies[k] for k in kept]
+    solids = {}
+    for index in {b.shape for b in bodies}:
+        shape = scene.shapes[index]
+        solids[str(index)] = _exact(replace(shape, nodes=shape.nodes - shape.com), shape.com)
+    count = len(kept)
+    track = Trajectory(
+        position=motion.position[:, kept],
+        quat_xyzw=motion.orientation[:, kept],
+        velocity=motion.velocity[:, kept],
+        angular_velocity=motion.angular_velocity[:, kept],
+        shape=np.array([str(b.shape) for b in bodies]),
+        scale=np.array([b.scale for b in bodies]),
+        mass=np.ones(count),
+        inertia=np.ones((count, 3)),
+        friction=np.ones(count),
+        restitution=np.ones(count),
+        static=np.array([b.motion == "static" for b in bodies]),
+        dt=float(motion.meta["dt"]),
+        gravity=scene.gravity,
+    )
+    distance = deepest(track, solids, every)
+    return np.maximum(0.0, -distance[np.isfinite(distance)])
+
+
 def _solid(data: Path, name: str, shape: Shape) -> Solid:
     # A dataset's body frames sit at the centre of mass, and so do its shapes' origins.
-    if not isinstance(shape.sdf, MlpSdf | GridSdf):
-        return _of_sdf(shape, "mesh" if isinstance(shape.sdf, MeshSdf) else "closed form")
-    if shape.source.get("kind") != "pieces":
-        return _of_sdf(with_sdf(shape, "mesh"), "mesh")
-    if not (pieces := engine_pieces(data, name)):
-        return _of_sdf(with_sdf(shape, "mesh"), "shown mesh")
-    oracle = PiecesDistance(pieces)
+    if shape.source.get("kind") != "pieces" or not isinstance(shape.sdf, MlpSdf | GridSdf):
+        return _exact(shape)
+    try:
+        oracle = PiecesDistance(pieces_of(dataset_urdf(data, name)))
+    except SdfsimError:
+        return replace(_exact(shape), kind="shown mesh")
     return Solid(shape.nodes, oracle.bounds, lambda points: oracle(points).distance, "pieces")
 
 
-def _of_sdf(shape: Shape, kind: str) -> Solid:
-    sdf = shape.sdf
-    return Solid(shape.nodes, np.asarray(sdf.bounds), lambda points: np.asarray(sdf(points)[0]), kind)
-
-
-def engine_pieces(data: Path, name: str) -> list[Mesh]:
-    """The convex pieces that the engine collides, in the body's frame; none where the dataset does not lead to them.
-
-    Of an exact sphere they are a hull of points on it.
-    """
-    try:
-        urdf = engine_file(data, name)
-        path, offset = (urdf.with_suffix(".obj"), np.zeros(3)) if is_sphere(urdf) else collision_mesh(urdf)
-        return [Mesh(piece.vertices + offset, piece.faces) for piece in load_pieces(path)]
-    except SdfsimError:
-        return []
+def _exact(shape: Shape, com: np.ndarray | float = 0.0) -> Solid:
+    """The geometry that a shape's distances stand for, seen from `com` [3] m."""
+    sdf = with_sdf(shape, "mesh").sdf if isinstance(shape.sdf, MlpSdf | GridSdf) else shape.sdf
+    kind = "mesh" if isinstance(sdf, MeshSdf) else "closed form"
+    return Solid(shape.nodes, np.asarray(sdf.bounds) - com, lambda points: np.asarray(sdf(points + com)[0]), kind)

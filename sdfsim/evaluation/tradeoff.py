@@ -1,208 +1,508 @@
-"""How much error for how many milliseconds: sweeps the knobs, and tells the front and the claims."""
+"""How much error for how many milliseconds: our models and their knobs, beside PyBullet and MuJoCo."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+import csv
+import io
+import time
+from collections.abc import Callable, Sequence
+from copy import deepcopy
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import sdfsim
-from sdfsim.data import metrics
-from sdfsim.dynamics.model import bundled_models, load_model
-from sdfsim.dynamics.simulator import pick_device
+from sdfsim.data.batching import scene_of
+from sdfsim.data.dataset import (
+    FLOOR,
+    Trajectory,
+    check_alike,
+    floor_of,
+    home_of,
+    load_shapes,
+    read_info,
+    trajectory_files,
+)
+from sdfsim.data.pybullet_sim import DT, SUBSTEP
+from sdfsim.data.replay import first_frames, roll_out
+from sdfsim.dynamics.froude import scene_units
+from sdfsim.dynamics.graph import SUBSTEPS
+from sdfsim.dynamics.model import SOLVER, Model, load_model, model_names
+from sdfsim.dynamics.precision import in_bfloat16
+from sdfsim.dynamics.simulator import Simulator, pick_device
 from sdfsim.errors import SdfsimError
-from sdfsim.evaluation.tradeoff_cases import Cases, load_cases
-from sdfsim.evaluation.tradeoff_contenders import Contender, Ours
-from sdfsim.evaluation.tradeoff_engines import Engine
-from sdfsim.evaluation.tradeoff_front import front
-from sdfsim.evaluation.tradeoff_knobs import Setting, setting_from, settings
-from sdfsim.evaluation.tradeoff_measure import Point, measure
-from sdfsim.evaluation.tradeoff_picture import draw
-from sdfsim.evaluation.tradeoff_report import write_report
-from sdfsim.evaluation.tradeoff_told import Rows, beaten_by, table, told
+from sdfsim.evaluation.baselines import perturbed
+from sdfsim.evaluation.engines import Start, Timing, bullet, dataset_urdf, mujoco, start_of_scene
+from sdfsim.evaluation.evaluate import energy_gain, errors
+from sdfsim.evaluation.hard_cases import tossed
+from sdfsim.evaluation.harness import (
+    Job,
+    Point,
+    draw_work_precision,
+    front,
+    machine,
+    measure,
+    number,
+    one_thread,
+    peak_memory,
+)
+from sdfsim.evaluation.penetration import Solid, exact_solids, penetration
 from sdfsim.files import locked, write_json, write_text
-from sdfsim.shape.mesh import MESH_SUFFIXES
+from sdfsim.scene.scene import Scene
+from sdfsim.scene.scene_file import load_scene
+from sdfsim.shape.mlp_sdf import MlpSdf
+from sdfsim.shape.sdf import GridSdf, MeshSdf, sample_grid
+from sdfsim.shape.shape import Shape, with_nodes
+from sdfsim.shape.surface_nodes import hull_nodes
 
-Progress = Callable[[float, str], None]
-FLOOR = Engine("PyBullet", 5, off=1e-3)
-QUICK_ENGINES = [FLOOR, Engine("PyBullet", 5), Engine("PyBullet", 1), Engine("MuJoCo", 5)]
-ENGINES = [FLOOR, *(Engine("PyBullet", k) for k in (5, 4, 3, 2, 1)), *(Engine("MuJoCo", k) for k in (10, 5, 2))]
+VERSION = 1  # counts up when what is measured changes, so that kept results are measured again
+REPEATS = 5
+MOST, MOST_QUICK = 20, 8  # trajectories
+STEPS, STEPS_QUICK = 100, 50
+TIMED = 80  # steps, at most
+EXPLODED = 1.0  # an energy gain of so many times the energy at the start is a motion that blew up
+OFF = 1e-3  # m/s, by which the starts of the chaos floor differ from the recorded ones
+HORIZON = 50  # steps of the errors that are drawn
+# Steps of the engine in a recorded one.
+ENGINES = [*(("PyBullet", k) for k in (5, 4, 3, 2, 1)), *(("MuJoCo", k) for k in (10, 5, 2))]
+ENGINES_QUICK = [("PyBullet", 5), ("PyBullet", 1), ("MuJoCo", 5)]
+FLOOR_LABEL = "chaos floor: PyBullet 4 ms, starts 1 mm per s off"
+PHYSICAL = ("contact", "friction", "restitution", "rotation")  # effects that the engines always have
+Rows = list[tuple[str, ...]]
+
+
+# --- what all are compared on ---
 
 
 @dataclass(frozen=True)
-class Sweep:
-    """What a study found.
+class Cases:
+    """What every contender simulates.
 
     Attributes:
-        points: of all contenders.
-        steps: the horizon of the front.
+        recorded: as the teacher moved the bodies, from their first frames on.
+        starts: the same with velocities at the instants of the positions: what ours start from.
+        shapes: of every name in use, their origins at the centres of mass.
+        urdfs: the engines' files, by name; those that are not at hand are absent.
+        solids: the exact geometry, by name.
+        floor: its friction and restitution.
+        own_inertia: see `Start`.
+        length, time: m and s of the scene in one of these; recordings are 1.
     """
 
-    points: list[Point]
-    steps: str
+    recorded: list[Trajectory]
+    starts: list[Trajectory]
+    shapes: dict[str, Shape]
+    urdfs: dict[str, Path]
+    solids: dict[str, Solid]
+    floor: tuple[float, float]
+    own_inertia: bool = False
+    length: float = 1.0
+    time: float = 1.0
 
     @property
-    def ours(self) -> list[Point]:
-        """Our points that can be compared."""
-        return [p for p in self.points if p["kind"] == "ours" and not p["failed"] and p["ms"]]
+    def steps(self) -> int:
+        """How far all are simulated."""
+        return len(self.recorded[0].position) - 1
 
     @property
-    def front(self) -> list[Point]:
-        """Those of ours that no other of ours beats, by time."""
-        return [self.ours[k] for k in front([p["ms"]["median"] for p in self.ours], [*map(self.error, self.ours)])]
+    def timed(self) -> int:
+        """Which trajectory is timed: the one in the middle by its number of bodies."""
+        return int(np.argsort([len(t.mass) for t in self.recorded], kind="stable")[len(self.recorded) // 2])
 
-    def error(self, point: Point) -> float:
-        """Translation RMSE m up to the front's horizon."""
-        return point["errors"][self.steps]["translation_rmse"]
-
-
-def setting_of(point: Point) -> Setting:
-    """The setting of a point of ours."""
-    return setting_from(point["fingerprint"]["setting"])
+    def engine_start(self, motion: Trajectory) -> Start:
+        """One of `recorded` for an engine. Raises SdfsimError where an engine's file is not at hand."""
+        if lacking := sorted({str(n) for n in motion.shape} - set(self.urdfs)):
+            raise SdfsimError(f"no engine file of {', '.join(lacking)} at hand")
+        return Start(motion, self.urdfs, self.floor, self.own_inertia)
 
 
-def run(
-    source: Path, out: Path, *, models: list[str], quick: bool, **rest: Any
-) -> tuple[dict[str, Any], Rows, list[str]]:
-    """The study that `source` asks for: of fits (meshes), else `tradeoff`.
-
-    Args:
-        source: dataset folder, scene file, mesh file or folder of meshes.
-        out, models, quick: see `tradeoff`.
-        rest: `device` and `on_progress`, as there.
-
-    Returns:
-        The report, the rows of a table of it, and lines that follow the table.
+def load_cases(data: Path, *, quick: bool) -> Cases:
+    """The trajectories of a dataset's test split, at most `MOST`; a quick study takes fewer and shorter ones.
 
     Raises:
-        SdfsimError: bad input, or another study that writes to the same folder.
+        SdfsimError: no or unreadable trajectories or shapes, or recordings of different steps or gravities.
     """
-    with locked(out):
-        return _run(source, out, models, quick, **rest)
+    files = trajectory_files(data, "test")[: MOST_QUICK if quick else MOST]
+    starts = [t for t in map(Trajectory.load, files) if not t.static.all()]
+    # The engine starts again from its own velocities, others from those at the instants of the positions.
+    recorded = [t for f in files if not (t := Trajectory.load(f, as_recorded=True)).static.all()]
+    if not recorded:
+        raise SdfsimError(f"{data}: nothing moves in any trajectory")
+    check_alike(str(data), recorded)
+    longest = min(STEPS_QUICK if quick else STEPS, *(len(t.position) - 1 for t in recorded))
+    recorded = [first_frames(t, longest + 1) for t in recorded]
+    shapes = load_shapes(data, {str(n) for t in recorded for n in t.shape})
+    urdfs = {}
+    for name in shapes:
+        try:
+            urdfs[name] = dataset_urdf(data, name)
+        except SdfsimError:
+            continue  # the engines are points that say so
+    return Cases(
+        recorded=recorded,
+        starts=[first_frames(t, longest + 1) for t in starts],
+        shapes={name: replace(shape, com=np.zeros(3)) for name, shape in shapes.items()},
+        urdfs=urdfs,
+        solids=exact_solids(data, shapes),
+        floor=FLOOR if (home := home_of(data)) is None else floor_of(read_info(home)),
+    )
 
 
-def _run(
-    source: Path, out: Path, models: list[str], quick: bool, **rest: Any
-) -> tuple[dict[str, Any], Rows, list[str]]:
-    tell = rest["on_progress"]
-    if meshes := _meshes(source):
-        if models or rest["device"] == "cuda":
-            raise SdfsimError("--model and --device: fits of meshes are measured on the CPU, without a model")
-        from sdfsim.evaluation import tradeoff_fit
+def cases_of_scene(scene: Scene, model: str, folder: Path, *, quick: bool) -> Cases:
+    """The one case that a scene makes: the teacher simulates it, and that is what contenders are judged by.
 
-        report = tradeoff_fit.fit_tradeoff(meshes, out, quick=quick, on_progress=tell)
-        return report, *tradeoff_fit.told(report)
-    report = tradeoff(source, out, models=models, quick=quick, **rest)
-    return report, *told(report)
+    Lengths, times and masses are the model's (Froude scaling), so that the teacher, whose steps and margins are meant
+    for bodies of about a metre, serves scenes of any size.
+
+    Args:
+        scene: what moves.
+        model: whose units are taken.
+        folder: of the engines' files.
+        quick: a shorter course.
+
+    Raises:
+        SdfsimError: a floor other than one level plane, bodies on a path, bodies that may not touch all others, effects
+            that are off, nothing that moves, or PyBullet is not installed.
+    """
+    if any(b.collides_with is not None for b in scene.bodies):
+        raise SdfsimError(f"{scene.path}: has bodies that may not touch all others, which is not measured")
+    if off := [name for name in PHYSICAL if getattr(scene.effects, name) == "off"]:
+        raise SdfsimError(f"{scene.path}: effects: {off[0]} is off, which is not measured", "leave it at auto")
+    if not any(b.motion == "dynamic" for b in scene.bodies):
+        raise SdfsimError(f"{scene.path}: nothing moves in it")
+    units = scene_units(scene, load_model(model, weights=False), None)
+    start, _ = start_of_scene(scene, folder, units)
+    if start.floor is None:
+        raise SdfsimError(f"{scene.path}: needs one level plane as its floor")
+    shapes = {name: _centred(scene.shapes[int(name)], name) for name in start.urdfs}
+    t = start.motion
+    # The engine's flights are those of bodies that are half an inner step of gravity faster than it is told.
+    lead = 0.5 * SUBSTEP * t.gravity * ~t.static[:, None]
+    steps = max(2, min(STEPS_QUICK if quick else STEPS, round(scene.duration / units.time / DT)))
+    recorded, _ = bullet(replace(start, motion=replace(t, velocity=t.velocity - lead)), steps)
+    solids = exact_solids(folder, shapes)
+    return Cases([recorded], [t], shapes, start.urdfs, solids, start.floor, True, units.length, units.time)
 
 
-def _meshes(source: Path) -> dict[str, Path]:
-    """Mesh files by name, in name order; none where `source` is something else."""
-    if source.is_file():
-        return {source.stem: source} if source.suffix.lower() in MESH_SUFFIXES else {}
-    if not source.is_dir():
-        raise SdfsimError(f"{source}: no such file or folder", "give a dataset, a scene.yaml or meshes")
-    files = [p for p in sorted(source.iterdir()) if p.suffix.lower() in MESH_SUFFIXES]
-    names = [p.stem for p in files]
-    if twice := {name for name in names if names.count(name) > 1}:
-        raise SdfsimError(f"{source}: two meshes are called {min(twice)!r}", "rename one")
-    return dict(zip(names, files, strict=True))
+def _centred(shape: Shape, name: str) -> Shape:
+    """The shape with its origin at its centre of mass."""
+    sdf, mesh = shape.sdf, replace(shape.mesh, vertices=shape.mesh.vertices - shape.com)
+    if isinstance(sdf, MlpSdf | GridSdf):
+        sdf = replace(sdf, frame=replace(sdf.frame, centre=sdf.frame.centre - shape.com), bounds=sdf.bounds - shape.com)
+    elif isinstance(sdf, MeshSdf):
+        sdf = MeshSdf(replace(sdf.mesh, vertices=sdf.mesh.vertices - shape.com))
+    pieces = tuple(piece - shape.com for piece in shape.pieces)
+    return replace(shape, name=name, mesh=mesh, sdf=sdf, nodes=shape.nodes - shape.com, com=np.zeros(3), pieces=pieces)
+
+
+# --- who takes part ---
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One way to simulate. The defaults are those of `sdfsim evaluate`.
+
+    Attributes:
+        model: name or path.
+        nodes: "own", the shapes' own nodes; "thin K", K of them, outermost first; "grid N", sampled anew from N^3
+            points.
+        sdf: "own", or "grid R", the own distances on a grid of R^3 samples.
+        reach: contact radius over the model's own.
+        rounds: of message passing, the first so many of the model's (None: all), a network that nobody has trained.
+        substeps: of the solver in one recorded step.
+        bf16: matrix products of the network are rounded to bfloat16.
+        learned_flight: the paper network predicts free flight too.
+        sleep: freeze what has come to rest.
+        device: "cpu" or "cuda".
+        contact: off is the ballistic baseline.
+    """
+
+    model: str
+    nodes: str = "own"
+    sdf: str = "own"
+    reach: float = 1.0
+    rounds: int | None = None
+    substeps: int = SUBSTEPS
+    bf16: bool = False
+    learned_flight: bool = False
+    sleep: bool = False
+    device: str = "cpu"
+    contact: bool = True
+
+    @property
+    def label(self) -> str:
+        """The model and all that is not the default."""
+        if not self.contact:
+            return "ballistic"
+        usual, path = Setting(self.model), Path(self.model)
+        name = path.parent.name if path.name == "model.safetensors" else path.name.removesuffix(".safetensors")
+        changed = {k: v for k, v in asdict(self).items() if v != getattr(usual, k)}
+        return ", ".join([name, *(k.replace("_", " ") if v is True else f"{k} {v}" for k, v in changed.items())])
+
+
+def settings(models: Sequence[str], *, quick: bool, cuda: bool) -> list[Setting]:
+    """Each model with each of its knobs alone, and two useful combinations for the first network."""
+    chosen, kinds = [], {name: load_model(name, weights=False).kind for name in models}
+    for name in models:
+        base = Setting(name)
+        chosen.append(base)
+        knobs: list[dict[str, Any]] = [{"nodes": f"thin {k}"} for k in ((64,) if quick else (32, 64, 128, 256))]
+        knobs += [{"nodes": f"grid {k}"} for k in ((7,) if quick else (5, 7, 10))]
+        if kinds[name] == SOLVER:
+            knobs += [{"substeps": k} for k in ((2, 10) if quick else (1, 2, 3, 10, 20))]
+        elif name == next(n for n in models if kinds[n] != SOLVER):
+            lean = {"nodes": "thin 128", "sdf": "grid 64"}
+            knobs += [{"sdf": "grid 64"}, {"bf16": True}, lean]
+            if kinds[name] == "impulse":
+                knobs += [{"rounds": 4}, lean | {"rounds": 4}]
+            if not quick:
+                knobs += [{"sdf": "grid 32"}, {"sdf": "grid 128"}, {"reach": 0.5}, {"reach": 2.0}, {"sleep": True}]
+            knobs += [{"device": "cuda"}] if cuda else []
+        else:
+            knobs = []
+        if kinds[name] == "paper":
+            knobs.append({"learned_flight": True})
+        chosen += [replace(base, **knob) for knob in knobs]
+    return [*chosen, Setting(models[0], contact=False)]
+
+
+def arranged(setting: Setting, cases: Cases) -> tuple[Model, dict[str, Shape]]:
+    """The model and the shapes as a setting wants them; closed forms keep their distances, which nothing beats.
+
+    Raises:
+        SdfsimError: the model has fewer rounds.
+    """
+    model = load_model(setting.model).to(pick_device(setting.device))
+    network = model.network
+    if setting.rounds is not None:
+        if not 1 <= setting.rounds <= len(getattr(network, "rounds", ())):
+            raise SdfsimError(f"{model.name}: has no {setting.rounds} rounds")
+        network = deepcopy(network)
+        network.rounds = network.rounds[: setting.rounds]  # type: ignore[index]
+    if setting.bf16:
+        network = in_bfloat16(network)
+    model = replace(model, network=network, reach=model.reach * setting.reach)
+    return model, {name: _arranged_shape(setting, shape, model.nodes) for name, shape in cases.shapes.items()}
+
+
+def _arranged_shape(setting: Setting, shape: Shape, most: int | None) -> Shape:
+    kind, _, count = setting.nodes.partition(" ")
+    if kind == "thin":
+        shape = replace(shape, nodes=hull_nodes(shape.nodes, int(count)))
+    elif kind == "grid":
+        shape = with_nodes(shape, int(count))
+    if setting.sdf != "own" and isinstance(shape.sdf, MlpSdf | GridSdf):
+        shape = replace(shape, sdf=sample_grid(shape.sdf, shape.sdf.bounds, int(setting.sdf.split()[1])))
+    return replace(shape, nodes=shape.nodes[:most])
+
+
+# --- measuring ---
+
+
+def measure_ours(setting: Setting, cases: Cases) -> dict[str, Any]:
+    """Errors and times of our simulator in one setting: see `_judged` and `_times`."""
+    with peak_memory() as memory:
+        began = time.perf_counter()
+        model, shapes = arranged(setting, cases)
+        prepared = time.perf_counter() - began
+        device = pick_device(setting.device)
+        motions = roll_out(
+            model, cases.starts, shapes, cases.steps, device, "learned" if setting.learned_flight else "exact",
+            contact=setting.contact, sleep=setting.sleep, floor=cases.floor, substeps=setting.substeps,
+            as_teacher=setting.contact,
+        )  # fmt: skip
+    result = _judged(motions, cases) | {"prepare_s": prepared, "peak_mib": memory["mib"]}
+    if result["exploded"]:
+        return result
+    repeats = [_time_simulator(setting, model, shapes, cases) for _ in range(REPEATS)]
+    return result | _times(repeats, cases, one_core=device.type == "cpu")
+
+
+def _time_simulator(setting: Setting, model: Model, shapes: dict[str, Shape], cases: Cases) -> Timing:
+    """One scene of the cases on its own, as `sdfsim simulate` runs it."""
+    start = cases.starts[cases.timed]
+    scene = scene_of([start], [0], shapes, cases.floor)[0]
+    effects = replace(
+        scene.effects, sleep="on" if setting.sleep else "off", contact="auto" if setting.contact else "off"
+    )
+    flight = "learned" if setting.learned_flight else "exact"
+    simulator = Simulator(replace(scene, effects=effects), model, setting.device, dt=start.dt, free_flight=flight)
+    simulator.rules = replace(simulator.rules, substeps=setting.substeps)
+    steps = min(TIMED, cases.steps)
+    began = time.perf_counter()
+    next(simulator.steps(1))
+    first_ms = 1e3 * (time.perf_counter() - began)
+    wall, cpu = time.perf_counter(), time.process_time()
+    for _ in simulator.steps(steps - 1):
+        pass
+    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    return Timing(first_ms, 1e3 * wall / (steps - 1), 1e3 * cpu / (steps - 1))
+
+
+def measure_engine(name: str, substeps: int, off: float, cases: Cases) -> dict[str, Any]:
+    """Errors and times of PyBullet or MuJoCo with so many of its steps in a recorded one, starts `off` m/s off."""
+    if abs(cases.recorded[0].dt - DT) > 1e-9:
+        raise SdfsimError(f"recorded with another step than {DT} s")
+    run: Callable[..., tuple[Trajectory, Timing]] = bullet if name == "PyBullet" else mujoco
+    recorded = cases.recorded if name == "PyBullet" else cases.starts
+    starts = [cases.engine_start(perturbed(t, off, [0, k])) for k, t in enumerate(recorded)]
+    with peak_memory() as memory:
+        motions = [run(start, cases.steps, substeps)[0] for start in starts]
+    repeats = [run(starts[cases.timed], min(TIMED, cases.steps), substeps)[1] for _ in range(REPEATS)]
+    return _judged(motions, cases) | {"peak_mib": memory["mib"]} | _times(repeats, cases, one_core=True)
+
+
+def _judged(motions: list[Trajectory], cases: Cases) -> dict[str, Any]:
+    """Errors of motions in the scene's metres, penetration, energy gain, and whether they blew up."""
+    if not all(np.isfinite(m.position).all() and np.isfinite(m.quat_xyzw).all() for m in motions):
+        raise SdfsimError("a state is not finite")
+    found = errors(motions, cases.recorded)
+    horizons = [h for h in found if int(h) in (HORIZON, cases.steps)]
+    gain = energy_gain([first_frames(m, cases.steps + 1) for m in motions])
+    depth = penetration(motions, cases.solids)["percentile_95"]
+    return {
+        "translation_rmse": {h: cases.length * found[h]["translation_rmse"] for h in horizons},
+        "translation_rmse_95": {h: [cases.length * end for end in found[h]["translation_rmse_95"]] for h in horizons},
+        "rotation_error": {h: found[h]["rotation_error"] for h in horizons},
+        "penetration_p95": None if depth is None else cases.length * depth,
+        "energy_gain": gain["worst"],
+        "exploded": gain["worst"] is not None and gain["worst"] > EXPLODED,
+    }
+
+
+def _times(repeats: list[Timing], cases: Cases, *, one_core: bool) -> dict[str, Any]:
+    """Milliseconds of computing per simulated second.
+
+    All work in one thread, and are timed by the processor's clock: on a shared core the wall shows what others do.
+    """
+    per_second = 1.0 / (cases.recorded[0].dt * cases.time)
+    taken = np.array([r.cpu_ms if one_core else r.wall_ms for r in repeats]) * per_second
+    return {
+        "ms": float(np.median(taken)),
+        "ms_p95": float(np.percentile(taken, 95)),
+        "first_step_ms": float(np.median([r.first_ms for r in repeats])),
+        "clock_over_processor": float(np.median([r.wall_ms / max(r.cpu_ms, 1e-9) for r in repeats])),
+    }
+
+
+# --- the study ---
 
 
 def tradeoff(
-    source: Path,
+    source: Path | None,
     out: Path,
     *,
-    models: list[str],
-    quick: bool,
-    device: str,
+    models: Sequence[str] = (),
+    quick: bool = False,
+    device: str = "cpu",
     on_progress: Callable[[str, float, str], None],
 ) -> dict[str, Any]:
-    """Sweep the knobs on recorded scenes and write tradeoff.png, tradeoff.csv, tradeoff.json and report.html.
+    """Measure all contenders on recorded scenes and write tradeoff.csv, tradeoff.png and report.json.
 
     Args:
-        source: dataset folder, or a scene file, which the teacher is then asked about.
-        out: folder to write; points that it holds already are kept.
-        models: bundled names or paths (none: all that are bundled); the knobs are turned on the first.
+        source: dataset folder, or a scene file, which the teacher is then asked about; None takes a random scene of
+            boxes and balls.
+        out: folder to write; results that it holds already are kept.
+        models: names or paths (none: the solver and all bundled networks); every network's knobs are the first's alone.
         quick: fewer settings on fewer, shorter scenes.
         device: "cpu", "cuda" or "auto"; CUDA is a knob beside the others where it is not "cpu".
         on_progress: called with (stage, fraction, message).
 
     Returns:
-        The content of tradeoff.json.
+        The content of report.json: `points`, each with its label, its kind ("ours", "engine", "floor", "baseline"),
+        what was measured, or why it `failed`; and `front`, the labels of ours that no other of ours beats, by time.
 
     Raises:
-        SdfsimError: bad input, or nothing of ours could be measured.
+        SdfsimError: bad input, nothing of ours could be measured, or another study that writes to the same folder.
     """
+    if source and not source.exists():
+        raise SdfsimError(f"{source}: no such file or folder", "give a dataset or a scene.yaml")
     cuda = pick_device(device).type == "cuda"
-    names = models or sorted(bundled_models(), key=lambda name: (name != "small", name))
-    paper = [name for name in names if load_model(name, weights=False).kind == "paper"]
-    cases = _cases(source, names[0], out, quick, lambda f, m: on_progress("scenes", f, m))
-    ours: list[Contender] = [Ours(s) for s in settings(names, paper, quick=quick, cuda=cuda)]
-    others: list[Contender] = [Ours(Setting(model=names[0]), contact=False), *(QUICK_ENGINES if quick else ENGINES)]
-    points = measure([*ours, *others], cases, out / "points", lambda f, m: on_progress("measure", f, m))
-    steps = str(min(50, cases.steps))
-    sweep = Sweep(points, steps)
-    if not sweep.ours:
-        raise SdfsimError(f"nothing of ours could be measured: {points[0]['failed']}")
-    report = {
-        "source": str(source),
-        "quick": quick,
-        "sdfsim": sdfsim.__version__,
-        "trajectories": len(cases.recorded),
-        "bodies": cases.bodies,
-        "horizon_steps": int(steps),
-        "dt_s": cases.recorded[0].dt * cases.time,
-        "points": [{k: v for k, v in p.items() if k != "end"} for p in points],
-        "front": [p["key"] for p in sweep.front],
-        "claims": claims(sweep),
-        "folder": str(out),
-    }
-    write_json(out / "tradeoff.json", report)
-    write_text(out / "tradeoff.csv", table(points))
-    draw(sweep.points, sweep.front, steps, out / "tradeoff.png")
-    write_report(report, beaten_by(report["claims"]), out / "report.html")
-    return report
-
-
-def claims(sweep: Sweep) -> dict[str, Any]:
-    """What the study is asked: is the default beaten, how wide is the front, do nodes of a grid replace vertices."""
-    by_key = {p["key"]: p for p in sweep.points}
-    best = sweep.front
-    default = sweep.ours[0]
-    beaten = [
-        p for p in sweep.ours if sweep.error(p) < sweep.error(default) and p["ms"]["median"] < default["ms"]["median"]
-    ]
-    found: dict[str, Any] = {
-        "default": default["key"],
-        "default_beaten_by": [p["key"] for p in beaten],
-        "default_clearly_beaten_by": [p["key"] for p in beaten if clearly(p, default, sweep.steps)],
-        "slowest_over_fastest_of_front": best[-1]["ms"]["median"] / best[0]["ms"]["median"],
-    }
-    grid, vertices = (by_key.get(replace(setting_of(default), nodes=n).key) for n in ("grid 7", "vertices"))
-    if grid and vertices and not grid["failed"] and not vertices["failed"] and grid["ms"] and vertices["ms"]:
-        nodes = [sum(s["nodes"] for s in p["scenes"]) for p in (grid, vertices)]
-        found["resampled"] = {
-            "fewer_nodes": 1 - nodes[0] / nodes[1],
-            "error_over_vertices": sweep.error(grid) / sweep.error(vertices),
-            "time_over_vertices": grid["ms"]["median"] / vertices["ms"]["median"],
+    names = list(models) or model_names()
+    with locked(out), one_thread():
+        on_progress("scenes", 0.0, "reading scenes and shapes")
+        if source and source.is_dir():
+            cases = load_cases(source, quick=quick)
+        else:
+            scene = load_scene(source, lambda f, m: on_progress("shapes", f, m)) if source else tossed((1,))
+            cases = cases_of_scene(scene, names[0], out / "engine", quick=quick)
+        kinds, jobs = {}, []
+        content = [VERSION, machine(), replace(cases, urdfs={}, solids={})]
+        for setting in settings(names, quick=quick, cuda=cuda):
+            kinds[setting.label] = "ours" if setting.contact else "baseline"
+            weights = load_model(setting.model) if setting.contact else None
+            jobs.append(Job("cases", setting.label, [content, setting, weights], measure_ours, (setting, cases)))
+        for name, substeps in ENGINES_QUICK if quick else ENGINES:
+            label = f"{name} {1e3 * DT / substeps:.3g} ms"
+            kinds[label] = "engine"
+            jobs.append(Job("cases", label, [content, label], measure_engine, (name, substeps, 0.0, cases)))
+        kinds[FLOOR_LABEL] = "floor"
+        jobs.append(Job("cases", FLOOR_LABEL, [content, OFF], measure_engine, ("PyBullet", 5, OFF, cases)))
+        results = measure(jobs, out / "results", on_progress=lambda f, m: on_progress("measure", f, m))
+        points = [{"label": label, "kind": kinds[label], **result} for (_, label), result in results.items()]
+        for point in points:
+            if point.get("exploded"):
+                point["failed"] = f"gains {point['energy_gain']:.1f} times its energy"
+        steps = str(min(HORIZON, cases.steps))
+        fine = [p for p in points if "failed" not in p]
+        ours = [p for p in fine if p["kind"] == "ours"]
+        if not ours:
+            raise SdfsimError(f"nothing of ours could be measured: {points[0]['failed']}")
+        best = [ours[k] for k in front([p["ms"] for p in ours], [p["translation_rmse"][steps] for p in ours])]
+        report = {
+            "source": str(source or "a random scene"),
+            "quick": quick,
+            "sdfsim": sdfsim.__version__,
+            "trajectories": len(cases.recorded),
+            "bodies": int(sum((~t.static).sum() for t in cases.recorded)),
+            "horizon_steps": int(steps),
+            "points": points,
+            "front": [p["label"] for p in best],
+            "folder": str(out),
         }
-    return found
+        write_json(out / "report.json", report)
+        write_text(out / "tradeoff.csv", table(points))
+        fine.sort(key=lambda p: (p["kind"] != "ours", p["kind"], p["ms"]))
+        draw_work_precision(
+            [Point(p["label"], p["kind"], p["ms"], p["ms_p95"], p["translation_rmse"][steps]) for p in fine],
+            [fine.index(p) for p in best],
+            out / "tradeoff.png",
+            x="milliseconds of computing per simulated second",
+            y=f"translation RMSE over {steps} steps, m",
+        )
+        return report
 
 
-def clearly(better: Point, worse: Point, steps: str) -> bool:
-    """Whether the difference of two errors is more than the choice of trajectories brings about (95 %, paired)."""
-    mine, other = (np.array(p["errors"][steps]["squared_by_trajectory"]) for p in (better, worse))
-    return len(mine) > 1 and metrics.interval(other - mine)[0] > 0
+def table(points: list[dict[str, Any]]) -> str:
+    """All points as CSV; errors have a column for each horizon."""
+    rows = []
+    for point in points:
+        row: dict[str, Any] = {}
+        for name, value in point.items():
+            if isinstance(value, dict):
+                row |= {f"{name}_{steps}": found for steps, found in value.items() if not isinstance(found, list)}
+            else:
+                row[name] = value
+        rows.append({name: f"{value:.6g}" if isinstance(value, float) else value for name, value in row.items()})
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(dict.fromkeys(name for row in rows for name in row)), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
 
 
-def _cases(source: Path, model: str, out: Path, quick: bool, tell: Progress) -> Cases:
-    if source.is_file():
-        from sdfsim.evaluation.tradeoff_scene import cases_of_scene
-
-        return cases_of_scene(source, model, out / "shapes", quick=quick, on_progress=tell)
-    tell(0.0, "reading trajectories and shapes")
-    return load_cases(source, out / "shapes", quick=quick)
+def told(report: dict[str, Any]) -> tuple[Rows, list[str]]:
+    """The report for people: a row a point, by time, and where to look."""
+    steps, best = str(report["horizon_steps"]), set(report["front"])
+    rows: Rows = [("", "ms / s", "p95", "m", "degrees", "penetration m", "MiB")]
+    for p in sorted(report["points"], key=lambda p: p.get("ms", float("inf"))):
+        if "failed" in p:
+            rows.append((f"{p['label']}: {p['failed']}", *[""] * 6))
+            continue
+        values = (p["ms"], p["ms_p95"], p["translation_rmse"][steps], p["rotation_error"][steps])
+        cells = map(number, (*values, p["penetration_p95"], p["peak_mib"]))
+        rows.append((f"{p['label']} *" if p["label"] in best else p["label"], *cells))
+    notes = [f"milliseconds per simulated second, errors over {steps} steps; * is on the front of ours"]
+    return rows, [*notes, f"wrote {report['folder']}"]

@@ -83,16 +83,16 @@ class MeshDistance:
         parts = [self._chunk(part) for part in _chunks(points)]
         return Reference(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
-    def inside(self, points: np.ndarray) -> np.ndarray:
-        """[P] bool at `points` [P, 3] m."""
-        return self(points).distance < 0
-
     def _chunk(self, points: np.ndarray) -> Reference:
         closest, normal = self._nearest(points)
         offset = points - closest
         unsigned = np.linalg.norm(offset, axis=1)
-        if self.solid.thickness:
-            return self._thickened(points, closest, offset, unsigned, normal)
+        if self.solid.thickness:  # everything within half of it from the sheet
+            half = 0.5 * self.solid.thickness
+            # On the sheet itself both of its sides are equally near.
+            on = unsigned <= 1e-7 * half
+            direction = np.where(on[:, None], normal, offset / np.where(on, 1.0, unsigned)[:, None])
+            return Reference(unsigned - half, closest + half * direction, np.ones(len(points), dtype=bool))
         clear = np.ones(len(points), dtype=bool)
         if self.solid.simple:
             inside = self._nearest.odd(points)
@@ -104,16 +104,6 @@ class MeshDistance:
         height = np.abs(np.einsum("pi,pi->p", offset, normal))
         trusted = clear & (height >= TRUSTED_COSINE * unsigned)
         return Reference(np.where(inside, -unsigned, unsigned), closest, trusted)
-
-    def _thickened(
-        self, points: np.ndarray, foot: np.ndarray, offset: np.ndarray, unsigned: np.ndarray, normal: np.ndarray
-    ) -> Reference:
-        """Everything within half the thickness of the sheet, whose nearest points are `foot` [P, 3]."""
-        half = 0.5 * self.solid.thickness
-        # On the sheet itself both of its sides are equally near.
-        on = unsigned <= 1e-7 * half
-        direction = np.where(on[:, None], normal, offset / np.where(on, 1.0, unsigned)[:, None])
-        return Reference(unsigned - half, foot + half * direction, np.ones(len(points), dtype=bool))
 
 
 class PiecesDistance:
@@ -182,10 +172,9 @@ class PiecesDistance:
         """The parts of the pieces' faces that no other piece covers."""
 
         def bare(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-            return (~self.inside(points + 1e-3 * size * normals)).astype(np.int64)
+            return (~self.inside(points * size + 1e-3 * size * normals)).astype(np.int64)
 
-        corners = everything.vertices[everything.faces] / size
-        triangles = exposed(corners, lambda points, normals: bare(points * size, normals))[0] * size
+        triangles = exposed(everything.vertices[everything.faces] / size, bare)[0] * size
         return Mesh(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3))
 
 

@@ -1,41 +1,134 @@
-"""Mesh -> SDF network, with a certificate from held-out points."""
+"""Mesh -> SDF network: recipes, the points a fit learns from, the training loop, and a certificate at its end."""
 
 from __future__ import annotations
 
 import hashlib
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal, TypeVar
+from functools import partial
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 import torch
 
 from sdfsim.errors import SdfsimError
-from sdfsim.shape import fit
+from sdfsim.parallel import choose_threads
 from sdfsim.shape.distance import DistanceOracle, MeshDistance, PiecesDistance
-from sdfsim.shape.fit import PLANS
-from sdfsim.shape.fit_metrics import certify
+from sdfsim.shape.far_field import BOX
+from sdfsim.shape.fit_metrics import SIGN_FROM, certify
 from sdfsim.shape.mass import mass_properties, mass_properties_of_sdf
-from sdfsim.shape.mesh import Mesh, clean, is_closed
-from sdfsim.shape.mlp_sdf import MlpSdf
-from sdfsim.shape.sdf import Sdf, accepts_numpy
+from sdfsim.shape.mesh import Mesh, clean, is_closed, normal_frame, sample_surface
+from sdfsim.shape.mlp_sdf import Activation, MlpSdf, Tape, value_and_gradient
+from sdfsim.shape.sdf import Sdf
 from sdfsim.shape.shape import Shape
-from sdfsim.shape.surface_nodes import DEFAULT_COUNT, edge_nodes, hull_nodes, sample_nodes, thin
+from sdfsim.shape.soap import Soap
+from sdfsim.shape.surface_nodes import DEFAULT_COUNT, edge_nodes, hull_nodes, sample_nodes, surface_nodes, thin
 from sdfsim.shape.watertight import solidify
 
 Recipe = Literal["quick", "default", "paper"]
 Progress = Callable[[float, str], None]
 Oracle = TypeVar("Oracle", bound=DistanceOracle)
+# Weights and biases per layer, [S, out, in] and [S, out].
+Layers = tuple[list[torch.Tensor], list[torch.Tensor]]
 
+# Changes whenever the same mesh would come out differently; part of every cache key.
+FIT_VERSION = 6
+
+# Points are drawn from a little beyond the box that is used: at the very edge of its data a network's slope is poor.
+MARGIN = 1.15
+# A solid whose distances agree with their mirror images' to this, relative to its size, is fitted on one side only.
+SAME = 1e-4
+# A fit is checked on the way on this many points of three kinds: with these spreads around the surface, and in the box.
+CHECKED = 4000
+CHECKED_SIGMAS = (0.006, 0.06)
+WARMUP = 50  # updates
+CHECK_EVERY = 100  # updates
+# Seconds that the certificate takes of a budget, beside a tenth.
+RESERVE = 2.0
 # Of the nodes of convex pieces: the pieces' vertices are at most this part, with points on their edges at most that.
 OWN_SHARE, EDGE_SHARE = 0.6, 0.85
 # Between points on the edges of convex pieces, relative to the size of the whole.
 EDGE_SPACING = 0.06
+CPU = torch.device("cpu")
 
-# Changes whenever the same mesh would come out differently; part of every cache key.
-FIT_VERSION = 6
+
+@dataclass(frozen=True)
+class Plan:
+    """One recipe; the defaults were chosen by measurement on scanned and thin-walled shapes.
+
+    Lengths are relative to the shape's largest extent. The box gets its share of points and the loss stays soft up to
+    some hundredths of the size, without which the far field is off by as much.
+
+    Attributes:
+        activation: of the hidden layers ("wave" or "relu").
+        width: of the hidden layers.
+        layers: linear layers, the last one included.
+        first: first-layer weights are uniform in +-first (periodic; it sets the finest scale the fit starts with).
+        optimiser: "soap" or "adam".
+        lr: step size.
+        decay: the part of the steps over which it falls to zero, at the end (0: constant).
+        steps: updates.
+        batch: points an update.
+        sigmas: points lie this far from the surface (standard deviation, log-uniform between the two).
+        near: fraction of points near the surface; the others are uniform in the box.
+        resample: updates between fresh pools of points (0: one pool).
+        pool: points in a pool.
+        soften: errors count with soften / (|distance| + soften); None counts all alike.
+        sign_everywhere: use the parity sign everywhere on closed surfaces, not only where the paper's rule trusts it.
+        goal: errors of the averaged weights at which the decay begins early, which halves them: of the distance (means
+            within 0.01 and in the box), of the gradient (median cosine distance within 0.1) and of the sign (fraction
+            wrong farther than 0.002). None never stops early.
+        settle: steps of an early decay.
+        fold: fit a solid that is its own mirror image on one side only.
+    """
+
+    activation: Activation = "wave"
+    width: int = 64
+    layers: int = 6
+    first: float = 8.0
+    optimiser: Literal["soap", "adam"] = "soap"
+    lr: float = 1e-2
+    decay: float = 0.5
+    steps: int = 5000
+    batch: int = 4096
+    sigmas: tuple[float, float] = (0.002, 0.15)
+    near: float = 0.8
+    resample: int = 0
+    pool: int = 400_000
+    soften: float | None = 0.04
+    sign_everywhere: bool = True
+    goal: tuple[float, float, float, float] | None = (7e-4, 6e-3, 4e-3, 1.3e-3)
+    settle: int = 1000
+    fold: bool = True
+
+
+PLANS = {
+    "default": Plan(),
+    # A surface from a few minutes of training is not known as exactly as a full fit would follow it.
+    "quick": Plan(steps=2000, settle=600),
+    # Rubanova et al. 2024, section 3.1 and appendix: 400k updates at 1e-5, noise 0.1 drawn again every 100 updates.
+    "paper": Plan(
+        activation="relu",
+        width=128,
+        layers=8,
+        first=0.0,
+        optimiser="adam",
+        lr=1e-5,
+        decay=0.0,
+        steps=400_000,
+        sigmas=(0.1, 0.1),
+        near=1.0,
+        resample=100,
+        pool=65_536,
+        soften=None,
+        sign_everywhere=False,
+        goal=None,
+        settle=0,
+        fold=False,
+    ),
+}
 
 
 def fit_mesh(
@@ -45,11 +138,9 @@ def fit_mesh(
     recipe: Recipe = "default",
     budget: float | None = None,
     seed: int = 0,
-    nodes: int = DEFAULT_COUNT,
     cap: bool = False,
     thicken: float | None = None,
     on_progress: Progress | None = None,
-    checkpoint: str | Path | None = None,
     device: torch.device | str = "cpu",
 ) -> Shape:
     """Fit the compact SDF network to the solid that a triangle mesh bounds (see `solidify`).
@@ -64,12 +155,9 @@ def fit_mesh(
             "paper" (ReLU, 128 wide, Adam 1e-5, 400k steps).
         budget: seconds of training at most; the schedule is shortened to fit.
         seed: of sampling and initialisation.
-        nodes: surface nodes at most.
         cap: close openings of any size.
         thicken: m; the solid is all within half of this distance from the mesh instead.
         on_progress: called with (fraction done, message).
-        checkpoint: a file to resume from when it exists and belongs to the same fit, and to write on the way; to be
-            removed by the caller once the shape is safe.
         device: to train on.
 
     Returns:
@@ -81,16 +169,8 @@ def fit_mesh(
     """
     if isinstance(mesh, Mesh):
         mesh = MeshDistance(solidify(mesh, name=name, cap=cap, thicken=thicken))
-    return fit_solids(
-        {name: mesh},
-        recipe=recipe,
-        budget=budget,
-        seed=seed,
-        nodes=nodes,
-        on_progress=on_progress,
-        checkpoint=checkpoint,
-        device=device,
-    )[0]
+    options = {"recipe": recipe, "budget": budget, "seed": seed, "on_progress": on_progress, "device": device}
+    return fit_solids({name: mesh}, **options)[0]
 
 
 def fit_solids(
@@ -99,9 +179,7 @@ def fit_solids(
     recipe: Recipe = "default",
     budget: float | None = None,
     seed: int = 0,
-    nodes: int = DEFAULT_COUNT,
     on_progress: Progress | None = None,
-    checkpoint: str | Path | None = None,
     device: torch.device | str = "cpu",
 ) -> list[Shape]:
     """Fit several solids side by side in one batched optimiser, which is what a GPU is good at.
@@ -109,29 +187,22 @@ def fit_solids(
     Args:
         solids: by name, from `MeshDistance(solidify(mesh))`.
         budget: seconds of training for all of them.
-        recipe, seed, nodes, on_progress, checkpoint, device: as for `fit_mesh`; the checkpoint for a single solid only.
+        recipe, seed, on_progress, device: as for `fit_mesh`.
 
     Returns:
         Shapes in the order of `solids`, as `fit_mesh` gives them.
     """
 
     def pick(sdf: Sdf, oracle: MeshDistance) -> np.ndarray:
-        return surface_nodes(sdf, oracle.surface, nodes)
+        return surface_nodes(sdf, oracle.surface, DEFAULT_COUNT)
 
-    oracles = list(solids.values())
+    fitted = _fit(list(solids.values()), recipe, budget, seed, pick, on_progress, device)
     shapes = []
-    fitted = _train(oracles, recipe, budget, seed, pick, on_progress, checkpoint, device)
     for (name, oracle), (sdf, points, certificate) in zip(solids.items(), fitted, strict=True):
         solid = oracle.solid
         source = _source("mesh", recipe, [solid.surface]) | ({"notes": list(solid.notes)} if solid.notes else {})
         shapes.append(Shape(name, solid.surface, sdf, points, *solid.mass_properties(), certificate, source))
     return shapes
-
-
-def surface_nodes(sdf: Sdf, surface: Mesh, count: int) -> np.ndarray:
-    """Nodes for contact, at most `count` [K, 3] m: first corners of the convex hull, then points all over `sdf`."""
-    corners = thin(surface.vertices[_outer(surface.vertices)], count // 3)
-    return thin(sample_nodes(sdf), count, keep=corners)
 
 
 def fit_pieces(
@@ -144,7 +215,6 @@ def fit_pieces(
     seed: int = 0,
     nodes: int = DEFAULT_COUNT,
     on_progress: Progress | None = None,
-    checkpoint: str | Path | None = None,
 ) -> Shape:
     """Fit the compact SDF network to the union of convex pieces: the body that a rigid-body engine collides.
 
@@ -154,7 +224,8 @@ def fit_pieces(
     Args:
         pieces: convex closed meshes, metres (see `load_pieces`).
         display: the mesh to show; by default the boundary of the union.
-        name, recipe, budget, seed, nodes, on_progress, checkpoint: as for `fit_mesh`.
+        nodes: surface nodes at most.
+        name, recipe, budget, seed, on_progress: as for `fit_mesh`.
 
     Returns:
         Shape; its mass properties are those of the union.
@@ -164,8 +235,6 @@ def fit_pieces(
     """
     oracle = PiecesDistance(pieces)
     size = float(np.ptp(oracle.bounds, axis=0).max())
-    vertices = np.concatenate([piece.vertices for piece in pieces])
-    edges = np.concatenate([edge_nodes(piece.vertices, EDGE_SPACING * size) for piece in pieces])
 
     def bare(points: np.ndarray) -> np.ndarray:
         _, first = np.unique(np.round(points / (1e-4 * size)), axis=0, return_index=True)
@@ -173,29 +242,29 @@ def fit_pieces(
         # Measured from the boundary of the union: a point on the seam of two pieces is deep in neither.
         return points[oracle(points).distance >= -1e-3 * size]
 
-    vertices, edges = bare(vertices), bare(edges)
+    vertices = bare(np.concatenate([piece.vertices for piece in pieces]))
+    edges = bare(np.concatenate([edge_nodes(piece.vertices, EDGE_SPACING * size) for piece in pieces]))
 
     def pick(sdf: Sdf, oracle: PiecesDistance) -> np.ndarray:
         own = hull_nodes(vertices, round(OWN_SHARE * nodes))
         return thin(sample_nodes(sdf), nodes, keep=thin(edges, round(EDGE_SHARE * nodes), keep=own))
 
-    sdf, points, certificate = _train([oracle], recipe, budget, seed, pick, on_progress, checkpoint, "cpu")[0]
+    sdf, points, certificate = _fit([oracle], recipe, budget, seed, pick, on_progress, "cpu")[0]
     single = len(pieces) == 1 and is_closed(pieces[0])
-    volume, com, inertia = mass_properties(pieces[0]) if single else mass_properties_of_sdf(_OracleSdf(oracle))
+    volume, com, inertia = mass_properties(pieces[0]) if single else mass_properties_of_sdf(oracle)
     mesh = display if display is not None else clean(oracle.surface, name=name)
     source = _source("pieces", recipe, pieces)
     hulls = tuple(piece.vertices for piece in pieces)
     return Shape(name, mesh, sdf, points, volume, com, inertia, certificate, source, hulls)
 
 
-def _train(
+def _fit(
     oracles: Sequence[Oracle],
     recipe: Recipe,
     budget: float | None,
     seed: int,
     pick: Callable[[Sdf, Oracle], np.ndarray],
     on_progress: Progress | None,
-    checkpoint: str | Path | None,
     device: torch.device | str,
 ) -> list[tuple[MlpSdf, np.ndarray, dict]]:
     """Per oracle the network, nodes [K, 3] m as `pick` takes them from it, and the certificate."""
@@ -203,15 +272,7 @@ def _train(
         raise SdfsimError(f"the budget of a fit must be > 0 seconds (got {budget})")
     started = time.monotonic()
     tell = on_progress or (lambda fraction, message: None)
-    fitted = training.train(
-        oracles,
-        PLANS[recipe],
-        budget=budget,
-        seed=seed,
-        tell=tell,
-        checkpoint=Path(checkpoint) if checkpoint else None,
-        device=torch.device(device),
-    )
+    fitted = train(oracles, PLANS[recipe], budget=budget, seed=seed, tell=tell, device=torch.device(device))
     trained = time.monotonic() - started
     results = []
     for done, (oracle, (sdf, steps)) in enumerate(zip(oracles, fitted, strict=True), start=1):
@@ -223,20 +284,9 @@ def _train(
         seconds = trained / len(oracles) + time.monotonic() - measuring
         certificate.update(recipe=recipe, seed=seed, steps=steps, seconds=round(seconds, 2))
         but = certificate["reason"] or certificate["caveat"]
-        told = f"fitted, but {but}" if but else "fitted"
-        tell(0.98 + 0.02 * done / len(oracles), told)
+        tell(0.98 + 0.02 * done / len(oracles), f"fitted, but {but}" if but else "fitted")
         results.append((sdf, nodes, certificate))
     return results
-
-
-def _outer(vertices: np.ndarray) -> np.ndarray:
-    """Indices of the convex hull's vertices; all of them when the vertices lie in a plane."""
-    from scipy.spatial import ConvexHull, QhullError
-
-    try:
-        return np.sort(ConvexHull(vertices).vertices)
-    except QhullError:
-        return np.arange(len(vertices))
 
 
 def _source(kind: str, recipe: Recipe, meshes: list[Mesh]) -> dict:
@@ -247,19 +297,290 @@ def _source(kind: str, recipe: Recipe, meshes: list[Mesh]) -> dict:
     return {"kind": kind, "geometry_sha256": digest.hexdigest(), "recipe": recipe, "fit_version": FIT_VERSION}
 
 
-@dataclass(frozen=True, eq=False)
-class _OracleSdf:
-    """Reference distances in the clothes of an Sdf, for integrals; its gradient is the direction to the surface."""
+class Pool(NamedTuple):
+    """Points of S shapes, P each, normalised.
 
-    oracle: DistanceOracle
+    Attributes:
+        points: [S, P, 3].
+        distance: [S, P] signed.
+        signed: [S, P] bool, whether the sign of the distance counts.
+        direction: [S, P, 3] unit, from the surface outwards; zero on the surface itself.
+    """
 
-    @property
-    def bounds(self) -> np.ndarray:
-        return self.oracle.bounds
+    points: torch.Tensor
+    distance: torch.Tensor
+    signed: torch.Tensor
+    direction: torch.Tensor
 
-    @accepts_numpy
-    def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        truth = self.oracle(points.double().cpu().numpy())
-        offset = points.double().cpu().numpy() - truth.closest
-        direction = offset / np.where(np.abs(truth.distance) < 1e-12, 1e-12, truth.distance)[:, None]
-        return torch.from_numpy(truth.distance).to(points), torch.from_numpy(direction).to(points)
+
+class Subject:
+    """One solid to be fitted: its frame, its mirror planes, and samples of it.
+
+    Args:
+        oracle: true distances, metres.
+        plan: the recipe.
+        seed: of the points.
+    """
+
+    def __init__(self, oracle: DistanceOracle, plan: Plan, seed: int) -> None:
+        self.oracle, self._plan, self._seed = oracle, plan, seed
+        self.frame = normal_frame(oracle.bounds)
+        self.mirrors = self._mirrors() if plan.fold else (False, False, False)
+
+    def pool(self, step: int) -> Pool:
+        """Points to learn from, of one shape, as drawn before update `step`."""
+        plan = self._plan
+        rng = np.random.default_rng([self._seed, 0, step] if step else [self._seed, 0])
+        near = int(plan.pool * plan.near)
+        low, high = np.log(plan.sigmas)
+        sigma = np.exp(rng.uniform(low, high, (near, 1)))
+        return self._sample(sigma, plan.pool - near, rng)
+
+    def check(self) -> Pool:
+        """Points to judge by on the way: `CHECKED` of each of three kinds."""
+        sigma = np.repeat(CHECKED_SIGMAS, CHECKED)[:, None]
+        return self._sample(sigma, CHECKED, np.random.default_rng([self._seed, 1]))
+
+    def _sample(self, sigma: np.ndarray, elsewhere: int, rng: np.random.Generator) -> Pool:
+        """Points with normal noise of `sigma` [N, 1] around the surface, then `elsewhere` points all over the box."""
+        local = self.frame.inward(sample_surface(self.oracle.surface, len(sigma), rng)[0])
+        around = local + sigma * rng.standard_normal((len(sigma), 3))
+        local = np.concatenate([around, rng.uniform(-MARGIN * BOX, MARGIN * BOX, (elsewhere, 3))])
+        local = np.clip(local, -MARGIN * BOX, MARGIN * BOX)
+        truth = self.oracle(self.frame.outward(local))
+        distance = truth.distance / self.frame.scale
+        signed = truth.trusted | (self.oracle.closed and self._plan.sign_everywhere)
+        # So close to the surface the direction from it is rounding.
+        clear = np.abs(distance) > 1e-4
+        offset = local - self.frame.inward(truth.closest)
+        direction = np.where(clear[:, None], offset / np.where(clear, distance, 1.0)[:, None], 0.0)
+        # What lies on the other side of a mirror plane is learned from its image.
+        side = np.where(np.asarray(self.mirrors) & (local < 0), -1.0, 1.0)
+        return Pool(
+            torch.from_numpy(local * side).float()[None],
+            torch.from_numpy(distance).float()[None],
+            torch.from_numpy(signed)[None],
+            torch.from_numpy(direction * side).float()[None],
+        )
+
+    def _mirrors(self) -> tuple[bool, bool, bool]:
+        """Across which planes of its frame the solid is its own mirror image, as far as sampled distances tell."""
+        rng = np.random.default_rng(0)
+        local = self.frame.inward(sample_surface(self.oracle.surface, 2000, rng)[0])
+        local = np.concatenate([local, local + rng.normal(0.0, 0.05, local.shape)])
+        truth = self.oracle(self.frame.outward(local)).distance
+
+        def same(axis: int) -> bool:
+            image = self.frame.outward(local * np.where(np.arange(3) == axis, -1.0, 1.0))
+            return bool(np.abs(self.oracle(image).distance - truth).max() < SAME * self.frame.scale)
+
+        return same(0), same(1), same(2)
+
+
+def train(
+    oracles: Sequence[DistanceOracle],
+    plan: Plan,
+    *,
+    budget: float | None,
+    seed: int,
+    tell: Progress,
+    device: torch.device = CPU,
+) -> list[tuple[MlpSdf, int]]:
+    """Run a plan for several solids in one batched optimiser; each comes out as it would alone, up to rounding.
+
+    Args:
+        oracles: true distances to each solid, metres.
+        plan: the recipe.
+        budget: seconds for all at most; the decay begins early enough to end within them.
+        seed: of points and weights.
+        tell: called with (fraction done, message).
+        device: to train on.
+
+    Returns:
+        per solid its network, on the CPU, and the number of updates made.
+    """
+    started = time.monotonic()
+    run = _Run(oracles, plan, seed, tell, device)
+    if device.type == "cpu":
+        choose_threads(partial(run.differentiate, torch.arange(plan.batch) % plan.pool))
+    looping = time.monotonic()
+    while run.step < run.stop.max():
+        run.update()
+        if run.step % CHECK_EVERY:
+            continue
+        near, far = run.judge()
+        if budget is not None:
+            pace = (time.monotonic() - looping) / run.step
+            run.hurry(run.step + int((training_share(budget) - (time.monotonic() - started)) / pace))
+        last = max(int(run.stop.max()), 1)
+        tell(0.97 * run.step / last, f"step {run.step} of {last}, error {near:.2g} near, {far:.2g} in the box")
+    return run.results()
+
+
+def training_share(budget: float) -> float:
+    """Seconds of a budget that the training may take; the rest is the certificate's."""
+    return budget - min(0.1 * budget + RESERVE, 0.5 * budget)
+
+
+class _Run:
+    """S networks in training.
+
+    Attributes:
+        step: updates made.
+        turn: [S] the update at which each one's decay begins; an early stop or a short budget moves it forward.
+        stop: [S] the update at which each one ends.
+    """
+
+    def __init__(
+        self, oracles: Sequence[DistanceOracle], plan: Plan, seed: int, tell: Progress, device: torch.device
+    ) -> None:
+        self.plan, self.device = plan, device
+        self.subjects, pools, checks = [], [], []
+        for done, oracle in enumerate(oracles, start=1):
+            tell(0.0, "sampling distances" + (f" of {done} of {len(oracles)}" if len(oracles) > 1 else ""))
+            subject = Subject(oracle, plan, seed)
+            self.subjects.append(subject)
+            pools.append(subject.pool(0))
+            checks.append(subject.check())
+        self.pool, self.check = self._stacked(pools), self._stacked(checks)
+        # Drawn on the CPU, so that points and first weights do not depend on the device.
+        self.generator = torch.Generator().manual_seed(seed)
+        self.parameters = [p.to(device) for p in _initial(plan, len(oracles), self.generator)]
+        for parameter in self.parameters:
+            parameter.grad = torch.zeros_like(parameter)
+        self.average = [parameter.clone() for parameter in self.parameters]
+        self.optimiser = (Soap if plan.optimiser == "soap" else torch.optim.Adam)(self.parameters, plan.lr)
+        self.step = 0
+        self.turn = np.full(len(oracles), int(plan.steps * (1.0 - plan.decay)))
+        self.stop = np.full(len(oracles), plan.steps)
+        self._tape = Tape(plan.activation, plan.width, plan.layers, self.parameters[0])
+
+    def _stacked(self, pools: list[Pool]) -> Pool:
+        return Pool(*(torch.cat(parts).to(self.device) for parts in zip(*pools, strict=True)))
+
+    def update(self) -> None:
+        """One step of the optimiser for all that are not done."""
+        plan = self.plan
+        if plan.resample and self.step and self.step % plan.resample == 0:
+            self.pool = self._stacked([subject.pool(self.step) for subject in self.subjects])
+        self.differentiate(torch.randint(plan.pool, (plan.batch,), generator=self.generator))
+        factor = np.full(len(self.subjects), min(1.0, (self.step + 1) / WARMUP))
+        if plan.decay:
+            late = np.clip((self.step - self.turn) / np.maximum(self.stop - self.turn, 1), 0.0, 1.0)
+            factor = factor * 0.5 * (1.0 + np.cos(math.pi * late))
+        factor = np.where(self.step < self.stop, factor, 0.0)
+        if isinstance(self.optimiser, Soap):
+            self.optimiser.step(torch.from_numpy(factor).to(self.parameters[0]))
+        else:  # without an early stop the schedule of all networks is one
+            self.optimiser.param_groups[0]["lr"] = plan.lr * float(factor.max())
+            self.optimiser.step()
+        self.step += 1
+        for mean, parameter in zip(self.average, self.parameters, strict=True):
+            mean.lerp_(parameter, 0.02)
+
+    def differentiate(self, chosen: torch.Tensor) -> None:
+        """Weighted L1 of the signed distance, and of the unsigned one where the sign is not known; fills the gradients.
+
+        Args:
+            chosen: [T] points of each pool.
+        """
+        chosen = chosen.to(self.device)
+        points, distance, signed = (
+            self.pool.points[:, chosen],
+            self.pool.distance[:, chosen],
+            self.pool.signed[:, chosen],
+        )
+        weights, biases = _layers(self.parameters, self.plan.activation)
+        value = self._tape.forward(weights, biases, points)
+        error = torch.where(signed, value - distance, value.abs() - distance.abs())
+        slope = error.sign() * torch.where(signed, 1.0, value.sign()) / len(chosen)
+        if self.plan.soften is not None:
+            slope = slope * (self.plan.soften / (distance.abs() + self.plan.soften))
+        gradients = [parameter.grad for parameter in self.parameters if parameter.grad is not None]
+        self._tape.parameter_gradients(weights, points, slope, *_split(gradients))
+        for gradient, scale in zip(gradients, _SCALES[self.plan.activation], strict=True):
+            gradient.mul_(scale)
+
+    def judge(self) -> tuple[float, float]:
+        """Begin the decay of those that meet the goal. Returns mean errors near the surface and in the box, of all."""
+        layers = _layers(self.average, self.plan.activation)
+        value, gradient = value_and_gradient(*layers, self.plan.activation, self.check.points)
+        distance, signed = self.check.distance, self.check.signed
+        error = torch.where(signed, value - distance, value.abs() - distance.abs()).abs()
+        near, far = error[:, :CHECKED].mean(1), error[:, 2 * CHECKED :].mean(1)
+        if self.plan.goal is not None:
+            cosine = torch.nn.functional.cosine_similarity(gradient, self.check.direction, dim=-1)
+            turned = 1.0 - cosine[:, CHECKED : 2 * CHECKED].median(1).values
+            clear = signed & (distance.abs() > SIGN_FROM)
+            wrong = (clear & (value * distance <= 0)).sum(1) / clear.sum(1).clamp_min(1)
+            errors = torch.stack([near, far, turned, wrong], -1)
+            met = (errors <= errors.new_tensor(self.plan.goal)).all(-1)
+            early = met.cpu().numpy() & (self.step < self.turn)
+            self.turn = np.where(early, self.step, self.turn)
+            self.stop = np.where(early, np.minimum(self.stop, self.step + self.plan.settle), self.stop)
+        return float(near.mean()), float(far.mean())
+
+    def hurry(self, possible: int) -> None:
+        """Place decay and end so that `possible` updates in all suffice.
+
+        Until the decay has begun the end moves both ways, since the first steps of a busy machine tell little; after
+        that it only comes nearer.
+        """
+        possible = max(possible, self.step)
+        begun = self.step >= self.turn
+        self.stop = np.minimum(np.where(begun, self.stop, self.plan.steps), possible)
+        open_ended = np.maximum(self.step, (self.stop * (1.0 - self.plan.decay)).astype(int))
+        self.turn = np.where(begun, self.turn, open_ended)
+
+    def results(self) -> list[tuple[MlpSdf, int]]:
+        """Every network and its updates, in the order of the solids."""
+        weights, biases = _layers(self.parameters, self.plan.activation)
+        found = []
+        for row, subject in enumerate(self.subjects):
+            sdf = MlpSdf(
+                tuple(weight[row].cpu().clone() for weight in weights),
+                tuple(bias[row].cpu().clone() for bias in biases),
+                self.plan.activation,
+                subject.frame,
+                subject.oracle.bounds.copy(),
+                subject.mirrors,
+            )
+            found.append((sdf, int(min(self.step, self.stop[row]))))
+        return found
+
+
+def _initial(plan: Plan, count: int, generator: torch.Generator) -> list[torch.Tensor]:
+    """First [1, S, W, 3], hidden [L - 2, S, W, W] and last [1, S, 1, W] weights; biases [L - 1, S, W, 1], [1, S, 1, 1].
+
+    All `count` networks start alike. Equal layers are stacked for the optimiser. Periodic layers start with phases all
+    around and the spread of inputs that sine layers have (Sitzmann et al. 2020); ReLU layers with He's variance.
+    """
+    width, hidden = plan.width, plan.layers - 2
+
+    def uniform(bound: float, layers: int, *shape: int) -> torch.Tensor:
+        one = (2.0 * torch.rand((layers, 1, *shape), generator=generator) - 1.0) * bound
+        return one.repeat(1, count, 1, 1)
+
+    periodic = plan.activation == "wave"
+    return [
+        uniform(plan.first if periodic else math.sqrt(2.0), 1, width, 3),
+        uniform(math.sqrt(6.0 / width), hidden, width, width),
+        uniform(math.sqrt(6.0 / width) / (10.0 if periodic else 1.0), 1, 1, width),
+        uniform(math.pi if periodic else 0.05, plan.layers - 1, width, 1),
+        uniform(0.05, 1, 1, 1),
+    ]
+
+
+# A wave of period 1 with the parameters of a sine of period 2 pi: they are trained at the sine's scale, on which
+# equal steps of the optimiser suit all layers, and multiplied by these before every use. Its height is 1/8.
+_SCALES = {"wave": (0.5 / math.pi, 4.0 / math.pi, 8.0, 0.5 / math.pi, 1.0), "relu": (1.0,) * 5}
+
+
+def _layers(parameters: list[torch.Tensor], activation: Activation) -> Layers:
+    """What the networks compute with."""
+    return _split([parameter * scale for parameter, scale in zip(parameters, _SCALES[activation], strict=True)])
+
+
+def _split(parts: list[torch.Tensor]) -> Layers:
+    first, hidden, last, biases, end = parts
+    return [first[0], *hidden.unbind(), last[0]], [*biases[..., 0].unbind(), end[0, ..., 0]]

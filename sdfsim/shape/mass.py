@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.mesh import Mesh, is_closed
-from sdfsim.shape.sdf import Sdf
+
+if TYPE_CHECKING:  # sdf.py measures meshes, and so imports this file
+    from sdfsim.shape.distance import DistanceOracle
+    from sdfsim.shape.sdf import Sdf
 
 
 def mass_properties(mesh: Mesh) -> tuple[float, np.ndarray, np.ndarray]:
@@ -50,7 +55,7 @@ def integrals(mesh: Mesh, weights: np.ndarray | float = 1.0) -> tuple[float, np.
     return volume, com + shift, np.trace(second) * np.eye(3) - second
 
 
-def mass_properties_of_sdf(sdf: Sdf, *, cells: int = 64) -> tuple[float, np.ndarray, np.ndarray]:
+def mass_properties_of_sdf(sdf: Sdf | DistanceOracle, *, cells: int = 64) -> tuple[float, np.ndarray, np.ndarray]:
     """The integrals of `mass_properties`, taken on a grid over the inside of any bounded SDF.
 
     A cell at distance f from the surface counts with the fraction 0.5 - f / cell (clamped), so the error is of

@@ -1,27 +1,26 @@
-"""Triangle meshes: loading, cleaning, and points on them."""
+"""Triangle meshes: reading and writing files, cleaning, convex hulls, and points on surfaces."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
+import re
+import struct
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sdfsim.errors import SdfsimError
-from sdfsim.shape.mesh import check_gltf, check_rows, counted_forwards
-from sdfsim.shape.watertight import without_doubles
 
-# Its readers log what they pass over, some with tracebacks; who wants to see that can still listen.
+# trimesh logs what it passes over, some of it with tracebacks. Whoever wants to see that can still listen.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
-MOST_BYTES = 2 * 2**30  # of a file
 FARTHEST = 1e12  # from the origin: beyond, not even double precision tells the vertices of a room-sized mesh apart
-TEXTURES = ("JPEG", "PNG", "WEBP", "BMP", "TIFF")  # others would start programs that draw them
+TEXTURES = ("JPEG", "PNG", "WEBP", "BMP", "TIFF")  # Pillow starts other programs to draw some of the other formats
 
 
 @dataclass(frozen=True)
@@ -84,39 +83,80 @@ def load_mesh(path: str | Path) -> Mesh:
     """Read a triangle mesh (obj, ply, glb, gltf, stl, off), cleaned by `clean`.
 
     Raises:
-        SdfsimError: missing file, not a mesh, no faces, vertices that are not finite, indices out of range, or an
-            absurd size.
+        SdfsimError: missing file, not a mesh, cut short, no faces, vertices that are not finite, or indices out of
+            range.
     """
-    import trimesh
-    from trimesh.resolvers import FilePathResolver
-
     path = Path(path)
     if not path.is_file():
         raise SdfsimError(f"{path}: no such mesh file")
-    if path.suffix.lower() not in MESH_SUFFIXES:
+    suffix = path.suffix.lower()
+    if suffix not in MESH_SUFFIXES:
         raise SdfsimError(f"{path}: not a mesh file ({path.suffix or 'no suffix'})", "use " + " ".join(MESH_SUFFIXES))
-    if (size := path.stat().st_size) > MOST_BYTES:
-        told = f"{size / 2**30:.1f} GiB, at most {MOST_BYTES // 2**30}"
-        raise SdfsimError(f"{path}: too large ({told})", "export it with fewer faces")
-    if path.suffix.lower() in (".glb", ".gltf"):
-        check_gltf(path)
-    if path.suffix.lower() in (".off", ".ply"):
-        check_rows(path)
-    text = counted_forwards(path) if path.suffix.lower() == ".obj" else None
     try:
-        if text is None:
-            loaded: Any = trimesh.load(path, force="mesh", process=False)
-        else:
-            loaded = trimesh.load(
-                BytesIO(text), "obj", resolver=FilePathResolver(str(path)), force="mesh", process=False
-            )
-        vertices = np.array(loaded.vertices, dtype=np.float64).reshape(-1, 3)
-        faces = np.array(getattr(loaded, "faces", []), dtype=np.int64).reshape(-1, 3)
-        colors = _vertex_colors(loaded, len(vertices))
+        # trimesh passes over each of these in silence and would give another geometry than the file's.
+        if suffix in (".glb", ".gltf"):
+            _check_gltf(path)
+        elif suffix == ".obj":
+            _check_obj(path)
+        loaded = _read(path)
+        colors = _vertex_colors(loaded, len(loaded.vertices))
+        mesh = Mesh(np.array(loaded.vertices, dtype=np.float64).reshape(-1, 3), _faces(loaded), colors)
+        if suffix in (".off", ".ply"):
+            _check_counts(path, mesh)
     except Exception as error:  # the readers raise whatever their format made them stumble over
-        reason = str(error).strip().splitlines()
-        raise SdfsimError(f"{path}: not a readable mesh ({reason[0] if reason else type(error).__name__})") from error
-    return clean(Mesh(vertices, faces, colors), name=str(path))
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise SdfsimError(f"{path}: not a readable mesh ({reason})") from error
+    return clean(mesh, name=str(path))
+
+
+def _read(path: Path) -> Any:
+    import trimesh
+
+    return trimesh.load(path, force="mesh", process=False)
+
+
+def _faces(loaded: Any) -> np.ndarray:
+    return np.array(getattr(loaded, "faces", []), dtype=np.int64).reshape(-1, 3)
+
+
+def _check_gltf(path: Path) -> None:
+    """Refuse a glTF file whose geometry is not in its buffers: compressed, sparse, or of a length they do not have."""
+    if path.suffix.lower() == ".gltf":
+        header = json.loads(path.read_text(encoding="utf-8"))
+    else:
+        with open(path, "rb") as file:
+            magic, _, _, length, _ = struct.unpack("<4s4I", file.read(20))
+            if magic != b"glTF":
+                raise ValueError("it does not begin with glTF")
+            header = json.loads(file.read(length))
+    views = header.get("bufferViews", [])
+    for accessor in header.get("accessors", []):
+        if "bufferView" not in accessor or "sparse" in accessor:
+            raise ValueError("compressed or sparse geometry: export it without either")
+        view = views[accessor["bufferView"]]
+        if not (0 < accessor["count"] <= view["byteLength"] and 4 <= view.get("byteStride", 4) <= 252):
+            raise ValueError("an accessor does not fit its buffer")
+
+
+def _check_obj(path: Path) -> None:
+    """Refuse faces whose indices count back from the rows before them, or are 0."""
+    text = path.read_bytes()
+    if found := re.search(rb"^f[ \t](?:[^\n]*[ \t/])?(-\d+|0+)(?![\d.])", text, re.MULTILINE):
+        number = text.count(b"\n", 0, found.start()) + 1
+        raise ValueError(f"line {number}: a face has the index {found[1].decode()}, only those above 0 are read")
+
+
+def _check_counts(path: Path, mesh: Mesh) -> None:
+    """Refuse an OFF or PLY file that has fewer vertices or faces than its header announces: it was cut short."""
+    with open(path, "rb") as file:
+        head = re.sub(rb"#.*", b"", file.read(4096))
+    if path.suffix.lower() == ".off":
+        announced = re.findall(rb"\d+", head)[:2]
+    else:
+        announced = [count for kind in (b"vertex", b"face") for count in re.findall(rb"element %b (\d+)" % kind, head)]
+    for kind, rows, wanted in zip(("vertices", "faces"), (mesh.vertices, mesh.faces), announced, strict=False):
+        if len(rows) < int(wanted):
+            raise ValueError(f"cut short: {len(rows)} of {int(wanted)} {kind}")
 
 
 def _vertex_colors(loaded: Any, count: int) -> np.ndarray | None:
@@ -133,6 +173,44 @@ def _vertex_colors(loaded: Any, count: int) -> np.ndarray | None:
         return None
     colors = np.asarray(visual.vertex_colors)
     return colors[:, :3].astype(np.uint8) if colors.shape[:1] == (count,) else None
+
+
+def write_ply(mesh: Mesh) -> bytes:
+    """A mesh as binary PLY, vertices in double precision: what is read back is what was written, to the last bit."""
+    columns = [(axis, "<f8", "double") for axis in "xyz"]
+    values = list(mesh.vertices.T)
+    if mesh.colors is not None:
+        columns += [(channel, "u1", "uchar") for channel in ("red", "green", "blue")]
+        values += list(mesh.colors.T)
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(mesh.vertices)}"]
+    header += [f"property {kind} {name}" for name, _, kind in columns]
+    header += [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices", "end_header", ""]
+    vertices = np.empty(len(mesh.vertices), dtype=[(name, kind) for name, kind, _ in columns])
+    for (name, _, _), column in zip(columns, values, strict=True):
+        vertices[name] = column
+    faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("corner", "<i4", 3)])
+    faces["count"], faces["corner"] = 3, mesh.faces
+    return "\n".join(header).encode() + vertices.tobytes() + faces.tobytes()
+
+
+def read_mesh(path: Path) -> Mesh:
+    """The mesh of a shape folder as `write_ply` wrote it: not cleaned, not reordered.
+
+    Raises:
+        SdfsimError: not readable.
+    """
+    try:
+        loaded = _read(path)
+        mesh = Mesh(np.array(loaded.vertices, dtype=np.float64), _faces(loaded), None)
+        if len(mesh.faces) and (mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices)):
+            raise ValueError("face indices out of range")
+        if not np.isfinite(mesh.vertices).all():
+            raise ValueError("vertices that are not finite")
+        if loaded.visual.kind != "vertex":
+            return mesh
+        return Mesh(mesh.vertices, mesh.faces, np.array(loaded.visual.vertex_colors)[:, :3].astype(np.uint8))
+    except Exception as error:  # the readers raise whatever their format made them stumble over
+        raise SdfsimError(f"{path}: damaged or cut short ({error})") from error
 
 
 def clean(mesh: Mesh, *, name: str = "mesh") -> Mesh:
@@ -180,6 +258,31 @@ def clean(mesh: Mesh, *, name: str = "mesh") -> Mesh:
     return result
 
 
+def without_doubles(faces: np.ndarray) -> np.ndarray:
+    """One face [F', 3] for each set of three corners in `faces` [F, 3].
+
+    Two faces back to back are either a wall between two touching cells, which is inside the solid, or a surface that
+    was drawn from both sides. Without a wall the rest is still closed; then both go. Otherwise one stays.
+    """
+    order = np.argsort(faces, axis=1)
+    # The sorted corners' permutation is even exactly when its inversions are.
+    odd = ((order[:, 0] > order[:, 1]) ^ (order[:, 0] > order[:, 2]) ^ (order[:, 1] > order[:, 2])).astype(bool)
+    _, first, label = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_inverse=True)
+    label = label.reshape(-1)
+    both = (np.bincount(label, weights=odd) > 0) & (np.bincount(label, weights=~odd) > 0)
+    kept = np.sort(first)
+    single, wall = faces[kept], both[label[kept]]
+    if not wall.any():
+        return single
+    edge, _ = directed_edges(single)
+    component = components(single)
+    uneven = np.bincount(edge[~np.tile(wall, 3)], minlength=edge.max() + 1) % 2 == 1
+    broken = np.zeros(component.max() + 1, dtype=bool)
+    broken[np.tile(component, 3)[uneven[edge]]] = True
+    emptied = np.bincount(component[~wall], minlength=component.max() + 1) == 0
+    return single[~(wall & ~(broken | emptied)[component])]
+
+
 def is_closed(mesh: Mesh) -> bool:
     """Whether every directed edge has exactly one opposite: watertight, with one consistent winding."""
     edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
@@ -194,6 +297,27 @@ def signed_volume(mesh: Mesh) -> float:
     """Volume enclosed, m^3; negative when the faces are wound inwards. Meaningful for closed meshes only."""
     corners = mesh.vertices[mesh.faces] - mesh.vertices.mean(0)
     return float(np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6.0)
+
+
+def components(faces: np.ndarray) -> np.ndarray:
+    """[F] labels: faces that share an edge, with whatever others, are of one component."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    edge, _ = directed_edges(faces)
+    face = np.tile(np.arange(len(faces)), 3)
+    links = coo_matrix((np.ones(len(edge)), (face, len(faces) + edge)), shape=(len(faces) + edge.max() + 1,) * 2)
+    _, label = np.unique(connected_components(links, directed=False)[1][: len(faces)], return_inverse=True)
+    return label
+
+
+def directed_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """For the 3 F directed edges (first ones, second, third): the undirected edge's number, and its sense +1 or -1."""
+    start = np.concatenate([faces[:, 0], faces[:, 1], faces[:, 2]]).astype(np.int64)
+    end = np.concatenate([faces[:, 1], faces[:, 2], faces[:, 0]]).astype(np.int64)
+    key = np.minimum(start, end) * (int(faces.max()) + 1) + np.maximum(start, end)
+    _, edge = np.unique(key, return_inverse=True)
+    return edge, np.where(start < end, 1, -1)
 
 
 def load_pieces(path: str | Path) -> list[Mesh]:

@@ -17,12 +17,11 @@ def box(size: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Mesh:
     """A box with full extents `size` m: 8 vertices, 12 faces."""
     corners = np.stack(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5], indexing="ij"), axis=-1).reshape(-1, 3)
     quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
-    return clean(Mesh(corners * _positive(*size), _quads(quads)), name="box")
+    return clean(Mesh(corners * np.array(size), _quads(quads)), name="box")
 
 
 def sphere(radius: float = 0.5, subdivisions: int = 3) -> Mesh:
     """An icosphere: 20 * 4^subdivisions faces, vertices on the sphere of `radius` m."""
-    _positive(radius)
     golden = (1.0 + 5.0**0.5) / 2.0
     vertices = np.array([[0, a, b * golden] for a in (-1, 1) for b in (-1, 1)], dtype=np.float64)
     solid = convex_hull(np.concatenate([np.roll(vertices, turn, axis=1) for turn in range(3)]))
@@ -39,14 +38,12 @@ def sphere(radius: float = 0.5, subdivisions: int = 3) -> Mesh:
 
 def cylinder(radius: float = 0.5, height: float = 1.0, segments: int = 64) -> Mesh:
     """A cylinder along z, its middle at the origin."""
-    _positive(radius, height)
     profile = np.array([[0, -height / 2], [radius, -height / 2], [radius, height / 2], [0, height / 2]])
     return _revolve(profile, segments, "cylinder")
 
 
 def cone(radius: float = 0.5, height: float = 1.0, segments: int = 64) -> Mesh:
     """A cone along z, apex up, the middle of its height at the origin."""
-    _positive(radius, height)
     return _revolve(np.array([[0, -height / 2], [radius, -height / 2], [0, height / 2]]), segments, "cone")
 
 
@@ -67,7 +64,11 @@ def gear(radius: float = 0.5, tooth: float = 0.1, thickness: float = 0.2, bore: 
     """
     outer, inner = _gear_outline(radius, tooth, bore, teeth)
     count = len(outer)
-    layers = [np.column_stack([outline, np.full(count, z)]) for z in _faces_at(thickness) for outline in (outer, inner)]
+    layers = [
+        np.column_stack([outline, np.full(count, z)])
+        for z in (-thickness / 2, thickness / 2)
+        for outline in (outer, inner)
+    ]
     this, following = np.arange(count), (np.arange(count) + 1) % count
     low_out, low_in, high_out, high_in = (count * layer for layer in range(4))
     quads = [
@@ -95,7 +96,6 @@ def torus_knot(
 def sponge(size: float = 1.0, holes: int = 2) -> Mesh:
     """A cube with `holes` x `holes` square channels through it along each axis, as wide as the walls between them."""
     solid = _sponge_cells(holes)
-    _positive(size)
     cells = len(solid)
     padded = np.pad(solid, 1)
     corners = []
@@ -133,7 +133,6 @@ def shoe(length: float = 1.0, cells: int = 72) -> Mesh:
     """
     from skimage.measure import marching_cubes
 
-    _positive(length)
     axis = np.linspace(-0.58, 0.58, cells)
     x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
     # The body thins towards the toe, so do its cavity and its height.
@@ -185,7 +184,7 @@ def convex_pieces(kind: str) -> list[Mesh]:
         outer, inner = _gear_outline(0.5, 0.1, 0.12, 12)
         outline = np.stack([outer, np.roll(outer, -1, axis=0), np.roll(inner, -1, axis=0), inner], axis=1)
         return [
-            convex_hull(np.concatenate([np.column_stack([sector, np.full(4, z)]) for z in _faces_at(0.2)]))
+            convex_hull(np.concatenate([np.column_stack([sector, np.full(4, z)]) for z in (-0.1, 0.1)]))
             for sector in outline
         ]
     if kind == "sponge":
@@ -203,12 +202,6 @@ def convex_pieces(kind: str) -> list[Mesh]:
             pieces += [convex_hull(np.concatenate(rings[k : k + 2])) for k in range(24)]
         return pieces
     raise SdfsimError(f"no convex pieces for {kind!r}", "decompose its mesh with another program")
-
-
-def _positive(*sizes: float) -> np.ndarray:
-    if not all(np.isfinite(size) and size > 0 for size in sizes):
-        raise SdfsimError(f"the sizes of a primitive must be > 0 (got {', '.join(f'{size:g}' for size in sizes)})")
-    return np.array(sizes, dtype=np.float64)
 
 
 def _quads(quads: np.ndarray) -> np.ndarray:
@@ -246,7 +239,6 @@ def _ring_hulls(rings: np.ndarray) -> list[Mesh]:
 
 
 def _torus_rings(major: float, minor: float, segments: int, sides: int) -> np.ndarray:
-    _positive(major, minor)
     around = 2 * np.pi * np.arange(sides) / sides
     profile = np.stack([major + minor * np.cos(around), minor * np.sin(around)], axis=1)
     return np.stack([_spin(profile, turn) for turn in 2 * np.pi * np.arange(segments) / segments])
@@ -255,7 +247,6 @@ def _torus_rings(major: float, minor: float, segments: int, sides: int) -> np.nd
 def _knot_rings(
     major: float, wrap: float, tube: float, turns: tuple[int, int], segments: int, sides: int
 ) -> np.ndarray:
-    _positive(major, wrap, tube)
     t = 2 * np.pi * np.arange(segments) / segments
     p, q = turns
     radius = major + wrap * np.cos(q * t)
@@ -275,7 +266,6 @@ def _knot_rings(
 
 def _gear_outline(radius: float, tooth: float, bore: float, teeth: int) -> tuple[np.ndarray, np.ndarray]:
     """Outer and bore outlines [4 * teeth, 2], counter-clockwise: root, rise, tip, fall of each tooth."""
-    _positive(radius, tooth, bore, radius - tooth - bore)
     fraction = np.array([0.0, 0.3, 0.4, 0.9])
     turn = (2 * np.pi / teeth * (np.arange(teeth)[:, None] + fraction)).reshape(-1)
     reach = np.tile([radius - tooth, radius - tooth, radius, radius], teeth)
@@ -283,22 +273,14 @@ def _gear_outline(radius: float, tooth: float, bore: float, teeth: int) -> tuple
     return circle * reach[:, None], circle * bore
 
 
-def _faces_at(thickness: float) -> tuple[float, float]:
-    _positive(thickness)
-    return -thickness / 2, thickness / 2
-
-
 def _sponge_cells(holes: int) -> np.ndarray:
     """[C, C, C] bool with C = 2 * holes + 1: solid unless two or more of the three indices are odd."""
-    if holes < 1:
-        raise SdfsimError(f"a sponge needs at least one hole a side (got {holes})")
     odd = np.arange(2 * holes + 1) % 2
     return odd[:, None, None] + odd[None, :, None] + odd[None, None, :] < 2
 
 
 def _bowl_profiles(radius: float, wall: float, bands: int) -> tuple[np.ndarray, np.ndarray]:
     """Outer and inner quarter circles [bands + 1, 2] of (radius, z), from the bottom to the rim."""
-    _positive(radius, wall, radius - wall)
     angle = np.pi / 2 * np.arange(bands + 1) / bands
     quarter = np.stack([np.sin(angle), -np.cos(angle)], axis=1)
     quarter[0, 0] = 0.0

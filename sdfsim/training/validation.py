@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from sdfsim.data.dataset import Trajectory, load_shapes, trajectory_files
-from sdfsim.data.velocities import at_instants, engine_substep
+from sdfsim.data.dataset import Trajectory, engine_substep, load_shapes, trajectory_files
 from sdfsim.errors import SdfsimError, run_main
 from sdfsim.files import replacing
 from sdfsim.training.contact_cache import inner_steps
@@ -57,7 +56,7 @@ class Rollouts:
         steps = len(self.recorded[0].position) - 1
         squared, degrees, bodies = 0.0, 0.0, 0
         known = {name: replace(s, nodes=s.nodes[: model.nodes]) for name, s in self.shapes.items()}
-        for group in batches([at_instants(t, self.substep) for t in self.recorded]):
+        for group in batches(self.recorded):
             try:
                 inner = inner_steps(group[0].dt, self.substep)
                 predicted = roll_out(model, group, known, steps, self.device, substeps=inner)

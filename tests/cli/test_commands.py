@@ -48,13 +48,6 @@ def test_a_second_run_replaces_the_first(scene, model, tmp_path):
     assert done.exit_code == 0 and f"{tmp_path / 'run'}: finished already\n" in done.stderr
 
 
-def test_no_time_is_no_step(scene, model, tmp_path):
-    done = run("simulate", scene, "-o", tmp_path / "run", "--model", model, "--seconds", 0)
-    assert done.exit_code == 0, done.stderr
-    assert done.stdout.startswith("0 steps of ")
-    assert len(Rollout.load(tmp_path / "run" / "rollout.npz")) == 0
-
-
 def test_json_is_one_object_and_nothing_else(scene, model, tmp_path):
     for arguments in (
         ("simulate", scene, "-o", tmp_path / "run", "--model", model, "--seconds", 0.1),
@@ -80,13 +73,6 @@ def test_json_keeps_native_output_off_stdout(scene, model, tmp_path):
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["steps"] > 0
     assert "from C" in done.stderr and "from Python" in done.stderr
-
-
-def test_plan_says_what_is_in_play(scene, model):
-    done = run("plan", scene, "--model", model)
-    assert done.exit_code == 0 and "gravity     on   9.81 m/s^2" in done.stdout
-    report = json.loads(run("plan", scene, "--model", model, "--json").stdout)
-    assert report["effects"]["contact"]["on"] and report["dynamic"] == ["ball"] and report["step_ms"] > 0
 
 
 BAD_SCENES = [
@@ -278,8 +264,3 @@ def test_a_folder_without_a_name_is_not_the_current_one(scene, model, monkeypatc
     before = sorted(tmp_path.rglob("*"))
     done = run("simulate", scene, "-o", "", "--model", model, "--seconds", 0.1)
     assert done.exit_code == 2 and "is empty" in done.stderr and sorted(tmp_path.rglob("*")) == before
-
-
-def test_corners_that_are_none_are_wrong_usage_of_reconstruct_too(tmp_path):
-    done = run("reconstruct", tmp_path, "-o", tmp_path / "run", "--crop", "1,1", "0,0,0")
-    assert done.exit_code == 2 and "two corners X,Y,Z" in done.stderr

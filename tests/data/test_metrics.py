@@ -26,7 +26,7 @@ def test_translation_rmse_of_a_constant_offset_is_its_length():
 
 
 def test_rotation_error_is_the_mean_angle_and_ignores_the_quaternions_sign():
-    truth = Rotation.random(12, random_state=0)
+    truth = Rotation.random(12, rng=np.random.default_rng(0))
     turn = Rotation.from_rotvec(np.repeat([[0.0, 0.0, np.radians(10)], [np.radians(30), 0.0, 0.0]], 6, axis=0))
     quat = (truth * turn).as_quat().reshape(6, 2, 4)
     assert rotation_error(-quat, truth.as_quat().reshape(6, 2, 4)) == pytest.approx(20.0)

@@ -8,13 +8,11 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("pybullet")
 
-from sdfsim.data.dataset import Trajectory, trajectory_files
+from sdfsim.data.dataset import Trajectory, at_instants, trajectory_files
 from sdfsim.data.generate import make_dataset, make_trajectory
 from sdfsim.data.pybullet_sim import DT, RATES, SUBSTEP, Teacher, TeacherBody
 from sdfsim.data.scenarios import MATERIALS, REGION, SIZES, Cast
-from sdfsim.data.shape_assets import Origin, find_shapes, prepare
-from sdfsim.data.velocities import at_instants
-from sdfsim.errors import SdfsimError
+from sdfsim.data.shape_assets import Origin, origins, prepare
 from sdfsim.evaluation.evaluate import evaluate
 from tests.dynamics.conftest import random_model
 from tests.recordings import balls
@@ -30,6 +28,11 @@ def urdfs(tmp_path_factory):
     found = [Origin(name, primitive=kind) for name, kind in kinds.items()]
     sources, _ = prepare(found, tmp_path_factory.mktemp("engine"), lambda fraction, message: None)
     return {source.name: source.urdf for source in sources}
+
+
+def sources_of(meshes, engine):
+    """The shapes of a folder of NAME/ folders, in their own size."""
+    return prepare(origins(meshes, as_is=True), engine, lambda fraction, message: None)[0]
 
 
 def motion(*bodies, steps, gravity=(0.0, 0.0, -GRAVITY), floor=(1.0, 1.0), fps=50):
@@ -177,7 +180,7 @@ def test_recorded_velocities_are_those_at_the_end_of_the_step(urdfs, fps):
 
 
 def test_free_fall_is_symplectic_euler_and_rest_is_at_half_the_size(cube_meshes, tmp_path):
-    source = find_shapes(cube_meshes, tmp_path)[0]
+    source = sources_of(cube_meshes, tmp_path)[0]
     assert source.volume == pytest.approx(1.0)
     with Teacher(np.array([0.0, 0.0, -10.0])) as teacher:
         teacher.add(TeacherBody(source.urdf, 1.0, 2.0, 0.5, 0.0), np.array([0.0, 0.0, 2.0]), np.array([0, 0, 0, 1.0]))
@@ -189,7 +192,7 @@ def test_free_fall_is_symplectic_euler_and_rest_is_at_half_the_size(cube_meshes,
 
 
 def test_the_recipe_keeps_to_its_ranges(cube_meshes, tmp_path):
-    sources = find_shapes(cube_meshes, tmp_path)
+    sources = sources_of(cube_meshes, tmp_path)
     t = make_trajectory("movi-b", np.random.default_rng(0), Cast(sources))
     assert len(t.position) == 101 and 3 <= t.position.shape[1] <= 10 and t.dt == pytest.approx(0.02)
     assert ((t.scale >= SIZES[0]) & (t.scale <= SIZES[1])).all()
@@ -213,18 +216,16 @@ def test_a_dataset_repeats_and_goes_on_where_it_was(cube_data, cube_meshes):
     assert report["made_now"] == 1
     for f, position in zip(files, before, strict=True):
         np.testing.assert_array_equal(Trajectory.load(f).position, position)
-    with pytest.raises(SdfsimError, match="no shapes found"):
-        find_shapes(cube_data / "test", cube_data)
 
 
 def test_flying_on_equals_the_teacher_until_something_touches(cube_data, cube_meshes, tmp_path):
     """The baseline's error in free fall is rounding: the engine's staggered start velocity is understood."""
-    source = find_shapes(cube_meshes, tmp_path)[0]
+    source = sources_of(cube_meshes, tmp_path)[0]
     with Teacher(np.array([0.0, 0.0, -10.0])) as teacher:
         teacher.add(TeacherBody(source.urdf, 1.0, 2.0, 0.5, 0.0), np.array([0.0, 0.0, 50.0]), np.array([0, 0, 0, 1.0]))
         teacher.push(0, np.array([3.0, -1.0, 2.0]), np.array([1.0, 2.0, 3.0]))
         motion = teacher.run(100)
-    whole = Trajectory.load(trajectory_files(cube_data, "test")[0])
+    whole = Trajectory.load(trajectory_files(cube_data, "test")[0], as_recorded=True)
     of_bodies = ("shape", "scale", "mass", "inertia", "friction", "restitution", "static")
     one = replace(whole, **motion, **{name: getattr(whole, name)[:1] for name in of_bodies})
     one = replace(one, inertia=np.full((1, 3), 1 / 3))

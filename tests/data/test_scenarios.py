@@ -8,20 +8,33 @@ import torch
 
 pytest.importorskip("pybullet")
 
-from sdfsim.shape.shape import Shape, analytic_shape, sdf_of_mesh
-
 from sdfsim.data import batching, generate, scenarios
 from sdfsim.data.dataset import SPLITS, Trajectory, load_shapes, trajectory_files
 from sdfsim.data.generate import GRAVITY, make_dataset, make_trajectory
 from sdfsim.data.pybullet_sim import Teacher, TeacherBody
-from sdfsim.data.scenarios import BALL, MASS_RATIO, OBSTACLES, RECIPES, SHARES, WALL, Cast
+from sdfsim.data.scenarios import (
+    BALL,
+    DROP,
+    MASS_RATIO,
+    MOTIONS,
+    NUDGE,
+    OBSTACLES,
+    PRESSED,
+    RECIPES,
+    SHARES,
+    SPINS,
+    STARTS,
+    WALL,
+    Cast,
+    at_rest,
+    set_moving,
+    steady_faces,
+)
 from sdfsim.data.shape_assets import Origin, prepare
-from sdfsim.data.starts_moving import MOTIONS, SPINS, set_moving
-from sdfsim.data.starts_resting import DROP, NUDGE, PRESSED, STARTS, at_rest, steady_faces
-from sdfsim.data.statistics import statistics, statistics_lines
 from sdfsim.errors import SdfsimError
 from sdfsim.shape import primitives
 from sdfsim.shape.mass import mass_properties
+from sdfsim.shape.shape import Shape, analytic_shape, sdf_of_mesh
 from sdfsim.training.contact_cache import contact_frames
 from sdfsim.training.impulse_task import ImpulseTask
 
@@ -110,10 +123,10 @@ def test_the_shares_of_varied_starts_are_those_that_are_told(cast, monkeypatch):
     monkeypatch.setattr(scenarios, "set_moving", lambda *args: drawn.append(args[3]))
     rng = np.random.default_rng(0)
     with Teacher(np.array(GRAVITY)) as teacher:
-        for _ in range(1000):
+        for _ in range(400):
             assert RECIPES["varied"].spawn(teacher, rng, cast) is None
     assert set(SHARES) == {"tossed", "resting", *MOTIONS} and sum(SHARES.values()) == pytest.approx(1.0)
-    assert {name: drawn.count(name) / 1000 for name in SHARES} == pytest.approx(SHARES, abs=0.04)
+    assert {name: drawn.count(name) / 400 for name in SHARES} == pytest.approx(SHARES, abs=0.06)
 
 
 def in_motion(motion: str, seed: int, cast: Cast, steps: int, count: int = 2):
@@ -121,7 +134,7 @@ def in_motion(motion: str, seed: int, cast: Cast, steps: int, count: int = 2):
     sources = [cast.scenery["ball"]] if motion == "rolling" else [cast.scenery["ball"], *cast.shapes]
     with Teacher(np.array(GRAVITY)) as teacher:
         bodies = [(s, TeacherBody(s.urdf, 1.0, 2.0, 0.8, 0.5)) for s in (sources * count)[:count]]
-        assert set_moving(teacher, np.random.default_rng(seed), bodies, motion, 100)
+        assert set_moving(teacher, np.random.default_rng(seed), bodies, motion)
         assert not any(teacher.overlaps(i) for i in range(count))
         return teacher.run(steps)
 
@@ -184,7 +197,7 @@ def test_resting_starts_are_low_and_slow_and_still_cubes_stay(cast, start):
     with Teacher(np.array(GRAVITY)) as teacher:
         bodies = [(cube, TeacherBody(cube.urdf, 0.8 + 0.05 * k, 1.0, 0.5, 0.2)) for k in range(6)]
         # Smaller ones on top: a cube that hangs over may fall.
-        assert at_rest(teacher, np.random.default_rng(1), bodies[::-1], start, 100)
+        assert at_rest(teacher, np.random.default_rng(1), bodies[::-1], start)
         motion = teacher.run(50)
     lowest = motion["position"][0, :, 2] - 0.5 * np.array([b.scale for _, b in bodies[::-1]])
     pressed = PRESSED if start == "pressed" else 0.0
@@ -226,18 +239,12 @@ def test_a_dataset_goes_on_where_it_was_and_refuses_another(cube_meshes, tmp_pat
     before = [Trajectory.load(file).position for file in files]
     files[1].unlink()
     again = make_dataset("pile", tmp_path, trajectories=2, shapes=cube_meshes, bodies=4)
-    assert report["made_now"] == 2 and again["made_now"] == 1 and again["statistics"] == report["statistics"]
+    assert report["made_now"] == 2 and again["made_now"] == 1
     np.testing.assert_array_equal(Trajectory.load(files[1]).position, before[1])
-    with pytest.raises(SdfsimError, match="a dataset of 50 frames a second, not 60"):
+    with pytest.raises(SdfsimError, match="a dataset with another fps"):
         make_dataset("pile", tmp_path, trajectories=2, shapes=cube_meshes, bodies=4, fps=60)
-    with pytest.raises(SdfsimError, match="--fps must be 50 or 60"):
-        make_dataset("pile", tmp_path, trajectories=2, shapes=cube_meshes, bodies=4, fps=30)
-    with pytest.raises(SdfsimError, match="another recipe, seed, engine, count"):
+    with pytest.raises(SdfsimError, match="a dataset with another bodies"):
         make_dataset("pile", tmp_path, trajectories=2, shapes=cube_meshes, bodies=5)
-    found = report["statistics"]
-    assert found["bodies"] == [4, 4, 4] and found["static_bodies"] == 0 and found["resting_at_start"] == 1.0
-    assert 0.5 <= found["extent_m"][0] <= found["extent_m"][2] <= 1.5
-    assert "  bodies: 4 to 4, mean 4" in statistics_lines(found)
 
 
 def bowl_shapes(folder):
@@ -269,10 +276,3 @@ def test_static_scenery_takes_part_in_contacts_but_never_in_what_is_learnt(cast,
     monkeypatch.setattr(batching, "TOGETHER", 50)
     for name, values in batching.find_edges(t, shapes, 0.1).items():
         np.testing.assert_allclose(values, whole[name], atol=1e-9)
-
-
-def test_statistics_of_balls_are_those_of_their_closed_forms(ball_data):
-    found = statistics(ball_data, "train")
-    assert found["bodies"] == [2, 2, 2] and found["volume_m3"] == pytest.approx([4 / 3 * np.pi / 8] * 3)
-    assert found["mass_ratio"] == pytest.approx([2.0] * 3) and found["nodes_per_scene"] == 256
-    assert 0 < found["contacts_per_step"] < 256 and "published" not in found

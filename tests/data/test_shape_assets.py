@@ -9,13 +9,12 @@ import pytest
 
 pytest.importorskip("pybullet")
 
-from sdfsim.data import convex_pieces, generate
-from sdfsim.data.convex_pieces import decompose, wavefront
+from sdfsim.data import generate, shape_assets
 from sdfsim.data.generate import make_dataset
-from sdfsim.data.pybullet_sim import Teacher, TeacherBody, write_urdf
-from sdfsim.data.shape_assets import COLLISION, VISUAL, find_shapes, made_from, origins, prepare, split_of
+from sdfsim.data.pybullet_sim import Teacher, TeacherBody
+from sdfsim.data.shape_assets import COLLISION, VISUAL, decompose, origins, prepare, split_of, wavefront
 from sdfsim.errors import SdfsimError
-from sdfsim.evaluation.baselines import engine_file
+from sdfsim.evaluation.engines import dataset_urdf
 from sdfsim.files import locked
 from sdfsim.shape import primitives
 from sdfsim.shape.mesh import Mesh, signed_volume, write_ply
@@ -51,7 +50,7 @@ def test_splits_are_eight_one_and_one_tenths_and_depend_on_the_name_alone():
 
 
 def test_an_angle_becomes_convex_pieces_of_nearly_its_volume_without_a_word(tmp_path, capfd, monkeypatch):
-    monkeypatch.setattr(convex_pieces, "VHACD_CALL", convex_pieces.VHACD_CALL.replace("1000000", "30000"))
+    monkeypatch.setattr(shape_assets, "VHACD_CALL", shape_assets.VHACD_CALL.replace("1000000", "30000"))
     outline = np.array([[0, 0], [2, 0], [2, 1], [1, 1], [1, 2], [0, 2]], dtype=np.float64)
     cap = np.array([[0, k, k + 1] for k in range(1, 5)])
     side = np.array([[k, (k + 1) % 6, (k + 1) % 6 + 6, k + 6] for k in range(6)])
@@ -65,10 +64,9 @@ def test_an_angle_becomes_convex_pieces_of_nearly_its_volume_without_a_word(tmp_
 
 
 def test_prepared_shapes_are_centred_of_unit_extent_and_kept_and_sheets_are_left_out(prepared):
-    found, engine, sources, info = prepared
-    assert [s.name for s in sources] == ["block"] and list(info["left_out"]) == ["sheet"]
-    assert {name: how["pieces"] for name, how in made_from(found).items()} == {"block": "own", "sheet": "vhacd"}
-    assert "thinner" in info["left_out"]["sheet"]
+    found, engine, sources, left_out = prepared
+    assert [s.name for s in sources] == ["block"] and list(left_out) == ["sheet"]
+    assert [origin.how for origin in found] == ["own", "vhacd"] and "thinner" in left_out["sheet"]
     (block,) = sources
     assert np.ptp(block.vertices, axis=0) == pytest.approx([1.0, 0.5, 0.25])
     assert block.vertices.min(0) == pytest.approx(-block.vertices.max(0))
@@ -76,7 +74,7 @@ def test_prepared_shapes_are_centred_of_unit_extent_and_kept_and_sheets_are_left
     assert block.com == pytest.approx([5.0, 0.0, 0.0], abs=1e-6) and block.size == pytest.approx(2.0)
     before = block.pieces.stat().st_mtime_ns
     again, same = prepare(found, engine, ignore)
-    assert same == info and again[0].pieces.stat().st_mtime_ns == before
+    assert same == left_out and again[0].pieces.stat().st_mtime_ns == before
 
 
 def test_the_engine_collides_the_pieces_about_their_centre_of_mass(prepared):
@@ -88,22 +86,14 @@ def test_the_engine_collides_the_pieces_about_their_centre_of_mass(prepared):
     assert motion["position"][-1, 0, 2] == pytest.approx(0.125, abs=0.01)
 
 
-@pytest.mark.parametrize("absolute", [False, True])
-def test_engine_files_can_be_moved_and_older_ones_are_made_so(tmp_path, monkeypatch, absolute):
+def test_engine_files_can_be_moved(tmp_path, monkeypatch):
     """In whatever folder the engine works, and whatever lies there."""
-    block = primitives.box((1.0, 1.0, 1.0))
-    (tmp_path / "block.ply").write_bytes(write_ply(block))
     (tmp_path / "block").mkdir()
     for name in (VISUAL, COLLISION):
-        (tmp_path / "block" / name).write_text(wavefront([block]))
-    (tmp_path / "block.ply").unlink()
-    first = tmp_path / "first" / "shapes" / "engine"
-    sources = [*prepare(origins(tmp_path), first / "own", ignore)[0], *find_shapes(tmp_path, first / "kubric")]
-    if absolute:  # as they were written once
-        for source in sources:
-            write_urdf(source.pieces.resolve(), np.zeros(3), source.urdf)
-        prepare(origins(tmp_path), first / "own", ignore)
-        find_shapes(tmp_path, first / "kubric")
+        (tmp_path / "block" / name).write_text(wavefront([primitives.box((1.0, 1.0, 1.0))]))
+    engine = tmp_path / "first" / "shapes" / "engine"
+    prepare(origins(tmp_path), engine / "own", ignore)
+    prepare(origins(tmp_path, as_is=True), engine / "kubric", ignore)
     shutil.rmtree(tmp_path / "block")
     (tmp_path / "first").rename(tmp_path / "second")
     monkeypatch.chdir(tmp_path)
@@ -111,7 +101,7 @@ def test_engine_files_can_be_moved_and_older_ones_are_made_so(tmp_path, monkeypa
     for kind in ("own", "kubric"):
         for start in (Path(), tmp_path):
             urdf = start / "second" / "shapes" / "engine" / kind / "block.urdf"
-            assert engine_file(tmp_path / "second", f"{kind}/block").samefile(urdf)
+            assert dataset_urdf(tmp_path / "second", f"{kind}/block").samefile(urdf)
             with Teacher(np.array([0.0, 0.0, -10.0])) as teacher:
                 teacher.add(TeacherBody(urdf, 1.0, 6.0, 0.5, 0.0), (0.0, 0.0, 2.0))
                 assert teacher.inertia(0) == pytest.approx([1.0, 1.0, 1.0], rel=0.1)
@@ -144,7 +134,6 @@ def test_another_shape_of_the_same_name_leaves_a_dataset_as_it_is(tmp_path, monk
     monkeypatch.setattr(generate, "fit_shapes", lambda *_: None)
     monkeypatch.setattr(generate, "_make_one", lambda *a: a[-1].write_text(""))
     monkeypatch.setattr(generate, "parallel", lambda work, jobs: ((k, work(*job)) for k, job in enumerate(jobs)))
-    monkeypatch.setattr(generate, "statistics", lambda *_: {})
     for name, mesh in (("first", primitives.box((1.0, 1.0, 1.0))), ("second", primitives.box((1.0, 1.0, 0.7)))):
         (tmp_path / name / "block").mkdir(parents=True)
         for file in (VISUAL, COLLISION):
@@ -153,7 +142,7 @@ def test_another_shape_of_the_same_name_leaves_a_dataset_as_it_is(tmp_path, monk
     make_dataset(recipe, out, shapes=tmp_path / "first", trajectories=1)
     engine = out / "shapes" / "engine" / "block.obj"
     before = engine.read_bytes()
-    with pytest.raises(SdfsimError, match="another recipe, seed, engine, count or set of shapes"):
+    with pytest.raises(SdfsimError, match="a dataset with another made_from"):
         make_dataset(recipe, out, shapes=tmp_path / "second", trajectories=2)
     assert engine.read_bytes() == before
     with locked(out), pytest.raises(SdfsimError, match="another run"):
@@ -166,7 +155,7 @@ def test_another_shape_of_the_same_name_leaves_a_dataset_as_it_is(tmp_path, monk
     [
         ("movi-z", {}, "unknown recipe"),
         ("movi-b", {}, "movi-b needs shapes"),
-        ("movi-c", {"split": "dev"}, "unknown split"),
+        ("movi-c", {"fps": 30}, "--fps must be 50 or 60"),
         ("movi-c", {"random_solids": 3, "bodies": 5}, "--bodies goes with bowl and pile"),
         ("pile", {"random_solids": 3, "bodies": 513}, "is 1 to 512"),
         ("bowl", {"random_solids": 3}, "no use for --random-solids"),
@@ -185,4 +174,4 @@ def test_a_split_without_shapes_and_a_folder_without_any_are_refused(cube_meshes
     with pytest.raises(SdfsimError, match="no shapes found"):
         make_dataset("movi-c", tmp_path / "out", trajectories=1, shapes=tmp_path)
     with pytest.raises(SdfsimError, match="no shapes found"):
-        find_shapes(tmp_path, tmp_path / "engine")
+        make_dataset("movi-b", tmp_path / "out", trajectories=1, shapes=tmp_path)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from sdfsim.scene.scene import Body, Scene
-from sdfsim.shape.shape import analytic_shape
 
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.model import Model, new_network
+from sdfsim.scene.scene import Body, Scene
+from sdfsim.shape.shape import analytic_shape
 
 
 def make_body(name: str, shape: int, position, **fields) -> Body:

@@ -5,8 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from sdfsim.scene.scene import Effects, Scene, Waypoints
-from sdfsim.shape.shape import analytic_shape
 
 from sdfsim.dynamics import freeflight, surfaces
 from sdfsim.dynamics import step as step_module
@@ -15,7 +13,9 @@ from sdfsim.dynamics.memory import COUNTS, PHASES
 from sdfsim.dynamics.model import Unread
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.dynamics.surfaces import compact, predict
+from sdfsim.scene.scene import Effects, Scene, Waypoints
 from sdfsim.shape import sdf_batch
+from sdfsim.shape.shape import analytic_shape
 from tests.dynamics.conftest import make_body, random_model
 from tests.dynamics.test_paper import paper_model
 
@@ -42,7 +42,7 @@ def forbid(monkeypatch):
 def test_contact_off_looks_for_nothing_and_equals_bodies_that_may_not_touch(dropped, forbid):
     alone = replace(dropped, bodies=tuple(replace(b, collides_with=()) for b in dropped.bodies))
     forbid(step_module, "find_contacts", "contact_graph", "settle")
-    forbid(bank, "_group")
+    forbid(sdf_batch, "_group")
     model = random_model("impulse")
     forbid(model.network, "forward")
     off = Simulator(replace(dropped, effects=Effects(contact="off")), model).run(steps=6)
@@ -61,7 +61,7 @@ def test_no_weights_are_read_that_nothing_asks(dropped, tmp_path):
 
 def test_no_sdf_is_loaded_before_a_pair_is_near(dropped, forbid):
     far = replace(dropped, bodies=(dropped.bodies[0], dropped.bodies[3]))
-    forbid(bank, "_group")
+    forbid(sdf_batch, "_group")
     sim = Simulator(far, random_model("impulse"))
     sim.run(steps=10)
     assert sim.memory.counts["pairs"] == 0 and sim.memory.counts["free"] == 1
@@ -256,7 +256,7 @@ def test_a_path_that_rests_costs_nothing_and_scripted_bodies_do_not_meet_scenery
         make_body("script", 0, [0, 0, 0], motion="kinematic", mass=0.0, path=path),
         make_body("free", 0, [0, 0, 9]),
     )
-    forbid(bank, "_group")
+    forbid(sdf_batch, "_group")
     sim = Simulator(Scene(shapes, bodies, np.zeros(3), 1.0), random_model("impulse"))
     sim.run(steps=3)
     assert sim.memory.counts["pairs"] == 0 and (sim.state.position[1] == 0).all()

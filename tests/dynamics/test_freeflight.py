@@ -2,11 +2,11 @@
 
 import numpy as np
 import torch
-from sdfsim.scene.scene import Scene
 
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.freeflight import torque_free
 from sdfsim.dynamics.simulator import Simulator
+from sdfsim.scene.scene import Scene
 from tests.dynamics.conftest import angle_between, make_body, random_model
 
 TOP = torch.diag(torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))[None]

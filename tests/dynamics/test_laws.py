@@ -6,11 +6,11 @@ from math import atan, cos, pi, radians, sin, sqrt, tan
 import numpy as np
 import pytest
 import torch
-from sdfsim.scene.scene import Body, Scene
-from sdfsim.shape.shape import Shape, analytic_shape
 
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.simulator import Simulator
+from sdfsim.scene.scene import Body, Scene
+from sdfsim.shape.shape import Shape, analytic_shape
 
 G = 9.81  # m/s^2
 STARTS = (0.95, 0.98, 1.0, 1.03, 1.07)

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from sdfsim.scene.scene import Scene
 
 from sdfsim.dynamics.ranges import _products
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.errors import SdfsimError
+from sdfsim.scene.scene import Scene
 from tests.dynamics.conftest import make_body, random_model
 
 RANGES = {

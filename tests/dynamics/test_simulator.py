@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from sdfsim.scene.scene import Scene
 
 from sdfsim import SdfsimError, Simulator
 from sdfsim.dynamics.simulator import SimulationError
+from sdfsim.scene.scene import Scene
 from tests.dynamics.conftest import make_body, random_model
 
 

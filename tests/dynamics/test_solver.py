@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from sdfsim.scene.scene import Scene
-from sdfsim.shape.shape import analytic_shape
 
 from sdfsim import Simulator
 from sdfsim.dynamics.rollout import Rollout
+from sdfsim.scene.scene import Scene
+from sdfsim.shape.shape import analytic_shape
 from tests.dynamics.test_laws import ball, body, cube
 from tests.hard_cases import gates
 from tests.test_resuming import Killed, simulate
@@ -85,7 +85,7 @@ def test_a_run_is_the_same_again():
 
 
 def test_a_killed_run_goes_on_to_the_last_bit(tmp_path, monkeypatch):
-    from sdfsim import resuming
+    from sdfsim import run
 
     path = tmp_path / "scene.yaml"
     path.write_text(
@@ -93,7 +93,7 @@ def test_a_killed_run_goes_on_to_the_last_bit(tmp_path, monkeypatch):
         "  - {name: floor, plane: {}}\n  - {name: ball, shape: ball, position: [0.1, 0, 2.6]}\n"
         "  - {name: box, shape: box, position: [0, 0, 0.6]}\n"
     )
-    monkeypatch.setattr(resuming, "EVERY", 0.0)
+    monkeypatch.setattr(run, "EVERY", 0.0)
     with pytest.raises(Killed):
         simulate(path, tmp_path / "run", stop=0.5, kind=Killed, seconds=1.0)
     simulate(path, tmp_path / "run", resume=True, seconds=1.0)

@@ -5,10 +5,10 @@ from functools import cache
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from sdfsim.scene.scene import Scene
-from sdfsim.shape.shape import Shape, analytic_shape, load_shape
 
 from sdfsim import Rollout, Simulator
+from sdfsim.scene.scene import Scene
+from sdfsim.shape.shape import Shape, analytic_shape, load_shape
 from tests.dynamics.test_laws import body
 from tests.dynamics.test_waits import SHAPES
 

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sdfsim.shape.shape import analytic_shape, with_sdf
 
 from sdfsim.data.pybullet_sim import write_urdf
 from sdfsim.errors import SdfsimError
-from sdfsim.evaluation.baselines import collision_mesh
+from sdfsim.evaluation.engines import collision_mesh
 from sdfsim.evaluation.penetration import Solid, deepest, exact_solids, penetration
 from sdfsim.shape import primitives
+from sdfsim.shape.shape import analytic_shape, with_sdf
 from tests.recordings import CUBE, balls
 
 POLES = np.concatenate([np.eye(3), -np.eye(3)])

@@ -3,12 +3,12 @@
 from pathlib import Path
 
 import pytest
-from sdfsim.shape.shape import analytic_shape
 
-from sdfsim.data.convex_pieces import wavefront
 from sdfsim.data.generate import make_dataset
+from sdfsim.data.shape_assets import wavefront
 from sdfsim.evaluation.evaluate import evaluate
 from sdfsim.shape import primitives
+from sdfsim.shape.shape import analytic_shape
 
 TRAJECTORIES = 30
 

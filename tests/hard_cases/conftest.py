@@ -8,7 +8,7 @@ from sdfsim.dynamics.model import SOLVER, Model, bundled_models, load_model, mod
 
 
 @pytest.fixture(scope="session", params=model_names())
-def model(request) -> Model:
+def every_model(request) -> Model:
     """The contact solve and every bundled network."""
     return load_model(request.param)
 
@@ -16,8 +16,8 @@ def model(request) -> Model:
 @pytest.fixture(
     scope="session", params=[SOLVER, *(pytest.param(name, marks=pytest.mark.slow) for name in bundled_models())]
 )
-def crowd_model(request) -> Model:
-    """For scenes where many bodies touch: networks take minutes there."""
+def model(request) -> Model:
+    """The contact solve; the networks, which take longer, among the slow tests."""
     return load_model(request.param)
 
 

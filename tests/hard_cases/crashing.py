@@ -124,7 +124,7 @@ def whole(folder: Path) -> None:
         elif path.suffix == ".npz":
             with np.load(path, allow_pickle=False) as data:
                 assert all(data[name] is not None for name in data.files)
-        elif path.suffix in (".safetensors", ".checkpoint"):
+        elif path.suffix == ".safetensors":
             load_file(path)
         elif path.suffix == ".ply":
             read_mesh(path)
@@ -136,16 +136,16 @@ def whole(folder: Path) -> None:
 
 def litter(folder: Path) -> list[str]:
     """Files that only a killed process can have left."""
-    return [p.name for p in folder.rglob("*") if p.name.endswith((".part", ".partial", ".lock", "fit.checkpoint"))]
+    return [p.name for p in folder.rglob("*") if p.name.endswith((".part", ".partial", ".lock"))]
 
 
 def tiny_fit() -> None:
-    """Fits of 120 steps, with a checkpoint every 40."""
-    from sdfsim.shape import fit
+    """Fits of 120 steps."""
+    from sdfsim.shape import fit as fit_module
 
-    plan = replace(plans.PLANS["default"], width=8, layers=3, steps=120, batch=64, pool=1000, goal=None)
-    plans.PLANS["default"] = plans.PLANS["quick"] = plan
-    training.CHECK = 20
+    plan = replace(fit_module.PLANS["default"], width=8, layers=3, steps=120, batch=64, pool=1000, goal=None)
+    fit_module.PLANS["default"] = fit_module.PLANS["quick"] = plan
+    fit_module.CHECK_EVERY = 20
 
 
 def tiny_train() -> None:
@@ -158,30 +158,31 @@ def tiny_train() -> None:
 
 def tiny_simulate() -> None:
     """A checkpoint after every step."""
-    from sdfsim import resuming
+    from sdfsim import run
 
-    resuming.EVERY = 0.0
+    run.EVERY = 0.0
 
 
 def tiny_reconstruct() -> None:
     """Poses that are given, 12 steps of training, a checkpoint after each, and a tiny fit of the ball it began as."""
-    from pipeline import distill, recipe, stages
-    from pipeline.field import FieldSize
+    from pipeline import stages
+    from pipeline.field import training
+    from pipeline.field.grid_field import FieldSize
 
     small = FieldSize((8, 16), (2, 2), 16, 8)
-    recipe.PRESETS["quick"] = replace(
-        recipe.PRESETS["quick"], size=small, rays=32, iterations=12, surface_points=16, long_side=64
+    training.PRESETS["quick"] = replace(
+        training.PRESETS["quick"], size=small, rays=32, iterations=12, surface_points=16, long_side=64
     )
     # One thread: its sums do not depend on how busy the machine is.
-    distill.train.__kwdefaults__ |= {"checkpoint_every": 0.0, "threads": 1}
-    stages.ACTIONS["poses"] = _given_poses
+    training.train.__kwdefaults__ |= {"checkpoint_every": 0.0, "threads": 1}
+    stages.STAGES["poses"] = replace(stages.STAGES["poses"], run=_given_poses)
     tiny_fit()
 
 
 def _given_poses(run: Any, work: Path) -> dict:
     """Four cameras around the origin, in place of structure from motion."""
     from pipeline.cameras import View, save_views
-    from pipeline.photos import load_photos
+    from pipeline.inputs.photos import load_photos
     from sdfsim.files import write_arrays
 
     views, rng = [], np.random.default_rng(0)

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from sdfsim.shape.shape import Shape, analytic_shape, load_shape
 
 import sdfsim
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.rollout import Rollout
-from sdfsim.scene.types import Body, Scene
+from sdfsim.scene.scene import Body, Scene
+from sdfsim.shape.shape import Shape, analytic_shape, load_shape
 from tests.dynamics.conftest import make_body
 
 SAMPLES = Path(__file__).resolve().parents[2] / "samples"

@@ -43,11 +43,10 @@ def check_told(work: Work, folder: Path, why: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["fit", "simulate", "train"])
-@pytest.mark.parametrize("pages", [1, 4])  # every one of them needs more
-def test_a_full_disk_is_told_and_the_run_goes_on_when_there_is_room(works, undisturbed, small_disk, name, pages):
+def test_a_full_disk_is_told_and_the_run_goes_on_when_there_is_room(works, undisturbed, small_disk, name):
     work, (_, expected) = works[name], undisturbed(name)
     folder, disk = small_disk / name, os.statvfs(small_disk)
-    (small_disk / "filler").write_bytes(bytes((disk.f_bavail - pages) * disk.f_bsize))
+    (small_disk / "filler").write_bytes(bytes((disk.f_bavail - 1) * disk.f_bsize))
     check_told(work, folder, "No space left on device")
     subprocess.run(["mount", "-o", "remount,size=16m", small_disk], check=True)
     ended = call(work, folder, NEVER, *work.again)

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from sdfsim.shape.shape import analytic_shape, shape_from_mesh
 
 from sdfsim import SceneError, load_scene
 from sdfsim.errors import printable
-from sdfsim.scene.types import Scene
+from sdfsim.scene.scene import Scene
+from sdfsim.shape.shape import analytic_shape, shape_from_mesh
 from tests.hard_cases.strangers import Spoiled, mangled_texts, scenes, spoiled_scenes, time_limit
 
 SECONDS = 5.0  # more than a hundred times what a scene of this size takes
@@ -131,7 +131,7 @@ cases = st.one_of(scenes(), spoiled_scenes(), mangled_texts())
 common = {"deadline": None, "derandomize": True, "database": None, "suppress_health_check": list(HealthCheck)}
 
 
-@settings(max_examples=120, **common)
+@settings(max_examples=60, **common)
 @given(case=cases)
 def test_no_scene_file_crashes_hangs_or_is_misread(folder, case):
     try_one(folder, case)

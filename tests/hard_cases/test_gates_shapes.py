@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from sdfsim.shape.sdf_batch import SdfBank
-from sdfsim.shape.shape import analytic_shape, with_sdf
 
 from sdfsim.dynamics.contacts import find_contacts
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.sdf import BoxSdf, SphereSdf
+from sdfsim.shape.sdf_batch import SdfBank
+from sdfsim.shape.shape import analytic_shape, with_sdf
 from tests.dynamics.conftest import random_model
 from tests.dynamics.test_paper import paper_model
 from tests.hard_cases import gates

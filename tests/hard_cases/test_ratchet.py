@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sdfsim.evaluation.hard_cases_ratchet import slipped_back
-from sdfsim.evaluation.hard_cases_run import stress
+from sdfsim.evaluation.stress import slipped_back, stress
 
 RATCHET = Path(__file__).resolve().parents[2] / "benchmarks" / "hard_cases_ratchet.json"
 

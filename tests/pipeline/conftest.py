@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline import report_page, stages
+from pipeline import stages
 
 
 @pytest.fixture
@@ -22,20 +24,36 @@ def photos(tmp_path) -> Path:
 
 
 @pytest.fixture
-def calls(monkeypatch) -> list[str]:
-    """Replaces what stages do by a note of their names and one file each."""
+def act(monkeypatch) -> Callable[[str, Callable], None]:
+    """Replaces what a stage does."""
+
+    def put(stage: str, action: Callable) -> None:
+        monkeypatch.setitem(stages.STAGES, stage, replace(stages.STAGES[stage], run=action))
+
+    return put
+
+
+@pytest.fixture
+def calls(act) -> list[str]:
+    """Replaces what all stages do by a note of their names and one file each."""
     done: list[str] = []
 
-    def action(name: str):
-        def act(run: stages.Run, work: Path) -> dict:
+    def action(name: str) -> Callable:
+        def note(run: stages.Run, work: Path) -> dict:
             done.append(name)
             (work / "result").write_text(name)
             if name == "scene":
                 (run.folder / "scene.yaml").write_text("version: 1\n")
-            return {"name": name}
+            return RESULTS.get(name, {})
 
-        return act
+        return note
 
-    monkeypatch.setattr(stages, "ACTIONS", {name: action(name) for name in stages.STAGES})
-    monkeypatch.setattr(report_page, "write_page", lambda folder, report: None)  # There is nothing to show.
+    for name in stages.STAGES:
+        act(name, action(name))
     return done
+
+
+RESULTS = {
+    "poses": {"posed": 3, "photos": 3, "mean_error": 0.5, "points": 9, "field_of_view": [60.0], "left_out": []},
+    "mesh": {"extent_m": [1.0, 1.0, 1.0], "size": "a ruler", "up_from": "plane", "up_within_degrees": 1.0},
+}

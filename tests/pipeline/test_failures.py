@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from pipeline.cameras import load_sparse, load_views
-from pipeline.photos import load_photos, prepare_photos
-from pipeline.poses import solve
+from pipeline.inputs.photos import load_photos, prepare_photos
+from pipeline.sfm.poses import solve
 from sdfsim.errors import EXIT_ERROR, EXIT_QUALITY, SdfsimError
 from tests.pipeline import photo_sets
 
@@ -128,11 +128,11 @@ def test_known_cameras_are_kept_and_checked(tmp_path):
     wrong.mkdir()
     views = load_views(work)
     from pipeline.cameras import save_views
-    from pipeline.photos import GIVEN
+    from pipeline.inputs.photos import KNOWN_CAMERAS
 
     (wrong / "images").symlink_to(work / "images")
     moved = [type(v)(**{**v.__dict__, "name": o.name}) for v, o in zip(views, views[3:] + views[:3], strict=True)]
-    save_views(moved, wrong / GIVEN)
+    save_views(moved, wrong / KNOWN_CAMERAS)
     with pytest.raises(SdfsimError, match="the known cameras do not fit the photos"):
         solve(load_photos(work), wrong, wrong)
 
@@ -148,8 +148,8 @@ def test_a_killed_run_goes_on_and_ends_as_an_undisturbed_one(tmp_path):
 
     photo_sets.good(tmp_path / "in", 10)
     code = (
-        "import sys; from pathlib import Path\nfrom pipeline.photos import load_photos\n"
-        "from pipeline.poses import solve\nwork = Path(sys.argv[1]); solve(load_photos(work), work, work)"
+        "import sys; from pathlib import Path\nfrom pipeline.inputs.photos import load_photos\n"
+        "from pipeline.sfm.poses import solve\nwork = Path(sys.argv[1]); solve(load_photos(work), work, work)"
     )
     work = tmp_path / "work"
     work.mkdir()

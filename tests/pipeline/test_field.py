@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
+from torch.nn import functional
 
-from pipeline.cameras import Sparse, View
-from pipeline.distill import save_field, train
-from pipeline.field import (
+from pipeline.cameras import Similarity, Sparse, View
+from pipeline.field.grid_field import (
     FieldSize,
     GridField,
     contract,
@@ -20,16 +21,16 @@ from pipeline.field import (
     render_weights,
     stencil,
 )
-from pipeline.landmarks import find_landmarks
-from pipeline.normalise import Normalisation
-from pipeline.photos import save_photos
-from pipeline.rays import Rays, camera_rays, load_rays
-from pipeline.recipe import PRESETS
-from pipeline.render import choose_samples, sdf_cache, sphere_interval
-from pipeline.trainer import Trainer
+from pipeline.field.interpolation import interpolate
+from pipeline.field.rays import Rays, camera_rays, load_rays
+from pipeline.field.rendering import choose_samples, sdf_cache, sphere_interval
+from pipeline.field.training import PRESETS, Trained, Trainer, save_field, train
+from pipeline.inputs.photos import save_photos
+from pipeline.sfm.supervision import supervision_of
 from sdfsim.errors import SdfsimError
 
 SMALL = FieldSize((8, 16), (2, 2), 16, 8)
+UNIT = Similarity(1.0, np.eye(3), np.zeros(3))
 
 
 def test_laplace_density_is_the_distribution_function():
@@ -131,9 +132,9 @@ def toy_rays(count: int = 2000) -> Rays:
 def trainer(seed: int = 0) -> Trainer:
     from dataclasses import replace
 
-    recipe = replace(PRESETS["quick"], size=SMALL, rays=64, iterations=20, surface_points=32)
+    settings = replace(PRESETS["quick"], size=SMALL, rays=64, iterations=20, surface_points=32)
     sparse = Sparse(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), np.zeros(0, int), np.zeros(0, int))
-    return Trainer(recipe, toy_rays(), find_landmarks(sparse, [], Normalisation(np.zeros(3), 1.0)), seed)
+    return Trainer(settings, toy_rays(), supervision_of(sparse, [], UNIT), seed)
 
 
 def test_batches_depend_on_seed_and_iteration_only():
@@ -161,7 +162,7 @@ def test_a_resumed_run_ends_as_an_undisturbed_one(tmp_path, one_thread):
     assert second.load(tmp_path / "c.safetensors")
     for _ in range(4):
         second.step()
-    for a, b in zip(whole.parameters(), second.parameters(), strict=True):
+    for a, b in zip(whole.field.parameters(), second.field.parameters(), strict=True):
         assert torch.equal(a, b)
 
 
@@ -185,8 +186,8 @@ def test_masks_make_what_they_exclude_transparent():
     rays = toy_rays()
     masked = replace(rays, mask=((rays.rgb[:, 0] == 200) * 255).to(torch.uint8))
     sparse = Sparse(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), np.zeros(0, int), np.zeros(0, int))
-    recipe = replace(PRESETS["quick"], size=SMALL, rays=128, iterations=40, surface_points=32)
-    run = Trainer(recipe, masked, find_landmarks(sparse, [], Normalisation(np.zeros(3), 1.0)), 0)
+    settings = replace(PRESETS["quick"], size=SMALL, rays=128, iterations=40, surface_points=32)
+    run = Trainer(settings, masked, supervision_of(sparse, [], UNIT), 0)
     losses = [run.step()["mask"] for _ in range(40)]
     assert np.mean(losses[-5:]) < 0.7 * np.mean(losses[:5])
 
@@ -195,7 +196,7 @@ def posed_noise(folder: Path) -> tuple[list[View], Sparse]:
     """Four photos of noise, as the photos stage leaves them, and cameras around points that mean nothing."""
     from PIL import Image
 
-    from tests.pipeline.test_verdict import photo
+    from tests.pipeline.test_poses import photo
 
     (folder / "images").mkdir()
     rng = np.random.default_rng(0)
@@ -212,28 +213,69 @@ def posed_noise(folder: Path) -> tuple[list[View], Sparse]:
 
 
 def test_train_writes_and_reads_back(tmp_path):
-    from pipeline.distill import load_field
+    from pipeline.field.training import load_field
 
     views, sparse = posed_noise(tmp_path)
-    recipe = replace(PRESETS["quick"], size=SMALL, rays=32, iterations=6, surface_points=16)
-    trained = train(views, sparse, tmp_path, tmp_path, recipe=recipe, threads=1)
+    settings = replace(PRESETS["quick"], size=SMALL, rays=32, iterations=6, surface_points=16)
+    trained = train(views, sparse, tmp_path, tmp_path, settings=settings, threads=1)
     again = load_field(tmp_path)
     p = torch.randn(10, 3) * 0.4
     with torch.no_grad():
         assert torch.equal(trained.field.sdf(p), again.field.sdf(p))
     assert not (tmp_path / "checkpoint.safetensors").exists()
-    assert len(load_rays(trained.normalisation.views(views), tmp_path, 40, masks=False)) > 0
+    assert len(load_rays([trained.to_unit.view(view) for view in views], tmp_path, 40, masks=False)) > 0
 
 
 def test_a_full_disk_is_one_clear_line(tmp_path):
     import resource
 
-    field, place = GridField(SMALL), Normalisation(np.zeros(3), 1.0)
+    trained = Trained(GridField(SMALL), 0.01, UNIT, {})
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))  # Writing fails as it does on a full disk.
     try:
         with pytest.raises(SdfsimError, match=r"field\.safetensors: cannot be written"):
-            save_field(field, 0.01, place, {}, tmp_path)
+            save_field(trained, tmp_path)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert list(tmp_path.iterdir()) == []
+
+
+def twin(grid: Tensor, points: Tensor) -> Tensor:
+    """The same by `grid_sample`."""
+    found = functional.grid_sample(
+        grid.permute(3, 0, 1, 2)[None], points.view(1, 1, 1, -1, 3), padding_mode="border", align_corners=True
+    )
+    return found.view(grid.shape[3], -1).t()
+
+
+@pytest.mark.parametrize(("side", "channels"), [(2, 1), (5, 4), (33, 2)])
+def test_values_and_gradient_are_those_of_the_general_sampler(side, channels):
+    rng = torch.Generator().manual_seed(side)
+    grid = torch.randn(side, side, side, channels, generator=rng, dtype=torch.float64, requires_grad=True)
+    inside = torch.rand(500, 3, generator=rng, dtype=torch.float64) * 2.4 - 1.2  # some of them outside
+    knots = torch.linspace(-1, 1, side, dtype=torch.float64)
+    points = torch.cat([inside, torch.cartesian_prod(knots, knots, knots)])
+    found, wanted = interpolate(grid, points), twin(grid, points)
+    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-12)
+    weights = torch.randn(found.shape, generator=rng, dtype=torch.float64)
+    (one,) = torch.autograd.grad((found * weights).sum(), grid)
+    (two,) = torch.autograd.grad((wanted * weights).sum(), grid)
+    torch.testing.assert_close(one, two, rtol=0, atol=1e-12)
+
+
+def test_a_linear_function_of_x_y_z_is_itself():
+    line = torch.linspace(-1, 1, 9, dtype=torch.float64)
+    z, y, x = torch.meshgrid(line, line, line, indexing="ij")
+    points = torch.rand(100, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 2 - 1
+    found = interpolate((x + 10 * y + 100 * z)[..., None], points)[:, 0]
+    torch.testing.assert_close(
+        found, points @ torch.tensor([1.0, 10.0, 100.0], dtype=torch.float64), rtol=0, atol=1e-12
+    )
+
+
+def test_nothing_asked_is_nothing_found():
+    grid = torch.ones(4, 4, 4, 3, requires_grad=True)
+    found = interpolate(grid, torch.zeros(0, 3))
+    assert found.shape == (0, 3)
+    found.sum().backward()
+    assert grid.grad is not None and not grid.grad.any()

@@ -9,15 +9,11 @@ import pytest
 import torch
 
 from pipeline.cameras import Sparse
-from pipeline.distill import load_field, save_field
-from pipeline.landmarks import find_landmarks
-from pipeline.mlp_field import MlpField, MlpSize, encoded
-from pipeline.mlp_trainer import MlpTrainer, trainer_for
-from pipeline.normalise import Normalisation
-from pipeline.recipe import PRESETS
-from pipeline.render import sdf_cache
-from pipeline.trainer import Trainer
-from tests.pipeline.test_field import one_thread, toy_rays  # noqa: F401  a fixture
+from pipeline.field.mlp_field import MlpField, MlpSize, encoded
+from pipeline.field.rendering import sdf_cache
+from pipeline.field.training import PRESETS, MlpTrainer, Trained, Trainer, load_field, save_field
+from pipeline.sfm.supervision import supervision_of
+from tests.pipeline.test_field import UNIT, one_thread, toy_rays  # noqa: F401  a fixture
 
 TINY = MlpSize(depth=4, width=32, frequencies=3, color_depth=2, view_frequencies=2, background=8)
 PAPER = PRESETS["paper"]
@@ -66,16 +62,16 @@ def test_without_gradients_nothing_is_kept():
     assert not (sdf.requires_grad or features.requires_grad or more.requires_grad)
 
 
-def trainer(**changes) -> Trainer:
+def trainer(**changes) -> MlpTrainer:
     small = {"size": TINY, "rays": 32, "samples": 16, "surface_points": 64, "iterations": 40, "rate": 2e-3}
-    recipe = replace(PAPER, **{**small, **changes})
+    settings = replace(PAPER, **{**small, **changes})
     nothing = np.zeros((0, 3))
     sparse = Sparse(nothing, nothing.astype(np.uint8), np.zeros(0), np.zeros(0, int), np.zeros(0, int))
-    landmarks = find_landmarks(sparse, [], Normalisation(np.zeros(3), 1.0))
+    supervision = supervision_of(sparse, [], UNIT)
     rays = toy_rays()
     # Without masks the background alone could paint both photos.
     rays = replace(rays, mask=((rays.rgb[:, 0] == 200) * 255).to(torch.uint8))
-    return trainer_for(recipe.size)(recipe, rays, landmarks, 0)
+    return MlpTrainer(settings, rays, supervision, 0)
 
 
 def falls(run: Trainer, steps: int, name: str, part: int) -> float:
@@ -87,7 +83,6 @@ def falls(run: Trainer, steps: int, name: str, part: int) -> float:
 
 def test_training_lowers_the_loss_and_keeps_a_distance():
     run = trainer()
-    assert isinstance(run, MlpTrainer)
     assert falls(run, 60, "color", 8) < 0.4
     assert run.converged > 0.5
     assert torch.isfinite(sdf_cache(run.field, 9)).all()
@@ -111,13 +106,13 @@ def test_a_resumed_run_ends_as_an_undisturbed_one(tmp_path, one_thread):  # noqa
     assert second.load(tmp_path / "c.safetensors")
     for _ in range(3):
         second.step()
-    for a, b in zip(whole.parameters(), second.parameters(), strict=True):
+    for a, b in zip(whole.field.parameters(), second.field.parameters(), strict=True):
         assert torch.equal(a, b)
 
 
 def test_the_field_is_read_back(tmp_path):
     field = MlpField(TINY, seed=5)
-    save_field(field, 0.01, Normalisation(np.zeros(3), 2.0), {}, tmp_path)
+    save_field(Trained(field, 0.01, UNIT, {}), tmp_path)
     again = load_field(tmp_path)
     assert isinstance(again.field, MlpField) and again.field.finest == field.finest
     with torch.no_grad():

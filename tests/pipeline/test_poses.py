@@ -3,20 +3,167 @@
 from __future__ import annotations
 
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from pipeline import poses
-from pipeline.cameras import load_sparse
-from pipeline.photos import prepare_photos
-from pipeline.poses import LADDER, ORDINARY, run_worker, size_groups, solve
+from pipeline.cameras import load_sparse, view_span
+from pipeline.inputs.photos import Photo, prepare_photos
+from pipeline.sfm import poses
+from pipeline.sfm.pose_checks import check, failure_hint, failure_message, find, views_of
+from pipeline.sfm.poses import ORDINARY, run_worker, size_groups, solve
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.files import write_arrays, write_json
-from tests.pipeline.test_verdict import photo, result
 
 ROOT = Path(__file__).resolve().parent.parent.parent
+
+
+def photo(index: int, width: int = 640, height: int = 480, focal: float | None = None, fault: str = "") -> Photo:
+    size = (width, height)
+    return Photo(f"{index:04d}.jpg", f"IMG_{index}.JPG", *size, size, None, focal, "", False, 0.4, fault)
+
+
+def result(count: int, posed: int, *, focal: float = 600.0, error: float = 0.5, features: int = 2000,
+           span: float = 360.0, still: float = 0.0, matches: int = 200) -> dict:  # fmt: skip
+    """What the worker would say of `posed` of `count` photos on an arc around the origin, all in a chain of pairs."""
+    views = []
+    for k in range(posed):
+        a = np.radians(span) * k / max(posed, 1)
+        turn = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+        views.append({"name": f"{k:04d}.jpg", "width": 640, "height": 480, "focal": focal, "cx": 320, "cy": 240,
+                      "k": 0, "camera": 1, "rotation": turn.tolist(), "translation": [0, 0, 3]})  # fmt: skip
+    names = [f"{k:04d}.jpg" for k in range(count)]
+    counts = {name: {"features": features, "best_matches": 10, "partners": 1} for name in names}
+    pairs = [{"a": a, "b": b, "matches": matches, "still": still} for a, b in pairwise(names)]
+    against = [{"a": pair["a"], "b": pair["b"], "matches": matches, "error": 0.3} for pair in pairs]
+    return {"views": views, "counts": counts, "pairs": pairs, "contradictions": against, "mean_error": error,
+            "points": 900, "track_length": 4.0, "models": [names[:posed]], "turn_only": 0.0,
+            "focal_of_pairs": {}}  # fmt: skip
+
+
+PHOTOS = [photo(k) for k in range(10)]
+
+
+def test_good_poses_pass():
+    verdict = check(result(10, 9), PHOTOS)
+    assert verdict["failures"] == [] and verdict["posed"] == 9 and verdict["causes"] == []
+    assert verdict["left_out"][0]["photo"] == "IMG_9.JPG"
+    assert "too few matches" in verdict["left_out"][0]["why"]
+
+
+def test_too_few_posed_names_photos_reasons_and_what_to_try():
+    verdict = check(result(10, 4, features=20), PHOTOS)
+    message = failure_message(verdict)
+    assert "only 4 of 10 photos" in message and "IMG_4.JPG: too few features (20)" in message and "\n" not in message
+    assert "textured" in failure_hint(verdict)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [({"focal": 5000.0}, "field of view"), ({"focal": 100.0}, "field of view"), ({"error": 3.0}, "reprojection error")],
+)
+def test_all_registered_is_not_right(changes, words):
+    verdict = check(result(10, 10, **changes), PHOTOS)
+    assert any(words in failure for failure in verdict["failures"])
+
+
+@pytest.mark.parametrize("times", [0.5, 2.0])
+def test_a_focal_length_off_by_two_does_not_pass(times):
+    """Against EXIF, or without EXIF against what the pairs of photos say on their own."""
+    by_exif = check(result(10, 10, focal=600 * times), [photo(k, focal=600.0) for k in range(10)])
+    assert any("what EXIF says" in failure for failure in by_exif["failures"])
+    alone = {**result(10, 10, focal=600 * times), "focal_of_pairs": {p.name: 600.0 for p in PHOTOS}}
+    assert any("the pairs of photos say" in failure for failure in check(alone, PHOTOS)["failures"])
+
+
+def test_wrong_exif_is_a_warning_where_the_pairs_agree_with_the_poses():
+    agreed = {**result(10, 10), "focal_of_pairs": {p.name: 610.0 for p in PHOTOS}}
+    verdict = check(agreed, [photo(k, focal=1500.0) for k in range(10)])
+    assert verdict["failures"] == [] and "EXIF" in verdict["warnings"][0]
+
+
+def test_pairs_that_contradict_the_poses_are_counted():
+    found = result(10, 10)
+    for pair in found["contradictions"][:4]:
+        pair["error"] = 40.0
+    verdict = check(found, PHOTOS)
+    assert verdict["contradictions"] == pytest.approx(4 / 9, abs=1e-3)
+    assert any("contradict" in failure for failure in verdict["failures"])
+    assert any("repeats" in cause for cause in verdict["causes"])
+
+
+def two_things() -> dict:
+    found = result(18, 11)
+    del found["pairs"][10]  # the chain falls into 11 and 7 photos
+    return found
+
+
+def test_two_sets_the_larger_is_taken_and_the_rest_is_named():
+    verdict = check(two_things(), [photo(k) for k in range(18)])
+    assert verdict["failures"] == [] and verdict["components"][:2] == [11, 7]
+    assert "sets of 11, 7 photos" in verdict["causes"][0]
+    assert [entry["photo"] for entry in verdict["left_out"]] == [f"IMG_{k}.JPG" for k in range(11, 18)]
+    assert all("shows something else" in entry["why"] for entry in verdict["left_out"])
+
+
+@pytest.mark.parametrize(
+    ("found", "words"),
+    [
+        (result(10, 0, features=30, matches=0), "too little to see"),
+        ({**result(10, 0), "turn_only": 0.8}, "from one spot"),
+        (result(10, 0, still=0.9), "turntable"),
+        (result(10, 2), "a texture that repeats"),
+        (result(10, 0, matches=5), "overlap too little"),
+        (result(3, 2), "3 photos are too few"),
+    ],
+)
+def test_what_is_wrong_with_the_photos(found, words):
+    verdict = check(found, PHOTOS[: len(found["counts"])])
+    assert words in verdict["causes"][0] and words in failure_message(verdict)
+
+
+@pytest.mark.parametrize(
+    ("first", "words"),
+    [({**result(10, 0), "turn_only": 0.8}, "from one spot"), (result(10, 0, still=0.9), "turntable")],
+)
+def test_how_the_camera_moved_is_told_by_the_ordinary_matches(first, words):
+    verdict = check(result(10, 3), PHOTOS, first)
+    assert words in verdict["causes"][0]
+    assert words not in check(result(10, 3), PHOTOS)["causes"][0]
+
+
+def test_blurred_photos_are_left_out_as_such():
+    verdict = check(result(10, 6), [photo(k, fault="blurred" if k > 5 else "") for k in range(10)])
+    assert all(entry["why"].startswith("blurred") for entry in verdict["left_out"])
+
+
+def test_blurred_photos_that_match_each_other_are_no_set_of_their_own():
+    verdict = check(two_things(), [photo(k, fault="blurred" if k > 10 else "") for k in range(18)])
+    assert all(entry["why"].startswith("blurred") for entry in verdict["left_out"]) and len(verdict["left_out"]) == 7
+    assert verdict["causes"] == [] and verdict["components"] == [11] + 7 * [1]
+
+
+def test_cameras_on_one_side_are_no_closed_object():
+    verdict = check(result(10, 10, span=90.0), PHOTOS)
+    assert verdict["failures"] == [] and "from one side (81 degrees" in verdict["warnings"][0]
+
+
+@pytest.mark.parametrize(("span", "expected"), [(90.0, 81.0), (200.0, 180.0), (360.0, 324.0)])
+def test_span_is_the_arc_less_the_largest_gap(span, expected):
+    assert view_span(views_of(result(10, 10, span=span), PHOTOS)) == pytest.approx(expected, abs=0.01)
+
+
+def test_cameras_too_close_together_fail():
+    verdict = check(result(10, 10, span=1.0), PHOTOS)
+    assert "too close together" in verdict["failures"][0]
+
+
+def test_components_need_more_than_a_few_matches():
+    found = result(6, 0, matches=200)
+    found["pairs"][2]["matches"] = 20
+    assert [len(group) for group in find(found, PHOTOS[:6]).components] == [3, 3]
 
 
 def test_one_camera_for_each_size_and_zoom():
@@ -56,7 +203,7 @@ def test_photos_without_anything_in_common_fail_with_reasons(tmp_path):
 
 
 def climb(monkeypatch, tmp_path, results: dict, photos: int = 10) -> tuple[list[str], dict]:
-    """Runs the ladder on made-up results by rung; returns the rungs that were tried, and the verdict."""
+    """Makes the attempts on made-up results; returns the names of those made, and the checks."""
     tried = []
 
     def run(job, folder, timeout, report):
@@ -71,57 +218,46 @@ def climb(monkeypatch, tmp_path, results: dict, photos: int = 10) -> tuple[list[
 
     monkeypatch.setattr(poses, "run_worker", run)
     try:
-        verdict = solve([photo(k) for k in range(photos)], tmp_path, tmp_path)
+        checks = solve([photo(k) for k in range(photos)], tmp_path, tmp_path)
     except SdfsimError as error:
         assert error.exit_code == EXIT_QUALITY
-        verdict = {"error": error.message}
-    return tried, verdict
+        checks = {"error": error.message}
+    return tried, checks
 
 
-def test_the_first_good_rung_is_the_last(monkeypatch, tmp_path):
-    tried, verdict = climb(monkeypatch, tmp_path, {"more pixels and features": result(10, 10)})
-    assert tried == ["ordinary", "more pixels and features"]
-    assert [(one["name"], one["posed"]) for one in verdict["attempts"]] == [
-        ("ordinary", 0), ("more pixels and features, looser thresholds", 10),
-    ]  # fmt: skip
+STILL, MORE = "without what stands still", "more features"
+
+
+def test_the_first_good_attempt_is_the_last(monkeypatch, tmp_path):
+    tried, checks = climb(monkeypatch, tmp_path, {MORE: result(10, 10)})
+    assert tried == ["ordinary", MORE]
+    assert [(one["name"], one["posed"]) for one in checks["attempts"]] == [("ordinary", 0), (MORE, 10)]
     assert (tmp_path / "cameras.json").exists()
 
 
-def test_the_ladder_ends_with_the_best_rung_not_the_last(monkeypatch, tmp_path):
-    tried, verdict = climb(monkeypatch, tmp_path, {"ordinary": result(10, 4), "global mapping": result(10, 3)})
-    assert tried == ["ordinary", "more pixels and features", "global mapping", "affine features"]
-    assert "only 4 of 10 photos" in verdict["error"]
+def test_the_best_attempt_counts_not_the_last(monkeypatch, tmp_path):
+    tried, checks = climb(monkeypatch, tmp_path, {"ordinary": result(10, 4), MORE: result(10, 3)})
+    assert tried == ["ordinary", MORE] and "only 4 of 10 photos" in checks["error"]
 
 
-def test_what_stands_still_gets_a_rung_of_its_own(monkeypatch, tmp_path):
-    still = result(10, 0, still=0.9)
-    tried, verdict = climb(
-        monkeypatch, tmp_path, {"ordinary": still, "without what stands still in the picture": result(10, 10)}
-    )
-    assert tried == ["ordinary", "without what stands still in the picture"] and verdict["posed"] == 10
+def test_what_stands_still_gets_an_attempt_of_its_own(monkeypatch, tmp_path):
+    tried, checks = climb(monkeypatch, tmp_path, {"ordinary": result(10, 0, still=0.9), STILL: result(10, 10)})
+    assert tried == ["ordinary", STILL] and checks["posed"] == 10
 
 
 def test_photos_from_one_spot_are_not_tried_for_long(monkeypatch, tmp_path):
-    turning = {**result(10, 0), "turn_only": 0.9}
-    tried, verdict = climb(monkeypatch, tmp_path, {"ordinary": turning, "more pixels and features": turning})
-    assert tried == ["ordinary", "more pixels and features"]
-    assert "taken from one spot" in verdict["error"]
+    tried, checks = climb(monkeypatch, tmp_path, {"ordinary": {**result(10, 0), "turn_only": 0.95}})
+    assert tried == ["ordinary"] and "taken from one spot" in checks["error"]
 
 
-def test_a_rung_that_breaks_leaves_the_verdict_of_the_others(monkeypatch, tmp_path):
-    broken = {"more pixels and features": SdfsimError("camera poses: stopped after 5 s"), "ordinary": result(10, 4)}
-    tried, verdict = climb(monkeypatch, tmp_path, broken)
-    assert "only 4 of 10 photos" in verdict["error"] and "IMG_4.JPG" in verdict["error"]
-    assert "global mapping" not in tried  # it would take matches that the broken rung has not made
+def test_an_attempt_that_breaks_leaves_the_findings_of_the_others(monkeypatch, tmp_path):
+    broken = {MORE: SdfsimError("camera poses: stopped after 5 s"), "ordinary": result(10, 4)}
+    tried, checks = climb(monkeypatch, tmp_path, broken)
+    assert tried == ["ordinary", MORE]
+    assert "only 4 of 10 photos" in checks["error"] and "IMG_4.JPG" in checks["error"]
 
 
-def test_rungs_that_share_matches_come_after_their_source():
-    names = [rung.name for rung in LADDER]
-    assert all(names.index(rung.matches_of) < k for k, rung in enumerate(LADDER) if rung.matches_of)
-    assert len({poses.folder_of(rung) for rung in LADDER}) == len(LADDER)
-
-
-def test_a_finished_rung_is_not_run_again(tmp_path, monkeypatch):
+def test_a_finished_attempt_is_not_run_again(tmp_path, monkeypatch):
     job = {"count": 3, "exhaustive_up_to": 100}
     (tmp_path / "try").mkdir()
     write_json(tmp_path / "try" / "job.json", job)
@@ -131,7 +267,7 @@ def test_a_finished_rung_is_not_run_again(tmp_path, monkeypatch):
 
 
 def test_poses_that_could_not_be_moved_to_their_place_are_found_again(tmp_path, monkeypatch):
-    """A full disk or a kill after the last line of `solve`: the next run takes the results of the rungs again."""
+    """A full disk or a kill after the last line of `solve`: the next run takes the results of the attempts again."""
 
     def run(job, folder, timeout, report):
         if not folder.exists():
@@ -158,7 +294,7 @@ def test_the_leavings_of_another_job_go(tmp_path, monkeypatch):
 
 def test_epipolar_errors_are_those_of_projected_points():
     """Matches of points that two cameras see have no error; moved off their lines by 3 px they have 3 / sqrt(2)."""
-    from pipeline.pair_checks import epipolar_errors
+    from pipeline.sfm.worker import epipolar_errors
 
     views = result(10, 10)["views"]
     for view in views[:2]:
@@ -172,7 +308,7 @@ def test_epipolar_errors_are_those_of_projected_points():
 
 
 def test_turning_on_the_spot_is_told_from_walking():
-    from pipeline.pair_checks import turn_only
+    from pipeline.sfm.worker import turn_only
 
     rng = np.random.default_rng(0)
     size = {"width": 640, "height": 480}

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFilter
 
-from pipeline.photos import prepare_photos
-from pipeline.quality import fault, sharpness
+from pipeline.inputs.images import fault, sharpness
+from pipeline.inputs.photos import prepare_photos
 from tests.pipeline.photo_sets import TABLE_VASE
 
 

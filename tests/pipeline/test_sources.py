@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.cameras import load_view_file
-from pipeline.given import read_given
-from pipeline.photos import GIVEN, load_photos, prepare_photos
-from pipeline.sources import find_source
+from pipeline.cameras import load_views
+from pipeline.inputs.known_cameras import read_cameras
+from pipeline.inputs.photos import KNOWN_CAMERAS, load_photos, prepare_photos
+from pipeline.inputs.sources import find_source
 from sdfsim.errors import SdfsimError
 
 SIZE = (120, 90)
@@ -88,7 +88,7 @@ def test_the_same_cameras_come_out_of_every_format(tmp_path, kind):
     else:
         (write_text_model if kind == "text" else write_binary_model)(given)
     prepared, _ = prepare_photos(given, fresh(tmp_path / "out"))
-    views = load_view_file(tmp_path / "out" / GIVEN)
+    views = load_views(tmp_path / "out" / KNOWN_CAMERAS)
     assert [p.source for p in prepared] == [v.source for v in views] == NAMES
     for k, view in enumerate(views):
         np.testing.assert_allclose(view.rotation, turned(0.3 * k), atol=1e-9)
@@ -96,14 +96,14 @@ def test_the_same_cameras_come_out_of_every_format(tmp_path, kind):
         assert (view.focal, view.cx, view.cy, view.k) == pytest.approx((100, 60, 45, 0))
 
 
-def test_intrinsics_of_another_size_are_scaled_and_numbers_may_be_padded(tmp_path):
+def test_intrinsics_of_another_size_are_scaled(tmp_path):
     photos(tmp_path / "images", ["r_000.png", "r_001.png", "r_010.png"])
-    about = json.loads(write_transforms(tmp_path, ["./train/r_0", "./train/r_1", "./train/r_10"]).read_text())
+    about = json.loads(write_transforms(tmp_path, ["./train/r_000", "./train/r_001", "./train/r_010"]).read_text())
     for key in ("w", "h", "fl_x"):
         del about[key]
     (tmp_path / "transforms.json").write_text(json.dumps({**about, "camera_angle_x": 2 * np.arctan(0.5 * 120 / 100)}))
     prepare_photos(tmp_path / "transforms.json", tmp_path, long_side=100)
-    view = load_view_file(tmp_path / GIVEN)[2]
+    view = load_views(tmp_path / KNOWN_CAMERAS)[2]
     assert view.source == "r_010.png" and view.focal == pytest.approx(100 * 100 / 120) and view.cx == 50
 
 
@@ -127,7 +127,7 @@ def test_a_lens_is_straightened(tmp_path):
     given = write_transforms(tmp_path, [f"images/{n.replace('jpg', 'png')}" for n in NAMES], fl_x=fx, fl_y=fy, cx=cx,
                              cy=cy, k1=k1, k2=k2, p1=p1, p2=p2)  # fmt: skip
     prepare_photos(given, fresh(tmp_path / "out"))
-    view = load_view_file(tmp_path / "out" / GIVEN)[0]
+    view = load_views(tmp_path / "out" / KNOWN_CAMERAS)[0]
     pixels = np.asarray(Image.open(tmp_path / "out" / "images" / view.name)).astype(float)
     found = (pixels[..., :2] - 128) / 150
     expected = np.stack([(column - view.cx) / view.focal, (row - view.cy) / view.focal], -1)
@@ -164,7 +164,7 @@ def test_an_ideal_fisheye_is_straightened_though_its_coefficients_are_all_zero(t
             about["frames"] = [{**frame, **fisheye} for frame in about["frames"]]
             given.write_text(json.dumps(about))
     prepare_photos(given, fresh(tmp_path / "out"))
-    view = load_view_file(tmp_path / "out" / GIVEN)[0]
+    view = load_views(tmp_path / "out" / KNOWN_CAMERAS)[0]
     pixels = np.asarray(Image.open(tmp_path / "out" / "images" / view.name)).astype(float)
     found = (pixels[..., :2] - 128) / 80
     expected = np.stack([(column - view.cx) / view.focal, (row - view.cy) / view.focal], -1)
@@ -209,7 +209,7 @@ def test_a_pixel_of_the_users_photo_is_found_in_the_prepared_one(tmp_path, model
     given = write_transforms(tmp_path, [f"images/{name}" for name in NAMES], **inner, **lens)
     prepared, _ = prepare_photos(given, tmp_path, long_side=96)
     assert load_photos(tmp_path) == prepared
-    photo, view = prepared[1], load_view_file(tmp_path / GIVEN)[1]
+    photo, view = prepared[1], load_views(tmp_path / KNOWN_CAMERAS)[1]
     assert photo.original == SIZE and (photo.width, photo.height) == (96, 72)
     rays = np.random.default_rng(0).uniform([-0.6, -0.45, 1], [0.6, 0.45, 1], (50, 3))
     points = (rays * 2.5) @ view.rotation + view.center
@@ -226,7 +226,7 @@ def test_photos_of_the_same_name_in_several_folders_keep_apart(tmp_path):
     photos(tmp_path, names)
     given = write_transforms(tmp_path, names)
     prepared, _ = prepare_photos(given, fresh(tmp_path / "out"))
-    assert [p.source for p in prepared] == [v.source for v in load_view_file(tmp_path / "out" / GIVEN)] == names
+    assert [p.source for p in prepared] == [v.source for v in load_views(tmp_path / "out" / KNOWN_CAMERAS)] == names
     source = find_source(given)
     assert [source.folder / p.source for p in prepared] == [path.absolute() for path in source.photos]
 
@@ -291,7 +291,7 @@ def test_cameras_without_photos_are_named(tmp_path):
 def test_a_lens_that_is_not_known_is_named(tmp_path):
     write_text_model(tmp_path / "model", "1 FOV 120 90 100 100 60 45 0.9")
     with pytest.raises(SdfsimError, match="the camera model FOV is not read"):
-        read_given(tmp_path / "model")
+        read_cameras(tmp_path / "model")
 
 
 def test_a_model_that_was_cut_is_one_line(tmp_path):
@@ -299,7 +299,7 @@ def test_a_model_that_was_cut_is_one_line(tmp_path):
     path = tmp_path / "model" / "images.bin"
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(SdfsimError, match="cannot be read as cameras"):
-        read_given(tmp_path / "model")
+        read_cameras(tmp_path / "model")
 
 
 def test_colmap_reads_the_model_as_we_do(tmp_path):
@@ -313,7 +313,7 @@ def test_colmap_reads_the_model_as_we_do(tmp_path):
     code = "import zlib, pycolmap, sys\nm = pycolmap.Reconstruction()\nm.read_text(sys.argv[1])\n"
     code += "m.write_binary(sys.argv[2])"
     subprocess.run([sys.executable, "-c", code, tmp_path / "text", tmp_path / "binary"], check=True)
-    for one, other in zip(read_given(tmp_path / "text"), read_given(tmp_path / "binary"), strict=True):
+    for one, other in zip(read_cameras(tmp_path / "text"), read_cameras(tmp_path / "binary"), strict=True):
         assert one.name == other.name and one.distortion == other.distortion
         np.testing.assert_allclose(one.matrix, other.matrix)
         np.testing.assert_allclose(one.rotation, other.rotation, atol=1e-12)

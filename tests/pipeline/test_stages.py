@@ -1,29 +1,44 @@
-"""Stages: skipped when nothing changed, done again when something did, resumed when killed, never half-written."""
+"""Stages: skipped when unchanged, done again when not, resumed when killed; nothing of the user's is lost."""
 
 from __future__ import annotations
 
 import json
+import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import torch
 from PIL import Image
 
-from pipeline import record, stages
-from pipeline.report import notes
+from pipeline import stages
+from pipeline.options import Options, read_config
+from pipeline.stages import STAGES, begin, finish, reconstruct, run_stage
 from sdfsim.errors import SdfsimError
 from sdfsim.files import locked
+from tests.cli.conftest import run as command
+from tests.pipeline.conftest import RESULTS
 
 ROOT = Path(__file__).resolve().parent.parent.parent
+NAMES = list(STAGES)
+DEVICES = ("distill", "mesh", "fit")
+REAL = dict(STAGES)
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    """Every file of a folder."""
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 def test_unchanged_stages_are_skipped(photos, tmp_path, calls):
-    stages.reconstruct(photos, tmp_path / "out", preset="quick")
-    assert calls == list(stages.STAGES)
+    reconstruct(photos, tmp_path / "out", preset="quick")
+    assert calls == NAMES
     calls.clear()
-    report = stages.reconstruct(photos, tmp_path / "out", preset="quick")
+    report = reconstruct(photos, tmp_path / "out", preset="quick")
     assert calls == []
-    assert set(report["stages"]) == set(stages.STAGES)
+    assert list(report["stages"]) == NAMES
     assert json.loads((tmp_path / "out" / "report.json").read_text()) == report
 
 
@@ -34,79 +49,74 @@ def test_unchanged_stages_are_skipped(photos, tmp_path, calls):
         ({"from_stage": "fit"}, ["fit", "scene"]),
         ({"preset": "standard"}, ["distill", "mesh", "fit", "scene"]),
         ({"until_stage": "poses", "seed": 3}, ["poses"]),
+        ({"drop": "none"}, ["scene"]),
     ],
 )
 def test_what_changed_is_done_again(photos, tmp_path, calls, changes, expected):
-    stages.reconstruct(photos, tmp_path / "out", preset="quick")
+    reconstruct(photos, tmp_path / "out", preset="quick")
     calls.clear()
-    stages.reconstruct(photos, tmp_path / "out", **{"preset": "quick", **changes})
+    reconstruct(photos, tmp_path / "out", **{"preset": "quick", **changes})
     assert calls == expected
 
 
-@pytest.mark.parametrize("stage", stages.STAGES)
-def test_a_stage_of_another_version_is_done_again_with_those_after_it(photos, tmp_path, calls, monkeypatch, stage):
-    stages.reconstruct(photos, tmp_path / "out", preset="quick")
+def test_a_stage_of_another_version_is_done_again_with_those_after_it(photos, tmp_path, calls, monkeypatch):
+    reconstruct(photos, tmp_path / "out")
     calls.clear()
-    monkeypatch.setitem(stages.STAGE_VERSIONS, stage, stages.STAGE_VERSIONS[stage] + 1)
-    stages.reconstruct(photos, tmp_path / "out", preset="quick")
-    assert calls == list(stages.STAGES[stages.STAGES.index(stage) :])
-
-
-def test_a_changed_comment_changes_no_stage(photos, tmp_path, calls, monkeypatch):
-    stages.reconstruct(photos, tmp_path / "out", preset="quick")
-    calls.clear()
-    ordinary = Path.read_bytes
-    monkeypatch.setattr(Path, "read_bytes", lambda path: ordinary(path) + b"#" * (path.suffix == ".py"))
-    stages.reconstruct(photos, tmp_path / "out", preset="quick")
-    assert calls == []
+    monkeypatch.setitem(STAGES, "mesh", replace(STAGES["mesh"], version=99))
+    reconstruct(photos, tmp_path / "out")
+    assert calls == ["mesh", "fit", "scene"]
 
 
 def test_another_photo_changes_everything(photos, tmp_path, calls):
-    stages.reconstruct(photos, tmp_path / "out", preset="quick")
+    reconstruct(photos, tmp_path / "out")
     calls.clear()
     Image.new("RGB", (80, 80)).save(photos / "9.png")
-    stages.reconstruct(photos, tmp_path / "out", preset="quick")
-    assert calls == list(stages.STAGES)
+    reconstruct(photos, tmp_path / "out")
+    assert calls == NAMES
 
 
-def test_a_killed_stage_goes_on_in_its_own_folder(photos, tmp_path, calls, monkeypatch):
+def test_a_killed_stage_goes_on_in_its_own_folder(photos, tmp_path, calls, act):
     def killed(run: stages.Run, work: Path) -> dict:
         (work / "checkpoint").write_text("half")
         raise KeyboardInterrupt
 
-    ordinary = stages.ACTIONS["distill"]
-    monkeypatch.setitem(stages.ACTIONS, "distill", killed)
+    ordinary, found = STAGES["distill"].run, []
+    act("distill", killed)
     with pytest.raises(KeyboardInterrupt):
-        stages.reconstruct(photos, tmp_path / "out", preset="quick")
+        reconstruct(photos, tmp_path / "out")
     assert not (tmp_path / "out" / "distill").exists()
-    found = []
-    monkeypatch.setitem(
-        stages.ACTIONS, "distill", lambda run, work: found.append((work / "checkpoint").exists()) or ordinary(run, work)
-    )
+    act("distill", lambda run, work: found.append((work / "checkpoint").exists()) or ordinary(run, work))
     calls.clear()
-    stages.reconstruct(photos, tmp_path / "out", preset="quick")
+    reconstruct(photos, tmp_path / "out")
     assert found == [True] and calls == ["distill", "mesh", "fit", "scene"]
 
 
 def test_leftovers_of_other_options_are_not_used(tmp_path):
-    work = record.begin(tmp_path / "w", "a", fresh=False)
+    work = begin(tmp_path / "w", "a", fresh=False)
     (work / "x").write_text("")
-    assert (record.begin(work, "a", fresh=False) / "x").exists()
-    assert not (record.begin(work, "b", fresh=False) / "x").exists()
+    (work / ".x.json.8.part").write_text("half")
+    again = begin(work, "a", fresh=False)
+    assert (again / "x").exists() and not (again / ".x.json.8.part").exists()
+    assert not (begin(work, "b", fresh=False) / "x").exists()
     (work / "x").write_text("")
-    assert not (record.begin(work, "b", fresh=True) / "x").exists()
+    assert not (begin(work, "b", fresh=True) / "x").exists()
 
 
 def test_run_stage_needs_the_stages_before(photos, tmp_path, calls):
+    out = tmp_path / "out"
     with pytest.raises(SdfsimError, match="not the folder of a reconstruction"):
-        stages.run_stage("distill", tmp_path / "out")
-    stages.reconstruct(photos, tmp_path / "out", preset="quick", until_stage="photos")
+        run_stage("distill", out)
+    reconstruct(photos, out, preset="quick", until_stage="photos")
     with pytest.raises(SdfsimError, match="the poses stage has not run"):
-        stages.run_stage("distill", tmp_path / "out")
-    stages.run_stage("poses", tmp_path / "out")
+        run_stage("distill", out)
+    run_stage("poses", out)
     calls.clear()
-    report = stages.run_stage("distill", tmp_path / "out", seed=5, preset=None)
+    report = run_stage("distill", out, seed=5, preset=None)
     assert calls == ["distill"] and report["options"]["preset"] == "quick" and report["options"]["seed"] == 5
+    (out / "photos" / stages.RECORD).unlink()
+    with pytest.raises(SdfsimError) as caught:
+        run_stage("mesh", out)
+    assert caught.value.hint == "run `sdfsim poses` first"
 
 
 @pytest.mark.parametrize(
@@ -116,98 +126,201 @@ def test_run_stage_needs_the_stages_before(photos, tmp_path, calls):
         ({"size": -1.0}, "size"),
         ({"budget": 0.0}, "budget"),
         ({"until_stage": "x"}, "stage"),
+        ({"distance": ["a:1,1", "b:1,1", 0.0]}, "distance"),
+        ({"distance": ["a:1,1", "a:1,1", 1.0]}, "both ends"),
+        ({"from_stage": "mesh", "until_stage": "poses"}, "poses comes before mesh"),
+        ({"photos": "none"}, "no such folder"),
     ],
 )
 def test_bad_options_are_one_line_and_write_nothing(photos, tmp_path, keywords, words):
     with pytest.raises(SdfsimError, match=words) as caught:
-        stages.reconstruct(photos, tmp_path / "out", **keywords)
+        reconstruct(**{"photos": photos, "out": tmp_path / "out", **keywords})
     assert "\n" not in caught.value.message
     assert not (tmp_path / "out").exists()
 
 
-def test_bad_photos_write_nothing(tmp_path):
-    with pytest.raises(SdfsimError, match="no such folder"):
-        stages.reconstruct(tmp_path / "none", tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
-def test_unwritable_output_is_one_clear_line(photos, tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(SdfsimError, match="cannot be written"):
-        stages.reconstruct(photos, tmp_path / "file" / "out")
-
-
-def test_full_disk_is_one_clear_line(photos, tmp_path, calls, monkeypatch):
+def test_a_full_disk_and_an_unwritable_folder_are_one_clear_line(photos, tmp_path, calls, act):
     def full(run: stages.Run, work: Path) -> dict:
         raise OSError(28, "No space left on device", str(work))
 
-    monkeypatch.setitem(stages.ACTIONS, "mesh", full)
+    act("mesh", full)
     with pytest.raises(SdfsimError, match="the disk is full"):
-        stages.reconstruct(photos, tmp_path / "out", preset="quick")
+        reconstruct(photos, tmp_path / "out")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SdfsimError, match="cannot be written"):
+        reconstruct(photos, tmp_path / "file" / "out")
 
 
-def test_stages_made_from_an_older_result_are_not_reported(photos, tmp_path, calls, monkeypatch):
-    ordinary = stages.ACTIONS["fit"]
-    failing = {"passed": False, "reason": "too coarse"}
-    monkeypatch.setitem(stages.ACTIONS, "fit", lambda run, work: {**ordinary(run, work), **failing})
-    out = tmp_path / "out"
-    report = stages.reconstruct(photos, out, preset="quick")
+def test_stages_made_from_an_older_result_are_not_reported(photos, tmp_path, calls, act):
+    ordinary, out = STAGES["fit"].run, tmp_path / "out"
+    act("fit", lambda run, work: {**ordinary(run, work), "passed": False, "reason": "too coarse"})
+    report = reconstruct(photos, out)
     assert report["failed_checks"] == ["fit: too coarse"] and "scene" in report["paths"]
-    report = stages.run_stage("mesh", out, size=5.0)
+    report = run_stage("mesh", out, size=5.0)
     assert list(report["stages"]) == ["photos", "poses", "distill", "mesh"]
     assert report["failed_checks"] == [] and "scene" not in report["paths"]
     with pytest.raises(SdfsimError, match="the fit stage is older than what it reads") as caught:
-        stages.run_stage("scene", out)
+        run_stage("scene", out)
     assert "sdfsim fit" in caught.value.hint
-    stages.run_stage("fit", out)
-    assert set(stages.run_stage("scene", out)["stages"]) == set(stages.STAGES)
+    run_stage("fit", out)
+    assert list(run_stage("scene", out)["stages"]) == NAMES
 
 
-def test_the_hint_names_a_command_that_exists(photos, tmp_path, calls):
+def test_another_result_of_the_same_options_makes_later_stages_old(photos, tmp_path, calls):
+    """With a budget, or on a GPU, a stage done again makes something else of the same."""
     out = tmp_path / "out"
-    stages.reconstruct(photos, out, until_stage="photos")
-    (out / "photos" / record.RECORD).unlink()
-    with pytest.raises(SdfsimError) as caught:
-        stages.run_stage("distill", out)
-    assert caught.value.hint == "run `sdfsim poses` first"
+    reconstruct(photos, out)
+    report = reconstruct(photos, out, from_stage="distill", until_stage="distill")
+    assert list(report["stages"]) == ["photos", "poses", "distill"]
+    calls.clear()
+    reconstruct(photos, out)
+    assert calls == ["mesh", "fit", "scene"]
 
 
 def test_a_second_run_into_the_same_folder_is_refused(photos, tmp_path, calls):
     out = tmp_path / "out"
-    stages.reconstruct(photos, out, until_stage="photos")
+    reconstruct(photos, out, until_stage="photos")
     with locked(out):
-        for again in (lambda: stages.reconstruct(photos, out), lambda: stages.run_stage("poses", out)):
+        for again in (lambda: reconstruct(photos, out), lambda: run_stage("poses", out)):
             with pytest.raises(SdfsimError, match="another run is writing") as caught:
                 again()
             assert caught.value.exit_code == 1
-    stages.run_stage("poses", out)
+    run_stage("poses", out)
 
 
 def test_a_record_that_cannot_be_written_keeps_the_work(tmp_path, monkeypatch):
-    work = record.begin(tmp_path / "w", "a", fresh=False)
+    work = begin(tmp_path / "w", "a", fresh=False)
     (work / "result").write_text("")
 
     def full(path: Path, content: dict) -> None:
         raise SdfsimError(f"{path}: cannot be written: No space left on device")
 
-    monkeypatch.setattr(record, "write_json", full)
+    monkeypatch.setattr(stages, "write_json", full)
     with pytest.raises(SdfsimError, match="No space left"):
-        record.finish(work, tmp_path / "place", "a", "before", {}, 1.0)
-    assert (record.begin(work, "a", fresh=False) / "result").exists()
+        finish(work, tmp_path / "place", "a", "before", {}, 1.0)
+    assert (begin(work, "a", fresh=False) / "result").exists()
 
 
-def test_notes_name_what_was_passed_over_assumed_or_is_vague():
-    found = notes({
-        "photos": {"notes": ["photos of several sizes"]},
-        "poses": {"warnings": ["12 left out"], "left_out": [{"photo": f"{k}.jpg", "why": "dark"} for k in range(12)]},
-        "mesh": {"up_from": "cameras", "size": "assumed: widest side = 1 m"},
-    })  # fmt: skip
-    assert found[:3] == ["photos of several sizes", "12 left out", "left out: 0.jpg: dark"]
-    assert found[-3:-1] == [
-        "left out: 2 more",
-        "no level plane found: up is taken from the cameras and may be off by some degrees",
-    ]
-    assert found[-1] == "size assumed: widest side = 1 m (give --size or --distance)"
+def test_a_skipped_stage_leaves_nothing_of_runs_that_were_killed(photos, tmp_path, calls, act):
+    """One that was to do it again, and one that had just put the new result in place of the old."""
+    out, ordinary = tmp_path / "out", STAGES["distill"].run
+    reconstruct(photos, out)
+
+    def killed(run: stages.Run, work: Path) -> dict:
+        raise KeyboardInterrupt
+
+    act("distill", killed)
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(photos, out, from_stage="distill")
+    act("distill", ordinary)
+    shutil.copytree(out / "mesh", out / ".mesh.old")
+    assert (out / ".distill.part").exists()
+    calls.clear()
+    reconstruct(photos, out)
+    assert calls == [] and not (out / ".distill.part").exists() and not (out / ".mesh.old").exists()
+
+
+@pytest.mark.parametrize("stage", ["photos", "fit"])
+def test_photos_where_a_result_belongs_stay(photos, tmp_path, calls, stage):
+    """By whatever path they are given."""
+    place = tmp_path / "scan" / STAGES[stage].folder
+    place.parent.mkdir()
+    shutil.copytree(photos, place / "images")
+    (tmp_path / "link").symlink_to(place / "images")
+    before = tree(tmp_path / "scan")
+    for given in (place, place / "images", tmp_path / "link"):
+        with pytest.raises(SdfsimError, match=f"where the result of the {stage} stage belongs"):
+            reconstruct(given, tmp_path / "scan")
+    assert calls == [] and tree(tmp_path / "scan") == before
+
+
+@pytest.mark.parametrize("name", ["photos/mine.blend", "assets/mine.blend", "config.yaml", "report.json", "report.md"])
+def test_anything_else_where_a_result_belongs_is_refused_before_the_first_stage(photos, tmp_path, calls, name):
+    out = tmp_path / "out"
+    (out / name).parent.mkdir(parents=True)
+    (out / name).write_text("mine: true")
+    with pytest.raises(SdfsimError, match="not replaced"):
+        reconstruct(photos, out)
+    assert calls == [] and tree(out) == {name: b"mine: true"}
+
+
+def test_what_appears_while_a_stage_runs_is_not_replaced(tmp_path):
+    work = begin(tmp_path / "w", "a", fresh=False)
+    (work / "result").write_text("")
+    (tmp_path / "place").mkdir()
+    (tmp_path / "place" / "mine").write_text("")
+    with pytest.raises(SdfsimError, match="not replaced"):
+        finish(work, tmp_path / "place", "a", "before", {}, 1.0)
+    assert (tmp_path / "place" / "mine").exists() and (work / "result").exists()
+
+
+@pytest.fixture
+def asked(calls, monkeypatch) -> dict[str, dict]:
+    """What was asked of distill, mesh and fit, which do nothing else; the other stages note their names."""
+    found: dict[str, dict] = {}
+
+    def note(where: str, stage: str, result) -> None:
+        monkeypatch.setattr(where, lambda *places, **options: found.setdefault(stage, options) and result)
+        monkeypatch.setitem(STAGES, stage, REAL[stage])
+
+    note("pipeline.field.training.train", "distill", SimpleNamespace(report={}))
+    note("pipeline.mesh.meshing.make_meshes", "mesh", RESULTS["mesh"])
+    note("pipeline.export.fit_parts", "fit", {})
+    monkeypatch.setattr("sdfsim.parallel.choose_threads", lambda work, repeat: 0.0)
+    monkeypatch.setattr("pipeline.cameras.load_views", lambda folder: [])
+    monkeypatch.setattr("pipeline.cameras.load_sparse", lambda folder: None)
+    return found
+
+
+def test_a_budget_for_everything_is_shared_and_one_for_a_stage_is_all_its_own(photos, tmp_path, asked):
+    out = tmp_path / "out"
+    reconstruct(photos, out, budget=1000.0)
+    assert asked["fit"]["budget"] == pytest.approx(150.0)
+    assert 700.0 < asked["distill"]["budget"] < 850.0 - stages.AFTER_TRAINING
+    asked.clear()
+    for stage in ("distill", "mesh", "fit"):
+        report = run_stage(stage, out, budget=None if stage == "mesh" else 30.0)
+        assert report["options"]["budget"] == 1000.0
+    assert asked["distill"]["budget"] == asked["fit"]["budget"] == 30.0
+    assert read_config(out).budget == 1000.0
+
+
+def test_the_device_reaches_every_stage_that_computes_there(photos, tmp_path, asked, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    reconstruct(photos, tmp_path / "out", device="cuda")
+    assert {stage: options["device"] for stage, options in asked.items()} == dict.fromkeys(DEVICES, "cuda")
+
+
+def test_a_device_that_is_not_there_is_refused_before_any_stage(photos, tmp_path, calls, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(SdfsimError, match="no CUDA device here"):
+        reconstruct(photos, tmp_path / "out", device="cuda")
+    assert not (tmp_path / "out").exists()
+    reconstruct(photos, tmp_path / "out")
+    with pytest.raises(SdfsimError, match="no CUDA device here"):
+        run_stage("mesh", tmp_path / "out", device="cuda", again=True)
+
+
+def test_poses_of_a_folder_in_work_keep_its_other_options(photos, tmp_path, calls, monkeypatch):
+    monkeypatch.setattr("pipeline.report.write_recording", lambda folder, done: None)
+    out = tmp_path / "out"
+    assert command("poses", photos, "-o", out).exit_code == 0
+    assert read_config(out) == Options(str(photos))
+    reconstruct(photos, out, preset="quick", seed=7, size=2.5, drop="ball", budget=900.0)
+    before = read_config(out)
+    calls.clear()
+    assert command("poses", photos, "-o", out).exit_code == 0
+    assert read_config(out) == before and calls == []
+    assert command("poses", photos, "-o", out, "--preset", "fine").exit_code == 0
+    assert read_config(out) == before.changed({"preset": "fine"})
+
+
+def test_a_place_that_is_not_in_the_photos_is_refused_before_the_poses(photos, tmp_path, calls, monkeypatch):
+    for stage in ("photos", "poses"):
+        monkeypatch.setitem(STAGES, stage, REAL[stage])
+    monkeypatch.setattr("pipeline.sfm.poses.solve", lambda *places, **options: pytest.fail("solved"))
+    with pytest.raises(SdfsimError, match=r"distance: no photo is called 'cup\.png'"):
+        reconstruct(photos, tmp_path / "out", distance=["0.png:3,4", "cup.png:1,1", 0.1])
 
 
 @pytest.mark.slow
@@ -216,7 +329,7 @@ def test_the_whole_chain_on_the_rendered_set(tmp_path):
     from benchmarks.reconstruct import evaluate
 
     source = ROOT / "samples" / "photos" / "table_vase"
-    report = stages.reconstruct(source, tmp_path, preset="quick")
+    report = reconstruct(source, tmp_path, preset="quick")
     truth = evaluate(tmp_path, source)
     assert truth["poses"]["center_error_worst_percent"] < 0.5
     surface = truth["surface_percent_of_table_width"]["surface"]

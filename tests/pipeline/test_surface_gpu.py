@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.field import GridField
-from pipeline.surface import field_colors, field_distance
+from pipeline.field.grid_field import GridField
+from pipeline.mesh.extraction import field_colors, field_distance
 from tests.pipeline.test_field import SMALL
 from tests.pipeline.test_surface import cube
 

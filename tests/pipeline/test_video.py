@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.photos import prepare_photos
-from pipeline.sources import find_source
-from pipeline.video import FEWEST, Track, choose, follow
+from pipeline.inputs.photos import prepare_photos
+from pipeline.inputs.sources import find_source
+from pipeline.inputs.video import FEWEST, Track, choose, follow
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from tests.pipeline.photo_sets import TABLE_VASE
 

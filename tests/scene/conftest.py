@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sdfsim import SceneError, load_scene
-from sdfsim.scene.types import Scene
+from sdfsim.scene.scene import Scene
 
 HEAD = "version: 1\nshapes:\n  ball: {sphere: {radius: 0.5}}\nbodies:\n"  # bodies[0] is on line 5
 

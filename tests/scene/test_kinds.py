@@ -6,21 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
-from sdfsim.shape.shape import analytic_shape, with_sdf
 
 from sdfsim import Simulator
-from sdfsim.dynamics.bodies import Units, from_scene
-from sdfsim.dynamics.contacts import find_contacts
-from sdfsim.scene.types import Scene
+from sdfsim.scene.scene import Scene
 from sdfsim.shape.mesh import write_ply
 from sdfsim.shape.sdf import BoxSdf, GridSdf, MeshSdf
+from sdfsim.shape.shape import analytic_shape, with_sdf
 from tests.scene.test_load import problems_of
 
 CRATE = {
     "box": "{box: {size: [0.4, 0.4, 0.4]}}",
     "grid": "{primitive: {name: box, size: 0.4}, sdf: grid, resolution: 64}",
-    "mesh": "{primitive: {name: box, size: 0.4}, sdf: mesh}",
     "asset": "{asset: crate, sdf: grid}",
     "file": "{mesh: crate.ply, units: cm, sdf: mesh}",
 }
@@ -57,7 +53,7 @@ def test_a_ball_bounces_alike_off_a_box_a_grid_and_a_mesh(load, tmp_path, no_fit
     (tmp_path / "crate.ply").write_bytes(write_ply(larger))
     scenes = {key: load(falling_ball(shape)) for key, shape in CRATE.items()}
     kinds = {key: type(scene.shapes[1].sdf) for key, scene in scenes.items()}
-    assert kinds == {"box": BoxSdf, "grid": GridSdf, "mesh": MeshSdf, "asset": GridSdf, "file": MeshSdf}
+    assert kinds == {"box": BoxSdf, "grid": GridSdf, "asset": GridSdf, "file": MeshSdf}
     assert all(scene.missed == () for scene in scenes.values())
     expected = heights(scenes["box"])
     # Without the crate it would be half a metre lower by now.
@@ -65,31 +61,6 @@ def test_a_ball_bounces_alike_off_a_box_a_grid_and_a_mesh(load, tmp_path, no_fit
     for key in CRATE:
         # Nodes differ where the shape is made from the mesh, and a node more or less is another contact.
         np.testing.assert_allclose(heights(scenes[key]), expected, atol=1e-4 if key == "asset" else 2e-3)
-
-
-def edges(scene: Scene) -> dict[tuple[int, ...], tuple[float, np.ndarray]]:
-    """Distance m and normal [3] of every contact edge at the start, by owner, node and other body."""
-    bodies, state = from_scene(scene, Units(1.0, 1.0, 1.0), torch.device("cpu"))
-    found = find_contacts(bodies, state, torch.tensor([0.0, 0.0, -9.81]), reach=0.05, dt=0.02)
-    keys = zip(found.owner.tolist(), found.node.tolist(), found.body.tolist(), strict=True)
-    return dict(zip(keys, zip(found.distance.tolist(), found.normal.numpy(), strict=True), strict=True))
-
-
-@pytest.mark.parametrize("kind", ["grid", "mesh"])
-def test_with_the_same_nodes_contacts_and_paths_are_the_same(load, kind):
-    exact = load(falling_ball(CRATE["box"]).replace("0.52]", "0.51]"))
-    ground, crate, ball = exact.shapes
-    crate = with_sdf(crate, kind, resolution=48)
-    other = replace(exact, shapes=(ground, crate, with_sdf(ball, kind, resolution=48)))
-    first, second = edges(exact), edges(other)
-    assert len(first) > 20
-    assert len(first.keys() ^ second.keys()) <= 2  # those at the very reach of an edge
-    for key in first.keys() & second.keys():
-        assert first[key][0] == pytest.approx(second[key][0], abs=1.5e-3)
-        assert first[key][1] @ second[key][1] > 0.99  # the ball has facets, the grid cells
-    # The ball stays a ball: one with facets would bounce off one of them.
-    other = replace(exact, shapes=(ground, crate, ball))
-    np.testing.assert_allclose(heights(other), heights(exact), atol=1e-3)
 
 
 def test_an_asset_keeps_its_own_sdf_unless_told_and_cannot_grow_a_network(load, tmp_path):

@@ -64,11 +64,6 @@ def test_no_pieces_where_there_is_no_simple_way() -> None:
         convex_pieces("shoe")
 
 
-def test_sizes_must_be_positive() -> None:
-    with pytest.raises(SdfsimError, match="> 0"):
-        sphere(-1.0)
-
-
 def test_sphere_vertices_are_on_the_sphere() -> None:
     mesh = sphere(0.25, subdivisions=2)
     np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), 0.25)

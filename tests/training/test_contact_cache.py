@@ -38,12 +38,12 @@ def test_the_engines_inner_steps_are_counted():
 
 
 def test_errors_at_a_frame_are_those_of_that_frame_alone():
-    from sdfsim.evaluation.evaluate import _errors
+    from sdfsim.evaluation.evaluate import errors
 
     truth = balls(np.zeros((31, 2, 3)))
     other = np.zeros((31, 2, 3))
     other[25, 0, 0], other[10, 1, 0] = 0.3, 7.0
-    errors = _errors([replace(truth, position=other), truth], [truth, truth])["25"]
-    assert errors["at_frame"]["translation_rmse"] == pytest.approx(0.5 * 0.3 / 2**0.5)
-    assert errors["translation_rmse"] == pytest.approx(((0.3**2 + 7.0**2) / (25 * 4)) ** 0.5)
-    assert errors["at_frame"]["rotation_error"] == 0.0
+    found = errors([replace(truth, position=other), truth], [truth, truth])["25"]
+    assert found["at_frame"]["translation_rmse"] == pytest.approx(0.5 * 0.3 / 2**0.5)
+    assert found["translation_rmse"] == pytest.approx(((0.3**2 + 7.0**2) / (25 * 4)) ** 0.5)
+    assert found["at_frame"]["rotation_error"] == 0.0

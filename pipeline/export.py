@@ -1,0 +1,289 @@
+"""Meshes -> a scene: Shape folders with compact SDFs, the scene.yaml, and a place to drop a body onto it."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import os
+import shutil
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from pipeline.mesh.cleaning import joined
+from pipeline.mesh.meshing import SCENERY, read_parts, rounded
+from pipeline.mesh.placement import Placement, load_placement
+from pipeline.mesh.visibility import Caster
+from pipeline.progress import Progress, quiet
+from sdfsim.errors import EXIT_QUALITY, SdfsimError
+from sdfsim.files import write_text
+from sdfsim.shape.mesh import Mesh, load_mesh
+
+SCENERY_SHARE = 2  # Of a budget the scenery gets as much as this many bodies: it has more to it.
+DENSITY = 400.0  # kg/m^3, wood: no photo tells what a thing is made of
+SURFACE = "friction: 0.8, restitution: 0.4"
+SIDE = 0.06  # of the dropped slab, as a share of the scenery's widest side
+THICKNESS = 0.5  # of the slab, as a share of its side; a cube tips over more easily
+LEVEL = 10.0  # degrees; far below what friction holds, as learned contacts creep on slopes
+BUMP = 0.06  # how far a level place may stick out of its plane, as a share of the side
+UNSEEN = 0.1  # share of the slab's footprint that photos may leave out
+GAP = 0.3  # of the fall, as a share of the side
+
+
+def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str = "default", seed: int = 0,
+              device: str = "cpu", on_progress: Progress = quiet) -> dict:  # fmt: skip
+    """Fits a compact SDF to the scenery and to every body, each a Shape folder in `out` that goes by its name.
+
+    The scenery's solid is closed (capped where the trained space ends), so the sign of its distance is right
+    everywhere, also above the open scenery where bodies come from; what is shown of it is its visible surface. A body's
+    origin is the middle of its base. Folders that are there already are kept.
+
+    Args:
+        mesh_folder: of the mesh stage.
+        out: existing folder.
+        budget: s of fitting, for all.
+        recipe: of the fits.
+        seed: of the fits.
+        device: where to compute.
+
+    Returns:
+        `shapes`: a certificate each; `passed`, `reason` and `caveats` (a line each) for all of them.
+
+    Raises:
+        SdfsimError: the mesh stage has not run, or a mesh cannot be used.
+    """
+    from sdfsim.shape.shape import load_shape
+
+    parts = read_parts(mesh_folder)
+    weights = {SCENERY: SCENERY_SHARE} if parts["scenery"] else {}
+    weights |= {entry["name"]: 1 for entry in parts["objects"]}
+    shares = {name: weight / sum(weights.values()) for name, weight in weights.items()}
+    certificates, done = {}, 0.0
+    for name, share in shares.items():
+
+        def tell(fraction: float, message: str, name: str = name, before: float = done, share: float = share) -> None:
+            on_progress(before + share * fraction, f"{name}: {message}")
+
+        done += share
+        folder = out / name
+        if (folder / "shape.json").exists():
+            certificates[name] = load_shape(folder).certificate
+            continue
+        solid, shown = meshes_of(mesh_folder, name)
+        certificates[name] = fit_one(
+            solid, shown, out, name, budget=None if budget is None else budget * share, recipe=recipe, seed=seed,
+            device=device, on_progress=tell,
+        )  # fmt: skip
+    missed = [f"{name}: {found['reason']}" for name, found in certificates.items() if not found["passed"]]
+    caveats = [f"{name}: {found['caveat']}" for name, found in certificates.items() if found["caveat"]]
+    return {"shapes": certificates, "passed": not missed, "reason": "; ".join(missed), "caveats": caveats}
+
+
+def fit_one(solid: Mesh, shown: Mesh, out: Path, name: str, *, budget: float | None, recipe: str, seed: int,
+            device: str, on_progress: Progress) -> dict:  # fmt: skip
+    """Fits one shape, saves it as the folder `out`/`name`, and returns its certificate."""
+    from sdfsim.shape.fit import fit_mesh
+
+    shape = fit_mesh(
+        solid, name=name, recipe=recipe, budget=budget, seed=seed, cap=True,  # type: ignore[arg-type]
+        on_progress=on_progress, device=device,
+    )  # fmt: skip
+    # The folder appears complete or not at all: a run that goes on keeps those that are there.
+    partial = out / f".{name}.part"
+    shutil.rmtree(partial, ignore_errors=True)
+    replace(shape, mesh=shown).save(partial)
+    partial.rename(out / name)
+    return shape.certificate
+
+
+def meshes_of(mesh_folder: Path, name: str) -> tuple[Mesh, Mesh]:
+    """The closed mesh of a part in its own frame, and what is displayed of it."""
+    if name == SCENERY:
+        return load_mesh(mesh_folder / "solid.ply"), load_mesh(mesh_folder / "shown.ply")
+    mesh = load_mesh(mesh_folder / "objects" / f"{name}.ply")
+    moved = replace(mesh, vertices=mesh.vertices - origin_of(mesh))
+    return moved, moved
+
+
+def origin_of(mesh: Mesh) -> np.ndarray:
+    """A body's origin [3]: the middle of the base of its bounding box."""
+    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    return np.array([*(low + high)[:2] / 2, low[2]])
+
+
+def write_scene(
+    mesh_folder: Path, scene_file: Path, *, drop: str = "box", written: str | None = None, seed: int = 0
+) -> dict:
+    """Writes scene.yaml for the meshes of a mesh folder; returns the stage's report.
+
+    A scene file that the user has changed is kept beside it as `scene.yaml.bak`.
+
+    Args:
+        mesh_folder: of the mesh stage.
+        scene_file: to write.
+        drop: what falls onto the scene: box, ball or none.
+        written: hash of the scene file as this function last wrote it; None where it never did.
+        seed: of the scene.
+
+    Raises:
+        SdfsimError: the mesh stage has not run.
+    """
+    mesh_folder = Path(mesh_folder)
+    parts, placement = read_parts(mesh_folder), load_placement(mesh_folder)
+    solids = {name: load_mesh(mesh_folder / "objects" / f"{name}.ply") for name in _names(parts)}
+    notes: list[str] = []
+    slab = None
+    if drop != "none":
+        scenery = [load_mesh(mesh_folder / "solid.ply")] if parts["scenery"] else []
+        shown = load_mesh(mesh_folder / "shown.ply") if parts["scenery"] else joined(list(solids.values()))
+        slab = choose_slab(shown, joined([*scenery, *solids.values()]))
+        if slab.slope > LEVEL:
+            notes.append(f"no level place to drop a body onto: the flattest slopes by {slab.slope:.0f} degrees")
+    origins = {name: origin_of(mesh) for name, mesh in solids.items()}
+    text = scene_text(placement, origins, slab, scenery=parts["scenery"], drop=drop, seed=seed)
+    if scene_file.exists() and content_hash(scene_file.read_bytes()) not in (written, content_hash(text.encode())):
+        numbers = itertools.chain([""], itertools.count(2))
+        names = (scene_file.with_name(f"{scene_file.name}.bak{n}") for n in numbers)
+        kept = next(path for path in names if not path.exists())
+        os.replace(scene_file, kept)
+        notes.append(f"{scene_file.name} had been changed by hand: kept as {kept.name}")
+    write_text(scene_file, text)
+    return {
+        "objects": list(solids), "density_assumed": DENSITY, "size": placement.size_from,
+        "drop": {"shape": drop, **(asdict(slab) if slab else {})}, "notes": notes,
+        "scene_sha256": content_hash(text.encode()),
+    }  # fmt: skip
+
+
+def _names(parts: dict) -> list[str]:
+    return [entry["name"] for entry in parts["objects"]]
+
+
+def content_hash(content: bytes) -> str:
+    """SHA-256 in hex."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab | None, *, scenery: bool = True,
+               drop: str = "box", seed: int = 0) -> str:  # fmt: skip
+    """The text of scene.yaml: a floor, the scenery, the bodies that were found, and one dropped from above.
+
+    Args:
+        placement: of the meshes.
+        origins: [3] m of each body that was found, by the name of its asset.
+        slab: where the dropped body starts; None leaves it out.
+        scenery: whether there is any.
+        drop: shape of what is dropped, box or ball.
+        seed: of the scene.
+    """
+    source = "the dominant plane" if placement.up_from == "plane" else "the cameras"
+    assumed = " (give --size or --distance for true metres)" if placement.size_from.startswith("assumed") else ""
+    shapes: list[str] = []
+    bodies = ["  - {name: floor, motion: static, plane: {normal: [0, 0, 1], offset: 0.0}}"]
+    if scenery:
+        shapes.append("  scene: {asset: assets/scene}")
+        bodies.append(f"  - {{name: scene, shape: scene, motion: static, {SURFACE}}}")
+    for name, origin in origins.items():
+        shapes.append(f"  {name}: {{asset: assets/{name}}}")
+        position = _flow(rounded(origin).tolist())
+        bodies.append(f"  - {{name: {name}, shape: {name}, position: {position}, density: {DENSITY:g}, {SURFACE}}}")
+    if slab is not None:
+        box = {"box": {"size": rounded((slab.side, slab.side, slab.thickness)).tolist()}}
+        ball = {"sphere": {"radius": float(rounded(slab.thickness / 2))}}
+        shapes.append(f"  {drop}: {_flow(box if drop == 'box' else ball)}")
+        position = _flow(rounded(slab.position).tolist())
+        bodies.append(f"  - {{name: {drop}, shape: {drop}, position: {position}, density: {DENSITY:g}, {SURFACE}}}")
+    return "\n".join([
+        f"# Reconstructed from photos. Up from {source}, within {placement.up_within:.1f} degrees "
+        f"(confidence: {placement.up_confidence}).",
+        f"# Size {placement.size_from}{assumed}. Lengths in m, density in kg/m^3.",
+        "version: 1",
+        "duration: 4.0                    # s",
+        f"seed: {seed}",
+        "gravity: [0, 0, -9.81]           # m/s^2",
+        "shapes:",
+        *shapes,
+        "bodies:",
+        *bodies,
+        "",
+    ])  # fmt: skip
+
+
+def _flow(content: dict | list) -> str:
+    """One line of YAML. Its numbers are not Python's: 1e-05 would be read as a text."""
+    return yaml.safe_dump(content, default_flow_style=True, sort_keys=False, width=1000).strip()
+
+
+@dataclass(frozen=True)
+class Slab:
+    """A level slab above a place where it can lie.
+
+    Attributes:
+        side: m.
+        thickness: m.
+        position: [3] m, its centre at the start.
+        slope: of the surface below, degrees.
+    """
+
+    side: float
+    thickness: float
+    position: tuple[float, float, float]
+    slope: float
+
+
+class Above:
+    """Heights of a mesh's topmost surface."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        self.caster = Caster(mesh)
+        self.top = float(mesh.vertices[:, 2].max()) + 1.0
+
+    def heights(self, at: np.ndarray) -> np.ndarray:
+        """Heights [...] m over the points `at` [..., 2] m; NaN where there is no surface."""
+        origin = np.full((at.size // 2, 3), self.top)
+        origin[:, :2] = at.reshape(-1, 2)
+        distance, _ = self.caster.hits(origin, np.tile([0.0, 0.0, -1.0], (len(origin), 1)))
+        return np.where(np.isfinite(distance), self.top - distance, np.nan).reshape(at.shape[:-1])
+
+
+def choose_slab(shown: Mesh, solid: Mesh) -> Slab:
+    """Chooses a place for a slab from geometry alone: level, flat, seen in the photos, high and central.
+
+    Args:
+        shown: visible surface, metres, z up; the slab has to land on it.
+        solid: closed surface, also what no photo shows.
+
+    Raises:
+        SdfsimError: (exit code 3) there is no place at all.
+    """
+    low, high = shown.vertices.min(0), shown.vertices.max(0)
+    side = SIDE * float((high - low).max())
+    axes = [np.arange(low[k], high[k] + side / 4, side / 2) for k in range(2)]
+    places = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
+    # Wider than the slab: what stands beside it must not be in its way on the way down.
+    line = np.linspace(-0.75, 0.75, 13) * side
+    around = np.stack(np.meshgrid(line, line, indexing="ij"), -1).reshape(-1, 2)
+    under = (np.abs(around) <= 0.5 * side + 1e-9).all(1)
+    visible = Above(shown).heights(places[:, None] + around[under])
+    top = Above(solid).heights(places[:, None] + around)
+    top[:, under] = np.fmax(top[:, under], visible)
+    whole = np.isfinite(top[:, under]).all(1)
+    if not whole.any():
+        raise SdfsimError("scene: no place to drop a body onto", "look at mesh/mesh.ply", exit_code=EXIT_QUALITY)
+    places, visible, top = places[whole], visible[whole], top[whole]
+    design = np.c_[around[under], np.ones(under.sum())]
+    plane = top[:, under] @ np.linalg.pinv(design).T  # [P, 3]: slopes along x and y, height of the middle
+    slope = np.degrees(np.arctan(np.hypot(plane[:, 0], plane[:, 1])))
+    bump = np.abs(top[:, under] - plane @ design.T).max(1) / side
+    unseen = 1 - (visible > top[:, under] - 0.2 * side).mean(1)
+    obstacle = (np.nanmax(top, 1) - top[:, under].max(1)) / side
+    central = np.linalg.norm((places - (low + high)[:2] / 2) / np.maximum(high - low, 1e-9)[:2], axis=1)
+    good = (plane[:, 2] - low[2]) / max(high[2] - low[2], side) - 1.2 * central - slope / LEVEL - obstacle
+    # What is not level, not flat, or not in the photos is taken only where there is nothing else, the flattest first.
+    bad = np.maximum(slope / LEVEL - 1, 0) + 10 * np.maximum(bump - BUMP, 0) + 10 * np.maximum(unseen - UNSEEN, 0)
+    best = int((good - 100 * bad).argmax())
+    thickness = THICKNESS * side
+    height = float(np.nanmax(top[best])) + 0.5 * thickness + GAP * side
+    return Slab(side, thickness, (float(places[best, 0]), float(places[best, 1]), height), float(slope[best]))

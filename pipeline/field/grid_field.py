@@ -1,0 +1,222 @@
+"""The volumetric field: an SDF and a colour on dense multi-resolution grids, rendered through a Laplace density.
+
+Density and rendering follow VolSDF (Yariv et al., 2021, sections 3.1 and 3.2). Space is the unit sphere; what lies
+outside it is a background of its own on contracted coordinates (Barron et al., 2022, eq. 10).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from pipeline.field.interpolation import interpolate
+
+
+@dataclass(frozen=True)
+class FieldSize:
+    """Resolution of a field.
+
+    Attributes:
+        levels: grid points a side of each level, coarse to fine.
+        channels: features a level.
+        width: hidden width of both small networks.
+        background: grid points a side of the background.
+    """
+
+    levels: tuple[int, ...] = (16, 32, 64, 128)
+    channels: tuple[int, ...] = (4, 4, 4, 2)
+    width: int = 64
+    background: int = 64
+
+    def to_dict(self) -> dict:
+        """Plain values for JSON."""
+        return asdict(self)
+
+
+BACKGROUND_SAMPLES = 12
+GEOMETRY = 13  # features that the SDF network hands to the colour network
+
+
+def laplace_density(sdf: Tensor, beta: float | Tensor) -> Tensor:
+    """Density 1/beta * Psi_beta(-sdf) with Psi the Laplace distribution function (VolSDF eq. 2, 3; alpha = 1/beta)."""
+    decay = 0.5 * torch.exp(-sdf.abs() / beta)
+    return torch.where(sdf > 0, decay, 1 - decay) / beta
+
+
+def render_weights(density: Tensor, delta: Tensor) -> tuple[Tensor, Tensor]:
+    """Quadrature of the volume rendering integral.
+
+    Args:
+        density: [R, S] at the samples along each ray, near to far.
+        delta: [R, S] length of each sample's interval.
+
+    Returns:
+        Weight [R, S] of each sample and transmittance [R] that is left behind the last one.
+    """
+    depth = torch.cumsum(density * delta, 1)
+    before = torch.cat([torch.zeros_like(depth[:, :1]), depth[:, :-1]], 1)
+    weights = torch.exp(-before) * -torch.expm1(-(density * delta))
+    return weights, torch.exp(-depth[:, -1])
+
+
+def direction_features(directions: Tensor) -> Tensor:
+    """Spherical harmonics of degree 1 and 2 without constants, [..., 3] -> [..., 8]."""
+    x, y, z = directions.unbind(-1)
+    return torch.stack([x, y, z, x * y, y * z, x * z, x * x - y * y, 3 * z * z - 1], -1)
+
+
+def contract(points: Tensor) -> Tensor:
+    """Points outside the unit sphere -> the shell between radius 0.5 and 1; infinity goes to radius 1."""
+    radius = points.norm(dim=-1, keepdim=True).clamp_min(1.0)
+    return points / radius * (2 - 1 / radius) / 2
+
+
+class Field(nn.Module, ABC):
+    """SDF and colour in the unit sphere, and a background outside; what both encodings have in common.
+
+    Attributes:
+        background: [n, n, n, 4], channel 0 density before softplus, channels 1 to 3 colour before sigmoid.
+        size: of the encoding, with `to_dict`.
+        start_radius: radius of the sphere that the SDF starts from.
+        active: how many levels of detail are in use.
+        view_dependence: how much colour changes with direction, 0 to 1.
+    """
+
+    background: nn.Parameter
+    size: Any
+    start_radius: float
+    active: int = 0
+    view_dependence: float = 1.0
+
+    @property
+    @abstractmethod
+    def finest(self) -> float:
+        """Size of the smallest detail, normalised units."""
+
+    @abstractmethod
+    def geometry_at(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """SDF [P] and two kinds of features [P, F] for `color_of` at points [P, 3] of normalised space."""
+
+    @abstractmethod
+    def color_of(self, geometry: Tensor, features: Tensor, directions: Tensor) -> Tensor:
+        """RGB [P, 3] in 0..1 seen along unit directions [P, 3]."""
+
+    def sdf(self, points: Tensor) -> Tensor:
+        """Signed distance [P] in normalised units at points [P, 3]."""
+        return self.geometry_at(points)[0]
+
+    def background_along(self, origins: Tensor, directions: Tensor, jitter: Tensor) -> Tensor:
+        """RGB [R, 3] of what lies behind the unit sphere, by rendering its grid.
+
+        Args:
+            origins: [R, 3].
+            directions: [R, 3] unit.
+            jitter: [R, S] in 0..1, place of each sample within its step of inverse radius.
+        """
+        count = jitter.shape[1]
+        inverse = 1 - (torch.arange(count, device=jitter.device) + jitter) / count * 0.995
+        radius = 1 / inverse
+        along = -(origins * directions).sum(1, keepdim=True)
+        closest = (origins * origins).sum(1, keepdim=True) - along**2
+        distance = along + torch.sqrt((radius**2 - closest).clamp_min(1e-6))
+        points = origins[:, None] + distance[..., None] * directions[:, None]
+        values = interpolate(self.background, contract(points).view(-1, 3)).view(*jitter.shape, 4)
+        # Optical depth per step of inverse radius, so that far steps are not heavier than near ones.
+        depth = functional.softplus(values[..., 0] * 10 - 1.0)
+        depth = torch.cat([depth[:, :-1], torch.full_like(depth[:, -1:], 20.0)], 1)
+        weights, _ = render_weights(depth, torch.ones_like(depth))
+        return (weights[..., None] * torch.sigmoid(values[..., 1:] * 10)).sum(1)
+
+
+class GridField(Field):
+    """SDF and colour in the unit sphere, and a background outside.
+
+    Args:
+        size: resolutions.
+        seed: of the initial weights.
+        start_radius: radius of the sphere that the SDF starts from.
+    """
+
+    def __init__(self, size: FieldSize, seed: int = 0, start_radius: float = 0.5) -> None:
+        super().__init__()
+        self.size, self.start_radius = size, start_radius
+        self.active = len(size.levels)
+        self.view_dependence = 1.0
+        rng = torch.Generator().manual_seed(seed)
+
+        def uniform(*shape: int, bound: float) -> nn.Parameter:
+            return nn.Parameter((torch.rand(*shape, generator=rng) * 2 - 1) * bound)
+
+        self.grids = nn.ParameterList(
+            [uniform(n, n, n, c, bound=1e-3) for n, c in zip(size.levels, size.channels, strict=True)]
+        )
+        inputs, width = 3 + sum(size.channels), size.width
+
+        def layer(count: int, outputs: int, gain: float = 1.0) -> nn.Linear:
+            linear = nn.Linear(count, outputs)
+            with torch.no_grad():
+                linear.weight.copy_((torch.rand(outputs, count, generator=rng) * 2 - 1) * gain * (6 / count) ** 0.5)
+                linear.bias.zero_()
+            return linear
+
+        self.geometry = nn.Sequential(layer(inputs, width), nn.ReLU(), layer(width, width), nn.ReLU())
+        self.head = layer(width, 1 + GEOMETRY, gain=0.2)
+        with torch.no_grad():
+            self.head.weight[0] *= 0.1
+        self.color = nn.Sequential(
+            layer(GEOMETRY + 8 + sum(size.channels), width), nn.ReLU(), layer(width, 3, gain=0.3)
+        )
+        n = size.background
+        self.background = uniform(n, n, n, 4, bound=1e-2)
+
+    @property
+    def finest(self) -> float:
+        """Width of a cell of the finest level, normalised units."""
+        return level_step(self.size.levels, len(self.size.levels))
+
+    def features(self, points: Tensor) -> Tensor:
+        """Grid features [P, F] at points [P, 3]; zeros for levels that are not active yet."""
+        found = [interpolate(grid, points) for grid in list(self.grids)[: self.active]]
+        missing = sum(self.size.channels[self.active :])
+        if missing:
+            found.append(points.new_zeros(len(points), missing))
+        return torch.cat(found, 1)
+
+    def geometry_at(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """SDF [P], geometry features [P, 13] and grid features [P, F] at points [P, 3] of normalised space."""
+        features = self.features(points)
+        hidden = self.head(self.geometry(torch.cat([points, features], 1)))
+        base = points.norm(dim=1) - self.start_radius
+        return base + hidden[:, 0], hidden[:, 1:], features
+
+    def color_of(self, geometry: Tensor, features: Tensor, directions: Tensor) -> Tensor:
+        """RGB [P, 3] in 0..1 seen along unit directions [P, 3]."""
+        seen_along = self.view_dependence * direction_features(directions)
+        return torch.sigmoid(self.color(torch.cat([geometry, features, seen_along], 1)))
+
+
+def stencil(points: Tensor, step: float) -> Tensor:
+    """The seven points [P, 7, 3] from which `differences` takes gradient and Laplacian at `points` [P, 3]."""
+    offsets = torch.eye(3, device=points.device, dtype=points.dtype) * step
+    return torch.cat([points[:, None] + offsets, points[:, None] - offsets, points[:, None]], 1)
+
+
+def differences(values: Tensor, step: float) -> tuple[Tensor, Tensor]:
+    """Gradient [P, 3] and Laplacian [P] by central differences from values [P, 7] on a `stencil`.
+
+    Differences over one grid cell reach all the cell's corners; an analytic gradient would only touch its own
+    (Li et al., Neuralangelo, 2023, eq. 3).
+    """
+    gradient = (values[:, :3] - values[:, 3:6]) / (2 * step)
+    return gradient, (values[:, :6].sum(1) - 6 * values[:, 6]) / (step * step)
+
+
+def level_step(levels: Sequence[int], active: int) -> float:
+    """Width of a cell of the finest active level, in normalised units."""
+    return 2.0 / (levels[active - 1] - 1)

@@ -1,0 +1,120 @@
+"""Photos that were not trained on: rendered from the field, compared, and kept as pictures."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from pipeline.cameras import View
+from pipeline.field.rays import load_rays
+from pipeline.field.rendering import render
+from pipeline.inputs.images import BACKDROP
+from pipeline.progress import Progress, quiet
+
+if TYPE_CHECKING:
+    from pipeline.field.training import Trainer
+
+FOLDER = "held_out"
+EMPTY = 0.9  # grey of pixels whose ray misses the trained spherefrom pipeline.progress import Progress, quiet
+
+
+@dataclass(frozen=True)
+class Compared:
+    """A held-out photo against its render, over pixels whose ray meets the unit sphere.
+
+    Attributes:
+        psnr: dB.
+        overlap: of the silhouettes, intersection over union; None without masks.
+        picture: [H, W, 3] uint8, the render.
+    """
+
+    psnr: float
+    overlap: float | None
+    picture: np.ndarray
+
+
+class HeldOut:
+    """The photos that were not trained on, at a third of the training resolution.
+
+    Those that show nothing of the unit sphere are passed over: there is nothing to compare.
+
+    Attributes:
+        shown: index of each view that shows some of it.
+
+    Args:
+        views: in normalised space.
+        photos_folder: of the photos stage.
+        trainer: of the field to look at.
+        masked: every photo has a mask.
+    """
+
+    def __init__(self, views: list[View], photos_folder: Path, trainer: Trainer, *, masked: bool) -> None:
+        self.views, self.trainer, self.masked = views, trainer, masked
+        longest = max(100, trainer.settings.long_side // 3)
+        self.rays = load_rays(views, photos_folder, longest, masks=masked).to(trainer.device)
+        self.shown: list[int] = self.rays.view.unique().tolist()
+        self.backdrop = torch.full((3,), BACKDROP, device=trainer.device) if masked else None
+
+    @torch.no_grad()
+    def compare(self, number: int) -> Compared:
+        """Renders one of the `shown` views with the field as it is; its cached SDF has to be up to date."""
+        trainer, rays = self.trainer, self.rays
+        assert trainer.cache is not None
+        index = torch.nonzero(rays.view == number)[:, 0]
+        parts = []
+        for part in index.split(4096):
+            origins, directions = rays.at(part)
+            parts.append(
+                render(trainer.field, trainer.cache, origins, directions, trainer.beta,
+                       samples=trainer.settings.samples, backdrop=self.backdrop)
+            )  # fmt: skip
+        rgb, opacity = (torch.cat([part[key] for part in parts]) for key in ("rgb", "opacity"))
+        error = float(((rgb - rays.rgb[index].float() / 255) ** 2).mean())
+        overlap = None
+        if rays.mask is not None:
+            inside, solid = rays.mask[index] >= 128, opacity >= 0.5
+            overlap = float((inside & solid).sum() / (inside | solid).sum().clamp_min(1))
+        return Compared(-10 * math.log10(max(error, 1e-10)), overlap, self._picture(number, index, rgb))
+
+    def _picture(self, number: int, index: Tensor, rgb: Tensor) -> np.ndarray:
+        width, height = (int(side) for side in self.rays.sizes[number])
+        picture = np.full((height, width, 3), EMPTY)
+        column, row = self.rays.pixel[index].cpu().numpy().T
+        picture[row, column] = rgb.cpu().numpy()
+        return (255 * picture.clip(0, 1) + 0.5).astype(np.uint8)
+
+
+def score(held: HeldOut, out: Path, on_progress: Progress = quiet) -> dict:
+    """PSNR (and, with masks, overlap of silhouettes) of the held-out views; writes the renders to `out`/held_out.
+
+    Args:
+        held: the views.
+        out: folder of the stage.
+
+    Returns:
+        For the report; empty where no view shows anything of the unit sphere.
+    """
+    if not held.shown:
+        return {}
+    (out / FOLDER).mkdir(exist_ok=True)
+    found = []
+    for count, number in enumerate(held.shown, 1):
+        found.append(held.compare(number))
+        Image.fromarray(found[-1].picture).save(out / FOLDER / held.views[number].name, quality=92)
+        on_progress(count / len(held.shown), f"held-out view {count} of {len(held.shown)}")
+    psnr = [one.psnr for one in found]
+    report = {
+        "held_out_photos": [held.views[number].source for number in held.shown],
+        "psnr": round(float(np.mean(psnr)), 2), "psnr_each": [round(value, 2) for value in psnr],
+    }  # fmt: skip
+    if held.masked:
+        overlaps = [one.overlap for one in found if one.overlap is not None]
+        report["silhouette_overlap"] = round(float(np.mean(overlaps)), 4)
+    return report

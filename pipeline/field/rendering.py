@@ -1,0 +1,301 @@
+"""Volume rendering: where along rays the field is asked, and the colour that comes out.
+
+The grids choose samples from a cached SDF; the MLP bounds the error of the opacity as VolSDF does (sections 3.3, 3.4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from pipeline.field.grid_field import BACKGROUND_SAMPLES, Field, laplace_density, render_weights
+from pipeline.field.interpolation import interpolate
+
+EPSILON = 0.1  # of opacity
+START = 128  # samples of every ray at first, and added to those that need more
+ROUNDS, BISECTIONS = 5, 10
+
+
+@torch.no_grad()
+def sdf_cache(field: Field, resolution: int, coarse: int = 4) -> Tensor:
+    """The SDF on a grid [n, n, n, 1] over [-1, 1]^3 (z, y, x order), from which samples along rays are chosen.
+
+    Every `coarse`-th value is the field's, the others only in blocks that the surface may cross; elsewhere, in empty
+    space and deep inside, they are interpolated.
+
+    Args:
+        field: the field.
+        resolution: n, a multiple of `coarse` plus 1.
+        coarse: see above.
+    """
+    device = field.background.device
+    line = torch.linspace(-1, 1, resolution, device=device)
+
+    def values(points: Tensor) -> Tensor:
+        return torch.cat([field.sdf(part) for part in points.split(1 << 16)])
+
+    knots = torch.stack(torch.meshgrid(*[line[::coarse]] * 3, indexing="ij"), -1)
+    rough = values(knots.view(-1, 3).flip(1)).view(1, 1, *knots.shape[:3])
+    cache = functional.interpolate(rough, size=(resolution,) * 3, mode="trilinear", align_corners=True)[0, 0]
+    low, high = -functional.max_pool3d(-rough, 2, 1), functional.max_pool3d(rough, 2, 1)
+    reach = 3**0.5 * coarse * float(line[1] - line[0])
+    block = torch.nonzero((low < reach) & (high > -reach))[:, 2:] * coarse
+    step = torch.stack(torch.meshgrid(*[torch.arange(coarse + 1, device=device)] * 3, indexing="ij"), -1).view(-1, 3)
+    near = torch.zeros_like(cache, dtype=torch.bool)
+    index = (block[:, None] + step).reshape(-1, 3)
+    near[index[:, 0], index[:, 1], index[:, 2]] = True
+    index = torch.nonzero(near)
+    cache[index[:, 0], index[:, 1], index[:, 2]] = values(line[index].flip(1))
+    return cache[..., None]
+
+
+def sphere_interval(origins: Tensor, directions: Tensor, near: float = 0.02) -> tuple[Tensor, Tensor]:
+    """Distances [R] at which rays enter and leave the unit sphere (equal where they miss it)."""
+    along = -(origins * directions).sum(1)
+    closest = (origins * origins).sum(1) - along**2
+    half = torch.sqrt((1 - closest).clamp_min(0))
+    enter = (along - half).clamp_min(near)
+    return enter, torch.maximum(along + half, enter)
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Where the field is asked along some rays.
+
+    Attributes:
+        distance: [R, S] from the camera, in order, normalised units.
+        delta: [R, S] length of each sample's interval.
+        points: [R, S, 3].
+        directions: [R, 3] unit.
+        near_surface: [R, S] whether it was drawn by importance.
+    """
+
+    distance: Tensor
+    delta: Tensor
+    points: Tensor
+    directions: Tensor
+    near_surface: Tensor
+
+
+@torch.no_grad()
+def choose_samples(
+    cache: Tensor, origins: Tensor, directions: Tensor, beta: float, uniforms: Tensor, *, bins: int = 96, plain: int = 8
+) -> Samples:
+    """Distances of the samples along each ray: some evenly spread, most where the cached SDF has its surface.
+
+    Args:
+        cache: from `sdf_cache`.
+        origins: [R, 3].
+        directions: [R, 3] unit.
+        beta: of the density, normalised units.
+        uniforms: [R, S] random in 0..1, S = number of samples.
+        bins: even steps at which the cache is read.
+        plain: how many of the S samples are evenly spread.
+    """
+    enter, leave = sphere_interval(origins, directions)
+    length = (leave - enter)[:, None]
+    steps = (torch.arange(bins, device=cache.device) + 0.5) / bins
+    points = origins[:, None] + (enter[:, None] + length * steps)[..., None] * directions[:, None]
+    sdf = interpolate(cache, points.view(-1, 3)).view(len(origins), bins)
+    # The cache knows the surface only to a fraction of its cell: no narrower than that.
+    broad = max(beta, 0.6 / cache.shape[0])
+    weights, _ = render_weights(laplace_density(sdf, broad), (length / bins).expand(-1, bins))
+    count = uniforms.shape[1] - plain
+    edges = torch.linspace(0, 1, bins + 1, device=cache.device).expand(len(origins), -1)
+    importance = draw(edges, weights + 9e-5, uniforms[:, :count])
+    even = (torch.arange(plain, device=cache.device) + uniforms[:, count:]) / plain
+    position, order = torch.cat([importance, even], 1).sort(1)
+    return samples_at(enter[:, None] + length * position, enter, leave, origins, directions, order < count)
+
+
+def samples_at(distance: Tensor, enter: Tensor, leave: Tensor, origins: Tensor, directions: Tensor,
+               near_surface: Tensor) -> Samples:  # fmt: skip
+    """Samples at distances [R, S], in order, along rays that enter and leave the sphere at distances [R]."""
+    edge = torch.cat([enter[:, None], (distance[:, 1:] + distance[:, :-1]) / 2, leave[:, None]], 1)
+    points = origins[:, None] + distance[..., None] * directions[:, None]
+    return Samples(distance, edge[:, 1:] - edge[:, :-1], points, directions, near_surface)
+
+
+def composite(
+    field: Field, samples: Samples, geometry: tuple[Tensor, Tensor, Tensor], beta: float | Tensor, behind: Tensor
+) -> dict[str, Tensor]:
+    """Renders rays from the field's values at their samples.
+
+    Args:
+        field: the field.
+        samples: of the rays.
+        geometry: what `field.geometry_at` gave at `samples.points`.
+        beta: of the density.
+        behind: [R, 3] or [3] colour behind the unit sphere.
+
+    Returns:
+        `rgb` [R, 3], `opacity` [R] inside the sphere, `depth` [R].
+    """
+    sdf, features, grid = geometry
+    shape = samples.distance.shape
+    weights, left = render_weights(laplace_density(sdf, beta).view(shape), samples.delta)
+    # Colour costs as much as the SDF, and most samples carry no weight.
+    chosen = torch.nonzero(weights.detach().view(-1) > 5e-4)[:, 0]
+    seen_along = samples.directions[:, None].expand(*shape, 3).reshape(-1, 3)[chosen]
+    color = torch.zeros(sdf.shape[0], 3, device=sdf.device).index_put(
+        (chosen,), field.color_of(features[chosen], grid[chosen], seen_along)
+    )
+    rgb = (weights[..., None] * color.view(*shape, 3)).sum(1)
+    return {
+        "rgb": rgb + left[:, None] * behind,
+        "opacity": 1 - left,
+        "depth": (weights * samples.distance).sum(1),
+    }
+
+
+@torch.no_grad()
+def render(
+    field: Field, cache: Tensor, origins: Tensor, directions: Tensor, beta: float, *,
+    samples: int = 32, backdrop: Tensor | None = None,
+) -> dict[str, Tensor]:  # fmt: skip
+    """Renders rays for looking at, without gradients and the same every time.
+
+    Args:
+        field: the field.
+        cache: from `sdf_cache`.
+        origins: [R, 3] normalised units.
+        directions: [R, 3] unit.
+        beta: of the density.
+        samples: along each ray inside the sphere.
+        backdrop: [3] a constant colour in place of the background model.
+
+    Returns:
+        See `composite`.
+    """
+    middle = torch.full((len(origins), samples), 0.5, device=origins.device)
+    chosen = choose_samples(cache, origins, directions, beta, middle)
+    behind = backdrop
+    if behind is None:
+        behind = field.background_along(origins, directions, middle[:, :BACKGROUND_SAMPLES])
+    return composite(field, chosen, field.geometry_at(chosen.points.view(-1, 3)), beta, behind)
+
+
+def nearest(sdf: Tensor, delta: Tensor) -> Tensor:
+    """A lower bound [R, S - 1] of the distance to the surface within each interval of a ray (eq. 13, figure 5).
+
+    The balls around both ends hold no surface; what is left of the interval may come as near as the corner where the
+    balls meet, and where they do not meet, anything may lie between.
+
+    Args:
+        sdf: [R, S] at the samples.
+        delta: [R, S - 1] lengths of the intervals.
+    """
+    a, b = sdf[:, :-1].abs(), sdf[:, 1:].abs()
+    half = (a + b + delta) / 2
+    area = (half * (half - a) * (half - b) * (half - delta)).clamp_min(0)
+    height = 2 * area.sqrt() / delta.clamp_min(1e-12)
+    obtuse = (a**2 - b**2).abs() >= delta**2
+    bound = torch.where(obtuse, torch.minimum(a, b), height)
+    apart = (a + b <= delta) | (sdf[:, :-1].sign() * sdf[:, 1:].sign() <= 0)
+    return torch.where(apart, torch.zeros_like(bound), bound)
+
+
+def opacity_bound(distance: Tensor, sdf: Tensor, beta: Tensor) -> tuple[Tensor, Tensor]:
+    """Bound of the error of the opacity by the rectangle rule, for each interval [R, S - 1] (theorem 1, eq. 12, 14).
+
+    Args:
+        distance: [R, S] of the samples, in order.
+        sdf: [R, S] there.
+        beta: [R, 1] of the density, alpha = 1 / beta.
+
+    Returns:
+        The bound, and the optical depth [R, S - 1] in front of each interval.
+    """
+    delta = distance[:, 1:] - distance[:, :-1]
+    density = laplace_density(sdf[:, :-1], beta)
+    before = torch.cumsum(density * delta, 1) - density * delta
+    error = torch.cumsum(delta**2 * torch.exp(-nearest(sdf, delta) / beta), 1) / (4 * beta**2)
+    return torch.exp(-before) * torch.expm1(error.clamp_max(30.0)), before
+
+
+def worst(distance: Tensor, sdf: Tensor, beta: Tensor) -> Tensor:
+    """The largest bound [R, 1] along each ray."""
+    return opacity_bound(distance, sdf, beta)[0].amax(1, keepdim=True)
+
+
+def _smallest_beta(distance: Tensor, sdf: Tensor, beta: Tensor, safe: Tensor) -> Tensor:
+    """The smallest beta+ [R, 1] between `beta` and `safe` whose bound is below `EPSILON`, by bisection."""
+    low, high = beta.expand_as(safe).clone(), safe.clone()
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        good = worst(distance, sdf, middle) <= EPSILON
+        high, low = torch.where(good, middle, high), torch.where(good, low, middle)
+    return high
+
+
+def draw(distance: Tensor, weights: Tensor, uniforms: Tensor) -> Tensor:
+    """Distances [R, M], in order, drawn from a density that is constant between samples [R, S].
+
+    Args:
+        distance: [R, S].
+        weights: [R, S - 1] of the intervals, not negative.
+        uniforms: [R, M] in 0..1.
+    """
+    weights = weights + 1e-5
+    cumulative = torch.cumsum(weights / weights.sum(1, keepdim=True), 1)
+    count = uniforms.shape[1]
+    wanted = (torch.arange(count, device=distance.device) + uniforms) / count * 0.9999
+    index = torch.searchsorted(cumulative, wanted.contiguous()).clamp_max(weights.shape[1] - 1)
+    before = torch.where(index > 0, cumulative.gather(1, (index - 1).clamp_min(0)), torch.zeros_like(wanted))
+    inside = ((wanted - before) / (cumulative.gather(1, index) - before).clamp_min(1e-9)).clamp(0, 1)
+    left, right = distance.gather(1, index), distance.gather(1, index + 1)
+    return (left + inside * (right - left)).sort(1).values
+
+
+@torch.no_grad()
+def bounded_samples(
+    sdf_at: Callable[[Tensor, Tensor], Tensor], enter: Tensor, leave: Tensor, beta: Tensor, uniforms: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Samples along rays by algorithm 1.
+
+    Args:
+        sdf_at: SDF [A, S] at distances [A, S] along the rays with indices [A].
+        enter: [R] distance at which each ray enters the trained space.
+        leave: [R] and leaves it.
+        beta: scalar, of the density.
+        uniforms: [R, M] in 0..1.
+
+    Returns:
+        Distances [R, M] in order, drawn by opacity, and whether each ray's error is below `EPSILON` [R].
+    """
+    count = len(enter)
+    steps = torch.linspace(0, 1, START, device=enter.device, dtype=enter.dtype)
+    distance = enter[:, None] + (leave - enter)[:, None] * steps
+    chosen = torch.empty_like(uniforms)
+    converged = torch.zeros(count, dtype=torch.bool, device=enter.device)
+    active = torch.arange(count, device=enter.device)
+    sdf = sdf_at(active, distance)
+    beta = beta.detach().reshape(1, 1).to(enter.dtype)
+    # Lemma 2: with this beta+ the first samples suffice.
+    length = (leave - enter)[:, None]
+    safe = (length**2 / (4 * (START - 1) * torch.log(torch.tensor(1 + EPSILON)))).sqrt().clamp_min(float(beta))
+    for number in range(ROUNDS + 1):
+        good = worst(distance, sdf, beta)[:, 0] <= EPSILON
+        last = number == ROUNDS
+        use = torch.where(good[:, None], beta, _smallest_beta(distance, sdf, beta, safe))
+        done = good | last
+        if done.any():
+            before = opacity_bound(distance[done], sdf[done], use[done])[1]
+            delta = distance[done, 1:] - distance[done, :-1]
+            weights = torch.exp(-before) * -torch.expm1(-laplace_density(sdf[done, :-1], use[done]) * delta)
+            chosen[active[done]] = draw(distance[done], weights, uniforms[active[done]])
+            converged[active[done]] = good[done]
+        if done.all():
+            break
+        active, distance, sdf, safe = active[~done], distance[~done], sdf[~done], use[~done]
+        # More samples where the bound is large.
+        bound, _ = opacity_bound(distance, sdf, safe)
+        middle = torch.full((len(active), START), 0.5, device=enter.device, dtype=enter.dtype)
+        added = draw(distance, bound, middle)
+        distance, order = torch.cat([distance, added], 1).sort(1)
+        sdf = torch.cat([sdf, sdf_at(active, added)], 1).gather(1, order)
+    return chosen, converged

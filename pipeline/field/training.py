@@ -1,0 +1,511 @@
+"""Trains a field on posed photos: presets and schedules, the losses of a step, checkpoints, and the trained field."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import safetensors.torch
+import torch
+from safetensors import SafetensorError, safe_open
+from torch import Tensor
+
+from pipeline.cameras import Similarity, Sparse, View
+from pipeline.field.grid_field import Field, FieldSize, GridField, differences, level_step, stencil
+from pipeline.field.held_out import HeldOut, score
+from pipeline.field.mlp_field import MlpField, MlpSize
+from pipeline.field.rays import Rays, held_out, load_rays
+from pipeline.field.rendering import (
+    BACKGROUND_SAMPLES,
+    Samples,
+    bounded_samples,
+    choose_samples,
+    composite,
+    samples_at,
+    sdf_cache,
+    sphere_interval,
+)
+from pipeline.inputs.images import BACKDROP
+from pipeline.inputs.photos import load_photos
+from pipeline.progress import Progress, quiet, share_of
+from pipeline.sfm.supervision import FreeSpace, Supervision, supervision_of, unit_sphere_of
+from sdfsim.errors import SdfsimError
+from sdfsim.files import replacing, write_json
+from sdfsim.parallel import choose_threads
+
+# Steps between updates of the cached SDF, fewer at first; a multiple, so that both fall on the same steps.
+EARLY, EARLY_PERIOD, PERIOD = 288, 16, 48
+CACHE = 129  # samples a side of the cached SDF; what is thinner than its cells is found by luck only
+HOLLOWS = 0.25  # of the training is done before filled free space is looked for
+BACKGROUND_RATE = 0.02  # of the background's grid beside the MLP
+FEWEST_STEPS = 100  # with however small a budget
+PACE = 25  # steps between looks at the clock
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a field is trained. Lengths are in normalised units (the scene is the unit sphere).
+
+    Attributes:
+        size: resolutions of the grids, or of the MLP of the VolSDF paper.
+        start_radius: radius of the ball that training starts from. Small, because what is solid at first has to be
+            carved away, and shadowed parts hardly are.
+        iterations: steps of Adam.
+        rays: a step.
+        samples: along a ray inside the sphere.
+        long_side: of the photos used, px.
+        beta: density scale at the start and at the end.
+        rate: Adam's rate for the grids at the start (the networks use a quarter of it).
+        eikonal: weight of (|grad| - 1)^2.
+        curvature: weight of |Laplacian| at the start, in units of the finest active cell.
+        sparse: weight of |sdf| at the points of structure-from-motion.
+        free: weight of what is solid between a camera and a point that it sees.
+        mask: weight of the opacity loss where photos have masks.
+        surface_points: points of the eikonal loss.
+    """
+
+    size: FieldSize | MlpSize = FieldSize()  # noqa: RUF009  frozen
+    start_radius: float = 0.25
+    iterations: int = 4000
+    rays: int = 512
+    samples: int = 32
+    long_side: int = 480
+    beta: tuple[float, float] = (0.1, 0.004)
+    rate: float = 0.02
+    eikonal: float = 0.1
+    curvature: float = 0.01
+    sparse: float = 0.3
+    free: float = 1.0
+    mask: float = 0.3
+    surface_points: int = 512
+
+
+PRESETS = {
+    "quick": Settings(),
+    "standard": Settings(iterations=7500, rays=768, samples=40, long_side=800, beta=(0.1, 0.0025)),
+    "fine": Settings(
+        size=FieldSize((16, 32, 64, 128, 224), (4, 4, 4, 4, 2), 64, 96),
+        iterations=20000, rays=1024, samples=48, long_side=1280, beta=(0.1, 0.0015),
+    ),
+    # The paper's (section 4, appendix B): L1 colour, eikonal 0.1, Adam 5e-4, 1024 rays of 64 samples. Its beta is
+    # learned; sparse points, which the paper did without, get little weight.
+    "paper": Settings(
+        size=MlpSize(), iterations=100_000, rays=1024, samples=64, long_side=1600, rate=5e-4, eikonal=0.1,
+        curvature=0.0, sparse=0.1, free=0.0, surface_points=2048,
+    ),
+}  # fmt: skip
+
+
+def beta_at(settings: Settings, fraction: float) -> float:
+    """Density scale: falls geometrically over the first 85 % of training, then stays."""
+    start, end = settings.beta
+    return start * (end / start) ** min(1.0, fraction / 0.85)
+
+
+def active_levels(size: FieldSize, fraction: float) -> int:
+    """Grid levels in use: two at first, the others one after the other until 45 % of training."""
+    extra = len(size.levels) - 2
+    return 2 + min(extra, int(extra * fraction / 0.45 + 0.4)) if extra > 0 else len(size.levels)
+
+
+class Trainer:
+    """One training run of the grids.
+
+    Args:
+        settings: how.
+        rays: pixels, in the space of the unit sphere.
+        supervision: sparse points and lines of sight in the same space.
+        seed: of everything random.
+        device: where to compute.
+    """
+
+    def __init__(self, settings: Settings, rays: Rays, supervision: Supervision, seed: int, device: str = "cpu"):
+        self.settings, self.rays, self.seed, self.device = settings, rays.to(device), seed, device
+        self.points, self.point_weights = (
+            torch.tensor(values, dtype=torch.float32, device=device)
+            for values in (supervision.points, supervision.weights)
+        )
+        self.free = FreeSpace(supervision.sight if settings.free else supervision.sight[:0], device)
+        self.field, self.optimizer = self.fresh()
+        self.iteration = 0
+        self.iterations = settings.iterations
+        self.seconds = 0.0
+        self.cache: Tensor | None = None
+
+    def fresh(self) -> tuple[Field, torch.optim.Adam]:
+        """A field that nothing was learned by yet, and its optimiser."""
+        settings = self.settings
+        assert isinstance(settings.size, FieldSize)
+        field = GridField(settings.size, self.seed, settings.start_radius).to(self.device)
+        networks = [p for name, p in field.named_parameters() if not name.startswith(("grids", "background"))]
+        groups = _groups(([*field.grids, field.background], settings.rate), (networks, settings.rate / 4))
+        return field, torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12, fused=True)
+
+    @property
+    def fraction(self) -> float:
+        """Share of the training that is done."""
+        return self.iteration / self.iterations
+
+    @property
+    def beta(self) -> float:
+        """Scale of the density now, normalised units."""
+        return beta_at(self.settings, self.fraction)
+
+    def density_scale(self) -> float | Tensor:
+        """The same, with a gradient where it is learned."""
+        return self.beta
+
+    def rate_factor(self) -> float:
+        """Factor of the learning rates: short warm-up, then cosine down to 3 %."""
+        warm = min(1.0, self.fraction / 0.02)
+        return max(0.05, warm) * (0.03 + 0.97 * 0.5 * (1 + math.cos(math.pi * self.fraction)))
+
+    @property
+    def period(self) -> int:
+        """Steps between updates of the cache; of the iteration alone, so that a resumed run does the same."""
+        return EARLY_PERIOD if self.iteration < EARLY else PERIOD
+
+    def refresh(self) -> None:
+        """Brings the cached SDF and the active levels up to date."""
+        assert isinstance(self.settings.size, FieldSize)
+        self.field.active = active_levels(self.settings.size, self.fraction)
+        # Colour does not change with direction at first, or a wrong surface is painted right.
+        self.field.view_dependence = min(1.0, max(0.0, (self.fraction - 0.4) / 0.3))
+        self.cache = sdf_cache(self.field, CACHE)
+        self.find_filled()
+
+    def find_filled(self) -> None:
+        """Finds free space that the cached SDF fills, once the field is fine enough to have room for a hollow."""
+        # A function of the step at which the cache was made, so that a resumed run finds the same.
+        made = self.iteration - self.iteration % self.period
+        if self.cache is not None and made > HOLLOWS * self.iterations and len(self.free):
+            self.free.look(self.cache, torch.Generator().manual_seed((self.seed + 11) * 1_000_003 + made))
+
+    def sample(self, origins: Tensor, directions: Tensor, uniforms: Tensor) -> Samples:
+        """Samples [R, S] along rays [R, 3], for as many uniforms [R, S]."""
+        if self.cache is None or self.iteration % self.period == 0:
+            self.refresh()
+        assert self.cache is not None
+        return choose_samples(self.cache, origins, directions, self.beta, uniforms)
+
+    def slope_queries(self, points: Tensor) -> Tensor:
+        """Where the field has to be asked [Q, 3] for its slopes at points [P, 3]."""
+        return stencil(points, self._cell()).view(-1, 3)
+
+    def slope_losses(self, sdf: Tensor, more: Tensor) -> dict[str, Tensor]:
+        """Losses of gradient and curvature from what the field gave at `slope_queries`."""
+        width = self._cell()
+        gradient, laplacian = differences(sdf.view(-1, 7), width)
+        fade = self.settings.curvature * max(0.03, 1 - self.fraction / 0.7)
+        return {
+            "eikonal": ((gradient.norm(dim=1) - 1) ** 2).mean() * self.settings.eikonal,
+            "curvature": (laplacian.abs() * width).clamp_max(10).mean() * fade,
+        }
+
+    def _cell(self) -> float:
+        assert isinstance(self.settings.size, FieldSize)
+        return level_step(self.settings.size.levels, self.field.active)
+
+    def step(self) -> dict[str, float]:
+        """One step of Adam; returns the losses."""
+        settings, field = self.settings, self.field
+        rng = torch.Generator().manual_seed((self.seed + 7) * 1_000_003 + self.iteration)
+        index = self.rays.batch(settings.rays, self.seed, self.iteration)
+        origins, directions = self.rays.at(index)
+        truth = self.rays.rgb[index].float() / 255
+        uniforms = torch.rand(settings.rays, settings.samples + BACKGROUND_SAMPLES, generator=rng).to(self.device)
+        samples = self.sample(origins, directions, uniforms[:, : settings.samples])
+        behind = torch.full((3,), BACKDROP, device=self.device)
+        if self.rays.mask is None:
+            behind = field.background_along(origins, directions, uniforms[:, settings.samples :])
+        slopes = self.slope_queries(self.regularised(samples, rng))
+        pick = torch.randint(max(1, len(self.points)), (min(256, len(self.points)),), generator=rng).to(self.device)
+        empty, clearance = self.free.pick(512, rng)
+        # One query for all: each would otherwise fill a gradient buffer as large as the grids.
+        parts = [samples.points.view(-1, 3), slopes, self.points[pick], empty]
+        sdf, geometry, more = (
+            values.split([len(part) for part in parts]) for values in field.geometry_at(torch.cat(parts))
+        )
+        out = composite(field, samples, (sdf[0], geometry[0], more[0]), self.density_scale(), behind)
+        losses = {"color": (out["rgb"] - truth).abs().mean()}
+        if self.rays.mask is not None:
+            wanted = self.rays.mask[index].float() / 255
+            opacity = out["opacity"].clamp(1e-4, 1 - 1e-4)
+            losses["mask"] = torch.nn.functional.binary_cross_entropy(opacity, wanted) * settings.mask
+        losses |= self.slope_losses(sdf[1], more[1])
+        if len(pick):
+            # Robust: a wrong point must not pull a surface out of nothing.
+            pull = self.point_weights[pick] * sdf[2].abs().clamp_max(0.1)
+            losses["sparse"] = pull.mean() * settings.sparse
+        if len(empty):
+            losses["free"] = torch.relu(clearance - sdf[3]).mean() * settings.free
+        self.optimizer.zero_grad(set_to_none=True)
+        torch.stack(list(losses.values())).sum().backward()
+        for group in self.optimizer.param_groups:
+            group["lr"] = group["base"] * self.rate_factor()
+        self.optimizer.step()
+        self.iteration += 1
+        return {name: float(value.detach()) for name, value in losses.items()}
+
+    def regularised(self, samples: Samples, rng: torch.Generator) -> Tensor:
+        """Points [P, 3] of the sphere for the eikonal and curvature losses, half of them near the surface."""
+        count = self.settings.surface_points // 2
+        free = torch.randn(count, 3, generator=rng)
+        radius = torch.rand(count, 1, generator=rng) ** (1 / 3)
+        free = (free / free.norm(dim=1, keepdim=True) * radius).to(self.device)
+        near = samples.points[samples.near_surface]
+        return torch.cat([free, near[torch.randint(len(near), (count,), generator=rng).to(self.device)]])
+
+    def save(self, path: Path) -> None:
+        """Writes everything needed to go on, atomically."""
+        tensors = {f"field.{k}": v.detach().contiguous() for k, v in self.field.state_dict().items()}
+        for number, parameter in enumerate(self._parameters()):
+            for key, value in self.optimizer.state.get(parameter, {}).items():
+                tensors[f"adam.{number}.{key}"] = torch.as_tensor(value).detach().contiguous()
+        if self.cache is not None:
+            tensors["cache"] = self.cache
+        about = {
+            "iteration": self.iteration, "iterations": self.iterations, "seconds": self.seconds,
+            "active": self.field.active, "view_dependence": self.field.view_dependence,
+            "size": self.settings.size.to_dict(),
+        }  # fmt: skip
+        # As bytes: safetensors' own writer does not raise OSError where the disk is full.
+        with replacing(path) as partial:
+            partial.write_bytes(safetensors.torch.save(tensors, metadata={"about": json.dumps(about)}))
+
+    def load(self, path: Path) -> bool:
+        """Goes on from a checkpoint; False where there is none that fits."""
+        try:
+            with safe_open(str(path), "pt") as file:
+                about = json.loads(file.metadata()["about"])
+                if about["size"] != json.loads(json.dumps(self.settings.size.to_dict())):
+                    return False
+                tensors = {key: file.get_tensor(key).to(self.device) for key in file.keys()}
+        except (OSError, SafetensorError, KeyError, TypeError, ValueError):
+            return False
+        self.field.load_state_dict({k[6:]: v for k, v in tensors.items() if k.startswith("field.")})
+        for number, parameter in enumerate(self._parameters()):
+            names = [k for k in tensors if k.startswith(f"adam.{number}.")]
+            if names:
+                self.optimizer.state[parameter] = {k.split(".")[2]: tensors[k] for k in names}
+        self.iteration, self.iterations = about["iteration"], about["iterations"]
+        self.seconds, self.field.active = about["seconds"], about["active"]
+        self.field.view_dependence = about["view_dependence"]
+        self.cache = tensors.get("cache")
+        self.find_filled()
+        return True
+
+    def _parameters(self) -> list[torch.nn.Parameter]:
+        """The optimiser's parameters in a fixed order."""
+        return [p for group in self.optimizer.param_groups for p in group["params"]]
+
+
+class MlpTrainer(Trainer):
+    """One training run of the VolSDF paper's field: error-bounded samples, learned beta; arguments as of `Trainer`."""
+
+    field: MlpField
+    converged = 0.0  # share of the last step's rays whose opacity is bounded
+
+    def fresh(self) -> tuple[Field, torch.optim.Adam]:
+        """A field that is a sphere, and its optimiser."""
+        settings = self.settings
+        assert isinstance(settings.size, MlpSize)
+        field = MlpField(settings.size, self.seed, settings.start_radius).to(self.device)
+        networks = [p for name, p in field.named_parameters() if name != "background"]
+        groups = _groups((networks, settings.rate), ([field.background], BACKGROUND_RATE))
+        return field, torch.optim.Adam(groups)
+
+    @property
+    def beta(self) -> float:
+        """Learned scale of the density, normalised units."""
+        return float(self.field.beta.detach())
+
+    def density_scale(self) -> Tensor:
+        """The same, with its gradient."""
+        return self.field.beta
+
+    def rate_factor(self) -> float:
+        """Factor of the learning rates: down to a tenth."""
+        return 0.1**self.fraction
+
+    def refresh(self) -> None:
+        """Brings the cached SDF up to date, from which only pictures are made."""
+        self.cache = sdf_cache(self.field, CACHE)
+
+    def sample(self, origins: Tensor, directions: Tensor, uniforms: Tensor) -> Samples:
+        """Samples [R, S] that bound the error of the opacity, for as many uniforms [R, S]."""
+        enter, leave = sphere_interval(origins, directions)
+
+        def sdf_at(rays: Tensor, distance: Tensor) -> Tensor:
+            points = origins[rays, None] + distance[..., None] * directions[rays, None]
+            return torch.cat([self.field.sdf(part) for part in points.view(-1, 3).split(1 << 18)]).view(distance.shape)
+
+        distance, converged = bounded_samples(sdf_at, enter, leave, self.field.beta, uniforms)
+        self.converged = float(converged.float().mean())
+        near = torch.ones_like(distance, dtype=torch.bool)
+        return samples_at(distance, enter, leave, origins, directions, near)
+
+    def slope_queries(self, points: Tensor) -> Tensor:
+        """The points themselves: the network hands on its own gradient."""
+        return points
+
+    def slope_losses(self, sdf: Tensor, more: Tensor) -> dict[str, Tensor]:
+        """The loss of the gradient."""
+        return {"eikonal": ((more[:, 3:].norm(dim=1) - 1) ** 2).mean() * self.settings.eikonal}
+
+
+def _groups(*groups: tuple[list, float]) -> list[dict]:
+    """Adam's groups of parameters, each with its full rate."""
+    return [{"params": parameters, "lr": rate, "base": rate} for parameters, rate in groups]
+
+
+@dataclass
+class Trained:
+    """A trained field, its density scale, the way from the world of the poses to its unit sphere, and its report."""
+
+    field: Field
+    beta: float
+    to_unit: Similarity
+    report: dict
+
+
+def train(
+    views: list[View], sparse: Sparse, photos_folder: Path, out: Path, *, settings: Settings,
+    budget: float | None = None, seed: int = 0, device: str = "cpu", threads: int | None = None,
+    checkpoint_every: float = 20.0, on_progress: Progress = quiet,
+) -> Trained:  # fmt: skip
+    """Trains a field and writes `field.safetensors` and `field.json` to `out`; resumes from `checkpoint.safetensors`.
+
+    Args:
+        views: posed cameras in the world of the poses.
+        sparse: points in the same world.
+        photos_folder: of the photos stage.
+        out: existing folder.
+        settings: see `PRESETS`.
+        budget: s of training, those before a kill included; the number of steps is cut to what fits, measured after
+            the first steps.
+        seed: of everything random.
+        device: where to compute.
+        threads: of the CPU; None takes what is fastest now (a second thread only slows things down where another
+            program uses the core).
+        checkpoint_every: s.
+
+    Raises:
+        SdfsimError: the loss is no longer finite.
+    """
+    out = Path(out)
+    masked = all(photo.mask for photo in load_photos(photos_folder))
+    to_unit = unit_sphere_of(views, sparse, masked=masked)
+    local = [to_unit.view(view) for view in views]
+    test = held_out(len(views))
+    training = [v for i, v in enumerate(local) if i not in test]
+    rays = load_rays(training, photos_folder, settings.long_side, masks=masked)
+    supervision = supervision_of(sparse, local, to_unit)
+    make = MlpTrainer if isinstance(settings.size, MlpSize) else Trainer
+    trainer = make(settings, rays, supervision, seed, device)
+    checkpoint = out / "checkpoint.safetensors"
+    resumed = trainer.load(checkpoint)
+    per_step = calibrate(make(settings, trainer.rays, supervision, seed, device), threads)
+    if budget is not None and not resumed:
+        trainer.iterations = min(settings.iterations, max(FEWEST_STEPS, int(budget / per_step)))
+    left = None if budget is None else budget - trainer.seconds
+    saved, started, first = time.monotonic(), time.monotonic(), trainer.iteration
+    before = trainer.seconds
+    smooth: dict[str, float] = {}
+    while trainer.iteration < trainer.iterations:
+        losses = trainer.step()
+        smooth = {k: 0.95 * smooth.get(k, v) + 0.05 * v for k, v in losses.items()}
+        if not all(math.isfinite(v) for v in losses.values()):
+            raise SdfsimError(
+                "distill: the loss is no longer finite",
+                "the poses may be wrong: look at them with `sdfsim poses`, or take more photos",
+            )
+        now = time.monotonic()
+        trainer.seconds = before + now - started
+        if left is not None and trainer.iteration % PACE == 0:
+            trainer.iterations = paced(trainer, settings, left, now - started, trainer.iteration - first)
+        if now - saved > checkpoint_every:
+            trainer.save(checkpoint)
+            saved = now
+        if trainer.iteration % 10 == 0:
+            on_progress(0.92 * trainer.fraction, f"step {trainer.iteration} of {trainer.iterations}, "
+                        f"colour error {smooth['color']:.4f}")  # fmt: skip
+    trainer.save(checkpoint)
+    trainer.refresh()
+    scores = {}
+    if test:
+        held = HeldOut([local[i] for i in test], photos_folder, trainer, masked=masked)
+        scores = score(held, out, share_of(on_progress, 0.92, 0.08))
+    report = {
+        "iterations": trainer.iterations, "rays": len(rays), "train_seconds": round(trainer.seconds, 1),
+        "seconds_before": round(before, 1), "resumed": resumed, "masked": masked, "beta": trainer.beta,
+        "threads": torch.get_num_threads(), "losses": {k: round(v, 5) for k, v in smooth.items()}, **scores,
+    }  # fmt: skip
+    trained = Trained(trainer.field.cpu(), trainer.beta, to_unit, report)
+    save_field(trained, out)
+    checkpoint.unlink(missing_ok=True)
+    return trained
+
+
+def calibrate(probe: Trainer, threads: int | None) -> float:
+    """Seconds a step, late in training; sets the number of threads to `threads`, or to the fastest."""
+    probe.iteration, probe.iterations = 9701, 10_000  # Late in training all levels are active.
+    probe.refresh()
+    return choose_threads(probe.step, threads if probe.device == "cpu" else torch.get_num_threads())
+
+
+def paced(trainer: Trainer, settings: Settings, budget: float, elapsed: float, done: int) -> int:
+    """Steps that fit into the time: the measured pace may be another than before training, when other work goes on.
+
+    Args:
+        trainer: in training.
+        settings: whose number of steps is never exceeded.
+        budget: s, for the steps of this run.
+        elapsed: s since it began.
+        done: steps since it began.
+    """
+    left = int((budget - elapsed) / (elapsed / done))
+    least = max(trainer.iteration, min(FEWEST_STEPS, settings.iterations))
+    if left <= 0:
+        return least
+    # Schedules follow the share that is done: they must not jump.
+    wanted = min(settings.iterations, trainer.iteration + left)
+    low, high = int(0.9 * trainer.iterations), int(1.1 * trainer.iterations)
+    return max(least, min(max(wanted, low), high))
+
+
+def save_field(trained: Trained, folder: Path) -> None:
+    """Writes `field.safetensors`, then `field.json`."""
+    field = trained.field
+    tensors = {k: v.detach().cpu().contiguous() for k, v in field.state_dict().items()}
+    with replacing(folder / "field.safetensors") as partial:
+        partial.write_bytes(safetensors.torch.save(tensors))
+    about = {
+        "version": 1, "size": field.size.to_dict(), "start_radius": field.start_radius, "beta": trained.beta,
+        "to_unit": trained.to_unit.to_dict(), "report": trained.report,
+    }  # fmt: skip
+    write_json(folder / "field.json", about)
+
+
+def load_field(folder: Path) -> Trained:
+    """Reads what `train` wrote.
+
+    Raises:
+        SdfsimError: no readable field in `folder`.
+    """
+    try:
+        about = json.loads((Path(folder) / "field.json").read_text(encoding="utf-8"))
+        size, radius = about["size"], float(about["start_radius"])
+        if "levels" in size:
+            size = replace(FieldSize(**size), levels=tuple(size["levels"]), channels=tuple(size["channels"]))
+            field: Field = GridField(size, start_radius=radius)
+        else:
+            field = MlpField(MlpSize(**size), start_radius=radius)
+        with safe_open(str(Path(folder) / "field.safetensors"), "pt") as file:
+            field.load_state_dict({key: file.get_tensor(key) for key in file.keys()})
+        return Trained(field, float(about["beta"]), Similarity.from_dict(about["to_unit"]), about["report"])
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise SdfsimError(f"{folder}: no trained field", "run the distill stage first") from error

@@ -1,0 +1,270 @@
+"""Cameras that others have found: transforms.json (NeRF, instant-ngp, nerfstudio) and COLMAP models, text or binary."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.cameras import View
+from pipeline.inputs.images import Picture
+from sdfsim.errors import SdfsimError
+
+LENSES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE")  # camera models of a transforms.json
+# COLMAP's camera models, by number: name, and the names of their parameters. Models whose lens is not one that a
+# pinhole photo can be made of by OpenCV's two formulas are refused by name.
+MODELS = {
+    0: ("SIMPLE_PINHOLE", "f cx cy"), 1: ("PINHOLE", "fx fy cx cy"), 2: ("SIMPLE_RADIAL", "f cx cy k1"),
+    3: ("RADIAL", "f cx cy k1 k2"), 4: ("OPENCV", "fx fy cx cy k1 k2 p1 p2"),
+    5: ("OPENCV_FISHEYE", "fx fy cx cy k1 k2 k3 k4"), 6: ("FULL_OPENCV", "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
+    7: ("FOV", ""), 8: ("SIMPLE_RADIAL_FISHEYE", "f cx cy k1"), 9: ("RADIAL_FISHEYE", "f cx cy k1 k2"),
+    10: ("THIN_PRISM_FISHEYE", ""),
+}  # fmt: skip
+SQUARE = 1e-3  # pixels that differ from squares by less are squares
+# OpenCV counts pixel centres from 0.
+CENTRE = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+
+
+@dataclass(frozen=True)
+class KnownCamera:
+    """A camera that was found elsewhere.
+
+    Attributes:
+        name: of its photo, as the file says it.
+        width: px of the photo that the intrinsics are for.
+        height: px.
+        matrix: [3, 3] intrinsics, pixel centres at +0.5.
+        distortion: OpenCV's coefficients (k1, k2, p1, p2, k3, ...), or four of its fisheye model.
+        fisheye: which of the two.
+        rotation: [3, 3] world to camera; x right, y down, z forward.
+        translation: [3].
+        mask: file name of its mask, or None.
+    """
+
+    name: str
+    width: int
+    height: int
+    matrix: np.ndarray
+    distortion: tuple[float, ...]
+    fisheye: bool
+    rotation: np.ndarray
+    translation: np.ndarray
+    mask: str | None = None
+
+
+def read_cameras(path: Path) -> list[KnownCamera]:
+    """The cameras of a transforms.json or of a COLMAP model's folder, in the order of their names.
+
+    Raises:
+        SdfsimError: not such a file, damaged, or a lens that is not known.
+    """
+    read = read_model if path.is_dir() else read_transforms
+    try:
+        return sorted(read(path), key=lambda camera: camera.name)
+    except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, struct.error) as error:
+        raise SdfsimError(f"{path}: cannot be read as cameras: {error!r}", "write it again") from error
+
+
+def read_transforms(path: Path) -> list[KnownCamera]:
+    """Cameras of a transforms.json: camera-to-world matrices with OpenGL axes; intrinsics for all or in each frame."""
+    about = json.loads(path.read_text(encoding="utf-8"))
+    flip = np.diag([1.0, -1, -1])
+    found = []
+    _check_lens(about, str(path))
+    for frame in about["frames"]:
+        values = {**about, **frame}
+        where = f"{path}: {frame['file_path']}"
+        _check_lens(values, where)
+        fisheye = values.get("camera_model") == "OPENCV_FISHEYE" or bool(values.get("is_fisheye"))
+        width, height = int(values.get("w", 0)), int(values.get("h", 0))
+        if "fl_x" in values:
+            if width <= 0 or height <= 0:
+                raise SdfsimError(f"{where}: fl_x without w and h", "give the size in px that fl_x is for")
+            fx = float(values["fl_x"])
+        elif fisheye:
+            raise SdfsimError(f"{where}: a fisheye without fl_x", "give fl_x, w and h in px")
+        elif width > 0 and height > 0:
+            fx = 0.5 * width / np.tan(0.5 * float(values["camera_angle_x"]))
+        else:  # For a photo of any width: `scaled` knows it.
+            width, height, fx = 1, 0, 0.5 / np.tan(0.5 * float(values["camera_angle_x"]))
+        fy = float(values.get("fl_y", fx))
+        cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
+        pose = np.array(frame["transform_matrix"], float).reshape(4, 4)
+        if not np.isfinite(pose).all() or abs(np.linalg.det(pose[:3, :3])) < 1e-6:
+            raise SdfsimError(f"{where}: transform_matrix is not a pose")
+        turn = pose[:3, :3] / np.cbrt(np.linalg.det(pose[:3, :3]))
+        rotation = flip @ turn.T
+        names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+        lens = tuple(float(values.get(name, 0.0)) for name in names)
+        found.append(
+            KnownCamera(str(frame["file_path"]), width, height, _matrix(fx, fy, cx, cy), lens, fisheye,
+                  rotation, -rotation @ pose[:3, 3], frame.get("mask_path"))
+        )  # fmt: skip
+    return found
+
+
+def _check_lens(values: dict, where: str) -> None:
+    """Raises SdfsimError for a lens that is none of `LENSES`."""
+    model = values.get("camera_model", LENSES[0])
+    if model not in LENSES:
+        raise SdfsimError(f"{where}: camera_model: {model!r} is not read", f"allowed: {', '.join(LENSES)}")
+
+
+def read_model(folder: Path) -> list[KnownCamera]:
+    """Cameras of a COLMAP model (its documentation, "Output Format")."""
+    binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
+    cameras = dict((_cameras_binary if binary else _cameras_text)(folder))
+    found = []
+    for name, camera, quaternion, translation in (_images_binary if binary else _images_text)(folder):
+        model, width, height, values = cameras[camera]
+        known = dict(zip(_parameters(folder, model), values, strict=True))
+        fx = known.get("fx", known.get("f", 0.0))
+        fisheye = model.endswith("FISHEYE")
+        names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+        lens = tuple(known.get(key, 0.0) for key in names)
+        found.append(
+            KnownCamera(name, width, height, _matrix(fx, known.get("fy", fx), known["cx"], known["cy"]),
+                  lens, fisheye, _rotation(quaternion), np.array(translation))
+        )  # fmt: skip
+    return found
+
+
+def _parameters(folder: Path, model: str) -> list[str]:
+    names = dict(MODELS.values()).get(model, "")
+    if not names:
+        readable = ", ".join(name for name, parameters in MODELS.values() if parameters)
+        raise SdfsimError(f"{folder}: the camera model {model} is not read", f"allowed: {readable}")
+    return names.split()
+
+
+def _matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+
+
+def _rotation(wxyz: tuple[float, ...]) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    w, x, y, z = wxyz
+    return Rotation.from_quat([x, y, z, w]).as_matrix()
+
+
+def _lines(path: Path) -> list[str]:
+    return [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+
+
+def _cameras_text(folder: Path) -> Iterator[tuple[int, tuple[str, int, int, list[float]]]]:
+    for line in _lines(folder / "cameras.txt"):
+        if line.strip():
+            number, model, width, height, *values = line.split()
+            yield int(number), (model, int(width), int(height), [float(v) for v in values])
+
+
+def _images_text(folder: Path) -> Iterator[tuple[str, int, tuple[float, ...], tuple[float, ...]]]:
+    # Two lines an image; the second, its points, may be empty.
+    for line in _lines(folder / "images.txt")[::2]:
+        if line.strip():
+            _, *values, camera, name = line.split(maxsplit=9)
+            numbers = tuple(float(v) for v in values)
+            yield name.strip(), int(camera), numbers[:4], numbers[4:7]
+
+
+def _cameras_binary(folder: Path) -> Iterator[tuple[int, tuple[str, int, int, list[float]]]]:
+    data = (folder / "cameras.bin").read_bytes()
+    (count,), at = struct.unpack_from("<Q", data), 8
+    for _ in range(count):
+        number, model, width, height = struct.unpack_from("<IiQQ", data, at)
+        name = MODELS[model][0]
+        length = len(_parameters(folder, name))
+        values = struct.unpack_from(f"<{length}d", data, at + 24)
+        at += 24 + 8 * length
+        yield number, (name, width, height, list(values))
+
+
+def _images_binary(folder: Path) -> Iterator[tuple[str, int, tuple[float, ...], tuple[float, ...]]]:
+    data = (folder / "images.bin").read_bytes()
+    (count,), at = struct.unpack_from("<Q", data), 8
+    for _ in range(count):
+        values = struct.unpack_from("<I7dI", data, at)
+        end = data.index(b"\0", at + 64)
+        name = data[at + 64 : end].decode("utf-8")
+        (points,) = struct.unpack_from("<Q", data, end + 1)
+        at = end + 9 + 24 * points
+        yield name, values[8], values[1:5], values[5:8]
+
+
+@dataclass(frozen=True)
+class Lens:
+    """What bent a photo before it was made straight.
+
+    Attributes:
+        matrix: rows of the intrinsics [3, 3] for the prepared photo's size, pixel centres at +0.5.
+        distortion: see `KnownCamera`.
+        fisheye: see `KnownCamera`.
+    """
+
+    matrix: tuple[tuple[float, ...], ...]
+    distortion: tuple[float, ...]
+    fisheye: bool
+
+    def straight(self, pixels: np.ndarray, view: View) -> np.ndarray:
+        """Where the straight photo of `view` shows what pixels [P, 2] of the bent one show; may lie outside it."""
+        import cv2
+
+        until = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-10)
+        undistort = cv2.fisheye.undistortPoints if self.fisheye else cv2.undistortPoints
+        new = np.array([[view.focal, 0, view.cx], [0, view.focal, view.cy], [0, 0, 1]])
+        points = np.ascontiguousarray(pixels, float)[:, None]
+        return undistort(points, np.array(self.matrix), np.array(self.distortion), P=new, criteria=until)[:, 0]
+
+
+def scaled(known: KnownCamera, width: int, height: int) -> np.ndarray:
+    """The camera's matrix [3, 3] for its photo at another size, px."""
+    if not known.height:  # Only a field of view is known.
+        return np.array([[known.matrix[0, 0] * width, 0, width / 2], [0, known.matrix[1, 1] * width, height / 2],
+                         [0, 0, 1]])  # fmt: skip
+    return np.diag([width / known.width, height / known.height, 1.0]) @ known.matrix
+
+
+def rectified(picture: Picture, known: KnownCamera, name: str, source: str) -> tuple[Picture, View, Lens | None]:
+    """A photo as a pinhole camera in the same place would have taken it, that camera, and the lens it was freed from.
+
+    Nothing is resampled where the lens has no distortion: then there is no lens. Elsewhere the photo is cut to what the
+    lens shows of the pinhole's picture all over.
+
+    Args:
+        picture: upright, sized.
+        known: its camera, intrinsics at any size.
+        name: of the prepared photo.
+        source: the user's name of it.
+    """
+    height, width = picture.pixels.shape[:2]
+    matrix, lens = scaled(known, width, height), None
+    pixels, mask = picture.pixels, picture.mask
+    # A fisheye bends also where all its coefficients are 0.
+    if known.fisheye or any(known.distortion) or abs(matrix[0, 0] / matrix[1, 1] - 1) > SQUARE:
+        import cv2
+
+        lens = Lens(tuple(map(tuple, matrix.tolist())), known.distortion, known.fisheye)
+        bent, size = np.array(known.distortion), (width, height)
+        old = matrix - CENTRE
+        if known.fisheye:
+            new = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(old, bent, size, np.eye(3), balance=0.0)
+        else:
+            new, _ = cv2.getOptimalNewCameraMatrix(old, bent, size, 0.0)
+        new = np.array(new, float)
+        new[0, 0] = new[1, 1] = max(new[0, 0], new[1, 1])
+        new[0, 1] = 0.0
+        make = cv2.fisheye.initUndistortRectifyMap if known.fisheye else cv2.initUndistortRectifyMap
+        x, y = make(old, bent, np.eye(3), new, size, cv2.CV_32FC1)
+        pixels = cv2.remap(pixels, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        if mask is not None:
+            mask = cv2.remap(mask, x, y, cv2.INTER_LINEAR)
+        matrix = new + CENTRE
+    focal = float(matrix[0, 0])
+    view = View(name, source, width, height, focal, float(matrix[0, 2]), float(matrix[1, 2]), 0.0,
+                known.rotation, known.translation)  # fmt: skip
+    return replace(picture, pixels=pixels, mask=mask, focal=focal), view, lens

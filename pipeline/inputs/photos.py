@@ -1,0 +1,206 @@
+"""Whatever the user gave -> upright, sized photos with masks, focal priors and a word on their quality."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from pipeline.cameras import View, save_views
+from pipeline.inputs.images import Picture, exposure, fault, read_photo, sharpness
+from pipeline.inputs.known_cameras import Lens, rectified
+from pipeline.inputs.sources import Source, find_source
+from pipeline.progress import Progress, quiet
+from sdfsim.errors import SdfsimError
+from sdfsim.files import read_json, write_json
+
+LONG_SIDE = 1600  # px; what reads the photos takes them as small as it needs
+KNOWN_CAMERAS = "known_cameras.json"  # cameras that came with the photos
+NAMED = 8  # photos named one by one in a note
+
+
+@dataclass(frozen=True)
+class Photo:
+    """One prepared photo.
+
+    Attributes:
+        name: file name under `images/` (and, with `.png` added, under `masks/`).
+        source: the user's name of it, see `Source.name_of`, or the video's with a time; no two photos have the same.
+        width: prepared width, px.
+        height: prepared height, px.
+        original: width and height of the user's photo, px, turned as the prepared one is; of a frame of a video, which
+            nobody has as a file, those of the prepared photo.
+        lens: what the photo was freed from; None where nothing was straightened.
+        focal: focal length read from EXIF, px of the prepared photo; None where EXIF has none.
+        camera: make and model from EXIF, empty where unknown.
+        mask: whether a mask came with it, as alpha or as a file.
+        sharpness: see `quality.sharpness`; 0.2 to 0.6 for photos in focus.
+        fault: "blurred", "too dark", "burnt out", or nothing.
+    """
+
+    name: str
+    source: str
+    width: int
+    height: int
+    original: tuple[int, int]
+    lens: Lens | None
+    focal: float | None
+    camera: str
+    mask: bool
+    sharpness: float
+    fault: str = ""
+
+    def prepared(self, pixels: np.ndarray, view: View) -> np.ndarray:
+        """Pixels [P, 2] of the prepared photo, of camera `view`, from those of the user's photo."""
+        found = pixels * np.array([self.width, self.height]) / self.original
+        return found if self.lens is None else self.lens.straight(found, view)
+
+
+def prepare_photos(
+    given: Path, out: Path, *, long_side: int = LONG_SIDE, on_progress: Progress = quiet
+) -> tuple[list[Photo], list[str]]:
+    """Reads every photo and writes upright, sized copies to `out`.
+
+    Writes `images/NNNN.jpg`, for photos with a mask `masks/NNNN.jpg.png`, `photos.json`, and, where the cameras are
+    known, `known_cameras.json`.
+
+    Args:
+        given: what the user gave, see `find_source`; never written to.
+        out: an existing folder.
+        long_side: limit of the longer side, px.
+
+    Returns:
+        The photos in order, and notes for the report.
+
+    Raises:
+        SdfsimError: see `find_source`, `read_photo` and `chosen_frames`.
+    """
+    source, out = find_source(given), Path(out)
+    (out / "images").mkdir(parents=True, exist_ok=True)
+    photos: list[Photo] = []
+    shares: list[tuple[float, float]] = []
+    views: list[View] = []
+    for origin, picture, view, lens, fraction in _pictures(source, long_side):
+        name = f"{len(photos):04d}.jpg"
+        Image.fromarray(picture.pixels).save(out / "images" / name, quality=95, subsampling=0)
+        if picture.mask is not None:
+            (out / "masks").mkdir(exist_ok=True)
+            Image.fromarray(picture.mask).save(out / "masks" / (name + ".png"))
+        if view is not None:
+            views.append(replace(view, name=name))
+        height, width = picture.pixels.shape[:2]
+        sharp = round(sharpness(picture.pixels), 4)
+        shares.append(exposure(picture.pixels))
+        focal = picture.focal if view is None else None  # A known camera is no prior.
+        photos.append(
+            Photo(name, origin, width, height, picture.original, lens, focal, picture.camera,
+                  picture.mask is not None, sharp)
+        )  # fmt: skip
+        on_progress(fraction, f"{len(photos)} photos")
+    typical = float(np.quantile([p.sharpness for p in photos], 0.75))
+    photos = [
+        replace(p, fault=fault(p.sharpness, *share, typical=typical, masked=p.mask))
+        for p, share in zip(photos, shares, strict=True)
+    ]
+    if views:
+        save_views(views, out / KNOWN_CAMERAS)
+    save_photos(photos, out)
+    return photos, [*source.notes, *notes_on(photos, len(source.masks))]
+
+
+def _pictures(source: Source, long_side: int) -> Iterator[tuple[str, Picture, View | None, Lens | None, float]]:
+    """Name, picture, known camera, lens and share done of each photo."""
+    if source.video:
+        from pipeline.inputs.video import chosen_frames
+
+        for name, pixels, fraction in chosen_frames(source.video):
+            image = Image.fromarray(pixels)
+            image.thumbnail((long_side, long_side), Image.Resampling.LANCZOS)
+            yield name, Picture(np.asarray(image), image.size), None, None, fraction
+        return
+    cameras = {}
+    if source.cameras:
+        from pipeline.inputs.known_cameras import read_cameras
+
+        cameras = {camera.name: camera for camera in read_cameras(source.cameras)}
+    masks = _masks_that_count(source, long_side)
+    for index, path in enumerate(source.photos):
+        camera = cameras.get(source.frames.get(path, ""))
+        shape = camera.width / camera.height if camera and camera.height else None
+        name, view, lens = source.name_of(path), None, None
+        picture = read_photo(path, long_side, masks.get(path), shape)
+        if camera:
+            _check_shape(path, picture, shape)
+            picture, view, lens = rectified(picture, camera, path.name, name)
+        yield name, picture, view, lens, (index + 1) / len(source.photos)
+
+
+def _masks_that_count(source: Source, long_side: int) -> dict[Path, Path]:
+    """The mask files, where every photo has one or is cut out by transparency; else none."""
+    lacking = [path for path in source.photos if path not in source.masks]
+    if source.masks and all(read_photo(path, long_side).mask is not None for path in lacking):
+        return source.masks
+    return {}
+
+
+def _check_shape(path: Path, picture: Picture, shape: float | None) -> None:
+    height, width = picture.pixels.shape[:2]
+    if shape is not None and abs(width / height / shape - 1) > 0.02:
+        raise SdfsimError(
+            f"{path}: shaped {width} x {height}, but its camera has {shape:.3f} times as many columns as rows",
+            "the photos have to be those that the cameras were found for, uncropped",
+        )
+
+
+def notes_on(photos: list[Photo], mask_files: int) -> list[str]:
+    """What a person should know about a set of photos, of which some came with mask files; one line each."""
+    notes = []
+    masked = sum(p.mask for p in photos)
+    if masked < len(photos):
+        why = "as masks count only where every photo has one"
+        if mask_files:
+            notes.append(f"{mask_files} of {len(photos)} photos have a mask file: ignored, {why}")
+        if masked:
+            notes.append(
+                f"{masked} of {len(photos)} photos are transparent in part: grey there, but not taken as masks, {why}"
+            )
+    sizes = sorted({(p.width, p.height) for p in photos})
+    if len(sizes) > 1:
+        notes.append("photos of several sizes: " + ", ".join(f"{w} x {h}" for w, h in sizes) + "; one camera for each")
+    for word in ("blurred", "too dark", "burnt out"):
+        names = [p.source for p in photos if p.fault == word]
+        if names:
+            more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+            notes.append(f"{len(names)} of {len(photos)} photos are {word}: {', '.join(names[:NAMED])}{more}")
+    return notes
+
+
+def save_photos(photos: list[Photo], folder: Path) -> None:
+    """Writes `photos.json`."""
+    write_json(Path(folder) / "photos.json", {"version": 1, "photos": [asdict(p) for p in photos]})
+
+
+def load_photos(folder: Path) -> list[Photo]:
+    """Reads the photos that `prepare_photos` wrote to `folder`.
+
+    Raises:
+        SdfsimError: the folder was not written by the photos stage.
+    """
+    path = Path(folder) / "photos.json"
+    data = read_json(path, "run the photos stage first")
+    try:
+        return [
+            Photo(**{**entry, "original": tuple(entry["original"]), "lens": _lens(entry["lens"])})
+            for entry in data["photos"]
+        ]
+    except (KeyError, TypeError) as error:
+        raise SdfsimError(f"{path}: damaged", "run the photos stage again") from error
+
+
+def _lens(entry: dict | None) -> Lens | None:
+    if entry is None:
+        return None
+    return Lens(tuple(map(tuple, entry["matrix"])), tuple(entry["distortion"]), entry["fisheye"])

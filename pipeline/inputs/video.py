@@ -1,0 +1,152 @@
+"""A video -> its sharpest frames, spread evenly over the motion of the camera."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.inputs.images import sharpness
+from sdfsim.errors import EXIT_QUALITY, SdfsimError
+
+SMALL, MIDDLE = 256, 960  # px, longer side of the frames that motion and sharpness are measured on
+STEP = 0.07  # of the picture's width: motion from one chosen frame to the next
+FEWEST, MOST = 24, 100
+LEAST_MOTION = 0.5  # picture widths in all: less is no walk around anything
+
+
+@dataclass(frozen=True)
+class Track:
+    """What a first pass over a video finds.
+
+    Attributes:
+        moved: [F] how far the picture has moved up to each frame, in picture widths.
+        sharp: [F] sharpness of each frame.
+        rate: frames a second.
+    """
+
+    moved: np.ndarray
+    sharp: np.ndarray
+    rate: float
+
+
+def frames_of(path: Path) -> tuple[Iterator[np.ndarray], float]:
+    """The frames of a video, upright RGB [H, W, 3] uint8, and their number a second.
+
+    Raises:
+        SdfsimError: it cannot be decoded.
+    """
+    import cv2
+
+    with _quiet():
+        video = cv2.VideoCapture(str(path))
+    if not video.isOpened():
+        raise SdfsimError(f"{path}: cannot be decoded as a video", "convert it to MP4 (H.264)")
+    rate = float(video.get(cv2.CAP_PROP_FPS)) or 30.0
+
+    def read() -> Iterator[np.ndarray]:
+        try:
+            while True:
+                with _quiet():
+                    good, frame = video.read()
+                if not good:
+                    return
+                yield frame[..., ::-1]
+        finally:
+            video.release()
+
+    return read(), rate
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keeps what the decoder prints about damaged files, past Python, off the user's terminal."""
+    saved, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(null, 2)
+        yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(null)
+
+
+def reduced(frame: np.ndarray, longest: int) -> np.ndarray:
+    """A frame no larger than `longest` px."""
+    import cv2
+
+    scale = min(1.0, longest / max(frame.shape[:2]))
+    size = (round(frame.shape[1] * scale), round(frame.shape[0] * scale))
+    return cv2.resize(frame, size, interpolation=cv2.INTER_AREA)
+
+
+def follow(path: Path) -> Track:
+    """First pass: motion and sharpness of every frame.
+
+    Motion is the median displacement of corners that are found again by Lucas-Kanade tracking; where most are lost
+    (a cut, or a blur) it counts as a step of its own.
+    """
+    import cv2
+
+    frames, rate = frames_of(path)
+    before, moved, sharp = None, [], []
+    for frame in frames:
+        frame = reduced(frame, MIDDLE)
+        sharp.append(sharpness(frame))
+        grey = cv2.cvtColor(reduced(frame, SMALL), cv2.COLOR_RGB2GRAY)
+        step = 0.0
+        if before is not None:
+            corners = cv2.goodFeaturesToTrack(before, 200, 0.01, 6)
+            if corners is not None and len(corners) >= 8:
+                found, status, _ = cv2.calcOpticalFlowPyrLK(before, grey, corners, np.empty_like(corners))
+                kept = status.ravel() == 1
+                shift = np.linalg.norm((found - corners).reshape(-1, 2)[kept], axis=1)
+                step = float(np.median(shift)) / grey.shape[1] if kept.mean() > 0.4 else STEP
+        moved.append((moved[-1] if moved else 0.0) + step)
+        before = grey
+    return Track(np.array(moved), np.array(sharp), rate)
+
+
+def choose(track: Track) -> list[int]:
+    """Frames to use: the motion is cut into equal stretches, and the sharpest frame of each is taken.
+
+    Returns:
+        Indices in order; at least `FEWEST` where there are as many frames, at most `MOST`.
+    """
+    total = float(track.moved[-1])
+    count = int(np.clip(round(total / STEP) + 1, FEWEST, MOST))
+    stretch = np.minimum((track.moved / max(total, 1e-9) * count).astype(int), count - 1)
+    return [int(max(np.flatnonzero(stretch == k), key=lambda i: track.sharp[i])) for k in np.unique(stretch)]
+
+
+def chosen_frames(path: Path) -> Iterator[tuple[str, np.ndarray, float]]:
+    """Name, pixels RGB [H, W, 3] uint8 and share done of each frame worth using.
+
+    Raises:
+        SdfsimError: it cannot be decoded, has hardly any frames, or (exit code 3) hardly moves.
+    """
+    track = follow(path)
+    if len(track.sharp) < FEWEST:
+        raise SdfsimError(
+            f"{path}: only {len(track.sharp)} frames can be decoded (at least {FEWEST} are needed)",
+            "is the video whole? Convert it to MP4 (H.264), or film for longer",
+        )
+    if track.moved[-1] < LEAST_MOTION:
+        raise SdfsimError(
+            f"{path}: the picture hardly moves (by {track.moved[-1]:.2f} picture widths in all)",
+            "walk around the object while filming",
+            exit_code=EXIT_QUALITY,
+        )
+    wanted = choose(track)
+    left = set(wanted)
+    frames, _ = frames_of(path)
+    for index, frame in enumerate(frames):
+        if index in left:
+            left.remove(index)
+            yield f"{path.name} at {index / track.rate:.2f} s", frame, 1 - len(left) / len(wanted)
+        if not left:
+            return

@@ -1,0 +1,412 @@
+"""What stands on a level plane becomes a body of its own; the scenery is closed where the body stood.
+
+Everything here is in normalised space; heights are measured along a plane's normal.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy import ndimage
+
+from pipeline.cameras import View, frame_of
+from pipeline.mesh.cleaning import components, face_normals, islands, keep_faces
+from pipeline.mesh.extraction import FLOATER, RIM, Distance, Surface, Volume, sample, sample_box
+from pipeline.mesh.visibility import Caster, Visibility, look, spread_colors, to_bytes
+from sdfsim.shape.mesh import Mesh
+
+# A level plane smaller than this share of the largest one carries nothing: the lid of a box is no table.
+LEVEL_SHARE = 0.1
+LEVEL_NORMAL = 0.95  # least cosine between up and the normal of a face of a level plane
+# A body covers less of what it stands on than this; what covers more is relief.
+LARGEST_FOOT = 0.5
+# A body needs photos of this share of its surface.
+SEEN_SHARE = 0.2
+# Least share of a body's lowest layer that has the solid of the plane right below it.
+STANDS = 0.3
+# What hangs beside a body and is smaller than this share of it was torn off it by noise, and goes where it goes.
+CRUMB = 0.05
+# How far sideways, in contact layers, what is around a body's foot is taken away together with it.
+FILLET = 3.0
+# Thickness of the layer in which a field cannot tell a body from what it stands on, in cells of its finest grid.
+LAYER = 1.5
+# What rises less than this (normalised units, or this many cells of the finest grid) stays part of what it stands on.
+SMALLEST, SMALLEST_CELLS = 0.04, 4.0
+# Samples of a body are so much closer than the cells of the field's finest grid.
+FINER = 3.0
+
+
+@dataclass(frozen=True)
+class Level:
+    """A level plane.
+
+    Attributes:
+        normal: [3] unit, upwards.
+        height: of the plane along it.
+        area: that photos show.
+    """
+
+    normal: np.ndarray
+    height: float
+    area: float
+
+    def above(self, points: np.ndarray) -> np.ndarray:
+        """Height [...] of points [..., 3] above the plane."""
+        return points @ self.normal - self.height
+
+
+@dataclass(frozen=True)
+class Body:
+    """A body that stands on a level plane.
+
+    Attributes:
+        name: object1, object2 ... from the largest down.
+        level: what it stands on.
+        size: the longest side of its bounding box.
+        own: [X, Y, Z] bool on a part of the samples: those nearest to this body, of all that stands on the plane.
+        low: [3] position of the first of these samples.
+        cell: between them.
+        layer: thickness of the contact layer, in which the field cannot tell body and plane apart.
+        hollow: [A, B] bool on the plane: places that the body goes around at the top of the contact layer.
+        corner: [2] of the first of these, in the axes of `frame_of` the plane.
+    """
+
+    name: str
+    level: Level
+    size: float
+    own: np.ndarray
+    low: np.ndarray
+    cell: float
+    layer: float
+    hollow: np.ndarray
+    corner: np.ndarray
+
+    def lifted(self, points: np.ndarray) -> np.ndarray:
+        """Points [P, 3], those below the top of the contact layer raised to it."""
+        return points + np.maximum(self.layer - self.level.above(points), 0)[:, None] * self.level.normal
+
+    def owns(self, points: np.ndarray) -> np.ndarray:
+        """Whether points [P, 3] are nearer to this body than to anything else on the plane."""
+        index = np.round((points - self.low) / self.cell).astype(int)
+        inside = ((index >= 0) & (index < self.own.shape)).all(1)
+        result = np.zeros(len(points), bool)
+        result[inside] = self.own[tuple(index[inside].T)]
+        return result
+
+    def holds(self, points: np.ndarray) -> np.ndarray:
+        """Whether points [P, 3] are in the contact layer and the body goes around them, as a cup around its floor."""
+        index = np.round((points @ frame_of(self.level.normal)[:2].T - self.corner) / (0.5 * self.cell)).astype(int)
+        inside = ((index >= 0) & (index < self.hollow.shape)).all(1) & (self.level.above(points) < self.layer)
+        inside[inside] = self.hollow[tuple(index[inside].T)]
+        return inside
+
+    def distance(self, field: Distance) -> Distance:
+        """Its signed distance, from the field's: the cross-section above the contact layer goes down to the plane.
+
+        What it goes around there is as the field has it: the floor of a cup, or nothing.
+        """
+
+        def value(points: np.ndarray) -> np.ndarray:
+            lifted, holds = self.lifted(points), self.holds(points)
+            found = field(np.where(holds[:, None], points, lifted))
+            return np.maximum(np.where(self.owns(lifted) | holds, found, self.cell), -self.level.above(points))
+
+        return value
+
+
+def find_levels(shown: Mesh, up: np.ndarray, width: float) -> list[Level]:
+    """Level planes of a surface, largest first.
+
+    Args:
+        shown: what photos show.
+        up: [3] unit.
+        width: within which faces belong to one plane.
+    """
+    normals, areas = face_normals(shown)
+    centers = shown.vertices[shown.faces].mean(1)
+    flat = normals @ up > LEVEL_NORMAL
+    normals, areas, centers = normals[flat], areas[flat], centers[flat]
+    levels: list[Level] = []
+    while len(areas):
+        height = centers @ up
+        bins = ((height - height.min()) / width).astype(int)
+        total = np.bincount(bins, areas)
+        # A plane that lies across the border of two bins must not be missed.
+        fullest = int(np.argmax(total + np.append(total[1:], 0)))
+        member = (bins == fullest) | (bins == fullest + 1)
+        if levels and areas[member].sum() < LEVEL_SHARE * levels[0].area:
+            break
+        middle = np.average(centers[member], axis=0, weights=areas[member])
+        offset = centers[member] - middle
+        normal = np.linalg.eigh((offset * areas[member, None]).T @ offset)[1][:, 0]
+        normal = normal * np.sign(normal @ up) if abs(normal @ up) > LEVEL_NORMAL else up
+        levels.append(Level(normal, float(middle @ normal), float(areas[member].sum())))
+        rest = (np.abs(levels[-1].above(centers)) > 2 * width) & ~member
+        normals, areas, centers = normals[rest], areas[rest], centers[rest]
+    return levels
+
+
+def find_bodies(surface: Surface, levels: list[Level], layer: float, smallest: float) -> list[Body]:
+    """Bodies that stand on level planes, each alone and wholly within the trained space.
+
+    What carries a level plane itself, as a table does, is scenery, and so is what reaches the end of the trained space.
+
+    Args:
+        surface: extracted.
+        levels: of its visible part.
+        layer: thickness of the contact layer.
+        smallest: what rises less than this above its plane stays part of it.
+    """
+    volume = surface.volume
+    solid = volume.values < 0
+    vertices = surface.raw.vertices[np.unique(surface.raw.faces[surface.kept])]
+    seen = surface.raw.vertices[surface.seen]
+    x, y, z = np.ix_(*volume.axes())
+    at_rim = np.sqrt(x**2 + y**2 + z**2) > RIM - 2 * volume.cell
+    taken = np.zeros(solid.shape, bool)
+    found: list[Body] = []
+    # From the top down: what stands on a table has been taken when the table itself is looked at.
+    for level in sorted(levels, key=lambda level: -level.height):
+        height = volume.along(level.normal).astype(np.float32) - level.height
+        label = np.empty(solid.shape, np.int32)
+        count = int(ndimage.label(solid & (height > layer), output=label))  # type: ignore[arg-type]
+        others = [other for other in levels if other is not level and level.above(other.height * other.normal) > layer]
+        boxes = ndimage.find_objects(label, count)
+        for number, box in enumerate(boxes, start=1):
+            mine = label[box] == number
+            if (at_rim[box] & mine).any() or (taken[box] & mine).any() or mine.sum() < 8:
+                continue
+            low = volume.low + volume.cell * np.array([part.start for part in box])
+            sides = volume.cell * np.array(mine.shape)
+            if height[box][mine].max() < smallest:
+                continue
+            place = Volume(mine.astype(np.float32), low, volume.cell)
+            if any(_carries(place, other, volume.cell) for other in others):
+                continue
+            if not _stands(volume, place, mine & (height[box] < layer + 1.5 * volume.cell), level, layer):
+                continue
+            if _share_seen(place, vertices, seen) < SEEN_SHARE:
+                continue
+            crumbs = _crumbs(label, boxes, number, height, layer, volume.cell)
+            axes = zip(*(boxes[k - 1] for k in (number, *crumbs)), strict=True)
+            box = tuple(slice(min(p.start for p in parts), max(p.stop for p in parts)) for parts in axes)
+            mine = np.isin(label[box], [number, *crumbs])
+            taken[box] |= mine
+            standing = solid & (height > layer)
+            found.append(_body(volume, standing, box, mine, level, layer, float(sides.max())))
+    found.sort(key=lambda body: -body.size)
+    return [replace(body, name=f"object{number}") for number, body in enumerate(found, start=1)]
+
+
+def _crumbs(label: np.ndarray, boxes: list[tuple[slice, ...]], number: int, height: np.ndarray, layer: float,
+            cell: float) -> list[int]:  # fmt: skip
+    """Numbers of the components next to component `number` that reach no plane and are far smaller than it.
+
+    Args:
+        label: [X, Y, Z] component of each sample.
+        boxes: of the components, in their order.
+        number: of the component.
+        height: [X, Y, Z] of the samples above the plane.
+        layer: thickness of the contact layer.
+        cell: between samples.
+    """
+    margin = int(np.ceil(FILLET * layer / cell))
+    box = boxes[number - 1]
+    wide = tuple(slice(max(part.start - margin, 0), part.stop + margin) for part in box)
+    around, size = label[wide], int((label[box] == number).sum())
+    found = []
+    for other in np.setdiff1d(np.unique(around), [0, number]):
+        own = boxes[other - 1]
+        inside = all(w.start <= o.start and o.stop <= w.stop for w, o in zip(wide, own, strict=True))
+        samples = label[own] == other
+        if inside and samples.sum() < CRUMB * size and height[own][samples].min() > layer + 1.5 * cell:
+            found.append(int(other))
+    return found
+
+
+def _carries(place: Volume, other: Level, cell: float) -> bool:
+    """Whether the samples right below a level plane are for a good part those of one component."""
+    below = -other.above(place.points())
+    return float((place.values * ((below > 0) & (below <= cell))).sum()) * cell**2 > 0.3 * other.area
+
+
+def _stands(volume: Volume, place: Volume, lowest: np.ndarray, level: Level, layer: float) -> bool:
+    """Whether a component's lowest samples have the plane's solid below them, and cover only a part of the plane."""
+    points = place.points()[lowest]
+    if not len(points) or len(points) * volume.cell**2 / 1.5 > LARGEST_FOOT * level.area:
+        return False
+    down = level.above(points) + 0.5 * layer
+    return float((volume.at(points - down[:, None] * level.normal) < 0).mean()) > STANDS
+
+
+def _share_seen(place: Volume, vertices: np.ndarray, seen: np.ndarray) -> float:
+    """Share of the surface vertices at a component that photos show."""
+
+    def here(points: np.ndarray) -> int:
+        inside = (points > place.low - place.cell) & (points < place.low + place.cell * np.array(place.values.shape))
+        near = points[inside.all(1)]
+        grown = replace(place, values=ndimage.binary_dilation(place.values > 0).astype(np.float32))
+        return int((grown.at(near) > 0.5).sum()) if len(near) else 0
+
+    return here(seen) / max(here(vertices), 1)
+
+
+def _body(volume: Volume, standing: np.ndarray, box: tuple[slice, ...], mine: np.ndarray, level: Level, layer: float,
+          size: float) -> Body:  # fmt: skip
+    """The body of one component: all samples around it that are nearer to it than to what else is on the plane."""
+    margin = int(np.ceil((FILLET + 1) * layer / volume.cell)) + 1
+    start = [max(part.start - margin, 0) for part in box]
+    wide = tuple(slice(low, part.stop + margin) for low, part in zip(start, box, strict=True))
+    label = standing[wide].astype(np.int8)
+    inner = tuple(slice(part.start - low, part.stop - low) for low, part in zip(start, box, strict=True))
+    label[inner][mine] = 2
+    away, nearest = np.empty(label.shape), np.empty((3, *label.shape), np.int32)
+    ndimage.distance_transform_edt(label == 0, return_indices=True, distances=away, indices=nearest)
+    own = (label[tuple(nearest)] == 2) & (away * volume.cell <= FILLET * layer)
+    corner = volume.low + volume.cell * np.array(start)
+    body = Body("", level, size, own, corner, volume.cell, layer, np.zeros((0, 0), bool), np.zeros(2))
+    frame = frame_of(level.normal)
+    flat = (corner + volume.cell * np.argwhere(own)) @ frame[:2].T
+    a, b = (np.arange(low, high, 0.5 * volume.cell) for low, high in zip(flat.min(0), flat.max(0), strict=True))
+    points = np.stack(np.meshgrid(a, b, indexing="ij"), -1).reshape(-1, 2) @ frame[:2]
+    points += (level.height + layer) * level.normal
+    cut = ((volume.at(points) < 0) & body.owns(points)).reshape(len(a), len(b))
+    return replace(body, hollow=np.asarray(ndimage.binary_fill_holes(cut)) & ~cut, corner=flat.min(0))
+
+
+def body_mesh(body: Body, field: Distance, cell: float) -> Mesh:
+    """The closed mesh of a body, sampled `cell` apart along its plane; crumbs are left out."""
+    frame = frame_of(body.level.normal)
+    points = body.low + body.cell * np.argwhere(body.own)
+    turned = points @ frame.T
+    low, high = turned.min(0), turned.max(0)
+    low[2] = body.level.height - 2 * cell
+    distance = body.distance(field)
+    volume = sample_box(lambda p: distance(p @ frame), low - 2 * cell, high + 2 * cell, cell)
+    mesh = volume.mesh()
+    mesh = Mesh(mesh.vertices @ frame, mesh.faces)
+    label = components(mesh)
+    area = np.bincount(label, face_normals(mesh)[1])
+    return keep_faces(mesh, (area > 0.02 * area.max())[label])
+
+
+def without_bodies(volume: Volume, bodies: list[Body], field: Distance) -> Volume:
+    """The scenery alone: what bodies leave behind is empty, and their plane goes on below them.
+
+    Args:
+        volume: of everything.
+        bodies: that stand on it.
+        field: the signed distance that `volume` holds samples of.
+    """
+    values = volume.values.copy()
+    for body in bodies:
+        start = np.round((body.low - volume.low) / volume.cell).astype(int)
+        part = tuple(slice(low, low + count) for low, count in zip(start, body.own.shape, strict=True))
+        shape = values[part].shape
+        points = (body.low + volume.cell * np.indices(shape).reshape(3, -1).T).astype(np.float64)
+        height, lifted, holds = body.level.above(points), body.lifted(points), body.holds(points)
+        own = body.owns(lifted) | holds
+        inside = values[part].reshape(-1).copy()
+        over = own & (height > 0)
+        inside[over] = np.maximum(inside[over], height[over])
+        # Below its foot the field never saw anything: there the plane's solid goes on, and holes in it are closed.
+        under = np.flatnonzero(own & (height <= 0) & (height > -2 * body.layer))
+        foot = under[holds[under] | (sample(field, lifted[under]) < 0.5 * body.layer)] if len(under) else under
+        inside[foot] = np.minimum(inside[foot], height[foot])
+        values[part] = inside.reshape(shape)
+    return replace(volume, values=values)
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What a scene is made of, in normalised space.
+
+    Attributes:
+        solid: closed mesh of the scenery; None where there are bodies alone.
+        shown: what is displayed of it: its visible surface, and the places where bodies stood; None like `solid`.
+        bodies: closed mesh of each body by name, with colours; the largest first.
+        smallest: what rises less than this above its plane stayed part of the scenery.
+    """
+
+    solid: Mesh | None
+    shown: Mesh | None
+    bodies: dict[str, Mesh]
+    smallest: float
+
+
+def split(surface: Surface, distance: Distance, finest: float, views: list[View], photos_folder: Path, up: np.ndarray,
+          *, alone: bool) -> Parts:  # fmt: skip
+    """Finds bodies and takes them out of the scenery.
+
+    Args:
+        surface: extracted.
+        distance: signed distance of the field that it was extracted from.
+        finest: width of a cell of the field's finest grid.
+        views: cameras in normalised space.
+        photos_folder: of the photos stage.
+        up: [3] unit, in normalised space.
+        alone: there is no scenery: all there is are bodies.
+    """
+    smallest = max(SMALLEST, SMALLEST_CELLS * finest)
+    if alone:
+        return Parts(None, None, whole_bodies(surface), smallest)
+    levels = find_levels(surface.visible, up, finest)
+    bodies = find_bodies(surface, levels, LAYER * finest, smallest)
+    if not bodies:
+        return Parts(surface.solid, surface.visible, {}, smallest)
+    blocking = Caster(surface.raw)
+    meshes = {}
+    for body in bodies:
+        cell = min(finest / FINER, surface.volume.cell)
+        mesh = body_mesh(body, distance, cell)
+        # Lifted clear of the surface in the way, which is sampled more coarsely.
+        found = look(Visibility(mesh, 0.75 * surface.volume.cell, blocking), views, photos_folder)
+        meshes[body.name] = colored(mesh, found.color, found.weight > 0)
+    solid, shown = scenery(surface, bodies, distance)
+    return Parts(solid, shown, meshes, smallest)
+
+
+def whole_bodies(surface: Surface) -> dict[str, Mesh]:
+    """Every connected component of the solid as a body, the largest first."""
+    solid = surface.solid
+    label = components(solid)
+    order = np.argsort(-np.bincount(label, face_normals(solid)[1]))
+    return {f"object{n}": keep_faces(solid, label == k) for n, k in enumerate(order, start=1)}
+
+
+def colored(mesh: Mesh, color: np.ndarray, known: np.ndarray) -> Mesh:
+    """The mesh with its colours [V, 3] in 0..255, those that are not known [V] bool taken from around them."""
+    color = color.copy()
+    if known.any() and not known.all():
+        color[~known] = spread_colors(mesh.vertices[~known], mesh.vertices[known], color[known])
+    return replace(mesh, colors=to_bytes(color))
+
+
+def scenery(surface: Surface, bodies: list[Body], distance: Distance) -> tuple[Mesh, Mesh]:
+    """The scenery's solid without bodies, and what is displayed of it."""
+    from scipy.spatial import KDTree
+
+    raw, mesh = surface.raw, without_bodies(surface.volume, bodies, distance).mesh()
+    assert raw.colors is not None
+    # Wherever nothing was cut, the vertices are those of the whole surface: from these they take what is known.
+    away, nearest = KDTree(raw.vertices).query(mesh.vertices)
+    same = away < 1e-6
+    shown = same & _at_faces(raw, surface.shown)[nearest]
+    color = raw.colors[nearest].astype(float)
+    color[~same] = spread_colors(mesh.vertices[~same], mesh.vertices[shown], color[shown])
+    mesh = replace(mesh, colors=to_bytes(color))
+    # Components of which nothing was there before are pockets that the cut has left.
+    label = components(mesh)
+    belongs = (same & _at_faces(raw, surface.kept)[nearest])[mesh.faces].any(1)
+    closed = (np.bincount(label, belongs) > 0)[label]
+    displayed = islands(mesh, closed & (shown | ~same)[mesh.faces].all(1), FLOATER)
+    return keep_faces(mesh, closed), keep_faces(mesh, displayed)
+
+
+def _at_faces(mesh: Mesh, faces: np.ndarray) -> np.ndarray:
+    """Vertices [V] bool that some faces [F] bool use."""
+    used = np.zeros(len(mesh.vertices), bool)
+    used[mesh.faces[faces]] = True
+    return used

@@ -1,0 +1,108 @@
+"""Parts of meshes: normals, connected components, and which of those belong."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sdfsim.shape.mesh import Mesh
+
+# A component of whose area photos show less than this share is matter behind the scenery.
+UNSEEN = 0.05
+
+
+def face_normals(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Unit normals [F, 3] and areas [F]."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    cross = np.cross(b - a, c - a)
+    double = np.linalg.norm(cross, axis=1)
+    return cross / np.maximum(double, 1e-30)[:, None], double / 2
+
+
+def vertex_normals(mesh: Mesh) -> np.ndarray:
+    """Area-weighted unit normals [V, 3]."""
+    normals, areas = face_normals(mesh)
+    total = np.zeros_like(mesh.vertices)
+    for k in range(3):
+        np.add.at(total, mesh.faces[:, k], normals * areas[:, None])
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
+
+
+def keep_faces(mesh: Mesh, keep: np.ndarray) -> Mesh:
+    """The mesh of the faces `keep` [F] bool, without the vertices that nothing uses."""
+    faces = mesh.faces[keep]
+    used, inverse = np.unique(faces, return_inverse=True)
+    colors = None if mesh.colors is None else mesh.colors[used]
+    return Mesh(mesh.vertices[used], inverse.reshape(-1, 3).astype(np.int64), colors)
+
+
+def joined(meshes: Sequence[Mesh]) -> Mesh:
+    """Several meshes as one, without colours."""
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
+    return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))
+
+
+def components(mesh: Mesh) -> np.ndarray:
+    """Component number [F] of each face; faces that share a vertex are connected."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]]])
+    count = len(mesh.vertices)
+    graph = coo_matrix((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    return connected_components(graph, directed=False)[1][mesh.faces[:, 0]]
+
+
+def belonging(mesh: Mesh, seen: np.ndarray, share: float, speck: float) -> tuple[np.ndarray, list[float], dict]:
+    """Which connected components of a closed mesh belong: those that photos show and that are not floaters.
+
+    Args:
+        mesh: closed, wound outwards.
+        seen: [F] bool, faces that photos show.
+        share: a component with less than this share of all the area is a floater.
+        speck: components shorter than this are only counted.
+
+    Returns:
+        The faces that belong [F] bool, the longest sides of the others from the largest down, and counts of these.
+    """
+    label = components(mesh)
+    _, area = face_normals(mesh)
+    total, shown = np.bincount(label, area), np.bincount(label, area * seen)
+    unseen, small = shown < UNSEEN * total, total < share * total.sum()
+    largest = int(np.argmax(shown))
+    small[largest] = unseen[largest] = False
+    corner = mesh.vertices[mesh.faces]
+    inward = np.bincount(label, np.einsum("fi,fi->f", corner[:, 0], np.cross(corner[:, 1], corner[:, 2]))) < 0
+    low, high = (np.full((len(total), 3), sign * np.inf) for sign in (1, -1))
+    np.minimum.at(low, label, corner.min(1))
+    np.maximum.at(high, label, corner.max(1))
+    size = (high - low).max(1)
+    # A cavity is a flaw of the piece around it and no piece of its own.
+    left_out = size[(small | unseen) & ~inward & (size >= speck)]
+    counts = {
+        "components": len(total), "dropped_small": int((small & ~unseen).sum()), "dropped_unseen": int(unseen.sum()),
+        "dropped_area_share": round(float(total[small | unseen].sum() / total.sum()), 4),
+    }  # fmt: skip
+    return ~(small | unseen)[label], sorted(left_out.tolist(), reverse=True), counts
+
+
+def islands(mesh: Mesh, faces: np.ndarray, share: float) -> np.ndarray:
+    """Of some faces [F] bool those [F] bool that lie together: patches too small to mean anything are left out.
+
+    Args:
+        mesh: any.
+        faces: [F] bool.
+        share: a patch needs this share of the area of all the faces, or of those of its own component of the mesh.
+    """
+    _, area = face_normals(mesh)
+    area = np.where(faces, area, 0)
+    index = np.flatnonzero(faces)
+    patch = components(Mesh(mesh.vertices, mesh.faces[index]))
+    _, whole = np.unique(components(mesh)[index], return_inverse=True)
+    size = np.bincount(patch, area[index])[patch]
+    own = np.bincount(whole, area[index])[whole]
+    result = np.zeros(len(faces), bool)
+    result[index] = size >= share * np.minimum(area.sum(), 5 * own)
+    return result

@@ -1,0 +1,271 @@
+"""Field -> surface: signed distances on a grid, marching cubes, and which part of the closed mesh the photos show."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from pipeline.cameras import View
+from pipeline.field.grid_field import Field
+from pipeline.mesh.cleaning import belonging, face_normals, islands, keep_faces, vertex_normals
+from pipeline.mesh.visibility import Visibility, look, to_bytes
+from pipeline.progress import Progress, quiet
+from sdfsim.errors import EXIT_QUALITY, SdfsimError
+from sdfsim.shape.mesh import Mesh
+
+Distance = Callable[[np.ndarray], np.ndarray]
+
+BATCH = 1 << 17  # points a query
+# The solid ends at this radius of normalised space: beyond it the field was never trained.
+RIM = 0.99
+EXTENT = 1.02  # half the side of the sampled cube
+MIN_SEEN = 2
+# Farther than this from every point of structure-from-motion (normalised units) a surface is a guess: on the rendered
+# set the median error there is ten times that within.
+MAX_FROM_POINTS = 0.1
+# A patch of the visible surface smaller than this share of it says nothing; of the closed solid a quarter of that.
+FLOATER = 0.01
+# What is left out is reported from this size on, normalised units.
+SPECK = 0.02
+
+
+@dataclass(frozen=True)
+class Volume:
+    """Samples of a signed distance.
+
+    Attributes:
+        values: [X, Y, Z] float32.
+        low: [3] position of the first sample.
+        cell: between neighbouring samples.
+    """
+
+    values: np.ndarray
+    low: np.ndarray
+    cell: float
+
+    def axes(self) -> list[np.ndarray]:
+        """Positions of the samples along x, y and z."""
+        return [low + self.cell * np.arange(count) for low, count in zip(self.low, self.values.shape, strict=True)]
+
+    def points(self) -> np.ndarray:
+        """Positions [X, Y, Z, 3] of the samples."""
+        return np.stack(np.meshgrid(*self.axes(), indexing="ij"), -1)
+
+    def along(self, direction: np.ndarray) -> np.ndarray:
+        """Coordinate [X, Y, Z] of the samples along a direction [3]."""
+        x, y, z = np.ix_(*self.axes())
+        return x * direction[0] + y * direction[1] + z * direction[2]
+
+    def at(self, points: np.ndarray) -> np.ndarray:
+        """Trilinear values [P] at points [P, 3]; outside the grid those of its border."""
+        from scipy.ndimage import map_coordinates
+
+        return map_coordinates(self.values, ((points - self.low) / self.cell).T, order=1, mode="nearest")
+
+    def limited(self, limit: Distance) -> Volume:
+        """What of the solid lies within another one, whose distance [P] at points [P, 3] is given."""
+        values = self.values.copy()
+        for number, x in enumerate(self.axes()[0]):  # A fine grid has too many points to hold at once.
+            slab = Volume(values[number : number + 1], np.array([x, *self.low[1:]]), self.cell)
+            values[number] = np.maximum(slab.values, limit(slab.points().reshape(-1, 3)).reshape(slab.values.shape))[0]
+        return replace(self, values=values)
+
+    def mesh(self) -> Mesh:
+        """The zero surface by marching cubes, faces counter-clockwise from outside.
+
+        Raises:
+            SdfsimError: (exit code 3) the values have one sign everywhere.
+        """
+        if not self.values.min() < 0 < self.values.max():
+            raise SdfsimError("mesh: the field holds no surface", "try --preset standard", exit_code=EXIT_QUALITY)
+        from skimage.measure import marching_cubes
+
+        # A surface through a sample makes several vertices in one place; merged later, they would pinch a closed mesh.
+        least = 0.02 * self.cell
+        values = np.where(np.abs(self.values) < least, np.where(self.values < 0, -least, least), self.values)
+        vertices, faces, _, _ = marching_cubes(values, 0.0)
+        return Mesh(self.low + self.cell * vertices.astype(np.float64), faces.astype(np.int64))
+
+
+def sample(distance: Distance, points: np.ndarray) -> np.ndarray:
+    """Values [P] float32 of a distance at points [P, 3], in batches."""
+    parts = np.array_split(points, max(1, len(points) // BATCH))
+    return np.concatenate([distance(part) for part in parts]).astype(np.float32)
+
+
+def sample_volume(
+    distance: Distance, resolution: int, *, extent: float = 1.02, coarse: int = 4, on_progress: Progress = quiet
+) -> Volume:
+    """Samples over [-extent, extent]^3, fine only near the surface.
+
+    Evaluates every `coarse`-th point first and all points only in blocks that can hold the surface, since an SDF
+    changes by no more than the distance moved (a factor of 2 is left for fields that are not quite SDFs). Elsewhere
+    values are interpolated.
+
+    Args:
+        distance: [P] at points [P, 3], float32.
+        resolution: samples a side, rounded up to a multiple of `coarse` plus 1.
+        extent: half the side.
+        coarse: see above.
+    """
+    from scipy.ndimage import zoom
+
+    blocks = -(-(resolution - 1) // coarse)
+    n = blocks * coarse + 1
+    line = np.linspace(-extent, extent, n, dtype=np.float32)
+    knots = line[::coarse]
+    values = sample(distance, np.stack(np.meshgrid(knots, knots, knots, indexing="ij"), -1).reshape(-1, 3))
+    values = values.reshape(blocks + 1, blocks + 1, blocks + 1)
+    volume = np.asarray(zoom(values, n / (blocks + 1), order=1, grid_mode=False, mode="nearest"), np.float32)
+    reach = 2.0 * np.sqrt(3) * (knots[1] - knots[0])
+    corners = np.stack(
+        [values[a : a + blocks, b : b + blocks, c : c + blocks] for a in (0, 1) for b in (0, 1) for c in (0, 1)]
+    )
+    low, high = corners.min(0), corners.max(0)
+    near = np.argwhere((np.abs(corners).min(0) < reach) | (low * high < 0))
+    step = np.arange(coarse + 1)
+    local = np.stack(np.meshgrid(step, step, step, indexing="ij"), -1).reshape(1, -1, 3)
+    parts = np.array_split(near, max(1, len(near) * local.shape[1] // BATCH))
+    for number, part in enumerate(parts):
+        index = (part[:, None] * coarse + local).reshape(-1, 3)
+        volume[tuple(index.T)] = distance(line[index])
+        if number % 4 == 0:
+            on_progress((number + 1) / len(parts), f"sampling the field, {number + 1} of {len(parts)} parts")
+    return Volume(volume, np.full(3, -extent), 2 * extent / (n - 1))
+
+
+def sample_box(distance: Distance, low: np.ndarray, high: np.ndarray, cell: float) -> Volume:
+    """All samples in the box between two corners [3], `cell` apart."""
+    counts = np.ceil((np.asarray(high) - low) / cell).astype(int) + 1
+    empty = Volume(np.empty(counts, np.float32), np.asarray(low, float), cell)
+    return replace(empty, values=sample(distance, empty.points().reshape(-1, 3)).reshape(counts))
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What was extracted, in normalised space.
+
+    Attributes:
+        volume: the signed distance it comes from.
+        raw: all of the closed surface, with colours.
+        seen: [V] bool, vertices of it that photos show well enough.
+        kept: [F] bool, faces of it that belong.
+        shown: [F] bool, faces of it that belong and that photos show.
+        report: counts of what was left out, and why.
+    """
+
+    volume: Volume
+    raw: Mesh
+    seen: np.ndarray
+    kept: np.ndarray
+    shown: np.ndarray
+    report: dict
+
+    @property
+    def visible(self) -> Mesh:
+        """What photos show, an open mesh with colours."""
+        return keep_faces(self.raw, self.shown)
+
+    @property
+    def solid(self) -> Mesh:
+        """The closed surface of what belongs."""
+        return keep_faces(self.raw, self.kept)
+
+    @property
+    def reaches_rim(self) -> bool:
+        """Whether what belongs goes on beyond the trained space."""
+        return bool((ball(self.solid.vertices) > -2 * self.volume.cell).any())
+
+
+def ball(points: np.ndarray) -> np.ndarray:
+    """Distance [P] from the ball that the field was trained in, at points [P, 3]."""
+    return np.linalg.norm(points, axis=1) - RIM
+
+
+def field_distance(field: Field) -> Distance:
+    """The field's signed distance as a function of points [P, 3] float in normalised space."""
+
+    @torch.no_grad()
+    def distance(points: np.ndarray) -> np.ndarray:
+        there = torch.from_numpy(np.ascontiguousarray(points, np.float32)).to(field.background.device)
+        return field.sdf(there).cpu().numpy()
+
+    return distance
+
+
+def trusted_vertices(mesh: Mesh, count: np.ndarray, at_limit: np.ndarray) -> np.ndarray:
+    """Vertices [V] that enough views see and that are not where the solid was cut off; small gaps are closed.
+
+    Args:
+        mesh: closed.
+        count: [V] how many views see each.
+        at_limit: [V] bool, vertices where the solid was cut off.
+    """
+    trusted = (count >= MIN_SEEN) & ~at_limit
+    edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
+    degree = np.maximum(np.bincount(edges[:, 0], minlength=len(trusted)), 1)
+    for _ in range(4):
+        neighbours = np.bincount(edges[:, 0], trusted[edges[:, 1]], minlength=len(trusted))
+        trusted |= (neighbours > 0.6 * degree) & ~at_limit
+    return trusted
+
+
+def surface_of(
+    volume: Volume, field: Field, views: list[View], points: np.ndarray, photos_folder: Path, limit: Distance, *,
+    on_progress: Progress = quiet,
+) -> Surface:  # fmt: skip
+    """The solid of a sampled field and its visible surface.
+
+    Args:
+        volume: samples of the field within `limit`.
+        field: trained.
+        views: cameras in normalised space.
+        points: [P, 3] sparse points in normalised space.
+        photos_folder: of the photos stage.
+        limit: distance [P] from the body that the solid was cut off at.
+
+    Raises:
+        SdfsimError: (exit code 3) the field has no surface, or hardly any of it is in the photos.
+    """
+    from scipy.spatial import KDTree
+
+    raw = volume.mesh()
+    cell = volume.cell
+    found = look(Visibility(raw, 0.75 * cell), views, photos_folder, on_progress)
+    far = KDTree(points).query(raw.vertices, distance_upper_bound=MAX_FROM_POINTS)[0] > MAX_FROM_POINTS
+    shown_at_all = trusted_vertices(raw, found.count, np.abs(limit(raw.vertices)) < 1.5 * cell)
+    seen = shown_at_all & ~far
+    faces_seen = seen[raw.faces].sum(1) >= 2
+    kept, left_out, counts = belonging(raw, faces_seen, FLOATER / 4, SPECK)
+    shown = islands(raw, faces_seen & kept, FLOATER)
+    if shown.sum() < 100:
+        raise SdfsimError(
+            "mesh: hardly any of the surface is visible in the photos", "check the poses; try --preset standard",
+            exit_code=EXIT_QUALITY,
+        )  # fmt: skip
+    rgb = np.where(found.weight[:, None] > 0, found.color, 255 * field_colors(field, raw))
+    area = face_normals(raw)[1]
+    report = {
+        "resolution": max(volume.values.shape), "cell": cell, "solid_faces": int(kept.sum()),
+        "left_out": left_out, "shown_faces": int(shown.sum()), "solid": {**counts, "smallest_share_kept": FLOATER / 4},
+        "dropped_far_from_points_share": round(float((shown_at_all & far).sum() / max(shown_at_all.sum(), 1)), 4),
+        "unseen_share": round(float(1 - area[shown].sum() / area[kept].sum()), 4),
+    }  # fmt: skip
+    return Surface(volume, replace(raw, colors=to_bytes(rgb)), seen, kept, shown, report)
+
+
+@torch.no_grad()
+def field_colors(field: Field, mesh: Mesh) -> np.ndarray:
+    """The field's colour [V, 3] in 0..1 of each vertex, seen straight on."""
+    device = field.background.device
+    points = torch.tensor(mesh.vertices, dtype=torch.float32, device=device)
+    against = -torch.tensor(vertex_normals(mesh), dtype=torch.float32, device=device)
+    parts = []
+    for p, d in zip(points.split(1 << 16), against.split(1 << 16), strict=True):
+        _, geometry, features = field.geometry_at(p)
+        parts.append(field.color_of(geometry, features, d))
+    return torch.cat(parts).cpu().numpy()

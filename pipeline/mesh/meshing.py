@@ -1,0 +1,203 @@
+"""The mesh stage: a trained field becomes meshes in metres, a picture with their names, and a list of them."""
+
+from __future__ import annotations
+
+import colorsys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+from PIL import Image, ImageDraw, ImageFont
+
+from pipeline.cameras import View, load_sparse, load_views
+from pipeline.field.training import load_field
+from pipeline.inputs.photos import load_photos
+from pipeline.mesh.bodies import Parts, split
+from pipeline.mesh.cleaning import joined
+from pipeline.mesh.extraction import EXTENT, ball, field_distance, sample_volume, surface_of
+from pipeline.mesh.placement import Placement, measured_scale, place
+from pipeline.mesh.visibility import Caster
+from pipeline.progress import Progress, quiet, share_of
+from sdfsim.errors import SdfsimError
+from sdfsim.files import read_json, replacing, write_json
+from sdfsim.shape.mesh import Mesh, write_ply
+
+SCENERY = "scene"
+RESOLUTION = {"quick": 192, "standard": 288, "fine": 448, "paper": 448}  # samples a side, by preset
+# The picture of names: at most so many photos, their width while they are chosen and in the picture, px, and the tint.
+PICTURES, THUMB, WIDE, TINT = 4, 80, 720, 0.45
+
+
+def make_meshes(
+    distill: Path, poses: Path, photos: Path, out: Path, *, preset: str, size: float | None = None,
+    distance: Sequence | None = None, crop: Sequence[float] | None = None, device: str = "cpu",
+    on_progress: Progress = quiet,
+) -> dict:  # fmt: skip
+    """Extracts surfaces and writes them to `out`.
+
+    Writes `mesh.ply` (all that photos show), of the scenery `solid.ply` (closed) and `shown.ply` (what is displayed),
+    `objects/NAME.ply` (closed) of each body, `parts.json`, `placement.json`, and `objects.png`.
+
+    Args:
+        distill: folder of that stage.
+        poses: folder of that stage.
+        photos: folder of that stage.
+        out: an existing folder.
+        preset: quick, standard or fine.
+        size: see `Options`; so are `distance` and `crop`.
+        distance: sets the scale in place of `size`.
+        crop: [6] m.
+        device: where the field is sampled.
+
+    Returns:
+        The stage's report.
+
+    Raises:
+        SdfsimError: (exit code 3) no surface worth the name; (exit code 1) a distance or box that makes no sense.
+    """
+
+    trained = load_field(distill)
+    field, to_unit = trained.field.to(device), trained.to_unit
+    views = [to_unit.view(view) for view in load_views(poses)]
+    points = to_unit.points(load_sparse(poses).xyz)
+    alone = bool(trained.report["masked"])
+    inner, limit = field_distance(field), ball
+    volume = sample_volume(
+        lambda p: np.maximum(inner(p), ball(p)),
+        RESOLUTION[preset],
+        extent=EXTENT,
+        on_progress=share_of(on_progress, 0.0, 0.25),
+    )
+    surface = surface_of(volume, field, views, points, photos, limit, on_progress=share_of(on_progress, 0.25, 0.25))
+    scale = measured_scale(distance, views, load_photos(photos), Caster(surface.raw)) if distance else None
+    placement = place(surface.visible, views, scale, size=size, alone=alone)
+    if crop is not None:
+        limit = box_of(placement, np.reshape(crop, (2, 3)))
+        volume = volume.limited(limit)
+        if not (volume.values < 0).any():
+            raise SdfsimError("crop: the box holds nothing", "corners are in metres, as in a mesh/mesh.ply without it")
+        surface = surface_of(volume, field, views, points, photos, limit, on_progress=share_of(on_progress, 0.5, 0.2))
+        # Where a person has cut the surroundings away, what is left is what they want to move.
+        alone = alone or not surface.reaches_rim
+    on_progress(0.7, "looking for bodies")
+    cut = lambda p: np.maximum(inner(p), limit(p))  # noqa: E731
+    parts = split(surface, cut, field.finest, views, photos, placement.to_metres.rotation[2], alone=alone)
+    write_parts(parts, surface.visible, placement, out)
+    on_progress(0.95, "drawing objects.png")
+    draw_names(parts, views, photos).save(out / "objects.png")
+    metres = placement.to_metres.scale
+    return {
+        **surface.report, "left_out_m": [float(rounded(length * metres)) for length in surface.report["left_out"]],
+        "extent_m": rounded(np.ptp(placement.mesh(surface.visible).vertices, axis=0)).tolist(),
+        "up_from": placement.up_from, "up_within_degrees": round(placement.up_within, 2),
+        "up_confidence": placement.up_confidence, "size": placement.size_from, "objects": list(parts.bodies),
+        "smallest_object_m": float(rounded(parts.smallest * metres)),
+    }  # fmt: skip
+
+
+def box_of(placement: Placement, corners: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Distance from what is left after cropping: the trained ball within a box with corners [2, 3] m."""
+    middle, half = corners.mean(0), np.ptp(corners, axis=0) / 2
+
+    def distance(points: np.ndarray) -> np.ndarray:
+        beyond = np.abs(placement.to_metres.points(points) - middle) - half
+        return np.maximum(ball(points), beyond.max(1) / placement.to_metres.scale)
+
+    return distance
+
+
+def rounded(values: ArrayLike) -> np.ndarray:
+    """Values [...] to six digits of the largest: scenes are from a tenth of a millimetre to 100 km wide."""
+    values = np.asarray(values, float)
+    largest = np.abs(values).max()
+    return values.round(5 - int(np.floor(np.log10(largest)))) if largest > 0 else values
+
+
+def write_parts(parts: Parts, visible: Mesh, placement: Placement, out: Path) -> None:
+    """Writes meshes in metres, `placement.json` and `parts.json`."""
+
+    def write(name: str, mesh: Mesh) -> Mesh:
+        moved = placement.mesh(mesh)
+        with replacing(out / name) as partial:
+            partial.write_bytes(write_ply(moved))
+        return moved
+
+    write("mesh.ply", visible)
+    if parts.solid is not None and parts.shown is not None:
+        write("solid.ply", parts.solid)
+        write("shown.ply", parts.shown)
+    (out / "objects").mkdir(exist_ok=True)
+    objects = []
+    for name, mesh in parts.bodies.items():
+        moved = write(f"objects/{name}.ply", mesh)
+        low, high = moved.vertices.min(0), moved.vertices.max(0)
+        objects.append({"name": name, "low": rounded(low).tolist(), "high": rounded(high).tolist()})
+    write_json(out / "parts.json", {"version": 1, "scenery": parts.solid is not None, "objects": objects})
+    placement.save(out)
+
+
+def read_parts(mesh_folder: Path) -> dict:
+    """What `write_parts` wrote to `parts.json`.
+
+    Raises:
+        SdfsimError: the mesh stage has not run.
+    """
+    return read_json(Path(mesh_folder) / "parts.json", "run the mesh stage first")
+
+
+def draw_names(parts: Parts, views: list[View], photos_folder: Path) -> Image.Image:
+    """A picture that tells which body has which name: the photos that show them best, each body tinted and labelled.
+
+    Args:
+        parts: in the space of the views.
+        views: cameras.
+        photos_folder: of the photos stage.
+    """
+    meshes = list(parts.bodies.values())
+    caster = Caster(joined(meshes if parts.solid is None else [*meshes, parts.solid]))
+    borders = np.cumsum([len(mesh.faces) for mesh in meshes])
+
+    def seen(view: View, longest: int) -> np.ndarray:
+        """Which body each pixel [H, W] shows; the number of bodies for none."""
+        scale = longest / max(view.width, view.height)
+        size = max(1, round(view.height * scale)), max(1, round(view.width * scale))
+        row, column = (axis.ravel() for axis in np.indices(size))
+        away, face = caster.hits(view.center, view.rays((column + 0.5) / scale, (row + 0.5) / scale))
+        number = np.searchsorted(borders, face, side="right")
+        return np.where(np.isfinite(away), number, len(meshes)).reshape(size)
+
+    pixels = np.array([np.bincount(seen(v, THUMB).ravel(), minlength=len(meshes) + 1)[:-1] for v in views], float)
+    share = pixels / np.maximum(pixels.max(0), 1)
+    chosen: list[int] = []
+    best = np.zeros(len(meshes))
+    while len(chosen) < min(PICTURES, len(views)):  # Each next photo shows most of what the earlier ones show worst.
+        gain = np.maximum(share - best, 0).sum(1)
+        if chosen and gain.max() < 0.3:
+            break
+        chosen.append(int(gain.argmax()))
+        best = np.maximum(best, share[chosen[-1]])
+    tiles = [_tile(views[k], seen(views[k], WIDE), list(parts.bodies), photos_folder) for k in chosen]
+    sheet = Image.new("RGB", (sum(t.width for t in tiles), max(t.height for t in tiles)), (255, 255, 255))
+    left = 0
+    for tile in tiles:
+        sheet.paste(tile, (left, 0))
+        left += tile.width
+    return sheet
+
+
+def _tile(view: View, seen: np.ndarray, names: list[str], photos_folder: Path) -> Image.Image:
+    with Image.open(Path(photos_folder) / "images" / view.name) as photo:
+        pixels = np.asarray(photo.convert("RGB").resize(seen.shape[::-1]), float)
+    for number in range(len(names)):  # Hues a golden section apart, so that neighbours differ.
+        color = 255 * np.array(colorsys.hsv_to_rgb(number * 0.618 % 1, 0.85, 1.0))
+        pixels[seen == number] += TINT * (color - pixels[seen == number])
+    tile = Image.fromarray(pixels.astype(np.uint8))
+    draw = ImageDraw.Draw(tile)
+    style = {"fill": (255, 255, 255), "stroke_width": 2, "stroke_fill": (0, 0, 0), "font": ImageFont.load_default(18)}
+    for number, name in enumerate(names):
+        rows, columns = np.nonzero(seen == number)
+        if len(rows) >= 12:
+            draw.text((float(np.median(columns)), float(np.median(rows))), name, anchor="mm", **style)
+    draw.text((6, 4), view.source, **style)
+    return tile

@@ -1,0 +1,281 @@
+"""Normalised space -> metres with z up: which way gravity points, how large the scene is, where its floor lies."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+
+from pipeline.cameras import Similarity, View, camera_up, frame_of
+from pipeline.inputs.photos import Photo
+from pipeline.mesh.cleaning import face_normals
+from pipeline.mesh.visibility import Caster
+from sdfsim.errors import SdfsimError
+from sdfsim.files import read_json, write_json
+from sdfsim.shape.mesh import Mesh
+
+# Degrees up to which gravity is known well, or well enough to look right: would a ball roll off a level table?
+CONFIDENT = {"high": 2.0, "medium": 6.0}
+FLOORS = 0.5  # degrees within which floors and tables are level
+# A pixel may miss what it is meant to show by these shares of the width; farther off by the factor is behind it.
+NEARBY, BEHIND = (0.0, 0.008, 0.016, 0.024), 1.1
+
+Named = TypeVar("Named", View, Photo)
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where a reconstruction stands in the world.
+
+    Attributes:
+        to_metres: from normalised space to metres, z up.
+        up_from: "plane" or "cameras".
+        size_from: where the scale comes from, in words.
+        up_within: degrees within which up can be trusted.
+    """
+
+    to_metres: Similarity
+    up_from: str
+    size_from: str
+    up_within: float = 0.0
+
+    @property
+    def up_confidence(self) -> str:
+        """high, medium or low."""
+        return next((word for word, most in CONFIDENT.items() if self.up_within <= most), "low")
+
+    def mesh(self, mesh: Mesh) -> Mesh:
+        """A mesh moved to metres."""
+        return Mesh(self.to_metres.points(mesh.vertices), mesh.faces, mesh.colors)
+
+    def save(self, mesh_folder: Path) -> None:
+        """Writes `placement.json`."""
+        write_json(mesh_folder / "placement.json", {**vars(self), "to_metres": self.to_metres.to_dict()})
+
+
+def load_placement(mesh_folder: Path) -> Placement:
+    """Reads `placement.json`.
+
+    Raises:
+        SdfsimError: the mesh stage has not run.
+    """
+    path = Path(mesh_folder) / "placement.json"
+    content = read_json(path, "run the mesh stage first")
+    try:
+        return Placement(**{**content, "to_metres": Similarity.from_dict(content["to_metres"])})
+    except (ValueError, KeyError, TypeError) as error:
+        raise SdfsimError(f"{path}: damaged", "run the mesh stage again") from error
+
+
+class Up(NamedTuple):
+    """Up in normalised space: a unit vector [3], "plane" or "cameras", and degrees within which it can be trusted."""
+
+    direction: np.ndarray
+    source: str
+    within: float
+
+
+def find_up(shown: Mesh, views: list[View]) -> Up:
+    """Up from the largest nearly level plane, else from the cameras; how far they disagree counts as doubt."""
+    cameras = camera_up(views)
+    normals, areas = face_normals(shown)
+    centers = shown.vertices[shown.faces].mean(1)
+    plane = plane_up(centers, normals, areas, cameras.normal, tolerance=0.02)
+    if plane is None:
+        return Up(cameras.normal, "cameras", cameras.within)
+    normal, slope = plane
+    within = float(np.hypot(FLOORS, slope))
+    apart = float(np.degrees(np.arccos(np.clip(normal @ cameras.normal, -1, 1))))
+    return Up(normal, "plane", within if apart < 3 * cameras.within else max(within, apart))
+
+
+def plane_up(
+    points: np.ndarray, normals: np.ndarray, weights: np.ndarray, guess: np.ndarray, tolerance: float, *,
+    max_angle: float = 25.0, min_share: float = 0.08,
+) -> tuple[np.ndarray, float] | None:  # fmt: skip
+    """The largest plane among surface samples whose normal is near a guess (RANSAC).
+
+    Args:
+        points: [P, 3].
+        normals: [P, 3] unit, outwards.
+        weights: [P] area of each sample.
+        guess: [3] unit; only planes within `max_angle` degrees of it count.
+        tolerance: distance within which a sample belongs to a plane.
+        max_angle: degrees.
+        min_share: share of all the area that a plane needs.
+
+    Returns:
+        Its unit normal [3] and the slope in degrees that its unevenness amounts to; None where none is large enough.
+    """
+    near = normals @ guess > np.cos(np.radians(max_angle))
+    if near.sum() <= 10:
+        return None
+    p, n, w = points[near], normals[near], weights[near]
+    rng = np.random.default_rng(0)
+    best, inside = 0.0, None
+    for pick in rng.choice(len(p), size=min(200, len(p)), replace=False, p=w / w.sum()):
+        member = (np.abs((p - p[pick]) @ n[pick]) < tolerance) & (n @ n[pick] > 0.9)
+        if w[member].sum() > best:
+            best, inside = float(w[member].sum()), member
+    if inside is None or best < min_share * weights.sum():
+        return None
+    for _ in range(3):
+        center = np.average(p[inside], axis=0, weights=w[inside])
+        offset = p[inside] - center
+        spread, axes = np.linalg.eigh((offset * w[inside, None]).T @ offset)
+        normal = axes[:, 0] * np.sign(axes[:, 0] @ guess)
+        inside = (np.abs((p - center) @ normal) < tolerance) & (n @ normal > 0.9)
+        if inside.sum() < 10:
+            return None
+    if normal @ guess < np.cos(np.radians(max_angle)):
+        return None
+    return normal, float(np.degrees(np.arctan(np.sqrt(max(spread[0], 0) / max(spread[1], 1e-30)))))
+
+
+def resting_height(mesh: Mesh, *, level: float = 0.95, share: float = 0.05) -> float:
+    """Height of the lowest level surface with at least `share` of the mesh's area; without one, the mesh's lowest part.
+
+    Args:
+        mesh: z up.
+        level: least z of a normal that counts as level.
+        share: of all the area.
+    """
+    normals, areas = face_normals(mesh)
+    height = mesh.vertices[mesh.faces][:, :, 2].mean(1)
+    flat = normals[:, 2] > level
+    if flat.any():
+        width = 0.01 * float(np.ptp(mesh.vertices, axis=0).max())
+        bins = ((height[flat] - height[flat].min()) / width).astype(int)
+        area = np.bincount(bins, areas[flat])
+        # A plane that lies across the border of two bins must not be missed.
+        enough = np.flatnonzero(area + np.append(area[1:], 0) > share * areas.sum())
+        if len(enough):
+            chosen = (bins == enough[0]) | (bins == enough[0] + 1)
+            order = np.argsort(height[flat][chosen])
+            total = np.cumsum(areas[flat][chosen][order])
+            return float(height[flat][chosen][order][np.searchsorted(total, total[-1] / 2)])
+    return float(np.quantile(mesh.vertices[:, 2], 0.002))
+
+
+def level(shown: Mesh, views: list[View], up: np.ndarray) -> np.ndarray:
+    """The rotation [3, 3] that turns up [3] to z and the front, which is towards the mean camera, to -y."""
+    center = (shown.vertices.min(0) + shown.vertices.max(0)) / 2
+    # Cameras all around have no front: take the first photo's side.
+    for eye in (np.mean([v.center for v in views], axis=0), views[0].center):
+        front = eye - center
+        front -= up * (front @ up)
+        if np.linalg.norm(front) > 0.2:
+            y = -front / np.linalg.norm(front)
+            return np.stack([np.cross(y, up), y, up])
+    return frame_of(up)
+
+
+def place(shown: Mesh, views: list[View], scale: tuple[float, str] | None = None, *, size: float | None = None,
+          alone: bool = False) -> Placement:  # fmt: skip
+    """Chooses up, scale and origin: the floor is z = 0 and the middle of the visible surface is over the origin.
+
+    Args:
+        shown: visible surface in normalised space.
+        views: cameras in normalised space.
+        scale: metres a normalised unit and where that comes from, if it is known; else `size` sets it.
+        size: widest side of the box around the visible surface, m; None means 1 m, and says so in `size_from`.
+        alone: there is no scenery: the floor is where the lowest point is.
+    """
+    up = find_up(shown, views)
+    rotation = level(shown, views, up.direction)
+    turned = shown.vertices @ rotation.T
+    if scale is None:
+        source = "assumed: widest side = 1 m" if size is None else f"given: widest side = {size:g} m"
+        scale = (1.0 if size is None else size) / float(np.ptp(turned, axis=0).max()), source
+    metres, source = scale
+    in_metres = Mesh(metres * turned, shown.faces)
+    low, high = in_metres.vertices.min(0), in_metres.vertices.max(0)
+    floor = low[2] if alone else resting_height(in_metres)
+    translation = -np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, floor])
+    return Placement(Similarity(metres, rotation, translation), up.source, source, up.within)
+
+
+def measured_scale(distance: Sequence, views: list[View], photos: list[Photo], surface: Caster) -> tuple[float, str]:
+    """Metres a normalised unit at which a known distance is what it should be, and where that comes from, in words.
+
+    Args:
+        distance: see `Options`.
+        views: cameras in normalised space.
+        photos: what the views' photos were made of; pixels are those of the user's own photos.
+        surface: in normalised space.
+
+    Raises:
+        SdfsimError: no such posed photo or several, a pixel outside it, or one that shows nothing of the surface.
+    """
+    first, second, metres = distance
+    start, end = (_locate(text, views, photos, surface) for text in (first, second))
+    found = float(np.linalg.norm(end - start))
+    if found < 1e-3:
+        raise SdfsimError(f"distance: {first} and {second} are in the same place")
+    return metres / found, f"given: {first} to {second} = {metres:g} m"
+
+
+def check_distance(distance: Sequence, photos: list[Photo]) -> None:
+    """Checks what can be known of a distance's ends before there are poses.
+
+    Raises:
+        SdfsimError: no such photo or several, or a pixel outside it.
+    """
+    for text in distance[:2]:
+        name, pixel = _parts(text)
+        _check_pixel(text, pixel, _called(name, photos, "photo"))
+
+
+def _locate(text: str, views: list[View], photos: list[Photo], surface: Caster) -> np.ndarray:
+    """Position [3] of one end of a known distance."""
+    name, pixel = _parts(text)
+    view = _called(name, views, "posed photo")
+    if pixel is None:
+        return view.center
+    photo = next(photo for photo in photos if photo.name == view.name)
+    _check_pixel(text, pixel, photo)
+    turn = np.arange(8) * np.pi / 4
+    around = np.concatenate([r * np.stack([np.cos(turn), np.sin(turn)], 1) for r in NEARBY]) * view.width
+    spots = photo.prepared(np.array([pixel]), view) + around
+    rays = view.rays(spots[:, 0], spots[:, 1])
+    away = surface.hits(view.center, rays)[0]
+    if not np.isfinite(away).any():
+        raise SdfsimError(f"distance: {text} shows nothing of the surface", "choose a pixel on what was reconstructed")
+    # People point at corners, which come out a little rounded, and just beside one is what lies far behind it: as far
+    # away as the first pixel that shows none of that, but where they pointed.
+    best = int((away < BEHIND * away.min()).argmax())
+    return view.center + away[best] * rays[0]
+
+
+def _parts(text: str) -> tuple[str, tuple[float, float] | None]:
+    """The photo's name, and the pixel if one is given."""
+    pixel = re.fullmatch(r"(.+):(\d+(?:\.\d+)?),(\d+(?:\.\d+)?)", text)
+    return (pixel[1], (float(pixel[2]), float(pixel[3]))) if pixel else (text, None)
+
+
+def _check_pixel(text: str, pixel: tuple[float, float] | None, photo: Photo) -> None:
+    width, height = photo.original
+    if pixel is not None and not (pixel[0] <= width and pixel[1] <= height):
+        raise SdfsimError(f"distance: {text} lies outside the photo ({width} x {height} px)")
+
+
+def _called(name: str, views: Sequence[Named], what: str) -> Named:
+    """The one of `views` whose photo has this name, with or without its subfolder."""
+    found = [v for v in views if v.source == name] or [v for v in views if Path(v.source).name == name]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise SdfsimError(
+            f"distance: {len(found)} {what}s are called {name!r}",
+            f"write its folder as well: {', '.join(v.source for v in found[:3])}",
+        )
+    near = difflib.get_close_matches(name, [v.source for v in views], 3, 0.3) or [v.source for v in views[:3]]
+    raise SdfsimError(
+        f"distance: no {what} is called {name!r}",
+        f"write PHOTO:X,Y for a pixel or PHOTO for the camera; photos: {', '.join(near)}, ...",
+    )

@@ -1,0 +1,127 @@
+"""Which points of a surface the photos show, and in which colours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from pipeline.cameras import View
+from pipeline.mesh.cleaning import vertex_normals
+from pipeline.progress import Progress, quiet
+from sdfsim.shape.mesh import Mesh
+
+# A point seen at a flatter angle than this (cosine) does not count as seen.
+FLATTEST = 0.08
+
+
+@dataclass(frozen=True)
+class Look:
+    """What the photos show of some points.
+
+    Attributes:
+        count: [V] how many views see each.
+        color: [V, 3] float in 0..255, the mean over photos, weighted towards those that look straight and from near.
+        weight: [V] behind the colour; 0: no photo shows the point.
+    """
+
+    count: np.ndarray
+    color: np.ndarray
+    weight: np.ndarray
+
+
+class Caster:
+    """Rays against a mesh."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        import open3d as o3d
+
+        self.tensor: Any = o3d.core.Tensor
+        self.scene = o3d.t.geometry.RaycastingScene()
+        self.scene.add_triangles(
+            self.tensor(mesh.vertices.astype(np.float32)), self.tensor(mesh.faces.astype(np.uint32))
+        )
+
+    def hits(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Distances [R] along unit directions [R, 3], inf where nothing is hit, and the faces hit [R]."""
+        rays = np.concatenate([np.broadcast_to(origins, directions.shape), directions], 1).astype(np.float32)
+        found = self.scene.cast_rays(self.tensor(rays))
+        return found["t_hit"].numpy().astype(np.float64), found["primitive_ids"].numpy().astype(np.int64)
+
+    def blocked(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """Whether something lies between points [R, 3] and [R, 3] or [3]."""
+        rays = np.concatenate([start, end - start], 1).astype(np.float32)
+        return self.scene.test_occlusions(self.tensor(rays), tnear=0.0, tfar=1.0).numpy()
+
+
+class Visibility:
+    """Which vertices of a mesh which views see.
+
+    Args:
+        mesh: whose vertices are looked at.
+        offset: how far along its normal a vertex is lifted before looking from it.
+        blocking: what can stand in the way; the mesh itself by default.
+    """
+
+    def __init__(self, mesh: Mesh, offset: float, blocking: Caster | None = None) -> None:
+        self.vertices, self.normals = mesh.vertices, vertex_normals(mesh)
+        self._from = mesh.vertices + offset * self.normals
+        self._blocking = blocking or Caster(mesh)
+
+    def of_view(self, view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Vertices [S] that a view sees, their pixels [S, 2], and the cosines [S] between normal and line of sight."""
+        pixels, depth = view.project(self.vertices)
+        towards = view.center - self.vertices
+        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        cosine = (towards * self.normals).sum(1)
+        inside = (depth > 0) & (pixels > 1).all(1) & (pixels < [view.width - 1, view.height - 1]).all(1)
+        index = np.flatnonzero(inside & (cosine > FLATTEST))
+        index = index[~self._blocking.blocked(self._from[index], view.center)]
+        return index, pixels[index], cosine[index]
+
+
+def look(sight: Visibility, views: list[View], photos_folder: Path, on_progress: Progress = quiet) -> Look:
+    """How many views see each vertex, and its colour in their photos."""
+    vertices = sight.vertices
+    count = np.zeros(len(vertices), np.int32)
+    color, weight = np.zeros((len(vertices), 3)), np.zeros(len(vertices))
+    for number, view in enumerate(views):
+        index, pixels, cosine = sight.of_view(view)
+        count[index] += 1
+        with Image.open(Path(photos_folder) / "images" / view.name) as image:
+            photo = np.asarray(image.convert("RGB"), np.float32)
+        share = cosine**2 / np.linalg.norm(view.center - vertices[index], axis=1) ** 2
+        color[index] += share[:, None] * bilinear(photo, pixels - 0.5)
+        weight[index] += share
+        on_progress((number + 1) / len(views), f"looking from photo {number + 1} of {len(views)}")
+    return Look(count, color / np.maximum(weight, 1e-12)[:, None], weight)
+
+
+def bilinear(image: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Values [P, C] of an image [H, W, C] at pixel positions [P, 2] (column, row; centres at whole numbers)."""
+    from scipy.ndimage import map_coordinates
+
+    channels = [map_coordinates(image[..., c], at.T[::-1], order=1, mode="nearest") for c in range(image.shape[2])]
+    return np.stack(channels, -1)
+
+
+def spread_colors(points: np.ndarray, known: np.ndarray, colors: np.ndarray) -> np.ndarray:
+    """Colours [P, C] at points [P, 3] from known ones [K, 3] with colours [K, C]: inverse-distance mean of the nearest.
+
+    What no photo shows, such as the place where a body stood, gets the colours around it.
+    """
+    from scipy.spatial import KDTree
+
+    nearest = min(8, len(known))
+    away, index = KDTree(known).query(points, k=nearest)
+    away, index = away.reshape(len(points), nearest), index.reshape(len(points), nearest)
+    share = 1 / np.maximum(away, 1e-9)
+    return (colors[index] * share[..., None]).sum(1) / share.sum(1, keepdims=True)
+
+
+def to_bytes(color: np.ndarray) -> np.ndarray:
+    """Colours [..., 3] in 0..255 as bytes."""
+    return np.clip(color + 0.5, 0, 255).astype(np.uint8)

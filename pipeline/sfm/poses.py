@@ -1,0 +1,219 @@
+"""Photos -> camera poses and sparse points, in at most three attempts, each checked for whether it can be trusted."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.cameras import load_views, save_views
+from pipeline.inputs.photos import KNOWN_CAMERAS, Photo
+from pipeline.progress import Progress, quiet
+from pipeline.sfm.pose_checks import check, failure_hint, failure_message, views_of
+from sdfsim.errors import EXIT_QUALITY, SdfsimError
+from sdfsim.files import read_json, replacing, write_json
+
+ORDINARY: dict[str, Any] = {
+    "pixels": 1000, "max_features": 3000, "peak_threshold": 0.0066667, "max_ratio": 0.8, "guided": False,
+    "moving_only": False, "min_inliers": 15, "min_inlier_ratio": 0.35, "init_inliers": 100, "init_angle": 16.0,
+    "pose_inliers": 30,
+}  # fmt: skip
+# What each attempt asks of the worker, by its name. The first that gives poses to be trusted is the last.
+ATTEMPTS = {
+    "ordinary": ORDINARY,
+    "without what stands still": {**ORDINARY, "moving_only": True},
+    "more features": {
+        **ORDINARY, "pixels": 1600, "max_features": 12000, "peak_threshold": 0.003, "max_ratio": 0.88, "guided": True,
+        "min_inliers": 12, "min_inlier_ratio": 0.25, "init_inliers": 40, "init_angle": 6.0, "pose_inliers": 15,
+    },
+}  # fmt: skip
+
+
+def hopeful(name: str, first: dict) -> bool:
+    """Whether an attempt is worth its time after the first one's failed checks.
+
+    Photos of one spot, or of a background that stands still, tell no more with more features.
+    """
+    still = first["still_pairs"] > 0.5
+    return still if name == "without what stands still" else first["turn_only_pairs"] <= 0.9 and not still
+
+
+def size_groups(photos: list[Photo]) -> list[dict]:
+    """Photos that share one camera: same size, same body, same zoom (EXIF focal within 2 %)."""
+    groups: dict[tuple, dict] = {}
+    for photo in photos:
+        zoom = round(np.log(photo.focal) / 0.02) if photo.focal else None
+        key = (photo.width, photo.height, photo.camera, zoom)
+        entry = {"width": photo.width, "height": photo.height, "focal": photo.focal, "names": []}
+        groups.setdefault(key, entry)["names"].append(photo.name)
+    return list(groups.values())
+
+
+def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0, timeout: float = 1800.0,
+          exhaustive_up_to: int = 150, on_progress: Progress = quiet) -> dict:  # fmt: skip
+    """Finds the poses of `photos` and writes `cameras.json`, `sparse.npz`, `checks.json` to `out`.
+
+    Makes `ATTEMPTS` until poses can be trusted; each has a folder of its own, in which a killed run goes on. Where the
+    photos came with cameras these are kept, checked against the photos, and given sparse points.
+
+    Args:
+        photos: what the photos stage prepared, in `photos_folder`.
+        photos_folder: holds `images/` (and `masks/`, `known_cameras.json`).
+        out: existing folder.
+        seed: of every random choice in matching and mapping.
+        timeout: s for each attempt.
+        exhaustive_up_to: with more photos than this only neighbours in name order are matched.
+
+    Returns:
+        The checks (also in checks.json): posed, left_out with reasons, mean_error px, warnings, and the attempts.
+
+    Raises:
+        SdfsimError: (exit code 3) too few photos could be posed, or the result is not plausible.
+    """
+    out, photos_folder = Path(out), Path(photos_folder)
+    known = photos_folder / KNOWN_CAMERAS
+    job = {
+        "images": str(photos_folder / "images"), "count": len(photos), "groups": size_groups(photos), "seed": seed,
+        "masks": str(photos_folder / "masks") if all(p.mask for p in photos) else "",
+        "known_cameras": str(known) if known.exists() else "", "exhaustive_up_to": exhaustive_up_to,
+    }  # fmt: skip
+    tries: list[tuple[dict, Path, dict]] = []
+    told: list[dict] = []
+    for name, settings in ATTEMPTS.items():
+        if tries and (job["known_cameras"] or not hopeful(name, tries[0][0])):
+            continue
+
+        def report(fraction: float, message: str, name: str = name, again: bool = bool(tries)) -> None:
+            on_progress(fraction, (f"again, {name}: " if again else "") + message)
+
+        folder = out / f"try_{name.replace(' ', '_')}"
+        try:
+            result = run_worker({**job, **settings}, folder, timeout, report)
+        except SdfsimError as error:
+            if not tries:
+                raise
+            # What the attempts before found out says more than that this one broke.
+            told.append({"name": name, "posed": 0, "failures": [error.message]})
+            continue
+        checks = check(result, photos, tries[0][2] if tries else None)
+        tries.append((checks, folder, result))
+        told.append({"name": name, "posed": checks["posed"], "failures": checks["failures"]})
+        if not checks["failures"]:
+            break
+    # Best: plausible first, then the most photos and points.
+    checks, folder, result = max(tries, key=lambda t: (not t[0]["failures"], t[0]["posed"], t[0]["points"]))
+    checks["attempts"], checks["known_cameras"] = told, bool(job["known_cameras"])
+    hint = failure_hint(checks)
+    if checks["known_cameras"] and checks["failures"]:
+        checks["failures"] = [f"the known cameras do not fit the photos: {'; '.join(checks['failures'])}"]
+        checks["causes"] = []
+        hint = (
+            "check which photo belongs to which camera, and its axes; or give the folder of photos to find poses anew"
+        )
+    write_json(out / "checks.json", checks)
+    if checks["failures"]:
+        raise SdfsimError(failure_message(checks), hint, exit_code=EXIT_QUALITY)
+    views = load_views(known) if job["known_cameras"] else views_of(result, photos)
+    save_views(views, out / "cameras.json")
+    with replacing(out / "sparse.npz") as partial:  # A copy: the attempt's result stays whole for a run that goes on.
+        shutil.copyfile(folder / "sparse.npz", partial)
+    for _, used, _ in tries:  # Tens of megabytes that nothing reads any more; the logs stay.
+        (used / "database.db").unlink(missing_ok=True)
+        shutil.rmtree(used / "colmap", ignore_errors=True)
+    return checks
+
+
+def read_if_there(path: Path) -> Any:
+    """The content of a JSON file, or None where it is absent or was cut short."""
+    try:
+        return read_json(path)
+    except SdfsimError:
+        return None
+
+
+def run_worker(job: dict, folder: Path, timeout: float, on_progress: Progress) -> dict:
+    """Runs the COLMAP child process on one job, unless the folder holds the result of the same job already.
+
+    Returns:
+        What it wrote to `result.json`.
+
+    Raises:
+        SdfsimError: it crashed or ran out of time; the message names its log.
+    """
+    if read_if_there(folder / "job.json") != job:
+        shutil.rmtree(folder, ignore_errors=True)  # Of other photos or settings.
+    elif (done := read_if_there(folder / "result.json")) is not None:
+        return done
+    folder.mkdir(parents=True, exist_ok=True)
+    log = folder / "colmap.log"
+    write_json(folder / "job.json", job)
+    environment = dict(os.environ)
+    root = str(Path(__file__).resolve().parents[2])
+    environment["PYTHONPATH"] = os.pathsep.join(filter(None, [root, environment.get("PYTHONPATH", "")]))
+    lines = folder / "progress.log"
+    with open(log, "wb") as errors, open(lines, "wb") as output:
+        child = subprocess.Popen(
+            [sys.executable, "-m", "pipeline.sfm.worker", str(folder / "job.json")],
+            stdout=output, stderr=errors, stdin=subprocess.DEVNULL, env=environment,
+        )  # fmt: skip
+        started = time.monotonic()
+        try:
+            while child.poll() is None:
+                if time.monotonic() - started > timeout:
+                    raise SdfsimError(
+                        f"camera poses: stopped after {timeout:.0f} s (log: {log})", "use fewer or smaller photos"
+                    )
+                on_progress(*estimate(folder, lines, job["count"], job["exhaustive_up_to"]))
+                try:
+                    child.wait(0.5)
+                except subprocess.TimeoutExpired:
+                    continue
+        finally:
+            if child.poll() is None:
+                child.kill()
+                child.wait()
+    if child.returncode != 0 or not (folder / "result.json").exists():
+        reason = crash_reason(child.returncode, log)
+        raise SdfsimError(f"camera poses: COLMAP {reason} (log: {log})", "run again; if it stays, try fewer photos")
+    return read_json(folder / "result.json")
+
+
+def crash_reason(code: int, log: Path) -> str:
+    """How the child ended, in words: a signal's name or the last line of its log."""
+    if code < 0:
+        return f"was ended by {signal.Signals(-code).name}"
+    tail = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    return f"failed: {tail[-1].strip()[:200]}" if tail else f"failed with status {code}"
+
+
+def estimate(folder: Path, lines: Path, count: int, exhaustive_up_to: int) -> tuple[float, str]:
+    """Fraction done and a message, from the child's lines and the row counts of its database."""
+    said = lines.read_text(errors="replace").splitlines()
+    phase = next((line.split()[1] for line in reversed(said) if line.startswith("phase")), "features")
+    placed = next((int(line.split()[1]) for line in reversed(said) if line.startswith("placed")), 0)
+    if phase == "mapping":
+        return 0.75 + 0.25 * min(1.0, placed / count), f"placing cameras, {placed} of {count}"
+    if phase == "done":
+        return 1.0, "done"
+    table, total = ("keypoints", count) if phase == "features" else ("two_view_geometries", count * (count - 1) / 2)
+    if phase == "matches" and count > exhaustive_up_to:
+        total = count * 20
+    rows = 0
+    try:
+        with sqlite3.connect(f"file:{folder / 'database.db'}?mode=ro", uri=True, timeout=0.2) as database:
+            rows = database.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
+        database.close()
+    except sqlite3.Error:
+        pass  # Not there yet, or busy: only a progress bar.
+    part = min(1.0, rows / max(total, 1))
+    if phase == "features":
+        return 0.2 * part, f"finding features, {rows} of {count} photos"
+    return 0.2 + 0.55 * part, f"matching, {rows} of {int(total)} pairs"

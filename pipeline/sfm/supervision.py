@@ -1,0 +1,164 @@
+"""What structure-from-motion tells the training: where the object is, points on its surface, and free space."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipeline.cameras import Similarity, Sparse, View, nearest_to_axes
+from pipeline.field.interpolation import interpolate
+
+# Lines of sight end this far before their points, normalised units.
+GAP = 0.015
+# Clearance that free space asks for: at most, and as a share of the way to the point, which may be on a grazed plane.
+CLEARANCE, SLOPE = 0.02, 0.1
+# Free space counts as filled where the field is below this; between, it may be its coarseness.
+FILLED, JUST_EMPTY = -0.004, 0.002
+TRIES = 16  # places along each line at which filled free space is looked for
+
+
+@dataclass(frozen=True)
+class Supervision:
+    """Sparse points and free space in the unit sphere.
+
+    Attributes:
+        points: [P, 3] surface points in the unit sphere.
+        weights: [P] how far each is trusted, mean 1.
+        sight: [L, 6] starts and ends of stretches of free space.
+    """
+
+    points: np.ndarray
+    weights: np.ndarray
+    sight: np.ndarray
+
+
+def supervision_of(sparse: Sparse, views: list[View], to_unit: Similarity) -> Supervision:
+    """Sparse points seen by three views or more with a small error, and their lines of sight within the sphere.
+
+    Args:
+        sparse: in the world of the poses.
+        views: in the space of the unit sphere.
+        to_unit: from one to the other.
+    """
+    points = to_unit.points(sparse.xyz)
+    seen = np.bincount(sparse.point_of, minlength=len(points))
+    good = (seen >= 3) & (sparse.error < 1.5)
+    inside = good & (np.linalg.norm(points, axis=1) < 1.0)
+    weights = point_weights(sparse, len(points))[inside]
+    use = good[sparse.point_of]
+    end, start = points[sparse.point_of[use]], np.array([v.center for v in views]).reshape(-1, 3)[sparse.view_of[use]]
+    length = np.linalg.norm(end - start, axis=1)
+    direction = (end - start) / np.maximum(length, 1e-9)[:, None]
+    along = -(start * direction).sum(1)
+    half = np.sqrt(np.maximum(1 - ((start**2).sum(1) - along**2), 0))
+    # Not all the way: a point is uncertain by a little, and so is the surface there.
+    low, high = np.maximum(along - half, 0), np.minimum(along + half, length - GAP)
+    crosses = (half > 0) & (high > low + 0.02)
+    sight = np.concatenate([start + low[:, None] * direction, start + high[:, None] * direction], 1)[crosses]
+    return Supervision(points[inside], weights / max(float(weights.mean()), 1e-9) if len(weights) else weights, sight)
+
+
+class FreeSpace:
+    """Points between cameras and what they see, which must be empty whatever the colours say.
+
+    Half of those handed out are where the field is solid all the same: a vase's mouth is crossed by one line of sight
+    in hundreds, and would stay filled if lines were drawn evenly.
+
+    Args:
+        sight: [L, 6] starts and ends of stretches of free space, normalised units.
+        device: of the points.
+    """
+
+    def __init__(self, sight: np.ndarray, device: str) -> None:
+        self.start, self.end = (
+            torch.tensor(part, dtype=torch.float32, device=device).reshape(-1, 3) for part in np.split(sight, 2, 1)
+        )
+        self.filled = torch.zeros(0, 2, device=device)
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+    def look(self, cache: Tensor, rng: torch.Generator) -> None:
+        """Finds filled places by the SDF on a grid [n, n, n, 1] over [-1, 1]^3, at random places of every line."""
+        device = self.start.device
+        found = []
+        for _ in range(TRIES):
+            along = torch.rand(len(self), generator=rng).to(device)
+            line = torch.arange(len(self), device=device)
+            wrong = interpolate(cache, self.at(line, along)[0])[:, 0] < FILLED
+            found.append(torch.stack([line[wrong].float(), along[wrong]], 1))
+        self.filled = torch.cat(found)
+
+    def at(self, line: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
+        """Points [P, 3] at fractions [P] of lines [P], and the clearance [P] that each asks for."""
+        start, end = self.start[line], self.end[line]
+        rest = (1 - along) * (end - start).norm(dim=1) + GAP
+        return start + along[:, None] * (end - start), (SLOPE * rest).clamp_max(CLEARANCE)
+
+    def pick(self, count: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
+        """At most `count` points [P, 3] and the SDF [P] that each must at least have."""
+        count, device = min(count, len(self)), self.start.device
+        line = torch.randint(max(1, len(self)), (count,), generator=rng).to(device)
+        along = torch.rand(count, generator=rng).to(device)
+        again = torch.randint(max(1, len(self.filled)), (count // 2,), generator=rng).to(device)
+        if not len(self.filled):
+            return self.at(line, along)
+        line[: count // 2] = self.filled[again, 0].long()
+        along[: count // 2] = self.filled[again, 1]
+        points, clearance = self.at(line, along)
+        # Emptied, but no more: right beside may be a surface, and this loss comes back to the same places.
+        clearance[: count // 2].clamp_(max=JUST_EMPTY)
+        return points, clearance
+
+
+def point_weights(sparse: Sparse, count: int) -> np.ndarray:
+    """Weight [P] of each sparse point: how many of the views see it, less where its error is large."""
+    seen = np.bincount(sparse.point_of, minlength=count).astype(float)
+    return seen / (1 + np.maximum(sparse.error, 0) ** 2)
+
+
+def weighted_quantile(values: np.ndarray, weights: np.ndarray, q: float) -> float:
+    """Quantile of `values` [P] with `weights` [P]."""
+    order = np.argsort(values)
+    total = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(total, q * total[-1])])
+
+
+def unit_sphere_of(views: list[View], sparse: Sparse, *, masked: bool = False) -> Similarity:
+    """The similarity that puts what the cameras look at into the unit sphere.
+
+    The centre is where the optical axes meet, drawn weakly to the points' median. The radius is what fits the longer
+    side of most photos, less where nearly all points are nearer, and never past the nearest cameras.
+
+    Args:
+        views: posed cameras.
+        sparse: points of the same reconstruction.
+        masked: every photo has a mask, so all points lie on the object.
+    """
+    centers = np.array([v.center for v in views])
+    axes = np.array([v.rotation[2] for v in views])
+    weights = point_weights(sparse, len(sparse.xyz))
+
+    def quantiles(q: float) -> np.ndarray:
+        return np.array([weighted_quantile(sparse.xyz[:, k], weights, q) for k in range(3)])
+
+    if masked:
+        center = (quantiles(0.005) + quantiles(0.995)) / 2
+        radius = 1.15 * weighted_quantile(np.linalg.norm(sparse.xyz - center, axis=1), weights, 0.99)
+    else:
+        center = nearest_to_axes(centers, axes, anchor=quantiles(0.5))
+        in_front = ((center - centers) * axes).sum(1) > 0
+        if in_front.mean() < 0.8:  # Axes that meet behind the cameras (a capture looking outwards) say nothing.
+            center = quantiles(0.5)
+        away = np.linalg.norm(centers - center, axis=1)
+        half = np.array([np.arctan(0.5 * max(v.width, v.height) / v.focal) for v in views])
+        points = np.linalg.norm(sparse.xyz - center, axis=1)
+        radius = min(
+            float(np.median(away * np.sin(half))), 1.25 * weighted_quantile(points, weights, 0.95),
+            0.9 * float(np.quantile(away, 0.05)),
+        )  # fmt: skip
+        radius = max(radius, 1e-9)
+    return Similarity(1 / radius, np.eye(3), -center / radius)

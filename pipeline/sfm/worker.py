@@ -1,0 +1,339 @@
+"""The child process of the poses stage: COLMAP through pycolmap. Run as `python -m pipeline.sfm.worker JOB.json`.
+
+A process of its own, because a native abort or an endless loop in here must not take the user's session down. Killed
+and started again with the same job, it goes on with the features and matches that its database holds.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+import threading
+import time
+import zlib  # noqa: F401  pycolmap exports its own zlib symbols: the real one has to be there first.
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sdfsim.files import write_arrays, write_json
+
+
+def say(message: str) -> None:
+    """One line for the parent, at once."""
+    print(message, flush=True)
+
+
+def watch_parent() -> None:
+    """Ends this process when its parent is gone (killed), so that no orphan keeps computing."""
+    parent = os.getppid()
+
+    def loop() -> None:
+        while os.getppid() == parent:
+            time.sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=loop, daemon=True).start()
+
+
+def features(pycolmap, job: dict, database: Path) -> None:
+    """Extracts features, one camera per group of photos of the same size and lens."""
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.use_gpu = False
+    extraction.max_image_size = job["pixels"]
+    extraction.sift.max_num_features = job["max_features"]
+    extraction.sift.peak_threshold = job["peak_threshold"]
+    pycolmap.Database.open(database).close()  # makes it
+    for group in job["groups"]:
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = "SIMPLE_RADIAL"
+        if job["masks"]:
+            reader.mask_path = job["masks"]
+        if group["focal"]:
+            reader.camera_params = f"{group['focal']},{group['width'] / 2},{group['height'] / 2},0"
+        common = {"image_names": group["names"], "camera_mode": pycolmap.CameraMode.SINGLE}
+        if not all(_known(pycolmap, database, name) for name in group["names"]):
+            # Before extraction, whose threads would number photos in the order in which they happen to end.
+            pycolmap.import_images(database, job["images"], options=reader, **common)
+        pycolmap.extract_features(
+            database, job["images"], reader_options=reader, extraction_options=extraction,
+            device=pycolmap.Device.cpu, **common,
+        )  # fmt: skip
+
+
+def _known(pycolmap, database: Path, name: str) -> bool:
+    with pycolmap.Database.open(database) as opened:
+        return opened.read_image_with_name(name) is not None
+
+
+def matches(pycolmap, job: dict, database: Path) -> None:
+    """Matches every pair, or neighbours in name order where there are too many pairs."""
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.use_gpu = False
+    matching.guided_matching = job["guided"]
+    matching.sift.max_ratio = job["max_ratio"]
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.min_num_inliers = job["min_inliers"]
+    verification.filter_stationary_matches = job["moving_only"]
+    verification.ransac.random_seed = job["seed"]
+    # Pairs that do not overlap would otherwise use up all 10,000 trials each, most of the time of this stage.
+    verification.ransac.min_inlier_ratio = job["min_inlier_ratio"]
+    common = {"matching_options": matching, "verification_options": verification, "device": pycolmap.Device.cpu}
+    if job["count"] <= job["exhaustive_up_to"]:
+        pairing = pycolmap.ExhaustivePairingOptions()
+        pairing.block_size = 10  # Small blocks only so that progress shows in the database.
+        pycolmap.match_exhaustive(database, pairing_options=pairing, **common)
+    else:
+        pairing = pycolmap.SequentialPairingOptions()
+        pairing.overlap = 20
+        pairing.quadratic_overlap = True
+        pycolmap.match_sequential(database, pairing_options=pairing, **common)
+
+
+def mapping(pycolmap, job: dict, database: Path, out: Path):
+    """Reconstructions from the matches: incremental mapping, or triangulation from known cameras."""
+    shutil.rmtree(out / "colmap", ignore_errors=True)
+    (out / "colmap").mkdir()
+    options = incremental_options(pycolmap, job)
+    if job["known_cameras"]:
+        known = known_cameras(pycolmap, job, database)
+        return [pycolmap.triangulate_points(known, database, job["images"], out / "colmap", options=options)]
+    done = 0
+
+    def count() -> None:
+        nonlocal done
+        done += 1
+        say(f"placed {done}")
+
+    found = pycolmap.incremental_mapping(
+        database, job["images"], out / "colmap", options=options, next_image_callback=count
+    )
+    return list(found.values())
+
+
+def incremental_options(pycolmap, job: dict):
+    """Settings of incremental mapping: on one thread, as several add up in an order that differs from run to run."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.min_model_size = 3
+    options.max_num_models = 4
+    options.num_threads = options.mapper.num_threads = 1
+    options.random_seed = job["seed"]
+    options.min_num_matches = job["min_inliers"]
+    options.mapper.random_seed = job["seed"]
+    options.triangulation.random_seed = job["seed"]
+    options.mapper.init_min_num_inliers = min(100, job["init_inliers"])
+    options.mapper.init_min_tri_angle = job["init_angle"]
+    options.mapper.abs_pose_min_num_inliers = job["pose_inliers"]
+    return options
+
+
+def known_cameras(pycolmap, job: dict, database: Path):
+    """A reconstruction without points, of the known cameras of the job."""
+    views = json.loads(Path(job["known_cameras"]).read_text(encoding="utf-8"))["views"]
+    model = pycolmap.Reconstruction()
+    with pycolmap.Database.open(database) as opened:
+        images = {image.name: image for image in opened.read_all_images()}
+        cameras = {}
+        for view in views:
+            lens = (view["width"], view["height"], view["focal"], view["cx"], view["cy"])
+            image = images[view["name"]]
+            if lens not in cameras:
+                cameras[lens] = pycolmap.Camera(
+                    camera_id=len(cameras) + 1, model="SIMPLE_RADIAL", width=view["width"], height=view["height"],
+                    params=[view["focal"], view["cx"], view["cy"], 0.0],
+                )  # fmt: skip
+                model.add_camera_with_trivial_rig(cameras[lens])
+            pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array(view["rotation"])), np.array(view["translation"]))
+            keypoints = opened.read_keypoints(image.image_id)[:, :2].astype(np.float64)
+            entry = pycolmap.Image(
+                name=view["name"], keypoints=keypoints, camera_id=cameras[lens].camera_id, image_id=image.image_id
+            )
+            model.add_image_with_trivial_frame(entry, pose)
+    return model
+
+
+def collect(reconstruction, out: Path) -> list[dict]:
+    """Writes `sparse.npz` and returns the posed views as plain values."""
+    views, index_of = [], {}
+    registered = sorted((i for i in reconstruction.images.values() if i.has_pose), key=lambda i: i.name)
+    for image in registered:
+        camera = reconstruction.cameras[image.camera_id]
+        focal, cx, cy, k = (float(value) for value in camera.params)
+        pose = image.cam_from_world()
+        index_of[image.image_id] = len(views)
+        views.append(
+            {
+                "name": image.name, "width": camera.width, "height": camera.height,
+                "focal": focal, "cx": cx, "cy": cy, "k": k, "camera": int(image.camera_id),
+                "rotation": pose.rotation.matrix().tolist(), "translation": list(map(float, pose.translation)),
+            }
+        )  # fmt: skip
+    points = [reconstruction.points3D[key] for key in sorted(reconstruction.points3D)]
+    seen = [
+        (p, index_of[e.image_id]) for p, point in enumerate(points) for e in point.track.elements
+        if e.image_id in index_of
+    ]  # fmt: skip
+    observations = np.array(seen, np.int32).reshape(-1, 2)
+    arrays = {
+        "xyz": np.array([p.xyz for p in points], np.float64).reshape(-1, 3),
+        "rgb": np.array([p.color for p in points], np.uint8).reshape(-1, 3),
+        "error": np.array([p.error for p in points], np.float32),
+        "point_of": observations[:, 0],
+        "view_of": observations[:, 1],
+    }
+    write_arrays(out / "sparse.npz", arrays, compressed=False)
+    return views
+
+
+def read_pairs(pycolmap, database: Path) -> tuple[dict[str, int], list[tuple[str, str, np.ndarray, np.ndarray]]]:
+    """Features of each photo, and every verified pair: two names and their matched pixels [M, 2]."""
+    pairs = []
+    with pycolmap.Database.open(database) as opened:
+        images = {image.image_id: image.name for image in opened.read_all_images()}
+        points = {key: opened.read_keypoints(key)[:, :2] for key in images}
+        for pair, geometry in zip(*opened.read_two_view_geometries(), strict=True):
+            matched = np.asarray(geometry.inlier_matches, int).reshape(-1, 2)
+            if len(matched):
+                a, b = pycolmap.pair_id_to_image_pair(pair)
+                pairs.append((images[a], images[b], points[a][matched[:, 0]], points[b][matched[:, 1]]))
+    return {name: len(points[key]) for key, name in images.items()}, pairs
+
+
+def findings(job: dict, features: dict[str, int], pairs: list) -> dict:
+    """What the matches say whatever the poses: `counts` of each photo, `pairs`, and the share of `turn_only` pairs.
+
+    A pair holds the names, the number of matches, and the share of them that did not move between the photos.
+    """
+    result = {name: {"features": count, "best_matches": 0} for name, count in features.items()}
+    sizes = {name: group for group in job["groups"] for name in group["names"]}
+    told, moving = [], []
+    for a, b, first, second in pairs:
+        still = float((np.linalg.norm(first - second, axis=1) < 2.0).mean())
+        told.append({"a": a, "b": b, "matches": len(first), "still": round(still, 3)})
+        if len(first) >= 30 and still < 0.5 and sizes[a] is sizes[b]:
+            moving.append((sizes[a], first, second))
+        for name in (a, b):
+            result[name]["best_matches"] = max(result[name]["best_matches"], len(first))
+    some = moving[:: max(1, len(moving) // 200)]
+    return {"counts": result, "pairs": told, "turn_only": round(turn_only(some), 3)}
+
+
+def turn_only(pairs: list[tuple[dict, np.ndarray, np.ndarray]], least: float = 2.0) -> float:
+    """Share of pairs of photos whose matches a turn of the camera on the spot explains.
+
+    A turn moves rays, not points: with the right focal length one rotation maps the rays of all matches. The focal
+    length is the one that explains most pairs so.
+
+    Args:
+        pairs: width and height of the photos, and matched pixels [M, 2] of both.
+        least: px, median error below which a turn explains a pair.
+    """
+    best = 0.0
+    for ratio in np.geomspace(0.4, 4.0, 24):
+        explained = 0
+        for size, first, second in pairs:
+            focal = ratio * max(size["width"], size["height"])
+            middle = np.array([size["width"], size["height"]]) / 2
+            p, q = (np.hstack([(pixels - middle) / focal, np.ones((len(pixels), 1))]) for pixels in (first, second))
+            p, q = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (p, q))
+            u, _, vt = np.linalg.svd(q.T @ p)
+            turn = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+            explained += np.median(np.linalg.norm(q - p @ turn.T, axis=1)) * focal < least
+        best = max(best, explained / max(1, len(pairs)))
+    return best
+
+
+def contradictions(pairs: list, views: list[dict]) -> list[dict]:
+    """Pairs of posed photos, with how far their matches are from the lines that the poses put them on.
+
+    Each pair was matched and verified on its own. Where poses are right nearly all pairs agree with them; photos of
+    repeating things match well in many places, and no poses agree with all of it.
+    """
+    posed = {view["name"]: view for view in views}
+    found = []
+    for a, b, first, second in pairs:
+        if len(first) >= 30 and a in posed and b in posed:
+            error = float(np.median(epipolar_errors(posed[a], posed[b], first, second)))
+            found.append({"a": a, "b": b, "matches": len(first), "error": round(error, 3)})
+    return found
+
+
+def epipolar_errors(a: dict, b: dict, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Sampson distances [M], px of photo `a`, of matched pixels [M, 2] of two posed photos."""
+
+    def rays(view: dict, pixels: np.ndarray) -> np.ndarray:
+        bent = (pixels - [view["cx"], view["cy"]]) / view["focal"]
+        flat = bent
+        for _ in range(8):
+            flat = bent / (1 + view["k"] * np.clip((flat**2).sum(1, keepdims=True), 0, 4))
+        return np.hstack([flat, np.ones((len(flat), 1))])
+
+    turn_a, turn_b = np.array(a["rotation"]), np.array(b["rotation"])
+    turn = turn_b @ turn_a.T
+    x, y, z = np.array(b["translation"]) - turn @ np.array(a["translation"])
+    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ turn
+    p, q = rays(a, first), rays(b, second)
+    forth, back = p @ essential.T, q @ essential
+    slope = (forth[:, :2] ** 2).sum(1) + (back[:, :2] ** 2).sum(1)
+    return np.abs((q * forth).sum(1)) / np.sqrt(np.maximum(slope, 1e-30)) * a["focal"]
+
+
+def focal_of_pairs(pycolmap, job: dict, database: Path, out: Path) -> dict[str, float]:
+    """Focal length (px) of each photo's camera from the pairs' fundamental matrices alone, where they tell it.
+
+    An estimate that owes nothing to the mapping: a second opinion on its focal length (view graph calibration, Sweeney
+    et al., 2015).
+    """
+    copy = out / "focal.db"
+    shutil.copyfile(database, copy)
+    try:
+        with pycolmap.Database.open(copy) as opened:
+            before = {camera.camera_id: float(camera.params[0]) for camera in opened.read_all_cameras()}
+        options = pycolmap.ViewGraphCalibrationOptions(random_seed=job["seed"], reestimate_relative_pose=False)
+        if not pycolmap.calibrate_view_graph(copy, options):
+            return {}
+        with pycolmap.Database.open(copy) as opened:
+            after = {camera.camera_id: float(camera.params[0]) for camera in opened.read_all_cameras()}
+            return {
+                image.name: after[image.camera_id] for image in opened.read_all_images()
+                if after[image.camera_id] != before[image.camera_id]
+            }  # fmt: skip
+    finally:
+        copy.unlink(missing_ok=True)
+
+
+def main(job_path: str) -> None:
+    """Runs one job file and writes `result.json` and `sparse.npz` beside it."""
+    import pycolmap
+
+    watch_parent()
+    job = json.loads(Path(job_path).read_text(encoding="utf-8"))
+    out = Path(job_path).parent
+    database = out / "database.db"
+    pycolmap.set_random_seed(job["seed"])
+    say("phase features")
+    features(pycolmap, job, database)
+    say("phase matches")
+    matches(pycolmap, job, database)
+    say("phase mapping")
+    counts, pairs = read_pairs(pycolmap, database)
+    result: dict[str, Any] = {"views": [], "models": [], **findings(job, counts, pairs)}
+    result["focal_of_pairs"] = {} if job["known_cameras"] else focal_of_pairs(pycolmap, job, database, out)
+    models = sorted(mapping(pycolmap, job, database, out), key=lambda r: (-r.num_reg_images(), -r.num_points3D()))
+    for model in models:
+        result["models"].append(sorted(image.name for image in model.images.values() if image.has_pose))
+    if models:
+        best = models[0]
+        result["views"] = collect(best, out)
+        result["contradictions"] = contradictions(pairs, result["views"])
+        result["mean_error"] = float(best.compute_mean_reprojection_error())
+        result["points"] = int(best.num_points3D())
+        result["track_length"] = float(best.compute_mean_track_length())
+    write_json(out / "result.json", result)
+    say("phase done")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,230 @@
+"""What a command says: progress and errors on stderr, its report on stdout, and its exit code."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Sequence
+from types import FrameType, TracebackType
+from typing import Any
+
+from sdfsim.errors import EXIT_ERROR, EXIT_INTERRUPTED, SceneError, SdfsimError
+
+_PLAIN_SECONDS = 5.0  # between two plain lines of one stage
+
+
+class Session:
+    """One command from start to exit code; a context manager around its work.
+
+    Errors inside become one line and a hint on stderr, and a `SystemExit`: see `sdfsim.errors` for the codes. With
+    `as_json` stdout carries exactly one JSON object (also for an error), and what libraries print goes to stderr.
+
+    Args:
+        as_json: report as JSON.
+        verbose: show tracebacks.
+    """
+
+    def __init__(self, *, as_json: bool = False, verbose: bool = False) -> None:
+        self.as_json = as_json
+        self.verbose = verbose
+        self.exit_code = 0
+        self._result: dict[str, Any] | None = None
+        self._pressed = False
+        self._clean_up = contextlib.ExitStack()
+        self._bar = _Bar()
+
+    def __enter__(self) -> Session:
+        default = signal.default_int_handler
+        if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is default:
+            signal.signal(signal.SIGINT, self._press)
+            self._clean_up.callback(signal.signal, signal.SIGINT, default)
+        if self.as_json:
+            sys.stdout.flush()
+            real = os.dup(1)  # native libraries write to the descriptor, past sys.stdout
+            os.dup2(2, 1)
+            self._clean_up.callback(os.close, real)
+            self._clean_up.callback(os.dup2, real, 1)
+            self._clean_up.enter_context(contextlib.redirect_stdout(sys.stderr))
+        return self
+
+    def _press(self, number: int, frame: FrameType | None) -> None:
+        self._pressed = True  # remembered, whatever becomes of the exception
+        raise KeyboardInterrupt
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.close()
+        code = self._explain(error) if error is not None else self.exit_code
+        try:
+            with self._clean_up:
+                sys.stdout.flush()
+            if self.as_json and self._result is not None:
+                print(json.dumps(_plain(self._result)), flush=True)
+        except OSError as unwritten:
+            lost = self._lost_output(unwritten)
+            code = code or lost
+        if code is not None:
+            raise SystemExit(code) from None
+
+    def _explain(self, error: BaseException) -> int | None:
+        """Tell the error; None lets it through (it is not ours to handle)."""
+        if isinstance(error, SdfsimError):
+            problems = {"problems": error.problems} if isinstance(error, SceneError) else {}
+            return self._fail(error.message, error.hint, error.exit_code, **problems)
+        if isinstance(error, BrokenPipeError):
+            return self._lost_output(error)
+        # A library that was interrupted while it was being imported fails in its own way.
+        if isinstance(error, KeyboardInterrupt) or (self._pressed and not isinstance(error, OSError)):
+            return self._fail("interrupted; what was finished is kept", "", EXIT_INTERRUPTED)
+        if isinstance(error, OSError):
+            where = f"{error.filename}: " if error.filename else ""
+            return self._fail(f"{where}{error.strerror or error}", "", EXIT_ERROR)
+        if isinstance(error, Exception):
+            hint = "" if self.verbose else "this is a fault of sdfsim; -v shows where"
+            return self._fail(f"internal error: {type(error).__name__}: {error}", hint, EXIT_ERROR)
+        return None
+
+    def _lost_output(self, error: OSError) -> int:
+        """The report cannot be written. Whoever read it and closed the pipe, such as `head`, has seen enough."""
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # else Python tries again at its end, and fails loudly
+        if not isinstance(error, BrokenPipeError):
+            self.say(f"error: the report cannot be written: {error.strerror or error}")
+        return EXIT_ERROR
+
+    def _fail(self, message: str, hint: str, code: int, **more: Any) -> int:
+        if self.verbose:
+            traceback.print_exc(file=sys.stderr)
+        self.say("\n".join(f"error: {line}" for line in message.splitlines()))
+        if hint:
+            self.say(f"hint: {hint}")
+        self._result = {**(self._result or {}), "error": message, "hint": hint, "exit_code": code, **more}
+        return code
+
+    def say(self, text: str) -> None:
+        """A line on stderr."""
+        self._bar.say(text)
+
+    def report(self, result: dict[str, Any], lines: list[str] | None = None) -> None:
+        """The outcome: `result` for --json, `lines` (or the entries of `result`) for people."""
+        self._result = result
+        if self.as_json:
+            return
+        self._bar.close()
+        try:
+            print("\n".join(_as_lines(_plain(result)) if lines is None else lines), flush=True)
+        except OSError as error:
+            self.exit_code = self._lost_output(error)
+
+    def hold(self, why: str) -> None:
+        """Wait for Ctrl-C, if a person is there to press it."""
+        if not self.as_json and sys.stdin.isatty():
+            self.say(why)
+            with contextlib.suppress(KeyboardInterrupt):
+                threading.Event().wait()
+
+    def progress(self, fraction: float, message: str) -> None:
+        """`fraction` (0 to 1) of the work is done."""
+        self._bar.update("", fraction, message)
+
+    def stage_progress(self, stage: str, fraction: float, message: str) -> None:
+        """The same for one stage of several; each has its own bar and ETA."""
+        self._bar.update(stage, fraction, message)
+
+
+class _Bar:
+    """A bar with an ETA on a terminal; elsewhere a line now and then."""
+
+    def __init__(self) -> None:
+        self._progress: Any = None
+        self._task: Any = None
+        self._stage: str | None = None
+        self._started = self._told = self._from = 0.0
+        self._ended = False
+
+    def update(self, stage: str, fraction: float, message: str) -> None:
+        fraction, now = min(max(fraction, 0.0), 1.0), time.monotonic()
+        title = f"{stage}: {message}" if stage and message else stage or message
+        fresh = stage != self._stage
+        if fresh:  # work that is gone on with begins in the middle
+            self._stage, self._started, self._from, self._ended = stage, now, fraction, False
+        if sys.stderr.isatty():
+            self._draw(fresh, fraction, title)
+            return
+        end = fraction >= 1 and not self._ended
+        if fresh or end or (fraction < 1 and now - self._told >= _PLAIN_SECONDS):
+            self._told, self._ended = now, fraction >= 1
+            elapsed, done = now - self._started, fraction - self._from
+            known = done > 0.01 and fraction < 1
+            left = f", about {duration(elapsed * (1 - fraction) / done)} left" if known else ""
+            self.say(f"[{fraction:4.0%}] {title} ({duration(elapsed)}{left})")
+
+    def _draw(self, fresh: bool, fraction: float, title: str) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+        from rich.progress import TimeRemainingColumn as Eta
+
+        if self._progress is None:
+            texts = TextColumn("{task.description}", markup=False)
+            parts = (BarColumn(24), TaskProgressColumn(), TimeElapsedColumn(), "left:", Eta(), texts)
+            self._progress = Progress(*parts, console=Console(stderr=True))
+            self._progress.start()
+        if fresh:
+            self._task = self._progress.add_task(title, total=1.0)
+        self._progress.update(self._task, completed=fraction, description=title)
+
+    def say(self, text: str) -> None:
+        if self._progress is not None:
+            self._progress.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        else:
+            print(text, file=sys.stderr, flush=True)
+
+    def close(self) -> None:
+        """Leave what is drawn and go to the next line."""
+        if self._progress is not None:
+            self._progress.stop()
+        self._progress, self._stage = None, None
+
+
+def duration(seconds: float) -> str:
+    """`42 s`, `3 min 20 s`, `1 h 5 min`."""
+    minutes, rest = divmod(round(seconds), 60)
+    if not minutes:
+        return f"{rest} s"
+    return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def columns(rows: Sequence[Sequence[str]]) -> list[str]:
+    """The rows of a table as lines, their cells below each other."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+def _plain(value: Any) -> Any:
+    """What JSON can hold: numpy numbers and arrays and paths become plain, numbers that are not finite null."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if value is None or isinstance(value, bool | int | str) else str(value)
+
+
+def _as_lines(result: dict[str, Any], indent: str = "") -> list[str]:
+    lines = []
+    for key, value in result.items():
+        if isinstance(value, dict):
+            lines += [f"{indent}{key}:", *_as_lines(value, indent + "  ")]
+        else:
+            lines.append(f"{indent}{key}: {f'{value:.6g}' if isinstance(value, float) else value}")
+    return lines

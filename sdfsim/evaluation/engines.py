@@ -1,0 +1,342 @@
+"""PyBullet (the teacher) and MuJoCo, run from one start: of a recording, or of a scene."""
+
+from __future__ import annotations
+
+import time
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sdfsim.data.dataset import Trajectory, shapes_folder
+from sdfsim.data.pybullet_sim import DT, SUBSTEPS, Teacher, TeacherBody, substeps_of, write_form_urdf, write_urdf
+from sdfsim.data.shape_assets import decompose, wavefront
+from sdfsim.dynamics.bodies import Units
+from sdfsim.errors import SdfsimError
+from sdfsim.files import replacing, write_text
+from sdfsim.scene.scene import Body, Scene
+from sdfsim.shape.mesh import Mesh, convex_hull, load_pieces
+from sdfsim.shape.primitives import PRIMITIVES, convex_pieces
+from sdfsim.shape.sdf import BoxSdf, PlaneSdf, SphereSdf
+from sdfsim.shape.shape import Shape
+
+SAME_INERTIA = 1e-3  # relative
+SOFTEST = 3.0  # MuJoCo: time constant of a contact over the engine's step, at least 2 for it to be stable
+
+
+@dataclass(frozen=True)
+class Start:
+    """What an engine starts from.
+
+    Attributes:
+        motion: its first frame counts.
+        urdfs: the engine's file of each shape, by name.
+        floor: friction and restitution of the floor z = 0, or None for no floor.
+        own_inertia: the bodies get the inertias of `motion`; else the engine takes its own, which must be the same.
+    """
+
+    motion: Trajectory
+    urdfs: dict[str, Path]
+    floor: tuple[float, float] | None
+    own_inertia: bool = False
+
+
+@dataclass(frozen=True)
+class Timing:
+    """ms of the first step, and of the mean step after it by the clock and of the processor."""
+
+    first_ms: float
+    wall_ms: float
+    cpu_ms: float
+
+
+def start_of_scene(scene: Scene, folder: Path, units: Units | None = None) -> tuple[Start, list[int]]:
+    """A scene whose only plane, if any, is a level floor.
+
+    Args:
+        scene: what is to move; the shapes are called by their index in it.
+        folder: of the engine's files, which are written where they are not there yet.
+        units: in which the engine has it; SI units where there are none.
+
+    Returns:
+        The start, and the indices of its bodies in the scene.
+
+    Raises:
+        SdfsimError: bodies on a path, or planes other than one level floor.
+    """
+    planes = [b for b in scene.bodies if isinstance(scene.shapes[b.shape].sdf, PlaneSdf)]
+    upright = [Rotation.from_quat(b.quat_xyzw).apply([0.0, 0.0, 1.0])[2] > 1 - 1e-9 for b in planes]
+    where = f"{scene.path}: " if scene.path else ""
+    if any(b.motion == "kinematic" for b in scene.bodies):
+        raise SdfsimError(f"{where}has bodies on a path, which the engines do not know")
+    if len(planes) > 1 or not all(upright):
+        raise SdfsimError(f"{where}the engines know one level plane as the floor (has {len(planes)} planes)")
+    units = units or Units(1.0, 1.0, 1.0)
+    rows = [k for k, b in enumerate(scene.bodies) if b not in planes]
+    solid = [scene.bodies[k] for k in rows]
+    shapes = [scene.shapes[b.shape] for b in solid]
+    turns = Rotation.from_quat(np.array([b.quat_xyzw for b in solid]))
+    centres = turns.apply(np.array([b.scale * s.com for b, s in zip(solid, shapes, strict=True)]))
+    height = np.array([0.0, 0.0, planes[0].position[2] if planes else 0.0])
+    inertia = [np.diag(body_inertia(b, s)) for b, s in zip(solid, shapes, strict=True)]
+    motion = Trajectory(
+        position=(np.array([b.position for b in solid]) + centres - height)[None] / units.length,
+        quat_xyzw=turns.as_quat()[None],
+        velocity=np.array([b.velocity for b in solid])[None] / units.velocity,
+        angular_velocity=np.array([b.angular_velocity for b in solid])[None] * units.time,
+        shape=np.array([str(b.shape) for b in solid]),
+        scale=np.array([b.scale for b in solid]) / units.length,
+        mass=np.array([b.mass for b in solid]) / units.mass,
+        inertia=np.array(inertia) / (units.mass * units.length**2),
+        friction=np.array([b.friction for b in solid]),
+        restitution=np.array([b.restitution for b in solid]),
+        static=np.array([b.motion != "dynamic" for b in solid]),
+        dt=DT,
+        gravity=scene.gravity / units.acceleration,
+    )
+    urdfs = {str(k): shape_urdf(scene.shapes[k], folder) for k in sorted({b.shape for b in solid})}
+    floor = (planes[0].friction, planes[0].restitution) if planes else None
+    return Start(motion, urdfs, floor, own_inertia=True), rows
+
+
+def body_inertia(body: Body, shape: Shape) -> np.ndarray:
+    """[3, 3] kg m^2 of a body about its centre of mass, shape axes."""
+    if body.inertia is not None:
+        return body.inertia
+    return body.mass / shape.volume * body.scale**2 * shape.inertia
+
+
+# --- PyBullet ---
+
+
+def bullet(start: Start, steps: int, substeps: int | None = None) -> tuple[Trajectory, Timing]:
+    """PyBullet's motion of `steps` recorded steps, in the teacher's own inner steps unless told.
+
+    Raises:
+        SdfsimError: PyBullet is not installed, a step that is none of the teacher's, or another inertia than recorded.
+    """
+    with bullet_at(start, substeps) as teacher:
+        began = time.perf_counter()
+        first = teacher.run(1)
+        first_ms = 1e3 * (time.perf_counter() - began)
+        wall, cpu = time.perf_counter(), time.process_time()
+        rest = teacher.run(steps - 1)
+        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    motion = {name: np.concatenate([first[name][:1], rest[name]]) for name in first}
+    count = max(1, steps - 1)
+    return replace(start.motion, **motion), Timing(first_ms, 1e3 * wall / count, 1e3 * cpu / count)
+
+
+@contextmanager
+def bullet_at(start: Start, substeps: int | None = None) -> Iterator[Teacher]:
+    """The teacher at a start. Raises as `bullet` does."""
+    t = start.motion
+    inner = substeps or substeps_of(t.dt)
+    with Teacher(t.gravity, start.floor, step=t.dt, substeps=inner) as teacher:
+        for i, name in enumerate(t.shape):
+            urdf = start.urdfs[str(name)]
+            mass = 0.0 if t.static[i] else float(t.mass[i])
+            # Far away first and moved then, as when it was recorded: the engine's order of pairs depends on it.
+            teacher.add(TeacherBody(urdf, float(t.scale[i]), mass, float(t.friction[i]), float(t.restitution[i])))
+            teacher.place(i, t.position[0, i], t.quat_xyzw[0, i])
+            if t.static[i]:
+                continue
+            teacher.push(i, t.velocity[0, i], t.angular_velocity[0, i])
+            if start.own_inertia:
+                teacher.set_inertia(i, t.inertia[i])
+            elif not np.allclose(teacher.inertia(i), t.inertia[i], rtol=SAME_INERTIA):
+                raise SdfsimError(f"{urdf}: the engine's inertia is not the recorded one")
+        yield teacher
+
+
+# --- MuJoCo ---
+
+
+def mujoco(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajectory, Timing]:
+    """MuJoCo's motion of the same geometry, masses, inertias and starts.
+
+    It takes the larger of two coefficients of friction where the teacher multiplies. So geoms that meet the floor carry
+    the product with the floor's, and those that meet other bodies carry their square: exact for bodies of one material.
+    Its contacts are soft: the restitution wanted is that of a damped spring.
+
+    Raises:
+        SdfsimError: MuJoCo is not installed, or a shape's engine file cannot be read.
+    """
+    try:
+        import mujoco as engine
+    except ImportError as error:
+        raise SdfsimError("MuJoCo is not installed", "pip install 'sdfsim[bench]'") from error
+    t = start.motion
+    model = _mujoco_model(engine, start, t.dt / substeps)
+    data: Any = engine.MjData(model)
+    moving = np.flatnonzero(~t.static)
+    place, speed = data.qpos.reshape(-1, 7), data.qvel.reshape(-1, 6)
+    place[:, :3], place[:, 3:] = t.position[0, moving], np.roll(t.quat_xyzw[0, moving], 1, axis=-1)
+    turned = Rotation.from_quat(t.quat_xyzw[0, moving])
+    speed[:, :3], speed[:, 3:] = t.velocity[0, moving], turned.inv().apply(t.angular_velocity[0, moving])
+    motion = {
+        "position": np.repeat(t.position[:1], steps + 1, axis=0),
+        "quat_xyzw": np.repeat(t.quat_xyzw[:1], steps + 1, axis=0),
+        "velocity": np.zeros((steps + 1, *t.velocity.shape[1:])),
+        "angular_velocity": np.zeros((steps + 1, *t.velocity.shape[1:])),
+    }
+    first_ms = wall = cpu = 0.0
+    for k in range(steps + 1):
+        began, ran = time.perf_counter(), time.process_time()
+        for _ in range(substeps if k else 0):
+            engine.mj_step(model, data)
+        motion["position"][k, moving] = place[:, :3]
+        motion["quat_xyzw"][k, moving] = np.roll(place[:, 3:], -1, axis=-1)
+        motion["velocity"][k, moving] = speed[:, :3]
+        turned = Rotation.from_quat(motion["quat_xyzw"][k, moving])
+        motion["angular_velocity"][k, moving] = turned.apply(speed[:, 3:])
+        took = time.perf_counter() - began
+        if k == 1:
+            first_ms = 1e3 * took
+        elif k:
+            wall, cpu = wall + took, cpu + time.process_time() - ran
+    count = max(1, steps - 1)
+    return replace(t, **motion), Timing(first_ms, 1e3 * wall / count, 1e3 * cpu / count)
+
+
+def _mujoco_model(engine: Any, start: Start, step: float) -> Any:
+    t, spec = start.motion, engine.MjSpec()
+    spec.option.timestep, spec.option.gravity = step, t.gravity
+    spec.memory = 2**31
+    if start.floor:
+        ground = spec.worldbody.add_geom(type=engine.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1.0])
+        ground.contype, ground.conaffinity, ground.friction[0], ground.solmix = 0, 1, 0.0, 1e-6
+    forms = {name: _forms(engine, urdf) for name, urdf in start.urdfs.items()}
+    for i, name in enumerate(t.shape):
+        body = spec.worldbody.add_body(name=f"b{i}")
+        if t.static[i]:
+            body.pos, body.quat = t.position[0, i], np.roll(t.quat_xyzw[0, i], 1)
+        else:
+            body.add_freejoint()
+            body.explicitinertial = True
+            body.mass, body.inertia, body.ipos = float(t.mass[i]), t.inertia[i], np.zeros(3)
+        for k, (kind, size, vertices) in enumerate(forms[str(name)]):
+            shape: dict[str, Any] = {"type": kind}
+            if vertices is None:
+                shape["size"] = t.scale[i] * size
+            else:
+                shape["meshname"] = f"{name}_{t.scale[i]:.9g}_{k}"
+                if spec.mesh(shape["meshname"]) is None:
+                    spec.add_mesh(name=shape["meshname"], uservert=(vertices * t.scale[i]).ravel())
+            for other in (start.floor, (t.friction[i], t.restitution[i])):
+                if other is None:
+                    continue
+                geom = body.add_geom(**shape)
+                geom.contype, geom.conaffinity = (1, 0) if other is start.floor else (2, 2)
+                geom.condim, geom.friction[0] = 3, t.friction[i] * other[0]
+                bounce = float(np.clip(t.restitution[i] * other[1], 1e-3, 1.0))
+                damping = -np.log(bounce) / np.hypot(np.pi, np.log(bounce))
+                geom.solref = [SOFTEST * step, max(damping, 1e-3)]
+    return spec.compile()
+
+
+def _forms(engine: Any, urdf: Path) -> list[tuple[Any, np.ndarray, np.ndarray | None]]:
+    """MuJoCo's kind of geom, its size [3] m, and its vertices [V, 3] m where it is a mesh: one a convex piece."""
+    body = _collision(urdf)
+    if (sphere := body.find("geometry/sphere")) is not None:
+        return [(engine.mjtGeom.mjGEOM_SPHERE, np.array([float(sphere.attrib["radius"]), 0.0, 0.0]), None)]
+    if (box := body.find("geometry/box")) is not None:
+        return [(engine.mjtGeom.mjGEOM_BOX, 0.5 * np.array(box.attrib["size"].split(), dtype=float), None)]
+    return [(engine.mjtGeom.mjGEOM_MESH, np.zeros(3), piece.vertices) for piece in pieces_of(urdf)]
+
+
+# --- the engine's files ---
+
+
+def shape_urdf(shape: Shape, folder: Path) -> Path:
+    """The URDF of a shape, written into `folder` unless it is there: exact spheres and boxes, convex pieces of others.
+
+    Raises:
+        SdfsimError: the shape's mesh cannot be cut into convex pieces.
+    """
+    sdf = shape.sdf
+    if isinstance(sdf, SphereSdf | BoxSdf):
+        sphere = isinstance(sdf, SphereSdf)
+        sizes = " ".join(f"{s:.9g}" for s in ([sdf.radius] if sphere else [2.0 * half for half in sdf.half]))
+        geometry = f'<sphere radius="{sizes}"/>' if sphere else f'<box size="{sizes}"/>'
+        urdf = folder / f"{'sphere' if sphere else 'box'}-{sizes.replace(' ', '-')}.urdf"
+        folder.mkdir(parents=True, exist_ok=True)
+        return urdf if urdf.exists() else write_form_urdf(geometry, urdf)
+    name = f"pieces-{shape.mesh.digest()[:16]}"
+    urdf, mesh = folder / f"{name}.urdf", folder / f"{name}.obj"
+    if not urdf.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        write_text(mesh, wavefront(_cut(shape, folder / name)))
+        with replacing(urdf) as partial:
+            write_urdf(mesh.resolve(), shape.com, partial)
+    return urdf
+
+
+def _cut(shape: Shape, scratch: Path) -> list[Mesh]:
+    kind = str(shape.source.get("primitive", ""))
+    try:
+        pieces = convex_pieces(kind)
+    except SdfsimError:
+        return decompose(shape.mesh, scratch)
+    factor = float(np.ptp(shape.mesh.vertices, axis=0).max() / np.ptp(PRIMITIVES[kind]().vertices, axis=0).max())
+    return [Mesh(piece.vertices * factor, piece.faces) for piece in pieces]
+
+
+def dataset_urdf(data: Path, shape: str) -> Path:
+    """The URDF of a dataset's shape. Raises SdfsimError when it, or the mesh that it names, is absent."""
+    path = shapes_folder(data) / "engine" / f"{shape}.urdf"
+    if not path.is_file():
+        raise SdfsimError(f"{path}: no engine file of shape {shape!r}", "`sdfsim dataset` writes them")
+    if not is_sphere(path) and not (mesh := collision_mesh(path)[0]).is_file():
+        raise SdfsimError(f"{path}: the mesh that it names, {mesh}, is absent", "make the dataset again")
+    return path
+
+
+def is_sphere(urdf: Path) -> bool:
+    """Whether a URDF's body collides as an exact sphere. Raises SdfsimError when it is unreadable."""
+    return _collision(urdf).find("geometry/sphere") is not None
+
+
+def collision_mesh(urdf: Path) -> tuple[Path, np.ndarray]:
+    """The mesh file that a URDF's body collides with, and where [3] m its origin is in the body's frame.
+
+    Raises:
+        SdfsimError: unreadable, or anything but one mesh, unturned and at its own size.
+    """
+    body = _collision(urdf)
+    mesh, origin = body.find("geometry/mesh"), body.find("origin")
+    if mesh is None or "scale" in mesh.attrib or "filename" not in mesh.attrib:
+        raise SdfsimError(f"{urdf}: must hold one collision mesh without a scale")
+    attributes = {} if origin is None else origin.attrib
+    if any(float(turn) for turn in attributes.get("rpy", "").split()):
+        raise SdfsimError(f"{urdf}: the collision mesh must not be turned")
+    offset = np.array([float(value) for value in attributes.get("xyz", "0 0 0").split()])
+    return urdf.parent / mesh.attrib["filename"], offset
+
+
+def pieces_of(urdf: Path) -> list[Mesh]:
+    """The convex pieces that the engine collides, in the body's frame.
+
+    A dataset has a hull of points on it beside the file of an exact sphere. Raises SdfsimError as `collision_mesh`
+    does, and where the mesh cannot be read.
+    """
+    if (box := _collision(urdf).find("geometry/box")) is not None:
+        half = 0.5 * np.array(box.attrib["size"].split(), dtype=float)
+        return [convex_hull(half * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]))]
+    path, offset = (urdf.with_suffix(".obj"), np.zeros(3)) if is_sphere(urdf) else collision_mesh(urdf)
+    return [Mesh(piece.vertices + offset, piece.faces) for piece in load_pieces(path)]
+
+
+def _collision(urdf: Path) -> ElementTree.Element:
+    try:
+        found = ElementTree.parse(urdf).getroot().findall("link/collision")
+    except (OSError, ElementTree.ParseError) as error:
+        raise SdfsimError(f"{urdf}: cannot be read as a URDF: {error}") from error
+    if len(found) != 1:
+        raise SdfsimError(f"{urdf}: must hold one collision element (has {len(found)})")
+    return found[0]

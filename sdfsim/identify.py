@@ -1,0 +1,471 @@
+"""Friction, restitution and mass ratios from a recorded motion: what `sdfsim identify` does.
+
+The recording is cut into short windows. The contact solve runs all of them side by side, each from where the recording
+has the bodies, and a least-squares fit moves the coefficients until the windows end as recorded. Windows are short, so
+that chaos has no time to grow, and long enough to tell a rebound from a slide.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+
+from sdfsim.dynamics import pose
+from sdfsim.dynamics.bodies import State, from_scene
+from sdfsim.dynamics.froude import scene_units
+from sdfsim.dynamics.memory import Memory
+from sdfsim.dynamics.model import SOLVER, load_model
+from sdfsim.dynamics.rollout import Rollout
+from sdfsim.dynamics.step import Rules, step
+from sdfsim.errors import SdfsimError
+from sdfsim.scene.scene import Body, Scene
+from sdfsim.scene.scene_file import load_scene
+
+WINDOW, EVERY = 0.15, 0.06  # model units of time, about seconds for bodies of a metre: length and spacing of windows
+SMOOTH = 4.0  # times gravity: a recording of poses tells no velocity where it accelerates more than that
+START = 0.5  # of every coefficient
+WEAK = 1e-3  # how strongly coefficients that nothing shows are held to it
+OUTLIER = 2e-3  # model lengths: errors of windows that count less than squared, beyond
+NUDGE = 0.02  # of a coefficient, for differences: contacts come and go, so that smaller ones tell nothing
+SURE = 1.96  # standard deviations in an interval of 95 %
+Progress = Callable[[float, str], None]
+COLUMNS = ("time", "body", "x", "y", "z", "qx", "qy", "qz", "qw")
+
+
+@dataclass(frozen=True)
+class Recording:
+    """T poses of D bodies, evenly spaced in time.
+
+    Attributes:
+        names: of the bodies.
+        dt: s.
+        position: [T, D, 3] m, of the centres of mass.
+        orientation: [T, D, 4] xyzw.
+        velocity, angular_velocity: [T, D, 3] m/s and rad/s.
+        known: [T] bool, whether the velocities are to be trusted.
+    """
+
+    names: tuple[str, ...]
+    dt: float
+    position: np.ndarray
+    orientation: np.ndarray
+    velocity: np.ndarray
+    angular_velocity: np.ndarray
+    known: np.ndarray
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number with its interval of 95 %; None where the recording does not show it."""
+
+    value: float
+    interval: tuple[float, float] | None
+
+
+@dataclass(frozen=True)
+class Identified:
+    """What a recording tells.
+
+    Attributes:
+        friction, restitution: pair of body names -> product of the two bodies' coefficients.
+        own_friction, own_restitution: body -> its own, where that of what it touched is given by the scene.
+        mass: body -> kg, as the ratio to the first body that is touched by another that moves.
+        error_m: root mean square error of the windows that are left, m; windows: how many there were.
+    """
+
+    friction: dict[tuple[str, str], Estimate]
+    restitution: dict[tuple[str, str], Estimate]
+    own_friction: dict[str, Estimate]
+    own_restitution: dict[str, Estimate]
+    mass: dict[str, Estimate]
+    error_m: float
+    windows: int
+
+    def lines(self) -> list[str]:
+        """As lines for people."""
+        heads = {"friction": "friction, product", "restitution": "restitution, product"}
+        heads |= {"own_friction": "friction of the body's own", "own_restitution": "restitution of the body's own"}
+        heads |= {"mass": "mass, kg"}
+        lines = []
+        for kind, head in heads.items():
+            for name, told in self.report()[kind].items():
+                low, high = told["interval"] or (None, None)
+                seen = "not shown by this motion" if low is None else f"{told['value']:.3f} ({low:.3f} to {high:.3f})"
+                lines.append(f"{head}: {name}: {seen}")
+        return [*lines, f"{self.windows} windows, repeated with an error of {self.error_m:.2g} m"]
+
+    def report(self) -> dict[str, Any]:
+        """As a JSON object."""
+
+        def told(estimates: dict) -> dict[str, Any]:
+            names = {k: " / ".join(k) if isinstance(k, tuple) else k for k in estimates}
+            return {names[k]: {"value": e.value, "interval": e.interval} for k, e in estimates.items()}
+
+        kinds = ("friction", "restitution", "own_friction", "own_restitution", "mass")
+        return {kind: told(getattr(self, kind)) for kind in kinds} | {"error_m": self.error_m, "windows": self.windows}
+
+
+def load_recording(
+    path: Path, scene_file: Path | None = None, *, allow_outside: bool = False, on_progress: Progress | None = None
+) -> tuple[Recording, Scene]:
+    """A recording and its scene.
+
+    Args:
+        path: a run folder, a `rollout.npz` or a CSV of poses.
+        scene_file: its scene; of a run folder the one that it was made from, if this is None.
+        allow_outside: whether the scene may name files outside of its own folder.
+        on_progress: called with the fraction done and a message while shapes are fitted.
+
+    Raises:
+        SdfsimError: no scene, or unreadable files.
+    """
+    if path.is_dir():
+        scene_file = scene_file or _scene_of(path)
+        path = path / "rollout.npz"
+    if scene_file is None:
+        raise SdfsimError(f"{path}: a recording without its scene", "give it: --scene scene.yaml")
+    scene = load_scene(scene_file, on_progress, allow_outside=allow_outside)
+    return recorded(path, scene), scene
+
+
+def _scene_of(folder: Path) -> Path:
+    try:
+        config = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
+        return Path(config["scene"])
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError) as error:
+        raise SdfsimError(f"{folder}: not the folder of a simulation ({error})", "give its scene: --scene") from error
+
+
+def recorded(path: Path, scene: Scene) -> Recording:
+    """A `rollout.npz`, or a CSV of poses with the columns of `COLUMNS`, of the bodies of a scene that move.
+
+    Positions in a CSV are those of the shapes' own origins, as in a scene file; their rows are sorted by time.
+
+    Raises:
+        SdfsimError: unreadable, or not of this scene.
+    """
+    moving = [b.name for b in scene.bodies if b.motion == "dynamic"]
+    if path.suffix == ".csv":
+        return _from_poses(*_read_csv(path, moving), scene)
+    rollout = Rollout.load(path)
+    if missing := [name for name in moving if name not in rollout.names]:
+        raise SdfsimError(f"{path}: no body {missing[0]!r} in it", "give the scene that it was made with")
+    rows = [rollout.names.index(name) for name in moving]
+    return Recording(
+        names=tuple(moving),
+        dt=float(np.diff(rollout.time).mean()) if len(rollout) else 0.0,
+        position=rollout.position[:, rows],
+        orientation=rollout.orientation[:, rows],
+        velocity=rollout.velocity[:, rows],
+        angular_velocity=rollout.angular_velocity[:, rows],
+        known=np.ones(len(rollout.time), dtype=bool),
+    )
+
+
+def _read_csv(path: Path, moving: list[str]) -> tuple[list[str], float, np.ndarray, np.ndarray]:
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            if tuple(reader.fieldnames or ()) != COLUMNS:
+                raise SdfsimError(f"{path}:1: columns must be {','.join(COLUMNS)}")
+            rows: dict[float, dict[str, list[float]]] = {}
+            for row in reader:
+                line = reader.line_num
+                if row["body"] not in moving:
+                    continue
+                try:
+                    values = [float(row[c]) for c in ("time", *COLUMNS[2:])]
+                except (TypeError, ValueError):
+                    raise SdfsimError(f"{path}:{line}: not a number in {row}") from None
+                if not np.isfinite(values).all() or not np.linalg.norm(values[4:]) > 0.0:
+                    raise SdfsimError(f"{path}:{line}: must be finite, with a quaternion that is not 0")
+                rows.setdefault(values[0], {})[row["body"]] = values[1:]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise SdfsimError(f"{path}: not a CSV of poses ({error})") from error
+    times = np.array(sorted(rows))
+    if len(times) < 4:
+        raise SdfsimError(f"{path}: {len(times)} times of {moving} (at least 4)")
+    gaps = np.diff(times)
+    if np.ptp(gaps) > 0.02 * gaps.mean():
+        raise SdfsimError(
+            f"{path}: times must be evenly spaced (they are {gaps.min():.4g} to {gaps.max():.4g} s apart)"
+        )
+    for time in times:
+        if missing := set(moving) - set(rows[time]):
+            raise SdfsimError(f"{path}: no pose of body {min(missing)!r} at time {time:g}")
+    poses = np.array([[rows[time][name] for name in moving] for time in times])
+    return moving, float(gaps.mean()), poses[..., :3], poses[..., 3:]
+
+
+def _from_poses(names: list[str], dt: float, origin: np.ndarray, orientation: np.ndarray, scene: Scene) -> Recording:
+    """Velocities by central differences, which are exact in free flight, where no impact is near."""
+    turn = torch.from_numpy(orientation / np.linalg.norm(orientation, axis=-1, keepdims=True))
+    body = {b.name: b for b in scene.bodies}
+    com = np.array([scene.shapes[body[n].shape].com * body[n].scale for n in names])
+    position = origin + pose.rotate(turn, torch.from_numpy(com).expand(len(origin), -1, -1)).numpy()
+    velocity, angular = np.zeros_like(position), np.zeros_like(position)
+    velocity[1:-1] = (position[2:] - position[:-2]) / (2.0 * dt)
+    angular[1:-1] = pose.to_rotvec(pose.multiply(turn[2:], pose.conjugate(turn[:-2]))).numpy() / (2.0 * dt)
+    bend = np.zeros(position.shape[:2])
+    bend[1:-1] = np.linalg.norm(position[2:] - 2.0 * position[1:-1] + position[:-2], axis=-1) / dt**2
+    known: np.ndarray = np.all(bend < SMOOTH * max(float(np.linalg.norm(scene.gravity)), 1.0), axis=-1)
+    known[[0, -1]] = False
+    return Recording(tuple(names), dt, position, turn.numpy(), velocity, angular, known)
+
+
+def identify(recording: Recording, scene: Scene, *, on_progress: Progress | None = None) -> Identified:
+    """Find the coefficients and masses with which the contact solve repeats a recording.
+
+    Args:
+        recording: what happened.
+        scene: shapes, sizes, masses and gravity; the coefficients of bodies that do not move are taken as they are.
+        on_progress: called with the fraction done and a message.
+
+    Raises:
+        SdfsimError: bodies on paths, a recording too short, or one in which nothing touches.
+    """
+    from scipy.optimize import least_squares
+
+    if any(b.motion == "kinematic" for b in scene.bodies):
+        raise SdfsimError("bodies on paths: identify works on bodies that move freely and those that are static")
+    tell = on_progress or (lambda fraction, message: None)
+    windows = Windows(recording, scene)
+    start = windows.start()
+    best = start
+    # A sweep over all coefficients alike finds the valley; the fit goes down in it.
+    tried = [(f, e) for f in (0.2, 0.5, 0.9) for e in (0.1, 0.4, 0.7, 0.95)]
+    costs = []
+    for k, (friction, restitution) in enumerate(tried):
+        trial = windows.start(friction, restitution)
+        costs.append(float(np.minimum(np.abs(windows.errors(trial)), 10.0).sum()))
+        best = trial if costs[-1] == min(costs) else best
+        tell(0.3 * k / len(tried), "a first sweep over friction and restitution")
+    count = [0]
+
+    def errors(parameters: np.ndarray) -> np.ndarray:
+        count[0] += 1
+        tell(min(0.95, 0.3 + 0.005 * count[0]), f"fit, run {count[0]} of all windows")
+        return np.concatenate([windows.errors(parameters), WEAK * (parameters - start)])
+
+    slope: Any = lambda parameters: windows.jacobian(parameters, errors)  # noqa: E731
+    found = least_squares(errors, best, slope, windows.bounds(), x_scale=0.1, loss="soft_l1", max_nfev=25)
+    return windows.told(found.x, windows.jacobian(found.x, errors), errors(found.x))
+
+
+class Windows:
+    """All windows of a recording as one set of bodies, each window a world of its own.
+
+    Parameters are friction and restitution of every body that touches another, then the logarithms of mass ratios.
+
+    Args:
+        recording: what happened.
+        scene: of it.
+    """
+
+    def __init__(self, recording: Recording, scene: Scene) -> None:
+        self.scene, self.recording = scene, recording
+        model = load_model(SOLVER)
+        self.units = scene_units(scene, model)
+        self.moving = [b for b in scene.bodies if b.motion == "dynamic"]
+        self.fixed = [b for b in scene.bodies if b.motion != "dynamic"]
+        self.length = max(3, round(WINDOW * self.units.time / recording.dt)) if recording.dt > 0 else 0
+        every = max(1, round(EVERY * self.units.time / recording.dt)) if recording.dt > 0 else 1
+        begin = np.arange(0, len(recording.position) - self.length, every)
+        begin = begin[recording.known[begin]]
+        if not len(begin):
+            raise SdfsimError(
+                "the recording is too short, or nowhere smooth", f"give at least {self.length + 1} frames"
+            )
+        inner = max(1, int(np.ceil(recording.dt / self.units.time / (model.dt / 5.0) - 0.01)))
+        gravity = torch.from_numpy(np.asarray(scene.gravity) / self.units.acceleration)
+        self.rules = Rules(gravity, recording.dt / self.units.time, inner)
+        self.model = model
+        self._build(begin)
+        self.touched = self._touched()
+        kept = np.array(sorted({w for w, _, _ in self.touched}), dtype=int)
+        if not len(kept):
+            raise SdfsimError("nothing touches in the recording", "friction and restitution show in contacts only")
+        self._build(begin[kept])
+        self.pairs = sorted({(a, b) for _, a, b in self.touched})
+        many = len(self.moving)
+        self.seen = sorted({k for pair in self.pairs for k in pair if k < many})
+        beside = [pair for pair in self.pairs if pair[1] < many]
+        self.weighed = sorted({k for pair in beside for k in pair})[1:]
+
+    def _build(self, begin: np.ndarray) -> None:
+        """Bodies and start states of the windows that begin at frames `begin`."""
+        bodies, world = [], []
+        for w in range(len(begin)):
+            bodies += [replace(b, name=f"{w}/{b.name}", collides_with=self._partners(b, w)) for b in self.moving]
+            world += [w] * len(self.moving)
+        names = tuple(b.name for b in self.moving)
+        bodies += [
+            replace(b, collides_with=None if b.collides_with is None else self._copies(b.collides_with, names, begin))
+            for b in self.fixed
+        ]
+        whole = replace(self.scene, bodies=tuple(bodies))
+        tensors, self.start_state = from_scene(whole, self.units, torch.device("cpu"))
+        self.bodies = replace(tensors, world=torch.tensor([*world, *[-1] * len(self.fixed)]))
+        r, u = self.recording, self.units
+
+        def of(values: np.ndarray, unit: float, rest: torch.Tensor) -> torch.Tensor:
+            moving = torch.from_numpy(np.ascontiguousarray(values[begin].reshape(-1, values.shape[-1]) / unit))
+            return torch.cat([moving, rest[len(moving) :]])
+
+        s = self.start_state
+        self.start_state = replace(
+            s,
+            position=of(r.position, u.length, s.position),
+            orientation=of(r.orientation, 1.0, s.orientation),
+            velocity=of(r.velocity, u.velocity, s.velocity),
+            angular_velocity=of(r.angular_velocity, 1.0 / u.time, s.angular_velocity),
+        )
+        frames = begin[None] + 1 + np.arange(self.length)[:, None]
+        self.goal = r.position[frames] / u.length, r.orientation[frames]
+        self.memory, self.count = Memory(), len(begin)
+        self.world = self.memory.compiled(self.bodies, self.start_state).world
+        self.given = {
+            name: getattr(self.world, name).copy()
+            for name in ("friction", "restitution", "inverse_mass", "inertia", "inverse_inertia")
+        }
+
+    def _partners(self, body: Body, w: int) -> tuple[str, ...] | None:
+        if body.collides_with is None:
+            return None
+        moving = {b.name for b in self.moving}
+        return tuple(f"{w}/{name}" if name in moving else name for name in body.collides_with)
+
+    @staticmethod
+    def _copies(names: tuple[str, ...], moving: tuple[str, ...], begin: np.ndarray) -> tuple[str, ...]:
+        copies = [f"{w}/{name}" for name in names if name in moving for w in range(len(begin))]
+        return (*copies, *(name for name in names if name not in moving))
+
+    def _run(self) -> list[State]:
+        state, states = self.start_state, []
+        for _ in range(self.length):
+            state, _ = step(self.model, self.bodies, state, self.rules, self.memory)
+            states.append(state)
+        return states
+
+    def _touched(self) -> set[tuple[int, int, int]]:
+        """Window and pair of bodies of every contact; static ones count on from those that move."""
+        many = len(self.moving)
+        total, found = many * self.count, set()
+        for state in self._run():
+            assert state.touch is not None
+            for a, b in state.touch.pair[state.touch.count > 0].tolist():
+                other = b % many if b < total else many + b - total
+                found.add((a // many, *sorted((a % many, other))))
+        return found
+
+    def start(self, friction: float = START, restitution: float = START) -> np.ndarray:
+        """Parameters to begin with."""
+        count = len(self.seen)
+        return np.concatenate([np.full(count, friction), np.full(count, restitution), np.zeros(len(self.weighed))])
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Least and largest parameters: a product of friction may be up to 2, one of restitution up to 1."""
+        ratios = np.full(len(self.weighed), 7.0)
+        high = np.concatenate([self._most("friction", 2.0), self._most("restitution", 1.0), ratios])
+        return np.concatenate([np.zeros(2 * len(self.seen)), -ratios]), high
+
+    def _most(self, name: str, product: float) -> np.ndarray:
+        """What a body's own coefficient may be at most, given those of the static bodies that it touched."""
+        most = []
+        for k in self.seen:
+            others = [
+                getattr(self.fixed[b - len(self.moving)], name)
+                for a, b in self.pairs
+                if a == k and b >= len(self.moving)
+            ]
+            most.append(product / max([v for v in others if v > 0.0], default=1.0))
+        return np.array(most)
+
+    def errors(self, parameters: np.ndarray) -> np.ndarray:
+        """Differences of all windows from the recording, in units of `OUTLIER`; turns at half of a body's size."""
+        count, many = len(self.seen), len(self.moving)
+        rows = {k: np.arange(self.count) * many + k for k in range(many)}
+        for name, values in self.given.items():
+            getattr(self.world, name)[:] = values
+        for i, k in enumerate(self.seen):
+            self.world.friction[rows[k]] = parameters[i]
+            self.world.restitution[rows[k]] = parameters[count + i]
+        for i, k in enumerate(self.weighed):
+            ratio = np.exp(parameters[2 * count + i])
+            self.world.inverse_mass[rows[k]] /= ratio
+            self.world.inertia[rows[k]] *= ratio
+            self.world.inverse_inertia[rows[k]] /= ratio
+        total = self.count * many
+        size = self.bodies.size[:total].numpy()[:, None]
+        errors = []
+        for t, state in enumerate(self._run()):
+            place, turn = (values[t].reshape(total, -1) for values in self.goal)
+            away = pose.multiply(
+                state.orientation[:total], pose.conjugate(torch.from_numpy(np.ascontiguousarray(turn)))
+            )
+            errors += [state.position[:total].numpy() - place, 0.5 * size * pose.to_rotvec(away).numpy()]
+        return np.nan_to_num(np.concatenate(errors).ravel(), nan=1e3) / OUTLIER
+
+    def jacobian(self, parameters: np.ndarray, errors: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """[R, P] by central differences of `NUDGE`, one-sided at the bounds."""
+        low, high = self.bounds()
+        columns = []
+        for k in range(len(parameters)):
+            one, other = parameters.copy(), parameters.copy()
+            one[k], other[k] = min(one[k] + NUDGE, high[k]), max(other[k] - NUDGE, low[k])
+            columns.append((errors(one) - errors(other)) / (one[k] - other[k]))
+        return np.stack(columns, 1)
+
+    def told(self, parameters: np.ndarray, jacobian: np.ndarray, errors: np.ndarray) -> Identified:
+        """Estimates with intervals: the curvature of the robust cost, and how windows pull apart (a sandwich)."""
+        data, slope = errors[: len(errors) - len(parameters)], jacobian[: len(errors) - len(parameters)]
+        weight = (1.0 + data**2) ** -0.5  # of the soft L1 loss
+        curvature = (slope * weight[:, None]).T @ slope + WEAK**2 * np.eye(len(parameters))
+        # Errors within a window go together: windows, not single poses, are what is independent.
+        window = np.tile(np.repeat(np.arange(self.count), 3 * len(self.moving)), 2 * self.length)
+        pull = np.zeros((self.count, len(parameters)))
+        np.add.at(pull, window, (weight * data)[:, None] * slope)
+        inverse = np.linalg.inv(curvature)
+        spread = max(1.0, self.count / max(1, self.count - len(parameters)))
+        covariance = spread * inverse @ (pull.T @ pull) @ inverse
+        shown = np.square(slope).sum(0) > 1.0
+        count, many = len(self.seen), len(self.moving)
+        names = [b.name for b in (*self.moving, *self.fixed)]
+
+        def estimate(value: float, gradient: np.ndarray) -> Estimate:
+            if not shown[gradient != 0.0].all():
+                return Estimate(float(value), None)
+            half = SURE * float(np.sqrt(gradient @ covariance @ gradient))
+            return Estimate(float(value), (max(0.0, float(value) - half), float(value) + half))
+
+        def coefficients(offset: int, name: str) -> tuple[dict, dict]:
+            products, own = {}, {}
+            for a, b in self.pairs:
+                gradient = np.zeros(len(parameters))
+                i = offset + self.seen.index(a)
+                if b < many:
+                    j = offset + self.seen.index(b)
+                    gradient[i], gradient[j] = parameters[j], parameters[i]
+                    products[names[a], names[b]] = estimate(parameters[i] * parameters[j], gradient)
+                else:
+                    other = getattr(self.fixed[b - many], name)
+                    gradient[i] = other
+                    products[names[a], names[b]] = estimate(parameters[i] * other, gradient)
+                    own[names[a]] = estimate(parameters[i], np.eye(len(parameters))[i])
+            return products, own
+
+        friction, own_friction = coefficients(0, "friction")
+        restitution, own_restitution = coefficients(count, "restitution")
+        mass = {}
+        for i, k in enumerate(self.weighed):
+            value = self.moving[k].mass * float(np.exp(parameters[2 * count + i]))
+            mass[self.moving[k].name] = estimate(value, value * np.eye(len(parameters))[2 * count + i])
+        rms = float(np.sqrt(np.mean((data * OUTLIER) ** 2))) * self.units.length
+        return Identified(friction, restitution, own_friction, own_restitution, mass, rms, self.count)

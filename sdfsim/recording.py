@@ -1,0 +1,407 @@
+"""Rollout -> rerun. A live run and a file go through the same calls: a live step is a chunk of one frame."""
+
+from __future__ import annotations
+
+import colorsys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import torch
+
+from sdfsim.dynamics import pose
+from sdfsim.dynamics.memory import PHASES
+from sdfsim.dynamics.rollout import Rollout
+from sdfsim.files import replacing
+from sdfsim.scene.scene import Scene
+from sdfsim.shape.mesh import Mesh
+
+if TYPE_CHECKING:
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+WORLD = "world"
+CONTACTS = "world/contacts"
+# What is plotted: the counters of a view by their legends.
+VIEWS = {
+    "kinetic energy (J)": {"kinetic_energy": "kinetic energy (J)"},
+    "energy from nothing (J)": {"energy_gain": "energy from nothing (J)"},
+    "worst penetration (m)": {"worst_penetration": "worst penetration (m)"},
+    "contacts": {"contacts": "contacts", "pairs": "near pairs of bodies"},
+    "bodies": {"free": "free", "active": "active", "asleep": "asleep", "held_back": "held back"},
+    "signed distances": {"sdf_queries": "asked", "sdf_waiting": "waiting"},
+    "network": {"nodes": "nodes", "edges": "edges"},
+    "milliseconds": {"step_ms": "step", **PHASES},
+}
+PLOTS = {key: legend for view in VIEWS.values() for key, legend in view.items()}
+_STATIC_COLOR = (150, 150, 155)
+_NODE_COLOR = (20, 20, 20)
+_CONTACT_COLOR = (255, 40, 40)
+_PHOTO_PIXELS = 320
+MANY = 24  # bodies of one shape that do not stay put, from which on they are a crowd
+COLORS = 4  # copies share their mesh's colour, so a crowd is split to be told apart
+_CREASE = np.cos(np.radians(40.0))
+_MOST_CORNER_PAIRS = 1_000_000  # more, about 10,000 vertices, and a mesh counts as smooth: splitting triples its size
+FARTHEST = 1.0  # what leaves the scene for good must not make it a dot
+
+
+class Playback:
+    """One recording of one scene, to be written to a file, or streamed to a viewer.
+
+    Args:
+        scene: what moves.
+        motion: how it does, where that is known already: the first view shows all of it.
+    """
+
+    def __init__(self, scene: Scene, motion: Rollout | None = None) -> None:
+        import rerun as rr
+
+        self._rr = rr
+        self._scene = scene
+        self._framed = framed(scene, motion)
+        self._step = 0
+        self._com = [b.scale * scene.shapes[b.shape].com for b in scene.bodies]
+        self._crowds = _crowds(scene)
+        crowded = {int(k) for crowd in self._crowds for k in crowd.bodies}
+        paths = [f"{WORLD}/{rr.escape_entity_path_part(body.name)}" for body in scene.bodies]
+        self._alone = [(k, path) for k, path in enumerate(paths) if k not in crowded]
+        self.stream = rr.RecordingStream("sdfsim")
+
+    def blueprint(self) -> rrb.Blueprint:
+        """The layout: the scene on the left, plots of the counters on the right; nodes and contact points hidden."""
+        import rerun.blueprint as rrb
+
+        hidden = [CONTACTS, *(f"{path}/nodes" for _, path in self._alone)]
+        centre, radius = self._framed
+        view = rrb.Spatial3DView(
+            origin=WORLD,
+            name="scene",
+            overrides={path: rrb.EntityBehavior(visible=False) for path in hidden},
+            eye_controls=_eye(centre, radius, -self._scene.gravity),
+            line_grid=False,
+        )
+        plots = [
+            rrb.TimeSeriesView(origin="plots", contents=[f"plots/{key}" for key in keys], name=name)
+            for name, keys in VIEWS.items()
+        ]
+        return rrb.Blueprint(
+            rrb.Horizontal(view, rrb.Vertical(*plots), column_shares=[3, 1]),
+            rrb.TimePanel(timeline="time", state="collapsed"),
+            rrb.BlueprintPanel(state="collapsed"),
+            rrb.SelectionPanel(state="collapsed"),
+            auto_views=False,
+        )
+
+    def log_static(self) -> None:
+        """Everything that does not change: meshes, surface nodes, and the names of the plots."""
+        rr, scene = self._rr, self._scene
+        self.stream.send_blueprint(self.blueprint())
+        self.stream.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        size = self._framed[1]
+        hues = distinct_colors(len(self._alone) + len(self._crowds))
+        for crowd in self._crowds:
+            shape = scene.shapes[crowd.shape]
+            mesh = Mesh(shape.mesh.vertices - shape.com, shape.mesh.faces, shape.mesh.colors)
+            self.stream.log(crowd.path, _shaded(rr, mesh, next(hues)), static=True)
+            scales = np.repeat([[scene.bodies[k].scale] for k in crowd.bodies], 3, 1)
+            self.stream.log(crowd.path, rr.InstancePoses3D.from_fields(scales=scales), static=True)
+        for k, path in self._alone:
+            body, com = scene.bodies[k], self._com[k]
+            shape = scene.shapes[body.shape]
+            infinite = not np.all(np.isfinite(shape.sdf.bounds))
+            color = _STATIC_COLOR if body.motion == "static" else next(hues)
+            mesh = sheet(6 * size) if infinite else shape.mesh
+            placed = Mesh(mesh.vertices * body.scale - com, mesh.faces, mesh.colors)
+            self.stream.log(f"{path}/mesh", _shaded(rr, placed, color), static=True)
+            if len(shape.nodes):
+                nodes = rr.Points3D(shape.nodes * body.scale - com, colors=_NODE_COLOR, radii=rr.Radius.ui_points(2))
+                self.stream.log(f"{path}/nodes", nodes, static=True)
+            if body.motion == "static":  # it has one pose for good
+                centre = body.position + _turned(com, body.quat_xyzw)
+                pose = rr.Transform3D(translation=centre, quaternion=rr.Quaternion(xyzw=body.quat_xyzw))
+                self.stream.log(path, pose, static=True)
+        style = rr.Points3D.from_fields(colors=_CONTACT_COLOR, radii=rr.Radius.ui_points(4))
+        self.stream.log(CONTACTS, style, static=True)
+        for key, name in PLOTS.items():
+            self.stream.log(f"plots/{key}", rr.SeriesLines(names=name), static=True)
+
+    def log_steps(self, chunk: Rollout) -> None:
+        """Poses, contact points and counters of the frames of `chunk`, which follow the frames logged before."""
+        rr, frames = self._rr, len(chunk.time)
+        steps = np.arange(self._step, self._step + frames)
+        self._step += frames
+        times = [rr.TimeColumn("time", duration=chunk.time), rr.TimeColumn("step", sequence=steps)]
+        for crowd in self._crowds:
+            places, turns = (getattr(chunk, k)[:, crowd.bodies] for k in ("position", "orientation"))
+            poses = rr.InstancePoses3D.columns(
+                translations=places.reshape(-1, 3).astype(np.float32),
+                quaternions=turns.reshape(-1, 4).astype(np.float32),
+            )
+            self.stream.send_columns(crowd.path, times, poses.partition(np.full(frames, len(crowd.bodies))))
+        for i, path in self._alone:
+            if self._scene.bodies[i].motion != "static":
+                motion = rr.Transform3D.columns(translation=chunk.position[:, i], quaternion=chunk.orientation[:, i])
+                self.stream.send_columns(path, times, motion)
+        points = rr.Points3D.columns(positions=chunk.contact_point).partition(chunk.contact_count)
+        self.stream.send_columns(CONTACTS, times, points)
+        for key in PLOTS:
+            if key in chunk.counters:
+                values = np.asarray(chunk.counters[key], dtype=np.float64)
+                self.stream.send_columns(f"plots/{key}", times, rr.Scalars.columns(scalars=values))
+
+
+class Crowd(NamedTuple):
+    """Bodies drawn as copies of one mesh, whose poses at a step are one row.
+
+    Attributes:
+        path: entity path.
+        shape: index into `Scene.shapes`.
+        bodies: [C] int64, which.
+    """
+
+    path: str
+    shape: int
+    bodies: np.ndarray
+
+
+def _crowds(scene: Scene) -> list[Crowd]:
+    """The crowds of a scene; bodies in none of them are drawn one by one."""
+    import rerun as rr
+
+    found = []
+    shape = np.array([b.shape if b.motion != "static" else -1 for b in scene.bodies])
+    for number, name in enumerate(s.name for s in scene.shapes):
+        members = np.flatnonzero(shape == number)
+        for k in range(COLORS if len(members) >= MANY else 0):
+            called = rr.escape_entity_path_part(f"{number}_{name}")
+            found.append(Crowd(f"{WORLD}/crowds/{called}/{k}", number, members[k::COLORS]))
+    return found
+
+
+def save_rollout(scene: Scene, rollout: Rollout, path: Path) -> None:
+    """Write `rollout` as a rerun recording: to a temporary name first, then renamed.
+
+    Raises:
+        SdfsimError: the file cannot be written.
+    """
+    playback = Playback(scene, rollout)
+    encoded = playback.stream.binary_stream()
+    playback.log_static()
+    playback.log_steps(rollout)
+    _write(path, encoded)
+
+
+@dataclass(frozen=True)
+class PosedPhoto:
+    """One camera of a reconstruction.
+
+    Attributes:
+        name: what the viewer calls it.
+        image: photo file, or None to show the camera alone.
+        focal: px.
+        principal: (cx, cy) px.
+        size: (width, height) px.
+        rotation: [3, 3] world to camera (x right, y down, z forward).
+        translation: [3] m, world to camera.
+    """
+
+    name: str
+    image: Path | None
+    focal: float
+    principal: tuple[float, float]
+    size: tuple[int, int]
+    rotation: np.ndarray
+    translation: np.ndarray
+
+
+def save_reconstruction(
+    path: Path, photos: list[PosedPhoto], points: np.ndarray, colors: np.ndarray | None, mesh: Mesh | None
+) -> None:
+    """Write cameras with their photos, sparse points and the surface as one rerun recording.
+
+    Args:
+        path: .rrd to write.
+        photos: posed cameras.
+        points: [P, 3] m, sparse points.
+        colors: [P, 3] uint8 RGB, or None.
+        mesh: the reconstructed surface, if it is there already.
+
+    Raises:
+        SdfsimError: the file cannot be written.
+    """
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    stream = rr.RecordingStream("sdfsim-reconstruct")
+    encoded = stream.binary_stream()
+    rotations = [np.asarray(photo.rotation) for photo in photos]
+    centres = [-turn.T @ photo.translation for turn, photo in zip(rotations, photos, strict=True)]
+    # Cameras surround what matters; sparse points also lie on whatever is behind it.
+    shown = np.concatenate([np.reshape(centres, (-1, 3)), points[:0] if mesh is None else mesh.vertices])
+    low, high = (shown.min(0), shown.max(0)) if len(shown) else (-np.ones(3), np.ones(3))
+    centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2 or 1.0
+    # Before there is a surface, z need not be up: photographers mostly hold the camera level.
+    up = -np.sum([turn[1] for turn in rotations], axis=0) if mesh is None and photos else np.array([0.0, 0.0, 1.0])
+    view = rrb.Spatial3DView(
+        origin=WORLD, name="reconstruction", eye_controls=_eye(centre, radius, up), line_grid=False
+    )
+    stream.send_blueprint(rrb.Blueprint(view, collapse_panels=True, auto_views=False))
+    stream.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    stream.log(f"{WORLD}/points", rr.Points3D(points, colors=colors, radii=rr.Radius.ui_points(1.5)), static=True)
+    if mesh is not None:
+        stream.log(f"{WORLD}/surface", _shaded(rr, mesh, (200, 190, 175)), static=True)
+    for photo, turn, centre_of in zip(photos, rotations, centres, strict=True):
+        entity = f"{WORLD}/cameras/{rr.escape_entity_path_part(photo.name)}"
+        pose = rr.Transform3D(translation=centre_of, mat3x3=turn.T)
+        stream.log(entity, pose, static=True)
+        shrink = min(1.0, _PHOTO_PIXELS / max(photo.size))
+        size = [max(1, round(s * shrink)) for s in photo.size]
+        pinhole = rr.Pinhole(
+            focal_length=photo.focal * shrink,
+            principal_point=np.array(photo.principal) * shrink,
+            resolution=size,
+            image_plane_distance=0.1 * radius,
+        )
+        stream.log(entity, pinhole, static=True)
+        if photo.image is not None and photo.image.exists():
+            stream.log(entity, rr.Image(_thumbnail(photo.image, size)).compress(jpeg_quality=80), static=True)
+    _write(path, encoded)
+
+
+def _thumbnail(path: Path, size: list[int]) -> np.ndarray:
+    from PIL import Image
+
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB").resize((size[0], size[1]), Image.Resampling.BILINEAR))
+
+
+def _write(path: Path, encoded: Any) -> None:
+    """All bytes of a rerun binary stream into `path`. We write them, since rerun's own sink only logs a full disk."""
+    with replacing(path) as partial:
+        partial.write_bytes(encoded.read() or b"")
+
+
+def _eye(centre: np.ndarray, radius: float, up: np.ndarray) -> rrb.EyeControls3D:
+    import rerun.blueprint as rrb
+
+    length = np.linalg.norm(up)
+    up = up / length if length > 0 else np.array([0.0, 0.0, 1.0])
+    side = np.cross(up, [0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0])
+    side /= np.linalg.norm(side)
+    away = 1.6 * np.cross(up, side) + 1.1 * side + 0.9 * up
+    return rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=centre + radius * away, look_target=centre, eye_up=up)
+
+
+def framed(scene: Scene, motion: Rollout | None = None) -> tuple[np.ndarray, float]:
+    """Centre [3] m and radius m of what the first view has to show.
+
+    The bodies at the start, planes left out, and the places on planes that they are over, as what is held up by
+    nothing falls there; and, where the motion is known, their way. What flies farther than `FARTHEST` times the size
+    of all this is followed so far only.
+    """
+    boxes: dict[int, np.ndarray] = {}
+    planes = []
+    for k, body in enumerate(scene.bodies):
+        shape = scene.shapes[body.shape]
+        if not np.all(np.isfinite(shape.sdf.bounds)):
+            planes.append((body.position, _turned(np.array([0.0, 0.0, 1.0]), body.quat_xyzw)))
+        elif len(shape.mesh.vertices):
+            box = np.stack([shape.mesh.vertices.min(0), shape.mesh.vertices.max(0)]) * body.scale
+            corners = np.stack(np.meshgrid(*box.T), -1).reshape(-1, 3)
+            boxes[k] = body.position + _turned(corners, body.quat_xyzw)
+    if not boxes:
+        return np.zeros(3), 1.0
+    start = np.concatenate(list(boxes.values()))
+    below = [start - ((start - at) @ normal)[:, None] * normal for at, normal in planes]
+    shown = np.concatenate([start, *below])
+    low, high = shown.min(0), shown.max(0)
+    if motion is not None:
+        size = float((high - low).max())
+        for k, corners in boxes.items():
+            half = np.linalg.norm(np.ptp(corners, axis=0)) / 2 if scene.bodies[k].motion != "static" else 0.0
+            way = np.clip(motion.position[:, k], low - FARTHEST * size, high + FARTHEST * size)
+            low, high = np.minimum(low, way.min(0) - half), np.maximum(high, way.max(0) + half)
+    return (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
+
+
+def _turned(vectors: np.ndarray, quat_xyzw: np.ndarray) -> np.ndarray:
+    """Vectors [..., 3] turned by a unit quaternion [4]."""
+    return vectors @ pose.to_matrix(torch.from_numpy(quat_xyzw)).numpy().T
+
+
+def _shaded(rr: Any, mesh: Mesh, color: tuple[int, ...]) -> rr.Mesh3D:
+    """With its own colours, or `color` where it has none."""
+    mesh, normals = with_normals(mesh)
+    return rr.Mesh3D(
+        vertex_positions=mesh.vertices,
+        triangle_indices=mesh.faces,
+        vertex_normals=normals,
+        vertex_colors=mesh.colors,
+        albedo_factor=color if mesh.colors is None else None,
+    )
+
+
+def sheet(half: float) -> Mesh:
+    """A square of z = 0, `half` m to each side, shown for an infinite plane."""
+    vertices = np.array([[-half, -half, 0.0], [half, -half, 0.0], [half, half, 0.0], [-half, half, 0.0]])
+    return Mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+def distinct_colors(count: int) -> Iterator[tuple[int, ...]]:
+    """`count` RGB colours (0 to 255) whose hues are a golden angle from each other."""
+    for i in range(count):
+        rgb = colorsys.hsv_to_rgb((0.58 + i * 0.61803398875) % 1.0, 0.62, 0.9 if i % 2 == 0 else 0.75)
+        yield tuple(round(255 * c) for c in rgb)
+
+
+def with_normals(mesh: Mesh) -> tuple[Mesh, np.ndarray]:
+    """The mesh with normals [V, 3]: smooth, its vertices split along creases so that boxes keep their edges."""
+    normals = _corner_normals(mesh.vertices, mesh.faces)
+    if normals is None:
+        return mesh, _smooth_normals(mesh.vertices, mesh.faces)
+    colors = None if mesh.colors is None else mesh.colors[mesh.faces].reshape(-1, 3)
+    vertices = mesh.vertices[mesh.faces].reshape(-1, 3)
+    return Mesh(vertices, np.arange(len(vertices)).reshape(-1, 3), colors), normals
+
+
+def _face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """[F, 3], twice the area long."""
+    a, b, c = vertices[faces.T]
+    return np.cross(b - a, c - a)
+
+
+def _smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """[V, 3] area-weighted means of the faces around each vertex."""
+    total = np.zeros_like(vertices)
+    normal = _face_normals(vertices, faces)
+    for k in range(3):
+        np.add.at(total, faces[:, k], normal)
+    return _normalise(total)
+
+
+def _corner_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
+    """[3 F, 3] for every face corner the mean of the faces at its vertex that bend less than the crease angle.
+
+    None for a mesh so fine that it may pass as smooth.
+    """
+    owner = faces.reshape(-1)
+    order = np.argsort(owner, kind="stable")
+    valence = np.bincount(owner, minlength=len(vertices))
+    if (valence**2).sum() > _MOST_CORNER_PAIRS:
+        return None
+    start = np.cumsum(valence) - valence
+    repeats = valence[owner]
+    first = np.repeat(np.arange(len(owner)), repeats)
+    second = order[np.repeat(start[owner] - (np.cumsum(repeats) - repeats), repeats) + np.arange(repeats.sum())]
+    normal = _face_normals(vertices, faces)
+    unit = _normalise(normal)
+    near = (unit[first // 3] * unit[second // 3]).sum(1) >= _CREASE
+    total = np.zeros((len(owner), 3))
+    np.add.at(total, first[near], normal[second[near] // 3])
+    return _normalise(total)
+
+
+def _normalise(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)

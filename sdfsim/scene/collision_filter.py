@@ -1,0 +1,72 @@
+"""Which bodies may touch: by groups, and counted by kinds, so that thousands of bodies make no millions of tests."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sdfsim.scene.scene import Body
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """The unordered pairs of bodies of a scene.
+
+    Attributes:
+        total: all there are.
+        unmoved: of these, without a dynamic body: they may overlap as they like.
+        excluded: of the others, those that `collides_with` keeps apart.
+        possible: what is left.
+        frictional: of the possible ones, with a friction product above zero.
+        bouncy: likewise with a restitution product above zero.
+    """
+
+    total: int
+    unmoved: int
+    excluded: int
+    possible: int
+    frictional: int
+    bouncy: int
+
+
+def contact_groups(bodies: Sequence[Body]) -> tuple[np.ndarray, np.ndarray]:
+    """Bodies that list the same names and are listed by the same bodies are one group.
+
+    Returns:
+        The group [N] int64 of every body, and [G, G] bool: whether `collides_with` of both lets two groups touch.
+    """
+    lists = {id(b.collides_with): set(b.collides_with) for b in bodies if b.collides_with is not None}
+    found: dict[tuple, int] = {}
+    group = np.empty(len(bodies), dtype=np.int64)
+    for k, body in enumerate(bodies):
+        own = None if body.collides_with is None else id(body.collides_with)
+        listed = frozenset(key for key, names in lists.items() if body.name in names)
+        group[k] = found.setdefault((own, listed), len(found))
+    allowed = np.array([[own is None or own in listed for _, listed in found] for own, _ in found], dtype=bool)
+    return group, (allowed & allowed.T).reshape(len(found), len(found))
+
+
+def count_pairs(bodies: Sequence[Body]) -> Pairs:
+    """Count the pairs of a scene by what lets them touch."""
+    group, allowed = contact_groups(bodies)
+    kinds: dict[tuple[int, bool, bool, bool], int] = {}
+    for body, number in zip(bodies, group.tolist(), strict=True):
+        kind = (number, body.motion == "dynamic", body.friction > 0, body.restitution > 0)
+        kinds[kind] = kinds.get(kind, 0) + 1
+    unmoved = excluded = possible = frictional = bouncy = 0
+    listed = list(kinds.items())
+    for i, ((one, moves, rough, springy), count) in enumerate(listed):
+        for (other, goes, grips, bounces), more in listed[i:]:
+            same = (one, moves, rough, springy) == (other, goes, grips, bounces)
+            pairs = count * (count - 1) // 2 if same else count * more
+            if not (moves or goes):
+                unmoved += pairs
+            elif not allowed[one, other]:
+                excluded += pairs
+            else:
+                possible += pairs
+                frictional += pairs * (rough and grips)
+                bouncy += pairs * (springy and bounces)
+    return Pairs(len(bodies) * (len(bodies) - 1) // 2, unmoved, excluded, possible, frictional, bouncy)

@@ -1,0 +1,957 @@
+"""scene.yaml: its keys (pydantic models), its YAML with line numbers, and `load_scene`.
+
+`python -m sdfsim.scene.scene_file` writes docs/scene.md, the reference of every key.
+"""
+
+from __future__ import annotations
+
+import difflib
+import errno
+import itertools
+import re
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import yaml
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, WrapValidator
+from pydantic import model_validator as validator_of_model
+from pydantic_core import InitErrorDetails, PydanticCustomError, core_schema
+
+from sdfsim.errors import SceneError, SdfsimError
+from sdfsim.scene.scene import Body, Effects, Limits, Motion, Scene, Waypoints
+from sdfsim.shape.primitives import PRIMITIVES
+from sdfsim.shape.shape import (
+    DEFAULT_RESOLUTION,
+    MESH_FILE,
+    RECORD_FILE,
+    WEIGHTS_FILE,
+    SdfKind,
+    Shape,
+    analytic_shape,
+    load_shape,
+    shape_from_mesh,
+    shape_from_primitive,
+    with_nodes,
+    with_sdf,
+)
+
+VERSION = 1
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+DEFAULT_DURATION = 4.0  # s
+DEFAULT_GRAVITY = (0.0, 0.0, -9.81)  # m/s^2
+MOST_COPIES = 100_000
+MOST_BYTES = 16 * 2**20  # of a file
+MOST_VALUES = 500_000  # of a file, each as often as an alias repeats it
+LARGEST = 1e12  # of any number: beyond it powers and products of what is legal are no longer finite
+MOST_LETTERS = 1000  # of a key or a text
+_SHOWN = 40  # letters of a value in a message
+_ALIKE = 100  # names longer than this, or more of them than ten times as many, are not searched for similar ones
+_NAMED = 20  # names in one message
+_LEVELS = 8  # no key lies deeper
+_NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
+_WHOLE = re.compile(r"[-+]?[0-9]{1,18}")
+_NOT_FINITE = re.compile(r"[-+]?\.?(nan|inf|infinity)", re.IGNORECASE)
+_NULL = ("", "~", "null", "Null", "NULL")
+_PLAIN_TAGS = {f"tag:yaml.org,2002:{t}" for t in ("str int float bool null map seq timestamp merge value".split())}
+
+Progress = Callable[[float, str], None]
+Loc = tuple[str | int, ...]  # keys and indices that lead to a value
+Fault = tuple[Loc, str]  # where below a table, and what is wrong there
+
+
+class Numeral(str):
+    """A number without quotes, as the file writes it.
+
+    Fields read their numbers themselves, as YAML 1.1 guesses: `1:30` would become 90, and `1e-3` a text.
+    """
+
+
+NOTHING = object()  # what a key has that is followed by nothing, `~` or `null`
+
+
+def _shown(value: Any) -> str:
+    """What the file says, for a message."""
+    if isinstance(value, str):
+        text = repr(str(value))
+        return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "...'"
+    return "nothing" if value is NOTHING else "a list" if isinstance(value, list) else "a mapping"
+
+
+def _nearest(name: str, known: Iterable[str]) -> str:
+    """` (did you mean 'x'?)` with the nearest known name, or an empty string."""
+    known = [other for other in known if len(other) <= _ALIKE]
+    if len(name) > _ALIKE or len(known) > 10 * _ALIKE:
+        return ""
+    match = difflib.get_close_matches(name, known, n=1, cutoff=0.55)
+    return f" (did you mean '{match[0]}'?)" if match else ""
+
+
+def _problem(text: str, kind: Any = "value") -> PydanticCustomError:
+    return PydanticCustomError(kind, "{text}", {"text": text})
+
+
+def _told(error: Any) -> tuple[str, str]:
+    """What pydantic found, in our words, and the kind of it."""
+    kind, got = error["type"], f"(got {_shown(error['input'])})"
+    if kind == "literal_error":
+        allowed = error["ctx"]["expected"].replace("'", "").replace(" or ", ", ")
+        return f"must be one of {allowed} {got}", "value"
+    texts = {
+        "missing": "is required",
+        "list_type": f"must be a list {got}",
+        "dict_type": f"must be a mapping {got}",
+        "string_type": f"must be a text {got}",
+        "too_short": "must hold at least one entry (got 0)",
+    }
+    return texts.get(kind) or error["msg"], "unknown" if kind == "unknown" else "value"
+
+
+@dataclass(frozen=True)
+class Number:
+    """A finite number, read from its text: above < x, least <= x <= most.
+
+    Attributes:
+        unit: its SI unit, or an empty string.
+        whole: it has no fraction.
+    """
+
+    unit: str = ""
+    above: float | None = None
+    least: float | None = None
+    most: float | None = None
+    whole: bool = False
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> core_schema.CoreSchema:
+        return core_schema.no_info_plain_validator_function(self.read)
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict:
+        limits = {"exclusiveMinimum": self.above, "minimum": self.least, "maximum": self.most}
+        kind = "integer" if self.whole else "number"
+        return {"type": kind, "unit": self.unit, **{k: v for k, v in limits.items() if v is not None}}
+
+    def read(self, value: Any) -> float:
+        unit, number = f" {self.unit}" if self.unit else "", isinstance(value, Numeral)
+        if number and (_NOT_FINITE.fullmatch(value) or np.isinf(float(value))):
+            raise _problem(f"must be finite (got {value})")
+        if not (number and (_WHOLE if self.whole else _NUMBER).fullmatch(value)):
+            what = "a whole number" if self.whole else f"a number in{unit}" if unit else "a number"
+            raise _problem(f"must be {what} (got {_shown(value)})")
+        found = int(value) if self.whole else float(value)
+        for limit, sign, fine in (
+            (self.above, ">", self.above is None or found > self.above),
+            (self.least, ">=", self.least is None or found >= self.least),
+            (self.most, "<=", self.most is None or found <= self.most),
+            (LARGEST, "at most", self.whole or abs(found) <= LARGEST),
+        ):
+            if not fine:
+                raise _problem(f"must be {sign} {limit:g} (got {value}{unit})")
+        return found
+
+
+@dataclass(frozen=True)
+class Vector:
+    """A list of numbers -> float64 [length].
+
+    Attributes:
+        of: each of them.
+        length: how many.
+        direction: why it may not be zero, where only its direction counts: it is made one long.
+    """
+
+    of: Number = Number()
+    length: int = 3
+    direction: str = ""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> core_schema.CoreSchema:
+        entries = core_schema.list_schema(core_schema.no_info_plain_validator_function(self.of.read))
+        return core_schema.no_info_wrap_validator_function(self._read, entries)
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict:
+        return {**self.of.__get_pydantic_json_schema__(schema, handler), "length": self.length}
+
+    def _read(self, value: Any, handler: Callable[[list], list[float]]) -> np.ndarray:
+        if not isinstance(value, list) or len(value) != self.length:
+            got = f"{len(value)} values" if isinstance(value, list) else _shown(value)
+            unit = f" in {self.of.unit}" if self.of.unit else ""
+            raise _problem(f"must be a list of {self.length} numbers{unit} (got {got})")
+        made = np.array(handler(value))
+        if not self.direction:
+            return made
+        largest = np.abs(made).max()
+        if largest < 1e-9:
+            raise _problem(f"must not be zero: {self.direction}")
+        made = made / largest  # first, so that the length of huge numbers does not overflow
+        return made / np.linalg.norm(made)
+
+
+def _text(text: str) -> str:
+    if not text.strip():
+        raise _problem(f"must be a text (got {_shown(text)})")
+    if len(text) > MOST_LETTERS:
+        raise _problem(f"must be a text of at most {MOST_LETTERS} letters (got {len(text)})")
+    return str(text)
+
+
+def _partners(value: Any, handler: Callable[[Any], list[str]]) -> list[str] | None:
+    if not isinstance(value, list) and value != "all":
+        raise _problem(f"must be all, or a list of names (got {_shown(value)})")
+    return None if value == "all" else handler(value)
+
+
+def _find(text: str, info: ValidationInfo) -> Path:
+    """The place that a path of the file names, whether something is there or not."""
+    context: Any = info.context
+    home: Path = context["folder"]
+    place = home / text
+    try:
+        # Where it leads when every link is followed; of a folder, also where the files of a shape lead.
+        inside = (WEIGHTS_FILE, MESH_FILE, RECORD_FILE) if place.is_dir() else ()
+        ends = [place.resolve(), *((place / name).resolve() for name in inside)]
+        with suppress(FileNotFoundError, NotADirectoryError):  # told in the words of whoever wants it
+            place.stat()
+        outside = not all(end.is_relative_to(home.resolve()) for end in ends)
+    except (OSError, RuntimeError, ValueError) as error:  # a loop of links, too long a name, a zero byte
+        raise _problem(f"cannot be looked up: {place} ({getattr(error, 'strerror', None) or error})") from None
+    if outside and not context["allow_outside"]:
+        advice = "copy it there, or allow it with --allow-outside, in Python allow_outside=True"
+        raise _problem(f"leads out of the scene's folder: {place} ({advice})")
+    return place
+
+
+def _folder(text: str, info: ValidationInfo) -> str:
+    place = _find(text, info)
+    if not place.is_dir():
+        raise _problem(f"no such folder: {place}")
+    return str(place)
+
+
+def _file(text: str, info: ValidationInfo) -> str:
+    place = _find(text, info)
+    if not place.is_file():
+        raise _problem(f"no such file: {place}")
+    return str(place)
+
+
+def _model(text: str, info: ValidationInfo) -> str:
+    """A bundled model's name, or the path of a file, taken from the scene's folder."""
+    return str(_find(text, info)) if text.endswith(".safetensors") else text
+
+
+def _primitive(name: str) -> str:
+    if name not in PRIMITIVES:
+        raise _problem(f"no such primitive: {name!r}{_nearest(name, PRIMITIVES)}; there are {', '.join(PRIMITIVES)}")
+    return name
+
+
+def _version(number: int) -> int:
+    if number != VERSION:
+        raise _problem(f"must be {VERSION} (got {number})")
+    return number
+
+
+Text = Annotated[str, AfterValidator(_text)]
+Metres = Annotated[float, Number("m", above=0)]
+Place = Annotated[Any, Vector(Number("m"))]
+Switch = Literal["auto", "on", "off"]
+Quaternion = Annotated[Any, Vector(length=4, direction="a quaternion has length 1")]
+
+
+class Table(BaseModel):
+    """A mapping of the file. All of its faults are found at once."""
+
+    model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True)
+
+    @validator_of_model(mode="wrap")
+    @classmethod
+    def _find_all(cls, data: Any, handler: Any) -> Any:
+        data = {} if data is NOTHING else data
+        if not isinstance(data, dict):
+            raise _problem(f"must be a mapping (got {_shown(data)})")
+        known = cls.model_fields
+        listed = f"; known here: {', '.join(known) or 'none'}"
+        faults = [(key, f"unknown key{_nearest(key, known) or listed}", "unknown") for key in data if key not in known]
+        found = [((key,), text, kind) for key, text, kind in faults]
+        found += [(loc, text, "value") for loc, text in cls.check_keys(data)]
+        made = None
+        try:
+            made = handler(data)
+            found += [(loc, text, "value") for loc, text in made.check_values()]
+        except ValidationError as error:
+            found += [(e["loc"], *_told(e)) for e in error.errors(include_url=False)]
+        if found:
+            details = [InitErrorDetails(type=_problem(text, kind), loc=loc, input=None) for loc, text, kind in found]
+            raise ValidationError.from_exception_data(cls.__name__, details)
+        return made
+
+    @classmethod
+    def check_keys(cls, data: dict) -> Iterator[Fault]:
+        """Which keys go together; asked of what the file says, whether its values are right or not."""
+        yield from ()
+
+    def check_values(self) -> Iterator[Fault]:
+        """Which values go together; asked once each is right by itself."""
+        yield from ()
+
+
+def _one_of(data: dict, keys: Iterable[str], *, required: bool = False) -> Iterator[Fault]:
+    there = [key for key in data if key in keys]
+    if len(there) > 1:
+        yield (there[1],), f"give only one of {', '.join(keys)} (got {' and '.join(there)})"
+    if not there and required:
+        yield (), f"one of {', '.join(keys)} is required"
+
+
+class EffectsTable(Table):
+    """Which effects to compute; `auto` is on where it can change the motion, as `sdfsim plan` tells."""
+
+    contact: Switch = Field(default="auto", description="bodies touch")
+    friction: Switch = Field(default="auto", description="contacts hold sideways")
+    restitution: Switch = Field(default="auto", description="contacts rebound")
+    rotation: Switch = Field(default="auto", description="bodies turn")
+    sleep: Switch = Field(default="auto", description="what rests is frozen until something disturbs it")
+
+
+class LimitsTable(Table):
+    """What a run must keep to."""
+
+    memory_gib: Annotated[float | None, Number("GiB", above=0)] = Field(
+        default=None, description="memory that one step may take for distances and edges; no limit without it"
+    )
+
+
+class Primitive(Table):
+    """A procedural shape."""
+
+    name: Annotated[Text, AfterValidator(_primitive)] = Field(description=f"one of {', '.join(PRIMITIVES)}")
+    size: Metres = Field(1.0, description="largest extent")
+
+
+class Sphere(Table):
+    """An exact sphere about the origin."""
+
+    radius: Metres = Field(description="radius")
+
+
+class Upright(Table):
+    """An exact capsule or cylinder along z, about the origin."""
+
+    radius: Metres = Field(description="radius")
+    height: Metres = Field(description="along z; of a capsule with its caps, so above twice the radius")
+
+
+class Box(Table):
+    """An exact box about the origin."""
+
+    size: Annotated[Any, Vector(Number("m", above=0))] = Field(description="extents along x, y, z")
+
+
+class PlaneShape(Table):
+    """z = 0, infinite. It takes no keys: tilt it by the body's pose, or give the body its own `plane`."""
+
+
+_KINDS = ("asset", "mesh", "primitive", "sphere", "capsule", "cylinder", "box", "plane")
+_FITTED = ("mesh", "primitive")  # made on first use, which may take a minute
+_WITH_SDF = ("asset", *_FITTED)  # the others have an exact SDF of their own
+
+
+class ShapeTable(Table):
+    """One shape: exactly one of `asset` to `plane`, and how its distances and surface nodes are made."""
+
+    asset: Annotated[Text, AfterValidator(_folder)] | None = Field(
+        None, description="folder that `reconstruct` or `fit` has written, from the scene's folder"
+    )
+    mesh: Annotated[Text, AfterValidator(_file)] | None = Field(
+        None, description="mesh file, from the scene's folder; fitted on first use, then taken from a cache"
+    )
+    primitive: Primitive | None = Field(None, description="a procedural shape, fitted on first use")
+    sphere: Sphere | None = Field(None, description="an exact sphere")
+    capsule: Upright | None = Field(None, description="an exact capsule")
+    cylinder: Upright | None = Field(None, description="an exact cylinder")
+    box: Box | None = Field(None, description="an exact box")
+    plane: PlaneShape | None = Field(None, description="an infinite plane")
+    units: Literal["m", "cm", "mm", "in"] = Field("m", description="of the numbers in a mesh file")
+    cap: Literal["on", "off"] = Field("off", description="close the openings of a mesh")
+    thicken: Annotated[float | None, Number("m", above=0)] = Field(
+        None, description="thickness that an open sheet of a mesh gets"
+    )
+    sdf: SdfKind | None = Field(
+        None,
+        description="where distances come from: a fitted network, samples on a grid, or the mesh itself; without it "
+        "an asset keeps its own and others are fitted",
+    )
+    resolution: Annotated[int, Number(least=8, most=512, whole=True)] = Field(
+        DEFAULT_RESOLUTION, description="samples along each side, with `sdf: grid`"
+    )
+    nodes: Annotated[int | None, Number(least=3, most=128, whole=True)] = Field(
+        None, description="N of the N^3 grid whose points become surface nodes; without it a shape keeps its own"
+    )
+
+    @classmethod
+    def check_keys(cls, data: dict) -> Iterator[Fault]:
+        yield from _one_of(data, _KINDS, required=True)
+        kind = _kind_of(data)
+        for key in ("units", "cap", "thicken"):
+            if key in data and kind not in ("mesh", None):
+                yield (key,), f"goes with mesh only (this is a {kind})"
+        if "sdf" in data and kind not in (*_WITH_SDF, None):
+            yield ("sdf",), f"goes with {', '.join(_WITH_SDF)} only (a {kind} has its exact SDF)"
+        if "resolution" in data and data.get("sdf") in (None, "mlp", "mesh"):
+            yield ("resolution",), "goes with sdf: grid only"
+        if "nodes" in data and kind == "plane":
+            yield ("nodes",), "goes with bodies only (a plane has no nodes)"
+
+    def check_values(self) -> Iterator[Fault]:
+        if self.capsule and self.capsule.height <= 2 * self.capsule.radius:
+            got = f"(got {self.capsule.height:g} m)"
+            yield ("capsule", "height"), f"must be above twice the radius, its caps included {got}"
+
+    @property
+    def kind(self) -> str:
+        """The one of `_KINDS` that is given."""
+        return next(kind for kind in _KINDS if getattr(self, kind) is not None)
+
+
+def _kind_of(data: Any) -> str | None:
+    return next((key for key in data if key in _KINDS), None) if isinstance(data, dict) else None
+
+
+_ROTATIONS = ("quat_xyzw", "quat_wxyz", "euler_xyz_deg")
+
+
+class Turned(Table):
+    """What has an orientation, given by at most one of three keys."""
+
+    quat_xyzw: Quaternion | None = Field(None, description="orientation as a quaternion, scalar last; of any length")
+    quat_wxyz: Quaternion | None = Field(None, description="the same with its scalar first")
+    euler_xyz_deg: Annotated[Any, Vector(Number("degrees"))] | None = Field(
+        None, description="the same as turns about the fixed x, then y, then z"
+    )
+
+    @classmethod
+    def check_keys(cls, data: dict) -> Iterator[Fault]:
+        yield from _one_of(data, _ROTATIONS)
+
+    def rotation(self) -> np.ndarray:
+        """[4] unit quaternion xyzw."""
+        if self.quat_wxyz is not None:
+            return np.roll(self.quat_wxyz, -1)
+        if self.euler_xyz_deg is not None:
+            from scipy.spatial.transform import Rotation  # slow to import
+
+            return Rotation.from_euler("xyz", self.euler_xyz_deg, degrees=True).as_quat()
+        return np.array([0.0, 0.0, 0.0, 1.0]) if self.quat_xyzw is None else self.quat_xyzw
+
+
+class Waypoint(Turned):
+    """One pose of a path. In between a body goes straight and turns evenly; before and after it rests."""
+
+    time: Annotated[float, Number("s", least=0)] = Field(description="when; later than the pose before it")
+    position: Place = Field(description="of the shape's own origin")
+
+
+class Plane(Table):
+    """The points x with normal . x = offset, of a body without a shape."""
+
+    normal: Annotated[Any, Vector(direction="it is the direction the plane faces")] = Field(
+        (0.0, 0.0, 1.0), description="the direction it faces; of any length"
+    )
+    offset: Annotated[float, Number("m")] = Field(0.0, description="distance from the origin along the normal")
+
+    def pose(self) -> tuple[np.ndarray, np.ndarray]:
+        """Position [3] m and quaternion [4] xyzw that carry z = 0 onto the plane."""
+        normal = np.array(self.normal)
+        # The shortest turn from z; straight down has none of its own, so turn about x.
+        quat = np.array([-normal[1], normal[0], 0.0, 1.0 + normal[2]])
+        quat = np.array([1.0, 0.0, 0.0, 0.0]) if np.linalg.norm(quat) < 1e-9 else quat / np.linalg.norm(quat)
+        return normal * self.offset, quat
+
+
+class Arrange(Table):
+    """Copies on a grid, centred on the position in x and y, its lowest layer at the position."""
+
+    grid: Annotated[Any, Vector(Number(least=1, whole=True))] = Field(description="copies along x, y, z")
+    spacing: Metres = Field(description="from one to the next")
+
+
+_NOT_WITH_PATH = ("position", *_ROTATIONS, "velocity", "angular_velocity", "mass", "density")
+_NOT_WITH_PLANE = ("shape", "scale", *_NOT_WITH_PATH, "count", "arrange")
+
+
+class BodyTable(Turned):
+    """One body, or many copies of it: either a `shape` or a `plane` of its own."""
+
+    name: Text = Field(description="unique; copies are called name[0], name[1], ...")
+    shape: Text | None = Field(None, description="a name under `shapes`")
+    plane: Plane | None = Field(None, description="makes it an infinite static plane")
+    motion: Motion | None = Field(
+        None, description="kinematic bodies follow their `path`, whatever they meet; dynamic without it, planes static"
+    )
+    path: Annotated[list[Waypoint], Field(min_length=1)] | None = Field(None, description="poses of a kinematic body")
+    scale: Annotated[float, Number(above=0)] = Field(1.0, description="factor on the size of the shape")
+    position: Place = Field((0.0, 0.0, 0.0), description="of the shape's own origin")
+    velocity: Annotated[Any, Vector(Number("m/s"))] = Field((0.0, 0.0, 0.0), description="of the centre of mass")
+    angular_velocity: Annotated[Any, Vector(Number("rad/s"))] = Field((0.0, 0.0, 0.0), description="in world axes")
+    mass: Annotated[float | None, Number("kg", above=0)] = Field(None, description="without it the density counts")
+    density: Annotated[float, Number("kg/m^3", above=0)] = Field(1000.0, description="not together with mass")
+    friction: Annotated[float, Number(least=0, most=1000)] = Field(
+        0.5, description="Coulomb coefficient; two bodies' product counts"
+    )
+    restitution: Annotated[float, Number(least=0, most=1)] = Field(0.5, description="two bodies' product counts")
+    collides_with: Annotated[list[Text] | None, WrapValidator(_partners)] = Field(
+        None, description="`all`, or a list of names: two bodies touch where each lists the other"
+    )
+    count: Annotated[int | None, Number(least=1, whole=True)] = Field(
+        None, description="how many copies; without it, as many as the grid has places"
+    )
+    arrange: Arrange | None = Field(None, description="where the copies are")
+
+    @classmethod
+    def check_keys(cls, data: dict) -> Iterator[Fault]:
+        for key in _NOT_WITH_PLANE if "plane" in data else ():
+            if key in data:
+                yield (key,), "does not go with plane: a plane is static and has its pose from normal and offset"
+        if "plane" not in data:
+            yield from _one_of(data, ("shape", "plane"), required=True)
+            yield from super().check_keys(data)
+            yield from _one_of(data, ("mass", "density"))
+        if data.get("motion") == "kinematic":
+            for key in _NOT_WITH_PATH:
+                if key in data:
+                    yield (key,), "does not go with motion: kinematic: its path says where it is"
+            if "path" not in data:
+                yield ("path",), "is required: a kinematic body follows timed poses"
+        elif "path" in data:
+            yield ("path",), "goes with motion: kinematic only"
+
+    def check_values(self) -> Iterator[Fault]:
+        if self.plane and self.motion not in (None, "static"):
+            yield ("motion",), "a plane must be static"
+        for i, (before, pose) in enumerate(itertools.pairwise(self.path or []), 1):
+            if pose.time <= before.time:
+                got = f"(got {pose.time:g} s after {before.time:g} s)"
+                yield ("path", i), f"must be later than the pose before it {got}"
+        if self.motion == "static":
+            yield from self.check_rest()
+        if self.arrange is None and self.copies > 1:
+            advice = "needs arrange: {grid: [nx, ny, nz], spacing: metres}"
+            yield ("count",), f"{advice} (got {self.copies} at one place)"
+        elif self.copies > self.places:
+            yield ("count",), f"must be <= {self.places}, the places of the grid (got {self.copies})"
+
+    def check_rest(self) -> Iterator[Fault]:
+        """That it has no velocity, as a static body."""
+        for key in ("velocity", "angular_velocity"):
+            if np.any(getattr(self, key)):
+                yield (key,), "must be zero: a static body does not move"
+
+    @property
+    def places(self) -> int:
+        """Of the grid, or the one of a body alone."""
+        return 1 if self.arrange is None else int(np.prod(self.arrange.grid, dtype=np.float64))
+
+    @property
+    def copies(self) -> int:
+        """How many bodies it stands for."""
+        return self.count or self.places
+
+    def names(self) -> list[str]:
+        """`balls[0]`, `balls[1]` ... where there is a count or a grid, be it of one; else its own name."""
+        grouped = self.count is not None or self.arrange is not None
+        return [f"{self.name}[{i}]" for i in range(self.copies)] if grouped else [self.name]
+
+    def offsets(self) -> np.ndarray:
+        """[copies, 3] m, added to the position."""
+        if self.arrange is None:
+            return np.zeros((1, 3))
+        nx, ny, _ = self.arrange.grid
+        index = np.arange(self.copies)
+        cells = np.stack([index % nx, index // nx % ny, index // (nx * ny)], axis=1).astype(np.float64)
+        return (cells - [(nx - 1) / 2, (ny - 1) / 2, 0.0]) * self.arrange.spacing
+
+
+class SceneTable(Table):
+    """The whole file."""
+
+    version: Annotated[int, Number(whole=True), AfterValidator(_version)] = Field(description=f"always {VERSION}")
+    model: Annotated[Text, AfterValidator(_model)] | None = Field(
+        None, description="bundled model, or a .safetensors file in the scene's folder; it owns its time step"
+    )
+    duration: Annotated[float, Number("s", above=0)] = Field(DEFAULT_DURATION, description="simulated time")
+    seed: Annotated[int, Number(least=0, whole=True)] = Field(0, description="of the run's random numbers")
+    gravity: Annotated[Any, Vector(Number("m/s^2"))] = Field(DEFAULT_GRAVITY, description="pull on every free body")
+    effects: EffectsTable = Field(default=EffectsTable(), description="which effects to compute")
+    limits: LimitsTable = Field(default=LimitsTable(), description="what a run must keep to")
+    shapes: dict[str, ShapeTable] = Field({}, description="shapes by name")
+    bodies: Annotated[list[BodyTable], Field(min_length=1)] = Field(description="all bodies")
+
+    @classmethod
+    def check_keys(cls, data: dict) -> Iterator[Fault]:
+        shapes = data["shapes"] if isinstance(data.get("shapes"), dict) else {}
+        listed = data["bodies"] if isinstance(data.get("bodies"), list) else []
+        bodies = [(i, entry) for i, entry in enumerate(listed) if isinstance(entry, dict)]
+        first: dict[str, int] = {}
+        for i, entry in bodies:
+            name, shape = (_name(entry.get(key)) for key in ("name", "shape"))
+            if name and first.setdefault(name, i) != i:
+                yield ("bodies", i, "name"), f"two bodies are called {name!r} (the first is bodies[{first[name]}])"
+            if shape and shape not in shapes:
+                few = [*list(shapes)[:_NAMED], *(["..."] if len(shapes) > _NAMED else [])]
+                there = f"; shapes are {', '.join(few)}" if shapes else "; the file has no shapes"
+                yield ("bodies", i, "shape"), f"no shape is called {shape!r}{_nearest(shape, shapes) or there}"
+            if _kind_of(shapes.get(shape)) == "plane" and entry.get("motion") in ("dynamic", "kinematic"):
+                yield ("bodies", i, "motion"), "a plane must be static"
+        for i, entry in bodies:
+            partners = entry.get("collides_with")
+            for k, partner in enumerate(map(_name, partners) if isinstance(partners, list) else ()):
+                if partner and partner not in first and "[" not in partner:
+                    yield ("bodies", i, "collides_with", k), _nobody(partner, first)
+
+    def check_values(self) -> Iterator[Fault]:
+        first = {body.name: i for i, body in enumerate(self.bodies)}
+        for i, copies in enumerate(itertools.accumulate(body.copies for body in self.bodies)):
+            if copies > MOST_COPIES:
+                yield ("bodies", i), f"one too many: a scene has at most {MOST_COPIES} bodies, copies included"
+                return
+        copies = {name: i for i, body in enumerate(self.bodies) for name in body.names() if name != body.name}
+        for name in copies.keys() & first.keys():
+            yield ("bodies", first[name], "name"), f"two bodies are called {name!r} (see bodies[{copies[name]}])"
+        for i, body in enumerate(self.bodies):
+            if body.motion is None and self.motion_of(body) == "static":
+                yield from ((("bodies", i, *loc), text) for loc, text in body.check_rest())
+            for k, partner in enumerate(body.collides_with or []):
+                if partner not in first and partner not in copies:
+                    yield ("bodies", i, "collides_with", k), _nobody(partner, first)
+
+    def motion_of(self, body: BodyTable) -> Motion:
+        """As it says, else static for planes and dynamic for others."""
+        shape = self.shapes.get(body.shape) if body.shape else None
+        flat = body.plane is not None or (shape is not None and shape.plane is not None)
+        return body.motion or ("static" if flat else "dynamic")
+
+
+def _name(value: Any) -> str:
+    """A name that can be looked for; empty where the value is a fault of its own."""
+    return str(value) if isinstance(value, str) and value.strip() and len(value) <= MOST_LETTERS else ""
+
+
+def _nobody(name: str, known: Iterable[str]) -> str:
+    return f"no body is called {name!r}{_nearest(name, known)}"
+
+
+class Document:
+    """The YAML of a file, and the faults found in it, each with its line.
+
+    Args:
+        path: of the file.
+
+    Attributes:
+        data: dicts, lists, texts and `Numeral`s; `NOTHING` where a key has no value.
+
+    Raises:
+        SceneError: the file is missing, too large, not UTF-8, not YAML (with the line), or empty, or its aliases
+            multiply it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._root = _compose(path)
+        self._read_so_far = 0
+        self._children: dict[int, dict] = {}  # of a mapping's node by its id: (node of the key, of the value) by key
+        self._found: dict[tuple[int, str], None] = {}  # in the order of the finding, each once
+        self.data = self._read(self._root, ())
+
+    def wrong(self, loc: Loc, text: str, *, key: bool = False) -> None:
+        """Note a fault at the value under `loc`, or at its key."""
+        node = self._root
+        for depth, part in enumerate(loc, 1):
+            pair = self._below(node).get(part)
+            if pair is None:
+                break
+            node = pair[0] if key and depth == len(loc) else pair[1]
+        self._add(node, loc, text)
+
+    def check(self) -> None:
+        """Raise SceneError with every fault, in the order of the file, if there is any."""
+        if self._found:
+            raise SceneError([text for _, text in sorted(self._found, key=lambda entry: entry[0])])
+
+    def _add(self, node: yaml.Node, loc: Loc, text: str) -> None:
+        where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc)[1:]
+        line = node.start_mark.line + 1
+        self._found[line, f"{self._path}:{line}: {where}: {text}" if loc else f"{self._path}:{line}: {text}"] = None
+
+    def _below(self, node: yaml.Node) -> dict[Any, tuple[yaml.Node, yaml.Node]]:
+        if id(node) not in self._children:
+            pairs: dict[Any, tuple[yaml.Node, yaml.Node]] = {}
+            if isinstance(node, yaml.SequenceNode):
+                pairs = {i: (child, child) for i, child in enumerate(node.value)}
+            for key, child in node.value if isinstance(node, yaml.MappingNode) else ():
+                if isinstance(key, yaml.ScalarNode):
+                    pairs.setdefault(key.value, (key, child))
+            self._children[id(node)] = pairs
+        return self._children[id(node)]
+
+    def _read(self, node: yaml.Node, loc: Loc) -> Any:
+        self._read_so_far += 1
+        if self._read_so_far > MOST_VALUES:
+            raise SceneError([f"{self._path}:1: with its aliases it has more than {MOST_VALUES} values"])
+        if node.tag not in _PLAIN_TAGS:
+            self._add(node, loc, f"must be plain YAML without tags (got {node.tag!r})")
+        if len(loc) > _LEVELS:
+            return "..."
+        if isinstance(node, yaml.SequenceNode):
+            return [self._read(child, (*loc, i)) for i, child in enumerate(node.value)]
+        if isinstance(node, yaml.ScalarNode):
+            plain = node.style is None
+            number = plain and (_NUMBER.fullmatch(node.value) or _NOT_FINITE.fullmatch(node.value))
+            return NOTHING if plain and node.value in _NULL else Numeral(node.value) if number else node.value
+        found: dict[str, Any] = {}
+        first: dict[str, int] = {}
+        for key_node, child in node.value:
+            key = key_node.value
+            if not isinstance(key_node, yaml.ScalarNode) or key_node.tag not in _PLAIN_TAGS:
+                self._add(key_node, loc, "a key must be a text without tags")
+            elif len(key) > MOST_LETTERS:
+                self._add(key_node, loc, f"a key of {len(key)} letters (at most {MOST_LETTERS})")
+            elif key in first:
+                self._add(key_node, (*loc, key), f"the key appears twice (first on line {first[key]})")
+            else:
+                first[key] = key_node.start_mark.line + 1
+                found[key] = self._read(child, (*loc, key))
+        return found
+
+
+def _compose(path: Path) -> yaml.Node:
+    try:
+        if path.exists() and not path.is_dir() and not path.is_file():
+            raise OSError(errno.EINVAL, "not a file")  # a device or a pipe may have no end
+        if path.is_file() and (size := path.stat().st_size) > MOST_BYTES:
+            told = f"{size / 2**20:.0f} MiB, at most {MOST_BYTES // 2**20}"
+            raise SceneError([f"{path}: too large for a scene ({told})"], "arrange makes many bodies of one entry")
+        text = path.read_bytes().decode("utf-8")
+    except OSError as error:
+        why = "no such file" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
+        raise SceneError([f"{path}: {why}"], "give the path of a scene.yaml") from error
+    except UnicodeDecodeError as error:
+        line = error.object[: error.start].count(b"\n") + 1
+        raise SceneError([f"{path}:{line}: not a text in UTF-8"], "a scene is a YAML text file") from error
+    try:
+        root = yaml.compose(text, Loader=yaml.SafeLoader)
+    except yaml.MarkedYAMLError as error:
+        line = error.problem_mark.line + 1 if error.problem_mark else 1
+        raise SceneError([f"{path}:{line}: not valid YAML: {error.problem or error.context}"]) from error
+    except yaml.reader.ReaderError as error:
+        line = text[: error.position].count("\n") + 1
+        raise SceneError([f"{path}:{line}: not valid YAML: {error.reason}"]) from error
+    except (yaml.YAMLError, RecursionError) as error:
+        raise SceneError([f"{path}:1: not valid YAML: {type(error).__name__}"]) from error
+    if root is None:
+        raise SceneError([f"{path}:1: the file is empty"], "a scene needs at least version and bodies")
+    return root
+
+
+def read_scene(path: Path, *, allow_outside: bool = False) -> tuple[SceneTable, Document]:
+    """Read and check a scene file; nothing is loaded yet.
+
+    Args:
+        path: of the file.
+        allow_outside: whether paths in it may lead out of its folder.
+
+    Returns:
+        What it says, and its document, to tell of faults that show only later.
+
+    Raises:
+        SceneError: with every fault found.
+    """
+    document, context = Document(path), {"folder": path.parent, "allow_outside": allow_outside}
+    try:
+        table = SceneTable.model_validate(document.data, context=context)
+    except ValidationError as error:
+        for e in error.errors(include_url=False):
+            document.wrong(e["loc"], e["msg"], key=e["type"] == "unknown")
+        document.check()
+        raise
+    document.check()
+    return table, document
+
+
+def load_scene(path: Path | str, on_progress: Progress | None = None, *, allow_outside: bool = False) -> Scene:
+    """Read a scene file, and load or fit the shapes that its bodies use.
+
+    Args:
+        path: of the scene.yaml; paths inside it are taken from its folder.
+        on_progress: called with (fraction, message) while shapes are fitted. A mesh is fitted on first use only.
+        allow_outside: whether meshes, shape folders and models that the file names may lie outside of its folder.
+
+    Returns:
+        The scene in SI units.
+
+    Raises:
+        SceneError: with one line `FILE:LINE: FIELD: what is wrong` for every fault found.
+    """
+    path = Path(path)
+    table, document = read_scene(path, allow_outside=allow_outside)
+    shapes = _load_shapes(table, document, on_progress or (lambda fraction, message: None))
+    order = {key: i for i, key in enumerate(shapes)}
+    groups = {body.name: body.names() for body in table.bodies}
+    bodies: list[Body] = []
+    for i, entry in enumerate(table.bodies):
+        made = _body(entry, order[entry.shape], table.motion_of(entry), groups)
+        if made.motion == "dynamic":
+            mass, fault = _mass(entry, shapes[entry.shape])
+            made = replace(made, mass=mass)
+            if fault:
+                document.wrong(("bodies", i, "name"), fault)
+        for name, offset in zip(entry.names(), entry.offsets(), strict=True):
+            way = made.path and replace(made.path, position=made.path.position + offset)
+            bodies.append(replace(made, name=name, position=made.position + offset, path=way))
+    document.check()
+    fitted = [shapes[key] for key, of in table.shapes.items() if key in shapes and of.kind in _FITTED]
+    return Scene(
+        shapes=tuple(shapes.values()),
+        bodies=tuple(bodies),
+        gravity=np.array(table.gravity),
+        duration=table.duration,
+        seed=table.seed,
+        model=table.model,
+        effects=Effects(**dict(table.effects)),
+        limits=Limits(**dict(table.limits)),
+        path=path,
+        missed=tuple(f"{s.name}: {s.certificate['reason']}" for s in fitted if s.certificate.get("reason")),
+        caveats=tuple(f"{s.name}: {s.certificate['caveat']}" for s in fitted if s.certificate.get("caveat")),
+    )
+
+
+def _load_shapes(table: SceneTable, document: Document, on_progress: Progress) -> dict[str | None, Shape]:
+    """Every shape in use, in the order of first use; None is the plane that all bodies with a `plane` share.
+
+    What must be fitted or sampled waits until all else is known to be right: a fit takes a minute.
+    """
+    used = dict.fromkeys(body.shape for body in table.bodies)
+    shapes: dict[str | None, Shape] = {None: analytic_shape("plane", name="plane")}
+    slow = {key: s.kind in _FITTED or s.sdf == "grid" for key, s in table.shapes.items()}
+    for now in (False, True):
+        todo = [key for key in used if key is not None and slow[key] is now]
+        for i, key in enumerate(todo):
+
+            def report(fraction: float, message: str, i: int = i, count: int = len(todo)) -> None:
+                on_progress((i + fraction) / count, message)
+
+            try:
+                shapes[key] = _load_shape(key, table.shapes[key], report)
+            except SdfsimError as error:
+                hint = f" ({error.hint})" if error.hint else ""
+                document.wrong(("shapes", key, table.shapes[key].kind), error.message + hint)
+        document.check()
+    return {key: shapes[key] for key in used}
+
+
+def _load_shape(name: str, entry: ShapeTable, on_progress: Progress) -> Shape:
+    kind: Any = entry.kind
+    made: Any = {"sdf": entry.sdf or "mlp", "resolution": entry.resolution, "on_progress": on_progress, "name": name}
+    if entry.asset:
+        shape = load_shape(entry.asset)
+        shape = with_sdf(shape, entry.sdf, resolution=entry.resolution) if entry.sdf else shape
+    elif entry.mesh:
+        made |= {"units": UNITS[entry.units], "cap": entry.cap == "on", "thicken": entry.thicken}
+        shape = shape_from_mesh(entry.mesh, **made)
+    elif entry.primitive:
+        shape = shape_from_primitive(entry.primitive.name, entry.primitive.size, **made)
+    else:
+        shape = analytic_shape(kind, name=name, **dict(getattr(entry, kind)))
+    return with_nodes(shape, entry.nodes) if entry.nodes else shape
+
+
+def _body(entry: BodyTable, shape: int, motion: Motion, groups: dict[str, list[str]]) -> Body:
+    """The first copy, without its mass."""
+    partners, path = entry.collides_with, None
+    position, quat = (np.array(entry.position), entry.rotation()) if entry.plane is None else entry.plane.pose()
+    if entry.path:
+        times, places, turns = zip(*((p.time, p.position, p.rotation()) for p in entry.path), strict=True)
+        path = Waypoints(np.array(times), np.stack(places), np.stack(turns))
+        position, quat = path.position[0], path.quat_xyzw[0]
+    return Body(
+        name=entry.name,
+        shape=shape,
+        motion=motion,
+        scale=entry.scale,
+        position=position,
+        quat_xyzw=quat,
+        velocity=np.array(entry.velocity),
+        angular_velocity=np.array(entry.angular_velocity),
+        mass=0.0,
+        friction=entry.friction,
+        restitution=entry.restitution,
+        collides_with=None if partners is None else tuple(n for p in partners for n in groups.get(p, [p])),
+        path=path,
+    )
+
+
+def _mass(entry: BodyTable, shape: Shape) -> tuple[float, str | None]:
+    """Of a dynamic body, kg; and why it cannot move, if so."""
+    volume = shape.volume * entry.scale**3
+    mass = entry.density * volume if entry.mass is None else entry.mass
+    if not (np.isfinite(volume) and volume > 0):
+        return mass, f"cannot move: its shape has a volume of {volume:g} m^3; close it, or make it static"
+    if not (np.isfinite(mass) and mass > 0):
+        told = f"density {entry.density:g} kg/m^3 times a volume of {volume:g} m^3"
+        return mass, f"has no usable mass: {told}; give mass in kg"
+    if not len(shape.nodes):
+        return mass, "cannot move: its shape has no surface nodes to touch others with; make it static"
+    return mass, None
+
+
+_SECTIONS: dict[str, type[Table]] = {
+    "The file": SceneTable,
+    "effects": EffectsTable,
+    "limits": LimitsTable,
+    "shapes: NAME": ShapeTable,
+    "shapes: NAME: primitive": Primitive,
+    "shapes: NAME: sphere": Sphere,
+    "shapes: NAME: capsule, cylinder": Upright,
+    "shapes: NAME: box": Box,
+    "shapes: NAME: plane": PlaneShape,
+    "bodies[]": BodyTable,
+    "bodies[]: plane": Plane,
+    "bodies[]: arrange": Arrange,
+    "bodies[]: path[]": Waypoint,
+}
+
+
+def reference() -> str:
+    """docs/scene.md: every key with its unit, what is allowed and its default."""
+    lines = [
+        "# Every key of scene.yaml",
+        "",
+        "Lengths are in metres, z is up. Unknown keys, keys that appear twice, NaN and infinity are refused.",
+        "`python -m sdfsim.scene.scene_file > docs/scene.md` writes this page.",
+    ]
+    for title, table in _SECTIONS.items():
+        schema = table.model_json_schema().get("properties", {})
+        lines += ["", f"## {title}", "", table.__doc__ or ""]
+        lines += ["", "| key | what | unit | allowed | default |", "| --- | --- | --- | --- | --- |"] if schema else []
+        for key, field in table.model_fields.items():
+            told = {**next(iter(schema[key].get("anyOf", [])), {}), **schema[key]}
+            default = "required" if field.is_required() else _default(told.get("default"))
+            cells = (f"`{key}`", told["description"], told.get("unit", ""), _allowed(told), default)
+            lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _default(value: Any) -> str:
+    return "" if value is None or isinstance(value, dict) else str(value)
+
+
+def _allowed(schema: dict) -> str:
+    signs = {"exclusiveMinimum": ">", "minimum": ">=", "maximum": "<="}
+    limits = " and ".join(f"{sign} {schema[key]:g}" for key, sign in signs.items() if key in schema)
+    count = f"{schema['length']} numbers" if "length" in schema else ""
+    return ", ".join(schema.get("enum", [])) or ", each ".join(part for part in (count, limits) if part)
+
+
+if __name__ == "__main__":
+    print(reference(), end="")

@@ -1,0 +1,200 @@
+"""A signed distance baked to a grid of bricks: what the contact solve asks thousands of times a step.
+
+A network is what a shape is stored and shipped as; a look into a grid is a hundred times faster than asking it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from sdfsim.errors import SdfsimError
+from sdfsim.files import read_arrays, write_arrays
+from sdfsim.shape.distance import PiecesDistance
+from sdfsim.shape.mesh import convex_hull
+from sdfsim.shape.mlp_sdf import MlpSdf
+from sdfsim.shape.sdf import GridSdf, Sdf
+
+BAKE_VERSION = 1
+SIDE = 8  # cells of a brick along each side
+CELLS = 128  # along the largest extent of a solid
+FINEST = 512  # likewise, where walls are thin
+PADDING = 4.0  # cells around the solid
+WALL = 2.0  # cells that a wall needs for either of its sides to be seen
+CHUNK = 2**18  # points asked at once
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class BakedGrid:
+    """Distances around one solid, in metres of the shape's own frame.
+
+    Attributes:
+        low: [3] the first sample.
+        cell: m between two samples.
+        coarse: [X + 1, Y + 1, Z + 1] float32 m, at the corners of bricks.
+        brick: [X, Y, Z] int32, which of `fine` holds a brick; -1 far from the surface.
+        fine: [B, 9, 9, 9] float32 m.
+        thickness: m, of the thinnest walls (twentieth part of the surface).
+        error: m, the largest difference from what was baked, at random places in the bricks of the surface.
+    """
+
+    low: np.ndarray
+    cell: float
+    coarse: np.ndarray
+    brick: np.ndarray
+    fine: np.ndarray
+    thickness: float
+    error: float
+
+
+def baked(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = (), cache_dir: Path | None = None) -> BakedGrid:
+    """The grid of an SDF, baked on first use and then taken from the cache.
+
+    Args:
+        sdf: of a solid that has an end.
+        nodes: [K, 3] m on its surface, where the thickness of its walls is measured.
+        pieces: vertices [V, 3] m of the convex pieces that the SDF was fitted to: the grid is then of their union.
+        cache_dir: by default `sdfsim/baked` in the user's cache folder.
+    """
+    if cache_dir is None:
+        cache_dir = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sdfsim" / "baked"
+    path = cache_dir / f"{_digest(sdf, pieces)}-{BAKE_VERSION}.npz"
+    if path.is_file():
+        try:
+            kept = read_arrays(path, "a baked grid", "delete it")
+            cell, thickness, error = (float(kept[name]) for name in ("cell", "thickness", "error"))
+            return BakedGrid(kept["low"], cell, kept["coarse"], kept["brick"], kept["fine"], thickness, error)
+        except (SdfsimError, KeyError):
+            path.unlink(missing_ok=True)  # a damaged entry is only a cache miss
+    grid = bake(sdf, nodes, pieces)
+    try:
+        cache_dir.mkdir(parents=True, exist_ok=True)
+        write_arrays(path, {name: np.asarray(value) for name, value in vars(grid).items()}, compressed=False)
+    except OSError as error:
+        _log.warning("a baked grid is not kept for the next time: %s", error)
+    return grid
+
+
+def bake(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = ()) -> BakedGrid:
+    """Sample an SDF: `CELLS` along the largest extent, more where walls are thin, up to `FINEST`."""
+    union = PiecesDistance([convex_hull(piece) for piece in pieces]) if len(pieces) else None
+
+    def ask(points: np.ndarray) -> np.ndarray:
+        parts = np.array_split(points, -(-len(points) // CHUNK))
+        found = [union(part).distance if union else _ask(sdf, part)[0] for part in parts]
+        return np.concatenate(found).astype(np.float32)
+
+    extent = float(np.ptp(sdf.bounds, axis=0).max())
+    thickness = wall_thickness(sdf, nodes)
+    cells = CELLS
+    while cells < FINEST and WALL * extent / cells > thickness:
+        cells *= 2
+    cell = extent / cells
+    low, high = sdf.bounds[0] - PADDING * cell, sdf.bounds[1] + PADDING * cell
+    count = np.ceil((high - low) / (SIDE * cell)).astype(int)
+    low = 0.5 * (low + high) - 0.5 * count * SIDE * cell
+    corners = _places(low, SIDE * cell, [np.arange(n + 1) for n in count])
+    coarse = ask(corners).reshape(count + 1)
+    middles = _places(low, SIDE * cell, [np.arange(n) + 0.5 for n in count])
+    # Distances change by no more than the way gone; two cells are for contacts that have not quite been made.
+    near = np.abs(ask(middles)) <= (0.5 * np.sqrt(3.0) * SIDE + 2.0) * cell
+    brick = np.full(len(middles), -1, dtype=np.int32)
+    brick[near] = np.arange(near.sum())
+    steps = (np.arange(SIDE + 1) - 0.5 * SIDE) * cell
+    offsets = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(1, -1, 3)
+    fine = ask((middles[near][:, None] + offsets).reshape(-1, 3)).reshape(-1, *(SIDE + 1,) * 3)
+    grid = BakedGrid(low, cell, coarse, brick.reshape(count), fine, thickness, 0.0)
+    generator = np.random.default_rng(0)
+    some = middles[near][generator.integers(near.sum(), size=20_000)]
+    points = some + generator.uniform(-0.5, 0.5, some.shape) * SIDE * cell
+    exact = ask(points)
+    close = np.abs(exact) <= 2.0 * cell
+    return replace(grid, error=float(np.abs(interpolated(grid, points) - exact)[close].max(initial=0.0)))
+
+
+def inwards(sdf: Sdf, nodes: np.ndarray) -> np.ndarray:
+    """[K, 3] unit vectors from nodes [K, 3] m on the surface into the solid: against the mean of the normals around.
+
+    On an edge or in a corner a distance has several normals; this is what lies between them.
+    """
+    if not len(nodes):
+        return np.zeros((0, 3))
+    reach = 0.008 * float(np.ptp(sdf.bounds, axis=0).max())
+    around = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1.0
+    around /= np.linalg.norm(around, axis=1, keepdims=True)
+    places = nodes[:, None] + reach * around
+    normal = -_ask(sdf, places.reshape(-1, 3))[1].reshape(places.shape).sum(1)
+    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+
+
+def wall_thickness(sdf: Sdf, nodes: np.ndarray) -> float:
+    """m: twice the depth to which one can go inwards from a node until the surface opposite is nearer.
+
+    The least that all nodes but a twentieth have: edges that come to a point are thin everywhere.
+    """
+    extent = float(np.ptp(sdf.bounds, axis=0).max())
+    some = nodes[:: max(1, len(nodes) // 512)]
+    depth = np.geomspace(1.0 / 512.0, 0.5, 32) * extent
+    inside = some[:, None] + depth[:, None] * inwards(sdf, some)[:, None]
+    # From what the distance is at the node itself: a fit is a little off.
+    found = _ask(sdf, some)[0][:, None] - _ask(sdf, inside.reshape(-1, 3))[0].reshape(len(some), len(depth))
+    # In a corner the distance grows half as fast as one goes; in the middle of a wall it stops growing.
+    stops = np.argmax(np.concatenate([found < 0.4 * depth, np.ones((len(some), 1), bool)], 1), axis=1)
+    reached = np.concatenate([depth[:1], depth])[stops]
+    return float(2.0 * np.quantile(reached, 0.05))
+
+
+def interpolated(grid: BakedGrid, points: np.ndarray) -> np.ndarray:
+    """[P] m at `points` [P, 3] m within bricks that are there."""
+    place = (points - grid.low) / grid.cell
+    block = np.clip((place / SIDE).astype(int), 0, np.array(grid.brick.shape) - 1)
+    local = place - SIDE * block
+    cell = np.clip(local.astype(int), 0, SIDE - 1)
+    part = local - cell
+    number = grid.brick[tuple(block.T)]
+    total = np.zeros(len(points))
+    for corner in np.ndindex(2, 2, 2):
+        weight = np.prod(np.where(corner, part, 1.0 - part), axis=1)
+        total += weight * grid.fine[(number, *(cell + corner).T)]
+    return total
+
+
+def _places(low: np.ndarray, spacing: float, axes: list[np.ndarray]) -> np.ndarray:
+    return low + spacing * np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _ask(sdf: Sdf, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    with torch.no_grad():
+        distance, gradient = sdf(torch.from_numpy(np.ascontiguousarray(points)))
+    return distance.cpu().numpy(), gradient.cpu().numpy()
+
+
+def _digest(sdf: Sdf, pieces: Sequence[np.ndarray]) -> str:
+    """Changes with all that a grid depends on."""
+    told = hashlib.sha256(f"{type(sdf).__name__} {CELLS} {FINEST}".encode())
+    if isinstance(sdf, MlpSdf):
+        parts = [*sdf.weights, *sdf.biases, torch.tensor(sdf.mirrors)]
+        told.update(f"{sdf.architecture}{sdf.frame.centre}{sdf.frame.scale}".encode())
+    elif isinstance(sdf, GridSdf):
+        parts = [sdf.values]
+        told.update(f"{sdf.frame.centre}{sdf.frame.scale}".encode())
+    else:
+        mesh = getattr(sdf, "mesh", None)
+        if mesh is None:
+            raise SdfsimError(f"an SDF of type {type(sdf).__name__} cannot be baked")
+        told.update(mesh.digest().encode())
+        parts = []
+    for part in parts:
+        told.update(part.detach().cpu().numpy().tobytes())
+    for array in (sdf.bounds, *pieces):
+        told.update(np.ascontiguousarray(array).tobytes())
+    return told.hexdigest()[:32]

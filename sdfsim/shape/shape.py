@@ -1,0 +1,568 @@
+"""A `Shape` (geometry, SDF, surface nodes, mass properties), the folder that holds it, and the cache of fitted ones."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from sdfsim.errors import SdfsimError
+from sdfsim.files import read_json, replacing, write_json
+from sdfsim.shape import primitives
+from sdfsim.shape.distance import MeshDistance
+from sdfsim.shape.mesh import Frame, Mesh, convex_hull, load_mesh, read_mesh, write_ply
+from sdfsim.shape.mlp_sdf import ACTIVATIONS, MlpSdf
+from sdfsim.shape.sdf import (
+    CLOSED_FORMS,
+    BoxSdf,
+    CapsuleSdf,
+    ClosedForm,
+    CylinderSdf,
+    GridSdf,
+    MeshSdf,
+    PlaneSdf,
+    Sdf,
+    SphereSdf,
+    sample_grid,
+)
+from sdfsim.shape.surface_nodes import DEFAULT_COUNT, sample_nodes, surface_nodes
+from sdfsim.shape.watertight import solidify
+
+SdfKind = Literal["mlp", "grid", "mesh"]
+Progress = Callable[[float, str], None]
+
+FORMAT_VERSION = 1
+# Samples along each side of a grid: its cells are then 0.022 of the solid's largest extent.
+DEFAULT_RESOLUTION = 64
+WEIGHTS_FILE, MESH_FILE, RECORD_FILE = "shape.safetensors", "mesh.ply", "shape.json"
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """One rigid shape in its own frame, metres, at scale 1.
+
+    Attributes:
+        name: what messages and the viewer call it.
+        mesh: what is shown, and what the SDF was made from (of convex pieces, the SDF is that of their union).
+        sdf: signed distance in the same frame.
+        nodes: [K, 3] float64 m, surface nodes that carry contact (empty for a plane).
+        volume: m^3.
+        com: [3] float64 m, centre of mass.
+        inertia: [3, 3] float64 kg m^2 per unit density, about `com`, shape axes.
+        certificate: fit errors measured on held-out points (empty where nothing was fitted).
+        source: where it came from and a content hash (for caching and for the record).
+        pieces: the vertices [V, 3] float64 m of each of its convex pieces, where it was made of such.
+    """
+
+    name: str
+    mesh: Mesh
+    sdf: Sdf
+    nodes: np.ndarray
+    volume: float
+    com: np.ndarray
+    inertia: np.ndarray
+    certificate: dict = field(default_factory=dict)
+    source: dict = field(default_factory=dict)
+    pieces: tuple[np.ndarray, ...] = ()
+
+    def save(self, folder: str | Path) -> Path:
+        """Write the shape folder: shape.safetensors, mesh.ply and, last, shape.json.
+
+        Each file appears complete or not at all, and shape.json only beside the files it describes.
+
+        Returns:
+            the folder.
+
+        Raises:
+            SdfsimError: the folder cannot be written, or the SDF has no file format: its kind has none, or it is exact
+                and not of this shape's mesh.
+        """
+        from safetensors.torch import save as to_bytes
+
+        folder = Path(folder)
+        tensors, description = _sdf_to_file(self.sdf, self.mesh)
+        tensors["nodes"] = torch.from_numpy(np.ascontiguousarray(self.nodes, dtype=np.float64))
+        if self.pieces:
+            tensors["pieces"] = torch.from_numpy(np.concatenate(self.pieces))
+        tensors["bounds"] = torch.from_numpy(np.ascontiguousarray(self.sdf.bounds, dtype=np.float64))
+        record = {
+            "version": FORMAT_VERSION,
+            "name": self.name,
+            "units": "m",
+            "scale": description.get("scale", 1.0),
+            "sdf": description,
+            "volume": self.volume,
+            "com": self.com.tolist(),
+            "inertia": self.inertia.tolist(),
+            "certificate": self.certificate,
+            "source": self.source,
+            "pieces": [len(piece) for piece in self.pieces],
+        }
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / RECORD_FILE).unlink(missing_ok=True)
+            write(folder / WEIGHTS_FILE, to_bytes(tensors))
+            write(folder / MESH_FILE, write_ply(self.mesh))
+            write_json(folder / RECORD_FILE, record)
+        except OSError as error:
+            raise SdfsimError(f"{folder}: cannot write the shape ({error.strerror or error})") from error
+        return folder
+
+
+def write(path: Path, content: bytes) -> None:
+    """Put `content` at `path` in one step: what was there before, or all of it, even when interrupted."""
+    with replacing(path) as partial:
+        partial.write_bytes(content)
+
+
+def load_shape(folder: str | Path) -> Shape:
+    """Read a folder written by `Shape.save` (or by `fit` or `reconstruct`).
+
+    Raises:
+        SdfsimError: a file is missing, cut short, of another version, or holds what it should not.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load as from_bytes
+
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise SdfsimError(f"{folder}: no such shape folder")
+    for name in (RECORD_FILE, WEIGHTS_FILE, MESH_FILE):
+        if not (folder / name).is_file():
+            raise SdfsimError(f"{folder}: {name} is missing, so this is no complete shape folder")
+    record = read_json(folder / RECORD_FILE, "fit the mesh again")
+    version = record.get("version") if isinstance(record, dict) else None
+    if version != FORMAT_VERSION:
+        told = f"shape format version {version!r}, this program reads {FORMAT_VERSION}"
+        raise SdfsimError(f"{folder / RECORD_FILE}: {told}", "fit the mesh again")
+    try:
+        tensors = from_bytes((folder / WEIGHTS_FILE).read_bytes())
+    except (SafetensorError, OSError) as error:
+        raise SdfsimError(f"{folder / WEIGHTS_FILE}: damaged or cut short ({error})") from error
+    for name, tensor in tensors.items():
+        if name != "bounds" and not torch.isfinite(tensor).all():
+            raise SdfsimError(f"{folder / WEIGHTS_FILE}: {name} is not finite")
+    mesh = read_mesh(folder / MESH_FILE)
+    try:
+        sizes = record.get("pieces", [])
+        return Shape(
+            name=str(record["name"]),
+            mesh=mesh,
+            sdf=_sdf_from_file(record["sdf"], tensors, mesh),
+            nodes=tensors["nodes"].numpy().reshape(-1, 3),
+            volume=float(_finite(record["volume"], "volume")),
+            com=_finite(record["com"], "com", 3),
+            inertia=_finite(record["inertia"], "inertia", 3, 3),
+            certificate=dict(record["certificate"]),
+            source=dict(record["source"]),
+            pieces=tuple(piece.numpy() for piece in tensors["pieces"].split(sizes)) if sizes else (),
+        )
+    except (SdfsimError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+        raise SdfsimError(f"{folder}: not a valid shape folder ({reason})") from error
+
+
+def _sdf_to_file(sdf: Sdf, mesh: Mesh) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    """Tensors and a description (for JSON) of an SDF, beside the folder's `mesh`."""
+    if isinstance(sdf, MlpSdf | GridSdf):
+        frame = {"centre": np.asarray(sdf.frame.centre).tolist(), "scale": float(sdf.frame.scale)}
+        if isinstance(sdf, GridSdf):
+            return {"grid": sdf.values.cpu().contiguous()}, {"kind": "grid", "resolution": sdf.resolution, **frame}
+        tensors = {}
+        for layer, (weight, bias) in enumerate(zip(sdf.weights, sdf.biases, strict=True)):
+            tensors[f"layer{layer}.weight"] = weight.cpu().contiguous()
+            tensors[f"layer{layer}.bias"] = bias.cpu().contiguous()
+        described = {"kind": "mlp", "activation": sdf.activation, "mirrors": list(sdf.mirrors)}
+        return tensors, {**described, "layers": len(sdf.weights), **frame}
+    if isinstance(sdf, MeshSdf):
+        if not all(np.array_equal(getattr(sdf.mesh, key), getattr(mesh, key)) for key in ("vertices", "faces")):
+            raise SdfsimError("an exact SDF of another mesh than the shape's own cannot be saved")
+        return {}, {"kind": "mesh"}
+    if isinstance(sdf, ClosedForm):
+        return {}, {"kind": sdf.KIND, **vars(sdf)}
+    raise SdfsimError(f"an SDF of type {type(sdf).__name__} cannot be saved", "fit it first")
+
+
+def _sdf_from_file(description: dict[str, Any], tensors: dict[str, torch.Tensor], mesh: Mesh) -> Sdf:
+    """The SDF that `_sdf_to_file` described. Raises KeyError, TypeError, ValueError or SdfsimError otherwise."""
+    kind = description["kind"]
+    if kind == "mesh":
+        return MeshSdf(mesh)
+    if kind in CLOSED_FORMS:
+        sizes = {
+            key: _finite(value, key, *np.shape(value)).tolist() for key, value in description.items() if key != "kind"
+        }
+        made: Any = CLOSED_FORMS[kind]
+        return made(**{key: tuple(v) if isinstance(v, list) else v for key, v in sizes.items()})
+    if kind not in ("mlp", "grid"):
+        raise ValueError(f"unknown SDF kind {kind!r}")
+    if not all(tensor.is_floating_point() for tensor in tensors.values()):
+        raise ValueError("weights that are not floating-point numbers")
+    frame = Frame(_finite(description["centre"], "centre", 3), float(_finite(description["scale"], "scale")))
+    if frame.scale <= 0:
+        raise ValueError(f"scale must be > 0 (got {frame.scale:g})")
+    bounds = _finite(tensors["bounds"].numpy(), "bounds", 2, 3)
+    if kind == "grid":
+        return GridSdf(tensors["grid"].float(), frame, bounds)
+    if description["activation"] not in ACTIVATIONS:
+        raise ValueError(f"unknown activation {description['activation']!r}")
+    weights, biases = (
+        tuple(tensors[f"layer{layer}.{part}"].float() for layer in range(int(description["layers"])))
+        for part in ("weight", "bias")
+    )
+    sizes = [3, *(len(weight) for weight in weights)]
+    if sizes[-1] != 1 or any(
+        tuple(weight.shape) != (rows, columns) or tuple(bias.shape) != (rows,)
+        for weight, bias, columns, rows in zip(weights, biases, sizes[:-1], sizes[1:], strict=True)
+    ):
+        raise ValueError("the layers do not fit together")
+    x, y, z = (bool(mirror) for mirror in description.get("mirrors", (False, False, False)))
+    return MlpSdf(weights, biases, description["activation"], frame, bounds, (x, y, z))
+
+
+def _finite(value: Any, what: str, *shape: int) -> np.ndarray:
+    """Finite numbers [*shape] out of JSON. Raises TypeError or ValueError otherwise."""
+    numbers = np.array(value, dtype=np.float64).reshape(shape)
+    if not np.isfinite(numbers).all():
+        raise ValueError(f"{what} is not finite")
+    return numbers
+
+
+def scaled(shape: Shape, factor: float) -> Shape:
+    """The same shape `factor` times as large, about its own origin.
+
+    Raises:
+        SdfsimError: the factor is not a positive finite number, or the SDF is of a kind that cannot be scaled.
+    """
+    if not (np.isfinite(factor) and factor > 0):
+        raise SdfsimError(f"{shape.name}: scale must be > 0 (got {factor})")
+    if factor == 1.0:
+        return shape
+    if not isinstance(shape.sdf, MlpSdf | GridSdf | MeshSdf | ClosedForm):
+        raise SdfsimError(f"{shape.name}: an SDF of type {type(shape.sdf).__name__} cannot be scaled")
+    return replace(
+        shape,
+        mesh=replace(shape.mesh, vertices=shape.mesh.vertices * factor),
+        pieces=tuple(piece * factor for piece in shape.pieces),
+        sdf=shape.sdf.scaled(factor),
+        nodes=shape.nodes * factor,
+        volume=shape.volume * factor**3,
+        com=shape.com * factor,
+        inertia=shape.inertia * factor**5,
+    )
+
+
+def with_sdf(shape: Shape, kind: SdfKind, *, resolution: int = DEFAULT_RESOLUTION) -> Shape:
+    """The same shape with its distances taken from another source; mesh, nodes and mass properties stay.
+
+    Args:
+        shape: any but a plane; "grid" and "mesh" are made from its mesh, whatever its SDF was.
+        kind: "mlp" (the shape as it is, which must have a network), "grid" (samples of the exact distance to the
+            mesh, see `sample_grid`) or "mesh" (that distance itself).
+        resolution: of a grid, samples along each side.
+
+    Returns:
+        Shape without a certificate, since nothing was fitted; its `source` notes the kind as `sdf`.
+
+    Raises:
+        SdfsimError: there is no network, the shape is a plane, or the grid has fewer than two samples a side.
+    """
+    if kind == "mlp":
+        if not isinstance(shape.sdf, MlpSdf):
+            raise SdfsimError(f"{shape.name}: the shape has no SDF network", "fit its mesh")
+        return shape
+    if isinstance(shape.sdf, PlaneSdf):
+        raise SdfsimError(f"{shape.name}: a plane has no end, so no grid or mesh holds it")
+    sdf, note = sdf_of_mesh(shape.mesh, kind, resolution)
+    return replace(shape, sdf=sdf, certificate={}, source=shape.source | note)
+
+
+def with_nodes(shape: Shape, grid: int) -> Shape:
+    """The same shape with other surface nodes: those of a grid of `grid`^3 points, sampled from its SDF alone.
+
+    The paper resamples a trained simulator's bodies like this (7^3 instead of the meshes' vertices). Nearer than a
+    40th of the shape's size no two nodes are kept.
+
+    Raises:
+        SdfsimError: the SDF has no end, or no point of the grid reached its surface.
+    """
+    nodes = sample_nodes(shape.sdf, grid=grid)
+    # What was measured of the former nodes does not hold for these.
+    certificate = {key: value for key, value in shape.certificate.items() if key != "coverage"}
+    return replace(shape, nodes=nodes, certificate=certificate)
+
+
+def sdf_of_mesh(
+    mesh: Mesh,
+    kind: Literal["grid", "mesh"],
+    resolution: int,
+    on_progress: Progress | None = None,
+) -> tuple[Sdf, dict]:
+    """A mesh's exact SDF or a grid of it, and what a shape's `source` says about it.
+
+    Raises:
+        SdfsimError: the mesh has no faces or no extent, or the grid fewer than two samples a side.
+    """
+    if kind == "mesh":
+        return MeshSdf(mesh), {"sdf": "mesh"}
+    oracle = MeshDistance(mesh)
+    return sample_grid(oracle, oracle.bounds, resolution, on_progress), {"sdf": "grid", "resolution": resolution}
+
+
+def shape_from_mesh(
+    path: str | Path,
+    cache_dir: str | Path | None = None,
+    *,
+    name: str | None = None,
+    units: float = 1.0,
+    cap: bool = False,
+    thicken: float | None = None,
+    sdf: SdfKind = "mlp",
+    resolution: int = DEFAULT_RESOLUTION,
+    on_progress: Progress | None = None,
+) -> Shape:
+    """The shape of a mesh file: made on first use, then taken from a cache keyed by what the file describes.
+
+    Args:
+        path: a mesh file.
+        cache_dir: where shapes are kept; by default `sdfsim/shapes` in the user's cache folder.
+        name: by default the file's.
+        units: metres per unit of the file.
+        cap: close openings of any size.
+        thicken: m; a thickness for an open sheet.
+        sdf: "mlp" fits the network; "grid" and "mesh" fit nothing (see `mesh_shape`).
+        resolution: of a grid, samples along each side.
+        on_progress: called with (fraction done, message) while fitting or sampling.
+
+    Raises:
+        SdfsimError: the mesh cannot be used.
+    """
+    path = Path(path)
+    mesh = load_mesh(path)
+    # Not of the file's bytes: a glTF keeps its vertices, and an OBJ its colours, in files beside it.
+    key = mesh.digest()
+    thicken = None if thicken is None else thicken / units
+    shape = _cached(mesh, key, path.stem, cap, thicken, sdf, resolution, cache_dir, on_progress)
+    shape = replace(shape, name=name or path.stem, source={**shape.source, "file": path.name, "sha256": key})
+    return scaled(shape, units)
+
+
+def shape_from_primitive(
+    kind: str,
+    size: float = 1.0,
+    cache_dir: str | Path | None = None,
+    *,
+    name: str | None = None,
+    sdf: SdfKind = "mlp",
+    resolution: int = DEFAULT_RESOLUTION,
+    on_progress: Progress | None = None,
+) -> Shape:
+    """The shape of a procedural mesh of `primitives.PRIMITIVES`, made on first use and cached.
+
+    Args:
+        kind: name in `PRIMITIVES`.
+        size: its largest extent, m.
+        cache_dir, name, sdf, resolution, on_progress: as for `shape_from_mesh`.
+
+    Raises:
+        SdfsimError: no such primitive.
+    """
+    if kind not in primitives.PRIMITIVES:
+        raise SdfsimError(f"no primitive called {kind!r}", "there are " + ", ".join(primitives.PRIMITIVES))
+    mesh = primitives.PRIMITIVES[kind]()
+    unit = Mesh(mesh.vertices / float(np.ptp(mesh.vertices, axis=0).max()), mesh.faces)
+    # Rounded, since sines and cosines differ in their last digit from machine to machine.
+    key = Mesh(unit.vertices.round(9), unit.faces).digest()
+    shape = _cached(unit, key, kind, False, None, sdf, resolution, cache_dir, on_progress)
+    return scaled(replace(shape, name=name or kind, source={**shape.source, "primitive": kind}), size)
+
+
+def mesh_shape(
+    mesh: Mesh,
+    *,
+    name: str,
+    kind: Literal["grid", "mesh"],
+    cap: bool = False,
+    thicken: float | None = None,
+    resolution: int = DEFAULT_RESOLUTION,
+    on_progress: Progress | None = None,
+) -> Shape:
+    """The shape of a mesh without any fit: its exact SDF or a grid of it, nodes and mass properties as a fit has them.
+
+    Args:
+        mesh: metres.
+        name: of the shape.
+        kind: "mesh" (the exact distance) or "grid" (samples of it).
+        cap, thicken: as for `solidify`.
+        resolution: of a grid, samples along each side.
+        on_progress: called with (fraction done, message) while a grid is sampled.
+
+    Raises:
+        SdfsimError: the mesh cannot be used.
+    """
+    solid = solidify(mesh, name=name, cap=cap, thicken=thicken)
+    sdf, note = sdf_of_mesh(solid.surface, kind, resolution, on_progress)
+    nodes = surface_nodes(sdf, solid.surface, DEFAULT_COUNT)
+    return Shape(name, solid.surface, sdf, nodes, *solid.mass_properties(), source={"kind": "mesh"} | note)
+
+
+def _cached(
+    mesh: Mesh,
+    key: str,
+    label: str,
+    cap: bool,
+    thicken: float | None,
+    kind: SdfKind,
+    resolution: int,
+    cache_dir: str | Path | None,
+    on_progress: Progress | None,
+) -> Shape:
+    if kind == "mesh":  # made as fast as it is read
+        return mesh_shape(mesh, name=label, kind=kind, cap=cap, thicken=thicken)
+    from sdfsim.shape.fit import FIT_VERSION, fit_mesh
+
+    if cache_dir is None:
+        cache_dir = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sdfsim" / "shapes"
+    variant = ("-cap" if cap else "") + (f"-thick{thicken:g}" if thicken is not None else "")
+    variant += f"-grid{resolution}" if kind == "grid" else ""
+    folder = Path(cache_dir) / f"{key[:24]}{variant}-{FIT_VERSION}.{FORMAT_VERSION}"
+    if folder.is_dir():
+        try:
+            return load_shape(folder)
+        except SdfsimError:
+            shutil.rmtree(folder, ignore_errors=True)  # a damaged entry is only a cache miss
+    options: dict[str, Any] = {"name": label, "cap": cap, "thicken": thicken, "on_progress": on_progress}
+    if kind == "grid":
+        shape = mesh_shape(mesh, kind=kind, resolution=resolution, **options)
+    else:
+        shape = fit_mesh(mesh, **options)
+    # A folder of its own first, so that processes fitting the same mesh never see each other's half.
+    partial = folder.with_name(f"{folder.name}.{os.getpid()}.partial")
+    try:
+        shape.save(partial)
+        if not folder.is_dir():  # else another process was first: its entry is as good
+            partial.rename(folder)
+    except (SdfsimError, OSError) as error:
+        _log.warning("the shape %s is not kept for the next time: %s", label, error)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return shape
+
+
+def analytic_shape(
+    kind: Literal["plane", "sphere", "capsule", "cylinder", "box"],
+    *,
+    radius: float | None = None,
+    height: float | None = None,
+    size: Sequence[float] | np.ndarray | None = None,
+    name: str | None = None,
+) -> Shape:
+    """A shape with an exact SDF, about the origin.
+
+    Args:
+        kind: "plane" (z = 0, +z outside, infinite), "sphere", "capsule", "cylinder" or "box".
+        radius: of the sphere, capsule or cylinder, m.
+        height: of the capsule, its caps included, or cylinder, both along z; m.
+        size: (x, y, z) full extents of the box, m.
+        name: by default the kind.
+
+    Returns:
+        Shape with exact mass properties (per unit density; those of the plane are 0), a mesh for display (of the
+        plane: a 20 m square) and nodes: sphere 128 spread as a Fibonacci spiral, capsule and cylinder rings,
+        box 8 corners and points along edges and on faces, plane none.
+
+    Raises:
+        SdfsimError: unknown kind, or a size that is missing or not positive.
+    """
+    source = {"kind": kind}
+    if kind == "plane":
+        square = np.array([[-10, -10, 0], [10, -10, 0], [10, 10, 0], [-10, 10, 0]], dtype=np.float64)
+        mesh = Mesh(square, np.array([[0, 1, 2], [0, 2, 3]]))
+        return Shape(
+            name or kind, mesh, PlaneSdf(), np.zeros((0, 3)), 0.0, np.zeros(3), np.zeros((3, 3)), source=source
+        )
+    if kind == "sphere":
+        if radius is None:
+            raise SdfsimError("a sphere needs a radius")
+        sdf = SphereSdf(float(radius))
+        volume = 4.0 / 3.0 * np.pi * sdf.radius**3
+        inertia = 0.4 * volume * sdf.radius**2 * np.eye(3)
+        mesh, nodes = primitives.sphere(sdf.radius), _sphere_nodes(sdf.radius, 128)
+    elif kind == "box":
+        if size is None or len(size) != 3:
+            raise SdfsimError("a box needs its size along x, y and z")
+        x, y, z = (0.5 * float(value) for value in size)
+        sdf = BoxSdf((x, y, z))
+        volume = 8.0 * x * y * z
+        inertia = volume / 3.0 * np.diag([y * y + z * z, z * z + x * x, x * x + y * y])
+        mesh, nodes = primitives.box((2 * x, 2 * y, 2 * z)), _box_nodes(np.array([x, y, z]))
+    elif kind in ("capsule", "cylinder"):
+        if radius is None or height is None:
+            raise SdfsimError(f"a {kind} needs a radius and a height")
+        caps = 2.0 * radius if kind == "capsule" else 0.0
+        if not height > caps:
+            raise SdfsimError(f"a capsule's height must be above twice its radius (got {height:g} and {radius:g})")
+        half = 0.5 * (float(height) - caps)
+        sdf = (CapsuleSdf if kind == "capsule" else CylinderSdf)(float(radius), half)
+        volume, inertia = _round_mass(sdf.radius, half, caps=caps > 0)
+        nodes = _round_nodes(sdf.radius, half, caps=caps > 0)
+        mesh = convex_hull(_round_nodes(sdf.radius, half, caps=caps > 0, around=48))
+    else:
+        raise SdfsimError(f"unknown analytic shape {kind!r}", "use plane, sphere, capsule, cylinder or box")
+    return Shape(name or kind, mesh, sdf, nodes, float(volume), np.zeros(3), inertia, source=source)
+
+
+def _round_mass(radius: float, half: float, *, caps: bool) -> tuple[float, np.ndarray]:
+    """Volume m^3 and inertia [3, 3] m^5 (per unit density) of a cylinder about z, with half balls at its ends."""
+    trunk = 2.0 * np.pi * radius**2 * half
+    across, about = trunk * (radius**2 / 4.0 + half**2 / 3.0), trunk * radius**2 / 2.0
+    if caps:
+        balls = 4.0 / 3.0 * np.pi * radius**3
+        # Half balls whose flat sides lie at +-half, their middles 3/8 of the radius beyond.
+        across += balls * (0.4 * radius**2 + half**2 + 0.75 * half * radius)
+        about += 0.4 * balls * radius**2
+        trunk += balls
+    return trunk, np.diag([across, across, about])
+
+
+def _round_nodes(radius: float, half: float, *, caps: bool, around: int = 16) -> np.ndarray:
+    """Rings about z on the surface of a capsule or cylinder: [K, 3] m, those of the ends first."""
+    turns = 2.0 * np.pi * np.arange(around) / around
+    circle = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    rings = [(radius, half * z) for z in (-1.0, 1.0)]
+    if caps:
+        tilts = np.arange(1, 4) * np.pi / 8.0
+        rings += [(radius * np.cos(t), z * (half + radius * np.sin(t))) for t in tilts for z in (-1.0, 1.0)]
+    else:
+        rings += [(0.5 * radius, half * z) for z in (-1.0, 1.0)]
+    rings += [(radius, half * z) for z in (-0.5, 0.0, 0.5)]
+    tips = np.array([[0.0, 0.0, z * (half + (radius if caps else 0.0))] for z in (-1.0, 1.0)])
+    placed = [np.column_stack([r * circle, np.full(around, z)]) for r, z in rings]
+    return np.concatenate([*placed, tips])
+
+
+def _sphere_nodes(radius: float, count: int) -> np.ndarray:
+    """Fibonacci spiral on the sphere: [count, 3] m."""
+    number = np.arange(count) + 0.5
+    height = 1.0 - 2.0 * number / count
+    turn = np.pi * (1.0 + 5.0**0.5) * number
+    ring = np.sqrt(1.0 - height**2)
+    return radius * np.stack([ring * np.cos(turn), ring * np.sin(turn), height], axis=1)
+
+
+def _box_nodes(half: np.ndarray) -> np.ndarray:
+    """Corners, edges and faces of a 5 x 5 x 5 lattice on the box: [98, 3] m, the corners first."""
+    axis = np.linspace(-1.0, 1.0, 5)
+    lattice = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    sides = (np.abs(lattice) == 1.0).sum(1)
+    order = np.argsort(-sides, kind="stable")
+    return (lattice * half)[order[sides[order] > 0]]

@@ -1,0 +1,231 @@
+"""Surface nodes: the points of a body that carry contact, sampled from its SDF alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sdfsim.errors import SdfsimError
+from sdfsim.shape.distance import PiecesDistance
+from sdfsim.shape.mesh import Mesh, convex_hull, normal_frame
+from sdfsim.shape.sdf import Sdf
+
+# The paper's sampling (section 3 and appendix): a grid over this half extent of the normalised frame, projected onto
+# the surface, points that did not reach it dropped, one point kept per voxel.
+GRID_HALF = 0.7
+VOXEL = 0.025
+REACHED = 0.005
+PROJECTIONS = 3
+DEFAULT_GRID = 24
+DEFAULT_COUNT = 512  # what the bundled model was trained with; docs/tradeoff.md has what fewer cost
+# Faces that meet at less than this cosine (20 degrees) make an edge worth nodes of its own.
+SHARP = 0.94
+
+
+def sample_nodes(sdf: Sdf, *, grid: int = DEFAULT_GRID, voxel: float = VOXEL) -> np.ndarray:
+    """Nodes on the zero level of an SDF, as in the paper: grid, project, filter, voxel downsample. Deterministic.
+
+    Lengths are relative to the largest extent of `sdf.bounds` (the frame in which the solid is within [-0.5, 0.5]).
+
+    Args:
+        sdf: bounded.
+        grid: points along each side of the sampling cube [-0.7, 0.7]^3.
+        voxel: edge of the downsampling voxels, normalised; the point nearest a voxel's middle stays.
+
+    Returns:
+        [K, 3] float64 m.
+
+    Raises:
+        SdfsimError: the SDF is unbounded, or no point reached its surface.
+    """
+    frame = normal_frame(sdf.bounds)
+    axis = np.linspace(-GRID_HALF, GRID_HALF, grid)
+    points = frame.outward(np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3))
+    points = project(sdf, points)
+    distance = np.asarray(sdf(points)[0])
+    reached = np.abs(distance) <= REACHED * frame.scale
+    # A network may have a stray zero level in the corners of its box: nothing outside the solid's bounds is surface.
+    margin = REACHED * frame.scale
+    reached &= ((points >= sdf.bounds[0] - margin) & (points <= sdf.bounds[1] + margin)).all(1)
+    points = points[reached]
+    if len(points) == 0:
+        raise SdfsimError("no surface nodes: the SDF has no zero level within its bounds")
+    return frame.outward(_one_per_voxel(frame.inward(points), voxel))
+
+
+def project(sdf: Sdf, points: np.ndarray, *, steps: int = PROJECTIONS) -> np.ndarray:
+    """Move points [P, 3] m to the zero level by a few steps x - f grad f / |grad f|^2."""
+    for _ in range(steps):
+        distance, gradient = sdf(points)
+        # A step never gets longer than twice the distance: slopes below 0.7 are errors of a fit, not geometry.
+        squared = np.maximum(np.square(gradient).sum(1), 0.5)
+        points = points - (np.asarray(distance) / squared)[:, None] * np.asarray(gradient)
+    return points
+
+
+def _one_per_voxel(points: np.ndarray, voxel: float) -> np.ndarray:
+    """The point nearest the middle of each occupied voxel; an average would leave the surface where it bends."""
+    # Voxels centred on the origin: the faces of a normalised box at 0.5 then run through their middles.
+    cell = np.round(points / voxel).astype(np.int64)
+    off_centre = np.square(points - cell * voxel).sum(1)
+    order = np.lexsort((off_centre, cell[:, 2], cell[:, 1], cell[:, 0]))
+    ordered = cell[order]
+    first = np.ones(len(order), dtype=bool)
+    first[1:] = (ordered[1:] != ordered[:-1]).any(1)
+    return points[order[first]]
+
+
+def thin(points: np.ndarray, count: int, *, keep: np.ndarray | None = None) -> np.ndarray:
+    """At most `count` points: all of `keep`, then the farthest remaining point again and again.
+
+    Args:
+        points: [P, 3] candidates.
+        count: how many points to return at most.
+        keep: [Q, 3] points that come first; when they alone exceed `count` they are thinned themselves.
+
+    Returns:
+        [min(count, P + Q), 3], `keep` first. Deterministic: it starts (without `keep`) at the point farthest
+        from the centroid.
+    """
+    if keep is not None and len(keep) >= count:
+        return thin(keep, count) if len(keep) > count else keep.copy()
+    chosen: list[np.ndarray] = [] if keep is None else list(keep)
+    nearest = np.full(len(points), np.inf)
+    for point in chosen:
+        np.minimum(nearest, np.square(points - point).sum(1), out=nearest)
+    if not chosen and len(points):
+        nearest = np.square(points - points.mean(0)).sum(1)
+        first = points[int(nearest.argmax())]
+        chosen.append(first)
+        nearest = np.square(points - first).sum(1)
+    while len(chosen) < count and len(points):
+        far = int(nearest.argmax())
+        if nearest[far] <= 0:
+            break
+        chosen.append(points[far])
+        np.minimum(nearest, np.square(points - points[far]).sum(1), out=nearest)
+    return np.array(chosen).reshape(-1, 3)
+
+
+def hull_nodes(vertices: np.ndarray, count: int) -> np.ndarray:
+    """At most `count` of a polyhedral body's own vertices [V, 3] m.
+
+    The vertices of the convex hull of all come first, for only they can touch a flat floor; the others follow
+    farthest first.
+    """
+    outer = _outer(vertices)
+    rest = np.delete(vertices, outer, axis=0)
+    return thin(rest, count, keep=vertices[outer])
+
+
+def edge_nodes(piece: np.ndarray, spacing: float, sharp: float = SHARP) -> np.ndarray:
+    """Points along the sharp edges of a convex polyhedron, its corners left out.
+
+    Two polyhedra often touch edge against edge, which their corners alone do not see.
+
+    Args:
+        piece: [V, 3] m, its corners.
+        spacing: m, between points at most; edges shorter than this get none.
+        sharp: cosine of the angle between the normals of the two faces, above which an edge counts as flat.
+
+    Returns:
+        [K, 3] m.
+    """
+    from scipy.spatial import ConvexHull
+
+    hull = ConvexHull(piece)
+    normals = hull.equations[:, :3]
+    face, corner = np.nonzero(np.arange(len(hull.simplices))[:, None] < hull.neighbors)
+    other = hull.neighbors[face, corner]
+    bent = (normals[face] * normals[other]).sum(1) < sharp
+    # The neighbour k of a face lies across the edge opposite to its corner k.
+    points = [np.empty((0, 3))]
+    for f, c in zip(face[bent], corner[bent], strict=True):
+        start, end = piece[np.delete(hull.simplices[f], c)]
+        parts = int(np.ceil(np.linalg.norm(end - start) / spacing))
+        points.append(start + np.arange(1, parts)[:, None] / parts * (end - start))
+    return np.concatenate(points)
+
+
+LATTICE = 40  # of the lattice that tells the nearest patch, along the largest extent
+OUTSIDE = 1e-3  # of the extent: vertices that lie deeper in the union are not on its surface
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Nodes of one shape and its patches, in the shape's own frame at scale 1.
+
+    Attributes:
+        nodes: [K, 3] m.
+        patch: [K] int64, the patch of each.
+        nearest: [X, Y, Z] int16, the patch that is nearest to the places of a lattice; None for a single patch.
+        low: [3] m, the first of these places; cell: m between two.
+    """
+
+    nodes: np.ndarray
+    patch: np.ndarray
+    nearest: np.ndarray | None
+    low: np.ndarray
+    cell: float
+
+
+def surface_of(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray]) -> Surface:
+    """The nodes that carry contact, with the vertices of convex pieces, where the shape has some, and their patches.
+
+    Args:
+        sdf: of the shape.
+        nodes: [K, 3] m on its surface.
+        pieces: the vertices [V, 3] m of each.
+    """
+    if len(pieces) == 0:
+        return Surface(nodes, np.zeros(len(nodes), np.int64), None, np.zeros(3), 1.0)
+    extent = float(np.ptp(sdf.bounds, axis=0).max())
+    vertices, union = np.concatenate(pieces), PiecesDistance([convex_hull(piece) for piece in pieces])
+    bare = union(vertices).distance > -OUTSIDE * extent
+    nodes = union(nodes).closest  # those of a fitted surface lie beside it
+    owner = np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
+    cell = extent / LATTICE
+    low = sdf.bounds[0] - cell
+    count = np.ceil((sdf.bounds[1] + cell - low) / cell).astype(int) + 1
+    axes = [low[a] + cell * np.arange(count[a]) for a in range(3)]
+    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    nearest = _nearest_piece(pieces, np.concatenate([places, nodes]))
+    return Surface(
+        nodes=np.concatenate([vertices[bare], nodes]),
+        patch=np.concatenate([owner[bare], nearest[len(places) :]]),
+        nearest=nearest[: len(places)].astype(np.int16).reshape(count),
+        low=low,
+        cell=cell,
+    )
+
+
+def _nearest_piece(pieces: Sequence[np.ndarray], places: np.ndarray) -> np.ndarray:
+    """[P] int64: the convex hull whose farthest face plane is least far from a place."""
+    from scipy.spatial import ConvexHull
+
+    least, nearest = np.full(len(places), np.inf), np.zeros(len(places), np.int64)
+    for k, piece in enumerate(pieces):
+        far = np.full(len(places), -np.inf)
+        for plane in np.unique(np.round(ConvexHull(piece).equations, 6), axis=0):
+            np.maximum(far, places @ plane[:3] + plane[3], out=far)
+        nearest[far < least] = k
+        np.minimum(least, far, out=least)
+    return nearest
+
+
+def surface_nodes(sdf: Sdf, surface: Mesh, count: int) -> np.ndarray:
+    """Nodes for contact, at most `count` [K, 3] m: first corners of the convex hull, then points all over `sdf`."""
+    corners = thin(surface.vertices[_outer(surface.vertices)], count // 3)
+    return thin(sample_nodes(sdf), count, keep=corners)
+
+
+def _outer(vertices: np.ndarray) -> np.ndarray:
+    """Indices of the convex hull's vertices; all of them when the vertices lie in a plane."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        return np.sort(ConvexHull(vertices).vertices)
+    except QhullError:
+        return np.arange(len(vertices))

@@ -1,0 +1,117 @@
+"""The engines that ours is compared with do what closed forms say, from recordings and from scenes of any size."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pybullet")
+
+from sdfsim.data.pybullet_sim import Teacher, TeacherBody
+from sdfsim.dynamics.froude import scene_units
+from sdfsim.dynamics.model import load_model
+from sdfsim.errors import SdfsimError
+from sdfsim.evaluation import hard_cases
+from sdfsim.evaluation.engines import bullet, mujoco, shape_urdf, start_of_scene
+from sdfsim.evaluation.stress import taught
+from sdfsim.scene.scene_file import load_scene
+from sdfsim.shape.mesh import load_pieces
+from sdfsim.shape.shape import analytic_shape, shape_from_primitive
+
+SCENE = """
+version: 1
+duration: 0.4
+shapes:
+  box: {box: {size: [0.1, 0.1, 0.1]}}
+bodies:
+  - {name: floor, plane: {offset: 0.5}, friction: 0.8, restitution: 0.5}
+  - {name: low, shape: box, position: [0, 0, 0.5501], mass: 1.0, friction: 0.5, restitution: 0.1}
+  - {name: high, shape: box, position: [3, 0, 9], velocity: [1, 0, 0], angular_velocity: [0, 0, 2], mass: 2.0}
+"""
+
+
+def started(folder, text: str = SCENE):
+    (folder / "scene.yaml").write_text(text)
+    scene = load_scene(folder / "scene.yaml")
+    units = scene_units(scene, load_model("small", weights=False))
+    return start_of_scene(scene, folder / "engine", units), units
+
+
+def test_a_scene_is_a_start_in_the_model_s_units(tmp_path):
+    (start, rows), units = started(tmp_path)
+    assert rows == [1, 2] and start.floor == (0.8, 0.5)
+    motion = start.motion
+    assert np.allclose(motion.gravity, [0, 0, -10])
+    np.testing.assert_allclose(units.length * motion.position[0], [[0, 0, 0.0501], [3, 0, 8.5]])
+    np.testing.assert_allclose(motion.velocity[0, 1], [1 / units.velocity, 0, 0])
+    cube = motion.mass * (0.1 / units.length) ** 2 / 6
+    np.testing.assert_allclose(motion.inertia, np.stack([cube] * 3, -1))
+
+
+@pytest.mark.parametrize("run", [bullet, mujoco])
+@pytest.mark.parametrize("substeps", [5, 2])
+def test_engines_fly_freely_and_rest(tmp_path, run, substeps):
+    if run is mujoco:
+        pytest.importorskip("mujoco")
+    (start, _), units = started(tmp_path)
+    steps = round(0.4 / units.time / 0.02)
+    motion, timing = run(start, steps, substeps)
+    t = np.arange(steps + 1) * 0.02 * units.time
+    path = np.array([3.0, 0.0, 8.5]) + np.outer(t, [1.0, 0, 0]) + 0.5 * np.outer(t * t, [0, 0, -9.81])
+    turned = 2 * np.arctan2(motion.quat_xyzw[-1, 1, 2], motion.quat_xyzw[-1, 1, 3])
+    # A symplectic step of h is off by g h t / 2 at most.
+    slack = 0.5 * 9.81 * 0.4 * 0.02 / substeps * units.time
+    assert np.linalg.norm(units.length * motion.position[:, 1] - path, axis=-1).max() < slack + 1e-4
+    assert turned == pytest.approx(2.0 * t[-1], abs=0.002)
+    assert np.abs(units.length * motion.position[:, 0] - [0, 0, 0.05]).max() < 0.002
+    assert timing.cpu_ms > 0 and timing.first_ms > 0
+
+
+@pytest.mark.parametrize(
+    ("floor", "message"),
+    [
+        ("{name: floor, plane: {normal: [0, 1, 1]}}", "one level plane"),
+        ("{name: two, plane: {}}\n  - {name: floor, plane: {}}", "has 2 planes"),
+    ],
+)
+def test_scenes_that_the_engines_do_not_know_are_refused(tmp_path, floor, message):
+    lines = SCENE.splitlines()
+    lines[6] = f"  - {floor}"
+    with pytest.raises(SdfsimError, match=message):
+        started(tmp_path, "\n".join(lines))
+
+
+def test_the_teacher_has_the_scenes_own_masses_and_starts(tmp_path):
+    scene = hard_cases.tossed((3,))
+    motion = taught(scene, tmp_path, 1.0, steps=2)
+    assert motion.position.shape == (3, len(scene.bodies), 3) and motion.time[-1] == pytest.approx(0.04)
+    np.testing.assert_allclose(motion.position[0], [b.position for b in scene.bodies], atol=1e-12)
+    np.testing.assert_allclose(motion.velocity[0], [b.velocity for b in scene.bodies], atol=1e-6)
+    high = [k for k, b in enumerate(scene.bodies) if b.position[2] > 1.5]
+    fallen = np.array([scene.bodies[k].velocity[2] for k in high]) - 10.0 * 0.04
+    assert high
+    np.testing.assert_allclose(motion.velocity[-1, high, 2], fallen, atol=1e-6)
+
+
+def test_an_inertia_other_than_the_engine_s_is_refused_where_a_recording_tells_it(tmp_path):
+    start, _ = start_of_scene(hard_cases.tower(2), tmp_path)
+    bullet(replace(start, own_inertia=False), 2)
+    doubled = replace(start.motion, inertia=2 * start.motion.inertia)
+    bullet(replace(start, motion=doubled), 2)
+    with pytest.raises(SdfsimError, match="inertia is not the recorded one"):
+        bullet(replace(start, motion=doubled, own_inertia=False), 2)
+
+
+def test_engine_files_are_of_the_size_of_the_shape(tmp_path):
+    shape = shape_from_primitive("torus", 2.0, sdf="mesh")
+    urdf = shape_urdf(shape, tmp_path)
+    vertices = np.concatenate([piece.vertices for piece in load_pieces(urdf.with_suffix(".obj"))])
+    np.testing.assert_allclose(np.ptp(vertices, axis=0), np.ptp(shape.mesh.vertices, axis=0), rtol=0.01)
+    box = shape_urdf(analytic_shape("box", size=(1.0, 2.0, 3.0)), tmp_path)
+    with Teacher(np.zeros(3), None) as teacher:
+        teacher.add(TeacherBody(box, 2.0, 1.0, 0.5, 0.5), (0, 0, 0))
+        teacher._call("performCollisionDetection")
+        low, high = teacher._call("getAABB", teacher.bodies[0])
+    np.testing.assert_allclose(np.array(high) - low, [2.0, 4.0, 6.0], atol=0.1)

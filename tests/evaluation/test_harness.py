@@ -1,0 +1,113 @@
+"""Results are kept and resumed; digests tell contents apart; the front is what brute force finds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sdfsim.dynamics.model import new_network
+from sdfsim.errors import SdfsimError
+from sdfsim.evaluation.harness import (
+    Job,
+    Line,
+    Panel,
+    Point,
+    digest,
+    draw,
+    draw_work_precision,
+    front,
+    markdown,
+    measure,
+    number,
+    peak_memory,
+)
+from sdfsim.shape.shape import analytic_shape, with_sdf
+from tests.recordings import trajectory
+
+
+def noted(file: Path, value: float) -> dict:
+    """A result that leaves a line behind when it is made."""
+    with open(file, "a") as handle:
+        handle.write("ran\n")
+    if value < 0:
+        raise SdfsimError("below zero\nand more")
+    return {"value": value, "pair": (value, value)}
+
+
+@pytest.mark.parametrize("where", ["here", "cores", pytest.param("fresh", marks=pytest.mark.slow)])
+def test_results_are_made_once_and_again_when_their_content_changes(tmp_path, where):
+    ran = tmp_path / "ran"
+    jobs = [Job(f"case {k}", "method", [k], noted, (ran, float(k))) for k in range(2)]
+    first = measure(jobs, tmp_path / "out", where=where)
+    assert first["case 1", "method"] == {"value": 1.0, "pair": [1.0, 1.0]}
+    assert measure(jobs, tmp_path / "out", where=where) == first and ran.read_text().count("ran") == 2
+    damaged = tmp_path / "out" / "method" / "case 0.json"
+    damaged.write_text(damaged.read_text()[:-20])
+    changed = [jobs[0], replace(jobs[1], content=["other"])]
+    assert measure(changed, tmp_path / "out", where=where) == first and ran.read_text().count("ran") == 4
+
+
+def test_failures_are_told_and_tried_again(tmp_path):
+    ran, seen = tmp_path / "ran", []
+    jobs = [Job("case", name, [], noted, (ran, value)) for name, value in (("good", 1.0), ("bad", -1.0))]
+    for _ in range(2):
+        results = measure(jobs, tmp_path / "out", on_progress=lambda fraction, message: seen.append(fraction))
+        assert results["case", "bad"] == {"failed": "below zero"}
+    assert ran.read_text().count("ran") == 3 and seen == [0.5, 1.0, 1.0, 1.0, 1.0]
+
+
+def test_what_was_finished_outlives_an_interruption(tmp_path):
+    def interrupt() -> dict:
+        raise KeyboardInterrupt
+
+    ran = tmp_path / "ran"
+    jobs = [Job("a", "m", [], noted, (ran, 1.0)), Job("b", "m", [], interrupt)]
+    with pytest.raises(KeyboardInterrupt):
+        measure(jobs, tmp_path / "out")
+    measure(jobs[:1], tmp_path / "out")
+    assert ran.read_text().count("ran") == 1
+
+
+def test_digests_change_with_whatever_a_result_depends_on():
+    box = analytic_shape("box", size=(1.0, 1.0, 1.0))
+    grid = with_sdf(box, "grid", resolution=8)
+    other = replace(grid, sdf=replace(grid.sdf, values=grid.sdf.values + 1e-3))
+    contents = [box, grid, other, replace(grid, nodes=grid.nodes[:-1]), replace(grid, inertia=2 * grid.inertia)]
+    start = trajectory()
+    contents += [start, replace(start, dt=0.01), replace(start, mass=2 * start.mass)]
+    contents += [[1, [2]], [[1], 2], {"a": 1}, {"a": 2}, "1", 1, 1.0, None]
+    for seed in range(2):
+        torch.manual_seed(seed)
+        contents.append(new_network("impulse", {"width": 8, "rounds": 1}))
+    assert len({digest(content) for content in contents}) == len(contents)
+    assert digest(start) == digest(trajectory())
+    with pytest.raises(TypeError):
+        digest(object())
+
+
+@given(st.lists(st.tuples(st.integers(1, 9), st.integers(1, 9)), min_size=1, max_size=30))
+def test_front_is_what_nothing_beats(points):
+    time, error = zip(*points, strict=True)
+    beaten = [any(b[0] <= a[0] and b[1] <= a[1] and b != a for b in points) for a in points]
+    found = front(time, error)
+    assert sorted(found) == [k for k, lost in enumerate(beaten) if not lost]
+    assert [time[k] for k in found] == sorted(time[k] for k in found)
+
+
+def test_tables_plots_and_memory(tmp_path):
+    assert markdown([("a", "b"), ("1", "2")]) == "| a | b |\n| --- | ---: |\n| 1 | 2 |\n"
+    assert [number(v) for v in (None, 0.012345, 12345.6, np.inf)] == ["-", "0.0123", "12,346", "-"]
+    panels = [Panel("title", "x", "y", [Line("one", [1, 2], [3, 4], [0.1, 0.1])], "xy", 3.5)] * 5
+    draw(panels, tmp_path / "a.png")
+    points = [Point("ours", "ours", 1.0, 2.0, 0.1), Point("teacher", "engine", 0.5, 0.6, 0.0)]
+    draw_work_precision(points, [0], tmp_path / "b.png", x="ms", y="m")
+    assert all((tmp_path / f"{name}.png").read_bytes()[:4] == b"\x89PNG" for name in "ab")
+    with peak_memory() as memory:
+        np.ones(4 * 2**20).sum()  # 32 MiB
+    assert memory["mib"] is None or memory["mib"] == pytest.approx(32, abs=16)

@@ -1,0 +1,185 @@
+"""The hard cases as a whole: resumed, reported, and held by the ratchet."""
+
+from __future__ import annotations
+
+import functools
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+import cli
+from sdfsim.dynamics.model import Model, load_model, new_network
+from sdfsim.dynamics.rollout import Rollout
+from sdfsim.errors import SdfsimError
+from sdfsim.evaluation import hard_cases, harness
+from sdfsim.evaluation import stress as study
+from sdfsim.evaluation.hard_cases import cases
+from sdfsim.evaluation.stress import accepted, losses, rows, simulated, slipped_back, table, write_report
+from sdfsim.files import write_json
+from sdfsim.shape import primitives
+from sdfsim.shape.mesh import write_ply
+
+FEW = ("overlap-balls", "thin-5", "cuda")
+
+
+def save_model(path: Path, *, factor: float = 1.0) -> Path:
+    torch.manual_seed(0)
+    network = new_network("impulse", {"width": 8, "rounds": 1})
+    for weights in network.parameters():
+        weights.data *= factor
+    ranges = {"friction": [0.2, 0.6], "restitution": [0.25, 0.25], "speed": [0.0, 4.0]}
+    Model(path.stem, "impulse", network, 0.02, 10.0, 1.0, 0.1, ranges=ranges).save(path)
+    return path
+
+
+@pytest.fixture
+def model(tmp_path) -> str:
+    return str(save_model(tmp_path / "untrained.safetensors"))
+
+
+@functools.cache
+def all_cases() -> list[hard_cases.Case]:
+    return cases(quick=True)
+
+
+@pytest.fixture(autouse=True)
+def few(monkeypatch):
+    """Three short cases, in this process, noted as they run."""
+    found = [replace(c, seconds=0.1, repeats=2) for c in all_cases() if c.name in FEW]
+    ran: list[tuple[str, str]] = []
+
+    def one_by_one(function, jobs):
+        for index, job in enumerate(jobs):
+            ran.append((job[0].case, job[0].method))
+            yield index, function(*job)
+
+    monkeypatch.setattr(study, "cases", lambda **_: found)
+    monkeypatch.setattr(harness, "parallel", one_by_one)
+    return ran
+
+
+def run(out: Path, *models: str, **options):
+    return study.stress(out, models=models, quick=True, **options)
+
+
+def test_what_is_finished_is_kept_and_what_changed_is_run_again(tmp_path, model, few):
+    first = run(tmp_path / "out", model)
+    assert sorted(few) == [(case, who) for case in FEW[:2] for who in ("teacher", "untrained")]
+    few.clear()
+    again = run(tmp_path / "out", model)
+    assert few == [] and again.results == first.results
+    save_model(Path(model), factor=1.01)
+    run(tmp_path / "out", model)
+    assert sorted(few) == [(case, "untrained") for case in FEW[:2]], "the teacher is as it was"
+
+
+def test_the_solver_takes_part_in_all_but_other_arithmetic(tmp_path, model):
+    found = run(tmp_path / "out", "solver", model)
+    assert found.who == ["solver", "untrained", "teacher"]
+    assert {case for case, who in found.results if who == "solver"} == set(FEW[:2])
+    assert losses(found)["solver"] == {"figures": 3, "missed": 0, "behind the teacher": 0, "cases that blew up": 0}
+
+
+def test_two_models_of_one_name_are_refused(tmp_path, model):
+    (tmp_path / "other").mkdir()
+    second = save_model(tmp_path / "other" / Path(model).name)
+    with pytest.raises(SdfsimError, match="two models are called 'untrained'"):
+        run(tmp_path / "out", model, str(second))
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_table_has_a_row_for_every_figure_and_says_what_was_not_run(tmp_path, model, monkeypatch):
+    found = run(tmp_path / "out", model)
+    head, *shown = rows(found, {})
+    assert head == ("case", "figure", "wanted", "untrained", "teacher")
+    assert [row[1] for row in shown] == [figure.name for case in found.cases for figure in case.figures]
+    cells = {(row[0], row[1]): row[3:] for row in shown}
+    assert cells["on CUDA", "diverges after"][1] == "-", "the teacher has no part in it"
+    assert "†" in cells["5 m/s", "through"][0], "faster than the model was trained on"
+    report = write_report(found, tmp_path / "out")
+    assert report["failed_checks"] == [] and report["models"]["untrained"]["cases that blew up"] == 0
+    text = Path(report["table"]).read_text()
+    assert table(found) in text and "plots/overlap.png" in text
+    assert (tmp_path / "out" / "plots" / "overlap.png").read_bytes()[:4] == b"\x89PNG"
+    assert json.loads((tmp_path / "out" / "report.json").read_text()) == report
+
+    def absent():
+        raise SdfsimError("PyBullet is not installed")
+
+    monkeypatch.setattr(study, "import_pybullet", absent)
+    assert run(tmp_path / "alone", model).who == ["untrained"]
+
+
+def broken(model: str) -> str:
+    return str(save_model(Path(model).with_name("broken.safetensors"), factor=1e12))
+
+
+def test_a_motion_that_blows_up_is_a_row_that_says_so(tmp_path, model):
+    recorded = {}
+    found = run(tmp_path / "out", broken(model), record=lambda scene, rollout, path: recorded.update({path: rollout}))
+    first = rows(found, {"missed": "**"})[1][3]
+    assert first.startswith("**blew up: ") and "step" in first
+    kept = recorded[tmp_path / "out" / "recordings" / "broken" / "overlap-balls.rrd"]
+    assert isinstance(kept, Rollout) and np.isfinite(kept.position).all()
+    report = write_report(found, tmp_path / "out")
+    assert report["models"]["broken"]["cases that blew up"] == 2
+    assert any(check.startswith("overlap-balls with broken blew up: ") for check in report["failed_checks"])
+
+
+def test_the_command_ends_with_3_when_a_model_blows_up_and_with_0_otherwise(tmp_path, model):
+    for weights, code in ((model, 0), (broken(model), 3)):
+        out = tmp_path / f"out{code}"
+        done = CliRunner().invoke(cli.app, ["stress", "-o", str(out), "--model", weights, "--quick", "--json"])
+        assert done.exit_code == code, done.stderr
+        report = json.loads(done.stdout)
+        assert bool(report["failed_checks"]) == bool(code) and report["quick"] is True
+        assert all(Path(recording).exists() for recording in report["recordings"])
+
+
+def test_the_ratchet_holds_what_was_accepted_and_no_more(tmp_path, model):
+    found = run(tmp_path / "out", model)
+    file = tmp_path / "ratchet.json"
+    write_json(file, accepted(found))
+    assert slipped_back(found, file) == []
+    content = json.loads(file.read_text())
+    entry = content["models"]["untrained"]["figures"]["overlap-balls/exit speed"]
+    now = entry["value"]
+    for was, noise, count in ((now - 0.5, 0.1, 1), (now - 0.5, 0.2, 0), (now + 5.0, 0.0, 0)):
+        entry.update(value=was, noise=noise)
+        write_json(file, content)
+        assert len(slipped_back(found, file)) == count
+    blown = run(tmp_path / "blown", broken(model))
+    with pytest.raises(SdfsimError, match="knows no model 'broken'"):
+        slipped_back(blown, file)
+    content["models"]["broken"] = {"figures": {}, "blew_up": ["overlap-balls"]}
+    write_json(file, content)
+    assert slipped_back(blown, file) == ["broken: thin-5: blew up"]
+    write_json(file, content | {"quick": False})
+    with pytest.raises(SdfsimError, match="long form"):
+        slipped_back(found, file)
+
+
+def test_reduced_precision_changes_a_little_and_leaves_the_network_as_it_was(model):
+    loaded = load_model(model)
+    before = {name: weight.clone() for name, weight in loaded.network.state_dict().items()}
+    case = replace(next(c for c in all_cases() if c.name == "bfloat16"), seconds=0.6)
+    scene = hard_cases.overlapping(hard_cases.ball(), hard_cases.ball(), 0.5)
+    one, other = (r.rollout.position for r in simulated(case, [scene], loaded, "cpu"))
+    assert 0 < np.abs(one - other).max() < 0.1
+    assert all(torch.equal(weight, before[name]) for name, weight in loaded.network.state_dict().items())
+
+
+def test_meshes_of_ones_own_rest_too_at_a_metre(tmp_path):
+    with pytest.raises(SdfsimError, match="no meshes found"):
+        cases(quick=True, shapes=tmp_path)
+    (tmp_path / "brick.ply").write_bytes(write_ply(primitives.box((2.0, 4.0, 1.0))))
+    found = {case.name: case for case in cases(quick=True, shapes=tmp_path)}
+    assert {"rest-brick", "rest-brick-sleep"} < set(found)
+    scene = found["rest-brick"].scenes(0)[0]
+    np.testing.assert_allclose(np.sort(np.ptp(scene.shapes[0].mesh.vertices, axis=0)), [0.25, 0.5, 1.0], rtol=1e-6)
+    assert scene.bodies[0].position[2] == pytest.approx(0.125)

@@ -1,0 +1,126 @@
+"""The trade-off study: what settings change, what a scene becomes, and the whole study in small."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("pybullet")
+
+from sdfsim.dynamics.model import load_model
+from sdfsim.errors import SdfsimError
+from sdfsim.evaluation import tradeoff as study
+from sdfsim.evaluation.tradeoff import Setting, arranged, cases_of_scene, load_cases, measure_engine, settings
+from sdfsim.shape.shape import analytic_shape, with_sdf
+from tests.evaluation.test_engines import SCENE
+
+
+@pytest.fixture(scope="module")
+def cases(cube_data):
+    return load_cases(cube_data, quick=True)
+
+
+def test_every_setting_has_a_label_of_its_own():
+    for quick in (False, True):
+        chosen = settings(["solver", "small"], quick=quick, cuda=True)
+        assert len({s.label for s in chosen}) == len(chosen) and not any("/" in s.label for s in chosen)
+        assert chosen[0] == Setting("solver") and Setting("small") in chosen and chosen[-1].label == "ballistic"
+
+
+def test_networks_and_shapes_are_what_a_setting_says(cases):
+    box = with_sdf(analytic_shape("box", size=(1.0, 0.6, 0.4)), "grid", resolution=48)
+    cases = replace(cases, shapes={"box": box, "ball": analytic_shape("sphere", radius=0.5)})
+    few = arranged(Setting("solver", nodes="thin 10"), cases)[1]["box"].nodes
+    # Outermost first: of a box, the eight corners are among them.
+    assert len(few) == 10 and (np.abs(np.abs(few) - [0.5, 0.3, 0.2]).max(1) < 1e-9).sum() == 8
+    grid = arranged(Setting("solver", nodes="grid 6"), cases)[1]["box"].nodes
+    assert 8 <= len(grid) <= 6**3 and np.abs(np.asarray(box.sdf(grid)[0])).max() < 0.01
+    shapes = arranged(Setting("solver", sdf="grid 8"), cases)[1]
+    assert shapes["box"].sdf.resolution == 8 and shapes["ball"].sdf is cases.shapes["ball"].sdf
+    whole = load_model("small").network
+    model, _ = arranged(Setting("small", rounds=2, reach=0.5), cases)
+    assert len(model.network.rounds) == 2 and len(whole.rounds) > 2
+    assert model.reach == 0.5 * load_model("small").reach
+    with pytest.raises(SdfsimError, match="no 40 rounds"):
+        arranged(Setting("small", rounds=40), cases)
+
+
+def test_a_scene_is_judged_by_the_teacher_in_the_model_s_units(tmp_path):
+    from sdfsim.scene.scene_file import load_scene
+
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    cases = cases_of_scene(load_scene(tmp_path / "scene.yaml"), "small", tmp_path / "engine", quick=True)
+    assert cases.length == pytest.approx(0.1 / load_model("small").length, rel=0.02)
+    assert cases.steps == min(50, round(0.4 / cases.time / 0.02)) and cases.floor == (0.8, 0.5)
+    (recorded,) = cases.recorded
+    t = np.arange(len(recorded.position)) * recorded.dt * cases.time
+    path = np.array([3.0, 0.0, 8.5]) + np.outer(t, [1.0, 0, 0]) + 0.5 * np.outer(t * t, [0, 0, -9.81])
+    assert np.abs(cases.length * recorded.position[:, 1] - path).max() < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("plane: {offset: 0.5}", "plane: {offset: 0.5}, collides_with: []"), "may not touch all others"),
+        (("version: 1", "version: 1\neffects: {friction: off}"), "effects: friction is off"),
+        (("  - {name: floor, plane: {offset: 0.5}, friction: 0.8, restitution: 0.5}\n", ""), "one level plane"),
+    ],
+)
+def test_scenes_that_would_become_another_are_refused(tmp_path, change, message):
+    from sdfsim.scene.scene_file import load_scene
+
+    (tmp_path / "scene.yaml").write_text(SCENE.replace(*change))
+    with pytest.raises(SdfsimError, match=message):
+        cases_of_scene(load_scene(tmp_path / "scene.yaml"), "small", tmp_path / "engine", quick=True)
+
+
+def test_engines_without_their_files_or_step_are_points_that_say_so(cases):
+    with pytest.raises(SdfsimError, match="no engine file of cube"):
+        measure_engine("PyBullet", 5, 0.0, replace(cases, urdfs={}))
+    other = [replace(t, dt=0.01) for t in cases.recorded]
+    with pytest.raises(SdfsimError, match="another step"):
+        measure_engine("PyBullet", 5, 0.0, replace(cases, recorded=other))
+
+
+def test_the_whole_study_in_small(cube_data, tmp_path, monkeypatch):
+    chosen = [Setting("solver"), Setting("small", nodes="thin 20"), Setting("solver", contact=False)]
+    monkeypatch.setattr(study, "settings", lambda *_, **__: chosen)
+    monkeypatch.setattr(study, "REPEATS", 2)
+    monkeypatch.setattr(study, "MOST_QUICK", 1)
+    monkeypatch.setattr(study, "ENGINES_QUICK", [("PyBullet", 5), ("MuJoCo", 5)])
+
+    def absent(*_):
+        raise SdfsimError("MuJoCo is not installed")
+
+    monkeypatch.setattr(study, "mujoco", absent)
+    before = torch.get_num_threads()
+
+    def run():
+        return study.tradeoff(cube_data, tmp_path, quick=True, on_progress=lambda *_: None)
+
+    report = run()
+    by_label = {p["label"]: p for p in report["points"]}
+    error = {label: p["translation_rmse"]["50"] for label, p in by_label.items() if "failed" not in p}
+    assert set(error) == {"solver", "small, nodes thin 20", "ballistic", "PyBullet 4 ms", study.FLOOR_LABEL}
+    assert error["PyBullet 4 ms"] < 1e-6, "the teacher repeats itself"
+    assert error["solver"] < 0.5 * error["ballistic"] and by_label["solver"]["ms"] > by_label["PyBullet 4 ms"]["ms"] / 9
+    assert set(report["front"]) <= {"solver", "small, nodes thin 20"} and report["front"]
+    assert torch.get_num_threads() == before
+    rows = list(csv.DictReader((tmp_path / "tradeoff.csv").read_text().splitlines()))
+    assert len(rows) == 6 and float(rows[0]["translation_rmse_50"]) == pytest.approx(error["solver"], rel=1e-4)
+    assert (tmp_path / "tradeoff.png").stat().st_size > 500
+    assert json.loads((tmp_path / "report.json").read_text())["front"] == report["front"]
+    table, notes = study.told(report)
+    assert len(table) == 7 and any("front of ours" in note for note in notes)
+    monkeypatch.setattr(study, "measure_ours", lambda *_: pytest.fail("measured again"))
+    assert run()["points"] == report["points"]
+
+
+def test_a_source_that_is_none_is_told(tmp_path):
+    with pytest.raises(SdfsimError, match="no such file or folder"):
+        study.tradeoff(tmp_path / "absent", tmp_path / "out", on_progress=lambda *_: None)

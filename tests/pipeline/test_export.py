@@ -1,0 +1,170 @@
+"""Where a body is dropped, and the scene file that says so."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+
+from pipeline.cameras import Similarity
+from pipeline.export import DENSITY, LEVEL, Above, choose_slab, fit_parts, scene_text, write_scene
+from pipeline.mesh.placement import Placement
+from sdfsim.files import write_json
+from sdfsim.scene.scene_file import load_scene
+from sdfsim.shape.mesh import Mesh, write_ply
+from sdfsim.shape.shape import Shape, analytic_shape
+from tests.pipeline.test_surface import cube, scenery
+
+PLACEMENT = Placement(Similarity(1.0, np.eye(3), np.zeros(3)), "plane", "assumed: widest side = 1 m")
+
+
+def terrain(height) -> Mesh:
+    """The surface z = height(x, y) over [-0.5, 0.5]^2, 1 cm apart."""
+    line = np.linspace(-0.5, 0.5, 101)
+    x, y = np.meshgrid(line, line, indexing="ij")
+    corner = (np.arange(100)[:, None] * 101 + np.arange(100)).ravel()
+    faces = np.concatenate([corner[:, None] + [0, 101, 102], corner[:, None] + [0, 102, 1]])
+    return Mesh(np.stack([x, y, height(x, y)], -1).reshape(-1, 3), faces)
+
+
+def test_drop_lands_on_the_block():
+    mesh = scenery()
+    drop = choose_slab(mesh, mesh)
+    x, y, z = drop.position
+    assert abs(x - 0.1) < 0.3 - 0.5 * drop.side and abs(y) < 0.3 - 0.5 * drop.side
+    assert drop.slope < 1 and 0.4 < z - 0.5 * drop.thickness < 0.5
+    assert drop.side == pytest.approx(0.12, rel=0.01)
+    assert np.isnan(Above(mesh).heights(np.array([[5.0, 5]]))).all()
+
+
+def test_a_level_step_is_preferred_to_a_higher_slope():
+    hill = terrain(lambda x, y: 0.6 * np.maximum(-x, 0) + 0.3 * np.maximum(np.abs(x - 0.3) - 0.15, 0))
+    drop = choose_slab(hill, hill)
+    assert drop.slope < LEVEL and 0.1 < drop.position[0] < 0.5
+
+
+def test_where_nothing_is_level_the_flattest_place_is_taken():
+    dome = terrain(lambda x, y: -2.0 * (x - 0.2) - 1.0 * y)
+    drop = choose_slab(dome, dome)
+    assert drop.slope == pytest.approx(np.degrees(np.arctan(np.hypot(2, 1))), abs=0.5)
+
+
+def test_matter_that_no_photo_shows_is_not_landed_on():
+    import trimesh
+
+    floor = terrain(lambda x, y: np.zeros_like(x))
+    box = trimesh.creation.box((0.3, 0.3, 0.3))
+    hidden = Mesh(
+        np.concatenate([floor.vertices, np.asarray(box.vertices)]),
+        np.concatenate([floor.faces, np.asarray(box.faces, np.int64) + len(floor.vertices)]),
+    )
+    drop = choose_slab(floor, hidden)
+    assert max(abs(drop.position[0]), abs(drop.position[1])) > 0.15 and drop.position[2] < 0.25
+
+
+def test_scene_text_is_valid_yaml_with_gravity_down():
+    mesh = scenery()
+    text = scene_text(PLACEMENT, {}, choose_slab(mesh, mesh))
+    data = yaml.safe_load(text)
+    assert data["gravity"] == [0, 0, -9.81] and data["shapes"]["scene"] == {"asset": "assets/scene"}
+    assert "assumed: widest side = 1 m" in text and "confidence: high" in text
+    assert [body["name"] for body in data["bodies"]] == ["floor", "scene", "box"]
+
+
+def test_bodies_found_can_move():
+    mesh = scenery()
+    origins = {"object1": np.array([0.1, 0.2, 0.4])}
+    data = yaml.safe_load(scene_text(PLACEMENT, origins, choose_slab(mesh, mesh), drop="ball"))
+    body = {body["name"]: body for body in data["bodies"]}["object1"]
+    assert body["position"] == [0.1, 0.2, 0.4] and body["density"] == DENSITY and "motion" not in body
+    assert data["shapes"]["object1"] == {"asset": "assets/object1"} and "sphere" in data["shapes"]["ball"]
+    alone = yaml.safe_load(scene_text(PLACEMENT, origins, None, scenery=False))
+    assert [body["name"] for body in alone["bodies"]] == ["floor", "object1"]
+
+
+@pytest.fixture
+def meshes(tmp_path):
+    """A mesh folder: a floor with a block of 0.6 m, and a cube that was found on the floor."""
+    parts = {"scenery": True, "objects": [{"name": "object1"}]}
+    (tmp_path / "objects").mkdir()
+    for name in ("solid.ply", "shown.ply"):
+        (tmp_path / name).write_bytes(write_ply(scenery()))
+    (tmp_path / "objects" / "object1.ply").write_bytes(write_ply(cube(0.2, (-0.6, 0.5, 0.1))))
+    PLACEMENT.save(tmp_path)
+    write_json(tmp_path / "parts.json", {"version": 1, **parts})
+    return tmp_path
+
+
+def test_a_scene_file_changed_by_hand_is_kept(meshes):
+    scene = meshes / "scene.yaml"
+    first = write_scene(meshes, scene)
+    again = write_scene(meshes, scene, written=first["scene_sha256"], seed=3)
+    assert again["notes"] == [] and not (meshes / "scene.yaml.bak").exists()
+    for kept in ("scene.yaml.bak", "scene.yaml.bak2"):
+        scene.write_text("mine\n")
+        report = write_scene(meshes, scene, written=again["scene_sha256"])
+        assert (meshes / kept).read_text() == "mine\n" and kept in report["notes"][0]
+        assert yaml.safe_load(scene.read_text())["version"] == 1
+
+
+def test_bodies_stand_where_they_were_found(meshes):
+    write_scene(meshes, meshes / "scene.yaml", drop="none")
+    body = yaml.safe_load((meshes / "scene.yaml").read_text())["bodies"][-1]
+    np.testing.assert_allclose(body["position"], [-0.6, 0.5, 0.0], atol=1e-4)
+
+
+def test_every_part_is_fitted_in_its_own_frame_and_kept_when_killed(meshes, tmp_path, monkeypatch):
+    fits = []
+
+    def fit_mesh(solid: Mesh, *, name: str, **options) -> Shape:
+        fits.append((name, solid, options["budget"]))
+        certificate = {"passed": name != "object1", "reason": "too thin" if name == "object1" else "", "caveat": ""}
+        return replace(analytic_shape("box", size=(0.2, 0.2, 0.2), name=name), mesh=solid, certificate=certificate)
+
+    monkeypatch.setattr("sdfsim.shape.fit.fit_mesh", fit_mesh)
+    out = tmp_path / "assets"
+    out.mkdir()
+    report = fit_parts(meshes, out, budget=30.0)
+    assert [(name, budget) for name, _, budget in fits] == [("scene", 20.0), ("object1", 10.0)]
+    np.testing.assert_allclose(fits[1][1].vertices.min(0), [-0.1, -0.1, 0.0], atol=1e-6)
+    assert report["passed"] is False and report["reason"] == "object1: too thin"
+    assert fit_parts(meshes, out, budget=30.0) == report and len(fits) == 2
+
+
+def test_a_checkpoint_that_a_kill_left_beside_its_shape_goes(meshes, tmp_path, monkeypatch):
+    def fit_mesh(solid: Mesh, *, name: str, device: str, **options) -> Shape:
+        certificate = {"passed": True, "reason": "", "caveat": "rough"}
+        return replace(analytic_shape("box", size=(0.2, 0.2, 0.2), name=name), mesh=solid, certificate=certificate)
+
+    monkeypatch.setattr("sdfsim.shape.fit.fit_mesh", fit_mesh)
+    out = tmp_path / "assets"
+    out.mkdir()
+    report = fit_parts(meshes, out, budget=None)
+    assert report["passed"] and report["caveats"] == ["scene: rough", "object1: rough"]
+    assert sorted(p.name for p in out.iterdir()) == ["object1", "scene"]
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e5])
+@pytest.mark.parametrize("shape", ["box", "ball"])
+def test_a_scene_of_any_size_that_is_allowed_is_the_same_scene(tmp_path, scale, shape):
+    """Lengths are those of the scene of 1 m times its size, to six digits, and the file can be loaded."""
+    mesh = scenery()
+    place, size = choose_slab(mesh, mesh), 2 * scale
+    drop = replace(place, side=place.side * size, thickness=place.thickness * size,
+                   position=tuple(size * v for v in place.position))  # fmt: skip
+    origins = {"object1": size * np.array([0.1, -0.2, 1e-3])}
+    text = scene_text(PLACEMENT, origins, drop, scenery=False, drop=shape)
+    data = yaml.safe_load(text)
+    bodies = {body["name"]: body for body in data["bodies"]}
+    np.testing.assert_allclose(bodies["object1"]["position"], size * np.array([0.1, -0.2, 1e-3]), atol=1e-5 * size)
+    np.testing.assert_allclose(bodies[shape]["position"], drop.position, rtol=1e-5, atol=1e-5 * size)
+    if shape == "box":
+        wanted = (drop.side, drop.side, drop.thickness)
+        np.testing.assert_allclose(data["shapes"]["box"]["box"]["size"], wanted, rtol=1e-5)
+    else:
+        assert data["shapes"]["ball"]["sphere"]["radius"] == pytest.approx(drop.thickness / 2, rel=1e-5)
+    analytic_shape("box", size=3 * [0.1 * size], name="object1").save(tmp_path / "assets" / "object1")
+    (tmp_path / "scene.yaml").write_text(text)
+    assert [body.name for body in load_scene(tmp_path / "scene.yaml").bodies] == ["floor", "object1", shape]

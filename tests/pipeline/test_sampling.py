@@ -1,0 +1,216 @@
+"""Where the field is asked: samples of bounded error, free space that photos prove, and the cached SDF."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.cameras import Sparse
+from pipeline.field.grid_field import FieldSize, GridField, laplace_density
+from pipeline.field.rendering import EPSILON, bounded_samples, draw, nearest, opacity_bound, sdf_cache, worst
+from pipeline.sfm.supervision import CLEARANCE, FILLED, GAP, JUST_EMPTY, SLOPE, FreeSpace, supervision_of
+from tests.pipeline.test_field import UNIT
+from tests.pipeline.test_surface import ring
+
+DOUBLE = torch.float64
+
+
+def rays(count: int = 40) -> tuple[torch.Tensor, torch.Tensor]:
+    """Rays through the unit sphere past a small ball in its middle, near and far."""
+    offset = torch.linspace(0.0, 0.9, count, dtype=DOUBLE)
+    origins = torch.stack([offset, torch.zeros(count, dtype=DOUBLE), torch.full((count,), -3.0, dtype=DOUBLE)], 1)
+    return origins, torch.tensor([0.0, 0, 1], dtype=DOUBLE)
+
+
+def ball(origins: torch.Tensor, direction: torch.Tensor, distance: torch.Tensor, radius: float = 0.2) -> torch.Tensor:
+    return (origins[:, None] + distance[..., None] * direction).norm(dim=-1) - radius
+
+
+def chord(origins: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    half = (1 - origins[:, 0] ** 2).sqrt()
+    return 3 - half, 3 + half
+
+
+def test_nothing_is_nearer_than_the_bound():
+    """Of 2,000 random pieces of rays past a ball, the true least distance is never less, and often equal."""
+    rng = torch.Generator().manual_seed(0)
+    start = torch.randn(2000, 3, generator=rng, dtype=DOUBLE)
+    along = torch.randn(2000, 3, generator=rng, dtype=DOUBLE)
+    along = along / along.norm(dim=1, keepdim=True)
+    length = torch.rand(2000, 1, generator=rng, dtype=DOUBLE) * 2
+    steps = torch.linspace(0, 1, 400, dtype=DOUBLE)
+    true = ((start[:, None] + (length * steps)[..., None] * along[:, None]).norm(dim=-1) - 0.3).abs().amin(1)
+    ends = torch.stack([start, start + length * along], 1).norm(dim=-1) - 0.3
+    bound = nearest(ends, length)[:, 0]
+    assert (bound <= true + 1e-9).all()
+    assert (bound > 0.5 * true).double().mean() > 0.3
+
+
+def test_the_bound_holds_for_every_ray_and_number_of_samples():
+    origins, direction = rays()
+    enter, leave = chord(origins)
+    beta = torch.tensor([[0.02]], dtype=DOUBLE)
+    for count in (16, 64, 400):
+        distance = enter[:, None] + (leave - enter)[:, None] * torch.linspace(0, 1, count, dtype=DOUBLE)
+        sdf = ball(origins, direction, distance)
+        bound, before = opacity_bound(distance, sdf, beta)
+        fine = enter[:, None] + (leave - enter)[:, None] * torch.linspace(0, 1, 20001, dtype=DOUBLE)
+        density = laplace_density(ball(origins, direction, fine), beta)
+        depth = torch.cumulative_trapezoid(density, fine, dim=1)
+        at_samples = np.stack([np.interp(distance[r, 1:], fine[r, 1:], depth[r]) for r in range(len(origins))])
+        delta = distance[:, 1:] - distance[:, :-1]
+        ours = 1 - torch.exp(-(before + laplace_density(sdf[:, :-1], beta) * delta))
+        error = (ours - (1 - torch.exp(-torch.tensor(at_samples)))).abs()
+        assert (error <= bound + 1e-6).all()
+
+
+def run(beta: float, sdf_calls: list | None = None) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    origins, direction = rays()
+    enter, leave = chord(origins)
+
+    def sdf_at(chosen: torch.Tensor, distance: torch.Tensor) -> torch.Tensor:
+        if sdf_calls is not None:
+            sdf_calls.append(distance.numel())
+        return ball(origins[chosen], direction, distance)
+
+    uniforms = torch.full((len(origins), 64), 0.5, dtype=DOUBLE)
+    return *bounded_samples(sdf_at, enter, leave, torch.tensor(beta), uniforms), origins
+
+
+@pytest.mark.parametrize("beta", [0.1, 0.01, 0.003])
+def test_rays_converge_one_by_one(beta):
+    calls: list[int] = []
+    distance, converged, origins = run(beta, calls)
+    assert converged.double().mean() > 0.9
+    assert (distance.diff(dim=1) >= 0).all()
+    enter, leave = chord(origins)
+    assert (distance >= enter[:, None] - 1e-9).all() and (distance <= leave[:, None] + 1e-9).all()
+    # A wide density needs no second look; a narrow one only along some of the rays.
+    assert (len(calls) == 1) == (beta == 0.1)
+    assert sum(calls[1:]) < 0.8 * len(origins) * 128 * max(1, len(calls) - 1)
+
+
+def test_samples_gather_where_a_ray_becomes_opaque():
+    distance, _, origins = run(0.003)
+    hit = origins[:, 0] < 0.15
+    surface = 3 - (0.2**2 - origins[hit, :1] ** 2).sqrt()
+    assert ((distance[hit] - surface).abs() < 0.05).double().mean() > 0.8
+
+
+def test_opacity_from_the_samples_is_right():
+    """What the samples are for: the opacity of rays, from 64 of them, is that of 20,000."""
+    distance, _, origins = run(0.01)
+    direction = torch.tensor([0.0, 0, 1], dtype=DOUBLE)
+    enter, leave = chord(origins)
+    edge = torch.cat([enter[:, None], (distance[:, 1:] + distance[:, :-1]) / 2, leave[:, None]], 1)
+    ours = 1 - torch.exp(-(laplace_density(ball(origins, direction, distance), 0.01) * edge.diff(dim=1)).sum(1))
+    fine = enter[:, None] + (leave - enter)[:, None] * torch.linspace(0, 1, 20001, dtype=DOUBLE)
+    true = 1 - torch.exp(-torch.trapezoid(laplace_density(ball(origins, direction, fine), 0.01), fine, dim=1))
+    assert (ours - true).abs().max() < EPSILON
+
+
+def test_draws_follow_their_density():
+    distance = torch.tensor([[0.0, 1.0, 2.0, 4.0]])
+    drawn = draw(distance, torch.tensor([[1.0, 0.0, 3.0]]), torch.full((1, 4000), 0.5))
+    counts = torch.histogram(drawn[0], torch.tensor([0.0, 1.0, 2.0, 4.0])).hist
+    assert counts.tolist() == pytest.approx([1000, 0, 3000], abs=5)
+
+
+def test_more_samples_bound_the_error_more_tightly():
+    origins, direction = rays()
+    enter, leave = chord(origins)
+    bounds = []
+    for count in (64, 128, 256):
+        distance = enter[:, None] + (leave - enter)[:, None] * torch.linspace(0, 1, count, dtype=DOUBLE)
+        sdf = ball(origins, direction, distance)
+        bounds.append(float(worst(distance, sdf, torch.tensor([[0.05]], dtype=DOUBLE)).max()))
+    assert bounds[0] > bounds[1] > bounds[2]
+
+
+def ball_cache(radius: float, n: int = 65) -> torch.Tensor:
+    line = torch.linspace(-1, 1, n)
+    return (torch.stack(torch.meshgrid(line, line, line, indexing="ij")).norm(dim=0) - radius)[..., None]
+
+
+def test_lines_of_sight_end_before_their_points_and_stay_in_the_sphere():
+    views = ring(4)
+    xyz = np.array([[0.1, 0.0, 0.2], [0.0, 0.3, 0.0], [0.0, 0.0, 0.4]])
+    seen = np.array([0, 0, 0, 0, 1, 1, 1, 2])  # The last point has too few views to be believed.
+    sparse = Sparse(xyz, np.zeros((3, 3), np.uint8), np.full(3, 0.5), seen, np.array([0, 1, 2, 3, 0, 1, 2, 0]))
+    found = supervision_of(sparse, views, UNIT)
+    np.testing.assert_allclose(found.points, xyz[:2])
+    assert found.sight.shape == (7, 6)
+    start, end = found.sight[:, :3], found.sight[:, 3:]
+    np.testing.assert_allclose(np.linalg.norm(start, axis=1), 1.0, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(end - xyz[seen[:7]], axis=1), GAP, atol=1e-9)
+
+
+def crossing(count: int) -> np.ndarray:
+    """Lines along x, evenly spread in y: few of them cross a ball of radius 0.1."""
+    y = np.linspace(-0.9, 0.9, count)
+    return np.stack([np.full(count, -0.4), y, 0 * y, np.full(count, 0.4), y, 0 * y], 1)
+
+
+def test_half_the_points_are_where_free_space_is_filled():
+    sight = crossing(400)
+    free = FreeSpace(sight, "cpu")
+    rng = torch.Generator().manual_seed(0)
+    evenly, _ = free.pick(200, rng)
+    assert (evenly.norm(dim=1) < 0.1).float().mean() < 0.1
+    free.look(ball_cache(0.1), rng)
+    assert len(free.filled) > 50
+    points, clearance = free.pick(200, rng)
+    filled = points.norm(dim=1) < 0.1 + FILLED + 0.01
+    assert filled[:100].all() and filled[100:].float().mean() < 0.1
+    rest = 0.4 - points[:, 0] + GAP
+    expected = (SLOPE * rest).clamp_max(CLEARANCE)
+    torch.testing.assert_close(clearance[100:], expected[100:])
+    torch.testing.assert_close(clearance[:100], expected[:100].clamp_max(JUST_EMPTY))
+
+
+def test_nothing_is_filled_in_an_empty_field():
+    free = FreeSpace(crossing(50), "cpu")
+    rng = torch.Generator().manual_seed(0)
+    free.look(ball_cache(0.1) * 0 + 1, rng)
+    assert len(free.filled) == 0 and len(free.pick(64, rng)[0]) == 50
+    assert len(FreeSpace(np.zeros((0, 6)), "cpu").pick(64, rng)[0]) == 0
+
+
+def test_the_cache_is_the_field_near_its_surface_and_has_its_signs_everywhere():
+    field = GridField(FieldSize((8, 16), (2, 2), 16, 8), seed=1, start_radius=0.4)
+    with torch.no_grad():
+        field.grids[1].normal_(0, 0.05, generator=torch.Generator().manual_seed(0))
+        line = torch.linspace(-1, 1, 41)
+        z, y, x = torch.meshgrid(line, line, line, indexing="ij")
+        dense = field.sdf(torch.stack([x, y, z], -1).view(-1, 3)).view(41, 41, 41, 1)
+    asked = []
+    plain = field.sdf
+    field.sdf = lambda points: asked.append(len(points)) or plain(points)  # type: ignore[method-assign]
+    cache = sdf_cache(field, 41)
+    near = dense.abs() < 0.05
+    torch.testing.assert_close(cache[near], dense[near], rtol=0, atol=1e-6)
+    assert ((cache < 0) == (dense < 0)).all()
+    assert sum(asked) < 0.6 * 41**3 and not torch.equal(cache, dense)
+
+
+@pytest.mark.parametrize("radius", [0.05, 0.3])
+def test_a_filled_hollow_is_emptied_by_its_lines_of_sight(radius):
+    """A field that is a ball everywhere learns from lines of sight alone that a part of it is empty."""
+    field = GridField(FieldSize((8, 16, 32), (2, 2, 2), 16, 8), seed=0, start_radius=0.5)
+    y, z = (a.ravel() for a in np.meshgrid(np.linspace(-radius, radius, 6), np.linspace(-radius, radius, 6)))
+    sight = np.stack([np.full(36, -0.9), y, z, np.full(36, 0.0), y, z], 1)
+    free = FreeSpace(sight, "cpu")
+    optimizer = torch.optim.Adam(field.parameters(), lr=0.01)
+    rng = torch.Generator().manual_seed(0)
+    inside = torch.tensor(sight[:, :3] * [0.2, 1, 1], dtype=torch.float32)  # On the lines, within the ball.
+    assert (field.sdf(inside) < 0).all()
+    for step in range(150):
+        if step % 25 == 0:
+            free.look(sdf_cache(field, 33), rng)
+        points, clearance = free.pick(128, rng)
+        loss = torch.relu(clearance - field.sdf(points)).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert (field.sdf(inside) > 0).all()

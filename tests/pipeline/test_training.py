@@ -1,0 +1,197 @@
+"""Training as a whole: held-out photos, budgets and resuming, and training that goes wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from pipeline.cameras import Sparse, View
+from pipeline.field import training
+from pipeline.field.held_out import FOLDER, HeldOut, score
+from pipeline.field.rendering import sdf_cache
+from pipeline.field.training import FEWEST_STEPS, PRESETS, Trainer, paced, train
+from pipeline.inputs.photos import save_photos
+from sdfsim.errors import SdfsimError
+from tests.pipeline.test_field import SMALL, posed_noise
+from tests.pipeline.test_poses import photo
+
+RED, SIDE = (200, 30, 30), 40
+
+
+def views(count: int) -> list[View]:
+    """Cameras on a ring of radius 3 that look at the origin."""
+    found = []
+    for k in range(count):
+        a = 2 * np.pi * k / count
+        turn = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+        found.append(
+            View(f"{k}.jpg", f"IMG_{k}.JPG", SIDE, SIDE, 50.0, SIDE / 2, SIDE / 2, 0.0, turn, np.array([0, 0, 3.0]))
+        )
+    return found
+
+
+def away(view: View) -> View:
+    """A camera in the same place that looks the other way."""
+    back = np.diag([-1.0, 1, -1])
+    return replace(view, rotation=back @ view.rotation, translation=back @ view.translation)
+
+
+def photos(folder: Path, count: int, *, masks: bool = False) -> None:
+    (folder / "images").mkdir()
+    save_photos([replace(photo(k, SIDE, SIDE), name=f"{k}.jpg", mask=masks) for k in range(count)], folder)
+    for k in range(count):
+        Image.new("RGB", (SIDE, SIDE), RED).save(folder / "images" / f"{k}.jpg", quality=98)
+        if masks:
+            (folder / "masks").mkdir(exist_ok=True)
+            row, column = np.mgrid[0:SIDE, 0:SIDE] + 0.5 - SIDE / 2
+            # A ball of radius 0.5 at distance 3 is a disc of radius 50 * 0.5 / sqrt(9 - 0.25).
+            disc = np.hypot(row, column) < 50 * 0.5 / np.sqrt(8.75)
+            Image.fromarray((255 * disc).astype(np.uint8)).save(folder / "masks" / f"{k}.jpg.png")
+
+
+def cloud() -> Sparse:
+    points = np.random.default_rng(0).normal(size=(60, 3)) * 0.4
+    point_of, view_of = np.repeat(np.arange(60), 4), np.tile(np.arange(4), 60)
+    return Sparse(points, np.zeros((60, 3), np.uint8), np.full(60, 0.5), point_of, view_of)
+
+
+def test_training_leaves_renders_and_scores(tmp_path):
+    photos(tmp_path, 16)
+    settings = replace(PRESETS["quick"], size=SMALL, rays=32, samples=12, iterations=40, surface_points=16)
+    report = train(views(16), cloud(), tmp_path, tmp_path, settings=settings, threads=1).report
+    assert report["held_out_photos"] == ["IMG_4.JPG", "IMG_12.JPG"]
+    assert len(report["psnr_each"]) == 2 and report["psnr"] == pytest.approx(np.mean(report["psnr_each"]), abs=0.01)
+    for name in ("4.jpg", "12.jpg"):
+        assert Image.open(tmp_path / "held_out" / name).size == (SIDE, SIDE)
+
+
+class Ball:
+    """A trainer whose field is a red ball of radius 0.5, opaque within a thousandth."""
+
+    settings = SimpleNamespace(long_side=120, samples=48)
+    device, beta = "cpu", 0.001
+
+    def __init__(self) -> None:
+        self.field = SimpleNamespace(
+            background=torch.zeros(1), sdf=lambda p: p.norm(dim=1) - 0.5,
+            geometry_at=lambda p: (p.norm(dim=1) - 0.5, p, p),
+            color_of=lambda geometry, features, directions: torch.tensor(RED).expand(len(geometry), 3) / 255,
+        )  # fmt: skip
+        self.cache = sdf_cache(self.field, 129)  # type: ignore[arg-type]
+
+
+def test_a_field_that_is_right_scores_as_such(tmp_path):
+    """Its silhouettes overlap with the masks, and pixels of the ball are those of the photo."""
+    photos(tmp_path, 2, masks=True)
+    held = HeldOut(views(2), tmp_path, Ball(), masked=True)  # type: ignore[arg-type]
+    seen = held.compare(0)
+    assert seen.overlap is not None and seen.overlap > 0.9
+    assert np.abs(seen.picture[SIDE // 2, SIDE // 2].astype(int) - RED).max() <= 2
+    # Outside the ball the photo is red and the render is the backdrop: the error of that share of pixels.
+    inside = np.hypot(*(np.mgrid[0:SIDE, 0:SIDE] + 0.5 - SIDE / 2)) < 50 / np.sqrt(8)  # of the unit sphere
+    ball = np.hypot(*(np.mgrid[0:SIDE, 0:SIDE] + 0.5 - SIDE / 2)) < 50 * 0.5 / np.sqrt(8.75)
+    wrong = ((np.array(RED) / 255 - 0.5) ** 2).mean() * (inside & ~ball).sum() / inside.sum()
+    assert seen.psnr == pytest.approx(-10 * np.log10(wrong), abs=0.5)
+
+
+def test_held_out_photos_that_show_nothing_of_the_sphere_are_passed_over(tmp_path):
+    photos(tmp_path, 16)
+    settings = replace(PRESETS["quick"], size=SMALL, rays=32, samples=12, iterations=40, surface_points=16)
+    ring = views(16)
+    ring[4] = away(ring[4])
+    report = train(ring, cloud(), tmp_path, tmp_path, settings=settings, threads=1).report
+    assert report["held_out_photos"] == ["IMG_12.JPG"] and len(report["psnr_each"]) == 1
+    assert np.isfinite(report["psnr"]) and [p.name for p in (tmp_path / FOLDER).iterdir()] == ["12.jpg"]
+    none = HeldOut([away(view) for view in views(2)], tmp_path, Ball(), masked=False)  # type: ignore[arg-type]
+    assert none.shown == [] and score(none, tmp_path) == {}
+
+
+def test_masks_count_only_where_every_photo_has_one_posed_or_not(tmp_path):
+    photos(tmp_path, 4, masks=True)
+    settings = replace(PRESETS["quick"], size=SMALL, rays=16, samples=12, iterations=2, surface_points=16)
+    assert train(views(4), cloud(), tmp_path, tmp_path, settings=settings, threads=1).report["masked"]
+    known = [replace(photo(k, SIDE, SIDE), name=f"{k}.jpg", mask=k < 4) for k in range(5)]
+    save_photos(known, tmp_path)
+    assert not train(views(4), cloud(), tmp_path, tmp_path, settings=settings, threads=1).report["masked"]
+
+
+def trainer(iteration: int, iterations: int) -> SimpleNamespace:
+    return SimpleNamespace(iteration=iteration, iterations=iterations)
+
+
+@pytest.mark.parametrize(
+    ("iteration", "iterations", "elapsed", "expected"),
+    [
+        (500, 1000, 50.0, 1000),  # as planned
+        (500, 1000, 80.0, 900),  # slower: 625 would fit, but schedules must not jump
+        (500, 1000, 30.0, 1100),  # faster
+        (500, 1000, 101.0, 500),  # over: ends at once
+        (3900, 3990, 10.0, PRESETS["quick"].iterations),  # never more than the settings's
+    ],
+)
+def test_steps_follow_the_clock(iteration, iterations, elapsed, expected):
+    found = paced(trainer(iteration, iterations), PRESETS["quick"], 100.0, elapsed, iteration)  # type: ignore[arg-type]
+    assert found == expected
+
+
+def test_a_budget_that_is_far_too_small_still_ends_with_a_field(tmp_path):
+    photos(tmp_path, 4)
+    settings = replace(PRESETS["quick"], size=SMALL, rays=16, samples=12, surface_points=16)
+    report = train(views(4), cloud(), tmp_path, tmp_path, settings=settings, threads=1, budget=1e-3).report
+    assert report["iterations"] <= FEWEST_STEPS and (tmp_path / "field.safetensors").exists()
+
+
+SETTINGS = replace(PRESETS["quick"], size=SMALL, rays=16, iterations=1000, surface_points=8)
+
+
+@pytest.fixture
+def clock(monkeypatch) -> SimpleNamespace:
+    """Every step of training takes one second, and learns nothing."""
+    clock = SimpleNamespace(now=0.0)
+
+    def timed(trainer: Trainer) -> dict[str, float]:
+        clock.now += 1.0
+        trainer.iteration += 1
+        return {"color": 0.1}
+
+    monkeypatch.setattr(training, "time", SimpleNamespace(monotonic=lambda: clock.now))
+    monkeypatch.setattr(Trainer, "step", timed)
+    monkeypatch.setattr(training, "calibrate", lambda probe, threads: 1.0)
+    monkeypatch.setattr("pipeline.field.training.CACHE", 9)
+    return clock
+
+
+def test_a_run_that_goes_on_has_what_is_left_of_its_budget(tmp_path, clock):
+    views, sparse = posed_noise(tmp_path)
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    whole.mkdir()
+    killed.mkdir()
+    report = train(views, sparse, tmp_path, whole, settings=SETTINGS, budget=150.0).report
+    assert report["train_seconds"] == 150.0 and report["iterations"] == 150
+    ended = clock.now
+
+    def kill(fraction: float, message: str) -> None:
+        if clock.now - ended >= 100:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(views, sparse, tmp_path, killed, settings=SETTINGS, budget=150.0, checkpoint_every=0.0, on_progress=kill)
+    report = train(views, sparse, tmp_path, killed, settings=SETTINGS, budget=150.0).report
+    assert report["resumed"] and report["seconds_before"] == 100.0
+    assert report["train_seconds"] == pytest.approx(150.0, abs=training.PACE)
+    assert report["train_seconds"] <= 150.0 and report["iterations"] == report["train_seconds"]
+
+
+def test_a_loss_that_is_not_finite_points_to_what_is_there_by_then(tmp_path, monkeypatch):
+    views, sparse = posed_noise(tmp_path)
+    monkeypatch.setattr(Trainer, "step", lambda trainer: {"color": float("nan")})
+    monkeypatch.setattr(training, "calibrate", lambda probe, threads: 1.0)
+    with pytest.raises(SdfsimError, match="no longer finite") as caught:
+        train(views, sparse, tmp_path, tmp_path, settings=SETTINGS)
+    assert "sdfsim poses" in caught.value.hint

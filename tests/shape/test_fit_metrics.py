@@ -1,0 +1,195 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+
+from sdfsim.shape import primitives
+from sdfsim.shape.distance import MeshDistance, PiecesDistance
+from sdfsim.shape.fit_metrics import EXACT, USABLE, certify, coverage, thin_share, verdict
+from sdfsim.shape.mesh import Mesh, sample_surface
+from sdfsim.shape.sdf import BoxSdf, Sdf, SphereSdf
+from sdfsim.shape.surface_nodes import sample_nodes, thin
+
+CUBE = BoxSdf((0.5, 0.5, 0.5))
+
+
+class Changed:
+    """An SDF whose distance [P] and gradient [P, 3] go through `change(points, distance, gradient)`."""
+
+    def __init__(self, sdf: Sdf, change: Callable) -> None:
+        self.sdf, self.change, self.bounds = sdf, change, sdf.bounds
+
+    def __call__(self, points):
+        return self.change(points, *self.sdf(points))
+
+
+class Exact:
+    """A mesh's own distance as an Sdf."""
+
+    def __init__(self, oracle: MeshDistance) -> None:
+        self.oracle, self.bounds = oracle, oracle.bounds
+
+    def __call__(self, points):
+        truth = self.oracle(points)
+        far = np.where(np.abs(truth.distance) < 1e-9, 1.0, truth.distance)
+        return truth.distance, (points - truth.closest) / far[:, None]
+
+
+def scaled_up(sdf: Sdf, factor: float) -> Changed:
+    return Changed(sdf, lambda points, distance, gradient: (factor * distance, factor * gradient))
+
+
+def shifted(sdf: Sdf, by: float) -> Changed:
+    return Changed(sdf, lambda points, distance, gradient: (distance + by, gradient))
+
+
+@pytest.fixture(scope="module")
+def cube() -> MeshDistance:
+    return MeshDistance(primitives.box())
+
+
+def test_the_certificate_of_the_truth_is_clean_and_json(cube: MeshDistance) -> None:
+    got = certify(CUBE, cube, points=2000)
+    assert got["passed"]
+    assert got["reason"] == ""
+    assert max(got[key] for key, _ in EXACT) < 1e-5
+    assert got["gradient_norm"] == pytest.approx([1.0, 1.0], abs=1e-6)
+    assert got["far_field_ratio"] == pytest.approx(1.0, abs=1e-5)
+    assert "coverage" not in got
+    assert json.loads(json.dumps(got, allow_nan=False)) == got
+    assert certify(CUBE, PiecesDistance([primitives.box()]), points=500)["passed"]
+
+
+def test_the_certificate_of_a_lie_is_not(cube: MeshDistance) -> None:
+    got = certify(SphereSdf(0.5), cube, points=2000)
+    assert not got["passed"]
+    assert "allowed" in got["reason"]
+    assert got["sign_errors"] > 0.1
+    assert not verdict({key: float("nan") for key, _ in EXACT})["passed"]
+
+
+def test_what_is_usable_but_not_exact_passes_with_a_caveat(cube: MeshDistance) -> None:
+    assert all(dict(EXACT)[key] < limit for key, limit in USABLE)
+    got = certify(shifted(CUBE, 0.0012), cube, points=500)
+    assert got["passed"] and got["reason"] == ""
+    assert got["caveat"] == "error_within_0.01 is 0.0012, exact fits have 0.001: fine detail, or too short a fit"
+    assert verdict(dict(EXACT)) == {"passed": True, "reason": "", "caveat": ""}
+    at_limit = verdict(dict(EXACT) | dict(USABLE))
+    assert at_limit["passed"] and at_limit["caveat"]
+
+
+@pytest.mark.parametrize("scale", [0.02, 1.0, 40.0])
+def test_an_added_error_is_measured_as_it_is(scale: float) -> None:
+    mesh = primitives.box((scale, 0.8 * scale, 0.6 * scale))
+    got = certify(shifted(BoxSdf((0.5 * scale, 0.4 * scale, 0.3 * scale)), -0.003 * scale), MeshDistance(mesh))
+    for key in ("error_within_0.01", "error_within_0.1", "error_in_box", "projected_from_0.01", "projected_from_0.1"):
+        assert got[key] == pytest.approx(0.003, abs=2e-5)
+    # Outside it says too little, so the worst is just inside the 0.1 in depth.
+    assert got["far_field_ratio"] == pytest.approx(1.03, abs=2e-3)
+    # Of the points farther than 0.002 those within 0.003 are inside out.
+    assert 0.01 < got["sign_errors"] < 0.2
+
+
+def test_a_ball_that_is_too_small_is_off_by_as_much_all_around() -> None:
+    oracle = MeshDistance(primitives.sphere(0.5, 5))
+    got = certify(shifted(SphereSdf(0.5), 0.003), oracle, points=4000)
+    assert got["error_in_box"] == pytest.approx(0.003, abs=1e-4)
+    assert got["projected_from_0.1"] == pytest.approx(0.003, abs=1e-4)
+
+
+def test_slopes_and_the_far_field_are_told(cube: MeshDistance) -> None:
+    got = certify(scaled_up(CUBE, 1.2), cube, points=2000)
+    assert got["gradient_norm"] == pytest.approx([1.2, 1.2], abs=1e-6)
+    assert got["far_field_ratio"] == pytest.approx(1.2, abs=1e-5)
+    assert got["gradient_within_0.1"] < 1e-6
+    assert got["projected_from_0.1"] < 1e-5
+
+    def tilt(points, distance, gradient):
+        # 60 degrees about a direction at right angles.
+        side = np.cross(gradient, np.roll(gradient, 1, axis=1) + np.array([0.1, 0.2, 0.3]))
+        return distance, 0.5 * gradient + 0.75**0.5 * side / np.linalg.norm(side, axis=1, keepdims=True)
+
+    tilted = certify(Changed(CUBE, tilt), cube, points=1000)
+    assert tilted["gradient_within_0.1"] == pytest.approx(0.5, abs=1e-4)
+
+
+def test_a_flipped_region_is_a_sign_error_of_its_size(cube: MeshDistance) -> None:
+    def flip(points, distance, gradient):
+        side = np.where(points[:, 0] > 0.2, -1.0, 1.0)
+        return side * distance, side[:, None] * gradient
+
+    got = certify(Changed(CUBE, flip), cube)
+    # Surface samples: the face at x = 0.5 and 0.3 of four others; box samples: 0.5 of 1.4.
+    assert got["sign_errors"] == pytest.approx(0.36, abs=0.02)
+    assert not got["passed"]
+
+
+def test_a_miss_says_what_can_be_measured_about_its_cause(cube: MeshDistance) -> None:
+    assert thin_share(cube) == 0.0
+    plate = MeshDistance(primitives.box((1.0, 1.0, 0.015)))
+    assert thin_share(plate) == pytest.approx(2.0 / 2.06, abs=0.02)
+    assert thin_share(plate, 0.01) < 0.02
+    inside_out = MeshDistance(Mesh(plate.surface.vertices, plate.surface.faces[:, ::-1]))
+    assert thin_share(inside_out) == pytest.approx(thin_share(plate), abs=0.02)
+    bad = shifted(CUBE, 0.01)
+    reason = certify(bad, plate, points=500)["reason"]
+    assert "thin walls (9" in reason
+    assert "% of the surface is thinner than 0.02)" in reason
+    assert certify(bad, cube, points=500)["reason"].endswith("fine detail, or too short a fit")
+    holed = MeshDistance(Mesh(cube.surface.vertices, cube.surface.faces[1:]))
+    got = certify(bad, holed, points=500)
+    assert "open mesh" in got["reason"]
+    assert json.dumps(got, allow_nan=False)
+
+
+def test_the_coverage_of_known_nodes_on_a_cube(cube: MeshDistance) -> None:
+    corners = cube.surface.vertices
+    got = coverage(corners, cube)
+    assert got["count"] == 8
+    assert got["per_area"] == pytest.approx(8 / 6)
+    # The middle of a face is farthest from its corners.
+    assert got["largest_hole"] == pytest.approx(0.5**0.5, abs=0.01)
+    # Mean distance from a uniform point of a square with half sides to its corner: 0.5 (sqrt 2 + asinh 1) / 3.
+    assert got["mean_gap"] == pytest.approx(0.5 * (2**0.5 + np.arcsinh(1.0)) / 3, abs=0.005)
+    # Eight corners with three quarter discs of radius 0.1 each.
+    assert got["uncovered"] == pytest.approx(1 - np.pi * 0.1**2 * 6 / 6, abs=0.005)
+    assert got["off_surface"] < 1e-6
+    assert coverage(corners, cube.surface) == got
+    large = coverage(30.0 * corners, primitives.box((30.0, 30.0, 30.0)))
+    assert large == pytest.approx(got, rel=1e-3, abs=1e-6)
+    assert coverage(np.concatenate([corners, np.zeros((1, 3))]), cube)["off_surface"] == pytest.approx(0.5)
+    none = coverage(np.zeros((0, 3)), cube)
+    assert (none["count"], none["largest_hole"], none["uncovered"]) == (0, None, 1.0)
+    assert certify(CUBE, cube, nodes=corners, points=200)["coverage"] == got
+
+
+def test_what_is_hidden_inside_needs_no_nodes() -> None:
+    # Two halves of a cube that share a face: nodes on the outside cover it all.
+    half = primitives.box((0.5, 1.0, 1.0))
+    pieces = [Mesh(half.vertices + np.array([side, 0, 0]), half.faces) for side in (-0.25, 0.25)]
+    nodes = sample_nodes(CUBE)
+    assert coverage(nodes, PiecesDistance(pieces))["largest_hole"] < 0.06
+
+
+@pytest.mark.parametrize("kind", ["bowl", "shoe"])
+def test_hollows_are_covered_as_well_as_the_outside(kind: str) -> None:
+    oracle = MeshDistance(primitives.PRIMITIVES[kind]())
+    nodes = thin(sample_nodes(Exact(oracle)), 256)
+    got = coverage(nodes, oracle)
+    assert got["largest_hole"] < 0.1
+    assert got["off_surface"] < 0.006
+    # Nodes of the other side of the wall must not stand in: only what is in the hollow, for what is in the hollow.
+    points, normal = sample_surface(oracle.surface, 20_000, np.random.default_rng(0))
+    if kind == "bowl":
+        in_hollow, own = np.linalg.norm(points, axis=1) < 0.45, np.linalg.norm(nodes, axis=1) < 0.45
+    else:
+        # The floor of the cavity is flat, at this height; the body's own side is farther out there.
+        in_hollow = (normal[:, 2] > 0.99) & (np.abs(points[:, 2] + 0.0646) < 0.002) & (points[:, 0] < 0.25)
+        own = (np.abs(nodes[:, 2] + 0.0646) < 0.006) & (np.abs(nodes[:, 1]) < 0.14) & (nodes[:, 0] < 0.3)
+    assert in_hollow.sum() > 100
+    assert own.sum() > 8
+    assert KDTree(nodes[own]).query(points[in_hollow])[0].max() < 0.13

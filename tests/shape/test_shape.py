@@ -1,0 +1,220 @@
+"""Shape folders: what is saved comes back, what is spoiled is told."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from sdfsim.errors import SdfsimError
+from sdfsim.shape import primitives
+from sdfsim.shape import shape as shape_module
+from sdfsim.shape.mesh import Frame, Mesh
+from sdfsim.shape.mlp_sdf import MlpSdf
+from sdfsim.shape.sdf import BoxSdf, PlaneSdf, SphereSdf
+from sdfsim.shape.shape import (
+    Shape,
+    analytic_shape,
+    load_shape,
+    scaled,
+)
+
+
+def fitted() -> Shape:
+    torch.manual_seed(0)
+    weights = (torch.randn(8, 3), torch.randn(8, 8), torch.randn(1, 8))
+    sdf = MlpSdf(
+        weights,
+        (torch.randn(8), torch.randn(8), torch.randn(1)),
+        "wave",
+        Frame(np.array([1.0, 2.0, 3.0]), 0.3),
+        np.array([[0.9, 1.9, 2.85], [1.1, 2.1, 3.15]]),
+    )
+    mesh = primitives.torus(segments=8, sides=5)
+    colors = np.arange(len(mesh.vertices) * 3, dtype=np.uint8).reshape(-1, 3)
+    return Shape(
+        name="ring",
+        mesh=Mesh(mesh.vertices, mesh.faces, colors),
+        sdf=sdf,
+        nodes=np.random.default_rng(0).random((20, 3)),
+        volume=0.125,
+        com=np.array([0.1, 0.2, 0.3]),
+        inertia=np.diag([1.0, 2.0, 3.0]) / 3,
+        certificate={"passed": False, "reason": "thin walls", "error_in_box": 0.01},
+        source={"file": "ring.obj"},
+        pieces=tuple(np.random.default_rng(k).random((4 + k, 3)) for k in range(3)),
+    )
+
+
+def test_a_saved_shape_comes_back_bit_for_bit(tmp_path: Path) -> None:
+    shape = fitted()
+    shape.save(tmp_path / "deep" / "ring")
+    back = load_shape(tmp_path / "deep" / "ring")
+    assert sorted(p.name for p in (tmp_path / "deep" / "ring").iterdir()) == [
+        "mesh.ply",
+        "shape.json",
+        "shape.safetensors",
+    ]
+    assert (back.name, back.volume, back.certificate, back.source) == (
+        shape.name,
+        shape.volume,
+        shape.certificate,
+        shape.source,
+    )
+    for key in ("nodes", "com", "inertia"):
+        np.testing.assert_array_equal(getattr(back, key), getattr(shape, key))
+    for key in ("vertices", "faces", "colors"):
+        np.testing.assert_array_equal(getattr(back.mesh, key), getattr(shape.mesh, key))
+    for piece, expected in zip(back.pieces, shape.pieces, strict=True):
+        np.testing.assert_array_equal(piece, expected)
+    np.testing.assert_array_equal(back.sdf.bounds, shape.sdf.bounds)
+    points = torch.rand(50, 3, dtype=torch.float64) + torch.tensor([0.5, 1.5, 2.5])
+    for one, other in zip(back.sdf(points), shape.sdf(points), strict=True):
+        assert torch.equal(one, other)
+    record = json.loads((tmp_path / "deep" / "ring" / "shape.json").read_text())
+    assert record["units"] == "m"
+    assert record["scale"] == 0.3
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        analytic_shape("plane"),
+        analytic_shape("sphere", radius=0.2),
+        analytic_shape("box", size=(1, 2, 3), name="crate"),
+    ],
+)
+def test_analytic_shapes_have_folders_too(tmp_path: Path, shape: Shape) -> None:
+    back = load_shape(shape.save(tmp_path / shape.name))
+    assert type(back.sdf) is type(shape.sdf)
+    points = np.random.default_rng(0).normal(size=(30, 3))
+    np.testing.assert_array_equal(back.sdf(points)[0], shape.sdf(points)[0])
+    np.testing.assert_array_equal(back.nodes, shape.nodes)
+    np.testing.assert_array_equal(back.sdf.bounds, shape.sdf.bounds)
+
+
+def test_saving_again_replaces_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    fitted().save(tmp_path)
+    replace(fitted(), name="other").save(tmp_path)
+    assert load_shape(tmp_path).name == "other"
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def edit(folder: Path, **changes: object) -> None:
+    record = json.loads((folder / "shape.json").read_text())
+    (folder / "shape.json").write_text(json.dumps({**record, **changes}))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda f: (f / "shape.json").unlink(), "shape.json is missing"),
+        (lambda f: (f / "shape.safetensors").unlink(), "shape.safetensors is missing"),
+        (lambda f: (f / "mesh.ply").write_bytes((f / "mesh.ply").read_bytes()[:300]), "mesh.ply: damaged"),
+        (
+            lambda f: (f / "shape.safetensors").write_bytes((f / "shape.safetensors").read_bytes()[:-50]),
+            "shape.safetensors: damaged or cut short",
+        ),
+        (lambda f: (f / "shape.json").write_text("{"), "shape.json: cannot be read"),
+        (lambda f: edit(f, version=99), "version 99"),
+        (lambda f: edit(f, sdf={"kind": "magic"}), "unknown SDF kind"),
+        (lambda f: edit(f, sdf={"kind": "mlp"}), "is missing"),
+        (lambda f: edit(f, com=[1, 2]), "not a valid shape folder"),
+        (lambda f: edit(f, volume="large"), "not a valid shape folder"),
+    ],
+)
+def test_a_spoiled_folder_is_one_clear_line(tmp_path: Path, spoil, message: str) -> None:
+    fitted().save(tmp_path / "ring")
+    spoil(tmp_path / "ring")
+    with pytest.raises(SdfsimError) as error:
+        load_shape(tmp_path / "ring")
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+    assert str(tmp_path / "ring") in str(error.value)
+
+
+def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
+    shape = fitted()
+    assert isinstance(shape.sdf, MlpSdf)
+    shape.sdf.weights[1][0, 0] = float("nan")
+    shape.save(tmp_path)
+    with pytest.raises(SdfsimError, match="not finite"):
+        load_shape(tmp_path)
+
+
+def test_no_folder_and_no_place_to_write(tmp_path: Path) -> None:
+    with pytest.raises(SdfsimError, match="no such shape folder"):
+        load_shape(tmp_path / "none")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SdfsimError, match="cannot write"):
+        fitted().save(tmp_path / "file" / "ring")
+
+
+def test_a_failed_write_leaves_no_complete_looking_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fitted().save(tmp_path)
+
+    def full(path: Path, content: bytes) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(shape_module, "write", full)
+    with pytest.raises(SdfsimError, match="No space left"):
+        fitted().save(tmp_path)
+    with pytest.raises(SdfsimError, match=r"shape\.json is missing"):
+        load_shape(tmp_path)
+
+
+def test_analytic_mass_properties_and_nodes() -> None:
+    ball = analytic_shape("sphere", radius=0.4)
+    assert ball.volume == pytest.approx(4 / 3 * np.pi * 0.064)
+    np.testing.assert_allclose(ball.inertia, 0.4 * ball.volume * 0.16 * np.eye(3))
+    assert ball.nodes.shape == (128, 3)
+    np.testing.assert_allclose(np.linalg.norm(ball.nodes, axis=1), 0.4)
+    np.testing.assert_allclose(ball.nodes.mean(0), 0, atol=2e-3)
+    crate = analytic_shape("box", size=(0.2, 0.4, 1.0))
+    assert crate.volume == pytest.approx(0.08)
+    np.testing.assert_allclose(crate.inertia, 0.08 / 12 * np.diag([1.16, 1.04, 0.2]))
+    assert len(crate.nodes) == 98
+    assert isinstance(crate.sdf, BoxSdf)
+    np.testing.assert_allclose(crate.sdf(crate.nodes)[0], 0, atol=1e-15)
+    np.testing.assert_allclose(np.abs(crate.nodes[:8]), np.tile([0.1, 0.2, 0.5], (8, 1)))
+    floor = analytic_shape("plane", name="floor")
+    assert isinstance(floor.sdf, PlaneSdf)
+    assert floor.nodes.shape == (0, 3)
+    assert floor.name == "floor"
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "message"),
+    [
+        ("sphere", {}, "radius"),
+        ("sphere", {"radius": -1.0}, "> 0"),
+        ("box", {}, "size"),
+        ("box", {"size": (1.0, 0.0, 1.0)}, "> 0"),
+        ("blob", {}, "unknown"),
+    ],
+)
+def test_bad_analytic_shapes_are_refused(kind, options: dict, message: str) -> None:
+    with pytest.raises(SdfsimError, match=message):
+        analytic_shape(kind, **options)
+
+
+def test_scaling_scales_everything() -> None:
+    small, large = analytic_shape("sphere", radius=0.1), scaled(analytic_shape("sphere", radius=0.1), 3.0)
+    assert isinstance(large.sdf, SphereSdf)
+    expected = analytic_shape("sphere", radius=0.3)
+    assert large.volume == pytest.approx(expected.volume)
+    np.testing.assert_allclose(large.inertia, expected.inertia)
+    np.testing.assert_allclose(large.nodes, expected.nodes)
+    assert scaled(small, 1.0) is small
+    shape = fitted()
+    twice = scaled(shape, 2.0)
+    points = np.random.default_rng(0).normal(size=(20, 3)) * 0.1 + [1, 2, 3]
+    np.testing.assert_allclose(twice.sdf(2 * points)[0], 2 * shape.sdf(points)[0], rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(twice.sdf.bounds, 2 * shape.sdf.bounds)
+    np.testing.assert_array_equal(twice.pieces[2], 2 * shape.pieces[2])
+    with pytest.raises(SdfsimError, match="> 0"):
+        scaled(shape, 0.0)
