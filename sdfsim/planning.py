@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
@@ -11,14 +12,12 @@ from typing import Any
 import numpy as np
 
 from sdfsim.console import duration
-from sdfsim.dynamics.memory import peak_bytes
 from sdfsim.dynamics.model import load_model
 from sdfsim.dynamics.ranges import constant_in_training
 from sdfsim.dynamics.simulator import Simulator, pick_device
 from sdfsim.scene.effects import Plan, plan
 from sdfsim.scene.scene import Effects, Scene
 from sdfsim.scene.scene_file import DEFAULT_DURATION, DEFAULT_GRAVITY, load_scene
-from sdfsim.shape.mlp_sdf import MlpSdf
 
 TRIAL_STEPS = 5
 
@@ -73,24 +72,14 @@ def describe(
 
 
 def _costs(simulator: Simulator, decided: Plan, steps: int) -> dict[str, Any]:
-    """Pairs by what filters them; nodes, edges, memory and time of a step; time of the run at that pace."""
+    """Pairs by what filters them; contacts, nodes, edges and time of a step, memory; time of the run at that pace."""
     counters = simulator.run(steps=TRIAL_STEPS).counters
     near = int(counters["pairs"][1])
     step_ms = float(np.median(counters["step_ms"][1:]))
-    memory = peak_bytes(
-        bodies=len(simulator.bodies),
-        nodes=len(simulator.bodies.node),
-        edges=float(counters["edges"].max()),
-        points=float((counters["sdf_queries"] + counters["sdf_waiting"]).max()),
-        fitted=any(isinstance(sdf, MlpSdf) for sdf in simulator.bodies.bank.sdfs),
-        rows=simulator.rules.rows,
-    )
     return {
         "pairs": {**asdict(decided.pairs), "apart": decided.pairs.possible - near, "near": near},
-        "step": {
-            **{k: float(counters[k][1:].max()) for k in ("nodes", "edges", "sdf_queries")},
-            "memory_mib": memory / 2**20,
-        },
+        "step": {k: float(counters[k][1:].max()) for k in ("contacts", "nodes", "edges")},
+        "memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "step_ms": step_ms,
         "run_s": 1e-3 * step_ms * steps,
     }
@@ -124,8 +113,8 @@ def plan_lines(report: dict[str, Any]) -> list[str]:
         f"{pairs['excluded']} kept apart by collides_with, {pairs['apart']} too far apart in the first step; "
         f"{pairs['near']} left",
         f"model {report['model']} on {report['device']}: {report['steps']} steps of {report['dt_s']:.4g} s",
-        f"a step (over the first {TRIAL_STEPS}): {report['step_ms']:.1f} ms, {step['sdf_queries']:.0f} distances, "
-        f"{step['nodes']:.0f} nodes and {step['edges']:.0f} edges in the network, {step['memory_mib']:.0f} MiB",
+        f"a step (over the first {TRIAL_STEPS}): {report['step_ms']:.2g} ms, {step['contacts']:.0f} contacts, "
+        f"{step['nodes']:.0f} nodes and {step['edges']:.0f} edges in the network; {report['memory_mib']:.0f} MiB",
         f"the whole run at that pace: {duration(report['run_s'])}; more where bodies meet later on",
         f"Froude scaling: the model's metre is {units['length_m']:.4g} m, its second {units['time_s']:.4g} s, "
         f"its kilogram {units['mass_kg']:.4g} kg",

@@ -27,11 +27,9 @@ CONTACTS = "world/contacts"
 # What is plotted: the counters of a view by their legends.
 VIEWS = {
     "kinetic energy (J)": {"kinetic_energy": "kinetic energy (J)"},
-    "energy from nothing (J)": {"energy_gain": "energy from nothing (J)"},
     "worst penetration (m)": {"worst_penetration": "worst penetration (m)"},
     "contacts": {"contacts": "contacts", "pairs": "near pairs of bodies"},
-    "bodies": {"free": "free", "active": "active", "asleep": "asleep", "held_back": "held back"},
-    "signed distances": {"sdf_queries": "asked", "sdf_waiting": "waiting"},
+    "bodies": {"free": "free", "active": "active", "asleep": "asleep"},
     "network": {"nodes": "nodes", "edges": "edges"},
     "milliseconds": {"step_ms": "step", **PHASES},
 }

@@ -16,13 +16,12 @@ import torch
 import yaml
 
 from sdfsim.console import columns
-from sdfsim.dynamics.bodies import Sleep, State, Touch
-from sdfsim.dynamics.energy import Guard
+from sdfsim.dynamics.bodies import State, Touch
 from sdfsim.dynamics.memory import COUNTS, PHASES
 from sdfsim.dynamics.model import Model, load_model
+from sdfsim.dynamics.rest import Rest
 from sdfsim.dynamics.rollout import Rollout, energy_from_nothing
 from sdfsim.dynamics.simulator import SimulationError, Simulator, check_seconds, join, pick_device
-from sdfsim.dynamics.sleep import Rest
 from sdfsim.errors import SdfsimError
 from sdfsim.files import (
     CONFIG,
@@ -37,7 +36,6 @@ from sdfsim.files import (
 )
 from sdfsim.recording import Playback, save_rollout
 from sdfsim.scene.scene_file import load_scene
-from sdfsim.shape.sdf_batch import SdfBank
 
 Viewer = Literal["none", "file", "native", "web"]
 Progress = Callable[[str, float, str], None]  # stage, fraction of it that is done, message
@@ -65,7 +63,6 @@ def simulate(
     allow_outside: bool = False,
     until_settled: bool = False,
     resume: bool = False,
-    guard: Guard = "none",
 ) -> dict[str, Any]:
     """Simulate a scene and write config.yaml, report.json, rollout.npz and (unless `viewer` is none) rollout.rrd.
 
@@ -84,7 +81,6 @@ def simulate(
         until_settled: end as soon as everything has come to rest.
         resume: go on with the run in `out` that was interrupted; from the start where there is none. A finished one is
             left as it is, and its report is returned.
-        guard: "energy" holds back contact that makes energy.
 
     Returns:
         The content of report.json; of the shapes that were fitted for this scene, `failed_checks` names those that are
@@ -109,7 +105,7 @@ def simulate(
 
         check_screen(viewer)
     scene = load_scene(scene_file, partial(on_progress, "shapes"), allow_outside=allow_outside)
-    simulator = Simulator(scene, model=model, device=device, seed=seed, guard=guard)
+    simulator = Simulator(scene, model=model, device=device, seed=seed)
     length = scene.duration if seconds is None else seconds
     config = {
         "command": "simulate",
@@ -120,7 +116,6 @@ def simulate(
         "viewer": viewer,
         "allow_outside": allow_outside,
         "until_settled": until_settled,
-        "guard": guard,
         "device": str(simulator.device),
     }
     out.mkdir(parents=True, exist_ok=True)
@@ -239,18 +234,12 @@ def cost(rollout: Rollout) -> dict[str, dict[str, Any]]:
 
 
 def energy_lines(report: dict[str, Any]) -> list[str]:
-    """What contact has made from nothing, and who was held back."""
+    """What contact has made from nothing."""
     made = report["energy_from_nothing"]
-    lines = [
+    return [
         f"energy from nothing: {made['sum_J']:.3g} J; {100 * made['steps_above_1_percent']:.1f} % of the steps made "
         f"more than 1 % of what was in play, the worst {100 * made['worst']:.2g} %"
     ]
-    if made["steps_held_back"]:
-        lines.append(
-            f"held back: velocities in {made['steps_held_back']} steps, {made['bodies_held_back']} bodies in all "
-            f"(see docs/stability.md)"
-        )
-    return lines
 
 
 def cost_lines(report: dict[str, Any]) -> list[str]:
@@ -376,8 +365,6 @@ def _pieces(value: Any) -> Iterator[bytes]:
     """All that `value` is made of, to the last bit."""
     if isinstance(value, torch.Tensor):
         value = value.cpu().numpy()
-    elif isinstance(value, SdfBank):
-        value = value.sdfs
     if isinstance(value, np.ndarray):
         yield f"{value.dtype}{value.shape}".encode()
         yield np.ascontiguousarray(value).tobytes()
@@ -397,7 +384,7 @@ def _part(number: int) -> str:
 def _arrays(state: State, rest: Rest) -> dict[str, np.ndarray]:
     """Every array of a state, of who sleeps in it and of how long all has rested, by name."""
     found = {"time": np.array(state.time), "rest.quiet": np.array(rest.quiet)}
-    for prefix, of in (("", state), ("sleep.", state.sleep), ("touch.", state.touch), ("rest.", rest)):
+    for prefix, of in (("", state), ("touch.", state.touch), ("rest.", rest)):
         for field in fields(of) if of is not None else ():
             value = getattr(of, field.name)
             if isinstance(value, torch.Tensor):
@@ -410,10 +397,5 @@ def _state(arrays: dict[str, np.ndarray], device: torch.device) -> State:
         names = {f.name: prefix + f.name for f in fields(kind) if f.name != "time"}
         return {k: torch.as_tensor(arrays[name], device=device) for k, name in names.items() if name in arrays}
 
-    asleep, touch = tensors(Sleep, "sleep."), tensors(Touch, "touch.")
-    return State(
-        **tensors(State, ""),
-        sleep=Sleep(**asleep) if asleep else None,
-        touch=Touch(**touch) if touch else None,
-        time=float(arrays["time"]),
-    )
+    touch = tensors(Touch, "touch.")
+    return State(**tensors(State, ""), touch=Touch(**touch) if touch else None, time=float(arrays["time"]))

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sdfsim.dynamics.sleep import STEPS
 
 from sdfsim import SdfsimError, Simulator, console, load_scene, run
 from sdfsim.dynamics.rollout import Rollout
-from sdfsim.dynamics.sleep import STEPS
 from sdfsim.files import read_arrays, write_arrays
 from sdfsim.scene.scene import Scene, Waypoints
 from sdfsim.shape.sdf import sample_grid

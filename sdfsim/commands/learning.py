@@ -80,9 +80,6 @@ def evaluate(
     free_flight: Annotated[
         Literal["exact", "learned"], typer.Option(help="Bodies without contact (learned: paper networks only).")
     ] = "exact",
-    guard: Annotated[
-        Literal["none", "energy"], typer.Option(help="energy: hold back contact that makes energy.")
-    ] = "none",
     chaos_floor: Annotated[
         bool,
         typer.Option("--chaos-floor", help="Also the teacher again from starts slightly off (needs PyBullet)."),
@@ -102,7 +99,6 @@ def evaluate(
             steps=steps,
             device=device,
             free_flight=free_flight,
-            guard=guard,
             chaos_floor=chaos_floor,
             on_progress=session.progress,
         )

@@ -28,9 +28,6 @@ def simulate(
         bool, typer.Option("--until-settled", help="End as soon as everything rests (--seconds at the latest).")
     ] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the interrupted run in the folder.")] = False,
-    guard: Annotated[
-        Literal["none", "energy"], typer.Option(help="energy: hold back contact that makes energy.")
-    ] = "none",
     bind: Bind = "127.0.0.1",
     allow_outside: Outside = False,
     as_json: Json = False,
@@ -54,7 +51,6 @@ def simulate(
             allow_outside=allow_outside,
             until_settled=until_settled,
             resume=resume,
-            guard=guard,
             device=device,
             on_progress=session.stage_progress,
             say=session.say,

@@ -9,11 +9,8 @@ import torch
 
 from sdfsim.data.dataset import FLOOR, Trajectory
 from sdfsim.dynamics.bodies import Bodies, State, Units, from_scene
-from sdfsim.dynamics.contacts import find_contacts
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.shape import Shape, analytic_shape
-
-TOGETHER = 4000  # bodies whose contacts are found in one call
 
 
 def merged(
@@ -74,39 +71,3 @@ def scene_of(
     plane = analytic_shape("plane")
     scene = Scene(shapes=(*centred, plane), bodies=tuple(bodies), gravity=trajectories[0].gravity, duration=1.0)
     return scene, [*world, -1]
-
-
-def find_edges(trajectory: Trajectory, shapes: dict[str, Shape], reach: float) -> dict[str, np.ndarray]:
-    """Contact edges of every frame but the last, SI units, sorted by frame.
-
-    Returns:
-        frame, first, second (-1 = floor) [E]; arm, other, normal [E, 3]; gap [E].
-    """
-    steps = len(trajectory.position) - 1
-    # Every pair of bodies of all frames is looked at, at first.
-    together = max(1, TOGETHER // trajectory.position.shape[1])
-    parts = [
-        _edges(trajectory, list(range(start, min(start + together, steps))), shapes, reach)
-        for start in range(0, steps, together)
-    ]
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-
-
-def _edges(t: Trajectory, frames: list[int], shapes: dict[str, Shape], reach: float) -> dict[str, np.ndarray]:
-    bodies, state = merged([t] * len(frames), frames, shapes, Units(1.0, 1.0, 1.0), torch.device("cpu"))
-    gravity = torch.from_numpy(np.asarray(t.gravity, dtype=np.float64))
-    # The engine's solids have facets, and touch at their corners: nodes.
-    contacts = find_contacts(bodies, state, gravity, reach, t.dt, thin=True, rounded=False)
-    per_world = t.position.shape[1]
-    floor = len(bodies) - 1
-    order = torch.argsort(contacts.owner // per_world, stable=True)
-    owner, other = contacts.owner[order], contacts.body[order]
-    return {
-        "frame": frames[0] + (owner // per_world).numpy(),
-        "first": (owner % per_world).numpy(),
-        "second": torch.where(other == floor, -1, other % per_world).numpy(),
-        "arm": contacts.arm[order].numpy(),
-        "other": (contacts.foot - contacts.arm)[order].numpy(),
-        "normal": contacts.normal[order].numpy(),
-        "gap": contacts.distance[order].numpy(),
-    }

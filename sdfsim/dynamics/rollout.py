@@ -86,24 +86,22 @@ _PER_FRAME = ("time", "position", "orientation", "velocity", "angular_velocity",
 
 
 def energy_from_nothing(rollout: Rollout) -> dict[str, float]:
-    """What contact has added to the energy, which it can only take from (but for what bodies on paths do).
+    """By how much mechanical energy has grown, which only bodies on paths may make it do.
 
     Returns:
-        sum_J: over all steps.
+        sum_J: over all steps in which it grew.
         worst: of a step, as a part of the energy in play: the largest kinetic energy so far, and what would lift every
             dynamic body by its own size.
         steps_above_1_percent: the part of the steps in which it was more than 0.01 of that.
-        steps_held_back, bodies_held_back: in how many steps velocities were held back, and of how many bodies in all.
     """
-    gain, held = rollout.counters["energy_gain"][1:], rollout.counters["held_back"][1:]
-    in_play = np.maximum.accumulate(rollout.counters["kinetic_energy"])[1:] + rollout.meta["lift_energy"]
+    kinetic, potential = rollout.counters["kinetic_energy"], rollout.counters["potential_energy"]
+    gain = np.diff(kinetic + potential).clip(min=0.0)
+    in_play = np.maximum.accumulate(kinetic)[1:] + rollout.meta["lift_energy"]
     part = np.divide(gain, in_play, out=np.zeros_like(gain), where=in_play > 0)
     return {
         "sum_J": float(gain.sum()),
         "worst": float(part.max(initial=0.0)),
         "steps_above_1_percent": float((part > 0.01).mean()) if len(part) else 0.0,
-        "steps_held_back": int((held > 0).sum()),
-        "bodies_held_back": int(held.sum()),
     }
 
 

@@ -144,8 +144,20 @@ def acts_of(edges: record.Edges, steps: int) -> Acts:
     """What the compiled step noted, `steps` inner steps long."""
     count = int(edges.count[0])
     pair, value = torch.from_numpy(edges.pair[:count]), torch.from_numpy(edges.value[:count])
-    vectors = (value[:, k : k + 3] for k in (record.ARM, record.OTHER, record.AXIS, record.GIVEN))
-    return Acts(pair[:, 0], pair[:, 1], *vectors, value[:, record.APART], value[:, record.WHEN] / steps)
+
+    def vector(column: int) -> torch.Tensor:
+        return value[:, column : column + 3]
+
+    return Acts(
+        first=pair[:, 0],
+        second=pair[:, 1],
+        arm_first=vector(record.ARM),
+        arm_second=vector(record.OTHER),
+        normal=vector(record.AXIS),
+        impulse=vector(record.GIVEN),
+        gap=value[:, record.APART],
+        when=value[:, record.WHEN] / steps,
+    )
 
 
 def solver_step(

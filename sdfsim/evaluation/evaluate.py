@@ -15,7 +15,6 @@ from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import Trajectory, engine_substep, load_shapes, trajectory_files
 from sdfsim.data.metrics import FRAMES, HORIZONS
 from sdfsim.data.replay import batches, first_frames, model_units, roll_out
-from sdfsim.dynamics.energy import Guard
 from sdfsim.dynamics.model import Model, load_model
 from sdfsim.dynamics.ranges import outside_training
 from sdfsim.dynamics.simulator import pick_device
@@ -43,7 +42,6 @@ def evaluate(
     split: str = "test",
     device: str = "cpu",
     free_flight: FreeFlight = "exact",
-    guard: Guard = "none",
     chaos_floor: bool = False,
     errors_only: bool = False,
     on_progress: Progress | None = None,
@@ -57,7 +55,6 @@ def evaluate(
         split: which part of the dataset.
         device: "cpu", "cuda" or "auto".
         free_flight: "exact" or (paper network) "learned".
-        guard: "energy" holds back contact that makes energy.
         chaos_floor: also run the teacher again from starts that differ slightly (see `baselines.PERTURBATIONS`).
         errors_only: leave out penetration, energy and rest.
         on_progress: called with the fraction done and a message.
@@ -92,7 +89,7 @@ def evaluate(
         tell(0.8 * k / len(groups), f"{used.name}: batch {k + 1} of {len(groups)}, {longest} steps")
         started = time.perf_counter()
         contenders["model"] += roll_out(
-            used, group, known, longest, place, free_flight, guard=guard, substeps=inner, as_teacher=True
+            used, group, known, longest, place, free_flight, substeps=inner, as_teacher=True
         )
         seconds += time.perf_counter() - started
         contenders["ballistic"] += ballistic(used, group, known, longest)
@@ -106,7 +103,6 @@ def evaluate(
         "split": split,
         "model_name": used.name,
         "free_flight": free_flight,
-        "guard": guard,
         "trajectories": len(recorded),
         "bodies": int(sum(t.position.shape[1] for t in recorded)),
         "dt": recorded[0].dt,

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from sdfsim.data.dataset import Trajectory, check_alike, load_shapes, trajectory_files
-from sdfsim.data.velocities import MARGIN, at_instants, engine_substep
+from sdfsim.data.dataset import Trajectory, check_alike, engine_substep, load_shapes, trajectory_files
+from sdfsim.data.pybullet_sim import MARGIN
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.freeflight import torque_free
 from sdfsim.dynamics.graph import SUBSTEPS
@@ -135,7 +135,8 @@ class ContactFrames:
                 f"{path}: not contact frames of this version of sdfsim ({FRAMES_VERSION})",
                 "where the trajectories are, delete it and train once: it is made again; then copy it here",
             )
-        return cls(**arrays | {"dt": float(arrays["dt"])})
+        arrays["dt"] = float(arrays["dt"])
+        return cls(**arrays)
 
     def digest(self) -> str:
         """Changes with what is trained on."""
@@ -231,7 +232,7 @@ def _followed(files: list[Path], how: Solved) -> list[dict[str, np.ndarray]]:
     from sdfsim.dynamics.step import Rules
 
     substep = engine_substep(files[0].parent)
-    group = [at_instants(Trajectory.load(file), substep) for file in files]
+    group = [Trajectory.load(file) for file in files]
     shapes = load_shapes(files[0].parent, {str(n) for t in group for n in t.shape})
     bodies, start = merged(group, [0] * len(group), shapes, Units(1.0, 1.0, 1.0), torch.device("cpu"))
     inner = how.inner or how.stride * inner_steps(group[0].dt, substep)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from sdfsim.scene.scene import Scene
-from sdfsim.shape.shape import analytic_shape
 
 from sdfsim.dynamics.bodies import Units, from_scene
 from sdfsim.dynamics.contacts import find_contacts
 from sdfsim.errors import SdfsimError
+from sdfsim.scene.scene import Scene
+from sdfsim.shape.shape import analytic_shape
 from tests.dynamics.conftest import make_body
 
 CPU = torch.device("cpu")

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from sdfsim.scene.scene import Scene
-from sdfsim.shape.shape import analytic_shape
 
 from sdfsim.dynamics.graph import ContactGraph, EdgeFrames, edge_frames
 from sdfsim.dynamics.impulse import bounded, pushed
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.dynamics.solver import solver_step
 from sdfsim.dynamics.step import contact_graph
+from sdfsim.scene.scene import Scene
+from sdfsim.shape.shape import analytic_shape
 from tests.dynamics.conftest import angle_between, make_body, random_model
 
 

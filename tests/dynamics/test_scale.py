@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from sdfsim.dynamics.clusters import layers
+from sdfsim.dynamics.sleep import STEPS, STRAY, Rest
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from sdfsim.dynamics.bodies import Units, from_scene
-from sdfsim.dynamics.clusters import layers
 from sdfsim.dynamics.contacts import ARRAYS, find_contacts, thin_contacts
 from sdfsim.dynamics.memory import Memory
-from sdfsim.dynamics.sleep import STEPS, STRAY, Rest
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.shape import analytic_shape, load_shape
 from tests.dynamics.conftest import make_body

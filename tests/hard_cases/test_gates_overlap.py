@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from sdfsim.dynamics.overlap import parting
 
 from sdfsim.dynamics.contacts import find_contacts
 from sdfsim.dynamics.memory import Memory
-from sdfsim.dynamics.overlap import parting
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.shape import primitives
 from sdfsim.shape.shape import analytic_shape, with_sdf
