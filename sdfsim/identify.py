@@ -63,7 +63,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number with its interval of 95 %; None where the recording does not show it."""
+    """A number with its interval of 95 %; no interval, and a number that means nothing, where it is not shown."""
 
     value: float
     interval: tuple[float, float] | None
@@ -106,7 +106,11 @@ class Identified:
 
         def told(estimates: dict) -> dict[str, Any]:
             names = {k: " / ".join(k) if isinstance(k, tuple) else k for k in estimates}
-            return {names[k]: {"value": e.value, "interval": e.interval} for k, e in estimates.items()}
+            # What the motion does not show has no value either: the fit left it where it happened to begin.
+            return {
+                names[k]: {"value": e.value if e.interval else None, "interval": e.interval}
+                for k, e in estimates.items()
+            }
 
         kinds = ("friction", "restitution", "own_friction", "own_restitution", "mass")
         return {kind: told(getattr(self, kind)) for kind in kinds} | {"error_m": self.error_m, "windows": self.windows}

@@ -76,6 +76,15 @@ def test_what_a_motion_was_made_with_is_found_again(recorded, file, exact):
     assert found.mass["ball"].value == pytest.approx(3.0, rel=exact)
 
 
+def test_what_a_motion_does_not_show_is_not_made_up(recorded, tmp_path):
+    """Up to 1.5 s the ball has met the floor and the box, but never slid on the floor for long enough."""
+    Simulator(load_scene(recorded / "known.yaml"), "solver").run(1.5).save(tmp_path / "rollout.npz")
+    found = identify(*load_recording(tmp_path / "rollout.npz", recorded / "scene.yaml"))
+    assert found.own_friction["ball"].interval is None
+    assert found.report()["own_friction"]["ball"] == {"value": None, "interval": None}
+    assert found.own_friction["box"].value == pytest.approx(BOX["friction"], abs=0.01)
+
+
 def test_a_body_that_only_falls_tells_nothing(recorded, tmp_path):
     scene = load_scene(recorded / "known.yaml")
     up = np.array([0.0, 0.0, 50.0])

@@ -122,7 +122,7 @@ def view(
 
 def identify(
     recording: Annotated[
-        Path, typer.Argument(help="Run folder, rollout.npz or CSV of poses (docs/files.md).", show_default=False)
+        Path, typer.Argument(help="Run folder, rollout.npz or CSV of poses (docs/identify.md).", show_default=False)
     ],
     scene: Annotated[Path | None, typer.Option(help="scene.yaml (default: that of the run folder).")] = None,
     allow_outside: Outside = False,
