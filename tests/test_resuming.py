@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sdfsim.dynamics.sleep import STEPS
 
 from sdfsim import SdfsimError, Simulator, console, load_scene, run
+from sdfsim.dynamics.rest import STEPS
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.files import read_arrays, write_arrays
 from sdfsim.scene.scene import Scene, Waypoints

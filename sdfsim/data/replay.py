@@ -105,6 +105,13 @@ def first_frames(trajectory: Trajectory, count: int) -> Trajectory:
     return replace(trajectory, **{name: getattr(trajectory, name)[:count] for name in names})
 
 
+def every(trajectory: Trajectory, stride: int) -> Trajectory:
+    """Every so many-th frame, told as one of longer steps."""
+    names = ("position", "quat_xyzw", "velocity", "angular_velocity")
+    frames = {name: getattr(trajectory, name)[::stride] for name in names}
+    return replace(trajectory, dt=trajectory.dt * stride, **frames)
+
+
 def model_units(model: Model, like: Trajectory) -> Units:
     """Model units in which the recorded step is the model's own; for the solver those of its bodies of a metre."""
     strength = float(np.linalg.norm(like.gravity)) or model.gravity

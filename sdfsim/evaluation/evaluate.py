@@ -14,7 +14,7 @@ from sdfsim.data import metrics
 from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import Trajectory, engine_substep, load_shapes, trajectory_files
 from sdfsim.data.metrics import FRAMES, HORIZONS
-from sdfsim.data.replay import batches, first_frames, model_units, roll_out
+from sdfsim.data.replay import batches, every, first_frames, model_units, roll_out
 from sdfsim.dynamics.model import Model, load_model
 from sdfsim.dynamics.ranges import outside_training
 from sdfsim.dynamics.simulator import pick_device
@@ -42,6 +42,8 @@ def evaluate(
     split: str = "test",
     device: str = "cpu",
     free_flight: FreeFlight = "exact",
+    stride: int = 1,
+    substeps: int | None = None,
     chaos_floor: bool = False,
     errors_only: bool = False,
     on_progress: Progress | None = None,
@@ -55,6 +57,8 @@ def evaluate(
         split: which part of the dataset.
         device: "cpu", "cuda" or "auto".
         free_flight: "exact" or (paper network) "learned".
+        stride: recorded steps in a step of the model; errors are then those of every so many-th frame.
+        substeps: inner steps of the solve in a step; None for the model's, else for those of the recording engine.
         chaos_floor: also run the teacher again from starts that differ slightly (see `baselines.PERTURBATIONS`).
         errors_only: leave out penetration, energy and rest.
         on_progress: called with the fraction done and a message.
@@ -79,12 +83,16 @@ def evaluate(
         raise SdfsimError("free_flight 'learned' exists for the paper network only", "give a model of that kind")
     recorded, shapes = _load(data, split)
     longest = min(steps, *(len(t.position) - 1 for t in recorded))
-    recorded = [first_frames(t, longest + 1) for t in recorded]
+    longest -= longest % stride
+    as_recorded = [first_frames(t, longest + 1) for t in recorded]
+    recorded = [every(t, stride) for t in as_recorded]
+    longest //= stride
     substep = engine_substep(data)
     known = {name: replace(shape, nodes=shape.nodes[: used.nodes]) for name, shape in shapes.items()}
     contenders: dict[str, Motions] = {"model": [], "ballistic": []}
     groups = batches(recorded)
-    inner, seconds = inner_steps(recorded[0].dt, substep), 0.0
+    inner, seconds = substeps or stride * inner_steps(as_recorded[0].dt, substep), 0.0
+    used = replace(used, inner=substeps or used.inner)
     for k, group in enumerate(groups):
         tell(0.8 * k / len(groups), f"{used.name}: batch {k + 1} of {len(groups)}, {longest} steps")
         started = time.perf_counter()
@@ -96,7 +104,7 @@ def evaluate(
     again, floor_report = {}, {}
     if chaos_floor:
         tell(0.8, "teacher, from starts that differ slightly")
-        again, floor_report = _teacher_again(data, split, longest)
+        again, floor_report = _teacher_again(data, split, longest, stride)
     scenes = [scene_of([t], [0], shapes)[0] for t in recorded]
     report = {
         "data": str(data),
@@ -177,14 +185,16 @@ def _load(data: Path, split: str, *, as_recorded: bool = False) -> tuple[Motions
     return recorded, load_shapes(data, {str(n) for t in recorded for n in t.shape})
 
 
-def _teacher_again(data: Path, split: str, steps: int) -> tuple[dict[str, Motions], dict]:
+def _teacher_again(data: Path, split: str, steps: int, stride: int) -> tuple[dict[str, Motions], dict]:
     """The teacher's motions from perturbed starts by "teacher NAME", and what the report says of them."""
-    recorded = [first_frames(t, steps + 1) for t in _load(data, split, as_recorded=True)[0]]
+    recorded = [first_frames(t, stride * steps + 1) for t in _load(data, split, as_recorded=True)[0]]
     try:
-        again = chaos_floor(data, recorded, steps)
+        again = chaos_floor(data, recorded, stride * steps)
     except SdfsimError as error:
         why = f"{error.message} ({error.hint})" if error.hint else error.message
         return {}, {"chaos_floor": {"left_out": why}}
+    again = {name: [every(motion, stride) for motion in motions] for name, motions in again.items()}
+    recorded = [every(t, stride) for t in recorded]
     farthest = [float(_distance(one, truth).max()) for one, truth in zip(again["0"], recorded, strict=True)]
     report = {
         "perturbations": {name: errors(motions, recorded) for name, motions in again.items()},

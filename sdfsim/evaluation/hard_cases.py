@@ -12,7 +12,7 @@ from functools import cache, partial
 from itertools import pairwise
 from math import atan, degrees
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -73,7 +73,6 @@ class Run:
     broke: str = ""
 
 
-Variant = Literal["float32", "bfloat16", "cuda"]
 Measured = tuple[dict[str, float], np.ndarray]  # figures by name, and the curve [2, K] to draw (K may be 0)
 Measure = Callable[[Sequence["Run"]], Measured]
 NO_CURVE = np.zeros((2, 0))
@@ -116,7 +115,7 @@ class Case:
         seconds: how long.
         steps: how many steps instead.
         repeats: repetitions, from starts slightly off or with other random scenes: their spread is the noise.
-        variant: the scenes are simulated a second time in this way, behind the first; "float32" is no second time.
+        cuda: the scenes are simulated a second time there, behind the first.
         teacher: whether the teacher can take part.
         x: where it stands in its group's plot of the first figure; None for a case that is not one of a row.
     """
@@ -130,7 +129,7 @@ class Case:
     seconds: float = 3.0
     steps: int | None = None
     repeats: int = 3
-    variant: Variant = "float32"
+    cuda: bool = False
     teacher: bool = True
     x: float | None = None
 
@@ -847,9 +846,4 @@ def _precision(quick: bool) -> list[Case]:
 
     figures = (Figure("diverges after", "s", 2, longer=True),)
     case = Case("start-off", "precision", "start 1e-6 m/s off", off, diverged, figures, repeats=2)
-    other = replace(case, scenes=plain, teacher=False)
-    return [
-        case,
-        replace(other, name="bfloat16", title="network in bfloat16", variant="bfloat16"),
-        replace(other, name="cuda", title="on CUDA", variant="cuda"),
-    ]
+    return [case, replace(case, scenes=plain, teacher=False, name="cuda", title="on CUDA", cuda=True)]

@@ -14,7 +14,6 @@ import torch
 import sdfsim
 from sdfsim.data.pybullet_sim import DT, SUBSTEPS, TEACHER_VERSION, engine_settings, import_pybullet
 from sdfsim.dynamics.model import SOLVER, Model, load_model, model_names
-from sdfsim.dynamics.precision import in_bfloat16
 from sdfsim.dynamics.ranges import constant_in_training
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.simulator import SimulationError, Simulator, pick_device
@@ -96,7 +95,7 @@ def stress(
     for case in found:
         repeats = [case.scenes(repeat) for repeat in range(case.repeats)]
         weight = _weight(case, repeats)
-        content = [VERSION, case.seconds, case.steps, case.variant, [figure.name for figure in case.figures], repeats]
+        content = [VERSION, case.seconds, case.steps, case.cuda, [figure.name for figure in case.figures], repeats]
         for model in tested:
             arguments = (case, model, device, out, record)
             if _takes_part(case, model):
@@ -116,10 +115,8 @@ def stress(
 
 
 def _takes_part(case: Case, model: Model) -> bool:
-    """Other arithmetic is for networks: the solver has none, and no other device than the CPU."""
-    if case.variant == "float32":
-        return True
-    return model.kind != SOLVER and (case.variant != "cuda" or torch.cuda.is_available())
+    """Another device is for networks: the solver has none."""
+    return not case.cuda or (model.kind != SOLVER and torch.cuda.is_available())
 
 
 def _teacher_is_here() -> bool:
@@ -134,7 +131,7 @@ def _weight(case: Case, repeats: list[list[Scene]]) -> float:
     """About how long a model takes, in no unit; a step has its price without bodies too."""
     seconds = case.seconds if case.steps is None else 0.02 * case.steps
     work = sum(10 + len(scene.bodies) for scenes in repeats for scene in scenes)
-    return seconds * work * (1 if case.variant == "float32" else 2)
+    return seconds * work * (2 if case.cuda else 1)
 
 
 def _tried(case: Case, model: Model | None, device: str, out: Path, record: Record | None) -> dict[str, Any]:
@@ -168,11 +165,9 @@ def _tried(case: Case, model: Model | None, device: str, out: Path, record: Reco
 
 
 def simulated(case: Case, scenes: list[Scene], model: Model, device: str) -> list[Run]:
-    """Every scene once; where the case is about another way to compute, then once more in that way."""
+    """Every scene once; where the case is about another device, then once more there."""
     used = [(model, device)]
-    if case.variant == "bfloat16":
-        used.append((replace(model, network=in_bfloat16(model.network)), device))
-    elif case.variant == "cuda":
+    if case.cuda:
         used.append((model, "cuda"))
     runs = []
     for one, place in used:

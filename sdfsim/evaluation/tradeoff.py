@@ -6,7 +6,6 @@ import csv
 import io
 import time
 from collections.abc import Callable, Sequence
-from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,11 +25,10 @@ from sdfsim.data.dataset import (
     trajectory_files,
 )
 from sdfsim.data.pybullet_sim import DT, SUBSTEP
-from sdfsim.data.replay import first_frames, roll_out
+from sdfsim.data.replay import every, first_frames, roll_out
 from sdfsim.dynamics.froude import scene_units
 from sdfsim.dynamics.graph import SUBSTEPS
 from sdfsim.dynamics.model import SOLVER, Model, load_model, model_names
-from sdfsim.dynamics.precision import in_bfloat16
 from sdfsim.dynamics.simulator import Simulator, pick_device
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.baselines import perturbed
@@ -209,10 +207,8 @@ class Setting:
         nodes: "own", the shapes' own nodes; "thin K", K of them, outermost first; "grid N", sampled anew from N^3
             points.
         sdf: "own", or "grid R", the own distances on a grid of R^3 samples.
-        reach: contact radius over the model's own.
-        rounds: of message passing, the first so many of the model's (None: all), a network that nobody has trained.
-        substeps: of the solver in one recorded step.
-        bf16: matrix products of the network are rounded to bfloat16.
+        stride: recorded steps in a step.
+        substeps: inner steps of the solve in a step, where the model does not say how many.
         learned_flight: the paper network predicts free flight too.
         sleep: freeze what has come to rest.
         device: "cpu" or "cuda".
@@ -222,10 +218,8 @@ class Setting:
     model: str
     nodes: str = "own"
     sdf: str = "own"
-    reach: float = 1.0
-    rounds: int | None = None
+    stride: int = 1
     substeps: int = SUBSTEPS
-    bf16: bool = False
     learned_flight: bool = False
     sleep: bool = False
     device: str = "cpu"
@@ -252,13 +246,13 @@ def settings(models: Sequence[str], *, quick: bool, cuda: bool) -> list[Setting]
         knobs += [{"nodes": f"grid {k}"} for k in ((7,) if quick else (5, 7, 10))]
         if kinds[name] == SOLVER:
             knobs += [{"substeps": k} for k in ((2, 10) if quick else (1, 2, 3, 10, 20))]
+            knobs += [{"stride": 2, "substeps": k} for k in ((1,) if quick else (1, 2, 4))]
         elif name == next(n for n in models if kinds[n] != SOLVER):
-            lean = {"nodes": "thin 128", "sdf": "grid 64"}
-            knobs += [{"sdf": "grid 64"}, {"bf16": True}, lean]
+            knobs += [{"sdf": "grid 64"}]
             if kinds[name] == "impulse":
-                knobs += [{"rounds": 4}, lean | {"rounds": 4}]
+                knobs += [{"stride": 2}]
             if not quick:
-                knobs += [{"sdf": "grid 32"}, {"sdf": "grid 128"}, {"reach": 0.5}, {"reach": 2.0}, {"sleep": True}]
+                knobs += [{"sdf": "grid 32"}, {"sdf": "grid 128"}, {"sleep": True}]
             knobs += [{"device": "cuda"}] if cuda else []
         else:
             knobs = []
@@ -269,21 +263,8 @@ def settings(models: Sequence[str], *, quick: bool, cuda: bool) -> list[Setting]
 
 
 def arranged(setting: Setting, cases: Cases) -> tuple[Model, dict[str, Shape]]:
-    """The model and the shapes as a setting wants them; closed forms keep their distances, which nothing beats.
-
-    Raises:
-        SdfsimError: the model has fewer rounds.
-    """
+    """The model and the shapes as a setting wants them; closed forms keep their distances, which nothing beats."""
     model = load_model(setting.model).to(pick_device(setting.device))
-    network = model.network
-    if setting.rounds is not None:
-        if not 1 <= setting.rounds <= len(getattr(network, "rounds", ())):
-            raise SdfsimError(f"{model.name}: has no {setting.rounds} rounds")
-        network = deepcopy(network)
-        network.rounds = network.rounds[: setting.rounds]  # type: ignore[index]
-    if setting.bf16:
-        network = in_bfloat16(network)
-    model = replace(model, network=network, reach=model.reach * setting.reach)
     return model, {name: _arranged_shape(setting, shape, model.nodes) for name, shape in cases.shapes.items()}
 
 
@@ -309,11 +290,11 @@ def measure_ours(setting: Setting, cases: Cases) -> dict[str, Any]:
         prepared = time.perf_counter() - began
         device = pick_device(setting.device)
         motions = roll_out(
-            model, cases.starts, shapes, cases.steps, device, "learned" if setting.learned_flight else "exact",
-            contact=setting.contact, sleep=setting.sleep, floor=cases.floor, substeps=setting.substeps,
-            as_teacher=setting.contact,
+            model, [every(t, setting.stride) for t in cases.starts], shapes, cases.steps // setting.stride, device,
+            "learned" if setting.learned_flight else "exact", contact=setting.contact, sleep=setting.sleep,
+            floor=cases.floor, substeps=setting.substeps, as_teacher=setting.contact,
         )  # fmt: skip
-    result = _judged(motions, cases) | {"prepare_s": prepared, "peak_mib": memory["mib"]}
+    result = _judged(motions, cases, setting.stride) | {"prepare_s": prepared, "peak_mib": memory["mib"]}
     if result["exploded"]:
         return result
     repeats = [_time_simulator(setting, model, shapes, cases) for _ in range(REPEATS)]
@@ -322,15 +303,15 @@ def measure_ours(setting: Setting, cases: Cases) -> dict[str, Any]:
 
 def _time_simulator(setting: Setting, model: Model, shapes: dict[str, Shape], cases: Cases) -> Timing:
     """One scene of the cases on its own, as `sdfsim simulate` runs it."""
-    start = cases.starts[cases.timed]
+    start = every(cases.starts[cases.timed], setting.stride)
     scene = scene_of([start], [0], shapes, cases.floor)[0]
     effects = replace(
         scene.effects, sleep="on" if setting.sleep else "off", contact="auto" if setting.contact else "off"
     )
     flight = "learned" if setting.learned_flight else "exact"
     simulator = Simulator(replace(scene, effects=effects), model, setting.device, dt=start.dt, free_flight=flight)
-    simulator.rules = replace(simulator.rules, substeps=setting.substeps)
-    steps = min(TIMED, cases.steps)
+    simulator.rules = replace(simulator.rules, substeps=model.inner or setting.substeps)
+    steps = min(TIMED, cases.steps // setting.stride)
     began = time.perf_counter()
     next(simulator.steps(1))
     first_ms = 1e3 * (time.perf_counter() - began)
@@ -338,7 +319,8 @@ def _time_simulator(setting: Setting, model: Model, shapes: dict[str, Shape], ca
     for _ in simulator.steps(steps - 1):
         pass
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    return Timing(first_ms, 1e3 * wall / (steps - 1), 1e3 * cpu / (steps - 1))
+    done = setting.stride * (steps - 1)
+    return Timing(first_ms, 1e3 * wall / done, 1e3 * cpu / done)
 
 
 def measure_engine(name: str, substeps: int, off: float, cases: Cases) -> dict[str, Any]:
@@ -354,11 +336,18 @@ def measure_engine(name: str, substeps: int, off: float, cases: Cases) -> dict[s
     return _judged(motions, cases) | {"peak_mib": memory["mib"]} | _times(repeats, cases, one_core=True)
 
 
-def _judged(motions: list[Trajectory], cases: Cases) -> dict[str, Any]:
-    """Errors of motions in the scene's metres, penetration, energy gain, and whether they blew up."""
+def _judged(motions: list[Trajectory], cases: Cases, stride: int = 1) -> dict[str, Any]:
+    """Errors of motions in the scene's metres, penetration, energy gain, and whether they blew up.
+
+    Args:
+        motions: of every case.
+        cases: what they are judged by.
+        stride: recorded steps in one of theirs.
+    """
     if not all(np.isfinite(m.position).all() and np.isfinite(m.quat_xyzw).all() for m in motions):
         raise SdfsimError("a state is not finite")
-    found = errors(motions, cases.recorded)
+    there = errors(motions, [every(first_frames(t, cases.steps + 1), stride) for t in cases.recorded])
+    found = {str(stride * int(steps)): error for steps, error in there.items()}
     horizons = [h for h in found if int(h) in (HORIZON, cases.steps)]
     gain = energy_gain([first_frames(m, cases.steps + 1) for m in motions])
     depth = penetration(motions, cases.solids)["percentile_95"]

@@ -117,7 +117,7 @@ class Run:
         for name, value in self.optimiser.state().items():
             arrays[f"optimiser/{name}"] = value.cpu().numpy()
         progress = {name: getattr(self, name) for name in ("step", "seconds", "loss", "total", "skipped")}
-        origin = {"plan": asdict(self.plan), "seed": self.seed, "data": self.digest}
+        origin = {"plan": _plain(self.plan), "seed": self.seed, "data": self.digest}
         arrays["run"] = np.array(json.dumps(origin | progress))
         write_arrays(path, arrays, compressed=False)
 
@@ -126,17 +126,16 @@ class Run:
         arrays = read_arrays(path, "a checkpoint", "delete it to start anew")
         try:
             info: dict[str, Any] = json.loads(str(arrays["run"]))
-            if info["plan"] != asdict(self.plan) or info["seed"] != self.seed or info["total"] != self.total:
+            if info["plan"] != _plain(self.plan) or info["seed"] != self.seed or info["total"] != self.total:
                 raise SdfsimError(f"{path} belongs to another preset, seed or number of steps", "choose another -o")
-            # Runs that were begun before data had a digest are taken at their word.
-            if info.get("data", self.digest) != self.digest:
+            if info["data"] != self.digest:
                 raise SdfsimError(f"{path} was trained on other data", "give the same --data, or choose another -o")
             tensors = {k: torch.from_numpy(v).to(self.device) for k, v in arrays.items() if k != "run"}
             self.network.load_state_dict({k[8:]: v for k, v in tensors.items() if k.startswith("network/")})
             self.average = {k[8:]: v for k, v in tensors.items() if k.startswith("average/")}
             self.optimiser.load({k[10:]: v for k, v in tensors.items() if k.startswith("optimiser/")})
             self.step, self.seconds, self.loss = info["step"], info["seconds"], info["loss"]
-            self.skipped = info.get("skipped", 0)
+            self.skipped = info["skipped"]
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise SdfsimError(
                 f"{path}: not a checkpoint of this training: {error}", "delete it to start anew"
@@ -170,6 +169,11 @@ class Run:
             ranges=ranges,
             card=card,
         )
+
+
+def _plain(plan: Preset) -> dict[str, Any]:
+    """A preset as JSON brings it back."""
+    return json.loads(json.dumps(asdict(plan)))
 
 
 def held_out_loss(run: Run, task: Task, batches: int = 8) -> float:

@@ -81,7 +81,9 @@ def train(
     with locked(out) if team.leads else nullcontext():
         with team.in_turn():  # the first finds contacts and caches them, the others read
             task, held_out = _tasks(plan, folders, place, lambda f, m: tell(0.0, m))
-        each = zip(folders, infos, task.counts, held_out.counts, strict=True)
+        # A folder's trajectories are followed once for each length of step.
+        counted = (t.counts[:: len(plan.strides)] for t in (task, held_out))
+        each = zip(folders, infos, *counted, strict=True)
         made = [_made(folder, info, *counts) for folder, info, *counts in each]
         run = Run(plan, task, total, seed, place, team)
         if checkpoint.exists():

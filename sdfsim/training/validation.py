@@ -59,7 +59,7 @@ class Rollouts:
         for group in batches(self.recorded):
             try:
                 inner = inner_steps(group[0].dt, self.substep)
-                predicted = roll_out(model, group, known, steps, self.device, substeps=inner)
+                predicted = roll_out(model, group, known, steps, self.device, substeps=inner, as_teacher=True)
             except SdfsimError:
                 return {"rollout_m": math.nan, "rollout_degrees": math.nan}
             for one, truth in zip(predicted, group, strict=True):

@@ -10,7 +10,7 @@ from sdfsim import Rollout, Simulator
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.shape import Shape, analytic_shape, load_shape
 from tests.dynamics.test_laws import body
-from tests.dynamics.test_waits import SHAPES
+from tests.dynamics.test_scale import SHAPES
 
 FEW, MANY, STEPS = 40, 1000, 60
 

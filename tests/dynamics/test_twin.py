@@ -14,8 +14,8 @@ from sdfsim.scene.scene import Scene
 from sdfsim.shape.primitives import convex_pieces
 from sdfsim.shape.shape import analytic_shape, load_shape
 from tests.dynamics.test_laws import ball, body, cube
+from tests.dynamics.test_scale import SHAPES
 from tests.dynamics.test_solver import heap
-from tests.dynamics.test_waits import SHAPES
 
 ONE = Units(1.0, 1.0, 1.0)
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from sdfsim.training.contact_cache import contact_frames
+from sdfsim.training.contact_cache import Solved, contact_frames
 from sdfsim.training.distributed import Team
-from sdfsim.training.impulse_task import ImpulseTask, Noise
+from sdfsim.training.impulse_task import ImpulseTask
 from sdfsim.training.train import train
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -23,8 +23,7 @@ def test_the_parts_of_a_batch_are_the_batch(size):
 
 
 def test_the_parts_losses_add_up_to_the_whole_batchs_loss(ball_data):
-    """Noise included: it is the same for a frame whoever works on it."""
-    task = ImpulseTask(contact_frames(ball_data, "train", 0.1), torch.device("cpu"), Noise())
+    task = ImpulseTask(contact_frames(ball_data, "train", Solved()), torch.device("cpu"))
 
     def flying(g, mirrored):
         from sdfsim.dynamics.impulse import Velocities
@@ -51,7 +50,7 @@ def test_two_processes_have_the_gradients_of_one(ball_data, tmp_path):
     subprocess.run(command, cwd=ROOT, check=True, capture_output=True, timeout=600)
     one, two = (dict(np.load(tmp_path / name / "checkpoint.npz")) for name in ("one", "two"))
     momenta = [name for name in one if name.endswith(("/exp_avg", "/momentum_buffer"))]
-    assert len(momenta) > 100
+    assert len(momenta) > 60
     largest = max(np.abs(one[name]).max() for name in momenta)
     assert largest > 1e-4
     for name in momenta:  # attention is the same whatever its bias is: that one's gradient is rounding alone

@@ -13,7 +13,7 @@ from sdfsim.data.replay import roll_out
 from sdfsim.dynamics.bodies import Units
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.errors import SdfsimError
-from sdfsim.training.contact_cache import contact_frames
+from sdfsim.training.contact_cache import Solved, contact_frames
 from sdfsim.training.distributed import Team
 from sdfsim.training.paper_task import PaperTask
 from tests.dynamics.conftest import random_model
@@ -111,7 +111,7 @@ def test_trajectories_of_different_steps_are_not_trained_on_together(ball_data, 
         replace(bouncing(3), **other).save(tmp_path / "data" / "train" / "9.npz")
         for read in (
             lambda data: PaperTask(data, "train", 0.1, CPU, None),
-            lambda data: contact_frames(data, "train", 0.1),
+            lambda data: contact_frames(data, "train", Solved()),
         ):
             with pytest.raises(SdfsimError, match=r"train: its trajectories differ in step or gravity"):
                 read(tmp_path / "data")
