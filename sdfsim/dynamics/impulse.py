@@ -191,8 +191,9 @@ def bounded(graph: ContactGraph, frames: EdgeFrames, added: Tensor, start: Tenso
     """What may be added to the solve, of what the network would add.
 
     - Only where surfaces moved against each other before the step, see `CALM`.
-    - Solve and network together never pull, push no more than twice as hard as the solve, or than closes what is left
-      of an overlap over the step, and keep to the friction cone.
+    - Solve and network together never pull, push no more than twice as hard as the solve, or than it takes to part
+      surfaces that would be inside each other at the end of the step as restitution allows, and keep to the friction
+      cone.
     - No more kinetic energy than the solve took, island by island.
 
     Args:
@@ -207,7 +208,8 @@ def bounded(graph: ContactGraph, frames: EdgeFrames, added: Tensor, start: Tenso
     seen = relative(graph, frames, start)
     push, drag = frames.solved[:, 0], frames.solved[:, 1:]
     left = graph.gap + seen[:, 0, 1] * (1.0 - graph.when) * graph.dt
-    most = 2.0 * push + frames.mass[:, 0] * (-left / graph.dt).clamp_min(0.0)
+    parting = (-left / graph.dt).clamp_min(0.0) + (1.0 + graph.restitution) * (-seen[:, 0, 0]).clamp_min(0.0)
+    most = 2.0 * push + frames.mass[:, 0] * torch.where(left < 0.0, parting, torch.zeros_like(parting))
     normal = torch.minimum((push + added[:, 0, 0]).clamp_min(0.0), most)
     ends = [(normal - push)[:, None]]
     if added.shape[1] == 3:

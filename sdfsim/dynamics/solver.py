@@ -30,6 +30,7 @@ ANALYTIC = PlaneSdf | SphereSdf | BoxSdf | CapsuleSdf | CylinderSdf
 Clumps = list[list[np.ndarray]]
 LEAF, CLUMP = 16, 256  # nodes that a leaf and a clump of leaves hold at most
 TOUCHING = 1e-3  # model lengths, within which a point is told as a contact
+COARSE = 0.01  # model times: in longer inner steps what is hit in their course is told to a network as well
 INWARD = 0.004  # of a solid's largest extent, from where its nodes look out
 
 
@@ -291,6 +292,7 @@ def compiled_rules(
         still=own.still, together=own.together, erp=own.erp, slop=own.slop, split=own.split,
         slow=own.slow * float(np.linalg.norm(gravity)) * inner, rounds=own.rounds, exact=own.exact, apart=own.apart,
         stray=own.stray, rest=own.rest, margin=margin, adds=adds, note=note,
+        ahead=inner if note and inner > COARSE else 0.0,
     )  # fmt: skip
 
 

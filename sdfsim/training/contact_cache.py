@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from sdfsim.dynamics.solver import Acts
 
 STEP = 0.02  # s, the step that networks know
-FRAMES_VERSION = 7  # counts up whenever frames of the same recordings come out differently
+FRAMES_VERSION = 8  # counts up whenever frames of the same recordings come out differently
 TOGETHER = 25  # trajectories that are followed side by side
 _SMALL = {"first": np.int16, "second": np.int16}
 

@@ -418,16 +418,28 @@ def _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, s
     if went - near.looked[p] < rules.still:
         return
     near.looked[p], near.away_all[p] = went, math.inf
-    count = 0
+    count, look = 0, rules.look + _nearer(world, motion, rules, a, b)
     for side in range(2):
         if _swallowed(shapes, world, motion, matrix, a, b, side, scratch.found, t):
             manifolds.count[p] = _merged(rules, manifolds.point, p, 0, scratch, t, 1, False)
             near.away_all[p] = -math.inf
             return
     for side in range(2):
-        count = _nodes(shapes, world, motion, matrix, rules, a, b, side, near, p, went, scratch, t, count)
+        count = _nodes(shapes, world, motion, matrix, look, a, b, side, near, p, went, scratch, t, count)
     count = _first_to_touch(rules, scratch.found, t, count)
     manifolds.count[p] = _merged(rules, manifolds.point, p, known, scratch, t, count, False)
+
+
+@njit(**BARE)
+def _nearer(world, motion, rules, a, b):
+    """How much farther than usual a pair looks for points: as far as any of its points may come nearer."""
+    if rules.ahead == 0.0:
+        return 0.0
+    speed = norm(sub(get(motion.velocity, a), get(motion.velocity, b))) + norm(vector(rules.gravity)) * rules.ahead
+    for body in (a, b):
+        if world.radius[body] < math.inf:
+            speed += norm(get(motion.angular, body)) * world.radius[body]
+    return speed * rules.ahead
 
 
 @njit(**BARE)
@@ -437,7 +449,8 @@ def _collide_round(shapes, world, motion, matrix, rules, manifolds, scratch, t, 
     first, second = shapes.table[world.shape[a], KIND], shapes.table[world.shape[b], KIND]
     one, other = first == SPHERE or first == CAPSULE, second == SPHERE or second == CAPSULE
     known, found, point = manifolds.count[p], scratch.found, manifolds.point
-    count = _round(shapes, world, motion, matrix, rules, a, b, 0 if one else 1, found, t)
+    reach = rules.reach + _nearer(world, motion, rules, a, b)
+    count = _round(shapes, world, motion, matrix, reach, a, b, 0 if one else 1, found, t)
     if count == 1 and first == SPHERE and second == SPHERE:
         for x in range(COLUMNS):
             if known == 0 or x < PUSH or x >= KEY:
@@ -509,7 +522,7 @@ def _moved(shapes, world, motion, matrix, rules, manifolds, p, count):
 
 
 @njit(**BARE)
-def _nodes(shapes, world, motion, matrix, rules, a, b, side, near, pair, went, scratch, t, count):
+def _nodes(shapes, world, motion, matrix, look, a, b, side, near, pair, went, scratch, t, count):
     """The deepest node of each near leaf of one body in the other's distances, refined; added to what is found."""
     table, brick, sample = shapes.table, shapes.brick, shapes.sample
     depth, node, keys, normal = scratch.depth, scratch.node, scratch.key, scratch.normal
@@ -521,11 +534,11 @@ def _nodes(shapes, world, motion, matrix, rules, a, b, side, near, pair, went, s
     kept = 0
     for at in range(near.start[pair, side], near.start[pair, side] + near.count[pair, side]):
         i = near.leaf[at]
-        if near.away[at] - went <= rules.look:
+        if near.away[at] - went <= look:
             d, _ = distance(table, brick, sample, s, mapped(w, c, get(shapes.leaf_ball, i)))
             near.away[at] = k * d - own * shapes.leaf_ball[i, 3] + went
         near.away_all[pair] = min(near.away_all[pair], near.away[at])
-        if near.away[at] - went > rules.look:
+        if near.away[at] - went > look:
             continue
         deepest, chosen, lowest = 0.0, -1, 1e300
         facing = (0.0, 0.0, 0.0)
@@ -534,7 +547,7 @@ def _nodes(shapes, world, motion, matrix, rules, a, b, side, near, pair, went, s
             d, n = _gap(table, brick, sample, s, w, c, p, get(shapes.inward, u))
             d *= k
             score = d - OUTWARD * own * norm(p)
-            if d <= rules.look and score < lowest:
+            if d <= look and score < lowest:
                 deepest, chosen, lowest, facing = d, u, score, n
         if chosen < 0:
             continue
@@ -562,7 +575,7 @@ def _nodes(shapes, world, motion, matrix, rules, a, b, side, near, pair, went, s
             break
         u = node[t, e]
         p, d, n = _refined(table, brick, sample, stride, r, s, w, c, k, own, get(shapes.node, u), get(shapes.inward, u))
-        if d > rules.look:
+        if d > look:
             continue
         # p of shape `one` -> about its centre of mass; its foot on the other, likewise.
         mine = sub(scale(p, own), get(world.com, one))
@@ -635,7 +648,7 @@ def _refined(table, brick, sample, stride, s, t, w, c, k, own, p, inward):
 
 
 @njit(**BARE)
-def _round(shapes, world, motion, matrix, rules, a, b, side, found, at):
+def _round(shapes, world, motion, matrix, reach, a, b, side, found, at):
     """A sphere or capsule against anything: the distance at its core, less its radius."""
     table, brick, sample = shapes.table, shapes.brick, shapes.sample
     one, other = (a, b) if side == 0 else (b, a)
@@ -658,7 +671,7 @@ def _round(shapes, world, motion, matrix, rules, a, b, side, found, at):
         core = (0.0, 0.0, heights[e])
         d, n = distance(table, brick, sample, t, mapped(w, c, core))
         gap = k * d - own * radius
-        if gap > rules.reach:
+        if gap > reach:
             continue
         mine = turn_back(matrix, one, turn(matrix, other, scale(n, -own * radius)))
         mine = sub(add(scale(core, own), mine), get(world.com, one))

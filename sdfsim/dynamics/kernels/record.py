@@ -60,7 +60,7 @@ def gathered(world, motion, matrix, manifolds, pairs, steps, edges):
         for k in range(manifolds.count[m]):
             if manifolds.point[m, k, PUSH] == 0.0:
                 edges = _with_room(edges)
-                _put(motion, matrix, manifolds, m, k, steps, edges)
+                _put(motion, matrix, manifolds, m, k, steps - 1, edges)
     n, total = len(world.shape), edges.count[0]
     key = np.empty(total)
     for e in range(total):

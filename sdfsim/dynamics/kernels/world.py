@@ -152,6 +152,7 @@ class Rules(NamedTuple):
         margin: all bodies but planes are larger by this than their distances say.
         adds: whether what is pushed out adds to the speed of a rebound.
         note: whether what contacts did in the step is wanted, see `record`.
+        ahead: new points are looked for so much time farther, as fast as two bodies move against each other.
     """
 
     gravity: np.ndarray
@@ -177,3 +178,4 @@ class Rules(NamedTuple):
     margin: float
     adds: bool
     note: bool
+    ahead: float
