@@ -38,6 +38,13 @@ class Contacts:
         return len(self.owner)
 
 
+def no_contacts(device: torch.device) -> Contacts:
+    """None at all."""
+    nobody = torch.zeros(0, dtype=torch.int64, device=device)
+    nothing = torch.zeros(0, 3, dtype=torch.float64, device=device)
+    return Contacts(nobody, nobody, nobody, nothing, nothing[:, 0], nothing)
+
+
 def find_contacts(
     bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, scene: Compiled | None = None
 ) -> Contacts:

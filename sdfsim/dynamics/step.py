@@ -193,8 +193,10 @@ def contact_graph(
     moves = bodies.moves[active]
     turns = (moves if rules.rotation else torch.zeros_like(moves))[:, None, None]
     inverse_inertia = rotation @ torch.linalg.inv(bodies.inertia[active]) @ rotation.mT * turns
-    spin = torque_free(state.orientation[active], state.angular_velocity[active], bodies.inertia[active], rules.dt)[1]
-    spin = torch.where(turns[..., 0], spin, state.angular_velocity[active])
+    spin = state.angular_velocity[active]
+    if rules.rotation:
+        free = torque_free(state.orientation[active], spin, bodies.inertia[active], rules.dt)[1]
+        spin = torch.where(moves[:, None], free, spin)
     turned = pose.multiply(solved.orientation[active], pose.conjugate(state.orientation[active]))
     nothing = torch.zeros_like(acts.gap)
     # Masses enter as ratios only; relative to the heaviest they stay within single precision.
@@ -231,7 +233,7 @@ def _paper_step(
     model: Model, bodies: Bodies, state: State, rules: Rules, memory: Memory
 ) -> tuple[State, Contacts | None]:
     """The published step of the bodies that have a contact edge; free flight, or its learned form, for the others."""
-    from sdfsim.dynamics.contacts import find_contacts
+    from sdfsim.dynamics.contacts import find_contacts, no_contacts
     from sdfsim.dynamics.surfaces import compact, predict
 
     with memory.timed("flight_ms"):
@@ -240,8 +242,10 @@ def _paper_step(
     if not rules.contact and not learned:
         return free, None
     with memory.timed("contact_ms"):
-        reach = model.reach if rules.contact else -torch.inf
-        contacts = find_contacts(bodies, state, rules.gravity, reach, rules.dt, memory.compiled(bodies, state))
+        contacts = no_contacts(bodies.device)
+        if rules.contact:
+            scene = memory.compiled(bodies, state)
+            contacts = find_contacts(bodies, state, rules.gravity, model.reach, rules.dt, scene)
     active = torch.cat([contacts.owner, contacts.body, *([awake(bodies, state)] if learned else [])])
     active = torch.unique(active)
     chosen = bodies.moves[active]

@@ -147,27 +147,6 @@ def test_turning_the_scene_with_its_gravity_turns_the_rollout(dropped):
     assert float(angle.max()) < 1e-3
 
 
-def straight_down(box_shape, tilt: list[float]) -> Scene:
-    """A box that falls without any motion along the floor, which then says nothing of a direction."""
-    quat = Rotation.from_rotvec(tilt).as_quat()
-    box = make_body("box", 0, [0.0, 0.0, 0.55], quat_xyzw=quat, velocity=np.array([0.0, 0.0, -3.0]))
-    floor = make_body("floor", 1, [0.0, 0.0, 0.0], motion="static")
-    return Scene((box_shape, analytic_shape("plane")), (box, floor), np.array([0.0, 0.0, -9.81]), duration=1.0)
-
-
-@pytest.mark.parametrize("tilt", [[0.0, 0.0, 0.0], [0.3, 0.2, 0.1]])
-@pytest.mark.parametrize("yaw", [0.5, 1.57, 3.0])
-def test_what_falls_straight_down_turns_with_the_scene_too(box_shape, tilt, yaw):
-    rotation, model = Rotation.from_rotvec([0.0, 0.0, yaw]), random_model("impulse")
-    scene = straight_down(box_shape, tilt)
-    plain = Simulator(scene, model).run(steps=6)
-    other = Simulator(turned(scene, rotation), model).run(steps=6)
-    assert plain.contact_count.sum() > 0 and np.abs(plain.velocity[-1, 0] - plain.velocity[0, 0]).max() > 0.1
-    for name in ("position", "velocity", "angular_velocity"):
-        expected = rotation.apply(getattr(plain, name)[:, 0])
-        np.testing.assert_allclose(getattr(other, name)[:, 0], expected, atol=2e-4, err_msg=name)
-
-
 @pytest.mark.parametrize("distance", [1e3, 1e4, 1e6])
 def test_far_from_the_origin_nothing_changes(dropped, distance):
     shift = np.array([distance, -distance, 0.0])

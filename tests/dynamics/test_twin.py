@@ -76,11 +76,11 @@ def test_the_compiled_step_is_its_twin(scene, steps, rules):
     manifolds, points = no_manifolds(), 0
     for k in range(steps):
         if k % 6:
-            manifolds, _ = inside.run(motion, manifolds, rules)
+            manifolds, *_ = inside.run(motion, manifolds, rules)
             continue
         bodies, moving = twin.of_compiled(inside, motion)
         after, contacts = twin.step(inside.shapes, bodies, moving, rules, twin.contacts_of(manifolds))
-        manifolds, counts = inside.run(motion, manifolds, rules)
+        manifolds, _, counts = inside.run(motion, manifolds, rules)
         assert sum(map(len, contacts.values())) == manifolds.count.sum()
         for name, bound in (("position", 1e-9), ("orientation", 1e-9), ("velocity", 1e-7), ("angular", 1e-7)):
             np.testing.assert_allclose(getattr(after, name).numpy(), getattr(motion, name), atol=bound, rtol=0)
@@ -125,7 +125,7 @@ def test_gradients_are_differences_of_the_compiled_step(name):
         inside, motion, rules = compiled(thrown(**(THROW | {name: value})))
         manifolds = no_manifolds()
         for _ in range(12):
-            manifolds, _ = inside.run(motion, manifolds, rules)
+            manifolds, *_ = inside.run(motion, manifolds, rules)
         return motion.position[:2].copy()
 
     inside, motion, rules = compiled(thrown(**THROW))
