@@ -37,8 +37,8 @@ class Sdf(Protocol):
     """A signed distance with its gradient: positive outside, negative inside, metres, the shape's own frame.
 
     Its members: `MlpSdf` (a fitted network), the closed forms `PlaneSdf`, `SphereSdf`, `CapsuleSdf`, `CylinderSdf` and
-    `BoxSdf`, `GridSdf` (samples) and `MeshSdf` (the exact mesh). `SdfBank` asks many of them at once. Those members
-    also have `to(device)` and `scaled(factor)`.
+    `BoxSdf`, `GridSdf` (samples) and `MeshSdf` (the exact mesh). Those members also have
+    `to(device)` and `scaled(factor)`.
 
     Attributes:
         bounds: [2, 3] float64 m, the axis-aligned box that holds the solid (infinite for a plane).

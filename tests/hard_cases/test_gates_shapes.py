@@ -12,7 +12,6 @@ from sdfsim.dynamics.contacts import find_contacts
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.sdf import BoxSdf, SphereSdf
-from sdfsim.shape.sdf_batch import SdfBank
 from sdfsim.shape.shape import analytic_shape, with_sdf
 from tests.dynamics.conftest import random_model
 from tests.dynamics.test_paper import paper_model
@@ -96,18 +95,17 @@ def kinds() -> dict:
 def test_gradients_are_defined_and_bounded_and_closest_points_stay_at_the_surface(kinds, kind, place, dtype, device):
     sdf, size = kinds[kind]
     points = torch.tensor(PLACES[place], dtype=dtype, device=device)
-    alone, banked = sdf.to(device)(points), SdfBank([sdf], device)(torch.zeros(len(points), dtype=torch.int64), points)
-    for distance, gradient in (alone, banked):
-        assert distance.isfinite().all() and gradient.isfinite().all()
-        length = gradient.double().norm(dim=-1)
-        assert (length > 0.85).all() and (length < 1.15).all()
-        if size is None:
-            continue
-        normal = gradient.double() / length[:, None]
-        closest = points.double() - distance.double()[:, None] * normal
-        # No farther out than the solid, but for what a fit errs and what the type rounds far away.
-        slack = 0.1 * size + (0.05 + 4 * torch.finfo(dtype).eps) * points.double().norm(dim=-1, keepdim=True)
-        assert (closest.abs() <= 0.5 * size + slack).all(), (place, (closest.abs() - slack).max())
+    distance, gradient = sdf.to(device)(points)
+    assert distance.isfinite().all() and gradient.isfinite().all()
+    length = gradient.double().norm(dim=-1)
+    assert (length > 0.85).all() and (length < 1.15).all()
+    if size is None:
+        return
+    normal = gradient.double() / length[:, None]
+    closest = points.double() - distance.double()[:, None] * normal
+    # No farther out than the solid, but for what a fit errs and what the type rounds far away.
+    slack = 0.1 * size + (0.05 + 4 * torch.finfo(dtype).eps) * points.double().norm(dim=-1, keepdim=True)
+    assert (closest.abs() <= 0.5 * size + slack).all(), (place, (closest.abs() - slack).max())
 
 
 @pytest.mark.parametrize("kind", ["sphere", "box", "network", "mesh"])
