@@ -58,7 +58,9 @@ def train(
         list[Path], typer.Option(help="Dataset folder; several are trained on together.", show_default=False)
     ],
     out: Out,
-    preset: Annotated[Literal["small", "base", "paper"], typer.Option(help="Kind and size of the model.")] = "small",
+    preset: Annotated[
+        Literal["small", "long", "alone", "base", "paper"], typer.Option(help="Kind and size of the model.")
+    ] = "small",
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in the folder.")] = False,
     as_json: Json = False,
     device: Device = "auto",
