@@ -59,11 +59,11 @@ def test_plan_tells_all_there_is_to_know(scene, model):
         "sleep": False,
     }
     assert (report["static"], report["kinematic"]) == (["floor"], ["lift"]) and len(report["dynamic"]) == 3
-    # 10 pairs: floor-lift is not driven, ghost meets the floor alone, and only two lie on the floor at the start.
+    # 10 pairs: floor-lift is not driven, ghost meets the floor alone, and a plane is near to everybody.
     pairs = {name: report["pairs"][name] for name in ("total", "unmoved", "excluded", "possible", "near", "apart")}
-    assert pairs == {"total": 10, "unmoved": 1, "excluded": 3, "possible": 6, "near": 2, "apart": 4}
-    assert report["step"]["nodes"] == 3 and report["step"]["edges"] > 0 and report["step"]["sdf_queries"] > 0
-    assert report["step"]["memory_mib"] > 0 and report["step_ms"] > 0 and report["units"]["length_m"] == 1.0
+    assert pairs == {"total": 10, "unmoved": 1, "excluded": 3, "possible": 6, "near": 3, "apart": 3}
+    assert report["step"]["contacts"] > 0 and report["step"]["edges"] == 0  # outside of training the solve stands alone
+    assert report["memory_mib"] > 0 and report["step_ms"] > 0 and report["units"]["length_m"] == 1.0
     assert report["constant_in_training"] == ["restitution"]
     assert any("path" in line for line in report["outside_training"])
     assert any(line.startswith("friction") for line in report["outside_training"]) is False  # 0.25 is in its range
@@ -78,7 +78,7 @@ def test_plan_reads_no_weights_where_the_run_would_not(scene, model, monkeypatch
     monkeypatch.setattr("sdfsim.dynamics.model.new_network", lambda *_: pytest.fail("weights were read"))
     report = told(scene, model)
     assert not report["effects"]["contact"]["on"] and report["effects"]["friction"]["why"] == "contact is off"
-    assert report["step"]["edges"] == report["step"]["sdf_queries"] == 0
+    assert report["step"]["edges"] == report["step"]["contacts"] == 0
     with pytest.raises(RuntimeError, match="not read"):
         load_model(model, weights=False).network(None)
 
@@ -92,6 +92,6 @@ def test_a_run_ends_with_what_it_has_cost(scene, model, tmp_path):
     assert list(report["cost"]) == [*COUNTS, *PHASES, "step_ms"]
     for name, values in report["cost"].items():
         assert values["sum"] == pytest.approx(rollout.counters[name][1:].sum())
-    assert report["cost"]["sdf_queries"]["sum"] > 0
+    assert report["cost"]["contacts"]["sum"] > 0
     for line in cost_lines(report):
         assert line in done.stdout

@@ -18,7 +18,6 @@ from sdfsim.errors import SdfsimError
 from sdfsim.files import replacing
 
 BUNDLED = Path(__file__).resolve().parent.parent / "models"
-DEFAULT_MODEL = "small"
 MOST = 4096  # of any size of a network
 MODEL_VERSION = 3  # 2: networks without the contact solve; 1: of an earlier teacher
 SOLVER = "solver"
@@ -107,7 +106,7 @@ def load_model(name: str | Path | None = None, *, weights: bool = True) -> Model
     """A bundled model by name, or any model file by path.
 
     Args:
-        name: None for the default model.
+        name: None for the solver.
         weights: False reads only what the model says of itself; its network is then `Unread`.
 
     Raises:
@@ -115,8 +114,7 @@ def load_model(name: str | Path | None = None, *, weights: bool = True) -> Model
     """
     from safetensors import SafetensorError, safe_open
 
-    name = name or DEFAULT_MODEL
-    if name == SOLVER:
+    if name is None or name == SOLVER:
         return Model(SOLVER, SOLVER, Unread().eval(), dt=0.02, gravity=10.0, length=1.4, reach=0.02)
     path = Path(name) if str(name).endswith(".safetensors") else BUNDLED / f"{name}.safetensors"
     if not path.exists():

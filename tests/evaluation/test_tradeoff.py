@@ -42,12 +42,6 @@ def test_networks_and_shapes_are_what_a_setting_says(cases):
     assert 8 <= len(grid) <= 6**3 and np.abs(np.asarray(box.sdf(grid)[0])).max() < 0.01
     shapes = arranged(Setting("solver", sdf="grid 8"), cases)[1]
     assert shapes["box"].sdf.resolution == 8 and shapes["ball"].sdf is cases.shapes["ball"].sdf
-    whole = load_model("small").network
-    model, _ = arranged(Setting("small", rounds=2, reach=0.5), cases)
-    assert len(model.network.rounds) == 2 and len(whole.rounds) > 2
-    assert model.reach == 0.5 * load_model("small").reach
-    with pytest.raises(SdfsimError, match="no 40 rounds"):
-        arranged(Setting("small", rounds=40), cases)
 
 
 def test_a_scene_is_judged_by_the_teacher_in_the_model_s_units(tmp_path):

@@ -42,7 +42,7 @@ def no_fit(tmp_path, monkeypatch):
 
 def heights(scene: Scene) -> np.ndarray:
     """[15, 3, 3] m: where the bodies are, step by step."""
-    simulator = Simulator(scene, model="small", device="cpu")
+    simulator = Simulator(scene, model="solver")
     return np.stack([np.asarray(state.position) for state in simulator.steps(15)])
 
 
