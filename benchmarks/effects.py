@@ -24,7 +24,7 @@ from sdfsim.files import write_text
 from sdfsim.scene.scene import Effects, Limits, Scene
 
 SAMPLES = Path(__file__).resolve().parents[1] / "samples"
-COUNTS = ("sdf_queries", "edges", "active", "asleep")
+COUNTS = ("contacts", "edges", "active", "asleep")
 VARIANTS: dict[str, Callable[[Scene], Scene]] = {
     "as it is": lambda scene: scene,
     "sleep on": lambda scene: replace(scene, effects=Effects(sleep="on")),

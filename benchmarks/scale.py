@@ -35,7 +35,7 @@ from sdfsim.scene.scene_file import load_scene
 BOWLS = (1, 16, 64, 256, 512)
 APART = (125, 500, 2000)
 PARTS = (16, 4, 1)  # of the nodes of a knot
-COUNTS = ("pairs", "sdf_queries", "sdf_waiting", "edges")
+COUNTS = ("pairs", "contacts", "edges")
 COLUMNS = {"ms": "ms a step", "peak_mib": "MiB", "contacts": "contacts", "depth_95": "deepest 95 %, mm", "lost": "lost"}
 
 

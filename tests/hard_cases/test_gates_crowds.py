@@ -92,7 +92,7 @@ def test_ten_thousand_steps_of_a_settled_pile(model, sleep):
 
 
 def test_ten_thousand_static_bodies_cost_one_mover_what_ten_do(model):
-    """Counted, not timed: pairs, distances, nodes and edges of every step; benchmarks/effects.py has the times."""
+    """Counted, not timed: pairs, contact points, nodes and edges of every step; benchmarks/effects.py has the times."""
 
     def run(count: int):
         scene = gates.mixed()
@@ -104,7 +104,7 @@ def test_ten_thousand_static_bodies_cost_one_mover_what_ten_do(model):
         return sim.run(steps=12)
 
     few, many = run(10), run(10_000)
-    for name in ("pairs", "sdf_queries", "nodes", "edges", "active", "free"):
+    for name in ("pairs", "contacts", "nodes", "edges", "active", "free"):
         np.testing.assert_array_equal(few.counters[name], many.counters[name], err_msg=name)
     assert few.counters["pairs"].sum() > 0
     np.testing.assert_array_equal(few.position[:, :4], many.position[:, :4])
