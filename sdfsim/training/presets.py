@@ -36,7 +36,7 @@ class Preset:
 
 PRESETS = {
     "small": Preset("impulse", {"width": 32, "rounds": 4}, steps=16_000, batch=32, rate=2e-3, matrix_rate=0.01),
-    "alone": Preset("impulse", {"width": 64, "rounds": 6, "alone": 1}, 16_000, batch=32, rate=2e-3, matrix_rate=0.01),
+    "alone": Preset("impulse", {"width": 32, "rounds": 4, "alone": 1}, 16_000, batch=32, rate=2e-3, matrix_rate=0.01),
     "long": Preset(
         "impulse",
         {"width": 32, "rounds": 4},
