@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,12 +19,14 @@ from sdfsim.dynamics.bodies import Bodies, State, awake, from_scene
 from sdfsim.dynamics.check import check_nodes, check_sizes, fault
 from sdfsim.dynamics.froude import scene_units
 from sdfsim.dynamics.graph import SUBSTEPS
+from sdfsim.dynamics.handles import BodyHandle, ContactPoint
 from sdfsim.dynamics.history import history_told, with_history
 from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.model import Model, load_model
 from sdfsim.dynamics.ranges import deep_starts, outside_training
 from sdfsim.dynamics.rollout import Rollout, join
 from sdfsim.dynamics.step import FreeFlight, Rules, step
+from sdfsim.dynamics.variants import Variant, rollouts
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.scene.effects import plan
 from sdfsim.scene.scene import Limits, Scene
@@ -95,7 +97,7 @@ class Simulator:
         if free_flight == "learned" and self.model.kind != "paper":
             raise SdfsimError("free_flight 'learned' exists for the paper network only", "give a model of that kind")
         self.seed = scene.seed if seed is None else seed
-        self.units = scene_units(scene, self.model, dt)
+        self.units, self._dt = scene_units(scene, self.model, dt), dt
         self.dt = self.model.dt * self.units.time
         self.outside_training = outside_training([scene], self.model, self.units)
         gravity = torch.tensor(scene.gravity / self.units.acceleration, dtype=torch.float64, device=self.device)
@@ -130,7 +132,7 @@ class Simulator:
         self.steps_done = 0
         if broken := self._fault(self.state, everybody(self.bodies)):
             raise SdfsimError(broken)
-        self._good = self.state
+        self._good = self._start = self.state
 
     def steps(self, count: int) -> Iterator[State]:
         """Advance by `count` steps, yielding the state after each (SI units).
@@ -148,6 +150,66 @@ class Simulator:
             started = time.perf_counter()
             self._step()
             yield self._frame(1e3 * (time.perf_counter() - started))
+
+    def step(self, count: int = 1) -> State:
+        """Advance by `count` steps; the state after them (SI units). Raises as `steps` does."""
+        for _ in range(count):
+            self._step()
+        return self.si_state()
+
+    def reset(self) -> None:
+        """Go back to the start of the scene."""
+        self.state = self._good = self._start
+        self.memory, self.contacts, self.steps_done = Memory(), None, 0
+
+    def __getitem__(self, name: str) -> BodyHandle:
+        """A body by its name. Raises SdfsimError where there is none of that name."""
+        if name not in self._names:
+            raise SdfsimError(f"there is no body {name!r}", f"there are {', '.join(self._names[:20])}")
+        return BodyHandle(self, self._names.index(name))
+
+    def contact_points(self) -> list[ContactPoint]:
+        """Where bodies touch in the present state, as the last step of the contact solve has left it.
+
+        Raises:
+            SdfsimError: the model is the *paper* network, which knows no impulses.
+        """
+        if self.model.kind == "paper":
+            raise SdfsimError("the paper network tells no impulses", "take the solver, or a network on top of it")
+        from sdfsim.dynamics.solver import contact_points
+
+        found, u = contact_points(self.state), self.units
+        return [
+            ContactPoint(
+                first=self._names[found.pair[k, 0]],
+                second=self._names[found.pair[k, 1]],
+                point=found.point[k] * u.length,
+                normal=found.normal[k],
+                impulse=found.impulse[k] * u.mass * u.velocity,
+                penetration=-float(found.gap[k]) * u.length,
+            )
+            for k in range(len(found.pair))
+        ]
+
+    def rollouts(
+        self, variants: Sequence[Variant], seconds: float | None = None, steps: int | None = None
+    ) -> list[Rollout]:
+        """The scene from its start with some values changed, once for each variant, on all cores.
+
+        Args:
+            variants: each maps names of bodies to changed fields: position, quat_xyzw, velocity, angular_velocity,
+                mass, friction, restitution (SI units), such as {"ball": {"velocity": (1, 0, 0)}}.
+            seconds: how long (default: the scene's duration).
+            steps: how many steps instead.
+
+        Returns:
+            A rollout each, in order; the same as of a `Simulator` of the changed scene.
+
+        Raises:
+            SdfsimError: no such body or field, or a value that it cannot have.
+            SimulationError: a state broke.
+        """
+        return rollouts(self.scene, variants, self.model, seconds=seconds, steps=steps, dt=self._dt)
 
     def run(self, seconds: float | None = None, steps: int | None = None) -> Rollout:
         """Simulate and keep everything.
@@ -233,8 +295,9 @@ class Simulator:
         if self.state.touch is not None:
             from sdfsim.dynamics.solver import contact_points
 
-            points, pairs, depth = contact_points(self.state)
-            points, depth, count = points * u.length, depth * u.length, len(points)
+            found = contact_points(self.state)
+            points, pairs, count = found.point * u.length, found.pair, len(found.pair)
+            depth = float((-found.gap).max(initial=0.0)) * u.length
         if c is not None and count:
             from sdfsim.dynamics.contacts import where
 

@@ -263,19 +263,39 @@ def held(state: State) -> torch.Tensor:
     return torch.cat([state.position, state.orientation, state.velocity, state.angular_velocity], -1)
 
 
-def contact_points(state: State) -> tuple[np.ndarray, np.ndarray, float]:
-    """Where bodies touch: points [E, 3] in the world, the two bodies of each [E, 2], the deepest penetration."""
+@dataclass(frozen=True)
+class Touching:
+    """E places where bodies touch, model units.
+
+    Attributes:
+        pair: [E, 2] int64, the two bodies.
+        point: [E, 3] on the first, world; normal: [E, 3] from the second to the first.
+        impulse: [E, 3] on the first in the last inner step.
+        gap: [E] below 0 where they are in each other.
+    """
+
+    pair: np.ndarray
+    point: np.ndarray
+    normal: np.ndarray
+    impulse: np.ndarray
+    gap: np.ndarray
+
+
+def contact_points(state: State) -> Touching:
+    """Where bodies touch in a state."""
     touch = state.touch
     if touch is None or not len(touch.pair):
-        return np.zeros((0, 3)), np.zeros((0, 2), np.int64), 0.0
+        nothing = np.zeros((0, 3))
+        return Touching(np.zeros((0, 2), np.int64), nothing, nothing, nothing, nothing[:, 0])
     there = torch.arange(compiled.POINTS)[None] < touch.count[:, None]
     pair, point = touch.pair[:, None].expand(-1, compiled.POINTS, 2)[there], touch.point[there]
     close = point[:, compiled.GAP] <= TOUCHING
     pair, point = pair[close], point[close]
     first = pair[:, 0]
     place = state.position[first] + pose.rotate(state.orientation[first], point[:, :3])
-    depth = float((-point[:, compiled.GAP]).clamp_min(0.0).max()) if len(point) else 0.0
-    return place.numpy(), pair.numpy(), depth
+    normal = point[:, compiled.NORMAL : compiled.NORMAL + 3]
+    impulse = normal * point[:, compiled.PUSH, None] + point[:, compiled.DRAG : compiled.DRAG + 3]
+    return Touching(*(t.numpy() for t in (pair, place, normal, impulse, point[:, compiled.GAP])))
 
 
 def compiled_rules(

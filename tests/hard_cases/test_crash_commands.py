@@ -59,13 +59,13 @@ def bits(arrays) -> dict[str, bytes]:
 
 
 class Close:
-    """Arrays that are equal up to rounding, which a fit's optimiser keeps only in the layout of its memory."""
+    """Arrays that are equal up to rounding: matrix products round as their operands lie in memory."""
 
-    def __init__(self, values: np.ndarray) -> None:
-        self.values = values
+    def __init__(self, values: np.ndarray, bound: float = 1e-3) -> None:
+        self.values, self.bound = values, bound
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Close) and np.allclose(self.values, other.values, rtol=0, atol=1e-3)
+        return isinstance(other, Close) and np.allclose(self.values, other.values, rtol=0, atol=self.bound)
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -91,9 +91,9 @@ def of_train(folder: Path) -> dict:
     from safetensors.numpy import load_file
 
     lines = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
-    return bits(load_file(folder / "model.safetensors")) | {
-        "log": [(entry["step"], entry["loss"], entry["held_out_loss"]) for entry in lines]
-    }
+    log = np.array([(entry["step"], entry["loss"], entry["held_out_loss"]) for entry in lines])
+    weights = load_file(folder / "model.safetensors")
+    return {name: Close(values, 1e-6) for name, values in weights.items()} | {"log": Close(log, 1e-6)}
 
 
 def of_reconstruct(folder: Path) -> dict:

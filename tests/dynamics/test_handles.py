@@ -1,0 +1,129 @@
+"""Bodies by name in SI units, contacts with their impulses, and many variants of a scene."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sdfsim import SdfsimError, Simulator
+from sdfsim.dynamics import variants
+from sdfsim.scene.scene import Scene
+from sdfsim.shape.shape import analytic_shape
+from tests.dynamics.conftest import make_body
+
+G = np.array([0.0, 0.0, -9.81])
+
+
+def small(gravity=G, **fields) -> Scene:
+    """A box of 10 cm (so that model units are not metres) 5 cm above a floor, its shape's origin off its centre."""
+    box = replace(analytic_shape("box", size=(0.1, 0.08, 0.06)), com=np.array([0.01, 0.0, 0.0]))
+    body = make_body("box", 0, [0.0, 0.0, 0.08], mass=0.2, **fields)
+    floor = make_body("floor", 1, [0, 0, 0], motion="static", mass=0.0)
+    return Scene((box, analytic_shape("plane")), (body, floor), gravity, 1.0)
+
+
+def test_reset_goes_back_to_the_start():
+    sim = Simulator(small())
+    first = sim.run(steps=40)
+    sim["box"].push((0.3, 0, 0))
+    sim.step(5)
+    sim.reset()
+    again = sim.run(steps=40)
+    for name in ("time", "position", "velocity", "contact_point"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
+
+
+def test_what_is_set_is_read_and_moves_the_body_in_metres_and_seconds():
+    sim = Simulator(small(np.zeros(3)))
+    box = sim["box"]
+    quat = np.array([0.0, 0.0, np.sin(0.3), np.cos(0.3)])
+    box.quat_xyzw, box.position, box.velocity, box.angular_velocity = 2 * quat, (1, 2, 3), (0.5, 0, 1), (0, 0, 2)
+    np.testing.assert_allclose(box.quat_xyzw, quat)
+    np.testing.assert_allclose(box.position, (1, 2, 3), atol=1e-12)
+    np.testing.assert_allclose(box.centre, (1 + 0.01 * np.cos(0.6), 2 + 0.01 * np.sin(0.6), 3), atol=1e-12)
+    before = box.centre
+    state = sim.step(7)
+    np.testing.assert_allclose(box.centre, before + 7 * sim.dt * np.array([0.5, 0, 1]), atol=1e-9)
+    np.testing.assert_allclose(state.position[0], box.centre, atol=1e-12)
+    np.testing.assert_allclose(box.angular_velocity, (0, 0, 2), atol=1e-9)
+    assert box.mass == pytest.approx(0.2) and not box.asleep
+
+
+def test_a_push_gives_its_momentum_and_its_moment():
+    quat = np.array([0.1, 0.2, 0.3, 0.9])
+    sim = Simulator(small(np.zeros(3), quat_xyzw=quat / np.linalg.norm(quat)))
+    box, impulse = sim["box"], np.array([0.02, -0.01, 0.03])
+    arm = np.array([0.02, 0.03, -0.01])
+    box.push(impulse, at=box.centre + arm)
+    np.testing.assert_allclose(0.2 * box.velocity, impulse, atol=1e-12)
+    # The angular momentum about the centre of mass is arm x impulse, and free flight keeps it.
+    for _ in range(2):
+        shape = sim.scene.shapes[0]
+        from scipy.spatial.transform import Rotation
+
+        turn = Rotation.from_quat(box.quat_xyzw).as_matrix()
+        inertia = turn @ (shape.inertia * 0.2 / shape.volume) @ turn.T
+        np.testing.assert_allclose(inertia @ box.angular_velocity, np.cross(arm, impulse), atol=1e-9)
+        sim.step(10)
+
+
+def test_contacts_carry_the_weight():
+    sim = Simulator(small(restitution=0.0))
+    assert sim.contact_points() == []
+    sim.step(100)
+    found = sim.contact_points()
+    assert {(c.first, c.second) for c in found} == {("box", "floor")} and len(found) >= 3
+    inner = sim.dt / sim.rules.substeps
+    np.testing.assert_allclose(sum(c.impulse for c in found) / inner, -0.2 * G, atol=0.02 * 0.2 * 9.81)
+    for c in found:
+        np.testing.assert_allclose(c.normal, (0, 0, 1), atol=1e-9)
+        assert abs(c.point[2]) < 1e-3 and -1e-3 < c.penetration < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [
+        (lambda sim: sim["bax"], "there is no body 'bax'"),
+        (lambda sim: sim["floor"].push((0, 0, 1)), "body 'floor': is static, so it cannot be pushed"),
+        (lambda sim: setattr(sim["box"], "velocity", (1, 2)), "velocity: must be 3 finite numbers"),
+        (lambda sim: setattr(sim["box"], "position", (1, 2, np.nan)), "position: must be 3 finite numbers"),
+        (lambda sim: setattr(sim["box"], "quat_xyzw", (0, 0, 0, 0)), "must not be zero"),
+    ],
+)
+def test_what_cannot_be_is_refused(what, message):
+    with pytest.raises(SdfsimError, match=message):
+        what(Simulator(small()))
+
+
+def test_variants_are_what_they_would_be_alone_in_their_order():
+    scene = small(restitution=0.8)
+    changed = [{"box": {"velocity": (k, 0, 0), "mass": 0.1 + k}, "floor": {"friction": 0.1 * k}} for k in range(5)]
+    sim = Simulator(scene)
+    found = sim.rollouts([{}, *changed], steps=30)
+    assert len(found) == 6
+    np.testing.assert_array_equal(found[0].position, sim.run(steps=30).position)
+    for rollout, variant in zip(found[1:], changed, strict=True):
+        bodies = (
+            replace(scene.bodies[0], velocity=np.array(variant["box"]["velocity"], float), mass=variant["box"]["mass"]),
+            replace(scene.bodies[1], friction=variant["floor"]["friction"]),
+        )
+        alone = Simulator(replace(scene, bodies=bodies)).run(steps=30)
+        np.testing.assert_array_equal(rollout.position, alone.position)
+    reach = [rollout.position[-1, 0, 0] for rollout in found[1:]]
+    assert reach == sorted(reach) and reach[-1] > 0.1
+
+
+@pytest.mark.parametrize(
+    ("variant", "message"),
+    [
+        ({"bix": {}}, r"no body 'bix' \(did you mean 'box'\?\)"),
+        ({"box": {"masss": 1}}, r"no such field \(did you mean 'mass'\?\); there are position"),
+        ({"box": {"mass": 0}}, "mass: must be > 0"),
+        ({"box": {"restitution": 1.5}}, "must be 0 to 1"),
+        ({"box": {"velocity": (1, 2)}}, "must be 3 finite numbers"),
+        ({"floor": {"velocity": (1, 2, 3)}}, "is static, so it has no velocity"),
+    ],
+)
+def test_variants_that_cannot_be_are_refused(variant, message):
+    with pytest.raises(SdfsimError, match=message):
+        variants.varied(small(), variant)
