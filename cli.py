@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import typer
 
 from pipeline.commands import distill, fit, mesh, poses, reconstruct
@@ -11,12 +13,30 @@ from sdfsim.commands.studying import stress, tradeoff
 
 app = typer.Typer(
     name="sdfsim",
-    help="Rigid-body simulation over learned signed-distance functions, from photos to motion.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
+
+
+def _tell_version(wanted: bool) -> None:
+    if wanted:
+        from sdfsim import __version__
+
+        print(f"sdfsim {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="Print the version and stop.")
+    ] = False,
+) -> None:
+    """Rigid-body simulation over learned signed-distance functions, from photos to motion."""
+
+
 for command in (
     reconstruct,
     poses,

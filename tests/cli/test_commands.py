@@ -264,3 +264,9 @@ def test_a_folder_without_a_name_is_not_the_current_one(scene, model, monkeypatc
     before = sorted(tmp_path.rglob("*"))
     done = run("simulate", scene, "-o", "", "--model", model, "--seconds", 0.1)
     assert done.exit_code == 2 and "is empty" in done.stderr and sorted(tmp_path.rglob("*")) == before
+
+
+def test_the_version_is_the_package_s():
+    import sdfsim
+
+    assert run("--version").stdout == f"sdfsim {sdfsim.__version__}\n"
