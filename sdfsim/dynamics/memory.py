@@ -20,7 +20,7 @@ COUNTS = {
     "nodes": "nodes of the graph that the network saw",
     "edges": "edges of that graph",
     "free": "dynamic bodies in free flight",
-    "active": "dynamic bodies that contacts moved",
+    "active": "dynamic bodies awake that contacts moved",
     "asleep": "dynamic bodies asleep",
 }
 PHASES = {

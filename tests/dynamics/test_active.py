@@ -198,6 +198,13 @@ def test_every_counter_is_in_every_rollout(dropped):
     assert (phases[1:] > 0).all() and (phases <= rollout.counters["step_ms"]).all()
 
 
+def test_every_dynamic_body_is_counted_once_while_it_flies_touches_and_falls_asleep(dropped):
+    found = Simulator(replace(dropped, effects=Effects(sleep="on"), bodies=dropped.bodies[:3]), "solver").run(steps=250)
+    free, active, asleep = (found.counters[name][1:] for name in ("free", "active", "asleep"))
+    assert (free + active + asleep == 2).all() and min(free.min(), active.min(), asleep.min()) == 0
+    assert free.max() > 0 and active.max() > 0 and asleep[-1] == 2
+
+
 STILL = np.array([0.0, 0.0, 0.0, 1.0])
 TURNED = np.array([0.0, 0.0, np.sin(0.4), np.cos(0.4)])
 

@@ -78,14 +78,14 @@ def step(shapes, world, work, motion, rules, manifolds):
                 moved = _advance(world, motion, matrix, rules, change, shift, work.part[b], trial, frame, b)
                 work.gone[b] += moved
                 work.met[b] = work.met[b] or motion.touching[b]
-    met = 0
-    for b in world.going:
-        met += work.met[b]
     if rules.note:
         edges = gathered(world, motion, matrix, manifolds, len(near.start), rules.steps, edges)
     _lead(world, motion, rules)
     if rules.sleep:
         _settle(world, motion, rules, manifolds)
+    met = 0  # of those that are awake still
+    for b in world.going:
+        met += work.met[b] and motion.island[b] < 0
     return manifolds, edges, (len(near.start), contacts, islands, met, looked)
 
 
