@@ -274,9 +274,5 @@ def _put(now: dict[str, Tensor], rows: Tensor, values: tuple[Tensor, ...]) -> di
     return {name: now[name].index_copy(0, rows, value) for name, value in zip(_POSE, values, strict=True)}
 
 
-def _product(coefficient: Tensor, contacts: Contacts) -> Tensor:
-    return coefficient[contacts.owner] * coefficient[contacts.body]
-
-
 def _shift(earlier: Tensor | None, now: Tensor) -> Tensor | None:
     return None if earlier is None else torch.stack([earlier[1], now])
