@@ -17,17 +17,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import Trajectory, load_shapes, read_info, trajectory_files
 from sdfsim.data.replay import every
-from sdfsim.dynamics.graph import SUBSTEPS
+from sdfsim.dynamics.graph import SUBSTEPS, ContactGraph
+from sdfsim.dynamics.impulse import Velocities
 from sdfsim.dynamics.model import SOLVER, load_model
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.errors import run_main
 from sdfsim.evaluation.evaluate import evaluate
 from sdfsim.evaluation.harness import Job, Results, markdown, measure, one_thread
 from sdfsim.files import write_text
+from sdfsim.training.contact_cache import Solved, contact_frames, join_frames
+from sdfsim.training.impulse_task import ImpulseTask
+from sdfsim.training.presets import PRESETS
 from sdfsim.training.train import train
 
 FRAME = "50"  # steps up to which, or at which, errors are told
@@ -83,6 +88,32 @@ def timed(model: str, method: Method, data: Path) -> dict[str, Any]:
     return {"us": statistics.median(taken)}
 
 
+def one_step(folders: list[Path], models: dict[str, list[str]]) -> str:
+    """Held-out one-step losses of free flight, the solve, and each preset's networks on the frames that it knows."""
+    lines = []
+    for preset, paths in models.items():
+        plan = PRESETS[preset]
+        sets = [contact_frames(f, "validation", Solved(k, plan.inner, 1)) for f in folders for k in plan.strides]
+        task = ImpulseTask(join_frames(sets), torch.device("cpu"))
+        batches = [task.draw(np.random.default_rng(seed), 64) for seed in range(8)]
+        ways = {"free flight": _free, "solve": _solve} | {
+            f"seed {k}": load_model(p).network for k, p in enumerate(paths)
+        }
+        with torch.no_grad():
+            found = {name: np.mean([float(task.loss(way, batch)) for batch in batches]) for name, way in ways.items()}
+        lines.append(f"{preset}: " + ", ".join(f"{name} {loss:.4f}" for name, loss in found.items()))
+    return "\n".join(["One-step losses on held-out frames, m/s", *lines]) + "\n"
+
+
+def _free(g: ContactGraph, *, mirrored: bool = False) -> Velocities:
+    mean = 0.5 * (g.velocity + g.free_velocity), 0.5 * (g.angular + g.free_angular)
+    return Velocities(g.free_velocity, g.free_angular, *mean)
+
+
+def _solve(g: ContactGraph, *, mirrored: bool = False) -> Velocities:
+    return Velocities(g.solved_velocity, g.solved_angular, g.mean_velocity, g.mean_angular)
+
+
 def trained(folders: list[Path], out: Path, preset: str, seed: int, steps: int | None) -> Path:
     """The model of a preset and a seed; trained now, or on from where it was left."""
     place = out / "runs" / f"{preset}-{seed}"
@@ -118,12 +149,15 @@ def main() -> None:
     chosen = parser.parse_args()
     seeds, first = list(range(chosen.seeds)), chosen.data[0]
     places = [(data, split) for data in (first, chosen.at_frames) for split in ("validation", "test")]
-    jobs = []
+    jobs: list[Job] = []
+    models: dict[str, list[str]] = {}
     for name, method in METHODS.items():
         for seed in seeds if method.preset else seeds[:1]:
             model = SOLVER
             if method.preset:
                 model = str(trained(chosen.data, chosen.out, method.preset, seed, chosen.steps))
+                if model not in models.setdefault(method.preset, []):
+                    models[method.preset].append(model)
             content = [method, load_model(model).network if method.preset else None, read_info(first)]
             for data, split in places:
                 key, floor = f"{data.name}-{split}", name == next(iter(METHODS))
@@ -145,7 +179,7 @@ def main() -> None:
             errors = errors["at_frame"] if errors and data == chosen.at_frames else errors
             cells.append("-" if not errors else f"{errors['translation_rmse']:.3f} m, {errors['rotation_error']:.1f}°")
         rows.append((f"the teacher again, {size} m/s off", *cells, ""))
-    table = markdown(rows)
+    table = markdown(rows) + "\n" + one_step(chosen.data, models)
     write_text(chosen.out / "table.md", table)
     print(table)
 

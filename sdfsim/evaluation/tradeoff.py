@@ -249,8 +249,6 @@ def settings(models: Sequence[str], *, quick: bool, cuda: bool) -> list[Setting]
             knobs += [{"stride": 2, "substeps": k} for k in ((1,) if quick else (1, 2, 4))]
         elif name == next(n for n in models if kinds[n] != SOLVER):
             knobs += [{"sdf": "grid 64"}]
-            if kinds[name] == "impulse":
-                knobs += [{"stride": 2}]
             if not quick:
                 knobs += [{"sdf": "grid 32"}, {"sdf": "grid 128"}, {"sleep": True}]
             knobs += [{"device": "cuda"}] if cuda else []
