@@ -96,7 +96,7 @@ def one_step(folders: list[Path], models: dict[str, list[str]]) -> str:
         sets = [contact_frames(f, "validation", Solved(k, plan.inner, 1)) for f in folders for k in plan.strides]
         task = ImpulseTask(join_frames(sets), torch.device("cpu"))
         batches = [task.draw(np.random.default_rng(seed), 64) for seed in range(8)]
-        ways = {"free flight": _free, "solve": _solve} | {
+        ways: dict[str, Any] = {"free flight": _free, "solve": _solve} | {
             f"seed {k}": load_model(p).network for k, p in enumerate(paths)
         }
         with torch.no_grad():
@@ -167,7 +167,7 @@ def main() -> None:
                 jobs.append(Job("time", name, content, timed, (model, method, first)))
     results = measure(jobs, chosen.out / "results", on_progress=told)
     head = ("", *(f"{data.name}, {split}" for data, split in places), "µs for 20 ms")
-    rows = [head]
+    rows: list[tuple[str, ...]] = [head]
     for name in METHODS:
         cells = [cell(results, name, seeds, f"{d.name}-{s}", d == chosen.at_frames) for d, s in places]
         rows.append((name, *cells, f"{results['time', name].get('us', float('nan')):.0f}"))
