@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import yaml
 
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import State, from_scene
@@ -25,6 +24,7 @@ from sdfsim.dynamics.model import SOLVER, load_model
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.step import Rules, step
 from sdfsim.errors import SdfsimError
+from sdfsim.run import scene_of
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.scene.scene_file import load_scene
 
@@ -131,20 +131,12 @@ def load_recording(
         SdfsimError: no scene, or unreadable files.
     """
     if path.is_dir():
-        scene_file = scene_file or _scene_of(path)
+        scene_file = scene_file or scene_of(path)
         path = path / "rollout.npz"
     if scene_file is None:
         raise SdfsimError(f"{path}: a recording without its scene", "give it: --scene scene.yaml")
     scene = load_scene(scene_file, on_progress, allow_outside=allow_outside)
     return recorded(path, scene), scene
-
-
-def _scene_of(folder: Path) -> Path:
-    try:
-        config = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
-        return Path(config["scene"])
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError) as error:
-        raise SdfsimError(f"{folder}: not the folder of a simulation ({error})", "give its scene: --scene") from error
 
 
 def recorded(path: Path, scene: Scene) -> Recording:

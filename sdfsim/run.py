@@ -35,10 +35,12 @@ from sdfsim.files import (
     write_text,
 )
 from sdfsim.recording import Playback, save_rollout
+from sdfsim.scene.scene import Scene
 from sdfsim.scene.scene_file import load_scene
 
 Viewer = Literal["none", "file", "native", "web"]
 Progress = Callable[[str, float, str], None]  # stage, fraction of it that is done, message
+Told = Callable[[float, str], None]
 CHECKPOINT = "checkpoint"  # folder in that of the run
 EVERY = 30.0  # s between two checkpoints
 _REPORT = "report.json"
@@ -197,6 +199,37 @@ def _live(scene: Any, viewer: Viewer, first: Rollout, say: Callable[[str], None]
     live.log_static()
     live.log_steps(first)
     return live
+
+
+def read_run(
+    path: Path, scene_file: Path | None = None, *, allow_outside: bool = False, on_progress: Told | None = None
+) -> tuple[Scene, Rollout]:
+    """A finished or interrupted run, and its scene.
+
+    Args:
+        path: run folder, or the `rollout.npz` in one.
+        scene_file: its scene; None: the one that the run was made from.
+        allow_outside: whether the scene may name files outside of its own folder.
+        on_progress: called with the fraction done and a message while shapes are fitted.
+
+    Raises:
+        SdfsimError: no run, no scene, or another scene than that of the run.
+    """
+    file = path / "rollout.npz" if path.is_dir() else path
+    rollout = Rollout.load(file)
+    scene = load_scene(scene_file or scene_of(file.parent), on_progress, allow_outside=allow_outside)
+    if tuple(body.name for body in scene.bodies) != rollout.names:
+        raise SdfsimError(f"{file}: its bodies are not those of {scene.path}", "give its scene: --scene")
+    return scene, rollout
+
+
+def scene_of(folder: Path) -> Path:
+    """The scene file of a run folder. Raises SdfsimError where there is none."""
+    try:
+        config = yaml.safe_load((folder / CONFIG).read_text(encoding="utf-8"))
+        return Path(config["scene"])
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError) as error:
+        raise SdfsimError(f"{folder}: not the folder of a simulation ({error})", "give its scene: --scene") from error
 
 
 def summary(rollout: Rollout, wall: float) -> dict[str, Any]:
