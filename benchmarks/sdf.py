@@ -2,9 +2,9 @@
 
     python benchmarks/sdf.py MESH_FOLDER -o DIR [--shapes cube,torus] [--seconds 60]
 
-MESH_FOLDER holds NAME/visual_geometry.obj for each shape. Each is fitted with our recipe and the paper's at equal time,
-with other widths of the network, and with smaller budgets; then queries of one shape are timed. Fits that DIR holds are
-not made again. Writes DIR/table.md and DIR/sdf.png.
+MESH_FOLDER holds NAME/visual_geometry.obj for each shape; `kubasic` downloads Kubric's. Each is fitted with our recipe
+and the paper's at equal time, with other widths of the network, and with smaller budgets; then queries of one shape are
+timed. Fits that DIR holds are not made again. Writes DIR/table.md and DIR/sdf.png.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from sdfsim.data.public_shapes import public_folder
 from sdfsim.errors import SdfsimError, run_main
 from sdfsim.evaluation.harness import Job, Line, Panel, Results, draw, machine, markdown, measure, number
 from sdfsim.files import write_text
@@ -97,7 +98,7 @@ def main() -> None:
     parser.add_argument("--shapes", help="names, separated by commas (default: all)")
     parser.add_argument("--seconds", type=float, default=60.0, help="budget of a fit")
     chosen = parser.parse_args()
-    files = {file.parent.name: file for file in sorted(chosen.meshes.glob("*/visual_geometry.obj"))}
+    files = {file.parent.name: file for file in sorted(public_folder(chosen.meshes).glob("*/visual_geometry.obj"))}
     names = chosen.shapes.split(",") if chosen.shapes else list(files)
     if not files or set(names) - set(files):
         raise SdfsimError(f"{chosen.meshes}: no NAME/visual_geometry.obj of {', '.join(names) or 'any shape'}")

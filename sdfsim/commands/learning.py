@@ -17,7 +17,10 @@ def dataset(
     trajectories: Annotated[int, typer.Option(help="How many.", min=1, show_default=False)],
     shapes: Annotated[
         Path | None,
-        typer.Option(help="Folder of meshes (bowl has its own; movi-b: NAME/ folders with convex pieces only)."),
+        typer.Option(
+            help="Folder of meshes (bowl has its own; movi-b: NAME/ folders with convex pieces only), or kubasic or "
+            "ycb: public ones, downloaded once."
+        ),
     ] = None,
     random_solids: Annotated[
         int, typer.Option(help="So many of PyBullet's random solids beside them (not movi-b).", min=0, max=1000)

@@ -49,7 +49,9 @@ def stress(
         list[str] | None, typer.Option(help="Bundled model or path; may be given again (default: all bundled ones).")
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Fewer and shorter cases, in minutes.")] = False,
-    shapes: Annotated[Path | None, typer.Option(help="Folder of meshes that are to rest on the floor too.")] = None,
+    shapes: Annotated[
+        Path | None, typer.Option(help="Folder of meshes that are to rest on the floor too, or ycb: downloaded once.")
+    ] = None,
     as_json: Json = False,
     device: Device = "auto",
     verbose: Verbose = False,

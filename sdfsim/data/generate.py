@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sdfsim.data.dataset import FLOOR, INFO, SPLITS, Trajectory, read_info
+from sdfsim.data.public_shapes import public_folder
 from sdfsim.data.pybullet_sim import FPS, RATES, TEACHER_VERSION, Teacher, engine_settings, import_pybullet
 from sdfsim.data.scenarios import RECIPES, Cast, Recipe
 from sdfsim.data.shape_assets import VHACD, Origin, fit_shapes, origins, prepare, split_of
@@ -47,7 +48,8 @@ def make_dataset(
         recipe: a name in `RECIPES`.
         out: dataset folder.
         trajectories: how many.
-        shapes: folder of shapes (see `origins`); movi-b takes its NAME/ folders alone.
+        shapes: folder of shapes (see `origins`) or name of a public set (see `public_folder`); movi-b takes NAME/
+            folders alone.
         random_solids: how many of PyBullet's random solids there are beside them.
         bodies: how many move, instead of the recipe's range (bowl and pile).
         fps: recorded frames a second, in `RATES`.
@@ -60,13 +62,13 @@ def make_dataset(
         why).
 
     Raises:
-        SdfsimError: unknown recipe or rate, an option that the recipe has no use for, no usable shapes, PyBullet
-            absent, another dataset in `out`, or another run writing to it.
+        SdfsimError: unknown recipe or rate, an option that the recipe has no use for, no usable shapes or none to be
+            fetched, PyBullet absent, another dataset in `out`, or another run writing to it.
     """
     plan = _checked(recipe, shapes, random_solids, bodies, fps)
     tell = on_progress or (lambda fraction, message: None)
     engine = import_pybullet()
-    given = _origins(plan, shapes, random_solids)
+    given = _origins(plan, shapes and public_folder(shapes, tell), random_solids)
     info = {
         "recipe": recipe,
         "seed": seed,
@@ -174,8 +176,8 @@ def _checked(recipe: str, shapes: Path | None, random_solids: int, bodies: int |
         counted = " and ".join(name for name, r in RECIPES.items() if r.counted)
         raise SdfsimError(f"--bodies goes with {counted}, and is 1 to {MOST_BODIES} (got {bodies} for {recipe})")
     if plan.given and shapes is None and (plan.kubasic or not random_solids):
-        also = "" if plan.kubasic else " or --random-solids N"
-        raise SdfsimError(f"{recipe} needs shapes", f"give --shapes FOLDER{also}")
+        which = "kubasic, or a folder of such shapes" if plan.kubasic else "FOLDER or --random-solids N"
+        raise SdfsimError(f"{recipe} needs shapes", f"give --shapes {which}")
     if random_solids and (plan.kubasic or not plan.given):
         raise SdfsimError(f"{recipe} has no use for --random-solids")
     if shapes is not None and not plan.given:

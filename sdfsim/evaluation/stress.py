@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 import sdfsim
+from sdfsim.data.public_shapes import public_folder
 from sdfsim.data.pybullet_sim import DT, SUBSTEPS, TEACHER_VERSION, engine_settings, import_pybullet
 from sdfsim.dynamics.model import SOLVER, Model, load_model, model_names
 from sdfsim.dynamics.ranges import constant_in_training
@@ -75,21 +76,21 @@ def stress(
         out: folder for results/, recordings/ and the engine's files.
         models: names or paths; none for the solver and all bundled networks.
         quick: fewer and shorter cases.
-        shapes: folder of meshes that are to rest on the floor too.
+        shapes: folder of meshes that are to rest on the floor too, or name of a public set (see `public_folder`).
         device: cpu, cuda or auto.
         record: writes a motion of each case that is not as wanted into a file; None for no recordings.
         on_progress: called with (fraction, message).
 
     Raises:
-        SdfsimError: no such model or device, two models of one name, unusable shapes, another run in the folder, or a
-            folder that cannot be written.
+        SdfsimError: no such model or device, two models of one name, unusable shapes or none to be fetched, another run
+            in the folder, or a folder that cannot be written.
     """
     device = str(pick_device(device))
     tested = [load_model(name) for name in models or model_names()]
     who = [model.name for model in tested]
     if twice := {name for name in who if who.count(name) > 1}:
         raise SdfsimError(f"two models are called {min(twice)!r}", "rename a file: results are kept by name")
-    found = cases(quick=quick, shapes=shapes)
+    found = cases(quick=quick, shapes=shapes and public_folder(shapes, on_progress))
     with_teacher = _teacher_is_here()
     jobs, cut = [], {}
     for case in found:
