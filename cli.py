@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from pipeline.commands import distill, fit, mesh, poses, reconstruct
+from sdfsim.commands.exporting import export
 from sdfsim.commands.learning import dataset, evaluate, train
 from sdfsim.commands.simulating import identify, info, plan, simulate, view
 from sdfsim.commands.studying import stress, tradeoff
@@ -47,6 +48,7 @@ for command in (
     plan,
     view,
     identify,
+    export,
     dataset,
     train,
     evaluate,

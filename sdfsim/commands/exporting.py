@@ -1,0 +1,49 @@
+"""Shapes, scenes and runs for other programs: export."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sdfsim.commands.arguments import Device, Json, Outside, Verbose, check_device
+from sdfsim.console import Session
+
+
+def export(
+    source: Annotated[
+        Path,
+        typer.Argument(help="Run folder, rollout.npz, scene.yaml or Shape folder.", show_default=False),
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(
+            "-o",
+            "--out",
+            metavar="FILE",
+            help="Ends in .glb .usd .usda .usdc .xml .mjcf .urdf or .csv.",
+            show_default=False,
+        ),
+    ],
+    scene: Annotated[Path | None, typer.Option(help="scene.yaml of a run (default: that of the run folder).")] = None,
+    allow_outside: Outside = False,
+    as_json: Json = False,
+    device: Device = "auto",
+    verbose: Verbose = False,
+) -> None:
+    """Shape, scene or run -> a file of other programs (docs/export.md)."""
+    with Session(as_json=as_json, verbose=verbose) as session:
+        from sdfsim import export as room
+
+        check_device(device)
+        report = room.export(
+            source, out, scene_file=scene, allow_outside=allow_outside, on_progress=session.stage_progress
+        )
+        files = report["files"]
+        lines = [
+            f"{report['bodies']} bodies, {report['frames']} frames",
+            f"wrote {files[0]}" if len(files) == 1 else f"wrote {len(files)} files, {files[-1]} the last of them",
+            *(f"not in it: {line}" for line in report["left_out"]),
+        ]
+        session.report(report, lines)

@@ -1,0 +1,709 @@
+"""`export`: a shape, a scene or a run becomes a file that other programs open.
+
+Pose frames are the shapes' own origins in every format. What a format cannot hold is told in the report's `left_out`;
+docs/export.md says it of each format.
+"""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import io
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sdfsim.errors import SdfsimError
+from sdfsim.files import check_writable, replacing, write_text
+from sdfsim.identify import COLUMNS
+from sdfsim.recording import distinct_colors, framed, sheet, with_normals
+from sdfsim.run import read_run
+from sdfsim.scene.collision_filter import contact_groups
+from sdfsim.scene.scene import Body, Scene
+from sdfsim.scene.scene_file import load_scene
+from sdfsim.shape.mesh import Mesh, convex_hull
+from sdfsim.shape.primitives import PRIMITIVES, convex_pieces
+from sdfsim.shape.sdf import BoxSdf, CapsuleSdf, ClosedForm, CylinderSdf, PlaneSdf, SphereSdf
+from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape
+
+DENSITY = 1000.0  # kg/m^3 of a shape on its own, as of a body that a scene says nothing about
+FRICTION = RESTITUTION = 0.5  # likewise
+GRAVITY = (0.0, 0.0, -9.81)  # m/s^2, likewise
+STATIC_COLOR = (150, 150, 155)
+HUES = 32  # colours that bodies take in turn
+COACD = {"threshold": 0.05, "seed": 0}  # concavity relative to the size
+RATE = 60.0  # USD time codes in a second; programs step through the whole ones
+STEP = 0.002  # s, of MuJoCo
+MOST_PAIRS = 1000  # of geoms whose coefficients are written one by one
+MOST_GROUPS = 31  # MuJoCo's bit masks
+RESERVED = ("world", "root", "physics", "materials", "shapes", "groups")  # names of ours, or of MuJoCo's own
+Progress = Callable[[str, float, str], None]  # stage, fraction of it that is done, message
+XML = ElementTree.Element
+
+
+@dataclass(frozen=True)
+class Take:
+    """What is exported: N bodies at T times.
+
+    Attributes:
+        scene: the bodies as they are at the start.
+        names: [N] unique names of ASCII letters, digits and underscores.
+        shapes: names of the scene's shapes, likewise.
+        colors: [N, 3] uint8 sRGB, for bodies whose mesh has no colours.
+        time: [T] s.
+        position: [T, N, 3] m, of the shapes' own origins.
+        quat_xyzw: [T, N, 4], the nearer of the two signs from one time to the next.
+    """
+
+    scene: Scene
+    names: list[str]
+    shapes: list[str]
+    colors: np.ndarray
+    time: np.ndarray
+    position: np.ndarray
+    quat_xyzw: np.ndarray
+
+    def each(self) -> Iterable[tuple[str, Body, Shape, np.ndarray]]:
+        """Name, body, shape and colour of every body."""
+        shapes = [self.scene.shapes[body.shape] for body in self.scene.bodies]
+        return zip(self.names, self.scene.bodies, shapes, self.colors, strict=True)
+
+    def plane_size(self) -> float:
+        """m to each side, of the sheet that is shown for a plane."""
+        return 6.0 * framed(self.scene)[1]
+
+    def display(self, shape: Shape) -> Mesh:
+        """The mesh that is shown at scale 1."""
+        return sheet(self.plane_size()) if isinstance(shape.sdf, PlaneSdf) else shape.mesh
+
+
+class Written(NamedTuple):
+    """The files of an export, and what they do not hold, one line each."""
+
+    files: list[Path]
+    left_out: list[str]
+
+
+def export(
+    source: Path,
+    out: Path,
+    *,
+    scene_file: Path | None = None,
+    allow_outside: bool = False,
+    on_progress: Progress = lambda stage, fraction, message: None,
+) -> dict[str, Any]:
+    """Write a shape, a scene or a run in the format that the ending of `out` names.
+
+    Args:
+        source: a run folder or its rollout.npz, a scene.yaml, or a Shape folder.
+        out: file to write, with one of the endings of `FORMATS`; its folder is made if missing.
+        scene_file: of a run, None for the one that it was made from.
+        allow_outside: whether the scene may name files outside of its own folder.
+        on_progress: called with (stage, fraction, message).
+
+    Returns:
+        A report: format, bodies, frames, files and left_out.
+
+    Raises:
+        SdfsimError: unknown ending, damaged source, an extra that is not installed, a shape without convex pieces, or
+            a file that cannot be written.
+    """
+    kind = out.suffix.lower()
+    if kind not in FORMATS:
+        raise SdfsimError(f"{out}: unknown format {out.suffix or '(no ending)'}", "end it in " + " ".join(FORMATS))
+    if FORMATS[kind] is _usd:
+        _extra("pxr.Usd")  # before shapes are fitted for minutes
+    check_writable(out.parent)
+    take = _read(source, scene_file, allow_outside, on_progress)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    written = FORMATS[kind](take, out, on_progress)
+    return {
+        "format": kind[1:],
+        "bodies": len(take.names),
+        "frames": len(take.time),
+        "files": written.files,
+        "left_out": written.left_out,
+    }
+
+
+def _extra(module: str) -> Any:
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        package = {"pxr": "usd-core"}.get(module.partition(".")[0], module)
+        raise SdfsimError(f"{package} is not installed", "pip install 'sdfsim[export]'") from error
+
+
+# --- the source ---
+
+
+def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progress: Progress) -> Take:
+    def told(fraction: float, message: str) -> None:
+        on_progress("shapes", fraction, message)
+
+    if source.suffix == ".npz" or (source / "rollout.npz").is_file():
+        scene, run = read_run(source, scene_file, allow_outside=allow_outside, on_progress=told)
+        turn = run.orientation.copy()
+        turn[1:] *= np.cumprod(np.where((turn[1:] * turn[:-1]).sum(-1) < 0, -1.0, 1.0), axis=0)[..., None]
+        com = np.array([body.scale * scene.shapes[body.shape].com for body in scene.bodies])
+        offset = Rotation.from_quat(turn.reshape(-1, 4)).apply(np.tile(com, (len(turn), 1)))
+        return _take(scene, run.time, run.position - offset.reshape(run.position.shape), turn)
+    if scene_file is not None:
+        raise SdfsimError(f"{source}: only a run has a scene beside it", "leave --scene away")
+    if (source / RECORD_FILE).is_file():
+        scene = _alone(load_shape(source))
+    elif source.suffix.lower() in (".yaml", ".yml"):
+        scene = load_scene(source, told, allow_outside=allow_outside)
+    else:
+        told_of = "a run folder, a rollout.npz, a scene.yaml or a Shape folder"
+        raise SdfsimError(f"{source}: {'not' if source.exists() else 'no such file;'} {told_of}")
+    position = np.array([body.position for body in scene.bodies])
+    return _take(scene, np.zeros(1), position[None], np.array([body.quat_xyzw for body in scene.bodies])[None])
+
+
+def _alone(shape: Shape) -> Scene:
+    """A shape as the one body of a scene."""
+    moves = shape.volume > 0
+    body = Body(
+        name=shape.name,
+        shape=0,
+        motion="dynamic" if moves else "static",
+        scale=1.0,
+        position=np.zeros(3),
+        quat_xyzw=np.array([0.0, 0.0, 0.0, 1.0]),
+        velocity=np.zeros(3),
+        angular_velocity=np.zeros(3),
+        mass=DENSITY * shape.volume if moves else 0.0,
+        friction=FRICTION,
+        restitution=RESTITUTION,
+    )
+    return Scene((shape,), (body,), np.array(GRAVITY), 0.0)
+
+
+def _take(scene: Scene, time: np.ndarray, position: np.ndarray, quat: np.ndarray) -> Take:
+    moving = [k for k, body in enumerate(scene.bodies) if body.motion != "static"]
+    colors = np.tile(np.array(STATIC_COLOR, dtype=np.uint8), (len(scene.bodies), 1))
+    hues = list(distinct_colors(min(len(moving), HUES)))
+    for count, k in enumerate(moving):
+        colors[k] = hues[count % HUES]
+    names = _plain_names([body.name for body in scene.bodies])
+    return Take(scene, names, _plain_names([s.name for s in scene.shapes]), colors, time, position, quat)
+
+
+def _plain_names(names: list[str]) -> list[str]:
+    """Unique names that every format takes, in place of `names`."""
+    used: set[str] = set(RESERVED)
+    plain = []
+    for name in names:
+        stem = re.sub(r"\W", "_", name, flags=re.ASCII) or "_"
+        stem = f"_{stem}" if stem[0].isdigit() else stem
+        # Files of one name but for their case would be one file on some systems.
+        choice = next(c for k in range(len(used) + 1) if (c := f"{stem}_{k}" if k else stem).lower() not in used)
+        used.add(choice.lower())
+        plain.append(choice)
+    return plain
+
+
+# --- what several formats need ---
+
+
+def _inertia(body: Body, shape: Shape) -> np.ndarray:
+    """[3, 3] kg m^2 of a dynamic body about its centre of mass, shape axes."""
+    return body.inertia if body.inertia is not None else body.mass / shape.volume * body.scale**2 * shape.inertia
+
+
+def _own_pieces(shape: Shape) -> list[Mesh]:
+    """Convex pieces [m] that a shape comes with; empty where it has none."""
+    if shape.pieces:
+        return [convex_hull(points) for points in shape.pieces]
+    kind = str(shape.source.get("primitive", ""))
+    try:
+        pieces = convex_pieces(kind)
+    except SdfsimError:  # no primitive, or one without
+        return []
+    factor = float(np.ptp(shape.mesh.vertices, axis=0).max() / np.ptp(PRIMITIVES[kind]().vertices, axis=0).max())
+    return [Mesh(piece.vertices * factor, piece.faces) for piece in pieces]
+
+
+def _pieces(shape: Shape) -> list[Mesh]:
+    """Convex pieces [m]: the shape's own, or those of CoACD. Raises SdfsimError where there are none."""
+    if own := _own_pieces(shape):
+        return own
+    coacd = _extra("coacd")
+    coacd.set_log_level("off")
+    try:
+        found = coacd.run_coacd(coacd.Mesh(shape.mesh.vertices, shape.mesh.faces), **COACD)
+        return [convex_hull(np.asarray(vertices)) for vertices, _ in found]
+    except (RuntimeError, ValueError, SdfsimError) as error:
+        raise SdfsimError(f"shape {shape.name}: CoACD cannot cut it into convex pieces ({error})") from error
+
+
+def _cut(take: Take, wanted: Callable[[Body], bool], on_progress: Progress) -> dict[int, list[Mesh]]:
+    """Convex pieces of every shape without a closed form that a wanted body has, by its index."""
+    used = {body.shape for body in take.scene.bodies if wanted(body)}
+    todo = sorted(k for k in used if not isinstance(take.scene.shapes[k].sdf, ClosedForm))
+    pieces = {}
+    for done, k in enumerate(todo):
+        on_progress("convex pieces", done / len(todo), f"of {take.scene.shapes[k].name}")
+        pieces[k] = _pieces(take.scene.shapes[k])
+    return pieces
+
+
+def _write_obj(folder: Path, name: str, mesh: Mesh) -> Path:
+    lines = ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in mesh.vertices]
+    lines += ["f {} {} {}".format(*(face + 1)) for face in mesh.faces]
+    write_text(folder / f"{name}.obj", "\n".join(lines) + "\n")
+    return folder / f"{name}.obj"
+
+
+def _write_assets(
+    take: Take, out: Path, pieces: dict[int, list[Mesh]]
+) -> tuple[dict[int, Path], dict[int, list[Path]]]:
+    """OBJ files in `NAME_assets/`: what is shown of each shape without a closed form, and its convex pieces."""
+    folder = out.with_name(f"{out.stem}_assets")
+    shown, cut = {}, {}
+    for k in sorted({body.shape for body in take.scene.bodies}):
+        if isinstance(take.scene.shapes[k].sdf, ClosedForm):
+            continue
+        folder.mkdir(exist_ok=True)
+        shown[k] = _write_obj(folder, take.shapes[k], take.scene.shapes[k].mesh)
+        cut[k] = [_write_obj(folder, f"{take.shapes[k]}_piece_{i}", p) for i, p in enumerate(pieces.get(k, []))]
+    return shown, cut
+
+
+def _numbers(*values: Any) -> str:
+    return " ".join(f"{value:.9g}" for value in np.concatenate([np.ravel(value) for value in values]))
+
+
+def _wxyz(quat_xyzw: np.ndarray) -> np.ndarray:
+    return np.roll(quat_xyzw, 1, axis=-1)
+
+
+def _linear(srgb: np.ndarray) -> np.ndarray:
+    """0 to 255 as light from 0 to 1, which glTF and USD count in."""
+    value = np.asarray(srgb) / 255.0
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def _add(parent: XML, tag: str, **attributes: str) -> XML:
+    return ElementTree.SubElement(parent, tag, {key.rstrip("_"): value for key, value in attributes.items()})
+
+
+def _write_xml(path: Path, root: XML) -> None:
+    ElementTree.indent(root)
+    write_text(path, ElementTree.tostring(root, encoding="unicode") + "\n")
+
+
+def _start_only(take: Take) -> list[str]:
+    """What a format without motion leaves out."""
+    moved = ["the motion: the scene is as it is at the start"] if len(take.time) > 1 else []
+    led = any(body.motion == "kinematic" for body in take.scene.bodies)
+    return moved + (["the paths of kinematic bodies: they stand where they start"] if led else [])
+
+
+# --- glTF ---
+
+
+def _glb(take: Take, out: Path, on_progress: Progress) -> Written:
+    import trimesh
+    from trimesh.exchange.gltf import export_glb
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
+
+    scene: Any = trimesh.Scene()
+    # One turn at the root takes z up to y up.
+    upright = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    scene.graph.update(frame_from=scene.graph.base_frame, frame_to="root", matrix=upright)
+    light: dict[str, np.ndarray] = {}
+    shaded: dict[int, tuple[Mesh, np.ndarray]] = {}
+    for name, body, shape, color in take.each():
+        if body.shape not in shaded:
+            shaded[body.shape] = with_normals(take.display(shape))
+        mesh, normals = shaded[body.shape]
+        # Bodies of one shape and colour share a mesh; of one shape they share its numbers.
+        key = take.shapes[body.shape] + ("" if mesh.colors is not None else "_{:02x}{:02x}{:02x}".format(*color))
+        if key not in scene.geometry:
+            base = np.ones(3) if mesh.colors is not None else _linear(color)
+            material = PBRMaterial(
+                name=key, baseColorFactor=[*base, 1.0], metallicFactor=0.0, roughnessFactor=0.8, doubleSided=True
+            )
+            visual = TextureVisuals(material=material)
+            scene.geometry[key] = trimesh.Trimesh(
+                mesh.vertices, mesh.faces, vertex_normals=normals, visual=visual, process=False
+            )
+            if mesh.colors is not None:
+                light[key] = _linear(mesh.colors)
+        scene.graph.update(frame_from="root", frame_to=name, geometry=key)
+
+    def finish(buffers: Any, tree: dict[str, Any]) -> None:
+        def accessor(values: np.ndarray, kind: str) -> int:
+            number = len(buffers)
+            buffers[f"sdfsim {number}"] = values.tobytes()
+            told = {"bufferView": number, "byteOffset": 0, "count": len(values), "type": kind}
+            told |= (
+                {"componentType": 5126} if values.dtype == np.float32 else {"componentType": 5123, "normalized": True}
+            )
+            rows = values.reshape(len(values), -1)
+            tree["accessors"][f"sdfsim {number}"] = told | {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()}
+            return len(tree["accessors"]) - 1
+
+        for mesh in tree["meshes"]:
+            if mesh["name"] in light:
+                # trimesh writes 8 bits, too few for dark colours once they count light.
+                rgba = np.pad(light[mesh["name"]], ((0, 0), (0, 1)), constant_values=1.0)
+                colors = accessor(np.round(65535 * rgba).astype(np.uint16), "VEC4")
+                mesh["primitives"][0]["attributes"]["COLOR_0"] = colors
+        nodes = {node["name"]: k for k, node in enumerate(tree["nodes"])}
+        moving = len(take.time) > 1
+        time = accessor(take.time.astype(np.float32), "SCALAR") if moving else 0
+        samplers, channels = [], []
+        for k, (name, body) in enumerate(zip(take.names, take.scene.bodies, strict=True)):
+            # An animated node may not have a matrix.
+            place, turn = take.position[:, k].astype(np.float32), take.quat_xyzw[:, k].astype(np.float32)
+            node = tree["nodes"][nodes[name]]
+            node |= {"translation": place[0].tolist(), "rotation": turn[0].tolist(), "scale": [body.scale] * 3}
+            for path, values, kind in (("translation", place, "VEC3"), ("rotation", turn, "VEC4")):
+                if moving and body.motion != "static":
+                    channels.append({"sampler": len(samplers), "target": {"node": nodes[name], "path": path}})
+                    samplers.append({"input": time, "output": accessor(values, kind), "interpolation": "LINEAR"})
+        if channels:
+            tree["animations"] = [{"name": "run", "samplers": samplers, "channels": channels}]
+
+    with replacing(out) as partial:
+        content = export_glb(scene, include_normals=True, buffer_postprocessor=finish)
+        partial.write_bytes(content)
+    return Written([out], ["masses, friction and what else is not seen"])
+
+
+# --- USD ---
+
+
+def _usd(take: Take, out: Path, on_progress: Progress) -> Written:
+    names = ("Gf", "Sdf", "Usd", "UsdGeom", "UsdPhysics", "UsdShade")
+    gf, sdf, usd, geom, physics, shade = (_extra(f"pxr.{name}") for name in names)
+    stage = usd.Stage.CreateInMemory()
+    geom.SetStageMetersPerUnit(stage, 1.0)
+    geom.SetStageUpAxis(stage, geom.Tokens.z)
+    physics.SetStageKilogramsPerUnit(stage, 1.0)
+    stage.SetDefaultPrim(geom.Xform.Define(stage, "/World").GetPrim())
+    strength = float(np.linalg.norm(take.scene.gravity))
+    gravity = physics.Scene.Define(stage, "/World/physics")
+    gravity.CreateGravityDirectionAttr(gf.Vec3f(*(take.scene.gravity / strength if strength else (0.0, 0.0, -1.0))))
+    gravity.CreateGravityMagnitudeAttr(strength)
+    moving = len(take.time) > 1
+    if moving:
+        stage.SetTimeCodesPerSecond(RATE)
+        stage.SetFramesPerSecond(RATE)
+        stage.SetStartTimeCode(RATE * float(take.time[0]))
+        stage.SetEndTimeCode(RATE * float(take.time[-1]))
+
+    drawn: dict[tuple[int, bool], str] = {}
+    materials: dict[tuple[float, float], Any] = {}
+    for k, (name, body, shape, color) in enumerate(take.each()):
+        prim = geom.Xform.Define(stage, f"/World/{name}").GetPrim()
+        place = geom.Xformable(prim).AddTranslateOp()
+        turn = geom.Xformable(prim).AddOrientOp(geom.XformOp.PrecisionDouble)
+        animated = moving and body.motion != "static"
+        for t in range(len(take.time) if animated else 1):
+            code = usd.TimeCode(RATE * float(take.time[t])) if animated else usd.TimeCode.Default()
+            place.Set(gf.Vec3d(*take.position[t, k].tolist()), code)
+            turn.Set(gf.Quatd(*_wxyz(take.quat_xyzw[t, k]).tolist()), code)
+        shown = geom.PrimvarsAPI(prim).CreatePrimvar("displayColor", sdf.ValueTypeNames.Color3fArray)
+        shown.Set([gf.Vec3f(*_linear(color).tolist())])
+        if body.motion != "static":
+            rigid = physics.RigidBodyAPI.Apply(prim)
+            rigid.CreateKinematicEnabledAttr(body.motion == "kinematic")
+        if body.motion == "dynamic":
+            rigid.CreateVelocityAttr(gf.Vec3f(*body.velocity.tolist()))
+            rigid.CreateAngularVelocityAttr(gf.Vec3f(*np.rad2deg(body.angular_velocity).tolist()))
+            diagonal, axes = np.linalg.eigh(_inertia(body, shape))
+            axes[:, 2] *= np.sign(np.linalg.det(axes))
+            mass = physics.MassAPI.Apply(prim)
+            mass.CreateMassAttr(body.mass)
+            mass.CreateCenterOfMassAttr(gf.Vec3f(*(body.scale * shape.com).tolist()))
+            mass.CreateDiagonalInertiaAttr(gf.Vec3f(*diagonal.tolist()))
+            mass.CreatePrincipalAxesAttr(gf.Quatf(*_wxyz(Rotation.from_matrix(axes).as_quat()).tolist()))
+        surface = (body.friction, body.restitution)
+        if surface not in materials:
+            path = f"/World/materials/surface_{len(materials)}"
+            materials[surface] = shade.Material.Define(stage, path)
+            told = physics.MaterialAPI.Apply(materials[surface].GetPrim())
+            told.CreateStaticFrictionAttr(body.friction)
+            told.CreateDynamicFrictionAttr(body.friction)
+            told.CreateRestitutionAttr(body.restitution)
+            # PhysX takes the mean of two bodies' coefficients unless told. Its schema is not part of OpenUSD.
+            materials[surface].GetPrim().AddAppliedSchema("PhysxMaterialAPI")
+            for what in ("friction", "restitution"):
+                mode = f"physxMaterial:{what}CombineMode"
+                materials[surface].GetPrim().CreateAttribute(mode, sdf.ValueTypeNames.Token).Set("multiply")
+        shade.MaterialBindingAPI.Apply(prim).Bind(materials[surface], materialPurpose="physics")
+
+        of = (body.shape, body.motion == "dynamic")
+        if of not in drawn:
+            drawn[of] = f"/World/shapes/{take.shapes[body.shape]}" + ("" if of[1] else "_fixed")
+            stage.CreateClassPrim(drawn[of])
+            _usd_geometry(take, shape, of[1], stage, drawn[of])
+        solid = geom.Xform.Define(stage, f"/World/{name}/geometry")
+        solid.GetPrim().GetReferences().AddInternalReference(drawn[of])
+        solid.AddScaleOp().Set(gf.Vec3f(body.scale))
+
+    group, allowed = contact_groups(take.scene.bodies)
+    for g in range(len(allowed) if not allowed.all() else 0):
+        made = physics.CollisionGroup.Define(stage, f"/World/groups/group_{g}")
+        for k in np.flatnonzero(group == g):
+            made.GetCollidersCollectionAPI().IncludePath(f"/World/{take.names[k]}")
+        for other in np.flatnonzero(~allowed[g]):
+            made.CreateFilteredGroupsRel().AddTarget(f"/World/groups/group_{other}")
+
+    with replacing(out) as partial:
+        # The ending tells OpenUSD what to write.
+        named = partial.with_name(partial.name + out.suffix.lower())
+        try:
+            if not stage.GetRootLayer().Export(str(named)):
+                raise OSError("OpenUSD could not write it")
+            named.rename(partial)
+        finally:
+            named.unlink(missing_ok=True)
+    still = replace(take, time=take.time[:1])
+    return Written([out], _start_only(still) if not moving else [])
+
+
+def _usd_geometry(take: Take, shape: Shape, dynamic: bool, stage: Any, path: str) -> None:
+    """Prims below `path` that are seen and collide."""
+    gf, geom, physics = (_extra(f"pxr.{name}") for name in ("Gf", "UsdGeom", "UsdPhysics"))
+    form, solid = shape.sdf, f"{path}/solid"
+    if isinstance(form, ClosedForm):
+        if isinstance(form, SphereSdf):
+            prim = geom.Sphere.Define(stage, solid)
+            prim.CreateRadiusAttr(form.radius)
+        elif isinstance(form, BoxSdf):
+            prim = geom.Cube.Define(stage, solid)
+            prim.CreateSizeAttr(2.0)
+            prim.AddScaleOp().Set(gf.Vec3f(*form.half))
+        elif isinstance(form, CapsuleSdf | CylinderSdf):
+            prim = (geom.Capsule if isinstance(form, CapsuleSdf) else geom.Cylinder).Define(stage, solid)
+            prim.CreateRadiusAttr(form.radius)
+            prim.CreateHeightAttr(2.0 * form.half)
+            prim.CreateAxisAttr(geom.Tokens.z)
+        else:
+            prim = geom.Plane.Define(stage, solid)
+            prim.CreateAxisAttr(geom.Tokens.z)
+            prim.CreateWidthAttr(2.0 * take.plane_size())
+            prim.CreateLengthAttr(2.0 * take.plane_size())
+        prim.CreateExtentAttr(geom.Boundable.ComputeExtentFromPlugins(prim, 0.0))
+        physics.CollisionAPI.Apply(prim.GetPrim())
+        return
+    seen = _usd_mesh(stage, solid, shape.mesh)
+    pieces = _own_pieces(shape) if dynamic else []
+    for k, piece in enumerate(pieces):
+        collider = _usd_mesh(stage, f"{path}/piece_{k}", piece)
+        geom.Imageable(collider).CreatePurposeAttr(geom.Tokens.guide)
+        physics.CollisionAPI.Apply(collider)
+        physics.MeshCollisionAPI.Apply(collider).CreateApproximationAttr("convexHull")
+    if not pieces:  # engines collide moving bodies as convex pieces, and cut them themselves
+        physics.CollisionAPI.Apply(seen)
+        approximation = "convexDecomposition" if dynamic else "none"
+        physics.MeshCollisionAPI.Apply(seen).CreateApproximationAttr(approximation)
+
+
+def _usd_mesh(stage: Any, path: str, mesh: Mesh) -> Any:
+    geom, vt = _extra("pxr.UsdGeom"), _extra("pxr.Vt")
+    prim = geom.Mesh.Define(stage, path)
+    points = vt.Vec3fArray.FromNumpy(mesh.vertices.astype(np.float32))
+    prim.CreatePointsAttr(points)
+    prim.CreateExtentAttr(geom.PointBased.ComputeExtent(points))
+    prim.CreateFaceVertexCountsAttr(vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, dtype=np.int32)))
+    prim.CreateFaceVertexIndicesAttr(vt.IntArray.FromNumpy(mesh.faces.reshape(-1).astype(np.int32)))
+    prim.CreateSubdivisionSchemeAttr(geom.Tokens.none)
+    prim.CreateDoubleSidedAttr(True)
+    split, normals = with_normals(mesh)
+    prim.CreateNormalsAttr(vt.Vec3fArray.FromNumpy(normals.astype(np.float32)))
+    # Split along its creases a mesh has a vertex, so a normal, for every corner of a face.
+    prim.SetNormalsInterpolation(geom.Tokens.vertex if split is mesh else geom.Tokens.faceVarying)
+    if mesh.colors is not None:
+        shown = prim.CreateDisplayColorPrimvar(geom.Tokens.vertex)
+        shown.Set(vt.Vec3fArray.FromNumpy(_linear(mesh.colors).astype(np.float32)))
+    return prim.GetPrim()
+
+
+# --- MuJoCo ---
+
+
+def _mjcf(take: Take, out: Path, on_progress: Progress) -> Written:
+    scene, left_out = take.scene, _start_only(take)
+    shown, cut = _write_assets(take, out, _cut(take, lambda body: True, on_progress))
+    root = XML("mujoco", model=_plain_names([out.stem])[0])
+    folder = out.with_name(f"{out.stem}_assets").name
+    _add(root, "compiler", angle="radian", meshdir=folder, balanceinertia="true")
+    _add(root, "option", timestep=_numbers(STEP), gravity=_numbers(scene.gravity), cone="elliptic", impratio="10")
+    _add(root, "size", memory="512M")  # of address space; contacts of many pieces need more than is the default
+    asset, world = _add(root, "asset"), _add(root, "worldbody")
+    group, allowed = contact_groups(scene.bodies)
+    if len(allowed) > MOST_GROUPS:
+        left_out.append(f"collides_with: {len(allowed)} groups of bodies (MuJoCo knows {MOST_GROUPS})")
+        group, allowed = np.zeros_like(group), np.ones((1, 1), dtype=bool)
+    meshes: set[str] = set()
+    geoms: list[list[str]] = []
+    places, speeds = [], []
+
+    def mesh_of(file: Path, scale: float) -> str:
+        name = file.stem + ("" if scale == 1.0 else f"_x{scale:.9g}")
+        if name not in meshes:
+            meshes.add(name)
+            # "convex" and "shell" ask for no volume inside, which what is only shown need not have.
+            inertia = "convex" if "_piece_" in file.stem else "shell"
+            _add(asset, "mesh", name=name, file=file.name, scale=_numbers([scale] * 3), inertia=inertia)
+        return name
+
+    for k, (name, body, shape, color) in enumerate(take.each()):
+        quat = body.quat_xyzw
+        node = _add(world, "body", name=name, pos=_numbers(body.position), quat=_numbers(_wxyz(quat)))
+        if body.motion == "kinematic":
+            node.set("mocap", "true")
+        elif body.motion == "dynamic":
+            _add(node, "freejoint", name=f"{name}_free")
+            com, tensor = body.scale * shape.com, _inertia(body, shape)
+            full = _numbers(tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
+            _add(node, "inertial", pos=_numbers(com), mass=_numbers(body.mass), fullinertia=full)
+            turn = Rotation.from_quat(quat)
+            # Of the body's own origin, in world axes; and of its turning, in its own axes.
+            speed = body.velocity - np.cross(body.angular_velocity, turn.apply(com))
+            places.append(_numbers(body.position, _wxyz(quat)))
+            speeds.append(_numbers(speed, turn.inv().apply(body.angular_velocity)))
+        rgba = _numbers(color / 255.0 if shape.mesh.colors is None else shape.mesh.colors.mean(0) / 255.0, 1.0)
+        if body.shape in shown:
+            mesh = mesh_of(shown[body.shape], body.scale)
+            _add(node, "geom", type="mesh", mesh=mesh, rgba=rgba, group="2", contype="0", conaffinity="0")
+            solids = [{"type": "mesh", "mesh": mesh_of(file, body.scale), "group": "3"} for file in cut[body.shape]]
+        else:
+            form: Any = shape.sdf
+            sizes = (take.plane_size(),) * 3 if isinstance(form, PlaneSdf) else form.scaled(body.scale).sizes
+            solids = [{"type": form.KIND, "size": _numbers(sizes), "rgba": rgba}]
+        surface = {"condim": "3", **_mjcf_surface(body.friction**2, body.restitution**2)}
+        surface |= {
+            "contype": f"{1 << group[k]}",
+            "conaffinity": f"{sum(1 << g for g in np.flatnonzero(allowed[group[k]]))}",
+        }
+        geoms.append([f"{name}_{i}" for i in range(len(solids))])
+        for solid, label in zip(solids, geoms[-1], strict=True):
+            _add(node, "geom", name=label, **solid, **surface)
+
+    # Between bodies of one material the square is the product. Other pairs are told one by one, while they are few.
+    pairs = []
+    for i, one in enumerate(scene.bodies):
+        for j in range(i):
+            other = scene.bodies[j]
+            same = (one.friction, one.restitution) == (other.friction, other.restitution)
+            if not same and "dynamic" in (one.motion, other.motion) and allowed[group[i], group[j]]:
+                surface = _mjcf_surface(one.friction * other.friction, one.restitution * other.restitution, pair=True)
+                pairs += [{"geom1": a, "geom2": b, "condim": "3", **surface} for a in geoms[j] for b in geoms[i]]
+        if len(pairs) > MOST_PAIRS:
+            left_out.append("friction and restitution of unlike bodies: MuJoCo takes the larger friction of the two")
+            break
+    else:
+        contact = _add(root, "contact")
+        for pair in pairs:
+            _add(contact, "pair", **pair)
+    if places:
+        _add(_add(root, "keyframe"), "key", name="start", qpos=" ".join(places), qvel=" ".join(speeds))
+    _write_xml(out, root)
+    return Written([out, *shown.values(), *(file for files in cut.values() for file in files)], left_out)
+
+
+def _mjcf_surface(friction: float, restitution: float, *, pair: bool = False) -> dict[str, str]:
+    """Friction, and a spring with the damping of this restitution, stiff as the step allows: 1 / (2 steps) its rate."""
+    bounce = np.log(np.clip(restitution, 1e-3, 0.999))
+    damping = -bounce / np.hypot(np.pi, bounce)
+    sliding = [friction, friction, 0.005, 0.0001, 0.0001] if pair else [friction, 0.005, 0.0001]
+    return {"friction": _numbers(sliding), "solref": _numbers(2.0 * STEP / damping, damping)}
+
+
+# --- URDF ---
+
+
+def _urdf(take: Take, out: Path, on_progress: Progress) -> Written:
+    shown, cut = _write_assets(take, out, _cut(take, lambda body: body.motion != "static", on_progress))
+    files = [*shown.values(), *(file for found in cut.values() for file in found)]
+    single = len(take.names) == 1 and take.scene.path is None
+    for name, body, shape, color in take.each():
+        root = XML("robot", name=name)
+        link = _add(root, "link", name=name)
+        surface = _add(link, "contact")
+        _add(surface, "lateral_friction", value=_numbers(body.friction))
+        _add(surface, "restitution", value=_numbers(body.restitution))
+        moves = body.motion == "dynamic"
+        inertial = _add(link, "inertial")
+        _add(inertial, "origin", xyz=_numbers(body.scale * shape.com), rpy="0 0 0")
+        _add(inertial, "mass", value=_numbers(body.mass if moves else 0.0))
+        tensor = _inertia(body, shape) if moves else np.zeros((3, 3))
+        sides = {f"i{'xyz'[a]}{'xyz'[b]}": _numbers(tensor[a, b]) for a in range(3) for b in range(a, 3)}
+        _add(inertial, "inertia", **sides)
+
+        def mesh(element: XML, file: Path, scale: float = body.scale) -> None:
+            path = f"{file.parent.name}/{file.name}"
+            _add(_add(element, "geometry"), "mesh", filename=path, scale=_numbers([scale] * 3))
+
+        visual = _add(link, "visual")
+        if body.shape not in shown:
+            _urdf_form(_add(visual, "geometry"), shape.sdf, body.scale)
+            _urdf_form(_add(_add(link, "collision"), "geometry"), shape.sdf, body.scale)
+        else:
+            mesh(visual, shown[body.shape])
+            if body.motion == "static":  # triangles as they are, which PyBullet knows of what never moves
+                mesh(_add(link, "collision", concave="yes"), shown[body.shape])
+            for file in cut[body.shape] if body.motion != "static" else []:
+                mesh(_add(link, "collision"), file)
+        rgba = _numbers(color / 255.0 if shape.mesh.colors is None else shape.mesh.colors.mean(0) / 255.0, 1.0)
+        _add(_add(visual, "material", name=f"{name}_color"), "color", rgba=rgba)
+        files.append(out if single else out.with_name(f"{out.stem}.{name}.urdf"))
+        _write_xml(files[-1], root)
+    if single:
+        return Written(files, [])
+    poses = out.with_suffix(".csv")
+    start = replace(take, time=take.time[:1], position=take.position[:1], quat_xyzw=take.quat_xyzw[:1])
+    _csv(start, poses, on_progress)
+    # Of the moving bodies only the place is kept in the poses.
+    left_out = ["poses at the start: they are in the CSV", "gravity, velocities and collides_with", *_start_only(take)]
+    return Written([*files, poses], left_out)
+
+
+def _urdf_form(geometry: XML, form: Any, scale: float) -> None:
+    form = form.scaled(scale)
+    if isinstance(form, PlaneSdf):
+        _add(geometry, "plane", normal="0 0 1")
+    elif isinstance(form, SphereSdf):
+        _add(geometry, "sphere", radius=_numbers(form.radius))
+    elif isinstance(form, BoxSdf):
+        _add(geometry, "box", size=_numbers(2.0 * np.array(form.half)))
+    else:
+        _add(geometry, form.KIND, radius=_numbers(form.radius), length=_numbers(2.0 * form.half))
+
+
+# --- poses ---
+
+
+def _csv(take: Take, out: Path, on_progress: Progress) -> Written:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for t, time in enumerate(take.time):
+        for k, body in enumerate(take.scene.bodies):
+            pose = np.concatenate([take.position[t, k], take.quat_xyzw[t, k]])
+            writer.writerow([f"{time:.9g}", body.name, *(f"{value:.12g}" for value in pose)])
+    write_text(out, text.getvalue())
+    return Written([out], ["everything but poses"])
+
+
+FORMATS: dict[str, Callable[[Take, Path, Progress], Written]] = {
+    ".glb": _glb,
+    **dict.fromkeys((".usd", ".usda", ".usdc"), _usd),
+    **dict.fromkeys((".xml", ".mjcf"), _mjcf),
+    ".urdf": _urdf,
+    ".csv": _csv,
+}
