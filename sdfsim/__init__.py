@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from sdfsim.dynamics.simulator import Simulator
     from sdfsim.errors import SceneError, SdfsimError
     from sdfsim.scene.scene_file import load_scene
+    from sdfsim.scene.written import Scene
     from sdfsim.shape.shape import Shape, load_shape
 
 # Threads of torch wait for one another by spinning, and beside other programs they take the processor from those they
@@ -22,10 +23,11 @@ if TYPE_CHECKING:
 os.environ.setdefault("GOMP_SPINCOUNT", "10000")
 
 __version__ = "0.1.0"
-__all__ = ["Rollout", "SceneError", "SdfsimError", "Shape", "Simulator", "load_scene", "load_shape"]
+__all__ = ["Rollout", "Scene", "SceneError", "SdfsimError", "Shape", "Simulator", "load_scene", "load_shape"]
 
 _HOME = {
     "Rollout": "sdfsim.dynamics.rollout",
+    "Scene": "sdfsim.scene.written",
     "SceneError": "sdfsim.errors",
     "SdfsimError": "sdfsim.errors",
     "Shape": "sdfsim.shape.shape",

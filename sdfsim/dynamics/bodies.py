@@ -146,6 +146,7 @@ class State:
         earlier_position, earlier_orientation: [2, N, 3] and [2, N, 4], the two poses before (oldest first),
             for the *paper* network; None where nobody needs them.
         touch: contacts and sleep of the solve; None before its first step.
+        load: [N, 6] force at the centre of mass and torque that pull at a body, world axes; None where nothing does.
         time: since the start.
     """
 
@@ -156,6 +157,7 @@ class State:
     earlier_position: Tensor | None = None
     earlier_orientation: Tensor | None = None
     touch: Touch | None = None
+    load: Tensor | None = None
     time: float = 0.0
 
 

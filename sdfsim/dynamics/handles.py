@@ -39,7 +39,7 @@ class ContactPoint:
 
 
 class BodyHandle:
-    """One body of a simulator: read it, set it, push it. What is set counts from the next step on.
+    """One body of a simulator: read it, set it, push and pull it. What is set counts from the next step on.
 
     Args:
         simulator: whose body.
@@ -129,6 +129,36 @@ class BodyHandle:
             axes = pose.to_matrix(sim.state.orientation[row]).cpu().numpy()
             inertia = axes @ sim.bodies.inertia[row].cpu().numpy() @ axes.T * sim.units.mass * sim.units.length**2
             self.angular_velocity = self.angular_velocity + np.linalg.solve(inertia, turn)
+
+    def pull(self, force: Numbers, at: Numbers | None = None, torque: Numbers = (0.0, 0.0, 0.0)) -> None:
+        """Let a force and a torque act from now on, in world axes, until the next call or `reset`; zero ends them.
+
+        Args:
+            force: [3] N.
+            at: [3] m, the point that it acts on now, world; None for the centre of mass. Its moment about the centre of
+                mass stays as it is, however the body moves: pull again after a step to follow the point.
+            torque: [3] N m, on top of that moment.
+
+        Raises:
+            SdfsimError: the body does not move by itself, or the model is the *paper* network, which knows no forces.
+        """
+        self._must_move("be pulled")
+        sim = self._simulator
+        if sim.model.kind == "paper":
+            raise SdfsimError("the paper network knows no forces", "take the solver, or a network on top of it")
+        given, moment = _vector("force", force), _vector("torque", torque)
+        if at is not None:
+            moment = moment + np.cross(_vector("at", at) - self.centre, given)
+        u, state = sim.units, sim.state
+        load = torch.zeros(len(sim.bodies), 6, dtype=torch.float64) if state.load is None else state.load.clone()
+        load[self._row, :3] = torch.from_numpy(given / (u.mass * u.acceleration))
+        load[self._row, 3:] = torch.from_numpy(moment / u.energy)
+        touch = state.touch
+        if touch is not None:  # what the last step left is another state than this, so that who sleeps wakes up
+            held = touch.held.clone()
+            held[self._row] = torch.nan
+            touch = replace(touch, held=held)
+        sim.state = replace(state, load=load if bool(load.any()) else None, touch=touch)
 
     def _of(self, name: str) -> np.ndarray:
         return getattr(self._simulator.state, name)[self._row].cpu().numpy().copy()

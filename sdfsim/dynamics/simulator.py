@@ -33,6 +33,7 @@ from sdfsim.scene.scene import Limits, Scene
 
 if TYPE_CHECKING:
     from sdfsim.dynamics.contacts import Contacts
+    from sdfsim.scene import written
 
 BYTES_AN_EDGE = 4096  # of the network, while it is worked on
 
@@ -56,7 +57,7 @@ class Simulator:
     """Simulates one scene.
 
     Args:
-        scene: bodies, shapes, gravity.
+        scene: bodies, shapes, gravity; one written in Python is loaded first.
         model: bundled name, path or `Model`; None takes the scene's, else the default one.
         device: "cpu", "cuda" or "auto".
         seed: of torch's generator (nothing in a step draws from it today; it is recorded).
@@ -77,7 +78,7 @@ class Simulator:
 
     def __init__(
         self,
-        scene: Scene,
+        scene: Scene | written.Scene,
         model: str | Path | Model | None = None,
         device: str = "cpu",
         seed: int | None = None,
@@ -85,6 +86,7 @@ class Simulator:
         dt: float | None = None,
         free_flight: FreeFlight = "exact",
     ) -> None:
+        scene = scene if isinstance(scene, Scene) else scene.load()
         self.scene = scene
         self.device = pick_device(device)
         effects = plan(scene)

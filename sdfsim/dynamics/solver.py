@@ -88,8 +88,8 @@ class Compiled:
         n = len(self.bodies)
         self.work = compiled.Work(
             matrix=pose.to_matrix(state.orientation.cpu()).numpy(), inverse=np.zeros((n, 3, 3)),
-            free=np.zeros((n, 6)), change=np.zeros((n, 6)), shift=np.zeros((n, 6)), part=np.ones(n),
-            ways=np.zeros(n), gone=np.zeros(n), low=np.zeros((n, 3)), high=np.zeros((n, 3)),
+            free=np.zeros((n, 6)), change=np.zeros((n, 6)), shift=np.zeros((n, 6)), load=np.zeros((n, 6)),
+            part=np.ones(n), ways=np.zeros(n), gone=np.zeros(n), low=np.zeros((n, 3)), high=np.zeros((n, 3)),
             beside=np.zeros(n, np.bool_), met=np.zeros(n, np.bool_),
             parent=np.zeros(n, np.int64), number=np.zeros(n, np.int64),
         )  # fmt: skip
@@ -189,6 +189,7 @@ def _solve(
     bodies: Bodies, state: State, scene: Compiled, rules: compiled.Rules
 ) -> tuple[State, record.Edges, tuple[int, ...]]:
     motion, manifolds = taken_up(bodies, state, scene, rules)
+    scene.work.load[:] = 0.0 if state.load is None else state.load.numpy()
     manifolds, edges, counts = scene.run(motion, manifolds, rules)
     after = replace(
         state,

@@ -111,7 +111,8 @@ def _solved_step(model: Model, bodies: Bodies, state: State, rules: Rules, memor
     """What the contact solve makes of the step, and on top of it the network, where the model is one."""
     from sdfsim.dynamics.solver import held, solver_step  # numba takes its time to load
 
-    on_top = model.kind == "impulse" and rules.trust > 0.0
+    # No network has seen forces in its training.
+    on_top = model.kind == "impulse" and rules.trust > 0.0 and state.load is None
     solved, acts = solver_step(bodies, state, rules, memory, note=on_top)
     if not (on_top and len(acts)):
         return solved
@@ -129,12 +130,14 @@ def fly(bodies: Bodies, state: State, rules: Rules) -> State:
     now = {name: getattr(state, name) for name in _POSE}
     if len(rows):
         place, velocity = state.position[rows], state.velocity[rows]
-        if rules.falls:
-            place, velocity = ballistic(place, velocity, rules.gravity, rules.dt)
+        load = None if state.load is None else state.load[rows]
+        if rules.falls or load is not None:
+            pull = rules.gravity if load is None else rules.gravity + bodies.inverse_mass[rows, None] * load[:, :3]
+            place, velocity = ballistic(place, velocity, pull, rules.dt)
         else:
             place = place + velocity * rules.dt
         if rules.rotation:
-            turned = torque_free(state.orientation[rows], state.angular_velocity[rows], bodies.inertia[rows], rules.dt)
+            turned = _turned(bodies, state, rows, rules.dt)
         else:
             turned = (state.orientation[rows], torch.zeros_like(velocity))
         now = _put(now, rows, (place, turned[0], velocity, turned[1]))
@@ -149,6 +152,21 @@ def fly(bodies: Bodies, state: State, rules: Rules) -> State:
         earlier_orientation=_shift(state.earlier_orientation, state.orientation),
         time=state.time + rules.dt,
     )
+
+
+def _turned(bodies: Bodies, state: State, rows: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+    """Orientation and angular velocity after free flight; a torque acts half before and half after it."""
+    orientation, angular, inertia = state.orientation[rows], state.angular_velocity[rows], bodies.inertia[rows]
+    if state.load is None:
+        return torque_free(orientation, angular, inertia, dt)
+    half = 0.5 * dt * state.load[rows, 3:, None]
+
+    def twisted(orientation: Tensor) -> Tensor:
+        axes = pose.to_matrix(orientation)
+        return (axes @ torch.linalg.solve(inertia, axes.mT @ half))[..., 0]
+
+    orientation, angular = torque_free(orientation, angular + twisted(orientation), inertia, dt)
+    return orientation, angular + twisted(orientation)
 
 
 def correct(model: Model, bodies: Bodies, state: State, solved: State, acts: Acts, rules: Rules) -> State:

@@ -45,6 +45,7 @@ class Bodies:
     infinite: list[bool]
     radius: Tensor
     meets: Tensor
+    load: Tensor
 
 
 @dataclass(frozen=True)
@@ -122,6 +123,7 @@ def of_compiled(scene: Compiled, motion: Motion) -> tuple[Bodies, Moving]:
         moves=world.moves.tolist(),
         isotropic=world.isotropic.tolist(),
         infinite=(world.radius == float("inf")).tolist(),
+        load=torch.from_numpy(scene.work.load.copy()),
         **{name: torch.from_numpy(getattr(world, name).copy()) for name in _TENSORS},
     )
     moving = Moving(
@@ -142,7 +144,7 @@ def step(
 ) -> tuple[Moving, Contacts]:
     """Advance by one step; see `kernels.step.step`."""
     gravity = torch.from_numpy(rules.gravity)
-    moving = _shifted(bodies, moving, -0.5 * rules.inner * gravity)
+    moving = _shifted(bodies, moving, rules, -0.5)
     gone = torch.zeros(len(bodies.moves), dtype=torch.float64)
     looked: dict[tuple[int, int], float] = {}
     for _ in range(rules.steps):
@@ -155,15 +157,15 @@ def step(
             if points := touching_points(shapes, bodies, moving, rules, pair, contacts.get(pair, []), anew=anew):
                 kept[pair] = points
         contacts = kept
-        free = _free(bodies, moving, gravity, rules)
+        free = _free(bodies, moving, rules)
         rows = equations(bodies, moving, rules, gravity, free, contacts)
         change, shift = torch.zeros_like(free), torch.zeros_like(free)
         for island in _islands(bodies, rows):
             change, shift = sequential_impulses(bodies, rules, island, change, shift)
         contacts = _remembered(contacts, rows)
-        before, moving = moving, advance(bodies, moving, rules, gravity, change, shift)
+        before, moving = moving, advance(bodies, moving, rules, change, shift)
         gone += _way(bodies, before, moving)
-    return _shifted(bodies, moving, 0.5 * rules.inner * gravity), contacts
+    return _shifted(bodies, moving, rules, 0.5), contacts
 
 
 def _way(bodies: Bodies, before: Moving, after: Moving) -> Tensor:
@@ -173,10 +175,22 @@ def _way(bodies: Bodies, before: Moving, after: Moving) -> Tensor:
     return torch.where(torch.tensor(bodies.infinite), 0.0, way).detach()
 
 
-def _shifted(bodies: Bodies, moving: Moving, change: Tensor) -> Moving:
+def _shifted(bodies: Bodies, moving: Moving, rules: Rules, part: float) -> Moving:
     """Velocities at an instant become those of the inner step before it, or back; what is touched has only one."""
-    flies = torch.tensor([m and not t for m, t in zip(bodies.moves, moving.touching, strict=True)])
-    return replace(moving, velocity=moving.velocity + flies[:, None] * change)
+    flies = torch.tensor([not t for t in moving.touching])[:, None]
+    pulled = part * flies * _pulled(bodies, moving, rules)
+    spun = pulled[:, 3:] * float(rules.rotation)
+    return replace(moving, velocity=moving.velocity + pulled[:, :3], angular=moving.angular + spun)
+
+
+def _pulled(bodies: Bodies, moving: Moving, rules: Rules) -> Tensor:
+    """[N, 6] what gravity and what pulls at a body add to its velocities in an inner step."""
+    gravity = torch.from_numpy(rules.gravity)
+    rows = []
+    for b, moves in enumerate(bodies.moves):
+        push = float(moves) * gravity + bodies.inverse_mass[b] * bodies.load[b, :3]
+        rows.append(torch.cat([push, _inverse(bodies, moving, b) @ bodies.load[b, 3:]]))
+    return rules.inner * torch.stack(rows)
 
 
 def _pairs(bodies: Bodies) -> list[tuple[int, int]]:
@@ -472,9 +486,10 @@ def _spread(rules: Rules, known: list[Point], found: list[Point], *, rounded: bo
 # What their velocities want
 
 
-def _free(bodies: Bodies, moving: Moving, gravity: Tensor, rules: Rules) -> Tensor:
-    """[N, 6] what gravity and the gyroscopic torque make of the velocities in an inner step."""
+def _free(bodies: Bodies, moving: Moving, rules: Rules) -> Tensor:
+    """[N, 6] what gravity, pulls and the gyroscopic torque make of the velocities in an inner step."""
     rows = []
+    pulled = _pulled(bodies, moving, rules)
     for b, moves in enumerate(bodies.moves):
         turn = torch.zeros(3, dtype=torch.float64)
         if moves and not bodies.isotropic[b]:
@@ -486,7 +501,7 @@ def _free(bodies: Bodies, moving: Moving, gravity: Tensor, rules: Rules) -> Tens
 
             middle = w + 0.5 * rules.inner * (inverse @ torch.linalg.cross(momentum(w), w))
             turn = rules.inner * (inverse @ torch.linalg.cross(momentum(middle), middle))
-        rows.append(torch.cat([gravity * rules.inner if moves else torch.zeros_like(gravity), turn]))
+        rows.append(pulled[b] + torch.cat([torch.zeros_like(turn), turn]))
     return torch.stack(rows)
 
 
@@ -674,15 +689,16 @@ def _remembered(contacts: Contacts, rows: list[Equations]) -> Contacts:
 # Motion
 
 
-def advance(bodies: Bodies, moving: Moving, rules: Rules, gravity: Tensor, change: Tensor, shift: Tensor) -> Moving:
+def advance(bodies: Bodies, moving: Moving, rules: Rules, change: Tensor, shift: Tensor) -> Moving:
     """Move all bodies by one inner step: positions with the new velocities."""
     position, orientation, velocity, angular, touching = [], [], [], [], []
+    pulled = _pulled(bodies, moving, rules)
     for b, moves in enumerate(bodies.moves):
         x, q, v, w = moving.position[b], moving.orientation[b], moving.velocity[b], moving.angular[b]
         touched = bool((change[b] != 0.0).any() or (shift[b] != 0.0).any()) and moves
         if moves:
-            v = v + gravity * rules.inner + change[b, :3]
-            w = (w + change[b, 3:]) * float(rules.rotation)
+            v = v + pulled[b, :3] + change[b, :3]
+            w = (w + pulled[b, 3:] + change[b, 3:]) * float(rules.rotation)
         x = x + rules.inner * (v + shift[b, :3])
         further = shift[b, 3:] * float(rules.rotation)
         if moves and rules.rotation and not bodies.isotropic[b]:

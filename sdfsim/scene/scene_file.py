@@ -81,7 +81,7 @@ def _shown(value: Any) -> str:
     return "nothing" if value is NOTHING else "a list" if isinstance(value, list) else "a mapping"
 
 
-def _nearest(name: str, known: Iterable[str]) -> str:
+def nearest(name: str, known: Iterable[str]) -> str:
     """` (did you mean 'x'?)` with the nearest known name, or an empty string."""
     known = [other for other in known if len(other) <= _ALIKE]
     if len(name) > _ALIKE or len(known) > 10 * _ALIKE:
@@ -243,7 +243,7 @@ def _model(text: str, info: ValidationInfo) -> str:
 
 def _primitive(name: str) -> str:
     if name not in PRIMITIVES:
-        raise _problem(f"no such primitive: {name!r}{_nearest(name, PRIMITIVES)}; there are {', '.join(PRIMITIVES)}")
+        raise _problem(f"no such primitive: {name!r}{nearest(name, PRIMITIVES)}; there are {', '.join(PRIMITIVES)}")
     return name
 
 
@@ -273,7 +273,7 @@ class Table(BaseModel):
             raise _problem(f"must be a mapping (got {_shown(data)})")
         known = cls.model_fields
         listed = f"; known here: {', '.join(known) or 'none'}"
-        faults = [(key, f"unknown key{_nearest(key, known) or listed}", "unknown") for key in data if key not in known]
+        faults = [(key, f"unknown key{nearest(key, known) or listed}", "unknown") for key in data if key not in known]
         found = [((key,), text, kind) for key, text, kind in faults]
         found += [(loc, text, "value") for loc, text in cls.check_keys(data)]
         made = None
@@ -601,7 +601,7 @@ class SceneTable(Table):
             if shape and shape not in shapes:
                 few = [*list(shapes)[:_NAMED], *(["..."] if len(shapes) > _NAMED else [])]
                 there = f"; shapes are {', '.join(few)}" if shapes else "; the file has no shapes"
-                yield ("bodies", i, "shape"), f"no shape is called {shape!r}{_nearest(shape, shapes) or there}"
+                yield ("bodies", i, "shape"), f"no shape is called {shape!r}{nearest(shape, shapes) or there}"
             if _kind_of(shapes.get(shape)) == "plane" and entry.get("motion") in ("dynamic", "kinematic"):
                 yield ("bodies", i, "motion"), "a plane must be static"
         for i, entry in bodies:
@@ -639,7 +639,7 @@ def _name(value: Any) -> str:
 
 
 def _nobody(name: str, known: Iterable[str]) -> str:
-    return f"no body is called {name!r}{_nearest(name, known)}"
+    return f"no body is called {name!r}{nearest(name, known)}"
 
 
 class Document:
@@ -647,6 +647,7 @@ class Document:
 
     Args:
         path: of the file.
+        text: what is in it; None reads it.
 
     Attributes:
         data: dicts, lists, texts and `Numeral`s; `NOTHING` where a key has no value.
@@ -656,9 +657,9 @@ class Document:
             multiply it.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, text: str | None = None) -> None:
         self._path = path
-        self._root = _compose(path)
+        self._root = _compose(path, _text_of(path) if text is None else text)
         self._read_so_far = 0
         self._children: dict[int, dict] = {}  # of a mapping's node by its id: (node of the key, of the value) by key
         self._found: dict[tuple[int, str], None] = {}  # in the order of the finding, each once
@@ -725,20 +726,23 @@ class Document:
         return found
 
 
-def _compose(path: Path) -> yaml.Node:
+def _text_of(path: Path) -> str:
     try:
         if path.exists() and not path.is_dir() and not path.is_file():
             raise OSError(errno.EINVAL, "not a file")  # a device or a pipe may have no end
         if path.is_file() and (size := path.stat().st_size) > MOST_BYTES:
             told = f"{size / 2**20:.0f} MiB, at most {MOST_BYTES // 2**20}"
             raise SceneError([f"{path}: too large for a scene ({told})"], "arrange makes many bodies of one entry")
-        text = path.read_bytes().decode("utf-8")
+        return path.read_bytes().decode("utf-8")
     except OSError as error:
         why = "no such file" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
         raise SceneError([f"{path}: {why}"], "give the path of a scene.yaml") from error
     except UnicodeDecodeError as error:
         line = error.object[: error.start].count(b"\n") + 1
         raise SceneError([f"{path}:{line}: not a text in UTF-8"], "a scene is a YAML text file") from error
+
+
+def _compose(path: Path, text: str) -> yaml.Node:
     try:
         root = yaml.compose(text, Loader=yaml.SafeLoader)
     except yaml.MarkedYAMLError as error:
@@ -754,12 +758,13 @@ def _compose(path: Path) -> yaml.Node:
     return root
 
 
-def read_scene(path: Path, *, allow_outside: bool = False) -> tuple[SceneTable, Document]:
+def read_scene(path: Path, *, allow_outside: bool = False, text: str | None = None) -> tuple[SceneTable, Document]:
     """Read and check a scene file; nothing is loaded yet.
 
     Args:
         path: of the file.
         allow_outside: whether paths in it may lead out of its folder.
+        text: what is in it; None reads it.
 
     Returns:
         What it says, and its document, to tell of faults that show only later.
@@ -767,7 +772,7 @@ def read_scene(path: Path, *, allow_outside: bool = False) -> tuple[SceneTable, 
     Raises:
         SceneError: with every fault found.
     """
-    document, context = Document(path), {"folder": path.parent, "allow_outside": allow_outside}
+    document, context = Document(path, text), {"folder": path.parent, "allow_outside": allow_outside}
     try:
         table = SceneTable.model_validate(document.data, context=context)
     except ValidationError as error:
@@ -779,13 +784,16 @@ def read_scene(path: Path, *, allow_outside: bool = False) -> tuple[SceneTable, 
     return table, document
 
 
-def load_scene(path: Path | str, on_progress: Progress | None = None, *, allow_outside: bool = False) -> Scene:
+def load_scene(
+    path: Path | str, on_progress: Progress | None = None, *, allow_outside: bool = False, text: str | None = None
+) -> Scene:
     """Read a scene file, and load or fit the shapes that its bodies use.
 
     Args:
         path: of the scene.yaml; paths inside it are taken from its folder.
         on_progress: called with (fraction, message) while shapes are fitted. A mesh is fitted on first use only.
         allow_outside: whether meshes, shape folders and models that the file names may lie outside of its folder.
+        text: what is in the file, where it is not written yet.
 
     Returns:
         The scene in SI units.
@@ -794,7 +802,7 @@ def load_scene(path: Path | str, on_progress: Progress | None = None, *, allow_o
         SceneError: with one line `FILE:LINE: FIELD: what is wrong` for every fault found.
     """
     path = Path(path)
-    table, document = read_scene(path, allow_outside=allow_outside)
+    table, document = read_scene(path, allow_outside=allow_outside, text=text)
     shapes = _load_shapes(table, document, on_progress or (lambda fraction, message: None))
     order = {key: i for i, key in enumerate(shapes)}
     groups = {body.name: body.names() for body in table.bodies}

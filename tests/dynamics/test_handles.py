@@ -7,7 +7,7 @@ import pytest
 
 from sdfsim import SdfsimError, Simulator
 from sdfsim.dynamics import variants
-from sdfsim.scene.scene import Scene
+from sdfsim.scene.scene import Effects, Scene
 from sdfsim.shape.shape import analytic_shape
 from tests.dynamics.conftest import make_body
 
@@ -67,6 +67,57 @@ def test_a_push_gives_its_momentum_and_its_moment():
         sim.step(10)
 
 
+@pytest.mark.parametrize("contact", ["on", "off"])
+def test_a_pull_is_mass_times_acceleration_until_it_ends(contact):
+    sim = Simulator(replace(small(), effects=Effects(contact=contact)))
+    box, force = sim["box"], np.array([0.3, -0.1, 0.2 * 9.81 + 0.4])  # up, so that nothing is met
+    start, axes = box.centre, [sim.bodies.inertia[0].cpu().numpy() * sim.units.mass * sim.units.length**2]
+    box.pull(force, torque=(0, 0, 1e-3))
+    sim.step(20)
+    time, push = 20 * sim.dt, force / 0.2 + G
+    np.testing.assert_allclose(box.velocity, push * time, atol=1e-9)
+    np.testing.assert_allclose(box.centre - start, 0.5 * push * time**2, atol=1e-9)
+    # z is a principal axis: the angular momentum grows by the torque alone.
+    np.testing.assert_allclose(box.angular_velocity, (0, 0, 1e-3 / axes[0][2, 2] * time), rtol=1e-6, atol=1e-9)
+    box.pull((0, 0, 0))
+    before = box.velocity
+    sim.step(10)
+    np.testing.assert_allclose(box.velocity, before + 10 * sim.dt * G, atol=1e-9)
+    box.pull(force)
+    sim.reset()
+    sim.step(3)
+    np.testing.assert_allclose(box.velocity, 3 * sim.dt * G, atol=1e-9)
+
+
+def test_a_pull_at_a_point_is_a_force_and_its_moment():
+    one, other = Simulator(small(np.zeros(3))), Simulator(small(np.zeros(3)))
+    force, arm = np.array([0.1, 0.2, -0.1]), np.array([0.02, -0.01, 0.03])
+    one["box"].pull(force, at=one["box"].centre + arm)
+    other["box"].pull(force, torque=np.cross(arm, force))
+    a, b = one.step(10), other.step(10)
+    np.testing.assert_allclose(a.orientation, b.orientation, atol=1e-12)
+    assert np.abs(one["box"].angular_velocity).max() > 0.1
+
+
+@pytest.mark.parametrize(("share", "moves"), [(0.8, False), (1.5, True)])
+def test_friction_holds_a_pull_up_to_mu_times_the_weight_and_a_sleeper_wakes(share, moves):
+    sim = Simulator(small(restitution=0.0, friction=0.6))  # the floor has its own: the product counts
+    sim.step(120)
+    box = sim["box"]
+    assert box.asleep
+    mu = 0.6 * sim.scene.bodies[1].friction
+    start, force = box.centre, share * mu * 0.2 * 9.81
+    box.pull((force, 0, 0), at=box.centre - [0, 0, 0.03])
+    sim.step(1)
+    assert not box.asleep
+    sim.step(39)
+    if moves:
+        wanted = (share - 1.0) * mu * 9.81 * 40 * sim.dt
+        np.testing.assert_allclose(box.velocity, (wanted, 0, 0), atol=0.03 * wanted)
+    else:
+        np.testing.assert_allclose(box.centre, start, atol=1e-4)
+
+
 def test_contacts_carry_the_weight():
     sim = Simulator(small(restitution=0.0))
     assert sim.contact_points() == []
@@ -85,6 +136,8 @@ def test_contacts_carry_the_weight():
     [
         (lambda sim: sim["bax"], "there is no body 'bax'"),
         (lambda sim: sim["floor"].push((0, 0, 1)), "body 'floor': is static, so it cannot be pushed"),
+        (lambda sim: sim["floor"].pull((0, 0, 1)), "body 'floor': is static, so it cannot be pulled"),
+        (lambda sim: sim["box"].pull((0, 0)), "force: must be 3 finite numbers"),
         (lambda sim: setattr(sim["box"], "velocity", (1, 2)), "velocity: must be 3 finite numbers"),
         (lambda sim: setattr(sim["box"], "position", (1, 2, np.nan)), "position: must be 3 finite numbers"),
         (lambda sim: setattr(sim["box"], "quat_xyzw", (0, 0, 0, 0)), "must not be zero"),

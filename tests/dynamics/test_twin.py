@@ -63,16 +63,18 @@ def floor(shape: int):
 
 
 @pytest.mark.parametrize(
-    ("scene", "steps", "rules"),
+    ("scene", "steps", "rules", "pull"),
     [
-        *((heap(0, 4), 60, {}), (heap(1, 4), 60, {"margin": 1e-3, "adds": True}), (tops(0), 45, {}), (tops(1), 45, {})),
-        (swallowed(), 30, {}),
+        (heap(0, 4), 60, {}, 0.0), (heap(1, 4), 60, {"margin": 1e-3, "adds": True}, 0.0),
+        (tops(0), 45, {}, 0.0), (tops(1), 25, {}, 0.5), (swallowed(), 30, {}, 0.0),
     ],
-    ids=["closed forms", "as the teacher", "fitted", "fitted, other", "swallowed"],
-)
-def test_the_compiled_step_is_its_twin(scene, steps, rules):
+    ids=["closed forms", "as the teacher", "fitted", "fitted, pulled at", "swallowed"],
+)  # fmt: skip
+def test_the_compiled_step_is_its_twin(scene, steps, rules, pull):
     """Step by step from the compiled states: chaos would soon make more of a rounding."""
     inside, motion, rules = compiled(scene, **rules)
+    moves = inside.world.moves[:, None]
+    inside.work.load[:] = pull * moves * np.random.default_rng(3).normal(size=inside.work.load.shape)
     manifolds, points = no_manifolds(), 0
     for k in range(steps):
         if k % 6:

@@ -53,7 +53,7 @@ def step(shapes, world, work, motion, rules, manifolds):
     scratch = scratch_room()
     contacts = islands = looked = 0
     edges = no_edges(64 if rules.note else 0)
-    _lag(world, motion, rules)
+    _shifted(world, work, motion, rules, -0.5)
     for k in range(rules.steps):
         for b in world.going:
             if work.gone[b] > work.ways[b] and world.moves[b]:
@@ -66,7 +66,7 @@ def step(shapes, world, work, motion, rules, manifolds):
                 free[b, x] = change[b, x] = shift[b, x] = 0.0
             motion.touching[b] = False
             if world.moves[b] and motion.island[b] < 0 and work.beside[b]:
-                _prepare(world, motion, matrix, inverse, rules, free, b)
+                _prepare(world, motion, matrix, inverse, work.load, rules, free, b)
         collide(shapes, world, motion, matrix, rules, manifolds, near, work.gone, scratch)
         system = respond(world, work, motion, rules, manifolds)
         contacts, islands = len(system.where), len(system.start) - 1
@@ -75,12 +75,12 @@ def step(shapes, world, work, motion, rules, manifolds):
         _parts(shapes, world, work, motion, rules, manifolds, near)
         for b in world.going:
             if motion.island[b] < 0 and (world.moves[b] or world.scripted[b]):
-                moved = _advance(world, motion, matrix, rules, change, shift, work.part[b], trial, frame, b)
+                moved = _advance(world, motion, matrix, rules, work.load, change, shift, work.part[b], trial, frame, b)
                 work.gone[b] += moved
                 work.met[b] = work.met[b] or motion.touching[b]
     if rules.note:
         edges = gathered(world, motion, matrix, manifolds, len(near.start), rules.steps, edges)
-    _lead(world, motion, rules)
+    _shifted(world, work, motion, rules, 0.5)
     if rules.sleep:
         _settle(world, motion, rules, manifolds)
     met = 0  # of those that are awake still
@@ -90,26 +90,35 @@ def step(shapes, world, work, motion, rules, manifolds):
 
 
 @njit(**BARE)
-def _lag(world, motion, rules):
-    """Velocities at an instant become those of the inner step before it, which contacts are solved with."""
+def _shifted(world, work, motion, rules, part):
+    """Velocities at an instant become those of the inner step before it, which contacts are solved with (part -0.5),
+    and back: bodies that nothing held in the last inner step then move exactly as in free flight."""
     for b in world.going:
         if world.moves[b] and motion.island[b] < 0 and not motion.touching[b]:
-            put(motion.velocity, b, along(get(motion.velocity, b), vector(rules.gravity), -0.5 * rules.inner))
+            v, w = _pulled(world, work.matrix, work.load, rules, part, b)
+            put(motion.velocity, b, add(get(motion.velocity, b), v))
+            if rules.rotation:
+                put(motion.angular, b, add(get(motion.angular, b), w))
 
 
 @njit(**BARE)
-def _lead(world, motion, rules):
-    """And back, for bodies that nothing held in the last inner step: their motion is then exact in free flight."""
-    for b in world.going:
-        if world.moves[b] and motion.island[b] < 0 and not motion.touching[b]:
-            put(motion.velocity, b, along(get(motion.velocity, b), vector(rules.gravity), 0.5 * rules.inner))
+def _pulled(world, matrix, load, rules, part, b):
+    """What gravity and what pulls at a body add to its velocities in a part of an inner step."""
+    span = rules.inner * part
+    weight = scale(vector(rules.gravity), span)
+    if not load[b].any():
+        return weight, (0.0, 0.0, 0.0)
+    force, torque = (load[b, 0], load[b, 1], load[b, 2]), (load[b, 3], load[b, 4], load[b, 5])
+    turned = turn(matrix, b, turn(world.inverse_inertia, b, turn_back(matrix, b, torque)))
+    return along(weight, force, world.inverse_mass[b] * span), scale(turned, span)
 
 
 @njit(**BARE)
-def _prepare(world, motion, matrix, inverse, rules, free, b):
-    """Inverse inertia in world axes, and what gravity and the gyroscopic torque make of the velocities."""
+def _prepare(world, motion, matrix, inverse, load, rules, free, b):
+    """Inverse inertia in world axes, and what gravity, pulls and the gyroscopic torque make of the velocities."""
+    v, w = _pulled(world, matrix, load, rules, 1.0, b)
     for x in range(3):
-        free[b, x] = rules.gravity[x] * rules.inner
+        free[b, x], free[b, 3 + x] = v[x], w[x]
     for x in range(3):
         for y in range(3):
             total = 0.0
@@ -126,11 +135,12 @@ def _prepare(world, motion, matrix, inverse, rules, free, b):
     middle = along(w, half, 0.5 * rules.inner)
     later = turn(matrix, b, turn(world.inertia, b, turn_back(matrix, b, middle)))
     change = scale(turn(inverse, b, cross(later, middle)), rules.inner)
-    free[b, 3], free[b, 4], free[b, 5] = change[0], change[1], change[2]
+    for x in range(3):
+        free[b, 3 + x] += change[x]
 
 
 @njit(**BARE)
-def _advance(world, motion, matrix, rules, change, shift, part, trial, frame, b):
+def _advance(world, motion, matrix, rules, load, change, shift, part, trial, frame, b):
     """Move a body by one inner step; returns how far at most any of its points has gone."""
     if world.scripted[b]:
         v, w = get(motion.velocity, b), get(motion.angular, b)
@@ -141,14 +151,14 @@ def _advance(world, motion, matrix, rules, change, shift, part, trial, frame, b)
         for x in range(6):
             if change[b, x] != 0.0 or shift[b, x] != 0.0:
                 motion.touching[b] = True
-        v = add(get(motion.velocity, b), scale(vector(rules.gravity), rules.inner))
-        v = add(v, (change[b, 0], change[b, 1], change[b, 2]))
+        v, spun = _pulled(world, matrix, load, rules, 1.0, b)
+        v = add(add(get(motion.velocity, b), v), (change[b, 0], change[b, 1], change[b, 2]))
         put(motion.velocity, b, v)
         v = add(v, (shift[b, 0], shift[b, 1], shift[b, 2]))
         w = (0.0, 0.0, 0.0)
         if rules.rotation:
             # What the gyroscopic torque adds comes with the exact motion below, which keeps angular momentum.
-            w = add(get(motion.angular, b), (change[b, 3], change[b, 4], change[b, 5]))
+            w = add(add(get(motion.angular, b), spun), (change[b, 3], change[b, 4], change[b, 5]))
         put(motion.angular, b, w)
         if rules.rotation and not world.isotropic[b]:
             put(motion.position, b, along(get(motion.position, b), v, rules.inner * part))

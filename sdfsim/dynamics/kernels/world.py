@@ -70,6 +70,7 @@ class Work(NamedTuple):
         matrix, inverse: [N, 3, 3] rotation and inverse inertia, world axes.
         free, change, shift: [N, 6] what an inner step makes of velocities without contact, what contact adds, and
             velocities that only move and are forgotten.
+        load: [N, 6] force at the centre of mass and torque, world axes, that pull at a body through the step.
         part: [N] how much of the inner step a body may move.
         ways: [N] how far a body may move until it has to be looked around again; gone: [N] how far it has.
         low, high: [N, 3] the box of all that it may reach till then.
@@ -82,6 +83,7 @@ class Work(NamedTuple):
     free: np.ndarray
     change: np.ndarray
     shift: np.ndarray
+    load: np.ndarray
     part: np.ndarray
     ways: np.ndarray
     gone: np.ndarray

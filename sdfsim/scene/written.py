@@ -1,0 +1,121 @@
+"""Scenes written in Python: the keys of scene.yaml as keyword arguments, and the same checks."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from sdfsim.errors import SceneError
+from sdfsim.files import write_text
+from sdfsim.scene import scene
+from sdfsim.scene.scene_file import VERSION, BodyTable, Progress, SceneTable, ShapeTable, load_scene, nearest
+
+_OF_SHAPE = [key for key in ShapeTable.model_fields if key not in BodyTable.model_fields]
+_PATHS = ("asset", "mesh")
+_HERE = "<scene>"  # what messages call a scene that is in no file
+
+
+class Scene:
+    """A scene that is being written. `print` shows it as the file that `save` writes.
+
+    Args:
+        settings: keys of the file itself: gravity, duration, seed, model, effects, limits.
+
+    Raises:
+        SceneError: no such key.
+    """
+
+    def __init__(self, **settings: Any) -> None:
+        known = [key for key in SceneTable.model_fields if key not in ("version", "shapes", "bodies")]
+        _check(settings, known, "a scene")
+        self._settings = _plain(settings)
+        self._shapes: dict[str, dict[str, Any]] = {}
+        self._bodies: list[dict[str, Any]] = []
+
+    def add(self, name: str, **keys: Any) -> Scene:
+        """Add a body, or many copies of one.
+
+        Args:
+            name: of the body, and of its shape.
+            keys: of the body and of its shape, as docs/scene.md has them, such as sphere={"radius": 0.1},
+                position=(0, 0, 1). Paths of meshes and folders start at the current folder. A body that looks like an
+                earlier one takes shape="name of that one".
+
+        Returns:
+            The scene itself.
+
+        Raises:
+            SceneError: no such key. What values may be is checked by `load`, all at once.
+        """
+        _check(keys, [*_OF_SHAPE, *(key for key in BodyTable.model_fields if key != "name")], f"body {name!r}")
+        shape = {key: value for key, value in keys.items() if key in _OF_SHAPE}
+        body = {key: value for key, value in keys.items() if key not in _OF_SHAPE}
+        if shape:
+            self._shapes[name] = _plain(shape)
+            body = {"shape": name, **body}
+        self._bodies.append(_plain({"name": name, **body}))
+        return self
+
+    def load(self, on_progress: Progress | None = None) -> scene.Scene:
+        """What a simulator takes; `Simulator` calls it by itself. Shapes are loaded or fitted as `load_scene` does.
+
+        Raises:
+            SceneError: one line for every fault, with the line that `print` shows it in.
+        """
+        found = load_scene(Path(_HERE), on_progress, allow_outside=True, text=str(self))
+        return replace(found, path=None)
+
+    def save(self, path: Path | str) -> Path:
+        """Write a scene.yaml; paths in it start at its folder. Nothing is checked: `load_scene` does that.
+
+        Raises:
+            SdfsimError: the file cannot be written.
+        """
+        path = Path(path)
+        write_text(path, self._text(path.resolve().parent))
+        return path
+
+    def __str__(self) -> str:
+        return self._text(None)
+
+    def _text(self, folder: Path | None) -> str:
+        """The file; paths start at `folder`, or stay as they are."""
+        shapes = {name: dict(entry) for name, entry in self._shapes.items()}
+        for entry in shapes.values() if folder else ():
+            entry.update(
+                {key: os.path.relpath(entry[key], folder) for key in _PATHS if isinstance(entry.get(key), str)}
+            )
+        settings = dict(self._settings)
+        if folder and str(settings.get("model", "")).endswith(".safetensors"):
+            settings["model"] = os.path.relpath(settings["model"], folder)
+        lines = [f"version: {VERSION}", *(f"{key}: {_flow(value)}" for key, value in settings.items())]
+        lines += ["shapes:", *(f"  {_flow(name)}: {_flow(entry)}" for name, entry in shapes.items())] if shapes else []
+        lines += ["bodies:", *(f"  - {_flow(body)}" for body in self._bodies)] if self._bodies else []
+        return "\n".join(lines) + "\n"
+
+
+def _check(keys: dict[str, Any], known: list[str], what: str) -> None:
+    wrong = [f"{what}: unknown key {key!r}{nearest(key, known)}" for key in keys if key not in known]
+    if wrong:
+        raise SceneError(wrong, f"known are {', '.join(known)}")
+
+
+def _plain(value: Any) -> Any:
+    """Dicts, lists, texts and numbers only: arrays and tuples become lists, paths texts, and what is on or off so."""
+    if isinstance(value, dict):
+        return {str(key): _plain(entry) for key, entry in value.items() if entry is not None}
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    return ("on" if value else "off") if isinstance(value, bool) else str(value) if isinstance(value, Path) else value
+
+
+def _flow(value: Any) -> str:
+    """One line of YAML."""
+    return yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10**9).removesuffix("...\n").strip()
