@@ -10,8 +10,9 @@ import csv
 import importlib
 import io
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
@@ -39,7 +40,8 @@ STATIC_COLOR = (150, 150, 155)
 HUES = 32  # colours that bodies take in turn
 COACD = {"threshold": 0.05, "seed": 0}  # concavity relative to the size
 RATE = 60.0  # USD time codes in a second; programs step through the whole ones
-STEP = 0.002  # s, of MuJoCo
+STEP = 0.001  # s, of MuJoCo
+SOFT = 4.0  # steps, over 2 pi: the time in which a contact of MuJoCo swings
 MOST_PAIRS = 1000  # of geoms whose coefficients are written one by one
 MOST_GROUPS = 31  # MuJoCo's bit masks
 RESERVED = ("world", "root", "physics", "materials", "shapes", "groups")  # names of ours, or of MuJoCo's own
@@ -68,6 +70,11 @@ class Take:
     time: np.ndarray
     position: np.ndarray
     quat_xyzw: np.ndarray
+
+    @property
+    def moving(self) -> bool:
+        """Whether there is motion: more than one time."""
+        return len(self.time) > 1
 
     def each(self) -> Iterable[tuple[str, Body, Shape, np.ndarray]]:
         """Name, body, shape and colour of every body."""
@@ -273,12 +280,12 @@ def _write_assets(
             continue
         folder.mkdir(exist_ok=True)
         shown[k] = _write_obj(folder, take.shapes[k], take.scene.shapes[k].mesh)
-        cut[k] = [_write_obj(folder, f"{take.shapes[k]}_piece_{i}", p) for i, p in enumerate(pieces.get(k, []))]
+        cut[k] = [_write_obj(folder, f"{take.shapes[k]}-{i}", p) for i, p in enumerate(pieces.get(k, []))]
     return shown, cut
 
 
 def _numbers(*values: Any) -> str:
-    return " ".join(f"{value:.9g}" for value in np.concatenate([np.ravel(value) for value in values]))
+    return " ".join(f"{value + 0.0:.9g}" for value in np.concatenate([np.ravel(value) for value in values]))
 
 
 def _wxyz(quat_xyzw: np.ndarray) -> np.ndarray:
@@ -289,6 +296,11 @@ def _linear(srgb: np.ndarray) -> np.ndarray:
     """0 to 255 as light from 0 to 1, which glTF and USD count in."""
     value = np.asarray(srgb) / 255.0
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def _rgba(shape: Shape, color: np.ndarray) -> str:
+    """For formats with one colour a mesh: the mean of its own ones, or `color`."""
+    return _numbers((color if shape.mesh.colors is None else shape.mesh.colors.mean(0)) / 255.0, 1.0)
 
 
 def _add(parent: XML, tag: str, **attributes: str) -> XML:
@@ -302,7 +314,7 @@ def _write_xml(path: Path, root: XML) -> None:
 
 def _start_only(take: Take) -> list[str]:
     """What a format without motion leaves out."""
-    moved = ["the motion: the scene is as it is at the start"] if len(take.time) > 1 else []
+    moved = ["the motion: the scene is as it is at the start"] if take.moving else []
     led = any(body.motion == "kinematic" for body in take.scene.bodies)
     return moved + (["the paths of kinematic bodies: they stand where they start"] if led else [])
 
@@ -360,8 +372,7 @@ def _glb(take: Take, out: Path, on_progress: Progress) -> Written:
                 colors = accessor(np.round(65535 * rgba).astype(np.uint16), "VEC4")
                 mesh["primitives"][0]["attributes"]["COLOR_0"] = colors
         nodes = {node["name"]: k for k, node in enumerate(tree["nodes"])}
-        moving = len(take.time) > 1
-        time = accessor(take.time.astype(np.float32), "SCALAR") if moving else 0
+        time = accessor(take.time.astype(np.float32), "SCALAR") if take.moving else 0
         samplers, channels = [], []
         for k, (name, body) in enumerate(zip(take.names, take.scene.bodies, strict=True)):
             # An animated node may not have a matrix.
@@ -369,7 +380,7 @@ def _glb(take: Take, out: Path, on_progress: Progress) -> Written:
             node = tree["nodes"][nodes[name]]
             node |= {"translation": place[0].tolist(), "rotation": turn[0].tolist(), "scale": [body.scale] * 3}
             for path, values, kind in (("translation", place, "VEC3"), ("rotation", turn, "VEC4")):
-                if moving and body.motion != "static":
+                if take.moving and body.motion != "static":
                     channels.append({"sampler": len(samplers), "target": {"node": nodes[name], "path": path}})
                     samplers.append({"input": time, "output": accessor(values, kind), "interpolation": "LINEAR"})
         if channels:
@@ -378,7 +389,7 @@ def _glb(take: Take, out: Path, on_progress: Progress) -> Written:
     with replacing(out) as partial:
         content = export_glb(scene, include_normals=True, buffer_postprocessor=finish)
         partial.write_bytes(content)
-    return Written([out], ["masses, friction and what else is not seen"])
+    return Written([out], ["masses, friction and all else that is not seen"])
 
 
 # --- USD ---
@@ -392,12 +403,13 @@ def _usd(take: Take, out: Path, on_progress: Progress) -> Written:
     geom.SetStageUpAxis(stage, geom.Tokens.z)
     physics.SetStageKilogramsPerUnit(stage, 1.0)
     stage.SetDefaultPrim(geom.Xform.Define(stage, "/World").GetPrim())
+    for group in ("materials", "shapes"):
+        stage.DefinePrim(f"/World/{group}", "Scope")
     strength = float(np.linalg.norm(take.scene.gravity))
     gravity = physics.Scene.Define(stage, "/World/physics")
     gravity.CreateGravityDirectionAttr(gf.Vec3f(*(take.scene.gravity / strength if strength else (0.0, 0.0, -1.0))))
     gravity.CreateGravityMagnitudeAttr(strength)
-    moving = len(take.time) > 1
-    if moving:
+    if take.moving:
         stage.SetTimeCodesPerSecond(RATE)
         stage.SetFramesPerSecond(RATE)
         stage.SetStartTimeCode(RATE * float(take.time[0]))
@@ -409,7 +421,7 @@ def _usd(take: Take, out: Path, on_progress: Progress) -> Written:
         prim = geom.Xform.Define(stage, f"/World/{name}").GetPrim()
         place = geom.Xformable(prim).AddTranslateOp()
         turn = geom.Xformable(prim).AddOrientOp(geom.XformOp.PrecisionDouble)
-        animated = moving and body.motion != "static"
+        animated = take.moving and body.motion != "static"
         for t in range(len(take.time) if animated else 1):
             code = usd.TimeCode(RATE * float(take.time[t])) if animated else usd.TimeCode.Default()
             place.Set(gf.Vec3d(*take.position[t, k].tolist()), code)
@@ -470,8 +482,7 @@ def _usd(take: Take, out: Path, on_progress: Progress) -> Written:
             named.rename(partial)
         finally:
             named.unlink(missing_ok=True)
-    still = replace(take, time=take.time[:1])
-    return Written([out], _start_only(still) if not moving else [])
+    return Written([out], [] if take.moving else _start_only(take))
 
 
 def _usd_geometry(take: Take, shape: Shape, dynamic: bool, stage: Any, path: str) -> None:
@@ -553,11 +564,11 @@ def _mjcf(take: Take, out: Path, on_progress: Progress) -> Written:
     places, speeds = [], []
 
     def mesh_of(file: Path, scale: float) -> str:
-        name = file.stem + ("" if scale == 1.0 else f"_x{scale:.9g}")
+        name = file.stem + ("" if scale == 1.0 else f"-x{scale:.9g}")
         if name not in meshes:
             meshes.add(name)
             # "convex" and "shell" ask for no volume inside, which what is only shown need not have.
-            inertia = "convex" if "_piece_" in file.stem else "shell"
+            inertia = "convex" if "-" in file.stem else "shell"
             _add(asset, "mesh", name=name, file=file.name, scale=_numbers([scale] * 3), inertia=inertia)
         return name
 
@@ -576,7 +587,7 @@ def _mjcf(take: Take, out: Path, on_progress: Progress) -> Written:
             speed = body.velocity - np.cross(body.angular_velocity, turn.apply(com))
             places.append(_numbers(body.position, _wxyz(quat)))
             speeds.append(_numbers(speed, turn.inv().apply(body.angular_velocity)))
-        rgba = _numbers(color / 255.0 if shape.mesh.colors is None else shape.mesh.colors.mean(0) / 255.0, 1.0)
+        rgba = _rgba(shape, color)
         if body.shape in shown:
             mesh = mesh_of(shown[body.shape], body.scale)
             _add(node, "geom", type="mesh", mesh=mesh, rgba=rgba, group="2", contype="0", conaffinity="0")
@@ -590,38 +601,52 @@ def _mjcf(take: Take, out: Path, on_progress: Progress) -> Written:
             "contype": f"{1 << group[k]}",
             "conaffinity": f"{sum(1 << g for g in np.flatnonzero(allowed[group[k]]))}",
         }
-        geoms.append([f"{name}_{i}" for i in range(len(solids))])
+        geoms.append([f"{name}-{i}" for i in range(len(solids))])
         for solid, label in zip(solids, geoms[-1], strict=True):
             _add(node, "geom", name=label, **solid, **surface)
 
     # Between bodies of one material the square is the product. Other pairs are told one by one, while they are few.
     pairs = []
-    for i, one in enumerate(scene.bodies):
-        for j in range(i):
-            other = scene.bodies[j]
-            same = (one.friction, one.restitution) == (other.friction, other.restitution)
-            if not same and "dynamic" in (one.motion, other.motion) and allowed[group[i], group[j]]:
-                surface = _mjcf_surface(one.friction * other.friction, one.restitution * other.restitution, pair=True)
-                pairs += [{"geom1": a, "geom2": b, "condim": "3", **surface} for a in geoms[j] for b in geoms[i]]
+    for i, j in _unlike(scene.bodies):
+        if not allowed[group[i], group[j]]:
+            continue
+        one, other = scene.bodies[i], scene.bodies[j]
+        surface = _mjcf_surface(one.friction * other.friction, one.restitution * other.restitution, pair=True)
+        pairs += [{"geom1": a, "geom2": b, "condim": "3", **surface} for a in geoms[i] for b in geoms[j]]
         if len(pairs) > MOST_PAIRS:
             left_out.append("friction and restitution of unlike bodies: MuJoCo takes the larger friction of the two")
+            pairs = []
             break
-    else:
-        contact = _add(root, "contact")
-        for pair in pairs:
-            _add(contact, "pair", **pair)
+    contact = _add(root, "contact") if pairs else root
+    for pair in pairs:
+        _add(contact, "pair", **pair)
     if places:
         _add(_add(root, "keyframe"), "key", name="start", qpos=" ".join(places), qvel=" ".join(speeds))
     _write_xml(out, root)
     return Written([out, *shown.values(), *(file for files in cut.values() for file in files)], left_out)
 
 
+def _unlike(bodies: Sequence[Body]) -> Iterator[tuple[int, int]]:
+    """Pairs of bodies with other coefficients than each other, of which one at least is dynamic."""
+    surfaces: dict[tuple[float, float], list[int]] = {}
+    for k, body in enumerate(bodies):
+        surfaces.setdefault((body.friction, body.restitution), []).append(k)
+    for some, others in combinations(surfaces.values(), 2):
+        yield from ((i, j) for i, j in product(some, others) if "dynamic" in (bodies[i].motion, bodies[j].motion))
+
+
 def _mjcf_surface(friction: float, restitution: float, *, pair: bool = False) -> dict[str, str]:
-    """Friction, and a spring with the damping of this restitution, stiff as the step allows: 1 / (2 steps) its rate."""
-    bounce = np.log(np.clip(restitution, 1e-3, 0.999))
-    damping = -bounce / np.hypot(np.pi, bounce)
+    """Friction, and a contact as stiff as the step allows, damped so that bodies part at this part of their speed.
+
+    MuJoCo has no restitution. A spring that only pushes, its damping relative to the critical one z, gives back
+    exp(-z arccos(2 z^2 - 1) / sqrt(1 - z^2)) of the speed; also above 1, where arccos and root are imaginary.
+    """
+    damping = (np.arange(1000) + 0.5) * SOFT / 2000  # up to where MuJoCo takes it as it is
+    turned = np.emath.arccos(2.0 * damping**2 - 1.0) / np.emath.sqrt(1.0 - damping**2)
+    back = np.exp(-damping * np.abs(turned))
+    found = np.interp(-restitution, -back, damping)
     sliding = [friction, friction, 0.005, 0.0001, 0.0001] if pair else [friction, 0.005, 0.0001]
-    return {"friction": _numbers(sliding), "solref": _numbers(2.0 * STEP / damping, damping)}
+    return {"friction": _numbers(sliding), "solref": _numbers(SOFT * STEP / found, found)}
 
 
 # --- URDF ---
@@ -651,7 +676,11 @@ def _urdf(take: Take, out: Path, on_progress: Progress) -> Written:
 
         visual = _add(link, "visual")
         if body.shape not in shown:
-            _urdf_form(_add(visual, "geometry"), shape.sdf, body.scale)
+            if isinstance(shape.sdf, PlaneSdf):  # PyBullet draws none
+                _add(visual, "origin", xyz="0 0 -0.001", rpy="0 0 0")
+                _add(_add(visual, "geometry"), "box", size=_numbers([2.0 * take.plane_size()] * 2, 0.002))
+            else:
+                _urdf_form(_add(visual, "geometry"), shape.sdf, body.scale)
             _urdf_form(_add(_add(link, "collision"), "geometry"), shape.sdf, body.scale)
         else:
             mesh(visual, shown[body.shape])
@@ -659,7 +688,7 @@ def _urdf(take: Take, out: Path, on_progress: Progress) -> Written:
                 mesh(_add(link, "collision", concave="yes"), shown[body.shape])
             for file in cut[body.shape] if body.motion != "static" else []:
                 mesh(_add(link, "collision"), file)
-        rgba = _numbers(color / 255.0 if shape.mesh.colors is None else shape.mesh.colors.mean(0) / 255.0, 1.0)
+        rgba = _rgba(shape, color)
         _add(_add(visual, "material", name=f"{name}_color"), "color", rgba=rgba)
         files.append(out if single else out.with_name(f"{out.stem}.{name}.urdf"))
         _write_xml(files[-1], root)
@@ -668,8 +697,7 @@ def _urdf(take: Take, out: Path, on_progress: Progress) -> Written:
     poses = out.with_suffix(".csv")
     start = replace(take, time=take.time[:1], position=take.position[:1], quat_xyzw=take.quat_xyzw[:1])
     _csv(start, poses, on_progress)
-    # Of the moving bodies only the place is kept in the poses.
-    left_out = ["poses at the start: they are in the CSV", "gravity, velocities and collides_with", *_start_only(take)]
+    left_out = ["where the bodies are: that is in the CSV", "gravity, velocities and collides_with", *_start_only(take)]
     return Written([*files, poses], left_out)
 
 
