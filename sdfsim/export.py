@@ -12,7 +12,7 @@ import io
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, product
+from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
@@ -605,18 +605,18 @@ def _mjcf(take: Take, out: Path, on_progress: Progress) -> Written:
         for solid, label in zip(solids, geoms[-1], strict=True):
             _add(node, "geom", name=label, **solid, **surface)
 
-    # Between bodies of one material the square is the product. Other pairs are told one by one, while they are few.
+    # Between bodies of one material the square is the product. Other pairs are told one by one, while they are few:
+    # those of few geoms first, since the floor is one.
     pairs = []
-    for i, j in _unlike(scene.bodies):
+    for i, j in _unlike(scene.bodies, sorted(range(len(geoms)), key=lambda k: len(geoms[k]))):
         if not allowed[group[i], group[j]]:
             continue
+        if len(pairs) + len(geoms[i]) * len(geoms[j]) > MOST_PAIRS:
+            left_out.append("friction and restitution of some unlike bodies: the larger friction of the two counts")
+            break
         one, other = scene.bodies[i], scene.bodies[j]
         surface = _mjcf_surface(one.friction * other.friction, one.restitution * other.restitution, pair=True)
         pairs += [{"geom1": a, "geom2": b, "condim": "3", **surface} for a in geoms[i] for b in geoms[j]]
-        if len(pairs) > MOST_PAIRS:
-            left_out.append("friction and restitution of unlike bodies: MuJoCo takes the larger friction of the two")
-            pairs = []
-            break
     contact = _add(root, "contact") if pairs else root
     for pair in pairs:
         _add(contact, "pair", **pair)
@@ -626,13 +626,14 @@ def _mjcf(take: Take, out: Path, on_progress: Progress) -> Written:
     return Written([out, *shown.values(), *(file for files in cut.values() for file in files)], left_out)
 
 
-def _unlike(bodies: Sequence[Body]) -> Iterator[tuple[int, int]]:
+def _unlike(bodies: Sequence[Body], order: list[int]) -> Iterator[tuple[int, int]]:
     """Pairs of bodies with other coefficients than each other, of which one at least is dynamic."""
-    surfaces: dict[tuple[float, float], list[int]] = {}
-    for k, body in enumerate(bodies):
-        surfaces.setdefault((body.friction, body.restitution), []).append(k)
-    for some, others in combinations(surfaces.values(), 2):
-        yield from ((i, j) for i, j in product(some, others) if "dynamic" in (bodies[i].motion, bodies[j].motion))
+    surfaces = [(body.friction, body.restitution) for body in bodies]
+    if len(set(surfaces)) == 1:
+        return
+    for i, j in combinations(order, 2):
+        if surfaces[i] != surfaces[j] and "dynamic" in (bodies[i].motion, bodies[j].motion):
+            yield i, j
 
 
 def _mjcf_surface(friction: float, restitution: float, *, pair: bool = False) -> dict[str, str]:
