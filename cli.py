@@ -9,7 +9,7 @@ import typer
 from pipeline.commands import distill, fit, mesh, poses, reconstruct
 from sdfsim.commands.exporting import export
 from sdfsim.commands.learning import dataset, evaluate, train
-from sdfsim.commands.simulating import identify, info, plan, simulate, view
+from sdfsim.commands.simulating import identify, info, plan, render, simulate, view
 from sdfsim.commands.studying import stress, tradeoff
 
 app = typer.Typer(
@@ -47,6 +47,7 @@ for command in (
     simulate,
     plan,
     view,
+    render,
     identify,
     export,
     dataset,

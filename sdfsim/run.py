@@ -16,7 +16,8 @@ import torch
 import yaml
 
 from sdfsim.console import columns
-from sdfsim.dynamics.bodies import State, Touch
+from sdfsim.dynamics.bodies import State, Touch, largest_extent
+from sdfsim.dynamics.froude import EARTH
 from sdfsim.dynamics.memory import COUNTS, PHASES
 from sdfsim.dynamics.model import Model, load_model
 from sdfsim.dynamics.rest import Rest
@@ -34,7 +35,7 @@ from sdfsim.files import (
     write_json,
     write_text,
 )
-from sdfsim.recording import Playback, save_rollout
+from sdfsim.recording import Place, Playback, eye_of, framed, save_rollout
 from sdfsim.scene.scene import Scene
 from sdfsim.scene.scene_file import load_scene
 
@@ -43,6 +44,10 @@ Progress = Callable[[str, float, str], None]  # stage, fraction of it that is do
 Told = Callable[[float, str], None]
 CHECKPOINT = "checkpoint"  # folder in that of the run
 EVERY = 30.0  # s between two checkpoints
+TOLD = 12  # bodies that are told of one by one at the end
+STILL = 0.01  # see `ended`
+FAR = 10.0  # times the size of the scene: who is farther away in the end has left it
+ODD = 0.01  # energy from nothing in a step, as a part of what is in play, that is told
 _REPORT = "report.json"
 _RESULTS = (_REPORT, "rollout.npz", "rollout.rrd")
 _STATE = "state.npz"
@@ -65,6 +70,8 @@ def simulate(
     allow_outside: bool = False,
     until_settled: bool = False,
     resume: bool = False,
+    camera: Place | None = None,
+    look_at: Place | None = None,
 ) -> dict[str, Any]:
     """Simulate a scene and write config.yaml, report.json, rollout.npz and (unless `viewer` is none) rollout.rrd.
 
@@ -83,6 +90,7 @@ def simulate(
         until_settled: end as soon as everything has come to rest.
         resume: go on with the run in `out` that was interrupted; from the start where there is none. A finished one is
             left as it is, and its report is returned.
+        camera, look_at: [3] m each, of the first view in the recording; None: all of the motion is in sight.
 
     Returns:
         The content of report.json; of the shapes that were fitted for this scene, `failed_checks` names those that are
@@ -107,6 +115,7 @@ def simulate(
 
         check_screen(viewer)
     scene = load_scene(scene_file, partial(on_progress, "shapes"), allow_outside=allow_outside)
+    eye_of(scene, None, camera, look_at)
     simulator = Simulator(scene, model=model, device=device, seed=seed)
     length = scene.duration if seconds is None else seconds
     config = {
@@ -138,7 +147,7 @@ def simulate(
             frames = [simulator.initial_rollout()]
             kept.add(frames[0])
         write_text(out / CONFIG, yaml.safe_dump(config, sort_keys=False))
-        live = _live(scene, viewer, join(frames), say, bind)
+        live = _live(Playback(scene, None, camera, look_at), viewer, join(frames), say, bind)
 
         started, broken = time.monotonic(), None
         settled = until_settled and kept.rest.settled  # already, where it was killed between its last step and the end
@@ -160,6 +169,7 @@ def simulate(
         on_progress("simulate", 1.0, f"{len(rollout)} steps" + (" (stopped early)" if broken else ""))
 
         report = summary(rollout, time.monotonic() - started)
+        report["ended"] = ended(scene, rollout)
         report["status"] = "done" if broken is None else "failed" if isinstance(broken, SdfsimError) else "interrupted"
         report["folder"] = str(out)
         report["identity"] = kept.identity
@@ -171,7 +181,7 @@ def simulate(
             report["error"] = broken.message
         rollout.save(out / "rollout.npz")
         if viewer != "none":
-            save_rollout(scene, rollout, out / "rollout.rrd")
+            save_rollout(scene, rollout, out / "rollout.rrd", camera, look_at)
             report["recording"] = str(out / "rollout.rrd")
         write_json(out / _REPORT, report)
         if not isinstance(broken, KeyboardInterrupt):
@@ -188,12 +198,11 @@ def _repeatable(asked: str | None, model: Model) -> str:
     return str(Path(asked).resolve()) if asked and asked.endswith(".safetensors") else model.name
 
 
-def _live(scene: Any, viewer: Viewer, first: Rollout, say: Callable[[str], None], bind: str) -> Playback | None:
+def _live(live: Playback, viewer: Viewer, first: Rollout, say: Callable[[str], None], bind: str) -> Playback | None:
     if viewer not in ("native", "web"):
         return None
     from sdfsim.viewer import stream_to_viewer
 
-    live = Playback(scene)
     if address := stream_to_viewer(live, viewer, bind=bind):
         say(f"watch it at {address}")
     live.log_static()
@@ -256,6 +265,65 @@ def summary(rollout: Rollout, wall: float) -> dict[str, Any]:
     }
 
 
+def ended(scene: Scene, rollout: Rollout) -> dict[str, Any]:
+    """Where the bodies that move by themselves are in the end.
+
+    Returns:
+        bodies: of the first `TOLD` of them the name, the place of the centre of mass in m, the speed in m/s and whether
+            they rest.
+        rest: how many do: they move by less than `STILL` of their size in the time that they take to fall that far.
+        moving: names of those that do not, the fastest first; left: names of those that have left the scene for good.
+    """
+    rows = [k for k, body in enumerate(scene.bodies) if body.motion == "dynamic"]
+    sizes = [scene.bodies[k].scale * largest_extent(scene.shapes[scene.bodies[k].shape]) for k in rows]
+    place, velocity, spin = (getattr(rollout, name)[-1, rows] for name in ("position", "velocity", "angular_velocity"))
+    size, speed = np.array(sizes), np.linalg.norm(velocity, axis=-1)
+    strength = float(np.linalg.norm(scene.gravity)) or EARTH
+    rests = speed + 0.5 * size * np.linalg.norm(spin, axis=-1) < STILL * np.sqrt(strength * size)
+    centre, radius = framed(scene)
+    left = np.linalg.norm(place - centre, axis=-1) > FAR * radius
+    names = np.array([scene.bodies[k].name for k in rows], dtype=str)
+    faster = np.argsort(-speed, kind="stable")
+    return {
+        "bodies": [
+            {
+                "name": str(names[k]),
+                "centre_m": place[k].tolist(),
+                "speed_m_s": _number(speed[k]),
+                "rests": bool(rests[k]),
+            }
+            for k in range(min(len(rows), TOLD))
+        ],
+        "count": len(rows),
+        "rest": int(rests.sum()),
+        "moving": [str(names[k]) for k in faster if not rests[k] and not left[k]],
+        "left": [str(names[k]) for k in faster if left[k]],
+    }
+
+
+def ending_lines(report: dict[str, Any]) -> list[str]:
+    """Where bodies ended, which rest, and what was odd."""
+    end, lines = report["ended"], []
+    if end["count"] == len(end["bodies"]):
+        rows = []
+        for body in end["bodies"]:
+            place = ", ".join(f"{x:.3f}" for x in body["centre_m"])
+            how = "left the scene" if body["name"] in end["left"] else f"{body['speed_m_s'] or 0.0:.2g} m/s"
+            rows.append((f"  {body['name']}", f"({place}) m", "at rest" if body["rests"] else how))
+        lines += columns(rows) if rows else []
+    moving = end["count"] - end["rest"]
+    fastest = f", the fastest {', '.join(end['moving'][:3])}" if moving and end["moving"] else ""
+    lines.append(f"{end['rest']} of {end['count']} bodies rest" + (f"; {moving} move{fastest}" if moving else ""))
+    if end["left"]:
+        many = f" and {len(end['left']) - 3} more" if len(end["left"]) > 3 else ""
+        lines.append(f"left the scene: {', '.join(end['left'][:3])}{many}")
+    made = report["energy_from_nothing"]
+    if made["worst"] > ODD:
+        part = f"{100 * made['steps_above_1_percent']:.1f} % of the steps made more than 1 % of what was in play"
+        lines.append(f"energy from nothing: {made['sum_J']:.3g} J; {part}, the worst {100 * made['worst']:.2g} %")
+    return lines
+
+
 def cost(rollout: Rollout) -> dict[str, dict[str, Any]]:
     """Sum and largest value over the steps of everything that was counted or timed."""
     counted = {name: rollout.counters[name][1:] for name in (*COUNTS, *PHASES, "step_ms") if name in rollout.counters}
@@ -264,15 +332,6 @@ def cost(rollout: Rollout) -> dict[str, dict[str, Any]]:
         for name, v in counted.items()
         if len(v)
     }
-
-
-def energy_lines(report: dict[str, Any]) -> list[str]:
-    """What contact has made from nothing."""
-    made = report["energy_from_nothing"]
-    return [
-        f"energy from nothing: {made['sum_J']:.3g} J; {100 * made['steps_above_1_percent']:.1f} % of the steps made "
-        f"more than 1 % of what was in play, the worst {100 * made['worst']:.2g} %"
-    ]
 
 
 def cost_lines(report: dict[str, Any]) -> list[str]:

@@ -28,7 +28,15 @@ def folder_of(text: str) -> Path:
 
 
 Json = Annotated[bool, typer.Option("--json", help="One JSON object on stdout, everything else on stderr.")]
-Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Tracebacks with errors.")]
+Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="More figures, and tracebacks with errors.")]
+Camera = Annotated[
+    tuple[float, float, float] | None,
+    typer.Option(metavar="X Y Z", help="Where the camera is, m (default: all of the motion is in sight)."),
+]
+LookAt = Annotated[
+    tuple[float, float, float] | None,
+    typer.Option("--look-at", metavar="X Y Z", help="What it looks at, m (default: the middle of the scene)."),
+]
 Device = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Where to compute.")]
 Outside = Annotated[
     bool, typer.Option("--allow-outside", help="Let the scene name files that are not in its own folder.")

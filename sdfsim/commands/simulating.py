@@ -8,7 +8,19 @@ from typing import Annotated, Literal
 
 import typer
 
-from sdfsim.commands.arguments import Bind, Device, Json, Model, Out, Outside, Verbose, check_device, tell_failed
+from sdfsim.commands.arguments import (
+    Bind,
+    Camera,
+    Device,
+    Json,
+    LookAt,
+    Model,
+    Out,
+    Outside,
+    Verbose,
+    check_device,
+    tell_failed,
+)
 from sdfsim.console import Session, duration
 
 _PACKAGES = (
@@ -28,6 +40,8 @@ def simulate(
         bool, typer.Option("--until-settled", help="End as soon as everything rests (--seconds at the latest).")
     ] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the interrupted run in the folder.")] = False,
+    camera: Camera = None,
+    look_at: LookAt = None,
     bind: Bind = "127.0.0.1",
     allow_outside: Outside = False,
     as_json: Json = False,
@@ -51,6 +65,8 @@ def simulate(
             allow_outside=allow_outside,
             until_settled=until_settled,
             resume=resume,
+            camera=camera,
+            look_at=look_at,
             device=device,
             on_progress=session.stage_progress,
             say=session.say,
@@ -60,9 +76,9 @@ def simulate(
             f"{report['steps']} steps of {report['dt_s']:.4g} s in {duration(report['wall_s'])}"
             + ("" if median is None else f" (median {median:.1f} ms a step)"),
             f"mean contacts {report['contacts_mean']:.1f}, worst penetration {report['worst_penetration_m']:.2g} m",
-            *run.energy_lines(report),
+            *run.ending_lines(report),
             *([] if report.get("settled", True) else ["not settled: give it more --seconds"]),
-            *run.cost_lines(report),
+            *(run.cost_lines(report) if verbose else []),
             f"wrote {out}",
             *(f"outside the model's training: {line}" for line in report["outside_training"]),
             *(f"usable, not exact: {line}" for line in report["caveats"]),
@@ -118,6 +134,33 @@ def view(
         else:
             viewer.show(recording, web=web, bind=bind)
             session.report({"recording": str(recording)})
+
+
+def render(
+    source: Annotated[Path, typer.Argument(help="Run folder or rollout.npz.", show_default=False)],
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help=".mp4 or .png.", show_default=False)],
+    scene: Annotated[Path | None, typer.Option(help="scene.yaml (default: that of the run folder).")] = None,
+    camera: Camera = None,
+    look_at: LookAt = None,
+    at: Annotated[float | None, typer.Option(help="Time of a picture, s (default: the end).")] = None,
+    allow_outside: Outside = False,
+    as_json: Json = False,
+    device: Device = "auto",
+    verbose: Verbose = False,
+) -> None:
+    """Run -> movie or picture, without a screen."""
+    if at is not None and out.suffix != ".png":
+        raise typer.BadParameter("--at goes with a picture, -o FILE.png")
+    with Session(as_json=as_json, verbose=verbose) as session:
+        from sdfsim import render as room
+        from sdfsim.run import read_run
+
+        check_device(device)
+        room.check_format(out)
+        shapes, frames = partial(session.stage_progress, "shapes"), partial(session.stage_progress, "render")
+        loaded, rollout = read_run(source, scene, allow_outside=allow_outside, on_progress=shapes)
+        room.render(loaded, rollout, out, camera=camera, look_at=look_at, at=at, on_progress=frames)
+        session.report({"picture" if out.suffix == ".png" else "movie": str(out)}, [f"wrote {out}"])
 
 
 def identify(

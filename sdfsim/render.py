@@ -1,0 +1,304 @@
+"""A run as a movie or a picture without a screen or a graphics driver: rays are cast on the processor."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sdfsim.dynamics.rollout import Rollout
+from sdfsim.errors import SdfsimError
+from sdfsim.files import replacing
+from sdfsim.recording import Eye, body_colors, eye_of, framed, sheet, with_normals
+from sdfsim.scene.scene import Scene
+
+SIZE = (960, 540)  # px, width and height
+FRAMES = 30  # a second
+FORMATS = (".mp4", ".png")
+_TALL = np.tan(np.radians(20.0))  # half of the field of view's height, at distance 1
+_SUN = np.array([0.35, -0.5, 0.8]) / np.linalg.norm([0.35, -0.5, 0.8])  # in a frame whose z is up
+_SKY, _SHADE = np.array([236.0, 240.0, 245.0]), 0.45  # what nothing is in front of; light where the sun does not shine
+_SUB = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]])  # px, where edges are looked at again
+_GRID = np.stack(np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5), -1).reshape(-1, 2)  # px
+Progress = Callable[[float, str], None]
+
+
+def render(
+    scene: Scene, rollout: Rollout, out: Path, *, camera: Any = None, look_at: Any = None, at: float | None = None,
+    on_progress: Progress = lambda fraction, message: None,
+) -> None:  # fmt: skip
+    """Write a movie (.mp4, H.264, as long as the run) or a picture (.png) of a run.
+
+    Args:
+        scene: of the run.
+        rollout: the run.
+        out: file to write.
+        camera: [3] m, where it is; None: where all of the motion is in sight.
+        look_at: [3] m, the point in its middle; None: the middle of all that moves or stands.
+        at: s, the time of a picture (default: the end).
+        on_progress: called with the fraction done and a message.
+
+    Raises:
+        SdfsimError: another ending, a time outside of the run, a camera where it looks at, or a file that cannot be
+            written.
+    """
+    check_format(out)
+    if at is not None and not rollout.time[0] <= at <= rollout.time[-1] + rollout.meta["dt"]:
+        raise SdfsimError(f"--at {at:g}: the run holds {rollout.time[0]:g} to {rollout.time[-1]:g} s")
+    studio = Studio(scene, eye_of(scene, rollout, camera, look_at), framed(scene, rollout)[1])
+    if out.suffix == ".png":
+        from PIL import Image
+
+        pixels = studio.picture(*poses_at(rollout, rollout.time[-1] if at is None else at))
+        with replacing(out) as partial:
+            Image.fromarray(pixels).save(partial, format="PNG")
+        return
+    count = max(1, round(float(rollout.time[-1] - rollout.time[0]) * FRAMES) + 1)
+
+    def pictures() -> Iterator[np.ndarray]:
+        for k in range(count):
+            yield studio.picture(*poses_at(rollout, rollout.time[0] + k / FRAMES))
+            on_progress((k + 1) / count, f"frame {k + 1} of {count}")
+
+    write_movie(out, pictures())
+
+
+def check_format(out: Path) -> None:
+    """Raises SdfsimError where the ending of a file says neither movie nor picture."""
+    if out.suffix not in FORMATS:
+        raise SdfsimError(f"{out}: must end with {' or '.join(FORMATS)}")
+
+
+def write_movie(out: Path, pictures: Iterator[np.ndarray]) -> None:
+    """Write RGB pictures of `SIZE` [H, W, 3] uint8, `FRAMES` a second, as H.264."""
+    import av
+
+    with replacing(out) as partial, av.open(str(partial), "w", format="mp4") as movie:
+        stream: Any = movie.add_stream("libx264", rate=Fraction(FRAMES), options={"crf": "20", "preset": "fast"})
+        (stream.width, stream.height), stream.pix_fmt = SIZE, "yuv420p"
+        for pixels in pictures:
+            movie.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+        movie.mux(stream.encode())
+
+
+def poses_at(rollout: Rollout, time: float) -> tuple[np.ndarray, np.ndarray]:
+    """Positions [N, 3] m of the centres of mass and orientations [N, 4] xyzw, between frames as if moved evenly."""
+    after = int(np.clip(np.searchsorted(rollout.time, time), min(1, len(rollout)), len(rollout)))
+    before = max(after - 1, 0)
+    span = rollout.time[after] - rollout.time[before]
+    part = float(np.clip((time - rollout.time[before]) / span, 0.0, 1.0)) if span > 0 else 1.0
+    one, other = rollout.orientation[before], rollout.orientation[after]
+    nearer = np.where((one * other).sum(-1, keepdims=True) < 0.0, -other, other)
+    turned = (1.0 - part) * one + part * nearer
+    place = (1.0 - part) * rollout.position[before] + part * rollout.position[after]
+    return place, turned / np.linalg.norm(turned, axis=-1, keepdims=True)
+
+
+@dataclass(frozen=True)
+class _Model:
+    """What is drawn of a body, about its centre of mass: vertices and normals [V, 3], faces [F, 3], colours [V, 3]."""
+
+    vertices: np.ndarray
+    normals: np.ndarray
+    faces: np.ndarray
+    colors: np.ndarray
+
+
+class _Cast:
+    """The triangles of some bodies where they are now.
+
+    Args:
+        models: of the bodies.
+        bodies: [B] their numbers.
+        places, turns: [B, 3] m and [B, 3, 3].
+    """
+
+    def __init__(self, models: list[_Model], bodies: np.ndarray, places: np.ndarray, turns: np.ndarray) -> None:
+        import open3d as o3d
+
+        starts = np.cumsum([0, *(len(m.vertices) for m in models)])
+        self.vertices = np.concatenate([m.vertices @ r.T + t for m, r, t in zip(models, turns, places, strict=True)])
+        self.normals = np.concatenate([m.normals @ r.T for m, r in zip(models, turns, strict=True)])
+        self.colors = np.concatenate([m.colors for m in models])
+        self.faces = np.concatenate([m.faces + start for m, start in zip(models, starts, strict=False)])
+        self.body = np.repeat(bodies, [len(m.faces) for m in models])
+        self._tensor: Any = o3d.core.Tensor
+        self._scene = o3d.t.geometry.RaycastingScene()
+        self._scene.add_triangles(
+            self._tensor(self.vertices.astype(np.float32)), self._tensor(self.faces.astype(np.uint32))
+        )
+
+    def hits(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Distances [R], inf where nothing is hit; faces [R]; where in the face [R, 2]."""
+        found = self._scene.cast_rays(self._tensor(rays))
+        return tuple(found[key].numpy() for key in ("t_hit", "primitive_ids", "primitive_uvs"))  # type: ignore[return-value]
+
+    def blocked(self, rays: np.ndarray) -> np.ndarray:
+        """[R] whether anything is hit."""
+        return self._scene.test_occlusions(self._tensor(rays)).numpy()
+
+    def surface(self, face: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Normals [R, 3] and colours [R, 3] at places of faces."""
+        share = np.stack([1.0 - uv.sum(-1), uv[:, 0], uv[:, 1]], -1)[..., None]
+        corners = self.faces[face]
+        normal, color = (self.normals[corners] * share).sum(1), (self.colors[corners] * share).sum(1)
+        return normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9), color
+
+
+@dataclass(frozen=True)
+class _Layer:
+    """What R rays see of some bodies.
+
+    Attributes:
+        away: [R] m, inf where they meet nothing.
+        body: [R] which, -1 where they meet nothing.
+        lit, shade: [R, 3] colours in the sun and out of it.
+        shadow: [R, 6] rays from there to the sun.
+        dark: [R] bool, whether the sun is known not to shine there.
+    """
+
+    away: np.ndarray
+    body: np.ndarray
+    lit: np.ndarray
+    shade: np.ndarray
+    shadow: np.ndarray
+    dark: np.ndarray
+
+    def behind(self, other: _Layer) -> _Layer:
+        """The nearer of both, ray by ray."""
+        near = other.away < self.away
+        return _Layer(
+            *(
+                np.where(near.reshape(-1, *[1] * (one.ndim - 1)), two, one)
+                for one, two in zip(vars(self).values(), vars(other).values(), strict=True)
+            )
+        )
+
+
+class Studio:
+    """A scene with a camera and a sun, of which pictures are taken.
+
+    Args:
+        scene: what is shown.
+        eye: from where.
+        radius: m, of all that is shown.
+    """
+
+    def __init__(self, scene: Scene, eye: Eye, radius: float) -> None:
+        self._scene, self._eye, self._radius = scene, eye, radius
+        self._floors = np.array([not np.isfinite(scene.shapes[b.shape].sdf.bounds).all() for b in scene.bodies])
+        colors = body_colors(scene)
+        self._models = [self._model(k, color) for k, color in enumerate(colors)]
+        self._com = [b.scale * scene.shapes[b.shape].com for b in scene.bodies]
+        self._moves = np.array([b.motion != "static" for b in scene.bodies])
+        forward = (eye.target - eye.position) / np.linalg.norm(eye.target - eye.position)
+        right = np.cross(forward, eye.up)
+        self._axes = np.stack([right / np.linalg.norm(right), np.zeros(3), forward])
+        self._axes[1] = np.cross(forward, self._axes[0])  # down the picture
+        frame = np.stack([self._axes[0], np.cross(eye.up, self._axes[0]), eye.up])
+        self._sun = _SUN @ frame
+        still = np.flatnonzero(~self._moves)
+        at = np.array([scene.bodies[k].quat_xyzw for k in still]).reshape(-1, 4)
+        turns = _matrices(at)
+        places = [scene.bodies[k].position + r @ self._com[k] for k, r in zip(still, turns, strict=True)]
+        self._still = None
+        if len(still):
+            self._still = _Cast([self._models[k] for k in still], still, np.array(places), turns)
+        self._through = self._rays(_GRID)
+        self._stands = self._layer(self._still, self._through)  # the same in every picture
+
+    def picture(self, position: np.ndarray, orientation: np.ndarray) -> np.ndarray:
+        """[H, W, 3] uint8 of bodies with these centres of mass [N, 3] m and orientations [N, 4]."""
+        goes = np.flatnonzero(self._moves)
+        moving = None
+        if len(goes):
+            moving = _Cast([self._models[k] for k in goes], goes, position[goes], _matrices(orientation[goes]))
+        wide, tall = SIZE
+        pixels, label = self._look(moving, self._through, self._stands)
+        pixels, label = pixels.reshape(tall, wide, 3), label.reshape(tall, wide)
+        edge = np.zeros((tall, wide), bool)
+        for axis in (0, 1):
+            differs = np.diff(label, axis=axis) != 0
+            edge[: tall - (axis == 0), : wide - (axis == 1)] |= differs
+            edge[axis == 0 :, axis == 1 :] |= differs
+        if edge.any():
+            rays = self._rays((_GRID[edge.reshape(-1)][:, None] + _SUB).reshape(-1, 2))
+            again, _ = self._look(moving, rays, self._layer(self._still, rays))
+            pixels[edge] = again.reshape(-1, len(_SUB), 3).mean(1)
+        return np.clip(pixels + 0.5, 0, 255).astype(np.uint8)
+
+    def _rays(self, at: np.ndarray) -> np.ndarray:
+        """[R, 6] float32 origins and unit directions through places [R, 2] px of the picture."""
+        flat = (at - np.array(SIZE) / 2) / (SIZE[1] / 2) * _TALL
+        direction = np.concatenate([flat, np.ones((len(at), 1))], 1) @ self._axes
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        return np.concatenate([np.broadcast_to(self._eye.position, direction.shape), direction], 1, dtype=np.float32)
+
+    def _look(self, moving: _Cast | None, rays: np.ndarray, stands: _Layer) -> tuple[np.ndarray, np.ndarray]:
+        """Colours [R, 3] along rays, and numbers [R] by which bodies, light and shade differ."""
+        layer = stands if moving is None else stands.behind(self._layer(moving, rays))
+        dark = layer.dark.copy()
+        if moving is not None:
+            light = np.flatnonzero(~dark & (layer.body >= 0))
+            dark[light] = moving.blocked(layer.shadow[light])
+        return np.where(dark[:, None], layer.shade, layer.lit), 2 * layer.body + dark
+
+    def _layer(self, cast: _Cast | None, rays: np.ndarray) -> _Layer:
+        """What rays [R, 6] see of some bodies, in the sun and in the shade that what stands still gives."""
+        count = len(rays)
+        sky = np.broadcast_to(_SKY.astype(np.float32), (count, 3))
+        layer = _Layer(
+            np.full(count, np.inf, np.float32), np.full(count, -1), sky.copy(), sky.copy(), np.zeros_like(rays),
+            np.ones(count, bool),
+        )  # fmt: skip
+        if cast is None:
+            return layer
+        layer.away[:], face, uv = cast.hits(rays)
+        there = np.flatnonzero(np.isfinite(layer.away))
+        face, uv, direction, away = face[there], uv[there], rays[there, 3:], layer.away[there, None]
+        layer.body[there] = cast.body[face]
+        normal, color = cast.surface(face, uv)
+        facing = np.where((normal * direction).sum(-1, keepdims=True) > 0.0, -normal, normal)
+        toward = facing @ self._sun
+        point = rays[there, :3] + away * direction
+        color = self._checked(point, color, layer.body[there])
+        # Far away the floor goes over into the sky.
+        fog = np.clip((away / (4.0 * self._radius) - 1.0) / 2.0, 0.0, 1.0)
+        least = _SHADE + 0.1 * (facing @ self._eye.up)
+        for found, light in ((layer.shade, least), (layer.lit, least + (1.0 - _SHADE) * toward)):
+            found[there] = (1.0 - fog) * np.clip(light, 0.0, 1.1)[:, None] * color + fog * _SKY
+        start = point + 1e-3 * self._radius * facing
+        layer.shadow[there] = np.concatenate([start, np.broadcast_to(self._sun, start.shape)], 1)
+        layer.dark[there] = toward <= 0.0
+        if self._still:
+            layer.dark[there] |= self._still.blocked(layer.shadow[there])
+        return layer
+
+    def _checked(self, point: np.ndarray, color: np.ndarray, body: np.ndarray) -> np.ndarray:
+        """Infinite planes are checked, so that motion over them is seen."""
+        on = np.flatnonzero(self._floors[body])
+        square = np.floor(point[on] / 10.0 ** np.floor(np.log10(self._radius)) + 1e-4)
+        color[on] *= np.where(square.sum(1) % 2 == 0, 1.0, 0.93)[:, None]
+        return color
+
+    def _model(self, k: int, color: tuple[int, ...]) -> _Model:
+        body = self._scene.bodies[k]
+        shape = self._scene.shapes[body.shape]
+        mesh = sheet(40.0 * self._radius) if self._floors[k] else shape.mesh
+        mesh, normals = with_normals(mesh)
+        colors = np.broadcast_to(color, mesh.vertices.shape) if mesh.colors is None else mesh.colors
+        vertices = mesh.vertices * body.scale - body.scale * shape.com
+        return _Model(vertices, normals, mesh.faces, colors.astype(np.float64))
+
+
+def _matrices(quat: np.ndarray) -> np.ndarray:
+    """[B, 3, 3] rotations of unit quaternions [B, 4] xyzw."""
+    import torch
+
+    from sdfsim.dynamics import pose
+
+    return pose.to_matrix(torch.from_numpy(np.ascontiguousarray(quat, dtype=np.float64))).numpy()
