@@ -555,6 +555,7 @@ def _mjcf(take: Take, out: Path, on_progress: Progress) -> Written:
     _add(root, "option", timestep=_numbers(STEP), gravity=_numbers(scene.gravity), cone="elliptic", impratio="10")
     _add(root, "size", memory="512M")  # of address space; contacts of many pieces need more than is the default
     asset, world = _add(root, "asset"), _add(root, "worldbody")
+    _add(world, "light", directional="true", castshadow="false", pos="0 0 10", dir="-0.4 0.3 -0.9")
     group, allowed = contact_groups(scene.bodies)
     if len(allowed) > MOST_GROUPS:
         left_out.append(f"collides_with: {len(allowed)} groups of bodies (MuJoCo knows {MOST_GROUPS})")

@@ -39,14 +39,14 @@ bodies:
   - {{name: floor, plane: {{}}, friction: 0.8, restitution: 0.1}}
   - {{name: the ring, shape: ring, scale: 0.4, position: [0, 0, 0.08], euler_xyz_deg: [12, 8, 30], mass: 0.1,
      friction: 0.6, restitution: 0.1}}
-  - {{name: cone, shape: cone, scale: 0.5, position: [0.5, 0, 0.12], euler_xyz_deg: [5, 3, 0], restitution: 0.1}}
+  - {{name: cone, shape: cone, scale: 0.5, position: [0.5, 0, 0.06], euler_xyz_deg: [4, 2, 0], restitution: 0.1}}
   - {{name: 1 box, shape: box, position: [0, 0.5, 0.09], euler_xyz_deg: [9, -7, 20], restitution: 0.1}}
   - {{name: slider, shape: box, position: [0, 1, 0.031], velocity: [1, 0.3, 0], angular_velocity: [0, 0, 3],
      friction: 0.4, restitution: 0.1}}
   - {{name: pill, shape: pill, position: [0.5, 0.5, 0.12], euler_xyz_deg: [90, 0, 0], collides_with: [floor]}}
   - {{name: can, shape: can, position: [1, 0.5, 0.06]}}
   - {{name: bowl, shape: bowl, motion: static, position: [-1, 0, 0.6], restitution: 0.1}}
-  - {{name: ball, shape: ball, position: [-0.97, 0, 0.5], restitution: 0.1, friction: 0.9}}
+  - {{name: ball, shape: ball, position: [-1, 0, 0.4], restitution: 0.1, friction: 0.9}}
   - {{name: sweep, shape: box, motion: kinematic, path: [{{time: 0, position: [0, -1, 0.2]}},
      {{time: 1, position: [1, -1, 0.2], euler_xyz_deg: [0, 0, 90]}}]}}
 """
@@ -248,6 +248,12 @@ def test_usd_groups_keep_apart_what_collides_with_does(dropped):
 # --- engines ---
 
 
+def assert_rests(there: np.ndarray, ours: np.ndarray, name: str) -> None:
+    # In the bowl a ball rolls to and fro on facets: 1.5 cm aside raises it by 0.3 mm.
+    aside = 0.03 if name == "ball" else 0.01
+    assert np.linalg.norm(there[:2] - ours[:2]) < aside and abs(there[2] - ours[2]) < 0.005, (name, there, ours)
+
+
 def test_mujoco_rests_where_we_do(dropped):
     import mujoco
 
@@ -272,7 +278,7 @@ def test_mujoco_rests_where_we_do(dropped):
         mujoco.mj_step(model, data)
     for name in RESTING:
         there = data.body("_1_box" if name == "1 box" else name.replace(" ", "_")).xipos
-        np.testing.assert_allclose(there, dropped.centre(name), atol=0.01, err_msg=name)
+        assert_rests(there, dropped.centre(name), name)
 
 
 def test_pybullet_rests_where_we_do(dropped):
@@ -298,8 +304,8 @@ def test_pybullet_rests_where_we_do(dropped):
         for _ in range(round(240 * SECONDS)):
             engine.stepSimulation()
         for name in RESTING:
-            there = engine.getBasePositionAndOrientation(found[name])[0]
-            np.testing.assert_allclose(there, dropped.centre(name), atol=0.01, err_msg=name)
+            there = np.array(engine.getBasePositionAndOrientation(found[name])[0])
+            assert_rests(there, dropped.centre(name), name)
     finally:
         engine.disconnect()
 
