@@ -18,11 +18,12 @@ echo "2/3  throwing a ball at the vase"
 
 echo "3/3  taking a picture"
 picture="$out/rollout/rollout.png"
-"$sdfsim" view "$out/rollout/rollout.rrd" --screenshot "$picture" --at 0.4 || picture="no picture: see above"
+"$sdfsim" render "$out/rollout" -o "$picture" --at 0.4
 
 cat <<TEXT
 
 A picture of it:          $picture
+a movie of it:            $sdfsim render $out/rollout -o movie.mp4
 Watch it:                 $sdfsim view $out/rollout/rollout.rrd
 in the browser:           $sdfsim view $out/rollout/rollout.rrd --web
 cameras and surface:      $sdfsim view $out/scene/reconstruction.rrd
