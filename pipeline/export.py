@@ -13,13 +13,13 @@ import numpy as np
 import yaml
 
 from pipeline.mesh.cleaning import joined
-from pipeline.mesh.meshing import SCENERY, read_parts, rounded
+from pipeline.mesh.meshing import SCENERY, TEXTURED, read_parts, rounded
 from pipeline.mesh.placement import Placement, load_placement
 from pipeline.mesh.visibility import Caster
 from pipeline.progress import Progress, quiet
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.files import write_text
-from sdfsim.shape.mesh import Mesh, load_mesh
+from sdfsim.shape.mesh import Mesh, load_mesh, read_glb
 
 SCENERY_SHARE = 2  # Of a budget the scenery gets as much as this many bodies: it has more to it.
 DENSITY = 400.0  # kg/m^3, wood: no photo tells what a thing is made of
@@ -56,7 +56,7 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
     """
     from sdfsim.shape.shape import load_shape
 
-    parts = read_parts(mesh_folder)
+    parts, skins = read_parts(mesh_folder), skins_of(mesh_folder)
     weights = {SCENERY: SCENERY_SHARE} if parts["scenery"] else {}
     weights |= {entry["name"]: 1 for entry in parts["objects"]}
     shares = {name: weight / sum(weights.values()) for name, weight in weights.items()}
@@ -73,16 +73,16 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
             continue
         solid, shown = meshes_of(mesh_folder, name)
         certificates[name] = fit_one(
-            solid, shown, out, name, budget=None if budget is None else budget * share, recipe=recipe, seed=seed,
-            device=device, on_progress=tell,
+            solid, shown, skins.get(name), out, name, budget=None if budget is None else budget * share, recipe=recipe,
+            seed=seed, device=device, on_progress=tell,
         )  # fmt: skip
     missed = [f"{name}: {found['reason']}" for name, found in certificates.items() if not found["passed"]]
     caveats = [f"{name}: {found['caveat']}" for name, found in certificates.items() if found["caveat"]]
     return {"shapes": certificates, "passed": not missed, "reason": "; ".join(missed), "caveats": caveats}
 
 
-def fit_one(solid: Mesh, shown: Mesh, out: Path, name: str, *, budget: float | None, recipe: str, seed: int,
-            device: str, on_progress: Progress) -> dict:  # fmt: skip
+def fit_one(solid: Mesh, shown: Mesh, skin: Mesh | None, out: Path, name: str, *, budget: float | None, recipe: str,
+            seed: int, device: str, on_progress: Progress) -> dict:  # fmt: skip
     """Fits one shape, saves it as the folder `out`/`name`, and returns its certificate."""
     from sdfsim.shape.fit import fit_mesh
 
@@ -93,7 +93,7 @@ def fit_one(solid: Mesh, shown: Mesh, out: Path, name: str, *, budget: float | N
     # The folder appears complete or not at all: a run that goes on keeps those that are there.
     partial = out / f".{name}.part"
     shutil.rmtree(partial, ignore_errors=True)
-    replace(shape, mesh=shown).save(partial)
+    replace(shape, mesh=shown, skin=skin).save(partial)
     partial.rename(out / name)
     return shape.certificate
 
@@ -105,6 +105,15 @@ def meshes_of(mesh_folder: Path, name: str) -> tuple[Mesh, Mesh]:
     mesh = load_mesh(mesh_folder / "objects" / f"{name}.ply")
     moved = replace(mesh, vertices=mesh.vertices - origin_of(mesh))
     return moved, moved
+
+
+def skins_of(mesh_folder: Path) -> dict[str, Mesh]:
+    """The textured mesh of each part in its own frame; none where the mesh stage is one that made no textures."""
+    if not (mesh_folder / TEXTURED).exists():
+        return {}
+    skins = read_glb(mesh_folder / TEXTURED)
+    origins = {name: origin_of(load_mesh(mesh_folder / "objects" / f"{name}.ply")) for name in skins if name != SCENERY}
+    return {name: replace(skin, vertices=skin.vertices - origins.get(name, 0)) for name, skin in skins.items()}
 
 
 def origin_of(mesh: Mesh) -> np.ndarray:

@@ -17,6 +17,7 @@ from sdfsim.files import read_json, write_json, write_text
 # What a person looks for, and the stage that writes it.
 RESULTS = {
     "scene": ("scene.yaml", "scene"), "shape": ("assets/scene", "fit"), "mesh": ("mesh/mesh.ply", "mesh"),
+    "textured": ("mesh/textured.glb", "mesh"),
     "names": ("mesh/objects.png", "mesh"), "cameras": ("poses/cameras.json", "poses"),
     "report": ("report.md", "photos"),
 }  # fmt: skip
@@ -207,13 +208,16 @@ def write_recording(folder: Path, done: Collection[str]) -> Path | None:
     Raises:
         SdfsimError: a stage's folder is damaged, or the file cannot be written.
     """
+    from pipeline.mesh.meshing import TEXTURED
     from sdfsim.recording import PosedPhoto, save_reconstruction
-    from sdfsim.shape.mesh import load_mesh
+    from sdfsim.shape.mesh import load_mesh, read_glb
 
     if "poses" not in done:
         return None
     views, points, colors = _in_place(folder, done)
     mesh = load_mesh(folder / "mesh" / "mesh.ply") if "mesh" in done else None
+    textured = folder / "mesh" / TEXTURED
+    skins = read_glb(textured) if "mesh" in done and textured.exists() else {}
     photos = []
     for view in views:
         image = folder / "photos" / "images" / view.name
@@ -221,7 +225,7 @@ def write_recording(folder: Path, done: Collection[str]) -> Path | None:
             PosedPhoto(view.source, image if image.is_file() else None, view.focal, (view.cx, view.cy),
                        (view.width, view.height), view.rotation, view.translation)
         )  # fmt: skip
-    save_reconstruction(folder / RECORDING, photos, points, colors, mesh)
+    save_reconstruction(folder / RECORDING, photos, points, colors, mesh, skins)
     return folder / RECORDING
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -38,6 +39,7 @@ _STATIC_COLOR = (150, 150, 155)
 _NODE_COLOR = (20, 20, 20)
 _CONTACT_COLOR = (255, 40, 40)
 _PHOTO_PIXELS = 320
+_TEXTURE_PIXELS = 2048
 MANY = 24  # bodies of one shape that do not stay put, from which on they are a crowd
 COLORS = 4  # copies share their mesh's colour, so a crowd is split to be told apart
 _CREASE = np.cos(np.radians(40.0))
@@ -101,7 +103,7 @@ class Playback:
         hues = distinct_colors(len(self._alone) + len(self._crowds))
         for crowd in self._crowds:
             shape = scene.shapes[crowd.shape]
-            mesh = Mesh(shape.mesh.vertices - shape.com, shape.mesh.faces, shape.mesh.colors)
+            mesh = replace(shape.shown, vertices=shape.shown.vertices - shape.com)
             self.stream.log(crowd.path, _shaded(rr, mesh, next(hues)), static=True)
             scales = np.repeat([[scene.bodies[k].scale] for k in crowd.bodies], 3, 1)
             self.stream.log(crowd.path, rr.InstancePoses3D.from_fields(scales=scales), static=True)
@@ -110,8 +112,8 @@ class Playback:
             shape = scene.shapes[body.shape]
             infinite = not np.all(np.isfinite(shape.sdf.bounds))
             color = _STATIC_COLOR if body.motion == "static" else next(hues)
-            mesh = sheet(6 * size) if infinite else shape.mesh
-            placed = Mesh(mesh.vertices * body.scale - com, mesh.faces, mesh.colors)
+            mesh = sheet(6 * size) if infinite else shape.shown
+            placed = replace(mesh, vertices=mesh.vertices * body.scale - com)
             self.stream.log(f"{path}/mesh", _shaded(rr, placed, color), static=True)
             if len(shape.nodes):
                 nodes = rr.Points3D(shape.nodes * body.scale - com, colors=_NODE_COLOR, radii=rr.Radius.ui_points(2))
@@ -215,8 +217,9 @@ class PosedPhoto:
 
 
 def save_reconstruction(
-    path: Path, photos: list[PosedPhoto], points: np.ndarray, colors: np.ndarray | None, mesh: Mesh | None
-) -> None:
+    path: Path, photos: list[PosedPhoto], points: np.ndarray, colors: np.ndarray | None, mesh: Mesh | None,
+    skins: Mapping[str, Mesh] = MappingProxyType({}),
+) -> None:  # fmt: skip
     """Write cameras with their photos, sparse points and the surface as one rerun recording.
 
     Args:
@@ -225,6 +228,7 @@ def save_reconstruction(
         points: [P, 3] m, sparse points.
         colors: [P, 3] uint8 RGB, or None.
         mesh: the reconstructed surface, if it is there already.
+        skins: its parts with their textures, by name, shown in its place where there are any.
 
     Raises:
         SdfsimError: the file cannot be written.
@@ -248,8 +252,11 @@ def save_reconstruction(
     stream.send_blueprint(rrb.Blueprint(view, collapse_panels=True, auto_views=False))
     stream.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     stream.log(f"{WORLD}/points", rr.Points3D(points, colors=colors, radii=rr.Radius.ui_points(1.5)), static=True)
-    if mesh is not None:
-        stream.log(f"{WORLD}/surface", _shaded(rr, mesh, (200, 190, 175)), static=True)
+    surfaces = {} if mesh is None else {f"{WORLD}/surface": mesh}
+    if skins:
+        surfaces = {f"{WORLD}/surface/{rr.escape_entity_path_part(name)}": skin for name, skin in skins.items()}
+    for entity, surface in surfaces.items():
+        stream.log(entity, _shaded(rr, surface, (200, 190, 175)), static=True)
     for photo, turn, centre_of in zip(photos, rotations, centres, strict=True):
         entity = f"{WORLD}/cameras/{rr.escape_entity_path_part(photo.name)}"
         pose = rr.Transform3D(translation=centre_of, mat3x3=turn.T)
@@ -330,15 +337,26 @@ def _turned(vectors: np.ndarray, quat_xyzw: np.ndarray) -> np.ndarray:
 
 
 def _shaded(rr: Any, mesh: Mesh, color: tuple[int, ...]) -> rr.Mesh3D:
-    """With its own colours, or `color` where it has none."""
+    """With its own texture or colours, or `color` where it has neither."""
     mesh, normals = with_normals(mesh)
     return rr.Mesh3D(
         vertex_positions=mesh.vertices,
         triangle_indices=mesh.faces,
         vertex_normals=normals,
         vertex_colors=mesh.colors,
-        albedo_factor=color if mesh.colors is None else None,
+        vertex_texcoords=mesh.uv,
+        albedo_texture=None if mesh.texture is None else _reduced(mesh.texture),
+        albedo_factor=color if mesh.colors is None and mesh.texture is None else None,
     )
+
+
+def _reduced(texture: np.ndarray) -> np.ndarray:
+    """A texture [H, W, 3] small enough for a recording, which holds every pixel of it."""
+    from PIL import Image
+
+    image = Image.fromarray(texture)
+    image.thumbnail((_TEXTURE_PIXELS, _TEXTURE_PIXELS))
+    return np.asarray(image)
 
 
 def sheet(half: float) -> Mesh:
@@ -356,6 +374,9 @@ def distinct_colors(count: int) -> Iterator[tuple[int, ...]]:
 
 def with_normals(mesh: Mesh) -> tuple[Mesh, np.ndarray]:
     """The mesh with normals [V, 3]: smooth, its vertices split along creases so that boxes keep their edges."""
+    if mesh.uv is not None:  # its vertices are doubled where its texture is cut, and that is no crease
+        _, first, label = np.unique(mesh.vertices, axis=0, return_index=True, return_inverse=True)
+        return mesh, _smooth_normals(mesh.vertices[first], label.reshape(-1)[mesh.faces])[label.reshape(-1)]
     normals = _corner_normals(mesh.vertices, mesh.faces)
     if normals is None:
         return mesh, _smooth_normals(mesh.vertices, mesh.faces)

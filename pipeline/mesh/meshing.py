@@ -17,13 +17,15 @@ from pipeline.mesh.bodies import Parts, split
 from pipeline.mesh.cleaning import joined
 from pipeline.mesh.extraction import EXTENT, ball, field_distance, sample_volume, surface_of
 from pipeline.mesh.placement import Placement, measured_scale, place
+from pipeline.mesh.texture import shots_of, texture_parts
 from pipeline.mesh.visibility import Caster
 from pipeline.progress import Progress, quiet, share_of
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, replacing, write_json
-from sdfsim.shape.mesh import Mesh, write_ply
+from sdfsim.shape.mesh import Mesh, write_glb, write_ply
 
 SCENERY = "scene"
+TEXTURED = "textured.glb"
 RESOLUTION = {"quick": 192, "standard": 288, "fine": 448, "paper": 448}  # samples a side, by preset
 # The picture of names: at most so many photos, their width while they are chosen and in the picture, px, and the tint.
 PICTURES, THUMB, WIDE, TINT = 4, 80, 720, 0.45
@@ -37,7 +39,8 @@ def make_meshes(
     """Extracts surfaces and writes them to `out`.
 
     Writes `mesh.ply` (all that photos show), of the scenery `solid.ply` (closed) and `shown.ply` (what is displayed),
-    `objects/NAME.ply` (closed) of each body, `parts.json`, `placement.json`, and `objects.png`.
+    `objects/NAME.ply` (closed) of each body, `parts.json`, `placement.json`, `objects.png`, and `textured.glb`: the
+    scenery and each body with a texture.
 
     Args:
         distill: folder of that stage.
@@ -84,9 +87,17 @@ def make_meshes(
     cut = lambda p: np.maximum(inner(p), limit(p))  # noqa: E731
     parts = split(surface, cut, field.finest, views, photos, placement.to_metres.rotation[2], alone=alone)
     write_parts(parts, surface.visible, placement, out)
-    on_progress(0.95, "drawing objects.png")
+    on_progress(0.8, "drawing objects.png")
     draw_names(parts, views, photos).save(out / "objects.png")
     metres = placement.to_metres.scale
+    moved = [placement.to_metres.view(view) for view in views]
+    whole = [placement.mesh(mesh) for mesh in (parts.solid, *parts.bodies.values()) if mesh is not None]
+    shots = shots_of(moved, load_photos(photos), photos, whole, surface.volume.cell * metres)
+    shown = {SCENERY: parts.shown} | parts.bodies
+    displayed = {name: placement.mesh(mesh) for name, mesh in shown.items() if mesh is not None}
+    textures = texture_parts(displayed, shots, share_of(on_progress, 0.85, 0.15))
+    with replacing(out / TEXTURED) as partial:
+        partial.write_bytes(write_glb(textures))
     return {
         **surface.report, "left_out_m": [float(rounded(length * metres)) for length in surface.report["left_out"]],
         "extent_m": rounded(np.ptp(placement.mesh(surface.visible).vertices, axis=0)).tolist(),

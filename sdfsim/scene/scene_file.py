@@ -28,6 +28,7 @@ from sdfsim.shape.shape import (
     DEFAULT_RESOLUTION,
     MESH_FILE,
     RECORD_FILE,
+    SKIN_FILE,
     WEIGHTS_FILE,
     SdfKind,
     Shape,
@@ -209,7 +210,7 @@ def _find(text: str, info: ValidationInfo) -> Path:
     place = home / text
     try:
         # Where it leads when every link is followed; of a folder, also where the files of a shape lead.
-        inside = (WEIGHTS_FILE, MESH_FILE, RECORD_FILE) if place.is_dir() else ()
+        inside = (WEIGHTS_FILE, MESH_FILE, RECORD_FILE, SKIN_FILE) if place.is_dir() else ()
         ends = [place.resolve(), *((place / name).resolve() for name in inside)]
         with suppress(FileNotFoundError, NotADirectoryError):  # told in the words of whoever wants it
             place.stat()

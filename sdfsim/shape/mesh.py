@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import logging
 import re
@@ -31,11 +32,15 @@ class Mesh:
         vertices: [V, 3] float64 m.
         faces: [F, 3] int64 vertex indices, counter-clockwise seen from outside.
         colors: [V, 3] uint8 RGB, or None.
+        uv: [V, 2] place of each vertex in the texture, from its upper left (0, 0) to its lower right (1, 1), or None.
+        texture: [H, W, 3] uint8 RGB, or None.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     colors: np.ndarray | None = None
+    uv: np.ndarray | None = None
+    texture: np.ndarray | None = None
 
     def digest(self) -> str:
         """SHA-256 of vertices, faces and colours, in hexadecimal."""
@@ -211,6 +216,110 @@ def read_mesh(path: Path) -> Mesh:
         return Mesh(mesh.vertices, mesh.faces, np.array(loaded.visual.vertex_colors)[:, :3].astype(np.uint8))
     except Exception as error:  # the readers raise whatever their format made them stumble over
         raise SdfsimError(f"{path}: damaged or cut short ({error})") from error
+
+
+# What z up is to the y up of glTF: columns of a matrix [4, 4].
+_Y_UP = [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1]
+
+
+def write_glb(meshes: dict[str, Mesh]) -> bytes:
+    """Meshes with textures as binary glTF: a node each by its name, all below one that turns them to glTF's y up.
+
+    Vertices become single precision, textures JPEG. They hold the light of the photos: nothing else is to light them.
+    """
+    from PIL import Image
+
+    content, views, accessors, images, made = bytearray(), [], [], [], []
+
+    def add(data: bytes) -> int:
+        views.append({"buffer": 0, "byteOffset": len(content), "byteLength": len(data)})
+        content.extend(data + bytes(-len(data) % 4))
+        return len(views) - 1
+
+    def array(values: np.ndarray, kind: str, width: str, **limits: list) -> int:
+        component = {"<f4": 5126, "<u4": 5125}[kind]
+        accessor = {"bufferView": add(np.ascontiguousarray(values, kind).tobytes()), "componentType": component}
+        accessors.append({**accessor, "count": len(values), "type": width, **limits})
+        return len(accessors) - 1
+
+    for number, (name, mesh) in enumerate(meshes.items()):
+        assert mesh.uv is not None and mesh.texture is not None
+        vertices = mesh.vertices.astype(np.float32)
+        limits = {"min": vertices.min(0).tolist(), "max": vertices.max(0).tolist()}
+        places = {
+            "POSITION": array(vertices, "<f4", "VEC3", **limits),
+            "TEXCOORD_0": array(mesh.uv, "<f4", "VEC2"),
+        }
+        corners = array(mesh.faces.reshape(-1), "<u4", "SCALAR")
+        made.append({"name": name, "primitives": [{"attributes": places, "indices": corners, "material": number}]})
+        file = io.BytesIO()
+        Image.fromarray(mesh.texture).save(file, "JPEG", quality=92, subsampling=0)
+        images.append({"bufferView": add(file.getvalue()), "mimeType": "image/jpeg"})
+    count = range(len(made))
+    surface = {"metallicFactor": 0, "roughnessFactor": 1}
+    header = {
+        "asset": {"version": "2.0", "generator": "sdfsim"},
+        "scene": 0,
+        "scenes": [{"nodes": [len(made)]}],
+        "nodes": [{"name": mesh["name"], "mesh": k} for k, mesh in enumerate(made)]
+        + [{"name": "z up", "children": list(count), "matrix": _Y_UP}],
+        "meshes": made,
+        "materials": [
+            {
+                "pbrMetallicRoughness": {**surface, "baseColorTexture": {"index": k}},
+                "extensions": {"KHR_materials_unlit": {}},
+            }
+            for k in count
+        ],
+        "textures": [{"source": k} for k in count],
+        "images": images,
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(content)}],
+        "extensionsUsed": ["KHR_materials_unlit"],
+    }
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    parts = struct.pack("<2I", len(text), 0x4E4F534A) + text + struct.pack("<2I", len(content), 0x004E4942) + content
+    return struct.pack("<4s2I", b"glTF", 2, 12 + len(parts)) + parts
+
+
+def read_glb(path: Path) -> dict[str, Mesh]:
+    """The meshes that `write_glb` wrote, z up, by their names.
+
+    Raises:
+        SdfsimError: not readable.
+    """
+    from PIL import Image
+
+    try:
+        data = path.read_bytes()
+        length = struct.unpack_from("<I", data, 12)[0]
+        header, content = json.loads(data[20 : 20 + length]), data[28 + length :]
+
+        def part(view: int) -> bytes:
+            start, size = (header["bufferViews"][view][key] for key in ("byteOffset", "byteLength"))
+            return content[start : start + size]
+
+        def array(number: int, kind: str, width: int) -> np.ndarray:
+            return np.frombuffer(part(header["accessors"][number]["bufferView"]), kind).reshape(-1, width)
+
+        found = {}
+        for mesh, image in zip(header["meshes"], header["images"], strict=True):
+            (drawn,) = mesh["primitives"]
+            with Image.open(io.BytesIO(part(image["bufferView"])), formats=["JPEG"]) as picture:
+                texture = np.asarray(picture.convert("RGB"))
+            vertices = array(drawn["attributes"]["POSITION"], "<f4", 3).astype(np.float64)
+            uv = array(drawn["attributes"]["TEXCOORD_0"], "<f4", 2)
+            faces = array(drawn["indices"], "<u4", 3).astype(np.int64)
+            if not (np.isfinite(vertices).all() and np.isfinite(uv).all() and len(uv) == len(vertices)):
+                raise ValueError("vertices that are not finite, or places in the texture that do not fit them")
+            if len(faces) and faces.max() >= len(vertices):
+                raise ValueError("face indices out of range")
+            found[str(mesh["name"])] = Mesh(vertices, faces, None, uv, texture)
+    except Exception as error:
+        raise SdfsimError(f"{path}: damaged or cut short ({error})") from error
+    return found
 
 
 def clean(mesh: Mesh, *, name: str = "mesh") -> Mesh:

@@ -17,7 +17,7 @@ from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, replacing, write_json
 from sdfsim.shape import primitives
 from sdfsim.shape.distance import MeshDistance
-from sdfsim.shape.mesh import Frame, Mesh, convex_hull, load_mesh, read_mesh, write_ply
+from sdfsim.shape.mesh import Frame, Mesh, convex_hull, load_mesh, read_glb, read_mesh, write_glb, write_ply
 from sdfsim.shape.mlp_sdf import ACTIVATIONS, MlpSdf
 from sdfsim.shape.sdf import (
     CLOSED_FORMS,
@@ -42,6 +42,7 @@ FORMAT_VERSION = 1
 # Samples along each side of a grid: its cells are then 0.022 of the solid's largest extent.
 DEFAULT_RESOLUTION = 64
 WEIGHTS_FILE, MESH_FILE, RECORD_FILE = "shape.safetensors", "mesh.ply", "shape.json"
+SKIN_FILE = "textured.glb"  # where there is a texture
 
 _log = logging.getLogger(__name__)
 
@@ -61,6 +62,7 @@ class Shape:
         certificate: fit errors measured on held-out points (empty where nothing was fitted).
         source: where it came from and a content hash (for caching and for the record).
         pieces: the vertices [V, 3] float64 m of each of its convex pieces, where it was made of such.
+        skin: a mesh with a texture that is shown in place of `mesh`, where there is one.
     """
 
     name: str
@@ -73,9 +75,15 @@ class Shape:
     certificate: dict = field(default_factory=dict)
     source: dict = field(default_factory=dict)
     pieces: tuple[np.ndarray, ...] = ()
+    skin: Mesh | None = None
+
+    @property
+    def shown(self) -> Mesh:
+        """What to draw."""
+        return self.mesh if self.skin is None else self.skin
 
     def save(self, folder: str | Path) -> Path:
-        """Write the shape folder: shape.safetensors, mesh.ply and, last, shape.json.
+        """Write the shape folder: shape.safetensors, mesh.ply, perhaps textured.glb and, last, shape.json.
 
         Each file appears complete or not at all, and shape.json only beside the files it describes.
 
@@ -112,6 +120,9 @@ class Shape:
             (folder / RECORD_FILE).unlink(missing_ok=True)
             write(folder / WEIGHTS_FILE, to_bytes(tensors))
             write(folder / MESH_FILE, write_ply(self.mesh))
+            (folder / SKIN_FILE).unlink(missing_ok=True)
+            if self.skin is not None:
+                write(folder / SKIN_FILE, write_glb({self.name: self.skin}))
             write_json(folder / RECORD_FILE, record)
         except OSError as error:
             raise SdfsimError(f"{folder}: cannot write the shape ({error.strerror or error})") from error
@@ -152,6 +163,7 @@ def load_shape(folder: str | Path) -> Shape:
         if name != "bounds" and not torch.isfinite(tensor).all():
             raise SdfsimError(f"{folder / WEIGHTS_FILE}: {name} is not finite")
     mesh = read_mesh(folder / MESH_FILE)
+    skins = read_glb(folder / SKIN_FILE) if (folder / SKIN_FILE).is_file() else {}
     try:
         sizes = record.get("pieces", [])
         return Shape(
@@ -165,6 +177,7 @@ def load_shape(folder: str | Path) -> Shape:
             certificate=dict(record["certificate"]),
             source=dict(record["source"]),
             pieces=tuple(piece.numpy() for piece in tensors["pieces"].split(sizes)) if sizes else (),
+            skin=next(iter(skins.values()), None),
         )
     except (SdfsimError, KeyError, TypeError, ValueError, RuntimeError) as error:
         reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
@@ -252,6 +265,7 @@ def scaled(shape: Shape, factor: float) -> Shape:
     return replace(
         shape,
         mesh=replace(shape.mesh, vertices=shape.mesh.vertices * factor),
+        skin=shape.skin and replace(shape.skin, vertices=shape.skin.vertices * factor),
         pieces=tuple(piece * factor for piece in shape.pieces),
         sdf=shape.sdf.scaled(factor),
         nodes=shape.nodes * factor,

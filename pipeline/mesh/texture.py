@@ -1,0 +1,334 @@
+"""Textures of reconstructed meshes: charts by xatlas, and for each texel the photos that show it best.
+
+Everything here is in metres. A texture is baked in blocks of texels: which photo shows a block, and how well, is found
+once a block; the colours are then taken texel by texel, with the blocks' weights interpolated between them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from pipeline.cameras import View
+from pipeline.inputs.photos import Photo
+from pipeline.mesh.cleaning import face_normals, joined, keep_faces, vertex_normals
+from pipeline.mesh.visibility import FLATTEST, Caster, bilinear, to_bytes
+from pipeline.progress import Progress, quiet, share_of
+from sdfsim.shape.mesh import Mesh, sample_surface
+
+FACES = 40_000  # of a textured mesh: finer detail is in its texture
+# The time of xatlas grows with the square of the faces of a chart: it gets the mesh in pieces of so many.
+PIECE = 300
+LARGEST = 4096  # px, longest side of a texture
+FULL = 0.5  # share of a texture that charts can be counted on to fill
+BLOCK = 4  # texels a side
+# Views are weighted by this power of how well they show a place: high enough that the best one gives nearly all of the
+# colour, as a mean of photos that are a few pixels apart is blurred; low enough that the next one takes over softly.
+POWER = 8.0
+LEAST = 0.02  # share of the colour below which a view is left out
+
+
+@dataclass(frozen=True)
+class Shots:
+    """Photos to take colours from.
+
+    Attributes:
+        views: cameras, metres.
+        sharpness: [N] of each photo, in any unit.
+        folder: of the photos stage.
+        blocking: what can stand in the way of a view.
+        lift: m, how far along its normal a place is lifted before looking from it.
+    """
+
+    views: list[View]
+    sharpness: np.ndarray
+    folder: Path
+    blocking: Caster
+    lift: float
+
+    def photo(self, view: View) -> np.ndarray:
+        """Colours [H, W, 3] uint8."""
+        with Image.open(self.folder / "images" / view.name) as image:
+            return np.asarray(image.convert("RGB"))
+
+    def density(self, points: np.ndarray, normals: np.ndarray) -> float:
+        """Photo pixels a metre of the surface has where it is seen best: the median over points [P, 3]."""
+        best = np.zeros(len(points))
+        for view in self.views:
+            index, density, _ = _facing(view, points, normals)
+            best[index] = np.maximum(best[index], density)
+        return float(np.median(best[best > 0])) if best.any() else 0.0
+
+
+def shots_of(views: list[View], photos: list[Photo], folder: Path, meshes: Sequence[Mesh], cell: float) -> Shots:
+    """The photos of some views, all in metres, of a scene that consists of `meshes`, exact to about a `cell`."""
+    sharpness = {photo.name: photo.sharpness for photo in photos}
+    return Shots(views, np.array([sharpness[view.name] for view in views]), folder, Caster(joined(meshes)), cell)
+
+
+@dataclass(frozen=True)
+class Texels:
+    """The texels of a texture that lie on the surface.
+
+    Attributes:
+        shape: rows and columns of the texture, multiples of `BLOCK`.
+        at: [T] index of each in the flat texture.
+        positions: [T, 3] float32 m.
+        normals: [T, 3] float32, about unit.
+        colors: [T, 3] float32 in 0..255, those of the mesh's vertices.
+    """
+
+    shape: tuple[int, int]
+    at: np.ndarray
+    positions: np.ndarray
+    normals: np.ndarray
+    colors: np.ndarray
+
+
+def texture_parts(meshes: dict[str, Mesh], shots: Shots, on_progress: Progress = quiet) -> dict[str, Mesh]:
+    """Each mesh with a texture, fewer faces where it has many, and vertices doubled where its charts meet.
+
+    Args:
+        meshes: with vertex colours, which stay wherever no photo shows the surface.
+        shots: photos.
+        on_progress: called with the share done.
+    """
+    sizes = np.array([len(mesh.faces) for mesh in meshes.values()], float)
+    ends = np.cumsum(sizes) / max(sizes.sum(), 1)
+    return {
+        name: textured(mesh, shots, share_of(on_progress, float(end - size / sizes.sum()), float(size / sizes.sum())))
+        for (name, mesh), size, end in zip(meshes.items(), sizes, ends, strict=True)
+    }
+
+
+def textured(mesh: Mesh, shots: Shots, on_progress: Progress = quiet, *, power: float = POWER) -> Mesh:
+    """One mesh with a texture, see `texture_parts`.
+
+    Args:
+        mesh: with vertex colours.
+        shots: photos.
+        on_progress: called with the share done.
+        power: of the weights; 1 gives the plain mean over photos.
+    """
+    on_progress(0.0, "unfolding the surface")
+    points, normals = sample_surface(mesh, 4000, np.random.default_rng(0))
+    coarse = fewer(mesh, FACES)
+    flat, origin, shape = unfold(coarse, shots.density(points, normals))
+    texels = rasterise(flat, vertex_normals(coarse)[origin], shape)
+    return replace(flat, colors=None, texture=bake(texels, shots, share_of(on_progress, 0.3, 0.7), power=power))
+
+
+def fewer(mesh: Mesh, most: int) -> Mesh:
+    """The mesh with at most about `most` faces, its vertices in the colours of the nearest ones before."""
+    if len(mesh.faces) <= most:
+        return mesh
+    import open3d as o3d
+    from scipy.spatial import KDTree
+
+    given = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.faces.astype(np.int32))
+    )
+    made = given.simplify_quadric_decimation(most)
+    vertices, faces = np.asarray(made.vertices), np.asarray(made.triangles).astype(np.int64)
+    coarse = keep_faces(Mesh(vertices, faces), face_normals(Mesh(vertices, faces))[1] > 0)
+    nearest = KDTree(mesh.vertices).query(coarse.vertices)[1]
+    return replace(coarse, colors=None if mesh.colors is None else mesh.colors[nearest])
+
+
+def unfold(mesh: Mesh, density: float) -> tuple[Mesh, np.ndarray, tuple[int, int]]:
+    """Places for the faces of a mesh in a texture.
+
+    Args:
+        mesh: any.
+        density: wanted texels a metre; fewer where the texture would be too large.
+
+    Returns:
+        The mesh with `uv`, its vertices doubled where charts meet; the vertex [V'] each of them was; and the rows and
+        columns of the texture, multiples of `BLOCK`.
+    """
+    import xatlas
+
+    pieces = _pieces(mesh.vertices[mesh.faces].mean(1))
+    parts = [np.unique(mesh.faces[piece], return_inverse=True) for piece in pieces]
+    density = min(density or np.inf, LARGEST * np.sqrt(FULL / face_normals(mesh)[1].sum()))
+    extent = float(np.ptp(mesh.vertices, axis=0).max())  # xatlas takes faces of a micrometre for none
+    while True:
+        atlas = xatlas.Atlas()
+        for used, corners in parts:
+            vertices = (mesh.vertices[used] / extent).astype(np.float32)
+            atlas.add_mesh(vertices, corners.reshape(-1, 3).astype(np.uint32))
+        packing = xatlas.PackOptions()
+        packing.texels_per_unit, packing.padding = density * extent, BLOCK
+        packing.blockAlign = packing.bilinear = True
+        atlas.generate(pack_options=packing)
+        size = np.array([atlas.height, atlas.width])
+        if size.max() <= LARGEST:
+            break
+        density *= 0.97 * LARGEST / size.max()
+    rows, columns = np.maximum(-(-size // BLOCK), 1) * BLOCK
+    origin, faces, uv = [], [], []
+    for number, (used, _) in enumerate(parts):
+        of, corners, at = atlas.get_mesh(number)
+        faces.append(corners.astype(np.int64) + sum(map(len, origin)))
+        origin.append(used[of])
+        uv.append(at * size[::-1] / [columns, rows])
+    of = np.concatenate(origin)
+    colors = None if mesh.colors is None else mesh.colors[of]
+    flat = Mesh(mesh.vertices[of], np.concatenate(faces), colors, np.concatenate(uv))
+    return flat, of, (int(rows), int(columns))
+
+
+def _pieces(places: np.ndarray) -> list[np.ndarray]:
+    """Indices of points [P, 3] that are near each other, at most `PIECE` together: halves of halves."""
+    done, left = [], [np.arange(len(places))]
+    while left:
+        piece = left.pop()
+        if len(piece) <= PIECE:
+            done.append(piece)
+            continue
+        own = places[piece]
+        order = np.argsort(own[:, np.ptp(own, axis=0).argmax()], kind="stable")
+        left += [piece[order[: len(order) // 2]], piece[order[len(order) // 2 :]]]
+    return done
+
+
+def rasterise(flat: Mesh, normals: np.ndarray, shape: tuple[int, int]) -> Texels:
+    """Where on the surface the texels of a texture lie.
+
+    Args:
+        flat: with `uv` and perhaps colours.
+        normals: [V, 3] of its vertices.
+        shape: rows and columns of the texture.
+    """
+    assert flat.uv is not None
+    rows, columns = shape
+    # The charts lie in a plane, and a ray through each texel's centre tells which face covers it, and where.
+    sheet = Caster(Mesh(np.c_[flat.uv * [columns, rows], np.zeros(len(flat.uv))], flat.faces))
+    v, u = np.indices(shape, np.float32).reshape(2, -1) + 0.5
+    down = np.zeros((len(u), 6), np.float32)
+    down[:, 0], down[:, 1], down[:, 2], down[:, 5] = u, v, 1, -1
+    found = sheet.scene.cast_rays(sheet.tensor(down))
+    at = np.flatnonzero(np.isfinite(found["t_hit"].numpy()))
+    corners = flat.faces[found["primitive_ids"].numpy()[at].astype(np.int64)]
+    second, third = found["primitive_uvs"].numpy()[at].T
+    weights = np.stack([1 - second - third, second, third])
+
+    def spread(values: np.ndarray) -> np.ndarray:
+        values = values.astype(np.float32)
+        return sum(weight[:, None] * values[corners[:, k]] for k, weight in enumerate(weights))  # type: ignore[return-value]
+
+    colors = np.full((len(normals), 3), 128) if flat.colors is None else flat.colors
+    return Texels(shape, at, spread(flat.vertices), spread(normals), spread(colors))
+
+
+def bake(texels: Texels, shots: Shots, on_progress: Progress = quiet, *, power: float = POWER) -> np.ndarray:
+    """The texture [H, W, 3] uint8: of each texel the colour in the photos that show it best.
+
+    A view counts by its pixels on the surface, by how straight it looks and how sharp its photo is. Within two blocks
+    of where something stands in its way, or its photo ends, it fades out: edges of the reconstruction are not so exact
+    that what is just beside them could be told. Photos differ in exposure, so what is larger than a few blocks has the
+    mean colour of all photos, and only what is smaller that of the best.
+    """
+    import cv2
+
+    rows, columns = texels.shape
+    small = rows // BLOCK, columns // BLOCK
+    block = texels.at // columns // BLOCK * small[1] + texels.at % columns // BLOCK
+    count = np.bincount(block, minlength=small[0] * small[1])
+    used = np.flatnonzero(count)
+
+    def by_block(values: np.ndarray) -> np.ndarray:
+        """Means [B, C] over the blocks in use of values [T, C]."""
+        return np.stack([np.bincount(block, axis, len(count))[used] / count[used] for axis in values.T], 1)
+
+    sites, normals = by_block(texels.positions), by_block(texels.normals)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    covered = np.zeros(small, np.float32)
+    covered.reshape(-1)[used] = 1
+    fully = covered / np.maximum(cv2.blur(covered, (3, 3)), 1e-6)
+
+    def soft(image: np.ndarray) -> np.ndarray:
+        """An image of blocks [h, w] or [h, w, 3] blurred within each chart: one block at least is between them."""
+        return cv2.blur(image, (3, 3)) * (fully if image.ndim == 2 else fully[..., None])
+
+    scores = np.zeros((len(shots.views), *small), np.float16)
+    unit = max(shots.density(sites[::16], normals[::16]), 1e-12) ** 2 * shots.sharpness.max()
+    mean, seen = LEAST * by_block(texels.colors), np.full(len(used), LEAST)
+    for number, view in enumerate(shots.views):
+        index, density, pixels = _facing(view, sites, normals)
+        free = ~shots.blocking.blocked(sites[index] + shots.lift * normals[index], view.center)
+        index, pixels = index[free], pixels[free]
+        # Beside the blocks of a chart are those of none, which must not count as unseen.
+        image = np.where(covered > 0, 0, np.inf).astype(np.float32)
+        image.reshape(-1)[used[index]] = density[free] ** 2 * shots.sharpness[number] / unit
+        image = np.where(covered > 0, cv2.erode(image, np.ones((3, 3))), 0)
+        scores[number] = np.clip(soft(image), 0, 1e4)
+        share = scores[number].reshape(-1)[used[index], None].astype(float)
+        photo = cv2.resize(shots.photo(view), None, fx=1 / BLOCK, fy=1 / BLOCK, interpolation=cv2.INTER_AREA)
+        scale = np.array(photo.shape[1::-1]) / [view.width, view.height]
+        mean[index] += share * bilinear(photo.astype(np.float32), pixels * scale - 0.5)
+        seen[index] += share[:, 0]
+        on_progress(0.5 * (number + 1) / len(shots.views), f"what photo {number + 1} of {len(shots.views)} shows")
+    total = np.zeros(small, np.float32)
+    for score in scores:
+        total += score.astype(np.float32) ** power
+    color, weight = LEAST * texels.colors, np.full(len(texels.at), LEAST, np.float32)
+    for number, view in enumerate(shots.views):
+        share = np.maximum(scores[number].astype(np.float32) ** power / np.maximum(total, 1e-37) - LEAST, 0)
+        if not share.any():
+            continue
+        own = cv2.resize(share, (columns, rows), interpolation=cv2.INTER_LINEAR).reshape(-1)[texels.at]
+        index = np.flatnonzero(own)
+        pixels, _ = view.project(texels.positions[index])
+        color[index] += own[index, None] * bilinear(shots.photo(view), pixels - 0.5)
+        weight[index] += own[index]
+        on_progress(0.5 + 0.5 * (number + 1) / len(shots.views), f"colours of photo {number + 1}")
+    color /= weight[:, None]
+    off = np.zeros((*small, 3), np.float32)
+    off.reshape(-1, 3)[used] = mean / seen[:, None] - by_block(color)
+    off = _filled(soft(soft(off)), covered > 0)
+    color += cv2.resize(off, (columns, rows), interpolation=cv2.INTER_LINEAR).reshape(-1, 3)[texels.at]
+    image = np.zeros((rows * columns, 3), np.float32)
+    image[texels.at] = color
+    known = np.zeros(rows * columns, bool)
+    known[texels.at] = True
+    return to_bytes(_filled(image.reshape(rows, columns, 3), known.reshape(rows, columns)))
+
+
+def _facing(view: View, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points [S] of [P, 3] that lie in a view's photo and face it, if nothing is in the way; and how they show.
+
+    The second is pixels a metre of the surface [S], where it is seen at an angle those along its shorter side; the
+    third are the places [S, 2] in the photo, px.
+    """
+    towards = view.center - points
+    away = np.maximum(np.linalg.norm(towards, axis=1), 1e-12)
+    cosine = (towards * normals).sum(1) / away
+    index = np.flatnonzero(cosine > FLATTEST)
+    pixels, depth = view.project(points[index])
+    inside = (depth > 0) & (pixels > 1).all(1) & (pixels < [view.width - 1, view.height - 1]).all(1)
+    index = index[inside]
+    return index, cosine[index] * view.focal / away[index], pixels[inside]
+
+
+def _filled(image: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """An image [H, W, C] whose pixels that are not known [H, W] take the colours around them.
+
+    What lies between charts is looked at by viewers that shrink textures, and beside them by those that interpolate.
+    """
+    import cv2
+
+    if known.all() or max(known.shape) == 1:
+        return image
+    rows, columns = known.shape
+    half = (columns + 1) // 2, (rows + 1) // 2
+    padded = np.pad(np.dstack([image * known[..., None], known]), ((0, rows % 2), (0, columns % 2), (0, 0)))
+    sums = padded.reshape(half[1], 2, half[0], 2, -1).sum((1, 3))
+    there = sums[..., -1] > 0
+    coarse = _filled(np.divide(sums[..., :-1], np.maximum(sums[..., -1:], 1)).astype(np.float32), there)
+    larger = cv2.resize(coarse, (2 * half[0], 2 * half[1]), interpolation=cv2.INTER_LINEAR)[:rows, :columns]
+    return np.where(known[..., None], image, larger.reshape(rows, columns, -1))

@@ -1,0 +1,216 @@
+"""Textures, baked from photos of a pattern that is known exactly and finer than the mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipeline.cameras import View
+from pipeline.export import skins_of
+from pipeline.inputs.photos import Photo
+from pipeline.mesh.cleaning import components, joined, vertex_normals
+from pipeline.mesh.texture import BLOCK, Shots, fewer, rasterise, shots_of, textured, unfold
+from pipeline.mesh.visibility import Caster, Visibility, bilinear, look, to_bytes
+from sdfsim.errors import SdfsimError
+from sdfsim.shape.mesh import Mesh, read_glb, sample_surface, write_glb, write_ply
+from sdfsim.shape.shape import analytic_shape, load_shape, scaled
+from tests.pipeline.test_surface import cube, look_at
+
+GREY, RED = np.array([90.0, 90, 90]), np.array([250.0, 20, 20])
+
+
+def pattern(points: np.ndarray) -> np.ndarray:
+    """Colours [P, 3] in 0..255: waves 8 cm long on all axes."""
+    return 127 + 100 * np.sin(2 * np.pi * points / 0.08 + [0, 1, 2])
+
+
+def plate(cells: int, z: float = 0.0, half: float = 0.5) -> Mesh:
+    """A level square in `cells` by `cells` cells, facing up."""
+    line = np.linspace(-half, half, cells + 1)
+    x, y = np.meshgrid(line, line, indexing="ij")
+    corner = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
+    faces = np.concatenate([corner[:, None] + [0, cells + 1, cells + 2], corner[:, None] + [0, cells + 2, 1]])
+    return Mesh(np.stack([x, y, np.full_like(x, z)], -1).reshape(-1, 3), faces)
+
+
+def photograph(folder: Path, views: list[View], meshes: list[Mesh], colors: list[Callable]) -> Shots:
+    """Photos of meshes, each with the colours [P, 3] that a function gives at points [P, 3], as a stage leaves them."""
+    (folder / "images").mkdir(exist_ok=True)
+    caster = Caster(joined(meshes))
+    first = np.cumsum([0, *(len(mesh.faces) for mesh in meshes)])
+    for view in views:
+        row, column = (axis.ravel() for axis in np.indices((view.height, view.width)))
+        rays = view.rays(column + 0.5, row + 0.5)
+        away, face = caster.hits(view.center, rays)
+        hit, seen = np.isfinite(away), np.full((len(away), 3), 30.0)
+        for number, color in enumerate(colors):
+            own = hit & (face >= first[number]) & (face < first[number + 1])
+            seen[own] = color(view.center + away[own, None] * rays[own])
+        image = to_bytes(seen.reshape(view.height, view.width, 3))
+        Image.fromarray(image).save(folder / "images" / view.name)
+    photos = [
+        Photo(v.name, v.source, v.width, v.height, (v.width, v.height), None, None, "", False, 0.4) for v in views
+    ]
+    return shots_of(views, photos, folder, meshes, 0.005)
+
+
+def ring(height: float, count: int = 8, far: float = 2.2) -> list[View]:
+    """Cameras that look at the origin from all around."""
+    angles = 2 * np.pi * np.arange(count) / count
+    views = [look_at(np.array([far * np.cos(a), far * np.sin(a), height])) for a in angles]
+    return [replace(view, name=f"{height:g}-{k}.png", source=f"{k}.png") for k, view in enumerate(views)]
+
+
+def on_surface(mesh: Mesh, points: np.ndarray) -> np.ndarray:
+    """Colours [P, 3] of a mesh at points [P, 3] of its surface: of its texture, else between its vertices."""
+    caster = Caster(mesh)
+    found = caster.scene.compute_closest_points(caster.tensor(points.astype(np.float32)))
+    corners = mesh.faces[found["primitive_ids"].numpy().astype(int)]
+    second, third = found["primitive_uvs"].numpy().T
+    weights = np.stack([1 - second - third, second, third], 1)
+    if mesh.uv is None or mesh.texture is None:
+        assert mesh.colors is not None
+        return (mesh.colors[corners] * weights[..., None]).sum(1)
+    uv = (mesh.uv[corners] * weights[..., None]).sum(1)
+    return bilinear(mesh.texture.astype(float), uv * mesh.texture.shape[1::-1] - 0.5)
+
+
+def in_colors(mesh: Mesh, shots: Shots) -> Mesh:
+    found = look(Visibility(mesh, shots.lift, shots.blocking), shots.views, shots.folder)
+    return replace(mesh, colors=to_bytes(found.color))
+
+
+def test_a_pattern_finer_than_the_mesh_is_in_the_texture(tmp_path):
+    ball = analytic_shape("sphere", radius=0.5).mesh
+    views = ring(0.5) + ring(-0.5)
+    shots = photograph(tmp_path, views, [ball], [pattern])
+    colored = in_colors(ball, shots)
+    made = textured(colored, shots)
+    points, _ = sample_surface(ball, 4000, np.random.default_rng(0))
+    points = points[np.abs(points[:, 2]) < 0.3]
+    plain, error = (np.abs(on_surface(drawn, points) - pattern(points)).mean() for drawn in (colored, made))
+    assert error < 5 and plain > 10 * error
+
+
+def test_the_best_view_gives_a_sharper_texture_than_the_mean(tmp_path):
+    """Where the mesh is off by a little, the photos do not agree."""
+    true, mesh = plate(1), plate(20, z=0.012)
+    shots = photograph(tmp_path, ring(1.2), [true], [pattern])
+    points = np.random.default_rng(0).uniform([-0.3, -0.3, 0.012], [0.3, 0.3, 0.012], (4000, 3))
+    contrast = [
+        on_surface(textured(in_colors(mesh, shots), shots, power=power), points)[:, :2].std() for power in (1.0, 8.0)
+    ]
+    print(contrast, pattern(points)[:, :2].std())
+    assert contrast[1] > 1.2 * contrast[0]
+
+
+def test_what_stands_in_front_does_not_print_itself_on_what_is_behind(tmp_path):
+    floor, block = plate(20), cube(0.25, (0.0, 0.0, 0.3))
+    views = ring(1.2)
+    red = lambda points: np.broadcast_to(RED, points.shape)  # noqa: E731
+    grey = lambda points: np.broadcast_to(GREY, points.shape)  # noqa: E731
+    shots = photograph(tmp_path, views, [floor, block], [grey, red])
+    made = textured(replace(floor, colors=np.full(floor.vertices.shape, 90, np.uint8)), shots)
+    assert made.texture is not None
+    points = np.random.default_rng(0).uniform([-0.48, -0.48, 0], [0.48, 0.48, 0], (4000, 3))
+    assert np.abs(on_surface(made, points) - GREY).max() < 12
+
+
+def test_what_no_photo_shows_keeps_its_vertex_colours(tmp_path):
+    floor = plate(20)
+    view = replace(look_at(np.array([0.6, 0.0, 1.0])), name="a.png")
+    narrow = replace(view, width=200, height=200, cx=100.0, cy=100.0)  # shows the middle of the plate alone
+    shots = photograph(tmp_path, [narrow], [floor], [pattern])
+    made = textured(replace(floor, colors=np.tile(np.array([10, 200, 60], np.uint8), (len(floor.vertices), 1))), shots)
+    corners = np.array([[-0.45, y, 0.0] for y in np.linspace(-0.45, 0.45, 20)])
+    assert np.abs(on_surface(made, corners) - [10, 200, 60]).max() < 4
+    assert np.abs(on_surface(made, np.array([[0.0, 0, 0]])) - pattern(np.zeros((1, 3)))).max() < 25
+
+
+def test_charts_have_blocks_of_their_own():
+    mesh = cube(0.3, (0.0, 0.0, 0.0))
+    flat, origin, (rows, columns) = unfold(mesh, 200.0)
+    assert flat.uv is not None and rows % BLOCK == columns % BLOCK == 0
+    assert np.array_equal(flat.vertices, mesh.vertices[origin])
+    assert flat.uv.min() >= 0 and flat.uv.max() <= 1
+    corners = flat.uv[flat.faces] * [columns, rows]
+    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum() / 2
+    assert area == pytest.approx(6 * 0.3**2 * 200**2, rel=0.12)  # charts grow to whole blocks
+    texels = rasterise(flat, vertex_normals(mesh)[origin], (rows, columns))
+    assert len(texels.at) == pytest.approx(area, rel=0.02)  # nothing lies twice
+    used = []
+    for chart in range((label := components(flat)).max() + 1):
+        own = rasterise(replace(flat, faces=flat.faces[label == chart]), vertex_normals(mesh)[origin], (rows, columns))
+        used.append(np.unique(own.at // columns // BLOCK * columns + own.at % columns // BLOCK))
+    assert len(used) >= 3 and len(np.concatenate(used)) == len(np.unique(np.concatenate(used)))
+
+
+def test_a_mesh_of_many_faces_gets_fewer():
+    mesh = plate(60)
+    mesh = replace(mesh, colors=to_bytes(pattern(mesh.vertices)))
+    coarse = fewer(mesh, 2000)
+    assert len(coarse.faces) <= 2000 and coarse.colors is not None and len(coarse.colors) == len(coarse.vertices)
+    assert fewer(mesh, len(mesh.faces)) is mesh
+
+
+def skin() -> Mesh:
+    flat, _, (rows, columns) = unfold(plate(2), 60.0)
+    smooth = np.linspace(40, 200, rows * columns).reshape(rows, columns, 1)
+    return replace(flat, colors=None, texture=to_bytes(np.repeat(smooth, 3, 2)))
+
+
+def test_a_shape_folder_keeps_its_texture(tmp_path):
+    shape = replace(analytic_shape("box", size=(1, 1, 1)), skin=skin())
+    back = load_shape(shape.save(tmp_path / "s"))
+    assert back.skin is not None and back.shown is back.skin and shape.skin is not None
+    assert np.allclose(back.skin.vertices, shape.skin.vertices) and np.array_equal(back.skin.faces, shape.skin.faces)
+    assert np.allclose(back.skin.uv, shape.skin.uv, atol=1e-6)  # type: ignore[arg-type]
+    assert np.abs(back.skin.texture.astype(int) - shape.skin.texture).max() < 8  # type: ignore[union-attr, operator]
+    assert np.allclose(scaled(back, 2.0).shown.vertices, 2 * back.skin.vertices)
+    assert load_shape(replace(shape, skin=None).save(tmp_path / "s")).skin is None
+
+
+def test_a_damaged_texture_is_told(tmp_path):
+    folder = replace(analytic_shape("box", size=(1, 1, 1)), skin=skin()).save(tmp_path / "s")
+    file = folder / "textured.glb"
+    whole = file.read_bytes()
+    for length in (0, 11, 300, len(whole) // 2, len(whole) - 9):
+        file.write_bytes(whole[:length])
+        with pytest.raises(SdfsimError, match="damaged or cut short"):
+            load_shape(folder)
+
+
+def test_other_programs_read_the_glb_upright_with_texture_and_places(tmp_path):
+    import trimesh
+
+    mesh = skin()
+    mesh = replace(mesh, vertices=mesh.vertices + np.array([0, 0, 0.7]))
+    (tmp_path / "a.glb").write_bytes(write_glb({"scene": mesh, "object1": mesh}))
+    scene = trimesh.load(tmp_path / "a.glb")
+    assert isinstance(scene, trimesh.Scene) and set(scene.geometry) == {"scene", "object1"}
+    assert np.allclose(scene.bounds[:, 1], 0.7)  # y is up in glTF
+    visual = scene.geometry["object1"].visual
+    image = np.asarray(visual.material.baseColorTexture.convert("RGB"), float)  # type: ignore[union-attr]
+    assert mesh.texture is not None and mesh.uv is not None and image.shape == mesh.texture.shape
+    assert np.abs(image - mesh.texture).max() < 8
+    assert np.allclose(visual.uv, np.c_[mesh.uv[:, 0], 1 - mesh.uv[:, 1]], atol=1e-6)  # type: ignore[union-attr]
+    assert set(read_glb(tmp_path / "a.glb")) == {"scene", "object1"}
+
+
+def test_the_skin_of_a_body_stands_at_the_bodys_origin(tmp_path):
+    (tmp_path / "objects").mkdir()
+    body = cube(0.2, (0.3, 0.4, 0.5))
+    (tmp_path / "objects" / "object1.ply").write_bytes(write_ply(body))
+    assert skins_of(tmp_path) == {}
+    flat, _, (rows, columns) = unfold(body, 60.0)
+    flat = replace(flat, texture=np.zeros((rows, columns, 3), np.uint8))
+    (tmp_path / "textured.glb").write_bytes(write_glb({"scene": flat, "object1": flat}))
+    skins = skins_of(tmp_path)
+    assert np.allclose(skins["scene"].vertices, flat.vertices, atol=1e-6)
+    assert np.allclose(skins["object1"].vertices, flat.vertices - [0.3, 0.4, 0.4], atol=1e-6)
