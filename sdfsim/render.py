@@ -186,6 +186,10 @@ class Studio:
         scene: what is shown.
         eye: from where.
         radius: m, of all that is shown.
+
+    Attributes:
+        axes: [3, 3] unit vectors: right and down in the picture, and into it.
+        sun: [3] unit vector towards the sun.
     """
 
     def __init__(self, scene: Scene, eye: Eye, radius: float) -> None:
@@ -197,10 +201,10 @@ class Studio:
         self._moves = np.array([b.motion != "static" for b in scene.bodies])
         forward = (eye.target - eye.position) / np.linalg.norm(eye.target - eye.position)
         right = np.cross(forward, eye.up)
-        self._axes = np.stack([right / np.linalg.norm(right), np.zeros(3), forward])
-        self._axes[1] = np.cross(forward, self._axes[0])  # down the picture
-        frame = np.stack([self._axes[0], np.cross(eye.up, self._axes[0]), eye.up])
-        self._sun = _SUN @ frame
+        self.axes = np.stack([right / np.linalg.norm(right), np.zeros(3), forward])
+        self.axes[1] = np.cross(forward, self.axes[0])  # down the picture
+        frame = np.stack([self.axes[0], np.cross(eye.up, self.axes[0]), eye.up])
+        self.sun = _SUN @ frame
         still = np.flatnonzero(~self._moves)
         at = np.array([scene.bodies[k].quat_xyzw for k in still]).reshape(-1, 4)
         turns = _matrices(at)
@@ -234,7 +238,7 @@ class Studio:
     def _rays(self, at: np.ndarray) -> np.ndarray:
         """[R, 6] float32 origins and unit directions through places [R, 2] px of the picture."""
         flat = (at - np.array(SIZE) / 2) / (SIZE[1] / 2) * _TALL
-        direction = np.concatenate([flat, np.ones((len(at), 1))], 1) @ self._axes
+        direction = np.concatenate([flat, np.ones((len(at), 1))], 1) @ self.axes
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         return np.concatenate([np.broadcast_to(self._eye.position, direction.shape), direction], 1, dtype=np.float32)
 
@@ -263,16 +267,17 @@ class Studio:
         layer.body[there] = cast.body[face]
         normal, color = cast.surface(face, uv)
         facing = np.where((normal * direction).sum(-1, keepdims=True) > 0.0, -normal, normal)
-        toward = facing @ self._sun
+        toward = facing @ self.sun
         point = rays[there, :3] + away * direction
         color = self._checked(point, color, layer.body[there])
         # Far away the floor goes over into the sky.
-        fog = np.clip((away / (4.0 * self._radius) - 1.0) / 2.0, 0.0, 1.0)
+        clear = 2.0 * (self._radius + np.linalg.norm(self._eye.target - self._eye.position))
+        fog = np.clip((away / clear - 1.0) / 2.0, 0.0, 1.0)
         least = _SHADE + 0.1 * (facing @ self._eye.up)
         for found, light in ((layer.shade, least), (layer.lit, least + (1.0 - _SHADE) * toward)):
             found[there] = (1.0 - fog) * np.clip(light, 0.0, 1.1)[:, None] * color + fog * _SKY
         start = point + 1e-3 * self._radius * facing
-        layer.shadow[there] = np.concatenate([start, np.broadcast_to(self._sun, start.shape)], 1)
+        layer.shadow[there] = np.concatenate([start, np.broadcast_to(self.sun, start.shape)], 1)
         layer.dark[there] = toward <= 0.0
         if self._still:
             layer.dark[there] |= self._still.blocked(layer.shadow[there])
