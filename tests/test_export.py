@@ -355,7 +355,7 @@ def test_a_shape_becomes_one_urdf(tmp_path):
     import pybullet as engine
 
     report = export(SHAPES / "cone", tmp_path / "cone.urdf")
-    assert [path.name for path in report["files"]] == ["cone.obj", "cone-0.obj", "cone.urdf"]
+    assert [path.name for path in report["files"]] == ["cone.urdf", "cone.obj", "cone-0.obj"]
     shape = load_shape(SHAPES / "cone")
     engine.connect(engine.DIRECT)
     try:

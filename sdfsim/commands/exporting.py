@@ -43,7 +43,7 @@ def export(
         files = report["files"]
         lines = [
             f"{report['bodies']} bodies, {report['frames']} frames",
-            f"wrote {files[0]}" if len(files) == 1 else f"wrote {len(files)} files, {files[-1]} the last of them",
+            f"wrote {files[0]}" + (f" and {len(files) - 1} files beside it" if len(files) > 1 else ""),
             *(f"not in it: {line}" for line in report["left_out"]),
         ]
         session.report(report, lines)
