@@ -88,7 +88,7 @@ class Take:
 
     def display(self, shape: Shape) -> Mesh:
         """The mesh that is shown at scale 1."""
-        return sheet(self.plane_size()) if isinstance(shape.sdf, PlaneSdf) else shape.mesh
+        return sheet(self.plane_size()) if isinstance(shape.sdf, PlaneSdf) else shape.shown
 
 
 class Written(NamedTuple):
@@ -317,11 +317,15 @@ def _write_xml(path: Path, root: XML) -> None:
     write_text(path, ElementTree.tostring(root, encoding="unicode") + "\n")
 
 
-def _start_only(take: Take) -> list[str]:
-    """What a format without motion leaves out."""
-    moved = ["the motion: the scene is as it is at the start"] if take.moving else []
+def _missing(take: Take, *, motion: bool = False, textures: bool = False) -> list[str]:
+    """What a format leaves out that has no motion, or no textures."""
     led = any(body.motion == "kinematic" for body in take.scene.bodies)
-    return moved + (["the paths of kinematic bodies: they stand where they start"] if led else [])
+    told = {
+        "the motion: the scene is as it is at the start": take.moving and not motion,
+        "the paths of kinematic bodies: they stand where they start": led and not (take.moving and motion),
+        "textures": not textures and any(shape.skin is not None for shape in take.scene.shapes),
+    }
+    return [line for line, missing in told.items() if missing]
 
 
 # --- glTF ---
@@ -344,13 +348,21 @@ def _glb(take: Take, out: Path, on_progress: Progress) -> Written:
             shaded[body.shape] = with_normals(take.display(shape))
         mesh, normals = shaded[body.shape]
         # Bodies of one shape and colour share a mesh; of one shape they share its numbers.
-        key = take.shapes[body.shape] + ("" if mesh.colors is not None else "_{:02x}{:02x}{:02x}".format(*color))
+        own = mesh.colors is not None or mesh.texture is not None
+        key = take.shapes[body.shape] + ("" if own else "_{:02x}{:02x}{:02x}".format(*color))
         if key not in scene.geometry:
-            base = np.ones(3) if mesh.colors is not None else _linear(color)
+            base = np.ones(3) if own else _linear(color)
             material = PBRMaterial(
-                name=key, baseColorFactor=[*base, 1.0], metallicFactor=0.0, roughnessFactor=0.8, doubleSided=True
+                name=key,
+                baseColorFactor=[*base, 1.0],
+                baseColorTexture=None if mesh.texture is None else _jpeg(mesh.texture),
+                metallicFactor=0.0,
+                roughnessFactor=0.8,
+                doubleSided=True,
             )
-            visual = TextureVisuals(material=material)
+            # trimesh counts up from the lower edge of a texture.
+            uv = None if mesh.uv is None else mesh.uv * [1.0, -1.0] + [0.0, 1.0]
+            visual = TextureVisuals(uv=uv, material=material)
             scene.geometry[key] = trimesh.Trimesh(
                 mesh.vertices, mesh.faces, vertex_normals=normals, visual=visual, process=False
             )
@@ -376,6 +388,10 @@ def _glb(take: Take, out: Path, on_progress: Progress) -> Written:
                 rgba = np.pad(light[mesh["name"]], ((0, 0), (0, 1)), constant_values=1.0)
                 colors = accessor(np.round(65535 * rgba).astype(np.uint16), "VEC4")
                 mesh["primitives"][0]["attributes"]["COLOR_0"] = colors
+        for material in tree["materials"]:
+            if "baseColorTexture" in material["pbrMetallicRoughness"]:  # it holds the light of the photos
+                material["extensions"] = {"KHR_materials_unlit": {}}
+                tree["extensionsUsed"] = ["KHR_materials_unlit"]
         nodes = {node["name"]: k for k, node in enumerate(tree["nodes"])}
         time = accessor(take.time.astype(np.float32), "SCALAR") if take.moving else 0
         samplers, channels = [], []
@@ -394,7 +410,18 @@ def _glb(take: Take, out: Path, on_progress: Progress) -> Written:
     with replacing(out) as partial:
         content = export_glb(scene, include_normals=True, buffer_postprocessor=finish)
         partial.write_bytes(content)
-    return Written([out], ["masses, friction and all else that is not seen"])
+    return Written(
+        [out], ["masses, friction and all else that is not seen", *_missing(take, motion=True, textures=True)]
+    )
+
+
+def _jpeg(texture: np.ndarray) -> Any:
+    """An image that trimesh writes as it is: JPEG, not PNG of many times the size."""
+    from PIL import Image
+
+    file = io.BytesIO()
+    Image.fromarray(texture).save(file, "JPEG", quality=92, subsampling=0)
+    return Image.open(file)
 
 
 # --- USD ---
@@ -487,7 +514,7 @@ def _usd(take: Take, out: Path, on_progress: Progress) -> Written:
             named.rename(partial)
         finally:
             named.unlink(missing_ok=True)
-    return Written([out], [] if take.moving else _start_only(take))
+    return Written([out], _missing(take, motion=True))
 
 
 def _usd_geometry(take: Take, shape: Shape, dynamic: bool, stage: Any, path: str) -> None:
@@ -552,7 +579,7 @@ def _usd_mesh(stage: Any, path: str, mesh: Mesh) -> Any:
 
 
 def _mjcf(take: Take, out: Path, on_progress: Progress) -> Written:
-    scene, left_out = take.scene, _start_only(take)
+    scene, left_out = take.scene, _missing(take)
     shown, cut = _write_assets(take, out, _cut(take, lambda body: True, on_progress))
     root = XML("mujoco", model=_plain_names([out.stem])[0])
     folder = out.with_name(f"{out.stem}_assets").name
@@ -705,7 +732,7 @@ def _urdf(take: Take, out: Path, on_progress: Progress) -> Written:
     poses = out.with_suffix(".csv")
     start = replace(take, time=take.time[:1], position=take.position[:1], quat_xyzw=take.quat_xyzw[:1])
     _csv(start, poses, on_progress)
-    left_out = ["where the bodies are: that is in the CSV", "gravity, velocities and collides_with", *_start_only(take)]
+    left_out = ["where the bodies are: that is in the CSV", "gravity, velocities and collides_with", *_missing(take)]
     return Written([*files, poses, *assets], left_out)
 
 

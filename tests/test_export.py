@@ -177,6 +177,24 @@ def test_vertex_colours_are_kept_as_light(tmp_path):
     np.testing.assert_allclose(np.frombuffer(binary, "<u2", 4, start) / 65535, [0.0030, 0.2159, 1, 1], atol=1e-4)
 
 
+def test_a_texture_lies_where_it_lay(tmp_path):
+    import trimesh
+
+    shape = load_shape(SHAPES / "ring")
+    rng = np.random.default_rng(0)
+    uv, texture = rng.random((len(shape.mesh.vertices), 2)), np.zeros((32, 64, 3), dtype=np.uint8)
+    texture[:16, :32] = (200, 40, 40)
+    replace(shape, skin=replace(shape.mesh, uv=uv, texture=texture)).save(tmp_path / "shape")
+    export(tmp_path / "shape", tmp_path / "shape.glb")
+    (found,) = trimesh.load_scene(tmp_path / "shape.glb").geometry.values()
+    np.testing.assert_allclose(
+        found.visual.to_color().vertex_colors[:5, :3] > 100, np.outer((uv[:5] < 0.5).all(1), (1, 0, 0))
+    )
+    np.testing.assert_allclose(found.visual.uv, uv * [1, -1] + [0, 1], atol=1e-6)
+    tree, _ = chunks(tmp_path / "shape.glb")
+    assert tree["images"][0]["mimeType"] == "image/jpeg"
+
+
 # --- USD ---
 
 
