@@ -100,12 +100,15 @@ def poses_at(rollout: Rollout, time: float) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class _Model:
-    """What is drawn of a body, about its centre of mass: vertices and normals [V, 3], faces [F, 3], colours [V, 3]."""
+    """What is drawn of a body, about its centre of mass: vertices and normals [V, 3], faces [F, 3], colours [V, 3], or
+    places [V, 2] in a texture [H, W, 3]."""
 
     vertices: np.ndarray
     normals: np.ndarray
     faces: np.ndarray
     colors: np.ndarray
+    uv: np.ndarray | None = None
+    texture: np.ndarray | None = None
 
 
 class _Cast:
@@ -125,6 +128,7 @@ class _Cast:
         self.normals = np.concatenate([m.normals @ r.T for m, r in zip(models, turns, strict=True)])
         self.colors = np.concatenate([m.colors for m in models])
         self.faces = np.concatenate([m.faces + start for m, start in zip(models, starts, strict=False)])
+        self._textured = [(k, m.uv, m.texture, start) for k, m, start in zip(bodies, models, starts, strict=False)]
         self.body = np.repeat(bodies, [len(m.faces) for m in models])
         self._tensor: Any = o3d.core.Tensor
         self._scene = o3d.t.geometry.RaycastingScene()
@@ -146,6 +150,12 @@ class _Cast:
         share = np.stack([1.0 - uv.sum(-1), uv[:, 0], uv[:, 1]], -1)[..., None]
         corners = self.faces[face]
         normal, color = (self.normals[corners] * share).sum(1), (self.colors[corners] * share).sum(1)
+        for body, places, texture, start in self._textured:
+            if places is not None and texture is not None:
+                on = np.flatnonzero(self.body[face] == body)
+                at = (places[corners[on] - start] * share[on]).sum(1) * texture.shape[1::-1]
+                column, row = np.clip(at, 0, np.array(texture.shape[1::-1]) - 1).astype(int).T
+                color[on] = texture[row, column]
         return normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9), color
 
 
@@ -293,11 +303,11 @@ class Studio:
     def _model(self, k: int, color: tuple[int, ...]) -> _Model:
         body = self._scene.bodies[k]
         shape = self._scene.shapes[body.shape]
-        mesh = sheet(40.0 * self._radius) if self._floors[k] else shape.mesh
+        mesh = sheet(40.0 * self._radius) if self._floors[k] else shape.shown
         mesh, normals = with_normals(mesh)
         colors = np.broadcast_to(color, mesh.vertices.shape) if mesh.colors is None else mesh.colors
         vertices = mesh.vertices * body.scale - body.scale * shape.com
-        return _Model(vertices, normals, mesh.faces, colors.astype(np.float64))
+        return _Model(vertices, normals, mesh.faces, colors.astype(np.float64), mesh.uv, mesh.texture)
 
 
 def _matrices(quat: np.ndarray) -> np.ndarray:

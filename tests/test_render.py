@@ -1,5 +1,7 @@
 """Movies and pictures: where things appear, how large, in what light; and what the end of a run says."""
 
+from dataclasses import replace
+
 import av
 import numpy as np
 import pytest
@@ -10,6 +12,8 @@ from sdfsim.recording import eye_of, framed
 from sdfsim.render import FRAMES, SIZE, Studio, poses_at, render
 from sdfsim.run import ended, ending_lines, summary
 from sdfsim.scene.scene import Scene
+from sdfsim.shape.mesh import Mesh
+from sdfsim.shape.shape import analytic_shape
 
 SKY = np.array([236, 240, 245])
 
@@ -60,6 +64,23 @@ def test_what_is_between_the_floor_and_the_sun_throws_a_shadow():
     inside = [at(middle + np.array([x, y, 0])) for x in (-0.15, 0.15) for y in (-0.15, 0.15)]
     outside = [at(middle + np.array([x, y, 0])) for x in (-0.25, 0.25) for y in (-0.25, 0.25)]
     assert studio.sun[2] > 0.5 and max(inside) < 0.7 * min(outside)
+
+
+def test_a_texture_is_seen_where_its_places_are():
+    corners = np.array([[x, 0.0, z] for z in (-1, 1) for x in (-1, 1)], dtype=float)
+    uv = np.array([[0.0, 1.0], [1.0, 1.0], [0.0, 0.0], [1.0, 0.0]])  # its upper left is at -x, +z
+    texture = np.zeros((2, 2, 3), np.uint8)
+    texture[0, 0], texture[0, 1], texture[1, 0], texture[1, 1] = (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 0)
+    sheet = Mesh(corners, np.array([[0, 1, 2], [1, 3, 2]]), uv=uv, texture=texture)
+    shape = replace(analytic_shape("box", size=(2.0, 0.1, 2.0)), skin=sheet)
+    scene, rollout = falling(position=(0, 0, 0))
+    scene = replace(scene, shapes=(shape,))
+    picture = Studio(scene, eye_of(scene, None, (0, -6, 0), (0, 0, 0)), 1.0).picture(*poses_at(rollout, 0.0))
+    middle, off = np.array(SIZE[::-1]) // 2, 60
+    for (row, column), color in np.ndenumerate(np.array([["r", "g"], ["b", "y"]])):
+        seen = picture[middle[0] + off * (2 * row - 1), middle[1] + off * (2 * column - 1)].astype(int)
+        strong = {"r": [1, 0, 0], "g": [0, 1, 0], "b": [0, 0, 1], "y": [1, 1, 0]}[str(color)]
+        assert ((seen > 60) == np.array(strong, bool)).all()
 
 
 def test_poses_between_two_frames_are_on_the_way():
