@@ -349,7 +349,7 @@ def _glb(take: Take, out: Path, on_progress: Progress) -> Written:
         mesh, normals = shaded[body.shape]
         # Bodies of one shape and colour share a mesh; of one shape they share its numbers.
         own = mesh.colors is not None or mesh.texture is not None
-        key = take.shapes[body.shape] + ("" if own else "_{:02x}{:02x}{:02x}".format(*color))
+        key = take.shapes[body.shape] + ("" if own else "-{:02x}{:02x}{:02x}".format(*color))
         if key not in scene.geometry:
             base = np.ones(3) if own else _linear(color)
             material = PBRMaterial(

@@ -159,7 +159,7 @@ def test_trimesh_finds_the_bodies_of_a_glb_upright_and_in_place(dropped):
 
 def test_bodies_of_one_shape_share_its_numbers_in_a_glb(dropped):
     tree, _ = chunks(dropped.export("scene.glb", motion=False))
-    boxes = [m["primitives"][0] for m in tree["meshes"] if m["name"].startswith("box_")]
+    boxes = [m["primitives"][0] for m in tree["meshes"] if m["name"].startswith("box-")]
     assert len(boxes) == 3 and len({p["attributes"]["POSITION"] for p in boxes}) == 1
     assert len({p["material"] for p in boxes}) == 3
 

@@ -42,7 +42,7 @@ def export(
         )
         files = report["files"]
         lines = [
-            f"{report['bodies']} bodies, {report['frames']} frames",
+            f"bodies {report['bodies']}, frames {report['frames']}",
             f"wrote {files[0]}" + (f" and {len(files) - 1} files beside it" if len(files) > 1 else ""),
             *(f"not in it: {line}" for line in report["left_out"]),
         ]
