@@ -25,7 +25,7 @@ RECORD = "stage.json"  # in the folder of a finished stage: fingerprint, inputs,
 UNFINISHED = "unfinished.json"  # in the folder of a stage at work: the fingerprint of what it is to become
 
 # Share of an overall time budget that fitting may take, and what the other stages need after training, s.
-FIT_SHARE, AFTER_TRAINING = 0.15, 40.0
+FIT_SHARE, AFTER_TRAINING = 0.15, 50.0
 
 
 @dataclass
