@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -15,6 +15,7 @@ import torch
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.memory import PHASES
 from sdfsim.dynamics.rollout import Rollout
+from sdfsim.errors import SdfsimError
 from sdfsim.files import replacing
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.mesh import Mesh
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     import rerun as rr
     import rerun.blueprint as rrb
 
+Place = Sequence[float] | np.ndarray
 WORLD = "world"
 CONTACTS = "world/contacts"
 # What is plotted: the counters of a view by their legends.
@@ -35,7 +37,7 @@ VIEWS = {
     "milliseconds": {"step_ms": "step", **PHASES},
 }
 PLOTS = {key: legend for view in VIEWS.values() for key, legend in view.items()}
-_STATIC_COLOR = (150, 150, 155)
+STATIC_COLOR = (150, 150, 155)
 _NODE_COLOR = (20, 20, 20)
 _CONTACT_COLOR = (255, 40, 40)
 _PHOTO_PIXELS = 320
@@ -53,14 +55,18 @@ class Playback:
     Args:
         scene: what moves.
         motion: how it does, where that is known already: the first view shows all of it.
+        camera, look_at: [3] m each, of the first view; None: see `eye_of`.
     """
 
-    def __init__(self, scene: Scene, motion: Rollout | None = None) -> None:
+    def __init__(
+        self, scene: Scene, motion: Rollout | None = None, camera: Place | None = None, look_at: Place | None = None
+    ) -> None:
         import rerun as rr
 
         self._rr = rr
         self._scene = scene
         self._framed = framed(scene, motion)
+        self._eye = eye_of(scene, motion, camera, look_at)
         self._step = 0
         self._com = [b.scale * scene.shapes[b.shape].com for b in scene.bodies]
         self._crowds = _crowds(scene)
@@ -74,12 +80,11 @@ class Playback:
         import rerun.blueprint as rrb
 
         hidden = [CONTACTS, *(f"{path}/nodes" for _, path in self._alone)]
-        centre, radius = self._framed
         view = rrb.Spatial3DView(
             origin=WORLD,
             name="scene",
             overrides={path: rrb.EntityBehavior(visible=False) for path in hidden},
-            eye_controls=_eye(centre, radius, -self._scene.gravity),
+            eye_controls=self._eye.controls(),
             line_grid=False,
         )
         plots = [
@@ -111,7 +116,7 @@ class Playback:
             body, com = scene.bodies[k], self._com[k]
             shape = scene.shapes[body.shape]
             infinite = not np.all(np.isfinite(shape.sdf.bounds))
-            color = _STATIC_COLOR if body.motion == "static" else next(hues)
+            color = STATIC_COLOR if body.motion == "static" else next(hues)
             mesh = sheet(6 * size) if infinite else shape.shown
             placed = replace(mesh, vertices=mesh.vertices * body.scale - com)
             self.stream.log(f"{path}/mesh", _shaded(rr, placed, color), static=True)
@@ -180,13 +185,21 @@ def _crowds(scene: Scene) -> list[Crowd]:
     return found
 
 
-def save_rollout(scene: Scene, rollout: Rollout, path: Path) -> None:
+def save_rollout(
+    scene: Scene, rollout: Rollout, path: Path, camera: Place | None = None, look_at: Place | None = None
+) -> None:
     """Write `rollout` as a rerun recording: to a temporary name first, then renamed.
+
+    Args:
+        scene: of the run.
+        rollout: the run.
+        path: .rrd to write.
+        camera, look_at: [3] m each, of the first view; None: see `eye_of`.
 
     Raises:
         SdfsimError: the file cannot be written.
     """
-    playback = Playback(scene, rollout)
+    playback = Playback(scene, rollout, camera, look_at)
     encoded = playback.stream.binary_stream()
     playback.log_static()
     playback.log_steps(rollout)
@@ -247,7 +260,7 @@ def save_reconstruction(
     # Before there is a surface, z need not be up: photographers mostly hold the camera level.
     up = -np.sum([turn[1] for turn in rotations], axis=0) if mesh is None and photos else np.array([0.0, 0.0, 1.0])
     view = rrb.Spatial3DView(
-        origin=WORLD, name="reconstruction", eye_controls=_eye(centre, radius, up), line_grid=False
+        origin=WORLD, name="reconstruction", eye_controls=_around(centre, radius, up).controls(), line_grid=False
     )
     stream.send_blueprint(rrb.Blueprint(view, collapse_panels=True, auto_views=False))
     stream.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -288,15 +301,69 @@ def _write(path: Path, encoded: Any) -> None:
         partial.write_bytes(encoded.read() or b"")
 
 
-def _eye(centre: np.ndarray, radius: float, up: np.ndarray) -> rrb.EyeControls3D:
-    import rerun.blueprint as rrb
+@dataclass(frozen=True)
+class Eye:
+    """From where a view looks.
 
+    Attributes:
+        position: [3] m.
+        target: [3] m, the point in the middle.
+        up: [3] unit vector.
+    """
+
+    position: np.ndarray
+    target: np.ndarray
+    up: np.ndarray
+
+    def controls(self) -> rrb.EyeControls3D:
+        """As the viewer takes it."""
+        import rerun.blueprint as rrb
+
+        return rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital, position=self.position, look_target=self.target, eye_up=self.up
+        )
+
+
+def eye_of(
+    scene: Scene, motion: Rollout | None = None, camera: Place | None = None, look_at: Place | None = None
+) -> Eye:
+    """From where a scene is looked at; what is not given is chosen so that all of it is in sight.
+
+    Args:
+        scene: what is looked at.
+        motion: how it moves, where that is known.
+        camera: [3] m, where the eye is.
+        look_at: [3] m, what it looks at.
+
+    Raises:
+        SdfsimError: the eye is where it looks at, or not at a finite place.
+    """
+    centre, radius = framed(scene, motion)
+    given = _around(centre if look_at is None else np.array(look_at, dtype=float), radius, -scene.gravity)
+    eye = given if camera is None else replace(given, position=np.array(camera, dtype=float))
+    sight = eye.target - eye.position
+    if not np.isfinite(sight).all() or np.linalg.norm(sight) < 1e-9:
+        raise SdfsimError("--camera and --look-at: must be two different points")
+    if np.linalg.norm(np.cross(sight, eye.up)) < 1e-3 * np.linalg.norm(sight):  # straight down, up has no place there
+        aside = np.cross(eye.up, eye.up[[1, 2, 0]] + [0.1, 0.2, 0.3])
+        eye = replace(eye, position=eye.position + 1e-3 * np.linalg.norm(sight) * aside)
+    return eye
+
+
+def _around(centre: np.ndarray, radius: float, up: np.ndarray) -> Eye:
+    """An eye from which a ball is in sight."""
     length = np.linalg.norm(up)
     up = up / length if length > 0 else np.array([0.0, 0.0, 1.0])
     side = np.cross(up, [0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0])
     side /= np.linalg.norm(side)
     away = 1.6 * np.cross(up, side) + 1.1 * side + 0.9 * up
-    return rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=centre + radius * away, look_target=centre, eye_up=up)
+    return Eye(centre + radius * away, centre, up)
+
+
+def body_colors(scene: Scene) -> list[tuple[int, ...]]:
+    """An RGB colour (0 to 255) for every body: grey where it stays put, else a hue of its own."""
+    hues = distinct_colors(len(scene.bodies))
+    return [STATIC_COLOR if body.motion == "static" else next(hues) for body in scene.bodies]
 
 
 def framed(scene: Scene, motion: Rollout | None = None) -> tuple[np.ndarray, float]:
