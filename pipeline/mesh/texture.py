@@ -24,12 +24,15 @@ FACES = 40_000  # of a textured mesh: finer detail is in its texture
 # The time of xatlas grows with the square of the faces of a chart: it gets the mesh in pieces of so many.
 PIECE = 300
 LARGEST = 4096  # px, longest side of a texture
+SMALLEST = 16  # texels that a mesh is long at least, also where no photo shows it
 FULL = 0.5  # share of a texture that charts can be counted on to fill
 BLOCK = 4  # texels a side
+BATCH = 1 << 21  # rays at once
 # Views are weighted by this power of how well they show a place: high enough that the best one gives nearly all of the
 # colour, as a mean of photos that are a few pixels apart is blurred; low enough that the next one takes over softly.
 POWER = 8.0
-LEAST = 0.02  # share of the colour below which a view is left out
+LEAST = 0.05  # share of the colour below which a view is left out
+FAINT = 1e-3  # weight of the vertex colours, which count where no photo does
 
 
 @dataclass(frozen=True)
@@ -154,8 +157,8 @@ def unfold(mesh: Mesh, density: float) -> tuple[Mesh, np.ndarray, tuple[int, int
 
     pieces = _pieces(mesh.vertices[mesh.faces].mean(1))
     parts = [np.unique(mesh.faces[piece], return_inverse=True) for piece in pieces]
-    density = min(density or np.inf, LARGEST * np.sqrt(FULL / face_normals(mesh)[1].sum()))
     extent = float(np.ptp(mesh.vertices, axis=0).max())  # xatlas takes faces of a micrometre for none
+    density = min(max(density, SMALLEST / extent), LARGEST * np.sqrt(FULL / face_normals(mesh)[1].sum()))
     while True:
         atlas = xatlas.Atlas()
         for used, corners in parts:
@@ -208,13 +211,17 @@ def rasterise(flat: Mesh, normals: np.ndarray, shape: tuple[int, int]) -> Texels
     rows, columns = shape
     # The charts lie in a plane, and a ray through each texel's centre tells which face covers it, and where.
     sheet = Caster(Mesh(np.c_[flat.uv * [columns, rows], np.zeros(len(flat.uv))], flat.faces))
-    v, u = np.indices(shape, np.float32).reshape(2, -1) + 0.5
-    down = np.zeros((len(u), 6), np.float32)
-    down[:, 0], down[:, 1], down[:, 2], down[:, 5] = u, v, 1, -1
-    found = sheet.scene.cast_rays(sheet.tensor(down))
-    at = np.flatnonzero(np.isfinite(found["t_hit"].numpy()))
-    corners = flat.faces[found["primitive_ids"].numpy()[at].astype(np.int64)]
-    second, third = found["primitive_uvs"].numpy()[at].T
+    parts = []
+    for first in range(0, rows * columns, BATCH):
+        texel = np.arange(first, min(first + BATCH, rows * columns))
+        rays = np.tile(np.array([0, 0, 1, 0, 0, -1], np.float32), (len(texel), 1))
+        rays[:, 0], rays[:, 1] = texel % columns + 0.5, texel // columns + 0.5
+        found = sheet.scene.cast_rays(sheet.tensor(rays))
+        hit = np.isfinite(found["t_hit"].numpy())
+        parts.append((texel[hit], *(found[key].numpy()[hit] for key in ("primitive_ids", "primitive_uvs"))))
+    at, face, places = (np.concatenate(part) for part in zip(*parts, strict=True))
+    corners = flat.faces[face.astype(np.int64)]
+    second, third = places.T
     weights = np.stack([1 - second - third, second, third])
 
     def spread(values: np.ndarray) -> np.ndarray:
@@ -257,7 +264,7 @@ def bake(texels: Texels, shots: Shots, on_progress: Progress = quiet, *, power: 
 
     scores = np.zeros((len(shots.views), *small), np.float16)
     unit = max(shots.density(sites[::16], normals[::16]), 1e-12) ** 2 * shots.sharpness.max()
-    mean, seen = LEAST * by_block(texels.colors), np.full(len(used), LEAST)
+    mean, seen = FAINT * by_block(texels.colors), np.full(len(used), FAINT)
     for number, view in enumerate(shots.views):
         index, density, pixels = _facing(view, sites, normals)
         free = ~shots.blocking.blocked(sites[index] + shots.lift * normals[index], view.center)
@@ -276,7 +283,7 @@ def bake(texels: Texels, shots: Shots, on_progress: Progress = quiet, *, power: 
     total = np.zeros(small, np.float32)
     for score in scores:
         total += score.astype(np.float32) ** power
-    color, weight = LEAST * texels.colors, np.full(len(texels.at), LEAST, np.float32)
+    color, weight = FAINT * texels.colors, np.full(len(texels.at), FAINT, np.float32)
     for number, view in enumerate(shots.views):
         share = np.maximum(scores[number].astype(np.float32) ** power / np.maximum(total, 1e-37) - LEAST, 0)
         if not share.any():

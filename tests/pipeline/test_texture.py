@@ -17,9 +17,12 @@ from pipeline.mesh.cleaning import components, joined, vertex_normals
 from pipeline.mesh.texture import BLOCK, Shots, fewer, rasterise, shots_of, textured, unfold
 from pipeline.mesh.visibility import Caster, Visibility, bilinear, look, to_bytes
 from sdfsim.errors import SdfsimError
+from sdfsim.recording import Playback, save_reconstruction, with_normals
+from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.mesh import Mesh, read_glb, sample_surface, write_glb, write_ply
 from sdfsim.shape.shape import analytic_shape, load_shape, scaled
 from tests.pipeline.test_surface import cube, look_at
+from tests.test_recording import read
 
 GREY, RED = np.array([90.0, 90, 90]), np.array([250.0, 20, 20])
 
@@ -132,6 +135,15 @@ def test_what_no_photo_shows_keeps_its_vertex_colours(tmp_path):
     assert np.abs(on_surface(made, np.array([[0.0, 0, 0]])) - pattern(np.zeros((1, 3)))).max() < 25
 
 
+def test_what_no_photo_shows_at_all_gets_a_small_texture(tmp_path):
+    views = ring(1.2, count=2)
+    mesh = cube(0.2, (0.0, 0.0, 9.0))
+    shots = photograph(tmp_path, views, [mesh], [pattern])
+    made = textured(replace(mesh, colors=np.full(mesh.vertices.shape, 77, np.uint8)), shots)
+    assert made.texture is not None and max(made.texture.shape) < 100
+    assert np.abs(made.texture.astype(int) - 77).max() <= 1
+
+
 def test_charts_have_blocks_of_their_own():
     mesh = cube(0.3, (0.0, 0.0, 0.0))
     flat, origin, (rows, columns) = unfold(mesh, 200.0)
@@ -201,6 +213,36 @@ def test_other_programs_read_the_glb_upright_with_texture_and_places(tmp_path):
     assert np.abs(image - mesh.texture).max() < 8
     assert np.allclose(visual.uv, np.c_[mesh.uv[:, 0], 1 - mesh.uv[:, 1]], atol=1e-6)  # type: ignore[union-attr]
     assert set(read_glb(tmp_path / "a.glb")) == {"scene", "object1"}
+
+
+def test_recordings_show_the_texture(tmp_path):
+    mesh = skin()
+    assert mesh.uv is not None and mesh.texture is not None
+    save_reconstruction(tmp_path / "r.rrd", [], np.zeros((0, 3)), None, plate(2), {"scene": mesh, "object1": mesh})
+    found = read(tmp_path / "r.rrd")
+    assert "/world/surface!" not in found and "/world/surface/scene!" in found
+    shown = found["/world/surface/object1!"]
+    np.testing.assert_allclose(shown["Mesh3D:vertex_texcoords"][0], mesh.uv, atol=1e-6)
+    assert len(shown["Mesh3D:albedo_texture_buffer"][0][0]) == mesh.texture.size
+    assert "Mesh3D:vertex_colors" not in shown and "Mesh3D:albedo_factor" not in shown
+    shape = replace(analytic_shape("box", size=(1, 1, 1)), skin=mesh)
+    still, ahead = np.zeros(3), np.array([0.0, 0, 0, 1])
+    body = Body("crate", 0, "dynamic", 2.0, np.array([0.0, 0, 1]), ahead, still, still, 1.0, 0.5, 0.5)
+    playback = Playback(Scene((shape,), (body,), np.array([0.0, 0, -9.81]), 1.0))
+    encoded = playback.stream.binary_stream()
+    playback.log_static()
+    (tmp_path / "p.rrd").write_bytes(encoded.read() or b"")
+    shown = read(tmp_path / "p.rrd")["/world/crate/mesh!"]
+    np.testing.assert_allclose(shown["Mesh3D:vertex_positions"][0], 2 * mesh.vertices, atol=1e-6)
+    assert len(shown["Mesh3D:albedo_texture_buffer"][0][0]) == mesh.texture.size
+
+
+def test_shading_goes_on_where_a_texture_is_cut():
+    ball = analytic_shape("sphere", radius=0.5).mesh
+    flat, _, (rows, columns) = unfold(ball, 60.0)
+    mesh, normals = with_normals(replace(flat, texture=np.zeros((rows, columns, 3), np.uint8)))
+    assert len(mesh.vertices) > len(ball.vertices)
+    np.testing.assert_allclose((normals * mesh.vertices).sum(1), 0.5, atol=1e-2)
 
 
 def test_the_skin_of_a_body_stands_at_the_bodys_origin(tmp_path):
