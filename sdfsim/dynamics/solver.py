@@ -17,7 +17,7 @@ from sdfsim.dynamics.kernels import distance as kinds
 from sdfsim.dynamics.kernels import record
 from sdfsim.dynamics.kernels import world as compiled
 from sdfsim.dynamics.kernels.step import step as compiled_step
-from sdfsim.shape.baked_grid import BakedGrid, baked, inwards
+from sdfsim.shape.baked_grid import WALL, BakedGrid, baked, inwards
 from sdfsim.shape.sdf import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, Sdf, SphereSdf
 from sdfsim.shape.surface_nodes import Surface, surface_of
 
@@ -383,6 +383,12 @@ def _geometry(
     kept = _known.get(sdf)
     if kept is None or kept[0].shape != nodes.shape or (kept[0] != nodes).any():
         grid = None if isinstance(sdf, ANALYTIC) else baked(sdf, nodes, pieces)
+        if grid and grid.thickness <= 1.001 * WALL * grid.cell:
+            size, wall, least = _extent(sdf), grid.thickness, WALL * grid.cell
+            _log.warning(
+                "walls of %.2g m or less of a shape of %.2g m: below %.2g m its grid sees one side only, so that things may "
+                "pass through; --thicken makes them thicker", wall, size, least,
+            )  # fmt: skip
         surface = surface_of(sdf, nodes, pieces)
         inward = INWARD * _extent(sdf) * inwards(sdf, surface.nodes)
         kept = nodes, grid, surface, inward, _clumps(surface.nodes, surface.patch)

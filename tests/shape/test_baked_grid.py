@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sdfsim.dynamics.kernels.distance import GRID, distance
-from sdfsim.dynamics.solver import compiled_shapes
+from sdfsim.dynamics.solver import _geometry, compiled_shapes
 from sdfsim.shape import baked_grid as module
 from sdfsim.shape.baked_grid import bake, baked, wall_thickness
 from sdfsim.shape.shape import analytic_shape, with_sdf
@@ -39,6 +39,13 @@ def two_halves() -> list[np.ndarray]:
     corners = analytic_shape("box", size=(1.0, 0.4, 0.4)).mesh.vertices
     aside = np.array([0.5, 0.0, 0.0])
     return [corners - aside, corners * np.array([1.0, 0.5, 0.5]) + aside]
+
+
+@pytest.mark.parametrize(("wall", "told"), [(0.002, True), (0.03, False)])
+def test_walls_that_no_grid_sees_are_told(wall, told, caplog):
+    rod = with_sdf(analytic_shape("box", size=(1.0, 0.03, wall)), "mesh")
+    _geometry(rod.sdf, rod.nodes, ())
+    assert ("its grid sees one side only" in caplog.text) is told
 
 
 def test_where_pieces_are_known_the_grid_is_of_these():
