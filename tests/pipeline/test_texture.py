@@ -62,7 +62,7 @@ def photograph(folder: Path, views: list[View], meshes: list[Mesh], colors: list
     return shots_of(views, photos, folder, meshes, 0.005)
 
 
-def ring(height: float, count: int = 8, far: float = 2.2) -> list[View]:
+def ring(height: float, count: int = 6, far: float = 2.2) -> list[View]:
     """Cameras that look at the origin from all around."""
     angles = 2 * np.pi * np.arange(count) / count
     views = [look_at(np.array([far * np.cos(a), far * np.sin(a), height])) for a in angles]
@@ -90,7 +90,7 @@ def in_colors(mesh: Mesh, shots: Shots) -> Mesh:
 
 def test_a_pattern_finer_than_the_mesh_is_in_the_texture(tmp_path):
     ball = analytic_shape("sphere", radius=0.5).mesh
-    views = ring(0.5) + ring(-0.5)
+    views = ring(0.5, 6) + ring(-0.5, 6)
     shots = photograph(tmp_path, views, [ball], [pattern])
     colored = in_colors(ball, shots)
     made = textured(colored, shots)
