@@ -19,11 +19,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from pipeline.distill import load_field
-from pipeline.meshing import read_parts
-from pipeline.placement import load_placement
-
 from pipeline.cameras import View, load_views
+from pipeline.field.training import load_field
+from pipeline.mesh.meshing import read_parts
+from pipeline.mesh.placement import load_placement
 from sdfsim.console import Session
 from sdfsim.errors import run_main
 

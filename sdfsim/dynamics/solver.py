@@ -384,11 +384,8 @@ def _geometry(
     if kept is None or kept[0].shape != nodes.shape or (kept[0] != nodes).any():
         grid = None if isinstance(sdf, ANALYTIC) else baked(sdf, nodes, pieces)
         if grid and grid.thickness <= 1.001 * WALL * grid.cell:
-            size, wall, least = _extent(sdf), grid.thickness, WALL * grid.cell
-            _log.warning(
-                "walls of %.2g m or less of a shape of %.2g m: below %.2g m its grid sees one side only, so that things may "
-                "pass through; --thicken makes them thicker", wall, size, least,
-            )  # fmt: skip
+            told = "a shape of %.2g m has walls of at most %.2g m: things may pass through; --thicken makes them thicker"
+            _log.warning(told, _extent(sdf), grid.thickness)
         surface = surface_of(sdf, nodes, pieces)
         inward = INWARD * _extent(sdf) * inwards(sdf, surface.nodes)
         kept = nodes, grid, surface, inward, _clumps(surface.nodes, surface.patch)
