@@ -384,7 +384,7 @@ def _geometry(
     if kept is None or kept[0].shape != nodes.shape or (kept[0] != nodes).any():
         grid = None if isinstance(sdf, ANALYTIC) else baked(sdf, nodes, pieces)
         if grid and grid.thickness <= 1.001 * WALL * grid.cell:
-            told = "a shape of %.2g m has walls of at most %.2g m: things may pass through; --thicken makes them thicker"
+            told = "a shape of %.2g m has walls of at most %.2g m: things may pass through; --thicken helps"
             _log.warning(told, _extent(sdf), grid.thickness)
         surface = surface_of(sdf, nodes, pieces)
         inward = INWARD * _extent(sdf) * inwards(sdf, surface.nodes)
