@@ -97,8 +97,8 @@ class Row:
 
 @dataclass
 class Equations:
-    """The rows of one contact point: along the normal and two tangents, the product of friction, and the speed that
-    resolves a deep penetration without staying."""
+    """The rows of one contact point: along the normal and two tangents, the product of friction, the speed that
+    resolves a penetration without staying, and what `kernels.solve.System.calm` has of it."""
 
     pair: tuple[int, int]
     number: int
@@ -106,6 +106,7 @@ class Equations:
     tangents: list[Row]
     grip: Tensor
     deep: Tensor
+    calm: tuple[Tensor, Tensor, Tensor]
 
 
 def of_compiled(scene: Compiled, motion: Motion) -> tuple[Bodies, Moving]:
@@ -543,15 +544,16 @@ def equations(
             if gap > solving.TOUCH and (-approach > rules.slow or gap + (then @ n) * rules.inner > 0.0):
                 continue
             target = -approach * bounce if -approach > rules.slow else nothing
-            deep = nothing
+            deep = push = rest = nothing
             if gap > solving.TOUCH:
-                target = -gap / rules.inner
+                target = rest = -gap / rules.inner
             elif gap <= -rules.split:
                 deep = -gap * rules.erp / rules.inner
             elif gap < -rules.slop:
                 push = (-gap - rules.slop) * rules.erp / rules.inner
                 target = torch.maximum(push, torch.minimum(target + push, -approach) if rules.adds else target)
-            normal = _row(bodies, moving, a, b, arms, n, target - then @ n, point.push)
+            before = then @ n
+            normal = _row(bodies, moving, a, b, arms, n, target - before, point.push)
             tangents = []
             if float(friction) > 0.0:
                 slip = then - (then @ n) * n
@@ -568,7 +570,8 @@ def equations(
                     most = friction * point.push
                     start = torch.clamp(point.drag @ axis, -most, most)
                     tangents.append(_row(bodies, moving, a, b, arms, axis, -(then @ axis), start))
-            found.append(Equations((a, b), number, normal, tangents, friction, deep))
+            calm = (rest - before, before, push)
+            found.append(Equations((a, b), number, normal, tangents, friction, deep, calm))
     return found
 
 
@@ -619,7 +622,7 @@ def _islands(bodies: Bodies, rows: list[Equations]) -> list[list[Equations]]:
 def sequential_impulses(
     bodies: Bodies, rules: Rules, island: list[Equations], change: Tensor, shift: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """All normals, then all friction, again and again, until no impulse changes a velocity by more than `exact`.
+    """What contacts of one island do, with less of what rebounds and pushes where it would gain energy from nothing.
 
     Returns:
         [N, 6] what contact adds to the velocities, and what only moves (of penetrations that are deep).
@@ -629,6 +632,39 @@ def sequential_impulses(
         for row in [contact.normal, *contact.tangents]:
             _apply(bodies, parts, contact.pair, row, row.impulse)
     pushed = [torch.zeros_like(contact.deep) for contact in island]
+    _part(bodies, rules, island, shifts, pushed)
+    _balance(bodies, rules, island, parts)
+    for share in (0.5, 0.0):
+        if not any(contact.normal.wanted > contact.calm[0] for contact in island) or not _gains(rules, island, parts):
+            break
+        parts = list(change)
+        for contact in island:
+            for row in [contact.normal, *contact.tangents]:
+                row.impulse = torch.zeros_like(row.impulse)
+            calm, _, push = contact.calm
+            contact.normal.wanted = calm + share * (contact.normal.wanted - calm)
+            if push > 0.0:
+                contact.deep = (1.0 - share) * push
+        _part(bodies, rules, island, shifts, pushed)
+        _balance(bodies, rules, island, parts)
+    return torch.stack(parts), torch.stack(shifts)
+
+
+def _gains(rules: Rules, island: list[Equations], parts: list[Tensor]) -> bool:
+    """Whether contacts have given an island more energy than they may: impulses times mean velocities, added up."""
+    work = spare = 0.0
+    lift = 2.0 * float(torch.from_numpy(rules.gravity).norm()) * solving.LIFT * rules.slop
+    for contact in island:
+        _, before, push = contact.calm
+        most = solving.SPARE * push * push + solving.ROUNDING * before * before + lift
+        spare += 0.5 * float(contact.normal.mass * most)
+        work += float(contact.normal.impulse * (before + 0.5 * _speed(parts, contact.pair, contact.normal)))
+        work += sum(float(t.impulse * (0.5 * _speed(parts, contact.pair, t) - t.wanted)) for t in contact.tangents)
+    return work > spare
+
+
+def _part(bodies: Bodies, rules: Rules, island: list[Equations], shifts: list[Tensor], pushed: list[Tensor]) -> None:
+    """Part what is deep in each other, by velocities that move bodies once and are forgotten."""
     for _ in range(rules.rounds):
         worst = 0.0
         for c, contact in enumerate(island):
@@ -640,6 +676,10 @@ def sequential_impulses(
                 pushed[c] = total
         if worst <= rules.exact:
             break
+
+
+def _balance(bodies: Bodies, rules: Rules, island: list[Equations], parts: list[Tensor]) -> None:
+    """All normals, then all friction, again and again, until no impulse changes a velocity by more than `exact`."""
     for _ in range(rules.rounds):
         worst = 0.0
         for contact in island:
@@ -649,7 +689,6 @@ def sequential_impulses(
                 worst = max(worst, _relax(bodies, parts, contact.pair, row, contact.grip * contact.normal.impulse))
         if worst <= rules.exact:
             break
-    return torch.stack(parts), torch.stack(shifts)
 
 
 def _relax(bodies: Bodies, parts: list[Tensor], pair: tuple[int, int], row: Row, most: Tensor | None) -> float:

@@ -112,6 +112,28 @@ def test_what_falls_stays_above_the_floor_and_gains_no_energy(seeds):
     assert_hardly_any_gains(gained)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_what_is_wedged_into_each_other_is_not_thrown_apart(seed):
+    """Hollow shapes that start deep in one another have contacts that contradict each other."""
+    draw, shapes = np.random.default_rng(seed), (load_shape(SHAPES / "ring"), load_shape(SHAPES / "bowl"))
+    bodies = []
+    for k in range(4):
+        quat = draw.normal(size=4)
+        scale = 1.0 / np.ptp(shapes[k % 2].sdf.bounds, axis=0).max()
+        bodies.append(
+            body(
+                str(k), k % 2, [*draw.uniform(-0.2, 0.2, 2), 0.4 * k], draw.uniform(0.5, 5.0), scale=scale,
+                quat_xyzw=quat / np.linalg.norm(quat), velocity=3.0 * draw.normal(size=3), restitution=0.9,
+                friction=0.7,
+            )
+        )  # fmt: skip
+    simulator = Simulator(Scene(shapes, tuple(bodies), np.zeros(3), 1.0), "solver")
+    rollout = simulator.run(steps=60)
+    assert_finite(rollout)
+    assert rollout.counters["active"].sum() > 20
+    assert energy_gained(simulator, rollout) < 0.05
+
+
 @pytest.mark.parametrize("friction", [0.0, 0.7])
 def test_a_collision_keeps_angular_momentum(friction):
     """To rounding, but where a deep overlap was pushed out: that moves places, and leaves velocities as they are."""

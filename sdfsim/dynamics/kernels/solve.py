@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit, prange
 
-from sdfsim.dynamics.kernels.vectors import BARE, FAST, add, along, cross, dot, get, scale, sub, turn, vector
+from sdfsim.dynamics.kernels.vectors import BARE, FAST, add, along, cross, dot, get, norm, scale, sub, turn, vector
 from sdfsim.dynamics.kernels.world import DRAG, GAP, NORMAL, PUSH
 
 # Columns of a row: its direction, how it turns the first and the second body, what a unit of impulse makes of their
@@ -19,6 +19,9 @@ AXIS, ARM, OTHER, SPIN, COUNTER, MASS, WANTED, IMPULSE, WIDTH = 0, 3, 6, 9, 12, 
 SPREAD = 0.58
 TOUCH = 1e-6  # model lengths: nearer is touching, so that rounding does not decide when what starts in contact is met
 AT_REST = 1e-9  # squared: slower tangential motion has no direction
+# No island may gain more energy than so many times what its pushes out of penetration would give each contact alone,
+# this share of what its contacts bring with them, and what lifts it by so many slops: a stack lifts all that is above.
+SPARE, ROUNDING, LIFT = 4.0, 0.01, 10.0
 MANY = 64  # islands of contacts from which on threads are worth their while
 
 
@@ -28,7 +31,10 @@ class System(NamedTuple):
     Attributes:
         where: [C, 4] int64: manifold, point, first and second body.
         row: [C, 3, WIDTH]: along the normal and two tangents.
-        grip: [C] product of friction; wanted: [C] impulse that resolves deep penetration; pushed: [C] of it so far.
+        grip: [C] product of friction; wanted: [C] speed that resolves penetration and is then forgotten; pushed: [C]
+            impulse that has given it so far.
+        calm: [C, 3]: the change that is wanted along the normal if nothing rebounds and no penetration is resolved; the
+            speed along it without contact; and the speed that resolves penetration and stays.
         start: [I + 1] int64, island i has the contacts order[start[i] : start[i + 1]].
         order: [C] int64.
     """
@@ -38,6 +44,7 @@ class System(NamedTuple):
     grip: np.ndarray
     wanted: np.ndarray
     pushed: np.ndarray
+    calm: np.ndarray
     start: np.ndarray
     order: np.ndarray
 
@@ -72,7 +79,7 @@ def _equations(world, work, motion, rules, manifolds):
     most = manifolds.count.sum()
     where = np.empty((most, 4), np.int64)
     row = np.empty((most, 3, WIDTH))
-    grip, wanted, pushed = np.empty(most), np.empty(most), np.zeros(most)
+    grip, wanted, pushed, calm = np.empty(most), np.empty(most), np.zeros(most), np.empty((most, 3))
     count = 0
     for m in range(len(manifolds.count)):
         a, b = manifolds.pair[m, 0], manifolds.pair[m, 1]
@@ -99,9 +106,9 @@ def _equations(world, work, motion, rules, manifolds):
                 continue
             _row(world.inverse_mass, inverse, a, b, arm, other, n, row, count, 0)
             target = -approach * bounce if -approach > rules.slow else 0.0
-            deep = 0.0
+            deep = push = rest = 0.0
             if gap > TOUCH:
-                target = -gap / rules.inner
+                target = rest = -gap / rules.inner
             elif gap > -rules.split:
                 if gap < -rules.slop:
                     push = (-gap - rules.slop) * rules.erp / rules.inner
@@ -111,6 +118,7 @@ def _equations(world, work, motion, rules, manifolds):
             row[count, 0, WANTED] = target - dot(then, n)
             row[count, 0, IMPULSE] = point[PUSH]
             wanted[count] = deep
+            calm[count, 0], calm[count, 1], calm[count, 2] = rest - dot(then, n), dot(then, n), push
             grip[count] = friction
             if friction > 0.0:
                 slip = along(then, n, -dot(then, n))
@@ -138,7 +146,7 @@ def _equations(world, work, motion, rules, manifolds):
             where[count, 0], where[count, 1], where[count, 2], where[count, 3] = m, k, a, b
             count += 1
     start, order = _islands(world, work.parent, work.number, where[:count])
-    return System(where[:count], row[:count], grip[:count], wanted[:count], pushed[:count], start, order)
+    return System(where[:count], row[:count], grip[:count], wanted[:count], pushed[:count], calm[:count], start, order)
 
 
 @njit(**BARE)
@@ -255,30 +263,79 @@ def _solve_many(world, rules, system, change, shift):
 
 @njit(**BARE)
 def _solve(world, rules, system, change, shift, island):
-    """One island: all normals, then all friction, until no impulse changes a velocity by more than `exact`."""
-    first, last = system.start[island], system.start[island + 1]
-    where, row, mass, order, grip = system.where, system.row, world.inverse_mass, system.order, system.grip
-    deep = False
-    for o in range(first, last):
+    """One island; where it would gain energy from nothing, again with half of what rebounds and pushes, then without.
+
+    Contacts that contradict each other, as of bodies that are wedged into one another, would else throw them apart.
+    """
+    where, row, mass, order = system.where, system.row, world.inverse_mass, system.order
+    lively = deep = False
+    for o in range(system.start[island], system.start[island + 1]):
         c = order[o]
         deep = deep or system.wanted[c] > 0.0
-        for e in range(3 if grip[c] > 0.0 else 1):
+        lively = lively or row[c, 0, WANTED] > system.calm[c, 0]
+        for e in range(3 if system.grip[c] > 0.0 else 1):
             if row[c, e, IMPULSE] != 0.0:
                 _apply(where, row, mass, change, c, e, row[c, e, IMPULSE])
     if deep:
-        for _ in range(rules.rounds):
-            worst = 0.0
-            for o in range(first, last):
-                c = order[o]
-                if system.wanted[c] > 0.0:
-                    short = system.wanted[c] - _speed(where, row, shift, c, 0)
-                    total = max(system.pushed[c] + short * row[c, 0, MASS], 0.0)
-                    step = total - system.pushed[c]
-                    system.pushed[c] = total
-                    _apply(where, row, mass, shift, c, 0, step)
-                    worst = max(worst, abs(step / row[c, 0, MASS]))
-            if worst <= rules.exact:
-                break
+        _part(mass, rules, system, shift, island)
+    _balance(mass, rules, system, change, island)
+    for share in (0.5, 0.0):
+        if not lively or not _gains(rules, system, change, island):
+            return
+        for o in range(system.start[island], system.start[island + 1]):
+            c = order[o]
+            for x in range(6):
+                change[where[c, 2], x] = change[where[c, 3], x] = 0.0
+            for e in range(3):
+                row[c, e, IMPULSE] = 0.0
+            # The first time half of the difference is left, then none.
+            row[c, 0, WANTED] = system.calm[c, 0] + share * (row[c, 0, WANTED] - system.calm[c, 0])
+            if system.calm[c, 2] > 0.0:
+                system.wanted[c] = (1.0 - share) * system.calm[c, 2]
+        _part(mass, rules, system, shift, island)
+        _balance(mass, rules, system, change, island)
+
+
+@njit(**BARE)
+def _gains(rules, system, change, island):
+    """Whether contacts have given an island more energy than they may: impulses times mean velocities, added up."""
+    where, row = system.where, system.row
+    work = spare = 0.0
+    lift = 2.0 * norm(vector(rules.gravity)) * LIFT * rules.slop
+    for o in range(system.start[island], system.start[island + 1]):
+        c = system.order[o]
+        before, push = system.calm[c, 1], system.calm[c, 2]
+        spare += 0.5 * row[c, 0, MASS] * (SPARE * push * push + ROUNDING * before * before + lift)
+        work += row[c, 0, IMPULSE] * (before + 0.5 * _speed(where, row, change, c, 0))
+        for e in range(1, 3 if system.grip[c] > 0.0 else 1):
+            work += row[c, e, IMPULSE] * (0.5 * _speed(where, row, change, c, e) - row[c, e, WANTED])
+    return work > spare
+
+
+@njit(**BARE)
+def _part(mass, rules, system, shift, island):
+    """Part what is deep in each other, by velocities that move bodies once and are forgotten."""
+    where, row, order = system.where, system.row, system.order
+    for _ in range(rules.rounds):
+        worst = 0.0
+        for o in range(system.start[island], system.start[island + 1]):
+            c = order[o]
+            if system.wanted[c] > 0.0:
+                short = system.wanted[c] - _speed(where, row, shift, c, 0)
+                total = max(system.pushed[c] + short * row[c, 0, MASS], 0.0)
+                step = total - system.pushed[c]
+                system.pushed[c] = total
+                _apply(where, row, mass, shift, c, 0, step)
+                worst = max(worst, abs(step / row[c, 0, MASS]))
+        if worst <= rules.exact:
+            break
+
+
+@njit(**BARE)
+def _balance(mass, rules, system, change, island):
+    """All normals, then all friction, until no impulse changes a velocity by more than `exact`."""
+    where, row, order, grip = system.where, system.row, system.order, system.grip
+    first, last = system.start[island], system.start[island + 1]
     for _ in range(rules.rounds):
         worst = 0.0
         for o in range(first, last):
