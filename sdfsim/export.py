@@ -99,10 +99,10 @@ class Written(NamedTuple):
 
 
 def export(
-    source: Path,
-    out: Path,
+    source: Path | str,
+    out: Path | str,
     *,
-    scene_file: Path | None = None,
+    scene_file: Path | str | None = None,
     allow_outside: bool = False,
     on_progress: Progress = lambda stage, fraction, message: None,
 ) -> dict[str, Any]:
@@ -122,6 +122,7 @@ def export(
         SdfsimError: unknown ending, damaged source, an extra that is not installed, a shape without convex pieces, or
             a file that cannot be written.
     """
+    source, out, scene_file = Path(source), Path(out), Path(scene_file) if scene_file else None
     kind = out.suffix.lower()
     if kind not in FORMATS:
         raise SdfsimError(f"{out}: unknown format {out.suffix or '(no ending)'}", "end it in " + " ".join(FORMATS))

@@ -6,15 +6,18 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.errors import SdfsimError
 from sdfsim.files import replacing
-from sdfsim.recording import Eye, body_colors, eye_of, framed, sheet, with_normals
+from sdfsim.recording import Eye, Place, body_colors, eye_of, framed, sheet, with_normals
 from sdfsim.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from sdfsim.scene import written
 
 SIZE = (960, 540)  # px, width and height
 FRAMES = 30  # a second
@@ -28,8 +31,8 @@ Progress = Callable[[float, str], None]
 
 
 def render(
-    scene: Scene, rollout: Rollout, out: Path, *, camera: Any = None, look_at: Any = None, at: float | None = None,
-    on_progress: Progress = lambda fraction, message: None,
+    scene: Scene | written.Scene, rollout: Rollout, out: Path | str, *, camera: Place | None = None,
+    look_at: Place | None = None, at: float | None = None, on_progress: Progress = lambda fraction, message: None,
 ) -> None:  # fmt: skip
     """Write a movie (.mp4, H.264, as long as the run) or a picture (.png) of a run.
 
@@ -46,6 +49,7 @@ def render(
         SdfsimError: another ending, a time outside of the run, a camera where it looks at, or a file that cannot be
             written.
     """
+    out, scene = Path(out), scene if isinstance(scene, Scene) else scene.load()
     check_format(out)
     if at is not None and not rollout.time[0] <= at <= rollout.time[-1] + rollout.meta["dt"]:
         raise SdfsimError(f"--at {at:g}: the run holds {rollout.time[0]:g} to {rollout.time[-1]:g} s")

@@ -49,6 +49,8 @@ class BodyHandle:
         name: of the body.
     """
 
+    __slots__ = ("_row", "_simulator", "name")  # so that a name that is misspelt is no new attribute
+
     def __init__(self, simulator: Simulator, row: int) -> None:
         self._simulator, self._row = simulator, row
         self.name = simulator.scene.bodies[row].name

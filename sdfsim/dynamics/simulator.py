@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import platform
 import re
 import time
@@ -114,7 +115,7 @@ class Simulator:
             free_flight=free_flight,
             substeps=self.model.inner or SUBSTEPS,
             rows=_rows(scene.limits),
-            sleep=self.model.kind != "paper" and effects.contact.on and scene.effects.sleep != "off",
+            sleep=self.model.kind != "paper" and effects.sleep.on,
         )
         check_nodes(scene, self.model.nodes)
         self.bodies, self.state = from_scene(scene, self.units, self.device, self.model.nodes)
@@ -167,7 +168,9 @@ class Simulator:
     def __getitem__(self, name: str) -> BodyHandle:
         """A body by its name. Raises SdfsimError where there is none of that name."""
         if name not in self._names:
-            raise SdfsimError(f"there is no body {name!r}", f"there are {', '.join(self._names[:20])}")
+            near = difflib.get_close_matches(name, self._names, n=1)
+            told = f" (did you mean {near[0]!r}?)" if near else ""
+            raise SdfsimError(f"there is no body {name!r}{told}", f"there are {', '.join(self._names[:20])}")
         return BodyHandle(self, self._names.index(name))
 
     def contact_points(self) -> list[ContactPoint]:

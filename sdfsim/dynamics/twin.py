@@ -338,9 +338,12 @@ def _seen_from_within(
     shapes: kinds.Shapes, bodies: Bodies, moving: Moving, one: int, other: int, p: Tensor, inward: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Distances [P] of nodes from the other body, and normals [P, 3] in its axes, from a little within their solid."""
-    q = _into(bodies, moving, one, other, p + inward)
-    d, n = distance(shapes, bodies.shape[other], q)
-    back = q - _into(bodies, moving, one, other, p)
+    at = _into(bodies, moving, one, other, p)
+    back = _into(bodies, moving, one, other, p + inward) - at
+    row = shapes.table[bodies.shape[other]]
+    if row[kinds.KIND] == kinds.GRID:  # fine only so near to its surface
+        back = back * (ways.NEAR * row[kinds.CELL] / back.norm(dim=-1, keepdim=True).clamp_min(1e-30)).clamp_max(1.0)
+    d, n = distance(shapes, bodies.shape[other], at + back)
     return bodies.scale[other] * (d - (back * n).sum(-1)), n
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import time
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
@@ -168,7 +169,7 @@ def mujoco(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajecto
         SdfsimError: MuJoCo is not installed, or a shape's engine file cannot be read.
     """
     try:
-        import mujoco as engine
+        engine: Any = importlib.import_module("mujoco")
     except ImportError as error:
         raise SdfsimError("MuJoCo is not installed", "pip install 'sdfsim[bench]'") from error
     t = start.motion

@@ -84,24 +84,20 @@ def plan(scene: Scene) -> Plan:
         told = f"{count} pairs have {name} above zero" if count else f"no pair has {name} above zero"
         return Effect(count > 0, told + note, field)
 
-    sleep = {
-        "on": "the file says on: resting islands freeze until disturbed",
-        "off": "the file says off",
-        "auto": "the file does not ask for it (the solver does it by itself)",
-    }[asked.sleep]
+    sleep = "the file says off" if asked.sleep == "off" else "what rests freezes until something disturbs it"
     turning = "the file says off: bodies translate only" if asked.rotation == "off" else "only the file can say off"
-    no_saving = "; an input of the network: off saves nothing"
+    no_saving = "; off saves nothing"
     return Plan(
         gravity=Effect(size > 0, f"{size:g} m/s^2" if size else "the file sets it to zero", "gravity"),
         free_flight=of_kind("dynamic", "in closed form while they touch nothing"),
         contact=contact,
-        scenery=of_kind("static", "encoded once, never moved"),
-        kinematic=of_kind("kinematic", "on their paths, never decoded"),
+        scenery=of_kind("static", "never moved"),
+        kinematic=of_kind("kinematic", "on their paths, whatever they meet"),
         rotation=Effect(asked.rotation != "off", turning, "effects.rotation"),
         friction=of_pairs(asked.friction, pairs.frictional, "friction"),
         restitution=of_pairs(asked.restitution, pairs.bouncy, "restitution", no_saving),
         sleep=Effect(
-            contact.on and asked.sleep == "on",
+            contact.on and asked.sleep != "off",
             sleep if contact.on else "contact is off: nothing can come to rest",
             "effects.sleep",
         ),

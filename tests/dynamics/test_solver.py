@@ -9,8 +9,9 @@ import torch
 from sdfsim import Simulator
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.scene.scene import Scene
-from sdfsim.shape.shape import analytic_shape
+from sdfsim.shape.shape import analytic_shape, load_shape
 from tests.dynamics.test_laws import ball, body, cube
+from tests.dynamics.test_scale import SHAPES
 from tests.hard_cases import gates
 from tests.test_resuming import Killed, simulate
 
@@ -156,3 +157,19 @@ def test_a_long_inner_step_is_told():
     assert lines(4.0) == []
     (line,) = lines(40.0)
     assert line.startswith("inner step: ") and "checked up to 10 ms" in line
+
+
+@pytest.mark.parametrize("wide", [0.3, 1.5, 9.0])
+@pytest.mark.parametrize("name", ["can", "ring"])
+def test_a_fitted_shape_rests_on_a_large_box_as_on_a_plane(name, wide):
+    """A node of a large body sees another's grid from no farther than the grid is fine."""
+    shape = load_shape(SHAPES / name)
+    bottom = shape.sdf.bounds[0, 2]
+    thing = body("thing", 0, [0.03, 0.0, -bottom], 0.2, restitution=0.0)
+    table = body("table", 1, [0, 0, -0.02], 0.0, motion="static", restitution=0.0)
+    top = analytic_shape("box", size=(wide, wide, 0.04))
+    sim = Simulator(Scene((shape, top), (thing, table), np.array([0.0, 0.0, -9.81]), 1.0))
+    rollout = sim.run(1.5)
+    moved = np.abs(rollout.position[:, 0] - rollout.position[0, 0])
+    assert moved.max() < 3e-3 * float(np.ptp(shape.sdf.bounds, axis=0).max())
+    assert sim["thing"].asleep

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit, prange
 
-from sdfsim.dynamics.kernels.distance import CAPSULE, KIND, PLANE, SIZE, SPHERE, distance, patch_of
+from sdfsim.dynamics.kernels.distance import CAPSULE, CELL, GRID, KIND, PLANE, SIZE, SPHERE, distance, patch_of
 from sdfsim.dynamics.kernels.vectors import (
     BARE,
     FAST,
@@ -31,6 +31,7 @@ EACH = 4  # points of a manifold that are of the same two patches
 KEYS = 1024  # patches of a shape at most
 ALIKE = 0.9  # cosine between normals that are taken for one
 ROUNDS = 12  # of refinement
+NEAR = 3.0  # cells: so near to its surface a grid is fine
 OUTWARD = 1e-3  # how much deeper another node must be to be preferred to one that is farther out by a length
 STRIDE, FINEST = 0.02, 5e-4  # of a body's size, the first step of the refinement and the last
 MANY = 48  # pairs from which on threads are worth their while
@@ -606,9 +607,11 @@ def _gap(table, brick, sample, t, w, c, p, inward):
     On an edge of t its own distance has two normals, and the one that parts two stacked boxes is not always the
     nearer. From within, only the face that is met is near.
     """
-    q = mapped(w, c, add(p, inward))
-    d, n = distance(table, brick, sample, t, q)
-    back = sub(q, mapped(w, c, p))
+    at = mapped(w, c, p)
+    back = sub(mapped(w, c, add(p, inward)), at)
+    if table[t, KIND] == GRID and norm(back) > NEAR * table[t, CELL]:
+        back = scale(back, NEAR * table[t, CELL] / norm(back))  # of a much larger body
+    d, n = distance(table, brick, sample, t, add(at, back))
     return d - dot(back, n), n
 
 
