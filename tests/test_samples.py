@@ -65,7 +65,8 @@ def test_what_is_stacked_stands(name):
     assert end["rest"] == end["count"]
     moved = np.linalg.norm(np.diff(rollout.position[[-40, -1]], axis=0), axis=-1)
     assert moved.max() < 1e-3
-    assert np.array_equal(np.argsort(rollout.position[0, :, 2]), np.argsort(rollout.position[-1, :, 2]))
+    fallen = rollout.position[0, :, 2] - rollout.position[-1, :, 2]
+    assert fallen.max() < 0.025  # what was put a little above has come down to what is below it
 
 
 def test_marbles_end_in_the_bowl():
