@@ -10,22 +10,24 @@ import numpy as np
 from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw, ImageFont
 
-from pipeline.cameras import View, load_sparse, load_views
+from pipeline.cameras import View, load_sparse, load_views, save_views
 from pipeline.field.training import load_field
 from pipeline.inputs.photos import load_photos
 from pipeline.mesh.bodies import Parts, split
 from pipeline.mesh.cleaning import joined
 from pipeline.mesh.extraction import EXTENT, ball, field_distance, sample_volume, surface_of
+from pipeline.mesh.next_photos import next_photos
 from pipeline.mesh.placement import Placement, measured_scale, place
-from pipeline.mesh.texture import shots_of, texture_parts
-from pipeline.mesh.visibility import Caster
+from pipeline.mesh.texture import Shots, shots_of, texture_parts
+from pipeline.mesh.trust import Support, color_range, draw_trust, summary, support_of
+from pipeline.mesh.visibility import Caster, Visibility
 from pipeline.progress import Progress, quiet, share_of
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, replacing, write_json
 from sdfsim.shape.mesh import Mesh, write_glb, write_ply
 
 SCENERY = "scene"
-TEXTURED = "textured.glb"
+TEXTURED, TRUST, NEXT = "textured.glb", "trust.png", "next_photos.json"
 RESOLUTION = {"quick": 192, "standard": 288, "fine": 448, "paper": 448}  # samples a side, by preset
 # The picture of names: at most so many photos, their width while they are chosen and in the picture, px, and the tint.
 PICTURES, THUMB, WIDE, TINT = 4, 80, 720, 0.45
@@ -40,7 +42,8 @@ def make_meshes(
 
     Writes `mesh.ply` (all that photos show), of the scenery `solid.ply` (closed) and `shown.ply` (what is displayed),
     `objects/NAME.ply` (closed) of each body, `parts.json`, `placement.json`, `objects.png`, and `textured.glb`: the
-    scenery and each body with a texture.
+    scenery and each body with a texture. Vertices in the PLY files have `views` and `uncertainty`, see `Support`;
+    `trust.png` draws the latter, and `next_photos.json` has the cameras of the photos that would help most.
 
     Args:
         distill: folder of that stage.
@@ -86,16 +89,20 @@ def make_meshes(
     on_progress(0.7, "looking for bodies")
     cut = lambda p: np.maximum(inner(p), limit(p))  # noqa: E731
     parts = split(surface, cut, field.finest, views, photos, placement.to_metres.rotation[2], alone=alone)
-    write_parts(parts, surface.visible, placement, out)
     on_progress(0.8, "drawing objects.png")
     draw_names(parts, views, photos).save(out / "objects.png")
     metres = placement.to_metres.scale
     moved = [placement.to_metres.view(view) for view in views]
-    whole = [placement.mesh(mesh) for mesh in (parts.solid, *parts.bodies.values()) if mesh is not None]
-    shots = shots_of(moved, load_photos(photos), photos, whole, surface.volume.cell * metres)
-    shown = {SCENERY: parts.shown} | parts.bodies
-    displayed = {name: placement.mesh(mesh) for name, mesh in shown.items() if mesh is not None}
-    textures = texture_parts(displayed, shots, share_of(on_progress, 0.85, 0.15))
+    closed, displayed = (
+        {name: placement.mesh(mesh) for name, mesh in ({SCENERY: first} | parts.bodies).items() if mesh is not None}
+        for first in (parts.solid, parts.shown)
+    )
+    shots = shots_of(moved, load_photos(photos), photos, list(closed.values()), surface.volume.cell * metres)
+    ends = placement.to_metres.inverse().points(joined(list(closed.values())).vertices)
+    on_progress(0.82, "asking how far each place can be trusted")
+    support, told = trust(closed, displayed, shots, np.abs(limit(ends)) > 1.5 * surface.volume.cell, out)
+    write_parts(parts, surface.visible, placement, support, out)
+    textures = texture_parts(displayed, shots, share_of(on_progress, 0.87, 0.13))
     with replacing(out / TEXTURED) as partial:
         partial.write_bytes(write_glb(textures))
     return {
@@ -103,7 +110,37 @@ def make_meshes(
         "extent_m": rounded(np.ptp(placement.mesh(surface.visible).vertices, axis=0)).tolist(),
         "up_from": placement.up_from, "up_within_degrees": round(placement.up_within, 2),
         "up_confidence": placement.up_confidence, "size": placement.size_from, "objects": list(parts.bodies),
-        "smallest_object_m": float(rounded(parts.smallest * metres)),
+        "smallest_object_m": float(rounded(parts.smallest * metres)), **told,
+    }  # fmt: skip
+
+
+def trust(
+    closed: dict[str, Mesh], displayed: dict[str, Mesh], shots: Shots, counted: np.ndarray, out: Path
+) -> tuple[Support, dict]:
+    """How far the surface can be trusted, and which photos would help; writes `trust.png` and `next_photos.json`.
+
+    Args:
+        closed: what the scene is made of, by name, metres.
+        displayed: what is shown of it, of vertices of `closed`.
+        shots: the photos.
+        counted: [V] bool, vertices of `closed` where it was not cut off.
+        out: of the stage.
+
+    Returns:
+        What the photos tell of the vertices of `closed`, one mesh after the other; and what the report says of it.
+    """
+    sight = Visibility(joined(list(closed.values())), shots.lift, shots.blocking)
+    support = support_of(sight, shots.views)
+    shown = {name: support.nearest(mesh.vertices) for name, mesh in displayed.items()}
+    advice = next_photos(closed, support, sight, shots.blocking, shots.views, counted)
+    save_views([photo.view for photo in advice.photos], out / NEXT)
+    limits = color_range(displayed, shown)
+    drawn = {shots.views[0].source: shots.views[0], **{f"a camera at {p.view.name}": p.view for p in advice.photos[:1]}}
+    draw_trust(displayed, shown, drawn, limits).save(out / TRUST)
+    return support, {
+        "trust": {name: summary(mesh, shown[name]) for name, mesh in displayed.items()},
+        "trust_colors_m": limits, "weak": round(advice.weak, 4), "weak_after_next": round(advice.left, 4),
+        "next_photos": [photo.told() for photo in advice.photos],
     }  # fmt: skip
 
 
@@ -125,13 +162,13 @@ def rounded(values: ArrayLike) -> np.ndarray:
     return values.round(5 - int(np.floor(np.log10(largest)))) if largest > 0 else values
 
 
-def write_parts(parts: Parts, visible: Mesh, placement: Placement, out: Path) -> None:
-    """Writes meshes in metres, `placement.json` and `parts.json`."""
+def write_parts(parts: Parts, visible: Mesh, placement: Placement, support: Support, out: Path) -> None:
+    """Writes meshes in metres with what the photos tell of their vertices, `placement.json` and `parts.json`."""
 
     def write(name: str, mesh: Mesh) -> Mesh:
         moved = placement.mesh(mesh)
         with replacing(out / name) as partial:
-            partial.write_bytes(write_ply(moved))
+            partial.write_bytes(write_ply(moved, support.nearest(moved.vertices).attributes()))
         return moved
 
     write("mesh.ply", visible)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -51,6 +52,10 @@ class Caster:
         found = self.scene.cast_rays(self.tensor(rays))
         return found["t_hit"].numpy().astype(np.float64), found["primitive_ids"].numpy().astype(np.int64)
 
+    def clearance(self, points: np.ndarray) -> np.ndarray:
+        """Distances [P] of points [P, 3] from the surface, which is closed; negative inside."""
+        return self.scene.compute_signed_distance(self.tensor(points.astype(np.float32))).numpy()
+
     def blocked(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Whether something lies between points [R, 3] and [R, 3] or [3]."""
         rays = np.concatenate([start, end - start], 1).astype(np.float32)
@@ -71,16 +76,32 @@ class Visibility:
         self._from = mesh.vertices + offset * self.normals
         self._blocking = blocking or Caster(mesh)
 
+    def at(self, index: np.ndarray) -> Visibility:
+        """The same for some of the vertices [S]."""
+        part = copy(self)
+        part.vertices, part.normals, part._from = self.vertices[index], self.normals[index], self._from[index]
+        return part
+
     def of_view(self, view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Vertices [S] that a view sees, their pixels [S, 2], and the cosines [S] between normal and line of sight."""
-        pixels, depth = view.project(self.vertices)
-        towards = view.center - self.vertices
+        pixels, inside = framed(view, self.vertices)
+        index, cosine = self.of_place(view.center, inside)
+        return index, pixels[index], cosine
+
+    def of_place(self, place: np.ndarray, among: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices [S], of those `among` [V] bool, in sight of a place [3], and cosines [S] as in `of_view`."""
+        towards = place - self.vertices
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
         cosine = (towards * self.normals).sum(1)
-        inside = (depth > 0) & (pixels > 1).all(1) & (pixels < [view.width - 1, view.height - 1]).all(1)
-        index = np.flatnonzero(inside & (cosine > FLATTEST))
-        index = index[~self._blocking.blocked(self._from[index], view.center)]
-        return index, pixels[index], cosine[index]
+        index = np.flatnonzero(among & (cosine > FLATTEST))
+        index = index[~self._blocking.blocked(self._from[index], place)]
+        return index, cosine[index]
+
+
+def framed(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels [P, 2] of points [P, 3], and whether they lie within the picture [P]."""
+    pixels, depth = view.project(points)
+    return pixels, (depth > 0) & (pixels > 1).all(1) & (pixels < [view.width - 1, view.height - 1]).all(1)
 
 
 def look(sight: Visibility, views: list[View], photos_folder: Path, on_progress: Progress = quiet) -> Look:

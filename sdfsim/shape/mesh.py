@@ -8,8 +8,10 @@ import json
 import logging
 import re
 import struct
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -180,13 +182,21 @@ def _vertex_colors(loaded: Any, count: int) -> np.ndarray | None:
     return colors[:, :3].astype(np.uint8) if colors.shape[:1] == (count,) else None
 
 
-def write_ply(mesh: Mesh) -> bytes:
-    """A mesh as binary PLY, vertices in double precision: what is read back is what was written, to the last bit."""
+def write_ply(mesh: Mesh, attributes: Mapping[str, np.ndarray] = MappingProxyType({})) -> bytes:
+    """A mesh as binary PLY, vertices in double precision: what is read back is what was written, to the last bit.
+
+    Args:
+        mesh: any.
+        attributes: more properties of the vertices by name, [V] int32 or float32 each; most programs pass over them.
+    """
     columns = [(axis, "<f8", "double") for axis in "xyz"]
     values = list(mesh.vertices.T)
     if mesh.colors is not None:
         columns += [(channel, "u1", "uchar") for channel in ("red", "green", "blue")]
         values += list(mesh.colors.T)
+    for name, column in attributes.items():
+        columns.append((name, column.dtype.newbyteorder("<").str, {"i": "int", "f": "float"}[column.dtype.kind]))
+        values.append(column)
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(mesh.vertices)}"]
     header += [f"property {kind} {name}" for name, _, kind in columns]
     header += [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices", "end_header", ""]
@@ -216,6 +226,19 @@ def read_mesh(path: Path) -> Mesh:
         return Mesh(mesh.vertices, mesh.faces, np.array(loaded.visual.vertex_colors)[:, :3].astype(np.uint8))
     except Exception as error:  # the readers raise whatever their format made them stumble over
         raise SdfsimError(f"{path}: damaged or cut short ({error})") from error
+
+
+def read_attributes(path: Path, names: Sequence[str]) -> list[np.ndarray]:
+    """Properties of the vertices [V] of a PLY file that `write_ply` wrote, by their names; see `read_mesh`.
+
+    Raises:
+        SdfsimError: not readable, or it has no such property.
+    """
+    try:
+        vertices = _read(path).metadata["_ply_raw"]["vertex"]["data"]
+        return [np.array(vertices[name]) for name in names]
+    except Exception as error:  # the readers raise whatever their format made them stumble over
+        raise SdfsimError(f"{path}: damaged, or without {', '.join(names)} ({error})") from error
 
 
 # What z up is to the y up of glTF: columns of a matrix [4, 4].

@@ -1,0 +1,215 @@
+"""Which photos would help most: cameras around the scene that see much of what too few photos show."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.cameras import View, focus
+from pipeline.mesh.cleaning import joined
+from pipeline.mesh.trust import FEW, Support, information, sigma_along, vertex_areas
+from pipeline.mesh.visibility import Caster, Visibility, framed
+from sdfsim.shape.mesh import Mesh
+
+WANTED = 3  # photos that are proposed
+SAMPLES = 6000  # of the surface
+PLACES = 600  # directions around the scene in which cameras are tried
+HIGHER = 30.0  # degrees by which these may be above or below the cameras given; and the lowest and highest
+LOWEST, HIGHEST = -60.0, 80.0
+FAIR = 0.35  # least cosine between normal and line of sight at which a photo helps
+UNSURE = 3.0  # times the median uncertainty: from there on a place is weak however many photos see it
+CLEAR = 0.1  # times the cameras' distance: least distance of a camera from anything solid and from the floor
+SHARED = 0.2  # share of what a photo shows that is known well already: else it cannot be joined to the others
+APART = 15.0  # degrees between the photos proposed
+LEAST = 0.01  # share of the surface that a photo has to help, else it is not worth the way
+NEARBY, SLIGHT = 35.0, 0.04  # degrees up to which a way is told in metres; share of the distance that is not worth it
+
+
+@dataclass(frozen=True)
+class NextPhoto:
+    """A photo that would help.
+
+    Attributes:
+        view: its camera, metres, z up.
+        target: [3] m that it looks at.
+        gain: what it adds, as a share of all weak surface that any photo from around could show.
+        words: where to stand and where to look.
+    """
+
+    view: View
+    target: np.ndarray
+    gain: float
+    words: str
+
+    def told(self) -> dict:
+        """Plain values for the report."""
+        return {
+            "position": [round(float(x), 3) for x in self.view.center],
+            "looking_at": [round(float(x), 3) for x in self.target],
+            "gain": round(self.gain, 3), "words": self.words,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What more photos could do.
+
+    Attributes:
+        photos: the best first; none where no photo helps `LEAST` of the surface.
+        weak: share of the surface that is weak and that a camera around could see.
+        left: share that is weak still after these photos.
+    """
+
+    photos: list[NextPhoto]
+    weak: float
+    left: float
+
+
+def next_photos(
+    meshes: Mapping[str, Mesh], support: Support, sight: Visibility, solid: Caster, views: Sequence[View],
+    counted: np.ndarray,
+) -> Advice:  # fmt: skip
+    """The photos that help most, chosen greedily, each given those before it.
+
+    Weak is what fewer than `FEW` photos see, or what is `UNSURE`. A photo helps a place that it sees freely and at a
+    fair angle: by the share of `FEW` photos that it lacks, else by how much less uncertain it becomes. Cameras are
+    tried on a shell around the scene, at the median distance of the given ones, in free space, in sight of a given
+    camera, and with something in the picture that is known well.
+
+    Args:
+        meshes: closed, with z up and the floor at z = 0, metres, by name.
+        support: of their vertices, one mesh after the other.
+        sight: of the same vertices.
+        solid: rays against all of the meshes.
+        views: given cameras, metres.
+        counted: [V] bool, vertices that matter; others are where the solid was cut off.
+    """
+    rng = np.random.default_rng(0)
+    area = np.where(counted, vertex_areas(joined(list(meshes.values()))), 0)
+    index = rng.choice(len(area), SAMPLES, p=area / area.sum())
+    part = np.repeat(np.arange(len(meshes)), [len(mesh.vertices) for mesh in meshes.values()])[index]
+    known, sight = support.at(index), sight.at(index)
+    uncertainty = known.uncertainty
+    limit = UNSURE * float(np.median(uncertainty[np.isfinite(uncertainty)])) if np.isfinite(uncertainty).any() else 0.0
+    middle, towards = focus(list(views))
+    places = _places(views, middle, towards, solid)
+    around = [sight.of_place(place, np.ones(SAMPLES, bool)) for place in places]
+    around = [seen[cosine > FAIR] for seen, cosine in around]
+    reachable = known.views > 0
+    for seen in around:
+        reachable[seen] = True
+    total = max(int(reachable.sum()), 1)
+
+    def weak(now: Support) -> np.ndarray:
+        return (now.views < FEW) | (now.uncertainty > limit)
+
+    def worth(now: Support, view: View, seen: np.ndarray) -> np.ndarray:
+        """How much a photo helps the places [S] that it sees."""
+        here = now.at(seen)
+        few = here.views < FEW
+        after = sigma_along(here.information + information(view, here.vertices), here.normals)
+        rest = np.divide(after, here.uncertainty, out=np.ones(len(seen)), where=np.isfinite(after))
+        return np.where(few, (FEW - here.views) / FEW, 1 - np.minimum(rest, 1))
+
+    now, before = known, weak(known) & reachable
+    lacking = np.where(known.views < FEW, (FEW - known.views) / FEW, 1.0)[before].sum()
+    chosen: list[NextPhoto] = []
+    free = np.ones(len(places), bool)
+    while len(chosen) < WANTED and before.any():
+        poor = weak(now)
+        best: tuple[float, int, View, np.ndarray, np.ndarray] | None = None
+        for number in np.flatnonzero(free):
+            helped = around[number][poor[around[number]]]
+            if not len(helped) or (best is not None and len(helped) <= best[0]):
+                continue
+            for target in (middle, sight.vertices[helped].mean(0)):
+                view = camera_at(places[number], target, views[0])
+                inside = framed(view, sight.vertices[around[number]])[1]
+                seen = around[number][inside]
+                if not inside.any() or poor[seen].mean() > 1 - SHARED:
+                    continue
+                seen = seen[poor[seen]]
+                gains = worth(now, view, seen)
+                if best is None or gains.sum() > best[0]:
+                    best = float(gains.sum()), int(number), view, target, seen[gains > 0]
+        if best is None or best[0] < LEAST * total:
+            break
+        gain, number, view, target, seen = best
+        counts, matrices = now.views.copy(), now.information.copy()
+        counts[seen] += 1
+        matrices[seen] += information(view, sight.vertices[seen])
+        view = replace(view, name=f"next{len(chosen) + 1}", source=f"next{len(chosen) + 1}")
+        most = list(meshes)[int(np.bincount(part[seen]).argmax())]
+        helped = sight.vertices[seen[part[seen] == list(meshes).index(most)]]
+        words = f"{way_to(view.center, views, middle)}, looking at {spot(most, meshes[most], helped)}"
+        chosen.append(NextPhoto(view, target, gain / max(lacking, 1e-12), words))
+        now = replace(now, views=counts, information=matrices)
+        turned = (places - middle) @ (view.center - middle)
+        turned /= np.linalg.norm(places - middle, axis=1) * np.linalg.norm(view.center - middle)
+        free &= turned < np.cos(np.radians(APART))
+    return Advice(chosen, float(before.sum() / total), float((weak(now) & reachable).sum() / total))
+
+
+def camera_at(place: np.ndarray, target: np.ndarray, like: View) -> View:
+    """A camera at a place [3] that looks at another [3], held level (z up), with the lens of another."""
+    forward = target - place
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    if np.linalg.norm(right) < 1e-6:
+        right = np.array([1.0, 0.0, 0.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return replace(like, rotation=rotation, translation=-rotation @ place)
+
+
+def _places(views: Sequence[View], middle: np.ndarray, towards: np.ndarray, solid: Caster) -> np.ndarray:
+    """Places [C, 3] where a camera could be, see `next_photos`."""
+    given = np.array([view.center for view in views])
+    far = float(np.median(np.linalg.norm(given - middle, axis=1)))
+    height = np.degrees(np.arcsin(np.clip(-towards[:, 2], -1, 1)))
+    low, high = np.sin(np.radians(np.clip([height.min() - HIGHER, height.max() + HIGHER], LOWEST, HIGHEST)))
+    z = low + (high - low) * (np.arange(PLACES) + 0.5) / PLACES
+    angle = np.pi * (1 + np.sqrt(5)) * np.arange(PLACES)  # the golden angle spreads them evenly
+    flat = np.sqrt(1 - z**2)
+    places = middle + far * np.stack([flat * np.cos(angle), flat * np.sin(angle), z], 1)
+    places = places[(places[:, 2] > CLEAR * far) & (solid.clearance(places) > CLEAR * far)]
+    starts, ends = np.repeat(places, len(given), axis=0), np.tile(given, (len(places), 1))
+    in_sight = ~solid.blocked(starts, ends).reshape(len(places), len(given))
+    return places[in_sight.any(1)]
+
+
+def way_to(place: np.ndarray, views: Sequence[View], middle: np.ndarray) -> str:
+    """How to get to a place [3] from where the nearest photo was taken, in words."""
+    nearest = min(views, key=lambda view: float(np.linalg.norm(view.center - place)))
+    right = nearest.rotation[0] * [1, 1, 0]
+    right /= max(np.linalg.norm(right), 1e-12)
+    forward = np.cross([0.0, 0.0, 1.0], right)
+    step = place - nearest.center
+    turns = [np.arctan2(*(at - middle)[1::-1]) for at in (nearest.center, place)]
+    turn = (np.degrees(turns[1] - turns[0]) + 180) % 360 - 180
+    ways = [(step[2], "higher", "lower")]
+    around = ""
+    if abs(turn) > NEARBY:
+        around = f"walk {abs(turn):.0f}° around the scene to your {'right' if turn > 0 else 'left'} from there, "
+    else:
+        ways = [(step @ right, "to the right", "to the left"), (step @ forward, "forward", "back"), *ways]
+    slight = SLIGHT * float(np.linalg.norm(place - middle))
+    told = [f"{abs(size):.2g} m {one if size > 0 else other}" for size, one, other in ways if abs(size) > slight]
+    side = place - middle
+    names = ["left" if side[0] < 0 else "right", "front" if side[1] < 0 else "back"]
+    keep = np.abs(side[:2]) > 0.4 * np.linalg.norm(side[:2])
+    corner = " ".join(name for name, kept in zip(names[::-1], keep[::-1], strict=True) if kept)
+    moved = around + (", ".join(told) or ("at the same height" if around else "from the same place"))
+    return f"from the {corner} of the scene: stand where {nearest.source} was taken, {moved}"
+
+
+def spot(name: str, mesh: Mesh, points: np.ndarray) -> str:
+    """What of a mesh lies at points [P, 3], in words."""
+    low, high = mesh.vertices[:, 2].min(), mesh.vertices[:, 2].max()
+    height = float(np.median(points[:, 2]))
+    if name == "scene":
+        return f"the scenery {height:.2g} m above the floor" if height > 0.05 * (high - low) else "the floor"
+    third = min(int(3 * (height - low) / max(high - low, 1e-12)), 2)
+    return f"the {('foot', 'middle', 'top')[third]} of {name}"

@@ -1,0 +1,224 @@
+"""How far each place of a surface can be trusted: how many photos see it, and how exactly they tell where it is.
+
+A photo tells where a point is across its line of sight, to about a pixel, and nothing along it. Lines of sight from
+several directions together tell the rest. What fewer than two photos see is a guess of the field.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from pipeline.cameras import View
+from pipeline.mesh.cleaning import face_normals, joined, vertex_normals
+from pipeline.mesh.visibility import Caster, Visibility, to_bytes
+from pipeline.progress import Progress, quiet
+from sdfsim.shape.mesh import Mesh
+
+FEW = 3  # photos: what fewer see is weak
+PARALLEL = 1e-12  # of lines of sight: least determinant of their information, with its trace as unit
+# Guessed places of a body are told by their side, each with this share of them at least.
+WORTH_NAMING = 0.2
+# Colours from the surest to the least sure place (anchors of viridis), and of what is guessed.
+SCALE = np.array([[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], float)
+GUESSED = np.array([255.0, 45, 45])
+TINT, WIDE, LEGEND = 0.75, 640, 44  # share of the map in a picture; width of each half and height of its legend, px
+
+
+@dataclass(frozen=True)
+class Support:
+    """What photos tell of the places of some points.
+
+    Attributes:
+        vertices: [V, 3] m, the points.
+        normals: [V, 3] unit, of the surface there.
+        views: [V] int, photos that see each.
+        information: [V, 3, 3] 1/m^2, see `information`; summed over these photos.
+    """
+
+    vertices: np.ndarray
+    normals: np.ndarray
+    views: np.ndarray
+    information: np.ndarray
+
+    @property
+    def uncertainty(self) -> np.ndarray:
+        """[V] m, see `sigma_along`; infinite: guessed, as fewer than two photos see the point."""
+        return np.where(self.views > 1, sigma_along(self.information, self.normals), np.inf)
+
+    def at(self, index: np.ndarray) -> Support:
+        """The same of some of the points."""
+        return Support(self.vertices[index], self.normals[index], self.views[index], self.information[index])
+
+    def nearest(self, points: np.ndarray) -> Support:
+        """That of the nearest vertex to each of other points [P, 3] m."""
+        from scipy.spatial import KDTree
+
+        return self.at(KDTree(self.vertices).query(points)[1])
+
+    def attributes(self) -> dict[str, np.ndarray]:
+        """What a mesh file holds of it: `views` [V] int32 and `uncertainty` [V] float32 m."""
+        return {"views": self.views.astype(np.int32), "uncertainty": self.uncertainty.astype(np.float32)}
+
+
+def information(view: View, points: np.ndarray) -> np.ndarray:
+    """How exactly one photo tells where points are: the inverse of the covariance of the place.
+
+    The photo is taken to be off by a standard deviation of 1 px on both axes, its camera to be exact: J^T J of the
+    projection's Jacobian J (Hartley and Zisserman, Multiple View Geometry, 5.2). Lens distortion is left out.
+
+    Args:
+        view: camera.
+        points: [P, 3] in front of it.
+
+    Returns:
+        [P, 3, 3], rank two, in 1 / (unit of the points)^2.
+    """
+    local = points @ view.rotation.T + view.translation
+    depth = local[:, 2, None, None]
+    rows = view.focal / depth * (view.rotation[:2] - local[:, :2, None] / depth * view.rotation[2])
+    return np.einsum("pki,pkj->pij", rows, rows)
+
+
+def sigma_along(information: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Standard deviation [P] of places along unit directions [P, 3], from information [P, 3, 3]; else infinite."""
+    a, b, c = np.moveaxis(information, 1, 0)
+    crossed = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], 1)  # the inverse, times the determinant
+    size = np.einsum("pi,pi->p", a, crossed[:, 0])
+    known = size > PARALLEL * np.trace(information, axis1=1, axis2=2) ** 3
+    variance = np.einsum("pi,pij,pj->p", normals, crossed, normals) / np.where(known, size, 1.0)
+    return np.where(known, np.sqrt(np.maximum(variance, 0)), np.inf)
+
+
+def support_of(sight: Visibility, views: Sequence[View], on_progress: Progress = quiet) -> Support:
+    """What views tell of the vertices of a mesh, all in metres."""
+    count = len(sight.vertices)
+    seen, total = np.zeros(count, np.int64), np.zeros((count, 3, 3))
+    for number, view in enumerate(views):
+        index = sight.of_view(view)[0]
+        seen[index] += 1
+        total[index] += information(view, sight.vertices[index])
+        on_progress((number + 1) / len(views), f"what photo {number + 1} of {len(views)} sees")
+    return Support(sight.vertices, sight.normals, seen, total)
+
+
+def vertex_areas(mesh: Mesh) -> np.ndarray:
+    """Area [V] m^2 of the surface that each vertex stands for: a third of its faces'."""
+    area = np.repeat(face_normals(mesh)[1] / 3, 3)
+    return np.bincount(mesh.faces.ravel(), area, minlength=len(mesh.vertices))
+
+
+def summary(mesh: Mesh, support: Support) -> dict:
+    """Shares of a mesh's area by how many photos see it, and the median uncertainty of what is not guessed.
+
+    Returns:
+        `area_m2`; `seen_by`, the shares of 0, 1, 2, and 3 or more photos; `guessed`, that of fewer than two or of
+        lines of sight that are parallel; `uncertainty_m`, None where all is guessed; `where`, see `guessed_sides`.
+    """
+    area, uncertainty = vertex_areas(mesh), support.uncertainty
+    known = np.isfinite(uncertainty)
+    seen_by = np.bincount(np.minimum(support.views, FEW), area, minlength=FEW + 1) / area.sum()
+    return {
+        "area_m2": float(area.sum()), "seen_by": [round(float(share), 4) for share in seen_by],
+        "guessed": round(float(area[~known].sum() / area.sum()), 4),
+        "uncertainty_m": weighted_quantile(uncertainty[known], area[known], 0.5) if known.any() else None,
+        "where": guessed_sides(mesh, np.where(known, 0, area)),
+    }  # fmt: skip
+
+
+def weighted_quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
+    """The value of values [N] below which this share of their weights [N] lies."""
+    order = np.argsort(values)
+    total = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(total, share * total[-1])])
+
+
+def guessed_sides(mesh: Mesh, weights: np.ndarray) -> list[str]:
+    """Where on a body, z up and its front towards -y, most of some weights [V] lies, in words."""
+    chosen = np.flatnonzero(weights > 0)
+    if not len(chosen):
+        return []
+    points, normals = mesh.vertices[chosen], vertex_normals(mesh)[chosen]
+    clear = 1e-3 * float(np.ptp(mesh.vertices, axis=0).max())
+    faces_itself = np.isfinite(Caster(mesh).hits(points + clear * normals, normals)[0])
+    axis = np.abs(normals).argmax(1)
+    side = 2 * axis + (normals[np.arange(len(axis)), axis] > 0)
+    side[faces_itself] = 6
+    names = ["left (-x)", "right (+x)", "front (-y)", "back (+y)", "underside", "top", "hollow"]
+    share = np.bincount(side, weights[chosen], minlength=len(names)) / weights.sum()
+    return [names[k] for k in np.argsort(-share) if share[k] >= WORTH_NAMING]
+
+
+def color_range(meshes: Mapping[str, Mesh], supports: Mapping[str, Support]) -> tuple[float, float]:
+    """Uncertainties (m) of the first and the last colour: between them lie nine tenths of the area that is known."""
+    area = np.concatenate([vertex_areas(mesh) for mesh in meshes.values()])
+    values = np.concatenate([supports[name].uncertainty for name in meshes])
+    known = np.isfinite(values)
+    if not known.any():
+        return 1e-3, 1e-2
+    low, high = (weighted_quantile(values[known], area[known], share) for share in (0.05, 0.95))
+    return low, max(high, 1.01 * low)
+
+
+def colors_of(uncertainty: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
+    """Colours [V, 3] in 0..255 of uncertainties [V] m: violet the surest, yellow the least sure, red what is guessed."""
+    known = np.isfinite(uncertainty)
+    position = np.log(np.where(known, uncertainty, 1.0) / limits[0]) / np.log(limits[1] / limits[0])
+    place = np.clip(position, 0, 1) * (len(SCALE) - 1)
+    color = np.stack([np.interp(place, np.arange(len(SCALE)), channel) for channel in SCALE.T], -1)
+    return np.where(known[:, None], color, GUESSED)
+
+
+def draw_trust(
+    meshes: Mapping[str, Mesh], supports: Mapping[str, Support], views: Mapping[str, View], limits: tuple[float, float]
+) -> Image.Image:
+    """The map of uncertainty over the surface, as some cameras see it, side by side above a legend.
+
+    Args:
+        meshes: with colours, by name, metres.
+        supports: of their vertices.
+        views: cameras by what is written above them, metres.
+        limits: see `color_range`.
+    """
+    whole = joined(list(meshes.values()))
+    own = np.concatenate([mesh.colors for mesh in meshes.values() if mesh.colors is not None]).astype(float)
+    color = own + TINT * (colors_of(np.concatenate([supports[n].uncertainty for n in meshes]), limits) - own)
+    normals, caster = face_normals(whole)[0], Caster(whole)
+    tiles = []
+    for title, view in views.items():
+        scale = WIDE / view.width
+        height = round(view.height * scale)
+        row, column = (axis.ravel() for axis in np.indices((height, WIDE)))
+        rays = view.rays((column + 0.5) / scale, (row + 0.5) / scale)
+        away, face = caster.hits(view.center, rays)
+        hit = np.isfinite(away)
+        pixels = np.full((len(rays), 3), 255.0)
+        shade = 0.55 + 0.45 * np.abs((normals[face[hit]] * rays[hit]).sum(1))
+        pixels[hit] = color[whole.faces[face[hit]]].mean(1) * shade[:, None]
+        tiles.append(Image.fromarray(to_bytes(pixels.reshape(height, WIDE, 3))))
+        ImageDraw.Draw(tiles[-1]).text((6, 4), title, font=ImageFont.load_default(18), fill=(255, 255, 255),
+                                       stroke_width=2, stroke_fill=(0, 0, 0))  # fmt: skip
+    tall = max(tile.height for tile in tiles)
+    sheet = Image.new("RGB", (WIDE * len(tiles), tall + LEGEND), (255, 255, 255))
+    for number, tile in enumerate(tiles):
+        sheet.paste(tile, (number * WIDE, 0))
+    _legend(sheet, tall, limits)
+    return sheet
+
+
+def _legend(sheet: Image.Image, top: int, limits: tuple[float, float]) -> None:
+    """Writes below `top` px what the colours mean."""
+    low, high = limits
+    bar = colors_of(np.geomspace(low, high, 200), limits)
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(16)
+    text = {"font": font, "fill": (0, 0, 0), "anchor": "lm"}
+    middle = top + LEGEND // 2
+    draw.text((10, middle), f"{1000 * low:.2g} mm", **text)
+    sheet.paste(Image.fromarray(to_bytes(np.broadcast_to(bar, (16, 200, 3)))), (90, middle - 8))
+    draw.text((300, middle), f"{1000 * high:.2g} mm", **text)
+    draw.rectangle((400, middle - 8, 424, middle + 8), fill=(255, 45, 45))
+    draw.text((432, middle), "guessed", **text)
