@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from pipeline.cameras import View
+from pipeline.inputs.depth import DepthFile
 from pipeline.inputs.images import Picture
 from sdfsim.errors import SdfsimError
 
@@ -43,6 +44,7 @@ class KnownCamera:
         rotation: [3, 3] world to camera; x right, y down, z forward.
         translation: [3].
         mask: file name of its mask, or None.
+        depth: its depth, or None.
     """
 
     name: str
@@ -54,6 +56,37 @@ class KnownCamera:
     rotation: np.ndarray
     translation: np.ndarray
     mask: str | None = None
+    depth: DepthFile | None = None
+
+    @property
+    def center(self) -> np.ndarray:
+        """[3] where it stands in the world."""
+        return -self.rotation.T @ self.translation
+
+
+def pinhole(name: str, size: tuple[int, int], lens: Sequence[float], pose: np.ndarray,
+            depth: DepthFile | None = None) -> KnownCamera:  # fmt: skip
+    """A camera without distortion.
+
+    Args:
+        name: of its photo.
+        size: width and height, px.
+        lens: focal lengths and middle, fx, fy, cx, cy, px.
+        pose: [3, 4] camera to world, OpenGL axes (x right, y up, z backwards).
+        depth: of its photo.
+    """
+    if not np.isfinite(pose).all() or abs(np.linalg.det(pose[:3, :3])) < 1e-6:
+        raise SdfsimError(f"{name}: its matrix is not a pose")
+    fx, fy, cx, cy = map(float, lens)
+    rotation, translation = world_to_camera(pose)
+    return KnownCamera(name, *size, _matrix(fx, fy, cx, cy), (), False, rotation, translation, depth=depth)
+
+
+def world_to_camera(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation [3, 3] and translation [3], axes x right, y down, z forward, of a pose [3 or 4, 4] with OpenGL axes."""
+    turn = pose[:3, :3] / np.cbrt(np.linalg.det(pose[:3, :3]))
+    rotation = np.diag([1.0, -1, -1]) @ turn.T
+    return rotation, -rotation @ pose[:3, 3]
 
 
 def read_cameras(path: Path) -> list[KnownCamera]:
@@ -72,7 +105,6 @@ def read_cameras(path: Path) -> list[KnownCamera]:
 def read_transforms(path: Path) -> list[KnownCamera]:
     """Cameras of a transforms.json: camera-to-world matrices with OpenGL axes; intrinsics for all or in each frame."""
     about = json.loads(path.read_text(encoding="utf-8"))
-    flip = np.diag([1.0, -1, -1])
     found = []
     _check_lens(about, str(path))
     for frame in about["frames"]:
@@ -96,15 +128,23 @@ def read_transforms(path: Path) -> list[KnownCamera]:
         pose = np.array(frame["transform_matrix"], float).reshape(4, 4)
         if not np.isfinite(pose).all() or abs(np.linalg.det(pose[:3, :3])) < 1e-6:
             raise SdfsimError(f"{where}: transform_matrix is not a pose")
-        turn = pose[:3, :3] / np.cbrt(np.linalg.det(pose[:3, :3]))
-        rotation = flip @ turn.T
+        rotation, translation = world_to_camera(pose)
         names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
         lens = tuple(float(values.get(name, 0.0)) for name in names)
         found.append(
             KnownCamera(str(frame["file_path"]), width, height, _matrix(fx, fy, cx, cy), lens, fisheye,
-                  rotation, -rotation @ pose[:3, 3], frame.get("mask_path"))
+                  rotation, translation, frame.get("mask_path"), _depth_of(values, path.parent))
         )  # fmt: skip
     return found
+
+
+def _depth_of(values: dict, folder: Path) -> DepthFile | None:
+    """The depth of a frame, as nerfstudio (`depth_file_path`) or instant-ngp (`depth_path`) say it."""
+    name = values.get("depth_file_path") or values.get("depth_path")
+    if name is None:
+        return None
+    unit = values.get("depth_unit_scale_factor", values.get("integer_depth_scale"))
+    return DepthFile(folder / str(name), None if unit is None else float(unit))
 
 
 def _check_lens(values: dict, where: str) -> None:
@@ -243,7 +283,7 @@ def rectified(picture: Picture, known: KnownCamera, name: str, source: str) -> t
     """
     height, width = picture.pixels.shape[:2]
     matrix, lens = scaled(known, width, height), None
-    pixels, mask = picture.pixels, picture.mask
+    pixels, mask, labels = picture.pixels, picture.mask, picture.labels
     # A fisheye bends also where all its coefficients are 0.
     if known.fisheye or any(known.distortion) or abs(matrix[0, 0] / matrix[1, 1] - 1) > SQUARE:
         import cv2
@@ -263,8 +303,10 @@ def rectified(picture: Picture, known: KnownCamera, name: str, source: str) -> t
         pixels = cv2.remap(pixels, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         if mask is not None:
             mask = cv2.remap(mask, x, y, cv2.INTER_LINEAR)
+        if labels is not None:
+            labels = cv2.remap(labels, x, y, cv2.INTER_NEAREST)
         matrix = new + CENTRE
     focal = float(matrix[0, 0])
     view = View(name, source, width, height, focal, float(matrix[0, 2]), float(matrix[1, 2]), 0.0,
                 known.rotation, known.translation)  # fmt: skip
-    return replace(picture, pixels=pixels, mask=mask, focal=focal), view, lens
+    return replace(picture, pixels=pixels, mask=mask, labels=labels, focal=focal), view, lens

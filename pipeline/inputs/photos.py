@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -10,8 +11,11 @@ import numpy as np
 from PIL import Image
 
 from pipeline.cameras import View, save_views
+from pipeline.inputs.captures import save_capture, spread, unpack
+from pipeline.inputs.depth import read_depth
 from pipeline.inputs.images import Picture, exposure, fault, read_photo, sharpness
-from pipeline.inputs.known_cameras import Lens, rectified
+from pipeline.inputs.known_cameras import KnownCamera, Lens, rectified
+from pipeline.inputs.labels import save_labels, save_names
 from pipeline.inputs.sources import Source, find_source
 from pipeline.progress import Progress, quiet
 from sdfsim.errors import SdfsimError
@@ -39,6 +43,7 @@ class Photo:
         mask: whether a mask came with it, as alpha or as a file.
         sharpness: see `quality.sharpness`; 0.2 to 0.6 for photos in focus.
         fault: "blurred", "too dark", "burnt out", or nothing.
+        depth: whether depth came with it.
     """
 
     name: str
@@ -52,6 +57,7 @@ class Photo:
     mask: bool
     sharpness: float
     fault: str = ""
+    depth: bool = False
 
     def prepared(self, pixels: np.ndarray, view: View) -> np.ndarray:
         """Pixels [P, 2] of the prepared photo, of camera `view`, from those of the user's photo."""
@@ -64,8 +70,9 @@ def prepare_photos(
 ) -> tuple[list[Photo], list[str]]:
     """Reads every photo and writes upright, sized copies to `out`.
 
-    Writes `images/NNNN.jpg`, for photos with a mask `masks/NNNN.jpg.png`, `photos.json`, and, where the cameras are
-    known, `known_cameras.json`.
+    Writes `images/NNNN.jpg`, for photos with a mask `masks/NNNN.jpg.png`, with depth `depth/NNNN.jpg.npy` (see
+    `read_depth`), where objects have masks `labels/NNNN.jpg.png` with their names, `photos.json`, where the cameras
+    are known `known_cameras.json`, and of a capture `capture.json`.
 
     Args:
         given: what the user gave, see `find_source`; never written to.
@@ -79,16 +86,27 @@ def prepare_photos(
         SdfsimError: see `find_source`, `read_photo` and `chosen_frames`.
     """
     source, out = find_source(given), Path(out)
+    unpacked = out / ".capture"
+    if source.archive:
+        unpack(source.archive, unpacked)
+        source = find_source(unpacked)
+    if source.capture:
+        source = replace(source, photos=tuple(spread(source.photos, source.frames)))
     (out / "images").mkdir(parents=True, exist_ok=True)
     photos: list[Photo] = []
     shares: list[tuple[float, float]] = []
     views: list[View] = []
-    for origin, picture, view, lens, fraction in _pictures(source, long_side):
+    for origin, picture, known, view, lens, fraction in _pictures(source, long_side):
         name = f"{len(photos):04d}.jpg"
         Image.fromarray(picture.pixels).save(out / "images" / name, quality=95, subsampling=0)
         if picture.mask is not None:
             (out / "masks").mkdir(exist_ok=True)
             Image.fromarray(picture.mask).save(out / "masks" / (name + ".png"))
+        if known and known.depth:
+            (out / "depth").mkdir(exist_ok=True)
+            np.save(out / "depth" / (name + ".npy"), _depth_of(known))
+        if picture.labels is not None:
+            save_labels(picture.labels, out, name)
         if view is not None:
             views.append(replace(view, name=name))
         height, width = picture.pixels.shape[:2]
@@ -97,7 +115,7 @@ def prepare_photos(
         focal = picture.focal if view is None else None  # A known camera is no prior.
         photos.append(
             Photo(name, origin, width, height, picture.original, lens, focal, picture.camera,
-                  picture.mask is not None, sharp)
+                  picture.mask is not None, sharp, depth=bool(known and known.depth))
         )  # fmt: skip
         on_progress(fraction, f"{len(photos)} photos")
     typical = float(np.quantile([p.sharpness for p in photos], 0.75))
@@ -107,35 +125,51 @@ def prepare_photos(
     ]
     if views:
         save_views(views, out / KNOWN_CAMERAS)
+    if source.capture:
+        save_capture(source.capture, out)
+    if source.labels.names:
+        save_names(source.labels.names, out)
     save_photos(photos, out)
+    shutil.rmtree(unpacked, ignore_errors=True)
     return photos, [*source.notes, *notes_on(photos, len(source.masks))]
 
 
-def _pictures(source: Source, long_side: int) -> Iterator[tuple[str, Picture, View | None, Lens | None, float]]:
-    """Name, picture, known camera, lens and share done of each photo."""
+def _pictures(
+    source: Source, long_side: int
+) -> Iterator[tuple[str, Picture, KnownCamera | None, View | None, Lens | None, float]]:
+    """Name, picture, camera where it is known, the same as a view of the straight photo, lens, and share done."""
     if source.video:
         from pipeline.inputs.video import chosen_frames
 
         for name, pixels, fraction in chosen_frames(source.video):
             image = Image.fromarray(pixels)
             image.thumbnail((long_side, long_side), Image.Resampling.LANCZOS)
-            yield name, Picture(np.asarray(image), image.size), None, None, fraction
+            yield name, Picture(np.asarray(image), image.size), None, None, None, fraction
         return
-    cameras = {}
-    if source.cameras:
-        from pipeline.inputs.known_cameras import read_cameras
-
-        cameras = {camera.name: camera for camera in read_cameras(source.cameras)}
     masks = _masks_that_count(source, long_side)
     for index, path in enumerate(source.photos):
-        camera = cameras.get(source.frames.get(path, ""))
+        camera = source.frames.get(path)
         shape = camera.width / camera.height if camera and camera.height else None
         name, view, lens = source.name_of(path), None, None
         picture = read_photo(path, long_side, masks.get(path), shape)
+        picture = replace(picture, labels=source.labels.of(path, picture.pixels.shape[1::-1]))
         if camera:
             _check_shape(path, picture, shape)
             picture, view, lens = rectified(picture, camera, path.name, name)
-        yield name, picture, view, lens, (index + 1) / len(source.photos)
+        yield name, picture, camera, view, lens, (index + 1) / len(source.photos)
+
+
+def _depth_of(camera: KnownCamera) -> np.ndarray:
+    """Depth [H, W] m, shaped like the photo of its camera."""
+    assert camera.depth is not None
+    depth = read_depth(camera.depth)
+    height, width = depth.shape
+    if camera.height and abs(width / height / (camera.width / camera.height) - 1) > 0.02:
+        raise SdfsimError(
+            f"{camera.depth.path}: shaped {width} x {height}, its photo {camera.width} x {camera.height}",
+            "depth has to show what its photo shows, turned the same way",
+        )
+    return depth
 
 
 def _masks_that_count(source: Source, long_side: int) -> dict[Path, Path]:

@@ -6,13 +6,15 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from pipeline.inputs.captures import ARCHIVES, Capture, find_capture, read_capture
+from pipeline.inputs.known_cameras import KnownCamera, read_cameras
+from pipeline.inputs.labels import Labels, find_labels, names_for
 from sdfsim.errors import SdfsimError
 
 MIN_PHOTOS = 3
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"}
 UNREADABLE = {".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw"}
 VIDEOS = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"}
-MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
 
 
 @dataclass(frozen=True)
@@ -22,23 +24,31 @@ class Source:
     Attributes:
         photos: photo files in name order; none where a video is given.
         masks: mask file of each photo that has one.
+        labels: which object each pixel shows, where that is given.
         video: the video, or None.
-        cameras: transforms.json, or the folder of a COLMAP model, whose poses are to be used; None: find them.
-        frames: name of each photo in `cameras`.
+        cameras: transforms.json, the folder of a COLMAP model or of a phone's capture, whose poses are to be used;
+            None: find them.
+        frames: camera of each photo in `cameras`.
+        capture: what a capture with depth says of its world; None where there is no depth.
+        archive: a zipped capture that has to be unpacked first; then there is nothing else.
         notes: what was passed over, for the report.
     """
 
     photos: tuple[Path, ...] = ()
     masks: dict[Path, Path] = field(default_factory=dict)
+    labels: Labels = field(default_factory=Labels)
     video: Path | None = None
     cameras: Path | None = None
-    frames: dict[Path, str] = field(default_factory=dict)
+    frames: dict[Path, KnownCamera] = field(default_factory=dict)
+    capture: Capture | None = None
+    archive: Path | None = None
     notes: tuple[str, ...] = ()
 
     @property
     def folder(self) -> Path:
         """The folder in and below which all photos lie; absolute."""
-        return Path(os.path.commonpath([path.absolute().parent for path in self.photos or (self.video or Path(),)]))
+        files = self.photos or (self.video or self.archive or Path(),)
+        return Path(os.path.commonpath([path.absolute().parent for path in files]))
 
     def name_of(self, photo: Path) -> str:
         """What a photo is called: its file's name, where subfolders hold photos with theirs before it; no two alike."""
@@ -46,18 +56,22 @@ class Source:
 
     def files(self) -> list[Path]:
         """Every file whose content the result depends on."""
-        found = [*self.photos, *sorted(self.masks.values())] + ([self.video] if self.video else [])
+        found = [*self.photos, *sorted(self.masks.values()), *self.labels.files()] + [p for p in (self.video, self.archive) if p]
+        found += [path for camera in self.frames.values() if camera.depth for path in camera.depth.files()]
         if self.cameras and self.cameras.is_dir():
-            return found + sorted(p for p in self.cameras.iterdir() if p.suffix in (".bin", ".txt"))
+            return found + sorted(
+                p for p in self.cameras.rglob("*") if p.suffix in (".bin", ".txt", ".json") or p.name == "metadata"
+            )
         return found + ([self.cameras] if self.cameras else [])
 
 
 def find_source(given: Path) -> Source:
     """Looks at what the user gave; reads no photo yet.
 
-    A folder holds photos (in it, or in its subfolder `images`), or is a COLMAP model, text or binary; a file is a
-    video, or a transforms.json. Masks lie in a folder `masks` in or beside that of the photos, named like the photo,
-    or like the photo with `.png` behind it, as COLMAP has them; white is the object.
+    A folder holds photos (in it, or in its subfolder `images`), or is a COLMAP model, text or binary, or a phone's
+    capture (see `find_capture`); a file is a video, a transforms.json, or a zipped capture. Masks lie in a folder `masks` in or beside that of the photos, named like the photo,
+    or like the photo with `.png` behind it, as COLMAP has them; white is the object. A folder in `masks` is about the
+    object of its name alone; a folder `labels` has label images.
 
     Raises:
         SdfsimError: nothing there, fewer than three photos, or two cameras of one photo.
@@ -69,15 +83,20 @@ def find_source(given: Path) -> Source:
         if given.suffix.lower() in VIDEOS:
             return Source(video=given)
         if given.suffix.lower() == ".json":
-            return _with_cameras(given)
+            return _with_cameras(given, read_cameras(given))
+        if given.suffix.lower() in ARCHIVES:
+            return Source(archive=given)
         raise SdfsimError(
-            f"{given}: not a folder, a video or a transforms.json",
+            f"{given}: not a folder, a video, a transforms.json or a zipped capture",
             "give the folder that holds the photos, not a single file",
         )
     if is_model(given):
-        return _with_cameras(given)
+        return _with_cameras(given, read_cameras(given))
+    if (capture := find_capture(given)) is not None:
+        return _with_cameras(capture, *reversed(read_capture(capture)))
     photos, notes = find_photos(given)
-    return Source(tuple(photos), find_masks(photos), notes=(*notes, *_unused(given)))
+    labels = find_labels(photos)
+    return Source(tuple(photos), find_masks(photos), labels, notes=(*notes, *labels.notes, *_unused(given)))
 
 
 def find_photos(folder: Path) -> tuple[list[Path], list[str]]:
@@ -120,8 +139,8 @@ def find_masks(photos: list[Path]) -> dict[Path, Path]:
     masks = {}
     for photo in photos:
         folders = [photo.parent / "masks", photo.parent.parent / "masks"]
-        names = [photo.name + ".png", *(photo.stem + suffix for suffix in MASK_SUFFIXES)]
-        found = next((folder / name for folder in folders for name in names if (folder / name).is_file()), None)
+        names = [folder / name for folder in folders for name in names_for(photo)]
+        found = next((path for path in names if path.is_file()), None)
         if found:
             masks[photo] = found
     return masks
@@ -142,21 +161,21 @@ def _unused(folder: Path) -> list[str]:
     return []
 
 
-def _with_cameras(cameras: Path) -> Source:
-    """The photos that known cameras belong to."""
-    from pipeline.inputs.known_cameras import read_cameras
-
-    frames = read_cameras(cameras)
-    photos, masks, names, missing = [], {}, {}, []
+def _with_cameras(cameras: Path, frames: list[KnownCamera], capture: Capture | None = None) -> Source:
+    """The photos that known cameras belong to, in the order of the cameras."""
+    photos, masks, missing = [], {}, []
+    known: dict[Path, KnownCamera] = {}
     for frame in frames:
         photo = _photo_of(frame.name, cameras)
         if photo is None:
             missing.append(frame.name)
             continue
-        if photo in names:
-            raise SdfsimError(f"{cameras}: {names[photo]} and {frame.name} are the same photo: {photo}", "remove one")
+        if photo in known:
+            raise SdfsimError(
+                f"{cameras}: {known[photo].name} and {frame.name} are the same photo: {photo}", "remove one"
+            )
         photos.append(photo)
-        names[photo] = frame.name
+        known[photo] = frame
         if frame.mask is not None and (cameras.parent / frame.mask).is_file():
             masks[photo] = cameras.parent / frame.mask
     if len(photos) < MIN_PHOTOS:
@@ -166,8 +185,14 @@ def _with_cameras(cameras: Path) -> Source:
             "the photos have to lie beside the cameras, or in a folder `images` there or up to two folders above",
         )  # fmt: skip
     notes = [f"{len(missing)} cameras have no photo (first: {missing[0]})"] if missing else []
-    photos.sort()
-    return Source(tuple(photos), {**find_masks(photos), **masks}, cameras=cameras, frames=names, notes=tuple(notes))
+    with_depth = sum(frame.depth is not None for frame in known.values())
+    if 0 < with_depth < len(photos):
+        notes.append(f"{len(photos) - with_depth} of {len(photos)} photos have no depth")
+    if with_depth and capture is None:
+        capture = Capture("transforms.json with depth", None)
+    labels = find_labels(photos)
+    return Source(tuple(photos), {**find_masks(photos), **masks}, labels, cameras=cameras, frames=known,
+                  capture=capture, notes=(*notes, *labels.notes))  # fmt: skip
 
 
 def _photo_of(name: str, cameras: Path) -> Path | None:

@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.cameras import load_views, save_views
+from pipeline.cameras import View, load_views, save_views
+from pipeline.inputs.captures import load_capture
 from pipeline.inputs.photos import KNOWN_CAMERAS, Photo
 from pipeline.progress import Progress, quiet
 from pipeline.sfm.pose_checks import check, failure_hint, failure_message, views_of
@@ -83,7 +84,8 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
     job = {
         "images": str(photos_folder / "images"), "count": len(photos), "groups": size_groups(photos), "seed": seed,
         "masks": str(photos_folder / "masks") if all(p.mask for p in photos) else "",
-        "known_cameras": str(known) if known.exists() else "", "exhaustive_up_to": exhaustive_up_to,
+        "known_cameras": str(known) if known.exists() else "", "refine": load_capture(photos_folder) is not None,
+        "exhaustive_up_to": exhaustive_up_to,
     }  # fmt: skip
     tries: list[tuple[dict, Path, dict]] = []
     told: list[dict] = []
@@ -111,6 +113,9 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
     # Best: plausible first, then the most photos and points.
     checks, folder, result = max(tries, key=lambda t: (not t[0]["failures"], t[0]["posed"], t[0]["points"]))
     checks["attempts"], checks["known_cameras"] = told, bool(job["known_cameras"])
+    views = views_of(result, photos) if job["refine"] or not job["known_cameras"] else load_views(known)
+    if job["refine"] and views:
+        checks["moved"] = moved(load_views(known), views)
     hint = failure_hint(checks)
     if checks["known_cameras"] and checks["failures"]:
         checks["failures"] = [f"the known cameras do not fit the photos: {'; '.join(checks['failures'])}"]
@@ -121,7 +126,6 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
     write_json(out / "checks.json", checks)
     if checks["failures"]:
         raise SdfsimError(failure_message(checks), hint, exit_code=EXIT_QUALITY)
-    views = load_views(known) if job["known_cameras"] else views_of(result, photos)
     save_views(views, out / "cameras.json")
     with replacing(out / "sparse.npz") as partial:  # A copy: the attempt's result stays whole for a run that goes on.
         shutil.copyfile(folder / "sparse.npz", partial)
@@ -129,6 +133,17 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
         (used / "database.db").unlink(missing_ok=True)
         shutil.rmtree(used / "colmap", ignore_errors=True)
     return checks
+
+
+def moved(before: list[View], after: list[View]) -> dict[str, float]:
+    """How far bundle adjustment moved the cameras of a capture: medians, m and degrees."""
+    given = {view.name: view for view in before}
+    pairs = [(given[view.name], view) for view in after]
+    turns = [np.clip((np.trace(a.rotation @ b.rotation.T) - 1) / 2, -1, 1) for a, b in pairs]
+    return {
+        "metres": round(float(np.median([np.linalg.norm(a.center - b.center) for a, b in pairs])), 5),
+        "degrees": round(float(np.degrees(np.median(np.arccos(turns)))), 4),
+    }
 
 
 def read_if_there(path: Path) -> Any:

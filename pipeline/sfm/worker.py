@@ -21,6 +21,10 @@ import numpy as np
 from sdfsim.files import write_arrays, write_json
 
 
+# Px that a point may be off while known cameras are refined, and points that a camera needs to be moved.
+REFINE_PIXELS, REFINE_POINTS = (16.0, 6.0), 30
+
+
 def say(message: str) -> None:
     """One line for the parent, at once."""
     print(message, flush=True)
@@ -99,6 +103,8 @@ def mapping(pycolmap, job: dict, database: Path, out: Path):
     options = incremental_options(pycolmap, job)
     if job["known_cameras"]:
         known = known_cameras(pycolmap, job, database)
+        if job["refine"]:
+            refine(pycolmap, known, database, job, out)
         return [pycolmap.triangulate_points(known, database, job["images"], out / "colmap", options=options)]
     done = 0
 
@@ -152,6 +158,37 @@ def known_cameras(pycolmap, job: dict, database: Path):
             )
             model.add_image_with_trivial_frame(entry, pose)
     return model
+
+
+def refine(pycolmap, model, database: Path, job: dict, out: Path) -> None:
+    """Moves known cameras to where the matches between their photos say they stood, by bundle adjustment.
+
+    A phone tracks its poses to a centimetre or so, which is many pixels. The first points are allowed as much, the
+    next ones less. As a whole the cameras stay where they were, at the scale they had; a camera that few points see
+    stays near its neighbours as given.
+    """
+    given = {key: image.cam_from_world() for key, image in model.images.items()}
+    for pixels in REFINE_PIXELS:
+        options = incremental_options(pycolmap, job)
+        options.mapper.filter_max_reproj_error = pixels
+        options.triangulation.complete_max_reproj_error = options.triangulation.merge_max_reproj_error = pixels
+        found = pycolmap.triangulate_points(model, database, job["images"], out / "colmap", options=options)
+        adjustment = pycolmap.BundleAdjustmentOptions()
+        adjustment.refine_focal_length = adjustment.refine_extra_params = False
+        adjustment.print_summary = False
+        adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+        adjustment.ceres.solver_options.num_threads = 1  # several add up in an order that differs from run to run
+        pycolmap.bundle_adjustment(found, adjustment)
+        # Bundle adjustment is free to move, turn and scale everything.
+        seen = [key for key, image in found.images.items() if image.has_pose and image.num_points3D >= REFINE_POINTS]
+        if len(seen) < 3:
+            return
+        after = np.array([found.images[key].projection_center() for key in seen])
+        before = np.array([given[key].inverse().translation for key in seen])
+        back = pycolmap.estimate_sim3d(after, before)
+        found.transform(back)
+        for key in seen:
+            model.frames[model.images[key].frame_id].rig_from_world = found.images[key].cam_from_world()
 
 
 def collect(reconstruction, out: Path) -> list[dict]:

@@ -1,0 +1,172 @@
+"""Captures of phones that know their depth, gravity and metres: Record3D, Polycam, and transforms.json with depth."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.inputs.depth import DepthFile
+from pipeline.inputs.images import read_photo, sharpness
+from pipeline.inputs.known_cameras import KnownCamera, pinhole
+from sdfsim.errors import SdfsimError
+from sdfsim.files import read_json, write_json
+
+CAPTURE = "capture.json"  # what `Capture` says, in the folder of the photos stage
+ARCHIVES = {".r3d", ".zip"}
+MOST = 100  # frames that are used of a recording
+TRIED = 5  # frames of a stretch that are looked at for the sharpest
+TURN = 1.0  # m of way that a turn by one radian counts as, when frames are spread along it
+UP = (0.0, 1.0, 0.0)  # ARKit measures gravity, and its worlds have y up
+
+
+@dataclass(frozen=True)
+class Capture:
+    """What a capture with depth says about its world, whose unit is the metre.
+
+    Attributes:
+        app: what wrote it.
+        up: [3] against gravity, in the world of its cameras; None: not said.
+    """
+
+    app: str
+    up: tuple[float, float, float] | None
+
+
+def find_capture(folder: Path) -> Path | None:
+    """The folder of a Record3D or Polycam export in `folder`, or None where it is none."""
+    for place in (folder, folder / "EXR_RGBD", folder / "keyframes"):
+        polycam = any((place / f"{kind}cameras").is_dir() and (place / f"{kind}images").is_dir()
+                      for kind in ("", "corrected_"))  # fmt: skip
+        record3d = _metadata(place).is_file() and any((place / name).is_dir() for name in ("rgb", "rgbd"))
+        if polycam or record3d:
+            return place
+    return None
+
+
+def read_capture(folder: Path) -> tuple[Capture, list[KnownCamera]]:
+    """What a Record3D or Polycam export says of its world, and its cameras; their names are paths in `folder`.
+
+    Raises:
+        SdfsimError: damaged.
+    """
+    try:
+        if _metadata(folder).is_file():
+            return Capture("Record3D", UP), _record3d(folder)
+        return Capture("Polycam", UP), _polycam(folder)
+    except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
+        raise SdfsimError(f"{folder}: cannot be read as a capture: {error!r}", "export it again") from error
+
+
+def _metadata(folder: Path) -> Path:
+    return folder / "metadata.json" if (folder / "metadata.json").is_file() else folder / "metadata"
+
+
+def _record3d(folder: Path) -> list[KnownCamera]:
+    """Record3D: a `.r3d` unpacked (`rgbd/N.jpg`, `N.depth`, `N.conf`), or its EXR export (`rgb/N.jpg`, `depth/N.exr`).
+
+    `metadata` holds the matrix K by columns, and a pose a frame: the quaternion x, y, z, w of the camera in the world,
+    OpenGL axes, and its position in metres.
+    """
+    from scipy.spatial.transform import Rotation
+
+    about: dict[str, Any] = json.loads(_metadata(folder).read_text(encoding="utf-8"))
+    width, height = int(about["w"]), int(about["h"])
+    same = np.reshape(about["K"], (3, 3)).T
+    each = about.get("perFrameIntrinsicCoeffs")
+    shape = (int(about["dh"]), int(about["dw"])) if "dh" in about else (256, 192)
+    rgb = folder / "rgb" if (folder / "rgb").is_dir() else folder / "rgbd"
+    photos = sorted((p for p in rgb.iterdir() if p.suffix in (".jpg", ".png") and p.stem.isdigit()),
+                    key=lambda p: int(p.stem))  # fmt: skip
+    if len(photos) > len(about["poses"]):
+        raise SdfsimError(f"{folder}: {len(photos)} photos, but {len(about['poses'])} poses", "export it again")
+    found = []
+    for photo in photos:
+        number = int(photo.stem)
+        lens = each[number] if each else (same[0, 0], same[1, 1], same[0, 2], same[1, 2])
+        x, y, z, w, *position = about["poses"][number]
+        pose = np.column_stack([Rotation.from_quat([x, y, z, w]).as_matrix(), position])
+        exr, raw, sure = folder / "depth" / f"{number}.exr", photo.with_suffix(".depth"), photo.with_suffix(".conf")
+        depth = None
+        if exr.is_file():
+            depth = DepthFile(exr)
+        elif raw.is_file():
+            depth = DepthFile(raw, None, sure if sure.is_file() else None, shape)
+        found.append(pinhole(photo.relative_to(folder).as_posix(), (width, height), lens, pose, depth))
+    return found
+
+
+def _polycam(folder: Path) -> list[KnownCamera]:
+    """Polycam's raw data: a JSON a camera with its matrix as t_00 to t_23 (OpenGL axes, y up), depth in millimetres."""
+    corrected = (folder / "corrected_cameras").is_dir() and (folder / "corrected_images").is_dir()
+    cameras, images = (folder / (("corrected_" if corrected else "") + name) for name in ("cameras", "images"))
+    found = []
+    for path in sorted(cameras.glob("*.json")):
+        about = json.loads(path.read_text(encoding="utf-8"))
+        photo = next((p for p in sorted(images.glob(path.stem + ".*"))), None)
+        if photo is None:
+            continue
+        pose = np.array([[about[f"t_{row}{column}"] for column in range(4)] for row in range(3)], float)
+        depth, sure = (folder / name / f"{path.stem}.png" for name in ("depth", "confidence"))
+        found.append(pinhole(
+            photo.relative_to(folder).as_posix(), (int(about["width"]), int(about["height"])),
+            (about["fx"], about["fy"], about["cx"], about["cy"]), pose,
+            DepthFile(depth, None, sure if sure.is_file() else None) if depth.is_file() else None,
+        ))  # fmt: skip
+    return found
+
+
+def unpack(archive: Path, folder: Path) -> None:
+    """Unpacks a zipped capture.
+
+    Raises:
+        SdfsimError: not a zip, or damaged.
+    """
+    try:
+        with zipfile.ZipFile(archive) as file:
+            file.extractall(folder)  # which leaves out what would lie outside
+    except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
+        raise SdfsimError(f"{archive}: cannot be unpacked: {error}", "export the capture again") from error
+
+
+def spread(photos: Sequence[Path], cameras: dict[Path, KnownCamera], most: int = MOST) -> list[Path]:
+    """At most `most` photos of a recording, evenly along the way of its camera, of each stretch the sharpest."""
+    if len(photos) <= most:
+        return list(photos)
+    centers = np.array([cameras[p].center for p in photos])
+    ahead = np.array([cameras[p].rotation[2] for p in photos])
+    turned = np.arccos(np.clip((ahead[1:] * ahead[:-1]).sum(1), -1, 1))
+    way = np.append(0, np.cumsum(np.linalg.norm(np.diff(centers, axis=0), axis=1) + TURN * turned))
+    stretch = np.minimum((way / max(way[-1], 1e-9) * most).astype(int), most - 1)
+    chosen = []
+    for number in np.unique(stretch):
+        members = np.flatnonzero(stretch == number)
+        some = members[np.linspace(0, len(members) - 1, min(TRIED, len(members))).round().astype(int)]
+        chosen.append(max(some, key=lambda k: sharpness(read_photo(photos[k], 640).pixels)))
+    return [photos[k] for k in chosen]
+
+
+def save_capture(capture: Capture, folder: Path) -> None:
+    """Writes `capture.json`."""
+    write_json(folder / CAPTURE, {"version": 1, **asdict(capture)})
+
+
+def load_capture(folder: Path) -> Capture | None:
+    """What the capture behind a folder of prepared photos says; None: these were just photos.
+
+    Raises:
+        SdfsimError: damaged.
+    """
+    path = Path(folder) / CAPTURE
+    if not path.exists():
+        return None
+    content = read_json(path)
+    try:
+        return Capture(str(content["app"]), None if content["up"] is None else tuple(map(float, content["up"])))
+    except (KeyError, TypeError, ValueError) as error:
+        raise SdfsimError(f"{path}: damaged", "run the photos stage again") from error

@@ -1,0 +1,108 @@
+"""Depth maps that came with photos: their files, and which of their pixels can be believed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sdfsim.errors import SdfsimError
+
+FARTHEST = 8.0  # m; a phone's sensor guesses beyond
+# Neighbours whose depths differ by more than this share lie on both sides of an edge, which sensors smear.
+EDGE = 0.04
+BELIEVED = 0.5  # of the highest confidence
+EXTRA = "install what reads it: bash scripts/setup.sh record3d (or pip install 'sdfsim[record3d]')"
+
+
+@dataclass(frozen=True)
+class DepthFile:
+    """Where the depth of a photo is kept.
+
+    Attributes:
+        path: PNG or TIFF of integers, EXR, NPY, or Record3D's compressed floats (`.depth`).
+        unit: m that a count stands for; None: integers are millimetres, floats metres.
+        confidence: file of the same shape, higher is better; None: there is none.
+        shape: rows and columns, of a file that does not say so itself.
+    """
+
+    path: Path
+    unit: float | None = None
+    confidence: Path | None = None
+    shape: tuple[int, int] | None = None
+
+    def files(self) -> list[Path]:
+        """The files that this depth is read from."""
+        return [self.path] + ([self.confidence] if self.confidence else [])
+
+
+def read_depth(file: DepthFile) -> np.ndarray:
+    """Depth [H, W] m along the optical axis; 0 where the sensor had none, was not sure, or saw an edge.
+
+    Raises:
+        SdfsimError: the file is not there, damaged, or of a kind that needs a package which is not installed.
+    """
+    counts = _read(file.path, file.shape, np.float32)
+    unit = file.unit if file.unit is not None else (1e-3 if counts.dtype.kind in "ui" else 1.0)
+    depth = counts.astype(np.float32) * np.float32(unit)
+    good = np.isfinite(depth) & (depth > 0) & (depth < FARTHEST)
+    if file.confidence is not None:
+        confidence = _read(file.confidence, file.shape, np.uint8)
+        if confidence.shape != depth.shape:
+            raise SdfsimError(f"{file.confidence}: shaped {confidence.shape}, its depth {depth.shape}")
+        good &= confidence >= BELIEVED * confidence.max()
+    depth = np.where(good, depth, 0)
+    return np.where(good & ~_edges(depth), depth, 0).astype(np.float32)
+
+
+def _edges(depth: np.ndarray) -> np.ndarray:
+    """Pixels [H, W] one of whose four neighbours is much nearer or farther."""
+    found = np.zeros(depth.shape, bool)
+    for axis in (0, 1):
+        a, b = (np.moveaxis(depth, axis, 0)[part] for part in (slice(None, -1), slice(1, None)))
+        jump = (a > 0) & (b > 0) & (np.abs(a - b) > EDGE * np.minimum(a, b))
+        at = np.moveaxis(found, axis, 0)
+        at[:-1] |= jump
+        at[1:] |= jump
+    return found
+
+
+def _read(path: Path, shape: tuple[int, int] | None, raw: type) -> np.ndarray:
+    """The numbers [H, W] of a file, `raw` ones where it does not say what they are."""
+    try:
+        if path.suffix in (".depth", ".conf"):
+            values = _compressed(path, raw).reshape(shape or (-1,))
+        elif path.suffix.lower() == ".exr":
+            values = _exr(path)
+        elif path.suffix.lower() == ".npy":
+            values = np.load(path, allow_pickle=False)
+        else:
+            import cv2
+
+            values = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    except (OSError, ValueError, RuntimeError) as error:
+        raise SdfsimError(f"{path}: cannot be read as depth: {error}", "export the capture again") from error
+    if values is None or np.squeeze(values).ndim != 2:
+        raise SdfsimError(f"{path}: no picture with one channel", "depth is a PNG of 16 bits, an EXR or an NPY")
+    return np.squeeze(values)
+
+
+def _compressed(path: Path, raw: type) -> np.ndarray:
+    """Numbers that Record3D packed by LZFSE."""
+    try:
+        import imagecodecs
+    except ImportError as error:
+        raise SdfsimError(f"{path}: compressed by LZFSE, which needs the package imagecodecs", EXTRA) from error
+    return np.frombuffer(imagecodecs.lzfse_decode(path.read_bytes()), raw)
+
+
+def _exr(path: Path) -> np.ndarray:
+    """The first channel of an EXR."""
+    try:
+        import OpenEXR
+    except ImportError as error:
+        raise SdfsimError(f"{path}: an EXR needs the package OpenEXR", EXTRA) from error
+    with OpenEXR.File(str(path)) as file:
+        pixels = next(iter(file.channels().values())).pixels
+    return pixels if pixels.ndim == 2 else pixels[..., 0]
