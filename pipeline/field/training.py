@@ -31,6 +31,7 @@ from pipeline.field.rendering import (
 from pipeline.inputs.images import BACKDROP
 from pipeline.inputs.photos import load_photos
 from pipeline.progress import Progress, quiet, share_of
+from pipeline.sfm.depth import depth_points, depth_scale
 from pipeline.sfm.supervision import FreeSpace, Supervision, supervision_of, unit_sphere_of
 from sdfsim.errors import SdfsimError
 from sdfsim.files import replacing, write_json
@@ -62,6 +63,7 @@ class Settings:
         eikonal: weight of (|grad| - 1)^2.
         curvature: weight of |Laplacian| at the start, in units of the finest active cell.
         sparse: weight of |sdf| at the points of structure-from-motion.
+        depth: weight of |sdf| at the points of a depth sensor.
         free: weight of what is solid between a camera and a point that it sees.
         mask: weight of the opacity loss where photos have masks.
         surface_points: points of the eikonal loss.
@@ -78,6 +80,7 @@ class Settings:
     eikonal: float = 0.1
     curvature: float = 0.01
     sparse: float = 0.3
+    depth: float = 0.3
     free: float = 1.0
     mask: float = 0.3
     surface_points: int = 512
@@ -128,6 +131,7 @@ class Trainer:
             torch.tensor(values, dtype=torch.float32, device=device)
             for values in (supervision.points, supervision.weights)
         )
+        self.depth = torch.tensor(supervision.depth, dtype=torch.float32, device=device)
         self.free = FreeSpace(supervision.sight if settings.free else supervision.sight[:0], device)
         self.field, self.optimizer = self.fresh()
         self.iteration = 0
@@ -224,8 +228,9 @@ class Trainer:
         slopes = self.slope_queries(self.regularised(samples, rng))
         pick = torch.randint(max(1, len(self.points)), (min(256, len(self.points)),), generator=rng).to(self.device)
         empty, clearance = self.free.pick(512, rng)
+        measured = torch.randint(max(1, len(self.depth)), (min(512, len(self.depth)),), generator=rng).to(self.device)
         # One query for all: each would otherwise fill a gradient buffer as large as the grids.
-        parts = [samples.points.view(-1, 3), slopes, self.points[pick], empty]
+        parts = [samples.points.view(-1, 3), slopes, self.points[pick], empty, self.depth[measured]]
         sdf, geometry, more = (
             values.split([len(part) for part in parts]) for values in field.geometry_at(torch.cat(parts))
         )
@@ -242,6 +247,8 @@ class Trainer:
             losses["sparse"] = pull.mean() * settings.sparse
         if len(empty):
             losses["free"] = torch.relu(clearance - sdf[3]).mean() * settings.free
+        if len(measured):
+            losses["depth"] = sdf[4].abs().clamp_max(0.1).mean() * settings.depth
         self.optimizer.zero_grad(set_to_none=True)
         torch.stack(list(losses.values())).sum().backward()
         for group in self.optimizer.param_groups:
@@ -397,13 +404,18 @@ def train(
         SdfsimError: the loss is no longer finite.
     """
     out = Path(out)
-    masked = all(photo.mask for photo in load_photos(photos_folder))
+    photos = load_photos(photos_folder)
+    masked = all(photo.mask for photo in photos)
     to_unit = unit_sphere_of(views, sparse, masked=masked)
     local = [to_unit.view(view) for view in views]
     test = held_out(len(views))
     training = [v for i, v in enumerate(local) if i not in test]
     rays = load_rays(training, photos_folder, settings.long_side, masks=masked)
-    supervision = supervision_of(sparse, local, to_unit)
+    depth, agreed = None, {}
+    if any(photo.depth for photo in photos):
+        agreed = depth_scale(views, sparse, depth_points(views, photos, photos_folder))
+        depth = depth_points(views, photos, photos_folder, scale=agreed["scale"])
+    supervision = supervision_of(sparse, local, to_unit, depth)
     make = MlpTrainer if isinstance(settings.size, MlpSize) else Trainer
     trainer = make(settings, rays, supervision, seed, device)
     checkpoint = out / "checkpoint.safetensors"
@@ -443,6 +455,7 @@ def train(
         "iterations": trainer.iterations, "rays": len(rays), "train_seconds": round(trainer.seconds, 1),
         "seconds_before": round(before, 1), "resumed": resumed, "masked": masked, "beta": trainer.beta,
         "threads": torch.get_num_threads(), "losses": {k: round(v, 5) for k, v in smooth.items()}, **scores,
+        "depth": agreed,
     }  # fmt: skip
     trained = Trained(trainer.field.cpu(), trainer.beta, to_unit, report)
     save_field(trained, out)

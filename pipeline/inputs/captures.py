@@ -167,6 +167,9 @@ def load_capture(folder: Path) -> Capture | None:
         return None
     content = read_json(path)
     try:
-        return Capture(str(content["app"]), None if content["up"] is None else tuple(map(float, content["up"])))
+        if content["up"] is None:
+            return Capture(str(content["app"]), None)
+        x, y, z = map(float, content["up"])
+        return Capture(str(content["app"]), (x, y, z))
     except (KeyError, TypeError, ValueError) as error:
         raise SdfsimError(f"{path}: damaged", "run the photos stage again") from error

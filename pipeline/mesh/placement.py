@@ -21,6 +21,7 @@ from sdfsim.shape.mesh import Mesh
 
 # Degrees up to which gravity is known well, or well enough to look right: would a ball roll off a level table?
 CONFIDENT = {"high": 2.0, "medium": 6.0}
+GRAVITY = 1.0  # degrees within which a phone knows it
 FLOORS = 0.5  # degrees within which floors and tables are level
 # A pixel may miss what it is meant to show by these shares of the width; farther off by the factor is behind it.
 NEARBY, BEHIND = (0.0, 0.008, 0.016, 0.024), 1.1
@@ -34,7 +35,7 @@ class Placement:
 
     Attributes:
         to_metres: from normalised space to metres, z up.
-        up_from: "plane" or "cameras".
+        up_from: "plane", "cameras", or in words what measured it.
         size_from: where the scale comes from, in words.
         up_within: degrees within which up can be trusted.
     """
@@ -73,7 +74,7 @@ def load_placement(mesh_folder: Path) -> Placement:
 
 
 class Up(NamedTuple):
-    """Up in normalised space: a unit vector [3], "plane" or "cameras", and degrees within which it can be trusted."""
+    """Up in normalised space: a unit vector [3], where it is from, and degrees within which it can be trusted."""
 
     direction: np.ndarray
     source: str
@@ -176,7 +177,7 @@ def level(shown: Mesh, views: list[View], up: np.ndarray) -> np.ndarray:
 
 
 def place(shown: Mesh, views: list[View], scale: tuple[float, str] | None = None, *, size: float | None = None,
-          alone: bool = False) -> Placement:  # fmt: skip
+          alone: bool = False, up: Up | None = None) -> Placement:  # fmt: skip
     """Chooses up, scale and origin: the floor is z = 0 and the middle of the visible surface is over the origin.
 
     Args:
@@ -185,8 +186,9 @@ def place(shown: Mesh, views: list[View], scale: tuple[float, str] | None = None
         scale: metres a normalised unit and where that comes from, if it is known; else `size` sets it.
         size: widest side of the box around the visible surface, m; None means 1 m, and says so in `size_from`.
         alone: there is no scenery: the floor is where the lowest point is.
+        up: where it was measured; else it is looked for.
     """
-    up = find_up(shown, views)
+    up = up or find_up(shown, views)
     rotation = level(shown, views, up.direction)
     turned = shown.vertices @ rotation.T
     if scale is None:

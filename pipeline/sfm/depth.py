@@ -51,7 +51,7 @@ def depth_points(views: list[View], photos: list[Photo], folder: Path, *, scale:
         try:
             depth = np.load(folder / "depth" / f"{view.name}.npy")
         except (OSError, ValueError) as error:
-            raise SdfsimError(f"{folder}: cannot read the depth of {view.name}", "run the photos stage again") from error
+            raise SdfsimError(f"{folder}: no depth of {view.name}", "run the photos stage again") from error
         row, column = np.nonzero(depth)
         shape = np.array(photo.original) / depth.shape[::-1]
         at = photo.prepared((np.stack([column, row], 1) + 0.5) * shape, view)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from pipeline.cameras import Similarity, Sparse, View, nearest_to_axes
 from pipeline.field.interpolation import interpolate
+from pipeline.sfm.depth import DepthPoints
 
 # Lines of sight end this far before their points, normalised units.
 GAP = 0.015
@@ -17,6 +18,7 @@ GAP = 0.015
 CLEARANCE, SLOPE = 0.02, 0.1
 # Free space counts as filled where the field is below this; between, it may be its coarseness.
 FILLED, JUST_EMPTY = -0.004, 0.002
+DEPTH_POINTS, DEPTH_LINES = 500_000, 60_000  # of a depth sensor, that are used
 TRIES = 16  # places along each line at which filled free space is looked for
 
 
@@ -28,20 +30,25 @@ class Supervision:
         points: [P, 3] surface points in the unit sphere.
         weights: [P] how far each is trusted, mean 1.
         sight: [L, 6] starts and ends of stretches of free space.
+        depth: [D, 3] points of a depth sensor in the unit sphere.
     """
 
     points: np.ndarray
     weights: np.ndarray
     sight: np.ndarray
+    depth: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
 
 
-def supervision_of(sparse: Sparse, views: list[View], to_unit: Similarity) -> Supervision:
+def supervision_of(
+    sparse: Sparse, views: list[View], to_unit: Similarity, depth: DepthPoints | None = None
+) -> Supervision:
     """Sparse points seen by three views or more with a small error, and their lines of sight within the sphere.
 
     Args:
         sparse: in the world of the poses.
         views: in the space of the unit sphere.
         to_unit: from one to the other.
+        depth: of a sensor, in the world of the poses; its pixels are lines of sight as well.
     """
     points = to_unit.points(sparse.xyz)
     seen = np.bincount(sparse.point_of, minlength=len(points))
@@ -49,7 +56,16 @@ def supervision_of(sparse: Sparse, views: list[View], to_unit: Similarity) -> Su
     inside = good & (np.linalg.norm(points, axis=1) < 1.0)
     weights = point_weights(sparse, len(points))[inside]
     use = good[sparse.point_of]
-    end, start = points[sparse.point_of[use]], np.array([v.center for v in views]).reshape(-1, 3)[sparse.view_of[use]]
+    centers = np.array([v.center for v in views]).reshape(-1, 3)
+    end, start = points[sparse.point_of[use]], centers[sparse.view_of[use]]
+    measured = np.zeros((0, 3))
+    if depth is not None:
+        rng = np.random.default_rng(0)
+        some = rng.permutation(len(depth.xyz))
+        measured = to_unit.points(depth.xyz[some])
+        end = np.concatenate([end, measured[:DEPTH_LINES]])
+        start = np.concatenate([start, centers[depth.view[some[:DEPTH_LINES]]]])
+        measured = measured[np.linalg.norm(measured, axis=1) < 1.0][:DEPTH_POINTS]
     length = np.linalg.norm(end - start, axis=1)
     direction = (end - start) / np.maximum(length, 1e-9)[:, None]
     along = -(start * direction).sum(1)
@@ -58,7 +74,8 @@ def supervision_of(sparse: Sparse, views: list[View], to_unit: Similarity) -> Su
     low, high = np.maximum(along - half, 0), np.minimum(along + half, length - GAP)
     crosses = (half > 0) & (high > low + 0.02)
     sight = np.concatenate([start + low[:, None] * direction, start + high[:, None] * direction], 1)[crosses]
-    return Supervision(points[inside], weights / max(float(weights.mean()), 1e-9) if len(weights) else weights, sight)
+    weights = weights / max(float(weights.mean()), 1e-9) if len(weights) else weights
+    return Supervision(points[inside], weights, sight, measured)
 
 
 class FreeSpace:

@@ -20,7 +20,6 @@ import numpy as np
 
 from sdfsim.files import write_arrays, write_json
 
-
 # Px that a point may be off while known cameras are refined, and points that a camera needs to be moved.
 REFINE_PIXELS, REFINE_POINTS = (16.0, 6.0), 30
 

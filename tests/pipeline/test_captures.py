@@ -1,0 +1,233 @@
+"""Captures of phones, written by ourselves from the bundled set in each app's layout, against its true cameras."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipeline.cameras import Similarity, Sparse, View, load_views
+from pipeline.inputs.captures import UP, load_capture, spread
+from pipeline.inputs.depth import DepthFile, read_depth
+from pipeline.inputs.known_cameras import pinhole
+from pipeline.inputs.photos import KNOWN_CAMERAS, Photo, load_photos, prepare_photos
+from pipeline.inputs.sources import find_source
+from pipeline.mesh.placement import Up, place
+from pipeline.sfm.depth import DepthPoints, depth_points, depth_scale
+from pipeline.sfm.poses import solve
+from sdfsim.errors import SdfsimError
+from sdfsim.shape.mesh import Mesh
+from tests.pipeline.photo_sets import SAMPLES, TABLE_VASE
+
+sys.path.insert(0, str(SAMPLES))
+import phone
+
+EVERY = 6
+
+
+def capture(layout: str, folder: Path, **more) -> Path:
+    out = folder / ("capture.r3d" if layout == "record3d" else layout)
+    phone.write(layout, out, every=EVERY, **more)
+    return out / "transforms.json" if layout == "nerfstudio" else out
+
+
+def true_poses() -> list[np.ndarray]:
+    """Camera to world [4, 4], OpenGL axes, in a world with y up."""
+    frames = json.loads((TABLE_VASE / "transforms.json").read_text())["frames"][::EVERY]
+    return [phone.TO_ARKIT @ np.array(frame["transform_matrix"]) for frame in frames]
+
+
+@pytest.mark.parametrize("layout", phone.LAYOUTS)
+def test_every_layout_gives_the_same_cameras_and_depth(layout, tmp_path):
+    given = capture(layout, tmp_path, exact=True)
+    out = tmp_path / "photos"
+    out.mkdir()
+    photos, _ = prepare_photos(given, out)
+    views, poses = load_views(out / KNOWN_CAMERAS), true_poses()
+    assert len(photos) == len(views) == len(poses)
+    assert photos == load_photos(out) and all(photo.depth for photo in photos)
+    assert not (out / ".capture").exists()
+    found = load_capture(out)
+    assert found is not None and found.up == (None if layout == "nerfstudio" else UP)
+    for view, pose in zip(views, poses, strict=True):
+        np.testing.assert_allclose(view.center, pose[:3, 3], atol=1e-6)
+        np.testing.assert_allclose(view.rotation, np.diag([1, -1, -1]) @ pose[:3, :3].T, atol=1e-6)
+    # The table's top is level at its height wherever the sensor saw it.
+    points = depth_points(views, photos, out)
+    on_table = (
+        (np.abs(points.xyz[:, 0]) < 0.5) & (np.abs(points.xyz[:, 2]) < 0.3) & (np.abs(points.xyz[:, 1] - 0.55) < 0.05)
+    )
+    height = points.xyz[on_table, 1]
+    assert on_table.sum() > 5000
+    assert abs(np.median(height) - 0.55) < 0.002 and np.abs(height - 0.55).mean() < 0.01
+
+
+def test_the_poses_of_a_phone_are_refined(tmp_path):
+    phone.write("polycam", tmp_path / "capture", every=4)
+    folder, out = tmp_path / "photos", tmp_path / "poses"
+    folder.mkdir(), out.mkdir()
+    photos, _ = prepare_photos(tmp_path / "capture", folder)
+    checks = solve(photos, folder, out)
+    frames = json.loads((TABLE_VASE / "transforms.json").read_text())["frames"][::4]
+    true = np.array([(phone.TO_ARKIT @ np.array(frame["transform_matrix"]))[:3, 3] for frame in frames])
+
+    def shape_error(views: list[View]) -> float:
+        """Median m by which the cameras are off after the best similarity: their world is the phone's."""
+        source = np.array([view.center for view in views])
+        a, b = source - source.mean(0), true - true.mean(0)
+        u, d, vt = np.linalg.svd(b.T @ a)
+        turn = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+        return float(np.median(np.linalg.norm(d.sum() / (a**2).sum() * a @ turn.T - b, axis=1)))
+
+    given, found = load_views(folder / KNOWN_CAMERAS), load_views(out)
+    assert shape_error(given) > 0.003
+    assert shape_error(found) < 0.3 * shape_error(given)
+    # As a whole they stay in the phone's world, at its scale.
+    centers = [np.array([view.center for view in views]) for views in (given, found)]
+    np.testing.assert_allclose(centers[0].mean(0), centers[1].mean(0), atol=0.003)
+    assert np.std(centers[0]) == pytest.approx(np.std(centers[1]), rel=2e-3)
+    assert 0.0005 < checks["moved"]["metres"] < 0.03
+
+
+def test_depth_is_read_in_its_unit_where_it_can_be_believed(tmp_path):
+    depth = np.full((6, 8), 1.5)
+    depth[:, 5:] = 2.5  # An edge between columns 4 and 5.
+    depth[0, 0], depth[1, 1] = 0, 20.0
+    sure = np.full((6, 8), 255, np.uint8)
+    sure[5, 7] = 0
+    Image.fromarray((1000 * depth).astype(np.uint16)).save(tmp_path / "mm.png")
+    Image.fromarray(sure).save(tmp_path / "sure.png")
+    np.save(tmp_path / "m.npy", depth.astype(np.float32))
+    wanted = depth.copy()
+    wanted[:, 4:6] = 0
+    wanted[0, 0] = wanted[1, 1] = wanted[5, 7] = 0
+    for file in (
+        DepthFile(tmp_path / "mm.png", None, tmp_path / "sure.png"),
+        DepthFile(tmp_path / "mm.png", 0.001, tmp_path / "sure.png"),
+        DepthFile(tmp_path / "m.npy", None, tmp_path / "sure.png"),
+    ):
+        np.testing.assert_allclose(read_depth(file), wanted, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["no.png", "text.png", "color.png", "text.exr", "text.depth"])
+def test_depth_that_cannot_be_read_is_told_by_its_file(name, tmp_path):
+    if name == "color.png":
+        Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(tmp_path / name)
+    elif name != "no.png":
+        (tmp_path / name).write_text("not a picture")
+    with pytest.raises(SdfsimError, match=name):
+        read_depth(DepthFile(tmp_path / name))
+
+
+def camera(name: str, x: float, width: int = 64, height: int = 48) -> View:
+    """A level camera at x, looking along +z."""
+    return View(name, name, width, height, 60.0, width / 2, height / 2, 0.0, np.eye(3), np.array([-x, 0.0, 0.0]))
+
+
+def photo(name: str, width: int = 64, height: int = 48) -> Photo:
+    return Photo(name, name, width, height, (width, height), None, None, "", False, 0.3, depth=True)
+
+
+def plane_at(tmp_path: Path, away: float) -> tuple[list[View], list[Photo]]:
+    """Two cameras before a plane z = away, with its depth on fewer pixels than the photos have."""
+    (tmp_path / "depth").mkdir()
+    for name in ("a", "b"):
+        np.save(tmp_path / "depth" / f"{name}.npy", np.full((24, 32), away, np.float32))
+    return [camera("a", 0.0), camera("b", 0.3)], [photo("a"), photo("b")]
+
+
+def test_pixels_with_depth_become_points_on_what_they_show(tmp_path):
+    views, photos = plane_at(tmp_path, 2.0)
+    points = depth_points(views, photos, tmp_path, scale=1.5)
+    np.testing.assert_allclose(points.xyz[:, 2], 3.0, rtol=1e-6)
+    for number, view in enumerate(views):
+        mine = points.view == number
+        np.testing.assert_allclose(view.project(points.xyz[mine])[0], points.pixel[mine], atol=1e-6)
+
+
+@pytest.mark.parametrize("factor", [0.9, 1.0, 1.1])
+def test_the_scale_of_depth_is_found_from_triangulated_points(factor, tmp_path):
+    views, photos = plane_at(tmp_path, 2.0)
+    rng = np.random.default_rng(0)
+    xyz = np.column_stack([rng.uniform(-0.5, 0.8, 300), rng.uniform(-0.5, 0.5, 300), np.full(300, 2.0 * factor)])
+    sparse = Sparse(
+        xyz, np.zeros((300, 3), np.uint8), np.zeros(300), np.tile(np.arange(300), 2), np.repeat([0, 1], 300)
+    )
+    found = depth_scale(views, sparse, depth_points(views, photos, tmp_path))
+    assert found["scale"] == pytest.approx(factor, rel=1e-6) and found["spread"] < 1e-6
+    again = depth_points(views, photos, tmp_path, scale=found["scale"])
+    np.testing.assert_allclose(again.xyz[:, 2], 2.0 * factor, rtol=1e-6)
+
+
+def test_depth_in_other_units_is_refused(tmp_path):
+    views, photos = plane_at(tmp_path, 2.0)
+    points = depth_points(views, photos, tmp_path, scale=1e-3)
+    rng = np.random.default_rng(0)
+    xyz = np.column_stack([rng.uniform(-0.5, 0.5, (300, 2)), np.full(300, 2.0)])
+    sparse = Sparse(xyz, np.zeros((300, 3), np.uint8), np.zeros(300), np.arange(300), np.zeros(300, int))
+    with pytest.raises(SdfsimError, match="1e\\+03 times as far"):
+        depth_scale(views, sparse, points)
+
+
+def test_depth_of_another_shape_is_refused(tmp_path):
+    given = capture("polycam", tmp_path, exact=True)
+    depth = sorted((given / "keyframes" / "depth").iterdir())[2]
+    Image.fromarray(np.full((256, 192), 1000, np.uint16)).save(depth)
+    (given / "keyframes" / "confidence" / depth.name).unlink()
+    out = tmp_path / "photos"
+    out.mkdir()
+    with pytest.raises(SdfsimError, match=f"{depth.name}: shaped 192 x 256"):
+        prepare_photos(given, out)
+
+
+def test_a_long_recording_is_thinned_along_its_way_to_its_sharpest_frames(tmp_path):
+    import cv2
+
+    pixels = np.random.default_rng(0).integers(0, 255, (96, 128, 3), dtype=np.uint8)
+    soft = cv2.GaussianBlur(pixels, (0, 0), 4)
+    photos, cameras = [], {}
+    for number in range(40):
+        path = tmp_path / f"{number:03d}.png"
+        Image.fromarray(pixels if number % 4 == 3 else soft).save(path)
+        # The camera stands still for a while: these frames are one stretch.
+        pose = np.column_stack([np.eye(3), [max(0, number - 20), 0.0, 0.0]])
+        photos.append(path)
+        cameras[path] = pinhole(path.name, (128, 96), (100, 100, 64, 48), pose)
+    chosen = [photos.index(path) for path in spread(photos, cameras, most=5)]
+    assert len(chosen) == 5 and chosen[0] <= 23 and chosen == sorted(set(chosen))
+    assert all(number % 4 == 3 for number in chosen)
+    assert spread(photos, cameras, most=40) == photos
+
+
+def test_scale_and_gravity_come_from_the_capture():
+    plane = Mesh(np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))
+    views = [replace(camera("a", 0.0), translation=np.array([0.0, 0, 3.0]))]
+    up = np.array([0.0, np.sin(0.2), np.cos(0.2)])  # A ramp: the only plane is not level.
+    placement = place(plane, views, (0.5, "metres of an app"), up=Up(up, "gravity of an app", 1.0))
+    np.testing.assert_allclose(placement.to_metres.rotation @ up, [0, 0, 1], atol=1e-12)
+    assert placement.to_metres.scale == 0.5 and placement.up_within == 1.0
+    assert isinstance(placement.to_metres, Similarity)
+
+
+def test_what_is_no_capture_is_told(tmp_path):
+    broken = tmp_path / "a.r3d"
+    broken.write_text("no zip")
+    out = tmp_path / "out"
+    out.mkdir()
+    with pytest.raises(SdfsimError, match=r"a\.r3d: cannot be unpacked"):
+        prepare_photos(broken, out)
+    given = capture("polycam", tmp_path)
+    file = sorted((given / "keyframes" / "cameras").iterdir())[0]
+    file.write_text("{}")
+    with pytest.raises(SdfsimError, match="cannot be read as a capture"):
+        find_source(given)
+
+
+def test_points_of_depth_are_an_empty_set_without_depth(tmp_path):
+    found = depth_points([camera("a", 0.0)], [replace(photo("a"), depth=False)], tmp_path)
+    assert isinstance(found, DepthPoints) and found.xyz.shape == (0, 3)
