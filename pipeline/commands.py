@@ -32,6 +32,15 @@ Crop = Annotated[
         metavar="X,Y,Z X,Y,Z", help="Corners of the box to keep, metres, the lower one first.", show_default=False
     ),
 ]
+Materials = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--material",
+        metavar="BODY=MATERIAL",
+        help="What a body is made of: object1=wood, or object1=ceramic:4mm where it is hollow. Can be repeated.",
+        show_default=False,
+    ),
+]
 DropShape = Annotated[Literal["box", "ball", "none"], typer.Option("--drop", help="What falls onto the scene.")]
 
 
@@ -48,13 +57,14 @@ def reconstruct(
     distance: Distance = None,
     crop: Crop = None,
     drop: DropShape = "box",
+    material: Materials = None,
     budget: Budget = None,
     as_json: Json = False,
     device: Device = "auto",
     verbose: Verbose = False,
 ) -> None:
     """Photos -> a scene that can be simulated, by all stages."""
-    corners = _corners(crop)
+    corners, materials = _corners(crop), _by_body(material or [])
     with Session(as_json=as_json, verbose=verbose) as session:
         from pipeline import stages
 
@@ -66,6 +76,7 @@ def reconstruct(
             distance=list(distance) if distance else None,
             crop=corners,
             drop=drop,
+            material=materials,
             budget=budget,
             from_stage=first,
             until_stage=last,
@@ -134,6 +145,17 @@ def _corners(crop: tuple[str, str] | None) -> list[float] | None:
     if [len(corner) for corner in corners] != [3, 3]:
         raise typer.BadParameter(f"--crop takes two corners X,Y,Z in metres (got {' '.join(crop)})")
     return corners[0] + corners[1]
+
+
+def _by_body(materials: list[str]) -> dict[str, str]:
+    """Materials by the body's name, from texts BODY=MATERIAL."""
+    pairs = [text.partition("=") for text in materials]
+    for text, (body, _, material) in zip(materials, pairs, strict=True):
+        if not body or not material:
+            raise typer.BadParameter(f"--material takes BODY=MATERIAL, such as object1=wood (got {text})")
+    if len({body for body, _, _ in pairs}) < len(pairs):
+        raise typer.BadParameter(f"--material names a body twice (got {' '.join(materials)})")
+    return {body: material for body, _, material in pairs}
 
 
 def fit(

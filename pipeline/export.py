@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from pipeline.materials import Choice
 from pipeline.mesh.cleaning import joined
 from pipeline.mesh.meshing import SCENERY, TEXTURED, read_parts, rounded
 from pipeline.mesh.placement import Placement, load_placement
@@ -19,15 +20,16 @@ from pipeline.mesh.visibility import Caster
 from pipeline.progress import Progress, quiet
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.files import write_text
+from sdfsim.scene.scene import Scene
+from sdfsim.scene.scene_file import load_scene, nearest
 from sdfsim.shape.mesh import Mesh, load_mesh, read_glb
 
 SCENERY_SHARE = 2  # Of a budget the scenery gets as much as this many bodies: it has more to it.
-DENSITY = 400.0  # kg/m^3, wood: no photo tells what a thing is made of
-SURFACE = "friction: 0.8, restitution: 0.4"
 SIDE = 0.06  # of the dropped slab, as a share of the scenery's widest side
 THICKNESS = 0.5  # of the slab, as a share of its side; a cube tips over more easily
 LEVEL = 10.0  # degrees; far below what friction holds, as learned contacts creep on slopes
 BUMP = 0.06  # how far a level place may stick out of its plane, as a share of the side
+FLOOR = "motion: static, plane: {normal: [0, 0, 1], offset: 0.0}"
 UNSEEN = 0.1  # share of the slab's footprint that photos may leave out
 GAP = 0.3  # of the fall, as a share of the side
 
@@ -123,21 +125,23 @@ def origin_of(mesh: Mesh) -> np.ndarray:
 
 
 def write_scene(
-    mesh_folder: Path, scene_file: Path, *, drop: str = "box", written: str | None = None, seed: int = 0
-) -> dict:
-    """Writes scene.yaml for the meshes of a mesh folder; returns the stage's report.
+    mesh_folder: Path, scene_file: Path, *, drop: str = "box", materials: dict[str, Choice] | None = None,
+    written: str | None = None, seed: int = 0,
+) -> dict:  # fmt: skip
+    """Writes scene.yaml for the meshes of a mesh folder and the shapes beside it; returns the stage's report.
 
     A scene file that the user has changed is kept beside it as `scene.yaml.bak`.
 
     Args:
         mesh_folder: of the mesh stage.
-        scene_file: to write.
+        scene_file: to write, in the folder that holds `assets` of the fit stage.
         drop: what falls onto the scene: box, ball or none.
+        materials: by the name of a body in scene.yaml, what it is made of; all others are assumed.
         written: hash of the scene file as this function last wrote it; None where it never did.
         seed: of the scene.
 
     Raises:
-        SdfsimError: the mesh stage has not run.
+        SdfsimError: the mesh or the fit stage has not run, or a material is for a body that there is not.
     """
     mesh_folder = Path(mesh_folder)
     parts, placement = read_parts(mesh_folder), load_placement(mesh_folder)
@@ -151,7 +155,15 @@ def write_scene(
         if slab.slope > LEVEL:
             notes.append(f"no level place to drop a body onto: the flattest slopes by {slab.slope:.0f} degrees")
     origins = {name: origin_of(mesh) for name, mesh in solids.items()}
-    text = scene_text(placement, origins, slab, scenery=parts["scenery"], drop=drop, seed=seed)
+    materials = materials or {}
+    text = scene_text(placement, origins, slab, scenery=parts["scenery"], drop=drop, materials=materials, seed=seed)
+    scene = load_scene(scene_file, text=text, allow_outside=True)
+    names = [body.name for body in scene.bodies]
+    for name in materials:
+        if name not in names:
+            raise SdfsimError(
+                f"material: no body is called {name!r}{nearest(name, names)}", "the bodies are " + ", ".join(names)
+            )
     if scene_file.exists() and content_hash(scene_file.read_bytes()) not in (written, content_hash(text.encode())):
         numbers = itertools.chain([""], itertools.count(2))
         names = (scene_file.with_name(f"{scene_file.name}.bak{n}") for n in numbers)
@@ -160,10 +172,33 @@ def write_scene(
         notes.append(f"{scene_file.name} had been changed by hand: kept as {kept.name}")
     write_text(scene_file, text)
     return {
-        "objects": list(solids), "density_assumed": DENSITY, "size": placement.size_from,
+        "objects": list(solids), "bodies": bodies_of(scene, materials), "size": placement.size_from,
         "drop": {"shape": drop, **(asdict(slab) if slab else {})}, "notes": notes,
         "scene_sha256": content_hash(text.encode()),
     }  # fmt: skip
+
+
+def bodies_of(scene: Scene, materials: dict[str, Choice]) -> dict[str, dict]:
+    """What the report says of each body that can move or has a material.
+
+    Args:
+        scene: as loaded.
+        materials: by body; all others are assumed.
+
+    Returns:
+        By body: `material`, `friction`, `restitution`; of those that can move also `density` kg/m^3, `wall` m (None of
+        solid ones), `volume` m^3 of what has mass, and `mass` kg.
+    """
+    found = {}
+    for body in scene.bodies:
+        choice = materials.get(body.name, Choice())
+        told: dict = {"material": choice.name, "friction": body.friction, "restitution": body.restitution}
+        if body.motion == "dynamic":
+            volume = scene.shapes[body.shape].volume
+            told |= {"density": body.mass / volume, "wall": choice.wall, "volume": volume, "mass": body.mass}
+        if body.motion == "dynamic" or body.name in materials:
+            found[body.name] = told
+    return found
 
 
 def _names(parts: dict) -> list[str]:
@@ -176,7 +211,7 @@ def content_hash(content: bytes) -> str:
 
 
 def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab | None, *, scenery: bool = True,
-               drop: str = "box", seed: int = 0) -> str:  # fmt: skip
+               drop: str = "box", materials: dict[str, Choice] | None = None, seed: int = 0) -> str:  # fmt: skip
     """The text of scene.yaml: a floor, the scenery, the bodies that were found, and one dropped from above.
 
     Args:
@@ -185,25 +220,40 @@ def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab 
         slab: where the dropped body starts; None leaves it out.
         scenery: whether there is any.
         drop: shape of what is dropped, box or ball.
+        materials: by body; those of no body are passed over.
         seed: of the scene.
     """
-    source = "the dominant plane" if placement.up_from == "plane" else "the cameras"
+    source = {"plane": "the dominant plane", "cameras": "the cameras"}.get(placement.up_from, placement.up_from)
     assumed = " (give --size or --distance for true metres)" if placement.size_from.startswith("assumed") else ""
+    made = materials or {}
     shapes: list[str] = []
-    bodies = ["  - {name: floor, motion: static, plane: {normal: [0, 0, 1], offset: 0.0}}"]
+    bodies: list[str] = []
+
+    def add(name: str, keys: str, shape: dict | None = None) -> None:
+        choice = made.get(name, Choice())
+        density = f"density: {choice.material.density:g}, " if shape and name != SCENERY else ""
+        surface = f"friction: {choice.material.friction:g}, restitution: {choice.material.restitution:g}"
+        if shape:
+            wall = {} if choice.wall is None else {"wall": float(rounded(choice.wall))}
+            shapes.append(f"  {name}: {_flow(shape | wall)}")
+            keys = f"shape: {name}, {keys}"
+        thick = f", a wall of {1000 * choice.wall:g} mm" if choice.wall else ""
+        known = f"{choice.name}{thick}. From: {choice.material.source}"
+        bodies.append(f"  # {known if name in made else 'assumed: no photo tells the material (give --material)'}")
+        bodies.append(f"  - {{name: {name}, {keys}, {density}{surface}}}")
+
+    if "floor" in made:
+        add("floor", FLOOR)
+    else:
+        bodies.append(f"  - {{name: floor, {FLOOR}}}")
     if scenery:
-        shapes.append("  scene: {asset: assets/scene}")
-        bodies.append(f"  - {{name: scene, shape: scene, motion: static, {SURFACE}}}")
+        add(SCENERY, "motion: static", {"asset": "assets/scene"})
     for name, origin in origins.items():
-        shapes.append(f"  {name}: {{asset: assets/{name}}}")
-        position = _flow(rounded(origin).tolist())
-        bodies.append(f"  - {{name: {name}, shape: {name}, position: {position}, density: {DENSITY:g}, {SURFACE}}}")
+        add(name, f"position: {_flow(rounded(origin).tolist())}", {"asset": f"assets/{name}"})
     if slab is not None:
         box = {"box": {"size": rounded((slab.side, slab.side, slab.thickness)).tolist()}}
         ball = {"sphere": {"radius": float(rounded(slab.thickness / 2))}}
-        shapes.append(f"  {drop}: {_flow(box if drop == 'box' else ball)}")
-        position = _flow(rounded(slab.position).tolist())
-        bodies.append(f"  - {{name: {drop}, shape: {drop}, position: {position}, density: {DENSITY:g}, {SURFACE}}}")
+        add(drop, f"position: {_flow(rounded(slab.position).tolist())}", box if drop == "box" else ball)
     return "\n".join([
         f"# Reconstructed from photos. Up from {source}, within {placement.up_within:.1f} degrees "
         f"(confidence: {placement.up_confidence}).",

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
+from pipeline.materials import choose
 from sdfsim.errors import SdfsimError
 from sdfsim.files import CONFIG, write_text
 
@@ -37,6 +38,7 @@ class Options:
             the surface that this pixel shows, or `photo.jpg`, the camera itself.
         crop: m, corners x, y, z, x, y, z of the box that is kept; None: everything.
         drop: what is dropped onto the scene: box, ball or none.
+        material: by body, what it is made of, such as `ceramic`, or `ceramic:4mm` for a hollow body's wall.
     """
 
     photos: str = ""
@@ -49,6 +51,7 @@ class Options:
     distance: list | None = None
     crop: list[float] | None = None
     drop: str = "box"
+    material: dict[str, str] = field(default_factory=dict)
 
     def check(self) -> None:
         """Raises SdfsimError where a value makes no sense."""
@@ -70,6 +73,7 @@ class Options:
                 f"crop: the second corner must lie beyond the first in x, y and z (got {self.crop})",
                 "corners are x,y,z in metres, the lower one first",
             )
+        choose(self.material)
 
     def changed(self, changes: dict[str, Any]) -> Options:
         """The options with other values; a new size takes the place of a known distance, and the other way round."""

@@ -139,7 +139,17 @@ def notes(stages: dict[str, dict]) -> list[str]:
         largest = max(mesh["left_out_m"])
         lines.append(f"{len(mesh['left_out_m'])} loose pieces were left out, the largest {largest:.2g} m long")
     lines += [f"usable, not exact: {caveat}" for caveat in stages.get("fit", {}).get("caveats", [])]
+    lines += [f"{name}: {material_line(body)}" for name, body in stages.get("scene", {}).get("bodies", {}).items()]
     return lines + stages.get("scene", {}).get("notes", [])
+
+
+def material_line(body: dict) -> str:
+    """What a body is made of and what it weighs, from an entry of `bodies_of`."""
+    line = f"{body['material']}, friction {body['friction']:g}, restitution {body['restitution']:g}"
+    if "mass" not in body:
+        return line
+    thick = f" in a wall of {1000 * body['wall']:g} mm" if body["wall"] else ""
+    return f"{line}, {body['mass']:.3g} kg ({body['volume']:.3g} m^3{thick}, {body['density']:g} kg/m^3)"
 
 
 def page(report: dict, folder: Path) -> str:

@@ -132,12 +132,14 @@ def do_fit(run: Run, work: Path) -> dict:
 def do_scene(run: Run, work: Path) -> dict:
     """Writes the scene file."""
     from pipeline.export import write_scene
+    from pipeline.materials import choose
 
     before = read_record(run.place("scene"))
     written = before["report"].get("scene_sha256") if before else None
     return write_scene(
-        run.place("mesh"), run.folder / "scene.yaml", drop=run.options.drop, written=written, seed=run.options.seed
-    )
+        run.place("mesh"), run.folder / "scene.yaml", drop=run.options.drop, materials=choose(run.options.material),
+        written=written, seed=run.options.seed,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -164,7 +166,7 @@ STAGES = {
     "distill": Stage(do_distill, "distill", ("preset", "seed", "budget"), 2),
     "mesh": Stage(do_mesh, "mesh", ("preset", "size", "distance", "crop"), 3),
     "fit": Stage(do_fit, "assets", ("seed", "budget", "recipe")),
-    "scene": Stage(do_scene, "scene", ("seed", "drop"), 2),
+    "scene": Stage(do_scene, "scene", ("seed", "drop", "material"), 3),
 }
 
 

@@ -44,14 +44,22 @@ def edge(above: Above, at: np.ndarray, base: float, size: float) -> tuple[np.nda
     return directions[best], float(min(first[best], away[-1]))
 
 
-def throw(body: dict, shape: Shape, above: Above) -> tuple[float, dict]:
-    """Radius m of the ball, and its entry among the bodies."""
+def throw(body: dict, mass: float, friction: float, shape: Shape, above: Above) -> tuple[float, dict]:
+    """Radius m of the ball, and its entry among the bodies.
+
+    Args:
+        body: its entry in scene.yaml.
+        mass: of it, kg.
+        friction: between it and what it stands on.
+        shape: of it.
+        above: the heights of what it stands on.
+    """
     low, high = np.stack([shape.mesh.vertices.min(0), shape.mesh.vertices.max(0)])
     height, wide = float(high[2] - low[2]), float(max(high[:2] - low[:2]))
     base = np.array(body["position"])
     direction, away = edge(above, base[:2], float(base[2]), max(height, wide))
     radius = 0.15 * height
-    friction, bounce = float(body["friction"]) ** 2, float(body["restitution"]) ** 2
+    bounce = float(body["restitution"]) ** 2
     sliding = SPARE * np.sqrt(2 * friction * GRAVITY * away)
     speed = max(SLOWEST, sliding * (1 + HEAVIER) / (HEAVIER * (1 + bounce)))
     flight = wide / 2 + 3 * radius
@@ -61,7 +69,7 @@ def throw(body: dict, shape: Shape, above: Above) -> tuple[float, dict]:
     return radius, {
         "name": "thrown", "shape": "thrown", "position": rounded(start).tolist(),
         "velocity": rounded(velocity).tolist(),
-        "mass": float(rounded(HEAVIER * float(body["density"]) * shape.volume)),
+        "mass": float(rounded(HEAVIER * mass)),
         "friction": body["friction"], "restitution": body["restitution"],
     }  # fmt: skip
 
@@ -72,7 +80,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="of a reconstruction")
     parser.add_argument("body", help="its name in scene.yaml (mesh/objects.png shows the names)")
     arguments = parser.parse_args()
-    load_scene(arguments.folder / "scene.yaml")  # says what is wrong with it
+    loaded = {body.name: body for body in load_scene(arguments.folder / "scene.yaml").bodies}
     scene = yaml.safe_load((arguments.folder / "scene.yaml").read_text(encoding="utf-8"))
     assets = {name: shape["asset"] for name, shape in scene["shapes"].items() if "asset" in shape}
     bodies = [body for body in scene["bodies"] if "plane" in body or body["shape"] in assets]
@@ -83,8 +91,10 @@ def main() -> None:
     if SCENERY not in assets:
         parser.error(f"{arguments.folder}/scene.yaml has no scenery, so there is no edge to knock a body over")
     shapes = {name: load_shape(arguments.folder / asset) for name, asset in assets.items()}
-    radius, ball = throw(target, shapes[target["shape"]], Above(shapes[SCENERY].mesh))
-    scene["shapes"] = {name: {"asset": asset} for name, asset in assets.items()}
+    own = loaded[target["name"]]
+    friction = own.friction * loaded[SCENERY].friction
+    radius, ball = throw(target, own.mass, friction, shapes[target["shape"]], Above(shapes[SCENERY].mesh))
+    scene["shapes"] = {name: scene["shapes"][name] for name in assets}
     scene["shapes"]["thrown"] = {"sphere": {"radius": float(rounded(radius))}}
     scene["bodies"] = [*bodies, ball]
     scene["duration"] = SECONDS

@@ -52,6 +52,16 @@ def test_a_ball_flies_at_the_body_from_behind(tmp_path, monkeypatch, size):
                                atol=1e-3)  # fmt: skip
 
 
+def test_the_ball_is_heavier_than_a_hollow_body_by_the_same_factor(tmp_path, monkeypatch):
+    write(tmp_path, 1.0, scenery=True)
+    text = (tmp_path / "scene.yaml").read_text()
+    (tmp_path / "scene.yaml").write_text(text.replace("asset: assets/object1", "asset: assets/object1\n    wall: 0.05"))
+    knock(tmp_path, "object1", monkeypatch)
+    mass = {body.name: body.mass for body in load_scene(tmp_path / "knock.yaml").bodies}
+    assert mass["object1"] == pytest.approx(400 * (0.5**3 - 0.4**3), rel=0.01)
+    assert mass["thrown"] == pytest.approx(2 * mass["object1"], rel=1e-4)
+
+
 def test_a_reconstruction_without_scenery_has_no_edge(tmp_path, monkeypatch, capsys):
     write(tmp_path, 1.0, scenery=False)
     with pytest.raises(SystemExit) as caught:

@@ -38,6 +38,7 @@ from sdfsim.shape.shape import (
     shape_from_primitive,
     with_nodes,
     with_sdf,
+    with_wall,
 )
 
 VERSION = 1
@@ -390,6 +391,9 @@ class ShapeTable(Table):
     nodes: Annotated[int | None, Number(least=3, most=128, whole=True)] = Field(
         None, description="N of the N^3 grid whose points become surface nodes; without it a shape keeps its own"
     )
+    wall: Metres | None = Field(
+        None, description="makes the shape hollow: only what lies within this of its surface has mass"
+    )
 
     @classmethod
     def check_keys(cls, data: dict) -> Iterator[Fault]:
@@ -402,8 +406,9 @@ class ShapeTable(Table):
             yield ("sdf",), f"goes with {', '.join(_WITH_SDF)} only (a {kind} has its exact SDF)"
         if "resolution" in data and data.get("sdf") in (None, "mlp", "mesh"):
             yield ("resolution",), "goes with sdf: grid only"
-        if "nodes" in data and kind == "plane":
-            yield ("nodes",), "goes with bodies only (a plane has no nodes)"
+        for key, why in (("nodes", "has no nodes"), ("wall", "has no mass")):
+            if key in data and kind == "plane":
+                yield (key,), f"goes with bodies only (a plane {why})"
 
     def check_values(self) -> Iterator[Fault]:
         if self.capsule and self.capsule.height <= 2 * self.capsule.radius:
@@ -872,6 +877,7 @@ def _load_shape(name: str, entry: ShapeTable, on_progress: Progress) -> Shape:
         shape = shape_from_primitive(entry.primitive.name, entry.primitive.size, **made)
     else:
         shape = analytic_shape(kind, name=name, **dict(getattr(entry, kind)))
+    shape = with_wall(shape, entry.wall) if entry.wall else shape
     return with_nodes(shape, entry.nodes) if entry.nodes else shape
 
 

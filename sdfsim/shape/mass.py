@@ -55,15 +55,18 @@ def integrals(mesh: Mesh, weights: np.ndarray | float = 1.0) -> tuple[float, np.
     return volume, com + shift, np.trace(second) * np.eye(3) - second
 
 
-def mass_properties_of_sdf(sdf: Sdf | DistanceOracle, *, cells: int = 64) -> tuple[float, np.ndarray, np.ndarray]:
+def mass_properties_of_sdf(
+    sdf: Sdf | DistanceOracle, *, cells: int = 64, wall: float = np.inf
+) -> tuple[float, np.ndarray, np.ndarray]:
     """The integrals of `mass_properties`, taken on a grid over the inside of any bounded SDF.
 
     A cell at distance f from the surface counts with the fraction 0.5 - f / cell (clamped), so the error is of
-    second order in the cell.
+    second order in the cell. Of a wall, the hollow below it is taken off in the same way.
 
     Args:
         sdf: bounded; metres.
         cells: along the longest side of its bounds.
+        wall: m; only what is nearer to the surface than this counts.
 
     Raises:
         SdfsimError: the SDF is unbounded, or negative nowhere.
@@ -79,7 +82,8 @@ def mass_properties_of_sdf(sdf: Sdf | DistanceOracle, *, cells: int = 64) -> tup
     for x in axes[0]:
         points = np.stack(np.meshgrid([x], axes[1], axes[2], indexing="ij"), axis=-1).reshape(-1, 3)
         distance = np.asarray(sdf(points)[0])
-        weight = np.clip(0.5 - distance / cell, 0.0, 1.0) * cell**3
+        solid, hollow = (np.clip(0.5 - depth / cell, 0.0, 1.0) for depth in (distance, distance + wall))
+        weight = (solid - hollow) * cell**3
         offset = points - start
         volume += float(weight.sum())
         first += weight @ offset

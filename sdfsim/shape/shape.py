@@ -17,6 +17,7 @@ from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, replacing, write_json
 from sdfsim.shape import primitives
 from sdfsim.shape.distance import MeshDistance
+from sdfsim.shape.mass import mass_properties_of_sdf
 from sdfsim.shape.mesh import Frame, Mesh, convex_hull, load_mesh, read_glb, read_mesh, write_glb, write_ply
 from sdfsim.shape.mlp_sdf import ACTIVATIONS, MlpSdf
 from sdfsim.shape.sdf import (
@@ -313,6 +314,25 @@ def with_nodes(shape: Shape, grid: int) -> Shape:
     # What was measured of the former nodes does not hold for these.
     certificate = {key: value for key, value in shape.certificate.items() if key != "coverage"}
     return replace(shape, nodes=nodes, certificate=certificate)
+
+
+def with_wall(shape: Shape, wall: float) -> Shape:
+    """The same shape as a hollow one: only what lies within `wall` of its surface has mass.
+
+    Volume, centre of mass and inertia are then those of the wall, taken from the SDF on a grid. Where the SDF is exact
+    and the wall at least 1/100 of the shape's longest side, the volume is within 1 % and the inertia within 4 %. A wall
+    that is thicker than the shape makes it solid. Outside nothing changes: contacts see the same surface, and nothing
+    gets in.
+
+    Args:
+        shape: any but a plane.
+        wall: m.
+
+    Raises:
+        SdfsimError: the shape is a plane.
+    """
+    volume, com, inertia = mass_properties_of_sdf(shape.sdf, wall=wall)
+    return replace(shape, volume=volume, com=com, inertia=inertia, source=shape.source | {"wall": wall})
 
 
 def sdf_of_mesh(

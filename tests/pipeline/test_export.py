@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 import yaml
 
 from pipeline.cameras import Similarity
-from pipeline.export import DENSITY, LEVEL, Above, choose_slab, fit_parts, scene_text, write_scene
+from pipeline.export import LEVEL, Above, choose_slab, fit_parts, scene_text, write_scene
+from pipeline.materials import ASSUMED, MATERIALS, choose
 from pipeline.mesh.placement import Placement
+from sdfsim.errors import SdfsimError
 from sdfsim.files import write_json
 from sdfsim.scene.scene_file import load_scene
 from sdfsim.shape.mesh import Mesh, write_ply
@@ -78,7 +81,7 @@ def test_bodies_found_can_move():
     origins = {"object1": np.array([0.1, 0.2, 0.4])}
     data = yaml.safe_load(scene_text(PLACEMENT, origins, choose_slab(mesh, mesh), drop="ball"))
     body = {body["name"]: body for body in data["bodies"]}["object1"]
-    assert body["position"] == [0.1, 0.2, 0.4] and body["density"] == DENSITY and "motion" not in body
+    assert body["position"] == [0.1, 0.2, 0.4] and body["density"] == ASSUMED.density and "motion" not in body
     assert data["shapes"]["object1"] == {"asset": "assets/object1"} and "sphere" in data["shapes"]["ball"]
     alone = yaml.safe_load(scene_text(PLACEMENT, origins, None, scenery=False))
     assert [body["name"] for body in alone["bodies"]] == ["floor", "object1"]
@@ -97,21 +100,29 @@ def meshes(tmp_path):
     return tmp_path
 
 
-def test_a_scene_file_changed_by_hand_is_kept(meshes):
-    scene = meshes / "scene.yaml"
-    first = write_scene(meshes, scene)
-    again = write_scene(meshes, scene, written=first["scene_sha256"], seed=3)
-    assert again["notes"] == [] and not (meshes / "scene.yaml.bak").exists()
+@pytest.fixture
+def fitted(meshes):
+    """The same with the shapes of the fit stage beside it."""
+    for name in ("scene", "object1"):
+        analytic_shape("box", size=(0.2, 0.2, 0.2), name=name).save(meshes / "assets" / name)
+    return meshes
+
+
+def test_a_scene_file_changed_by_hand_is_kept(fitted):
+    scene = fitted / "scene.yaml"
+    first = write_scene(fitted, scene)
+    again = write_scene(fitted, scene, written=first["scene_sha256"], seed=3)
+    assert again["notes"] == [] and not (fitted / "scene.yaml.bak").exists()
     for kept in ("scene.yaml.bak", "scene.yaml.bak2"):
         scene.write_text("mine\n")
-        report = write_scene(meshes, scene, written=again["scene_sha256"])
-        assert (meshes / kept).read_text() == "mine\n" and kept in report["notes"][0]
+        report = write_scene(fitted, scene, written=again["scene_sha256"])
+        assert (fitted / kept).read_text() == "mine\n" and kept in report["notes"][0]
         assert yaml.safe_load(scene.read_text())["version"] == 1
 
 
-def test_bodies_stand_where_they_were_found(meshes):
-    write_scene(meshes, meshes / "scene.yaml", drop="none")
-    body = yaml.safe_load((meshes / "scene.yaml").read_text())["bodies"][-1]
+def test_bodies_stand_where_they_were_found(fitted):
+    write_scene(fitted, fitted / "scene.yaml", drop="none")
+    body = yaml.safe_load((fitted / "scene.yaml").read_text())["bodies"][-1]
     np.testing.assert_allclose(body["position"], [-0.6, 0.5, 0.0], atol=1e-4)
 
 
@@ -168,3 +179,37 @@ def test_a_scene_of_any_size_that_is_allowed_is_the_same_scene(tmp_path, scale, 
     analytic_shape("box", size=3 * [0.1 * size], name="object1").save(tmp_path / "assets" / "object1")
     (tmp_path / "scene.yaml").write_text(text)
     assert [body.name for body in load_scene(tmp_path / "scene.yaml").bodies] == ["floor", "object1", shape]
+
+
+def test_bodies_weigh_what_their_materials_do(fitted):
+    """A cube of 0.2 m: solid, and with a wall of 20 mm around a hollow of 0.16 m."""
+    scene, solid, hollow = fitted / "scene.yaml", 0.2**3, 0.2**3 - 0.16**3
+    for given, density, volume in (
+        ({}, 400, solid), ({"object1": "glass"}, 2500, solid), ({"object1": "glass:2cm"}, 2500, hollow),
+    ):  # fmt: skip
+        report = write_scene(fitted, scene, drop="none", materials=choose(given | {"scene": "rubber"}))
+        bodies = {body.name: body for body in load_scene(scene).bodies}
+        assert bodies["object1"].mass == pytest.approx(density * volume, rel=0.01)
+        told = report["bodies"]["object1"]
+        assert told["mass"] == bodies["object1"].mass and told["density"] == pytest.approx(density)
+        assert told["volume"] == pytest.approx(volume, rel=0.01)
+        assert bodies["scene"].friction == MATERIALS["rubber"].friction and "mass" not in report["bodies"]["scene"]
+
+
+def test_the_scene_file_names_the_source_of_every_number_and_what_is_assumed(fitted):
+    materials = choose({"object1": "ceramic:4mm", "floor": "wood"})
+    write_scene(fitted, fitted / "scene.yaml", materials=materials)
+    lines = [line.strip() for line in (fitted / "scene.yaml").read_text().splitlines()]
+    above = {line.split(",")[0]: before for before, line in pairwise(lines) if line.startswith("- {name")}
+    assert above["- {name: object1"].startswith("# ceramic, a wall of 4 mm. From: density: CRC Handbook")
+    assert above["- {name: floor"].startswith("# wood. From: density: CRC Handbook")
+    assert all(above[f"- {{name: {name}"].startswith("# assumed") for name in ("scene", "box"))
+
+
+def test_a_material_of_no_body_is_refused_and_nothing_is_written(fitted):
+    with pytest.raises(
+        SdfsimError, match=r"^material: no body is called 'objct1' \(did you mean 'object1'\?\)$"
+    ) as caught:
+        write_scene(fitted, fitted / "scene.yaml", materials=choose({"objct1": "wood"}))
+    assert caught.value.hint == "the bodies are floor, scene, object1, box" and caught.value.exit_code == 1
+    assert not (fitted / "scene.yaml").exists()

@@ -50,6 +50,7 @@ def test_unchanged_stages_are_skipped(photos, tmp_path, calls):
         ({"preset": "standard"}, ["distill", "mesh", "fit", "scene"]),
         ({"until_stage": "poses", "seed": 3}, ["poses"]),
         ({"drop": "none"}, ["scene"]),
+        ({"material": {"object1": "wood"}}, ["scene"]),
     ],
 )
 def test_what_changed_is_done_again(photos, tmp_path, calls, changes, expected):

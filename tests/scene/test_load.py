@@ -109,6 +109,8 @@ TOP = [
     ("shapes: {cup: {sphere: {radius: 1}, nodes: 2}}", "shapes.cup.nodes: must be >= 3"),
     ("shapes: {cup: {sphere: {radius: 1}, nodes: 500}}", "shapes.cup.nodes: must be <= 128"),
     ("shapes: {cup: {plane: {}, nodes: 7}}", "shapes.cup.nodes: goes with bodies only"),
+    ("shapes: {cup: {plane: {}, wall: 0.01}}", "shapes.cup.wall: goes with bodies only"),
+    ("shapes: {cup: {sphere: {radius: 1}, wall: 0}}", "shapes.cup.wall: must be > 0"),
     ("shapes: {cup: {sphere: {radius: 1}, sdf: grid}}", "shapes.cup.sdf: goes with asset, mesh, primitive only"),
     (
         "shapes: {cup: {primitive: {name: box}, sdf: gird}}",

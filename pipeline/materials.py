@@ -1,0 +1,138 @@
+"""Named materials: how heavy, how rough and how bouncy a body is, and where each number comes from.
+
+`python -m pipeline.materials` prints the table of docs/objects.md.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from sdfsim.errors import SdfsimError
+from sdfsim.scene.scene_file import UNITS, nearest
+
+CRC = "CRC Handbook of Chemistry and Physics"
+TOOLBOX = "Engineering ToolBox"
+FACTBOOK = "The Physics Factbook"
+EUROCODE = "EN 1991-1-1"
+ROUGH = "rough"
+UNMOVED = ("floor", "scene")  # bodies whose mass never counts
+_WALL = re.compile(r"(\d+\.?\d*|\.\d+)(mm|cm|m)", re.ASCII)
+
+
+@dataclass(frozen=True)
+class Material:
+    """What a body is made of. The numbers are typical ones.
+
+    A contact takes the product of its two bodies' friction, and likewise of their restitution. So `friction` is the
+    root of what the material has on itself, moved within the published range towards its other common pairs.
+    `restitution` is such that the product with concrete's 0.8 is what a ball of the material has on a hard floor.
+
+    Attributes:
+        density: kg/m^3.
+        friction: Coulomb coefficient of the body itself.
+        restitution: of the body itself.
+        density_from, friction_from, restitution_from: the source; `rough` where the number is only plausible.
+    """
+
+    density: float
+    friction: float
+    restitution: float
+    density_from: str = ROUGH
+    friction_from: str = ROUGH
+    restitution_from: str = ROUGH
+
+    @property
+    def source(self) -> str:
+        """One line that names the source of each number."""
+        return f"density: {self.density_from}; friction: {self.friction_from}; restitution: {self.restitution_from}"
+
+
+ASSUMED = Material(400.0, 0.8, 0.4)  # of a light wood; no photo tells what a thing is made of
+MATERIALS = {
+    "wood": Material(650, 0.65, 0.75, CRC, TOOLBOX, FACTBOOK),
+    "plywood": Material(600, 0.65, 0.7),
+    "cardboard": Material(690, 0.7, 0.5, CRC, TOOLBOX),
+    "paper": Material(800, 0.6, 0.3, CRC),
+    "ceramic": Material(2400, 0.65, 0.8, CRC),
+    "glass": Material(2500, 0.65, 0.8, CRC, TOOLBOX, FACTBOOK),
+    "steel": Material(7850, 0.75, 0.8, EUROCODE, TOOLBOX, FACTBOOK),
+    "aluminium": Material(2700, 0.7, 0.7, CRC, TOOLBOX),
+    "plastic": Material(1050, 0.6, 0.85, TOOLBOX, TOOLBOX, FACTBOOK),
+    "rubber": Material(1100, 1.1, 0.95, CRC, TOOLBOX, FACTBOOK),
+    "cork": Material(240, 0.7, 0.7, CRC),
+    "foam": Material(30, 0.7, 0.5),
+    "stone": Material(2650, 0.8, 0.8, CRC),
+    "concrete": Material(2400, 0.8, 0.8, EUROCODE, TOOLBOX),
+    "leather": Material(860, 0.65, 0.4, CRC, TOOLBOX),
+    "textile": Material(200, 0.6, 0.2, ROUGH, TOOLBOX),
+}
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What one body is made of.
+
+    Attributes:
+        name: in `MATERIALS`, or `assumed`.
+        material: its numbers.
+        wall: m, how thick the wall of a hollow body is; None of a solid one.
+    """
+
+    name: str = "assumed"
+    material: Material = ASSUMED
+    wall: float | None = None
+
+
+def choose(given: dict[str, str]) -> dict[str, Choice]:
+    """Looks up what bodies are made of.
+
+    Args:
+        given: by the body's name, a name in `MATERIALS`, perhaps with the thickness of a hollow body's wall:
+            `ceramic` or `ceramic:4mm`. Units are mm, cm and m.
+
+    Raises:
+        SdfsimError: no such material, no such thickness, or a thickness of what does not move.
+    """
+    found = {}
+    for body, text in given.items():
+        name, colon, thickness = text.partition(":")
+        if name not in MATERIALS:
+            raise SdfsimError(
+                f"material: {body}: no such material: {name!r}{nearest(name, MATERIALS)}",
+                "there are " + ", ".join(MATERIALS),
+            )
+        wall = _wall(body, thickness) if colon else None
+        if colon and body in UNMOVED:
+            raise SdfsimError(f"material: {body}: takes no thickness: it does not move, so its mass never counts")
+        found[body] = Choice(name, MATERIALS[name], wall)
+    return found
+
+
+def _wall(body: str, text: str) -> float:
+    match = _WALL.fullmatch(text)
+    metres = float(match[1]) * UNITS[match[2]] if match else 0.0
+    if not metres > 0:
+        raise SdfsimError(
+            f"material: {body}: {text!r} is not the thickness of a wall", "give one such as 4mm, 0.4cm or 0.004m"
+        )
+    return metres
+
+
+def table() -> str:
+    """The table of docs/objects.md."""
+    lines = ["| material | density, kg/m^3 | friction | restitution |", "| --- | --- | --- | --- |"]
+    for name, made in MATERIALS.items():
+        cells = (
+            f"{number:g} ({source})"
+            for number, source in (
+                (made.density, made.density_from), (made.friction, made.friction_from),
+                (made.restitution, made.restitution_from),
+            )
+        )  # fmt: skip
+        lines.append("| " + " | ".join((f"`{name}`", *cells)) + " |")
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    print(table(), end="")

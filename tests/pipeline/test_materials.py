@@ -1,0 +1,73 @@
+"""The table of materials, and how a command names them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.materials import MATERIALS, choose, table
+from pipeline.options import Options
+from pipeline.report import material_line
+from sdfsim.errors import SdfsimError
+
+ROOT = Path(__file__).parents[2]
+# What the Engineering ToolBox has for dry pairs: from the least of the sliding to the most of the static friction.
+FRICTION = {
+    ("wood", "wood"): (0.2, 0.5), ("wood", "steel"): (0.2, 0.6), ("wood", "concrete"): (0.4, 0.62),
+    ("leather", "wood"): (0.3, 0.61), ("glass", "glass"): (0.4, 1.0), ("glass", "steel"): (0.4, 0.7),
+    ("steel", "steel"): (0.42, 0.8), ("aluminium", "steel"): (0.47, 0.61), ("plastic", "steel"): (0.3, 0.5),
+    ("rubber", "concrete"): (0.6, 1.0), ("rubber", "steel"): (0.64, 0.86), ("rubber", "cardboard"): (0.5, 0.8),
+    ("textile", "textile"): (0.3, 0.4),
+}  # fmt: skip
+# What The Physics Factbook has for balls on a hard floor.
+REBOUND = {"wood": 0.6, "steel": 0.6, "glass": 0.66, "plastic": 0.69, "rubber": 0.83}
+
+
+@pytest.mark.parametrize("pair", FRICTION)
+def test_the_product_of_two_frictions_is_that_of_the_pair(pair):
+    least, most = FRICTION[pair]
+    assert least <= MATERIALS[pair[0]].friction * MATERIALS[pair[1]].friction <= most
+
+
+@pytest.mark.parametrize("name", REBOUND)
+def test_the_product_of_two_restitutions_is_the_rebound_on_a_hard_floor(name):
+    product = MATERIALS[name].restitution * MATERIALS["concrete"].restitution
+    assert product == pytest.approx(REBOUND[name], rel=0.1)
+
+
+def test_the_table_of_the_documents_is_that_of_the_code():
+    assert table() in (ROOT / "docs" / "objects.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("text", "wall"), [("glass", None), ("glass:4mm", 0.004), ("glass:.5cm", 0.005), ("glass:2m", 2)]
+)
+def test_a_material_may_have_the_thickness_of_a_wall(text, wall):
+    choice = choose({"object1": text})["object1"]
+    assert (choice.name, choice.material) == ("glass", MATERIALS["glass"]) and choice.wall == pytest.approx(wall)
+
+
+@pytest.mark.parametrize(
+    ("body", "text", "message"),
+    [
+        ("object1", "cermic", "object1: no such material: 'cermic' (did you mean 'ceramic'?)"),
+        ("object1", "glass:4", "object1: '4' is not the thickness of a wall"),
+        ("object1", "glass:0mm", "object1: '0mm' is not the thickness of a wall"),
+        ("object1", "glass:-4mm", "object1: '-4mm' is not the thickness of a wall"),
+        ("object1", "glass:", "object1: '' is not the thickness of a wall"),
+        ("scene", "glass:4mm", "scene: takes no thickness: it does not move, so its mass never counts"),
+    ],
+)
+def test_what_is_no_material_is_refused_before_any_work(body, text, message):
+    with pytest.raises(SdfsimError) as caught:
+        Options(material={body: text}).check()
+    assert caught.value.message == f"material: {message}" and caught.value.exit_code == 1
+
+
+def test_the_report_says_what_a_body_is_made_of_and_weighs():
+    surface = {"friction": 0.65, "restitution": 0.8}
+    vase = {"material": "ceramic", **surface, "density": 2400.0, "wall": 0.004, "volume": 1.04e-3, "mass": 2.496}
+    expected = "ceramic, friction 0.65, restitution 0.8, 2.5 kg (0.00104 m^3 in a wall of 4 mm, 2400 kg/m^3)"
+    assert material_line(vase) == expected
+    assert material_line({"material": "wood", **surface}) == "wood, friction 0.65, restitution 0.8"
