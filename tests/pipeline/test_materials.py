@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 
 from pipeline.materials import MATERIALS, choose, table
-from pipeline.options import Options
+from pipeline.options import Options, read_config
 from pipeline.report import material_line
 from sdfsim.errors import SdfsimError
+from tests.cli.conftest import run as command
 
 ROOT = Path(__file__).parents[2]
 # What the Engineering ToolBox has for dry pairs: from the least of the sliding to the most of the static friction.
@@ -71,3 +72,17 @@ def test_the_report_says_what_a_body_is_made_of_and_weighs():
     expected = "ceramic, friction 0.65, restitution 0.8, 2.5 kg (0.00104 m^3 in a wall of 4 mm, 2400 kg/m^3)"
     assert material_line(vase) == expected
     assert material_line({"material": "wood", **surface}) == "wood, friction 0.65, restitution 0.8"
+
+
+def test_the_command_takes_a_material_for_every_body(photos, tmp_path, calls, monkeypatch):
+    monkeypatch.setattr("pipeline.report.write_recording", lambda folder, done: None)
+
+    def reconstruct(*materials: str) -> int:
+        options = [part for text in materials for part in ("--material", text)]
+        return command("reconstruct", photos, "-o", tmp_path / "out", *options).exit_code
+
+    assert reconstruct("object1=cermic") == 1
+    assert reconstruct("object1") == reconstruct("=wood") == reconstruct("a=wood", "a=glass") == 2
+    assert calls == [] and not (tmp_path / "out").exists()
+    assert reconstruct("object1=ceramic:4mm", "scene=wood") == 0
+    assert read_config(tmp_path / "out").material == {"object1": "ceramic:4mm", "scene": "wood"}
