@@ -3,7 +3,8 @@
     python benchmarks/reconstruct.py -o DIR [--preset quick] [--budget MINUTES]
 
 Runs the whole chain on samples/photos/table_vase (or takes what is already in the folder), moves the result onto the
-true cameras by a similarity, and prints pose errors, surface errors and times. A folder of photos without
+true cameras by a similarity, and prints pose errors, surface errors, how these go with the uncertainty that the run
+gave, and times. A folder of photos without
 `transforms.json` and `truth.ply` gets the report only.
 """
 
@@ -23,8 +24,10 @@ from pipeline.cameras import View, load_views
 from pipeline.field.training import load_field
 from pipeline.mesh.meshing import read_parts
 from pipeline.mesh.placement import load_placement
+from pipeline.mesh.trust import vertex_areas, weighted_quantile
 from sdfsim.console import Session
 from sdfsim.errors import run_main
+from sdfsim.shape.mesh import read_attributes, read_mesh
 
 PHOTOS = Path(__file__).resolve().parent.parent / "samples" / "photos" / "table_vase"
 TABLE, VASE = 0.55, np.array([0.12, -0.05])  # m: the table's height, and the vase's axis
@@ -64,6 +67,52 @@ def pose_errors(views: list[View], photos: Path) -> tuple[dict[str, float], Simi
     }, move
 
 
+def to_truth(folder: Path, points: np.ndarray, move: Similarity) -> np.ndarray:
+    """Points [P, 3] of a run's meshes, moved from its metres onto the true cameras."""
+    place, to_unit = load_placement(folder / "mesh").to_metres, load_field(folder / "distill").to_unit
+    scale, rotation, translation = move
+    return scale * to_unit.inverse().points(place.inverse().points(points)) @ rotation.T + translation
+
+
+def trust_errors(folder: Path, photos: Path, move: Similarity) -> list[dict[str, Any]]:
+    """Measured errors, mm, beside the uncertainty that the run says of the same places.
+
+    Each vertex of what is displayed counts by its area: the scenery as shown, and the closed bodies. First those of
+    which the photos tell something, in quarters from the surest on, and the least sure twentieth; then what is guessed
+    there, and what is guessed of all that the scene is made of, also where nothing is displayed.
+    """
+    import open3d as o3d
+
+    truth = _scene(o3d.io.read_triangle_mesh(photos / "truth.ply"))
+
+    def measured(names: list[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Areas, uncertainties and errors [V] of vertices, m."""
+        meshes = [read_mesh(folder / "mesh" / name) for name in names]
+        given = [read_attributes(folder / "mesh" / name, ["uncertainty"])[0] for name in names]
+        points = to_truth(folder, np.concatenate([mesh.vertices for mesh in meshes]), move)
+        error = truth.compute_distance(points.astype(np.float32)).numpy()
+        return np.concatenate([vertex_areas(mesh) for mesh in meshes]), np.concatenate(given).astype(float), error
+
+    parts = read_parts(folder / "mesh")
+    bodies = [f"objects/{entry['name']}.ply" for entry in parts["objects"]]
+    area, uncertainty, error = measured(["shown.ply", *bodies])
+    known = np.isfinite(uncertainty)
+    limits = [weighted_quantile(uncertainty[known], area[known], share) for share in (0, 0.25, 0.5, 0.75, 0.95, 1)]
+    rows: list[dict[str, Any]] = []
+
+    def add(name: str, chosen: np.ndarray, area: np.ndarray, error: np.ndarray, told: list[float] | None) -> None:
+        median, p90 = (1000 * weighted_quantile(error[chosen], area[chosen], share) for share in (0.5, 0.9))
+        rows.append({"part": name, "uncertainty_mm": told, "error_median_mm": median, "error_p90_mm": p90})
+
+    ends = [(f"quarter {k}", limits[k - 1], limits[k if k < 4 else 5]) for k in (1, 2, 3, 4)]
+    for name, low, high in [*ends, ("least sure 5 %", limits[4], limits[5])]:
+        add(name, known & (uncertainty >= low) & (uncertainty <= high), area, error, [1000 * low, 1000 * high])
+    add("guessed and displayed", ~known, area, error, None)
+    area, uncertainty, error = measured(["solid.ply", *bodies])
+    add("guessed, of all", ~np.isfinite(uncertainty), area, error, None)
+    return rows
+
+
 def surface_errors(folder: Path, photos: Path, move: Similarity) -> dict[str, Any]:
     """Distances between the reconstructed visible surface and the true one, in percent of the table's width.
 
@@ -75,16 +124,14 @@ def surface_errors(folder: Path, photos: Path, move: Similarity) -> dict[str, An
     import open3d as o3d
 
     about = json.loads((photos / "transforms.json").read_text())
-    width, place = about["table_width"], load_placement(folder / "mesh")
-    normal = load_field(folder / "distill").normalisation
-    scale, rotation, translation = move
+    width, place = about["table_width"], load_placement(folder / "mesh").to_metres
+    to_unit = load_field(folder / "distill").to_unit
+    scale, rotation, _ = move
 
     def read(name: str) -> Any:
         """A mesh of the mesh stage on the true cameras."""
         mesh: Any = o3d.io.read_triangle_mesh(folder / "mesh" / name)
-        points = (np.asarray(mesh.vertices) - place.translation) @ place.rotation / place.scale
-        points = (points * normal.radius + normal.center) * scale @ rotation.T + translation
-        mesh.vertices = o3d.utility.Vector3dVector(points)
+        mesh.vertices = o3d.utility.Vector3dVector(to_truth(folder, np.asarray(mesh.vertices), move))
         return mesh
 
     def distances(to: Any, at: np.ndarray) -> np.ndarray:
@@ -119,7 +166,7 @@ def surface_errors(folder: Path, photos: Path, move: Similarity) -> dict[str, An
         "object": summary(errors[near]),
         "missing": summary(missing),
         "complete_percent": 100 * float((missing < 1.0).mean()),
-        "scale_error_percent": 100 * abs(place.scale / (normal.radius * scale) - 1),
+        "scale_error_percent": 100 * abs(place.scale * to_unit.scale / scale - 1),
         "bodies": list(objects),
         "vase": {name: vase_size(body) for name, body in vases.items()} | {"truth": vase_size(truth)},
         "up_error_degrees": float(np.degrees(np.arccos(np.clip((rotation @ place.rotation.T @ [0, 0, 1])[2], -1, 1)))),
@@ -147,7 +194,10 @@ def _scene(mesh: Any) -> Any:
 def evaluate(folder: Path, photos: Path) -> dict[str, Any]:
     """All errors of a finished run against the truth beside its photos."""
     poses, move = pose_errors(load_views(folder / "poses"), photos)
-    return {"poses": poses, "surface_percent_of_table_width": surface_errors(folder, photos, move)}
+    return {
+        "poses": poses, "surface_percent_of_table_width": surface_errors(folder, photos, move),
+        "trust": trust_errors(folder, photos, move),
+    }  # fmt: skip
 
 
 def main() -> None:

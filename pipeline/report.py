@@ -22,8 +22,10 @@ RESULTS = {
     "report": ("report.md", "photos"),
 }  # fmt: skip
 RECORDING = "reconstruction.rrd"
+PROPOSED = (255, 40, 200)  # RGB of the cameras that are proposed
 NAMED = 10  # photos that a note names one by one
 FEW_PHOTOS, LOW_PSNR, HIGH_ERROR = 20, 20.0, 1.0
+GUESSED_SHARE = 0.01  # of a body's surface, from which on a note says so
 
 
 def write_report(
@@ -110,10 +112,35 @@ def improvements(report: dict) -> list[str]:
     if report["psnr"] is not None and report["psnr"] < LOW_PSNR:
         lines.append(f"photos that were not trained on come out at {report['psnr']:.1f} dB only: train for longer "
                      "(--preset standard), and keep light and exposure the same in all photos")  # fmt: skip
+    lines += [f"{k}. of the photos that would help most: {photo_line(photo)}"
+              for k, photo in enumerate(stages.get("mesh", {}).get("next_photos", []), start=1)]  # fmt: skip
     if str(stages.get("mesh", {}).get("size", "")).startswith("assumed"):
         lines.append("give --size or --distance: until then nobody knows how large the scene is")
     if report["failed_checks"]:
         lines.append("fit for longer (a larger --budget), or mend the mesh: a shape is not usable")
+    return lines
+
+
+def photo_line(photo: dict) -> str:
+    """Where to take a photo, from an entry of `next_photos`: in words and as numbers."""
+    place, target = (", ".join(f"{x:.2f}" for x in photo[key]) for key in ("position", "looking_at"))
+    return (f"{photo['words']} (camera at {place} m, aimed at {target} m); it makes up for {photo['gain']:.0%} of what "
+            "is weak")  # fmt: skip
+
+
+def trust_lines(mesh: dict) -> list[str]:
+    """What of each body is guessed, and how much more photos could do, from the report of the mesh stage."""
+    lines = []
+    for name, part in mesh.get("trust", {}).items():
+        if part["guessed"] > GUESSED_SHARE and name != "scene":
+            where = f": {', '.join(part['where'])}" if part["where"] else ""
+            share = f"{part['guessed']:.0%} of its surface is guessed"
+            lines.append(f"{name}: {share}, fewer than two photos see it{where}")
+    if "weak" in mesh:
+        made_up = sum(photo["gain"] for photo in mesh["next_photos"])
+        more = f"the photos proposed make up for {made_up:.0%} of that" if made_up else "no one photo would help much"
+        lines.append(f"{mesh['weak']:.1%} of what could be photographed is weak: fewer than three photos see it, or "
+                     f"all from nearly one direction; {more}")  # fmt: skip
     return lines
 
 
@@ -138,6 +165,7 @@ def notes(stages: dict[str, dict]) -> list[str]:
     if mesh.get("left_out_m"):
         largest = max(mesh["left_out_m"])
         lines.append(f"{len(mesh['left_out_m'])} loose pieces were left out, the largest {largest:.2g} m long")
+    lines += trust_lines(mesh)
     lines += [f"usable, not exact: {caveat}" for caveat in stages.get("fit", {}).get("caveats", [])]
     lines += [f"{name}: {material_line(body)}" for name, body in stages.get("scene", {}).get("bodies", {}).items()]
     return lines + stages.get("scene", {}).get("notes", [])
@@ -186,6 +214,11 @@ def page(report: dict, folder: Path) -> str:
             ("extent", " x ".join(f"{side:.3g}" for side in mesh["extent_m"]) + " m"), ("scale", mesh["size"]),
             ("up", f"from the {mesh['up_from']}, within {mesh['up_within_degrees']:.1f}°"),
         ]  # fmt: skip
+        for name, part in mesh.get("trust", {}).items():
+            seen = " / ".join(f"{share:.1%}" for share in part["seen_by"])
+            sure = part["uncertainty_m"]
+            middle = "all guessed" if sure is None else f"median uncertainty {1000 * sure:.2g} mm"
+            rows.append((f"{name}: seen by 0 / 1 / 2 / 3 or more photos", f"{seen}; {middle}"))
     for name, certificate in stages.get("fit", {}).get("shapes", {}).items():
         bad = f"not usable: {certificate['reason']}"
         rows.append((f"shape {name}", certificate["caveat"] or "exact" if certificate["passed"] else bad))
@@ -193,6 +226,8 @@ def page(report: dict, folder: Path) -> str:
     lines += ["## Numbers", "", "| | |", "| --- | --- |", *(f"| {name} | {value} |" for name, value in rows), ""]
     if (folder / "mesh" / "objects.png").exists() and mesh:
         lines += ["## What was found", "", "![bodies by name](mesh/objects.png)", ""]
+    if (folder / "mesh" / "trust.png").exists() and mesh:
+        lines += ["## How far to trust the surface", "", "![uncertainty](mesh/trust.png)", ""]
     files = {photo["photo"]: photo["file"] for photo in report["photos"]}
     held = [name for name in distill.get("held_out_photos", []) if name in files]
     if held:
@@ -204,7 +239,7 @@ def page(report: dict, folder: Path) -> str:
 
 
 def write_recording(folder: Path, done: Collection[str]) -> Path | None:
-    """Writes `reconstruction.rrd`: cameras with their photos, sparse points, and the surface.
+    """Writes `reconstruction.rrd`: cameras with their photos, sparse points, the surface, how far it can be trusted.
 
     Before the mesh stage it is in the units of the camera poses, from then on in metres with z up.
 
@@ -218,7 +253,7 @@ def write_recording(folder: Path, done: Collection[str]) -> Path | None:
     Raises:
         SdfsimError: a stage's folder is damaged, or the file cannot be written.
     """
-    from pipeline.mesh.meshing import TEXTURED
+    from pipeline.mesh.meshing import NEXT, TEXTURED, trust_meshes
     from sdfsim.recording import PosedPhoto, save_reconstruction
     from sdfsim.shape.mesh import load_mesh, read_glb
 
@@ -228,14 +263,18 @@ def write_recording(folder: Path, done: Collection[str]) -> Path | None:
     mesh = load_mesh(folder / "mesh" / "mesh.ply") if "mesh" in done else None
     textured = folder / "mesh" / TEXTURED
     skins = read_glb(textured) if "mesh" in done and textured.exists() else {}
+    trusted = "mesh" in done and (folder / "mesh" / NEXT).exists()
+    proposed = load_views(folder / "mesh" / NEXT) if trusted else []
     photos = []
-    for view in views:
+    for number, view in enumerate([*views, *proposed]):
         image = folder / "photos" / "images" / view.name
         photos.append(
             PosedPhoto(view.source, image if image.is_file() else None, view.focal, (view.cx, view.cy),
-                       (view.width, view.height), view.rotation, view.translation)
+                       (view.width, view.height), view.rotation, view.translation,
+                       PROPOSED if number >= len(views) else None)
         )  # fmt: skip
-    save_reconstruction(folder / RECORDING, photos, points, colors, mesh, skins)
+    trust = trust_meshes(folder / "mesh") if trusted else {}
+    save_reconstruction(folder / RECORDING, photos, points, colors, mesh, skins, trust)
     return folder / RECORDING
 
 

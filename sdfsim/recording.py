@@ -218,6 +218,7 @@ class PosedPhoto:
         size: (width, height) px.
         rotation: [3, 3] world to camera (x right, y down, z forward).
         translation: [3] m, world to camera.
+        color: RGB of its frame, or None for the viewer's own.
     """
 
     name: str
@@ -227,13 +228,16 @@ class PosedPhoto:
     size: tuple[int, int]
     rotation: np.ndarray
     translation: np.ndarray
+    color: tuple[int, int, int] | None = None
 
 
 def save_reconstruction(
     path: Path, photos: list[PosedPhoto], points: np.ndarray, colors: np.ndarray | None, mesh: Mesh | None,
-    skins: Mapping[str, Mesh] = MappingProxyType({}),
+    skins: Mapping[str, Mesh] = MappingProxyType({}), trust: Mapping[str, Mesh] = MappingProxyType({}),
 ) -> None:  # fmt: skip
     """Write cameras with their photos, sparse points and the surface as one rerun recording.
+
+    With `trust` the viewer has a second tab that shows it in place of the surface.
 
     Args:
         path: .rrd to write.
@@ -242,6 +246,7 @@ def save_reconstruction(
         colors: [P, 3] uint8 RGB, or None.
         mesh: the reconstructed surface, if it is there already.
         skins: its parts with their textures, by name, shown in its place where there are any.
+        trust: its parts in colours that tell how far each place can be trusted, by name.
 
     Raises:
         SdfsimError: the file cannot be written.
@@ -259,15 +264,21 @@ def save_reconstruction(
     centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2 or 1.0
     # Before there is a surface, z need not be up: photographers mostly hold the camera level.
     up = -np.sum([turn[1] for turn in rotations], axis=0) if mesh is None and photos else np.array([0.0, 0.0, 1.0])
-    view = rrb.Spatial3DView(
-        origin=WORLD, name="reconstruction", eye_controls=_around(centre, radius, up).controls(), line_grid=False
-    )
-    stream.send_blueprint(rrb.Blueprint(view, collapse_panels=True, auto_views=False))
+    hidden = {"reconstruction": "trust"} | ({"trust": "surface"} if trust else {})
+    tabs = [
+        rrb.Spatial3DView(
+            origin=WORLD, name=name, eye_controls=_around(centre, radius, up).controls(), line_grid=False,
+            contents=["+ $origin/**", f"- $origin/{other}/**"],
+        )
+        for name, other in hidden.items()
+    ]  # fmt: skip
+    stream.send_blueprint(rrb.Blueprint(rrb.Tabs(*tabs), collapse_panels=True, auto_views=False))
     stream.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     stream.log(f"{WORLD}/points", rr.Points3D(points, colors=colors, radii=rr.Radius.ui_points(1.5)), static=True)
     surfaces = {} if mesh is None else {f"{WORLD}/surface": mesh}
     if skins:
         surfaces = {f"{WORLD}/surface/{rr.escape_entity_path_part(name)}": skin for name, skin in skins.items()}
+    surfaces |= {f"{WORLD}/trust/{rr.escape_entity_path_part(name)}": part for name, part in trust.items()}
     for entity, surface in surfaces.items():
         stream.log(entity, _shaded(rr, surface, (200, 190, 175)), static=True)
     for photo, turn, centre_of in zip(photos, rotations, centres, strict=True):
@@ -281,6 +292,7 @@ def save_reconstruction(
             principal_point=np.array(photo.principal) * shrink,
             resolution=size,
             image_plane_distance=0.1 * radius,
+            color=photo.color,
         )
         stream.log(entity, pinhole, static=True)
         if photo.image is not None and photo.image.exists():

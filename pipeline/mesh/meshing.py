@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import colorsys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,19 +13,20 @@ from PIL import Image, ImageDraw, ImageFont
 
 from pipeline.cameras import View, load_sparse, load_views, save_views
 from pipeline.field.training import load_field
+from pipeline.inputs.captures import load_capture
 from pipeline.inputs.photos import load_photos
 from pipeline.mesh.bodies import Parts, split
 from pipeline.mesh.cleaning import joined
 from pipeline.mesh.extraction import EXTENT, ball, field_distance, sample_volume, surface_of
 from pipeline.mesh.next_photos import next_photos
-from pipeline.mesh.placement import Placement, measured_scale, place
+from pipeline.mesh.placement import GRAVITY, Placement, Up, measured_scale, place
 from pipeline.mesh.texture import Shots, shots_of, texture_parts
-from pipeline.mesh.trust import Support, color_range, draw_trust, summary, support_of
-from pipeline.mesh.visibility import Caster, Visibility
+from pipeline.mesh.trust import Support, color_range, colors_of, draw_trust, summary, support_of
+from pipeline.mesh.visibility import Caster, Visibility, to_bytes
 from pipeline.progress import Progress, quiet, share_of
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, replacing, write_json
-from sdfsim.shape.mesh import Mesh, write_glb, write_ply
+from sdfsim.shape.mesh import Mesh, read_attributes, read_mesh, write_glb, write_ply
 
 SCENERY = "scene"
 TEXTURED, TRUST, NEXT = "textured.glb", "trust.png", "next_photos.json"
@@ -77,7 +79,12 @@ def make_meshes(
     )
     surface = surface_of(volume, field, views, points, photos, limit, on_progress=share_of(on_progress, 0.25, 0.25))
     scale = measured_scale(distance, views, load_photos(photos), Caster(surface.raw)) if distance else None
-    placement = place(surface.visible, views, scale, size=size, alone=alone)
+    capture, up = load_capture(photos), None
+    if capture is not None:
+        up = None if capture.up is None else Up(to_unit.rotation @ capture.up, f"gravity of {capture.app}", GRAVITY)
+        if scale is None and size is None:
+            scale = 1 / to_unit.scale, f"metres of {capture.app}"
+    placement = place(surface.visible, views, scale, size=size, alone=alone, up=up)
     if crop is not None:
         limit = box_of(placement, np.reshape(crop, (2, 3)))
         volume = volume.limited(limit)
@@ -129,17 +136,20 @@ def trust(
     Returns:
         What the photos tell of the vertices of `closed`, one mesh after the other; and what the report says of it.
     """
-    sight = Visibility(joined(list(closed.values())), shots.lift, shots.blocking)
+    whole = joined(list(closed.values()))
+    sight = Visibility(whole, shots.lift, shots.blocking)
     support = support_of(sight, shots.views)
     shown = {name: support.nearest(mesh.vertices) for name, mesh in displayed.items()}
     advice = next_photos(closed, support, sight, shots.blocking, shots.views, counted)
     save_views([photo.view for photo in advice.photos], out / NEXT)
-    limits = color_range(displayed, shown)
-    drawn = {shots.views[0].source: shots.views[0], **{f"a camera at {p.view.name}": p.view for p in advice.photos[:1]}}
-    draw_trust(displayed, shown, drawn, limits).save(out / TRUST)
+    limits = color_range(whole, support.uncertainty)
+    drawn = {view.source: view for view in [shots.views[0], *(photo.view for photo in advice.photos[:1])]}
+    # Neither where the solid was cut off nor its side below the floor says anything.
+    told_of = (counted & (whole.vertices[:, 2] > -3 * shots.lift))[whole.faces].all(1)
+    draw_trust(replace(whole, faces=whole.faces[told_of]), support.uncertainty, drawn, limits).save(out / TRUST)
     return support, {
         "trust": {name: summary(mesh, shown[name]) for name, mesh in displayed.items()},
-        "trust_colors_m": limits, "weak": round(advice.weak, 4), "weak_after_next": round(advice.left, 4),
+        "trust_colors_m": limits, "weak": round(advice.weak, 4),
         "next_photos": [photo.told() for photo in advice.photos],
     }  # fmt: skip
 
@@ -192,6 +202,21 @@ def read_parts(mesh_folder: Path) -> dict:
         SdfsimError: the mesh stage has not run.
     """
     return read_json(Path(mesh_folder) / "parts.json", "run the mesh stage first")
+
+
+def trust_meshes(mesh_folder: Path) -> dict[str, Mesh]:
+    """The meshes that the scene is made of, by name, in the colours of `colors_of` their uncertainty.
+
+    Raises:
+        SdfsimError: the mesh stage has not run, or its files are damaged.
+    """
+    known = read_parts(mesh_folder)
+    files = {SCENERY: "solid.ply"} if known["scenery"] else {}
+    files |= {entry["name"]: f"objects/{entry['name']}.ply" for entry in known["objects"]}
+    meshes = {name: read_mesh(mesh_folder / file) for name, file in files.items()}
+    values = {name: read_attributes(mesh_folder / file, ["uncertainty"])[0] for name, file in files.items()}
+    limits = color_range(joined(list(meshes.values())), np.concatenate(list(values.values())))
+    return {name: replace(mesh, colors=to_bytes(colors_of(values[name], limits))) for name, mesh in meshes.items()}
 
 
 def draw_names(parts: Parts, views: list[View], photos_folder: Path) -> Image.Image:

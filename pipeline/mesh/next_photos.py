@@ -34,7 +34,7 @@ class NextPhoto:
     Attributes:
         view: its camera, metres, z up.
         target: [3] m that it looks at.
-        gain: what it adds, as a share of all weak surface that any photo from around could show.
+        gain: what it adds, as a share of all that photos from around could add.
         words: where to stand and where to look.
     """
 
@@ -58,13 +58,11 @@ class Advice:
 
     Attributes:
         photos: the best first; none where no photo helps `LEAST` of the surface.
-        weak: share of the surface that is weak and that a camera around could see.
-        left: share that is weak still after these photos.
+        weak: share that is weak, of the surface that the photos or a camera around could show.
     """
 
     photos: list[NextPhoto]
     weak: float
-    left: float
 
 
 def next_photos(
@@ -114,7 +112,8 @@ def next_photos(
         return np.where(few, (FEW - here.views) / FEW, 1 - np.minimum(rest, 1))
 
     now, before = known, weak(known) & reachable
-    lacking = np.where(known.views < FEW, (FEW - known.views) / FEW, 1.0)[before].sum()
+    short = FEW - known.views[before]
+    lacking = float(np.where(short > 0, short * (short + 1) / (2 * FEW), 1.0).sum())  # what `worth` may add up to
     chosen: list[NextPhoto] = []
     free = np.ones(len(places), bool)
     while len(chosen) < WANTED and before.any():
@@ -142,14 +141,15 @@ def next_photos(
         matrices[seen] += information(view, sight.vertices[seen])
         view = replace(view, name=f"next{len(chosen) + 1}", source=f"next{len(chosen) + 1}")
         most = list(meshes)[int(np.bincount(part[seen]).argmax())]
-        helped = sight.vertices[seen[part[seen] == list(meshes).index(most)]]
-        words = f"{way_to(view.center, views, middle)}, looking at {spot(most, meshes[most], helped)}"
-        chosen.append(NextPhoto(view, target, gain / max(lacking, 1e-12), words))
+        helped = seen[part[seen] == list(meshes).index(most)]
+        aim = spot(most, meshes[most], sight.vertices[helped], sight.normals[helped])
+        words = f"{way_to(view.center, views, middle)}, looking at {aim}"
+        chosen.append(NextPhoto(view, target, gain / lacking, words))
         now = replace(now, views=counts, information=matrices)
         turned = (places - middle) @ (view.center - middle)
         turned /= np.linalg.norm(places - middle, axis=1) * np.linalg.norm(view.center - middle)
         free &= turned < np.cos(np.radians(APART))
-    return Advice(chosen, float(before.sum() / total), float((weak(now) & reachable).sum() / total))
+    return Advice(chosen, float(before.sum() / total))
 
 
 def camera_at(place: np.ndarray, target: np.ndarray, like: View) -> View:
@@ -205,11 +205,12 @@ def way_to(place: np.ndarray, views: Sequence[View], middle: np.ndarray) -> str:
     return f"from the {corner} of the scene: stand where {nearest.source} was taken, {moved}"
 
 
-def spot(name: str, mesh: Mesh, points: np.ndarray) -> str:
-    """What of a mesh lies at points [P, 3], in words."""
+def spot(name: str, mesh: Mesh, points: np.ndarray, normals: np.ndarray) -> str:
+    """What of a mesh lies at points [P, 3] that face along normals [P, 3], in words."""
     low, high = mesh.vertices[:, 2].min(), mesh.vertices[:, 2].max()
-    height = float(np.median(points[:, 2]))
+    height, facing = float(np.median(points[:, 2])), float(np.median(normals[:, 2]))
+    below = "the underside of " if facing < -0.5 else ""
     if name == "scene":
-        return f"the scenery {height:.2g} m above the floor" if height > 0.05 * (high - low) else "the floor"
+        return "the floor" if height < 0.05 * (high - low) else f"{below}the scenery {height:.2g} m above the floor"
     third = min(int(3 * (height - low) / max(high - low, 1e-12)), 2)
-    return f"the {('foot', 'middle', 'top')[third]} of {name}"
+    return f"{below or ('the foot of ', 'the middle of ', 'the top of ')[third]}{name}"

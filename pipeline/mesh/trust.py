@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from pipeline.cameras import View
-from pipeline.mesh.cleaning import face_normals, joined, vertex_normals
+from pipeline.mesh.cleaning import face_normals, vertex_normals
 from pipeline.mesh.visibility import Caster, Visibility, to_bytes
 from pipeline.progress import Progress, quiet
 from sdfsim.shape.mesh import Mesh
@@ -26,7 +25,7 @@ WORTH_NAMING = 0.2
 # Colours from the surest to the least sure place (anchors of viridis), and of what is guessed.
 SCALE = np.array([[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], float)
 GUESSED = np.array([255.0, 45, 45])
-TINT, WIDE, LEGEND = 0.75, 640, 44  # share of the map in a picture; width of each half and height of its legend, px
+WIDE, LEGEND = 640, 44  # width of each half of a picture and height of its legend, px
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,7 @@ class Support:
         """That of the nearest vertex to each of other points [P, 3] m."""
         from scipy.spatial import KDTree
 
-        return self.at(KDTree(self.vertices).query(points)[1])
+        return self.at(np.asarray(KDTree(self.vertices).query(points)[1]))
 
     def attributes(self) -> dict[str, np.ndarray]:
         """What a mesh file holds of it: `views` [V] int32 and `uncertainty` [V] float32 m."""
@@ -153,19 +152,17 @@ def guessed_sides(mesh: Mesh, weights: np.ndarray) -> list[str]:
     return [names[k] for k in np.argsort(-share) if share[k] >= WORTH_NAMING]
 
 
-def color_range(meshes: Mapping[str, Mesh], supports: Mapping[str, Support]) -> tuple[float, float]:
+def color_range(mesh: Mesh, uncertainty: np.ndarray) -> tuple[float, float]:
     """Uncertainties (m) of the first and the last colour: between them lie nine tenths of the area that is known."""
-    area = np.concatenate([vertex_areas(mesh) for mesh in meshes.values()])
-    values = np.concatenate([supports[name].uncertainty for name in meshes])
-    known = np.isfinite(values)
+    known = np.isfinite(uncertainty)
     if not known.any():
         return 1e-3, 1e-2
-    low, high = (weighted_quantile(values[known], area[known], share) for share in (0.05, 0.95))
+    low, high = (weighted_quantile(uncertainty[known], vertex_areas(mesh)[known], share) for share in (0.05, 0.95))
     return low, max(high, 1.01 * low)
 
 
 def colors_of(uncertainty: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
-    """Colours [V, 3] in 0..255 of uncertainties [V] m: violet the surest, yellow the least sure, red what is guessed."""
+    """Colours [V, 3] in 0..255 of uncertainties [V] m: violet is surest, yellow least sure, red is guessed."""
     known = np.isfinite(uncertainty)
     position = np.log(np.where(known, uncertainty, 1.0) / limits[0]) / np.log(limits[1] / limits[0])
     place = np.clip(position, 0, 1) * (len(SCALE) - 1)
@@ -174,20 +171,18 @@ def colors_of(uncertainty: np.ndarray, limits: tuple[float, float]) -> np.ndarra
 
 
 def draw_trust(
-    meshes: Mapping[str, Mesh], supports: Mapping[str, Support], views: Mapping[str, View], limits: tuple[float, float]
+    mesh: Mesh, uncertainty: np.ndarray, views: Mapping[str, View], limits: tuple[float, float]
 ) -> Image.Image:
-    """The map of uncertainty over the surface, as some cameras see it, side by side above a legend.
+    """The uncertainty over a surface in colours, as some cameras see it, side by side above a legend.
 
     Args:
-        meshes: with colours, by name, metres.
-        supports: of their vertices.
+        mesh: metres.
+        uncertainty: [V] m.
         views: cameras by what is written above them, metres.
         limits: see `color_range`.
     """
-    whole = joined(list(meshes.values()))
-    own = np.concatenate([mesh.colors for mesh in meshes.values() if mesh.colors is not None]).astype(float)
-    color = own + TINT * (colors_of(np.concatenate([supports[n].uncertainty for n in meshes]), limits) - own)
-    normals, caster = face_normals(whole)[0], Caster(whole)
+    color = colors_of(uncertainty, limits)
+    normals, caster = face_normals(mesh)[0], Caster(mesh)
     tiles = []
     for title, view in views.items():
         scale = WIDE / view.width
@@ -198,7 +193,7 @@ def draw_trust(
         hit = np.isfinite(away)
         pixels = np.full((len(rays), 3), 255.0)
         shade = 0.55 + 0.45 * np.abs((normals[face[hit]] * rays[hit]).sum(1))
-        pixels[hit] = color[whole.faces[face[hit]]].mean(1) * shade[:, None]
+        pixels[hit] = color[mesh.faces[face[hit]]].mean(1) * shade[:, None]
         tiles.append(Image.fromarray(to_bytes(pixels.reshape(height, WIDE, 3))))
         ImageDraw.Draw(tiles[-1]).text((6, 4), title, font=ImageFont.load_default(18), fill=(255, 255, 255),
                                        stroke_width=2, stroke_fill=(0, 0, 0))  # fmt: skip

@@ -1,0 +1,202 @@
+"""How far a surface can be trusted, against closed forms and renderings whose answer is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipeline.cameras import View
+from pipeline.mesh.cleaning import joined
+from pipeline.mesh.next_photos import Advice, next_photos
+from pipeline.mesh.trust import Support, colors_of, draw_trust, information, sigma_along, summary, support_of
+from pipeline.mesh.visibility import Caster, Visibility
+from pipeline.report import improvements, notes
+from sdfsim.errors import SdfsimError
+from sdfsim.shape.mesh import Mesh, load_mesh, read_attributes, write_ply
+from tests.pipeline.photo_sets import orbit, still_life, studio
+from tests.pipeline.test_surface import cube, look_at
+from tests.pipeline.test_texture import plate
+
+FLIP = np.diag([1.0, -1, -1])  # OpenGL camera axes to ours
+
+
+def pair(baseline: float, away: float) -> list[View]:
+    """Two cameras side by side, both looking straight down from a height."""
+    down = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
+    eyes = [np.array([x, 0, away]) for x in (-baseline / 2, baseline / 2)]
+    return [replace(look_at(np.array([0.0, -1, 1])), rotation=down, translation=-down @ eye) for eye in eyes]
+
+
+@pytest.mark.parametrize(("baseline", "away"), [(0.2, 2.0), (1.0, 3.0)])
+def test_two_cameras_tell_depth_as_the_stereo_formula_says(baseline, away):
+    """Depth = focal * baseline / disparity, and the disparity is off by the square root of two pixels."""
+    views = pair(baseline, away)
+    point, up, side = np.zeros((1, 3)), np.array([[0.0, 0, 1]]), np.array([[0.0, 1, 0]])
+    total = information(views[0], point) + information(views[1], point)
+    focal = views[0].focal
+    assert sigma_along(total, up)[0] == pytest.approx(np.sqrt(2) * away**2 / (focal * baseline), rel=1e-9)
+    # Across both lines of sight there are two measurements of one pixel each.
+    assert sigma_along(total, side)[0] == pytest.approx(away / focal / np.sqrt(2), rel=1e-9)
+
+
+def test_information_is_that_of_the_projection():
+    view = look_at(np.array([1.0, 2, 1.5]))
+    point = np.array([[0.3, -0.2, 0.1]])
+    steps = 1e-6 * np.eye(3)
+    slope = (view.project(point + steps)[0] - view.project(point - steps)[0]) / 2e-6  # [3, 2]
+    np.testing.assert_allclose(information(view, point)[0], slope @ slope.T, rtol=1e-6, atol=1e-3)
+
+
+def test_one_line_of_sight_tells_nothing_along_it():
+    views = pair(0.4, 2.0)
+    point, up = np.zeros((1, 3)), np.array([[0.0, 0, 1]])
+    assert np.isinf(sigma_along(information(views[0], point), up)).all()
+    assert np.isinf(sigma_along(3 * information(views[0], point), up)).all()
+
+
+def test_what_is_behind_something_is_guessed():
+    floor = plate(20)
+    wall = plate(4, z=0.5, half=0.2)
+    views = [view for shift in (-0.2, 0.2) for view in pair(0.1 + abs(shift), 3.0)]
+    found = support_of(Visibility(floor, 1e-3, Caster(joined([floor, wall]))), views)
+    under = np.abs(floor.vertices[:, :2]).max(1) < 0.15
+    beside = np.abs(floor.vertices[:, :2]).min(1) > 0.35
+    assert np.isinf(found.uncertainty[under]).all() and (found.views[under] == 0).all()
+    assert np.isfinite(found.uncertainty[beside]).all() and (found.views[beside] == 4).all()
+    told = summary(floor, found)
+    assert told["guessed"] == pytest.approx(0.2, abs=0.06)  # The wall's shadow is 0.48 m wide, and seen from two sides.
+    assert sum(told["seen_by"]) == pytest.approx(1, abs=1e-3)
+
+
+def test_the_guessed_side_of_a_body_is_named():
+    block = cube(0.4, (0, 0, 0.2))
+    views = [look_at(np.array([2 * np.cos(a), 2 * np.sin(a), 1.2])) for a in np.arange(8) * np.pi / 4]
+    found = support_of(Visibility(block, 1e-3, Caster(joined([block, plate(4)]))), views)
+    told = summary(block, found)
+    # A sixth, and a half of the lowest triangles around it.
+    assert told["where"] == ["underside"] and told["guessed"] == pytest.approx(1 / 6 + 1 / 24, abs=0.005)
+    report = {"trust": {"scene": told, "object1": told}, "weak": 0.0, "next_photos": []}
+    lines = " / ".join(notes({"mesh": report}))
+    assert "object1: 21% of its surface is guessed, fewer than two photos see it: underside" in lines
+
+
+def test_attributes_survive_reading_and_other_programs_read_the_mesh(tmp_path):
+    import open3d as o3d
+    import trimesh
+
+    block = cube(0.4)
+    block = replace(block, colors=np.full(block.vertices.shape, 90, np.uint8))
+    sure = np.linspace(0.001, 0.002, len(block.vertices)).astype(np.float32)
+    sure[3] = np.inf
+    views = np.arange(len(sure), dtype=np.int32)
+    path = tmp_path / "block.ply"
+    path.write_bytes(write_ply(block, {"views": views, "uncertainty": sure}))
+    found = read_attributes(path, ["views", "uncertainty"])
+    np.testing.assert_array_equal(found[0], views)
+    np.testing.assert_array_equal(found[1], sure)
+    theirs: Any = trimesh.load(path, force="mesh", process=False)
+    ours = load_mesh(path)
+    opened: Any = o3d.io.read_triangle_mesh(path)
+    assert ours.vertices.shape == block.vertices.shape and ours.colors is not None and (ours.colors == 90).all()
+    np.testing.assert_array_equal(theirs.vertices, block.vertices)
+    np.testing.assert_allclose(np.asarray(opened.vertices), block.vertices)
+    np.testing.assert_array_equal(np.asarray(opened.triangles), block.faces)
+    with pytest.raises(SdfsimError, match="without weight"):
+        read_attributes(path, ["weight"])
+
+
+def test_a_picture_shows_what_is_guessed_in_a_colour_of_its_own():
+    floor = plate(20)
+    value = np.where(floor.vertices[:, 0] > 0, np.inf, 0.001)
+    picture = draw_trust(floor, value, {"above": pair(0.0, 2.0)[0]}, (0.001, 0.01))
+    pixels = np.asarray(picture, float)[:480]
+    left, right = pixels[240, 250], pixels[240, 390]
+    assert left[2] > left[0] and right[0] > 4 * right[2]
+    ends = colors_of(np.array([0.001, 0.01, np.inf]), (0.001, 0.01))
+    assert np.abs(ends[:, None] - ends).sum(-1)[np.triu_indices(3, 1)].min() > 100
+    assert isinstance(picture, Image.Image)
+
+
+class Photographed:
+    """The box on a floor within four walls of `photo_sets`, as photos from some poses show it."""
+
+    def __init__(self, poses: list[np.ndarray]) -> None:
+        import trimesh
+
+        make = studio()
+        # The walls are sheets that photos show from one side; here the box and its floor are enough.
+        parts = still_life(make, 1)
+        box = Mesh(np.asarray(parts[0].vertices, float), np.asarray(parts[0].faces, np.int64))
+        self.box = finer(box)
+        ground = trimesh.creation.box((3.0, 3.0, 0.1)).apply_translation((0, 0, -0.05))
+        self.meshes = {"scene": finer(Mesh(np.asarray(ground.vertices), np.asarray(ground.faces))), "box": self.box}
+        whole = joined(list(self.meshes.values()))
+        self.caster, self.sight = Caster(whole), Visibility(whole, 2e-3, None)
+        self.views = [view_of(make, pose, number) for number, pose in enumerate(poses)]
+        self.vertices = whole.vertices
+
+    def support(self, more: list[View] | None = None) -> Support:
+        return support_of(self.sight, [*self.views, *(more or [])])
+
+    def advice(self) -> Advice:
+        counted = self.vertices[:, 2] > -1e-3
+        return next_photos(self.meshes, self.support(), self.sight, self.caster, self.views, counted)
+
+    def unseen(self, more: list[View] | None = None) -> float:
+        """Share of the box's vertices above the floor that fewer than two photos see."""
+        own = slice(len(self.vertices) - len(self.box.vertices), None)
+        above = self.vertices[own, 2] > 0.01
+        return float((self.support(more).views[own][above] < 2).mean())
+
+
+def finer(mesh: Mesh) -> Mesh:
+    """The mesh in triangles of 7 cm at most."""
+    import trimesh
+
+    vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, 0.07)[:2]
+    made = trimesh.Trimesh(vertices, faces, process=True)
+    return Mesh(np.asarray(made.vertices), np.asarray(made.faces, np.int64))
+
+
+def view_of(make, pose: np.ndarray, number: int) -> View:
+    rotation = FLIP @ pose[:3, :3].T
+    name = f"{number:03d}.jpg"
+    return View(name, name, make.WIDTH, make.HEIGHT, make.FOCAL, make.WIDTH / 2, make.HEIGHT / 2, 0.0, rotation,
+                -rotation @ pose[:3, 3])  # fmt: skip
+
+
+def test_photos_of_one_half_ask_for_the_other_half():
+    """Photos from the side of +y alone: the proposals stand at -y, and with them little of the box is left unseen."""
+    set_up = Photographed(orbit(studio(), 12, span=180.0))
+    found = set_up.advice()
+    assert len(found.photos) == 3 and found.weak > 0.05
+    places = np.array([photo.view.center for photo in found.photos])
+    assert (places[:, 1] < -0.3).all() and (places[:, 2] > 0.05).all()
+    gains = [photo.gain for photo in found.photos]
+    assert gains == sorted(gains, reverse=True) and 0.5 < sum(gains) <= 1
+    before, after = set_up.unseen(), set_up.unseen([photo.view for photo in found.photos])
+    assert before > 0.2 and after < 0.5 * before
+    for photo in found.photos:
+        assert "stand where 0" in photo.words and "around the scene to your" in photo.words
+        assert "looking at the" in photo.words
+        # The camera does look there.
+        pixels, depth = photo.view.project(photo.target[None])
+        np.testing.assert_allclose(pixels[0], [photo.view.cx, photo.view.cy], atol=1e-6)
+        assert depth[0] > 0
+    text = " / ".join(improvements({
+        "poses": {}, "photos": [], "psnr": None, "failed_checks": [],
+        "stages": {"mesh": {"next_photos": [photo.told() for photo in found.photos]}},
+    }))  # fmt: skip
+    assert found.photos[0].words in text and f"{places[0][0]:.2f}" in text
+
+
+def test_where_all_is_photographed_nothing_is_asked_for():
+    set_up = Photographed(orbit(studio(), 36))
+    found = set_up.advice()
+    assert found.photos == []
+    told = notes({"mesh": {"trust": {}, "weak": found.weak, "next_photos": []}})
+    assert any("no one photo would help much" in line for line in told)
