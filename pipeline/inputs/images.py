@@ -35,6 +35,7 @@ class Picture:
         mask: [H, W] uint8 (255 = object), or None.
         focal: prior from EXIF, px of `pixels`, or None.
         camera: make and model, empty where unknown.
+        labels: [H, W] uint8, see `Labels.of`, or None.
     """
 
     pixels: np.ndarray
@@ -42,6 +43,7 @@ class Picture:
     mask: np.ndarray | None = None
     focal: float | None = None
     camera: str = ""
+    labels: np.ndarray | None = None
 
 
 def exif_focal(image: Image.Image) -> tuple[float | None, str]:
@@ -87,9 +89,9 @@ def read_photo(path: Path, long_side: int, mask: Path | None = None, shape: floa
     Raises:
         SdfsimError: not an image, truncated, too small or too large; the message names the file.
     """
-    image, original, focal, camera = _decoded(path, long_side)
+    image, original, focal, camera = decoded(path, long_side)
     turned = ImageOps.exif_transpose(image)
-    if shape is not None and _off(turned, shape) > _off(image, shape):
+    if shape is not None and off(turned, shape) > off(image, shape):
         turned = image
     if turned.size != image.size:
         original = original[1], original[0]
@@ -120,9 +122,9 @@ def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
     Raises:
         SdfsimError: it cannot be read, or is not shaped like the photo.
     """
-    stored, _, _, _ = _decoded(path, max(size))
+    stored, _, _, _ = decoded(path, max(size))
     for image in (ImageOps.exif_transpose(stored), stored):
-        if _off(image, size[0] / size[1]) < 0.02:
+        if off(image, size[0] / size[1]) < 0.02:
             grey = image.getchannel("A") if image.mode == "RGBA" else image.convert("L")
             return np.asarray(grey.resize(size, Image.Resampling.BOX))
     raise SdfsimError(
@@ -153,7 +155,7 @@ def opened(path: Path) -> Iterator[Image.Image]:
         Image.MAX_IMAGE_PIXELS = limit
 
 
-def _decoded(path: Path, long_side: int) -> tuple[Image.Image, tuple[int, int], float | None, str]:
+def decoded(path: Path, long_side: int) -> tuple[Image.Image, tuple[int, int], float | None, str]:
     """A decoded image, its size in the file, its focal length in longer sides, and its camera."""
     try:
         with opened(path) as image:
@@ -173,7 +175,7 @@ def _decoded(path: Path, long_side: int) -> tuple[Image.Image, tuple[int, int], 
         raise SdfsimError(f"{path}: {what}", "copy it again from the camera, or remove it") from error
 
 
-def _off(image: Image.Image, shape: float) -> float:
+def off(image: Image.Image, shape: float) -> float:
     """By what share an image is wider or narrower than a shape, width over height."""
     return abs(image.width / image.height / shape - 1)
 

@@ -1,0 +1,187 @@
+"""Which object each pixel shows: masks by object, or label images, that came with the photos."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import yaml
+from PIL import Image, ImageOps
+
+from pipeline.inputs.images import decoded, off, read_mask
+from sdfsim.errors import SdfsimError
+from sdfsim.files import read_json, write_json
+
+MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
+FOLDER, NAMES = "labels", "names.json"  # what the photos stage writes
+UNKNOWN = 255  # a pixel of which nothing is said
+# Names that a scene file may hold already.
+TAKEN = ("scene", "floor", "box", "ball")
+NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
+
+
+@dataclass(frozen=True)
+class Labels:
+    """Object masks, or label images, of a set of photos.
+
+    Attributes:
+        masks: mask file of each object on each photo that has one: white is the object.
+        images: label image of each photo that has one.
+        names: of the objects; pixels of a prepared label image count from 1 in this order, 0 is none of them.
+        values: label of each object in `images`; none where masks are given.
+        notes: what was passed over, for the report.
+    """
+
+    masks: dict[Path, dict[str, Path]] = field(default_factory=dict)
+    images: dict[Path, Path] = field(default_factory=dict)
+    names: tuple[str, ...] = ()
+    values: tuple[int, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def files(self) -> list[Path]:
+        """Every file whose content the result depends on."""
+        return sorted([path for each in self.masks.values() for path in each.values()] + list(self.images.values()))
+
+    def of(self, photo: Path, size: tuple[int, int]) -> np.ndarray | None:
+        """Number of the object at each pixel [H, W] uint8 of a photo that is width x height upright; None: not given.
+
+        Where some objects have no mask of this photo, a pixel outside the others is `UNKNOWN`; so is one in two masks.
+
+        Raises:
+            SdfsimError: a file cannot be read, or is not shaped like the photo.
+        """
+        if photo in self.images:
+            found = read_label_image(self.images[photo], size)
+            result = np.zeros(found.shape, np.uint8)
+            for number, value in enumerate(self.values, start=1):
+                result[found == value] = number
+            return result
+        if photo not in self.masks:
+            return None
+        inside = {name: read_mask(path, size) >= 128 for name, path in self.masks[photo].items()}
+        result = np.full(size[::-1], 0 if len(inside) == len(self.names) else UNKNOWN, np.uint8)
+        for number, name in enumerate(self.names, start=1):
+            if name in inside:
+                result[inside[name]] = number
+        result[np.sum(list(inside.values()), axis=0) > 1] = UNKNOWN
+        return result
+
+
+def names_for(photo: Path) -> list[str]:
+    """What a mask file of a photo may be called: like the photo with `.png` behind it, or with another suffix."""
+    return [photo.name + ".png", *(photo.stem + suffix for suffix in MASK_SUFFIXES)]
+
+
+def find_labels(photos: list[Path]) -> Labels:
+    """Looks for `masks/NAME/` and `labels/` in and beside the photos' folders.
+
+    Raises:
+        SdfsimError: both are given, a name that no body can have, or files of which none belongs to a photo.
+    """
+    roots = list(dict.fromkeys(root for photo in photos for root in (photo.parent, photo.parent.parent)))
+    folders = [(root / "masks", path) for root in roots for path in _folders(root / "masks")]
+    folders = [(root, path) for root, path in folders if path not in [photo.parent for photo in photos]]
+    images, notes = {}, []
+    for root in roots:
+        if (root / FOLDER).is_dir() and root / FOLDER not in [photo.parent for photo in photos]:
+            found, more = _of_photos(root / FOLDER, photos)
+            images, notes = {**found, **images}, [*notes, *more]
+    if images and folders:
+        raise SdfsimError(f"{folders[0][1]}: there are label images as well", "keep only one of masks/NAME and labels")
+    masks: dict[Path, dict[str, Path]] = {}
+    for _, folder in folders:
+        found, more = _of_photos(folder, photos)
+        notes += more
+        known = NAME.fullmatch(folder.name) and yaml.safe_load(folder.name) == folder.name  # "no" would be False
+        if found and (not known or folder.name in TAKEN):
+            raise SdfsimError(f"{folder}: no body can have this name",
+                              f"use letters, digits, - and _, a letter first; not {', '.join(TAKEN)}")  # fmt: skip
+        for photo, path in found.items():
+            masks.setdefault(photo, {}).setdefault(folder.name, path)
+    if notes and not masks and not images:
+        raise SdfsimError(f"{'; '.join(notes)}: nothing of it can be used",
+                          "name a mask like its photo: a.png or a.jpg.png for a.jpg")  # fmt: skip
+    names = tuple(sorted({name for each in masks.values() for name in each}))
+    values: tuple[int, ...] = ()
+    if images:
+        found = np.unique(np.concatenate([np.unique(read_label_image(path)) for path in images.values()]))
+        values = tuple(int(value) for value in found if value)
+        names = tuple(f"object{value}" for value in values)
+        if not names:
+            raise SdfsimError(f"{next(iter(images.values())).parent}: all labels are 0", "0 is no object")
+    if len(names) >= UNKNOWN:
+        raise SdfsimError(f"{len(names)} objects in labels and masks, at most {UNKNOWN - 1} can be told apart")
+    return Labels(masks, images, names, values, tuple(notes))
+
+
+def _folders(root: Path) -> list[Path]:
+    return sorted(p for p in root.iterdir() if p.is_dir() and not p.name.startswith(".")) if root.is_dir() else []
+
+
+def _of_photos(folder: Path, photos: list[Path]) -> tuple[dict[Path, Path], list[str]]:
+    """The file of each photo in a folder, and a note on what belongs to none."""
+    there = {path.name for path in folder.iterdir() if path.is_file() and path.suffix.lower() in MASK_SUFFIXES}
+    found = {}
+    for photo in photos:
+        near = folder.is_relative_to(photo.parent) or folder.is_relative_to(photo.parent.parent)
+        name = near and next((name for name in names_for(photo) if name in there), None)
+        if name:
+            found[photo] = folder / name
+    rest = sorted(there - {path.name for path in found.values()})
+    called = f"{folder.parent.name}/{folder.name}" if folder.name != FOLDER else FOLDER
+    if not found and not rest:
+        return found, [f"{called} holds no masks"] if folder.name != FOLDER else []
+    return found, [f"{len(rest)} files in {called} belong to no photo (first: {rest[0]})"] if rest else []
+
+
+def read_label_image(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
+    """A label image [H, W] int, palette or grey of 8 or 16 bits, at the size (width, height) of its upright photo.
+
+    Without a size it stays as it is stored.
+
+    Raises:
+        SdfsimError: it cannot be read, is in colour, or is not shaped like the photo.
+    """
+    stored = decoded(path, 1 << 20)[0]
+    if stored.mode not in ("1", "L", "P") and not stored.mode.startswith("I"):
+        raise SdfsimError(f"{path}: a label image has one number a pixel, this one is {stored.mode}",
+                          "write it as a palette PNG, or in grey of 8 or 16 bits")  # fmt: skip
+    if size is None:
+        return np.asarray(stored).astype(np.int64)
+    for image in (ImageOps.exif_transpose(stored), stored):
+        if off(image, size[0] / size[1]) < 0.02:
+            rows, columns = ((np.arange(n) + 0.5) / n for n in size[::-1])
+            found = np.asarray(image).astype(np.int64)
+            return found[np.ix_((rows * image.height).astype(int), (columns * image.width).astype(int))]
+    raise SdfsimError(
+        f"{path}: labels of {stored.width} x {stored.height} do not fit their photo, shaped {size[0]} x {size[1]}",
+        "label images have to be as large as their photos, and upright",
+    )
+
+
+def save_labels(labels: np.ndarray, folder: Path, name: str) -> None:
+    """Writes the labels [H, W] uint8 of a prepared photo into the photos stage's folder."""
+    (folder / FOLDER).mkdir(exist_ok=True)
+    Image.fromarray(labels).save(folder / FOLDER / (name + ".png"))
+
+
+def save_names(names: tuple[str, ...], folder: Path) -> None:
+    """Writes the names of the objects beside their labels."""
+    write_json(folder / FOLDER / NAMES, {"version": 1, "names": list(names)})
+
+
+def load_names(folder: Path) -> list[str]:
+    """Names of the objects whose labels `save_labels` wrote to a photos folder; none where there are none."""
+    path = Path(folder) / FOLDER / NAMES
+    return read_json(path)["names"] if path.exists() else []
+
+
+def load_labels(folder: Path, name: str) -> np.ndarray | None:
+    """Labels [H, W] uint8 of a prepared photo: numbers of the names from 1 on, 0 none, `UNKNOWN`; None: not given."""
+    path = Path(folder) / FOLDER / (name + ".png")
+    if not path.exists():
+        return None
+    with Image.open(path) as image:
+        return np.asarray(image)
