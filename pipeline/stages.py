@@ -161,9 +161,9 @@ class Stage:
 
 
 STAGES = {
-    "photos": Stage(do_photos, "photos", version=2),
-    "poses": Stage(do_poses, "poses", ("seed",), 2),
-    "distill": Stage(do_distill, "distill", ("preset", "seed", "budget"), 2),
+    "photos": Stage(do_photos, "photos", version=3),
+    "poses": Stage(do_poses, "poses", ("seed",), 3),
+    "distill": Stage(do_distill, "distill", ("preset", "seed", "budget"), 3),
     "mesh": Stage(do_mesh, "mesh", ("preset", "size", "distance", "crop"), 4),
     "fit": Stage(do_fit, "assets", ("seed", "budget", "recipe")),
     "scene": Stage(do_scene, "scene", ("seed", "drop", "material"), 3),

@@ -63,7 +63,7 @@ class Settings:
         eikonal: weight of (|grad| - 1)^2.
         curvature: weight of |Laplacian| at the start, in units of the finest active cell.
         sparse: weight of |sdf| at the points of structure-from-motion.
-        depth: weight of |sdf| at the points of a depth sensor.
+        depth: weight of |sdf| at the points of a depth sensor, at the start.
         free: weight of what is solid between a camera and a point that it sees.
         mask: weight of the opacity loss where photos have masks.
         surface_points: points of the eikonal loss.
@@ -248,7 +248,9 @@ class Trainer:
         if len(empty):
             losses["free"] = torch.relu(clearance - sdf[3]).mean() * settings.free
         if len(measured):
-            losses["depth"] = sdf[4].abs().clamp_max(0.1).mean() * settings.depth
+            # It gives the shape early on. Later, colours see finer than the sensor's noise.
+            fade = max(0.03, 1 - self.fraction / 0.5)
+            losses["depth"] = sdf[4].abs().clamp_max(0.1).mean() * settings.depth * fade
         self.optimizer.zero_grad(set_to_none=True)
         torch.stack(list(losses.values())).sum().backward()
         for group in self.optimizer.param_groups:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import zipfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -18,6 +19,7 @@ from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, write_json
 
 CAPTURE = "capture.json"  # what `Capture` says, in the folder of the photos stage
+LARGEST = 32 << 30  # bytes of a capture
 ARCHIVES = {".r3d", ".zip"}
 MOST = 100  # frames that are used of a recording
 TRIED = 5  # frames of a stretch that are looked at for the sharpest
@@ -122,14 +124,25 @@ def _polycam(folder: Path) -> list[KnownCamera]:
 
 
 def unpack(archive: Path, folder: Path) -> None:
-    """Unpacks a zipped capture.
+    """Unpacks the files of a zipped capture.
 
     Raises:
-        SdfsimError: not a zip, or damaged.
+        SdfsimError: not a zip, damaged, too large once unpacked, or with names that lead out of the folder.
     """
     try:
         with zipfile.ZipFile(archive) as file:
-            file.extractall(folder)  # which leaves out what would lie outside
+            entries = [entry for entry in file.infolist() if not entry.is_dir()]
+            if sum(entry.file_size for entry in entries) > LARGEST:
+                raise SdfsimError(f"{archive}: more than {LARGEST >> 30} GiB unpacked", "export fewer frames")
+            for entry in entries:
+                place = folder / entry.filename
+                if not place.resolve().is_relative_to(folder.resolve()):
+                    raise SdfsimError(
+                        f"{archive}: {entry.filename} would lie outside of the capture", "export it again"
+                    )
+                place.parent.mkdir(parents=True, exist_ok=True)
+                with file.open(entry) as packed, open(place, "wb") as out:
+                    shutil.copyfileobj(packed, out)
     except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
         raise SdfsimError(f"{archive}: cannot be unpacked: {error}", "export the capture again") from error
 

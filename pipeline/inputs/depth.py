@@ -24,7 +24,7 @@ class DepthFile:
         path: PNG or TIFF of integers, EXR, NPY, or Record3D's compressed floats (`.depth`).
         unit: m that a count stands for; None: integers are millimetres, floats metres.
         confidence: file of the same shape, higher is better; None: there is none.
-        shape: rows and columns, of a file that does not say so itself.
+        shape: rows and columns, of a `.depth` file, which does not say so itself.
     """
 
     path: Path
@@ -72,7 +72,7 @@ def _read(path: Path, shape: tuple[int, int] | None, raw: type) -> np.ndarray:
     """The numbers [H, W] of a file, `raw` ones where it does not say what they are."""
     try:
         if path.suffix in (".depth", ".conf"):
-            values = _compressed(path, raw).reshape(shape or (-1,))
+            values = _compressed(path, raw, shape or (256, 192))
         elif path.suffix.lower() == ".exr":
             values = _exr(path)
         elif path.suffix.lower() == ".npy":
@@ -88,13 +88,14 @@ def _read(path: Path, shape: tuple[int, int] | None, raw: type) -> np.ndarray:
     return np.squeeze(values)
 
 
-def _compressed(path: Path, raw: type) -> np.ndarray:
-    """Numbers that Record3D packed by LZFSE."""
+def _compressed(path: Path, raw: type, shape: tuple[int, int]) -> np.ndarray:
+    """Numbers [H, W] that Record3D packed by LZFSE."""
     try:
         import imagecodecs
     except ImportError as error:
         raise SdfsimError(f"{path}: compressed by LZFSE, which needs the package imagecodecs", EXTRA) from error
-    return np.frombuffer(imagecodecs.lzfse_decode(path.read_bytes()), raw)
+    size = shape[0] * shape[1] * np.dtype(raw).itemsize
+    return np.frombuffer(imagecodecs.lzfse_decode(path.read_bytes(), out=size), raw).reshape(shape)
 
 
 def _exr(path: Path) -> np.ndarray:

@@ -49,7 +49,7 @@ def depth_points(views: list[View], photos: list[Photo], folder: Path, *, scale:
         if not photo.depth:
             continue
         try:
-            depth = np.load(folder / "depth" / f"{view.name}.npy")
+            depth = np.load(folder / "depth" / f"{view.name}.npy", allow_pickle=False)
         except (OSError, ValueError) as error:
             raise SdfsimError(f"{folder}: no depth of {view.name}", "run the photos stage again") from error
         row, column = np.nonzero(depth)

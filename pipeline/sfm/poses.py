@@ -38,6 +38,9 @@ ATTEMPTS = {
 }  # fmt: skip
 
 
+WIDEST_PAIR = 60.0  # degrees between the optical axes of known cameras whose photos are matched
+
+
 def hopeful(name: str, first: dict) -> bool:
     """Whether an attempt is worth its time after the first one's failed checks.
 
@@ -85,7 +88,7 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
         "images": str(photos_folder / "images"), "count": len(photos), "groups": size_groups(photos), "seed": seed,
         "masks": str(photos_folder / "masks") if all(p.mask for p in photos) else "",
         "known_cameras": str(known) if known.exists() else "", "refine": load_capture(photos_folder) is not None,
-        "exhaustive_up_to": exhaustive_up_to,
+        "pairs": seen_together(load_views(known)) if known.exists() else None, "exhaustive_up_to": exhaustive_up_to,
     }  # fmt: skip
     tries: list[tuple[dict, Path, dict]] = []
     told: list[dict] = []
@@ -133,6 +136,13 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
         (used / "database.db").unlink(missing_ok=True)
         shutil.rmtree(used / "colmap", ignore_errors=True)
     return checks
+
+
+def seen_together(views: list[View]) -> list[list[str]]:
+    """Pairs of photos that may show the same, by their cameras: seen from farther round, features look different."""
+    ahead = np.array([view.rotation[2] for view in views])
+    close = ahead @ ahead.T > np.cos(np.radians(WIDEST_PAIR))
+    return [[views[a].name, views[b].name] for a, b in np.argwhere(np.triu(close, 1)).tolist()]
 
 
 def moved(before: list[View], after: list[View]) -> dict[str, float]:
@@ -186,7 +196,7 @@ def run_worker(job: dict, folder: Path, timeout: float, on_progress: Progress) -
                     raise SdfsimError(
                         f"camera poses: stopped after {timeout:.0f} s (log: {log})", "use fewer or smaller photos"
                     )
-                on_progress(*estimate(folder, lines, job["count"], job["exhaustive_up_to"]))
+                on_progress(*estimate(folder, lines, job))
                 try:
                     child.wait(0.5)
                 except subprocess.TimeoutExpired:
@@ -209,8 +219,9 @@ def crash_reason(code: int, log: Path) -> str:
     return f"failed: {tail[-1].strip()[:200]}" if tail else f"failed with status {code}"
 
 
-def estimate(folder: Path, lines: Path, count: int, exhaustive_up_to: int) -> tuple[float, str]:
+def estimate(folder: Path, lines: Path, job: dict) -> tuple[float, str]:
     """Fraction done and a message, from the child's lines and the row counts of its database."""
+    count = job["count"]
     said = lines.read_text(errors="replace").splitlines()
     phase = next((line.split()[1] for line in reversed(said) if line.startswith("phase")), "features")
     placed = next((int(line.split()[1]) for line in reversed(said) if line.startswith("placed")), 0)
@@ -219,7 +230,9 @@ def estimate(folder: Path, lines: Path, count: int, exhaustive_up_to: int) -> tu
     if phase == "done":
         return 1.0, "done"
     table, total = ("keypoints", count) if phase == "features" else ("two_view_geometries", count * (count - 1) / 2)
-    if phase == "matches" and count > exhaustive_up_to:
+    if phase == "matches" and job["pairs"] is not None:
+        total = len(job["pairs"])
+    elif phase == "matches" and count > job["exhaustive_up_to"]:
         total = count * 20
     rows = 0
     try:

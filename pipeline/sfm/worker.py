@@ -20,8 +20,10 @@ import numpy as np
 
 from sdfsim.files import write_arrays, write_json
 
-# Px that a point may be off while known cameras are refined, and points that a camera needs to be moved.
-REFINE_PIXELS, REFINE_POINTS = (16.0, 6.0), 30
+# Px that a point may be off while known cameras are refined, points that a camera needs to be moved, points that most
+# need for any to be moved (with fewer, a dozen photos came out worse than given), and the m within which a phone tracks
+# its place.
+REFINE_PIXELS, REFINE_POINTS, SUPPORTED, TRACKED = (16.0, 6.0), 30, 70, 0.02
 
 
 def say(message: str) -> None:
@@ -72,7 +74,7 @@ def _known(pycolmap, database: Path, name: str) -> bool:
 
 
 def matches(pycolmap, job: dict, database: Path) -> None:
-    """Matches every pair, or neighbours in name order where there are too many pairs."""
+    """Matches the pairs of the job, else every pair, or neighbours in name order where there are too many."""
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
     matching.guided_matching = job["guided"]
@@ -84,9 +86,14 @@ def matches(pycolmap, job: dict, database: Path) -> None:
     # Pairs that do not overlap would otherwise use up all 10,000 trials each, most of the time of this stage.
     verification.ransac.min_inlier_ratio = job["min_inlier_ratio"]
     common = {"matching_options": matching, "verification_options": verification, "device": pycolmap.Device.cpu}
-    if job["count"] <= job["exhaustive_up_to"]:
+    if job["pairs"] is not None:
+        pairing = pycolmap.ImportedPairingOptions(block_size=100)
+        pairing.match_list_path = database.with_name("pairs.txt")
+        pairing.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in job["pairs"]))
+        pycolmap.match_image_pairs(database, pairing_options=pairing, **common)
+    elif job["count"] <= job["exhaustive_up_to"]:
         pairing = pycolmap.ExhaustivePairingOptions()
-        pairing.block_size = 10  # Small blocks only so that progress shows in the database.
+        pairing.block_size = 10  # Small blocks, here and above, only so that progress shows in the database.
         pycolmap.match_exhaustive(database, pairing_options=pairing, **common)
     else:
         pairing = pycolmap.SequentialPairingOptions()
@@ -163,29 +170,43 @@ def refine(pycolmap, model, database: Path, job: dict, out: Path) -> None:
     """Moves known cameras to where the matches between their photos say they stood, by bundle adjustment.
 
     A phone tracks its poses to a centimetre or so, which is many pixels. The first points are allowed as much, the
-    next ones less. As a whole the cameras stay where they were, at the scale they had; a camera that few points see
-    stays near its neighbours as given.
+    next ones less. Every camera is drawn to where it was given, which decides where matches do not; as a whole the
+    cameras stay where they were, at the scale they had.
     """
-    given = {key: image.cam_from_world() for key, image in model.images.items()}
+    given = {key: image.projection_center() for key, image in model.images.items()}
+    priors = [
+        pycolmap.PosePrior(
+            position=center, position_covariance=np.eye(3) * TRACKED**2, corr_data_id=model.images[key].data_id,
+            coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
+        )
+        for key, center in given.items()
+    ]  # fmt: skip
     for pixels in REFINE_PIXELS:
         options = incremental_options(pycolmap, job)
         options.mapper.filter_max_reproj_error = pixels
         options.triangulation.complete_max_reproj_error = options.triangulation.merge_max_reproj_error = pixels
         found = pycolmap.triangulate_points(model, database, job["images"], out / "colmap", options=options)
-        adjustment = pycolmap.BundleAdjustmentOptions()
-        adjustment.refine_focal_length = adjustment.refine_extra_params = False
-        adjustment.print_summary = False
+        config, adjustment = pycolmap.BundleAdjustmentConfig(), pycolmap.BundleAdjustmentOptions()
+        adjustment.refine_focal_length = adjustment.refine_extra_params = adjustment.print_summary = False
         adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
         adjustment.ceres.solver_options.num_threads = 1  # several add up in an order that differs from run to run
-        pycolmap.bundle_adjustment(found, adjustment)
-        # Bundle adjustment is free to move, turn and scale everything.
         seen = [key for key, image in found.images.items() if image.has_pose and image.num_points3D >= REFINE_POINTS]
-        if len(seen) < 3:
+        if np.median([image.num_points3D for image in found.images.values()]) < SUPPORTED:
             return
+        for key in seen:
+            config.add_image(key)
+        with_priors = pycolmap.PosePriorBundleAdjustmentOptions()
+        with_priors.alignment_ransac.random_seed = job["seed"]
+        adjuster = pycolmap.create_pose_prior_bundle_adjuster(
+            adjustment,
+            with_priors,
+            config,
+            [prior for key, prior in zip(given, priors, strict=True) if key in seen],
+            found,
+        )
+        adjuster.solve()
         after = np.array([found.images[key].projection_center() for key in seen])
-        before = np.array([given[key].inverse().translation for key in seen])
-        back = pycolmap.estimate_sim3d(after, before)
-        found.transform(back)
+        found.transform(pycolmap.estimate_sim3d(after, np.array([given[key] for key in seen])))
         for key in seen:
             model.frames[model.images[key].frame_id].rig_from_world = found.images[key].cam_from_world()
 

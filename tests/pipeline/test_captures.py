@@ -68,12 +68,13 @@ def test_every_layout_gives_the_same_cameras_and_depth(layout, tmp_path):
 
 
 def test_the_poses_of_a_phone_are_refined(tmp_path):
-    phone.write("polycam", tmp_path / "capture", every=4)
+    phone.write("polycam", tmp_path / "capture", every=3)
     folder, out = tmp_path / "photos", tmp_path / "poses"
-    folder.mkdir(), out.mkdir()
+    folder.mkdir()
+    out.mkdir()
     photos, _ = prepare_photos(tmp_path / "capture", folder)
     checks = solve(photos, folder, out)
-    frames = json.loads((TABLE_VASE / "transforms.json").read_text())["frames"][::4]
+    frames = json.loads((TABLE_VASE / "transforms.json").read_text())["frames"][::3]
     true = np.array([(phone.TO_ARKIT @ np.array(frame["transform_matrix"]))[:3, 3] for frame in frames])
 
     def shape_error(views: list[View]) -> float:
@@ -86,7 +87,7 @@ def test_the_poses_of_a_phone_are_refined(tmp_path):
 
     given, found = load_views(folder / KNOWN_CAMERAS), load_views(out)
     assert shape_error(given) > 0.003
-    assert shape_error(found) < 0.3 * shape_error(given)
+    assert shape_error(found) < 0.5 * shape_error(given)
     # As a whole they stay in the phone's world, at its scale.
     centers = [np.array([view.center for view in views]) for views in (given, found)]
     np.testing.assert_allclose(centers[0].mean(0), centers[1].mean(0), atol=0.003)
@@ -231,3 +232,13 @@ def test_what_is_no_capture_is_told(tmp_path):
 def test_points_of_depth_are_an_empty_set_without_depth(tmp_path):
     found = depth_points([camera("a", 0.0)], [replace(photo("a"), depth=False)], tmp_path)
     assert isinstance(found, DepthPoints) and found.xyz.shape == (0, 3)
+
+
+def test_a_zip_does_not_write_outside_of_its_folder(tmp_path):
+    import zipfile
+
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        archive.writestr("../outside.txt", "no")
+    with pytest.raises(SdfsimError, match="outside of the capture"):
+        prepare_photos(tmp_path / "a.zip", tmp_path / "out")
+    assert not (tmp_path / "outside.txt").exists() and not (tmp_path / "out" / "outside.txt").exists()

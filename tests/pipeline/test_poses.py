@@ -172,7 +172,7 @@ def test_one_camera_for_each_size_and_zoom():
 
 
 def test_a_crash_of_the_child_is_one_clear_line(tmp_path):
-    job = {**ORDINARY, "count": 3, "exhaustive_up_to": 100}  # Lacks what the child needs.
+    job = {**ORDINARY, "count": 3, "exhaustive_up_to": 100, "pairs": None}  # Lacks what the child needs.
     with pytest.raises(SdfsimError) as caught:
         run_worker(job, tmp_path, 60, lambda fraction, message: None)
     assert "COLMAP failed" in caught.value.message and "colmap.log" in caught.value.message
@@ -184,7 +184,7 @@ def test_a_child_that_hangs_is_ended(tmp_path, monkeypatch):
     script.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(script))
     with pytest.raises(SdfsimError, match="stopped after 1 s"):
-        run_worker({"count": 3, "exhaustive_up_to": 100}, tmp_path / "work", 1.0, lambda fraction, message: None)
+        run_worker({"count": 3, "exhaustive_up_to": 100, "pairs": None}, tmp_path / "work", 1.0, lambda fraction, message: None)
 
 
 def test_photos_without_anything_in_common_fail_with_reasons(tmp_path):
@@ -258,7 +258,7 @@ def test_an_attempt_that_breaks_leaves_the_findings_of_the_others(monkeypatch, t
 
 
 def test_a_finished_attempt_is_not_run_again(tmp_path, monkeypatch):
-    job = {"count": 3, "exhaustive_up_to": 100}
+    job = {"count": 3, "exhaustive_up_to": 100, "pairs": None}
     (tmp_path / "try").mkdir()
     write_json(tmp_path / "try" / "job.json", job)
     write_json(tmp_path / "try" / "result.json", {"views": []})
@@ -288,7 +288,7 @@ def test_the_leavings_of_another_job_go(tmp_path, monkeypatch):
     (tmp_path / "database.db").write_text("old")
     monkeypatch.setattr(sys, "executable", "/bin/false")
     with pytest.raises(SdfsimError):
-        run_worker({"count": 3, "exhaustive_up_to": 100}, tmp_path, 5.0, lambda fraction, message: None)
+        run_worker({"count": 3, "exhaustive_up_to": 100, "pairs": None}, tmp_path, 5.0, lambda fraction, message: None)
     assert not (tmp_path / "database.db").exists()
 
 
