@@ -144,6 +144,19 @@ def trust_lines(mesh: dict) -> list[str]:
     return lines
 
 
+def touching_lines(mesh: dict) -> list[str]:
+    """Which bodies touch, which masks have no body, and how deep hollows are, from the report of the mesh stage."""
+    from pipeline.mesh.hollows import hollow_line
+
+    lines = []
+    for first, second, by in mesh.get("touching", []):
+        how = "split where their masks end" if by == "masks" else (
+            "split along a seam by concavity and colour; give masks to be sure")  # fmt: skip
+        lines.append(f"{first} and {second} touch; {how}")
+    lines += [f"masks of {name}: no surface corresponds to them" for name in mesh.get("masks_without_surface", [])]
+    return lines + [hollow_line(name, *found) for name, found in mesh.get("hollows_m", {}).items()]
+
+
 def notes(stages: dict[str, dict]) -> list[str]:
     """What a person should know about a run: what was passed over, assumed or is uncertain; one line each."""
     poses, mesh = stages.get("poses", {}), stages.get("mesh", {})
@@ -160,6 +173,7 @@ def notes(stages: dict[str, dict]) -> list[str]:
         lines.append(f"size {mesh['size']} (give --size or --distance)")
     if mesh.get("objects"):
         lines.append(f"bodies of their own: {', '.join(mesh['objects'])} (mesh/objects.png shows which is which)")
+    lines += touching_lines(mesh)
     if "smallest_object_m" in mesh:
         lines.append(f"what rises less than {mesh['smallest_object_m']:.2g} m stays part of what it stands on")
     if mesh.get("left_out_m"):
@@ -226,8 +240,8 @@ def page(report: dict, folder: Path) -> str:
     lines += ["## Numbers", "", "| | |", "| --- | --- |", *(f"| {name} | {value} |" for name, value in rows), ""]
     if (folder / "mesh" / "objects.png").exists() and mesh:
         lines += ["## What was found", "", "![bodies by name](mesh/objects.png)", ""]
-    if (folder / "mesh" / "trust.png").exists() and mesh:
-        lines += ["## How far to trust the surface", "", "![uncertainty](mesh/trust.png)", ""]
+    if (folder / "mesh" / "trust.jpg").exists() and mesh:
+        lines += ["## How far to trust the surface", "", "![uncertainty](mesh/trust.jpg)", ""]
     files = {photo["photo"]: photo["file"] for photo in report["photos"]}
     held = [name for name in distill.get("held_out_photos", []) if name in files]
     if held:

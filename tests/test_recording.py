@@ -192,6 +192,16 @@ def test_a_reconstruction_shows_cameras_photos_points_and_surface(tmp_path):
     assert "/world/surface!" in found
 
 
+def test_what_is_proposed_and_how_far_to_trust_the_surface_are_things_of_their_own(tmp_path):
+    photo = PosedPhoto("next1", None, 700.0, (400.0, 300.0), (800, 600), np.eye(3), np.zeros(3), (255, 40, 200))
+    tinted = replace(box(), colors=np.full((len(box().vertices), 3), 7, np.uint8))
+    save_reconstruction(tmp_path / "r.rrd", [photo], np.zeros((0, 3)), None, box(), trust={"a box": tinted})
+    found = read(tmp_path / "r.rrd")
+    assert found["/world/cameras/next1!"]["Pinhole:color"][0][0] == 0xFF28C8FF
+    assert len(found[r"/world/trust/a\ box!"]["Mesh3D:vertex_colors"][0]) == 36
+    assert "/world/surface!" in found
+
+
 def test_boxes_keep_their_edges_and_balls_stay_smooth():
     mesh, normals = with_normals(box())
     assert len(mesh.vertices) == 36

@@ -18,6 +18,7 @@ from pipeline.inputs.photos import load_photos
 from pipeline.mesh.bodies import Parts, split
 from pipeline.mesh.cleaning import joined
 from pipeline.mesh.extraction import EXTENT, ball, field_distance, sample_volume, surface_of
+from pipeline.mesh.hollows import hollow
 from pipeline.mesh.next_photos import next_photos
 from pipeline.mesh.placement import GRAVITY, Placement, Up, measured_scale, place
 from pipeline.mesh.texture import Shots, shots_of, texture_parts
@@ -29,7 +30,7 @@ from sdfsim.files import read_json, replacing, write_json
 from sdfsim.shape.mesh import Mesh, read_attributes, read_mesh, write_glb, write_ply
 
 SCENERY = "scene"
-TEXTURED, TRUST, NEXT = "textured.glb", "trust.png", "next_photos.json"
+TEXTURED, TRUST, NEXT = "textured.glb", "trust.jpg", "next_photos.json"
 RESOLUTION = {"quick": 192, "standard": 288, "fine": 448, "paper": 448}  # samples a side, by preset
 # The picture of names: at most so many photos, their width while they are chosen and in the picture, px, and the tint.
 PICTURES, THUMB, WIDE, TINT = 4, 80, 720, 0.45
@@ -45,7 +46,7 @@ def make_meshes(
     Writes `mesh.ply` (all that photos show), of the scenery `solid.ply` (closed) and `shown.ply` (what is displayed),
     `objects/NAME.ply` (closed) of each body, `parts.json`, `placement.json`, `objects.png`, and `textured.glb`: the
     scenery and each body with a texture. Vertices in the PLY files have `views` and `uncertainty`, see `Support`;
-    `trust.png` draws the latter, and `next_photos.json` has the cameras of the photos that would help most.
+    `trust.jpg` draws the latter, and `next_photos.json` has the cameras of the photos that would help most.
 
     Args:
         distill: folder of that stage.
@@ -112,19 +113,22 @@ def make_meshes(
     textures = texture_parts(displayed, shots, share_of(on_progress, 0.87, 0.13))
     with replacing(out / TEXTURED) as partial:
         partial.write_bytes(write_glb(textures))
+    deep = {name: hollow(closed[name], 2 * surface.volume.cell * metres) for name in parts.bodies}
+    hollows = {name: rounded(found).tolist() for name, found in deep.items() if found is not None}
     return {
         **surface.report, "left_out_m": [float(rounded(length * metres)) for length in surface.report["left_out"]],
         "extent_m": rounded(np.ptp(placement.mesh(surface.visible).vertices, axis=0)).tolist(),
         "up_from": placement.up_from, "up_within_degrees": round(placement.up_within, 2),
         "up_confidence": placement.up_confidence, "size": placement.size_from, "objects": list(parts.bodies),
-        "smallest_object_m": float(rounded(parts.smallest * metres)), **told,
+        "smallest_object_m": float(rounded(parts.smallest * metres)), "touching": parts.touching,
+        "masks_without_surface": parts.missing, "hollows_m": hollows, **told,
     }  # fmt: skip
 
 
 def trust(
     closed: dict[str, Mesh], displayed: dict[str, Mesh], shots: Shots, counted: np.ndarray, out: Path
 ) -> tuple[Support, dict]:
-    """How far the surface can be trusted, and which photos would help; writes `trust.png` and `next_photos.json`.
+    """How far the surface can be trusted, and which photos would help; writes `trust.jpg` and `next_photos.json`.
 
     Args:
         closed: what the scene is made of, by name, metres.
@@ -146,7 +150,9 @@ def trust(
     drawn = {view.source: view for view in [shots.views[0], *(photo.view for photo in advice.photos[:1])]}
     # Neither where the solid was cut off nor its side below the floor says anything.
     told_of = (counted & (whole.vertices[:, 2] > -3 * shots.lift))[whole.faces].all(1)
-    draw_trust(replace(whole, faces=whole.faces[told_of]), support.uncertainty, drawn, limits).save(out / TRUST)
+    draw_trust(replace(whole, faces=whole.faces[told_of]), support.uncertainty, drawn, limits).save(
+        out / TRUST, quality=90
+    )
     return support, {
         "trust": {name: summary(mesh, shown[name]) for name, mesh in displayed.items()},
         "trust_colors_m": limits, "weak": round(advice.weak, 4),

@@ -84,72 +84,85 @@ def next_photos(
         views: given cameras, metres.
         counted: [V] bool, vertices that matter; others are where the solid was cut off.
     """
-    rng = np.random.default_rng(0)
+    if not counted.any():
+        return Advice([], 0.0)
     area = np.where(counted, vertex_areas(joined(list(meshes.values()))), 0)
-    index = rng.choice(len(area), SAMPLES, p=area / area.sum())
+    index = np.random.default_rng(0).choice(len(area), SAMPLES, p=area / area.sum())
     part = np.repeat(np.arange(len(meshes)), [len(mesh.vertices) for mesh in meshes.values()])[index]
-    known, sight = support.at(index), sight.at(index)
-    uncertainty = known.uncertainty
-    limit = UNSURE * float(np.median(uncertainty[np.isfinite(uncertainty)])) if np.isfinite(uncertainty).any() else 0.0
+    now, sight = support.at(index), sight.at(index)
+    sure = now.uncertainty[np.isfinite(now.uncertainty)]
+    limit = UNSURE * float(np.median(sure)) if len(sure) else 0.0
     middle, towards = focus(list(views))
     places = _places(views, middle, towards, solid)
     around = [sight.of_place(place, np.ones(SAMPLES, bool)) for place in places]
     around = [seen[cosine > FAIR] for seen, cosine in around]
-    reachable = known.views > 0
+    reachable = now.views > 0
     for seen in around:
         reachable[seen] = True
     total = max(int(reachable.sum()), 1)
-
-    def weak(now: Support) -> np.ndarray:
-        return (now.views < FEW) | (now.uncertainty > limit)
-
-    def worth(now: Support, view: View, seen: np.ndarray) -> np.ndarray:
-        """How much a photo helps the places [S] that it sees."""
-        here = now.at(seen)
-        few = here.views < FEW
-        after = sigma_along(here.information + information(view, here.vertices), here.normals)
-        rest = np.divide(after, here.uncertainty, out=np.ones(len(seen)), where=np.isfinite(after))
-        return np.where(few, (FEW - here.views) / FEW, 1 - np.minimum(rest, 1))
-
-    now, before = known, weak(known) & reachable
-    short = FEW - known.views[before]
+    poor = (now.views < FEW) | (now.uncertainty > limit)
+    weak = poor & reachable
+    short = FEW - now.views[weak]
     lacking = float(np.where(short > 0, short * (short + 1) / (2 * FEW), 1.0).sum())  # what `worth` may add up to
     chosen: list[NextPhoto] = []
     free = np.ones(len(places), bool)
-    while len(chosen) < WANTED and before.any():
-        poor = weak(now)
-        best: tuple[float, int, View, np.ndarray, np.ndarray] | None = None
-        for number in np.flatnonzero(free):
-            helped = around[number][poor[around[number]]]
-            if not len(helped) or (best is not None and len(helped) <= best[0]):
-                continue
-            for target in (middle, sight.vertices[helped].mean(0)):
-                view = camera_at(places[number], target, views[0])
-                inside = framed(view, sight.vertices[around[number]])[1]
-                seen = around[number][inside]
-                if not inside.any() or poor[seen].mean() > 1 - SHARED:
-                    continue
-                seen = seen[poor[seen]]
-                gains = worth(now, view, seen)
-                if best is None or gains.sum() > best[0]:
-                    best = float(gains.sum()), int(number), view, target, seen[gains > 0]
-        if best is None or best[0] < LEAST * total:
+    while len(chosen) < WANTED:
+        found = _best(now, poor, [(places[k], around[k]) for k in np.flatnonzero(free)], middle, views[0])
+        if found is None or found[0] < LEAST * total:
             break
-        gain, number, view, target, seen = best
+        gain, view, target, seen = found
+        view = replace(view, name=f"next{len(chosen) + 1}", source=f"next{len(chosen) + 1}")
         counts, matrices = now.views.copy(), now.information.copy()
         counts[seen] += 1
-        matrices[seen] += information(view, sight.vertices[seen])
-        view = replace(view, name=f"next{len(chosen) + 1}", source=f"next{len(chosen) + 1}")
-        most = list(meshes)[int(np.bincount(part[seen]).argmax())]
-        helped = seen[part[seen] == list(meshes).index(most)]
-        aim = spot(most, meshes[most], sight.vertices[helped], sight.normals[helped])
+        matrices[seen] += information(view, now.vertices[seen])
+        now = replace(now, views=counts, information=matrices)
+        poor = (counts < FEW) | (now.uncertainty > limit)
+        most = int(np.bincount(part[seen]).argmax())
+        helped, name = seen[part[seen] == most], list(meshes)[most]
+        aim = spot(name, meshes[name], now.vertices[helped], now.normals[helped])
         words = f"{way_to(view.center, views, middle)}, looking at {aim}"
         chosen.append(NextPhoto(view, target, gain / lacking, words))
-        now = replace(now, views=counts, information=matrices)
         turned = (places - middle) @ (view.center - middle)
         turned /= np.linalg.norm(places - middle, axis=1) * np.linalg.norm(view.center - middle)
         free &= turned < np.cos(np.radians(APART))
-    return Advice(chosen, float(before.sum() / total))
+    return Advice(chosen, float(weak.sum() / total))
+
+
+def worth(now: Support, view: View, seen: np.ndarray) -> np.ndarray:
+    """How much a photo helps each of the places [S] that it sees, 0 to 1."""
+    here = now.at(seen)
+    after = sigma_along(here.information + information(view, here.vertices), here.normals)
+    rest = np.divide(after, here.uncertainty, out=np.ones(len(seen)), where=np.isfinite(after))
+    return np.where(here.views < FEW, (FEW - here.views) / FEW, 1 - np.minimum(rest, 1))
+
+
+def _best(
+    now: Support, poor: np.ndarray, tried: Sequence[tuple[np.ndarray, np.ndarray]], middle: np.ndarray, lens: View
+) -> tuple[float, View, np.ndarray, np.ndarray] | None:
+    """The photo that helps most: how much, its camera, what it looks at [3] m, and the places [S] that it helps.
+
+    Args:
+        now: of the samples.
+        poor: [V] bool, samples that are weak.
+        tried: where a camera could be [3] m, each with the samples [S] in sight, all around.
+        middle: [3] m; a camera looks there, or at the middle of the weak places in sight.
+        lens: view whose lens a camera has.
+    """
+    best = None
+    for place, around in tried:
+        helped = around[poor[around]]
+        if not len(helped) or (best is not None and len(helped) <= best[0]):
+            continue
+        for target in (middle, now.vertices[helped].mean(0)):
+            view = camera_at(place, target, lens)
+            seen = around[framed(view, now.vertices[around])[1]]
+            if not len(seen) or poor[seen].mean() > 1 - SHARED:
+                continue
+            seen = seen[poor[seen]]
+            gains = worth(now, view, seen)
+            if best is None or gains.sum() > best[0]:
+                best = float(gains.sum()), view, target, seen[gains > 0]
+    return best
 
 
 def camera_at(place: np.ndarray, target: np.ndarray, like: View) -> View:
@@ -175,6 +188,8 @@ def _places(views: Sequence[View], middle: np.ndarray, towards: np.ndarray, soli
     flat = np.sqrt(1 - z**2)
     places = middle + far * np.stack([flat * np.cos(angle), flat * np.sin(angle), z], 1)
     places = places[(places[:, 2] > CLEAR * far) & (solid.clearance(places) > CLEAR * far)]
+    if not len(places):
+        return places
     starts, ends = np.repeat(places, len(given), axis=0), np.tile(given, (len(places), 1))
     in_sight = ~solid.blocked(starts, ends).reshape(len(places), len(given))
     return places[in_sight.any(1)]

@@ -10,14 +10,15 @@ import pytest
 import torch
 from PIL import Image
 
-from pipeline.cameras import Similarity, Sparse, View, save_views
+from pipeline.cameras import Similarity, Sparse, View, load_views, save_views
 from pipeline.field.training import Trained
 from pipeline.inputs.photos import Photo, save_photos
 from pipeline.mesh import meshing
-from pipeline.mesh.meshing import make_meshes, read_parts, rounded
+from pipeline.mesh.meshing import make_meshes, read_parts, rounded, trust_meshes
 from pipeline.mesh.placement import load_placement
+from pipeline.mesh.trust import GUESSED, WIDE
 from sdfsim.errors import SdfsimError
-from sdfsim.shape.mesh import is_closed, load_mesh
+from sdfsim.shape.mesh import is_closed, load_mesh, read_attributes, read_mesh
 from tests.pipeline.test_objects import TABLE, TOP, both, box
 from tests.pipeline.test_surface import look_at
 
@@ -107,6 +108,21 @@ def test_a_cup_on_a_table_becomes_meshes_in_metres_with_names(mesh):
     assert np.abs(np.median(cup.colors, axis=0) - [180, 90, 40]).max() < 4  # As in the photos.
     picture = np.asarray(Image.open(folder / "objects.png"), float)
     assert (np.abs(picture - [180, 90, 40]).max(-1) > 40).mean() > 0.002  # The cup is tinted.
+
+
+def test_the_files_tell_what_photos_see_of_each_vertex(mesh):
+    report, folder = mesh(size=2.0)
+    cup = read_mesh(folder / "objects" / "object1.ply")
+    views, uncertainty = read_attributes(folder / "objects" / "object1.ply", ["views", "uncertainty"])
+    below = cup.vertices[:, 2] < cup.vertices[:, 2].min() + 1e-3 * np.ptp(cup.vertices[:, 2])
+    assert np.isinf(uncertainty[views < 2]).all() and np.isfinite(uncertainty[~below]).mean() > 0.5
+    inner = below & (np.linalg.norm(cup.vertices[:, :2] - cup.vertices[below, :2].mean(0), axis=1) < 0.03)
+    assert inner.any() and (views[inner] == 0).all()  # It stands on its table.
+    assert "underside" in report["trust"]["object1"]["where"]
+    colors = {name: part.colors for name, part in trust_meshes(folder).items()}
+    assert list(colors) == ["scene", "object1"] and (colors["object1"][views == 0] == GUESSED).all()
+    assert len(load_views(folder / "next_photos.json")) == len(report["next_photos"])
+    assert Image.open(folder / "trust.jpg").width % WIDE == 0
 
 
 def test_what_is_left_out_is_reported(mesh):
