@@ -123,7 +123,7 @@ def improvements(report: dict) -> list[str]:
 
 def photo_line(photo: dict) -> str:
     """Where to take a photo, from an entry of `next_photos`: in words and as numbers."""
-    place, target = (", ".join(f"{x:.2f}" for x in photo[key]) for key in ("position", "looking_at"))
+    place, target = (", ".join(f"{round(x, 2) + 0.0:.2f}" for x in photo[key]) for key in ("position", "looking_at"))
     return (f"{photo['words']} (camera at {place} m, aimed at {target} m); it makes up for {photo['gain']:.0%} of what "
             "is weak")  # fmt: skip
 
