@@ -1,6 +1,7 @@
 """How far from the truth a reconstruction of the rendered photo set is.
 
     python benchmarks/reconstruct.py -o DIR [--preset quick] [--budget MINUTES]
+    python benchmarks/reconstruct.py -o DIR --capture record3d      # the same photos as a phone with depth exports them
 
 Runs the whole chain on samples/photos/table_vase (or takes what is already in the folder), moves the result onto the
 true cameras by a similarity, and prints pose errors, surface errors, how these go with the uncertainty that the run
@@ -48,8 +49,9 @@ def similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
 def pose_errors(views: list[View], photos: Path) -> tuple[dict[str, float], Similarity]:
     """Errors of the camera centres (% of the distance to the table), of rotations and focal lengths; and the move."""
     about = json.loads((photos / "transforms.json").read_text())
-    truth = {Path(f["file_path"]).name: np.array(f["transform_matrix"]) for f in about["frames"]}
-    true = np.array([truth[v.source] for v in views])
+    # Record3D numbers its photos without zeros in front.
+    truth = {Path(f["file_path"]).stem.lstrip("0"): np.array(f["transform_matrix"]) for f in about["frames"]}
+    true = np.array([truth[Path(v.source).stem.lstrip("0")] for v in views])
     move = scale, rotation, translation = similarity(np.array([v.center for v in views]), true[:, :3, 3])
     moved = scale * np.array([v.center for v in views]) @ rotation.T + translation
     distance = np.linalg.norm(true[:, :3, 3] - [0, 0, about["table_height"]], axis=1)
@@ -167,6 +169,7 @@ def surface_errors(folder: Path, photos: Path, move: Similarity) -> dict[str, An
         "missing": summary(missing),
         "complete_percent": 100 * float((missing < 1.0).mean()),
         "scale_error_percent": 100 * abs(place.scale * to_unit.scale / scale - 1),
+        "tilt_degrees": float(np.degrees(np.arccos(min(1.0, float((rotation @ place.rotation[2])[2]))))),
         "bodies": list(objects),
         "vase": {name: vase_size(body) for name, body in vases.items()} | {"truth": vase_size(truth)},
         "up_error_degrees": float(np.degrees(np.arccos(np.clip((rotation @ place.rotation.T @ [0, 0, 1])[2], -1, 1)))),
@@ -200,6 +203,18 @@ def evaluate(folder: Path, photos: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def captured(layout: str, out: Path) -> Path:
+    """The bundled photos as a phone's capture beside `out`, made where it is not there."""
+    sys.path.insert(0, str(PHOTOS.parent))
+    import phone
+
+    place = out.with_name(f"{out.name}-{layout}" + (".r3d" if layout == "record3d" else ""))
+    if not place.exists():
+        place.parent.mkdir(parents=True, exist_ok=True)
+        phone.write(layout, place)
+    return place / "transforms.json" if layout == "nerfstudio" else place
+
+
 def main() -> None:
     """Runs the chain and prints one JSON object."""
     from pipeline.stages import reconstruct
@@ -207,6 +222,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("photos", type=Path, nargs="?", default=PHOTOS)
     parser.add_argument("-o", "--out", type=Path, required=True)
+    parser.add_argument("--capture", choices=("record3d", "exr", "polycam", "nerfstudio"), help="with depth, see above")
     parser.add_argument("--preset", default="quick")
     parser.add_argument("--size", type=float)
     parser.add_argument("--distance", nargs=3, metavar=("PLACE", "PLACE", "METRES"))
@@ -214,9 +230,10 @@ def main() -> None:
     chosen = parser.parse_args()
     distance = [*chosen.distance[:2], float(chosen.distance[2])] if chosen.distance else None
     budget = None if chosen.budget is None else 60 * chosen.budget
+    given = chosen.photos if chosen.capture is None else captured(chosen.capture, chosen.out)
     with Session(as_json=True) as session:
         report = reconstruct(
-            chosen.photos, chosen.out, preset=chosen.preset, size=chosen.size, distance=distance, budget=budget,
+            given, chosen.out, preset=chosen.preset, size=chosen.size, distance=distance, budget=budget,
             progress=session.stage_progress,
         )  # fmt: skip
         if (chosen.photos / "truth.ply").exists():

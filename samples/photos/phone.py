@@ -139,9 +139,9 @@ def _polycam(out: Path, photos: list, poses: list, measured: list, lens: dict, a
     folders = {name: out / "keyframes" / name for name in ("images", "cameras", "depth", "confidence")}
     for folder in folders.values():
         folder.mkdir(parents=True)
-    for number, (photo, pose, (depth, confidence)) in enumerate(zip(photos, poses, measured, strict=True)):
-        name = f"{1_000_000 + 33 * number}"
-        shutil.copyfile(photo, folders["images"] / f"{name}.jpg")
+    for photo, pose, (depth, confidence) in zip(photos, poses, measured, strict=True):
+        name = photo.stem
+        shutil.copyfile(photo, folders["images"] / photo.name)
         matrix = {f"t_{row}{column}": float(pose[row, column]) for row in range(3) for column in range(4)}
         camera = {**lens, "width": about["w"], "height": about["h"], "blur_score": 200.0, **matrix}
         (folders["cameras"] / f"{name}.json").write_text(json.dumps(camera))
@@ -153,8 +153,8 @@ def _nerfstudio(out: Path, photos: list, poses: list, measured: list, lens: dict
     frames = []
     for name in ("images", "depth"):
         (out / name).mkdir(parents=True)
-    for number, (photo, pose, (depth, _)) in enumerate(zip(photos, poses, measured, strict=True), 1):
-        image, map_ = f"images/frame_{number:05d}.jpg", f"depth/frame_{number:05d}.png"
+    for photo, pose, (depth, _) in zip(photos, poses, measured, strict=True):
+        image, map_ = f"images/{photo.name}", f"depth/{photo.stem}.png"
         shutil.copyfile(photo, out / image)
         Image.fromarray((1000 * depth).round().astype(np.uint16)).save(out / map_)
         frames.append({"file_path": image, "depth_file_path": map_, "transform_matrix": pose.tolist()})
