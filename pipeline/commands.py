@@ -47,7 +47,7 @@ DropShape = Annotated[Literal["box", "ball", "none"], typer.Option("--drop", hel
 def reconstruct(
     photos: Annotated[
         Path,
-        typer.Argument(help="Folder of photos, a video, a transforms.json, or a COLMAP model.", show_default=False),
+        typer.Argument(help="Folder of photos, a video, a transforms.json, a COLMAP model, or a phone's capture.", show_default=False),
     ],
     out: Out,
     preset: Preset = "standard",
@@ -89,7 +89,7 @@ def reconstruct(
 def poses(
     photos: Annotated[
         Path,
-        typer.Argument(help="Folder of photos, a video, a transforms.json, or a COLMAP model.", show_default=False),
+        typer.Argument(help="Folder of photos, a video, a transforms.json, a COLMAP model, or a phone's capture.", show_default=False),
     ],
     out: Out,
     preset: KeptPreset = None,

@@ -221,6 +221,12 @@ def page(report: dict, folder: Path) -> str:
         ]
         rows += [(f"attempt: {one['name']}", "; ".join(one["failures"]) or f"good, {one['posed']} posed")
                  for one in poses.get("attempts", [])]  # fmt: skip
+    if moved := poses.get("moved"):
+        rows.append(("cameras moved from where the capture saw them, median",
+                     f"{1000 * moved['metres']:.1f} mm, {moved['degrees']:.2f}°"))  # fmt: skip
+    if depth := distill.get("depth"):
+        rows.append(("depth beside the points that photos give", f"{depth['scale'] - 1:+.2%} in scale, then "
+                     f"{depth['spread']:.2%} in the median, {depth['points']} pixels"))  # fmt: skip
     if report["psnr"] is not None:
         rows.append(("photos that were not trained on", f"PSNR {report['psnr']:.1f} dB"))
     if mesh:
