@@ -86,12 +86,14 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
 def fit_one(solid: Mesh, shown: Mesh, skin: Mesh | None, out: Path, name: str, *, budget: float | None, recipe: str,
             seed: int, device: str, on_progress: Progress) -> dict:  # fmt: skip
     """Fits one shape, saves it as the folder `out`/`name`, and returns its certificate."""
+    from sdfsim.shape.baked_grid import grid_certificate
     from sdfsim.shape.fit import fit_mesh
 
     shape = fit_mesh(
         solid, name=name, recipe=recipe, budget=budget, seed=seed, cap=True,  # type: ignore[arg-type]
         on_progress=on_progress, device=device,
     )  # fmt: skip
+    shape.certificate.update(grid_certificate(shape.sdf, shape.nodes))
     # The folder appears complete or not at all: a run that goes on keeps those that are there.
     partial = out / f".{name}.part"
     shutil.rmtree(partial, ignore_errors=True)

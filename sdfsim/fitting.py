@@ -15,6 +15,7 @@ from sdfsim.errors import SdfsimError
 from sdfsim.files import check_writable, locked, read_json
 from sdfsim.parallel import parallel
 from sdfsim.scene.scene_file import UNITS
+from sdfsim.shape.baked_grid import grid_certificate
 from sdfsim.shape.distance import MeshDistance
 from sdfsim.shape.fit import FIT_VERSION, Recipe, fit_mesh, fit_solids
 from sdfsim.shape.mesh import MESH_SUFFIXES, Mesh, load_mesh
@@ -216,7 +217,8 @@ def _stacked(todo: list[tuple[str, Path]], out: Path, options: Options, device: 
 
 def _save(shape: Shape, request: str, folder: Path) -> dict[str, Any]:
     """Write a shape with the `_request` that it was made for, and report on it."""
-    shape = replace(shape, source=shape.source | {"request": request})
+    certificate = shape.certificate | grid_certificate(shape.sdf, shape.nodes)
+    shape = replace(shape, source=shape.source | {"request": request}, certificate=certificate)
     shape.save(folder)
     return _report(shape, folder)
 

@@ -17,6 +17,7 @@ from sdfsim.fitting import Options, fit_many, named_meshes
 from sdfsim.parallel import cluster, parallel
 from sdfsim.scene.scene_file import UNITS
 from sdfsim.shape import primitives
+from sdfsim.shape.baked_grid import baked
 from sdfsim.shape.mesh import Mesh, write_ply
 from sdfsim.shape.shape import load_shape, scaled
 
@@ -45,6 +46,12 @@ def test_a_folder_of_meshes_becomes_a_folder_of_shapes(meshes: Path, tmp_path: P
     assert "failed" not in lines["box"] + lines["ball"]
     assert "holed: " in done.stdout and "open" in done.stdout
     assert load_shape(out / "box").volume == pytest.approx(1.0)
+    ball = load_shape(out / "ball")
+    grid = baked(ball.sdf, ball.nodes)
+    assert (
+        ball.certificate["baked_error"] * float(np.ptp(ball.sdf.bounds, axis=0).max()) == pytest.approx(grid.error)
+        and grid.error > 0
+    )
     assert not (out / "holed").exists()
 
     # Again: what is there is kept, the others are tried once more; with what was missing they succeed.
