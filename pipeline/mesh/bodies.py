@@ -1,19 +1,23 @@
 """What stands on a level plane becomes a body of its own; the scenery is closed where the body stood.
 
-Everything here is in normalised space; heights are measured along a plane's normal.
+What masks name becomes one wherever it is, and bodies that touch are told apart (`seams.py`). Everything here is in
+normalised space; heights are measured along a plane's normal.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import itertools
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
 
 from pipeline.cameras import View, frame_of
+from pipeline.inputs.labels import load_names
 from pipeline.mesh.cleaning import components, face_normals, islands, keep_faces
 from pipeline.mesh.extraction import FLOATER, RIM, Distance, Surface, Volume, sample, sample_box
+from pipeline.mesh.seams import Part, Solid, Votes, count_votes, part_of_name, parts_by_shape, parts_by_votes, solid_of
 from pipeline.mesh.visibility import Caster, Visibility, look, spread_colors, to_bytes
 from sdfsim.shape.mesh import Mesh
 
@@ -59,11 +63,11 @@ class Level:
 
 @dataclass(frozen=True)
 class Body:
-    """A body that stands on a level plane.
+    """A body that stands on a level plane, or that masks name.
 
     Attributes:
-        name: object1, object2 ... from the largest down.
-        level: what it stands on.
+        name: that of its masks, else object1, object2 ... from the largest down.
+        level: what it stands on; `nothing` where that is not known.
         size: the longest side of its bounding box.
         own: [X, Y, Z] bool on a part of the samples: those nearest to this body, of all that stands on the plane.
         low: [3] position of the first of these samples.
@@ -71,6 +75,7 @@ class Body:
         layer: thickness of the contact layer, in which the field cannot tell body and plane apart.
         hollow: [A, B] bool on the plane: places that the body goes around at the top of the contact layer.
         corner: [2] of the first of these, in the axes of `frame_of` the plane.
+        seam: where it ends against what it touches, negative within; None where it ends by itself.
     """
 
     name: str
@@ -82,6 +87,7 @@ class Body:
     layer: float
     hollow: np.ndarray
     corner: np.ndarray
+    seam: Volume | None = None
 
     def lifted(self, points: np.ndarray) -> np.ndarray:
         """Points [P, 3], those below the top of the contact layer raised to it."""
@@ -111,9 +117,16 @@ class Body:
         def value(points: np.ndarray) -> np.ndarray:
             lifted, holds = self.lifted(points), self.holds(points)
             found = field(np.where(holds[:, None], points, lifted))
+            if self.seam is not None:
+                found = np.maximum(found, self.seam.at(lifted))
             return np.maximum(np.where(self.owns(lifted) | holds, found, self.cell), -self.level.above(points))
 
         return value
+
+
+def nothing(up: np.ndarray) -> Level:
+    """A plane that lies below everything, for what stands on none."""
+    return Level(up, -np.inf, 0.0)
 
 
 def find_levels(shown: Mesh, up: np.ndarray, width: float) -> list[Level]:
@@ -148,8 +161,9 @@ def find_levels(shown: Mesh, up: np.ndarray, width: float) -> list[Level]:
     return levels
 
 
-def find_bodies(surface: Surface, levels: list[Level], layer: float, smallest: float) -> list[Body]:
-    """Bodies that stand on level planes, each alone and wholly within the trained space.
+def find_bodies(surface: Surface, levels: list[Level], layer: float, smallest: float,
+                named: np.ndarray | None = None) -> list[Body]:  # fmt: skip
+    """Bodies that stand on level planes, wholly within the trained space; those that touch are one.
 
     What carries a level plane itself, as a table does, is scenery, and so is what reaches the end of the trained space.
 
@@ -157,7 +171,11 @@ def find_bodies(surface: Surface, levels: list[Level], layer: float, smallest: f
         surface: extracted.
         levels: of its visible part.
         layer: thickness of the contact layer.
-        smallest: what rises less than this above its plane stays part of it.
+        smallest: what rises less than this above its plane stays part of it, unless masks name it.
+        named: [V] bool, vertices of the surface that masks name.
+
+    Returns:
+        The bodies, without names.
     """
     volume = surface.volume
     solid = volume.values < 0
@@ -180,14 +198,15 @@ def find_bodies(surface: Surface, levels: list[Level], layer: float, smallest: f
                 continue
             low = volume.low + volume.cell * np.array([part.start for part in box])
             sides = volume.cell * np.array(mine.shape)
-            if height[box][mine].max() < smallest:
-                continue
             place = Volume(mine.astype(np.float32), low, volume.cell)
-            if any(_carries(place, other, volume.cell) for other in others):
+            known = named is not None and _share_seen(place, vertices, surface.raw.vertices[named]) > SEEN_SHARE
+            if height[box][mine].max() < smallest and not known:
+                continue
+            if any(_carries(place, other, volume.cell) for other in others) and not known:
                 continue
             if not _stands(volume, place, mine & (height[box] < layer + 1.5 * volume.cell), level, layer):
                 continue
-            if _share_seen(place, vertices, seen) < SEEN_SHARE:
+            if _share_seen(place, vertices, seen) < SEEN_SHARE and not known:
                 continue
             crumbs = _crumbs(label, boxes, number, height, layer, volume.cell)
             axes = zip(*(boxes[k - 1] for k in (number, *crumbs)), strict=True)
@@ -196,8 +215,7 @@ def find_bodies(surface: Surface, levels: list[Level], layer: float, smallest: f
             taken[box] |= mine
             standing = solid & (height > layer)
             found.append(_body(volume, standing, box, mine, level, layer, float(sides.max())))
-    found.sort(key=lambda body: -body.size)
-    return [replace(body, name=f"object{number}") for number, body in enumerate(found, start=1)]
+    return found
 
 
 def _crumbs(label: np.ndarray, boxes: list[tuple[slice, ...]], number: int, height: np.ndarray, layer: float,
@@ -242,7 +260,7 @@ def _stands(volume: Volume, place: Volume, lowest: np.ndarray, level: Level, lay
 
 
 def _share_seen(place: Volume, vertices: np.ndarray, seen: np.ndarray) -> float:
-    """Share of the surface vertices at a component that photos show."""
+    """Share of the surface vertices at a component that some others, like those that photos show, are."""
 
     def here(points: np.ndarray) -> int:
         inside = (points > place.low - place.cell) & (points < place.low + place.cell * np.array(place.values.shape))
@@ -271,6 +289,8 @@ def _body(volume: Volume, standing: np.ndarray, box: tuple[slice, ...], mine: np
     flat = (corner + volume.cell * np.argwhere(own)) @ frame[:2].T
     a, b = (np.arange(low, high, 0.5 * volume.cell) for low, high in zip(flat.min(0), flat.max(0), strict=True))
     points = np.stack(np.meshgrid(a, b, indexing="ij"), -1).reshape(-1, 2) @ frame[:2]
+    if not np.isfinite(level.height):
+        return body
     points += (level.height + layer) * level.normal
     cut = ((volume.at(points) < 0) & body.owns(points)).reshape(len(a), len(b))
     return replace(body, hollow=np.asarray(ndimage.binary_fill_holes(cut)) & ~cut, corner=flat.min(0))
@@ -282,7 +302,7 @@ def body_mesh(body: Body, field: Distance, cell: float) -> Mesh:
     points = body.low + body.cell * np.argwhere(body.own)
     turned = points @ frame.T
     low, high = turned.min(0), turned.max(0)
-    low[2] = body.level.height - 2 * cell
+    low[2] = max(low[2], body.level.height - 2 * cell)
     distance = body.distance(field)
     volume = sample_box(lambda p: distance(p @ frame), low - 2 * cell, high + 2 * cell, cell)
     mesh = volume.mesh()
@@ -310,7 +330,9 @@ def without_bodies(volume: Volume, bodies: list[Body], field: Distance) -> Volum
         own = body.owns(lifted) | holds
         inside = values[part].reshape(-1).copy()
         over = own & (height > 0)
-        inside[over] = np.maximum(inside[over], height[over])
+        # What stands on nothing known leaves a dent that ends at its seam.
+        gone = height if np.isfinite(body.level.height) or body.seam is None else -body.seam.at(points)
+        inside[over] = np.maximum(inside[over], gone[over])
         # Below its foot the field never saw anything: there the plane's solid goes on, and holes in it are closed.
         under = np.flatnonzero(own & (height <= 0) & (height > -2 * body.layer))
         foot = under[holds[under] | (sample(field, lifted[under]) < 0.5 * body.layer)] if len(under) else under
@@ -328,17 +350,21 @@ class Parts:
         shown: what is displayed of it: its visible surface, and the places where bodies stood; None like `solid`.
         bodies: closed mesh of each body by name, with colours; the largest first.
         smallest: what rises less than this above its plane stayed part of the scenery.
+        touching: names of two bodies that touch, and "masks" or "shape", which told them apart.
+        missing: names of masks whose object has no surface of its own.
     """
 
     solid: Mesh | None
     shown: Mesh | None
     bodies: dict[str, Mesh]
     smallest: float
+    touching: list[tuple[str, str, str]] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)
 
 
 def split(surface: Surface, distance: Distance, finest: float, views: list[View], photos_folder: Path, up: np.ndarray,
           *, alone: bool) -> Parts:  # fmt: skip
-    """Finds bodies and takes them out of the scenery.
+    """Finds bodies, takes them out of the scenery and tells those that touch apart.
 
     Args:
         surface: extracted.
@@ -349,23 +375,139 @@ def split(surface: Surface, distance: Distance, finest: float, views: list[View]
         up: [3] unit, in normalised space.
         alone: there is no scenery: all there is are bodies.
     """
-    smallest = max(SMALLEST, SMALLEST_CELLS * finest)
-    if alone:
+    smallest, layer, lift = max(SMALLEST, SMALLEST_CELLS * finest), LAYER * finest, 0.75 * surface.volume.cell
+    names = load_names(photos_folder)
+    if alone and not names:
         return Parts(None, None, whole_bodies(surface), smallest)
-    levels = find_levels(surface.visible, up, finest)
-    bodies = find_bodies(surface, levels, LAYER * finest, smallest)
-    if not bodies:
-        return Parts(surface.solid, surface.visible, {}, smallest)
     blocking = Caster(surface.raw)
+    votes = None
+    if names:
+        sight = Visibility(surface.raw, lift, blocking)
+        votes = count_votes(sight, surface.raw.faces, views, photos_folder, names)
+    if alone:
+        whole = [_whole(surface, mesh, up, layer) for mesh in whole_bodies(surface).values()]
+    else:
+        named = None if votes is None else votes.winner > 0
+        # What lies on a body is told apart from it by masks, not by the plane between them.
+        plain = surface.shown if named is None else surface.shown & ~named[surface.raw.faces].any(1)
+        levels = find_levels(keep_faces(surface.raw, plain), up, finest)
+        whole = find_bodies(surface, levels, layer, smallest, named)
+    pieces: list[Body] = []
+    pairs: list[tuple[int, int, str]] = []
+    for body in whole:
+        found, by = _told_apart(surface, body, votes, smallest)
+        first = len(pieces)
+        for part in found:
+            pieces.append(_piece(body, part, names[part.number - 1] if part.number else ""))
+            index = len(pieces) - 1
+            pairs += [(index, first + other, by) for other in part.neighbours if first + other > index]
+        if not found:
+            pieces.append(replace(body, name=by))
+    if votes is not None and not alone:
+        for number, name in enumerate(names, start=1):
+            if name not in [body.name for body in pieces]:
+                loose = _loose(surface, votes, number, whole, up, layer, smallest)
+                whole, pieces = [*whole, *loose], [*pieces, *(replace(body, name=name) for body in loose)]
+    called = _names(pieces)
+    if not pieces:
+        return Parts(surface.solid, surface.visible, {}, smallest, missing=names)
     meshes = {}
-    for body in bodies:
-        cell = min(finest / FINER, surface.volume.cell)
-        mesh = body_mesh(body, distance, cell)
+    for name, body in sorted(zip(called, pieces, strict=True), key=lambda item: -item[1].size):
+        mesh = body_mesh(body, distance, min(finest / FINER, surface.volume.cell))
         # Lifted clear of the surface in the way, which is sampled more coarsely.
-        found = look(Visibility(mesh, 0.75 * surface.volume.cell, blocking), views, photos_folder)
-        meshes[body.name] = colored(mesh, found.color, found.weight > 0)
-    solid, shown = scenery(surface, bodies, distance)
-    return Parts(solid, shown, meshes, smallest)
+        seen = look(Visibility(mesh, lift, blocking), views, photos_folder)
+        meshes[name] = colored(mesh, seen.color, seen.weight > 0)
+    solid, shown = (None, None) if alone else scenery(surface, whole, distance)
+    return Parts(solid, shown, meshes, smallest, [(called[a], called[b], by) for a, b, by in pairs],
+                 [name for name in names if name not in called])  # fmt: skip
+
+
+def _told_apart(surface: Surface, body: Body, votes: Votes | None, smallest: float) -> tuple[list[Part], str]:
+    """The parts that a body is made of, and what told them apart; for a single one none, and the name of its masks."""
+    solid = _solid(surface, body)
+    if votes is not None:
+        parts, number = parts_by_votes(solid, votes)
+        if parts or number:
+            return parts, "masks" if parts else votes.names[number - 1]
+    if np.isfinite(body.level.height):
+        assert surface.raw.colors is not None
+        parts = parts_by_shape(solid, surface.raw.colors[solid.index], smallest)
+        return parts, "shape" if parts else ""
+    return [], ""
+
+
+def _solid(surface: Surface, body: Body) -> Solid:
+    """What is solid of a body above its contact layer."""
+    volume = surface.volume
+    start = np.round((body.low - volume.low) / volume.cell).astype(int)
+    part = tuple(slice(low, low + count) for low, count in zip(start, body.own.shape, strict=True))
+    around = Volume(volume.values[part], body.low, body.cell)
+    inside = body.own & (around.values < 0) & (body.level.above(around.points()) > body.layer)
+    return solid_of(around, inside, surface.raw)
+
+
+def _piece(body: Body, part: Part, name: str) -> Body:
+    """One part of a body, with no more samples than it needs."""
+    mine = body.own & (part.seam.values < 0)
+    box = ndimage.find_objects(ndimage.binary_dilation(mine, iterations=3).astype(np.int8))[0]
+    size = max(np.ptp(places) for places in np.nonzero(mine)) * body.cell
+    low = body.low + body.cell * np.array([side.start for side in box])
+    return replace(body, name=name, seam=part.seam, own=body.own[box], low=low, size=float(size))
+
+
+def _whole(surface: Surface, mesh: Mesh, up: np.ndarray, layer: float) -> Body:
+    """A connected component of the solid, given by its mesh, as a body that stands on nothing."""
+    volume = surface.volume
+    label = ndimage.label(volume.values < 0)[0]  # type: ignore[index]
+    at = np.round((mesh.vertices - volume.low) / volume.cell).astype(int)
+    touched = ndimage.maximum_filter(label, 3)[tuple(at.T)]
+    mine = label == np.bincount(touched[touched > 0]).argmax()
+    return _at_nothing(volume, mine, volume.values < 0, up, layer)
+
+
+def _at_nothing(volume: Volume, mine: np.ndarray, solid: np.ndarray, up: np.ndarray, layer: float) -> Body:
+    """The body of some samples `mine` [X, Y, Z] of a solid that stands on nothing known."""
+    box = ndimage.find_objects(mine.astype(np.int8))[0]
+    size = max(part.stop - part.start for part in box) * volume.cell
+    return _body(volume, solid, box, mine[box], nothing(up), layer, size)
+
+
+def _loose(surface: Surface, votes: Votes, number: int, bodies: list[Body], up: np.ndarray, layer: float,
+           smallest: float) -> list[Body]:  # fmt: skip
+    """The body that masks name and that stands on no plane, cut off what it touches; none where there is too little."""
+    volume = surface.volume
+    vertices = surface.raw.vertices
+    index = np.flatnonzero((votes.winner == number) & ~np.any([body.owns(vertices) for body in bodies] or [False], 0))
+    if not len(index) or np.ptp(vertices[index], axis=0).max() < smallest:
+        return []
+    margin = 8 * volume.cell
+    low, high = vertices[index].min(0) - margin, vertices[index].max(0) + margin
+    start = np.maximum(((low - volume.low) / volume.cell).astype(int), 0)
+    stop = np.minimum(((high - volume.low) / volume.cell).astype(int) + 1, volume.values.shape)
+    box = tuple(slice(a, b) for a, b in zip(start, stop, strict=True))
+    part = Volume(volume.values[box], volume.low + volume.cell * start, volume.cell)
+    inside = np.pad(part.values[1:-1, 1:-1, 1:-1] < 0, 1)
+    found = part_of_name(solid_of(part, inside, surface.raw), votes, number)
+    if found is None:
+        return []
+    mine = np.zeros(volume.values.shape, bool)
+    mine[box] = inside & (found.seam.values < 0)
+    body = _at_nothing(volume, mine, mine, up, layer)
+    return [replace(body, seam=found.seam)]
+
+
+def _names(bodies: list[Body]) -> list[str]:
+    """A name of its own for each body: that of its masks, or else a number from the largest down."""
+    order = sorted(range(len(bodies)), key=lambda index: -bodies[index].size)
+    names, taken = [""] * len(bodies), {body.name for body in bodies}
+    for index in order:
+        wanted = bodies[index].name
+        choices = itertools.chain([wanted] if wanted else [], (f"{wanted}_{n}" for n in itertools.count(2)))
+        free = (name for name in choices if name not in names)
+        if not wanted:
+            free = (name for n in itertools.count(1) if (name := f"object{n}") not in taken | set(names))
+        names[index] = next(free)
+    return names
 
 
 def whole_bodies(surface: Surface) -> dict[str, Mesh]:

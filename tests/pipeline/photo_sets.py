@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import shutil
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import ModuleType
 
@@ -182,3 +182,119 @@ def turntable(folder: Path, count: int = 24) -> None:
         room, box = shots
         inside = box.max(-1, keepdims=True) > 0
         Image.fromarray(np.where(inside, box, room)).save(folder / f"{number:03d}.jpg", quality=92)
+
+
+def ring(axis: Iterable[float], major: float, minor: float, segments: int = 64) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and outward faces of a torus that lies flat, its middle at `axis`."""
+    u, v = np.meshgrid(*[np.arange(segments) * 2 * np.pi / segments] * 2, indexing="ij")
+    radius = major + minor * np.cos(v)
+    vertices = np.stack([radius * np.cos(u), radius * np.sin(u), minor * np.sin(v)], -1).reshape(-1, 3) + list(axis)
+    k = np.arange(segments * segments)
+    right, up = (k + segments) % len(k), k // segments * segments + (k + 1) % segments
+    corner = right // segments * segments + up % segments
+    return vertices, np.concatenate([np.stack([k, right, corner], 1), np.stack([k, corner, up], 1)])
+
+
+def hues(color: Iterable[float]) -> list[tuple[float, ...]]:
+    """A palette of lighter and darker shades around one colour."""
+    return [tuple(np.clip(np.array(list(color)) * share, 0.04, 0.95)) for share in (0.35, 0.65, 1.0, 1.35)]
+
+
+def in_room(make: ModuleType, shapes: dict[str, tuple], colors: dict[str, tuple], texel: float = 0.0015) -> list:
+    """Parts: each shape (vertices, faces) in shades of its colour, then a floor and four walls."""
+    parts = []
+    for number, (name, shape) in enumerate(shapes.items()):
+        size = np.ptp(shape[0], axis=0)
+        rows, columns = int((2 * size[1] + 4 * size[2]) / texel) + 2, int(max(size[0], size[1]) / texel) + 2
+        picture = make.texture(900 + number, rows, columns, hues(colors[name]), 14, 0.12)
+        parts.append(make.Part(*shape, picture, "box", texel))
+    return [*parts, *still_life(make, 3)[1:]]
+
+
+def touching(make: ModuleType) -> tuple[list, list[str]]:
+    """A cup that touches a vase, and beside them three books in a stack, on a floor; and the names of these parts."""
+
+    def turned(profile: list[tuple[float, float]], at: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+        vertices, faces = make.lathe(np.array(profile))
+        return vertices + [*at, 0], faces
+
+    cup = [(0, 0), (0.08, 0), (0.08, 0.16), (0.062, 0.16), (0.062, 0.03), (0, 0.03)]
+    vase = [(0, 0), (0.09, 0), (0.12, 0.1), (0.12, 0.16), (0.075, 0.28), (0.09, 0.34), (0, 0.34)]
+    shapes = {
+        "cup": turned(cup, (-0.08, 0.2)), "vase": turned(vase, (-0.28, 0.2)),
+        "book1": make.box((0.0, -0.3, 0), (0.34, -0.06, 0.08)), "book2": make.box((0.03, -0.27, 0.08), (0.3, -0.08, 0.16)),
+        "book3": make.box((0.05, -0.26, 0.16), (0.33, -0.1, 0.24)),
+    }  # fmt: skip
+    colors = {"cup": (0.75, 0.72, 0.62), "vase": (0.16, 0.3, 0.62), "book1": (0.6, 0.14, 0.12),
+              "book2": (0.72, 0.62, 0.3), "book3": (0.14, 0.42, 0.24)}  # fmt: skip
+    return in_room(make, shapes, colors), list(shapes)
+
+
+def shelf(make: ModuleType) -> tuple[list, list[str]]:
+    """A torus, a box and a jug apart from one another on a shelf that is open in front and behind; and their names."""
+    profile = [(0, 0), (0.07, 0), (0.1, 0.06), (0.1, 0.14), (0.06, 0.22), (0.075, 0.27), (0, 0.27)]
+    jug, faces = make.lathe(np.array(profile))
+    shapes = {
+        "torus": ring((-0.33, 0, 0.27), 0.11, 0.05),
+        "carton": make.box((-0.08, -0.09, 0.22), (0.1, 0.09, 0.42)),
+        "jug": (jug + [0.34, 0, 0.22], faces),
+        "board": make.box((-0.6, -0.2, 0.18), (0.6, 0.2, 0.22)),
+        "left": make.box((-0.64, -0.2, 0.0), (-0.6, 0.2, 0.34)),
+        "right": make.box((0.6, -0.2, 0.0), (0.64, 0.2, 0.34)),
+    }
+    wood = (0.6, 0.45, 0.28)
+    colors = {"torus": (0.62, 0.2, 0.16), "carton": (0.2, 0.42, 0.3), "jug": (0.2, 0.32, 0.62), "board": wood,
+              "left": wood, "right": wood}  # fmt: skip
+    return in_room(make, shapes, colors), ["torus", "carton", "jug"]
+
+
+def around(count: int, radius: float, target: Iterable[float] = (0, 0, 0.12)) -> list[np.ndarray]:
+    """Poses on three rings around what stands at the origin, the last one looking down steeply."""
+    poses = []
+    for ring_number, elevation in enumerate((12, 32, 58)):
+        angles = np.arange(ring_number, count, 3) * 2 * np.pi / count + 0.1
+        tilt = np.radians(elevation)
+        for a in angles:
+            offset = np.array([np.cos(tilt) * np.cos(a), np.cos(tilt) * np.sin(a), np.sin(tilt)])
+            poses.append(look(None, np.array(list(target)) + radius * offset, target))  # type: ignore[arg-type]
+    return poses
+
+
+def shoot_labels(make: ModuleType, parts: list, poses: list[np.ndarray], count: int) -> list[np.ndarray]:
+    """Which of the first `count` parts each pixel [H, W] uint8 of each photo shows, from 1 on; 0 for the others."""
+    import open3d as o3d
+
+    caster = o3d.t.geometry.RaycastingScene()
+    for part in parts:
+        caster.add_triangles(o3d.core.Tensor(part.vertices.astype(np.float32)),
+                             o3d.core.Tensor(part.faces.astype(np.uint32)))  # fmt: skip
+    row, column = np.mgrid[0 : make.HEIGHT, 0 : make.WIDTH] + 0.5
+    x, y = (column - make.WIDTH / 2) / make.FOCAL, (make.HEIGHT / 2 - row) / make.FOCAL
+    found = []
+    for pose in poses:
+        direction = np.stack([x, y, -np.ones_like(x)], -1) @ pose[:3, :3].T
+        rays = np.concatenate([np.broadcast_to(pose[:3, 3], direction.shape), direction], -1).astype(np.float32)
+        part = caster.cast_rays(rays)["geometry_ids"].numpy().astype(np.int64)
+        found.append(np.where(part < count, part + 1, 0).astype(np.uint8))
+    return found
+
+
+def shoot_bodies(folder: Path, build: Callable[[ModuleType], tuple[list, list[str]]], count: int = 48,
+                 radius: float = 1.25) -> None:  # fmt: skip
+    """A set with truth: `images`, `masks/NAME` of each body where a photo shows it, and `truth/NAME.ply`."""
+    from sdfsim.shape.mesh import Mesh, write_ply
+
+    make = studio(640, 480, 620.0)
+    parts, names = build(make)
+    poses = around(count, radius)
+    photos = shoot(make, parts, poses, folder / "images")
+    (folder / "truth").mkdir()
+    for name, part in zip(names, parts, strict=False):
+        (folder / "truth" / f"{name}.ply").write_bytes(write_ply(Mesh(part.vertices, part.faces)))
+        (folder / "masks" / name).mkdir(parents=True)
+    for photo, labels in zip(photos, shoot_labels(make, parts, poses, len(names)), strict=True):
+        for number, name in enumerate(names, start=1):
+            if (labels == number).any():
+                Image.fromarray(255 * (labels == number).astype(np.uint8)).save(
+                    folder / "masks" / name / f"{photo.stem}.png"
+                )

@@ -1,0 +1,422 @@
+"""Where one connected solid is several bodies that touch: who owns which part of the surface, and the seams between.
+
+Masks say it, or else the shape: bodies that touch meet in a sharp groove. Nobody sees the seam through the inside. It
+is taken to be flat: the plane through the line on the surface where the parts meet. Where that line is not flat, the
+inside belongs to the part whose surface is nearest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy import ndimage
+from scipy.signal import fftconvolve
+from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull, KDTree
+
+from pipeline.cameras import View, frame_of
+from pipeline.inputs.labels import UNKNOWN, load_labels
+from pipeline.mesh.cleaning import vertex_normals
+from pipeline.mesh.extraction import Volume
+from pipeline.mesh.visibility import Visibility
+from sdfsim.shape.mesh import Mesh
+
+SMOOTHING = 2  # times that votes are averaged over neighbours on the surface
+# A patch of one label that is smaller than this share of the label's largest is a mistake of some mask.
+STRAY = 0.1
+# What masks do not name is a part of its own from this share of the surface on; a name from that.
+REST, NAMED = 0.1, 0.02
+# Radius of the ball, in samples, in which grooves are looked for, and the share of it beyond a half that is solid in
+# one: 0.1 is an angle of 144 degrees between the sides.
+BALL, GROOVE = 2, 0.1
+# Least share of all the surface that a part has, and of the seam's border that lies in a groove.
+LEAST_PART, ALL_ALONG = 0.08, 0.8
+# Least share of a seam that is within the solid: the floor of a cup is ringed by a groove as well.
+THROUGH = 0.6
+# Two parts are apart if their seam is smaller than this share of the smaller one's surface, or their colours differ.
+NARROW, COLORS = 0.06, 0.12
+# How far a line where parts meet may be from a plane, as a share of its width, beyond a sample.
+FLAT = 0.1
+# The samples fill grooves: their line is so many samples below the surface.
+FILLED = 0.45
+# A seam is marked out within so many samples of its plane, which no flood through the inside passes.
+WALL = 0.9
+
+
+@dataclass(frozen=True)
+class Votes:
+    """Which object each vertex of a surface belongs to.
+
+    Attributes:
+        names: of the objects.
+        share: [V, 1 + names] share of the photos' votes for none of the objects, and for each; 0 where none votes.
+    """
+
+    names: list[str]
+    share: np.ndarray
+
+    @property
+    def known(self) -> np.ndarray:
+        """[V] bool, vertices with votes."""
+        return self.share.sum(1) > 0
+
+    @property
+    def winner(self) -> np.ndarray:
+        """[V] number of the object with most votes, counted from 1; 0 for none of them, -1 where none votes."""
+        return np.where(self.known, self.share.argmax(1), -1)
+
+
+def count_votes(sight: Visibility, faces: np.ndarray, views: list[View], photos_folder: Path,
+                names: list[str]) -> Votes:  # fmt: skip
+    """Lets every photo with labels vote for the vertices that it sees, weighted as in `look`; strays are left out.
+
+    Args:
+        sight: of the surface.
+        faces: [F, 3] of it.
+        views: cameras in the space of the surface.
+        photos_folder: of the photos stage.
+        names: of the objects in the label images.
+    """
+    votes = np.zeros((len(sight.vertices), len(names) + 1))
+    for view in views:
+        labels = load_labels(photos_folder, view.name)
+        if labels is None:
+            continue
+        index, pixels, cosine = sight.of_view(view)
+        column, row = pixels.astype(int).T
+        found = labels[np.clip(row, 0, labels.shape[0] - 1), np.clip(column, 0, labels.shape[1] - 1)]
+        weight = cosine**2 / np.linalg.norm(view.center - sight.vertices[index], axis=1) ** 2
+        said = found != UNKNOWN
+        votes[index[said], found[said]] += weight[said]
+    total = votes.sum(1, keepdims=True)
+    share = votes / np.where(total > 0, total, 1)
+    near = _neighbours(faces, len(share))
+    for _ in range(SMOOTHING):
+        voting = near @ (share.sum(1) > 0).astype(float)
+        mean = (near @ share) / np.maximum(voting, 1)[:, None]
+        share = np.where(total > 0, mean, 0)
+    winner = np.where(total[:, 0] > 0, share.argmax(1), -1)
+    patch = _patches(faces, winner, len(winner))
+    size = np.bincount(patch)
+    largest = np.zeros(len(names) + 2)
+    np.maximum.at(largest, winner, size[patch])
+    share[size[patch] < STRAY * largest[winner]] = 0
+    return Votes(names, share)
+
+
+def _neighbours(faces: np.ndarray, count: int) -> csr_matrix:
+    """Which vertices share an edge, each one with itself: [V, V] of ones."""
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    own = np.arange(count)
+    rows, columns = np.concatenate([ends[:, 0], ends[:, 1], own]), np.concatenate([ends[:, 1], ends[:, 0], own])
+    found = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count)).tocsr()
+    found.data[:] = 1
+    return found
+
+
+def _patches(faces: np.ndarray, label: np.ndarray, count: int) -> np.ndarray:
+    """Number [V] of the connected patch of vertices of one label [V] that each of `count` vertices is in."""
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    ends = ends[label[ends[:, 0]] == label[ends[:, 1]]]
+    graph = coo_matrix((np.ones(len(ends), np.int8), tuple(ends.T)), shape=(count, count))
+    return connected_components(graph, directed=False)[1]
+
+
+@dataclass(frozen=True)
+class Part:
+    """One of the bodies that a solid is made of.
+
+    Attributes:
+        number: of the name in `Votes`; 0: it has none.
+        seam: negative where the part is; zero at the seams. Its slope is that of a distance, roughly.
+        neighbours: index, in the list of the parts, of those that it touches.
+    """
+
+    number: int
+    seam: Volume
+    neighbours: list[int]
+
+
+@dataclass(frozen=True)
+class Seam:
+    """Where two parts meet, as far as it is one piece.
+
+    Attributes:
+        pair: numbers of the two parts.
+        rim: [R, 3] points on the surface where they meet.
+        point: [3] in the middle.
+        normal: [3] unit, from the first part to the second.
+        flat: whether the rim lies in a plane.
+        sides: [S, 3] the lines (a, b, c) around the seam in its plane: a x + b y + c <= 0 within.
+    """
+
+    pair: tuple[int, int]
+    rim: np.ndarray
+    point: np.ndarray
+    normal: np.ndarray
+    flat: bool
+    sides: np.ndarray
+
+    def beyond(self, points: np.ndarray) -> np.ndarray:
+        """Distances [P] of points [P, 3] from the plane, positive towards the second part."""
+        return (points - self.point) @ self.normal
+
+    def outside(self, points: np.ndarray) -> np.ndarray:
+        """How far [P] the feet of points [P, 3] in the plane are outside the rim; negative within."""
+        flat = (points - self.point) @ frame_of(self.normal)[:2].T
+        return (flat @ self.sides[:, :2].T + self.sides[:, 2]).max(1)
+
+
+@dataclass(frozen=True)
+class Solid:
+    """One connected solid.
+
+    Attributes:
+        volume: samples of the signed distance around it.
+        inside: [X, Y, Z] bool, those within it.
+        index: [P] its vertices in the mesh of everything.
+        points: [P, 3] these vertices.
+        normals: [P, 3] unit, outwards.
+        faces: [F, 3] between them.
+    """
+
+    volume: Volume
+    inside: np.ndarray
+    index: np.ndarray
+    points: np.ndarray
+    normals: np.ndarray
+    faces: np.ndarray
+
+    @property
+    def border(self) -> np.ndarray:
+        """[X, Y, Z] bool, samples within it beside others that are not."""
+        return self.inside & ~ndimage.binary_erosion(self.inside)
+
+
+def solid_of(volume: Volume, inside: np.ndarray, mesh: Mesh) -> Solid:
+    """The solid of the samples `inside` [X, Y, Z], with the vertices of the mesh of everything that lie at it."""
+    at = np.round((mesh.vertices - volume.low) / volume.cell).astype(int)
+    within = np.flatnonzero(((at >= 0) & (at < inside.shape)).all(1))
+    index = within[ndimage.binary_dilation(inside)[tuple(at[within].T)]]
+    place = np.full(len(mesh.vertices), -1)
+    place[index] = np.arange(len(index))
+    faces = place[mesh.faces]
+    faces = faces[(faces >= 0).all(1)]
+    normals = vertex_normals(Mesh(mesh.vertices[index], faces))
+    return Solid(volume, inside, index, mesh.vertices[index], normals, faces)
+
+
+def parts_by_votes(solid: Solid, votes: Votes) -> tuple[list[Part], int]:
+    """The parts of a solid that masks tell apart.
+
+    Args:
+        solid: to take apart.
+        votes: for all vertices.
+
+    Returns:
+        The parts, none where there are no two, and the name's number of the whole solid where it has one, else 0.
+    """
+    winner = votes.winner[solid.index]
+    count = np.bincount(winner[winner >= 0], minlength=len(votes.names) + 1)
+    least = np.full(len(count), NAMED)
+    least[0] = REST
+    there = np.flatnonzero(count >= np.maximum(least * count.sum(), 1))
+    if len(there) < 2:
+        return [], int(there[0]) if len(there) else 0
+    share = owners(solid.points, votes.share[solid.index][:, there], solid.volume.cell)
+    return cut(solid, share.argmax(1), seams(solid, share), there.tolist()), 0
+
+
+def part_of_name(solid: Solid, votes: Votes, number: int) -> Part | None:
+    """What masks name of a larger solid, of which a box shows a part; None: there is nothing.
+
+    Args:
+        solid: in the box, whose border is left empty.
+        votes: for all vertices.
+        number: of the name.
+    """
+    mine = votes.share[solid.index, number]
+    if not mine.any():
+        return None
+    share = np.stack([votes.share[solid.index].sum(1) - mine, mine], 1)
+    share = owners(solid.points, share, solid.volume.cell)
+    parts = cut(solid, share.argmax(1), seams(solid, share), [0, number])
+    return parts[1] if parts else None
+
+
+def parts_by_shape(solid: Solid, colors: np.ndarray, least: float) -> list[Part]:
+    """The parts of a solid that meet in a groove all along, and whose seam is narrow or whose colours differ.
+
+    Args:
+        solid: to take apart.
+        colors: [P, 3] of its vertices, 0..255.
+        least: what is shorter than this in any direction is no part.
+
+    Returns:
+        The parts; none where the solid is one.
+    """
+    groove = _solid_around(solid) > 0.5 + GROOVE
+    lobe = _patches(solid.faces, groove.astype(int), len(groove))
+    size = np.bincount(lobe)
+    chosen = np.setdiff1d(np.flatnonzero(size >= LEAST_PART * len(lobe)), lobe[groove])
+    if len(chosen) < 2:
+        return []
+    share = owners(solid.points, (lobe[:, None] == chosen).astype(float), solid.volume.cell)
+    while share.shape[1] > 1:
+        found, label = seams(solid, share), share.argmax(1)
+        joined = _not_apart(solid, label, found, colors, groove, least)
+        if joined is None:
+            return cut(solid, label, found, [0] * share.shape[1])
+        share[:, joined[0]] += share[:, joined[1]]
+        share = np.delete(share, joined[1], axis=1)
+    return []
+
+
+def _solid_around(solid: Solid) -> np.ndarray:
+    """Share [P] of a ball about each vertex that is solid: a half on a plane, more in a groove."""
+    volume = solid.volume
+    axis = np.arange(-BALL, BALL + 1)
+    x, y, z = np.meshgrid(axis, axis, axis)
+    ball = (x**2 + y**2 + z**2 <= BALL**2).astype(np.float32)
+    filled = np.clip(0.5 - volume.values / volume.cell, 0, 1) * ndimage.binary_dilation(solid.inside)
+    share = fftconvolve(np.pad(filled, BALL), ball / ball.sum(), mode="same").astype(np.float32)
+    return Volume(share, volume.low - BALL * volume.cell, volume.cell).at(solid.points)
+
+
+def owners(points: np.ndarray, share: np.ndarray, cell: float) -> np.ndarray:
+    """How much each vertex belongs to each part, [P, K], from the votes [P, K] around it."""
+    voting = np.flatnonzero(share.sum(1) > 0)
+    away, near = KDTree(points[voting]).query(points, k=min(8, len(voting)))
+    away, near = away.reshape(len(points), -1), near.reshape(len(points), -1)
+    weight = np.exp(-np.minimum((away**2 - away[:, :1] ** 2) / cell**2, 50))
+    return (share[voting][near] * weight[..., None]).sum(1) / weight.sum(1, keepdims=True)
+
+
+def seams(solid: Solid, share: np.ndarray) -> list[Seam]:
+    """Where the parts of a solid meet, from how much each vertex belongs to each part [P, K]."""
+    label = share.argmax(1)
+    ends = np.concatenate([solid.faces[:, [0, 1]], solid.faces[:, [1, 2]], solid.faces[:, [2, 0]]])
+    ends = ends[label[ends[:, 0]] < label[ends[:, 1]]]
+    found = []
+    for a, b in np.unique(label[ends], axis=0):
+        mine = ends[(label[ends] == (a, b)).all(1)]
+        lead = share[mine, a] - share[mine, b]
+        at = (lead[:, 0] / np.maximum(lead[:, 0] - lead[:, 1], 1e-9))[:, None]
+        middle = (1 - at) * solid.points[mine[:, 0]] + at * solid.points[mine[:, 1]]
+        middle = middle - FILLED * solid.volume.cell * solid.normals[mine].mean(1)
+        near = KDTree(middle).sparse_distance_matrix(KDTree(middle), 3 * solid.volume.cell)
+        piece = connected_components(near, directed=False)[1]
+        for k in range(piece.max() + 1):
+            rim, across = middle[piece == k], np.diff(solid.points[mine[piece == k]], axis=1)[:, 0].mean(0)
+            if np.ptp(rim, axis=0).max() > 3 * solid.volume.cell:
+                found.append(_seam((int(a), int(b)), rim, across, solid.volume.cell))
+    return found
+
+
+def _seam(pair: tuple[int, int], rim: np.ndarray, across: np.ndarray, cell: float) -> Seam:
+    """The seam of a rim [R, 3]; `across` [3] points from the first part to the second."""
+    point = (rim.min(0) + rim.max(0)) / 2
+    spread, axes = np.linalg.eigh(np.cov((rim - rim.mean(0)).T))
+    # A rim as thin as a line lies in many planes: of these, in that which faces the other part.
+    free = axes[:, : 2 if spread[1] < (1.5 * cell) ** 2 else 1]
+    normal = free @ (free.T @ across) if free.shape[1] > 1 else free[:, 0] * np.sign(free[:, 0] @ across or 1.0)
+    normal /= np.linalg.norm(normal)
+    point = rim.mean(0)
+    off = np.sqrt(np.mean(((rim - point) @ normal) ** 2))
+    flat = off < cell + FLAT * np.sqrt(spread[2])
+    sides = ConvexHull((rim - point) @ frame_of(normal)[:2].T, qhull_options="QJ").equations
+    return Seam(pair, rim, point, normal, bool(flat), sides)
+
+
+def _walled(solid: Solid, seam: Seam) -> tuple[np.ndarray, np.ndarray]:
+    """Samples [N] of a solid within the rim of a seam, and their distance [N] from its plane, both within 3 samples."""
+    cell = solid.volume.cell
+    at = np.argwhere(solid.inside)
+    points = solid.volume.low + cell * at
+    beyond = seam.beyond(points)
+    close = np.flatnonzero(np.abs(beyond) < 3 * cell)
+    close = close[seam.outside(points[close]) < 1.5 * cell]
+    return at[close], beyond[close]
+
+
+def flood(solid: Solid, label: np.ndarray, found: list[Seam]) -> np.ndarray:
+    """Part [X, Y, Z] of each sample: that of the nearest vertex through the inside, past no flat seam; -1 outside."""
+    from skimage.segmentation import watershed
+
+    cell = solid.volume.cell
+    at = np.argwhere(solid.border)
+    away, near = KDTree(solid.points).query(solid.volume.low + cell * at)
+    marks = np.zeros(solid.inside.shape, np.int32)
+    marks[tuple(at.T)] = np.where(away < 1.5 * cell, label[near] + 1, 0)
+    free = solid.inside.copy()
+    walls = []
+    for seam in found:
+        if seam.flat:
+            place, beyond = _walled(solid, seam)
+            marks[tuple(place.T)] = 0
+            wall = np.abs(beyond) < WALL * cell
+            free[tuple(place[wall].T)] = False
+            walls.append((tuple(place[wall].T), np.where(beyond[wall] > 0, seam.pair[1], seam.pair[0]) + 1))
+    part = watershed(np.zeros(marks.shape, np.uint8), marks * free, mask=free)
+    for place, side in walls:
+        part[place] = side
+    nearest = ndimage.distance_transform_edt(part == 0, return_distances=False, return_indices=True)
+    return np.where(solid.inside, part[tuple(nearest)] - 1, -1)
+
+
+def cut(solid: Solid, label: np.ndarray, found: list[Seam], numbers: list[int]) -> list[Part]:
+    """The parts of a solid from the part of each vertex [P] and the seams between; `numbers` of their names."""
+    cell, part = solid.volume.cell, flood(solid, label, found)
+    outer = ndimage.distance_transform_edt(part < 0, return_distances=False, return_indices=True)
+    spread = part[tuple(outer)]
+    points = solid.volume.points().reshape(-1, 3)
+    there = [k for k in range(len(numbers)) if (part == k).any()]
+    parts = []
+    for k in there:
+        value = -2 * cell * ndimage.gaussian_filter(np.where(spread == k, 1.0, -1.0), 1.0)
+        for seam in found:
+            if seam.flat and k in seam.pair:
+                beyond = seam.beyond(points) * (1 if k == seam.pair[0] else -1)
+                close = (np.abs(beyond) < 2.5 * cell) & np.isin(spread.ravel(), seam.pair)
+                close[close] = seam.outside(points[close]) < 0.3 * cell
+                value.reshape(-1)[close] = beyond[close]
+        beside = {k2 for seam in found if k in seam.pair for k2 in seam.pair} - {k}
+        parts.append(Part(numbers[k], Volume(value.astype(np.float32), solid.volume.low, cell),
+                          sorted(there.index(k2) for k2 in beside if k2 in there)))  # fmt: skip
+    return parts if len(parts) > 1 else []
+
+
+def _not_apart(solid: Solid, label: np.ndarray, found: list[Seam], colors: np.ndarray, groove: np.ndarray,
+               least: float) -> tuple[int, int] | None:  # fmt: skip
+    """The pair of parts with the longest rim among those that do not meet as bodies do; None: all do."""
+    cell, part = solid.volume.cell, flood(solid, label, found)
+    tree, border = KDTree(solid.points), solid.border
+    rims: dict[tuple[int, int], int] = {}
+    for seam in found:
+        beyond = _walled(solid, seam)[1]
+        area = (np.abs(beyond) < WALL * cell).sum() * cell**2 / (2 * WALL)
+        hull = ConvexHull((seam.rim - seam.point) @ frame_of(seam.normal)[:2].T, qhull_options="QJ").volume
+        skins = [(border & (part == k)).sum() * cell**2 for k in seam.pair]
+        whole = all(np.ptp(np.argwhere(part == k), axis=0).min() * cell > least for k in seam.pair if (part == k).any())
+        first, second = (_hue(colors[label == k]) for k in seam.pair)
+        apart = (
+            seam.flat
+            and sum(other.pair == seam.pair for other in found) == 1
+            and whole and min(skins) > 0
+            and groove[tree.query(seam.rim)[1]].mean() > ALL_ALONG
+            and area > THROUGH * hull
+            and (area < NARROW * min(skins) or np.linalg.norm(first - second) > COLORS)
+        )  # fmt: skip
+        if not apart:
+            rims[seam.pair] = rims.get(seam.pair, 0) + len(seam.rim)
+    return max(rims, key=rims.__getitem__) if rims else None
+
+
+def _hue(color: np.ndarray) -> np.ndarray:
+    """Hue and a little of the brightness [3] of colours [P, 3]: light and shade count less than paint."""
+    red, green, blue = np.maximum(color.mean(0), 1.0)
+    total = red + green + blue
+    return np.array([(red - green) / total, ((red + green) / 2 - blue) / total, 0.15 * np.log(total)])
