@@ -417,7 +417,7 @@ def train(
     if any(photo.depth for photo in photos):
         agreed = depth_scale(views, sparse, depth_points(views, photos, photos_folder))
         depth = depth_points(views, photos, photos_folder, scale=agreed["scale"])
-    supervision = supervision_of(sparse, local, to_unit, depth)
+    supervision = supervision_of(sparse, local, to_unit, depth, agreed.get("spread", 0.0))
     make = MlpTrainer if isinstance(settings.size, MlpSize) else Trainer
     trainer = make(settings, rays, supervision, seed, device)
     checkpoint = out / "checkpoint.safetensors"

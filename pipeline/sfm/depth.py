@@ -12,6 +12,7 @@ from pipeline.inputs.photos import Photo
 from sdfsim.errors import SdfsimError
 
 APART = 0.2  # A scale that differs by more than this share means other units, or another photo's depth.
+USUAL = 0.01  # share by which a phone's depth is off, where nothing tells better
 FEWEST = 50  # sparse points on pixels with depth that the scale needs
 
 
@@ -69,7 +70,7 @@ def depth_scale(views: list[View], sparse: Sparse, points: DepthPoints) -> dict[
 
     Returns:
         `scale`: factor of the depth that makes both agree; `spread`: the median share by which a pixel differs after
-        that; `points`: how many were compared.
+        that; `points`: how many were compared. With fewer than `FEWEST` points the depth is taken as it is.
 
     Raises:
         SdfsimError: they differ by more than `APART`, so that the depth cannot be that of these photos in metres.
@@ -89,7 +90,7 @@ def depth_scale(views: list[View], sparse: Sparse, points: DepthPoints) -> dict[
         ratios.append((depth / ahead)[off < spacing])
     ratio = np.concatenate(ratios) if ratios else np.zeros(0)
     if len(ratio) < FEWEST:
-        return {"scale": 1.0, "spread": float("nan"), "points": len(ratio)}
+        return {"scale": 1.0, "spread": USUAL, "points": len(ratio)}
     scale = float(np.median(ratio))
     if not 1 / (1 + APART) < scale < 1 + APART:
         raise SdfsimError(

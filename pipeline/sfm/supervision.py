@@ -19,6 +19,7 @@ CLEARANCE, SLOPE = 0.02, 0.1
 # Free space counts as filled where the field is below this; between, it may be its coarseness.
 FILLED, JUST_EMPTY = -0.004, 0.002
 DEPTH_POINTS, DEPTH_LINES = 500_000, 60_000  # of a depth sensor, that are used
+NOISES = 5.0  # median errors of the depth before which its lines of sight end: a line through the surface erodes it
 TRIES = 16  # places along each line at which filled free space is looked for
 
 
@@ -40,7 +41,7 @@ class Supervision:
 
 
 def supervision_of(
-    sparse: Sparse, views: list[View], to_unit: Similarity, depth: DepthPoints | None = None
+    sparse: Sparse, views: list[View], to_unit: Similarity, depth: DepthPoints | None = None, noise: float = 0.0
 ) -> Supervision:
     """Sparse points seen by three views or more with a small error, and their lines of sight within the sphere.
 
@@ -49,6 +50,7 @@ def supervision_of(
         views: in the space of the unit sphere.
         to_unit: from one to the other.
         depth: of a sensor, in the world of the poses; its pixels are lines of sight as well.
+        noise: median share by which that depth is off; its lines end as much earlier.
     """
     points = to_unit.points(sparse.xyz)
     seen = np.bincount(sparse.point_of, minlength=len(points))
@@ -58,20 +60,22 @@ def supervision_of(
     use = good[sparse.point_of]
     centers = np.array([v.center for v in views]).reshape(-1, 3)
     end, start = points[sparse.point_of[use]], centers[sparse.view_of[use]]
-    measured = np.zeros((0, 3))
+    measured, gap = np.zeros((0, 3)), np.full(len(end), GAP)
     if depth is not None:
         rng = np.random.default_rng(0)
         some = rng.permutation(len(depth.xyz))
         measured = to_unit.points(depth.xyz[some])
         end = np.concatenate([end, measured[:DEPTH_LINES]])
         start = np.concatenate([start, centers[depth.view[some[:DEPTH_LINES]]]])
+        away = np.linalg.norm(end[len(gap) :] - start[len(gap) :], axis=1)
+        gap = np.concatenate([gap, GAP + NOISES * noise * away])
         measured = measured[np.linalg.norm(measured, axis=1) < 1.0][:DEPTH_POINTS]
     length = np.linalg.norm(end - start, axis=1)
     direction = (end - start) / np.maximum(length, 1e-9)[:, None]
     along = -(start * direction).sum(1)
     half = np.sqrt(np.maximum(1 - ((start**2).sum(1) - along**2), 0))
     # Not all the way: a point is uncertain by a little, and so is the surface there.
-    low, high = np.maximum(along - half, 0), np.minimum(along + half, length - GAP)
+    low, high = np.maximum(along - half, 0), np.minimum(along + half, length - gap)
     crosses = (half > 0) & (high > low + 0.02)
     sight = np.concatenate([start + low[:, None] * direction, start + high[:, None] * direction], 1)[crosses]
     weights = weights / max(float(weights.mean()), 1e-9) if len(weights) else weights
