@@ -192,6 +192,26 @@ def test_masks_make_what_they_exclude_transparent():
     assert np.mean(losses[-5:]) < 0.7 * np.mean(losses[:5])
 
 
+def test_depth_draws_the_surface_to_where_a_sensor_saw_it():
+    """Colours say nothing here (all grey): with the points of a ball of another size the surface goes there."""
+    rays = toy_rays()
+    grey = replace(rays, rgb=torch.full_like(rays.rgb, 128))
+    directions = np.random.default_rng(0).normal(size=(4000, 3))
+    ball = 0.45 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    nothing = supervision_of(
+        Sparse(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), np.zeros(0, int), np.zeros(0, int)), [], UNIT
+    )
+    settings = replace(PRESETS["quick"], size=SMALL, rays=64, iterations=120, surface_points=64)
+    off = []
+    for supervision in (nothing, replace(nothing, depth=ball)):
+        run = Trainer(settings, grey, supervision, 0)
+        for _ in range(60):
+            run.step()
+        with torch.no_grad():
+            off.append(float(run.field.sdf(torch.tensor(ball, dtype=torch.float32)).abs().mean()))
+    assert off[1] < 0.03 and off[1] < 0.3 * off[0]
+
+
 def posed_noise(folder: Path) -> tuple[list[View], Sparse]:
     """Four photos of noise, as the photos stage leaves them, and cameras around points that mean nothing."""
     from PIL import Image

@@ -184,7 +184,9 @@ def test_a_child_that_hangs_is_ended(tmp_path, monkeypatch):
     script.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(script))
     with pytest.raises(SdfsimError, match="stopped after 1 s"):
-        run_worker({"count": 3, "exhaustive_up_to": 100, "pairs": None}, tmp_path / "work", 1.0, lambda fraction, message: None)
+        run_worker(
+            {"count": 3, "exhaustive_up_to": 100, "pairs": None}, tmp_path / "work", 1.0, lambda fraction, message: None
+        )
 
 
 def test_photos_without_anything_in_common_fail_with_reasons(tmp_path):

@@ -9,7 +9,8 @@ import torch
 from pipeline.cameras import Sparse
 from pipeline.field.grid_field import FieldSize, GridField, laplace_density
 from pipeline.field.rendering import EPSILON, bounded_samples, draw, nearest, opacity_bound, sdf_cache, worst
-from pipeline.sfm.supervision import CLEARANCE, FILLED, GAP, JUST_EMPTY, SLOPE, FreeSpace, supervision_of
+from pipeline.sfm.depth import DepthPoints
+from pipeline.sfm.supervision import CLEARANCE, FILLED, GAP, JUST_EMPTY, NOISES, SLOPE, FreeSpace, supervision_of
 from tests.pipeline.test_field import UNIT
 from tests.pipeline.test_surface import ring
 
@@ -144,6 +145,23 @@ def test_lines_of_sight_end_before_their_points_and_stay_in_the_sphere():
     start, end = found.sight[:, :3], found.sight[:, 3:]
     np.testing.assert_allclose(np.linalg.norm(start, axis=1), 1.0, atol=1e-9)
     np.testing.assert_allclose(np.linalg.norm(end - xyz[seen[:7]], axis=1), GAP, atol=1e-9)
+
+
+def test_lines_of_sight_of_a_sensor_end_before_its_noise():
+    views = ring(4)
+    rng = np.random.default_rng(1)
+    xyz = np.concatenate([rng.uniform(-0.3, 0.3, (50, 3)), [[0.0, 0.0, 1.5]]])  # The last one is beyond the sphere.
+    depth = DepthPoints(xyz, np.zeros((51, 2)), rng.integers(0, 4, 51))
+    nothing = Sparse(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), np.zeros(0, int), np.zeros(0, int))
+    found = supervision_of(nothing, views, UNIT, depth, noise=0.01)
+    assert {tuple(point) for point in found.depth} == {tuple(point) for point in xyz[:50]}
+    centers = np.array([view.center for view in views])
+    assert (np.linalg.norm(found.sight.reshape(-1, 3), axis=1) < 1 + 1e-9).all()
+    # Every point has a line from its own camera, which ends 5 noises and the usual gap before it.
+    sight = xyz[:50] - centers[depth.view[:50]]
+    away = np.linalg.norm(sight, axis=1)
+    ends = xyz[:50] - ((GAP + NOISES * 0.01 * away) / away)[:, None] * sight
+    assert np.linalg.norm(ends[:, None] - found.sight[:, 3:], axis=2).min(1).max() < 1e-9
 
 
 def crossing(count: int) -> np.ndarray:
