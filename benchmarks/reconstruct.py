@@ -7,12 +7,19 @@ Runs the whole chain on samples/photos/table_vase (or takes what is already in t
 true cameras by a similarity, and prints pose errors, surface errors, how these go with the uncertainty that the run
 gave, and times. A folder of photos without
 `transforms.json` and `truth.ply` gets the report only.
+
+    python benchmarks/reconstruct.py touching -o DIR
+    python benchmarks/reconstruct.py shelf -o DIR
+
+render a set with truth of tests/pipeline/photo_sets.py into DIR, reconstruct it with the masks of its bodies and
+without, and print the errors of every body.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -28,10 +35,11 @@ from pipeline.mesh.placement import load_placement
 from pipeline.mesh.trust import vertex_areas, weighted_quantile
 from sdfsim.console import Session
 from sdfsim.errors import run_main
-from sdfsim.shape.mesh import read_attributes, read_mesh
+from sdfsim.shape.mesh import Mesh, load_mesh, read_attributes, read_mesh, signed_volume
 
 PHOTOS = Path(__file__).resolve().parent.parent / "samples" / "photos" / "table_vase"
 TABLE, VASE = 0.55, np.array([0.12, -0.05])  # m: the table's height, and the vase's axis
+RENDERED = ("touching", "shelf")
 NEAR_FLOOR = 0.03  # m, below which a surface is the floor's
 Similarity = tuple[float, np.ndarray, np.ndarray]  # scale, rotation [3, 3], translation [3]
 
@@ -215,12 +223,51 @@ def captured(layout: str, out: Path) -> Path:
     return place / "transforms.json" if layout == "nerfstudio" else place
 
 
+def body_errors(folder: Path, photos: Path) -> dict[str, dict]:
+    """Errors of every body of a run: of its sides x, y, z and its volume against the true body in the same place, %."""
+    about = json.loads((photos / "images" / "transforms.json").read_text())
+    truth = {f["file_path"]: np.array(f["transform_matrix"])[:3, 3] for f in about["frames"]}
+    views, place = load_views(folder / "poses"), load_placement(folder / "mesh").to_metres.inverse()
+    scale, rotation, translation = similarity(
+        np.array([v.center for v in views]), np.array([truth[v.source] for v in views])
+    )
+    back, found = load_field(folder / "distill").to_unit.inverse(), {}
+    true = {path.stem: load_mesh(path) for path in sorted((photos / "truth").glob("*.ply"))}
+    middles = {name: (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2 for name, mesh in true.items()}
+    for entry in read_parts(folder / "mesh")["objects"]:
+        mesh = load_mesh(folder / "mesh" / "objects" / f"{entry['name']}.ply")
+        at = scale * back.points(place.points(mesh.vertices)) @ rotation.T + translation
+        middle = (at.min(0) + at.max(0)) / 2
+        name = min(true, key=lambda name: float(np.linalg.norm(middles[name] - middle)))
+        sides = np.ptp(at, axis=0) / np.ptp(true[name].vertices, axis=0) - 1
+        volume = signed_volume(Mesh(at, mesh.faces)) / signed_volume(true[name]) - 1
+        found[entry["name"]] = {
+            "truth": name, "sides_percent": (100 * sides).round(1).tolist(), "volume_percent": round(100 * volume, 1)
+        }  # fmt: skip
+    return found
+
+
+def rendered(name: str, out: Path, **options: Any) -> dict[str, Any]:
+    """Renders a set of `photo_sets`, reconstructs it with masks and without; notes and errors of the bodies of both."""
+    from pipeline.stages import reconstruct
+    from tests.pipeline import photo_sets
+
+    photos, result = out / "photos", {}
+    if not photos.exists():
+        photo_sets.shoot_bodies(photos, getattr(photo_sets, name))
+        shutil.copytree(photos / "images", out / "plain")
+    for kind, given in (("masks", photos / "images"), ("plain", out / "plain")):
+        report = reconstruct(given, out / f"run_{kind}", until_stage="mesh", **options)
+        result[kind] = {"notes": report["notes"], "bodies": body_errors(out / f"run_{kind}", photos)}
+    return result
+
+
 def main() -> None:
     """Runs the chain and prints one JSON object."""
     from pipeline.stages import reconstruct
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("photos", type=Path, nargs="?", default=PHOTOS)
+    parser.add_argument("photos", type=Path, nargs="?", default=PHOTOS, help="a folder, or: touching, shelf")
     parser.add_argument("-o", "--out", type=Path, required=True)
     parser.add_argument("--capture", choices=("record3d", "exr", "polycam", "nerfstudio"), help="with depth, see above")
     parser.add_argument("--preset", default="quick")
@@ -230,6 +277,11 @@ def main() -> None:
     chosen = parser.parse_args()
     distance = [*chosen.distance[:2], float(chosen.distance[2])] if chosen.distance else None
     budget = None if chosen.budget is None else 60 * chosen.budget
+    if str(chosen.photos) in RENDERED:
+        with Session(as_json=True) as session:
+            told = session.stage_progress
+            session.report(rendered(str(chosen.photos), chosen.out, preset=chosen.preset, budget=budget, progress=told))
+        return
     given = chosen.photos if chosen.capture is None else captured(chosen.capture, chosen.out)
     with Session(as_json=True) as session:
         report = reconstruct(

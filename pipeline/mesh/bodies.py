@@ -32,6 +32,8 @@ SEEN_SHARE = 0.2
 STANDS = 0.3
 # What hangs beside a body and is smaller than this share of it was torn off it by noise, and goes where it goes.
 CRUMB = 0.05
+# A second piece of what masks name as one is left out if it is shorter than this share of the first.
+SCRAP = 0.4
 # How far sideways, in contact layers, what is around a body's foot is taken away together with it.
 FILLET = 3.0
 # Thickness of the layer in which a field cannot tell a body from what it stands on, in cells of its finest grid.
@@ -408,6 +410,7 @@ def split(surface: Surface, distance: Distance, finest: float, views: list[View]
             if name not in [body.name for body in pieces]:
                 loose = _loose(surface, votes, number, whole, up, layer, smallest)
                 whole, pieces = [*whole, *loose], [*pieces, *(replace(body, name=name) for body in loose)]
+    pieces, pairs = _without_scraps(pieces, pairs)
     called = _names(pieces)
     if not pieces:
         return Parts(surface.solid, surface.visible, {}, smallest, missing=names)
@@ -494,6 +497,16 @@ def _loose(surface: Surface, votes: Votes, number: int, bodies: list[Body], up: 
     mine[box] = inside & (found.seam.values < 0)
     body = _at_nothing(volume, mine, mine, up, layer)
     return [replace(body, seam=found.seam)]
+
+
+def _without_scraps(pieces: list[Body], pairs: list[tuple[int, int, str]]) -> tuple[list[Body], list]:
+    """Bodies without what is a scrap beside a larger one of the same masks, and the pairs of those that touch."""
+    largest: dict[str, float] = {}
+    for body in pieces:
+        largest[body.name] = max(largest.get(body.name, 0.0), body.size)
+    kept = [k for k, body in enumerate(pieces) if not body.name or body.size > SCRAP * largest[body.name]]
+    place = {k: index for index, k in enumerate(kept)}
+    return [pieces[k] for k in kept], [(place[a], place[b], by) for a, b, by in pairs if a in place and b in place]
 
 
 def _names(bodies: list[Body]) -> list[str]:

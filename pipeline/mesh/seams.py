@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 from scipy.signal import fftconvolve
-from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse import coo_matrix, csr_array, diags, identity
 from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import eigsh
 from scipy.spatial import ConvexHull, KDTree
 
 from pipeline.cameras import View, frame_of
@@ -30,16 +31,21 @@ STRAY = 0.1
 # What masks do not name is a part of its own from this share of the surface on; a name from that.
 REST, NAMED = 0.1, 0.02
 # Radius of the ball, in samples, in which grooves are looked for, and the share of it beyond a half that is solid in
-# one: 0.1 is an angle of 144 degrees between the sides.
-BALL, GROOVE = 2, 0.1
+# one, and their mean along a seam. In a sharp right angle it is 0.25; trained fields fill their grooves.
+BALL, GROOVE, DEEP = 3, 0.03, 0.055
+# Colours are means within so many samples. A surface is cut e times as easily where it is a groove by the first of
+# these, or where colours differ by the second from vertex to vertex.
+HUE, SOFT = 3.0, (0.03, 0.03)
 # Least share of all the surface that a part has, and of the seam's border that lies in a groove.
-LEAST_PART, ALL_ALONG = 0.08, 0.8
+LEAST_PART, ALL_ALONG = 0.08, 0.65
 # Least share of a seam that is within the solid: the floor of a cup is ringed by a groove as well.
 THROUGH = 0.6
 # Two parts are apart if their seam is smaller than this share of the smaller one's surface, or their colours differ.
 NARROW, COLORS = 0.06, 0.12
 # How far a line where parts meet may be from a plane, as a share of its width, beyond a sample.
 FLAT = 0.1
+# Parts touch that have so many samples beside one another.
+MEET = 12
 # The samples fill grooves: their line is so many samples below the surface.
 FILLED = 0.45
 # A seam is marked out within so many samples of its plane, which no flood through the inside passes.
@@ -107,7 +113,7 @@ def count_votes(sight: Visibility, faces: np.ndarray, views: list[View], photos_
     return Votes(names, share)
 
 
-def _neighbours(faces: np.ndarray, count: int) -> csr_matrix:
+def _neighbours(faces: np.ndarray, count: int) -> csr_array:
     """Which vertices share an edge, each one with itself: [V, V] of ones."""
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     own = np.arange(count)
@@ -200,7 +206,7 @@ def solid_of(volume: Volume, inside: np.ndarray, mesh: Mesh) -> Solid:
     """The solid of the samples `inside` [X, Y, Z], with the vertices of the mesh of everything that lie at it."""
     at = np.round((mesh.vertices - volume.low) / volume.cell).astype(int)
     within = np.flatnonzero(((at >= 0) & (at < inside.shape)).all(1))
-    index = within[ndimage.binary_dilation(inside)[tuple(at[within].T)]]
+    index = within[np.asarray(ndimage.binary_dilation(inside), bool)[tuple(at[within].T)]]
     place = np.full(len(mesh.vertices), -1)
     place[index] = np.arange(len(index))
     faces = place[mesh.faces]
@@ -258,21 +264,59 @@ def parts_by_shape(solid: Solid, colors: np.ndarray, least: float) -> list[Part]
     Returns:
         The parts; none where the solid is one.
     """
-    groove = _solid_around(solid) > 0.5 + GROOVE
-    lobe = _patches(solid.faces, groove.astype(int), len(groove))
-    size = np.bincount(lobe)
-    chosen = np.setdiff1d(np.flatnonzero(size >= LEAST_PART * len(lobe)), lobe[groove])
-    if len(chosen) < 2:
+    groove = _solid_around(solid) - 0.5
+    label = np.zeros(len(groove), int)
+    waiting = [0]
+    while waiting:
+        number = waiting.pop()
+        trial, new = label.copy(), label.max() + 1
+        trial[_half(solid, label == number, groove, colors)] = new
+        share = owners(solid.points, np.eye(new + 1)[trial], solid.volume.cell)
+        if _apart(solid, trial, seams(solid, share), (number, new), colors, groove, least):
+            label = trial
+            waiting += [number, new]
+    if not label.any():
         return []
-    share = owners(solid.points, (lobe[:, None] == chosen).astype(float), solid.volume.cell)
-    while share.shape[1] > 1:
-        found, label = seams(solid, share), share.argmax(1)
-        joined = _not_apart(solid, label, found, colors, groove, least)
-        if joined is None:
-            return cut(solid, label, found, [0] * share.shape[1])
-        share[:, joined[0]] += share[:, joined[1]]
-        share = np.delete(share, joined[1], axis=1)
-    return []
+    share = owners(solid.points, np.eye(label.max() + 1)[label], solid.volume.cell)
+    return cut(solid, label, seams(solid, share), [0] * (label.max() + 1))
+
+
+def _half(solid: Solid, mine: np.ndarray, groove: np.ndarray, colors: np.ndarray) -> np.ndarray:
+    """One side [N] of the best division of some vertices [P] bool in two, through grooves and where colours change.
+
+    The normalised cut of Shi and Malik (2000), from the second eigenvector of the surface's Laplacian.
+    """
+    place = np.cumsum(mine) - 1
+    ends = np.concatenate([solid.faces[:, [0, 1]], solid.faces[:, [1, 2]], solid.faces[:, [2, 0]]])
+    ends = ends[mine[ends].all(1)]
+    around = KDTree(solid.points).query_ball_point(solid.points, HUE * solid.volume.cell)
+    rows = np.repeat(np.arange(len(around)), [len(each) for each in around])
+    mean = coo_matrix((np.ones(len(rows)), (rows, np.concatenate(around)))).tocsr() @ colors.astype(float)
+    hue = _hue(mean / np.bincount(rows)[:, None])
+    deep = np.maximum(groove[ends].max(1), 0) / SOFT[0]
+    apart = np.linalg.norm(hue[ends[:, 0]] - hue[ends[:, 1]], axis=1) / SOFT[1]
+    weight = np.exp(-deep - apart) + 1e-3
+    index = place[ends]
+    count = int(mine.sum())
+    link = coo_matrix((np.tile(weight, 2), (np.r_[index[:, 0], index[:, 1]], np.r_[index[:, 1], index[:, 0]])),
+                      shape=(count, count)).tocsr()  # fmt: skip
+    patch = connected_components(link, directed=False)[1]
+    whole = np.flatnonzero(patch == np.bincount(patch).argmax())
+    link = link[whole][:, whole]
+    degree = np.asarray(link.sum(1)).ravel()
+    root = diags(degree**-0.5)
+    start = np.random.default_rng(0).normal(size=len(whole))
+    value = eigsh(root @ link @ root + identity(len(whole)), k=2, which="LA", v0=start, tol=1e-5)[1][:, 0]  # type: ignore[arg-type]
+    value = value * degree**-0.5
+    limits = np.quantile(value, np.linspace(LEAST_PART, 1 - LEAST_PART, 60))
+    row, column = link.nonzero()
+    strength = np.asarray(link[row, column]).ravel()
+    costs = []
+    for limit in limits:
+        side = value > limit
+        across = strength[side[row] != side[column]].sum() / 2
+        costs.append(across / max(min(degree[side].sum(), degree[~side].sum()), 1e-9))
+    return np.flatnonzero(mine)[whole[value > limits[int(np.argmin(costs))]]]
 
 
 def _solid_around(solid: Solid) -> np.ndarray:
@@ -363,15 +407,20 @@ def flood(solid: Solid, label: np.ndarray, found: list[Seam]) -> np.ndarray:
     part = watershed(np.zeros(marks.shape, np.uint8), marks * free, mask=free)
     for place, side in walls:
         part[place] = side
-    nearest = ndimage.distance_transform_edt(part == 0, return_distances=False, return_indices=True)
-    return np.where(solid.inside, part[tuple(nearest)] - 1, -1)
+    return np.where(solid.inside, _spread(part, part > 0) - 1, -1)
+
+
+def _spread(values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Values [X, Y, Z], those that are not known [X, Y, Z] bool replaced by the nearest one that is."""
+    nearest = np.empty((3, *values.shape), np.int32)
+    ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True, indices=nearest)
+    return values[tuple(nearest)]
 
 
 def cut(solid: Solid, label: np.ndarray, found: list[Seam], numbers: list[int]) -> list[Part]:
     """The parts of a solid from the part of each vertex [P] and the seams between; `numbers` of their names."""
     cell, part = solid.volume.cell, flood(solid, label, found)
-    outer = ndimage.distance_transform_edt(part < 0, return_distances=False, return_indices=True)
-    spread = part[tuple(outer)]
+    spread = _spread(part, part >= 0)
     points = solid.volume.points().reshape(-1, 3)
     there = [k for k in range(len(numbers)) if (part == k).any()]
     parts = []
@@ -383,40 +432,41 @@ def cut(solid: Solid, label: np.ndarray, found: list[Seam], numbers: list[int]) 
                 close = (np.abs(beyond) < 2.5 * cell) & np.isin(spread.ravel(), seam.pair)
                 close[close] = seam.outside(points[close]) < 0.3 * cell
                 value.reshape(-1)[close] = beyond[close]
-        beside = {k2 for seam in found if k in seam.pair for k2 in seam.pair} - {k}
+        # What meets at an edge only does not touch.
+        beside = (
+            np.bincount(
+                part[np.asarray(ndimage.binary_dilation(part == k), bool) & (part >= 0)], minlength=len(numbers)
+            )
+            >= MEET
+        )
+        beside[k] = False
         parts.append(Part(numbers[k], Volume(value.astype(np.float32), solid.volume.low, cell),
-                          sorted(there.index(k2) for k2 in beside if k2 in there)))  # fmt: skip
+                          [there.index(int(other)) for other in np.flatnonzero(beside)]))  # fmt: skip
     return parts if len(parts) > 1 else []
 
 
-def _not_apart(solid: Solid, label: np.ndarray, found: list[Seam], colors: np.ndarray, groove: np.ndarray,
-               least: float) -> tuple[int, int] | None:  # fmt: skip
-    """The pair of parts with the longest rim among those that do not meet as bodies do; None: all do."""
-    cell, part = solid.volume.cell, flood(solid, label, found)
-    tree, border = KDTree(solid.points), solid.border
-    rims: dict[tuple[int, int], int] = {}
-    for seam in found:
-        beyond = _walled(solid, seam)[1]
-        area = (np.abs(beyond) < WALL * cell).sum() * cell**2 / (2 * WALL)
-        hull = ConvexHull((seam.rim - seam.point) @ frame_of(seam.normal)[:2].T, qhull_options="QJ").volume
-        skins = [(border & (part == k)).sum() * cell**2 for k in seam.pair]
-        whole = all(np.ptp(np.argwhere(part == k), axis=0).min() * cell > least for k in seam.pair if (part == k).any())
-        first, second = (_hue(colors[label == k]) for k in seam.pair)
-        apart = (
-            seam.flat
-            and sum(other.pair == seam.pair for other in found) == 1
-            and whole and min(skins) > 0
-            and groove[tree.query(seam.rim)[1]].mean() > ALL_ALONG
-            and area > THROUGH * hull
-            and (area < NARROW * min(skins) or np.linalg.norm(first - second) > COLORS)
-        )  # fmt: skip
-        if not apart:
-            rims[seam.pair] = rims.get(seam.pair, 0) + len(seam.rim)
-    return max(rims, key=rims.__getitem__) if rims else None
+def _apart(solid: Solid, label: np.ndarray, found: list[Seam], pair: tuple[int, int], colors: np.ndarray,
+           groove: np.ndarray, least: float) -> bool:  # fmt: skip
+    """Whether two parts meet as bodies do: in one flat seam, in a groove all along, and narrow or of two colours."""
+    between = [seam for seam in found if seam.pair == pair]
+    if len(between) != 1 or not between[0].flat:
+        return False
+    seam, cell, part = between[0], solid.volume.cell, flood(solid, label, found)
+    if any(not (part == k).any() or np.ptp(np.argwhere(part == k), axis=0).min() * cell < least for k in pair):
+        return False
+    deep = groove[KDTree(solid.points).query(seam.rim)[1]]
+    along = (deep > GROOVE).mean() > ALL_ALONG and deep.mean() > DEEP
+    beyond = _walled(solid, seam)[1]
+    area = (np.abs(beyond) < WALL * cell).sum() * cell**2 / (2 * WALL)
+    ring = ConvexHull((seam.rim - seam.point) @ frame_of(seam.normal)[:2].T, qhull_options="QJ").volume
+    skin = min((solid.border & (part == k)).sum() * cell**2 for k in pair)
+    first, second = (_hue(colors[label == k].mean(0)) for k in pair)
+    differ = np.linalg.norm(first - second) > COLORS
+    return bool(along and area > THROUGH * ring and (area < NARROW * skin or differ))
 
 
 def _hue(color: np.ndarray) -> np.ndarray:
-    """Hue and a little of the brightness [3] of colours [P, 3]: light and shade count less than paint."""
-    red, green, blue = np.maximum(color.mean(0), 1.0)
+    """Hue and a little of the brightness [..., 3] of colours [..., 3]: light and shade count less than paint."""
+    red, green, blue = np.moveaxis(np.maximum(color, 1.0), -1, 0)
     total = red + green + blue
-    return np.array([(red - green) / total, ((red + green) / 2 - blue) / total, 0.15 * np.log(total)])
+    return np.stack([(red - green) / total, ((red + green) / 2 - blue) / total, 0.15 * np.log(total)], -1)

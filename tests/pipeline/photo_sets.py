@@ -188,7 +188,8 @@ def ring(axis: Iterable[float], major: float, minor: float, segments: int = 64) 
     """Vertices and outward faces of a torus that lies flat, its middle at `axis`."""
     u, v = np.meshgrid(*[np.arange(segments) * 2 * np.pi / segments] * 2, indexing="ij")
     radius = major + minor * np.cos(v)
-    vertices = np.stack([radius * np.cos(u), radius * np.sin(u), minor * np.sin(v)], -1).reshape(-1, 3) + list(axis)
+    vertices = np.stack([radius * np.cos(u), radius * np.sin(u), minor * np.sin(v)], -1).reshape(-1, 3)
+    vertices += np.array(list(axis))
     k = np.arange(segments * segments)
     right, up = (k + segments) % len(k), k // segments * segments + (k + 1) % segments
     corner = right // segments * segments + up % segments
@@ -216,13 +217,14 @@ def touching(make: ModuleType) -> tuple[list, list[str]]:
 
     def turned(profile: list[tuple[float, float]], at: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
         vertices, faces = make.lathe(np.array(profile))
-        return vertices + [*at, 0], faces
+        return vertices + np.array([*at, 0]), faces
 
     cup = [(0, 0), (0.08, 0), (0.08, 0.16), (0.062, 0.16), (0.062, 0.03), (0, 0.03)]
     vase = [(0, 0), (0.09, 0), (0.12, 0.1), (0.12, 0.16), (0.075, 0.28), (0.09, 0.34), (0, 0.34)]
     shapes = {
         "cup": turned(cup, (-0.08, 0.2)), "vase": turned(vase, (-0.28, 0.2)),
-        "book1": make.box((0.0, -0.3, 0), (0.34, -0.06, 0.08)), "book2": make.box((0.03, -0.27, 0.08), (0.3, -0.08, 0.16)),
+        "book1": make.box((0.0, -0.3, 0), (0.34, -0.06, 0.08)),
+        "book2": make.box((0.03, -0.27, 0.08), (0.3, -0.08, 0.16)),
         "book3": make.box((0.05, -0.26, 0.16), (0.33, -0.1, 0.24)),
     }  # fmt: skip
     colors = {"cup": (0.75, 0.72, 0.62), "vase": (0.16, 0.3, 0.62), "book1": (0.6, 0.14, 0.12),
@@ -237,7 +239,7 @@ def shelf(make: ModuleType) -> tuple[list, list[str]]:
     shapes = {
         "torus": ring((-0.33, 0, 0.27), 0.11, 0.05),
         "carton": make.box((-0.08, -0.09, 0.22), (0.1, 0.09, 0.42)),
-        "jug": (jug + [0.34, 0, 0.22], faces),
+        "jug": (jug + np.array([0.34, 0, 0.22]), faces),
         "board": make.box((-0.6, -0.2, 0.18), (0.6, 0.2, 0.22)),
         "left": make.box((-0.64, -0.2, 0.0), (-0.6, 0.2, 0.34)),
         "right": make.box((0.6, -0.2, 0.0), (0.64, 0.2, 0.34)),
