@@ -88,8 +88,11 @@ def grid_certificate(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] =
     """What the grid adds to the certificate of a fit; it stays in the cache for the first simulation.
 
     Returns:
-        `baked_cell` and `baked_error` (see `BakedGrid`), as fractions of the largest extent.
+        `baked_cell` and `baked_error` (see `BakedGrid`), as fractions of the largest extent; nothing of what was not
+        fitted.
     """
+    if not isinstance(sdf, MlpSdf):
+        return {}
     grid, extent = baked(sdf, nodes, pieces), float(np.ptp(sdf.bounds, axis=0).max())
     return {"baked_cell": grid.cell / extent, "baked_error": grid.error / extent}
 
