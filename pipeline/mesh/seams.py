@@ -35,7 +35,7 @@ REST, NAMED = 0.1, 0.02
 BALL, GROOVE, DEEP = 3, 0.03, 0.055
 # Colours are means within so many samples. A surface is cut e times as easily where it is a groove by the first of
 # these, or where colours differ by the second from vertex to vertex.
-HUE, SOFT = 3.0, (0.03, 0.03)
+HUE, SOFT = 1.5, (0.03, 0.015)
 # Least share of all the surface that a part has, and of the seam's border that lies in a groove.
 LEAST_PART, ALL_ALONG = 0.08, 0.65
 # Least share of a seam that is within the solid: the floor of a cup is ringed by a groove as well.
