@@ -46,12 +46,14 @@ class Scene:
 
     Args:
         build: of `photo_sets`.
-        chosen: names of the parts that are there; the floor always is.
+        chosen: names of the parts that are there; floor and furniture always are.
         radius: m, of the space that the field is trained in.
         side: samples a side of that space.
+        floor: whether it is there.
     """
 
-    def __init__(self, build: Callable, chosen: Sequence[str], radius: float, side: int = 97) -> None:
+    def __init__(self, build: Callable, chosen: Sequence[str], radius: float, side: int = 97,
+                 *, floor: bool = True) -> None:  # fmt: skip
         self.make = photo_sets.studio()
         parts, names = build(self.make)
         self.parts = [part for name, part in zip(names, parts, strict=False) if name in chosen] + parts[len(names) :]
@@ -73,7 +75,9 @@ class Scene:
 
         def distance(points: np.ndarray) -> np.ndarray:
             there = self.to_unit.inverse().points(points)
-            return (np.minimum.reduce([there[:, 2], *(one(there) for one in each)]) / radius).astype(np.float32)
+            return (
+                np.minimum.reduce([there[:, 2] if floor else np.inf, *(one(there) for one in each)]) / radius
+            ).astype(np.float32)
 
         volume = sample_volume(lambda p: np.maximum(distance(p), ball(p)).astype(np.float32), side, extent=EXTENT)
         raw = volume.mesh()
@@ -204,3 +208,25 @@ def test_the_report_tells_what_touches_and_which_masks_have_no_body():
         "object2 and object3 touch; split along a seam by concavity and colour; give masks to be sure",
         "cup and vase touch; split where their masks end", "masks of spoon: no surface corresponds to them",
     ]  # fmt: skip
+
+
+def test_without_scenery_a_connected_pair_comes_apart_by_masks(tmp_path):
+    free = Scene(photo_sets.touching, PAIR, 0.4, floor=False)
+    found = free.split(tmp_path / "p", PAIR, alone=True)
+    assert list(found.bodies) == ["vase", "cup"] and found.solid is None
+    free.check(found, {"cup": "cup", "vase": "vase"}, 0.5 * CELL, 0.02)
+
+
+def test_what_masks_name_is_cut_off_a_wall_too(tmp_path):
+    def wall(make) -> tuple[list, list[str]]:
+        shapes = {
+            "shelf": make.box((-0.06, -0.05, 0.1), (0.06, 0.05, 0.22)),
+            "wall": make.box((-0.96, -0.3, 0), (-0.06, 0.3, 0.5)),
+        }
+        colors = {"shelf": (0.2, 0.42, 0.3), "wall": (0.6, 0.45, 0.28)}
+        return photo_sets.in_room(make, shapes, colors), ["shelf"]
+
+    scene = Scene(wall, ("shelf",), 0.3)
+    found = scene.split(tmp_path / "p", ("shelf",))
+    assert list(found.bodies) == ["shelf"] and found.solid is not None and is_closed(found.solid)
+    scene.check(found, {"shelf": "shelf"}, CELL, 0.05)
