@@ -76,7 +76,10 @@ class Scene:
         def distance(points: np.ndarray) -> np.ndarray:
             there = self.to_unit.inverse().points(points)
             return (
-                np.minimum.reduce([there[:, 2] if floor else np.inf, *(one(there) for one in each)]) / radius
+                np.minimum.reduce(
+                    [there[:, 2] if floor else np.full(len(there), np.inf), *(one(there) for one in each)]
+                )
+                / radius
             ).astype(np.float32)
 
         volume = sample_volume(lambda p: np.maximum(distance(p), ball(p)).astype(np.float32), side, extent=EXTENT)
