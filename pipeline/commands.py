@@ -47,7 +47,10 @@ DropShape = Annotated[Literal["box", "ball", "none"], typer.Option("--drop", hel
 def reconstruct(
     photos: Annotated[
         Path,
-        typer.Argument(help="Folder of photos, a video, a transforms.json, a COLMAP model, or a phone's capture.", show_default=False),
+        typer.Argument(
+            help="Folder of photos, a video, a transforms.json, a COLMAP model, or a phone's capture.",
+            show_default=False,
+        ),
     ],
     out: Out,
     preset: Preset = "standard",
@@ -89,7 +92,10 @@ def reconstruct(
 def poses(
     photos: Annotated[
         Path,
-        typer.Argument(help="Folder of photos, a video, a transforms.json, a COLMAP model, or a phone's capture.", show_default=False),
+        typer.Argument(
+            help="Folder of photos, a video, a transforms.json, a COLMAP model, or a phone's capture.",
+            show_default=False,
+        ),
     ],
     out: Out,
     preset: KeptPreset = None,

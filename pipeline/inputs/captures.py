@@ -43,8 +43,10 @@ class Capture:
 def find_capture(folder: Path) -> Path | None:
     """The folder of a Record3D or Polycam export in `folder`, or None where it is none."""
     for place in (folder, folder / "EXR_RGBD", folder / "keyframes"):
-        polycam = any((place / f"{kind}cameras").is_dir() and (place / f"{kind}images").is_dir()
-                      for kind in ("", "corrected_"))  # fmt: skip
+        polycam = any(
+            any((place / f"{kind}cameras").glob("*.json")) and (place / f"{kind}images").is_dir()
+            for kind in ("", "corrected_")
+        )
         record3d = _metadata(place).is_file() and any((place / name).is_dir() for name in ("rgb", "rgbd"))
         if polycam or record3d:
             return place

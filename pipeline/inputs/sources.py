@@ -56,7 +56,9 @@ class Source:
 
     def files(self) -> list[Path]:
         """Every file whose content the result depends on."""
-        found = [*self.photos, *sorted(self.masks.values()), *self.labels.files()] + [p for p in (self.video, self.archive) if p]
+        found = [*self.photos, *sorted(self.masks.values()), *self.labels.files()] + [
+            p for p in (self.video, self.archive) if p
+        ]
         found += [path for camera in self.frames.values() if camera.depth for path in camera.depth.files()]
         if self.cameras and self.cameras.is_dir():
             return found + sorted(
@@ -69,9 +71,10 @@ def find_source(given: Path) -> Source:
     """Looks at what the user gave; reads no photo yet.
 
     A folder holds photos (in it, or in its subfolder `images`), or is a COLMAP model, text or binary, or a phone's
-    capture (see `find_capture`); a file is a video, a transforms.json, or a zipped capture. Masks lie in a folder `masks` in or beside that of the photos, named like the photo,
-    or like the photo with `.png` behind it, as COLMAP has them; white is the object. A folder in `masks` is about the
-    object of its name alone; a folder `labels` has label images.
+    capture (see `find_capture`); a file is a video, a transforms.json, or a zipped capture. Masks lie in a folder
+    `masks` in or beside that of the photos, named like the photo, or like the photo with `.png` behind it, as COLMAP
+    has them; white is the object. A folder in `masks` is about the object of its name alone; a folder `labels` has
+    label images.
 
     Raises:
         SdfsimError: nothing there, fewer than three photos, or two cameras of one photo.
@@ -92,8 +95,9 @@ def find_source(given: Path) -> Source:
         )
     if is_model(given):
         return _with_cameras(given, read_cameras(given))
-    if (capture := find_capture(given)) is not None:
-        return _with_cameras(capture, *reversed(read_capture(capture)))
+    if (place := find_capture(given)) is not None:
+        capture, frames = read_capture(place)
+        return _with_cameras(place, frames, capture)
     photos, notes = find_photos(given)
     labels = find_labels(photos)
     return Source(tuple(photos), find_masks(photos), labels, notes=(*notes, *labels.notes, *_unused(given)))

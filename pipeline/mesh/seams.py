@@ -199,7 +199,7 @@ class Solid:
     @property
     def border(self) -> np.ndarray:
         """[X, Y, Z] bool, samples within it beside others that are not."""
-        return self.inside & ~ndimage.binary_erosion(self.inside)
+        return self.inside & np.logical_not(ndimage.binary_erosion(self.inside))
 
 
 def solid_of(volume: Volume, inside: np.ndarray, mesh: Mesh) -> Solid:
