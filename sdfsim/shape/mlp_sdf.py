@@ -9,13 +9,12 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Literal
 
 import numpy as np
 import torch
 
-from sdfsim.shape.far_field import BoxedStack
+from sdfsim.shape.far_field import in_metres
 from sdfsim.shape.mesh import Frame
 from sdfsim.shape.sdf import accepts_numpy
 
@@ -26,8 +25,6 @@ PREPARED = 131_072
 # Points in one sweep of a stack. 64 wide and 8 layers are 4 kB a point: 33 MB on the CPU, of which the two layers at
 # work stay in the cache; a GPU wants more at a time.
 SWEPT = {"cpu": 8192, "cuda": 131_072}
-# Points of one network in a tile of a stack's sweep; the best of these is taken.
-TILES = (8, 16, 32, 64, 128, 256, 512, 1024)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +54,7 @@ class MlpSdf:
 
     @property
     def architecture(self) -> tuple:
-        """Networks with equal architecture can be evaluated in one batched product."""
+        """Activation, and [out, in] of every layer."""
         return (self.activation, *(tuple(weight.shape) for weight in self.weights))
 
     def to(self, device: torch.device | str) -> MlpSdf:
@@ -70,62 +67,21 @@ class MlpSdf:
         frame = Frame(self.frame.centre * factor, self.frame.scale * factor)
         return replace(self, frame=frame, bounds=self.bounds * factor)
 
-    @cached_property
-    def _stack(self) -> MlpStack:
-        return MlpStack([self], self.device)
-
     @accepts_numpy
     def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Distance [P] m and gradient [P, 3] at `points` [P, 3] m; evaluated in float32, cast back.
 
         Near the solid the gradient is the network's own; see `everywhere` for what is not.
         """
-        return self._stack.alone(points)
+        return in_metres(self._inside, self.frame, self.bounds, points, PREPARED)
 
-
-class MlpStack(BoxedStack):
-    """Networks of one architecture. Points are sorted by network and cut into tiles of one network each."""
-
-    def __init__(self, sdfs: list[MlpSdf], device: torch.device) -> None:
-        super().__init__(sdfs, device, PREPARED)
-        layers = range(len(sdfs[0].weights))
-        self._weights = [torch.stack([sdf.weights[layer] for sdf in sdfs]).to(device) for layer in layers]
-        self._biases = [torch.stack([sdf.biases[layer] for sdf in sdfs]).to(device) for layer in layers]
-        self._activation: Activation = sdfs[0].activation
-        self._mirrors = torch.tensor([sdf.mirrors for sdf in sdfs], device=device)
-
-    def _inside(self, slot: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _inside(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         # -1 where the point is on the side of a mirror plane that the network does not know.
-        side = 1.0 - 2.0 * (self._mirrors.index_select(0, slot) & (points < 0)).to(points.dtype)
-        value, gradient = self._network(slot, points * side)
-        return value, gradient * side
-
-    def _network(self, slot: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Network `slot[p]` at `points[p]`: [P], [P, 3]."""
-        if self._count == 1 or len(slot) == 0:
-            value, gradient = value_and_gradient(self._weights, self._biases, self._activation, points[None])
-            return value[0], gradient[0]
-        counts = torch.bincount(slot, minlength=self._count)
-        order = slot.argsort(stable=True)
-        known = counts.tolist()
-        # A tile costs its padding and a copy of its network, which is worth about 24 points.
-        tile = min(TILES, key=lambda size: sum(-(-count // size) for count in known) * (size + 24))
-        tiles = (counts + tile - 1).div(tile, rounding_mode="floor")
-        first_tile, first_point = tiles.cumsum(0) - tiles, counts.cumsum(0) - counts
-        owner = slot[order]
-        place = first_tile[owner] * tile + torch.arange(len(slot), device=slot.device) - first_point[owner]
-        network = torch.repeat_interleave(torch.arange(self._count, device=slot.device), tiles)
-        padded = points.new_zeros(len(network) * tile, 3)
-        padded[place] = points[order]
-        value, gradient = value_and_gradient(
-            [weight[network] for weight in self._weights],
-            [bias[network] for bias in self._biases],
-            self._activation,
-            padded.view(len(network), tile, 3),
-        )
-        back = torch.empty_like(place)
-        back[order] = place
-        return value.reshape(-1)[back], gradient.reshape(-1, 3)[back]
+        mirrored = torch.tensor(self.mirrors, device=points.device)
+        side = 1.0 - 2.0 * (mirrored & (points < 0)).to(points.dtype)
+        weights, biases = ([part[None] for part in parts] for parts in (self.weights, self.biases))
+        value, gradient = value_and_gradient(weights, biases, self.activation, (points * side)[None])
+        return value[0], gradient[0] * side
 
 
 def wave(before: torch.Tensor, slope: torch.Tensor, spare: torch.Tensor) -> None:

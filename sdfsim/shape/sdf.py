@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, wraps
+from functools import cached_property, partial, wraps
 from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 
 import numpy as np
@@ -12,7 +12,7 @@ import torch
 
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.distance import MeshDistance
-from sdfsim.shape.far_field import BOX, BoxedStack
+from sdfsim.shape.far_field import BOX, in_metres
 from sdfsim.shape.mesh import Frame, Mesh, normal_frame
 
 # Points of a grid evaluated at once: eight indices and corners with what is made of them, about 250 bytes a point.
@@ -281,10 +281,8 @@ def _up(points: torch.Tensor) -> torch.Tensor:
     return up
 
 
-def trilinear(
-    values: torch.Tensor, slot: torch.Tensor | None, points: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Interpolate a stack of grids over [-BOX, BOX]^3, each point in its own, and differentiate what comes out.
+def trilinear(values: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Interpolate a grid over [-BOX, BOX]^3, and differentiate what comes out.
 
     The gradient is the exact one of the interpolant, not an interpolation of central differences: the step
     x - f grad f then leads to the level that the value has (which is what contact points and nodes are made of), and
@@ -292,8 +290,7 @@ def trilinear(
     the cell over the radius of curvature.
 
     Args:
-        values: [S, R, R, R] float32 distances; the outermost samples lie on the faces of the box.
-        slot: [P] int64 which grid, or None for the only one.
+        values: [R, R, R] float32 distances; the outermost samples lie on the faces of the box.
         points: [P, 3] float32 within the box; from a NaN comes a NaN.
 
     Returns:
@@ -306,11 +303,9 @@ def trilinear(
     cell = place.long().clamp_(0, side - 2)
     across, along, up = (place - cell).unbind(1)
     first = (cell[:, 0] * side + cell[:, 1]) * side + cell[:, 2]
-    if slot is not None:
-        first = first + slot * side**3
     bit = torch.arange(2, device=points.device)
     corner = ((bit[:, None, None] * side + bit[:, None]) * side + bit).view(8, 1)
-    # Three times as fast on a CPU as brackets are, here and in the bank.
+    # Three times as fast on a CPU as brackets are, here.
     found = values.reshape(-1).index_select(0, (first + corner).view(-1)).view(2, 2, 2, -1)
     rise_x = found[1] - found[0]
     face = found[0] + across * rise_x
@@ -363,30 +358,13 @@ class GridSdf:
         frame = Frame(self.frame.centre * factor, self.frame.scale * factor)
         return replace(self, frame=frame, bounds=self.bounds * factor)
 
-    @cached_property
-    def _stack(self) -> GridStack:
-        return GridStack([self], self.device)
-
     @accepts_numpy
     def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Distance [P] m and gradient [P, 3] at `points` [P, 3] m; interpolated in float32, cast back.
 
         Near the solid the gradient is the interpolant's own (see `trilinear`); see `everywhere` for what is far.
         """
-        return self._stack.alone(points)
-
-
-class GridStack(BoxedStack):
-    """Grids of one resolution, asked together."""
-
-    def __init__(self, sdfs: list[GridSdf], device: torch.device) -> None:
-        super().__init__(sdfs, device, CHUNK)
-        # One grid alone is not copied: at 512 samples a side it is half a gigabyte.
-        alone = len(sdfs) == 1
-        self._values = sdfs[0].values.to(device)[None] if alone else torch.stack([s.values.to(device) for s in sdfs])
-
-    def _inside(self, slot: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        return trilinear(self._values, slot if self._count > 1 else None, points)
+        return in_metres(partial(trilinear, self.values), self.frame, self.bounds, points, CHUNK)
 
 
 def sample_grid(

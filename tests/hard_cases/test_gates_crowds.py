@@ -92,7 +92,7 @@ def test_ten_thousand_steps_of_a_settled_pile(model, sleep):
 
 
 def test_ten_thousand_static_bodies_cost_one_mover_what_ten_do(model):
-    """Counted, not timed: pairs, contact points, nodes and edges of every step; benchmarks/effects.py has the times."""
+    """Counted, not timed: pairs, contact points, nodes and edges of every step."""
 
     def run(count: int):
         scene = gates.mixed()

@@ -85,18 +85,17 @@ def test_a_box_is_met_but_for_its_edges() -> None:
 
 def test_the_gradient_is_that_of_the_value() -> None:
     """In double precision: against autograd, and against differences within a cell, where they are exact."""
-    values = torch.from_numpy(np.random.default_rng(0).normal(size=(3, 6, 6, 6)))
-    slot = torch.arange(3).repeat(100)
+    values = torch.from_numpy(np.random.default_rng(0).normal(size=(6, 6, 6)))
     cell = 2 * BOX / 5
     points = (torch.randint(5, (300, 3)) + 0.2 + 0.6 * torch.rand(300, 3, dtype=torch.float64)) * cell - BOX
     points.requires_grad_()
-    value, gradient = trilinear(values, slot, points)
+    value, gradient = trilinear(values, points)
     (slope,) = torch.autograd.grad(value.sum(), points)
     torch.testing.assert_close(gradient.detach(), slope, rtol=1e-9, atol=1e-9)
     for axis in range(3):
         step = torch.zeros(3, dtype=torch.float64)
         step[axis] = 0.1 * cell
-        ahead, behind = trilinear(values, slot, points.detach() + step), trilinear(values, slot, points.detach() - step)
+        ahead, behind = trilinear(values, points.detach() + step), trilinear(values, points.detach() - step)
         torch.testing.assert_close((ahead[0] - behind[0]) / (0.2 * cell), gradient[:, axis].detach())
 
 
