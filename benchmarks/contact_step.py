@@ -68,7 +68,7 @@ def movi_b(data: Path) -> tuple[float, float]:
 def bowl(count: int, folder: Path) -> tuple[float, float]:
     """Milliseconds a step of PyBullet and of the solve."""
     scene = load_scene(write_scene("bowl", folder / str(count), count))
-    start, _ = start_of_scene(scene, folder / "engine", scene_units(scene, load_model("solver")))
+    start = start_of_scene(scene, folder / "engine", scene_units(scene, load_model("solver")))
     return bullet(start, FALL)[1].wall_ms, solved(scene, FALL)[0]
 
 

@@ -11,17 +11,20 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from sdfsim.console import Session
 from sdfsim.evaluation.hard_cases import GROUPS
-from sdfsim.evaluation.stress import Study, accepted, draw_group, stress, table, write_report
-from sdfsim.files import write_json, write_text
+from sdfsim.evaluation.stress import TEACHER, Study, draw_group, figures, stress, table, write_report
+from sdfsim.files import read_json, write_json, write_text
 from sdfsim.recording import save_rollout
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENT = ROOT / "docs" / "stability.md"
 RATCHET = Path(__file__).with_name("hard_cases_ratchet.json")
 BEGIN, END = "<!-- written by benchmarks/hard_cases.py -->", "<!-- end -->"
+SPREADS = 3.0  # so many standard deviations are noise
+SHARE = 0.05  # of a figure: what another machine's rounding may change where repetitions agree
 PICTURES = {"stack": "stability_stacks.png", "bounce": "stability_bounces.png", "slope": "stability_slopes.png"}
 
 
@@ -34,6 +37,37 @@ def write_document(study: Study) -> None:
     write_text(DOCUMENT, before + shown + rest.split(END)[1])
     for group, name in PICTURES.items():
         draw_group(study, group, ROOT / "docs" / "images" / name)
+
+
+def accepted(study: Study) -> dict[str, Any]:
+    """What the ratchet file holds: each model's figures, and the cases in which it blew up."""
+    models = {}
+    for who, found in figures(study).items():
+        if who != TEACHER:
+            blown = [case for (case, one), result in study.results.items() if one == who and result["broke"]]
+            models[who] = {"figures": found, "blew_up": blown}
+    return {"quick": study.quick, "models": models}
+
+
+def slipped_back(study: Study, file: Path) -> list[str]:
+    """A line for every figure of a study that is clearly worse than in the ratchet, and for every new blow-up."""
+    ratchet, now = read_json(file), accepted(study)
+    worse = []
+    for who, entry in now["models"].items():
+        was = ratchet["models"][who]
+        worse += [f"{who}: {case}: blew up" for case in entry["blew_up"] if case not in was["blew_up"]]
+        for case in study.cases:
+            for figure in case.figures:
+                key = f"{case.name}/{figure.name}"
+                before, after = was["figures"].get(key), entry["figures"].get(key)
+                if before is None or after is None:
+                    continue
+                slack = max(SPREADS * before["noise"], SHARE * abs(before["value"]), 10.0**-figure.digits)
+                gap = after["value"] - before["value"]
+                if (-gap if figure.longer else gap) > slack:
+                    accepted_was = f"accepted {before['value']:.4g} ± {before['noise']:.2g}"
+                    worse.append(f"{who}: {key} {after['value']:.4g} {figure.unit}, {accepted_was}")
+    return worse
 
 
 def main() -> None:

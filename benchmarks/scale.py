@@ -24,10 +24,10 @@ from sdfsim.dynamics.froude import scene_units
 from sdfsim.dynamics.model import load_model
 from sdfsim.dynamics.simulator import SimulationError, Simulator, join
 from sdfsim.errors import run_main
-from sdfsim.evaluation.engines import bullet, mujoco, start_of_scene
+from sdfsim.evaluation.engines import bullet, mujoco, rollout_motion, start_of_scene
 from sdfsim.evaluation.hard_cases import body, box, on_floor
 from sdfsim.evaluation.harness import Job, Line, Panel, Results, draw, markdown, measure, number, peak_memory
-from sdfsim.evaluation.penetration import deepest, exact_solids, rollout_penetration
+from sdfsim.evaluation.penetration import depths
 from sdfsim.files import write_text
 from sdfsim.scene.scene import Scene
 from sdfsim.scene.scene_file import load_scene
@@ -69,7 +69,7 @@ def ours(source: Path | int, steps: int, model: str | None, keep: float = 1.0) -
             broken = error.message
         spent = time.process_time() - began
     rollout = join(frames)
-    depth = rollout_penetration(scene, rollout)
+    depth = depths(scene, rollout_motion(scene, rollout))
     return {
         "bodies": int(simulator.bodies.moves.sum()),
         "nodes": len(simulator.bodies.node),
@@ -87,17 +87,15 @@ def engine(name: str, file: Path, steps: int) -> dict:
     """The same of PyBullet or MuJoCo; spheres are spheres there, everything else its convex pieces."""
     scene = load_scene(file)
     units = scene_units(scene, load_model("solver"))
-    start, _ = start_of_scene(scene, file.parent / "engine", units)
+    start = start_of_scene(scene, file.parent / "engine", units)
     with peak_memory() as memory:
         motion, timing = (bullet if name == "PyBullet" else mujoco)(start, steps)
-    shapes = {key: scene.shapes[int(key)] for key in start.urdfs}
-    centred = {key: replace(s, nodes=s.nodes - s.com) for key, s in shapes.items()}
-    distance = deepest(motion, exact_solids(file.parent, centred), every=5)
-    depth = np.maximum(0.0, -distance[np.isfinite(distance)])
+    lengths = {"position": units.length, "scale": units.length}
+    depth = depths(scene, replace(motion, **{name: f * getattr(motion, name) for name, f in lengths.items()}))
     return {
         "bodies": int((~motion.static).sum()),
         "ms": timing.cpu_ms,
-        "depth_95": 1e3 * units.length * float(np.percentile(depth, 95)) if len(depth) else 0.0,
+        "depth_95": 1e3 * float(np.percentile(depth, 95)) if len(depth) else 0.0,
         "lost": int((units.length * motion.position[-1, :, 2] < -0.1).sum()),
         "peak_mib": memory["mib"],
     }

@@ -29,9 +29,8 @@ from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.scene.scene_file import load_scene
 from sdfsim.shape.mesh import Mesh, convex_hull
-from sdfsim.shape.primitives import PRIMITIVES, convex_pieces
 from sdfsim.shape.sdf import BoxSdf, CapsuleSdf, ClosedForm, CylinderSdf, PlaneSdf, SphereSdf
-from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape
+from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape, own_pieces
 
 DENSITY = 1000.0  # kg/m^3 of a shape on its own, as of a body that a scene says nothing about
 FRICTION = RESTITUTION = 0.5  # likewise
@@ -227,22 +226,9 @@ def _inertia(body: Body, shape: Shape) -> np.ndarray:
     return body.inertia if body.inertia is not None else body.mass / shape.volume * body.scale**2 * shape.inertia
 
 
-def _own_pieces(shape: Shape) -> list[Mesh]:
-    """Convex pieces [m] that a shape comes with; empty where it has none."""
-    if shape.pieces:
-        return [convex_hull(points) for points in shape.pieces]
-    kind = str(shape.source.get("primitive", ""))
-    try:
-        pieces = convex_pieces(kind)
-    except SdfsimError:  # no primitive, or one without
-        return []
-    factor = float(np.ptp(shape.mesh.vertices, axis=0).max() / np.ptp(PRIMITIVES[kind]().vertices, axis=0).max())
-    return [Mesh(piece.vertices * factor, piece.faces) for piece in pieces]
-
-
 def _pieces(shape: Shape) -> list[Mesh]:
     """Convex pieces [m]: the shape's own, or those of CoACD. Raises SdfsimError where there are none."""
-    if own := _own_pieces(shape):
+    if own := own_pieces(shape):
         return own
     import open3d  # noqa: F401  (it cannot be loaded after CoACD)
 
@@ -544,7 +530,7 @@ def _usd_geometry(take: Take, shape: Shape, dynamic: bool, stage: Any, path: str
         physics.CollisionAPI.Apply(prim.GetPrim())
         return
     seen = _usd_mesh(stage, solid, shape.mesh)
-    pieces = _own_pieces(shape) if dynamic else []
+    pieces = own_pieces(shape) if dynamic else []
     for k, piece in enumerate(pieces):
         collider = _usd_mesh(stage, f"{path}/piece_{k}", piece)
         geom.Imageable(collider).CreatePurposeAttr(geom.Tokens.guide)

@@ -12,19 +12,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
 from sdfsim.data.dataset import Trajectory, shapes_folder
 from sdfsim.data.pybullet_sim import DT, SUBSTEPS, Teacher, TeacherBody, substeps_of, write_form_urdf, write_urdf
 from sdfsim.data.shape_assets import decompose, wavefront
-from sdfsim.dynamics.bodies import Units
+from sdfsim.dynamics.bodies import Units, from_scene
+from sdfsim.dynamics.rollout import Rollout
 from sdfsim.errors import SdfsimError
 from sdfsim.files import replacing, write_text
-from sdfsim.scene.scene import Body, Scene
+from sdfsim.scene.scene import Scene
 from sdfsim.shape.mesh import Mesh, convex_hull, load_pieces
-from sdfsim.shape.primitives import PRIMITIVES, convex_pieces
 from sdfsim.shape.sdf import BoxSdf, PlaneSdf, SphereSdf
-from sdfsim.shape.shape import Shape
+from sdfsim.shape.shape import Shape, own_pieces
 
 SAME_INERTIA = 1e-3  # relative
 SOFTEST = 3.0  # MuJoCo: time constant of a contact over the engine's step, at least 2 for it to be stable
@@ -56,16 +57,13 @@ class Timing:
     cpu_ms: float
 
 
-def start_of_scene(scene: Scene, folder: Path, units: Units | None = None) -> tuple[Start, list[int]]:
+def start_of_scene(scene: Scene, folder: Path, units: Units | None = None) -> Start:
     """A scene whose only plane, if any, is a level floor.
 
     Args:
         scene: what is to move; the shapes are called by their index in it.
         folder: of the engine's files, which are written where they are not there yet.
         units: in which the engine has it; SI units where there are none.
-
-    Returns:
-        The start, and the indices of its bodies in the scene.
 
     Raises:
         SdfsimError: bodies on a path, or planes other than one level floor.
@@ -78,38 +76,44 @@ def start_of_scene(scene: Scene, folder: Path, units: Units | None = None) -> tu
     if len(planes) > 1 or not all(upright):
         raise SdfsimError(f"{where}the engines know one level plane as the floor (has {len(planes)} planes)")
     units = units or Units(1.0, 1.0, 1.0)
-    rows = [k for k, b in enumerate(scene.bodies) if b not in planes]
-    solid = [scene.bodies[k] for k in rows]
-    shapes = [scene.shapes[b.shape] for b in solid]
-    turns = Rotation.from_quat(np.array([b.quat_xyzw for b in solid]))
-    centres = turns.apply(np.array([b.scale * s.com for b, s in zip(solid, shapes, strict=True)]))
-    height = np.array([0.0, 0.0, planes[0].position[2] if planes else 0.0])
-    inertia = [np.diag(body_inertia(b, s)) for b, s in zip(solid, shapes, strict=True)]
-    motion = Trajectory(
-        position=(np.array([b.position for b in solid]) + centres - height)[None] / units.length,
-        quat_xyzw=turns.as_quat()[None],
-        velocity=np.array([b.velocity for b in solid])[None] / units.velocity,
-        angular_velocity=np.array([b.angular_velocity for b in solid])[None] * units.time,
-        shape=np.array([str(b.shape) for b in solid]),
-        scale=np.array([b.scale for b in solid]) / units.length,
-        mass=np.array([b.mass for b in solid]) / units.mass,
-        inertia=np.array(inertia) / (units.mass * units.length**2),
-        friction=np.array([b.friction for b in solid]),
-        restitution=np.array([b.restitution for b in solid]),
-        static=np.array([b.motion != "dynamic" for b in solid]),
+    motion = start_motion(scene, units)
+    motion.position[..., 2] -= planes[0].position[2] / units.length if planes else 0.0
+    urdfs = {name: shape_urdf(scene.shapes[int(name)], folder) for name in sorted(set(motion.shape.tolist()))}
+    return Start(motion, urdfs, (planes[0].friction, planes[0].restitution) if planes else None, own_inertia=True)
+
+
+def start_motion(scene: Scene, units: Units = Units(1.0, 1.0, 1.0)) -> Trajectory:  # noqa: B008
+    """The start of a scene's bodies but for planes as a recording of one frame, shapes called by their index."""
+    bodies, state = from_scene(scene, units, torch.device("cpu"))
+    solid = np.array([not isinstance(scene.shapes[b.shape].sdf, PlaneSdf) for b in scene.bodies])
+
+    def of(values: torch.Tensor) -> np.ndarray:
+        return values.numpy()[solid].copy()
+
+    return Trajectory(
+        position=of(state.position)[None],
+        quat_xyzw=of(state.orientation)[None],
+        velocity=of(state.velocity)[None],
+        angular_velocity=of(state.angular_velocity)[None],
+        shape=np.array([str(b.shape) for b in scene.bodies])[solid],
+        scale=of(bodies.scale),
+        mass=of(bodies.mass),
+        inertia=np.diagonal(of(bodies.inertia), axis1=1, axis2=2).copy(),
+        friction=of(bodies.friction),
+        restitution=of(bodies.restitution),
+        static=~of(bodies.moves),
         dt=DT,
         gravity=scene.gravity / units.acceleration,
     )
-    urdfs = {str(k): shape_urdf(scene.shapes[k], folder) for k in sorted({b.shape for b in solid})}
-    floor = (planes[0].friction, planes[0].restitution) if planes else None
-    return Start(motion, urdfs, floor, own_inertia=True), rows
 
 
-def body_inertia(body: Body, shape: Shape) -> np.ndarray:
-    """[3, 3] kg m^2 of a body about its centre of mass, shape axes."""
-    if body.inertia is not None:
-        return body.inertia
-    return body.mass / shape.volume * body.scale**2 * shape.inertia
+def rollout_motion(scene: Scene, rollout: Rollout) -> Trajectory:
+    """Our motion of a scene as `start_motion` has its start."""
+    solid = [not isinstance(scene.shapes[b.shape].sdf, PlaneSdf) for b in scene.bodies]
+    names = {"quat_xyzw": "orientation"}
+    frames = ("position", "quat_xyzw", "velocity", "angular_velocity")
+    found = {name: getattr(rollout, names.get(name, name))[:, solid] for name in frames}
+    return replace(start_motion(scene), **found, dt=float(rollout.meta["dt"]))
 
 
 # --- PyBullet ---
@@ -272,20 +276,10 @@ def shape_urdf(shape: Shape, folder: Path) -> Path:
     urdf, mesh = folder / f"{name}.urdf", folder / f"{name}.obj"
     if not urdf.exists():
         folder.mkdir(parents=True, exist_ok=True)
-        write_text(mesh, wavefront(_cut(shape, folder / name)))
+        write_text(mesh, wavefront(own_pieces(shape) or decompose(shape.mesh, folder / name)))
         with replacing(urdf) as partial:
             write_urdf(mesh.resolve(), shape.com, partial)
     return urdf
-
-
-def _cut(shape: Shape, scratch: Path) -> list[Mesh]:
-    kind = str(shape.source.get("primitive", ""))
-    try:
-        pieces = convex_pieces(kind)
-    except SdfsimError:
-        return decompose(shape.mesh, scratch)
-    factor = float(np.ptp(shape.mesh.vertices, axis=0).max() / np.ptp(PRIMITIVES[kind]().vertices, axis=0).max())
-    return [Mesh(piece.vertices * factor, piece.faces) for piece in pieces]
 
 
 def dataset_urdf(data: Path, shape: str) -> Path:

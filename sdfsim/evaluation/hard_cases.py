@@ -17,12 +17,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sdfsim.data.dataset import Trajectory
+from sdfsim.data.metrics import energy
 from sdfsim.data.scenarios import steady_faces
 from sdfsim.dynamics.bodies import largest_extent
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.errors import SdfsimError
-from sdfsim.evaluation.engines import body_inertia
-from sdfsim.evaluation.penetration import rollout_penetration
+from sdfsim.evaluation.penetration import depths
 from sdfsim.scene.scene import Body, Effects, Scene
 from sdfsim.shape.mesh import MESH_SUFFIXES
 from sdfsim.shape.shape import Shape, analytic_shape, shape_from_mesh, shape_from_primitive
@@ -46,7 +47,6 @@ FALLEN = 0.25  # of a body's height at the start: what has sunk by more has fall
 GAIN = 0.01  # of the energy at the start: a step that adds more is counted
 APART = 0.1  # of a body's size: motions farther from each other than this have diverged
 RUNAWAY = 10.0  # times the energy at the start, and no motion is worth measuring
-CURVE = 120  # points kept of a curve
 
 FEWEST = 2  # repetitions: there is no spread of one
 YAWS = (0.0, 37.0, 121.0, 245.0)  # degrees
@@ -64,18 +64,28 @@ class Run:
 
     Attributes:
         scene: what moved.
-        rollout: how, up to the last good state.
-        broke: the simulator's error where it ended early, else empty.
+        motion: its bodies but for planes, up to the last good state.
+        broke: why it ended early, else empty.
+        rollout: the simulator's own record; None of the teacher.
     """
 
     scene: Scene
-    rollout: Rollout
+    motion: Trajectory
     broke: str = ""
+    rollout: Rollout | None = None
+
+    @property
+    def path(self) -> np.ndarray:
+        """[T, M, 3] m, positions of the dynamic bodies."""
+        return self.motion.position[:, ~self.motion.static]
+
+    @property
+    def time(self) -> np.ndarray:
+        """[T] s."""
+        return self.motion.dt * np.arange(len(self.motion.position))
 
 
-Measured = tuple[dict[str, float], np.ndarray]  # figures by name, and the curve [2, K] to draw (K may be 0)
-Measure = Callable[[Sequence["Run"]], Measured]
-NO_CURVE = np.zeros((2, 0))
+Measure = Callable[[Sequence["Run"]], dict[str, float]]
 
 
 @dataclass(frozen=True)
@@ -113,7 +123,6 @@ class Case:
         measure: of the motions of these scenes, in their order.
         figures: what `measure` gives.
         seconds: how long.
-        steps: how many steps instead.
         repeats: repetitions, from starts slightly off or with other random scenes: their spread is the noise.
         cuda: the scenes are simulated a second time there, behind the first.
         teacher: whether the teacher can take part.
@@ -127,7 +136,6 @@ class Case:
     measure: Measure
     figures: tuple[Figure, ...]
     seconds: float = 3.0
-    steps: int | None = None
     repeats: int = 3
     cuda: bool = False
     teacher: bool = True
@@ -140,37 +148,27 @@ class Group:
 
     Attributes:
         title: what they have in common.
-        curve: labels (x, y) of what a case draws.
         axis: label of the cases' `x`.
         about: the quantity of a model's ranges that the cases are about: one that never varied was not learned.
     """
 
     title: str
-    curve: tuple[str, str] = ("", "")
     axis: str = ""
     about: str = ""
 
 
-TIME = "time (s)"
-SHIFT = (TIME, "largest shift (% of size)")
 GROUPS = {
-    "yaw": Group("the whole scene turned about the vertical", (TIME, "deviation (% of size)")),
-    "overlap": Group("bodies that start inside each other", (TIME, "fastest body (m/s)")),
-    "thin": Group("fast bodies of 20 cm and a plate of 1 cm", axis="speed (m/s)"),
-    "rest": Group("bodies at rest on the floor", (TIME, "drift (% of size)")),
-    "stack": Group("stacks, after 3 s", SHIFT, "cubes in the tower"),
-    "mass": Group("a heavy cube on a light one", SHIFT, "mass ratio", "mass_ratio"),
-    "bounce": Group(
-        "balls dropped from about 1 m", (TIME, "height of its lowest point (m)"), "restitution e", "restitution"
-    ),
-    "slope": Group(
-        "a box at rest on a slope", ("degrees beyond atan(mu)", "travelled in 2 s (m)"), "friction mu", "friction"
-    ),
-    "pile": Group("a pile in a bowl", (TIME, "energy (% of the start's)"), "bodies"),
+    "yaw": Group("the whole scene turned about the vertical"),
+    "overlap": Group("bodies that start inside each other"),
+    "thin": Group("fast bodies of 20 cm and a plate of 1 cm", "speed (m/s)"),
+    "rest": Group("bodies at rest on the floor"),
+    "stack": Group("stacks, after 3 s", "cubes in the tower"),
+    "mass": Group("a heavy cube on a light one", "mass ratio", "mass_ratio"),
+    "bounce": Group("balls dropped from about 1 m", "restitution e", "restitution"),
+    "slope": Group("a box at rest on a slope", "friction mu", "friction"),
+    "pile": Group("a pile in a bowl", "bodies"),
     "energy": Group("random scenes: energy from nothing"),
-    "precision": Group(
-        "other arithmetic: time until motions are 10 % of a body's size apart", (TIME, "apart (% of size)")
-    ),
+    "precision": Group("other arithmetic: time until motions are 10 % of a body's size apart"),
 }
 
 
@@ -441,12 +439,7 @@ def tossed(seed: Sequence[int]) -> Scene:
     return on_floor(shapes, bodies)
 
 
-# --- measures ---
-
-
-def movers(scene: Scene) -> np.ndarray:
-    """[M] indices of the dynamic bodies."""
-    return np.array([k for k, b in enumerate(scene.bodies) if b.motion == "dynamic"])
+# --- measures: what `Case.measure` is made of; sizes are mean largest extents ---
 
 
 def size(scene: Scene) -> float:
@@ -454,120 +447,83 @@ def size(scene: Scene) -> float:
     return float(np.mean([largest_extent(scene.shapes[b.shape]) * b.scale for b in _dynamic(scene)]))
 
 
-def energy(run: Run) -> np.ndarray:
-    """[T+1] J: kinetic energy of the dynamic bodies, and their potential energy above the height 0."""
-    scene, motion = run.scene, run.rollout
-    total = np.zeros(len(motion.time))
-    for k in movers(scene):
-        body = scene.bodies[k]
-        turn = Rotation.from_quat(motion.orientation[:, k])
-        spin = turn.inv().apply(motion.angular_velocity[:, k])
-        total += 0.5 * body.mass * np.square(motion.velocity[:, k]).sum(1)
-        total += 0.5 * np.einsum("ti,ij,tj->t", spin, body_inertia(body, scene.shapes[body.shape]), spin)
-        total -= body.mass * motion.position[:, k] @ scene.gravity
-    return total
-
-
 def ran_away(run: Run) -> str:
     """When a motion had more than `RUNAWAY` times the energy it started with; empty if never.
 
     The energy at the start counts from one size below the lowest body, so that it is not zero.
     """
-    scene, motion = run.scene, run.rollout
-    rows = movers(scene)
-    mass = np.array([scene.bodies[k].mass for k in rows])
-    strength = float(np.linalg.norm(scene.gravity))
-    course = energy(run)
-    lowest = (motion.position[0, rows] @ -scene.gravity).min() - strength * size(scene)
-    at = np.flatnonzero(course - mass.sum() * lowest > RUNAWAY * (course[0] - mass.sum() * lowest))
-    if not len(at):
-        return ""
-    return f"more than {RUNAWAY:g} times the energy of the start from {motion.time[at[0]]:.2f} s on"
+    course, strength = energy(run.motion), float(np.linalg.norm(run.scene.gravity))
+    lowest = (run.path[0] @ -run.scene.gravity).min() - strength * size(run.scene)
+    given = course - run.motion.mass[~run.motion.static].sum() * lowest
+    at = np.flatnonzero(given > RUNAWAY * given[0])
+    return f"more than {RUNAWAY:g} times the energy of the start from {run.time[at[0]]:.2f} s on" if len(at) else ""
 
 
-def rest(runs: Sequence[Run], *, times: Sequence[float]) -> Measured:
+def rest(runs: Sequence[Run], *, times: Sequence[float]) -> dict[str, float]:
     """How a body at rest behaves: drift after each of `times`, and speed, height and motion over the last second."""
     run = runs[0]
-    motion, k, extent = run.rollout, movers(run.scene)[0], size(run.scene)
-    path = motion.position[:, k]
-    drift = 100 / extent * np.linalg.norm((path - path[0])[:, :2], axis=1)
-    last = motion.time >= motion.time[-1] - 1.0
-    moved = np.abs(path[last] - path[-1]).max() + np.abs(motion.orientation[last, k] - motion.orientation[-1, k]).max()
-    seconds = max(float(np.ptp(motion.time[last])), 1e-9)
-    figures = {f"drift {t:g} s": float(drift[min(np.searchsorted(motion.time, t), len(drift) - 1)]) for t in times}
-    figures["speed"] = float(np.linalg.norm(np.diff(path[last], axis=0), axis=1).sum()) / seconds
-    figures["height"] = 100 * abs(float(path[-1, 2] - path[0, 2])) / float(path[0, 2])
-    figures["motion"] = float(moved)
-    return figures, _curve(motion.time, drift)
+    path, turn = run.path[:, 0], run.motion.quat_xyzw[:, ~run.motion.static][:, 0]
+    drift = 100 / size(run.scene) * np.linalg.norm((path - path[0])[:, :2], axis=1)
+    last = run.time >= run.time[-1] - 1.0
+    seconds = max(float(np.ptp(run.time[last])), 1e-9)
+    return {
+        **{f"drift {t:g} s": float(drift[min(np.searchsorted(run.time, t), len(drift) - 1)]) for t in times},
+        "speed": float(np.linalg.norm(np.diff(path[last], axis=0), axis=1).sum()) / seconds,
+        "height": 100 * abs(float(path[-1, 2] - path[0, 2])) / float(path[0, 2]),
+        "motion": float(np.abs(path[last] - path[-1]).max() + np.abs(turn[last] - turn[-1]).max()),
+    }
 
 
-def standing(runs: Sequence[Run]) -> Measured:
+def standing(runs: Sequence[Run]) -> dict[str, float]:
     """How many bodies of a stack have fallen, and how far the others have shifted sideways at most, % of size."""
-    run = runs[0]
-    motion, rows = run.rollout, movers(run.scene)
-    path = motion.position[:, rows]
-    sunk = (path[0, :, 2] - path[-1, :, 2]) / _heights(run.scene)
-    shift = 100 / size(run.scene) * np.linalg.norm(path - path[0], axis=2)
-    fallen = sunk > FALLEN
-    figures = {"fallen": float(fallen.sum()), "shift": float(shift[-1, ~fallen].max(initial=0.0))}
-    return figures, _curve(motion.time, shift.max(1))
+    path, scene = runs[0].path, runs[0].scene
+    heights = []
+    for body in _dynamic(scene):
+        level = Rotation.from_quat(body.quat_xyzw).apply(scene.shapes[body.shape].mesh.vertices) @ UP
+        heights.append(float(np.ptp(level)) * body.scale)
+    fallen = path[0, :, 2] - path[-1, :, 2] > FALLEN * np.array(heights)
+    shift = 100 / size(scene) * np.linalg.norm(path[-1] - path[0], axis=1)
+    return {"fallen": float(fallen.sum()), "shift": float(shift[~fallen].max(initial=0.0))}
 
 
-def squeezed(runs: Sequence[Run]) -> Measured:
+def squeezed(runs: Sequence[Run]) -> dict[str, float]:
     """Penetration of a stack, % of size, and how many have fallen."""
-    depth = rollout_penetration(runs[0].scene, runs[0].rollout)
-    figures = {"worst depth": 100 * float(depth.max(initial=0.0)) / size(runs[0].scene)}
-    stood, curve = standing(runs)
-    return figures | {"fallen": stood["fallen"]}, curve
+    depth = depths(runs[0].scene, runs[0].motion)
+    return standing(runs) | {"worst depth": 100 * float(depth.max(initial=0.0)) / size(runs[0].scene)}
 
 
-def separated(runs: Sequence[Run]) -> Measured:
+def separated(runs: Sequence[Run]) -> dict[str, float]:
     """Highest speed m/s of bodies that start in each other, and how deep they still are at the end, % of size."""
-    run = runs[0]
-    motion = run.rollout
-    speed = np.linalg.norm(motion.velocity[:, movers(run.scene)], axis=2).max(1)
-    left = (
-        100
-        * float(rollout_penetration(run.scene, run.rollout, every=len(motion) or 1).max(initial=0.0))
-        / size(run.scene)
-    )
-    return {"exit speed": float(speed.max()), "depth left": left}, _curve(motion.time, speed)
+    scene, motion = runs[0].scene, runs[0].motion
+    speed = np.linalg.norm(motion.velocity[:, ~motion.static], axis=2)
+    left = depths(scene, motion, every=max(1, len(motion.position) - 1)).max(initial=0.0)
+    return {"exit speed": float(speed.max()), "depth left": 100 * float(left) / size(scene)}
 
 
-def passed(runs: Sequence[Run]) -> Measured:
+def passed(runs: Sequence[Run]) -> dict[str, float]:
     """Share % of bodies thrown at a plate about the origin that have been below it while over its area."""
     shares = []
     for run in runs:
         plate = next(b for b in run.scene.bodies if b.motion == "static")
         half = run.scene.shapes[plate.shape].sdf.bounds[1]
-        path = run.rollout.position[:, movers(run.scene)]
-        over = (np.abs(path[..., :2]) < half[:2]).all(-1)
-        below = path[..., 2] < plate.position[2] - 0.5 * size(run.scene)
+        over = (np.abs(run.path[..., :2]) < half[:2]).all(-1)
+        below = run.path[..., 2] < plate.position[2] - 0.5 * size(run.scene)
         shares.append(100 * float((over & below).any(0).mean()))
-    return {"through": float(np.mean(shares))}, NO_CURVE
+    return {"through": float(np.mean(shares))}
 
 
-def rebound(runs: Sequence[Run], *, restitution: float) -> Measured:
-    """Height of the first rebound of balls dropped onto the floor, % of what they fell, against e^2.
-
-    The mean over the balls of a scene; the curve is that of the first, its lowest point.
-    """
-    run = runs[0]
-    motion, shares = run.rollout, []
-    for k in movers(run.scene):
-        radius = run.scene.shapes[run.scene.bodies[k].shape].sdf.bounds[1, 2]
-        low, rate = motion.position[:, k, 2] - radius, motion.velocity[:, k, 2]
+def rebound(runs: Sequence[Run], *, restitution: float) -> dict[str, float]:
+    """Mean height of the first rebound of balls dropped onto the floor, % of what they fell, against e^2."""
+    scene, motion, shares = runs[0].scene, runs[0].motion, []
+    for k, body in enumerate(_dynamic(scene)):
+        low, rate = runs[0].path[:, k, 2] - scene.shapes[body.shape].sdf.bounds[1, 2], motion.velocity[:, k, 2]
         hit = np.flatnonzero(rate[1:] > rate[:-1])  # what flies gets slower upwards with every step
         up = np.flatnonzero(rate[hit[0] + 1 :] > 0) if len(hit) else hit
         shares.append(100 * max(0.0, float(low[hit[0] + 1 + up[0] :].max())) / float(low[0]) if len(up) else 0.0)
-    share = float(np.mean(shares))
-    first = movers(run.scene)[0]
-    radius = run.scene.shapes[run.scene.bodies[first].shape].sdf.bounds[1, 2]
-    figures = {"rebound": share, "error": abs(share - 100 * restitution**2)}
-    return figures, _curve(motion.time, motion.position[:, first, 2] - radius)
+    return {"rebound": float(np.mean(shares)), "error": abs(float(np.mean(shares)) - 100 * restitution**2)}
 
 
-def slipped(runs: Sequence[Run], *, friction: float, offsets: Sequence[float]) -> Measured:
+def slipped(runs: Sequence[Run], *, friction: float, offsets: Sequence[float]) -> dict[str, float]:
     """Where a body on a slope begins to slide, in degrees from atan(friction).
 
     The first of the angles tried at which it travels more than half of what it would slide two degrees beyond the
@@ -579,12 +535,12 @@ def slipped(runs: Sequence[Run], *, friction: float, offsets: Sequence[float]) -
         offsets: of the angles, degrees from the critical one.
     """
     critical = float(np.degrees(np.arctan(friction)))
-    travelled = np.array([np.linalg.norm(r.rollout.position[-1, 0] - r.rollout.position[0, 0]) for r in runs])
-    seconds, gravity = float(runs[0].rollout.time[-1]), float(np.linalg.norm(runs[0].scene.gravity))
-    a_degree = slide(friction, critical + 2.0, seconds, gravity) / 2.0
+    travelled = np.array([np.linalg.norm(run.path[-1, 0] - run.path[0, 0]) for run in runs])
+    gravity = float(np.linalg.norm(runs[0].scene.gravity))
+    a_degree = slide(friction, critical + 2.0, float(runs[0].time[-1]), gravity) / 2.0
     over = np.flatnonzero(travelled > a_degree)
     begins = float(offsets[over[0]] - travelled[over[0]] / a_degree) if len(over) else float(offsets[-1])
-    return {"slips at": begins, "error": abs(begins)}, np.array([offsets, travelled])
+    return {"slips at": begins, "error": abs(begins)}
 
 
 def slide(friction: float, degrees: float, seconds: float, gravity: float) -> float:
@@ -593,90 +549,60 @@ def slide(friction: float, degrees: float, seconds: float, gravity: float) -> fl
     return 0.5 * gravity * max(0.0, float(np.sin(angle) - friction * np.cos(angle))) * seconds**2
 
 
-def heaped(runs: Sequence[Run]) -> Measured:
+def heaped(runs: Sequence[Run]) -> dict[str, float]:
     """A pile in a bowl: penetration, who left through the wall, and energy beyond that of the start."""
-    run = runs[0]
-    motion, rows, extent = run.rollout, movers(run.scene), size(run.scene)
-    bowl = next(b for b in run.scene.bodies if b.name == "bowl")
+    scene, motion = runs[0].scene, runs[0].motion
+    bowl = next(b for b in scene.bodies if b.name == "bowl")
     outer = 0.5 * bowl.scale
     middle = outer * (1 - 0.5 * WALL)
-    from_centre = motion.position[:, rows] - bowl.position
+    from_centre = runs[0].path - bowl.position
     radius, under = np.linalg.norm(from_centre, axis=2), from_centre[..., 2] < 0
     out = (under[:-1] & under[1:] & (radius[:-1] < middle) & (radius[1:] >= middle)).any(0)
-    course = energy(run)
-    mass = np.array([run.scene.bodies[k].mass for k in rows])
-    given = course[0] - float(mass.sum() * np.linalg.norm(run.scene.gravity) * (outer - middle))
-    depth = rollout_penetration(run.scene, run.rollout, every=10)
-    figures = {
-        "depth 95 %": 100 * float(np.percentile(depth, 95)) / extent if len(depth) else 0.0,
+    course, weight = energy(motion), motion.mass[~motion.static].sum() * np.linalg.norm(scene.gravity)
+    depth = depths(scene, motion, every=10)
+    return {
+        "depth 95 %": 100 * float(np.percentile(depth, 95)) / size(scene) if len(depth) else 0.0,
         "through the wall": float(out.sum()),
-        "energy gain": 100 * float((course - course[0]).max() / given),
+        "energy gain": 100 * float((course - course[0]).max() / (course[0] - weight * (outer - middle))),
     }
-    return figures, _curve(motion.time, 100 * course / course[0])
 
 
-def created(runs: Sequence[Run]) -> Measured:
+def created(runs: Sequence[Run]) -> dict[str, float]:
     """Energy that came from nothing: share % of steps that add more than `GAIN` of the start's, and the worst, %."""
-    gains = [np.diff(energy(run)) / energy(run)[0] for run in runs]
-    every = np.concatenate(gains)
-    worst = [float(gain.max(initial=0.0)) for gain in gains]
-    figures = {"steps with gain": 100 * float((every > GAIN).mean()), "worst gain": 100 * max(worst)}
-    return figures, NO_CURVE
+    courses = [energy(run.motion) for run in runs]
+    gains = np.concatenate([np.diff(course) / course[0] for course in courses])
+    return {"steps with gain": 100 * float((gains > GAIN).mean()), "worst gain": 100 * float(gains.max(initial=0.0))}
 
 
-def turned_back(runs: Sequence[Run], *, degrees: Sequence[float]) -> Measured:
+def turned_back(runs: Sequence[Run], *, degrees: Sequence[float]) -> dict[str, float]:
     """Deviation % of size, at the end, of turned scenes from themselves; `degrees` is one group's, the first 0."""
-    apart, curve = 0.0, NO_CURVE
+    apart = 0.0
     for start in range(0, len(runs), len(degrees)):
-        reference = runs[start]
         for offset, angle in enumerate(degrees[1:], 1):
             back = Rotation.from_euler("z", -angle, degrees=True)
-            distance = _apart(reference, runs[start + offset], back)
-            if len(distance) and distance[-1] >= apart:
-                apart = float(distance[-1])
-                curve = _curve(reference.rollout.time[: len(distance)], distance)
-    return {"deviation": apart}, curve
+            apart = max(apart, float(_apart(runs[start], runs[start + offset], back)[-1]))
+    return {"deviation": apart}
 
 
-def diverged(runs: Sequence[Run]) -> Measured:
+def diverged(runs: Sequence[Run]) -> dict[str, float]:
     """Mean time s until motions of the second half are 10 % of a size from the first half's; their length if never."""
-    half = len(runs) // 2
-    times, curves = [], []
+    half, times = len(runs) // 2, []
     for one, other in zip(runs[:half], runs[half:], strict=True):
         distance = _apart(one, other, Rotation.identity())
-        clock = one.rollout.time[: len(distance)]
         away = np.flatnonzero(distance > 100 * APART)
-        times.append(float(clock[away[0]] if len(away) else clock[-1]))
-        curves.append(_curve(clock, distance))
-    return {"diverges after": float(np.mean(times))}, curves[int(np.argmin(times))]
+        times.append(float(one.time[away[0] if len(away) else len(distance) - 1]))
+    return {"diverges after": float(np.mean(times))}
 
 
 def _apart(reference: Run, other: Run, back: Rotation) -> np.ndarray:
-    """[T+1] % of size: root mean square over the bodies of how far they are from each other."""
-    rows = movers(reference.scene)
-    frames = min(len(reference.rollout.time), len(other.rollout.time))
-    place = other.rollout.position[:frames, rows]
-    returned = back.apply(place.reshape(-1, 3)).reshape(place.shape)
-    distance = np.square(returned - reference.rollout.position[:frames, rows]).sum(2).mean(1) ** 0.5
-    return 100 / size(reference.scene) * distance
+    """[T] % of size: root mean square over the bodies of how far they are from each other."""
+    frames = min(len(reference.path), len(other.path))
+    returned = back.apply(other.path[:frames].reshape(-1, 3)).reshape(frames, -1, 3)
+    return 100 / size(reference.scene) * np.square(returned - reference.path[:frames]).sum(2).mean(1) ** 0.5
 
 
-def _heights(scene: Scene) -> np.ndarray:
-    """[M] m, vertical extent of the dynamic bodies as they stand at the start."""
-    tops = []
-    for body in _dynamic(scene):
-        level = Rotation.from_quat(body.quat_xyzw).apply(scene.shapes[body.shape].mesh.vertices) @ UP
-        tops.append(float(np.ptp(level)) * body.scale)
-    return np.array(tops)
-
-
-def _dynamic(scene: Scene) -> list:
+def _dynamic(scene: Scene) -> list[Body]:
     return [b for b in scene.bodies if b.motion == "dynamic"]
-
-
-def _curve(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    kept = np.unique(np.linspace(0, len(x) - 1, min(len(x), CURVE)).astype(int))
-    return np.array([x[kept], y[kept]])
 
 
 # --- the cases ---
@@ -693,37 +619,26 @@ def cases(*, quick: bool = False, shapes: Path | None = None) -> list[Case]:
     Raises:
         SdfsimError: the folder holds no meshes, or one that cannot be used.
     """
-    found = [
-        *_yaw(quick),
-        *_overlaps(),
-        *_thin(),
-        *_resting(quick, shapes),
-        *_stacks(),
-        *_bounces_and_slopes(quick),
-        *_piles_and_tosses(quick),
-        *_precision(quick),
-    ]
-    return [replace(case, repeats=min(case.repeats, FEWEST)) if quick else case for case in found]
+    found: list[Case] = []
 
+    def add(
+        name: str, title: str, scenes: Any, measure: Measure, *figures: Figure, group: str = "", **more: Any
+    ) -> None:
+        """A case of `scenes`: a function of the repetition, or one scene that repetitions nudge."""
+        of = (lambda repeat: [nudged(scenes, repeat)]) if isinstance(scenes, Scene) else scenes
+        case = Case(name, group or name.split("-")[0], title, of, measure, figures, **more)
+        found.append(replace(case, repeats=min(case.repeats, FEWEST)) if quick else case)
 
-def _nudged(scene: Scene) -> Callable[[int], list[Scene]]:
-    return lambda repeat: [nudged(scene, repeat)]
-
-
-def _yaw(quick: bool) -> list[Case]:
-    yaws = YAWS[:2] if quick else YAWS
+    yaws, offsets = (YAWS[:2], OFFSETS[::2]) if quick else (YAWS, OFFSETS)
 
     def turned(repeat: int) -> list[Scene]:
         return [yawed(tossed((6, repeat, k)), yaw) for k in range(2) for yaw in yaws]
 
-    figures = (Figure("deviation", "% of size", 5, largest=True),)
-    measure = partial(turned_back, degrees=yaws)
-    return [Case("yaw", "yaw", "random scenes, 50 steps", turned, measure, figures, steps=50)]
+    deviation = Figure("deviation", "% of size", 5, largest=True)
+    add("yaw", "random scenes, 1 s", turned, partial(turned_back, degrees=yaws), deviation, seconds=1.0)
 
-
-def _overlaps() -> list[Case]:
     cube, sphere = box(1.0), ball()
-    built = {
+    overlaps = {
         "overlap-boxes": ("two boxes, half in each other", overlapping(cube, cube, 0.5)),
         "overlap-balls": ("two balls, half in each other", overlapping(sphere, sphere, 0.5)),
         "coincident-boxes": ("two boxes in one place", overlapping(cube, cube, 0.0)),
@@ -732,41 +647,64 @@ def _overlaps() -> list[Case]:
         "sunk-box": ("a box, half in the floor", sunk(cube)),
     }
     figures = (Figure("exit speed", "m/s", 2, limit=3.0), Figure("depth left", "% of size", 1))
-    return [
-        Case(name, "overlap", title, _nudged(scene), separated, figures, seconds=1.0)
-        for name, (title, scene) in built.items()
-    ]
+    for name, (title, scene) in overlaps.items():
+        add(name, title, scene, separated, *figures, group="overlap", seconds=1.0)
 
+    for v in SPEEDS:
+        throw = lambda repeat, v=v: [thrown_at_plate(v, repeat)]  # noqa: E731
+        add(f"thin-{v:g}", f"{v:g} m/s", throw, passed, Figure("through", "%", 0, limit=0.0), seconds=0.6, x=v)
 
-def _thin() -> list[Case]:
-    figures = (Figure("through", "%", 0, limit=0.0),)
-    return [
-        Case(f"thin-{v:g}", "thin", f"{v:g} m/s", lambda repeat, v=v: [thrown_at_plate(v, repeat)], passed, figures,
-             seconds=0.6, x=v)
-        for v in SPEEDS
-    ]  # fmt: skip
-
-
-def _resting(quick: bool, folder: Path | None) -> list[Case]:
     times = (10.0,) if quick else (10.0, 60.0)
-    built = {"box": box(1.0), "ball": ball(), "knot": shape_from_primitive("torus_knot", sdf="grid", name="knot")}
-    if folder:
-        built |= _meshes(folder)
-    drifts = tuple(Figure(f"drift {t:g} s", "% of size", 2, limit=1.0) for t in times)
-    awake = (*drifts, Figure("speed", "m/s", 4, limit=0.01), Figure("height", "%", 2, limit=5.0))
-    asleep = (Figure("motion", "m", 9, limit=0.0), drifts[0])
-    found = []
-    for name, shape in built.items():
-        scene, measure = resting(shape, sleep=False), partial(rest, times=times)
-        title = f"{name}, sleep"
-        found.append(
-            Case(f"rest-{name}", "rest", f"{title} off", _nudged(scene), measure, awake, seconds=times[-1], repeats=2)
-        )
-        scene, measure = resting(shape, sleep=True), partial(rest, times=times[:1])
-        found.append(
-            Case(f"rest-{name}-sleep", "rest", f"{title} on", _nudged(scene), measure, asleep, seconds=times[0],
-                 repeats=2, teacher=False)
-        )  # fmt: skip
+    drifts = [Figure(f"drift {t:g} s", "% of size", 2, limit=1.0) for t in times]
+    resters = {"box": cube, "ball": sphere, "knot": shape_from_primitive("torus_knot", sdf="grid", name="knot")}
+    for name, shape in (resters | (_meshes(shapes) if shapes else {})).items():
+        awake, asleep = resting(shape, sleep=False), resting(shape, sleep=True)
+        speed, height = Figure("speed", "m/s", 4, limit=0.01), Figure("height", "%", 2, limit=5.0)
+        add(f"rest-{name}", f"{name}, sleep off", awake, partial(rest, times=times), *drifts, speed, height,
+            seconds=times[-1], repeats=2)  # fmt: skip
+        add(f"rest-{name}-sleep", f"{name}, sleep on", asleep, partial(rest, times=times[:1]),
+            Figure("motion", "m", 9, limit=0.0), drifts[0], seconds=times[0], repeats=2, teacher=False)  # fmt: skip
+
+    fallen, shift = Figure("fallen", "bodies", 1, limit=0.0), Figure("shift", "% of size", 1)
+    for n in TOWERS:
+        add(f"tower-{n}", f"tower of {n}", tower(n), standing, fallen, shift, group="stack", x=float(n))
+    add("pyramid", "pyramid of 10 cubes", pyramid(), standing, fallen, shift, group="stack")
+    add("wall", "wall of 22 bricks", wall(), standing, fallen, shift, group="stack")
+    add("cards", "two cards that lean on each other", card_house(), standing, fallen, shift, group="stack")
+    for m in RATIOS:
+        depth = Figure("worst depth", "% of size", 1)
+        add(f"mass-{m:g}", f"{m:g} kg on 1 kg", heavy_on_light(m), squeezed, depth, fallen, x=m)
+
+    for e in RESTITUTIONS:
+        error, height = Figure("error", "% of drop", 1, limit=5.0), Figure("rebound", "% of drop", 1, judged=False)
+        add(f"bounce-{e:g}", f"e = {e:g}: {100 * e * e:.0f} % wanted", lambda k, e=e: [dropped(e, k)],
+            partial(rebound, restitution=e), error, height, seconds=1.3, x=e)  # fmt: skip
+    for mu in FRICTIONS:
+        critical = degrees(atan(mu))
+        built = [slope(mu, critical + offset) for offset in offsets]
+        error, begins = Figure("error", "degrees", 1, limit=2.0), Figure("slips at", "degrees", 1, judged=False)
+        add(f"slope-{mu:g}", f"mu = {mu:g}: atan(mu) = {critical:.1f} degrees",
+            lambda repeat, built=built: [nudged(scene, repeat) for scene in built],
+            partial(slipped, friction=mu, offsets=offsets), error, begins, seconds=2.0, repeats=2, x=mu)  # fmt: skip
+
+    for n, repeats in ((64, 2),) if quick else ((64, 2), (512, 1)):
+        add(f"pile-{n}", f"{n} bodies", lambda repeat, n=n: [piled(n, repeat)], heaped,
+            Figure("depth 95 %", "% of size", 1), Figure("through the wall", "bodies", 1, limit=0.0),
+            Figure("energy gain", "%", 1, limit=1.0), seconds=2.0, repeats=repeats, x=n)  # fmt: skip
+    each, repeats = (10, FEWEST) if quick else (50, 4)
+    add("energy", f"{repeats * each} scenes of 3 to 8 bodies",
+        lambda repeat: [tossed((20, repeat, k)) for k in range(each)], created, Figure("steps with gain", "%", 2),
+        Figure("worst gain", "% of start", 2, largest=True), seconds=2.0, repeats=repeats)  # fmt: skip
+
+    def plain(repeat: int) -> list[Scene]:
+        return [tossed((22, repeat, k)) for k in range(2 if quick else 4)]
+
+    def off(repeat: int) -> list[Scene]:
+        return [*plain(repeat), *(started_off(scene, 1e-6) for scene in plain(repeat))]
+
+    diverges = Figure("diverges after", "s", 2, longer=True)
+    add("start-off", "start 1e-6 m/s off", off, diverged, diverges, group="precision", repeats=2)
+    add("cuda", "on CUDA", plain, diverged, diverges, group="precision", repeats=2, teacher=False, cuda=True)
     return found
 
 
@@ -776,74 +714,3 @@ def _meshes(folder: Path) -> dict[str, Shape]:
         raise SdfsimError(f"{folder}: no meshes found", f"expected {', '.join(sorted(MESH_SUFFIXES))}")
     extents = {file: largest_extent(shape_from_mesh(file, sdf="mesh")) for file in files}
     return {file.stem: shape_from_mesh(file, sdf="grid", units=1.0 / extent) for file, extent in extents.items()}
-
-
-def _stacks() -> list[Case]:
-    fallen = Figure("fallen", "bodies", 1, limit=0.0)
-    figures = (fallen, Figure("shift", "% of size", 1))
-    built = {f"tower-{n}": (f"tower of {n}", tower(n), float(n)) for n in TOWERS} | {
-        "pyramid": ("pyramid of 10 cubes", pyramid(), None),
-        "wall": ("wall of 22 bricks", wall(), None),
-        "cards": ("two cards that lean on each other", card_house(), None),
-    }
-    stacks = [
-        Case(name, "stack", title, _nudged(scene), standing, figures, x=x) for name, (title, scene, x) in built.items()
-    ]
-    figures = (Figure("worst depth", "% of size", 1), fallen)
-    return stacks + [
-        Case(f"mass-{m:g}", "mass", f"{m:g} kg on 1 kg", _nudged(heavy_on_light(m)), squeezed, figures, x=m)
-        for m in RATIOS
-    ]
-
-
-def _bounces_and_slopes(quick: bool) -> list[Case]:
-    figures = (Figure("error", "% of drop", 1, limit=5.0), Figure("rebound", "% of drop", 1, judged=False))
-    bounces = [
-        Case(f"bounce-{e:g}", "bounce", f"e = {e:g}: {100 * e * e:.0f} % wanted", lambda k, e=e: [dropped(e, k)],
-             partial(rebound, restitution=e), figures, seconds=1.3, x=e)
-        for e in RESTITUTIONS
-    ]  # fmt: skip
-    figures = (Figure("error", "degrees", 1, limit=2.0), Figure("slips at", "degrees", 1, judged=False))
-    offsets = OFFSETS[::2] if quick else OFFSETS
-    slopes = []
-    for mu in FRICTIONS:
-        critical = degrees(atan(mu))
-        built = [slope(mu, critical + offset) for offset in offsets]
-        slopes.append(
-            Case(f"slope-{mu:g}", "slope", f"mu = {mu:g}: atan(mu) = {critical:.1f} degrees",
-                 lambda repeat, built=built: [nudged(scene, repeat) for scene in built],
-                 partial(slipped, friction=mu, offsets=offsets), figures, seconds=2.0, repeats=2, x=mu)
-        )  # fmt: skip
-    return bounces + slopes
-
-
-def _piles_and_tosses(quick: bool) -> list[Case]:
-    figures = (
-        Figure("depth 95 %", "% of size", 1),
-        Figure("through the wall", "bodies", 1, limit=0.0),
-        Figure("energy gain", "%", 1, limit=1.0),
-    )
-    piles = [
-        Case(f"pile-{n}", "pile", f"{n} bodies", lambda repeat, n=n: [piled(n, repeat)], heaped, figures, seconds=2.0,
-             repeats=repeats, x=n)
-        for n, repeats in (((64, 2),) if quick else ((64, 2), (512, 1)))
-    ]  # fmt: skip
-    each, repeats = (10, FEWEST) if quick else (50, 4)
-    figures = (Figure("steps with gain", "%", 2), Figure("worst gain", "% of start", 2, largest=True))
-    tosses = Case(
-        "energy", "energy", f"{repeats * each} scenes of 3 to 8 bodies",
-        lambda repeat: [tossed((20, repeat, k)) for k in range(each)], created, figures, seconds=2.0, repeats=repeats,
-    )  # fmt: skip
-    return [*piles, tosses]
-
-
-def _precision(quick: bool) -> list[Case]:
-    def plain(repeat: int) -> list[Scene]:
-        return [tossed((22, repeat, k)) for k in range(2 if quick else 4)]
-
-    def off(repeat: int) -> list[Scene]:
-        return [*plain(repeat), *(started_off(scene, 1e-6) for scene in plain(repeat))]
-
-    figures = (Figure("diverges after", "s", 2, longer=True),)
-    case = Case("start-off", "precision", "start 1e-6 m/s off", off, diverged, figures, repeats=2)
-    return [case, replace(case, scenes=plain, teacher=False, name="cuda", title="on CUDA", cuda=True)]

@@ -11,13 +11,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sdfsim.data.dataset import Trajectory
-from sdfsim.dynamics.rollout import Rollout
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.engines import dataset_urdf, pieces_of
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.distance import PiecesDistance
 from sdfsim.shape.mlp_sdf import MlpSdf
-from sdfsim.shape.sdf import GridSdf, MeshSdf, PlaneSdf
+from sdfsim.shape.sdf import GridSdf, MeshSdf
 from sdfsim.shape.shape import Shape, with_sdf
 
 TOUCH = 0.01  # mean sizes of the moving bodies; a node this near to another surface is in contact
@@ -98,8 +97,7 @@ def penetration(motions: list[Trajectory], solids: dict[str, Solid]) -> dict:
         percentile_95 and worst of the depth of a frame's deepest node (None where nothing touches), and
         steps_with_contact.
     """
-    distance = np.concatenate([deepest(motion, solids) for motion in motions])
-    depth = np.maximum(0.0, -distance[np.isfinite(distance)])
+    depth = penetrations(np.concatenate([deepest(motion, solids) for motion in motions]))
     return {
         "percentile_95": float(np.percentile(depth, 95)) if len(depth) else None,
         "worst": float(depth.max()) if len(depth) else None,
@@ -119,34 +117,23 @@ def _near(position: np.ndarray, turn: np.ndarray, bounds: np.ndarray, moving: np
     return (gap <= 0).all(-1) & pairs
 
 
-def rollout_penetration(scene: Scene, motion: Rollout, every: int = 5) -> np.ndarray:
+def depths(scene: Scene, motion: Trajectory, every: int = 5) -> np.ndarray:
     """[F] m, depth of the deepest node in those of every so many frames in which anything touches.
 
-    The only plane of the scene, if any, is the floor z = 0.
+    Args:
+        scene: its only plane, if any, is the floor z = 0.
+        motion: see `start_motion`.
+        every: so many frames.
     """
-    kept = [k for k, b in enumerate(scene.bodies) if not isinstance(scene.shapes[b.shape].sdf, PlaneSdf)]
-    bodies = [scene.bodies[k] for k in kept]
     solids = {}
-    for index in {b.shape for b in bodies}:
-        shape = scene.shapes[index]
-        solids[str(index)] = _exact(replace(shape, nodes=shape.nodes - shape.com), shape.com)
-    count = len(kept)
-    track = Trajectory(
-        position=motion.position[:, kept],
-        quat_xyzw=motion.orientation[:, kept],
-        velocity=motion.velocity[:, kept],
-        angular_velocity=motion.angular_velocity[:, kept],
-        shape=np.array([str(b.shape) for b in bodies]),
-        scale=np.array([b.scale for b in bodies]),
-        mass=np.ones(count),
-        inertia=np.ones((count, 3)),
-        friction=np.ones(count),
-        restitution=np.ones(count),
-        static=np.array([b.motion == "static" for b in bodies]),
-        dt=float(motion.meta["dt"]),
-        gravity=scene.gravity,
-    )
-    distance = deepest(track, solids, every)
+    for name in set(motion.shape.tolist()):
+        shape = scene.shapes[int(name)]
+        solids[name] = _exact(replace(shape, nodes=shape.nodes - shape.com), shape.com)
+    return penetrations(deepest(motion, solids, every))
+
+
+def penetrations(distance: np.ndarray) -> np.ndarray:
+    """[F] m, depths of those frames of `deepest` in which anything touches."""
     return np.maximum(0.0, -distance[np.isfinite(distance)])
 
 

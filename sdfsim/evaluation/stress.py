@@ -1,4 +1,4 @@
-"""Runs the hard cases with models and the teacher; their table, plots and report, and the ratchet."""
+"""Runs the hard cases with models and the teacher; their table, plots and report."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 import sdfsim
@@ -19,19 +18,17 @@ from sdfsim.dynamics.ranges import constant_in_training
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.simulator import SimulationError, Simulator, pick_device
 from sdfsim.errors import SdfsimError
-from sdfsim.evaluation.engines import bullet, shape_urdf, start_of_scene
+from sdfsim.evaluation.engines import bullet, rollout_motion, shape_urdf, start_of_scene
 from sdfsim.evaluation.hard_cases import GROUPS, Case, Figure, Run, cases, ran_away
 from sdfsim.evaluation.harness import Job, Line, Panel, Progress, Results, check_matplotlib, draw, markdown, measure
-from sdfsim.files import locked, read_json, write_json, write_text
+from sdfsim.files import locked, write_json, write_text
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.sdf import PlaneSdf
 
-VERSION = 2  # counts up when what is measured changes, so that kept results are measured again
+VERSION = 3  # counts up when what is measured changes, so that kept results are measured again
 TEACHER = "teacher"
 OUTSIDE = "†"
 WATCHED = 10.0  # s of a recording
-SPREADS = 3.0  # so many standard deviations are noise
-SHARE = 0.05  # of a figure: what another machine's rounding may change where repetitions agree
 LEGEND = (
     "bold: beyond what is wanted, or the motion blew up",
     "italic: worse than the teacher by more than both spreads, where nothing else is wanted",
@@ -49,8 +46,8 @@ class Study:
     Attributes:
         cases: what was run, in order.
         who: models, then the teacher where PyBullet is installed.
-        results: (case, who) -> figures (name -> a value a repetition), broke and outside (lines), curve ([2, K]) and
-            recording (a path in the folder, or None); nothing for a case that one cannot take part in.
+        results: (case, who) -> figures (name -> a value a repetition), broke and outside (lines) and recording (a
+            path in the folder, or None); nothing for a case that one cannot take part in.
         quick: whether it is the short form.
     """
 
@@ -95,11 +92,13 @@ def stress(
     jobs, cut = [], {}
     for case in found:
         repeats = [case.scenes(repeat) for repeat in range(case.repeats)]
-        weight = _weight(case, repeats)
-        content = [VERSION, case.seconds, case.steps, case.cuda, [figure.name for figure in case.figures], repeats]
+        # About how long a model takes, in no unit; a step has its price without bodies too.
+        weight = case.seconds * sum(10 + len(scene.bodies) for scenes in repeats for scene in scenes)
+        content = [VERSION, case.seconds, case.cuda, [figure.name for figure in case.figures], repeats]
         for model in tested:
-            arguments = (case, model, device, out, record)
-            if _takes_part(case, model):
+            # Another device is for networks: the solver has none.
+            if not case.cuda or (model.kind != SOLVER and torch.cuda.is_available()):
+                arguments = (case, model, device, out, record)
                 jobs.append(Job(case.name, model.name, [content, model, device], _tried, arguments, weight))
         if with_teacher and case.teacher:
             settings, arguments = [TEACHER_VERSION, engine_settings(DT, SUBSTEPS)], (case, None, "", out, None)
@@ -115,11 +114,6 @@ def stress(
     return Study(found, [*who, TEACHER] if with_teacher else who, results, quick)
 
 
-def _takes_part(case: Case, model: Model) -> bool:
-    """Another device is for networks: the solver has none."""
-    return not case.cuda or (model.kind != SOLVER and torch.cuda.is_available())
-
-
 def _teacher_is_here() -> bool:
     try:
         import_pybullet()
@@ -128,35 +122,28 @@ def _teacher_is_here() -> bool:
     return True
 
 
-def _weight(case: Case, repeats: list[list[Scene]]) -> float:
-    """About how long a model takes, in no unit; a step has its price without bodies too."""
-    seconds = case.seconds if case.steps is None else 0.02 * case.steps
-    work = sum(10 + len(scene.bodies) for scenes in repeats for scene in scenes)
-    return seconds * work * (2 if case.cuda else 1)
-
-
 def _tried(case: Case, model: Model | None, device: str, out: Path, record: Record | None) -> dict[str, Any]:
     """All repetitions of a case with one model, or with the teacher: see `Study.results`."""
     figures: dict[str, list[float]] = {figure.name: [] for figure in case.figures}
-    result: dict[str, Any] = {"figures": figures, "broke": [], "outside": [], "curve": [], "recording": None}
+    result: dict[str, Any] = {"figures": figures, "broke": [], "outside": [], "recording": None}
     if model and (about := GROUPS[case.group].about) in constant_in_training(model):
         result["outside"].append(f"{about} was constant in training, so it was not learned")
     for repeat in range(case.repeats):
         scenes = case.scenes(repeat)
         if model is None:
-            runs = [_checked(scene, taught(scene, out / "engine", case.seconds, case.steps)) for scene in scenes]
+            runs = [taught(scene, out / "engine", case.seconds) for scene in scenes]
         else:
-            runs = simulated(case, scenes, model, device)
-            result["outside"] += [line for run in runs for line in run.rollout.meta["outside_training"]]
-        measured, curve = case.measure(runs)
+            places = [device, "cuda"] if case.cuda else [device]
+            runs = [simulated(scene, model, place, case.seconds) for place in places for scene in scenes]
+            result["outside"] += [line for run in runs if run.rollout for line in run.rollout.meta["outside_training"]]
+        measured = case.measure(runs)
         for name, values in figures.items():
             values.append(float(measured[name]))
         result["broke"] += [run.broke for run in runs if run.broke]
-        if repeat == 0:
-            result["curve"] = curve.tolist()
         missed = any(f.limit is not None and measured[f.name] > f.limit for f in case.figures)
         if record and model and result["recording"] is None and (result["broke"] or missed):
             shown = next((run for run in runs if run.broke), runs[0])
+            assert shown.rollout is not None
             path = Path("recordings") / model.name / f"{case.name}.rrd"
             (out / path).parent.mkdir(parents=True, exist_ok=True)
             record(shown.scene, shown.rollout.frames(0, int((shown.rollout.time <= WATCHED).sum())), out / path)
@@ -165,54 +152,21 @@ def _tried(case: Case, model: Model | None, device: str, out: Path, record: Reco
     return result
 
 
-def simulated(case: Case, scenes: list[Scene], model: Model, device: str) -> list[Run]:
-    """Every scene once; where the case is about another device, then once more there."""
-    used = [(model, device)]
-    if case.cuda:
-        used.append((model, "cuda"))
-    runs = []
-    for one, place in used:
-        for scene in scenes:
-            try:
-                runs.append(_checked(scene, Simulator(scene, one, place).run(seconds=case.seconds, steps=case.steps)))
-            except SimulationError as error:
-                runs.append(Run(scene, error.rollout, error.message))
-    return runs
+def simulated(scene: Scene, model: Model, device: str, seconds: float) -> Run:
+    """Our motion of a scene; one that ran away counts as broken."""
+    broke = ""
+    try:
+        rollout = Simulator(scene, model, device).run(seconds=seconds)
+    except SimulationError as error:
+        rollout, broke = error.rollout, error.message
+    run = Run(scene, rollout_motion(scene, rollout), broke, rollout)
+    return run if broke else replace(run, broke=ran_away(run))
 
 
-def taught(scene: Scene, folder: Path, seconds: float, steps: int | None = None) -> Rollout:
-    """The teacher's motion of a scene, as a rollout of all its bodies without contact points. It has no sleep.
-
-    Args:
-        scene: see `start_of_scene`, which says what is refused.
-        folder: of the engine's files.
-        seconds: how long.
-        steps: or so many steps of the teacher's own length.
-    """
-    start, rows = start_of_scene(scene, folder)
-    motion, _ = bullet(start, steps or max(1, round(seconds / DT)))
-    frames = len(motion.position)
-    position, velocity, angular = np.zeros((3, frames, len(scene.bodies), 3))
-    turn = np.tile([0.0, 0.0, 0.0, 1.0], (frames, len(scene.bodies), 1))
-    position[:, rows], turn[:, rows] = motion.position, motion.quat_xyzw
-    velocity[:, rows], angular[:, rows] = motion.velocity, motion.angular_velocity
-    return Rollout(
-        time=np.arange(frames) * DT,
-        position=position,
-        orientation=turn,
-        velocity=velocity,
-        angular_velocity=angular,
-        contact_count=np.zeros(frames, dtype=np.int64),
-        contact_point=np.zeros((0, 3)),
-        contact_body=np.zeros((0, 2), dtype=np.int64),
-        names=tuple(b.name for b in scene.bodies),
-        meta={"model": TEACHER, "dt": DT},
-    )
-
-
-def _checked(scene: Scene, rollout: Rollout) -> Run:
-    """A complete motion; one that ran away counts as broken."""
-    run = Run(scene, rollout)
+def taught(scene: Scene, folder: Path, seconds: float) -> Run:
+    """The teacher's motion of a scene (see `start_of_scene`), with the engine's files in `folder`. It has no sleep."""
+    motion, _ = bullet(start_of_scene(scene, folder), max(1, round(seconds / DT)))
+    run = Run(scene, motion)
     return replace(run, broke=ran_away(run))
 
 
@@ -290,40 +244,24 @@ def table(study: Study) -> str:
     ]
     lines += [f"- {line}" for line in LEGEND]
     parts = ["\n".join(lines) + "\n"]
-    for name, group in groups(study).items():
+    for name in dict.fromkeys(case.group for case in study.cases):
         part = replace(study, cases=[case for case in study.cases if case.group == name])
-        parts += [f"**{group.title}**\n", markdown(rows(part, {"missed": "**", "behind": "*"}))]
+        parts += [f"**{GROUPS[name].title}**\n", markdown(rows(part, {"missed": "**", "behind": "*"}))]
     return "\n".join(parts)
 
 
-def groups(study: Study) -> dict[str, Any]:
-    """The groups that a study has cases of, in order."""
-    return {name: GROUPS[name] for name in dict.fromkeys(case.group for case in study.cases)}
-
-
 def draw_group(study: Study, name: str, path: Path) -> bool:
-    """Write one group's plots: the first figure along the cases, then what each case draws; False if there are none."""
-    group, members = GROUPS[name], [case for case in study.cases if case.group == name]
-    along = [case for case in members if case.x is not None]
-    panels = []
-    if len(along) > 1:
-        figure, lines = along[0].figures[0], []
-        for who in study.who:
-            done = [case for case in along if (case.name, who) in study.results]
-            found = [study.results[case.name, who] for case in done]
-            level, spread = ([f(result, figure) for result in found] for f in (value, noise))
-            lines.append(Line(who, [case.x or 0.0 for case in done], level, spread))
-        places = [case.x or 0.0 for case in along]
-        log = "x" if min(places) > 0 and max(places) > 20 * min(places) else ""
-        panels.append(Panel("all", group.axis, f"{figure.name} ({figure.unit})", lines, log, figure.limit))
-    for case in members:
-        curves = {who: study.results[case.name, who]["curve"] for who in study.who if (case.name, who) in study.results}
-        lines = [Line(who, *curve) for who, curve in curves.items() if curve and curve[0]]
-        if lines:
-            panels.append(Panel(case.title, *group.curve, lines))
-    if panels:
-        draw(panels, path)
-    return bool(panels)
+    """Write a plot of one group's first figure along its cases; False where they are no row."""
+    group, along = GROUPS[name], [case for case in study.cases if case.group == name and case.x is not None]
+    if len(along) < 2:
+        return False
+    figure, lines, places = along[0].figures[0], [], [case.x or 0.0 for case in along]
+    for who in study.who:
+        found = [study.results[case.name, who] for case in along]
+        lines.append(Line(who, places, *([of(result, figure) for result in found] for of in (value, noise))))
+    log = "x" if min(places) > 0 and max(places) > 20 * min(places) else ""
+    draw([Panel(group.title, group.axis, f"{figure.name} ({figure.unit})", lines, log, figure.limit)], path)
+    return True
 
 
 def write_report(study: Study, out: Path) -> dict[str, Any]:
@@ -334,7 +272,7 @@ def write_report(study: Study, out: Path) -> dict[str, Any]:
         line for each case that blew up.
     """
     check_matplotlib()
-    drawn = [name for name in groups(study) if draw_group(study, name, out / "plots" / f"{name}.png")]
+    drawn = [name for name in GROUPS if draw_group(study, name, out / "plots" / f"{name}.png")]
     form = "the short form" if study.quick else "the long form"
     head = f"# Hard cases\n\nsdfsim {sdfsim.__version__}, {form}. Teacher: PyBullet as it made the training data.\n\n"
     plots = "\n".join(f"![{GROUPS[name].title}](plots/{name}.png)" for name in drawn)
@@ -365,9 +303,6 @@ def write_report(study: Study, out: Path) -> dict[str, Any]:
     return report
 
 
-# --- the ratchet ---
-
-
 def figures(study: Study) -> dict[str, dict[str, dict[str, float]]]:
     """By model or teacher, then CASE/FIGURE: value and noise of every judged figure."""
     found: dict[str, dict] = {who: {} for who in study.who}
@@ -378,42 +313,3 @@ def figures(study: Study) -> dict[str, dict[str, dict[str, float]]]:
                     entry = {"value": value(result, figure), "noise": noise(result, figure)}
                     found[who][f"{case.name}/{figure.name}"] = entry
     return found
-
-
-def accepted(study: Study) -> dict[str, Any]:
-    """What the ratchet file holds: each model's figures, and the cases in which it blew up."""
-    models = {}
-    for who, found in figures(study).items():
-        if who != TEACHER:
-            blown = [case for (case, one), result in study.results.items() if one == who and result["broke"]]
-            models[who] = {"figures": found, "blew_up": blown}
-    return {"quick": study.quick, "models": models}
-
-
-def slipped_back(study: Study, file: Path) -> list[str]:
-    """One line for every figure that is clearly worse than accepted, and for every case that blows up now and did not.
-
-    Raises:
-        SdfsimError: the file is unreadable, of the other form, or does not know a model of the study.
-    """
-    ratchet, now = read_json(file, "write it with benchmarks/hard_cases.py"), accepted(study)
-    if ratchet["quick"] != study.quick:
-        raise SdfsimError(f"{file}: made with the {'short' if ratchet['quick'] else 'long'} form of the cases")
-    worse = []
-    for who, entry in now["models"].items():
-        if who not in ratchet["models"]:
-            raise SdfsimError(f"{file}: knows no model {who!r}", "write it anew with benchmarks/hard_cases.py")
-        was = ratchet["models"][who]
-        worse += [f"{who}: {case}: blew up" for case in entry["blew_up"] if case not in was["blew_up"]]
-        for case in study.cases:
-            for figure in case.figures:
-                key = f"{case.name}/{figure.name}"
-                before, after = was["figures"].get(key), entry["figures"].get(key)
-                if before is None or after is None:
-                    continue
-                slack = max(SPREADS * before["noise"], SHARE * abs(before["value"]), 10.0**-figure.digits)
-                gap = after["value"] - before["value"]
-                if (-gap if figure.longer else gap) > slack:
-                    accepted_was = f"accepted {before['value']:.4g} ± {before['noise']:.2g}"
-                    worse.append(f"{who}: {key} {after['value']:.4g} {figure.unit}, {accepted_was}")
-    return worse

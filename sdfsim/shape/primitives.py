@@ -9,7 +9,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sdfsim.errors import SdfsimError
 from sdfsim.shape.mesh import Mesh, clean, convex_hull
 
 
@@ -166,14 +165,7 @@ PRIMITIVES: dict[str, Callable[..., Mesh]] = {
 
 
 def convex_pieces(kind: str) -> list[Mesh]:
-    """Convex pieces whose union is (close to) the default mesh of a primitive, for engines that need them.
-
-    Args:
-        kind: a name in `PRIMITIVES` other than "shoe".
-
-    Raises:
-        SdfsimError: there is no such primitive, or no simple decomposition of it.
-    """
+    """Convex pieces whose union is (close to) the default mesh of a primitive; none of any other or of "shoe"."""
     if kind in ("box", "sphere", "cylinder", "cone"):
         return [convex_hull(PRIMITIVES[kind]().vertices)]
     if kind == "torus":
@@ -201,7 +193,7 @@ def convex_pieces(kind: str) -> list[Mesh]:
             rings = [_spin(wall, turn) for turn in turns]
             pieces += [convex_hull(np.concatenate(rings[k : k + 2])) for k in range(24)]
         return pieces
-    raise SdfsimError(f"no convex pieces for {kind!r}", "decompose its mesh with another program")
+    return []
 
 
 def _quads(quads: np.ndarray) -> np.ndarray:

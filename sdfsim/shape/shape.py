@@ -276,6 +276,19 @@ def scaled(shape: Shape, factor: float) -> Shape:
     )
 
 
+def own_pieces(shape: Shape) -> list[Mesh]:
+    """Convex pieces [m] that a shape comes with, or that its primitive has; empty where there are none."""
+    if shape.pieces:
+        return [convex_hull(points) for points in shape.pieces]
+    kind = str(shape.source.get("primitive", ""))
+    pieces = primitives.convex_pieces(kind)
+    if not pieces:
+        return []
+    usual = primitives.PRIMITIVES[kind]().vertices
+    factor = float(np.ptp(shape.mesh.vertices, axis=0).max() / np.ptp(usual, axis=0).max())
+    return [Mesh(piece.vertices * factor, piece.faces) for piece in pieces]
+
+
 def with_sdf(shape: Shape, kind: SdfKind, *, resolution: int = DEFAULT_RESOLUTION) -> Shape:
     """The same shape with its distances taken from another source; mesh, nodes and mass properties stay.
 

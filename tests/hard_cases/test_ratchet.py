@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
-from sdfsim.evaluation.stress import slipped_back, stress
-
-RATCHET = Path(__file__).resolve().parents[2] / "benchmarks" / "hard_cases_ratchet.json"
+from benchmarks.hard_cases import RATCHET, slipped_back
+from sdfsim.evaluation.stress import stress
 
 
 @pytest.mark.slow
