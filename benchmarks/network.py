@@ -22,9 +22,9 @@ import torch
 from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import Trajectory, load_shapes, read_info, trajectory_files
 from sdfsim.data.replay import every
-from sdfsim.dynamics.graph import SUBSTEPS, ContactGraph
-from sdfsim.dynamics.impulse import Velocities
 from sdfsim.dynamics.model import SOLVER, load_model
+from sdfsim.dynamics.models.contact_graph import SUBSTEPS, ContactGraph
+from sdfsim.dynamics.models.impulse import Velocities
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.errors import run_main
 from sdfsim.evaluation.evaluate import evaluate

@@ -11,10 +11,10 @@ from sdfsim.data.batching import merged
 from sdfsim.data.dataset import FLOOR, Trajectory
 from sdfsim.data.pybullet_sim import MARGIN
 from sdfsim.dynamics.bodies import Units
-from sdfsim.dynamics.graph import SUBSTEPS
 from sdfsim.dynamics.history import with_history
 from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.model import Model
+from sdfsim.dynamics.models.contact_graph import SUBSTEPS
 from sdfsim.dynamics.step import FreeFlight, Rules, step
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.shape.shape import Shape

@@ -12,8 +12,8 @@ from typing import Any
 import torch
 from torch import nn
 
-from sdfsim.dynamics.impulse import ImpulseConfig, ImpulseNetwork
-from sdfsim.dynamics.paper import PaperConfig, PaperNetwork
+from sdfsim.dynamics.models.impulse import ImpulseConfig, ImpulseNetwork
+from sdfsim.dynamics.models.paper import PaperConfig, PaperNetwork
 from sdfsim.errors import SdfsimError
 from sdfsim.files import replacing
 

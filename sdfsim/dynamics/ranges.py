@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from sdfsim.dynamics.bodies import Bodies, State, Units, largest_extent
-from sdfsim.dynamics.graph import SUBSTEPS, number_pairs
 from sdfsim.dynamics.model import SOLVER, Model
+from sdfsim.dynamics.models.contact_graph import SUBSTEPS, number_pairs
 from sdfsim.scene.scene import Scene
 
 LABELS = {

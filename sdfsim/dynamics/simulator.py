@@ -19,11 +19,11 @@ from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State, awake, from_scene
 from sdfsim.dynamics.check import check_nodes, check_sizes, fault
 from sdfsim.dynamics.froude import scene_units
-from sdfsim.dynamics.graph import SUBSTEPS
 from sdfsim.dynamics.handles import BodyHandle, ContactPoint
 from sdfsim.dynamics.history import history_told, with_history
 from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.model import Model, load_model
+from sdfsim.dynamics.models.contact_graph import SUBSTEPS
 from sdfsim.dynamics.ranges import deep_starts, outside_training
 from sdfsim.dynamics.rollout import Rollout, join
 from sdfsim.dynamics.step import FreeFlight, Rules, step

@@ -15,9 +15,9 @@ from torch import Tensor
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State, awake
 from sdfsim.dynamics.freeflight import ballistic, torque_free
-from sdfsim.dynamics.graph import SUBSTEPS, ContactGraph, number_pairs
 from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.model import Model
+from sdfsim.dynamics.models.contact_graph import SUBSTEPS, ContactGraph, number_pairs
 
 if TYPE_CHECKING:
     from sdfsim.dynamics.contacts import Contacts
@@ -252,7 +252,7 @@ def _paper_step(
 ) -> tuple[State, Contacts | None]:
     """The published step of the bodies that have a contact edge; free flight, or its learned form, for the others."""
     from sdfsim.dynamics.contacts import find_contacts, no_contacts
-    from sdfsim.dynamics.surfaces import compact, predict
+    from sdfsim.dynamics.models.surfaces import compact, predict
 
     with memory.timed("flight_ms"):
         free = fly(bodies, state, rules)

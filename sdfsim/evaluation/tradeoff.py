@@ -27,8 +27,8 @@ from sdfsim.data.dataset import (
 from sdfsim.data.pybullet_sim import DT, SUBSTEP
 from sdfsim.data.replay import every, first_frames, roll_out
 from sdfsim.dynamics.froude import scene_units
-from sdfsim.dynamics.graph import SUBSTEPS
 from sdfsim.dynamics.model import SOLVER, Model, load_model, model_names
+from sdfsim.dynamics.models.contact_graph import SUBSTEPS
 from sdfsim.dynamics.simulator import Simulator, pick_device
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.baselines import perturbed
@@ -171,7 +171,7 @@ def cases_of_scene(scene: Scene, model: str, folder: Path, *, quick: bool) -> Ca
     if not any(b.motion == "dynamic" for b in scene.bodies):
         raise SdfsimError(f"{scene.path}: nothing moves in it")
     units = scene_units(scene, load_model(model, weights=False), None)
-    start, _ = start_of_scene(scene, folder, units)
+    start = start_of_scene(scene, folder, units)
     if start.floor is None:
         raise SdfsimError(f"{scene.path}: needs one level plane as its floor")
     shapes = {name: _centred(scene.shapes[int(name)], name) for name in start.urdfs}

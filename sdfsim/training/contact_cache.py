@@ -20,7 +20,7 @@ from sdfsim.data.dataset import Trajectory, check_alike, engine_substep, load_sh
 from sdfsim.data.pybullet_sim import MARGIN
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.freeflight import torque_free
-from sdfsim.dynamics.graph import SUBSTEPS
+from sdfsim.dynamics.models.contact_graph import SUBSTEPS
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_arrays, write_arrays
 from sdfsim.parallel import parallel

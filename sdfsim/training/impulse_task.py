@@ -10,8 +10,8 @@ from torch import Tensor
 
 from sdfsim.data.dataset import FLOOR, product_range
 from sdfsim.dynamics import pose
-from sdfsim.dynamics.graph import ContactGraph, number_pairs
-from sdfsim.dynamics.impulse import ImpulseNetwork, Velocities
+from sdfsim.dynamics.models.contact_graph import ContactGraph, number_pairs
+from sdfsim.dynamics.models.impulse import ImpulseNetwork, Velocities
 from sdfsim.training.contact_cache import ContactFrames
 from sdfsim.training.distributed import ALONE, Team
 

@@ -15,8 +15,8 @@ from sdfsim.data.dataset import FLOOR, Trajectory, check_alike, load_shapes, pro
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State, Units
 from sdfsim.dynamics.contacts import find_contacts
-from sdfsim.dynamics.paper import PaperNetwork, SurfaceGraph
-from sdfsim.dynamics.surfaces import node_owner, surface_graph, target_acceleration
+from sdfsim.dynamics.models.paper import PaperNetwork, SurfaceGraph
+from sdfsim.dynamics.models.surfaces import node_owner, surface_graph, target_acceleration
 from sdfsim.training.distributed import ALONE, Team
 
 NODES = 64  # surface nodes a body: the first of each shape's, which are its corners and then the most spread

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from sdfsim.dynamics import freeflight, solver, surfaces
+from sdfsim.dynamics import freeflight, solver
 from sdfsim.dynamics import step as step_module
 from sdfsim.dynamics.contacts import find_contacts
 from sdfsim.dynamics.kernels import nodes
 from sdfsim.dynamics.memory import COUNTS, PHASES
 from sdfsim.dynamics.model import Unread
+from sdfsim.dynamics.models.surfaces import compact, node_owner, predict
 from sdfsim.dynamics.simulator import Simulator
-from sdfsim.dynamics.surfaces import compact, predict
 from sdfsim.scene.scene import Effects, Scene, Waypoints
 from sdfsim.shape.shape import analytic_shape
 from tests.dynamics.conftest import make_body, random_model
@@ -178,7 +178,7 @@ def test_with_everything_active_nothing_is_copied(dropped):
     made = compact(sim.bodies, sim.state, contacts, torch.arange(len(sim.bodies)))
     assert made[0] is sim.bodies and made[1] is sim.state and made[2] is contacts
     some = compact(sim.bodies, sim.state, contacts, torch.cat([contacts.owner, contacts.body]).unique())
-    place = surfaces.node_owner(some[0])[some[2].node]
+    place = node_owner(some[0])[some[2].node]
     assert torch.equal(place, some[2].owner)
     assert torch.equal(some[0].node[some[2].node], sim.bodies.node[contacts.node])
 

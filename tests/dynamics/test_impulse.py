@@ -7,8 +7,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from sdfsim.dynamics.graph import ContactGraph, EdgeFrames, edge_frames
-from sdfsim.dynamics.impulse import bounded, pushed
+from sdfsim.dynamics.models.contact_graph import ContactGraph, EdgeFrames, edge_frames
+from sdfsim.dynamics.models.impulse import bounded, pushed
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.dynamics.solver import solver_step
 from sdfsim.dynamics.step import contact_graph

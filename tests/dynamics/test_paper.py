@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from sdfsim.dynamics.models.surfaces import advance, node_owner
 from sdfsim.dynamics.simulator import Simulator
-from sdfsim.dynamics.surfaces import advance, node_owner
 from sdfsim.scene.scene import Effects
 from tests.dynamics.conftest import angle_between, random_model
 

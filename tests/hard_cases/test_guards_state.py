@@ -16,7 +16,7 @@ from sdfsim import Rollout, SdfsimError
 from sdfsim.dynamics import check
 from sdfsim.dynamics.bodies import Units
 from sdfsim.dynamics.freeflight import MOST_TURN
-from sdfsim.dynamics.impulse import ImpulseNetwork, Velocities
+from sdfsim.dynamics.models.impulse import ImpulseNetwork, Velocities
 from sdfsim.dynamics.simulator import SimulationError, Simulator
 from tests.dynamics.conftest import random_model
 from tests.dynamics.test_paper import paper_model

@@ -10,10 +10,10 @@ import torch
 from sdfsim.data.batching import merged
 from sdfsim.data.pybullet_sim import MARGIN
 from sdfsim.dynamics.bodies import Units
-from sdfsim.dynamics.graph import REST_SPEED
-from sdfsim.dynamics.impulse import Velocities
 from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.model import load_model
+from sdfsim.dynamics.models.contact_graph import REST_SPEED
+from sdfsim.dynamics.models.impulse import Velocities
 from sdfsim.dynamics.solver import solver_step
 from sdfsim.dynamics.step import Rules, contact_graph
 from sdfsim.errors import SdfsimError
@@ -113,7 +113,7 @@ def test_a_checkpoint_of_another_run_is_refused(ball_data, presets, tmp_path):
 def test_paper_targets_lead_exactly_to_the_recorded_pose(ball_data):
     """Advancing by the target acceleration lands on the next recorded frame, noise or not."""
     from sdfsim.data.dataset import Trajectory, load_shapes
-    from sdfsim.dynamics.surfaces import advance, target_acceleration
+    from sdfsim.dynamics.models.surfaces import advance, target_acceleration
 
     t = Trajectory.load(ball_data / "train" / "0.npz")
     bodies, state = merged([t], [5], load_shapes(ball_data, {"ball"}), Units(1.0, 1.0, 1.0), CPU)

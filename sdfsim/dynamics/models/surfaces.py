@@ -10,8 +10,8 @@ from torch import Tensor
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State
 from sdfsim.dynamics.contacts import Contacts
-from sdfsim.dynamics.matching import match_shapes
-from sdfsim.dynamics.paper import PaperNetwork, SurfaceGraph
+from sdfsim.dynamics.models.matching import match_shapes
+from sdfsim.dynamics.models.paper import PaperNetwork, SurfaceGraph
 
 _NOT_PER_BODY = ("pieces", "node", "node_start", "allowed", "sdfs", "tracks")
 

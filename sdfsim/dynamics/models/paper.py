@@ -15,7 +15,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from sdfsim.dynamics.impulse import by_rows
+from sdfsim.dynamics.models.impulse import by_rows
 
 NODE_FEATURES = 13  # of surface nodes and of body nodes
 INTRA_FEATURES = 8

@@ -17,7 +17,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from sdfsim.dynamics.graph import EDGE_FEATURES, ContactGraph, EdgeFrames, edge_frames
+from sdfsim.dynamics.models.contact_graph import EDGE_FEATURES, ContactGraph, EdgeFrames, edge_frames
 
 # Model units, relative speeds of two surfaces before the step: up to the first what they do is left to the solve, from
 # the second on the network has its full say. So what rests, rolls or stands in a tower does what the solve knows.
