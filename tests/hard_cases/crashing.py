@@ -73,6 +73,7 @@ def _child(
     import torch
 
     torch.set_num_threads(1)
+    os.environ["LOKY_MAX_CPU_COUNT"] = "1"  # this process does all the work: others take seconds to start
     descriptor = os.open(said, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     os.dup2(descriptor, 1)
     os.dup2(descriptor, 2)
@@ -140,12 +141,14 @@ def litter(folder: Path) -> list[str]:
 
 
 def tiny_fit() -> None:
-    """Fits of 120 steps."""
+    """Fits of 120 steps, baked coarsely."""
+    from sdfsim.shape import baked_grid
     from sdfsim.shape import fit as fit_module
 
     plan = replace(fit_module.PLANS["default"], width=8, layers=3, steps=120, batch=64, pool=1000, goal=None)
     fit_module.PLANS["default"] = fit_module.PLANS["quick"] = plan
     fit_module.CHECK_EVERY = 20
+    baked_grid.CELLS = baked_grid.FINEST = 16
 
 
 def tiny_train() -> None:

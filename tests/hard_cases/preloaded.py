@@ -1,4 +1,6 @@
-"""What every command needs, imported once in the server that the children of `crashing` are forked from."""
+"""What every command needs, loaded once in the server that the children of `crashing` are forked from."""
+
+import torch
 
 import cli
 import pipeline.stages
@@ -6,5 +8,9 @@ import sdfsim.fitting
 import sdfsim.run
 import sdfsim.shape.fit
 import sdfsim.training.train
+
+torch.set_num_threads(1)  # what is forked may have no threads
+_box = {"box": {"size": (1, 1, 1)}, "position": (0, 0, 0.5)}
+sdfsim.Simulator(sdfsim.Scene().add("floor", plane={}).add("a", **_box)).run(steps=2)  # loads what is compiled
 
 __all__ = ["cli", "pipeline", "sdfsim"]

@@ -42,6 +42,7 @@ def check_told(work: Work, folder: Path, why: str) -> None:
         whole(folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["fit", "simulate", "train"])
 def test_a_full_disk_is_told_and_the_run_goes_on_when_there_is_room(works, undisturbed, small_disk, name):
     work, (_, expected) = works[name], undisturbed(name)
