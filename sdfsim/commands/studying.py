@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sdfsim.commands.arguments import Device, Json, Out, Verbose, folder_of, tell_failed
+from sdfsim.commands.arguments import Device, Json, Out, Verbose, check_device, folder_of, tell_failed
 from sdfsim.console import Session, columns
 
 
@@ -30,10 +30,9 @@ def tradeoff(
         from sdfsim.evaluation import tradeoff as study
         from sdfsim.evaluation.harness import check_matplotlib
 
+        check_device(device)
         check_matplotlib()
-        report = study.tradeoff(
-            source, out, models=model or [], quick=quick, device=device, on_progress=session.stage_progress
-        )
+        report = study.tradeoff(source, out, models=model or [], quick=quick, on_progress=session.stage_progress)
         rows, notes = study.told(report)
         session.report(report, [*columns(rows), *notes])
 

@@ -216,16 +216,24 @@ class Panel:
     limit: float | None = None
 
 
-def draw(panels: Sequence[Panel], path: Path, *, wide: int = 4, dpi: int = 80) -> None:
-    """Write panels side by side, `wide` in a row, as a PNG. Raises SdfsimError when matplotlib is not installed."""
+def draw(
+    panels: Sequence[Panel], path: Path, *, wide: int = 4, dpi: int = 80, size: tuple[float, float] = (3.3, 2.5),
+    key: Literal["inside", "outside"] = "inside",
+) -> None:  # fmt: skip
+    """Write panels of `size` inches side by side, `wide` in a row, as a PNG.
+
+    Raises:
+        SdfsimError: matplotlib is not installed.
+    """
     pyplot = check_matplotlib()
     high, wide = -(-len(panels) // wide), min(wide, len(panels))
-    figure, axes = pyplot.subplots(high, wide, figsize=(3.3 * wide, 2.5 * high), squeeze=False, layout="constrained")
+    across, up = size
+    figure, axes = pyplot.subplots(high, wide, figsize=(across * wide, up * high), squeeze=False, layout="constrained")
     names = list(dict.fromkeys(line.name for panel in panels for line in panel.lines))
     for axis, panel in zip(axes.flat, panels, strict=False):
         for line in panel.lines:
-            marker = "o-" if len(line.x) <= 12 else "-"
-            style = {"label": line.name, "color": f"C{names.index(line.name)}", "markersize": 3, "linewidth": 1.2}
+            marker, at = ("o-" if len(line.x) <= 12 else "-"), names.index(line.name)
+            style = {"label": line.name, "color": f"C{at}", "markersize": 3 + at // 10, "linewidth": 1.2}
             axis.errorbar(line.x, line.y, yerr=line.noise, fmt=marker, capsize=2, **style)
         for letter in panel.log:
             getattr(axis, f"set_{letter}scale")("log")
@@ -236,44 +244,13 @@ def draw(panels: Sequence[Panel], path: Path, *, wide: int = 4, dpi: int = 80) -
         axis.set_ylabel(panel.y, fontsize=8)
         axis.tick_params(labelsize=7)
         axis.grid(alpha=0.3)
-        axis.legend(fontsize=6)
+        axis.legend(fontsize=6, **({"bbox_to_anchor": (1.0, 1.0), "loc": "upper left"} if key == "outside" else {}))
     for axis in axes.flat[len(panels) :]:
         axis.set_visible(False)
-    _save(pyplot, figure, path, dpi)
-
-
-@dataclass(frozen=True)
-class Point:
-    """One point of a work-precision plot: its label, its kind (one colour each), time, 95th percentile, error."""
-
-    label: str
-    kind: str
-    time: float
-    slow: float
-    error: float
-
-
-def draw_work_precision(points: Sequence[Point], best: Sequence[int], path: Path, *, x: str, y: str) -> None:
-    """Write error against time, both logarithmic, as a PNG: numbered points, a line through the `best`, a key."""
-    pyplot = check_matplotlib()
-    figure, (axis, names) = pyplot.subplots(1, 2, figsize=(12, 6.5), width_ratios=(2, 1), layout="constrained")
-    kinds = list(dict.fromkeys(point.kind for point in points))
-    least = 0.3 * min((p.error for p in points if p.error > 1e-6), default=1e-6)
-    names.axis("off")
-    for k, point in enumerate(points):
-        color, level = f"C{kinds.index(point.kind)}", max(point.error, least)
-        marker = "v" if point.error < least else "os^D"[kinds.index(point.kind) % 4]
-        late = [[0.0], [max(0.0, point.slow - point.time)]]
-        axis.errorbar(point.time, level, xerr=late, marker=marker, color=color, linewidth=0.8)
-        axis.annotate(str(k + 1), (point.time, level), xytext=(4, 4), textcoords="offset points", fontsize=8)
-        weight = "bold" if k in best else "normal"
-        row = 1.0 - (k + 0.5) / max(len(points), 30)
-        names.text(0.0, row, f"{k + 1:>2}  {point.label}", fontsize=8, color=color, weight=weight)
-    axis.plot([points[k].time for k in best], [points[k].error for k in best], color="C0", alpha=0.5)
-    axis.set(xscale="log", yscale="log", xlabel=x, ylabel=y)
-    axis.set_title("lower left is better; whiskers: 95th percentile; bold: the front", fontsize=9)
-    axis.grid(True, which="both", linewidth=0.3)
-    _save(pyplot, figure, path, 110)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as partial:
+        figure.savefig(partial, dpi=dpi, format="png")
+    pyplot.close(figure)
 
 
 def check_matplotlib() -> Any:
@@ -286,13 +263,6 @@ def check_matplotlib() -> Any:
     from matplotlib import pyplot
 
     return pyplot
-
-
-def _save(pyplot: Any, figure: Any, path: Path, dpi: int) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as partial:
-        figure.savefig(partial, dpi=dpi, format="png")
-    pyplot.close(figure)
 
 
 @contextmanager

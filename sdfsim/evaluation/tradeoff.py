@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 import sdfsim
 from sdfsim.data.batching import scene_of
@@ -29,7 +30,7 @@ from sdfsim.data.replay import every, first_frames, roll_out
 from sdfsim.dynamics.froude import scene_units
 from sdfsim.dynamics.model import SOLVER, Model, load_model, model_names
 from sdfsim.dynamics.models.contact_graph import SUBSTEPS
-from sdfsim.dynamics.simulator import Simulator, pick_device
+from sdfsim.dynamics.simulator import Simulator
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.baselines import perturbed
 from sdfsim.evaluation.engines import Start, Timing, bullet, dataset_urdf, mujoco, start_of_scene
@@ -37,8 +38,9 @@ from sdfsim.evaluation.evaluate import energy_gain, errors
 from sdfsim.evaluation.hard_cases import tossed
 from sdfsim.evaluation.harness import (
     Job,
-    Point,
-    draw_work_precision,
+    Line,
+    Panel,
+    draw,
     front,
     machine,
     measure,
@@ -51,7 +53,7 @@ from sdfsim.files import locked, write_json, write_text
 from sdfsim.scene.scene import Scene
 from sdfsim.scene.scene_file import load_scene
 from sdfsim.shape.mlp_sdf import MlpSdf
-from sdfsim.shape.sdf import GridSdf, MeshSdf, sample_grid
+from sdfsim.shape.sdf import GridSdf, MeshSdf
 from sdfsim.shape.shape import Shape, with_nodes
 from sdfsim.shape.surface_nodes import hull_nodes
 
@@ -68,6 +70,7 @@ ENGINES = [*(("PyBullet", k) for k in (5, 4, 3, 2, 1)), *(("MuJoCo", k) for k in
 ENGINES_QUICK = [("PyBullet", 5), ("PyBullet", 1), ("MuJoCo", 5)]
 FLOOR_LABEL = "chaos floor: PyBullet 4 ms, starts 1 mm per s off"
 PHYSICAL = ("contact", "friction", "restitution", "rotation")  # effects that the engines always have
+CPU = torch.device("cpu")
 Rows = list[tuple[str, ...]]
 
 
@@ -206,23 +209,15 @@ class Setting:
         model: name or path.
         nodes: "own", the shapes' own nodes; "thin K", K of them, outermost first; "grid N", sampled anew from N^3
             points.
-        sdf: "own", or "grid R", the own distances on a grid of R^3 samples.
         stride: recorded steps in a step.
         substeps: inner steps of the solve in a step, where the model does not say how many.
-        learned_flight: the paper network predicts free flight too.
-        sleep: freeze what has come to rest.
-        device: "cpu" or "cuda".
         contact: off is the ballistic baseline.
     """
 
     model: str
     nodes: str = "own"
-    sdf: str = "own"
     stride: int = 1
     substeps: int = SUBSTEPS
-    learned_flight: bool = False
-    sleep: bool = False
-    device: str = "cpu"
     contact: bool = True
 
     @property
@@ -232,49 +227,34 @@ class Setting:
             return "ballistic"
         usual, path = Setting(self.model), Path(self.model)
         name = path.parent.name if path.name == "model.safetensors" else path.name.removesuffix(".safetensors")
-        changed = {k: v for k, v in asdict(self).items() if v != getattr(usual, k)}
-        return ", ".join([name, *(k.replace("_", " ") if v is True else f"{k} {v}" for k, v in changed.items())])
+        return ", ".join([name, *(f"{k} {v}" for k, v in asdict(self).items() if v != getattr(usual, k))])
 
 
-def settings(models: Sequence[str], *, quick: bool, cuda: bool) -> list[Setting]:
-    """Each model with each of its knobs alone, and two useful combinations for the first network."""
-    chosen, kinds = [], {name: load_model(name, weights=False).kind for name in models}
+def settings(models: Sequence[str], *, quick: bool) -> list[Setting]:
+    """Each model with each of its knobs alone, and two useful combinations."""
+    chosen = []
     for name in models:
-        base = Setting(name)
-        chosen.append(base)
-        knobs: list[dict[str, Any]] = [{"nodes": f"thin {k}"} for k in ((64,) if quick else (32, 64, 128, 256))]
+        knobs: list[dict[str, Any]] = [{}]
+        knobs += [{"nodes": f"thin {k}"} for k in ((64,) if quick else (32, 64, 128, 256))]
         knobs += [{"nodes": f"grid {k}"} for k in ((7,) if quick else (5, 7, 10))]
-        if kinds[name] == SOLVER:
+        if load_model(name, weights=False).kind == SOLVER:
             knobs += [{"substeps": k} for k in ((2, 10) if quick else (1, 2, 3, 10, 20))]
             knobs += [{"stride": 2, "substeps": k} for k in ((1,) if quick else (1, 2, 4))]
-        elif name == next(n for n in models if kinds[n] != SOLVER):
-            knobs += [{"sdf": "grid 64"}]
-            if not quick:
-                knobs += [{"sdf": "grid 32"}, {"sdf": "grid 128"}, {"sleep": True}]
-            knobs += [{"device": "cuda"}] if cuda else []
-        else:
-            knobs = []
-        if kinds[name] == "paper":
-            knobs.append({"learned_flight": True})
-        chosen += [replace(base, **knob) for knob in knobs]
+        chosen += [Setting(name, **knob) for knob in knobs]
     return [*chosen, Setting(models[0], contact=False)]
 
 
 def arranged(setting: Setting, cases: Cases) -> tuple[Model, dict[str, Shape]]:
-    """The model and the shapes as a setting wants them; closed forms keep their distances, which nothing beats."""
-    model = load_model(setting.model).to(pick_device(setting.device))
-    return model, {name: _arranged_shape(setting, shape, model.nodes) for name, shape in cases.shapes.items()}
-
-
-def _arranged_shape(setting: Setting, shape: Shape, most: int | None) -> Shape:
+    """The model, and the shapes with the nodes that a setting wants."""
+    model, shapes = load_model(setting.model), {}
     kind, _, count = setting.nodes.partition(" ")
-    if kind == "thin":
-        shape = replace(shape, nodes=hull_nodes(shape.nodes, int(count)))
-    elif kind == "grid":
-        shape = with_nodes(shape, int(count))
-    if setting.sdf != "own" and isinstance(shape.sdf, MlpSdf | GridSdf):
-        shape = replace(shape, sdf=sample_grid(shape.sdf, shape.sdf.bounds, int(setting.sdf.split()[1])))
-    return replace(shape, nodes=shape.nodes[:most])
+    for name, shape in cases.shapes.items():
+        if kind == "thin":
+            shape = replace(shape, nodes=hull_nodes(shape.nodes, int(count)))
+        elif kind == "grid":
+            shape = with_nodes(shape, int(count))
+        shapes[name] = replace(shape, nodes=shape.nodes[: model.nodes])
+    return model, shapes
 
 
 # --- measuring ---
@@ -286,28 +266,23 @@ def measure_ours(setting: Setting, cases: Cases) -> dict[str, Any]:
         began = time.perf_counter()
         model, shapes = arranged(setting, cases)
         prepared = time.perf_counter() - began
-        device = pick_device(setting.device)
+        starts, steps = [every(t, setting.stride) for t in cases.starts], cases.steps // setting.stride
         motions = roll_out(
-            model, [every(t, setting.stride) for t in cases.starts], shapes, cases.steps // setting.stride, device,
-            "learned" if setting.learned_flight else "exact", contact=setting.contact, sleep=setting.sleep,
-            floor=cases.floor, substeps=setting.substeps, as_teacher=setting.contact,
+            model, starts, shapes, steps, CPU, contact=setting.contact, floor=cases.floor, substeps=setting.substeps,
+            as_teacher=setting.contact,
         )  # fmt: skip
     result = _judged(motions, cases, setting.stride) | {"prepare_s": prepared, "peak_mib": memory["mib"]}
     if result["exploded"]:
         return result
-    repeats = [_time_simulator(setting, model, shapes, cases) for _ in range(REPEATS)]
-    return result | _times(repeats, cases, one_core=device.type == "cpu")
+    return result | _times([_time_simulator(setting, model, shapes, cases) for _ in range(REPEATS)], cases)
 
 
 def _time_simulator(setting: Setting, model: Model, shapes: dict[str, Shape], cases: Cases) -> Timing:
     """One scene of the cases on its own, as `sdfsim simulate` runs it."""
     start = every(cases.starts[cases.timed], setting.stride)
     scene = scene_of([start], [0], shapes, cases.floor)[0]
-    effects = replace(
-        scene.effects, sleep="on" if setting.sleep else "off", contact="auto" if setting.contact else "off"
-    )
-    flight = "learned" if setting.learned_flight else "exact"
-    simulator = Simulator(replace(scene, effects=effects), model, setting.device, dt=start.dt, free_flight=flight)
+    effects = replace(scene.effects, sleep="off", contact="auto" if setting.contact else "off")
+    simulator = Simulator(replace(scene, effects=effects), model, dt=start.dt)
     simulator.rules = replace(simulator.rules, substeps=model.inner or setting.substeps)
     steps = min(TIMED, cases.steps // setting.stride)
     began = time.perf_counter()
@@ -331,7 +306,7 @@ def measure_engine(name: str, substeps: int, off: float, cases: Cases) -> dict[s
     with peak_memory() as memory:
         motions = [run(start, cases.steps, substeps)[0] for start in starts]
     repeats = [run(starts[cases.timed], min(TIMED, cases.steps), substeps)[1] for _ in range(REPEATS)]
-    return _judged(motions, cases) | {"peak_mib": memory["mib"]} | _times(repeats, cases, one_core=True)
+    return _judged(motions, cases) | {"peak_mib": memory["mib"]} | _times(repeats, cases)
 
 
 def _judged(motions: list[Trajectory], cases: Cases, stride: int = 1) -> dict[str, Any]:
@@ -359,13 +334,13 @@ def _judged(motions: list[Trajectory], cases: Cases, stride: int = 1) -> dict[st
     }
 
 
-def _times(repeats: list[Timing], cases: Cases, *, one_core: bool) -> dict[str, Any]:
+def _times(repeats: list[Timing], cases: Cases) -> dict[str, Any]:
     """Milliseconds of computing per simulated second.
 
     All work in one thread, and are timed by the processor's clock: on a shared core the wall shows what others do.
     """
     per_second = 1.0 / (cases.recorded[0].dt * cases.time)
-    taken = np.array([r.cpu_ms if one_core else r.wall_ms for r in repeats]) * per_second
+    taken = np.array([r.cpu_ms for r in repeats]) * per_second
     return {
         "ms": float(np.median(taken)),
         "ms_p95": float(np.percentile(taken, 95)),
@@ -383,7 +358,6 @@ def tradeoff(
     *,
     models: Sequence[str] = (),
     quick: bool = False,
-    device: str = "cpu",
     on_progress: Callable[[str, float, str], None],
 ) -> dict[str, Any]:
     """Measure all contenders on recorded scenes and write tradeoff.csv, tradeoff.png and report.json.
@@ -392,9 +366,8 @@ def tradeoff(
         source: dataset folder, or a scene file, which the teacher is then asked about; None takes a random scene of
             boxes and balls.
         out: folder to write; results that it holds already are kept.
-        models: names or paths (none: the solver and all bundled networks); every network's knobs are the first's alone.
+        models: names or paths (none: the solver and all bundled networks).
         quick: fewer settings on fewer, shorter scenes.
-        device: "cpu", "cuda" or "auto"; CUDA is a knob beside the others where it is not "cpu".
         on_progress: called with (stage, fraction, message).
 
     Returns:
@@ -406,7 +379,6 @@ def tradeoff(
     """
     if source and not source.exists():
         raise SdfsimError(f"{source}: no such file or folder", "give a dataset or a scene.yaml")
-    cuda = pick_device(device).type == "cuda"
     names = list(models) or model_names()
     with locked(out), one_thread():
         on_progress("scenes", 0.0, "reading scenes and shapes")
@@ -417,7 +389,7 @@ def tradeoff(
             cases = cases_of_scene(scene, names[0], out / "engine", quick=quick)
         kinds, jobs = {}, []
         content = [VERSION, machine(), replace(cases, urdfs={}, solids={})]
-        for setting in settings(names, quick=quick, cuda=cuda):
+        for setting in settings(names, quick=quick):
             kinds[setting.label] = "ours" if setting.contact else "baseline"
             weights = load_model(setting.model) if setting.contact else None
             jobs.append(Job("cases", setting.label, [content, setting, weights], measure_ours, (setting, cases)))
@@ -451,14 +423,11 @@ def tradeoff(
         }
         write_json(out / "report.json", report)
         write_text(out / "tradeoff.csv", table(points))
-        fine.sort(key=lambda p: (p["kind"] != "ours", p["kind"], p["ms"]))
-        draw_work_precision(
-            [Point(p["label"], p["kind"], p["ms"], p["ms_p95"], p["translation_rmse"][steps]) for p in fine],
-            [fine.index(p) for p in best],
-            out / "tradeoff.png",
-            x="milliseconds of computing per simulated second",
-            y=f"translation RMSE over {steps} steps, m",
-        )
+        lines = [Line("front", [p["ms"] for p in best], [p["translation_rmse"][steps] for p in best])]
+        for p in sorted(fine, key=lambda p: (p["kind"] != "ours", p["kind"], p["ms"])):
+            lines.append(Line(p["label"], [p["ms"]], [max(p["translation_rmse"][steps], 1e-6)]))
+        axes = ("milliseconds of computing per simulated second", f"translation RMSE over {steps} steps, m")
+        draw([Panel("lower left is better", *axes, lines, "xy")], out / "tradeoff.png", size=(9.0, 6.5), key="outside")
         return report
 
 

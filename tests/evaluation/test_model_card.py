@@ -8,7 +8,7 @@ pytest.importorskip("pybullet")
 
 from sdfsim.data.generate import make_dataset
 from sdfsim.dynamics.model import Model, load_model, new_network
-from sdfsim.evaluation.model_card import bundle, dataset_folders, training_commands
+from sdfsim.evaluation.model_card import bundle
 from sdfsim.training.train import train
 
 
@@ -33,8 +33,8 @@ def test_a_trained_model_is_bundled_with_its_errors(cube_data, trained, tmp_path
     assert len(first) == 6 and first[-1].strip().endswith(" s")
     assert f"| this model | {report['model']['50']['translation_rmse']:.3f} (" in card
     assert f"| teacher, 1e-3 m/s off | {_error(report, '1e-3'):.3f} (" in card
-    assert "m, 50 steps = 1 s" in card and "penetration 95 %" in card and "| 20 | 16 |" in card
-    assert "--preset tiny" in card and "--trajectories 3 --seed 1 --split test" in card
+    assert "m, 50 steps = 1 s" in card and "penetration 95 %" in card and "| tiny | 2 | 20 | 16 |" in card
+    assert "recipe movi-b" in card and "seed 1" in card
 
 
 def test_a_paper_network_is_told_as_published_too(cube_data, trained, tmp_path):
@@ -46,29 +46,6 @@ def test_a_paper_network_is_told_as_published_too(cube_data, trained, tmp_path):
     error = report["as_published"]["50"]["translation_rmse"]
     card = (tmp_path / "models" / "mine.md").read_text()
     assert f"| this model, free flight learned too (as published) | {error:.3f} (" in card
-
-
-def test_the_card_says_how_to_repeat_exactly_this_training(cube_data, trained):
-    model = load_model(trained)
-    assert model.card["seed"] == 2 and model.card["optimiser_steps"] == 20
-    made = {"engine": "pybullet", "shapes": 2, "random_solids": 0}
-    piles = [
-        made | {"recipe": "pile", "seed": seed, "trajectories": {"train": 5}, "bodies": count}
-        for seed, count in ((0, 8), (7, None))
-    ]
-    data = [*model.card["data"], *piles]
-    lines = training_commands(model.card | {"data": data}, dataset_folders(data))
-    assert dataset_folders(data) == ["MOVI-B", "PILE-1", "PILE-2"]
-    assert lines[3:5] == [
-        "sdfsim dataset pile -o PILE-1 --shapes SHAPES --bodies 8 --trajectories 5 --seed 0 --split train",
-        "sdfsim dataset pile -o PILE-2 --shapes SHAPES --trajectories 5 --seed 7 --split train",
-    ]
-    module = "python -m sdfsim.training.train MOVI-B PILE-1 PILE-2 RUN --preset tiny"
-    assert lines[5] == f"{module} --seed 2 --steps 20"
-    usual = {"seed": 0, "optimiser_steps": 150, "data": data}
-    assert training_commands(model.card | usual, dataset_folders(data))[5] == (
-        "sdfsim train --data MOVI-B --data PILE-1 --data PILE-2 -o RUN --preset tiny"
-    )
 
 
 def _error(report: dict, size: str) -> float:
