@@ -49,9 +49,7 @@ MOST_COPIES = 100_000
 MOST_BYTES = 16 * 2**20  # of a file
 MOST_VALUES = 500_000  # of a file, each as often as an alias repeats it
 LARGEST = 1e12  # of any number: beyond it powers and products of what is legal are no longer finite
-MOST_LETTERS = 1000  # of a key or a text
 _SHOWN = 40  # letters of a value in a message
-_ALIKE = 100  # names longer than this, or more of them than ten times as many, are not searched for similar ones
 _NAMED = 20  # names in one message
 _LEVELS = 8  # no key lies deeper
 _NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
@@ -85,10 +83,7 @@ def _shown(value: Any) -> str:
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """` (did you mean 'x'?)` with the nearest known name, or an empty string."""
-    known = [other for other in known if len(other) <= _ALIKE]
-    if len(name) > _ALIKE or len(known) > 10 * _ALIKE:
-        return ""
-    match = difflib.get_close_matches(name, known, n=1, cutoff=0.55)
+    match = difflib.get_close_matches(name[:100], itertools.islice(known, 1000), n=1, cutoff=0.55)
     return f" (did you mean '{match[0]}'?)" if match else ""
 
 
@@ -193,8 +188,6 @@ class Vector:
 def _text(text: str) -> str:
     if not text.strip():
         raise _problem(f"must be a text (got {_shown(text)})")
-    if len(text) > MOST_LETTERS:
-        raise _problem(f"must be a text of at most {MOST_LETTERS} letters (got {len(text)})")
     return str(text)
 
 
@@ -641,7 +634,7 @@ class SceneTable(Table):
 
 def _name(value: Any) -> str:
     """A name that can be looked for; empty where the value is a fault of its own."""
-    return str(value) if isinstance(value, str) and value.strip() and len(value) <= MOST_LETTERS else ""
+    return str(value) if isinstance(value, str) and value.strip() else ""
 
 
 def _nobody(name: str, known: Iterable[str]) -> str:
@@ -665,49 +658,29 @@ class Document:
 
     def __init__(self, path: Path, text: str | None = None) -> None:
         self._path = path
-        self._root = _compose(path, _text_of(path) if text is None else text)
-        self._read_so_far = 0
-        self._children: dict[int, dict] = {}  # of a mapping's node by its id: (node of the key, of the value) by key
+        self._line: dict[Loc, int] = {}  # of every value
+        self._key_line: dict[Loc, int] = {}
         self._found: dict[tuple[int, str], None] = {}  # in the order of the finding, each once
-        self.data = self._read(self._root, ())
+        self.data = self._read(_compose(path, _text_of(path) if text is None else text), ())
 
-    def wrong(self, loc: Loc, text: str, *, key: bool = False) -> None:
-        """Note a fault at the value under `loc`, or at its key."""
-        node = self._root
-        for depth, part in enumerate(loc, 1):
-            pair = self._below(node).get(part)
-            if pair is None:
-                break
-            node = pair[0] if key and depth == len(loc) else pair[1]
-        self._add(node, loc, text)
+    def wrong(self, loc: Loc, text: str, *, key: bool = False, line: int = 0) -> None:
+        """Note a fault at the value under `loc`, at its key, or at a line."""
+        known = next(loc[:depth] for depth in range(len(loc), -1, -1) if loc[:depth] in self._line)
+        line = line or (self._key_line.get(loc, 0) if key else 0) or self._line[known]
+        where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc)[1:200]
+        self._found[line, f"{self._path}:{line}: {where}: {text}" if loc else f"{self._path}:{line}: {text}"] = None
 
     def check(self) -> None:
         """Raise SceneError with every fault, in the order of the file, if there is any."""
         if self._found:
             raise SceneError([text for _, text in sorted(self._found, key=lambda entry: entry[0])])
 
-    def _add(self, node: yaml.Node, loc: Loc, text: str) -> None:
-        where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc)[1:]
-        line = node.start_mark.line + 1
-        self._found[line, f"{self._path}:{line}: {where}: {text}" if loc else f"{self._path}:{line}: {text}"] = None
-
-    def _below(self, node: yaml.Node) -> dict[Any, tuple[yaml.Node, yaml.Node]]:
-        if id(node) not in self._children:
-            pairs: dict[Any, tuple[yaml.Node, yaml.Node]] = {}
-            if isinstance(node, yaml.SequenceNode):
-                pairs = {i: (child, child) for i, child in enumerate(node.value)}
-            for key, child in node.value if isinstance(node, yaml.MappingNode) else ():
-                if isinstance(key, yaml.ScalarNode):
-                    pairs.setdefault(key.value, (key, child))
-            self._children[id(node)] = pairs
-        return self._children[id(node)]
-
     def _read(self, node: yaml.Node, loc: Loc) -> Any:
-        self._read_so_far += 1
-        if self._read_so_far > MOST_VALUES:
+        self._line[loc] = node.start_mark.line + 1
+        if len(self._line) > MOST_VALUES:
             raise SceneError([f"{self._path}:1: with its aliases it has more than {MOST_VALUES} values"])
         if node.tag not in _PLAIN_TAGS:
-            self._add(node, loc, f"must be plain YAML without tags (got {node.tag!r})")
+            self.wrong(loc, f"must be plain YAML without tags (got {node.tag!r})")
         if len(loc) > _LEVELS:
             return "..."
         if isinstance(node, yaml.SequenceNode):
@@ -717,17 +690,15 @@ class Document:
             number = plain and (_NUMBER.fullmatch(node.value) or _NOT_FINITE.fullmatch(node.value))
             return NOTHING if plain and node.value in _NULL else Numeral(node.value) if number else node.value
         found: dict[str, Any] = {}
-        first: dict[str, int] = {}
         for key_node, child in node.value:
-            key = key_node.value
+            key, line = key_node.value, key_node.start_mark.line + 1
             if not isinstance(key_node, yaml.ScalarNode) or key_node.tag not in _PLAIN_TAGS:
-                self._add(key_node, loc, "a key must be a text without tags")
-            elif len(key) > MOST_LETTERS:
-                self._add(key_node, loc, f"a key of {len(key)} letters (at most {MOST_LETTERS})")
-            elif key in first:
-                self._add(key_node, (*loc, key), f"the key appears twice (first on line {first[key]})")
+                self.wrong(loc, "a key must be a text without tags", line=line)
+            elif key in found:
+                first = self._key_line[*loc, key]
+                self.wrong((*loc, key), f"the key appears twice (first on line {first})", line=line)
             else:
-                first[key] = key_node.start_mark.line + 1
+                self._key_line[*loc, key] = line
                 found[key] = self._read(child, (*loc, key))
         return found
 
@@ -751,14 +722,11 @@ def _text_of(path: Path) -> str:
 def _compose(path: Path, text: str) -> yaml.Node:
     try:
         root = yaml.compose(text, Loader=yaml.SafeLoader)
-    except yaml.MarkedYAMLError as error:
-        line = error.problem_mark.line + 1 if error.problem_mark else 1
-        raise SceneError([f"{path}:{line}: not valid YAML: {error.problem or error.context}"]) from error
-    except yaml.reader.ReaderError as error:
-        line = text[: error.position].count("\n") + 1
-        raise SceneError([f"{path}:{line}: not valid YAML: {error.reason}"]) from error
     except (yaml.YAMLError, RecursionError) as error:
-        raise SceneError([f"{path}:1: not valid YAML: {type(error).__name__}"]) from error
+        mark, place = getattr(error, "problem_mark", None), getattr(error, "position", None)
+        line = mark.line + 1 if mark else text[:place].count("\n") + 1 if place is not None else 1
+        why = next((told for name in ("problem", "context", "reason") if (told := getattr(error, name, None))), "")
+        raise SceneError([f"{path}:{line}: not valid YAML: {why or type(error).__name__}"]) from error
     if root is None:
         raise SceneError([f"{path}:1: the file is empty"], "a scene needs at least version and bodies")
     return root
