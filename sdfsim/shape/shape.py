@@ -64,6 +64,7 @@ class Shape:
         source: where it came from and a content hash (for caching and for the record).
         pieces: the vertices [V, 3] float64 m of each of its convex pieces, where it was made of such.
         skin: a mesh with a texture that is shown in place of `mesh`, where there is one.
+        faces: [F, 3] int64 triangles between the nodes, where these are the vertices of a mesh; never stored.
     """
 
     name: str
@@ -77,6 +78,7 @@ class Shape:
     source: dict = field(default_factory=dict)
     pieces: tuple[np.ndarray, ...] = ()
     skin: Mesh | None = None
+    faces: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), dtype=np.int64))
 
     @property
     def shown(self) -> Mesh:

@@ -56,8 +56,7 @@ def test_the_certificate_of_the_truth_is_clean_and_json(cube: MeshDistance) -> N
     got = certify(CUBE, cube, points=2000)
     assert got["passed"]
     assert got["reason"] == ""
-    assert max(got[key] for key, _ in EXACT) < 1e-5
-    assert got["gradient_norm"] == pytest.approx([1.0, 1.0], abs=1e-6)
+    assert max(got[key] for key in EXACT) < 1e-5
     assert got["far_field_ratio"] == pytest.approx(1.0, abs=1e-5)
     assert "coverage" not in got
     assert json.loads(json.dumps(got, allow_nan=False)) == got
@@ -69,16 +68,16 @@ def test_the_certificate_of_a_lie_is_not(cube: MeshDistance) -> None:
     assert not got["passed"]
     assert "allowed" in got["reason"]
     assert got["sign_errors"] > 0.1
-    assert not verdict({key: float("nan") for key, _ in EXACT})["passed"]
+    assert not verdict({key: float("nan") for key in EXACT})["passed"]
 
 
 def test_what_is_usable_but_not_exact_passes_with_a_caveat(cube: MeshDistance) -> None:
-    assert all(dict(EXACT)[key] < limit for key, limit in USABLE)
+    assert all(EXACT[key] < limit for key, limit in USABLE.items())
     got = certify(shifted(CUBE, 0.0012), cube, points=500)
     assert got["passed"] and got["reason"] == ""
     assert got["caveat"] == "error_within_0.01 is 0.0012, exact fits have 0.001: fine detail, or too short a fit"
-    assert verdict(dict(EXACT)) == {"passed": True, "reason": "", "caveat": ""}
-    at_limit = verdict(dict(EXACT) | dict(USABLE))
+    assert verdict(EXACT) == {"passed": True, "reason": "", "caveat": ""}
+    at_limit = verdict(EXACT | USABLE)
     assert at_limit["passed"] and at_limit["caveat"]
 
 
@@ -103,7 +102,6 @@ def test_a_ball_that_is_too_small_is_off_by_as_much_all_around() -> None:
 
 def test_slopes_and_the_far_field_are_told(cube: MeshDistance) -> None:
     got = certify(scaled_up(CUBE, 1.2), cube, points=2000)
-    assert got["gradient_norm"] == pytest.approx([1.2, 1.2], abs=1e-6)
     assert got["far_field_ratio"] == pytest.approx(1.2, abs=1e-5)
     assert got["gradient_within_0.1"] < 1e-6
     assert got["projected_from_0.1"] < 1e-5
@@ -150,11 +148,8 @@ def test_the_coverage_of_known_nodes_on_a_cube(cube: MeshDistance) -> None:
     corners = cube.surface.vertices
     got = coverage(corners, cube)
     assert got["count"] == 8
-    assert got["per_area"] == pytest.approx(8 / 6)
     # The middle of a face is farthest from its corners.
     assert got["largest_hole"] == pytest.approx(0.5**0.5, abs=0.01)
-    # Mean distance from a uniform point of a square with half sides to its corner: 0.5 (sqrt 2 + asinh 1) / 3.
-    assert got["mean_gap"] == pytest.approx(0.5 * (2**0.5 + np.arcsinh(1.0)) / 3, abs=0.005)
     # Eight corners with three quarter discs of radius 0.1 each.
     assert got["uncovered"] == pytest.approx(1 - np.pi * 0.1**2 * 6 / 6, abs=0.005)
     assert got["off_surface"] < 1e-6
