@@ -1,14 +1,16 @@
-"""Files that are whole or absent: written under a temporary name, then renamed. Arrays without pickle."""
+"""Files that are whole or absent: written under a temporary name, then renamed. Arrays without pickle. Digests."""
 
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import json
 import os
 import tempfile
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -161,3 +163,31 @@ def check_own(folder: Path, command: str, *names: str) -> None:
             f"{folder / there[0]}: in the way, and not replaced: not from an earlier `sdfsim {command}`",
             "choose another folder to write to, or move it away",
         )
+
+
+def digest(*parts: Any) -> str:
+    """Changes with the content of `parts`: arrays, tensors, networks, dataclasses, and what Python has of its own."""
+    told = hashlib.sha256()
+    _feed(told, parts)
+    return told.hexdigest()[:32]
+
+
+def _feed(told: Any, value: Any) -> None:
+    if hasattr(value, "state_dict"):  # a network
+        value = [type(value).__name__, dict(value.state_dict())]
+    elif hasattr(value, "detach"):  # a tensor
+        value = value.detach().cpu().numpy()
+    if isinstance(value, np.ndarray):
+        told.update(f"{value.dtype}{value.shape}".encode() + np.ascontiguousarray(value).tobytes())
+    elif isinstance(value, dict):
+        _feed(told, [[str(key), value[key]] for key in sorted(value, key=str)])
+    elif isinstance(value, list | tuple):
+        told.update(f"{len(value)}[".encode())
+        for item in value:
+            _feed(told, item)
+    elif is_dataclass(value) and not isinstance(value, type):
+        _feed(told, [type(value).__name__, *([field.name, getattr(value, field.name)] for field in fields(value))])
+    elif value is None or isinstance(value, str | int | float | bool | np.generic | Path):
+        told.update(repr(value).encode() + b";")
+    else:
+        raise TypeError(f"no digest of a {type(value).__name__}")

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import shutil
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import fields, is_dataclass, replace
+from collections.abc import Callable
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -28,6 +27,7 @@ from sdfsim.files import (
     CONFIG,
     check_own,
     check_writable,
+    digest,
     locked,
     read_arrays,
     read_json,
@@ -448,27 +448,9 @@ def finished(report_file: Path, identity: str, steps: int, *, until_settled: boo
 
 def identity(simulator: Simulator) -> str:
     """A hash of all that decides how a run goes: bodies with their paths and distances, start, rules, units, model."""
-    s, told = simulator, hashlib.sha256()
-    model = (s.model.kind, s.model.reach, *s.model.network.state_dict().items())
-    for piece in _pieces((s.dt, s.seed, replace(s.rules, rows=None), s.units, s.bodies, s.state, model)):
-        told.update(piece)
-    return told.hexdigest()
-
-
-def _pieces(value: Any) -> Iterator[bytes]:
-    """All that `value` is made of, to the last bit."""
-    if isinstance(value, torch.Tensor):
-        value = value.cpu().numpy()
-    if isinstance(value, np.ndarray):
-        yield f"{value.dtype}{value.shape}".encode()
-        yield np.ascontiguousarray(value).tobytes()
-    elif is_dataclass(value) or isinstance(value, tuple):
-        parts = value if isinstance(value, tuple) else [getattr(value, field.name) for field in fields(value)]
-        yield f"{type(value).__name__}{len(parts)}".encode()
-        for part in parts:
-            yield from _pieces(part)
-    else:
-        yield repr(value).encode()
+    s = simulator
+    model = (s.model.kind, s.model.reach, s.model.network)
+    return digest(s.dt, s.seed, replace(s.rules, rows=None), s.units, s.bodies, s.state, model)
 
 
 def _part(number: int) -> str:

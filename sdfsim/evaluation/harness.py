@@ -6,8 +6,6 @@ into one JSON file, so that an interrupted study goes on where it was.
 
 from __future__ import annotations
 
-import dataclasses
-import hashlib
 import multiprocessing
 import platform
 from collections.abc import Callable, Iterator, Sequence
@@ -19,11 +17,10 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from torch import nn
 
 import sdfsim
 from sdfsim.errors import SdfsimError
-from sdfsim.files import read_json, replacing, write_json
+from sdfsim.files import digest, read_json, replacing, write_json
 from sdfsim.parallel import parallel
 
 Progress = Callable[[float, str], None]
@@ -122,36 +119,6 @@ def _kept(file: Path, mark: str) -> dict[str, Any] | None:
         return content["result"] if content["digest"] == mark else None
     except (SdfsimError, KeyError, TypeError):
         return None
-
-
-def digest(*parts: Any) -> str:
-    """Changes with the content of `parts`: arrays, tensors, networks, dataclasses, and what Python has of its own."""
-    told = hashlib.sha256()
-    _feed(told, parts)
-    return told.hexdigest()[:16]
-
-
-def _feed(told: Any, value: Any) -> None:
-    if isinstance(value, torch.Tensor):
-        value = value.detach().cpu().numpy()
-    if isinstance(value, np.ndarray):
-        told.update(f"{value.dtype}{value.shape}".encode() + np.ascontiguousarray(value).tobytes())
-    elif isinstance(value, nn.Module):
-        _feed(told, [type(value).__name__, dict(value.state_dict())])
-    elif isinstance(value, dict):
-        for key in sorted(value, key=str):
-            _feed(told, [str(key), value[key]])
-    elif isinstance(value, list | tuple):
-        told.update(f"{len(value)}[".encode())
-        for item in value:
-            _feed(told, item)
-    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
-        told.update(type(value).__name__.encode())
-        _feed(told, [[field.name, getattr(value, field.name)] for field in dataclasses.fields(value)])
-    elif value is None or isinstance(value, str | int | float | bool | np.generic | Path):
-        told.update(repr(value).encode() + b";")
-    else:
-        raise TypeError(f"no digest of a {type(value).__name__}")
 
 
 def machine() -> str:

@@ -5,7 +5,6 @@ A network is what a shape is stored and shipped as; a look into a grid is a hund
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import os
 from collections.abc import Sequence
@@ -16,11 +15,11 @@ import numpy as np
 import torch
 
 from sdfsim.errors import SdfsimError
-from sdfsim.files import read_arrays, write_arrays
+from sdfsim.files import digest, read_arrays, write_arrays
 from sdfsim.shape.distance import PiecesDistance
 from sdfsim.shape.mesh import convex_hull
 from sdfsim.shape.mlp_sdf import MlpSdf
-from sdfsim.shape.sdf import GridSdf, Sdf
+from sdfsim.shape.sdf import Sdf
 
 BAKE_VERSION = 1
 SIDE = 8  # cells of a brick along each side
@@ -67,7 +66,7 @@ def baked(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = (), cache_
     """
     if cache_dir is None:
         cache_dir = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sdfsim" / "baked"
-    path = cache_dir / f"{_digest(sdf, pieces)}-{BAKE_VERSION}.npz"
+    path = cache_dir / f"{digest(sdf, [*pieces], CELLS, FINEST)}-{BAKE_VERSION}.npz"
     if path.is_file():
         try:
             kept = read_arrays(path, "a baked grid", "delete it")
@@ -189,25 +188,3 @@ def _ask(sdf: Sdf, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     with torch.no_grad():
         distance, gradient = sdf(torch.from_numpy(np.ascontiguousarray(points)))
     return distance.cpu().numpy(), gradient.cpu().numpy()
-
-
-def _digest(sdf: Sdf, pieces: Sequence[np.ndarray]) -> str:
-    """Changes with all that a grid depends on."""
-    told = hashlib.sha256(f"{type(sdf).__name__} {CELLS} {FINEST}".encode())
-    if isinstance(sdf, MlpSdf):
-        parts = [*sdf.weights, *sdf.biases, torch.tensor(sdf.mirrors)]
-        told.update(f"{sdf.architecture}{sdf.frame.centre}{sdf.frame.scale}".encode())
-    elif isinstance(sdf, GridSdf):
-        parts = [sdf.values]
-        told.update(f"{sdf.frame.centre}{sdf.frame.scale}".encode())
-    else:
-        mesh = getattr(sdf, "mesh", None)
-        if mesh is None:
-            raise SdfsimError(f"an SDF of type {type(sdf).__name__} cannot be baked")
-        told.update(mesh.digest().encode())
-        parts = []
-    for part in parts:
-        told.update(part.detach().cpu().numpy().tobytes())
-    for array in (sdf.bounds, *pieces):
-        told.update(np.ascontiguousarray(array).tobytes())
-    return told.hexdigest()[:32]

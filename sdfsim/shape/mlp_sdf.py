@@ -52,11 +52,6 @@ class MlpSdf:
     def device(self) -> torch.device:
         return self.weights[0].device
 
-    @property
-    def architecture(self) -> tuple:
-        """Activation, and [out, in] of every layer."""
-        return (self.activation, *(tuple(weight.shape) for weight in self.weights))
-
     def to(self, device: torch.device | str) -> MlpSdf:
         """The same network on `device`."""
         weights, biases = (tuple(part.to(device) for part in parts) for parts in (self.weights, self.biases))
