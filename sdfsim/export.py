@@ -28,7 +28,8 @@ from sdfsim.run import read_run
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.scene.scene_file import load_scene
-from sdfsim.shape.mesh import Mesh, convex_hull
+from sdfsim.shape.gltf import Gltf
+from sdfsim.shape.mesh import Mesh, convex_hull, wavefront
 from sdfsim.shape.sdf import BoxSdf, CapsuleSdf, ClosedForm, CylinderSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape, own_pieces
 
@@ -255,9 +256,7 @@ def _cut(take: Take, wanted: Callable[[Body], bool], on_progress: Progress) -> d
 
 
 def _write_obj(folder: Path, name: str, mesh: Mesh) -> Path:
-    lines = ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in mesh.vertices]
-    lines += ["f {} {} {}".format(*(face + 1)) for face in mesh.faces]
-    write_text(folder / f"{name}.obj", "\n".join(lines) + "\n")
+    write_text(folder / f"{name}.obj", wavefront([mesh]))
     return folder / f"{name}.obj"
 
 
@@ -319,96 +318,41 @@ def _missing(take: Take, *, motion: bool = False, textures: bool = False) -> lis
 
 
 def _glb(take: Take, out: Path, on_progress: Progress) -> Written:
-    import trimesh
-    from trimesh.exchange.gltf import export_glb
-    from trimesh.visual import TextureVisuals
-    from trimesh.visual.material import PBRMaterial
-
-    scene: Any = trimesh.Scene()
-    # One turn at the root takes z up to y up.
-    upright = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-    scene.graph.update(frame_from=scene.graph.base_frame, frame_to="root", matrix=upright)
-    light: dict[str, np.ndarray] = {}
-    shaded: dict[int, tuple[Mesh, np.ndarray]] = {}
-    for name, body, shape, color in take.each():
-        if body.shape not in shaded:
-            shaded[body.shape] = with_normals(take.display(shape))
-        mesh, normals = shaded[body.shape]
-        # Bodies of one shape and colour share a mesh; of one shape they share its numbers.
-        own = mesh.colors is not None or mesh.texture is not None
+    file = Gltf()
+    # Bodies of one shape and colour share a mesh; of one shape they share its numbers.
+    numbers: dict[int, tuple[dict[str, int], int]] = {}
+    drawn: dict[str, int] = {}
+    time = file.array(take.time) if take.moving else 0
+    samplers, channels = [], []
+    for k, (name, body, shape, color) in enumerate(take.each()):
+        shown = take.display(shape)
+        own = shown.colors is not None or shown.texture is not None
+        if body.shape not in numbers:
+            mesh, normals = with_normals(shown)
+            attributes = {"POSITION": file.array(mesh.vertices), "NORMAL": file.array(normals)}
+            if mesh.uv is not None:
+                attributes["TEXCOORD_0"] = file.array(mesh.uv)
+            if mesh.colors is not None:  # in 16 bits: 8 are too few for dark colours once they count light
+                light = np.pad(_linear(mesh.colors), ((0, 0), (0, 1)), constant_values=1.0)
+                attributes["COLOR_0"] = file.array(np.round(65535 * light), "<u2")
+            numbers[body.shape] = attributes, file.array(mesh.faces.reshape(-1), "<u4")
         key = take.shapes[body.shape] + ("" if own else "-{:02x}{:02x}{:02x}".format(*color))
-        if key not in scene.geometry:
-            base = np.ones(3) if own else _linear(color)
-            material = PBRMaterial(
-                name=key,
-                baseColorFactor=[*base, 1.0],
-                baseColorTexture=None if mesh.texture is None else _jpeg(mesh.texture),
-                metallicFactor=0.0,
-                roughnessFactor=0.8,
-                doubleSided=True,
-            )
-            # trimesh counts up from the lower edge of a texture.
-            uv = None if mesh.uv is None else mesh.uv * [1.0, -1.0] + [0.0, 1.0]
-            visual = TextureVisuals(uv=uv, material=material)
-            scene.geometry[key] = trimesh.Trimesh(
-                mesh.vertices, mesh.faces, vertex_normals=normals, visual=visual, process=False
-            )
-            if mesh.colors is not None:
-                light[key] = _linear(mesh.colors)
-        scene.graph.update(frame_from="root", frame_to=name, geometry=key)
-
-    def finish(buffers: Any, tree: dict[str, Any]) -> None:
-        def accessor(values: np.ndarray, kind: str) -> int:
-            number = len(buffers)
-            buffers[f"sdfsim {number}"] = values.tobytes()
-            told = {"bufferView": number, "byteOffset": 0, "count": len(values), "type": kind}
-            told |= (
-                {"componentType": 5126} if values.dtype == np.float32 else {"componentType": 5123, "normalized": True}
-            )
-            rows = values.reshape(len(values), -1)
-            tree["accessors"][f"sdfsim {number}"] = told | {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()}
-            return len(tree["accessors"]) - 1
-
-        for mesh in tree["meshes"]:
-            if mesh["name"] in light:
-                # trimesh writes 8 bits, too few for dark colours once they count light.
-                rgba = np.pad(light[mesh["name"]], ((0, 0), (0, 1)), constant_values=1.0)
-                colors = accessor(np.round(65535 * rgba).astype(np.uint16), "VEC4")
-                mesh["primitives"][0]["attributes"]["COLOR_0"] = colors
-        for material in tree["materials"]:
-            if "baseColorTexture" in material["pbrMetallicRoughness"]:  # it holds the light of the photos
-                material["extensions"] = {"KHR_materials_unlit": {}}
-                tree["extensionsUsed"] = ["KHR_materials_unlit"]
-        nodes = {node["name"]: k for k, node in enumerate(tree["nodes"])}
-        time = accessor(take.time.astype(np.float32), "SCALAR") if take.moving else 0
-        samplers, channels = [], []
-        for k, (name, body) in enumerate(zip(take.names, take.scene.bodies, strict=True)):
-            # An animated node may not have a matrix.
-            place, turn = take.position[:, k].astype(np.float32), take.quat_xyzw[:, k].astype(np.float32)
-            node = tree["nodes"][nodes[name]]
-            node |= {"translation": place[0].tolist(), "rotation": turn[0].tolist(), "scale": [body.scale] * 3}
-            for path, values, kind in (("translation", place, "VEC3"), ("rotation", turn, "VEC4")):
-                if take.moving and body.motion != "static":
-                    channels.append({"sampler": len(samplers), "target": {"node": nodes[name], "path": path}})
-                    samplers.append({"input": time, "output": accessor(values, kind), "interpolation": "LINEAR"})
-        if channels:
-            tree["animations"] = [{"name": "run", "samplers": samplers, "channels": channels}]
-
+        if key not in drawn:
+            material = file.material(key, np.ones(3) if own else _linear(color), shown.texture, rough=0.8)
+            drawn[key] = file.mesh(key, *numbers[body.shape], material)
+        place, turn = take.position[:, k], take.quat_xyzw[:, k]
+        node = {"translation": place[0].tolist(), "rotation": turn[0].tolist(), "scale": [body.scale] * 3}
+        file.nodes.append({"name": name, "mesh": drawn[key], **node})
+        if take.moving and body.motion != "static":
+            for path, values in (("translation", place), ("rotation", turn)):
+                channels.append({"sampler": len(samplers), "target": {"node": k, "path": path}})
+                samplers.append({"input": time, "output": file.array(values), "interpolation": "LINEAR"})
+    if channels:
+        file.animations.append({"name": "run", "samplers": samplers, "channels": channels})
     with replacing(out) as partial:
-        content = export_glb(scene, include_normals=True, buffer_postprocessor=finish)
-        partial.write_bytes(content)
-    return Written(
-        [out], ["masses, friction and all else that is not seen", *_missing(take, motion=True, textures=True)]
-    )
-
-
-def _jpeg(texture: np.ndarray) -> Any:
-    """An image that trimesh writes as it is: JPEG, not PNG of many times the size."""
-    from PIL import Image
-
-    file = io.BytesIO()
-    Image.fromarray(texture).save(file, "JPEG", quality=92, subsampling=0)
-    return Image.open(file)
+        partial.write_bytes(file.to_bytes())
+    unseen = ["masses, friction and all else that is not seen"]
+    return Written([out], unseen + _missing(take, motion=True, textures=True))
 
 
 # --- USD ---

@@ -21,7 +21,7 @@ from sdfsim.shape import primitives
 from sdfsim.shape.distance import PiecesDistance
 from sdfsim.shape.fit import fit_pieces
 from sdfsim.shape.mass import mass_properties, mass_properties_of_sdf
-from sdfsim.shape.mesh import MESH_SUFFIXES, Mesh, convex_hull, is_closed, load_mesh, load_pieces
+from sdfsim.shape.mesh import MESH_SUFFIXES, Mesh, convex_hull, is_closed, load_mesh, load_pieces, wavefront
 from sdfsim.shape.shape import analytic_shape
 from sdfsim.shape.watertight import solidify
 
@@ -264,17 +264,6 @@ def decompose(mesh: Mesh, scratch: Path) -> list[Mesh]:
     finally:
         for file in (before, after, log):
             file.unlink(missing_ok=True)
-
-
-def wavefront(pieces: list[Mesh]) -> str:
-    """Wavefront OBJ with one `o` group a piece."""
-    lines, before = [], 1
-    for number, piece in enumerate(pieces):
-        lines.append(f"o piece_{number}")
-        lines += ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in piece.vertices]
-        lines += ["f {} {} {}".format(*(face + before)) for face in piece.faces]
-        before += len(piece.vertices)
-    return "\n".join(lines) + "\n"
 
 
 def fit_shapes(sources: list[ShapeSource], out: Path, on_progress: Progress) -> None:

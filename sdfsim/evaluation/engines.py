@@ -17,13 +17,13 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim.data.dataset import Trajectory, shapes_folder
 from sdfsim.data.pybullet_sim import DT, SUBSTEPS, Teacher, TeacherBody, substeps_of, write_form_urdf, write_urdf
-from sdfsim.data.shape_assets import decompose, wavefront
+from sdfsim.data.shape_assets import decompose
 from sdfsim.dynamics.bodies import Units, from_scene
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.errors import SdfsimError
 from sdfsim.files import replacing, write_text
 from sdfsim.scene.scene import Scene
-from sdfsim.shape.mesh import Mesh, convex_hull, load_pieces
+from sdfsim.shape.mesh import Mesh, convex_hull, load_pieces, wavefront
 from sdfsim.shape.sdf import BoxSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.shape import Shape, own_pieces
 

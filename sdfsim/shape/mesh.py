@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from sdfsim.errors import SdfsimError
+from sdfsim.shape.gltf import Gltf
 
 # trimesh logs what it passes over, some of it with tracebacks. Whoever wants to see that can still listen.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
@@ -241,70 +242,19 @@ def read_attributes(path: Path, names: Sequence[str]) -> list[np.ndarray]:
         raise SdfsimError(f"{path}: damaged, or without {', '.join(names)} ({error})") from error
 
 
-# What z up is to the y up of glTF: columns of a matrix [4, 4].
-_Y_UP = [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1]
-
-
 def write_glb(meshes: dict[str, Mesh]) -> bytes:
     """Meshes with textures as binary glTF: a node each by its name, all below one that turns them to glTF's y up.
 
     Vertices become single precision, textures JPEG. They hold the light of the photos: nothing else is to light them.
     """
-    from PIL import Image
-
-    content, views, accessors, images, made = bytearray(), [], [], [], []
-
-    def add(data: bytes) -> int:
-        views.append({"buffer": 0, "byteOffset": len(content), "byteLength": len(data)})
-        content.extend(data + bytes(-len(data) % 4))
-        return len(views) - 1
-
-    def array(values: np.ndarray, kind: str, width: str, **limits: list) -> int:
-        component = {"<f4": 5126, "<u4": 5125}[kind]
-        accessor = {"bufferView": add(np.ascontiguousarray(values, kind).tobytes()), "componentType": component}
-        accessors.append({**accessor, "count": len(values), "type": width, **limits})
-        return len(accessors) - 1
-
-    for number, (name, mesh) in enumerate(meshes.items()):
+    file = Gltf()
+    for name, mesh in meshes.items():
         assert mesh.uv is not None and mesh.texture is not None
-        vertices = mesh.vertices.astype(np.float32)
-        limits = {"min": vertices.min(0).tolist(), "max": vertices.max(0).tolist()}
-        places = {
-            "POSITION": array(vertices, "<f4", "VEC3", **limits),
-            "TEXCOORD_0": array(mesh.uv, "<f4", "VEC2"),
-        }
-        corners = array(mesh.faces.reshape(-1), "<u4", "SCALAR")
-        made.append({"name": name, "primitives": [{"attributes": places, "indices": corners, "material": number}]})
-        file = io.BytesIO()
-        Image.fromarray(mesh.texture).save(file, "JPEG", quality=92, subsampling=0)
-        images.append({"bufferView": add(file.getvalue()), "mimeType": "image/jpeg"})
-    count = range(len(made))
-    surface = {"metallicFactor": 0, "roughnessFactor": 1}
-    header = {
-        "asset": {"version": "2.0", "generator": "sdfsim"},
-        "scene": 0,
-        "scenes": [{"nodes": [len(made)]}],
-        "nodes": [{"name": mesh["name"], "mesh": k} for k, mesh in enumerate(made)]
-        + [{"name": "z up", "children": list(count), "matrix": _Y_UP}],
-        "meshes": made,
-        "materials": [
-            {
-                "pbrMetallicRoughness": {**surface, "baseColorTexture": {"index": k}},
-                "extensions": {"KHR_materials_unlit": {}},
-            }
-            for k in count
-        ],
-        "textures": [{"source": k} for k in count],
-        "images": images,
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": len(content)}],
-        "extensionsUsed": ["KHR_materials_unlit"],
-    }
-    text = json.dumps(header).encode()
-    text += b" " * (-len(text) % 4)
-    parts = struct.pack("<2I", len(text), 0x4E4F534A) + text + struct.pack("<2I", len(content), 0x004E4942) + content
-    return struct.pack("<4s2I", b"glTF", 2, 12 + len(parts)) + parts
+        places = {"POSITION": file.array(mesh.vertices), "TEXCOORD_0": file.array(mesh.uv)}
+        corners = file.array(mesh.faces.reshape(-1), "<u4")
+        drawn = file.mesh(name, places, corners, file.material(name, np.ones(3), mesh.texture))
+        file.nodes.append({"name": name, "mesh": drawn})
+    return file.to_bytes()
 
 
 def read_glb(path: Path) -> dict[str, Mesh]:
@@ -480,6 +430,17 @@ def load_pieces(path: str | Path) -> list[Mesh]:
     if not pieces:
         raise SdfsimError(f"{path}: no vertices, so no convex pieces")
     return pieces
+
+
+def wavefront(pieces: list[Mesh]) -> str:
+    """Wavefront OBJ with one `o` group a piece."""
+    lines, before = [], 1
+    for number, piece in enumerate(pieces):
+        lines.append(f"o piece_{number}")
+        lines += ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in piece.vertices]
+        lines += ["f {} {} {}".format(*(face + before)) for face in piece.faces]
+        before += len(piece.vertices)
+    return "\n".join(lines) + "\n"
 
 
 def convex_hull(points: np.ndarray) -> Mesh:
