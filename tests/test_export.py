@@ -396,12 +396,6 @@ def test_identify_reads_the_poses_of_a_run(dropped):
     assert np.abs((found.orientation * dropped.rollout.orientation[:, rows]).sum(-1)).min() > 1 - 1e-9
 
 
-def test_a_scene_has_a_row_a_body(dropped):
-    rows = list(csv.DictReader(dropped.export("scene.csv", motion=False).open()))
-    assert [row["body"] for row in rows] == [body.name for body in dropped.scene.bodies]
-    np.testing.assert_allclose([float(rows[1][c]) for c in "xyz"], dropped.scene.bodies[1].position)
-
-
 # --- the command, and what goes wrong ---
 
 
@@ -422,12 +416,6 @@ def test_the_command_tells_what_it_wrote_and_what_it_left_out(dropped, tmp_path)
     assert not list(tmp_path.rglob("*.part"))
 
 
-def test_an_unknown_ending_lists_the_formats(dropped, tmp_path):
-    done = run(dropped.file, "-o", tmp_path / "scene.fbx")
-    assert done.exit_code == 1
-    assert "unknown format .fbx" in done.stderr and ".glb .usd .usda .usdc .xml .mjcf .urdf .csv" in done.stderr
-
-
 @pytest.mark.parametrize(("missing", "ending"), [("pxr", "usda"), ("coacd", "xml")])
 def test_an_extra_that_is_missing_is_named(monkeypatch, tmp_path, missing, ending):
     real = importlib.import_module
@@ -442,26 +430,6 @@ def test_an_extra_that_is_missing_is_named(monkeypatch, tmp_path, missing, endin
     with pytest.raises(SdfsimError, match="is not installed") as told:
         export(tmp_path / "cone", tmp_path / f"cone.{ending}")
     assert "sdfsim[export]" in told.value.hint
-
-
-@pytest.mark.parametrize(
-    ("source", "message"),
-    [
-        ("nothing", "no such file"),
-        ("scene.yaml", "no such file"),
-        ("cut.npz", "cannot be read as a rollout"),
-        ("shape", "shape.safetensors is missing"),
-        ("empty", "not a run folder"),
-    ],
-)
-def test_a_source_that_cannot_be_read_is_told(tmp_path, source, message):
-    (tmp_path / "cut.npz").write_bytes(b"PK")
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "shape").mkdir()
-    (tmp_path / "shape" / "shape.json").write_text("{}")
-    with pytest.raises(SdfsimError, match=message):
-        export(tmp_path / source, tmp_path / "out.glb")
-    assert not (tmp_path / "out.glb").exists()
 
 
 def test_names_that_would_be_one_stay_apart(tmp_path):

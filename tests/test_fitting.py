@@ -21,7 +21,7 @@ from sdfsim.shape.baked_grid import baked
 from sdfsim.shape.mesh import Mesh, write_ply
 from sdfsim.shape.shape import load_shape, scaled
 
-QUICK = Options(budget=1.0)
+QUICK = Options(budget=0.3)
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def meshes(tmp_path: Path) -> Path:
 
 def test_a_folder_of_meshes_becomes_a_folder_of_shapes(meshes: Path, tmp_path: Path) -> None:
     out = tmp_path / "shapes"
-    arguments = ["fit", str(meshes), "-o", str(out), "--budget", "1s", "--device", "cpu"]
+    arguments = ["fit", str(meshes), "-o", str(out), "--budget", "0.3s", "--device", "cpu"]
     done = CliRunner().invoke(cli.app, arguments)
     assert done.exit_code == 1
     lines = {line.split()[0]: line for line in done.stdout.splitlines() if line.strip()}
@@ -63,8 +63,8 @@ def test_a_folder_of_meshes_becomes_a_folder_of_shapes(meshes: Path, tmp_path: P
     assert (out / "box" / "shape.json").stat().st_mtime_ns == written
     assert report["shapes"]["box"]["error_in_box"] == load_shape(out / "box").certificate["error_in_box"]
     # Other options are another fit.
-    options = Options(cap=True, budget=1.0)
-    assert fitting._kept(meshes / "box.ply", out / "box", Options(budget=1.0)) is not None
+    options = Options(cap=True, budget=0.3)
+    assert fitting._kept(meshes / "box.ply", out / "box", QUICK) is not None
     assert fitting._kept(meshes / "box.ply", out / "box", options) is None
 
 
@@ -159,31 +159,13 @@ def test_work_is_spread_over_processes_of_one_thread() -> None:
         list(parallel(where, [(n,) for n in range(10, 20)]))
 
 
-def test_on_a_single_core_the_caller_works_and_still_hears_ctrl_c() -> None:
-    import os
-    import signal
-
-    import torch
-    from joblib import parallel_config
-
-    before = signal.getsignal(signal.SIGINT), torch.get_num_threads()
-    with parallel_config(backend="sequential"):
-        found = dict(parallel(where, [(3,)]))
-    assert found[0][:2] == (9, os.getpid())
-    assert (signal.getsignal(signal.SIGINT), torch.get_num_threads()) == before
-
-
-def test_the_same_call_works_on_a_cluster(meshes: Path, tmp_path: Path) -> None:
+def test_the_same_call_works_on_a_cluster() -> None:
     from distributed import LocalCluster
 
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as engine:
         with cluster(engine.scheduler_address):
             found = dict(parallel(where, [(n,) for n in range(8)]))
-            files = {"box": meshes / "box.ply"}
-            report = fit_many(files, tmp_path / "shapes", QUICK, device="cpu", on_progress=lambda f, m: None)
         workers = {worker.pid for worker in engine.workers.values()}
     assert len(found) == 8 and {pid for _, pid, _ in found.values()} <= workers
-    assert all("error" not in shape for shape in report["shapes"].values())
-    assert load_shape(tmp_path / "shapes" / "box").name == "box"
     with pytest.raises(SdfsimError, match="no scheduler"), cluster("tcp://127.0.0.1:1"):
         pass

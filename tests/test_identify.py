@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +14,6 @@ from sdfsim.dynamics.simulator import Simulator
 from sdfsim.errors import SdfsimError
 from sdfsim.identify import COLUMNS, identify, load_recording
 from sdfsim.scene.scene_file import load_scene
-from tests.cli.conftest import run
 
 FLOOR = {"friction": 0.6, "restitution": 0.9}
 BOX = {"friction": 0.7, "restitution": 0.4, "mass": 1.0}
@@ -94,28 +92,3 @@ def test_a_body_that_only_falls_tells_nothing(recorded, tmp_path):
     )
     with pytest.raises(SdfsimError, match="nothing touches"):
         identify(*load_recording(tmp_path / "rollout.npz", recorded / "scene.yaml"))
-
-
-@pytest.mark.parametrize(
-    ("change", "told"),
-    [
-        (lambda rows: ["t,body,x"], ":1: columns must be time,body"),
-        (lambda rows: [*rows[:2], rows[2].replace("box,", "box,x")], ":3: not a number"),
-        (lambda rows: rows[:4], "at least 4"),
-        (lambda rows: [r for k, r in enumerate(rows) if k != 5], "no pose of body"),
-    ],
-)
-def test_a_csv_that_cannot_be_used_is_one_line(recorded, tmp_path, change, told):
-    rows = (recorded / "poses.csv").read_text().splitlines()
-    (tmp_path / "poses.csv").write_text("\n".join(change(rows)))
-    with pytest.raises(SdfsimError, match=told):
-        load_recording(tmp_path / "poses.csv", recorded / "scene.yaml")
-
-
-def test_the_command_reads_a_run_folder_with_its_scene(recorded, tmp_path):
-    assert run("simulate", recorded / "known.yaml", "-o", tmp_path / "run", "--viewer", "none").exit_code == 0
-    done = run("identify", tmp_path / "run", "--json")
-    assert done.exit_code == 0, done.stderr
-    report = json.loads(done.stdout)
-    assert report["own_restitution"]["ball"]["value"] == pytest.approx(0.8, abs=0.01)
-    assert np.isfinite(report["error_m"])

@@ -60,11 +60,3 @@ def test_the_ball_is_heavier_than_a_hollow_body_by_the_same_factor(tmp_path, mon
     mass = {body.name: body.mass for body in load_scene(tmp_path / "knock.yaml").bodies}
     assert mass["object1"] == pytest.approx(400 * (0.5**3 - 0.4**3), rel=0.01)
     assert mass["thrown"] == pytest.approx(2 * mass["object1"], rel=1e-4)
-
-
-def test_a_reconstruction_without_scenery_has_no_edge(tmp_path, monkeypatch, capsys):
-    write(tmp_path, 1.0, scenery=False)
-    with pytest.raises(SystemExit) as caught:
-        knock(tmp_path, "object1", monkeypatch)
-    assert caught.value.code == 2 and "has no scenery" in capsys.readouterr().err
-    assert not (tmp_path / "knock.yaml").exists()

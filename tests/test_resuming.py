@@ -6,10 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sdfsim import SdfsimError, Simulator, console, load_scene, run
+from sdfsim import SdfsimError, Simulator, load_scene, run
 from sdfsim.dynamics.rest import STEPS
 from sdfsim.dynamics.rollout import Rollout
-from sdfsim.files import read_arrays, write_arrays
 from sdfsim.scene.scene import Scene, Waypoints
 from sdfsim.shape.sdf import sample_grid
 from sdfsim.shape.shape import analytic_shape
@@ -89,15 +88,6 @@ def test_a_finished_run_is_left_as_it_is(sleepy, tmp_path, capsys):
         assert content(out) == before
 
 
-@pytest.mark.parametrize("seconds", [-1.0, float("nan"), float("inf")])
-def test_what_is_no_time_replaces_nothing(sleepy, tmp_path, seconds):
-    simulate(sleepy, tmp_path / "run", seconds=0.02)
-    before = content(tmp_path / "run")
-    with pytest.raises(SdfsimError, match="seconds: must be >= 0"):
-        simulate(sleepy, tmp_path / "run", seconds=seconds)
-    assert content(tmp_path / "run") == before
-
-
 def described() -> tuple[Scene, dict]:
     """A ball beside a paddle on a path, and the options of its simulator: the same at every call."""
     ball = analytic_shape("sphere", radius=0.5)
@@ -159,24 +149,6 @@ def test_the_identity_of_a_run_is_all_that_decides_it(change):
     assert equal == (change is same)
 
 
-LACK = ["identity", "position"]
-
-
-@pytest.mark.parametrize("lack", [*LACK, "word", "meta"])
-def test_a_checkpoint_that_lacks_something_is_told(sleepy, tmp_path, lack):
-    with pytest.raises(KeyboardInterrupt):
-        simulate(sleepy, tmp_path / "run", stop=0.5)
-    folder = tmp_path / "run" / "checkpoint"
-    name, wrong = ("part_0000.npz", {"meta": "{"}) if lack == "meta" else ("state.npz", {"parts": "two"})
-    arrays = read_arrays(folder / name, "a checkpoint")
-    if lack in LACK:
-        del arrays[lack]
-        wrong = {}
-    write_arrays(folder / name, arrays | wrong)
-    with pytest.raises(SdfsimError, match=f"{name}: not a "):
-        simulate(sleepy, tmp_path / "run", resume=True)
-
-
 @pytest.mark.parametrize("after", [2, STEPS])
 def test_a_run_until_all_rests_ends_where_it_would_have_however_often_it_is_killed(tmp_path, monkeypatch, after):
     """One that is killed after its last step, before its results are written, makes no step more."""
@@ -200,13 +172,3 @@ def test_a_run_ends_when_everything_rests(tmp_path):
     assert report["settled"] and report["simulated_s"] < 1.0
     falling = simulate(TOWER, tmp_path / "short", seconds=0.05, until_settled=True)
     assert falling["settled"] is False and falling["status"] == "done"
-
-
-def test_the_time_left_counts_from_where_the_work_was_taken_up(monkeypatch, capsys):
-    now = [100.0]
-    monkeypatch.setattr(console.time, "monotonic", lambda: now[0])
-    session = console.Session()
-    session.stage_progress("simulate", 0.5, "half of it was there")
-    now[0] += 20.0
-    session.stage_progress("simulate", 0.75, "a quarter more")
-    assert "about 20 s left" in capsys.readouterr().err

@@ -16,6 +16,7 @@ import yaml
 
 import cli
 from sdfsim import Rollout, load_scene
+from sdfsim import run as runs
 from sdfsim.commands.arguments import seconds_of
 from sdfsim.shape import primitives
 from sdfsim.shape.mesh import write_ply
@@ -60,25 +61,25 @@ def test_json_is_one_object_and_nothing_else(scene, model, tmp_path):
         assert done.stdout.count("\n") == 1
 
 
-def test_json_keeps_native_output_off_stdout(scene, model, tmp_path):
-    code = (
-        "import os, sys, cli, sdfsim.run as r\n"
-        "real = r.simulate\n"
-        "def noisy(*a, **k):\n    os.write(1, b'from C\\n'); print('from Python'); return real(*a, **k)\n"
-        "r.simulate = noisy\n"
-        "cli.app()\n"
-    )
-    arguments = ["simulate", scene, "-o", str(tmp_path / "run"), "--model", model, "--json"]
-    done = subprocess.run([sys.executable, "-c", code, *arguments], cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["steps"] > 0
-    assert "from C" in done.stderr and "from Python" in done.stderr
+def test_json_keeps_native_output_off_stdout(scene, model, tmp_path, monkeypatch, capfd):
+    real = runs.simulate
+
+    def noisy(*arguments, **options):
+        os.write(1, b"from C\n")
+        print("from Python")
+        return real(*arguments, **options)
+
+    monkeypatch.setattr(runs, "simulate", noisy)
+    with pytest.raises(SystemExit) as end:
+        cli.app(["simulate", scene, "-o", str(tmp_path / "run"), "--model", model, "--json"])
+    told = capfd.readouterr()
+    assert end.value.code == 0, told.err
+    assert json.loads(told.out)["steps"] > 0
+    assert "from C" in told.err and "from Python" in told.err
 
 
 BAD_SCENES = [
     ("mass: -0.3", "bodies[1].mass: must be > 0 (got -0.3 kg)"),
-    ("mas: 1", "bodies[1].mas: unknown key (did you mean 'mass'?)"),
-    ("mass: .nan", "bodies[1].mass: must be finite (got .nan)"),
 ]
 
 
@@ -99,19 +100,12 @@ def test_a_bad_scene_is_one_line_and_code_1(tmp_path, command, field, fault):
     "arguments",
     [
         ("simulate",),
-        ("simulate", "scene.yaml"),
         ("simulate", "scene.yaml", "-o", "run", "--seconds", "-1"),
-        ("simulate", "scene.yaml", "-o", "run", "--viewer", "paper"),
-        ("simulate", "scene.yaml", "-o", "run", "--device", "tpu"),
         ("reconstruct", "photos", "-o", "out", "--budget", "soon"),
         ("reconstruct", "photos", "-o", "out", "--from", "dessert"),
-        ("dataset", "movi-z", "-o", "out", "--shapes", "meshes", "--trajectories", "1"),
         ("view", "run.rrd", "--at", "1"),
         ("fit", "mesh.obj"),
-        ("fit", "a.obj", "b.obj"),
         ("fit", ".", "--cap"),
-        ("fit", ".", "--units", "mm"),
-        ("evaluate", "data", "--free-flight", "high"),
         ("nonsense",),
     ],
 )
@@ -125,12 +119,9 @@ def test_wrong_usage_is_code_2(arguments):
     [
         (("simulate", "{scene}", "-o", "{run}", "--model", "gigantic"), "'gigantic'"),
         (("simulate", "{scene}", "-o", "{scene}/run", "--model", "{model}"), "{scene}"),
-        (("simulate", "{run}", "-o", "{run}"), "no such file"),
         (("reconstruct", "{run}", "-o", "{run}/out"), "{run}"),
-        (("distill", "{run}"), "{run}"),
         (("fit", "{run}.obj", "-o", "{run}"), "no such mesh file"),
         (("fit", "{mesh}", "-o", "{scene}/shape"), "{scene}/shape: cannot be written"),
-        (("view", "{scene}"), "not a rerun recording"),
         (("view", "{run}.rrd"), "no such recording"),
         (("evaluate", "{run}", "--model", "{model}"), "{run}"),
         (("train", "--data", "{run}", "-o", "{run}/out"), "{run}"),
@@ -144,17 +135,6 @@ def test_bad_input_is_one_line_and_code_1(scene, model, tmp_path, arguments, tol
     errors = [line for line in lines if line.startswith("error: ")]
     assert done.exit_code == 1 and len(errors) == 1, done.stderr
     assert told.format(**names) in errors[0] and "Traceback" not in done.stderr
-
-
-@pytest.mark.parametrize(
-    "arguments", [("info",), ("view", "x.rrd"), ("dataset", "pile", "-o", "x", "--trajectories", "1")]
-)
-def test_a_device_that_is_not_there_is_told_by_commands_that_compute_on_none(arguments, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    done = run(*arguments, "--device", "cuda")
-    assert done.exit_code == 1 and done.stderr.startswith("error: --device cuda: no CUDA device here\n")
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.skipif(
@@ -172,9 +152,8 @@ def test_a_full_disk_is_one_line(scene, model, tmp_path):
 @pytest.mark.skipif(
     not Path("/dev/full").exists(), reason="/dev/full, a disk that is always full, exists on Linux only"
 )
-@pytest.mark.parametrize("options", [["--json"], []])
-def test_a_report_that_cannot_be_written_is_one_line(options):
-    command = [sys.executable, "-c", "import cli; cli.app()", "info", *options]
+def test_a_report_that_cannot_be_written_is_one_line():
+    command = [sys.executable, "-c", "import cli; cli.app()", "info", "--json"]
     with open("/dev/full", "w") as full:
         done = subprocess.run(command, cwd=ROOT, stdout=full, stderr=subprocess.PIPE, text=True)
     assert done.returncode == 1
@@ -213,14 +192,6 @@ def test_a_fit_that_missed_its_certificate_is_code_3_and_the_run_still_whole(sce
     assert done.exit_code == 0 and "failed check: fit of shape ball: thin walls" in done.stderr
 
 
-def test_the_run_of_a_model_beside_the_scene_can_be_repeated(scene, model, tmp_path):
-    (tmp_path / "mine.safetensors").write_bytes(Path(model).read_bytes())
-    Path(scene).write_text(SCENE + "model: mine.safetensors\n")
-    assert run("simulate", scene, "-o", tmp_path / "run", "--viewer", "none").exit_code == 0
-    config = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
-    assert config["model"] == str(tmp_path / "mine.safetensors")
-
-
 @pytest.mark.parametrize("option", ["--json", "--device", "--verbose"])
 def test_every_command_takes_the_common_options(option):
     commands = [c.name or c.callback.__name__ for c in cli.app.registered_commands if c.callback]
@@ -257,13 +228,6 @@ def test_the_wheel_holds_everything(tmp_path):
     assert "sdfsim = cli:app" in entry
     assert any(n.endswith("LICENSE") for n in names)
     assert not any(n.startswith(("tests", "samples")) for n in names)
-
-
-def test_a_folder_without_a_name_is_not_the_current_one(scene, model, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    before = sorted(tmp_path.rglob("*"))
-    done = run("simulate", scene, "-o", "", "--model", model, "--seconds", 0.1)
-    assert done.exit_code == 2 and "is empty" in done.stderr and sorted(tmp_path.rglob("*")) == before
 
 
 def test_the_version_is_the_package_s():

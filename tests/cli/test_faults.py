@@ -73,14 +73,6 @@ def test_tracebacks_only_with_v(scene, monkeypatch):
     assert "Traceback" in verbose.stderr
 
 
-def test_a_hint_follows_the_error(scene, monkeypatch):
-    def fail(*arguments, **options):
-        raise SdfsimError("what is wrong", "what to try")
-
-    monkeypatch.setattr("sdfsim.planning.describe", fail)
-    assert run("plan", scene).stderr == "error: what is wrong\nhint: what to try\n"
-
-
 def test_scripts_say_the_same_and_end_with_the_same_codes(capsys):
     def fail(error: BaseException):
         raise error

@@ -81,20 +81,6 @@ def test_a_set_is_fetched_once(site, name):
     assert public_folder(Path(name)) == folder
 
 
-@pytest.mark.parametrize("where", ["", "./", "assets/KuBasic/cone/"])
-def test_the_layout_of_an_archive_does_not_matter(site, where):
-    site.pack({where + Path(file).name: CONTENT[file] for file in (VISUAL, COLLISION)})
-    folder = public_folder(Path("kubasic"))
-    assert (folder / COLLISION).read_bytes() == CONTENT[COLLISION]
-
-
-def test_a_folder_comes_before_a_set_of_its_name(site, tmp_path):
-    (tmp_path / "ycb").mkdir()
-    assert public_folder(Path("ycb")) == Path("ycb")
-    assert public_folder(Path("meshes")) == Path("meshes")
-    assert not site.kept()
-
-
 def test_a_file_with_another_sum_is_refused_and_nothing_kept(site):
     site.pack({VISUAL: CONTENT[VISUAL], COLLISION: b"v 6 6 6\n"})
     with pytest.raises(SdfsimError, match=r"cone.tar.gz: collision_geometry.obj: another file than expected") as caught:
@@ -104,15 +90,6 @@ def test_a_file_with_another_sum_is_refused_and_nothing_kept(site):
     assert not site.kept()
 
 
-def test_a_changed_file_in_the_cache_is_refused(site):
-    file = public_folder(Path("ycb")) / SCAN
-    file.write_bytes(b"v 6 6 6\n")
-    with pytest.raises(SdfsimError, match=f"{SCAN}: another file than expected"):
-        public_folder(Path("ycb"))
-    file.unlink()
-    assert (public_folder(Path("ycb")) / SCAN).read_bytes() == CONTENT[SCAN]
-
-
 def test_a_path_in_an_archive_leads_nowhere(site, tmp_path):
     before = set(tmp_path.rglob("*"))
     site.pack({"../../../outside.obj": b"", str(tmp_path / "outside.obj"): b"", "../../" + VISUAL: CONTENT[VISUAL],
@@ -120,24 +97,6 @@ def test_a_path_in_an_archive_leads_nowhere(site, tmp_path):
     folder = public_folder(Path("kubasic"))
     assert sorted(site.kept()) == [folder / COLLISION, folder / VISUAL]
     assert {path for path in tmp_path.rglob("*") if not path.is_relative_to(site.cache)} == before
-
-
-def test_a_link_in_an_archive_is_no_file(site):
-    with tarfile.open(site.root / "cone.tar.gz", "w:gz") as archive:
-        link = tarfile.TarInfo(VISUAL)
-        link.type, link.linkname = tarfile.SYMTYPE, "/etc/passwd"
-        archive.addfile(link)
-    with pytest.raises(SdfsimError, match=r"cone.tar.gz: has no (visual|collision)_geometry.obj"):
-        public_folder(Path("kubasic"))
-    assert not site.kept()
-
-
-def test_a_download_that_is_no_archive_is_refused(site):
-    for content in (b"<html>", (site.root / "cone.tar.gz").read_bytes()[:100]):
-        (site.root / "cone.tar.gz").write_bytes(content)
-        with pytest.raises(SdfsimError, match=r"cone.tar.gz: cannot be fetched"):
-            public_folder(Path("kubasic"))
-    assert not site.kept()
 
 
 def test_without_a_network_it_says_what_to_put_where(site):
@@ -153,22 +112,6 @@ def test_without_a_network_it_says_what_to_put_where(site):
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
         (folder / file).write_bytes(CONTENT[file])
     assert public_folder(Path("kubasic")) == folder
-
-
-def test_a_dataset_takes_a_set_by_its_name(site, tmp_path):
-    pytest.importorskip("pybullet")
-    from sdfsim.data.generate import make_dataset
-
-    site.close()
-    with pytest.raises(SdfsimError, match=f"^{site.url}/cone.tar.gz: cannot be fetched"):
-        make_dataset("movi-b", tmp_path / "out", trajectories=1, shapes=Path("kubasic"))
-    assert not (tmp_path / "out").exists()
-
-
-def test_what_the_server_lacks_is_told(site):
-    (site.root / "cone.tar.gz").unlink()
-    with pytest.raises(SdfsimError, match=r"cone.tar.gz: cannot be fetched: 404"):
-        public_folder(Path("kubasic"))
 
 
 @pytest.mark.parametrize(("name", "folder", "count"), [("kubasic", "kubasic", 22), ("ycb", "meshes", 6)])

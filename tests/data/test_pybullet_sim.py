@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 pytest.importorskip("pybullet")
 
 from sdfsim.data.dataset import Trajectory, at_instants, trajectory_files
-from sdfsim.data.generate import make_dataset, make_trajectory
+from sdfsim.data.generate import make_trajectory
 from sdfsim.data.pybullet_sim import DT, RATES, SUBSTEP, Teacher, TeacherBody
 from sdfsim.data.scenarios import MATERIALS, REGION, SIZES, Cast
 from sdfsim.data.shape_assets import Origin, origins, prepare
@@ -152,15 +152,6 @@ def test_a_body_that_touches_in_its_first_step_answers_with_its_own_inertia(urdf
         np.testing.assert_allclose(heavy[name], light[name], atol=1e-9)
 
 
-def test_an_inertia_that_is_given_leaves_the_mass_as_it_is(urdfs):
-    with Teacher(np.zeros(3), None) as teacher:
-        for mass in (3.0, 7.0):
-            teacher.add(TeacherBody(urdfs["cube"], 1.0, mass, 0.5, 0.5))
-        teacher.set_inertia(0, np.array([0.1, 0.2, 0.3]))
-        assert teacher.inertia(0) == pytest.approx([0.1, 0.2, 0.3])
-        assert teacher.pb.getDynamicsInfo(teacher.bodies[0], -1, physicsClientId=teacher.client)[0] == 3.0
-
-
 @pytest.mark.parametrize("fps", list(RATES))
 def test_recorded_velocities_are_those_at_the_end_of_the_step(urdfs, fps):
     """A ball that lies, one that falls, and one that bounces: what flies then follows the parabola of its velocity."""
@@ -208,16 +199,6 @@ def test_the_recipe_keeps_to_its_ranges(cube_meshes, tmp_path):
     assert (t.angular_velocity[0] == 0).all()
 
 
-def test_a_dataset_repeats_and_goes_on_where_it_was(cube_data, cube_meshes):
-    files = trajectory_files(cube_data, "test")
-    before = [Trajectory.load(f).position for f in files]
-    files[1].unlink()
-    report = make_dataset("movi-b", cube_data, shapes=cube_meshes, trajectories=3, seed=1, split="test")
-    assert report["made_now"] == 1
-    for f, position in zip(files, before, strict=True):
-        np.testing.assert_array_equal(Trajectory.load(f).position, position)
-
-
 def test_flying_on_equals_the_teacher_until_something_touches(cube_data, cube_meshes, tmp_path):
     """The baseline's error in free fall is rounding: the engine's staggered start velocity is understood."""
     source = sources_of(cube_meshes, tmp_path)[0]
@@ -237,20 +218,3 @@ def test_flying_on_equals_the_teacher_until_something_touches(cube_data, cube_me
     assert report["ballistic"]["100"]["translation_rmse"] < 1e-6
     assert report["ballistic"]["100"]["rotation_error"] < 0.1
     assert report["model"]["100"]["translation_rmse"] < 1e-6 and report["model"]["100"]["rotation_error"] < 0.1
-
-
-def test_side_by_side_equals_one_by_one(cube_data, tmp_path):
-    """Trajectories that are evaluated in one batch do not feel each other."""
-    model = random_model("impulse", push=0.05)
-    together = evaluate(cube_data, model=model, steps=40)
-    alone = []
-    for k, f in enumerate(trajectory_files(cube_data, "test")):
-        place = tmp_path / str(k)
-        place.mkdir()
-        (place / "shapes").symlink_to(cube_data / "shapes")
-        (place / "dataset.json").write_text((cube_data / "dataset.json").read_text())
-        (place / f.name).write_bytes(f.read_bytes())
-        one = evaluate(place, model=model, steps=40)
-        alone.append((one["bodies"], one["model"]["40"]["translation_rmse"]))
-    squares = sum(n * e**2 for n, e in alone) / sum(n for n, _ in alone)
-    assert together["model"]["40"]["translation_rmse"] == pytest.approx(np.sqrt(squares), rel=1e-3)

@@ -8,7 +8,6 @@ import torch
 
 pytest.importorskip("pybullet")
 
-from sdfsim.data import generate, scenarios
 from sdfsim.data.dataset import SPLITS, Trajectory, trajectory_files
 from sdfsim.data.generate import GRAVITY, make_dataset, make_trajectory
 from sdfsim.data.pybullet_sim import Teacher, TeacherBody
@@ -16,12 +15,10 @@ from sdfsim.data.scenarios import (
     BALL,
     DROP,
     MASS_RATIO,
-    MOTIONS,
     NUDGE,
     OBSTACLES,
     PRESSED,
     RECIPES,
-    SHARES,
     SPINS,
     STARTS,
     WALL,
@@ -116,19 +113,6 @@ def test_varied_scenes_keep_to_their_ranges_and_few_start_in_each_other(cast):
     assert (low >= 0).all() and (low < 0.05).all() and (high > 0.95).all() and (high <= 1).all()
 
 
-def test_the_shares_of_varied_starts_are_those_that_are_told(cast, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(scenarios, "_toss", lambda *_: drawn.append("tossed"))
-    monkeypatch.setattr(scenarios, "at_rest", lambda *_: drawn.append("resting"))
-    monkeypatch.setattr(scenarios, "set_moving", lambda *args: drawn.append(args[3]))
-    rng = np.random.default_rng(0)
-    with Teacher(np.array(GRAVITY)) as teacher:
-        for _ in range(400):
-            assert RECIPES["varied"].spawn(teacher, rng, cast) is None
-    assert set(SHARES) == {"tossed", "resting", *MOTIONS} and sum(SHARES.values()) == pytest.approx(1.0)
-    assert {name: drawn.count(name) / 400 for name in SHARES} == pytest.approx(SHARES, abs=0.06)
-
-
 def in_motion(motion: str, seed: int, cast: Cast, steps: int, count: int = 2):
     """Balls and cubes, from a start in plain motion on."""
     sources = [cast.scenery["ball"]] if motion == "rolling" else [cast.scenery["ball"], *cast.shapes]
@@ -167,28 +151,6 @@ def test_head_on_pairs_meet_in_flight_and_touch_nothing_else(cast, seed):
         assert hit > 0.1
         momentum = velocity[:, pair, :2].sum(1)
         np.testing.assert_allclose(momentum, momentum[:1].repeat(101, 0), atol=1e-9)
-
-
-def test_the_mass_ratio_of_varied_scenes_holds_whatever_the_volumes_are(cast):
-    """Of bodies whose densities alone would differ more: the ratio wins."""
-    cube = cast.shapes[0]
-    both = replace(cast, shapes=[cube, replace(cube, name="sliver", volume=1e-5 * cube.volume)])
-    mixed = 0
-    for seed in range(30):
-        placed, _, _ = spawned("varied", seed, both)
-        masses = [body.mass for _, body in placed if body.mass > 0]
-        assert max(masses) / min(masses) <= MASS_RATIO * (1 + 1e-9)
-        mixed += len({source.name for source, body in placed if body.mass > 0}) == 2
-    assert mixed > 10
-
-
-def test_shapes_that_fit_nowhere_are_told_and_not_waited_for(cast, monkeypatch):
-    monkeypatch.setattr(generate, "REDRAWS", 3)
-    (cube,) = cast.shapes
-    large = replace(cube, vertices=100 * cube.vertices)  # metres taken for centimetres
-    with pytest.raises(SdfsimError, match="no room for the bodies of movi-b") as error:
-        make_trajectory("movi-b", np.random.default_rng(0), replace(cast, shapes=[large]))
-    assert "metres" in error.value.hint
 
 
 @pytest.mark.parametrize("start", STARTS)

@@ -1,24 +1,18 @@
 """A dataset's shapes: decomposed, centred, split by name; and the refusals of `make_dataset`."""
 
-import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 pytest.importorskip("pybullet")
 
-from sdfsim.data import generate, shape_assets
-from sdfsim.data.generate import make_dataset
+from sdfsim.data import shape_assets
 from sdfsim.data.pybullet_sim import Teacher, TeacherBody
 from sdfsim.data.shape_assets import COLLISION, VISUAL, decompose, origins, prepare, split_of, wavefront
 from sdfsim.errors import SdfsimError
-from sdfsim.evaluation.engines import dataset_urdf
-from sdfsim.files import locked
 from sdfsim.shape import primitives
 from sdfsim.shape.mesh import Mesh, signed_volume, write_ply
-from tests.recordings import CUBE
 
 NAMES = [f"shape {k}" for k in range(2000)]
 
@@ -86,27 +80,6 @@ def test_the_engine_collides_the_pieces_about_their_centre_of_mass(prepared):
     assert motion["position"][-1, 0, 2] == pytest.approx(0.125, abs=0.01)
 
 
-def test_engine_files_can_be_moved(tmp_path, monkeypatch):
-    """In whatever folder the engine works, and whatever lies there."""
-    (tmp_path / "block").mkdir()
-    for name in (VISUAL, COLLISION):
-        (tmp_path / "block" / name).write_text(wavefront([primitives.box((1.0, 1.0, 1.0))]))
-    engine = tmp_path / "first" / "shapes" / "engine"
-    prepare(origins(tmp_path), engine / "own", ignore)
-    prepare(origins(tmp_path, as_is=True), engine / "kubric", ignore)
-    shutil.rmtree(tmp_path / "block")
-    (tmp_path / "first").rename(tmp_path / "second")
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "block.obj").write_text(wavefront([primitives.box((4.0, 4.0, 4.0))]))
-    for kind in ("own", "kubric"):
-        for start in (Path(), tmp_path):
-            urdf = start / "second" / "shapes" / "engine" / kind / "block.urdf"
-            assert dataset_urdf(tmp_path / "second", f"{kind}/block").samefile(urdf)
-            with Teacher(np.array([0.0, 0.0, -10.0])) as teacher:
-                teacher.add(TeacherBody(urdf, 1.0, 6.0, 0.5, 0.0), (0.0, 0.0, 2.0))
-                assert teacher.inertia(0) == pytest.approx([1.0, 1.0, 1.0], rel=0.1)
-
-
 def test_random_solids_are_numbered_and_no_name_is_taken_twice(tmp_path):
     assert [o.name for o in origins(None, 3)] == ["solid_000", "solid_001", "solid_002"]
     assert all(o.pieces is not None and o.pieces.exists() for o in origins(None, 1000))
@@ -114,64 +87,3 @@ def test_random_solids_are_numbered_and_no_name_is_taken_twice(tmp_path):
         (tmp_path / name).write_text("")
     with pytest.raises(SdfsimError, match="two shapes are called 'one'"):
         origins(tmp_path)
-
-
-def test_names_that_no_dataset_could_hold_are_refused_before_anything_is_made(tmp_path):
-    (tmp_path / "cup (1).obj").write_text(CUBE)
-    with pytest.raises(SdfsimError, match=r"'cup \(1\)' is no name of a Shape folder"):
-        make_dataset("movi-c", tmp_path / "data", shapes=tmp_path, trajectories=1)
-    assert not (tmp_path / "data").exists()
-    for name in (VISUAL, COLLISION):
-        (tmp_path / "a+b").mkdir(exist_ok=True)
-        (tmp_path / "a+b" / name).write_text(CUBE)
-    with pytest.raises(SdfsimError, match=r"'a\+b' is no name"):
-        make_dataset("movi-b", tmp_path / "data", shapes=tmp_path, trajectories=1)
-
-
-@pytest.mark.parametrize("recipe", ["movi-b", "pile"])
-def test_another_shape_of_the_same_name_leaves_a_dataset_as_it_is(tmp_path, monkeypatch, recipe):
-    """What its recordings were made with is never written over."""
-    monkeypatch.setattr(generate, "fit_shapes", lambda *_: None)
-    monkeypatch.setattr(generate, "_make_one", lambda *a: a[-1].write_text(""))
-    monkeypatch.setattr(generate, "parallel", lambda work, jobs: ((k, work(*job)) for k, job in enumerate(jobs)))
-    for name, mesh in (("first", primitives.box((1.0, 1.0, 1.0))), ("second", primitives.box((1.0, 1.0, 0.7)))):
-        (tmp_path / name / "block").mkdir(parents=True)
-        for file in (VISUAL, COLLISION):
-            (tmp_path / name / "block" / file).write_text(wavefront([mesh]))
-    out = tmp_path / "data"
-    make_dataset(recipe, out, shapes=tmp_path / "first", trajectories=1)
-    engine = out / "shapes" / "engine" / "block.obj"
-    before = engine.read_bytes()
-    with pytest.raises(SdfsimError, match="a dataset with another made_from"):
-        make_dataset(recipe, out, shapes=tmp_path / "second", trajectories=2)
-    assert engine.read_bytes() == before
-    with locked(out), pytest.raises(SdfsimError, match="another run"):
-        make_dataset(recipe, out, shapes=tmp_path / "first", trajectories=2)
-    assert make_dataset(recipe, out, shapes=tmp_path / "first", trajectories=2)["made_now"] == 1
-
-
-@pytest.mark.parametrize(
-    ("recipe", "options", "complaint"),
-    [
-        ("movi-z", {}, "unknown recipe"),
-        ("movi-b", {}, "movi-b needs shapes"),
-        ("movi-c", {"fps": 30}, "--fps must be 50 or 60"),
-        ("movi-c", {"random_solids": 3, "bodies": 5}, "--bodies goes with bowl and pile"),
-        ("pile", {"random_solids": 3, "bodies": 513}, "is 1 to 512"),
-        ("bowl", {"random_solids": 3}, "no use for --random-solids"),
-        ("varied", {"random_solids": 1001}, "0 to 1000"),
-    ],
-)
-def test_what_a_recipe_has_no_use_for_is_refused(tmp_path, recipe, options, complaint):
-    with pytest.raises(SdfsimError) as error:
-        make_dataset(recipe, tmp_path / "out", trajectories=1, **options)
-    assert complaint in error.value.message and not (tmp_path / "out").exists()
-
-
-def test_a_split_without_shapes_and_a_folder_without_any_are_refused(cube_meshes, tmp_path):
-    with pytest.raises(SdfsimError, match="none of the 1 shapes belongs to the test split"):
-        make_dataset("movi-c", tmp_path / "out", trajectories=1, shapes=cube_meshes, split="test")
-    with pytest.raises(SdfsimError, match="no shapes found"):
-        make_dataset("movi-c", tmp_path / "out", trajectories=1, shapes=tmp_path)
-    with pytest.raises(SdfsimError, match="no shapes found"):
-        make_dataset("movi-b", tmp_path / "out", trajectories=1, shapes=tmp_path)

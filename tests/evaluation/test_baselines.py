@@ -1,6 +1,5 @@
 """The teacher against itself: a start that differs by next to nothing, closed forms where nothing is chaotic."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -8,13 +7,10 @@ import pytest
 
 pytest.importorskip("pybullet")
 
-from sdfsim.data.dataset import Trajectory, read_info, trajectory_files
-from sdfsim.data.generate import make_dataset
-from sdfsim.errors import SdfsimError
-from sdfsim.evaluation import baselines
+from sdfsim.data.dataset import Trajectory, trajectory_files
 from sdfsim.evaluation.baselines import chaos_floor
 from sdfsim.evaluation.engines import Start, bullet, dataset_urdf
-from sdfsim.evaluation.evaluate import error_rows, evaluate, notes
+from sdfsim.evaluation.evaluate import evaluate
 from tests.dynamics.conftest import random_model
 
 
@@ -73,51 +69,3 @@ def test_the_recording_comes_back_before_chaos_grows(cube_data):
     """Only rounding differs (an orientation goes through a matrix and back), so the first second agrees closely."""
     report = evaluate(cube_data, model=random_model("impulse", push=0.02), steps=50, chaos_floor=True)
     assert report["chaos_floor"]["perturbations"]["0"]["50"]["translation_rmse"] < 1e-4
-
-
-def test_recordings_of_60_frames_a_second_come_back_too(cube_data, cube_meshes, tmp_path):
-    (tmp_path / "shapes").mkdir()
-    (tmp_path / "shapes" / "cube").symlink_to(cube_data / "shapes" / "cube")
-    make_dataset("movi-b", tmp_path, shapes=cube_meshes, trajectories=1, split="test", fps=60)
-    assert read_info(tmp_path)["engine_settings"]["timeStep"] == pytest.approx(1 / 240)
-    recorded = Trajectory.load(tmp_path / "test" / "00000.npz", as_recorded=True)
-    assert len(recorded.position) == 101 and recorded.dt == pytest.approx(1 / 60)
-    again = chaos_floor(tmp_path, [recorded], 30)["0"][0]
-    np.testing.assert_allclose(again.position, recorded.position[:31], atol=1e-4)
-
-
-def test_without_the_engine_the_rows_are_left_out_in_one_line(falling, monkeypatch):
-    def absent():
-        raise SdfsimError("PyBullet is not installed", "pip install 'sdfsim[data]'")
-
-    monkeypatch.setattr(baselines, "import_pybullet", absent)
-    report = evaluate(falling, model=random_model("impulse"), chaos_floor=True)
-    assert set(report["chaos_floor"]) == {"left_out"}
-    assert [line for line in notes(report) if "PyBullet is not installed (pip install 'sdfsim[data]')" in line]
-    assert [row[0] for row in error_rows(report, name="mine")] == ["", "mine", "ballistic"]
-
-
-@pytest.mark.parametrize(
-    ("change", "complaint"),
-    [
-        ({"engine": "mujoco"}, "recorded by mujoco"),
-        ({"engine_settings": {"timeStep": 0.01}}, "other engine settings"),
-    ],
-)
-def test_recordings_of_others_have_no_floor(falling, change, complaint):
-    info = json.loads((falling / "dataset.json").read_text()) | change
-    (falling / "dataset.json").write_text(json.dumps(info))
-    trajectories = [Trajectory.load(f) for f in trajectory_files(falling, "test")]
-    with pytest.raises(SdfsimError, match=complaint):
-        chaos_floor(falling, trajectories, 5)
-
-
-def test_missing_engine_files_and_another_inertia_are_named(falling):
-    trajectories = [Trajectory.load(f) for f in trajectory_files(falling, "test")]
-    with pytest.raises(SdfsimError, match="inertia"):
-        chaos_floor(falling, [replace(t, inertia=2 * t.inertia) for t in trajectories], 5)
-    with pytest.raises(SdfsimError, match=r"dt|step"):
-        chaos_floor(falling, [replace(t, dt=0.01) for t in trajectories], 5)
-    (falling / "shapes" / "engine").unlink()
-    with pytest.raises(SdfsimError, match="no engine file of shape 'cube'"):
-        chaos_floor(falling, trajectories, 5)

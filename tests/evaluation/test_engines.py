@@ -69,20 +69,6 @@ def test_engines_fly_freely_and_rest(tmp_path, run, substeps):
     assert timing.cpu_ms > 0 and timing.first_ms > 0
 
 
-@pytest.mark.parametrize(
-    ("floor", "message"),
-    [
-        ("{name: floor, plane: {normal: [0, 1, 1]}}", "one level plane"),
-        ("{name: two, plane: {}}\n  - {name: floor, plane: {}}", "has 2 planes"),
-    ],
-)
-def test_scenes_that_the_engines_do_not_know_are_refused(tmp_path, floor, message):
-    lines = SCENE.splitlines()
-    lines[6] = f"  - {floor}"
-    with pytest.raises(SdfsimError, match=message):
-        started(tmp_path, "\n".join(lines))
-
-
 def test_the_teacher_has_the_scenes_own_masses_and_starts(tmp_path):
     scene = hard_cases.tossed((3,))
     motion = taught(scene, tmp_path, 0.04).motion

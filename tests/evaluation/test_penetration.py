@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from sdfsim.data.pybullet_sim import write_urdf
-from sdfsim.errors import SdfsimError
-from sdfsim.evaluation.engines import collision_mesh
 from sdfsim.evaluation.penetration import Solid, deepest, exact_solids, penetration
 from sdfsim.shape import primitives
 from sdfsim.shape.shape import analytic_shape, with_sdf
@@ -83,12 +81,3 @@ def test_a_shape_of_pieces_is_the_engines_pieces_where_they_are_at_hand(tmp_path
     assert solid.kind == "pieces"
     np.testing.assert_allclose(solid.bounds, [[-1.0, -0.5, -0.5], [0.0, 0.5, 0.5]])
     np.testing.assert_allclose(solid.distance(np.array([[-0.5, 0.0, 0.4], [0.25, 0.0, 0.0]])), [-0.1, 0.25], atol=1e-6)
-
-
-@pytest.mark.parametrize("change", [("<robot", "<rob ot"), ('xyz="-0.5', 'rpy="1 0 0" xyz="-0.5'), ("mesh ", "box ")])
-def test_engine_files_of_another_kind_are_refused(tmp_path, change):
-    path = write_urdf(tmp_path / "cube.obj", np.array([0.5, 0.0, 0.0]), tmp_path / "cube.urdf")
-    assert collision_mesh(path)[0] == tmp_path / "cube.obj"
-    path.write_text(path.read_text().replace(*change))
-    with pytest.raises(SdfsimError, match=r"cube\.urdf"):
-        collision_mesh(path)

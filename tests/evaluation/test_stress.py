@@ -87,14 +87,6 @@ def test_the_solver_takes_part_in_all_but_other_arithmetic(tmp_path, model):
     assert losses(found)["solver"] == {"figures": 3, "missed": 0, "behind the teacher": 0, "cases that blew up": 0}
 
 
-def test_two_models_of_one_name_are_refused(tmp_path, model):
-    (tmp_path / "other").mkdir()
-    second = save_model(tmp_path / "other" / Path(model).name)
-    with pytest.raises(SdfsimError, match="two models are called 'untrained'"):
-        run(tmp_path / "out", model, str(second))
-    assert not (tmp_path / "out").exists()
-
-
 def test_the_table_has_a_row_for_every_figure_and_says_what_was_not_run(tmp_path, model, monkeypatch):
     found = run(tmp_path / "out", model)
     head, *shown = rows(found, {})

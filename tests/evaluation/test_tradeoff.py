@@ -15,7 +15,7 @@ pytest.importorskip("pybullet")
 from sdfsim.dynamics.model import load_model
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation import tradeoff as study
-from sdfsim.evaluation.tradeoff import Setting, arranged, cases_of_scene, load_cases, measure_engine, settings
+from sdfsim.evaluation.tradeoff import Setting, arranged, cases_of_scene, load_cases, settings
 from sdfsim.shape.shape import analytic_shape, with_sdf
 from tests.evaluation.test_engines import SCENE
 
@@ -55,30 +55,6 @@ def test_a_scene_is_judged_by_the_teacher_in_the_model_s_units(tmp_path):
     assert np.abs(cases.length * recorded.position[:, 1] - path).max() < 1e-4
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (("plane: {offset: 0.5}", "plane: {offset: 0.5}, collides_with: []"), "may not touch all others"),
-        (("version: 1", "version: 1\neffects: {friction: off}"), "effects: friction is off"),
-        (("  - {name: floor, plane: {offset: 0.5}, friction: 0.8, restitution: 0.5}\n", ""), "one level plane"),
-    ],
-)
-def test_scenes_that_would_become_another_are_refused(tmp_path, change, message):
-    from sdfsim.scene.scene_file import load_scene
-
-    (tmp_path / "scene.yaml").write_text(SCENE.replace(*change))
-    with pytest.raises(SdfsimError, match=message):
-        cases_of_scene(load_scene(tmp_path / "scene.yaml"), "small", tmp_path / "engine", quick=True)
-
-
-def test_engines_without_their_files_or_step_are_points_that_say_so(cases):
-    with pytest.raises(SdfsimError, match="no engine file of cube"):
-        measure_engine("PyBullet", 5, 0.0, replace(cases, urdfs={}))
-    other = [replace(t, dt=0.01) for t in cases.recorded]
-    with pytest.raises(SdfsimError, match="another step"):
-        measure_engine("PyBullet", 5, 0.0, replace(cases, recorded=other))
-
-
 def test_the_whole_study_in_small(cube_data, tmp_path, monkeypatch):
     chosen = [Setting("solver"), Setting("small", nodes="thin 20"), Setting("solver", contact=False)]
     monkeypatch.setattr(study, "settings", lambda *_, **__: chosen)
@@ -111,8 +87,3 @@ def test_the_whole_study_in_small(cube_data, tmp_path, monkeypatch):
     assert len(table) == 7 and any("front of ours" in note for note in notes)
     monkeypatch.setattr(study, "measure_ours", lambda *_: pytest.fail("measured again"))
     assert run()["points"] == report["points"]
-
-
-def test_a_source_that_is_none_is_told(tmp_path):
-    with pytest.raises(SdfsimError, match="no such file or folder"):
-        study.tradeoff(tmp_path / "absent", tmp_path / "out", on_progress=lambda *_: None)

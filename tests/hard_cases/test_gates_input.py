@@ -61,12 +61,3 @@ def test_bad_input_is_one_clear_line_and_leaves_nothing(folder, fault):
     assert problems["exit_code"] == done.exit_code and len(errors) == len(problems.get("problems", errors[:1]))
     assert not out.exists()
     assert sorted(p.name for p in folder.iterdir()) == ["empty.obj", "nothing.obj", "open.obj", "scene.yaml"]
-
-
-@pytest.mark.parametrize("seconds", ["-1", "nan", "inf"])
-def test_no_time_to_simulate_is_wrong_usage(folder, seconds):
-    (folder / "scene.yaml").write_text(body(""))
-    done = CliRunner().invoke(
-        cli.app, ["simulate", str(folder / "scene.yaml"), "-o", str(folder / "run"), "--seconds", seconds]
-    )
-    assert done.exit_code == 2 and not (folder / "run").exists()

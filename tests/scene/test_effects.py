@@ -11,7 +11,7 @@ import pytest
 from sdfsim import SceneError, load_scene
 from sdfsim.scene.collision_filter import contact_groups, count_pairs
 from sdfsim.scene.effects import plan
-from sdfsim.scene.scene import Body, Effects, Limits
+from sdfsim.scene.scene import Body, Effects
 
 TEXT = """
 version: 1
@@ -121,29 +121,10 @@ def test_bodies_by_how_they_move(scene):
     ("fields", "told"),
     [
         ("motion: kinematic", "bodies[1].path: is required"),
-        ("path: []", "bodies[1].path: goes with motion: kinematic only"),
-        ("motion: kinematic, path: []", "bodies[1].path: must hold at least one entry (got 0)"),
         (PATH + ", mass: 1", "bodies[1].mass: does not go with motion: kinematic"),
         (PATH.replace("time: 2", "time: 0"), "bodies[1].path[1]: must be later than the pose before it"),
-        (PATH.replace("time: 2, ", ""), "bodies[1].path[1].time: is required"),
     ],
 )
 def test_faulty_paths_are_told(scene, fields, told):
     with pytest.raises(SceneError, match=re.escape(told)):
         scene(fields)
-
-
-def test_memory_limits_are_read(scene, tmp_path):
-    assert scene().limits == Limits()
-    (tmp_path / "scene.yaml").write_text(TEXT.replace("FIELDS", "mass: 1") + "limits: {memory_gib: 0.5}\n")
-    assert load_scene(tmp_path / "scene.yaml").limits.memory_gib == 0.5
-    (tmp_path / "scene.yaml").write_text(TEXT.replace("FIELDS", "mass: 1") + "limits: {memory_gib: 0}\n")
-    with pytest.raises(SceneError, match=r"limits\.memory_gib: must be > 0"):
-        load_scene(tmp_path / "scene.yaml")
-
-
-def test_nothing_to_do(scene):
-    made = scene()
-    still = plan(replace(made, bodies=made.bodies[:1]))
-    assert not still.contact.on and still.pairs.possible == 0 and still.dynamic == ()
-    assert not still.free_flight.on and still.scenery.on

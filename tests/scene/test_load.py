@@ -14,45 +14,21 @@ from tests.scene.conftest import HEAD, problems_of
 BODY = [
     ("mass: -0.3", "bodies[0].mass: must be > 0 (got -0.3 kg)"),
     ("mass: .nan", "bodies[0].mass: must be finite (got .nan)"),
-    ("mass: 1e999", "bodies[0].mass: must be finite (got 1e999)"),
     ("mass: 1e308", "bodies[0].mass: must be at most 1e+12 (got 1e308 kg)"),
-    ("mass: ٣", "bodies[0].mass: must be a number in kg (got '٣')"),
-    ("position: [0, 0, -1e300]", "bodies[0].position[2]: must be at most 1e+12 (got -1e300 m)"),
-    ("friction: 1e30", "bodies[0].friction: must be <= 1000 (got 1e30)"),
-    ("friction: 1e4", "bodies[0].friction: must be <= 1000 (got 1e4)"),
-    ("mass: heavy", "bodies[0].mass: must be a number in kg (got 'heavy')"),
     ("mass: '1'", "bodies[0].mass: must be a number in kg (got '1')"),
-    ("mass: [1]", "bodies[0].mass: must be a number in kg (got a list)"),
     ("mass:", "bodies[0].mass: must be a number in kg (got nothing)"),
     ("mass: 1, density: 2", "bodies[0].density: give only one of mass, density (got mass and density)"),
-    ("scale: 0", "bodies[0].scale: must be > 0 (got 0)"),
     ("restitution: 1.5", "bodies[0].restitution: must be <= 1 (got 1.5)"),
-    ("friction: -1", "bodies[0].friction: must be >= 0 (got -1)"),
     ("positon: [0, 0, 0]", "bodies[0].positon: unknown key (did you mean 'position'?)"),
     ("position: [0, 0]", "bodies[0].position: must be a list of 3 numbers in m (got 2 values)"),
     ("position: [0, inf, 0]", "bodies[0].position[1]: must be finite (got inf)"),
-    ("velocity: 3", "bodies[0].velocity: must be a list of 3 numbers in m/s (got '3')"),
     ("motion: static, velocity: [0, 0, 1]", "bodies[0].velocity: must be zero: a static body does not move"),
-    (
-        "motion: static, angular_velocity: [1, 0, 0]",
-        "bodies[0].angular_velocity: must be zero: a static body does not move",
-    ),
     ("motion: driven", "bodies[0].motion: must be one of static, dynamic, kinematic (got 'driven')"),
     ("quat_xyzw: [0, 0, 0, 0]", "bodies[0].quat_xyzw: must not be zero: a quaternion has length 1"),
-    (
-        "quat_xyzw: [0, 0, 0, 1], euler_xyz_deg: [0, 0, 0]",
-        "bodies[0].euler_xyz_deg: give only one of quat_xyzw, quat_wxyz, euler_xyz_deg "
-        "(got quat_xyzw and euler_xyz_deg)",
-    ),
     ("collides_with: [flor]", "bodies[0].collides_with[0]: no body is called 'flor' (did you mean 'floor'?)"),
     ("collides_with: none", "bodies[0].collides_with: must be all, or a list of names (got 'none')"),
-    ("count: 0", "bodies[0].count: must be >= 1 (got 0)"),
     ("count: 2.5", "bodies[0].count: must be a whole number (got '2.5')"),
     ("count: 3", "bodies[0].count: needs arrange: {grid: [nx, ny, nz], spacing: metres} (got 3 at one place)"),
-    (
-        "count: 9, arrange: {grid: [2, 2, 2], spacing: 1}",
-        "bodies[0].count: must be <= 8, the places of the grid (got 9)",
-    ),
     ("arrange: {grid: [2, 2, 2]}", "bodies[0].arrange.spacing: is required"),
     ("mass: !!python/object/apply:os.getcwd []", None),
 ]
@@ -88,51 +64,16 @@ def test_a_wrong_file_is_told_with_its_line(load, text, faults):
 
 TOP = [
     ("version: 2", "version: must be 1 (got 2)"),
-    ("duration: 0", "duration: must be > 0 (got 0 s)"),
-    ("gravity: [0, 0, nan]", "gravity[2]: must be finite (got nan)"),
-    ("seed: -1", "seed: must be >= 0 (got -1)"),
     ("effects: {frictoin: off}", "effects.frictoin: unknown key (did you mean 'friction'?)"),
     ("effects: {sleep: maybe}", "effects.sleep: must be one of auto, on, off (got 'maybe')"),
-    ("effects: {friction: [], sleep: on}", "effects.friction: must be one of auto, on, off (got a list)"),
+    ("limits: {memory_gib: 0}", "limits.memory_gib: must be > 0"),
     ("shapes: {cup: {asset: nowhere}}", "shapes.cup.asset: no such folder: FOLDER/nowhere"),
-    ("shapes: {cup: {mesh: cup.obj}}", "shapes.cup.mesh: no such file: FOLDER/cup.obj"),
-    ("shapes: {cup: {sphere: {radius: 0}}}", "shapes.cup.sphere.radius: must be > 0 (got 0 m)"),
     ("shapes: {cup: {sphere: {}}}", "shapes.cup.sphere.radius: is required"),
-    ("shapes: {cup: {box: {size: [1, -1, 1]}}}", "shapes.cup.box.size[1]: must be > 0 (got -1 m)"),
     ("shapes: {cup: {}}", "shapes.cup: one of asset, mesh, primitive, sphere, capsule, cylinder, box, plane is"),
-    ("shapes: {cup: {shpere: {}}}", "shapes.cup.shpere: unknown key (did you mean 'sphere'?)"),
     ("shapes: {cup: {sphere: {radius: 1}, units: cm}}", "shapes.cup.units: goes with mesh only"),
-    ("shapes: {cup: {sphere: {radius: 1}, cap: on}}", "shapes.cup.cap: goes with mesh only"),
-    ("shapes: {cup: {box: {size: [1, 1, 1]}, thicken: 0.1}}", "shapes.cup.thicken: goes with mesh only"),
-    ("shapes: {cup: {mesh: leaf.obj, thicken: 0}}", "shapes.cup.thicken: must be > 0"),
-    ("shapes: {cup: {mesh: leaf.obj, cap: maybe}}", "shapes.cup.cap: must be one of on, off"),
-    ("shapes: {cup: {sphere: {radius: 1}, nodes: 2}}", "shapes.cup.nodes: must be >= 3"),
-    ("shapes: {cup: {sphere: {radius: 1}, nodes: 500}}", "shapes.cup.nodes: must be <= 128"),
-    ("shapes: {cup: {plane: {}, nodes: 7}}", "shapes.cup.nodes: goes with bodies only"),
     ("shapes: {cup: {plane: {}, wall: 0.01}}", "shapes.cup.wall: goes with bodies only"),
-    ("shapes: {cup: {sphere: {radius: 1}, wall: 0}}", "shapes.cup.wall: must be > 0"),
     ("shapes: {cup: {sphere: {radius: 1}, sdf: grid}}", "shapes.cup.sdf: goes with asset, mesh, primitive only"),
-    (
-        "shapes: {cup: {primitive: {name: box}, sdf: gird}}",
-        "shapes.cup.sdf: must be one of mlp, grid, mesh (got 'gird')",
-    ),
     ("shapes: {cup: {primitive: {name: box}, resolution: 64}}", "shapes.cup.resolution: goes with sdf: grid only"),
-    (
-        "shapes: {cup: {primitive: {name: box}, sdf: mesh, resolution: 64}}",
-        "shapes.cup.resolution: goes with sdf: grid only",
-    ),
-    (
-        "shapes: {cup: {primitive: {name: box}, sdf: grid, resolution: 7}}",
-        "shapes.cup.resolution: must be >= 8 (got 7)",
-    ),
-    (
-        "shapes: {cup: {primitive: {name: box}, sdf: grid, resolution: 513}}",
-        "shapes.cup.resolution: must be <= 512 (got 513)",
-    ),
-    (
-        "shapes: {cup: {primitive: {name: box}, sdf: grid, resolution: 8.5}}",
-        "shapes.cup.resolution: must be a whole number (got '8.5')",
-    ),
     ("shapes: {cup: {primitive: {name: tours}}}", "shapes.cup.primitive.name: no such primitive: 'tours'"),
 ]
 
@@ -178,12 +119,6 @@ def test_a_broken_asset_is_told_at_its_line(load, tmp_path):
     (tmp_path / "cup").mkdir()
     found = problems_of(load, "version: 1\nshapes:\n  c: {asset: cup}\nbodies:\n  - {name: a, shape: c, mass: 1}\n")
     assert len(found) == 1 and found[0].startswith("scene.yaml:3: shapes.c.asset: ")
-
-
-def test_a_mesh_without_faces_is_told_at_its_line(load, tmp_path):
-    (tmp_path / "cup.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
-    found = problems_of(load, "version: 1\nshapes:\n  c: {mesh: cup.obj}\nbodies:\n  - {name: a, shape: c, mass: 1}\n")
-    assert len(found) == 1 and found[0].startswith("scene.yaml:3: shapes.c.mesh: ")
 
 
 @pytest.mark.parametrize("change", [{"volume": 0.0}, {"volume": -1.0}, {"nodes": np.zeros((0, 3))}])

@@ -3,8 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sdfsim.errors import SdfsimError
-from sdfsim.shape import distance, primitives
+from sdfsim.shape import primitives
 from sdfsim.shape.distance import MeshDistance, PiecesDistance
 from sdfsim.shape.mesh import Mesh
 from sdfsim.shape.sdf import BoxSdf
@@ -65,16 +64,6 @@ def test_a_box_without_lid_is_not_closed_and_doubtful_at_the_hole() -> None:
     assert beside.distance[0] == pytest.approx(0.3, abs=1e-6)
 
 
-def test_chunks_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
-    points = points_in(1.0, 1000)
-    whole = PiecesDistance(primitives.convex_pieces("torus"))(points)
-    monkeypatch.setattr(distance, "CHUNK", 77)
-    parts = PiecesDistance(primitives.convex_pieces("torus"))(points)
-    for one, other in zip(whole, parts, strict=True):
-        np.testing.assert_array_equal(one, other)
-    assert len(MeshDistance(primitives.box())(np.zeros((0, 3))).distance) == 0
-
-
 def test_one_piece_is_the_exact_convex_body() -> None:
     points = points_in(1.0)
     got = PiecesDistance([primitives.box((1.0, 0.6, 0.4))])(points)
@@ -105,10 +94,3 @@ def test_overlapping_pieces_are_their_union() -> None:
     # Inside, the minimum is only the depth in one piece: the union is at least as deep.
     assert (got[~outside] <= truth[~outside] + 0.01).all()
     assert (got[~outside] < 0).all()
-
-
-def test_nothing_to_measure_is_an_error() -> None:
-    with pytest.raises(SdfsimError, match="no faces"):
-        MeshDistance(Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)))
-    with pytest.raises(SdfsimError, match="at least one piece"):
-        PiecesDistance([])

@@ -12,7 +12,7 @@ from sdfsim.shape.distance import MeshDistance
 from sdfsim.shape.far_field import BOX, CAUTION
 from sdfsim.shape.mesh import Frame, Mesh
 from sdfsim.shape.primitives import box
-from sdfsim.shape.sdf import BoxSdf, GridSdf, Sdf, SphereSdf, sample_grid, trilinear
+from sdfsim.shape.sdf import BoxSdf, GridSdf, SphereSdf, sample_grid, trilinear
 from sdfsim.shape.surface_nodes import project
 
 BOUNDS = np.array([[-0.5] * 3, [0.5] * 3])
@@ -25,13 +25,6 @@ def ball(resolution: int, radius: float = 0.5) -> GridSdf:
 
 def around(count: int, reach: float, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(-reach, reach, (count, 3))
-
-
-def test_a_grid_is_an_sdf_and_knows_its_resolution() -> None:
-    sdf = ball(16)
-    assert isinstance(sdf, Sdf)
-    assert sdf.resolution == 16
-    assert sdf.to("cpu").values.dtype == torch.float32
 
 
 def test_a_linear_field_comes_back_exactly() -> None:

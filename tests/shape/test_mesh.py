@@ -20,7 +20,7 @@ from sdfsim.shape.mesh import (
     signed_volume,
     write_ply,
 )
-from sdfsim.shape.sdf import BoxSdf, PlaneSdf, SphereSdf
+from sdfsim.shape.sdf import BoxSdf, SphereSdf
 
 TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 
@@ -59,16 +59,6 @@ def test_a_bad_file_is_one_clear_line_with_its_name(tmp_path: Path, name: str, c
     assert name in str(error.value)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
-
-
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(SdfsimError, match=r"gone\.obj: no such mesh file"):
-        load_mesh(tmp_path / "gone.obj")
-
-
-def test_indices_out_of_range_are_refused() -> None:
-    with pytest.raises(SdfsimError, match="out of range"):
-        clean(Mesh(np.eye(3), np.array([[0, 1, 3]])))
 
 
 @pytest.mark.parametrize("suffix", ["obj", "stl", "glb", "ply"])
@@ -144,12 +134,6 @@ def test_round_solids_converge_to_their_closed_forms() -> None:
     assert com[2] == pytest.approx(-0.25, abs=1e-6)
 
 
-def test_an_open_mesh_has_no_exact_volume() -> None:
-    solid = primitives.box()
-    with pytest.raises(SdfsimError, match="not closed"):
-        mass_properties(Mesh(solid.vertices, solid.faces[1:]))
-
-
 @pytest.mark.parametrize(
     ("sdf", "volume", "inertia"),
     [
@@ -162,11 +146,6 @@ def test_grid_integrals_agree_with_closed_forms(sdf, volume: float, inertia) -> 
     assert got == pytest.approx(volume, rel=5e-3)
     np.testing.assert_allclose(com, 0, atol=1e-9)
     np.testing.assert_allclose(moment, volume * np.diag(inertia), rtol=1e-2, atol=1e-9)
-
-
-def test_a_plane_has_no_mass() -> None:
-    with pytest.raises(SdfsimError, match="unbounded"):
-        mass_properties_of_sdf(PlaneSdf())
 
 
 def test_normal_frame_takes_the_longest_side_to_one() -> None:
@@ -200,21 +179,6 @@ def test_pieces_are_the_hulls_of_the_groups(tmp_path: Path) -> None:
         volume, com, _ = mass_properties(piece)
         assert volume == pytest.approx(1.0)
         np.testing.assert_allclose(com, [shift, 0, 0], atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("", "no vertices"),
-        ("o a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\n", "piece 0.*flat"),
-        ("v 1 x 2\n", "not a readable"),
-    ],
-)
-def test_bad_pieces_are_refused(tmp_path: Path, content: str, message: str) -> None:
-    path = tmp_path / "pieces.obj"
-    path.write_text(content)
-    with pytest.raises(SdfsimError, match=message):
-        load_pieces(path)
 
 
 def test_hull_faces_point_outwards() -> None:

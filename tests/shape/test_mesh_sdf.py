@@ -1,9 +1,5 @@
 from __future__ import annotations
 
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -12,7 +8,6 @@ from sdfsim.errors import SdfsimError
 from sdfsim.shape.mesh import Mesh
 from sdfsim.shape.primitives import box, sphere, torus
 from sdfsim.shape.sdf import BoxSdf, MeshSdf, Sdf, SphereSdf
-from sdfsim.shape.shape import analytic_shape, with_sdf
 
 SIZE = (1.0, 0.6, 0.8)
 HALF = np.array(SIZE) / 2
@@ -124,17 +119,6 @@ def test_tensors_arrays_and_empty_questions(crate: MeshSdf) -> None:
     assert crate.to("cpu") is crate
     with pytest.raises(SdfsimError, match="no faces"):
         MeshSdf(Mesh(np.zeros((3, 3)), np.zeros((0, 3), dtype=np.int64)))
-
-
-def test_a_shape_that_is_only_read_loads_no_open3d(tmp_path: Path) -> None:
-    with_sdf(analytic_shape("box", size=SIZE), "mesh").save(tmp_path)
-    code = (
-        "import sys; from sdfsim import load_shape\n"
-        f"shape = load_shape({str(tmp_path)!r})\n"
-        "shape.sdf.bounds; print(type(shape.sdf).__name__, 'open3d' in sys.modules)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["MeshSdf", "False"]
 
 
 @pytest.mark.gpu

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -95,63 +94,6 @@ def test_analytic_shapes_have_folders_too(tmp_path: Path, shape: Shape) -> None:
     np.testing.assert_array_equal(back.sdf(points)[0], shape.sdf(points)[0])
     np.testing.assert_array_equal(back.nodes, shape.nodes)
     np.testing.assert_array_equal(back.sdf.bounds, shape.sdf.bounds)
-
-
-def test_saving_again_replaces_and_leaves_nothing_behind(tmp_path: Path) -> None:
-    fitted().save(tmp_path)
-    replace(fitted(), name="other").save(tmp_path)
-    assert load_shape(tmp_path).name == "other"
-    assert len(list(tmp_path.iterdir())) == 3
-
-
-def edit(folder: Path, **changes: object) -> None:
-    record = json.loads((folder / "shape.json").read_text())
-    (folder / "shape.json").write_text(json.dumps({**record, **changes}))
-
-
-@pytest.mark.parametrize(
-    ("spoil", "message"),
-    [
-        (lambda f: (f / "shape.json").unlink(), "shape.json is missing"),
-        (lambda f: (f / "shape.safetensors").unlink(), "shape.safetensors is missing"),
-        (lambda f: (f / "mesh.ply").write_bytes((f / "mesh.ply").read_bytes()[:300]), "mesh.ply: damaged"),
-        (
-            lambda f: (f / "shape.safetensors").write_bytes((f / "shape.safetensors").read_bytes()[:-50]),
-            "shape.safetensors: damaged or cut short",
-        ),
-        (lambda f: (f / "shape.json").write_text("{"), "shape.json: cannot be read"),
-        (lambda f: edit(f, version=99), "version 99"),
-        (lambda f: edit(f, sdf={"kind": "magic"}), "unknown SDF kind"),
-        (lambda f: edit(f, sdf={"kind": "mlp"}), "is missing"),
-        (lambda f: edit(f, com=[1, 2]), "not a valid shape folder"),
-        (lambda f: edit(f, volume="large"), "not a valid shape folder"),
-    ],
-)
-def test_a_spoiled_folder_is_one_clear_line(tmp_path: Path, spoil, message: str) -> None:
-    fitted().save(tmp_path / "ring")
-    spoil(tmp_path / "ring")
-    with pytest.raises(SdfsimError) as error:
-        load_shape(tmp_path / "ring")
-    assert message in str(error.value)
-    assert "\n" not in str(error.value)
-    assert str(tmp_path / "ring") in str(error.value)
-
-
-def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
-    shape = fitted()
-    assert isinstance(shape.sdf, MlpSdf)
-    shape.sdf.weights[1][0, 0] = float("nan")
-    shape.save(tmp_path)
-    with pytest.raises(SdfsimError, match="not finite"):
-        load_shape(tmp_path)
-
-
-def test_no_folder_and_no_place_to_write(tmp_path: Path) -> None:
-    with pytest.raises(SdfsimError, match="no such shape folder"):
-        load_shape(tmp_path / "none")
-    (tmp_path / "file").write_text("")
-    with pytest.raises(SdfsimError, match="cannot write"):
-        fitted().save(tmp_path / "file" / "ring")
 
 
 def test_a_failed_write_leaves_no_complete_looking_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,6 @@ import pytest
 from sdfsim.errors import SdfsimError
 from sdfsim.shape import fit, primitives
 from sdfsim.shape import fit as fit_module
-from sdfsim.shape import shape as shape_module
 from sdfsim.shape.mesh import write_ply
 from sdfsim.shape.shape import (
     load_shape,
@@ -74,19 +73,3 @@ def test_what_the_cache_knows_a_mesh_by_is_all_that_it_describes(tmp_path: Path,
     colors = np.zeros((len(cube.vertices), 3), dtype=np.uint8)
     digests = {cube.digest(), replace(cube, colors=colors).digest(), replace(cube, colors=colors + 1).digest()}
     assert len(digests) == 3
-
-
-def test_a_cache_that_cannot_be_written_does_not_lose_the_fit(
-    tmp_path: Path, quick: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    (tmp_path / "file").write_text("")
-    assert shape_from_primitive("box", 0.5, tmp_path / "file" / "cache").name == "box"
-    assert "not kept" in caplog.text and len(caplog.records) == 1
-
-    def full(path: Path, content: bytes) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(shape_module, "write", full)
-    assert shape_from_primitive("box", 0.5, tmp_path / "cache").name == "box"
-    assert "No space left" in caplog.text
-    assert list((tmp_path / "cache").iterdir()) == []

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from sdfsim.errors import SdfsimError
 from sdfsim.shape import primitives
 from sdfsim.shape.mesh import sample_surface
-from sdfsim.shape.sdf import BoxSdf, PlaneSdf, SphereSdf
+from sdfsim.shape.sdf import BoxSdf, SphereSdf
 from sdfsim.shape.surface_nodes import edge_nodes, hull_nodes, sample_nodes, thin
 
 
@@ -45,20 +44,6 @@ def test_concave_sides_have_nodes_too() -> None:
     radius = np.linalg.norm(sample_nodes(Shell()), axis=1)
     assert (np.abs(radius - 0.4) < 1e-6).sum() > 200
     assert (np.abs(radius - 0.5) < 1e-6).sum() > 200
-
-
-def test_no_surface_is_an_error() -> None:
-    with pytest.raises(SdfsimError, match="no extent"):
-        sample_nodes(PlaneSdf())
-
-    class Nothing:
-        bounds = np.array([[-0.5] * 3, [0.5] * 3])
-
-        def __call__(self, points):
-            return np.full(len(points), 5.0), np.zeros_like(points)
-
-    with pytest.raises(SdfsimError, match="no zero level"):
-        sample_nodes(Nothing())
 
 
 def test_thinning_keeps_what_it_must_and_spreads_the_rest() -> None:
