@@ -79,21 +79,24 @@ def public_folder(shapes: Path, on_progress: Callable[[float, str], None] | None
     if name not in SUMS or shapes.is_dir():
         return shapes
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sdfsim" / "public" / name
-    missing: dict[str, dict[str, str]] = {}
+    missing: dict[str, list[str]] = {}
     for file, expected in SUMS[name].items():
-        if not _is_there(folder / file, expected):
-            missing.setdefault(_url(file), {})[Path(file).name] = file
-    hint = f"put these files into {folder} by hand: {_listed(list(SUMS[name]))}"
+        if (folder / file).is_file():  # people may have put it there, so it is checked each time
+            _check((folder / file).read_bytes(), expected, str(folder / file), "remove it, then it is fetched again")
+        else:
+            missing.setdefault(_url(file), []).append(file)
+    hint = f"put these files into {folder} by hand: {', '.join(SUMS[name])}"
     for url, files in missing.items():
         if on_progress is not None:
             on_progress(0.0, f"fetching {url}")
-        found = _fetched(url, set(files), hint)
-        for last, file in files.items():  # all of them before any is kept
-            _check(found[last], SUMS[name][file], f"{url}: {last}", hint)
-        for last, file in files.items():
+        found = _fetched(url, hint)
+        content = {file: found.get(Path(file).name) or found.get("", b"") for file in files}
+        for file in files:  # all of them before any is kept
+            _check(content[file], SUMS[name][file], f"{url}: {Path(file).name}", hint)
+        for file in files:
             with replacing(folder / file) as partial:
                 partial.parent.mkdir(parents=True, exist_ok=True)
-                partial.write_bytes(found[last])
+                partial.write_bytes(content[file])
     return folder
 
 
@@ -104,56 +107,27 @@ def _url(file: str) -> str:
     return f"{YCB}/{Path(file).stem.title().replace('_', '')}/textured_simple_reoriented.obj"
 
 
-def _listed(files: list[str]) -> str:
-    """The files of a set in few words."""
-    folders, names = (list(dict.fromkeys(parts)) for parts in zip(*map(os.path.split, files), strict=True))
-    if folders == [""]:
-        return ", ".join(names)
-    return f"{' and '.join(f'NAME/{name}' for name in names)}, NAME being {', '.join(folders)}"
-
-
-def _is_there(file: Path, expected: str) -> bool:
-    """Whether a file is in the cache; people may have put it there, so it is checked each time."""
-    try:
-        content = file.read_bytes()
-    except OSError:
-        return False
-    _check(content, expected, str(file), "remove it, then it is fetched again")
-    return True
-
-
 def _check(content: bytes, expected: str, what: str, hint: str) -> None:
     if (got := hashlib.sha256(content).hexdigest()) != expected:
         raise SdfsimError(f"{what}: another file than expected: SHA-256 {got}, not {expected}", hint)
 
 
-def _fetched(url: str, names: set[str], hint: str) -> dict[str, bytes]:
-    """Files behind an address, name -> content. Raises SdfsimError with the hint where they cannot be had."""
+def _fetched(url: str, hint: str) -> dict[str, bytes]:
+    """The files of an archive by their last names alone, so that no path in it decides anything; a single one by ""."""
     import pooch
 
     pooch.get_logger().setLevel("WARNING")  # it would tell the sum of each download
     try:
         with tempfile.TemporaryDirectory() as scratch:
             file = Path(pooch.retrieve(url, known_hash=None, fname="download", path=scratch))
-            found = _members(file, names) if url.endswith(ARCHIVE) else dict.fromkeys(names, file.read_bytes())
+            if not url.endswith(ARCHIVE):
+                return {"": file.read_bytes()}
+            with tarfile.open(file, "r:gz") as archive:
+                members = [member for member in archive if member.isfile() and member.size <= FREELY]
+                opened = ((Path(member.name).name, archive.extractfile(member)) for member in members)
+                return {name: content.read() for name, content in opened if content is not None}
     except (OSError, EOFError, tarfile.TarError, zlib.error) as error:
         reason: BaseException = error
         while reason.__context__ is not None:  # the first cause is short: "Name or service not known"
             reason = reason.__context__
         raise SdfsimError(f"{url}: cannot be fetched: {reason}", hint) from error
-    if lacking := names - found.keys():
-        raise SdfsimError(f"{url}: has no {min(lacking)}", hint)
-    return found
-
-
-def _members(file: Path, names: set[str]) -> dict[str, bytes]:
-    """Files of an archive by their last names alone, so that no path in it decides where anything is written."""
-    found = {}
-    with tarfile.open(file, "r:gz") as archive:
-        for member in archive:
-            name = Path(member.name).name
-            if name in names and name not in found and member.isfile() and member.size <= FREELY:
-                content = archive.extractfile(member)
-                assert content is not None  # it is a file
-                found[name] = content.read()
-    return found

@@ -68,7 +68,7 @@ APART = 1000.0  # m between bodies that are not to touch
 Vector = np.ndarray | tuple[float, ...]
 URDF_TEMPLATE = """<robot name="body"><link name="base">
 <inertial><origin xyz="0 0 0"/><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
-<collision><origin xyz="{x} {y} {z}"/><geometry>{geometry}</geometry></collision>
+<collision><origin xyz="0 0 0"/><geometry>{geometry}</geometry></collision>
 </link></robot>
 """
 
@@ -101,15 +101,14 @@ def import_pybullet():
     return pybullet
 
 
-def write_urdf(mesh: Path, com: np.ndarray, path: Path) -> Path:
-    """Write a URDF about the centre of mass `com` [3] m of `mesh` (an OBJ; a relative path starts at the URDF)."""
-    write_text(path, URDF_TEMPLATE.format(geometry=f'<mesh filename="{mesh}"/>', x=-com[0], y=-com[1], z=-com[2]))
-    return path
+def write_urdf(mesh: Path, path: Path) -> None:
+    """Write the URDF of a body that collides `mesh`, an OBJ about its centre of mass; a relative path starts at it."""
+    write_form_urdf(f'<mesh filename="{mesh}"/>', path)
 
 
 def write_form_urdf(geometry: str, path: Path) -> Path:
-    """Write the URDF of an exact form about its centre; `geometry` is its URDF element: '<sphere radius="1"/>'."""
-    write_text(path, URDF_TEMPLATE.format(geometry=geometry, x=0, y=0, z=0))
+    """Write the URDF of a geometry about its centre; `geometry` is its URDF element, such as '<sphere radius="1"/>'."""
+    write_text(path, URDF_TEMPLATE.format(geometry=geometry))
     return path
 
 

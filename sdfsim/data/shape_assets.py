@@ -204,24 +204,10 @@ def _write_pieces(origin: Origin, engine: Path) -> dict[str, Any]:
     if len(pieces) == 1 and is_closed(pieces[0]):
         volume, com, _ = mass_properties(pieces[0])
     else:
-        volume, com, _ = mass_properties_of_sdf(_Union(PiecesDistance(pieces)), cells=48)
+        volume, com, _ = mass_properties_of_sdf(PiecesDistance(pieces), cells=48)
     size = float(np.ptp(np.concatenate([piece.vertices for piece in pieces]), axis=0).max())
     write_text(file, wavefront([Mesh((piece.vertices - com) / size, piece.faces) for piece in pieces]))
     return {"volume": volume / size**3, "com": com.tolist(), "size": size}
-
-
-@dataclass(frozen=True)
-class _Union:
-    """Distances to a union of pieces in the form that integrals over an SDF take; without gradients."""
-
-    oracle: PiecesDistance
-
-    @property
-    def bounds(self) -> np.ndarray:
-        return self.oracle.bounds
-
-    def __call__(self, points: np.ndarray) -> tuple[np.ndarray, None]:
-        return self.oracle(points).distance, None
 
 
 def _source(origin: Origin, record: dict[str, Any], engine: Path) -> ShapeSource:
@@ -232,7 +218,7 @@ def _source(origin: Origin, record: dict[str, Any], engine: Path) -> ShapeSource
     else:
         # A path from the URDF on, so that a dataset can be moved. Not the bare name: the engine looks in the working
         # directory first, where a mesh of that name may well lie.
-        write_urdf(Path("..", pieces.resolve().parent.name, pieces.name), np.zeros(3), urdf)
+        write_urdf(Path("..", pieces.resolve().parent.name, pieces.name), urdf)
     if origin.as_is:
         assert origin.mesh is not None
         vertices = load_mesh(origin.mesh).vertices

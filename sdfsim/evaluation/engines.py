@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import re
 import time
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -23,7 +23,7 @@ from sdfsim.dynamics.rollout import Rollout
 from sdfsim.errors import SdfsimError
 from sdfsim.files import replacing, write_text
 from sdfsim.scene.scene import Scene
-from sdfsim.shape.mesh import Mesh, convex_hull, load_pieces, wavefront
+from sdfsim.shape.mesh import Mesh, load_pieces, wavefront
 from sdfsim.shape.sdf import BoxSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.shape import Shape, own_pieces
 
@@ -247,12 +247,14 @@ def _mujoco_model(engine: Any, start: Start, step: float) -> Any:
 
 def _forms(engine: Any, urdf: Path) -> list[tuple[Any, np.ndarray, np.ndarray | None]]:
     """MuJoCo's kind of geom, its size [3] m, and its vertices [V, 3] m where it is a mesh: one a convex piece."""
-    body = _collision(urdf)
-    if (sphere := body.find("geometry/sphere")) is not None:
-        return [(engine.mjtGeom.mjGEOM_SPHERE, np.array([float(sphere.attrib["radius"]), 0.0, 0.0]), None)]
-    if (box := body.find("geometry/box")) is not None:
-        return [(engine.mjtGeom.mjGEOM_BOX, 0.5 * np.array(box.attrib["size"].split(), dtype=float), None)]
-    return [(engine.mjtGeom.mjGEOM_MESH, np.zeros(3), piece.vertices) for piece in pieces_of(urdf)]
+    kind, sizes = form_of(urdf)
+    if kind == "sphere":
+        return [(engine.mjtGeom.mjGEOM_SPHERE, np.array([*sizes, 0.0, 0.0]), None)]
+    if kind == "box":
+        return [(engine.mjtGeom.mjGEOM_BOX, 0.5 * sizes, None)]
+    return [
+        (engine.mjtGeom.mjGEOM_MESH, np.zeros(3), piece.vertices) for piece in load_pieces(urdf.with_suffix(".obj"))
+    ]
 
 
 # --- the engine's files ---
@@ -272,66 +274,25 @@ def shape_urdf(shape: Shape, folder: Path) -> Path:
         urdf = folder / f"{'sphere' if sphere else 'box'}-{sizes.replace(' ', '-')}.urdf"
         folder.mkdir(parents=True, exist_ok=True)
         return urdf if urdf.exists() else write_form_urdf(geometry, urdf)
-    name = f"pieces-{shape.mesh.digest()[:16]}"
-    urdf, mesh = folder / f"{name}.urdf", folder / f"{name}.obj"
+    urdf = folder / f"pieces-{shape.mesh.digest()[:16]}.urdf"
     if not urdf.exists():
         folder.mkdir(parents=True, exist_ok=True)
-        write_text(mesh, wavefront(own_pieces(shape) or decompose(shape.mesh, folder / name)))
+        pieces, mesh = own_pieces(shape) or decompose(shape.mesh, folder / urdf.stem), urdf.with_suffix(".obj")
+        write_text(mesh, wavefront([Mesh(piece.vertices - shape.com, piece.faces) for piece in pieces]))
         with replacing(urdf) as partial:
-            write_urdf(mesh.resolve(), shape.com, partial)
+            write_urdf(mesh.resolve(), partial)
     return urdf
 
 
 def dataset_urdf(data: Path, shape: str) -> Path:
-    """The URDF of a dataset's shape. Raises SdfsimError when it, or the mesh that it names, is absent."""
+    """The URDF of a dataset's shape. Raises SdfsimError when it, or the convex pieces beside it, are absent."""
     path = shapes_folder(data) / "engine" / f"{shape}.urdf"
-    if not path.is_file():
+    if not path.is_file() or not path.with_suffix(".obj").is_file():
         raise SdfsimError(f"{path}: no engine file of shape {shape!r}", "`sdfsim dataset` writes them")
-    if not is_sphere(path) and not (mesh := collision_mesh(path)[0]).is_file():
-        raise SdfsimError(f"{path}: the mesh that it names, {mesh}, is absent", "make the dataset again")
     return path
 
 
-def is_sphere(urdf: Path) -> bool:
-    """Whether a URDF's body collides as an exact sphere. Raises SdfsimError when it is unreadable."""
-    return _collision(urdf).find("geometry/sphere") is not None
-
-
-def collision_mesh(urdf: Path) -> tuple[Path, np.ndarray]:
-    """The mesh file that a URDF's body collides with, and where [3] m its origin is in the body's frame.
-
-    Raises:
-        SdfsimError: unreadable, or anything but one mesh, unturned and at its own size.
-    """
-    body = _collision(urdf)
-    mesh, origin = body.find("geometry/mesh"), body.find("origin")
-    if mesh is None or "scale" in mesh.attrib or "filename" not in mesh.attrib:
-        raise SdfsimError(f"{urdf}: must hold one collision mesh without a scale")
-    attributes = {} if origin is None else origin.attrib
-    if any(float(turn) for turn in attributes.get("rpy", "").split()):
-        raise SdfsimError(f"{urdf}: the collision mesh must not be turned")
-    offset = np.array([float(value) for value in attributes.get("xyz", "0 0 0").split()])
-    return urdf.parent / mesh.attrib["filename"], offset
-
-
-def pieces_of(urdf: Path) -> list[Mesh]:
-    """The convex pieces that the engine collides, in the body's frame.
-
-    A dataset has a hull of points on it beside the file of an exact sphere. Raises SdfsimError as `collision_mesh`
-    does, and where the mesh cannot be read.
-    """
-    if (box := _collision(urdf).find("geometry/box")) is not None:
-        half = 0.5 * np.array(box.attrib["size"].split(), dtype=float)
-        return [convex_hull(half * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]))]
-    path, offset = (urdf.with_suffix(".obj"), np.zeros(3)) if is_sphere(urdf) else collision_mesh(urdf)
-    return [Mesh(piece.vertices + offset, piece.faces) for piece in load_pieces(path)]
-
-
-def _collision(urdf: Path) -> ElementTree.Element:
-    try:
-        found = ElementTree.parse(urdf).getroot().findall("link/collision")
-    except (OSError, ElementTree.ParseError) as error:
-        raise SdfsimError(f"{urdf}: cannot be read as a URDF: {error}") from error
-    if len(found) != 1:
-        raise SdfsimError(f"{urdf}: must hold one collision element (has {len(found)})")
-    return found[0]
+def form_of(urdf: Path) -> tuple[str, np.ndarray]:
+    """What a URDF of ours collides: "sphere" and its radius, "box" and its extents [3] m, or "mesh", its pieces."""
+    found = re.search(r'<(sphere|box) (?:radius|size)="([^"]*)"', urdf.read_text(encoding="utf-8"))
+    return (found[1], np.array(found[2].split(), dtype=float)) if found else ("mesh", np.zeros(0))

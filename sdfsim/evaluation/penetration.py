@@ -12,9 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim.data.dataset import Trajectory
 from sdfsim.errors import SdfsimError
-from sdfsim.evaluation.engines import dataset_urdf, pieces_of
+from sdfsim.evaluation.engines import dataset_urdf
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.distance import PiecesDistance
+from sdfsim.shape.mesh import load_pieces
 from sdfsim.shape.mlp_sdf import MlpSdf
 from sdfsim.shape.sdf import GridSdf, MeshSdf
 from sdfsim.shape.shape import Shape, with_sdf
@@ -142,7 +143,7 @@ def _solid(data: Path, name: str, shape: Shape) -> Solid:
     if shape.source.get("kind") != "pieces" or not isinstance(shape.sdf, MlpSdf | GridSdf):
         return _exact(shape)
     try:
-        oracle = PiecesDistance(pieces_of(dataset_urdf(data, name)))
+        oracle = PiecesDistance(load_pieces(dataset_urdf(data, name).with_suffix(".obj")))
     except SdfsimError:
         return replace(_exact(shape), kind="shown mesh")
     return Solid(shape.nodes, oracle.bounds, lambda points: oracle(points).distance, "pieces")

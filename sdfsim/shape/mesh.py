@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import logging
 import re
@@ -218,10 +217,7 @@ def read_mesh(path: Path) -> Mesh:
     try:
         loaded = _read(path)
         mesh = Mesh(np.array(loaded.vertices, dtype=np.float64), _faces(loaded), None)
-        if len(mesh.faces) and (mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices)):
-            raise ValueError("face indices out of range")
-        if not np.isfinite(mesh.vertices).all():
-            raise ValueError("vertices that are not finite")
+        _check_read(mesh)
         if loaded.visual.kind != "vertex":
             return mesh
         return Mesh(mesh.vertices, mesh.faces, np.array(loaded.visual.vertex_colors)[:, :3].astype(np.uint8))
@@ -263,36 +259,31 @@ def read_glb(path: Path) -> dict[str, Mesh]:
     Raises:
         SdfsimError: not readable.
     """
-    from PIL import Image
+    import trimesh
 
     try:
-        data = path.read_bytes()
-        length = struct.unpack_from("<I", data, 12)[0]
-        header, content = json.loads(data[20 : 20 + length]), data[28 + length :]
-
-        def part(view: int) -> bytes:
-            start, size = (header["bufferViews"][view][key] for key in ("byteOffset", "byteLength"))
-            return content[start : start + size]
-
-        def array(number: int, kind: str, width: int) -> np.ndarray:
-            return np.frombuffer(part(header["accessors"][number]["bufferView"]), kind).reshape(-1, width)
-
+        loaded: Any = trimesh.load_scene(path, process=False)
         found = {}
-        for mesh, image in zip(header["meshes"], header["images"], strict=True):
-            (drawn,) = mesh["primitives"]
-            with Image.open(io.BytesIO(part(image["bufferView"])), formats=["JPEG"]) as picture:
-                texture = np.asarray(picture.convert("RGB"))
-            vertices = array(drawn["attributes"]["POSITION"], "<f4", 3).astype(np.float64)
-            uv = array(drawn["attributes"]["TEXCOORD_0"], "<f4", 2)
-            faces = array(drawn["indices"], "<u4", 3).astype(np.int64)
-            if not (np.isfinite(vertices).all() and np.isfinite(uv).all() and len(uv) == len(vertices)):
-                raise ValueError("vertices that are not finite, or places in the texture that do not fit them")
-            if len(faces) and faces.max() >= len(vertices):
-                raise ValueError("face indices out of range")
-            found[str(mesh["name"])] = Mesh(vertices, faces, None, uv, texture)
-    except Exception as error:
+        for name, drawn in loaded.geometry.items():
+            image = drawn.visual.material.baseColorTexture
+            if image.format != "JPEG":
+                raise ValueError("a texture that is no JPEG")
+            # trimesh counts up from the lower edge of a texture.
+            uv = np.asarray(drawn.visual.uv) * [1.0, -1.0] + [0.0, 1.0]
+            mesh = Mesh(np.array(drawn.vertices), _faces(drawn), None, uv, np.asarray(image.convert("RGB")))
+            _check_read(mesh)
+            found[str(name)] = mesh
+    except Exception as error:  # the readers raise whatever their format made them stumble over
         raise SdfsimError(f"{path}: damaged or cut short ({error})") from error
     return found
+
+
+def _check_read(mesh: Mesh) -> None:
+    """Raise ValueError where a mesh of our own making is not whole."""
+    if len(mesh.faces) and (mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices)):
+        raise ValueError("face indices out of range")
+    if not np.isfinite(mesh.vertices).all() or (mesh.uv is not None and not np.isfinite(mesh.uv).all()):
+        raise ValueError("vertices that are not finite")
 
 
 def clean(mesh: Mesh, *, name: str = "mesh") -> Mesh:

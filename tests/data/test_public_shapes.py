@@ -104,10 +104,7 @@ def test_without_a_network_it_says_what_to_put_where(site):
     folder = site.cache / "sdfsim" / "public" / "kubasic"
     with pytest.raises(SdfsimError, match=f"^{site.url}/cone.tar.gz: cannot be fetched: .*refused$") as caught:
         public_folder(Path("kubasic"))
-    assert caught.value.hint == (
-        f"put these files into {folder} by hand: NAME/visual_geometry.obj and NAME/collision_geometry.obj, "
-        "NAME being cone"
-    )
+    assert caught.value.hint == f"put these files into {folder} by hand: {VISUAL}, {COLLISION}"
     for file in (VISUAL, COLLISION):
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
         (folder / file).write_bytes(CONTENT[file])

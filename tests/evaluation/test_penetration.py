@@ -68,16 +68,16 @@ def test_the_hole_of_static_concave_scenery_is_empty(tmp_path):
 
 
 def test_a_shape_of_pieces_is_the_engines_pieces_where_they_are_at_hand(tmp_path):
-    """The unit cube collides half a metre off its file's origin; the mesh that is shown is smaller."""
+    """The pieces are a unit cube; the mesh that is shown is smaller."""
     shown = replace(analytic_shape("box", size=(0.8, 0.8, 0.8)), source={"kind": "pieces"})
     shapes = {"cube": with_sdf(shown, "grid", resolution=4)}
     shapes["cube"] = replace(shapes["cube"], source={"kind": "pieces"})
     assert exact_solids(tmp_path, shapes)["cube"].kind == "shown mesh"
     engine = tmp_path / "shapes" / "engine"
     engine.mkdir(parents=True)
-    (tmp_path / "cube.obj").write_text("o piece\n" + CUBE)
-    write_urdf(tmp_path / "cube.obj", np.array([0.5, 0.0, 0.0]), engine / "cube.urdf")
+    (engine / "cube.obj").write_text("o piece\n" + CUBE)
+    write_urdf(engine / "cube.obj", engine / "cube.urdf")
     solid = exact_solids(tmp_path, shapes)["cube"]
     assert solid.kind == "pieces"
-    np.testing.assert_allclose(solid.bounds, [[-1.0, -0.5, -0.5], [0.0, 0.5, 0.5]])
-    np.testing.assert_allclose(solid.distance(np.array([[-0.5, 0.0, 0.4], [0.25, 0.0, 0.0]])), [-0.1, 0.25], atol=1e-6)
+    np.testing.assert_allclose(solid.bounds, [[-0.5] * 3, [0.5] * 3])
+    np.testing.assert_allclose(solid.distance(np.array([[0.0, 0.0, 0.4], [0.75, 0.0, 0.0]])), [-0.1, 0.25], atol=1e-6)
