@@ -21,11 +21,10 @@ from sdfsim.dynamics.bodies import State, from_scene
 from sdfsim.dynamics.froude import scene_units
 from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.model import SOLVER, load_model
-from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.step import Rules, step
 from sdfsim.errors import SdfsimError
-from sdfsim.run import scene_of
-from sdfsim.scene.scene import Body, Scene
+from sdfsim.run import read_run
+from sdfsim.scene.scene import Scene
 from sdfsim.scene.scene_file import load_scene
 
 WINDOW, EVERY = 0.15, 0.06  # model units of time, about seconds for bodies of a metre: length and spacing of windows
@@ -92,70 +91,55 @@ class Identified:
         """As lines for people."""
         heads = {"friction": "friction, product", "restitution": "restitution, product"}
         heads |= {"own_friction": "friction of the body's own", "own_restitution": "restitution of the body's own"}
-        heads |= {"mass": "mass, kg"}
-        lines = []
-        for kind, head in heads.items():
-            for name, told in self.report()[kind].items():
-                low, high = told["interval"] or (None, None)
-                seen = "not shown by this motion" if low is None else f"{told['value']:.3f} ({low:.3f} to {high:.3f})"
+        lines, report = [], self.report()
+        for kind, head in (heads | {"mass": "mass, kg"}).items():
+            for name, told in report[kind].items():
+                seen = "not shown by this motion"
+                if told["interval"]:
+                    seen = "{:.3f} ({:.3f} to {:.3f})".format(told["value"], *told["interval"])
                 lines.append(f"{head}: {name}: {seen}")
         return [*lines, f"{self.windows} windows, repeated with an error of {self.error_m:.2g} m"]
 
     def report(self) -> dict[str, Any]:
         """As a JSON object."""
-
-        def told(estimates: dict) -> dict[str, Any]:
-            names = {k: " / ".join(k) if isinstance(k, tuple) else k for k in estimates}
+        found: dict[str, Any] = {"error_m": self.error_m, "windows": self.windows}
+        for kind in ("friction", "restitution", "own_friction", "own_restitution", "mass"):
             # What the motion does not show has no value either: the fit left it where it happened to begin.
-            return {
-                names[k]: {"value": e.value if e.interval else None, "interval": e.interval}
-                for k, e in estimates.items()
+            found[kind] = {
+                " / ".join(name) if isinstance(name, tuple) else name: {
+                    "value": e.value if e.interval else None,
+                    "interval": e.interval,
+                }
+                for name, e in getattr(self, kind).items()
             }
-
-        kinds = ("friction", "restitution", "own_friction", "own_restitution", "mass")
-        return {kind: told(getattr(self, kind)) for kind in kinds} | {"error_m": self.error_m, "windows": self.windows}
+        return found
 
 
 def load_recording(
     path: Path, scene_file: Path | None = None, *, allow_outside: bool = False, on_progress: Progress | None = None
 ) -> tuple[Recording, Scene]:
-    """A recording and its scene.
+    """A recording of the bodies of a scene that move, and the scene.
 
     Args:
-        path: a run folder, a `rollout.npz` or a CSV of poses.
-        scene_file: its scene; of a run folder the one that it was made from, if this is None.
+        path: a run folder, a `rollout.npz`, or a CSV of poses (`COLUMNS`), whose positions are those of
+            the shapes' own origins, as in a scene file.
+        scene_file: its scene; of a run the one that it was made from, if this is None.
         allow_outside: whether the scene may name files outside of its own folder.
         on_progress: called with the fraction done and a message while shapes are fitted.
 
     Raises:
-        SdfsimError: no scene, or unreadable files.
+        SdfsimError: no scene, unreadable files, or a recording that is not of this scene.
     """
-    if path.is_dir():
-        scene_file = scene_file or scene_of(path)
-        path = path / "rollout.npz"
-    if scene_file is None:
-        raise SdfsimError(f"{path}: a recording without its scene", "give it: --scene scene.yaml")
-    scene = load_scene(scene_file, on_progress, allow_outside=allow_outside)
-    return recorded(path, scene), scene
-
-
-def recorded(path: Path, scene: Scene) -> Recording:
-    """A `rollout.npz`, or a CSV of poses with the columns of `COLUMNS`, of the bodies of a scene that move.
-
-    Positions in a CSV are those of the shapes' own origins, as in a scene file; their rows are sorted by time.
-
-    Raises:
-        SdfsimError: unreadable, or not of this scene.
-    """
-    moving = [b.name for b in scene.bodies if b.motion == "dynamic"]
     if path.suffix == ".csv":
-        return _from_poses(*_read_csv(path, moving), scene)
-    rollout = Rollout.load(path)
-    if missing := [name for name in moving if name not in rollout.names]:
-        raise SdfsimError(f"{path}: no body {missing[0]!r} in it", "give the scene that it was made with")
-    rows = [rollout.names.index(name) for name in moving]
-    return Recording(
-        names=tuple(moving),
+        if scene_file is None:
+            raise SdfsimError(f"{path}: a recording without its scene", "give it: --scene scene.yaml")
+        scene = load_scene(scene_file, on_progress, allow_outside=allow_outside)
+        moving = [b.name for b in scene.bodies if b.motion == "dynamic"]
+        return _from_poses(moving, *_read_csv(path, moving), scene), scene
+    scene, rollout = read_run(path, scene_file, allow_outside=allow_outside, on_progress=on_progress)
+    rows = [k for k, b in enumerate(scene.bodies) if b.motion == "dynamic"]
+    recording = Recording(
+        names=tuple(scene.bodies[k].name for k in rows),
         dt=float(np.diff(rollout.time).mean()) if len(rollout) else 0.0,
         position=rollout.position[:, rows],
         orientation=rollout.orientation[:, rows],
@@ -163,9 +147,11 @@ def recorded(path: Path, scene: Scene) -> Recording:
         angular_velocity=rollout.angular_velocity[:, rows],
         known=np.ones(len(rollout.time), dtype=bool),
     )
+    return recording, scene
 
 
-def _read_csv(path: Path, moving: list[str]) -> tuple[list[str], float, np.ndarray, np.ndarray]:
+def _read_csv(path: Path, moving: list[str]) -> tuple[float, np.ndarray, np.ndarray]:
+    """Spacing s, positions [T, D, 3] m and orientations [T, D, 4] of the bodies."""
     try:
         with path.open(newline="", encoding="utf-8") as file:
             reader = csv.DictReader(file)
@@ -197,7 +183,7 @@ def _read_csv(path: Path, moving: list[str]) -> tuple[list[str], float, np.ndarr
         if missing := set(moving) - set(rows[time]):
             raise SdfsimError(f"{path}: no pose of body {min(missing)!r} at time {time:g}")
     poses = np.array([[rows[time][name] for name in moving] for time in times])
-    return moving, float(gaps.mean()), poses[..., :3], poses[..., 3:]
+    return float(gaps.mean()), poses[..., :3], poses[..., 3:]
 
 
 def _from_poses(names: list[str], dt: float, origin: np.ndarray, orientation: np.ndarray, scene: Scene) -> Recording:
@@ -297,18 +283,11 @@ class Windows:
 
     def _build(self, begin: np.ndarray) -> None:
         """Bodies and start states of the windows that begin at frames `begin`."""
-        bodies, world = [], []
-        for w in range(len(begin)):
-            bodies += [replace(b, name=f"{w}/{b.name}", collides_with=self._partners(b, w)) for b in self.moving]
-            world += [w] * len(self.moving)
-        names = tuple(b.name for b in self.moving)
-        bodies += [
-            replace(b, collides_with=None if b.collides_with is None else self._copies(b.collides_with, names, begin))
-            for b in self.fixed
-        ]
+        bodies = self.moving * len(begin) + self.fixed
+        world = np.repeat(np.arange(len(begin)), len(self.moving))
         whole = replace(self.scene, bodies=tuple(bodies))
         tensors, self.start_state = from_scene(whole, self.units, torch.device("cpu"))
-        self.bodies = replace(tensors, world=torch.tensor([*world, *[-1] * len(self.fixed)]))
+        self.bodies = replace(tensors, world=torch.tensor([*world.tolist(), *[-1] * len(self.fixed)]))
         r, u = self.recording, self.units
 
         def of(values: np.ndarray, unit: float, rest: torch.Tensor) -> torch.Tensor:
@@ -331,17 +310,6 @@ class Windows:
             name: getattr(self.world, name).copy()
             for name in ("friction", "restitution", "inverse_mass", "inertia", "inverse_inertia")
         }
-
-    def _partners(self, body: Body, w: int) -> tuple[str, ...] | None:
-        if body.collides_with is None:
-            return None
-        moving = {b.name for b in self.moving}
-        return tuple(f"{w}/{name}" if name in moving else name for name in body.collides_with)
-
-    @staticmethod
-    def _copies(names: tuple[str, ...], moving: tuple[str, ...], begin: np.ndarray) -> tuple[str, ...]:
-        copies = [f"{w}/{name}" for name in names if name in moving for w in range(len(begin))]
-        return (*copies, *(name for name in names if name not in moving))
 
     def _run(self) -> list[State]:
         state, states = self.start_state, []

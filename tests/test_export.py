@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 import cli
 from sdfsim import Rollout, SdfsimError, Simulator, load_scene
 from sdfsim.export import export
-from sdfsim.identify import recorded
+from sdfsim.identify import load_recording
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.mesh import Mesh
 from sdfsim.shape.shape import analytic_shape, load_shape, mesh_shape
@@ -390,7 +390,7 @@ def test_a_shape_becomes_one_urdf(tmp_path):
 
 
 def test_identify_reads_the_poses_of_a_run(dropped):
-    found = recorded(dropped.export("run.csv"), dropped.scene)
+    found, _ = load_recording(dropped.export("run.csv"), dropped.file, allow_outside=True)
     rows = [dropped.index(name) for name in found.names]
     np.testing.assert_allclose(found.position, dropped.rollout.position[:, rows], atol=1e-9)
     assert np.abs((found.orientation * dropped.rollout.orientation[:, rows]).sum(-1)).min() > 1 - 1e-9
