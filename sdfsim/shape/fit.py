@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -51,7 +50,6 @@ RESERVE = 2.0
 OWN_SHARE, EDGE_SHARE = 0.6, 0.85
 # Between points on the edges of convex pieces, relative to the size of the whole.
 EDGE_SPACING = 0.06
-CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True)
@@ -200,7 +198,8 @@ def fit_solids(
     shapes = []
     for (name, oracle), (sdf, points, certificate) in zip(solids.items(), fitted, strict=True):
         solid = oracle.solid
-        source = _source("mesh", recipe, [solid.surface]) | ({"notes": list(solid.notes)} if solid.notes else {})
+        source: dict[str, Any] = {"kind": "mesh", "recipe": recipe, "fit_version": FIT_VERSION}
+        source |= {"notes": list(solid.notes)} if solid.notes else {}
         shapes.append(Shape(name, solid.surface, sdf, points, *solid.mass_properties(), certificate, source))
     return shapes
 
@@ -210,11 +209,7 @@ def fit_pieces(
     *,
     name: str,
     display: Mesh | None = None,
-    recipe: Recipe = "default",
-    budget: float | None = None,
-    seed: int = 0,
     nodes: int = DEFAULT_COUNT,
-    on_progress: Progress | None = None,
 ) -> Shape:
     """Fit the compact SDF network to the union of convex pieces: the body that a rigid-body engine collides.
 
@@ -223,9 +218,9 @@ def fit_pieces(
 
     Args:
         pieces: convex closed meshes, metres (see `load_pieces`).
+        name: of the shape.
         display: the mesh to show; by default the boundary of the union.
         nodes: surface nodes at most.
-        name, recipe, budget, seed, on_progress: as for `fit_mesh`.
 
     Returns:
         Shape; its mass properties are those of the union.
@@ -249,11 +244,11 @@ def fit_pieces(
         own = hull_nodes(vertices, round(OWN_SHARE * nodes))
         return thin(sample_nodes(sdf), nodes, keep=thin(edges, round(EDGE_SHARE * nodes), keep=own))
 
-    sdf, points, certificate = _fit([oracle], recipe, budget, seed, pick, on_progress, "cpu")[0]
+    sdf, points, certificate = _fit([oracle], "default", None, 0, pick, None, "cpu")[0]
     single = len(pieces) == 1 and is_closed(pieces[0])
     volume, com, inertia = mass_properties(pieces[0]) if single else mass_properties_of_sdf(oracle)
     mesh = display if display is not None else clean(oracle.surface, name=name)
-    source = _source("pieces", recipe, pieces)
+    source = {"kind": "pieces", "recipe": "default", "fit_version": FIT_VERSION}
     hulls = tuple(piece.vertices for piece in pieces)
     return Shape(name, mesh, sdf, points, volume, com, inertia, certificate, source, hulls)
 
@@ -267,15 +262,31 @@ def _fit(
     on_progress: Progress | None,
     device: torch.device | str,
 ) -> list[tuple[MlpSdf, np.ndarray, dict]]:
-    """Per oracle the network, nodes [K, 3] m as `pick` takes them from it, and the certificate."""
+    """Per oracle the network, nodes [K, 3] m as `pick` takes them from it, and the certificate.
+
+    The solids are trained in one batched optimiser; each comes out as it would alone, up to rounding.
+    """
     if budget is not None and not budget > 0:
         raise SdfsimError(f"the budget of a fit must be > 0 seconds (got {budget})")
-    started = time.monotonic()
+    started, plan = time.monotonic(), PLANS[recipe]
     tell = on_progress or (lambda fraction, message: None)
-    fitted = train(oracles, PLANS[recipe], budget=budget, seed=seed, tell=tell, device=torch.device(device))
+    run = _Run(oracles, plan, seed, tell, torch.device(device))
+    if run.device.type == "cpu":
+        choose_threads(partial(run.differentiate, torch.arange(plan.batch) % plan.pool))
+    looping = time.monotonic()
+    while run.step < run.stop.max():
+        run.update()
+        if run.step % CHECK_EVERY:
+            continue
+        near, far = run.judge()
+        if budget is not None:
+            left = budget - min(0.1 * budget + RESERVE, 0.5 * budget) - (time.monotonic() - started)
+            run.hurry(run.step + int(left * run.step / (time.monotonic() - looping)))
+        last = max(int(run.stop.max()), 1)
+        tell(0.97 * run.step / last, f"step {run.step} of {last}, error {near:.2g} near, {far:.2g} in the box")
     trained = time.monotonic() - started
     results = []
-    for done, (oracle, (sdf, steps)) in enumerate(zip(oracles, fitted, strict=True), start=1):
+    for done, (oracle, (sdf, steps)) in enumerate(zip(oracles, run.results(), strict=True), start=1):
         tell(0.98 + 0.02 * (done - 1) / len(oracles), "measuring")
         measuring = time.monotonic()
         nodes = pick(sdf, oracle)
@@ -287,14 +298,6 @@ def _fit(
         tell(0.98 + 0.02 * done / len(oracles), f"fitted, but {but}" if but else "fitted")
         results.append((sdf, nodes, certificate))
     return results
-
-
-def _source(kind: str, recipe: Recipe, meshes: list[Mesh]) -> dict:
-    digest = hashlib.sha256()
-    for mesh in meshes:
-        digest.update(np.ascontiguousarray(mesh.vertices).tobytes())
-        digest.update(np.ascontiguousarray(mesh.faces).tobytes())
-    return {"kind": kind, "geometry_sha256": digest.hexdigest(), "recipe": recipe, "fit_version": FIT_VERSION}
 
 
 class Pool(NamedTuple):
@@ -375,51 +378,6 @@ class Subject:
             return bool(np.abs(self.oracle(image).distance - truth).max() < SAME * self.frame.scale)
 
         return same(0), same(1), same(2)
-
-
-def train(
-    oracles: Sequence[DistanceOracle],
-    plan: Plan,
-    *,
-    budget: float | None,
-    seed: int,
-    tell: Progress,
-    device: torch.device = CPU,
-) -> list[tuple[MlpSdf, int]]:
-    """Run a plan for several solids in one batched optimiser; each comes out as it would alone, up to rounding.
-
-    Args:
-        oracles: true distances to each solid, metres.
-        plan: the recipe.
-        budget: seconds for all at most; the decay begins early enough to end within them.
-        seed: of points and weights.
-        tell: called with (fraction done, message).
-        device: to train on.
-
-    Returns:
-        per solid its network, on the CPU, and the number of updates made.
-    """
-    started = time.monotonic()
-    run = _Run(oracles, plan, seed, tell, device)
-    if device.type == "cpu":
-        choose_threads(partial(run.differentiate, torch.arange(plan.batch) % plan.pool))
-    looping = time.monotonic()
-    while run.step < run.stop.max():
-        run.update()
-        if run.step % CHECK_EVERY:
-            continue
-        near, far = run.judge()
-        if budget is not None:
-            pace = (time.monotonic() - looping) / run.step
-            run.hurry(run.step + int((training_share(budget) - (time.monotonic() - started)) / pace))
-        last = max(int(run.stop.max()), 1)
-        tell(0.97 * run.step / last, f"step {run.step} of {last}, error {near:.2g} near, {far:.2g} in the box")
-    return run.results()
-
-
-def training_share(budget: float) -> float:
-    """Seconds of a budget that the training may take; the rest is the certificate's."""
-    return budget - min(0.1 * budget + RESERVE, 0.5 * budget)
 
 
 class _Run:
