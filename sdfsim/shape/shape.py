@@ -316,32 +316,33 @@ def with_sdf(shape: Shape, kind: SdfKind, *, resolution: int = DEFAULT_RESOLUTIO
     return replace(shape, sdf=sdf, certificate={}, source=shape.source | note)
 
 
+def sdf_of_mesh(
+    mesh: Mesh, kind: Literal["grid", "mesh"], resolution: int, on_progress: Progress | None = None
+) -> tuple[Sdf, dict]:
+    """A mesh's exact SDF or a grid of it, and what a shape's `source` says about it. Raises as `with_sdf` does."""
+    if kind == "mesh":
+        return MeshSdf(mesh), {"sdf": "mesh"}
+    oracle = MeshDistance(mesh)
+    return sample_grid(oracle, oracle.bounds, resolution, on_progress), {"sdf": "grid", "resolution": resolution}
+
+
 def with_nodes(shape: Shape, grid: int) -> Shape:
     """The same shape with other surface nodes: those of a grid of `grid`^3 points, sampled from its SDF alone.
 
     The paper resamples a trained simulator's bodies like this (7^3 instead of the meshes' vertices). Nearer than a
-    40th of the shape's size no two nodes are kept.
-
-    Raises:
-        SdfsimError: the SDF has no end, or no point of the grid reached its surface.
+    40th of the shape's size no two nodes are kept. Raises as `sample_nodes` does.
     """
-    nodes = sample_nodes(shape.sdf, grid=grid)
     # What was measured of the former nodes does not hold for these.
     certificate = {key: value for key, value in shape.certificate.items() if key != "coverage"}
-    return replace(shape, nodes=nodes, certificate=certificate)
+    return replace(shape, nodes=sample_nodes(shape.sdf, grid=grid), certificate=certificate)
 
 
 def with_wall(shape: Shape, wall: float) -> Shape:
-    """The same shape as a hollow one: only what lies within `wall` of its surface has mass.
+    """The same shape as a hollow one: only what lies within `wall` m of its surface has mass.
 
     Volume, centre of mass and inertia are then those of the wall, taken from the SDF on a grid. Where the SDF is exact
     and the wall at least 1/100 of the shape's longest side, the volume is within 1 % and the inertia within 4 %. A wall
-    that is thicker than the shape makes it solid. Outside nothing changes: contacts see the same surface, and nothing
-    gets in.
-
-    Args:
-        shape: any but a plane.
-        wall: m.
+    that is thicker than the shape makes it solid. Contacts see the same surface, and nothing gets in.
 
     Raises:
         SdfsimError: the shape is a plane.
@@ -350,35 +351,11 @@ def with_wall(shape: Shape, wall: float) -> Shape:
     return replace(shape, volume=volume, com=com, inertia=inertia, source=shape.source | {"wall": wall})
 
 
-def sdf_of_mesh(
-    mesh: Mesh,
-    kind: Literal["grid", "mesh"],
-    resolution: int,
-    on_progress: Progress | None = None,
-) -> tuple[Sdf, dict]:
-    """A mesh's exact SDF or a grid of it, and what a shape's `source` says about it.
-
-    Raises:
-        SdfsimError: the mesh has no faces or no extent, or the grid fewer than two samples a side.
-    """
-    if kind == "mesh":
-        return MeshSdf(mesh), {"sdf": "mesh"}
-    oracle = MeshDistance(mesh)
-    return sample_grid(oracle, oracle.bounds, resolution, on_progress), {"sdf": "grid", "resolution": resolution}
-
-
 def shape_from_mesh(
-    path: str | Path,
-    cache_dir: str | Path | None = None,
-    *,
-    name: str | None = None,
-    units: float = 1.0,
-    cap: bool = False,
-    thicken: float | None = None,
-    sdf: SdfKind = "mlp",
-    resolution: int = DEFAULT_RESOLUTION,
+    path: str | Path, cache_dir: str | Path | None = None, *, name: str | None = None, units: float = 1.0,
+    cap: bool = False, thicken: float | None = None, sdf: SdfKind = "mlp", resolution: int = DEFAULT_RESOLUTION,
     on_progress: Progress | None = None,
-) -> Shape:
+) -> Shape:  # fmt: skip
     """The shape of a mesh file: made on first use, then taken from a cache keyed by what the file describes.
 
     Args:
@@ -399,22 +376,16 @@ def shape_from_mesh(
     mesh = load_mesh(path)
     # Not of the file's bytes: a glTF keeps its vertices, and an OBJ its colours, in files beside it.
     key = mesh.digest()
-    thicken = None if thicken is None else thicken / units
-    shape = _cached(mesh, key, path.stem, cap, thicken, sdf, resolution, cache_dir, on_progress)
-    shape = replace(shape, name=name or path.stem, source={**shape.source, "file": path.name, "sha256": key})
-    return scaled(shape, units)
+    how = {"cap": cap, "thicken": None if thicken is None else thicken / units, "on_progress": on_progress}
+    shape = _cached(mesh, key, path.stem, sdf, resolution, cache_dir, how)
+    source = {**shape.source, "file": path.name, "sha256": key}
+    return scaled(replace(shape, name=name or path.stem, source=source), units)
 
 
 def shape_from_primitive(
-    kind: str,
-    size: float = 1.0,
-    cache_dir: str | Path | None = None,
-    *,
-    name: str | None = None,
-    sdf: SdfKind = "mlp",
-    resolution: int = DEFAULT_RESOLUTION,
-    on_progress: Progress | None = None,
-) -> Shape:
+    kind: str, size: float = 1.0, cache_dir: str | Path | None = None, *, name: str | None = None,
+    sdf: SdfKind = "mlp", resolution: int = DEFAULT_RESOLUTION, on_progress: Progress | None = None,
+) -> Shape:  # fmt: skip
     """The shape of a procedural mesh of `primitives.PRIMITIVES`, made on first use and cached.
 
     Args:
@@ -431,32 +402,17 @@ def shape_from_primitive(
     unit = Mesh(mesh.vertices / float(np.ptp(mesh.vertices, axis=0).max()), mesh.faces)
     # Rounded, since sines and cosines differ in their last digit from machine to machine.
     key = Mesh(unit.vertices.round(9), unit.faces).digest()
-    shape = _cached(unit, key, kind, False, None, sdf, resolution, cache_dir, on_progress)
+    shape = _cached(unit, key, kind, sdf, resolution, cache_dir, {"on_progress": on_progress})
     return scaled(replace(shape, name=name or kind, source={**shape.source, "primitive": kind}), size)
 
 
 def mesh_shape(
-    mesh: Mesh,
-    *,
-    name: str,
-    kind: Literal["grid", "mesh"],
-    cap: bool = False,
-    thicken: float | None = None,
-    resolution: int = DEFAULT_RESOLUTION,
-    on_progress: Progress | None = None,
-) -> Shape:
-    """The shape of a mesh without any fit: its exact SDF or a grid of it, nodes and mass properties as a fit has them.
+    mesh: Mesh, *, name: str, kind: Literal["grid", "mesh"], cap: bool = False, thicken: float | None = None,
+    resolution: int = DEFAULT_RESOLUTION, on_progress: Progress | None = None,
+) -> Shape:  # fmt: skip
+    """The shape of a mesh (metres) without any fit: its exact SDF or a grid of it, nodes and mass as a fit has them.
 
-    Args:
-        mesh: metres.
-        name: of the shape.
-        kind: "mesh" (the exact distance) or "grid" (samples of it).
-        cap, thicken: as for `solidify`.
-        resolution: of a grid, samples along each side.
-        on_progress: called with (fraction done, message) while a grid is sampled.
-
-    Raises:
-        SdfsimError: the mesh cannot be used.
+    Arguments as of `shape_from_mesh`. Raises SdfsimError: the mesh cannot be used.
     """
     solid = solidify(mesh, name=name, cap=cap, thicken=thicken)
     sdf, note = sdf_of_mesh(solid.surface, kind, resolution, on_progress)
@@ -465,23 +421,16 @@ def mesh_shape(
 
 
 def _cached(
-    mesh: Mesh,
-    key: str,
-    label: str,
-    cap: bool,
-    thicken: float | None,
-    kind: SdfKind,
-    resolution: int,
-    cache_dir: str | Path | None,
-    on_progress: Progress | None,
+    mesh: Mesh, key: str, name: str, kind: SdfKind, resolution: int, cache_dir: str | Path | None, how: dict[str, Any]
 ) -> Shape:
     if kind == "mesh":  # made as fast as it is read
-        return mesh_shape(mesh, name=label, kind=kind, cap=cap, thicken=thicken)
+        return mesh_shape(mesh, name=name, kind=kind, **how)
     from sdfsim.shape.fit import FIT_VERSION, fit_mesh
 
     if cache_dir is None:
         cache_dir = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sdfsim" / "shapes"
-    variant = ("-cap" if cap else "") + (f"-thick{thicken:g}" if thicken is not None else "")
+    variant = "-cap" if how.get("cap") else ""
+    variant += "" if how.get("thicken") is None else f"-thick{how['thicken']:g}"
     variant += f"-grid{resolution}" if kind == "grid" else ""
     folder = Path(cache_dir) / f"{key[:24]}{variant}-{FIT_VERSION}.{FORMAT_VERSION}"
     if folder.is_dir():
@@ -489,11 +438,10 @@ def _cached(
             return load_shape(folder)
         except SdfsimError:
             shutil.rmtree(folder, ignore_errors=True)  # a damaged entry is only a cache miss
-    options: dict[str, Any] = {"name": label, "cap": cap, "thicken": thicken, "on_progress": on_progress}
     if kind == "grid":
-        shape = mesh_shape(mesh, kind=kind, resolution=resolution, **options)
+        shape = mesh_shape(mesh, name=name, kind=kind, resolution=resolution, **how)
     else:
-        shape = fit_mesh(mesh, **options)
+        shape = fit_mesh(mesh, name=name, **how)
     # A folder of its own first, so that processes fitting the same mesh never see each other's half.
     partial = folder.with_name(f"{folder.name}.{os.getpid()}.partial")
     try:
@@ -501,7 +449,7 @@ def _cached(
         if not folder.is_dir():  # else another process was first: its entry is as good
             partial.rename(folder)
     except (SdfsimError, OSError) as error:
-        _log.warning("the shape %s is not kept for the next time: %s", label, error)
+        _log.warning("the shape %s is not kept for the next time: %s", name, error)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return shape
