@@ -51,23 +51,11 @@ def torus(major: float = 0.35, minor: float = 0.15, segments: int = 64, sides: i
     return _tube(_torus_rings(major, minor, segments, sides), "torus")
 
 
-def gear(radius: float = 0.5, tooth: float = 0.1, thickness: float = 0.2, bore: float = 0.12, teeth: int = 12) -> Mesh:
-    """A spur gear about z.
-
-    Args:
-        radius: to the tips, m.
-        tooth: height of a tooth, m.
-        thickness: along z, m.
-        bore: radius of the hole, m.
-        teeth: how many.
-    """
-    outer, inner = _gear_outline(radius, tooth, bore, teeth)
+def gear() -> Mesh:
+    """A spur gear about z: 12 teeth of 0.1 m, 0.2 m thick, with a bore of radius 0.12 m."""
+    outer, inner = _gear_outline()
     count = len(outer)
-    layers = [
-        np.column_stack([outline, np.full(count, z)])
-        for z in (-thickness / 2, thickness / 2)
-        for outline in (outer, inner)
-    ]
+    layers = [np.column_stack([outline, np.full(count, z)]) for z in (-0.1, 0.1) for outline in (outer, inner)]
     this, following = np.arange(count), (np.arange(count) + 1) % count
     low_out, low_in, high_out, high_in = (count * layer for layer in range(4))
     quads = [
@@ -77,24 +65,14 @@ def gear(radius: float = 0.5, tooth: float = 0.1, thickness: float = 0.2, bore: 
     return clean(Mesh(np.concatenate(layers), _quads(np.concatenate(quads))), name="gear")
 
 
-def torus_knot(
-    major: float = 0.3, wrap: float = 0.13, tube: float = 0.06, turns: tuple[int, int] = (2, 3), segments: int = 192
-) -> Mesh:
-    """A tube along a torus knot.
-
-    Args:
-        major: radius of the torus the curve lies on, m.
-        wrap: radius of that torus' section, m.
-        tube: radius of the tube, m.
-        turns: around the axis, and around the section; without common divisor.
-        segments: along the curve.
-    """
-    return _tube(_knot_rings(major, wrap, tube, turns, segments, 24), "torus_knot")
+def torus_knot() -> Mesh:
+    """A tube of radius 0.06 m along a (2, 3) torus knot."""
+    return _tube(_knot_rings(192, 24), "torus_knot")
 
 
-def sponge(size: float = 1.0, holes: int = 2) -> Mesh:
-    """A cube with `holes` x `holes` square channels through it along each axis, as wide as the walls between them."""
-    solid = _sponge_cells(holes)
+def sponge() -> Mesh:
+    """A cube with 2 x 2 square channels through it along each axis, as wide as the walls between them."""
+    solid = _sponge_cells()
     cells = len(solid)
     padded = np.pad(solid, 1)
     corners = []
@@ -107,32 +85,20 @@ def sponge(size: float = 1.0, holes: int = 2) -> Mesh:
             quad = [base, base + first, base + first + second, base + second]
             corners.append(np.stack(quad if step > 0 else quad[::-1], axis=1))
     vertices = np.concatenate(corners).reshape(-1, 3) / cells - 0.5
-    return clean(Mesh(vertices * size, _quads(np.arange(len(vertices)).reshape(-1, 4))), name="sponge")
+    return clean(Mesh(vertices, _quads(np.arange(len(vertices)).reshape(-1, 4))), name="sponge")
 
 
-def bowl(radius: float = 0.5, wall: float = 0.06, segments: int = 64, bands: int = 16) -> Mesh:
-    """Half of a thick spherical shell, open at the top (+z); the centre of the sphere is the origin.
-
-    Args:
-        radius: outer, m.
-        wall: thickness, m, less than the radius.
-        segments: around.
-        bands: from the bottom to the rim.
-    """
-    outer, inner = _bowl_profiles(radius, wall, bands)
-    return _revolve(np.concatenate([outer, inner[::-1]]), segments, "bowl")
+def bowl(radius: float = 0.5, wall: float = 0.06) -> Mesh:
+    """Half of a spherical shell about the origin, of outer `radius` m and `wall` m thick, open at the top (+z)."""
+    outer, inner = _bowl_profiles(radius, wall, 16)
+    return _revolve(np.concatenate([outer, inner[::-1]]), 64, "bowl")
 
 
-def shoe(length: float = 1.0, cells: int = 72) -> Mesh:
-    """A clog: a long rounded body with a flat sole and a deep opening over the heel, toe along +x.
-
-    Args:
-        length: m.
-        cells: of the grid it is cut from, along the length.
-    """
+def shoe() -> Mesh:
+    """A clog of 1 m: a long rounded body with a flat sole and a deep opening over the heel, toe along +x."""
     from skimage.measure import marching_cubes
 
-    axis = np.linspace(-0.58, 0.58, cells)
+    axis = np.linspace(-0.58, 0.58, 72)
     x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
     # The body thins towards the toe, so do its cavity and its height.
     reach = np.clip((x + 0.3) / 0.6, 0.0, 1.0)
@@ -147,7 +113,7 @@ def shoe(length: float = 1.0, cells: int = 72) -> Mesh:
     field = np.maximum(body, -np.minimum(cavity, opening))
     vertices, faces, _, _ = marching_cubes(field, 0.0, spacing=(axis[1] - axis[0],) * 3)
     vertices = vertices.astype(np.float64) + axis[0]
-    return clean(Mesh(vertices * (length / np.ptp(vertices[:, 0])), faces.astype(np.int64)), name="shoe")
+    return clean(Mesh(vertices * (1.0 / np.ptp(vertices[:, 0])), faces.astype(np.int64)), name="shoe")
 
 
 PRIMITIVES: dict[str, Callable[..., Mesh]] = {
@@ -171,16 +137,16 @@ def convex_pieces(kind: str) -> list[Mesh]:
     if kind == "torus":
         return _ring_hulls(_torus_rings(0.35, 0.15, 32, 16))
     if kind == "torus_knot":
-        return _ring_hulls(_knot_rings(0.3, 0.13, 0.06, (2, 3), 64, 12))
+        return _ring_hulls(_knot_rings(64, 12))
     if kind == "gear":
-        outer, inner = _gear_outline(0.5, 0.1, 0.12, 12)
+        outer, inner = _gear_outline()
         outline = np.stack([outer, np.roll(outer, -1, axis=0), np.roll(inner, -1, axis=0), inner], axis=1)
         return [
             convex_hull(np.concatenate([np.column_stack([sector, np.full(4, z)]) for z in (-0.1, 0.1)]))
             for sector in outline
         ]
     if kind == "sponge":
-        solid = _sponge_cells(2)
+        solid = _sponge_cells()
         cells = len(solid)
         cube = box((1.0 / cells, 1.0 / cells, 1.0 / cells))
         return [Mesh(cube.vertices + (cell + 0.5) / cells - 0.5, cube.faces) for cell in np.argwhere(solid)]
@@ -236,11 +202,10 @@ def _torus_rings(major: float, minor: float, segments: int, sides: int) -> np.nd
     return np.stack([_spin(profile, turn) for turn in 2 * np.pi * np.arange(segments) / segments])
 
 
-def _knot_rings(
-    major: float, wrap: float, tube: float, turns: tuple[int, int], segments: int, sides: int
-) -> np.ndarray:
+def _knot_rings(segments: int, sides: int) -> np.ndarray:
+    # Radii of the torus that the curve lies on, of its section and of the tube; turns around the axis and the section.
+    major, wrap, tube, p, q = 0.3, 0.13, 0.06, 2, 3
     t = 2 * np.pi * np.arange(segments) / segments
-    p, q = turns
     radius = major + wrap * np.cos(q * t)
     curve = np.stack([radius * np.cos(p * t), radius * np.sin(p * t), wrap * np.sin(q * t)], axis=1)
     tangent = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
@@ -256,8 +221,9 @@ def _knot_rings(
     return curve[:, None] + tube * offset
 
 
-def _gear_outline(radius: float, tooth: float, bore: float, teeth: int) -> tuple[np.ndarray, np.ndarray]:
+def _gear_outline() -> tuple[np.ndarray, np.ndarray]:
     """Outer and bore outlines [4 * teeth, 2], counter-clockwise: root, rise, tip, fall of each tooth."""
+    radius, tooth, bore, teeth = 0.5, 0.1, 0.12, 12
     fraction = np.array([0.0, 0.3, 0.4, 0.9])
     turn = (2 * np.pi / teeth * (np.arange(teeth)[:, None] + fraction)).reshape(-1)
     reach = np.tile([radius - tooth, radius - tooth, radius, radius], teeth)
@@ -265,9 +231,9 @@ def _gear_outline(radius: float, tooth: float, bore: float, teeth: int) -> tuple
     return circle * reach[:, None], circle * bore
 
 
-def _sponge_cells(holes: int) -> np.ndarray:
-    """[C, C, C] bool with C = 2 * holes + 1: solid unless two or more of the three indices are odd."""
-    odd = np.arange(2 * holes + 1) % 2
+def _sponge_cells() -> np.ndarray:
+    """[5, 5, 5] bool: solid unless two or more of the three indices are odd."""
+    odd = np.arange(5) % 2
     return odd[:, None, None] + odd[None, :, None] + odd[None, None, :] < 2
 
 
