@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import importlib
 import json
 import struct
 from dataclasses import dataclass, replace
@@ -15,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 import cli
-from sdfsim import Rollout, SdfsimError, Simulator, load_scene
+from sdfsim import Rollout, Simulator, load_scene
 from sdfsim.export import export
 from sdfsim.identify import load_recording
 from sdfsim.scene.scene import Scene
@@ -414,22 +413,6 @@ def test_the_command_tells_what_it_wrote_and_what_it_left_out(dropped, tmp_path)
     }
     assert any("the motion" in line for line in report["left_out"])
     assert not list(tmp_path.rglob("*.part"))
-
-
-@pytest.mark.parametrize(("missing", "ending"), [("pxr", "usda"), ("coacd", "xml")])
-def test_an_extra_that_is_missing_is_named(monkeypatch, tmp_path, missing, ending):
-    real = importlib.import_module
-
-    def absent(name: str, *rest):
-        if name.partition(".")[0] == missing:
-            raise ImportError(name)
-        return real(name, *rest)
-
-    replace(load_shape(SHAPES / "cone"), source={}).save(tmp_path / "cone")
-    monkeypatch.setattr(importlib, "import_module", absent)
-    with pytest.raises(SdfsimError, match="is not installed") as told:
-        export(tmp_path / "cone", tmp_path / f"cone.{ending}")
-    assert "sdfsim[export]" in told.value.hint
 
 
 def test_names_that_would_be_one_stay_apart(tmp_path):

@@ -68,28 +68,6 @@ def test_a_folder_of_meshes_becomes_a_folder_of_shapes(meshes: Path, tmp_path: P
     assert fitting._kept(meshes / "box.ply", out / "box", options) is None
 
 
-def test_a_mesh_whose_data_lie_in_a_file_beside_it_is_fitted_anew_when_that_changes(tmp_path: Path) -> None:
-    import trimesh
-
-    for name, content in trimesh.creation.box((1.0, 1.0, 1.0)).export(file_type="gltf").items():
-        (tmp_path / name).write_bytes(content)
-    file = tmp_path / "model.gltf"
-    told = json.loads(file.read_text())
-    (place,) = (told["bufferViews"][a["bufferView"]]["buffer"] for a in told["accessors"] if a["type"] == "VEC3")
-    corners = tmp_path / told["buffers"][place]["uri"]
-
-    def volume() -> float:
-        report = fit_many({"box": file}, tmp_path / "shapes", QUICK, device="cpu", on_progress=lambda f, m: None)
-        return report["shapes"]["box"]["volume_m3"]
-
-    assert volume() == pytest.approx(1.0)
-    written = (tmp_path / "shapes" / "box" / "shape.json").stat().st_mtime_ns
-    assert volume() == pytest.approx(1.0)
-    assert (tmp_path / "shapes" / "box" / "shape.json").stat().st_mtime_ns == written
-    corners.write_bytes((2 * np.frombuffer(corners.read_bytes(), np.float32)).tobytes())
-    assert volume() == pytest.approx(8.0)
-
-
 def test_units_are_those_of_a_scene_file_and_odd_sizes_are_told(tmp_path: Path) -> None:
     size, file, out = np.array([20.0, 30.0, 40.0]), tmp_path / "box.ply", tmp_path / "box"
     file.write_bytes(write_ply(primitives.box((20.0, 30.0, 40.0))))

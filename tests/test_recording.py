@@ -39,13 +39,12 @@ def scene(tmp_path):
     return load_scene(tmp_path / "scene.yaml")
 
 
-@pytest.fixture
-def rollout(scene) -> Rollout:
+def motion(scene, count: np.ndarray) -> Rollout:
+    """Anything at all, with `count` [T] contact points in each frame."""
     rng = np.random.default_rng(0)
-    count = np.array([0, 2, 0, 1, 3, 0, 1])
-    shape = (STEPS + 1, len(scene.bodies))
+    shape = (len(count), len(scene.bodies))
     return Rollout(
-        time=np.arange(STEPS + 1) * 0.25,
+        time=np.arange(len(count)) * 0.25,
         position=rng.normal(size=(*shape, 3)),
         orientation=Rotation.random(shape[0] * shape[1], random_state=1).as_quat().reshape(*shape, 4),
         velocity=np.zeros((*shape, 3)),
@@ -53,9 +52,14 @@ def rollout(scene) -> Rollout:
         contact_count=count,
         contact_point=rng.normal(size=(count.sum(), 3)),
         contact_body=np.zeros((count.sum(), 2), dtype=np.int64),
-        counters={key: rng.random(STEPS + 1) for key in PLOTS},
+        counters={key: rng.random(len(count)) for key in PLOTS},
         names=tuple(b.name for b in scene.bodies),
     )
+
+
+@pytest.fixture
+def rollout(scene) -> Rollout:
+    return motion(scene, np.array([0, 2, 0, 1, 3, 0, 1]))
 
 
 def test_the_first_view_shows_all_of_the_motion(scene, rollout):
@@ -205,20 +209,7 @@ def crowd(tmp_path, count: int, frames: int, name: str = "ball"):
         f"  - {{name: balls, shape: {name}, scale: 2, arrange: {{grid: [{count}, 1, 1], spacing: 3}}}}\n"
     )
     scene = load_scene(tmp_path / "scene.yaml")
-    rng, shape = np.random.default_rng(0), (frames, len(scene.bodies))
-    rollout = Rollout(
-        time=np.arange(frames) * 0.25,
-        position=rng.normal(size=(*shape, 3)),
-        orientation=Rotation.random(shape[0] * shape[1], random_state=1).as_quat().reshape(*shape, 4),
-        velocity=np.zeros((*shape, 3)),
-        angular_velocity=np.zeros((*shape, 3)),
-        contact_count=np.zeros(frames, dtype=np.int64),
-        contact_point=np.zeros((0, 3)),
-        contact_body=np.zeros((0, 2), dtype=np.int64),
-        counters={key: rng.random(frames) for key in PLOTS},
-        names=tuple(b.name for b in scene.bodies),
-    )
-    return scene, rollout
+    return scene, motion(scene, np.zeros(frames, dtype=np.int64))
 
 
 def test_every_copy_is_where_its_body_is(tmp_path):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import sdfsim
-from sdfsim import SdfsimError, Simulator
+from sdfsim import Simulator
 from sdfsim.recording import eye_of, framed
 from sdfsim.render import FRAMES, SIZE, Studio, poses_at, render
 from sdfsim.run import ended, ending_lines, summary
@@ -106,21 +106,6 @@ def test_a_movie_has_its_frames_and_ends_as_the_picture_of_the_end(tmp_path):
     last = np.asarray(Image.open(tmp_path / "fall.png"), dtype=float)
     assert np.abs(frames[-1] - last).mean() < 3.0 < np.abs(frames[0].astype(float) - frames[-1]).max()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["fall.mp4", "fall.png"]
-
-
-@pytest.mark.parametrize(
-    ("name", "keys", "message"),
-    [
-        ("x.gif", {}, "must end with .mp4 or .png"),
-        ("x.png", {"at": 2.0}, "the run holds 0 to"),
-        ("x.png", {"camera": (0, 0, 1), "look_at": (0, 0, 1)}, "two different points"),
-        ("missing/x.png", {}, "missing"),
-    ],
-)
-def test_what_cannot_be_drawn_is_refused(tmp_path, name, keys, message):
-    scene, rollout = falling(position=(0, 0, 1))
-    with pytest.raises(SdfsimError, match=message):
-        render(scene, rollout, tmp_path / name, **keys)
 
 
 def test_the_end_of_a_run_tells_who_rests_who_moves_and_who_is_gone():

@@ -207,17 +207,6 @@ def boxes(scene: Scene) -> np.ndarray:
     return np.array([[c.min(0), c.max(0)] for c in corners])
 
 
-@pytest.mark.parametrize("degrees", [0.0, 11.3, 30.0])
-def test_a_slope_pulls_along_x_and_presses_as_one_of_its_angle_does(degrees):
-    scene = hard_cases.slope(0.4, degrees)
-    along, across, press = scene.gravity
-    assert along == pytest.approx(10.0 * np.sin(np.radians(degrees)))
-    assert press == pytest.approx(-10.0 * np.cos(np.radians(degrees))) and across == 0
-    slab, floor = scene.bodies
-    assert slab.friction * floor.friction == pytest.approx(0.4)
-    assert vertices(scene, slab)[:, 2].min() == pytest.approx(0.0)
-
-
 @pytest.mark.parametrize(
     ("built", "count", "layers"),
     [("tower", 5, 5), ("pyramid", 10, 4), ("wall", 22, 5)],
@@ -236,21 +225,6 @@ def test_stacks_touch_without_overlap_and_each_body_has_something_below(built, c
         middle = box[:, 0].mean()
         rests = under[(shared > 0).all(1)]
         assert len(rests) and rests[:, 0, 0].min() < middle < rests[:, 1, 0].max()
-
-
-def test_a_pile_starts_within_the_bowl_and_nothing_touches():
-    scene = hard_cases.piled(64, 1)
-    inner, outer = hard_cases.bowl_radii(64)
-    *bodies, bowl, _ = scene.bodies
-    assert len(bodies) == 64 and bowl.scale == pytest.approx(2 * outer)
-    centre = np.array([b.position for b in bodies]) - bowl.position
-    reach = np.linalg.norm(np.minimum(centre, [np.inf, np.inf, 0.0]), axis=1)
-    around = np.array([np.linalg.norm(scene.shapes[b.shape].sdf.bounds[1]) for b in bodies])
-    around[[b.shape == 0 for b in bodies]] = hard_cases.BOWL_BALL / 2
-    assert (reach + around < inner).all()
-    for i, j in combinations(range(64), 2):
-        assert np.linalg.norm(centre[i] - centre[j]) > around[i] + around[j]
-    assert np.ptp(scene.shapes[bowl.shape].mesh.vertices, axis=0).max() * bowl.scale == pytest.approx(2 * outer)
 
 
 def test_a_body_is_put_to_rest_on_the_floor_on_its_steady_face():

@@ -54,16 +54,6 @@ def test_nodes_that_do_not_tell_how_a_body_turns_are_refused(nodes, told):
     assert caught.value.exit_code == 1 and "nodes: 7" in caught.value.hint
 
 
-def test_it_is_the_nodes_in_use_that_count_and_only_of_what_moves():
-    """A model that looks at the first two of a shape's nodes sees a line; scenery may have any."""
-    scene = dropped(np.concatenate([LINE[:2], FLAT]))
-    Simulator(scene, random_model("impulse"))
-    with pytest.raises(SdfsimError, match="on one line"):
-        Simulator(scene, replace(random_model("impulse"), nodes=2))
-    still = replace(scene, bodies=tuple(replace(b, motion="static", mass=0.0) for b in scene.bodies))
-    Simulator(replace(still, shapes=(replace(gates.CUBE, nodes=LINE), *still.shapes[1:])), random_model("impulse"))
-
-
 # Where the gradient is not that of a smooth function, on a body of size 1 about the origin.
 CORNERS = np.stack(np.meshgrid(*[[-0.5, 0.0, 0.5]] * 3, indexing="ij"), -1).reshape(-1, 3)
 PLACES = {

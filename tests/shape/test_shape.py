@@ -129,21 +129,6 @@ def test_analytic_mass_properties_and_nodes() -> None:
     assert floor.name == "floor"
 
 
-@pytest.mark.parametrize(
-    ("kind", "options", "message"),
-    [
-        ("sphere", {}, "radius"),
-        ("sphere", {"radius": -1.0}, "> 0"),
-        ("box", {}, "size"),
-        ("box", {"size": (1.0, 0.0, 1.0)}, "> 0"),
-        ("blob", {}, "unknown"),
-    ],
-)
-def test_bad_analytic_shapes_are_refused(kind, options: dict, message: str) -> None:
-    with pytest.raises(SdfsimError, match=message):
-        analytic_shape(kind, **options)
-
-
 def test_scaling_scales_everything() -> None:
     small, large = analytic_shape("sphere", radius=0.1), scaled(analytic_shape("sphere", radius=0.1), 3.0)
     assert isinstance(large.sdf, SphereSdf)
