@@ -12,10 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.hard_cases import crashing
-from tests.hard_cases.crashing import NEVER, litter, whole
-from tests.hard_cases.test_crash_commands import Work, call, undisturbed, works
-
-__all__ = ["undisturbed", "works"]  # fixtures
+from tests.hard_cases.crashing import NEVER, Work, call, litter, whole
 
 
 @pytest.fixture

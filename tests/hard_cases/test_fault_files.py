@@ -57,12 +57,11 @@ def test_shapes_that_are_cut_short_are_one_line(tmp_path, name, share):
 def test_a_training_checkpoint_that_is_cut_short_is_one_line(tmp_path, monkeypatch):
     from sdfsim.training import train
     from tests.hard_cases import crashing
-    from tests.hard_cases.test_crash_commands import write_cubes
 
     monkeypatch.setattr(train, "PRESETS", dict(train.PRESETS))
     monkeypatch.setattr(train, "CHECKPOINT_SECONDS", train.CHECKPOINT_SECONDS)
     crashing.tiny_train()
-    write_cubes(tmp_path / "data")
+    crashing.write_cubes(tmp_path / "data")
     command = ("train", "--data", tmp_path / "data", "-o", tmp_path / "out")
     assert run(*command).exit_code == 0
     checkpoint = tmp_path / "out" / "checkpoint.npz"

@@ -17,6 +17,7 @@ from sdfsim.dynamics.models.impulse import ImpulseNetwork, Velocities
 from sdfsim.dynamics.simulator import SimulationError, Simulator
 from tests.dynamics.conftest import random_model
 from tests.hard_cases import gates
+
 BROKEN = {
     "nan": ("velocity", torch.nan),
     "inf": ("position", torch.inf),
