@@ -306,56 +306,51 @@ def quality_rows(report: dict[str, Any], *, name: str) -> Rows:
         seconds = report["median_survival_s"][who][SURVIVED]
         return f"> {length:g} s" if seconds is None else f"{seconds:.2f} s"
 
+    def quality(who: str) -> list[str]:
+        depth, gain = report["penetration"][who], report["energy_gain"][who]
+        told = zip(
+            (depth["percentile_95"], depth["worst"], gain["mean"], gain["worst"], report["resting_speed"][who]),
+            ("{:.4f} m", "{:.4f} m", "{:.2%}", "{:.2%}", "{:.4f} m/s"),
+            strict=True,
+        )
+        return [NOTHING if value is None else form.format(value).replace("%", " %") for value, form in told]
+
     others = {f"teacher, {size} m/s off": f"teacher {size}" for size in _perturbed(report)} | {"ballistic": "ballistic"}
     return [
         head,
-        (name, *_quality_cells(report, "model"), lasting("model")),
-        ("teacher, recorded", *_quality_cells(report, "teacher"), NOTHING),
+        (name, *quality("model"), lasting("model")),
+        ("teacher, recorded", *quality("teacher"), NOTHING),
         *((who, *[NOTHING] * (len(head) - 2), lasting(key)) for who, key in others.items()),
     ]
 
 
 def notes(report: dict[str, Any]) -> list[str]:
     """What has to be known beside the tables, a line each."""
-    depth, floor = report["penetration"], report.get("chaos_floor", {})
-    frames = {who: depth[who]["steps_with_contact"] for who in ("model", "teacher")}
-    lines = [
-        f"Penetration: the deepest node in every {depth['every']}th frame, of {frames['model']} with contact "
-        f"(recorded: {frames['teacher']}).",
-        "Energy gain: the largest over the energy at the start; mean and worst of the trajectories.",
-        f"Resting speed: median of the {report['resting_speed']['bodies']} bodies that rest in the recording.",
-        f"Within {SURVIVED} m: how long it takes until half of the bodies have been farther from the recording.",
-    ]
-    if shown := sorted(name for name, kind in depth["geometry"].items() if kind == "shown mesh"):
-        lines.append(f"Without the engine's files, penetration is into the mesh that is shown of {', '.join(shown)}.")
-    if (steps := report["steps"]) < report["steps_asked"]:
-        lines.append(f"The shortest recording ends after {steps} steps; {report['steps_asked']} were asked for.")
-    lines += [f"Outside the model's training: {line}." for line in report["outside_training"]]
-    if not report["engine_substep"]:
-        lines.append("No dataset.json tells the engine's inner step: velocities count as at the positions' instants.")
-    if "left_out" in floor:
-        lines.append(f"The teacher's chaos floor is left out: {floor['left_out']}.")
-    elif floor:
-        lines.append(
-            "Run again unperturbed, the teacher departs from its recording by up to "
-            f"{floor['median_farthest_unperturbed_m']:.1g} m (median of the trajectories)."
-        )
-    return lines
+    depth, floor, steps = report["penetration"], report.get("chaos_floor", {}), report["steps"]
+    shown = sorted(name for name, kind in depth["geometry"].items() if kind == "shown mesh")
+    lines = {
+        f"Penetration: the deepest node in every {depth['every']}th frame with contact.": True,
+        "Energy gain: the largest over the energy at the start; mean and worst of the trajectories.": True,
+        f"Resting speed: median of the {report['resting_speed']['bodies']} bodies that rest in the recording.": True,
+        f"Within {SURVIVED} m: until half of the bodies have been farther from the recording.": True,
+        f"Without the engine's files, penetration is into the mesh that is shown of {', '.join(shown)}.": shown,
+        f"The shortest recording ends after {steps} steps; {report['steps_asked']} were asked for.": (
+            steps < report["steps_asked"]
+        ),
+        **{f"Outside the model's training: {line}.": True for line in report["outside_training"]},
+        "No dataset.json tells the engine's inner step: velocities count as at the positions' instants.": (
+            not report["engine_substep"]
+        ),
+        f"The teacher's chaos floor is left out: {floor.get('left_out')}.": "left_out" in floor,
+        "Run again unperturbed, the teacher departs from its recording by up to "
+        f"{floor.get('median_farthest_unperturbed_m', 0.0):.1g} m (median of the trajectories).": (
+            "perturbations" in floor
+        ),
+    }
+    return [line for line, holds in lines.items() if holds]
 
 
 def _perturbed(report: dict[str, Any]) -> dict[str, dict]:
     """Errors of the teacher run again, by perturbation, without the run that nothing perturbs: that one is a note."""
     runs = report.get("chaos_floor", {}).get("perturbations", {})
     return {size: found for size, found in runs.items() if size != "0"}
-
-
-def _quality_cells(report: dict[str, Any], who: str) -> list[str]:
-    depth, gain = report["penetration"][who], report["energy_gain"][who]
-    told = [
-        (depth["percentile_95"], "{:.4f} m"),
-        (depth["worst"], "{:.4f} m"),
-        (gain["mean"], "{:.2%}"),
-        (gain["worst"], "{:.2%}"),
-        (report["resting_speed"][who], "{:.4f} m/s"),
-    ]
-    return [NOTHING if value is None else form.format(value).replace("%", " %") for value, form in told]

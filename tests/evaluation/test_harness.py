@@ -105,5 +105,5 @@ def test_tables_plots_and_memory(tmp_path):
     draw(panels, tmp_path / "a.png")
     assert (tmp_path / "a.png").read_bytes()[:4] == b"\x89PNG"
     with peak_memory() as memory:
-        np.ones(4 * 2**20).sum()  # 32 MiB
-    assert memory["mib"] is None or memory["mib"] == pytest.approx(32, abs=16)
+        np.ones(32 * 2**20).sum()  # 256 MiB
+    assert memory["mib"] is None or memory["mib"] == pytest.approx(256, abs=32)
