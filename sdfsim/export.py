@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 from sdfsim.errors import SdfsimError
 from sdfsim.files import check_writable, replacing, write_text
 from sdfsim.identify import COLUMNS
+from sdfsim.parallel import StageProgress
 from sdfsim.recording import distinct_colors, framed, sheet, with_normals
 from sdfsim.run import read_run
 from sdfsim.scene.collision_filter import contact_groups
@@ -46,7 +47,6 @@ SOFT = 4.0  # steps, over 2 pi: the time in which a contact of MuJoCo swings
 MOST_PAIRS = 1000  # of geoms whose coefficients are written one by one
 MOST_GROUPS = 31  # MuJoCo's bit masks
 RESERVED = ("world", "root", "physics", "materials", "shapes", "groups")  # names of ours, or of MuJoCo's own
-Progress = Callable[[str, float, str], None]  # stage, fraction of it that is done, message
 XML = ElementTree.Element
 
 
@@ -104,7 +104,7 @@ def export(
     *,
     scene_file: Path | str | None = None,
     allow_outside: bool = False,
-    on_progress: Progress = lambda stage, fraction, message: None,
+    on_progress: StageProgress = lambda stage, fraction, message: None,
 ) -> dict[str, Any]:
     """Write a shape, a scene or a run in the format that the ending of `out` names.
 
@@ -113,7 +113,6 @@ def export(
         out: file to write, with one of the endings of `FORMATS`; its folder is made if missing.
         scene_file: of a run, None for the one that it was made from.
         allow_outside: whether the scene may name files outside of its own folder.
-        on_progress: called with (stage, fraction, message).
 
     Returns:
         A report: format, bodies, frames, files and left_out.
@@ -152,7 +151,7 @@ def _extra(module: str) -> Any:
 # --- the source ---
 
 
-def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progress: Progress) -> Take:
+def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progress: StageProgress) -> Take:
     def told(fraction: float, message: str) -> None:
         on_progress("shapes", fraction, message)
 
@@ -242,7 +241,7 @@ def _pieces(shape: Shape) -> list[Mesh]:
         raise SdfsimError(f"shape {shape.name}: CoACD cannot cut it into convex pieces ({error})") from error
 
 
-def _cut(take: Take, wanted: Callable[[Body], bool], on_progress: Progress) -> dict[int, list[Mesh]]:
+def _cut(take: Take, wanted: Callable[[Body], bool], on_progress: StageProgress) -> dict[int, list[Mesh]]:
     """Convex pieces of every shape without a closed form that a wanted body has, by its index."""
     used = {body.shape for body in take.scene.bodies if wanted(body)}
     todo = sorted(k for k in used if not isinstance(take.scene.shapes[k].sdf, ClosedForm))
@@ -317,7 +316,7 @@ def _missing(take: Take, *, motion: bool = False, textures: bool = False) -> lis
 # --- glTF ---
 
 
-def _glb(take: Take, out: Path, on_progress: Progress) -> Written:
+def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
     file = Gltf()
     # Bodies of one shape and colour share a mesh; of one shape they share its numbers.
     numbers: dict[int, tuple[dict[str, int], int]] = {}
@@ -358,7 +357,7 @@ def _glb(take: Take, out: Path, on_progress: Progress) -> Written:
 # --- USD ---
 
 
-def _usd(take: Take, out: Path, on_progress: Progress) -> Written:
+def _usd(take: Take, out: Path, on_progress: StageProgress) -> Written:
     names = ("Gf", "Sdf", "Usd", "UsdGeom", "UsdPhysics", "UsdShade")
     gf, sdf, usd, geom, physics, shade = (_extra(f"pxr.{name}") for name in names)
     stage = usd.Stage.CreateInMemory()
@@ -509,7 +508,7 @@ def _usd_mesh(stage: Any, path: str, mesh: Mesh) -> Any:
 # --- MuJoCo ---
 
 
-def _mjcf(take: Take, out: Path, on_progress: Progress) -> Written:
+def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
     scene, left_out = take.scene, _missing(take)
     shown, cut = _write_assets(take, out, _cut(take, lambda body: True, on_progress))
     root = XML("mujoco", model=_plain_names([out.stem])[0])
@@ -617,7 +616,7 @@ def _mjcf_surface(friction: float, restitution: float, *, pair: bool = False) ->
 # --- URDF ---
 
 
-def _urdf(take: Take, out: Path, on_progress: Progress) -> Written:
+def _urdf(take: Take, out: Path, on_progress: StageProgress) -> Written:
     shown, cut = _write_assets(take, out, _cut(take, lambda body: body.motion != "static", on_progress))
     files: list[Path] = []
     single = len(take.names) == 1 and take.scene.path is None
@@ -682,7 +681,7 @@ def _urdf_form(geometry: XML, form: Any, scale: float) -> None:
 # --- poses ---
 
 
-def _csv(take: Take, out: Path, on_progress: Progress) -> Written:
+def _csv(take: Take, out: Path, on_progress: StageProgress) -> Written:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
@@ -694,7 +693,7 @@ def _csv(take: Take, out: Path, on_progress: Progress) -> Written:
     return Written([out], ["everything but poses"])
 
 
-FORMATS: dict[str, Callable[[Take, Path, Progress], Written]] = {
+FORMATS: dict[str, Callable[[Take, Path, StageProgress], Written]] = {
     ".glb": _glb,
     **dict.fromkeys((".usd", ".usda", ".usdc"), _usd),
     **dict.fromkeys((".xml", ".mjcf"), _mjcf),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -13,7 +12,7 @@ from sdfsim.dynamics.bodies import largest_extent
 from sdfsim.dynamics.simulator import pick_device
 from sdfsim.errors import SdfsimError
 from sdfsim.files import check_writable, locked, read_json
-from sdfsim.parallel import parallel
+from sdfsim.parallel import Progress, parallel
 from sdfsim.scene.scene_file import UNITS
 from sdfsim.shape.baked_grid import grid_certificate
 from sdfsim.shape.distance import MeshDistance
@@ -21,8 +20,6 @@ from sdfsim.shape.fit import FIT_VERSION, Recipe, fit_mesh, fit_solids
 from sdfsim.shape.mesh import MESH_SUFFIXES, Mesh, load_mesh
 from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape
 from sdfsim.shape.watertight import solidify
-
-Progress = Callable[[float, str], None]
 
 # Shapes that one GPU trains side by side: some 40 MB each.
 STACK = 256
@@ -50,7 +47,6 @@ def fit(mesh_file: Path, out: Path, options: Options, *, device: str, on_progres
         out: shape folder.
         options: of the fit.
         device: cpu, cuda or auto.
-        on_progress: called with (fraction, message).
 
     Returns:
         Folder, volume, number of nodes, what was done to the mesh, the certificate, and in `failed_checks` whether it
@@ -132,7 +128,6 @@ def fit_many(
         out: folder of shape folders.
         options: of each fit.
         device: cpu, cuda or auto.
-        on_progress: called with (fraction, message).
 
     Returns:
         `shapes`, a report by name: that of `fit`, or the `error` that kept a mesh from being fitted; and in

@@ -23,6 +23,7 @@ from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.model import SOLVER, load_model
 from sdfsim.dynamics.step import Rules, step
 from sdfsim.errors import SdfsimError
+from sdfsim.parallel import Progress
 from sdfsim.run import read_run
 from sdfsim.scene.scene import Scene
 from sdfsim.scene.scene_file import load_scene
@@ -34,7 +35,6 @@ WEAK = 1e-3  # how strongly coefficients that nothing shows are held to it
 OUTLIER = 2e-3  # model lengths: errors of windows that count less than squared, beyond
 NUDGE = 0.02  # of a coefficient, for differences: contacts come and go, so that smaller ones tell nothing
 SURE = 1.96  # standard deviations in an interval of 95 %
-Progress = Callable[[float, str], None]
 COLUMNS = ("time", "body", "x", "y", "z", "qx", "qy", "qz", "qw")
 
 
@@ -125,7 +125,6 @@ def load_recording(
             the shapes' own origins, as in a scene file.
         scene_file: its scene; of a run the one that it was made from, if this is None.
         allow_outside: whether the scene may name files outside of its own folder.
-        on_progress: called with the fraction done and a message while shapes are fitted.
 
     Raises:
         SdfsimError: no scene, unreadable files, or a recording that is not of this scene.
@@ -208,7 +207,6 @@ def identify(recording: Recording, scene: Scene, *, on_progress: Progress | None
     Args:
         recording: what happened.
         scene: shapes, sizes, masses and gravity; the coefficients of bodies that do not move are taken as they are.
-        on_progress: called with the fraction done and a message.
 
     Raises:
         SdfsimError: bodies on paths, a recording too short, or one in which nothing touches.

@@ -14,6 +14,8 @@ import torch
 
 from sdfsim.errors import SdfsimError
 
+Progress = Callable[[float, str], None]  # called with the fraction of the work that is done, and a message
+StageProgress = Callable[[str, float, str], None]  # the same, behind the name of one stage of several
 _most = torch.get_num_threads()  # Before anything here has changed it.
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import resource
-from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -15,6 +14,7 @@ from sdfsim.console import duration
 from sdfsim.dynamics.model import load_model
 from sdfsim.dynamics.ranges import constant_in_training
 from sdfsim.dynamics.simulator import Simulator, pick_device
+from sdfsim.parallel import StageProgress
 from sdfsim.scene.effects import Plan, plan
 from sdfsim.scene.scene import Effects, Scene
 from sdfsim.scene.scene_file import DEFAULT_DURATION, DEFAULT_GRAVITY, load_scene
@@ -27,7 +27,7 @@ def describe(
     *,
     model: str | None,
     device: str,
-    on_progress: Callable[[str, float, str], None],
+    on_progress: StageProgress,
     allow_outside: bool = False,
 ) -> dict[str, Any]:
     """The plan of a scene with its units and the cost of a step, measured over the first few.
@@ -36,7 +36,6 @@ def describe(
         scene_file: scene.yaml.
         model: bundled name or path (None: what the scene says).
         device: cpu, cuda or auto.
-        on_progress: called with (stage, fraction, message).
         allow_outside: whether the scene may name files outside of its own folder.
 
     Raises:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -13,6 +13,7 @@ import numpy as np
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.errors import SdfsimError
 from sdfsim.files import replacing
+from sdfsim.parallel import Progress
 from sdfsim.recording import Eye, Place, body_colors, eye_of, framed, sheet, with_normals
 from sdfsim.scene.scene import Scene
 
@@ -27,7 +28,6 @@ _SUN = np.array([0.35, -0.5, 0.8]) / np.linalg.norm([0.35, -0.5, 0.8])  # in a f
 _SKY, _SHADE = np.array([236.0, 240.0, 245.0]), 0.45  # what nothing is in front of; light where the sun does not shine
 _SUB = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]])  # px, where edges are looked at again
 _GRID = np.stack(np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5), -1).reshape(-1, 2)  # px
-Progress = Callable[[float, str], None]
 
 
 def render(
@@ -43,7 +43,6 @@ def render(
         camera: [3] m, where it is; None: where all of the motion is in sight.
         look_at: [3] m, the point in its middle; None: the middle of all that moves or stands.
         at: s, the time of a picture (default: the end).
-        on_progress: called with the fraction done and a message.
 
     Raises:
         SdfsimError: another ending, a time outside of the run, a camera where it looks at, or a file that cannot be

@@ -35,13 +35,12 @@ from sdfsim.files import (
     write_json,
     write_text,
 )
+from sdfsim.parallel import Progress, StageProgress
 from sdfsim.recording import Place, Playback, eye_of, framed, save_rollout
 from sdfsim.scene.scene import Scene
 from sdfsim.scene.scene_file import load_scene
 
 Viewer = Literal["none", "file", "native", "web"]
-Progress = Callable[[str, float, str], None]  # stage, fraction of it that is done, message
-Told = Callable[[float, str], None]
 CHECKPOINT = "checkpoint"  # folder in that of the run
 EVERY = 30.0  # s between two checkpoints
 TOLD = 12  # bodies that are told of one by one at the end
@@ -64,7 +63,7 @@ def simulate(
     seed: int | None,
     viewer: Viewer,
     device: str,
-    on_progress: Progress,
+    on_progress: StageProgress,
     say: Callable[[str], None],
     bind: str = "127.0.0.1",
     allow_outside: bool = False,
@@ -83,7 +82,6 @@ def simulate(
         seed: None: the scene's.
         viewer: where to watch: not at all, later from the file, or live in a window or a page.
         device: cpu, cuda or auto.
-        on_progress: called with (stage, fraction, message).
         say: called with a line for the person: what was replaced, where the page of `viewer` web is.
         bind: address of this machine that a live viewer listens on.
         allow_outside: whether the scene may name files outside of its own folder.
@@ -211,7 +209,7 @@ def _live(live: Playback, viewer: Viewer, first: Rollout, say: Callable[[str], N
 
 
 def read_run(
-    path: Path, scene_file: Path | None = None, *, allow_outside: bool = False, on_progress: Told | None = None
+    path: Path, scene_file: Path | None = None, *, allow_outside: bool = False, on_progress: Progress | None = None
 ) -> tuple[Scene, Rollout]:
     """A finished or interrupted run, and its scene.
 
@@ -219,7 +217,6 @@ def read_run(
         path: run folder, or the `rollout.npz` in one.
         scene_file: its scene; None: the one that the run was made from.
         allow_outside: whether the scene may name files outside of its own folder.
-        on_progress: called with the fraction done and a message while shapes are fitted.
 
     Raises:
         SdfsimError: no run, no scene, or another scene than that of the run.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -15,14 +14,12 @@ from sdfsim.data.scenarios import RECIPES, Cast, Recipe
 from sdfsim.data.shape_assets import VHACD, Origin, fit_shapes, origins, prepare, split_of
 from sdfsim.errors import SdfsimError
 from sdfsim.files import locked, write_json
-from sdfsim.parallel import parallel
+from sdfsim.parallel import Progress, parallel
 
 GRAVITY = (0.0, 0.0, -10.0)  # m/s^2
 STEPS = 100
 MOST_BODIES = 512
 REDRAWS = 1000  # of a scene in which a body found no room
-
-Progress = Callable[[float, str], None]
 
 
 def make_dataset(
@@ -55,7 +52,6 @@ def make_dataset(
         fps: recorded frames a second, in `RATES`.
         seed: of the dataset.
         split: "train", "validation" or "test".
-        on_progress: called with the fraction done and a message.
 
     Returns:
         A report: dataset, split, trajectories, made_now, shapes (how many the split draws from), left_out (name ->

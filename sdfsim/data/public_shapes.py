@@ -15,11 +15,11 @@ import os
 import tarfile
 import tempfile
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 
 from sdfsim.errors import SdfsimError
 from sdfsim.files import FREELY, replacing
+from sdfsim.parallel import Progress
 
 KUBRIC = "https://storage.googleapis.com/kubric-public/assets/KuBasic"
 # One commit, so that nothing there can move.
@@ -65,12 +65,11 @@ SUMS = {
 }
 
 
-def public_folder(shapes: Path, on_progress: Callable[[float, str], None] | None = None) -> Path:
+def public_folder(shapes: Path, on_progress: Progress | None = None) -> Path:
     """The folder that `--shapes` means: that of this path, or the public set of this name, fetched if need be.
 
     Args:
         shapes: a folder, or the name of a set in `SUMS`; a folder of that name comes first.
-        on_progress: called with 0 and a message for each download.
 
     Raises:
         SdfsimError: a download failed, or a file is not the one expected.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from sdfsim.data.dataset import SOLID, check_names
 from sdfsim.data.pybullet_sim import write_form_urdf, write_urdf
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, write_json, write_text
-from sdfsim.parallel import parallel
+from sdfsim.parallel import Progress, parallel
 from sdfsim.shape import primitives
 from sdfsim.shape.distance import PiecesDistance
 from sdfsim.shape.fit import fit_pieces
@@ -37,8 +36,6 @@ resource.setrlimit(resource.RLIMIT_AS, (4 << 30, 4 << 30))
 pybullet.vhacd(*sys.argv[1:], **{VHACD})
 """
 VHACD_TIME = 600  # s
-
-Progress = Callable[[float, str], None]
 
 
 @dataclass(frozen=True)
@@ -146,7 +143,6 @@ def prepare(found: list[Origin], engine: Path, on_progress: Progress) -> tuple[l
     Args:
         found: from `origins`, or primitives.
         engine: folder for NAME.obj (the pieces), NAME.urdf and NAME.json.
-        on_progress: called with the fraction done and a message.
 
     Returns:
         The usable shapes in the order of `found`; and the others, name -> why.

@@ -61,7 +61,6 @@ def evaluate(
         substeps: inner steps of the solve in a step; None for the model's, else for those of the recording engine.
         chaos_floor: also run the teacher again from starts that differ slightly (see `baselines.PERTURBATIONS`).
         errors_only: leave out penetration, energy and rest.
-        on_progress: called with the fraction done and a message.
 
     Returns:
         A report:

@@ -21,9 +21,8 @@ import torch
 import sdfsim
 from sdfsim.errors import SdfsimError
 from sdfsim.files import digest, read_json, replacing, write_json
-from sdfsim.parallel import parallel
+from sdfsim.parallel import Progress, parallel
 
-Progress = Callable[[float, str], None]
 Results = dict[tuple[str, str], dict[str, Any]]
 FAILURES = (SdfsimError, RuntimeError, MemoryError)
 
@@ -64,7 +63,6 @@ def measure(
         folder: holds METHOD/CASE.json.
         where: "here", one after the other in this process; "cores", on all of them, the longest first; "fresh", each in
             a process of its own, whose peak memory is then the job's.
-        on_progress: called with (fraction, message).
     """
     tell = on_progress or (lambda fraction, message: None)
     files = [folder / job.method / f"{job.case}.json" for job in jobs]

@@ -76,7 +76,6 @@ def stress(
         shapes: folder of meshes that are to rest on the floor too, or name of a public set (see `public_folder`).
         device: cpu, cuda or auto.
         record: writes a motion of each case that is not as wanted into a file; None for no recordings.
-        on_progress: called with (fraction, message).
 
     Raises:
         SdfsimError: no such model or device, two models of one name, unusable shapes or none to be fetched, another run

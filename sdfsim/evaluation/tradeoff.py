@@ -50,6 +50,7 @@ from sdfsim.evaluation.harness import (
 )
 from sdfsim.evaluation.penetration import Solid, exact_solids, penetration
 from sdfsim.files import locked, write_json, write_text
+from sdfsim.parallel import StageProgress
 from sdfsim.scene.scene import Scene
 from sdfsim.scene.scene_file import load_scene
 from sdfsim.shape.mlp_sdf import MlpSdf
@@ -358,7 +359,7 @@ def tradeoff(
     *,
     models: Sequence[str] = (),
     quick: bool = False,
-    on_progress: Callable[[str, float, str], None],
+    on_progress: StageProgress,
 ) -> dict[str, Any]:
     """Measure all contenders on recorded scenes and write tradeoff.csv, tradeoff.png and report.json.
 
@@ -368,7 +369,6 @@ def tradeoff(
         out: folder to write; results that it holds already are kept.
         models: names or paths (none: the solver and all bundled networks).
         quick: fewer settings on fewer, shorter scenes.
-        on_progress: called with (stage, fraction, message).
 
     Returns:
         The content of report.json: `points`, each with its label, its kind ("ours", "engine", "floor", "baseline"),

@@ -22,6 +22,7 @@ from pydantic import model_validator as validator_of_model
 from pydantic_core import InitErrorDetails, PydanticCustomError, core_schema
 
 from sdfsim.errors import SceneError, SdfsimError
+from sdfsim.parallel import Progress
 from sdfsim.scene.scene import Body, Effects, Limits, Motion, Scene, Waypoints
 from sdfsim.shape.primitives import PRIMITIVES
 from sdfsim.shape.shape import (
@@ -58,7 +59,6 @@ _NOT_FINITE = re.compile(r"[-+]?\.?(nan|inf|infinity)", re.IGNORECASE)
 _NULL = ("", "~", "null", "Null", "NULL")
 _PLAIN_TAGS = {f"tag:yaml.org,2002:{t}" for t in ("str int float bool null map seq timestamp merge value".split())}
 
-Progress = Callable[[float, str], None]
 Loc = tuple[str | int, ...]  # keys and indices that lead to a value
 Fault = tuple[Loc, str]  # where below a table, and what is wrong there
 
@@ -765,7 +765,6 @@ def load_scene(
 
     Args:
         path: of the scene.yaml; paths inside it are taken from its folder.
-        on_progress: called with (fraction, message) while shapes are fitted. A mesh is fitted on first use only.
         allow_outside: whether meshes, shape folders and models that the file names may lie outside of its folder.
         text: what is in the file, where it is not written yet.
 

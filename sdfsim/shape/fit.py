@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from sdfsim.errors import SdfsimError
-from sdfsim.parallel import choose_threads
+from sdfsim.parallel import Progress, choose_threads
 from sdfsim.shape.distance import DistanceOracle, MeshDistance, PiecesDistance
 from sdfsim.shape.far_field import BOX
 from sdfsim.shape.fit_metrics import SIGN_FROM, certify
@@ -27,7 +27,6 @@ from sdfsim.shape.surface_nodes import DEFAULT_COUNT, edge_nodes, hull_nodes, sa
 from sdfsim.shape.watertight import solidify
 
 Recipe = Literal["quick", "default", "paper"]
-Progress = Callable[[float, str], None]
 Oracle = TypeVar("Oracle", bound=DistanceOracle)
 # Weights and biases per layer, [S, out, in] and [S, out].
 Layers = tuple[list[torch.Tensor], list[torch.Tensor]]
@@ -155,7 +154,6 @@ def fit_mesh(
         seed: of sampling and initialisation.
         cap: close openings of any size.
         thicken: m; the solid is all within half of this distance from the mesh instead.
-        on_progress: called with (fraction done, message).
         device: to train on.
 
     Returns:

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from sdfsim.errors import SdfsimError
+from sdfsim.parallel import Progress
 from sdfsim.shape.distance import MeshDistance
 from sdfsim.shape.far_field import BOX, in_metres
 from sdfsim.shape.mesh import Frame, Mesh, normal_frame
@@ -371,7 +372,7 @@ def sample_grid(
     distance: Callable[[np.ndarray], tuple[Any, ...]],
     bounds: np.ndarray,
     resolution: int,
-    on_progress: Callable[[float, str], None] | None = None,
+    on_progress: Progress | None = None,
 ) -> GridSdf:
     """Sample a signed distance on a voxel grid.
 
@@ -381,7 +382,6 @@ def sample_grid(
         bounds: [2, 3] float64 m, the box that holds the solid.
         resolution: samples along each side of the cube 1.4 times as wide as the solid: `resolution`^3 in all,
             4 bytes each, 1.4 / (resolution - 1) of the solid's largest extent apart.
-        on_progress: called with (fraction done, message).
 
     Raises:
         SdfsimError: fewer than two samples a side, or bounds that have no extent or are not finite.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -15,6 +15,7 @@ import torch
 
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, replacing, write_json
+from sdfsim.parallel import Progress
 from sdfsim.shape import primitives
 from sdfsim.shape.distance import MeshDistance
 from sdfsim.shape.mass import mass_properties_of_sdf
@@ -37,7 +38,6 @@ from sdfsim.shape.surface_nodes import DEFAULT_COUNT, sample_nodes, surface_node
 from sdfsim.shape.watertight import solidify
 
 SdfKind = Literal["mlp", "grid", "mesh"]
-Progress = Callable[[float, str], None]
 
 FORMAT_VERSION = 1
 # Samples along each side of a grid: its cells are then 0.022 of the solid's largest extent.
@@ -367,7 +367,6 @@ def shape_from_mesh(
         thicken: m; a thickness for an open sheet.
         sdf: "mlp" fits the network; "grid" and "mesh" fit nothing (see `mesh_shape`).
         resolution: of a grid, samples along each side.
-        on_progress: called with (fraction done, message) while fitting or sampling.
 
     Raises:
         SdfsimError: the mesh cannot be used.
