@@ -58,7 +58,7 @@ def ours(source: Path | int, steps: int, model: str | None, keep: float = 1.0) -
     scene = apart(source) if isinstance(source, int) else with_nodes_cut(load_scene(source), keep)
     frames, broken = [], None
     with peak_memory() as memory:
-        paper = load_model(model, weights=False).kind == "paper"
+        paper = load_model(model, weights=False).on_surfaces
         simulator = Simulator(scene, model, free_flight="learned" if paper else "exact")
         frames.extend(simulator.frames(1))  # not timed: it loads what is compiled
         began = time.process_time()

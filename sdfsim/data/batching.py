@@ -12,6 +12,8 @@ from sdfsim.dynamics.bodies import Bodies, State, Units, from_scene
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.shape import Shape, analytic_shape
 
+PLANE = analytic_shape("plane")
+
 
 def merged(
     trajectories: list[Trajectory],
@@ -20,11 +22,12 @@ def merged(
     units: Units,
     device: torch.device,
     floor: tuple[float, float] = FLOOR,
+    plane: Shape = PLANE,
 ) -> tuple[Bodies, State]:
     """Bodies of all trajectories, each at its frame, then one floor they share; worlds do not touch each other.
 
     Masses and inertias are relative to the mean mass of the bodies that move in the trajectory, as in `Simulator`:
-    inverse masses are inputs of the *paper* network.
+    inverse masses are inputs of networks on surface nodes.
 
     Args:
         trajectories: W of them.
@@ -33,16 +36,21 @@ def merged(
         units: model units of length and time; its mass is to be 1.
         device: of the tensors.
         floor: its friction and restitution.
+        plane: its shape.
     """
     means = [1.0 if t.static.all() else float(t.mass[~t.static].mean()) for t in trajectories]
     relative = [replace(t, mass=t.mass / m, inertia=t.inertia / m) for t, m in zip(trajectories, means, strict=True)]
-    scene, world = scene_of(relative, frames, shapes, floor)
+    scene, world = scene_of(relative, frames, shapes, floor, plane)
     tensors, state = from_scene(scene, units, device)
     return replace(tensors, world=torch.tensor(world, device=device)), state
 
 
 def scene_of(
-    trajectories: list[Trajectory], frames: list[int], shapes: dict[str, Shape], floor: tuple[float, float] = FLOOR
+    trajectories: list[Trajectory],
+    frames: list[int],
+    shapes: dict[str, Shape],
+    floor: tuple[float, float] = FLOOR,
+    plane: Shape = PLANE,
 ) -> tuple[Scene, list[int]]:
     """One scene of all trajectories, each at its frame, and the world of each of its bodies (-1, the floor: in all)."""
     names = sorted({str(n) for t in trajectories for n in t.shape})
@@ -68,6 +76,5 @@ def scene_of(
             world.append(w)
     zero, unturned = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
     bodies.append(Body("floor", len(names), "static", 1.0, zero, unturned, zero, zero, 0.0, *floor))
-    plane = analytic_shape("plane")
     scene = Scene(shapes=(*centred, plane), bodies=tuple(bodies), gravity=trajectories[0].gravity, duration=1.0)
     return scene, [*world, -1]

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from sdfsim.data.batching import merged
+from sdfsim.data.batching import PLANE, merged
 from sdfsim.data.dataset import FLOOR, Trajectory
 from sdfsim.data.pybullet_sim import MARGIN
 from sdfsim.dynamics.bodies import Units
@@ -41,10 +41,10 @@ def roll_out(
     Args:
         model: what simulates.
         group: trajectories of one step and one gravity; only their first frames are used.
-        shapes: of every name in use, with the nodes that the model needs.
+        shapes: of every name in use.
         steps: how many.
         device: where to compute.
-        free_flight: "exact", or "learned" for the *paper* network.
+        free_flight: "exact", or "learned" for networks on surface nodes.
         contact: False leaves every body in free flight.
         sleep: freeze what has come to rest.
         substeps: inner steps that the recording engine makes in one step.
@@ -59,13 +59,14 @@ def roll_out(
         SdfsimError: a state that is not finite (exit code 3).
     """
     units = model_units(model, group[0])
-    bodies, state = merged(group, [0] * len(group), shapes, units, device, floor)
+    known = {name: model.surface(shape) for name, shape in shapes.items()}
+    bodies, state = merged(group, [0] * len(group), known, units, device, floor, model.surface(PLANE))
     gravity = torch.tensor(group[0].gravity / units.acceleration, dtype=torch.float64, device=device)
     rules = Rules(
         gravity, group[0].dt / units.time, model.inner or substeps, contact=contact, free_flight=free_flight,
         sleep=sleep, margin=MARGIN / units.length if as_teacher else 0.0, adds=as_teacher,
     )  # fmt: skip
-    if model.kind == "paper":
+    if model.on_surfaces:
         state = with_history(state, bodies, rules)
     states, memory = [state], Memory()
     for k in range(steps):
@@ -115,7 +116,7 @@ def every(trajectory: Trajectory, stride: int) -> Trajectory:
 def model_units(model: Model, like: Trajectory) -> Units:
     """Model units in which the recorded step is the model's own; for the solver those of its bodies of a metre."""
     strength = float(np.linalg.norm(like.gravity)) or model.gravity
-    if model.kind != "paper":  # the solve takes the inner steps that it is told
+    if not model.on_surfaces:  # the solve takes the inner steps that it is told
         return Units(length=1.0, time=float(np.sqrt(model.gravity / strength)), mass=1.0)
     length = (like.dt / model.dt) ** 2 * strength / model.gravity
     return Units(length=length, time=like.dt / model.dt, mass=1.0)

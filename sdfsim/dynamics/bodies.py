@@ -63,6 +63,7 @@ class Bodies:
         radius: [N] float64, how far `bounds` reach from the centre of mass (infinite for a plane).
         node: [M, 3] float64, surface nodes about the centre of mass, shape axes, scaled.
         node_start: [N + 1] int64, body k owns nodes node_start[k] : node_start[k + 1].
+        face: [F, 3] int64, corners of the surfaces' triangles, indices into `node`; none where nodes are points alone.
         group: [N] int64, what `collides_with` makes of a body.
         allowed: [G, G] bool, whether bodies of two groups may touch.
         world: [N] int64: bodies of two worlds never meet; -1 is in all of them.
@@ -85,6 +86,7 @@ class Bodies:
     radius: Tensor
     node: Tensor
     node_start: Tensor
+    face: Tensor
     group: Tensor
     allowed: Tensor
     world: Tensor
@@ -167,16 +169,13 @@ def awake(bodies: Bodies, state: State) -> Tensor:
     return moves.nonzero()[:, 0]
 
 
-def from_scene(
-    scene: Scene, units: Units, device: torch.device, nodes_a_body: int | None = None
-) -> tuple[Bodies, State]:
+def from_scene(scene: Scene, units: Units, device: torch.device) -> tuple[Bodies, State]:
     """Bodies and initial state of a scene, in model units on `device`.
 
     Args:
         scene: what is to be simulated.
         units: model units.
         device: of the tensors.
-        nodes_a_body: use only the first that many surface nodes of each body.
 
     Raises:
         SdfsimError: a body that moves has no mass or no surface nodes.
@@ -192,7 +191,9 @@ def from_scene(
     inertia[moves] /= units.mass * units.length**2
     com = np.stack([s.com for s in shapes]) * scale[:, None]
     bounds = np.stack([(s.sdf.bounds - s.com) * k for s, k in zip(shapes, scale, strict=True)])
-    nodes = [(s.nodes[:nodes_a_body] - s.com) * k for s, k in zip(shapes, scale, strict=True)]
+    nodes = [(s.nodes - s.com) * k for s, k in zip(shapes, scale, strict=True)]
+    node_start = np.concatenate([[0], np.cumsum([len(n) for n in nodes])])
+    faces = [s.faces + first for s, first in zip(shapes, node_start[:-1], strict=True)]
 
     def tensor(array, dtype=torch.float64) -> Tensor:
         return torch.as_tensor(np.asarray(array), dtype=dtype, device=device)
@@ -215,7 +216,8 @@ def from_scene(
         size=tensor((bounds[:, 1] - bounds[:, 0]).max(-1)),
         radius=tensor(np.linalg.norm(np.abs(bounds).max(1), axis=-1)),
         node=tensor(np.concatenate(nodes).reshape(-1, 3)),
-        node_start=tensor(np.concatenate([[0], np.cumsum([len(n) for n in nodes])]), torch.int64),
+        node_start=tensor(node_start, torch.int64),
+        face=tensor(np.concatenate(faces), torch.int64),
         group=tensor(group, torch.int64),
         allowed=tensor(allowed, torch.bool),
         world=torch.zeros(len(scene.bodies), dtype=torch.int64, device=device),

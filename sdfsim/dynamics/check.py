@@ -84,12 +84,11 @@ def check_sizes(bodies: Bodies, names: Sequence[str], metres: float) -> None:
         )
 
 
-def check_nodes(scene: Scene, nodes_a_body: int | None) -> None:
+def check_nodes(scene: Scene) -> None:
     """That every dynamic body has nodes that tell how it is turned.
 
     Args:
         scene: what is to be simulated.
-        nodes_a_body: the simulator uses only the first that many of each; None for all.
 
     Raises:
         SdfsimError: its nodes are one place or one line.
@@ -99,7 +98,7 @@ def check_nodes(scene: Scene, nodes_a_body: int | None) -> None:
         if body.motion != "dynamic" or body.shape in told:
             continue
         told.add(body.shape)
-        nodes = scene.shapes[body.shape].nodes[:nodes_a_body]
+        nodes = scene.shapes[body.shape].nodes
         extents = np.linalg.svd(nodes - nodes.mean(0), compute_uv=False) if len(nodes) > 1 else np.zeros(2)
         if extents[0] == 0 or len(extents) < 2 or extents[1] <= LINE * extents[0]:
             where = "in one place" if extents[0] == 0 else "on one line"

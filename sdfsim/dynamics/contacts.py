@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State
-from sdfsim.dynamics.solver import Compiled, compiled_rules, taken_up
+from sdfsim.dynamics.memory import Memory
+from sdfsim.dynamics.models.surfaces import Near
+from sdfsim.dynamics.solver import compiled_rules, taken_up
 
 
 @dataclass(frozen=True)
@@ -37,16 +39,13 @@ class Contacts:
     def __len__(self) -> int:
         return len(self.owner)
 
-
-def no_contacts(device: torch.device) -> Contacts:
-    """None at all."""
-    nobody = torch.zeros(0, dtype=torch.int64, device=device)
-    nothing = torch.zeros(0, 3, dtype=torch.float64, device=device)
-    return Contacts(nobody, nobody, nobody, nothing, nothing[:, 0], nothing)
+    def renumbered(self, body: Tensor, node: Tensor) -> Contacts:
+        """The same among other bodies: `body` [N] and `node` [M] give their new numbers."""
+        return replace(self, owner=body[self.owner], body=body[self.body], node=node[self.node])
 
 
 def find_contacts(
-    bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, scene: Compiled | None = None
+    bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, memory: Memory | None = None
 ) -> Contacts:
     """All contact edges of a state.
 
@@ -59,11 +58,11 @@ def find_contacts(
         gravity: [3], model units.
         reach: contact radius D, model length.
         dt: the step, model time.
-        scene: the bodies compiled, where that has been done before.
+        memory: of the run; it keeps the compiled bodies.
     """
     from sdfsim.dynamics.kernels.nodes import nodes_within
 
-    scene = scene or Compiled(bodies, state)
+    scene = (memory or Memory()).compiled(bodies, state)
     rules = compiled_rules(gravity.cpu().numpy(), dt, 1)._replace(reach=reach)
     motion, _ = taken_up(bodies, state, scene, rules)
     start = bodies.node_start.cpu().numpy()
@@ -82,7 +81,7 @@ def find_contacts(
     )
 
 
-def where(state: State, bodies: Bodies, contacts: Contacts) -> Tensor:
+def where(state: State, bodies: Bodies, contacts: Near) -> Tensor:
     """[E, 3] where the nodes of contact edges are in a state, world."""
     turned = pose.rotate(state.orientation[contacts.owner], bodies.node[contacts.node])
     return state.position[contacts.owner] + turned

@@ -35,7 +35,7 @@ def scene_units(scene: Scene, model: Model, dt: float | None = None) -> Units:
         length = (dt / model.dt) ** 2 * strength / model.gravity
     elif sizes:
         _check_sizes([b.name for b in moving], np.array(sizes))
-        length = float(np.mean(sizes) if model.kind == "paper" else np.min(sizes)) / model.length
+        length = float(np.mean(sizes) if model.on_surfaces else np.min(sizes)) / model.length
     else:
         length = 1.0
     mass = float(np.mean([b.mass for b in moving])) if moving else 1.0

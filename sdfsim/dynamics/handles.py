@@ -146,7 +146,7 @@ class BodyHandle:
         """
         self._must_move("be pulled")
         sim = self._simulator
-        if sim.model.kind == "paper":
+        if sim.model.on_surfaces:
             raise SdfsimError("the paper network knows no forces", "take the solver, or a network on top of it")
         given, moment = _vector("force", force), _vector("torque", torque)
         if at is not None:

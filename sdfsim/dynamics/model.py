@@ -13,15 +13,15 @@ import torch
 from torch import nn
 
 from sdfsim.dynamics.models.impulse import ImpulseConfig, ImpulseNetwork
-from sdfsim.dynamics.models.paper import PaperConfig, PaperNetwork
 from sdfsim.errors import SdfsimError
 from sdfsim.files import replacing
+from sdfsim.shape.shape import Shape
 
 BUNDLED = Path(__file__).resolve().parent.parent / "models"
 MOST = 4096  # of any size of a network
 MODEL_VERSION = 3  # 2: networks without the contact solve; 1: of an earlier teacher
 SOLVER = "solver"
-NETWORKS = {"impulse": (ImpulseConfig, ImpulseNetwork), "paper": (PaperConfig, PaperNetwork)}
+SURFACE = ("paper", "fignet", "fignet-star", "mgn", "dpi")  # networks whose messages run between surface nodes
 
 
 @dataclass(frozen=True)
@@ -30,14 +30,14 @@ class Model:
 
     Attributes:
         name: bundled name or file stem.
-        kind: "solver", "impulse" or "paper".
+        kind: "solver", "impulse" or one of `SURFACE`.
         network: in evaluation mode; the solver has none.
         dt: s, the step of the training data, or of the solver for bodies of `length` at `gravity`.
         gravity: m/s^2, its magnitude in the training data.
         length: m, the middle of the range of training bodies' largest extents; other scenes are rescaled to it. The
             solver is rescaled to the smallest body that moves.
         reach: m, contact radius D.
-        nodes: surface nodes a body it was trained with, the first of each shape's; None for all.
+        nodes: surface nodes a body it was trained with, see `surface`; None for all.
         inner: inner steps of the solve in a step; 0 for those of the recording engine (5 where none has recorded).
         ranges: name -> [low, high] of what training saw (friction, restitution, mass_ratio, speed, size).
         card: training record (data, steps, seconds, errors).
@@ -54,6 +54,19 @@ class Model:
     inner: int = 0
     ranges: dict[str, list[float]] = field(default_factory=dict)
     card: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def on_surfaces(self) -> bool:
+        """Whether it predicts motions of surface nodes, as the published networks do."""
+        return self.kind in SURFACE
+
+    def surface(self, shape: Shape) -> Shape:
+        """The shape with the surface nodes, and the faces between them, that the model works on."""
+        if not self.on_surfaces:
+            return shape
+        from sdfsim.dynamics.models.families import FAMILIES
+
+        return FAMILIES[self.kind].surface(shape, self.nodes)
 
     def to(self, device: torch.device) -> Model:
         """The same model with its weights on `device`: this one, or a copy where they are elsewhere."""
@@ -79,9 +92,13 @@ class Model:
 
 
 def new_network(kind: str, config: dict[str, Any]) -> nn.Module:
-    """An untrained network of `kind` ("impulse" or "paper")."""
-    make_config, make_network = NETWORKS[kind]
-    return make_network(make_config(**config))
+    """An untrained network of `kind` ("impulse" or one of `SURFACE`). Raises KeyError for another."""
+    if kind == "impulse":
+        return ImpulseNetwork(ImpulseConfig(**config))
+    from sdfsim.dynamics.models.families import FAMILIES
+    from sdfsim.dynamics.models.message_passing import GraphConfig, GraphNetwork
+
+    return GraphNetwork(FAMILIES[kind].layout, GraphConfig(**config))
 
 
 def bundled_models() -> list[str]:

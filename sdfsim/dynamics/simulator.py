@@ -33,7 +33,7 @@ from sdfsim.scene.effects import plan
 from sdfsim.scene.scene import Limits, Scene
 
 if TYPE_CHECKING:
-    from sdfsim.dynamics.contacts import Contacts
+    from sdfsim.dynamics.models.families import Near
     from sdfsim.scene import written
 
 BYTES_AN_EDGE = 4096  # of the network, while it is worked on
@@ -63,7 +63,7 @@ class Simulator:
         device: "cpu", "cuda" or "auto".
         seed: of torch's generator (nothing in a step draws from it today; it is recorded).
         dt: s, the step; None lets the size of the bodies decide (the model owns the step in its own units).
-        free_flight: "exact", or "learned" for the *paper* network's own formulation.
+        free_flight: "exact", or "learned" for the own formulation of networks on surface nodes.
 
     Attributes:
         state: bodies and how they move, model units. Give it another one to start from there, or to change a body:
@@ -95,10 +95,12 @@ class Simulator:
         asked = effects.contact.on or free_flight == "learned"
         self.model = model if isinstance(model, Model) else load_model(model, weights=asked)
         self.model = self.model.to(self.device)
-        if self.model.kind != "paper":
+        if not self.model.on_surfaces:
             self.device = torch.device("cpu")  # the compiled step has no other; a network on top may
-        if free_flight == "learned" and self.model.kind != "paper":
-            raise SdfsimError("free_flight 'learned' exists for the paper network only", "give a model of that kind")
+        if free_flight == "learned" and not self.model.on_surfaces:
+            raise SdfsimError(
+                "free_flight 'learned' exists for networks on surface nodes only", "give a model of that kind"
+            )
         self.seed = scene.seed if seed is None else seed
         self.units, self._dt = scene_units(scene, self.model, dt), dt
         self.dt = self.model.dt * self.units.time
@@ -115,23 +117,24 @@ class Simulator:
             free_flight=free_flight,
             substeps=self.model.inner or SUBSTEPS,
             rows=_rows(scene.limits),
-            sleep=self.model.kind != "paper" and effects.sleep.on,
+            sleep=effects.sleep.on and not self.model.on_surfaces,
         )
-        check_nodes(scene, self.model.nodes)
-        self.bodies, self.state = from_scene(scene, self.units, self.device, self.model.nodes)
+        worked_on = replace(scene, shapes=tuple(self.model.surface(shape) for shape in scene.shapes))
+        check_nodes(worked_on)
+        self.bodies, self.state = from_scene(worked_on, self.units, self.device)
         self._names = tuple(b.name for b in scene.bodies)
         check_sizes(self.bodies, self._names, self.units.length)
         if effects.contact.on and self.model.ranges:
             self.outside_training += deep_starts(self.bodies, self.state, self._names, self.units.length)
         if self.outside_training:
             self.rules = replace(self.rules, trust=0.0)
-        if self.model.kind == "paper":
+        if self.model.on_surfaces:
             self.state = with_history(self.state, self.bodies, self.rules)
         self.memory = Memory()
         self._dynamic = self.bodies.moves.nonzero()[:, 0]
         weight = self.bodies.mass[self._dynamic] * self.rules.gravity.norm()
         self._lift = float((weight * self.bodies.size[self._dynamic]).sum()) * self.units.energy
-        self.contacts: Contacts | None = None
+        self.contacts: Near | None = None
         self.steps_done = 0
         if broken := self._fault(self.state, everybody(self.bodies)):
             raise SdfsimError(broken)
@@ -177,10 +180,12 @@ class Simulator:
         """Where bodies touch in the present state, as the last step of the contact solve has left it.
 
         Raises:
-            SdfsimError: the model is the *paper* network, which knows no impulses.
+            SdfsimError: the model is a network on surface nodes, which knows no impulses.
         """
-        if self.model.kind == "paper":
-            raise SdfsimError("the paper network tells no impulses", "take the solver, or a network on top of it")
+        if self.model.on_surfaces:
+            raise SdfsimError(
+                "networks on surface nodes tell no impulses", "take the solver, or a network on top of it"
+            )
         from sdfsim.dynamics.solver import contact_points
 
         found, u = contact_points(self.state), self.units
@@ -281,7 +286,7 @@ class Simulator:
         if broken:
             self.state = self._good
             raise self._broke(broken)
-        if self.model.kind == "paper":
+        if self.model.on_surfaces:
             self.state = history_told(self.state, self._good, self.bodies, self.rules)
         self._good = self.state
 

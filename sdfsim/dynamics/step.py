@@ -6,6 +6,7 @@ network's graph, and what sleeps is not looked at until something moves beside i
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
@@ -20,7 +21,7 @@ from sdfsim.dynamics.model import Model
 from sdfsim.dynamics.models.contact_graph import SUBSTEPS, ContactGraph, number_pairs
 
 if TYPE_CHECKING:
-    from sdfsim.dynamics.contacts import Contacts
+    from sdfsim.dynamics.models.families import Near
     from sdfsim.dynamics.solver import Acts
 
 FreeFlight = Literal["exact", "learned"]
@@ -40,7 +41,7 @@ class Rules:
         friction: False computes no tangential impulse.
         restitution: False makes every contact one of restitution 0.
         rotation: False lets bodies translate only.
-        free_flight: "exact", or "learned" where the *paper* network predicts all of every body's motion.
+        free_flight: "exact", or "learned" where a network on surface nodes predicts all of every body's motion.
         rows: how many edges a network works on at once; None for all.
         sleep: whether the solve freezes what rests.
         margin: by which all bodies but planes are larger for the solve than their distances say; adds: whether what
@@ -67,7 +68,7 @@ class Rules:
 @torch.no_grad()
 def step(
     model: Model, bodies: Bodies, state: State, rules: Rules, memory: Memory | None = None
-) -> tuple[State, Contacts | None]:
+) -> tuple[State, Near | None]:
     """Advance `state` by one step.
 
     Args:
@@ -78,13 +79,13 @@ def step(
         memory: of the run; without one every step starts from nothing, with the same result.
 
     Returns:
-        The next state, and the contact edges of the *paper* network, None for other models.
+        The next state, and where a network on surface nodes saw bodies near each other, None for other models.
     """
     memory = memory or Memory()
     memory.begin(bodies)
     state, contacts = drive(bodies, state, rules), None
-    if model.kind == "paper":
-        after, contacts = _paper_step(model, bodies, state, rules, memory)
+    if model.on_surfaces:
+        after, contacts = _surface_step(model, bodies, state, rules, memory)
     elif rules.contact:
         after = _solved_step(model, bodies, state, rules, memory)
     else:
@@ -247,44 +248,44 @@ def contact_graph(
     return active, ContactGraph(**single, first=first, second=second, pair=pair, pairs=pairs, dt=dt)
 
 
-def _paper_step(
+def _surface_step(
     model: Model, bodies: Bodies, state: State, rules: Rules, memory: Memory
-) -> tuple[State, Contacts | None]:
-    """The published step of the bodies that have a contact edge; free flight, or its learned form, for the others."""
-    from sdfsim.dynamics.contacts import find_contacts, no_contacts
+) -> tuple[State, Near | None]:
+    """A published step of the bodies that are near another; free flight, or its learned form, for the others."""
+    from sdfsim.dynamics.models.families import FAMILIES
     from sdfsim.dynamics.models.surfaces import compact, predict
 
+    family = FAMILIES[model.kind]
     with memory.timed("flight_ms"):
         free = fly(bodies, state, rules)
     learned = rules.free_flight == "learned"
     if not rules.contact and not learned:
         return free, None
     with memory.timed("contact_ms"):
-        contacts = no_contacts(bodies.device)
-        if rules.contact:
-            scene = memory.compiled(bodies, state)
-            contacts = find_contacts(bodies, state, rules.gravity, model.reach, rules.dt, scene)
-    active = torch.cat([contacts.owner, contacts.body, *([awake(bodies, state)] if learned else [])])
+        reach = model.reach if rules.contact else -math.inf
+        near = family.near(bodies, state, rules.gravity, reach, rules.dt, memory)
+    active = torch.cat([near.owner, near.body, *([awake(bodies, state)] if learned else [])])
     active = torch.unique(active)
     chosen = bodies.moves[active]
-    memory.count(active=int(chosen.sum()), contacts=len(contacts))
+    memory.count(active=int(chosen.sum()), contacts=len(near))
     if not bool(chosen.any()):
-        return free, contacts
+        return free, near
     if not rules.friction:
         bodies = replace(bodies, friction=torch.zeros_like(bodies.friction))
     if not rules.restitution:
         bodies = replace(bodies, restitution=torch.zeros_like(bodies.restitution))
     with memory.timed("network_ms"):
-        some = compact(bodies, state, contacts, active)
-        predicted = predict(model.network, *some, rules.dt, rules.rows)  # type: ignore[arg-type]
-    memory.count(nodes=len(active) + len(some[0].node), edges=2 * (len(some[0].node) + len(contacts)))
+        some, start, among = compact(bodies, state, near, active)
+        graph = family.graph(some, start, among)
+        predicted = predict(model.network, graph, some, start, rules.dt, rules.rows)  # type: ignore[arg-type]
+    memory.count(nodes=len(graph), edges=graph.edge_count)
     rows = active[chosen]
     orientation, angular = predicted.orientation[chosen], predicted.angular_velocity[chosen]
     if not rules.rotation:
         orientation, angular = state.orientation[rows], torch.zeros_like(angular)
     now = {name: getattr(free, name) for name in _POSE}
     moved = (predicted.position[chosen], orientation, predicted.velocity[chosen], angular)
-    return replace(free, **_put(now, rows, moved)), contacts
+    return replace(free, **_put(now, rows, moved)), near
 
 
 def _put(now: dict[str, Tensor], rows: Tensor, values: tuple[Tensor, ...]) -> dict[str, Tensor]:

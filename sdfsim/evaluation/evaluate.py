@@ -78,8 +78,10 @@ def evaluate(
     tell = on_progress or (lambda fraction, message: None)
     place = pick_device(device)
     used = (model if isinstance(model, Model) else load_model(model)).to(place)
-    if free_flight == "learned" and used.kind != "paper":
-        raise SdfsimError("free_flight 'learned' exists for the paper network only", "give a model of that kind")
+    if free_flight == "learned" and not used.on_surfaces:
+        raise SdfsimError(
+            "free_flight 'learned' exists for networks on surface nodes only", "give a model of that kind"
+        )
     recorded, shapes = _load(data, split)
     longest = min(steps, *(len(t.position) - 1 for t in recorded))
     longest -= longest % stride
@@ -87,7 +89,6 @@ def evaluate(
     recorded = [every(t, stride) for t in as_recorded]
     longest //= stride
     substep = engine_substep(data)
-    known = {name: replace(shape, nodes=shape.nodes[: used.nodes]) for name, shape in shapes.items()}
     contenders: dict[str, Motions] = {"model": [], "ballistic": []}
     groups = batches(recorded)
     inner, seconds = substeps or stride * inner_steps(as_recorded[0].dt, substep), 0.0
@@ -96,10 +97,10 @@ def evaluate(
         tell(0.8 * k / len(groups), f"{used.name}: batch {k + 1} of {len(groups)}, {longest} steps")
         started = time.perf_counter()
         contenders["model"] += roll_out(
-            used, group, known, longest, place, free_flight, substeps=inner, as_teacher=True
+            used, group, shapes, longest, place, free_flight, substeps=inner, as_teacher=True
         )
         seconds += time.perf_counter() - started
-        contenders["ballistic"] += ballistic(used, group, known, longest)
+        contenders["ballistic"] += ballistic(used, group, shapes, longest)
     again, floor_report = {}, {}
     if chaos_floor:
         tell(0.8, "teacher, from starts that differ slightly")

@@ -32,7 +32,7 @@ def bundle(path: Path, data: Path, name: str, folder: Path = BUNDLED) -> dict:
     model = load_model(path)
     report = evaluate(data, model=model, chaos_floor=True)
     report["as_published"] = None
-    if model.kind == "paper":
+    if model.on_surfaces:
         report["as_published"] = evaluate(data, model=model, free_flight="learned", errors_only=True)["model"]
     kept = ("model", "ballistic", "as_published", "chaos_floor", "median_survival_s")
     kept += ("penetration", "energy_gain", "resting_speed")

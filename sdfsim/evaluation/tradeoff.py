@@ -254,7 +254,7 @@ def arranged(setting: Setting, cases: Cases) -> tuple[Model, dict[str, Shape]]:
             shape = replace(shape, nodes=hull_nodes(shape.nodes, int(count)))
         elif kind == "grid":
             shape = with_nodes(shape, int(count))
-        shapes[name] = replace(shape, nodes=shape.nodes[: model.nodes])
+        shapes[name] = shape
     return model, shapes
 
 

@@ -10,16 +10,17 @@ class Preset:
     """One way to train one network.
 
     Attributes:
-        kind: "impulse" or "paper".
+        kind: "impulse", or a network on surface nodes: "paper", "fignet", "fignet-star", "mgn", "dpi".
         config: sizes of the network.
         steps: of the optimiser.
-        batch: contact frames (impulse) or recorded steps (paper) a step.
+        batch: contact frames (impulse) or recorded steps (others) a step.
         rate: peak learning rate of Adam; it falls to a hundredth along a cosine.
         matrix_rate: the same of Muon, which then trains the hidden matrices; None leaves all to Adam, as published.
         reach: m, contact radius D.
         strides: recorded steps in a step (impulse); several for a network of several step lengths.
         inner: inner steps of the solve in a step; 0 for those of the recording engine.
-        noise: m, standard deviation of pose noise of the *paper* network (None: none); *impulse* has its own.
+        nodes: surface nodes a body of networks on surface nodes (meshes: about so many vertices); None for all.
+        noise: m, standard deviation of their pose noise (None: none); *impulse* has its own.
     """
 
     kind: str
@@ -28,11 +29,14 @@ class Preset:
     batch: int
     rate: float
     reach: float = 0.1
+    nodes: int | None = None
     noise: float | None = None
     matrix_rate: float | None = None
     strides: tuple[int, ...] = (1,)
     inner: int = 0
 
+
+PUBLISHED = {"width": 128, "steps": 10}  # sizes of SDF-Sim's network
 
 PRESETS = {
     "small": Preset("impulse", {"width": 32, "rounds": 4}, steps=16_000, batch=32, rate=2e-3, matrix_rate=0.01),
@@ -48,5 +52,15 @@ PRESETS = {
         inner=1,
     ),
     "base": Preset("impulse", {"width": 128, "rounds": 8}, steps=100_000, batch=64, rate=1e-3, matrix_rate=0.01),
-    "paper": Preset("paper", {"width": 128, "steps": 10}, steps=1_000_000, batch=8, rate=1e-3, noise=0.003),
+    **{
+        name: Preset(kind, PUBLISHED, steps=1_000_000, batch=8, rate=1e-3, reach=reach, nodes=64, noise=0.003)
+        for name, kind, reach in (
+            ("paper", "paper", 0.1),
+            ("fignet", "fignet", 0.1),
+            ("fignet-star", "fignet-star", 0.1),
+            ("mgn", "mgn", 0.1),
+            ("mgn-large", "mgn", 0.5),
+            ("dpi", "dpi", 0.5),
+        )
+    },
 }

@@ -1,4 +1,4 @@
-"""Training: one loop for both networks, resumable to the step, needing only torch and numpy once frames are cached."""
+"""Training: one loop for all networks, resumable to the step, needing only torch and numpy once frames are cached."""
 
 from __future__ import annotations
 
@@ -132,15 +132,12 @@ def _tasks(plan: Preset, folders: Sequence[Path], device: torch.device, tell: Pr
             return ImpulseTask(join_frames(sets), device)
 
         return task("train", 2), task("validation", 1)
-    from sdfsim.training.paper_task import PaperTask
+    from sdfsim.training.surface_task import SurfaceTask
 
     if len(folders) > 1:
-        raise SdfsimError("the paper network trains on one dataset", "give a single --data")
+        raise SdfsimError("networks on surface nodes train on one dataset", "give a single --data")
     data = folders[0]
-    return (
-        PaperTask(data, "train", plan.reach, device, plan.noise),
-        PaperTask(data, "validation", plan.reach, device, None),
-    )
+    return SurfaceTask(data, "train", plan, device, noisy=True), SurfaceTask(data, "validation", plan, device)
 
 
 def _loop(run: Run, held_out: Task, rollouts: Rollouts | None, out: Path, tell: Progress) -> None:

@@ -9,7 +9,7 @@ import argparse
 import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -55,11 +55,10 @@ class Rollouts:
         model = run.export(name="watched", data=[], ranges=run.task.ranges())
         steps = len(self.recorded[0].position) - 1
         squared, degrees, bodies = 0.0, 0.0, 0
-        known = {name: replace(s, nodes=s.nodes[: model.nodes]) for name, s in self.shapes.items()}
         for group in batches(self.recorded):
             try:
                 inner = inner_steps(group[0].dt, self.substep)
-                predicted = roll_out(model, group, known, steps, self.device, substeps=inner, as_teacher=True)
+                predicted = roll_out(model, group, self.shapes, steps, self.device, substeps=inner, as_teacher=True)
             except SdfsimError:
                 return {"rollout_m": math.nan, "rollout_degrees": math.nan}
             for one, truth in zip(predicted, group, strict=True):

@@ -22,11 +22,13 @@ from sdfsim.training import contact_cache, validation
 from sdfsim.training import train as train_module
 from sdfsim.training.contact_cache import Solved, contact_frames, join_frames
 from sdfsim.training.impulse_task import ImpulseTask
-from sdfsim.training.paper_task import PaperTask
+from sdfsim.training.presets import PRESETS
 from sdfsim.training.run import Run, held_out_loss
+from sdfsim.training.surface_task import SurfaceTask
 from sdfsim.training.train import train
 
 CPU = torch.device("cpu")
+PAPER = PRESETS["paper"]
 ONCE = Solved(draws=1)
 
 
@@ -131,7 +133,7 @@ def test_paper_targets_lead_exactly_to_the_recorded_pose(ball_data):
     )
     landed = advance(bodies, state, target_acceleration(bodies, state, *after), t.dt)
     torch.testing.assert_close(landed.position, after[0], rtol=0, atol=1e-12)
-    assert PaperTask(ball_data, "train", 0.1, CPU, 0.003).dt == t.dt
+    assert SurfaceTask(ball_data, "train", PAPER, CPU, noisy=True).dt == t.dt
 
 
 def test_an_unreadable_frame_cache_is_named(ball_data):

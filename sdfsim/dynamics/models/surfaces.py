@@ -1,19 +1,56 @@
-"""Features of the *paper* network, and its step from node accelerations to poses."""
+"""What all networks on surface nodes share: features of nodes and of edges within bodies, targets, the step to poses.
+
+A network gives every surface node an acceleration; shape matching turns those of a body into its next pose.
+"""
 
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from typing import Protocol, Self, TypeVar
 
 import torch
 from torch import Tensor
 
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State
-from sdfsim.dynamics.contacts import Contacts
 from sdfsim.dynamics.models.matching import match_shapes
-from sdfsim.dynamics.models.paper import PaperNetwork, SurfaceGraph
+from sdfsim.dynamics.models.message_passing import Edges, Features, Graph, GraphNetwork
 
-_NOT_PER_BODY = ("pieces", "node", "node_start", "allowed", "sdfs", "tracks")
+NODE = Features(13, (0, 3, 6))  # of surface nodes and of body nodes
+INTRA = Features(8, (0, 4))  # of edges within a body
+TARGET = Features(3, (0,))  # of accelerations
+_NOT_PER_BODY = ("pieces", "node", "node_start", "face", "allowed", "sdfs", "tracks")
+
+
+class Near(Protocol):
+    """E places where surfaces of two bodies are near each other.
+
+    Attributes:
+        owner, body: [E] int64, the two bodies.
+        node: [E] int64, a node of the first, index into `Bodies.node`.
+        distance: [E] float64, model length.
+    """
+
+    @property
+    def owner(self) -> Tensor: ...
+
+    @property
+    def body(self) -> Tensor: ...
+
+    @property
+    def node(self) -> Tensor: ...
+
+    @property
+    def distance(self) -> Tensor: ...
+
+    def __len__(self) -> int: ...
+
+    def renumbered(self, body: Tensor, node: Tensor) -> Self:
+        """The same among other bodies: `body` [N] and `node` [M] give their new numbers."""
+        ...
+
+
+Met = TypeVar("Met", bound=Near)
 
 
 def node_owner(bodies: Bodies) -> Tensor:
@@ -22,31 +59,38 @@ def node_owner(bodies: Bodies) -> Tensor:
     return torch.repeat_interleave(torch.arange(len(bodies), device=bodies.device), count)
 
 
-def compact(bodies: Bodies, state: State, contacts: Contacts, rows: Tensor) -> tuple[Bodies, State, Contacts]:
+def compact(bodies: Bodies, state: State, contacts: Met, rows: Tensor) -> tuple[Bodies, State, Met]:
     """The bodies `rows` [A] alone, in ascending order, with their states and all the contacts, which are among them."""
     if len(rows) == len(bodies):
         return bodies, state, contacts
-    owner, node = _expanded(bodies.node_start[rows], bodies.node_start[rows + 1])
-    number = torch.full((len(bodies),), -1, dtype=torch.int64, device=bodies.device)
-    number[rows] = torch.arange(len(rows), device=bodies.device)
+    owner, node = expanded(bodies.node_start[rows], bodies.node_start[rows + 1])
+    number = _numbers(rows, len(bodies))
+    place = _numbers(node, len(bodies.node))
     ends = torch.bincount(owner, minlength=len(rows)).cumsum(0)
     start = torch.cat([ends.new_zeros(1), ends])
     per_body = [f.name for f in fields(bodies) if f.name not in _NOT_PER_BODY]
+    face = place[bodies.face]
     some = replace(
-        bodies, **{k: getattr(bodies, k)[rows] for k in per_body}, node=bodies.node[node], node_start=start, tracks=None
-    )
+        bodies, **{k: getattr(bodies, k)[rows] for k in per_body}, node=bodies.node[node], node_start=start,
+        face=face[(face >= 0).all(-1)], tracks=None,
+    )  # fmt: skip
     earlier_position, earlier_orientation = _history(state)
     moved = State(
         *(v[rows] for v in (state.position, state.orientation, state.velocity, state.angular_velocity)),
         earlier_position=earlier_position[:, rows],
         earlier_orientation=earlier_orientation[:, rows],
     )
-    mine = number[contacts.owner]
-    place = contacts.node - bodies.node_start[contacts.owner] + start[mine]
-    return some, moved, replace(contacts, owner=mine, body=number[contacts.body], node=place)
+    return some, moved, contacts.renumbered(number, place)
 
 
-def _expanded(start: Tensor, stop: Tensor) -> tuple[Tensor, Tensor]:
+def _numbers(kept: Tensor, count: int) -> Tensor:
+    """[count] int64, the place of each of `count` things among the `kept` ones; -1 for the others."""
+    number = torch.full((count,), -1, dtype=torch.int64, device=kept.device)
+    number[kept] = torch.arange(len(kept), device=kept.device)
+    return number
+
+
+def expanded(start: Tensor, stop: Tensor) -> tuple[Tensor, Tensor]:
     """For ranges start[k] : stop[k], the range index and the value of every element, in order."""
     count = stop - start
     which = torch.repeat_interleave(torch.arange(len(count), device=count.device), count)
@@ -54,12 +98,12 @@ def _expanded(start: Tensor, stop: Tensor) -> tuple[Tensor, Tensor]:
     return which, start[which] + torch.arange(len(which), device=count.device) - first
 
 
-def surface_graph(bodies: Bodies, state: State, contacts: Contacts) -> SurfaceGraph:
-    """The published graph for a state that carries its two earlier poses.
+def motion_features(bodies: Bodies, state: State) -> dict[str, Tensor]:
+    """Features of body nodes [N, 13] and surface nodes [M, 13], the same for every network.
 
-    Node features: displacement over each of the last two steps, displacement of the body's centre over the last,
-    inverse mass, friction, restitution, and whether the body is static. Displacements are
-    differences of poses in float64, never of large float32 positions.
+    Displacement over each of the last two steps, displacement of the body's centre over the last, inverse mass,
+    friction, restitution, and whether the body is static. Displacements are differences of poses in float64, never of
+    large float32 positions.
     """
     earlier_position, earlier_orientation = _history(state)
     owner = node_owner(bodies)
@@ -71,40 +115,40 @@ def surface_graph(bodies: Bodies, state: State, contacts: Contacts) -> SurfaceGr
         return _apply((turns[k + 1] - turns[k])[owner], bodies.node) + (places[k + 1] - places[k])[owner]
 
     travel = [places[1] - places[0], places[2] - places[1]]
-    material = torch.stack(
-        [
-            bodies.inverse_mass,
-            bodies.friction,
-            bodies.restitution,
-            (~bodies.moves).to(bodies.friction.dtype),
-        ],
-        -1,
-    )
-    arm = _apply(turns[2][owner], bodies.node)
-    intra = torch.cat([arm, arm.norm(dim=-1, keepdim=True), bodies.node, bodies.node.norm(dim=-1, keepdim=True)], -1)
-    return SurfaceGraph(
-        body=torch.cat([travel[1], travel[0], travel[1], material], -1).float(),
-        node=torch.cat([moved(1), moved(0), travel[1][owner], material[owner]], -1).float(),
-        owner=owner,
-        intra=intra.float(),
-        contact_node=contacts.node,
-        contact_body=contacts.body,
-        contact=_contact_features(bodies, state, contacts).float(),
-    )
+    fixed = (~bodies.moves).to(bodies.friction.dtype)
+    material = torch.stack([bodies.inverse_mass, bodies.friction, bodies.restitution, fixed], -1)
+    body = torch.cat([travel[1], travel[0], travel[1], material], -1)
+    node = torch.cat([moved(1), moved(0), travel[1][owner], material[owner]], -1)
+    return {"body": body.float(), "node": node.float()}
 
 
-def _contact_features(bodies: Bodies, state: State, contacts: Contacts) -> Tensor:
-    """[E, CONTACT_FEATURES]: node to closest point, normal, both seen from the other body's centre, distances.
+def star(bodies: Bodies, state: State) -> dict[str, Edges]:
+    """Edges between the surface nodes and their body's node, up and down: the node from the centre, now and at rest."""
+    owner = node_owner(bodies)
+    features = _now_and_at_rest(_arms(bodies, state), bodies.node)
+    node, body = torch.arange(len(owner), device=owner.device)[:, None], owner[:, None]
+    return {"intra_up": Edges(features, node, body), "intra_down": Edges(features, body, node)}
 
-    An infinite floor has no centre: its body node stands in for the closest point.
-    """
-    c = contacts
-    to_closest = -c.distance[:, None] * c.normal
-    bounded = bodies.size[c.body].isfinite()[:, None]
-    seen = torch.where(bounded, c.seen, -to_closest)
-    closest = seen + to_closest
-    lengths = [c.distance, seen.norm(dim=-1), closest.norm(dim=-1)]
-    return torch.cat([to_closest, c.normal, seen, closest, torch.stack(lengths, -1)], -1)
+
+def mesh_edges(bodies: Bodies, state: State) -> Edges:
+    """Edges along the sides of the mesh's faces, each once a direction: sender from receiver, now and at rest."""
+    sides = torch.cat([bodies.face[:, [0, 1]], bodies.face[:, [1, 2]], bodies.face[:, [2, 0]]])
+    sides = sides[sides[:, 0] != sides[:, 1]]  # those of the plane's one node
+    sides = torch.unique(torch.cat([sides, sides.flip(1)]), dim=0)
+    sender, receiver = sides.unbind(1)
+    arm = _arms(bodies, state)
+    features = _now_and_at_rest(arm[sender] - arm[receiver], bodies.node[sender] - bodies.node[receiver])
+    return Edges(features, sender[:, None], receiver[:, None])
+
+
+def _now_and_at_rest(now: Tensor, rest: Tensor) -> Tensor:
+    """[E, 8] float32: a vector [E, 3] as it is in the world and as it is in the body's axes, and its lengths."""
+    return torch.cat([now, now.norm(dim=-1, keepdim=True), rest, rest.norm(dim=-1, keepdim=True)], -1).float()
+
+
+def _arms(bodies: Bodies, state: State) -> Tensor:
+    """[M, 3] nodes from their body's centre of mass, world axes."""
+    return _apply(pose.to_matrix(state.orientation)[node_owner(bodies)], bodies.node)
 
 
 def advance(bodies: Bodies, state: State, acceleration: Tensor, dt: float) -> State:
@@ -129,10 +173,9 @@ def advance(bodies: Bodies, state: State, acceleration: Tensor, dt: float) -> St
 
 
 def predict(
-    network: PaperNetwork, bodies: Bodies, state: State, contacts: Contacts, dt: float, rows: int | None = None
+    network: GraphNetwork, graph: Graph, bodies: Bodies, state: State, dt: float, rows: int | None = None
 ) -> State:
-    """One step of the published simulator, its network working on at most `rows` edges at once."""
-    graph = surface_graph(bodies, state, contacts)
+    """One step of the published simulators, the network working on at most `rows` edges at once."""
     return advance(bodies, state, network.target.undo(network(graph, rows=rows)).double(), dt)
 
 
@@ -147,7 +190,7 @@ def target_acceleration(bodies: Bodies, state: State, position: Tensor, orientat
 
 def _history(state: State) -> tuple[Tensor, Tensor]:
     if state.earlier_position is None or state.earlier_orientation is None:
-        raise ValueError("the paper network needs the two earlier poses")
+        raise ValueError("a network on surface nodes needs the two earlier poses")
     return state.earlier_position, state.earlier_orientation
 
 

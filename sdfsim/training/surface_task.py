@@ -1,25 +1,26 @@
-"""What training the *paper* network means: recorded steps of whole scenes, and a loss on node accelerations."""
+"""What training a network on surface nodes means: recorded steps of whole scenes, and a loss on node accelerations."""
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from sdfsim.data.batching import merged
+from sdfsim.data.batching import PLANE, merged
 from sdfsim.data.dataset import FLOOR, Trajectory, check_alike, load_shapes, product_range, trajectory_files
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State, Units
-from sdfsim.dynamics.contacts import find_contacts
-from sdfsim.dynamics.models.paper import PaperNetwork, SurfaceGraph
-from sdfsim.dynamics.models.surfaces import node_owner, surface_graph, target_acceleration
+from sdfsim.dynamics.memory import Memory
+from sdfsim.dynamics.models.families import FAMILIES
+from sdfsim.dynamics.models.message_passing import Graph, GraphNetwork, flipped
+from sdfsim.dynamics.models.surfaces import TARGET, node_owner, target_acceleration
 from sdfsim.training.distributed import ALONE, Team
+from sdfsim.training.presets import Preset
 
-NODES = 64  # surface nodes a body: the first of each shape's, which are its corners and then the most spread
 WARM_BATCHES = 20  # batches that set the feature statistics before the first step
 
 
@@ -27,28 +28,30 @@ WARM_BATCHES = 20  # batches that set the feature statistics before the first st
 class Batch:
     """A graph, the accelerations [M, 3] that were recorded, and which nodes move [M]."""
 
-    graph: SurfaceGraph
+    graph: Graph
     target: Tensor
     moves: Tensor
 
 
-class PaperTask:
+class SurfaceTask:
     """Draws recorded steps of random trajectories, turned by a random yaw, with rigid pose noise.
 
     Args:
         data: dataset folder.
         split: "train" or "validation".
-        reach: m, contact radius D.
+        plan: which network, its surface nodes and its contact radius.
         device: where batches are made.
-        noise: m, standard deviation of the noise on the earlier poses (paper: 0.003), None for exact inputs.
+        noisy: with the noise of the plan on the input poses; else they are exact.
     """
 
-    def __init__(self, data: Path, split: str, reach: float, device: torch.device, noise: float | None) -> None:
+    def __init__(self, data: Path, split: str, plan: Preset, device: torch.device, *, noisy: bool = False) -> None:
         self.trajectories = [Trajectory.load(f) for f in trajectory_files(data, split)]
         check_alike(f"{data / split}", self.trajectories)
         names = {str(n) for t in self.trajectories for n in t.shape}
-        self.shapes = {k: replace(s, nodes=s.nodes[:NODES]) for k, s in load_shapes(data, names).items()}
-        self.reach, self.device, self.noise, self.nodes = reach, device, noise, NODES
+        self.family, self.nodes = FAMILIES[plan.kind], plan.nodes
+        self.shapes = {k: self.family.surface(s, plan.nodes) for k, s in load_shapes(data, names).items()}
+        self.plane = self.family.surface(PLANE, plan.nodes)
+        self.reach, self.device, self.noise = plan.reach, device, plan.noise if noisy else None
         self.dt = self.trajectories[0].dt
         self.gravity = float(np.linalg.norm(self.trajectories[0].gravity))
 
@@ -67,12 +70,11 @@ class PaperTask:
         """Trajectories of each dataset: of the one."""
         return [len(self.trajectories)]
 
-    def prepare(self, network: PaperNetwork, rng: np.random.Generator) -> None:
+    def prepare(self, network: GraphNetwork, rng: np.random.Generator) -> None:
         """Set the network's feature statistics from a few batches."""
         for _ in range(WARM_BATCHES):
             batch = self.draw(rng, 4)
-            for name in ("body", "node", "intra", "contact"):
-                network.scale[name].observe(getattr(batch.graph, name))  # type: ignore[operator]
+            network.observe(batch.graph)
             network.target.observe(batch.target[batch.moves])
 
     def draw(self, rng: np.random.Generator, count: int, team: Team = ALONE) -> Batch:
@@ -83,7 +85,7 @@ class PaperTask:
         noise = self._noise(picked, rng, team)
         picked, frames = picked[team.share(count)], frames[team.share(count)]
         units = Units(1.0, 1.0, 1.0)
-        bodies, state = merged(picked, frames, self.shapes, units, self.device)
+        bodies, state = merged(picked, frames, self.shapes, units, self.device, plane=self.plane)
         poses = [self._poses(picked, frames, offset, yaw) for offset in (-2, -1, 0, 1)]
         noisy = poses if noise is None else _disturbed(poses, bodies, noise)
         state = State(
@@ -95,16 +97,18 @@ class PaperTask:
             earlier_orientation=torch.stack([noisy[0][1], noisy[1][1]]),
         )
         gravity = torch.tensor(picked[0].gravity, dtype=torch.float64, device=self.device)
-        contacts = find_contacts(bodies, state, gravity, self.reach, self.dt)
+        near = self.family.near(bodies, state, gravity, self.reach, self.dt, Memory())
         # The target leads from the disturbed poses to the recorded one, so that errors are learnt to be undone.
         target = target_acceleration(bodies, state, *poses[3])
-        return Batch(surface_graph(bodies, state, contacts), target.float(), bodies.moves[node_owner(bodies)])
+        graph = self.family.graph(bodies, state, near)
+        return Batch(graph, target.float(), bodies.moves[node_owner(bodies)])
 
-    def loss(self, network: PaperNetwork, batch: Batch, *, mirrored: bool = False) -> Tensor:
+    def loss(self, network: GraphNetwork, batch: Batch, *, mirrored: bool = False) -> Tensor:
         """Mean squared error of the standardised accelerations; a mirror image reverses the y axis of the world."""
+        graph, target = batch.graph, batch.target
         if mirrored:
-            batch = _mirror(batch)
-        error = network(batch.graph) - network.target(batch.target)
+            graph, target = graph.mirrored(network.layout), flipped(target, TARGET)
+        error = network(graph) - network.target(target)
         return error[batch.moves].square().mean()
 
     def weight_of(self, batch: Batch) -> int:
@@ -165,22 +169,3 @@ def _disturbed(poses, bodies: Bodies, noise: Tensor):
         for (position, quat), s, t in zip(poses, shift, turn, strict=False)
     ]
     return [*walked, poses[3]]
-
-
-def _mirror(batch: Batch) -> Batch:
-    """Reverse y of every vector feature; body-frame reference offsets stay (a mirrored body has its own frame)."""
-    g = batch.graph
-
-    def flip(values: Tensor, columns: tuple[int, ...]) -> Tensor:
-        sign = torch.ones(values.shape[-1], dtype=values.dtype, device=values.device)
-        sign[list(columns)] = -1.0
-        return values * sign
-
-    graph = replace(
-        g,
-        body=flip(g.body, (1, 4, 7)),
-        node=flip(g.node, (1, 4, 7)),
-        intra=flip(g.intra, (1, 5)),
-        contact=flip(g.contact, (1, 4, 7, 10)),
-    )
-    return replace(batch, graph=graph, target=flip(batch.target, (1,)))

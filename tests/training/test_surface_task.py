@@ -15,11 +15,13 @@ from sdfsim.dynamics.simulator import Simulator
 from sdfsim.errors import SdfsimError
 from sdfsim.training.contact_cache import Solved, contact_frames
 from sdfsim.training.distributed import Team
-from sdfsim.training.paper_task import PaperTask
+from sdfsim.training.presets import PRESETS
+from sdfsim.training.surface_task import SurfaceTask
 from tests.dynamics.conftest import random_model
 from tests.recordings import bouncing
 
 CPU = torch.device("cpu")
+PAPER = PRESETS["paper"]
 
 
 @pytest.fixture
@@ -52,9 +54,9 @@ def test_training_sees_masses_relative_to_the_scenes_mean(pair, ball_data):
     assert bodies.inverse_mass.tolist() == pytest.approx([0.75, 1.5, 0.75, 1.5, 0.0])
     radii = (torch.diagonal(bodies.inertia, dim1=1, dim2=2)[:4, 0] / bodies.mass[:4]).tolist()
     assert radii == pytest.approx([0.05, 0.1, 0.05, 0.1])
-    task = PaperTask(ball_data, "train", 0.1, CPU, None)
+    task = SurfaceTask(ball_data, "train", PAPER, CPU)
     task.trajectories = group
-    seen = task.draw(np.random.default_rng(0), 8).graph.body[:, 9]
+    seen = task.draw(np.random.default_rng(0), 8).graph.nodes["body"][:, 9]
     assert sorted(set(seen.tolist())) == pytest.approx([0.0, 0.75, 1.5])
 
 
@@ -66,27 +68,27 @@ def test_bodies_alone_that_never_move_have_no_mean_mass(pair):
 
 
 def test_the_mass_ratio_is_that_within_a_scene(pair, ball_data):
-    task = PaperTask(ball_data, "train", 0.1, CPU, None)
+    task = SurfaceTask(ball_data, "train", PAPER, CPU)
     task.trajectories = pair[0]
     assert task.ranges()["mass_ratio"] == [1.0, pytest.approx(2.0)]
 
 
 def test_the_parts_of_a_noisy_batch_are_the_batch(ball_data):
-    task = PaperTask(ball_data, "train", 0.1, CPU, 0.003)
+    task = SurfaceTask(ball_data, "train", PAPER, CPU, noisy=True)
 
     def drawn(team: Team):
         batch = task.draw(np.random.default_rng(3), 8, team)
-        return torch.cat([batch.graph.node, batch.target], -1)[batch.moves]
+        return torch.cat([batch.graph.nodes["node"], batch.target], -1)[batch.moves]
 
     whole, parts = drawn(Team()), [drawn(Team(rank, 3)) for rank in range(3)]
     torch.testing.assert_close(torch.cat(parts), whole, rtol=0, atol=0)
-    exact = PaperTask(ball_data, "train", 0.1, CPU, None).draw(np.random.default_rng(3), 8)
-    assert not torch.equal(exact.graph.node, task.draw(np.random.default_rng(3), 8).graph.node)
+    exact = SurfaceTask(ball_data, "train", PAPER, CPU).draw(np.random.default_rng(3), 8)
+    assert not torch.equal(exact.graph.nodes["node"], task.draw(np.random.default_rng(3), 8).graph.nodes["node"])
 
 
 def test_noise_walks_by_the_given_size(ball_data):
     """The last of three poses is off by it, the first by a third of the variance; the recorded target is not."""
-    task = PaperTask(ball_data, "train", 0.1, CPU, 0.003)
+    task = SurfaceTask(ball_data, "train", PAPER, CPU, noisy=True)
     picked = [task.trajectories[k % 6] for k in range(2000)]
     noise = task._noise(picked, np.random.default_rng(0), Team())
     assert noise is not None and noise.shape == (3, 2, 4001, 3)
@@ -97,7 +99,7 @@ def test_noise_walks_by_the_given_size(ball_data):
 def test_ranges_are_of_what_moves(pair, ball_data):
     """Scenery is as large as it likes, and does not set the model's unit of length."""
     (one, _), _ = pair
-    task = PaperTask(ball_data, "train", 0.1, CPU, None)
+    task = SurfaceTask(ball_data, "train", PAPER, CPU)
     task.trajectories = [one]
     known = task.ranges()
     scenery = {"static": np.array([False, True]), "scale": np.array([1.0, 9.0]), "mass": np.array([2.0, 0.0])}
@@ -110,7 +112,7 @@ def test_trajectories_of_different_steps_are_not_trained_on_together(ball_data, 
     for other in ({"dt": 0.01}, {"gravity": np.array([0.0, 0.0, -5.0])}):
         replace(bouncing(3), **other).save(tmp_path / "data" / "train" / "9.npz")
         for read in (
-            lambda data: PaperTask(data, "train", 0.1, CPU, None),
+            lambda data: SurfaceTask(data, "train", PAPER, CPU),
             lambda data: contact_frames(data, "train", Solved()),
         ):
             with pytest.raises(SdfsimError, match=r"train: its trajectories differ in step or gravity"):

@@ -1,0 +1,44 @@
+"""The networks on surface nodes by name: SDF-Sim (*paper*) and the baselines of its paper."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from sdfsim.dynamics.bodies import Bodies, State
+from sdfsim.dynamics.contacts import find_contacts
+from sdfsim.dynamics.memory import Memory
+from sdfsim.dynamics.models import dpi, fignet, mgn, nodes, paper
+from sdfsim.dynamics.models.collisions import face_pairs, node_pairs
+from sdfsim.dynamics.models.message_passing import Graph, Layout
+from sdfsim.dynamics.models.surfaces import Near
+from sdfsim.shape.shape import Shape
+
+
+@dataclass(frozen=True)
+class Family:
+    """What is a network's own beside its weights.
+
+    Attributes:
+        layout: of its graphs.
+        surface: a shape, with the nodes (at most so many, None for all) that the network works on.
+        near: what of the bodies is near what, for bodies, state, gravity, reach, time step and what the run remembers.
+        graph: the graph of bodies, their state and what is near.
+    """
+
+    layout: Layout
+    surface: Callable[[Shape, int | None], Shape]
+    near: Callable[[Bodies, State, Tensor, float, float, Memory], Near]
+    graph: Callable[[Bodies, State, Any], Graph]
+
+
+FAMILIES = {
+    "paper": Family(paper.LAYOUT, nodes.points, find_contacts, paper.graph),
+    "fignet": Family(fignet.LAYOUT, nodes.vertices, face_pairs, fignet.graph),
+    "fignet-star": Family(fignet.STAR, nodes.vertices, face_pairs, fignet.star_graph),
+    "mgn": Family(mgn.LAYOUT, nodes.vertices, node_pairs, mgn.graph),
+    "dpi": Family(dpi.LAYOUT, nodes.particles, node_pairs, dpi.graph),
+}

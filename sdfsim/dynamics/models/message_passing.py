@@ -1,0 +1,251 @@
+"""Encode, process, decode on typed graphs: the one network that SDF-Sim and its baselines share.
+
+They differ in their graphs alone: which sets of nodes there are, and which kinds of edges join them (`Layout`). An edge
+joins single nodes, or the three corners of one face to those of another and then carries a message for each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+
+from sdfsim.dynamics.models.impulse import by_rows
+
+
+@dataclass(frozen=True)
+class Features:
+    """How many numbers something is told by, and the columns at which vectors begin (their y turns in a mirror)."""
+
+    size: int
+    vectors: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class EdgeKind:
+    """Edges from nodes of the set `sender` to nodes of the set `receiver`, `corners` at either end."""
+
+    sender: str
+    receiver: str
+    features: Features
+    corners: int = 1
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What graphs of a network consist of; the set "node" is decoded."""
+
+    nodes: dict[str, Features]
+    edges: dict[str, EdgeKind]
+
+
+@dataclass(frozen=True)
+class Edges:
+    """E edges of one kind.
+
+    Attributes:
+        features: [E, F] float32.
+        sender, receiver: [E, corners] int64, in the sets that the kind names.
+    """
+
+    features: Tensor
+    sender: Tensor
+    receiver: Tensor
+
+
+@dataclass(frozen=True)
+class Graph:
+    """A graph of some layout.
+
+    Attributes:
+        nodes: features [n, F] float32 of each set.
+        edges: of each kind.
+    """
+
+    nodes: dict[str, Tensor]
+    edges: dict[str, Edges]
+
+    def __len__(self) -> int:
+        """How many nodes there are."""
+        return sum(len(features) for features in self.nodes.values())
+
+    @property
+    def edge_count(self) -> int:
+        """How many edges there are, each direction counted."""
+        return sum(len(edges.sender) for edges in self.edges.values())
+
+    def mirrored(self, layout: Layout) -> Graph:
+        """What the mirror image of the scene would give: y of every vector feature reversed."""
+        nodes = {name: flipped(x, layout.nodes[name]) for name, x in self.nodes.items()}
+        kinds = layout.edges
+        edges = {k: replace(e, features=flipped(e.features, kinds[k].features)) for k, e in self.edges.items()}
+        return Graph(nodes, edges)
+
+
+def flipped(values: Tensor, told: Features) -> Tensor:
+    """`values` [n, F] with y of their vectors reversed."""
+    sign = torch.ones(values.shape[-1], dtype=values.dtype, device=values.device)
+    sign[[column + 1 for column in told.vectors]] = -1.0
+    return values * sign
+
+
+def both_ways(forth: Tensor, back: Tensor, first: Tensor, second: Tensor) -> Edges:
+    """Edges in both directions: features `forth` [E, F] from `first` to `second` [E, corners], `back` the other way."""
+    features = torch.cat([forth, back]).float()
+    return Edges(features, torch.cat([first, second]), torch.cat([second, first]))
+
+
+@dataclass(frozen=True)
+class GraphConfig:
+    """Sizes of a network (published, all of them: width 128; SDF-Sim, FIGNet, MeshGraphNets: 10 to 15 steps).
+
+    Attributes:
+        width: of every latent and hidden layer.
+        steps: of message passing, each with weights of its own.
+    """
+
+    width: int = 128
+    steps: int = 10
+
+
+def mlp(inputs: int, width: int, outputs: int, *, normalised: bool = True) -> nn.Sequential:
+    """Two hidden layers, then LayerNorm unless it decodes."""
+    layers = [nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, outputs)]
+    return nn.Sequential(*layers, *([nn.LayerNorm(outputs)] if normalised else []))
+
+
+class EdgeUpdate(nn.Module):
+    """MLP over [edge, its senders, its receivers], its first layer split so that each part is as cheap as it can be."""
+
+    def __init__(self, width: int, corners: int) -> None:
+        super().__init__()
+        self.edge = nn.Linear(corners * width, width)
+        self.sender = nn.Linear(corners * width, width, bias=False)
+        self.receiver = nn.Linear(corners * width, width, bias=False)
+        outputs = corners * width
+        self.rest = nn.Sequential(
+            nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, outputs), nn.LayerNorm(outputs)
+        )
+
+    def forward(self, sent: Tensor, received: Tensor, edge: Tensor, sender: Tensor, receiver: Tensor) -> Tensor:
+        """[E, corners * width] updates of edges from nodes `sender` [E, corners] to `receiver` [E, corners]."""
+        ends = _gathered(self.sender, sent, sender) + _gathered(self.receiver, received, receiver)
+        return self.rest(self.edge(edge) + ends)
+
+
+def _gathered(layer: nn.Linear, latent: Tensor, index: Tensor) -> Tensor:
+    """[E, width] of a layer on the latents of nodes `index` [E, corners]: each edge's, or first every node's once."""
+    if len(index) < len(latent):
+        return layer(latent[index].flatten(1))
+    parts = layer.weight.split(latent.shape[1], dim=1)
+    projected = [(latent @ part.T)[index[:, k]] for k, part in enumerate(parts)]
+    return torch.stack(projected).sum(0) if len(projected) > 1 else projected[0]
+
+
+class Step(nn.Module):
+    """One step of message passing: all kinds of edges, then all sets of nodes; residual latents."""
+
+    edges: nn.ModuleDict
+    nodes: nn.ModuleDict
+
+    def __init__(self, layout: Layout, width: int) -> None:
+        super().__init__()
+        self.edges = nn.ModuleDict({name: EdgeUpdate(width, kind.corners) for name, kind in layout.edges.items()})
+        heard = {name: 1 + sum(kind.receiver == name for kind in layout.edges.values()) for name in layout.nodes}
+        self.nodes = nn.ModuleDict({name: mlp(count * width, width, width) for name, count in heard.items()})
+
+
+class GraphNetwork(nn.Module):
+    """Encode, `steps` of message passing, decode; inputs and targets are normalised by statistics of the training data.
+
+    Args:
+        layout: of the graphs.
+        config: sizes.
+    """
+
+    def __init__(self, layout: Layout, config: GraphConfig) -> None:
+        super().__init__()
+        self.layout, self.config = layout, config
+        width, kinds = config.width, layout.edges
+        sizes = {name: told.size for name, told in layout.nodes.items()}
+        sizes |= {name: kind.features.size for name, kind in kinds.items()}
+        outputs = {name: width * (kinds[name].corners if name in kinds else 1) for name in sizes}
+        self.scale = nn.ModuleDict({name: Normaliser(size) for name, size in sizes.items()})
+        self.target = Normaliser(3)
+        self.encode = nn.ModuleDict({name: mlp(size, width, outputs[name]) for name, size in sizes.items()})
+        self.steps = nn.ModuleList([Step(layout, width) for _ in range(config.steps)])
+        self.decode = mlp(width, width, 3, normalised=False)
+
+    def observe(self, graph: Graph) -> None:
+        """Count the features of a graph into the statistics."""
+        for name, features in graph.nodes.items():
+            cast("Normaliser", self.scale[name]).observe(features)
+        for name, edges in graph.edges.items():
+            cast("Normaliser", self.scale[name]).observe(edges.features)
+
+    def forward(self, graph: Graph, *, rows: int | None = None) -> Tensor:
+        """Standardised accelerations (change of displacement a step) of the set "node", [n, 3].
+
+        Args:
+            graph: of the network's layout.
+            rows: update no more than that many edges at once; None for all.
+        """
+
+        def encoded(name: str, features: Tensor) -> Tensor:
+            return by_rows(lambda part: self.encode[name](self.scale[name](part)), rows, features)
+
+        node = {name: encoded(name, features) for name, features in graph.nodes.items()}
+        edge = {name: encoded(name, edges.features) for name, edges in graph.edges.items()}
+        for step in cast("Iterable[Step]", self.steps):
+            heard = {name: [latent] for name, latent in node.items()}
+            for name, kind in self.layout.edges.items():
+                ends, update = graph.edges[name], partial(step.edges[name], node[kind.sender], node[kind.receiver])
+                edge[name] = edge[name] + by_rows(update, rows, edge[name], ends.sender, ends.receiver)
+                told = torch.zeros_like(node[kind.receiver])
+                messages = edge[name].reshape(-1, self.config.width)
+                heard[kind.receiver].append(told.index_add_(0, ends.receiver.flatten(), messages))
+            node = {name: node[name] + step.nodes[name](torch.cat(parts, -1)) for name, parts in heard.items()}
+        return self.decode(node["node"])
+
+
+class Normaliser(nn.Module):
+    """Standardises features by mean and deviation that are gathered before training and kept with the weights."""
+
+    total: Tensor
+    sum: Tensor
+    squares: Tensor
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.register_buffer("total", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("sum", torch.zeros(size, dtype=torch.float64))
+        self.register_buffer("squares", torch.zeros(size, dtype=torch.float64))
+
+    def observe(self, values: Tensor) -> None:
+        """Count [*, size] values in."""
+        values = values.detach().to(torch.float64)
+        self.total += len(values)
+        self.sum += values.sum(0)
+        self.squares += values.square().sum(0)
+
+    def moments(self) -> tuple[Tensor, Tensor]:
+        """Mean and deviation (at least 1e-6), float32 [size] each."""
+        mean = self.sum / self.total.clamp_min(1)
+        variance = (self.squares / self.total.clamp_min(1) - mean.square()).clamp_min(0.0)
+        # A feature that never varied (a constant coefficient) is only centred.
+        deviation = torch.where(variance > 1e-12, variance.sqrt(), torch.ones_like(variance))
+        return mean.float(), deviation.float()
+
+    def forward(self, values: Tensor) -> Tensor:
+        """Standardised values."""
+        mean, deviation = self.moments()
+        return (values - mean) / deviation
+
+    def undo(self, values: Tensor) -> Tensor:
+        """Back from standardised values."""
+        mean, deviation = self.moments()
+        return values * deviation + mean
