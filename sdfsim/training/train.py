@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import signal
 import threading
 import time
@@ -36,11 +37,12 @@ def train(
     data: Path | Sequence[Path],
     out: Path,
     *,
-    preset: str = "small",
+    preset: str | Preset = "small",
     resume: bool = False,
     steps: int | None = None,
     seed: int = 0,
     device: str = "cpu",
+    budget: float = math.inf,
     on_progress: Progress | None = None,
 ) -> dict:
     """Train a preset on one dataset or several; write `model.safetensors`, `log.jsonl` and a checkpoint under `out`.
@@ -48,15 +50,16 @@ def train(
     Args:
         data: dataset folders with train/ and validation/; several (impulse only) are drawn from as if they were one.
         out: training folder.
-        preset: name in `PRESETS`.
+        preset: name in `PRESETS`, or one of your own.
         resume: go on from the checkpoint in `out`; the result equals an uninterrupted run's.
         steps: of the optimiser, instead of the preset's.
         seed: of initial weights and batches.
         device: "cpu", "cuda" or "auto".
+        budget: seconds of processor time, all cores together, after which it stops early; `resume` goes on from there.
         on_progress: called with the fraction done and a message.
 
     Returns:
-        A report: paths, losses, seconds.
+        A report: paths, losses, seconds of processor time.
 
     Raises:
         SdfsimError: unknown preset, unusable data, a checkpoint in `out` without `resume`, another run writing
@@ -64,9 +67,9 @@ def train(
     """
     from sdfsim.dynamics.simulator import pick_device
 
-    if preset not in PRESETS:
+    if isinstance(preset, str) and preset not in PRESETS:
         raise SdfsimError(f"unknown preset {preset!r}", f"known: {', '.join(PRESETS)}")
-    plan = PRESETS[preset]
+    plan = PRESETS[preset] if isinstance(preset, str) else preset
     folders = [data] if isinstance(data, Path) else list(data)
     if steps is not None and steps < 1:
         raise SdfsimError(f"steps: must be at least 1 (got {steps})")
@@ -92,10 +95,10 @@ def train(
         if team.leads:
             _shorten(out / "log.jsonl", run.step)
         watched = held_out_rollouts(folders[0], place, lambda m: tell(0.0, m)) if team.leads else None
-        _loop(run, held_out, watched, out, tell)
+        _loop(run, held_out, watched, out, budget, tell)
         report = {"steps": run.step, "seconds": run.seconds, "loss": run.loss}
         if team.leads:
-            model = run.export(name=preset, data=made, ranges=task.ranges())
+            model = run.export(name=preset if isinstance(preset, str) else preset.kind, data=made, ranges=task.ranges())
             report |= {"model": _saved(model, out), "held_out_loss": held_out_loss(run, held_out)}
     return report
 
@@ -140,14 +143,14 @@ def _tasks(plan: Preset, folders: Sequence[Path], device: torch.device, tell: Pr
     return SurfaceTask(data, "train", plan, device, noisy=True), SurfaceTask(data, "validation", plan, device)
 
 
-def _loop(run: Run, held_out: Task, rollouts: Rollouts | None, out: Path, tell: Progress) -> None:
+def _loop(run: Run, held_out: Task, rollouts: Rollouts | None, out: Path, budget: float, tell: Progress) -> None:
     saved = time.monotonic()
     try:
-        while run.step < run.total:
-            started = time.monotonic()
+        while run.step < run.total and run.seconds < budget:
+            started = time.process_time()
             with _uninterrupted():
                 run.advance()
-                run.seconds += time.monotonic() - started
+                run.seconds += time.process_time() - started
                 due = run.step % min(1000, max(1, run.total // 10)) == 0 or run.step == run.total
                 if run.team.leads and due:  # a step's line in the log is part of it
                     _log(run, held_out, rollouts, out / "log.jsonl")
