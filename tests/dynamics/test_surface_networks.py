@@ -1,19 +1,26 @@
-"""The paper network's step: what is off is off, free flight exact or learned, and its history is a rigid motion."""
+"""The step of networks on surface nodes: what is off is off, free flight exact or learned, history a rigid motion."""
 
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
+from sdfsim.dynamics.model import SURFACE
 from sdfsim.dynamics.models.surfaces import advance, node_owner
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.scene.scene import Effects
 from tests.dynamics.conftest import angle_between, random_model
 
 
-def paper_model(push: float = 1e-3):
+@pytest.fixture(params=SURFACE)
+def kind(request) -> str:
+    return request.param
+
+
+def surface_model(kind: str = "paper", push: float = 1e-3):
     """Untrained, its accelerations of the size of `push`."""
-    model = random_model("paper", width=16, steps=2)
+    model = random_model(kind, width=16, steps=2)
     model.network.target.total.fill_(1.0)
     model.network.target.squares.fill_(push**2)
     return model
@@ -21,7 +28,7 @@ def paper_model(push: float = 1e-3):
 
 def test_without_acceleration_every_body_goes_on_as_it_came(dropped):
     """Zero acceleration of every node is uniform motion: translation exactly, rotation to the order of the step."""
-    sim = Simulator(dropped, paper_model())
+    sim = Simulator(dropped, surface_model())
     zero = torch.zeros(len(sim.bodies.node), 3, dtype=torch.float64)
     after = advance(sim.bodies, sim.state, zero, sim.rules.dt)
     moves = sim.bodies.moves
@@ -33,7 +40,7 @@ def test_without_acceleration_every_body_goes_on_as_it_came(dropped):
 
 
 def test_a_common_acceleration_moves_the_centre_by_it(free_pair):
-    sim = Simulator(free_pair, paper_model())
+    sim = Simulator(free_pair, surface_model())
     push = torch.tensor([[0.01, -0.02, 0.03], [0.0, 0.05, 0.0]], dtype=torch.float64)
     owner = node_owner(sim.bodies)
     with_push = advance(sim.bodies, sim.state, push[owner], sim.rules.dt)
@@ -42,9 +49,9 @@ def test_a_common_acceleration_moves_the_centre_by_it(free_pair):
     assert float(angle_between(with_push.orientation, without.orientation).max()) < 1e-6
 
 
-def test_exact_free_flight_leaves_the_high_body_to_gravity_and_learned_does_not(dropped):
-    exact = Simulator(dropped, paper_model()).run(steps=5)
-    learned = Simulator(dropped, paper_model(), free_flight="learned").run(steps=5)
+def test_exact_free_flight_leaves_the_high_body_to_gravity_and_learned_does_not(dropped, kind):
+    exact = Simulator(dropped, surface_model(kind)).run(steps=5)
+    learned = Simulator(dropped, surface_model(kind), free_flight="learned").run(steps=5)
     high = dropped.bodies[3]
     t = exact.time[:, None]
     fall = high.position + 0.5 * dropped.gravity * t**2
@@ -52,15 +59,15 @@ def test_exact_free_flight_leaves_the_high_body_to_gravity_and_learned_does_not(
     assert np.abs(learned.position[:, 3] - fall).max() > 1e-4
 
 
-def test_learned_free_flight_reaches_the_network_without_any_contact(dropped):
+def test_learned_free_flight_reaches_the_network_without_any_contact(dropped, kind):
     alone = replace(dropped, bodies=(dropped.bodies[3],))
-    learned = Simulator(alone, paper_model(), free_flight="learned").run(steps=3)
+    learned = Simulator(alone, surface_model(kind), free_flight="learned").run(steps=3)
     fall = alone.bodies[0].position + 0.5 * alone.gravity * learned.time[:, None] ** 2
     assert np.abs(learned.position[:, 0] - fall).max() > 1e-4
 
 
 def test_rotation_off_keeps_every_orientation(dropped):
-    for model in (paper_model(), random_model("impulse", push=0.05)):
+    for model in (*map(surface_model, SURFACE), random_model("impulse", push=0.05)):
         scene = replace(dropped, effects=Effects(rotation="off"))
         rollout = Simulator(scene, model).run(steps=8)
         assert rollout.contact_count.sum() > 0
@@ -68,8 +75,8 @@ def test_rotation_off_keeps_every_orientation(dropped):
         assert (rollout.angular_velocity[1:] == 0).all()
 
 
-def test_friction_and_restitution_off_equal_bodies_without_them(dropped):
-    model = paper_model()
+def test_friction_and_restitution_off_equal_bodies_without_them(dropped, kind):
+    model = surface_model(kind)
     off = Simulator(replace(dropped, effects=Effects(friction="off", restitution="off")), model).run(steps=6)
     bare = tuple(replace(b, friction=0.0, restitution=0.0) for b in dropped.bodies)
     none = Simulator(replace(dropped, bodies=bare), model).run(steps=6)
@@ -78,7 +85,7 @@ def test_friction_and_restitution_off_equal_bodies_without_them(dropped):
 
 
 def test_a_body_that_is_changed_goes_on_as_its_new_state_says_and_the_others_as_before(dropped):
-    calm = paper_model(push=2e-6)
+    calm = surface_model(push=2e-6)
     changed, plain = (Simulator(dropped, calm, free_flight="learned") for _ in range(2))
     for sim in (changed, plain):
         list(sim.steps(3))
@@ -95,10 +102,28 @@ def test_a_body_that_is_changed_goes_on_as_its_new_state_says_and_the_others_as_
 
 
 def test_a_state_of_another_run_keeps_its_own_history_and_one_without_gets_one(dropped):
-    one, other, bare = (Simulator(dropped, paper_model(), free_flight="learned") for _ in range(3))
+    one, other, bare = (Simulator(dropped, surface_model(), free_flight="learned") for _ in range(3))
     list(one.steps(3))
     other.state = one.state
     bare.state = replace(one.state, earlier_position=None, earlier_orientation=None)
     (went,), (same,), (near,) = (list(sim.steps(1)) for sim in (one, other, bare))
     assert torch.equal(went.position, same.position)
     torch.testing.assert_close(went.position, near.position, rtol=0, atol=0.02)
+
+
+def test_far_from_the_origin_a_step_is_the_same(dropped, kind):
+    """Only differences of poses enter; the floor is infinite, so scenes may be anywhere above it."""
+    far = np.array([1e4, -2e4, 0.0])
+    moved = replace(dropped, bodies=tuple(replace(b, position=b.position + far) for b in dropped.bodies))
+    here, there = (Simulator(scene, surface_model(kind), free_flight="learned") for scene in (dropped, moved))
+    (one,), (other,) = (list(sim.steps(1)) for sim in (here, there))
+    torch.testing.assert_close(other.position - torch.from_numpy(far), one.position, rtol=0, atol=1e-6)
+
+
+def test_the_order_of_bodies_does_not_matter(dropped, kind):
+    """Where surfaces do not cross: of crossing faces any common point is the closest."""
+    apart = replace(dropped.bodies[2], position=np.array([0.85, 0.95, 0.8]))
+    bodies, order = (*dropped.bodies[:2], apart, dropped.bodies[3]), [2, 0, 3, 1]
+    scenes = (replace(dropped, bodies=b) for b in (bodies, tuple(bodies[k] for k in order)))
+    one, other = (next(Simulator(s, surface_model(kind), free_flight="learned").steps(1)) for s in scenes)
+    torch.testing.assert_close(other.position, one.position[order], rtol=0, atol=1e-6)
