@@ -6,6 +6,8 @@
         the same with 2 to 512 spheres in a bowl, and where memory ends
     python benchmarks/paper.py accuracy DATA -o DIR [--minutes 5 15 30 60]
         trains all of them on one core for equal times, then rolls them out
+    python benchmarks/paper.py sdf DATA -o DIR
+        rollouts of the solver on networks of distances of several widths
 
 DATA is a MOVi-B dataset with train, validation and test. Graphs have as many surface nodes as the paper's, about 440 a
 body, and networks the published size. Networks of the last command have `NODES` nodes a body and the sizes `TRAINED`,
@@ -30,11 +32,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from samples.large import write_scene
 from sdfsim.data.batching import scene_of
-from sdfsim.data.dataset import Trajectory, load_shapes, read_info, trajectory_files
-from sdfsim.dynamics.model import Model, new_network
+from sdfsim.data.dataset import Trajectory, engine_substep, load_shapes, read_info, trajectory_files
+from sdfsim.data.replay import batches, first_frames, roll_out
+from sdfsim.dynamics.model import SOLVER, Model, load_model, new_network
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.errors import run_main
-from sdfsim.evaluation.evaluate import evaluate
+from sdfsim.evaluation.evaluate import errors, evaluate
 from sdfsim.evaluation.harness import (
     Job,
     Line,
@@ -50,6 +53,10 @@ from sdfsim.evaluation.harness import (
 from sdfsim.files import write_text
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.scene.scene_file import load_scene
+from sdfsim.shape.fit import PLANS, fit_pieces
+from sdfsim.shape.mesh import convex_hull
+from sdfsim.shape.shape import Shape, load_shape
+from sdfsim.training.contact_cache import inner_steps
 from sdfsim.training.presets import PRESETS, Preset
 from sdfsim.training.train import train
 
@@ -227,6 +234,48 @@ def accuracy(data: Path, out: Path, minutes: list[float]) -> None:
     draw(panels, out / "accuracy.png", wide=2, dpi=110)
 
 
+def rolled_out(data: Path, width: int | None, home: Path) -> dict[str, Any]:
+    """Errors of the solver on validation data whose shapes are networks of so many hidden units, refitted where they
+    are not 64 wide and kept in `home`; on the convex pieces themselves for None."""
+    torch.set_num_threads(1)
+    recorded = [Trajectory.load(file) for file in trajectory_files(data, "validation")]
+    recorded = [first_frames(t, int(FRAME) + 1) for t in recorded if not t.static.all()]
+    shapes = load_shapes(data, {str(n) for t in recorded for n in t.shape})
+    if width is not None:
+        shapes = {name: refitted(shape, width, home / name) for name, shape in shapes.items()}
+    inner = inner_steps(recorded[0].dt, engine_substep(data))
+    solver, motions = load_model(SOLVER), []
+    for group in batches(recorded):
+        motions += roll_out(solver, group, shapes, int(FRAME), torch.device("cpu"), substeps=inner, as_teacher=True)
+    return errors(motions, [t for group in batches(recorded) for t in group])[FRAME]
+
+
+def refitted(shape: Shape, width: int, folder: Path) -> Shape:
+    """The shape known by a network of so many hidden units alone, with its own nodes, fitted for a minute."""
+    if width == PLANS["default"].width:
+        return replace(shape, pieces=())
+    if not (folder / "shape.json").exists():
+        usual = PLANS["default"]
+        PLANS["default"] = replace(usual, width=width)
+        try:
+            fit_pieces([convex_hull(piece) for piece in shape.pieces], name=shape.name).save(folder)
+        finally:
+            PLANS["default"] = usual
+    return replace(shape, pieces=(), sdf=load_shape(folder).sdf)
+
+
+def sdf(data: Path, out: Path) -> None:
+    """Write sdf.md."""
+    ways = {"convex pieces, exactly": None, "64 wide": 64, "32 wide": 32, "128 wide": 128}
+    jobs = [
+        Job("rollouts", name, [width, read_info(data)], rolled_out, (data, width, out / "shapes" / str(width)))
+        for name, width in ways.items()
+    ]
+    results = measure(jobs, out / "sdf", on_progress=told)
+    rows = [("distances", f"validation, {FRAME} steps"), *((name, _cell(results["rollouts", name])) for name in ways)]
+    written(out / "sdf.md", markdown(rows))
+
+
 def accuracy_table(results: Results, minutes: list[float]) -> str:
     """Errors by network and minutes; a table for each form of free flight."""
     parts = []
@@ -264,7 +313,7 @@ def written(path: Path, table: str) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
-    for name in ("graphs", "growth", "accuracy"):
+    for name in ("graphs", "growth", "accuracy", "sdf"):
         command = commands.add_parser(name)
         if name != "growth":
             command.add_argument("data", type=Path)
@@ -276,6 +325,8 @@ def main() -> None:
         graphs(chosen.data, chosen.out)
     elif chosen.command == "growth":
         growth(chosen.out)
+    elif chosen.command == "sdf":
+        sdf(chosen.data, chosen.out)
     else:
         accuracy(chosen.data, chosen.out, chosen.minutes)
 

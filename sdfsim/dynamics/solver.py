@@ -433,9 +433,12 @@ _ARRAYS = (
 
 
 def _nodes_of(bodies: Bodies, k: int) -> np.ndarray:
-    """[K, 3] surface nodes of the shape of body k, at scale 1 in the shape's own frame."""
+    """[K, 3] surface nodes of the shape of body k, at scale 1 in the shape's own frame.
+
+    Rounded to 1e-12 m, so that bodies of different scales know them as the same nodes.
+    """
     first, last = int(bodies.node_start[k]), int(bodies.node_start[k + 1])
-    return ((bodies.node[first:last] + bodies.com[k]) / bodies.scale[k]).cpu().numpy()
+    return ((bodies.node[first:last] + bodies.com[k]) / bodies.scale[k]).cpu().numpy().round(12)
 
 
 def _extent(sdf: Sdf) -> float:
