@@ -11,7 +11,7 @@
 
 DATA is a MOVi-B dataset with train, validation and test. Graphs have as many surface nodes as the paper's, about 440 a
 body, and networks the published size. Networks of the last command have `NODES` nodes a body and the sizes `TRAINED`,
-so that an hour of one core is enough to learn something. Trainings go on where they were left, results that DIR holds
+so that an hour of a core is enough to learn something. Trainings go on where they were left, results that DIR holds
 are kept. Each command writes a table in Markdown into DIR.
 """
 
@@ -69,7 +69,7 @@ PUBLISHED_NODES = 440  # a body: what the paper's counts of edges leave
 BOWLS = (2, 8, 32, 128, 512)
 SETTLED = 200  # steps of the solver before the networks see the bowl
 MEMORY = 12  # GiB that a process may take
-TRAINED = {"width": 64, "steps": 5}
+TRAINED, BATCH = {"width": 32, "steps": 4}, 4
 NODES = 64  # a body, in training
 FRAME = "50"
 
@@ -140,7 +140,7 @@ def trained(name: str, data: Path, place: Path, minutes: float) -> Path:
 
 def plan_of(name: str) -> Preset:
     """How a network is trained for the comparison: at equal sizes, with the schedule of the published ones."""
-    return replace(PRESETS[name], config=TRAINED, nodes=NODES)
+    return replace(PRESETS[name], config=TRAINED, batch=BATCH, nodes=NODES)
 
 
 def judged(model: Path, data: Path, split: str, free_flight: str) -> dict[str, Any]:
