@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from sdfsim.dynamics import freeflight, solver
+from sdfsim.dynamics import freeflight, inference, solver
 from sdfsim.dynamics import step as step_module
 from sdfsim.dynamics.contacts import find_contacts
-from sdfsim.dynamics.kernels import nodes
+from sdfsim.dynamics.kernels import impulse, nodes
 from sdfsim.dynamics.memory import COUNTS, PHASES
 from sdfsim.dynamics.model import Unread
 from sdfsim.dynamics.models.surfaces import compact, node_owner, predict
@@ -43,8 +43,8 @@ def test_contact_off_looks_for_nothing_and_equals_bodies_that_may_not_touch(drop
     alone = replace(dropped, bodies=tuple(replace(b, collides_with=()) for b in dropped.bodies))
     forbid(step_module, "_solved_step", "contact_graph")
     forbid(solver, "_geometry")
+    forbid(inference, "corrected")
     model = random_model("impulse")
-    forbid(model.network, "forward")
     assert Simulator(alone, model).bodies.shape.tolist() == [-1] * 4  # there is no SDF to ask
     off = Simulator(replace(dropped, effects=Effects(contact="off")), model).run(steps=6)
     assert same(off, Simulator(alone, model).run(steps=6))
@@ -61,9 +61,8 @@ def test_no_weights_are_read_that_nothing_asks(dropped, tmp_path):
 
 def test_the_network_is_not_asked_before_a_pair_is_near(dropped, forbid):
     far = replace(dropped, bodies=(dropped.bodies[0], dropped.bodies[3]))
-    model = random_model("impulse")
-    forbid(model.network, "forward")
-    sim = Simulator(far, model)
+    forbid(inference, "corrected")
+    sim = Simulator(far, random_model("impulse"))
     sim.run(steps=10)
     assert sim.memory.counts["edges"] == 0 and sim.memory.counts["free"] == 1
 
@@ -132,16 +131,21 @@ def test_scenery_far_away_is_never_asked(dropped, make):
 
 
 def seen_by(model) -> list:
-    """The graphs that the network is given."""
+    """The graphs that a network in torch is given."""
     graphs, real = [], model.network.forward
     model.network.forward = lambda graph, **options: graphs.append(graph) or real(graph, **options)
     return graphs
 
 
-def test_the_impulse_network_sees_only_bodies_that_met_somebody(dropped):
-    model = random_model("impulse")
-    graphs = seen_by(model)
-    sim = Simulator(dropped, model)
+def test_the_impulse_network_sees_only_bodies_that_met_somebody(dropped, monkeypatch):
+    graphs, compiled = [], impulse.correct
+
+    def correct(weights, *rest):
+        graphs.append(impulse._graph(*rest))
+        compiled(weights, *rest)
+
+    monkeypatch.setattr(impulse, "correct", correct)
+    sim = Simulator(dropped, random_model("impulse"))
     met = 0
     for _ in range(8):
         before = len(graphs)
@@ -151,8 +155,8 @@ def test_the_impulse_network_sees_only_bodies_that_met_somebody(dropped):
         if len(graphs) > before:
             graph = graphs[-1]
             assert counts["nodes"] == len(graph.inverse_mass) < len(dropped.bodies)
-            assert counts["edges"] == len(graph.first)
-            assert set(torch.cat([graph.first, graph.second]).tolist()) == set(range(len(graph.inverse_mass)))
+            assert counts["edges"] == len(graph.pair)
+            assert set(graph.pair.ravel().tolist()) == set(range(len(graph.inverse_mass)))
             met += 1
     assert met > 0
 

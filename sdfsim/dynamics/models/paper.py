@@ -7,15 +7,13 @@ every surface node an acceleration; shape matching turns those of a body into it
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from typing import cast
 
 import torch
 from torch import Tensor, nn
-
-from sdfsim.dynamics.models.impulse import by_rows
 
 NODE_FEATURES = 13  # of surface nodes and of body nodes
 INTRA_FEATURES = 8
@@ -56,6 +54,13 @@ class SurfaceGraph:
     contact_node: Tensor
     contact_body: Tensor
     contact: Tensor
+
+
+def by_rows(function: Callable[..., Tensor], rows: int | None, *inputs: Tensor) -> Tensor:
+    """`function` of inputs [E, ...] that treats every row alone, on at most `rows` of them at once."""
+    if rows is None or len(inputs[0]) <= rows:
+        return function(*inputs)
+    return torch.cat([function(*part) for part in zip(*(v.split(rows) for v in inputs), strict=True)])
 
 
 def mlp(inputs: int, width: int, outputs: int, *, normalised: bool = True) -> nn.Sequential:
