@@ -28,11 +28,7 @@ ROUNDING = 1e-5  # by the largest speed around
 def pile(seed: int, bodies: int = 5, **effects: str) -> Scene:
     """Boxes and balls of all masses and coefficients that fall onto each other; nothing is symmetric."""
     draw = np.random.default_rng(seed)
-    shapes = (
-        analytic_shape("box", size=(1.0, 0.8, 0.6)),
-        analytic_shape("sphere", radius=0.4),
-        analytic_shape("plane"),
-    )
+    box, ball = analytic_shape("box", size=(1.0, 0.8, 0.6)), analytic_shape("sphere", radius=0.4)
     moving = []
     for k in range(bodies):
         quat = draw.normal(size=4)
@@ -45,7 +41,8 @@ def pile(seed: int, bodies: int = 5, **effects: str) -> Scene:
             )
         )  # fmt: skip
     floor = make_body("floor", 2, [0, 0, 0], motion="static", mass=0.0)
-    return Scene((box, ball, analytic_shape("plane")), (*moving, floor), np.array([0.7, 0.3, -9.0]), 1.0, effects=replace(Effects(), **effects))
+    shapes, played = (box, ball, analytic_shape("plane")), replace(Effects(), **effects)
+    return Scene(shapes, (*moving, floor), np.array([0.7, 0.3, -9.0]), 1.0, effects=played)
 
 
 def model_of(name: str, seed: int = 0) -> Model:
