@@ -73,7 +73,7 @@ def steps(monkeypatch) -> list[Compared]:
 
     def both(weights, world, before, solved, acts, rules, *, known):
         mine = compiled(weights, world, before, solved, acts, rules, known=known)
-        theirs = correct(*given, before, solved, acts, rules)
+        theirs = correct(given[0], given[1], before, solved, acts, rules)
         rows = torch.cat([acts.first, acts.second])
         speed = max(float(getattr(s, n)[rows].abs().max()) for s in (before, solved, theirs) for n in POSE[2:])
 
@@ -97,14 +97,14 @@ def agree(steps: list[Compared], count: int, change: float = 1e-3) -> bool:
 @pytest.mark.parametrize("effects", [{}, {"friction": "off"}, {"rotation": "off"}, {"restitution": "off"}], ids=str)
 @pytest.mark.parametrize("name", ["small", "random", "alone"])
 def test_compiled_and_torch_agree_to_rounding(steps, name, effects):
-    for seed in range(3):
-        Simulator(pile(seed, **effects), model_of(name, seed)).run(steps=15)
-    assert agree(steps, 30) and max(s.edges for s in steps) > 5
+    for seed in range(2):
+        Simulator(pile(seed, **effects), model_of(name, seed)).run(steps=12)
+    assert agree(steps, 16) and max(s.edges for s in steps) > 5
 
 
 @pytest.mark.parametrize("push", [5.0, 50.0])
 def test_they_agree_where_every_bound_of_the_trust_region_acts(steps, push):
-    for seed in range(3):
+    for seed in range(2):
         weightless = replace(pile(seed, 4), gravity=np.zeros(3))
         Simulator(weightless, random_model("impulse", seed, push=push)).run(steps=15)
     assert agree(steps, 10)
