@@ -5,14 +5,18 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import torch
+from torch import nn
 
 from sdfsim.dynamics.bodies import Bodies, State
+from sdfsim.dynamics.models.impulse import ImpulseNetwork
 
 if TYPE_CHECKING:
+    from sdfsim.dynamics.kernels.impulse import Weights
     from sdfsim.dynamics.solver import Compiled
+    from sdfsim.dynamics.step import Rules
 
 COUNTS = {
     "pairs": "pairs of bodies that the broad phase let through",
@@ -31,7 +35,7 @@ PHASES = {
 
 
 class Memory:
-    """Of one run: the compiled scene, counters and timers.
+    """Of one run: the compiled scene, the packed network, counters and timers.
 
     Attributes:
         counts: what the present step has counted so far, by the names of `COUNTS` and `PHASES` (ms).
@@ -40,6 +44,7 @@ class Memory:
     def __init__(self) -> None:
         self.counts = dict.fromkeys((*COUNTS, *PHASES), 0.0)
         self._compiled: Compiled | None = None
+        self._packed: tuple[nn.Module, bool, Weights] | None = None
         self._cuda = False
 
     def compiled(self, bodies: Bodies, state: State) -> Compiled:
@@ -49,6 +54,15 @@ class Memory:
         if self._compiled is None or self._compiled.bodies is not bodies:
             self._compiled = Compiled(bodies, state)
         return self._compiled
+
+    def weights(self, network: nn.Module, rules: Rules) -> Weights:
+        """Those of an *impulse* network as compiled code wants them, taken once."""
+        from sdfsim.dynamics.inference import packed
+
+        if self._packed is None or self._packed[0] is not network or self._packed[1] != rules.friction:
+            weights = packed(cast("ImpulseNetwork", network), friction=rules.friction)
+            self._packed = network, rules.friction, weights
+        return self._packed[2]
 
     def begin(self, bodies: Bodies) -> None:
         """Start counting a step."""

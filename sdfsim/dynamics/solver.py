@@ -102,17 +102,21 @@ class Compiled:
 
 
 def warm() -> None:
-    """Have the step compiled now, so that nobody waits for it later."""
+    """Have the step and the network on top of it compiled now, so that nobody waits for them later."""
     from sdfsim.dynamics.bodies import Units, from_scene
+    from sdfsim.dynamics.model import Model
+    from sdfsim.dynamics.models.impulse import ImpulseConfig, ImpulseNetwork
+    from sdfsim.dynamics.step import Rules, step
     from sdfsim.scene.scene import Body, Scene
     from sdfsim.shape.shape import analytic_shape
 
     still = np.zeros(3)
-    ball = Body("ball", 0, "dynamic", 1.0, still, np.array([0.0, 0.0, 0.0, 1.0]), still, still, 1.0, 0.5, 0.5)
-    one = Scene((analytic_shape("sphere", radius=0.5),), (ball,), still, 0.0)
-    bodies, state = from_scene(one, Units(1.0, 1.0, 1.0), torch.device("cpu"))
-    scene, rules = Compiled(bodies, state), compiled_rules(np.zeros(3), 0.02, 5)
-    scene.run(*taken_up(bodies, state, scene, rules), rules)
+    one = Body("one", 0, "dynamic", 1.0, still, np.array([0.0, 0.0, 0.0, 1.0]), still, still, 1.0, 0.5, 0.5)
+    other = replace(one, name="other", position=np.array([0.9, 0.0, 0.0]))
+    pair = Scene((analytic_shape("sphere", radius=0.5),), (one, other), still, 0.0)
+    network = ImpulseNetwork(ImpulseConfig(width=1, rounds=1))
+    model = Model("untrained", "impulse", network, dt=0.02, gravity=10.0, length=1.0, reach=0.0)
+    step(model, *from_scene(pair, Units(1.0, 1.0, 1.0), torch.device("cpu")), Rules(torch.zeros(3).double(), 0.02))
 
 
 @dataclass(frozen=True)

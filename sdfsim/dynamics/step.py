@@ -42,7 +42,7 @@ class Rules:
         restitution: False makes every contact one of restitution 0.
         rotation: False lets bodies translate only.
         free_flight: "exact", or "learned" where a network on surface nodes predicts all of every body's motion.
-        rows: how many edges a network works on at once; None for all.
+        rows: how many edges such a network works on at once; None for all.
         sleep: whether the solve freezes what rests.
         margin: by which all bodies but planes are larger for the solve than their distances say; adds: whether what
             it pushes out adds to the speed of a rebound. Both are habits of the teacher, for comparisons with it.
@@ -118,7 +118,13 @@ def _solved_step(model: Model, bodies: Bodies, state: State, rules: Rules, memor
     if not (on_top and len(acts)):
         return solved
     with memory.timed("network_ms"):
-        after = correct(model, bodies, state, solved, acts, rules)
+        if next(model.network.parameters()).device.type == "cpu":
+            from sdfsim.dynamics.inference import corrected
+
+            weights, world = memory.weights(model.network, rules), memory.compiled(bodies, state).world
+            after = corrected(weights, world, state, solved, acts, rules, known=model.dt)
+        else:
+            after = correct(model, bodies, state, solved, acts, rules)
     memory.count(nodes=len(torch.unique(torch.cat([acts.first, acts.second]))), edges=len(acts))
     # The solve takes poses and velocities that it did not leave behind for changes from outside.
     assert after.touch is not None
@@ -171,10 +177,13 @@ def _turned(bodies: Bodies, state: State, rows: Tensor, dt: float) -> tuple[Tens
 
 
 def correct(model: Model, bodies: Bodies, state: State, solved: State, acts: Acts, rules: Rules) -> State:
-    """What the network makes of the solve: only bodies that have met somebody are in its graph."""
-    active, graph = contact_graph(bodies, state, solved, acts, rules, model.dt)
-    device = next(model.network.parameters()).device
-    predicted = model.network(graph.to(device), friction=rules.friction, rows=rules.rows, trust=rules.trust)
+    """What the network makes of the solve: only bodies that have met somebody are in its graph.
+
+    `inference.corrected` is the same, compiled, for the CPU.
+    """
+    weight = next(model.network.parameters())
+    active, graph = contact_graph(bodies, state, solved, acts, rules, model.dt, weight.dtype)
+    predicted = model.network(graph.to(weight.device), friction=rules.friction, trust=rules.trust)
     # From the network's units of time and length back to those of the bodies.
     time = rules.dt / model.dt
     chosen = (graph.inverse_mass > 0).cpu()
@@ -196,9 +205,9 @@ def correct(model: Model, bodies: Bodies, state: State, solved: State, acts: Act
 
 
 def contact_graph(
-    bodies: Bodies, state: State, solved: State, acts: Acts, rules: Rules, dt: float
+    bodies: Bodies, state: State, solved: State, acts: Acts, rules: Rules, dt: float, dtype: torch.dtype = torch.float32
 ) -> tuple[Tensor, ContactGraph]:
-    """The bodies [A] that met somebody, and the graph among them in single precision.
+    """The bodies [A] that met somebody, and the graph among them in `dtype`.
 
     It is told in units in which the step lasts `dt` and gravity is what it is (Froude scaling): a network knows no
     other step, and takes a longer one for the same step of smaller bodies.
@@ -244,8 +253,8 @@ def contact_graph(
         "friction": product(bodies.friction) if rules.friction else nothing,
         "restitution": product(bodies.restitution) if rules.restitution else nothing,
     }
-    single = {name: value.float() for name, value in values.items()}
-    return active, ContactGraph(**single, first=first, second=second, pair=pair, pairs=pairs, dt=dt)
+    given = {name: value.to(dtype) for name, value in values.items()}
+    return active, ContactGraph(**given, first=first, second=second, pair=pair, pairs=pairs, dt=dt)
 
 
 def _surface_step(

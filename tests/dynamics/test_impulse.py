@@ -187,15 +187,11 @@ def test_same_scene_same_bits(dropped):
 
 
 def test_without_friction_nothing_tangential_is_computed(dropped):
-    """The heads for tangential impulses are not even called, and every push is along a sum of contact normals."""
+    """The heads for tangential impulses are not even read, and every push is along a sum of contact normals."""
     smooth = replace(dropped, bodies=tuple(replace(b, friction=0.0) for b in dropped.bodies[:2]))
     model = random_model("impulse")
     for layer in model.network.rounds:
-
-        def refuse(*_):
-            raise AssertionError("tangential head called")
-
-        layer.tangent_impulse.forward = refuse
+        layer.tangent_impulse.weight.fill_(torch.nan)
     sim = Simulator(smooth, model)
     assert not sim.rules.friction
     rollout = sim.run(steps=8)

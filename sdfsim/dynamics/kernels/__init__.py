@@ -22,9 +22,9 @@ def _cache() -> Path:
     return home / "sdfsim" / "kernels" / told.hexdigest()[:16]
 
 
-def compiled() -> bool:
-    """Whether the step was compiled before, so that it is there in a second."""
-    return any(_cache().glob("**/step.step-*.nbi"))
+def compiled(what: str = "step.step") -> bool:
+    """Whether the step, or another function here, was compiled before, so that it is there in a second."""
+    return any(_cache().glob(f"**/{what}-*.nbi"))
 
 
 _settings: Any = config
@@ -32,6 +32,7 @@ _before = _settings.CACHE_DIR
 if not _before:
     _settings.CACHE_DIR = str(_cache())
 try:
+    from sdfsim.dynamics.kernels import impulse as impulse
     from sdfsim.dynamics.kernels import step as step
 finally:
     _settings.CACHE_DIR = _before

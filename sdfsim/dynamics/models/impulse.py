@@ -5,13 +5,14 @@ true mass and inertia. So linear momentum is conserved exactly, angular momentum
 act, and the step turns with the scene, whatever the weights are.
 
 The rounds start from what the solve makes of the step, and what they add is held to a trust region (`bounded`).
+
+This form is for training, for a GPU, and to be read. On the CPU `kernels.impulse` does the same, compiled.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import cast
 
 import torch
@@ -39,6 +40,10 @@ class ImpulseConfig:
     rounds: int = 6
     alone: int = 0
 
+    def __post_init__(self) -> None:
+        if min(self.width, self.rounds) < 1:
+            raise ValueError(f"width and rounds must be at least 1 (got {self.width} and {self.rounds})")
+
 
 @dataclass(frozen=True)
 class Velocities:
@@ -60,13 +65,6 @@ def mlp(inputs: int, width: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(
         nn.Linear(inputs, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, outputs)
     )
-
-
-def by_rows(function: Callable[..., Tensor], rows: int | None, *inputs: Tensor) -> Tensor:
-    """`function` of inputs [E, ...] that treats every row alone, on at most `rows` of them at once."""
-    if rows is None or len(inputs[0]) <= rows:
-        return function(*inputs)
-    return torch.cat([function(*part) for part in zip(*(v.split(rows) for v in inputs), strict=True)])
 
 
 class Round(nn.Module):
@@ -127,7 +125,6 @@ class ImpulseNetwork(nn.Module):
         *,
         friction: bool = True,
         mirrored: bool = False,
-        rows: int | None = None,
         trust: float = 1.0,
     ) -> Velocities:
         """Velocities after the contacts have acted.
@@ -136,13 +133,12 @@ class ImpulseNetwork(nn.Module):
             graph: bodies and edges.
             friction: False computes no tangential impulse at all.
             mirrored: see `edge_frames`.
-            rows: update no more than that many edges at once; None for all.
             trust: of the trust region; at 0 the solve stands alone.
         """
         alone = bool(self.config.alone)
         graph = without_solve(graph) if alone else graph
         frames = edge_frames(graph, mirrored=mirrored)
-        edge = by_rows(self.encode, rows, frames.start)
+        edge = self.encode(frames.start)
         body = edge.new_zeros(len(graph.inverse_mass), self.config.width)
         end = torch.cat([graph.solved_velocity, graph.solved_angular], -1)
         mean = torch.cat([graph.mean_velocity, graph.mean_angular], -1)
@@ -150,7 +146,7 @@ class ImpulseNetwork(nn.Module):
         added = edge.new_zeros(len(edge), 3 if friction else 1, 2)
         for number, layer in enumerate(cast("Iterable[Round]", self.rounds), start=1):
             seen = (relative(graph, frames, twist) / frames.speed[..., None]).mT.flatten(1)
-            hidden = by_rows(partial(layer.read, body), rows, edge, graph.first, graph.second, seen)
+            hidden = layer.read(body, edge, graph.first, graph.second, seen)
             weight = _share_of_pair(layer.attention(hidden)[:, 0], graph)[:, None]
             change = layer.impulse(hidden, friction) * weight[..., None]
             added = added + change * (frames.speed * frames.mass[:, : added.shape[1]])[..., None]

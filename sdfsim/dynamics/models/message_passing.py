@@ -6,15 +6,13 @@ joins single nodes, or the three corners of one face to those of another and the
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import cast
 
 import torch
 from torch import Tensor, nn
-
-from sdfsim.dynamics.models.impulse import by_rows
 
 
 @dataclass(frozen=True)
@@ -110,6 +108,13 @@ class GraphConfig:
 
     width: int = 128
     steps: int = 10
+
+
+def by_rows(function: Callable[..., Tensor], rows: int | None, *inputs: Tensor) -> Tensor:
+    """`function` of inputs [E, ...] that treats every row alone, on at most `rows` of them at once."""
+    if rows is None or len(inputs[0]) <= rows:
+        return function(*inputs)
+    return torch.cat([function(*part) for part in zip(*(v.split(rows) for v in inputs), strict=True)])
 
 
 def mlp(inputs: int, width: int, outputs: int, *, normalised: bool = True) -> nn.Sequential:

@@ -1,0 +1,102 @@
+"""The *impulse* network on the CPU: its weights and a solved step as the compiled code wants them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from typing import cast
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from sdfsim.dynamics import kernels
+from sdfsim.dynamics.bodies import State
+from sdfsim.dynamics.kernels import impulse as compiled
+from sdfsim.dynamics.kernels.world import World
+from sdfsim.dynamics.models.contact_graph import REST_SPEED
+from sdfsim.dynamics.models.impulse import CALM, LIVELY, ImpulseNetwork, Round
+from sdfsim.dynamics.solver import Acts
+from sdfsim.dynamics.step import Rules
+
+_log = logging.getLogger(__name__)
+
+
+def packed(network: ImpulseNetwork, *, friction: bool) -> compiled.Weights:
+    """Copies of the weights of a network.
+
+    Args:
+        network: on any device.
+        friction: False leaves out what decodes tangential impulses.
+    """
+    if not kernels.compiled("impulse.correct"):
+        _log.warning("compiling the network, once for this version: about half a minute")
+    rounds = list(cast("Iterable[Round]", network.rounds))
+
+    def layer(*modules: Iterable[nn.Linear | nn.LayerNorm]) -> compiled.Layer:
+        """Of every round the modules side by side."""
+        each = list(zip(*modules, strict=True))
+        weight = [torch.cat([m.weight.mT if m.weight.ndim == 2 else m.weight for m in some], -1) for some in each]
+        return compiled.Layer(_array(weight), _array([torch.cat([m.bias for m in some]) for some in each]))
+
+    def linear(sequences: list[nn.Module]) -> tuple[compiled.Layer, ...]:
+        return tuple(layer(cast("Iterable[nn.Linear]", ms)) for ms in zip(*map(_linear, sequences), strict=True))
+
+    impulse = layer([r.normal_impulse for r in rounds])
+    if friction:
+        both = layer([r.normal_impulse for r in rounds], [r.tangent_impulse for r in rounds])
+        order = [0, 1, 2, 4, 3, 5]  # the tangential ones have both axes beside each other, here each has (end, mean)
+        impulse = compiled.Layer(*(np.ascontiguousarray(values[..., order]) for values in both))
+    return compiled.Weights(
+        encode=linear([network.encode]),  # type: ignore[arg-type]
+        normalise=layer([r.normalise for r in rounds]),
+        edge=linear([r.edge for r in rounds]),  # type: ignore[arg-type]
+        attention=layer([r.attention for r in rounds]),
+        impulse=impulse,
+        tell=layer([r.latent for r in rounds], [r.message for r in rounds]),
+        body=linear([r.body for r in rounds]),  # type: ignore[arg-type]
+        alone=bool(network.config.alone),
+    )
+
+
+def _linear(sequence: nn.Module) -> Iterator[nn.Module]:
+    return (m for m in sequence.children() if isinstance(m, nn.Linear))
+
+
+def _array(values: list[Tensor]) -> np.ndarray:
+    return np.ascontiguousarray(torch.stack(values).detach().cpu().float().numpy())
+
+
+def corrected(
+    weights: compiled.Weights, world: World, before: State, solved: State, acts: Acts, rules: Rules, *,
+    known: float,
+) -> State:  # fmt: skip
+    """What the network makes of a step of the solve.
+
+    Args:
+        weights: see `packed`.
+        world: the scene.
+        before: the state at the start of the step.
+        solved: what the solve makes of it.
+        acts: its edges, at least one; those of a pair of bodies stand together.
+        rules: what is in play.
+        known: the step that the network knows.
+    """
+    pair = torch.stack([acts.first, acts.second], 1).numpy()
+    vectors = [acts.arm_first, acts.arm_second, acts.normal, acts.impulse]
+    value = torch.cat([*vectors, acts.gap[:, None], acts.when[:, None]], 1).numpy()
+    terms = compiled.Terms(
+        gravity=rules.gravity.cpu().numpy(), dt=rules.dt, known=known, friction=rules.friction,
+        restitution=rules.restitution, rotation=rules.rotation, trust=rules.trust, rest=REST_SPEED, calm=CALM,
+        lively=LIVELY,
+    )  # fmt: skip
+    after = [tensor.clone() for tensor in _poses(solved)]
+    start, end = (compiled.Poses(*(t.contiguous().numpy() for t in some)) for some in (_poses(before), after))
+    compiled.correct(weights, world, start, end, pair, value, terms)
+    position, orientation, velocity, angular = after
+    return replace(solved, position=position, orientation=orientation, velocity=velocity, angular_velocity=angular)
+
+
+def _poses(state: State) -> tuple[Tensor, ...]:
+    return state.position, state.orientation, state.velocity, state.angular_velocity
