@@ -157,9 +157,8 @@ def resting_height(mesh: Mesh, *, level: float = 0.95, share: float = 0.05) -> f
         enough = np.flatnonzero(area + np.append(area[1:], 0) > share * areas.sum())
         if len(enough):
             chosen = (bins == enough[0]) | (bins == enough[0] + 1)
-            order = np.argsort(height[flat][chosen])
-            total = np.cumsum(areas[flat][chosen][order])
-            return float(height[flat][chosen][order][np.searchsorted(total, total[-1] / 2)])
+            weights = areas[flat][chosen]
+            return float(np.quantile(height[flat][chosen], 0.5, weights=weights, method="inverted_cdf"))
     return float(np.quantile(mesh.vertices[:, 2], 0.002))
 
 
