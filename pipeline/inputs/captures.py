@@ -172,19 +172,9 @@ def save_capture(capture: Capture, folder: Path) -> None:
 
 
 def load_capture(folder: Path) -> Capture | None:
-    """What the capture behind a folder of prepared photos says; None: these were just photos.
-
-    Raises:
-        SdfsimError: damaged.
-    """
+    """What the capture behind a folder of prepared photos says; None: these were just photos."""
     path = Path(folder) / CAPTURE
     if not path.exists():
         return None
-    content = read_json(path)
-    try:
-        if content["up"] is None:
-            return Capture(str(content["app"]), None)
-        x, y, z = map(float, content["up"])
-        return Capture(str(content["app"]), (x, y, z))
-    except (KeyError, TypeError, ValueError) as error:
-        raise SdfsimError(f"{path}: damaged", "run the photos stage again") from error
+    content = read_json(path, "run the photos stage again")
+    return Capture(content["app"], content["up"] and tuple(content["up"]))

@@ -75,18 +75,12 @@ def pinhole(name: str, size: tuple[int, int], lens: Sequence[float], pose: np.nd
         pose: [3, 4] camera to world, OpenGL axes (x right, y up, z backwards).
         depth: of its photo.
     """
-    if not np.isfinite(pose).all() or abs(np.linalg.det(pose[:3, :3])) < 1e-6:
+    turn, place = pose[:, :3], pose[:, 3]
+    if not np.isfinite(pose).all() or abs(np.linalg.det(turn)) < 1e-6:
         raise SdfsimError(f"{name}: its matrix is not a pose")
     fx, fy, cx, cy = map(float, lens)
-    rotation, translation = world_to_camera(pose)
-    return KnownCamera(name, *size, _matrix(fx, fy, cx, cy), (), False, rotation, translation, depth=depth)
-
-
-def world_to_camera(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation [3, 3] and translation [3], axes x right, y down, z forward, of a pose [3 or 4, 4] with OpenGL axes."""
-    turn = pose[:3, :3] / np.cbrt(np.linalg.det(pose[:3, :3]))
-    rotation = np.diag([1.0, -1, -1]) @ turn.T
-    return rotation, -rotation @ pose[:3, 3]
+    rotation = np.diag([1.0, -1, -1]) @ (turn / np.cbrt(np.linalg.det(turn))).T
+    return KnownCamera(name, *size, _matrix(fx, fy, cx, cy), (), False, rotation, -rotation @ place, depth=depth)
 
 
 def read_cameras(path: Path) -> list[KnownCamera]:
@@ -125,16 +119,12 @@ def read_transforms(path: Path) -> list[KnownCamera]:
             width, height, fx = 1, 0, 0.5 / np.tan(0.5 * float(values["camera_angle_x"]))
         fy = float(values.get("fl_y", fx))
         cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
-        pose = np.array(frame["transform_matrix"], float).reshape(4, 4)
-        if not np.isfinite(pose).all() or abs(np.linalg.det(pose[:3, :3])) < 1e-6:
-            raise SdfsimError(f"{where}: transform_matrix is not a pose")
-        rotation, translation = world_to_camera(pose)
+        pose = np.array(frame["transform_matrix"], float).reshape(4, 4)[:3]
+        straight = pinhole(str(frame["file_path"]), (width, height), (fx, fy, cx, cy), pose)
         names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
         lens = tuple(float(values.get(name, 0.0)) for name in names)
-        found.append(
-            KnownCamera(str(frame["file_path"]), width, height, _matrix(fx, fy, cx, cy), lens, fisheye,
-                  rotation, translation, frame.get("mask_path"), _depth_of(values, path.parent))
-        )  # fmt: skip
+        depth = _depth_of(values, path.parent)
+        found.append(replace(straight, distortion=lens, fisheye=fisheye, mask=frame.get("mask_path"), depth=depth))
     return found
 
 
