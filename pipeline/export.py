@@ -16,7 +16,7 @@ from pipeline.materials import Choice
 from pipeline.mesh.cleaning import joined
 from pipeline.mesh.meshing import SCENERY, TEXTURED, read_parts, rounded
 from pipeline.mesh.placement import Placement, load_placement
-from pipeline.mesh.visibility import Caster
+from pipeline.mesh.visibility import Above
 from pipeline.progress import Progress, quiet, share_of
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.files import write_text
@@ -277,21 +277,6 @@ class Slab:
     thickness: float
     position: tuple[float, float, float]
     slope: float
-
-
-class Above:
-    """Heights of a mesh's topmost surface."""
-
-    def __init__(self, mesh: Mesh) -> None:
-        self.caster = Caster(mesh)
-        self.top = float(mesh.vertices[:, 2].max()) + 1.0
-
-    def heights(self, at: np.ndarray) -> np.ndarray:
-        """Heights [...] m over the points `at` [..., 2] m; NaN where there is no surface."""
-        origin = np.full((at.size // 2, 3), self.top)
-        origin[:, :2] = at.reshape(-1, 2)
-        distance, _ = self.caster.hits(origin, np.tile([0.0, 0.0, -1.0], (len(origin), 1)))
-        return np.where(np.isfinite(distance), self.top - distance, np.nan).reshape(at.shape[:-1])
 
 
 def choose_slab(shown: Mesh, solid: Mesh) -> Slab:
