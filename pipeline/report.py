@@ -97,15 +97,8 @@ def improvements(report: dict) -> list[str]:
     """What to do for a better result, most useful first; one line each."""
     poses, stages = report["poses"], report["stages"]
     lines = [*poses.get("causes", [])]
-    for fault in ("blurred", "too dark", "burnt out"):
-        names = [photo["photo"] for photo in report["photos"] if photo["fault"] == fault]
-        if names:
-            more = " ..." if len(names) > NAMED else ""
-            lines.append(f"take again what is {fault}: {', '.join(names[:NAMED])}{more}")
     if 0 < len(report["photos"]) < FEW_PHOTOS:
         lines.append(f"take more photos: {len(report['photos'])} are few, 20 to 60 are good")
-    if poses and poses.get("span_degrees", 360) < 150 and not poses.get("failures"):
-        lines.append("walk further around the object: what no photo shows is guessed")
     if poses.get("mean_error", 0) > HIGH_ERROR:
         lines.append("keep zoom and focus fixed, and nothing moving in view: the photos agree only within "
                      f"{poses['mean_error']:.1f} px")  # fmt: skip
@@ -114,8 +107,6 @@ def improvements(report: dict) -> list[str]:
                      "(--preset standard), and keep light and exposure the same in all photos")  # fmt: skip
     lines += [f"{k}. of the photos that would help most: {photo_line(photo)}"
               for k, photo in enumerate(stages.get("mesh", {}).get("next_photos", []), start=1)]  # fmt: skip
-    if str(stages.get("mesh", {}).get("size", "")).startswith("assumed"):
-        lines.append("give --size or --distance: until then nobody knows how large the scene is")
     if report["failed_checks"]:
         lines.append("fit for longer (a larger --budget), or mend the mesh: a shape is not usable")
     return lines
@@ -283,7 +274,7 @@ def write_recording(folder: Path, done: Collection[str]) -> Path | None:
     if "poses" not in done:
         return None
     views, sparse, place = load_views(folder / "poses"), load_sparse(folder / "poses"), folder / "mesh"
-    moves = [Similarity(1.0, frame_of(camera_up(views).normal), np.zeros(3))]
+    moves = [Similarity(1.0, frame_of(camera_up(views).direction), np.zeros(3))]
     mesh, skins, trust, proposed = None, {}, {}, []
     if "mesh" in done:
         moves = [load_field(folder / "distill").to_unit, load_placement(place).to_metres]

@@ -229,8 +229,7 @@ def find_poses(photos: str | Path, out: str | Path, *, progress: Callable[[str, 
 
 
 def run_stage(
-    name: str, folder: str | Path, *, progress: Callable[[str, float, str], None] | None = None, again: bool = False,
-    **changes: Any,
+    name: str, folder: str | Path, *, progress: Callable[[str, float, str], None] | None = None, **changes: Any
 ) -> dict:  # fmt: skip
     """Runs one stage in a folder that the stages before it have written.
 
@@ -238,7 +237,6 @@ def run_stage(
         name: one of `STAGES`.
         folder: of an earlier `reconstruct`.
         progress: called with (stage, fraction, message).
-        again: also when nothing changed.
         **changes: options that differ from those in the folder's config.yaml (see `Options`), from then on kept there;
             None changes nothing. A budget is that of this stage and this call alone, and not kept.
 
@@ -260,7 +258,7 @@ def run_stage(
             why = "is older than what it reads" if read_record(run.place(before)) else "has not run"
             command = "poses" if before == "photos" else before  # No command does the photos alone.
             raise SdfsimError(f"{folder}: the {before} stage {why}", f"run `sdfsim {command}` first")
-    return run_all(run, {name: again})
+    return run_all(run, {name: False})
 
 
 def _check_name(name: str) -> None:

@@ -207,8 +207,8 @@ def notes_on(photos: list[Photo], mask_files: int) -> list[str]:
     for word in ("blurred", "too dark", "burnt out"):
         names = [p.source for p in photos if p.fault == word]
         if names:
-            more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-            notes.append(f"{len(names)} of {len(photos)} photos are {word}: {', '.join(names[:NAMED])}{more}")
+            named = ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
+            notes.append(f"{len(names)} of {len(photos)} photos are {word}, take them again: {named}")
     return notes
 
 
