@@ -73,9 +73,9 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
             continue
         solid, shown = meshes_of(mesh_folder, name)
         shape = fit_mesh(
-            solid, name=name, recipe=recipe, budget=None if budget is None else budget * share, seed=seed, cap=True,
-            on_progress=tell, device=device,
-        )  # type: ignore[arg-type]  # fmt: skip
+            solid, name=name, recipe=recipe, seed=seed, cap=True,  # type: ignore[arg-type]
+            budget=None if budget is None else budget * share, on_progress=tell, device=device,
+        )  # fmt: skip
         shape.certificate.update(grid_certificate(shape.sdf, shape.nodes))
         # The folder appears complete or not at all: a run that goes on keeps those that are there.
         shutil.rmtree(partial, ignore_errors=True)
