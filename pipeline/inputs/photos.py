@@ -96,8 +96,11 @@ def prepare_photos(
     photos: list[Photo] = []
     shares: list[tuple[float, float]] = []
     views: list[View] = []
-    for origin, picture, known, view, lens, fraction in _pictures(source, long_side):
-        name = f"{len(photos):04d}.jpg"
+    for origin, picture, known, fraction in _pictures(source, long_side):
+        name, lens = f"{len(photos):04d}.jpg", None
+        if known:
+            picture, view, lens = rectified(picture, known, name, origin)
+            views.append(view)
         Image.fromarray(picture.pixels).save(out / "images" / name, quality=95, subsampling=0)
         if picture.mask is not None:
             (out / "masks").mkdir(exist_ok=True)
@@ -107,12 +110,10 @@ def prepare_photos(
             np.save(out / "depth" / (name + ".npy"), _depth_of(known))
         if picture.labels is not None:
             save_labels(picture.labels, out, name)
-        if view is not None:
-            views.append(replace(view, name=name))
         height, width = picture.pixels.shape[:2]
         sharp = round(sharpness(picture.pixels), 4)
         shares.append(exposure(picture.pixels))
-        focal = picture.focal if view is None else None  # A known camera is no prior.
+        focal = None if known else picture.focal  # A known camera is no prior.
         photos.append(
             Photo(name, origin, width, height, picture.original, lens, focal, picture.camera,
                   picture.mask is not None, sharp, depth=bool(known and known.depth))
@@ -134,29 +135,24 @@ def prepare_photos(
     return photos, [*source.notes, *notes_on(photos, len(source.masks))]
 
 
-def _pictures(
-    source: Source, long_side: int
-) -> Iterator[tuple[str, Picture, KnownCamera | None, View | None, Lens | None, float]]:
-    """Name, picture, camera where it is known, the same as a view of the straight photo, lens, and share done."""
+def _pictures(source: Source, long_side: int) -> Iterator[tuple[str, Picture, KnownCamera | None, float]]:
+    """Name, picture, camera where it is known, and share done."""
     if source.video:
         from pipeline.inputs.video import chosen_frames
 
         for name, pixels, fraction in chosen_frames(source.video):
             image = Image.fromarray(pixels)
             image.thumbnail((long_side, long_side), Image.Resampling.LANCZOS)
-            yield name, Picture(np.asarray(image), image.size), None, None, None, fraction
+            yield name, Picture(np.asarray(image), image.size), None, fraction
         return
     masks = _masks_that_count(source, long_side)
     for index, path in enumerate(source.photos):
         camera = source.frames.get(path)
         shape = camera.width / camera.height if camera and camera.height else None
-        name, view, lens = source.name_of(path), None, None
         picture = read_photo(path, long_side, masks.get(path), shape)
         picture = replace(picture, labels=source.labels.of(path, picture.pixels.shape[1::-1]))
-        if camera:
-            _check_shape(path, picture, shape)
-            picture, view, lens = rectified(picture, camera, path.name, name)
-        yield name, picture, camera, view, lens, (index + 1) / len(source.photos)
+        _check_shape(path, picture, shape)
+        yield source.name_of(path), picture, camera, (index + 1) / len(source.photos)
 
 
 def _depth_of(camera: KnownCamera) -> np.ndarray:
