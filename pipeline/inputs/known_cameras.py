@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -31,16 +31,45 @@ CENTRE = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 
 
 @dataclass(frozen=True)
+class Lens:
+    """What bends a photo of some size.
+
+    Attributes:
+        matrix: rows of the intrinsics [3, 3], pixel centres at +0.5.
+        distortion: OpenCV's coefficients (k1, k2, p1, p2, k3, ...), or four of its fisheye model.
+        fisheye: which of the two.
+    """
+
+    matrix: tuple[tuple[float, ...], ...]
+    distortion: tuple[float, ...] = ()
+    fisheye: bool = False
+
+    def straight(self, pixels: np.ndarray, view: View) -> np.ndarray:
+        """Where the straight photo of `view` shows what pixels [P, 2] of the bent one show; may lie outside it."""
+        import cv2
+
+        until = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-10)
+        undistort = cv2.fisheye.undistortPoints if self.fisheye else cv2.undistortPoints
+        new = np.array([[view.focal, 0, view.cx], [0, view.focal, view.cy], [0, 0, 1]])
+        points = np.ascontiguousarray(pixels, float)[:, None]
+        return undistort(points, np.array(self.matrix), np.array(self.distortion), P=new, criteria=until)[:, 0]
+
+
+def lens_of(fx: float, fy: float, cx: float, cy: float, distortion: tuple[float, ...] = (),
+            fisheye: bool = False) -> Lens:  # fmt: skip
+    """The lens of two focal lengths and a middle, px."""
+    return Lens(((fx, 0, cx), (0, fy, cy), (0, 0, 1)), distortion, fisheye)
+
+
+@dataclass(frozen=True)
 class KnownCamera:
     """A camera that was found elsewhere.
 
     Attributes:
         name: of its photo, as the file says it.
-        width: px of the photo that the intrinsics are for.
+        width: px of the photo that the lens is for.
         height: px.
-        matrix: [3, 3] intrinsics, pixel centres at +0.5.
-        distortion: OpenCV's coefficients (k1, k2, p1, p2, k3, ...), or four of its fisheye model.
-        fisheye: which of the two.
+        lens: of a photo of this size.
         rotation: [3, 3] world to camera; x right, y down, z forward.
         translation: [3].
         mask: file name of its mask, or None.
@@ -50,9 +79,7 @@ class KnownCamera:
     name: str
     width: int
     height: int
-    matrix: np.ndarray
-    distortion: tuple[float, ...]
-    fisheye: bool
+    lens: Lens
     rotation: np.ndarray
     translation: np.ndarray
     mask: str | None = None
@@ -64,23 +91,18 @@ class KnownCamera:
         return -self.rotation.T @ self.translation
 
 
-def pinhole(name: str, size: tuple[int, int], lens: Sequence[float], pose: np.ndarray,
-            depth: DepthFile | None = None) -> KnownCamera:  # fmt: skip
-    """A camera without distortion.
+def posed(name: str, size: tuple[int, int], lens: Lens, pose: np.ndarray, mask: str | None = None,
+          depth: DepthFile | None = None) -> KnownCamera:  # fmt: skip
+    """A camera by its pose [3, 4], camera to world, OpenGL axes (x right, y up, z backwards).
 
-    Args:
-        name: of its photo.
-        size: width and height, px.
-        lens: focal lengths and middle, fx, fy, cx, cy, px.
-        pose: [3, 4] camera to world, OpenGL axes (x right, y up, z backwards).
-        depth: of its photo.
+    Raises:
+        SdfsimError: it is no pose.
     """
     turn, place = pose[:, :3], pose[:, 3]
     if not np.isfinite(pose).all() or abs(np.linalg.det(turn)) < 1e-6:
         raise SdfsimError(f"{name}: its matrix is not a pose")
-    fx, fy, cx, cy = map(float, lens)
     rotation = np.diag([1.0, -1, -1]) @ (turn / np.cbrt(np.linalg.det(turn))).T
-    return KnownCamera(name, *size, _matrix(fx, fy, cx, cy), (), False, rotation, -rotation @ place, depth=depth)
+    return KnownCamera(name, *size, lens, rotation, -rotation @ place, mask, depth)
 
 
 def read_cameras(path: Path) -> list[KnownCamera]:
@@ -120,11 +142,10 @@ def read_transforms(path: Path) -> list[KnownCamera]:
         fy = float(values.get("fl_y", fx))
         cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
         pose = np.array(frame["transform_matrix"], float).reshape(4, 4)[:3]
-        straight = pinhole(str(frame["file_path"]), (width, height), (fx, fy, cx, cy), pose)
         names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
-        lens = tuple(float(values.get(name, 0.0)) for name in names)
+        lens = lens_of(fx, fy, cx, cy, tuple(float(values.get(name, 0.0)) for name in names), fisheye)
         depth = _depth_of(values, path.parent)
-        found.append(replace(straight, distortion=lens, fisheye=fisheye, mask=frame.get("mask_path"), depth=depth))
+        found.append(posed(str(frame["file_path"]), (width, height), lens, pose, frame.get("mask_path"), depth))
     return found
 
 
@@ -155,11 +176,9 @@ def read_model(folder: Path) -> list[KnownCamera]:
         fx = known.get("fx", known.get("f", 0.0))
         fisheye = model.endswith("FISHEYE")
         names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-        lens = tuple(known.get(key, 0.0) for key in names)
-        found.append(
-            KnownCamera(name, width, height, _matrix(fx, known.get("fy", fx), known["cx"], known["cy"]),
-                  lens, fisheye, _rotation(quaternion), np.array(translation))
-        )  # fmt: skip
+        bent = tuple(known.get(key, 0.0) for key in names)
+        lens = lens_of(fx, known.get("fy", fx), known["cx"], known["cy"], bent, fisheye)
+        found.append(KnownCamera(name, width, height, lens, _rotation(quaternion), np.array(translation)))
     return found
 
 
@@ -169,10 +188,6 @@ def _parameters(folder: Path, model: str) -> list[str]:
         readable = ", ".join(name for name, parameters in MODELS.values() if parameters)
         raise SdfsimError(f"{folder}: the camera model {model} is not read", f"allowed: {readable}")
     return names.split()
-
-
-def _matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
 
 def _rotation(wxyz: tuple[float, ...]) -> np.ndarray:
@@ -226,37 +241,12 @@ def _images_binary(folder: Path) -> Iterator[tuple[str, int, tuple[float, ...], 
         yield name, values[8], values[1:5], values[5:8]
 
 
-@dataclass(frozen=True)
-class Lens:
-    """What bent a photo before it was made straight.
-
-    Attributes:
-        matrix: rows of the intrinsics [3, 3] for the prepared photo's size, pixel centres at +0.5.
-        distortion: see `KnownCamera`.
-        fisheye: see `KnownCamera`.
-    """
-
-    matrix: tuple[tuple[float, ...], ...]
-    distortion: tuple[float, ...]
-    fisheye: bool
-
-    def straight(self, pixels: np.ndarray, view: View) -> np.ndarray:
-        """Where the straight photo of `view` shows what pixels [P, 2] of the bent one show; may lie outside it."""
-        import cv2
-
-        until = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-10)
-        undistort = cv2.fisheye.undistortPoints if self.fisheye else cv2.undistortPoints
-        new = np.array([[view.focal, 0, view.cx], [0, view.focal, view.cy], [0, 0, 1]])
-        points = np.ascontiguousarray(pixels, float)[:, None]
-        return undistort(points, np.array(self.matrix), np.array(self.distortion), P=new, criteria=until)[:, 0]
-
-
 def scaled(known: KnownCamera, width: int, height: int) -> np.ndarray:
     """The camera's matrix [3, 3] for its photo at another size, px."""
     if not known.height:  # Only a field of view is known.
-        return np.array([[known.matrix[0, 0] * width, 0, width / 2], [0, known.matrix[1, 1] * width, height / 2],
-                         [0, 0, 1]])  # fmt: skip
-    return np.diag([width / known.width, height / known.height, 1.0]) @ known.matrix
+        focal = known.lens.matrix[0][0] * width
+        return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return np.diag([width / known.width, height / known.height, 1.0]) @ known.lens.matrix
 
 
 def rectified(picture: Picture, known: KnownCamera, name: str, source: str) -> tuple[Picture, View, Lens | None]:
@@ -272,24 +262,24 @@ def rectified(picture: Picture, known: KnownCamera, name: str, source: str) -> t
         source: the user's name of it.
     """
     height, width = picture.pixels.shape[:2]
-    matrix, lens = scaled(known, width, height), None
+    matrix, bent, lens = scaled(known, width, height), known.lens, None
     pixels, mask, labels = picture.pixels, picture.mask, picture.labels
     # A fisheye bends also where all its coefficients are 0.
-    if known.fisheye or any(known.distortion) or abs(matrix[0, 0] / matrix[1, 1] - 1) > SQUARE:
+    if bent.fisheye or any(bent.distortion) or abs(matrix[0, 0] / matrix[1, 1] - 1) > SQUARE:
         import cv2
 
-        lens = Lens(tuple(map(tuple, matrix.tolist())), known.distortion, known.fisheye)
-        bent, size = np.array(known.distortion), (width, height)
+        lens = replace(bent, matrix=tuple(map(tuple, matrix.tolist())))
+        curve, size = np.array(bent.distortion), (width, height)
         old = matrix - CENTRE
-        if known.fisheye:
-            new = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(old, bent, size, np.eye(3), balance=0.0)
+        if bent.fisheye:
+            new = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(old, curve, size, np.eye(3), balance=0.0)
         else:
-            new, _ = cv2.getOptimalNewCameraMatrix(old, bent, size, 0.0)
+            new, _ = cv2.getOptimalNewCameraMatrix(old, curve, size, 0.0)
         new = np.array(new, float)
         new[0, 0] = new[1, 1] = max(new[0, 0], new[1, 1])
         new[0, 1] = 0.0
-        make = cv2.fisheye.initUndistortRectifyMap if known.fisheye else cv2.initUndistortRectifyMap
-        x, y = make(old, bent, np.eye(3), new, size, cv2.CV_32FC1)
+        make = cv2.fisheye.initUndistortRectifyMap if bent.fisheye else cv2.initUndistortRectifyMap
+        x, y = make(old, curve, np.eye(3), new, size, cv2.CV_32FC1)
         pixels = cv2.remap(pixels, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         if mask is not None:
             mask = cv2.remap(mask, x, y, cv2.INTER_LINEAR)

@@ -308,7 +308,7 @@ def test_colmap_reads_the_model_as_we_do(tmp_path):
     code += "m.write_binary(sys.argv[2])"
     subprocess.run([sys.executable, "-c", code, tmp_path / "text", tmp_path / "binary"], check=True)
     for one, other in zip(read_cameras(tmp_path / "text"), read_cameras(tmp_path / "binary"), strict=True):
-        assert one.name == other.name and one.distortion == other.distortion
-        np.testing.assert_allclose(one.matrix, other.matrix)
+        assert one.name == other.name and one.lens.distortion == other.lens.distortion
+        np.testing.assert_allclose(one.lens.matrix, other.lens.matrix)
         np.testing.assert_allclose(one.rotation, other.rotation, atol=1e-12)
         np.testing.assert_allclose(one.translation, other.translation, atol=1e-12)
