@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -41,8 +42,8 @@ class Lens:
     """
 
     matrix: tuple[tuple[float, ...], ...]
-    distortion: tuple[float, ...] = ()
-    fisheye: bool = False
+    distortion: tuple[float, ...]
+    fisheye: bool
 
     def straight(self, pixels: np.ndarray, view: View) -> np.ndarray:
         """Where the straight photo of `view` shows what pixels [P, 2] of the bent one show; may lie outside it."""
@@ -55,9 +56,12 @@ class Lens:
         return undistort(points, np.array(self.matrix), np.array(self.distortion), P=new, criteria=until)[:, 0]
 
 
-def lens_of(fx: float, fy: float, cx: float, cy: float, distortion: tuple[float, ...] = (),
-            fisheye: bool = False) -> Lens:  # fmt: skip
-    """The lens of two focal lengths and a middle, px."""
+def lens_of(
+    fx: float, fy: float, cx: float, cy: float, bends: Mapping[str, float] = MappingProxyType({}), fisheye: bool = False
+) -> Lens:
+    """The lens of two focal lengths and a middle, px, and of coefficients by their names in OpenCV."""
+    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    distortion = tuple(float(bends.get(name, 0.0)) for name in names)
     return Lens(((fx, 0, cx), (0, fy, cy), (0, 0, 1)), distortion, fisheye)
 
 
@@ -122,12 +126,13 @@ def read_transforms(path: Path) -> list[KnownCamera]:
     """Cameras of a transforms.json: camera-to-world matrices with OpenGL axes; intrinsics for all or in each frame."""
     about = json.loads(path.read_text(encoding="utf-8"))
     found = []
-    _check_lens(about, str(path))
     for frame in about["frames"]:
         values = {**about, **frame}
         where = f"{path}: {frame['file_path']}"
-        _check_lens(values, where)
-        fisheye = values.get("camera_model") == "OPENCV_FISHEYE" or bool(values.get("is_fisheye"))
+        model = values.get("camera_model", LENSES[0])
+        if model not in LENSES:
+            raise SdfsimError(f"{where}: camera_model: {model!r} is not read", f"allowed: {', '.join(LENSES)}")
+        fisheye = model == "OPENCV_FISHEYE" or bool(values.get("is_fisheye"))
         width, height = int(values.get("w", 0)), int(values.get("h", 0))
         if "fl_x" in values:
             if width <= 0 or height <= 0:
@@ -142,8 +147,9 @@ def read_transforms(path: Path) -> list[KnownCamera]:
         fy = float(values.get("fl_y", fx))
         cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
         pose = np.array(frame["transform_matrix"], float).reshape(4, 4)[:3]
-        names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
-        lens = lens_of(fx, fy, cx, cy, tuple(float(values.get(name, 0.0)) for name in names), fisheye)
+        # Where not of a fisheye, what others call k4 is not OpenCV's.
+        bends = values if fisheye else {**values, "k4": 0, "k5": 0, "k6": 0}
+        lens = lens_of(fx, fy, cx, cy, bends, fisheye)
         depth = _depth_of(values, path.parent)
         found.append(posed(str(frame["file_path"]), (width, height), lens, pose, frame.get("mask_path"), depth))
     return found
@@ -158,15 +164,10 @@ def _depth_of(values: dict, folder: Path) -> DepthFile | None:
     return DepthFile(folder / str(name), None if unit is None else float(unit))
 
 
-def _check_lens(values: dict, where: str) -> None:
-    """Raises SdfsimError for a lens that is none of `LENSES`."""
-    model = values.get("camera_model", LENSES[0])
-    if model not in LENSES:
-        raise SdfsimError(f"{where}: camera_model: {model!r} is not read", f"allowed: {', '.join(LENSES)}")
-
-
 def read_model(folder: Path) -> list[KnownCamera]:
     """Cameras of a COLMAP model (its documentation, "Output Format")."""
+    from scipy.spatial.transform import Rotation
+
     binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
     cameras = dict((_cameras_binary if binary else _cameras_text)(folder))
     found = []
@@ -174,11 +175,9 @@ def read_model(folder: Path) -> list[KnownCamera]:
         model, width, height, values = cameras[camera]
         known = dict(zip(_parameters(folder, model), values, strict=True))
         fx = known.get("fx", known.get("f", 0.0))
-        fisheye = model.endswith("FISHEYE")
-        names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-        bent = tuple(known.get(key, 0.0) for key in names)
-        lens = lens_of(fx, known.get("fy", fx), known["cx"], known["cy"], bent, fisheye)
-        found.append(KnownCamera(name, width, height, lens, _rotation(quaternion), np.array(translation)))
+        lens = lens_of(fx, known.get("fy", fx), known["cx"], known["cy"], known, model.endswith("FISHEYE"))
+        rotation = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
+        found.append(KnownCamera(name, width, height, lens, rotation, np.array(translation)))
     return found
 
 
@@ -188,13 +187,6 @@ def _parameters(folder: Path, model: str) -> list[str]:
         readable = ", ".join(name for name, parameters in MODELS.values() if parameters)
         raise SdfsimError(f"{folder}: the camera model {model} is not read", f"allowed: {readable}")
     return names.split()
-
-
-def _rotation(wxyz: tuple[float, ...]) -> np.ndarray:
-    from scipy.spatial.transform import Rotation
-
-    w, x, y, z = wxyz
-    return Rotation.from_quat([x, y, z, w]).as_matrix()
 
 
 def _lines(path: Path) -> list[str]:

@@ -259,7 +259,6 @@ def test_cameras_beside_the_photos_are_mentioned_not_used(tmp_path):
 @pytest.mark.parametrize(
     ("content", "words"),
     [("{", "cannot be read as cameras"), ('{"frames": []}', "0 cameras, at least 3"),
-     ('{"camera_model": "PANO", "frames": []}', "camera_model: 'PANO' is not read"),
      ('{"frames": [{"file_path": "a.jpg", "camera_model": "PANO"}]}', r"a\.jpg: camera_model: 'PANO' is not read"),
      ('{"fl_x": 9, "w": 5, "frames": [{"file_path": "a.jpg"}]}', r"a\.jpg: fl_x without w and h"),
      ('{"camera_angle_x": 2, "is_fisheye": true, "frames": [{"file_path": "a.jpg"}]}', r"a fisheye without fl_x")],
