@@ -106,8 +106,10 @@ def prepare_photos(
             (out / "masks").mkdir(exist_ok=True)
             Image.fromarray(picture.mask).save(out / "masks" / (name + ".png"))
         if known and known.depth:
+            depth = read_depth(known.depth)
+            _check_shape(known.depth.path, depth.shape[::-1], known)
             (out / "depth").mkdir(exist_ok=True)
-            np.save(out / "depth" / (name + ".npy"), _depth_of(known))
+            np.save(out / "depth" / (name + ".npy"), depth)
         if picture.labels is not None:
             save_labels(picture.labels, out, name)
         height, width = picture.pixels.shape[:2]
@@ -150,22 +152,10 @@ def _pictures(source: Source, long_side: int) -> Iterator[tuple[str, Picture, Kn
         camera = source.frames.get(path)
         shape = camera.width / camera.height if camera and camera.height else None
         picture = read_photo(path, long_side, masks.get(path), shape)
-        picture = replace(picture, labels=source.labels.of(path, picture.pixels.shape[1::-1]))
-        _check_shape(path, picture, shape)
+        size = picture.pixels.shape[1::-1]
+        _check_shape(path, size, camera)
+        picture = replace(picture, labels=source.labels.of(path, size))
         yield source.name_of(path), picture, camera, (index + 1) / len(source.photos)
-
-
-def _depth_of(camera: KnownCamera) -> np.ndarray:
-    """Depth [H, W] m, shaped like the photo of its camera."""
-    assert camera.depth is not None
-    depth = read_depth(camera.depth)
-    height, width = depth.shape
-    if camera.height and abs(width / height / (camera.width / camera.height) - 1) > 0.02:
-        raise SdfsimError(
-            f"{camera.depth.path}: shaped {width} x {height}, its photo {camera.width} x {camera.height}",
-            "depth has to show what its photo shows, turned the same way",
-        )
-    return depth
 
 
 def _masks_that_count(source: Source, long_side: int) -> dict[Path, Path]:
@@ -176,12 +166,12 @@ def _masks_that_count(source: Source, long_side: int) -> dict[Path, Path]:
     return {}
 
 
-def _check_shape(path: Path, picture: Picture, shape: float | None) -> None:
-    height, width = picture.pixels.shape[:2]
-    if shape is not None and abs(width / height / shape - 1) > 0.02:
+def _check_shape(path: Path, size: tuple[int, int], camera: KnownCamera | None) -> None:
+    """Checks that a photo, or its depth, of this width and height is shaped like the photo of its camera."""
+    if camera and camera.height and abs(size[0] / size[1] / (camera.width / camera.height) - 1) > 0.02:
         raise SdfsimError(
-            f"{path}: shaped {width} x {height}, but its camera has {shape:.3f} times as many columns as rows",
-            "the photos have to be those that the cameras were found for, uncropped",
+            f"{path}: shaped {size[0]} x {size[1]}, but its camera's photo {camera.width} x {camera.height}",
+            "photos and depth have to be those that the cameras were found for, uncropped, and turned the same way",
         )
 
 
