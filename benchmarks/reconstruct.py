@@ -32,7 +32,7 @@ from pipeline.cameras import View, load_views
 from pipeline.field.training import load_field
 from pipeline.mesh.meshing import read_parts
 from pipeline.mesh.placement import load_placement
-from pipeline.mesh.trust import vertex_areas, weighted_quantile
+from pipeline.mesh.trust import vertex_areas
 from sdfsim.console import Session
 from sdfsim.errors import run_main
 from sdfsim.shape.mesh import Mesh, load_mesh, read_attributes, read_mesh, signed_volume
@@ -107,11 +107,12 @@ def trust_errors(folder: Path, photos: Path, move: Similarity) -> list[dict[str,
     bodies = [f"objects/{entry['name']}.ply" for entry in parts["objects"]]
     area, uncertainty, error = measured(["shown.ply", *bodies])
     known = np.isfinite(uncertainty)
-    limits = [weighted_quantile(uncertainty[known], area[known], share) for share in (0, 0.25, 0.5, 0.75, 0.95, 1)]
+    shares = [0, 0.25, 0.5, 0.75, 0.95, 1]
+    limits = np.quantile(uncertainty[known], shares, weights=area[known], method="inverted_cdf").tolist()
     rows: list[dict[str, Any]] = []
 
     def add(name: str, chosen: np.ndarray, area: np.ndarray, error: np.ndarray, told: list[float] | None) -> None:
-        median, p90 = (1000 * weighted_quantile(error[chosen], area[chosen], share) for share in (0.5, 0.9))
+        median, p90 = 1000 * np.quantile(error[chosen], [0.5, 0.9], weights=area[chosen], method="inverted_cdf")
         rows.append({"part": name, "uncertainty_mm": told, "error_median_mm": median, "error_p90_mm": p90})
 
     ends = [(f"quarter {k}", limits[k - 1], limits[k if k < 4 else 5]) for k in (1, 2, 3, 4)]

@@ -197,14 +197,15 @@ def nearest_to_axes(centers: np.ndarray, axes: np.ndarray, anchor: np.ndarray | 
     return np.linalg.solve(matrix, right + weight * len(centers) * pull)
 
 
-class CameraUp(NamedTuple):
-    """Up from the cameras alone: the unit vector [3], and degrees within which it can be trusted."""
+class Up(NamedTuple):
+    """Up: a unit vector [3], where it is from, and degrees within which it can be trusted."""
 
-    normal: np.ndarray
+    direction: np.ndarray
+    source: str
     within: float
 
 
-def camera_up(views: list[View]) -> CameraUp:
+def camera_up(views: list[View]) -> Up:
     """Up from the cameras alone: people hold cameras level, so their right axes are horizontal.
 
     The direction with the least spread of the right axes, with the sign of the mean image up. Where the right axes
@@ -216,9 +217,9 @@ def camera_up(views: list[View]) -> CameraUp:
     values, vectors = np.linalg.eigh(right.T @ right / len(right))
     up = vectors[:, 0] * np.sign(vectors[:, 0] @ mean or 1.0)
     if values[1] < 0.05 or values[0] > 0.3 * values[1] or up @ mean < 0.5:
-        return CameraUp(mean, UNKNOWN)
+        return Up(mean, "cameras", UNKNOWN)
     # Where the right axes fan out little, a roll of each camera tilts the whole the more.
-    return CameraUp(up, float(np.hypot(CAREFUL, np.degrees(np.sqrt(max(values[0], 0) / values[1])))))
+    return Up(up, "cameras", float(np.hypot(CAREFUL, np.degrees(np.sqrt(max(values[0], 0) / values[1])))))
 
 
 def focus(views: list[View]) -> tuple[np.ndarray, np.ndarray]:
@@ -237,11 +238,11 @@ def spread_angle(views: list[View]) -> float:
 
 def view_span(views: list[View]) -> float:
     """Degrees around the scene's upright axis from which it was photographed: 360 less the largest gap."""
-    rays, up = focus(views)[1], camera_up(views).normal
+    rays, up = focus(views)[1], camera_up(views).direction
     flat = rays - np.outer(rays @ up, up)
     level = np.linalg.norm(flat, axis=1) > 0.1  # a photo from straight above has no side
     if level.sum() < 2:
         return 0.0
-    east = np.cross(up, np.eye(3)[np.abs(up).argmin()])
-    angle = np.sort(np.degrees(np.arctan2(flat[level] @ np.cross(up, east), flat[level] @ east)))
+    east, north, _ = frame_of(up)
+    angle = np.sort(np.degrees(np.arctan2(flat[level] @ north, flat[level] @ east)))
     return 360.0 - float(np.diff(np.append(angle, angle[0] + 360)).max())

@@ -15,6 +15,12 @@ Preset = Annotated[
     Literal["quick", "standard", "fine", "paper"],
     typer.Option(help="How much time to spend; paper is the network of the VolSDF paper, for a GPU."),
 ]
+Photos = Annotated[
+    Path,
+    typer.Argument(
+        help="Folder of photos, a video, a transforms.json, a COLMAP model, or a phone's capture.", show_default=False
+    ),
+]
 KeptPreset = Annotated[Literal["quick", "standard", "fine", "paper"] | None, typer.Option(help="Default: as before.")]
 Stage = Literal["photos", "poses", "distill", "mesh", "fit", "scene"]
 Size = Annotated[float | None, typer.Option(help="Widest side of the scene, metres.", min=0.0)]
@@ -45,13 +51,7 @@ DropShape = Annotated[Literal["box", "ball", "none"], typer.Option("--drop", hel
 
 
 def reconstruct(
-    photos: Annotated[
-        Path,
-        typer.Argument(
-            help="Folder of photos, a video, a transforms.json, a COLMAP model, or a phone's capture.",
-            show_default=False,
-        ),
-    ],
+    photos: Photos,
     out: Out,
     preset: Preset = "standard",
     first: Annotated[Stage | None, typer.Option("--from", help="Do this stage and those after it again.")] = None,
@@ -90,13 +90,7 @@ def reconstruct(
 
 
 def poses(
-    photos: Annotated[
-        Path,
-        typer.Argument(
-            help="Folder of photos, a video, a transforms.json, a COLMAP model, or a phone's capture.",
-            show_default=False,
-        ),
-    ],
+    photos: Photos,
     out: Out,
     preset: KeptPreset = None,
     as_json: Json = False,

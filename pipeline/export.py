@@ -16,8 +16,8 @@ from pipeline.materials import Choice
 from pipeline.mesh.cleaning import joined
 from pipeline.mesh.meshing import SCENERY, TEXTURED, read_parts, rounded
 from pipeline.mesh.placement import Placement, load_placement
-from pipeline.mesh.visibility import Caster
-from pipeline.progress import Progress, quiet
+from pipeline.mesh.visibility import Above
+from pipeline.progress import Progress, quiet, share_of
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.files import write_text
 from sdfsim.scene.scene import Scene
@@ -56,50 +56,35 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
     Raises:
         SdfsimError: the mesh stage has not run, or a mesh cannot be used.
     """
+    from sdfsim.shape.baked_grid import grid_certificate
+    from sdfsim.shape.fit import fit_mesh
     from sdfsim.shape.shape import load_shape
 
     parts, skins = read_parts(mesh_folder), skins_of(mesh_folder)
-    weights = {SCENERY: SCENERY_SHARE} if parts["scenery"] else {}
-    weights |= {entry["name"]: 1 for entry in parts["objects"]}
-    shares = {name: weight / sum(weights.values()) for name, weight in weights.items()}
+    weights = ({SCENERY: SCENERY_SHARE} if parts["scenery"] else {}) | dict.fromkeys(_names(parts), 1)
     certificates, done = {}, 0.0
-    for name, share in shares.items():
-
-        def tell(fraction: float, message: str, name: str = name, before: float = done, share: float = share) -> None:
-            on_progress(before + share * fraction, f"{name}: {message}")
-
+    for name, weight in weights.items():
+        share = weight / sum(weights.values())
+        tell = share_of(lambda part, message, name=name: on_progress(part, f"{name}: {message}"), done, share)
         done += share
-        folder = out / name
+        folder, partial = out / name, out / f".{name}.part"
         if (folder / "shape.json").exists():
             certificates[name] = load_shape(folder).certificate
             continue
         solid, shown = meshes_of(mesh_folder, name)
-        certificates[name] = fit_one(
-            solid, shown, skins.get(name), out, name, budget=None if budget is None else budget * share, recipe=recipe,
-            seed=seed, device=device, on_progress=tell,
+        shape = fit_mesh(
+            solid, name=name, recipe=recipe, seed=seed, cap=True,  # type: ignore[arg-type]
+            budget=None if budget is None else budget * share, on_progress=tell, device=device,
         )  # fmt: skip
+        shape.certificate.update(grid_certificate(shape.sdf, shape.nodes))
+        # The folder appears complete or not at all: a run that goes on keeps those that are there.
+        shutil.rmtree(partial, ignore_errors=True)
+        replace(shape, mesh=shown, skin=skins.get(name)).save(partial)
+        partial.rename(folder)
+        certificates[name] = shape.certificate
     missed = [f"{name}: {found['reason']}" for name, found in certificates.items() if not found["passed"]]
     caveats = [f"{name}: {found['caveat']}" for name, found in certificates.items() if found["caveat"]]
     return {"shapes": certificates, "passed": not missed, "reason": "; ".join(missed), "caveats": caveats}
-
-
-def fit_one(solid: Mesh, shown: Mesh, skin: Mesh | None, out: Path, name: str, *, budget: float | None, recipe: str,
-            seed: int, device: str, on_progress: Progress) -> dict:  # fmt: skip
-    """Fits one shape, saves it as the folder `out`/`name`, and returns its certificate."""
-    from sdfsim.shape.baked_grid import grid_certificate
-    from sdfsim.shape.fit import fit_mesh
-
-    shape = fit_mesh(
-        solid, name=name, recipe=recipe, budget=budget, seed=seed, cap=True,  # type: ignore[arg-type]
-        on_progress=on_progress, device=device,
-    )  # fmt: skip
-    shape.certificate.update(grid_certificate(shape.sdf, shape.nodes))
-    # The folder appears complete or not at all: a run that goes on keeps those that are there.
-    partial = out / f".{name}.part"
-    shutil.rmtree(partial, ignore_errors=True)
-    replace(shape, mesh=shown, skin=skin).save(partial)
-    partial.rename(out / name)
-    return shape.certificate
 
 
 def meshes_of(mesh_folder: Path, name: str) -> tuple[Mesh, Mesh]:
@@ -292,21 +277,6 @@ class Slab:
     thickness: float
     position: tuple[float, float, float]
     slope: float
-
-
-class Above:
-    """Heights of a mesh's topmost surface."""
-
-    def __init__(self, mesh: Mesh) -> None:
-        self.caster = Caster(mesh)
-        self.top = float(mesh.vertices[:, 2].max()) + 1.0
-
-    def heights(self, at: np.ndarray) -> np.ndarray:
-        """Heights [...] m over the points `at` [..., 2] m; NaN where there is no surface."""
-        origin = np.full((at.size // 2, 3), self.top)
-        origin[:, :2] = at.reshape(-1, 2)
-        distance, _ = self.caster.hits(origin, np.tile([0.0, 0.0, -1.0], (len(origin), 1)))
-        return np.where(np.isfinite(distance), self.top - distance, np.nan).reshape(at.shape[:-1])
 
 
 def choose_slab(shown: Mesh, solid: Mesh) -> Slab:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.cameras import View, camera_up, frame_of, load_sparse, load_views
+from pipeline.cameras import Similarity, camera_up, frame_of, load_sparse, load_views
 from pipeline.options import Options
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, write_json, write_text
@@ -97,15 +97,8 @@ def improvements(report: dict) -> list[str]:
     """What to do for a better result, most useful first; one line each."""
     poses, stages = report["poses"], report["stages"]
     lines = [*poses.get("causes", [])]
-    for fault in ("blurred", "too dark", "burnt out"):
-        names = [photo["photo"] for photo in report["photos"] if photo["fault"] == fault]
-        if names:
-            more = " ..." if len(names) > NAMED else ""
-            lines.append(f"take again what is {fault}: {', '.join(names[:NAMED])}{more}")
     if 0 < len(report["photos"]) < FEW_PHOTOS:
         lines.append(f"take more photos: {len(report['photos'])} are few, 20 to 60 are good")
-    if poses and poses.get("span_degrees", 360) < 150 and not poses.get("failures"):
-        lines.append("walk further around the object: what no photo shows is guessed")
     if poses.get("mean_error", 0) > HIGH_ERROR:
         lines.append("keep zoom and focus fixed, and nothing moving in view: the photos agree only within "
                      f"{poses['mean_error']:.1f} px")  # fmt: skip
@@ -114,8 +107,6 @@ def improvements(report: dict) -> list[str]:
                      "(--preset standard), and keep light and exposure the same in all photos")  # fmt: skip
     lines += [f"{k}. of the photos that would help most: {photo_line(photo)}"
               for k, photo in enumerate(stages.get("mesh", {}).get("next_photos", []), start=1)]  # fmt: skip
-    if str(stages.get("mesh", {}).get("size", "")).startswith("assumed"):
-        lines.append("give --size or --distance: until then nobody knows how large the scene is")
     if report["failed_checks"]:
         lines.append("fit for longer (a larger --budget), or mend the mesh: a shape is not usable")
     return lines
@@ -261,7 +252,8 @@ def page(report: dict, folder: Path) -> str:
 def write_recording(folder: Path, done: Collection[str]) -> Path | None:
     """Writes `reconstruction.rrd`: cameras with their photos, sparse points, the surface, how far it can be trusted.
 
-    Before the mesh stage it is in the units of the camera poses, from then on in metres with z up.
+    Before the mesh stage it is in the units of the camera poses, with z up as far as the cameras tell; from then on in
+    metres with z up.
 
     Args:
         folder: of the run.
@@ -273,18 +265,24 @@ def write_recording(folder: Path, done: Collection[str]) -> Path | None:
     Raises:
         SdfsimError: a stage's folder is damaged, or the file cannot be written.
     """
+    from pipeline.field.training import load_field
     from pipeline.mesh.meshing import NEXT, TEXTURED, trust_meshes
+    from pipeline.mesh.placement import load_placement
     from sdfsim.recording import PosedPhoto, save_reconstruction
     from sdfsim.shape.mesh import load_mesh, read_glb
 
     if "poses" not in done:
         return None
-    views, points, colors = _in_place(folder, done)
-    mesh = load_mesh(folder / "mesh" / "mesh.ply") if "mesh" in done else None
-    textured = folder / "mesh" / TEXTURED
-    skins = read_glb(textured) if "mesh" in done and textured.exists() else {}
-    trusted = "mesh" in done and (folder / "mesh" / NEXT).exists()
-    proposed = load_views(folder / "mesh" / NEXT) if trusted else []
+    views, sparse, place = load_views(folder / "poses"), load_sparse(folder / "poses"), folder / "mesh"
+    moves = [Similarity(1.0, frame_of(camera_up(views).direction), np.zeros(3))]
+    mesh, skins, trust, proposed = None, {}, {}, []
+    if "mesh" in done:
+        moves = [load_field(folder / "distill").to_unit, load_placement(place).to_metres]
+        mesh, skins = load_mesh(place / "mesh.ply"), read_glb(place / TEXTURED)
+        trust, proposed = trust_meshes(place), load_views(place / NEXT)
+    points = sparse.xyz
+    for move in moves:
+        views, points = [move.view(view) for view in views], move.points(points)
     photos = []
     for number, view in enumerate([*views, *proposed]):
         image = folder / "photos" / "images" / view.name
@@ -293,24 +291,5 @@ def write_recording(folder: Path, done: Collection[str]) -> Path | None:
                        (view.width, view.height), view.rotation, view.translation,
                        PROPOSED if number >= len(views) else None)
         )  # fmt: skip
-    trust = trust_meshes(folder / "mesh") if trusted else {}
-    save_reconstruction(folder / RECORDING, photos, points, colors, mesh, skins, trust)
+    save_reconstruction(folder / RECORDING, photos, points, sparse.rgb, mesh, skins, trust)
     return folder / RECORDING
-
-
-def _in_place(folder: Path, done: Collection[str]) -> tuple[list[View], np.ndarray, np.ndarray]:
-    """Cameras, sparse points [P, 3] and their colours [P, 3]: in metres with z up once there is a mesh.
-
-    Before the mesh stage they are in the units of the poses, turned so that z is up as far as the cameras tell.
-    """
-    views, sparse = load_views(folder / "poses"), load_sparse(folder / "poses")
-    if "mesh" in done:
-        from pipeline.field.training import load_field
-        from pipeline.mesh.placement import load_placement
-
-        to_unit, placed = load_field(folder / "distill").to_unit, load_placement(folder / "mesh").to_metres
-        return [placed.view(to_unit.view(v)) for v in views], placed.points(to_unit.points(sparse.xyz)), sparse.rgb
-    from pipeline.cameras import Similarity
-
-    turn = Similarity(1.0, frame_of(camera_up(views).normal), np.zeros(3))
-    return [turn.view(view) for view in views], turn.points(sparse.xyz), sparse.rgb

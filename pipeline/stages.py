@@ -10,7 +10,7 @@ import os
 import shutil
 import time
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -21,8 +21,8 @@ from pipeline.report import write_report
 from sdfsim.errors import SdfsimError
 from sdfsim.files import CONFIG, check_own, locked, write_json
 
-RECORD = "stage.json"  # in the folder of a finished stage: fingerprint, inputs, made, seconds, report
-UNFINISHED = "unfinished.json"  # in the folder of a stage at work: the fingerprint of what it is to become
+# In the folder of a finished stage: fingerprint, inputs, made, seconds, report. Of one at work: its fingerprint alone.
+RECORD = "stage.json"
 
 # Share of an overall time budget that fitting may take, and what the other stages need after training, s.
 FIT_SHARE, AFTER_TRAINING = 0.15, 50.0
@@ -164,7 +164,7 @@ STAGES = {
     "photos": Stage(do_photos, "photos", version=3),
     "poses": Stage(do_poses, "poses", ("seed",), 3),
     "distill": Stage(do_distill, "distill", ("preset", "seed", "budget"), 3),
-    "mesh": Stage(do_mesh, "mesh", ("preset", "size", "distance", "crop"), 5),
+    "mesh": Stage(do_mesh, "mesh", ("preset", "size", "distance", "crop"), 6),
     "fit": Stage(do_fit, "assets", ("seed", "budget", "recipe")),
     "scene": Stage(do_scene, "scene", ("seed", "drop", "material"), 3),
 }
@@ -204,14 +204,7 @@ def reconstruct(
         raise SdfsimError(f"from {from_stage} until {until_stage}: {until_stage} comes before {from_stage}")
     run = Run(Path(out), resolved, progress)
     check_apart(run)
-    check_before(run, names[: last + 1])
-    with readable_errors(run.folder):
-        run.folder.mkdir(parents=True, exist_ok=True)
-        with locked(run.folder):
-            write_config(resolved, run.folder)
-            for number, stage in enumerate(names[: last + 1]):
-                run_reported(run, stage, again=number >= first)
-            return write_report(run.folder, resolved, current(run.folder))
+    return run_all(run, {stage: number >= first for number, stage in enumerate(names[: last + 1])})
 
 
 def find_poses(photos: str | Path, out: str | Path, *, progress: Callable[[str, float, str], None] | None = None,
@@ -236,8 +229,7 @@ def find_poses(photos: str | Path, out: str | Path, *, progress: Callable[[str, 
 
 
 def run_stage(
-    name: str, folder: str | Path, *, progress: Callable[[str, float, str], None] | None = None, again: bool = False,
-    **changes: Any,
+    name: str, folder: str | Path, *, progress: Callable[[str, float, str], None] | None = None, **changes: Any
 ) -> dict:  # fmt: skip
     """Runs one stage in a folder that the stages before it have written.
 
@@ -245,7 +237,6 @@ def run_stage(
         name: one of `STAGES`.
         folder: of an earlier `reconstruct`.
         progress: called with (stage, fraction, message).
-        again: also when nothing changed.
         **changes: options that differ from those in the folder's config.yaml (see `Options`), from then on kept there;
             None changes nothing. A budget is that of this stage and this call alone, and not kept.
 
@@ -261,17 +252,13 @@ def run_stage(
     options = kept.changed(known)
     options.check()
     run = Run(Path(folder), replace(options, budget=kept.budget), progress, known.get("budget"))
-    check_before(run, [name])
-    with readable_errors(run.folder), locked(run.folder):
-        done, names = current(run.folder), list(STAGES)
-        for before in names[: names.index(name)]:
-            if before not in done:
-                why = "is older than what it reads" if read_record(run.place(before)) else "has not run"
-                command = "poses" if before == "photos" else before  # No command does the photos alone.
-                raise SdfsimError(f"{folder}: the {before} stage {why}", f"run `sdfsim {command}` first")
-        write_config(run.options, run.folder)
-        run_reported(run, name, again=again)
-        return write_report(run.folder, run.options, current(run.folder))
+    done, names = current(run.folder), list(STAGES)
+    for before in names[: names.index(name)]:
+        if before not in done:
+            why = "is older than what it reads" if read_record(run.place(before)) else "has not run"
+            command = "poses" if before == "photos" else before  # No command does the photos alone.
+            raise SdfsimError(f"{folder}: the {before} stage {why}", f"run `sdfsim {command}` first")
+    return run_all(run, {name: False})
 
 
 def _check_name(name: str) -> None:
@@ -279,17 +266,23 @@ def _check_name(name: str) -> None:
         raise SdfsimError(f"no such stage: {name!r}", "stages: " + ", ".join(STAGES))
 
 
-def check_before(run: Run, names: Sequence[str]) -> None:
-    """Checks, before anything is written, what would stop these stages.
+def run_all(run: Run, stages: dict[str, bool]) -> dict:
+    """Runs stages, those whose value is True also when nothing changed, and returns the report.
 
     Raises:
-        SdfsimError: no such device, or something that is not ours lies where a stage's result belongs.
+        SdfsimError: before anything is written where there is no such device, or where something that is not ours lies
+            where a stage's result belongs.
     """
     if run.options.device == "cuda":
         run.device()
     check_own(run.folder, COMMAND, "report.json", "report.md")
-    for name in names:
-        check_replaceable(run.place(name))
+    for stage in stages:
+        check_replaceable(run.place(stage))
+    with readable_errors(run.folder), locked(run.folder):
+        write_config(run.options, run.folder)
+        for stage, again in stages.items():
+            run_reported(run, stage, again=again)
+        return write_report(run.folder, run.options, current(run.folder))
 
 
 def check_apart(run: Run) -> None:
@@ -410,14 +403,14 @@ def begin(work: Path, wanted: str, *, fresh: bool) -> Path:
         fresh: never go on from a killed run.
     """
     try:
-        left = json.loads((work / UNFINISHED).read_text(encoding="utf-8"))["fingerprint"]
+        left = json.loads((work / RECORD).read_text(encoding="utf-8"))["fingerprint"]
     except (OSError, ValueError, KeyError, TypeError):
         left = None
     if fresh or left != wanted:
         if work.exists():
             shutil.rmtree(work)
         work.mkdir(parents=True)
-        write_json(work / UNFINISHED, {"fingerprint": wanted})
+        write_json(work / RECORD, {"fingerprint": wanted})
     for half_written in work.rglob(".*.part"):
         if half_written.is_file():
             half_written.unlink()
@@ -441,7 +434,7 @@ def finish(work: Path, place: Path, wanted: str, inputs: str, report: dict, seco
         SdfsimError: a stage did not write what lies at the place.
     """
     check_replaceable(place)
-    # The mark of unfinished work goes last: where the record cannot be written, the next run goes on from here.
+    # Where the record cannot be written, the one with the fingerprint alone stays, and the next run goes on from here.
     write_json(
         work / RECORD,
         {"version": 1, "fingerprint": wanted, "inputs": inputs, "made": uuid.uuid4().hex, "seconds": seconds,
@@ -453,7 +446,6 @@ def finish(work: Path, place: Path, wanted: str, inputs: str, report: dict, seco
     if place.exists():
         os.rename(place, old)
     os.rename(work, place)
-    (place / UNFINISHED).unlink(missing_ok=True)
     shutil.rmtree(old, ignore_errors=True)
 
 

@@ -18,8 +18,8 @@ import yaml
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from pipeline.export import Above
 from pipeline.mesh.meshing import SCENERY, rounded
+from pipeline.mesh.visibility import Above
 from sdfsim.errors import run_main
 from sdfsim.files import write_text
 from sdfsim.scene.scene_file import load_scene

@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline.inputs.depth import DepthFile
 from pipeline.inputs.images import read_photo, sharpness
-from pipeline.inputs.known_cameras import KnownCamera, pinhole
+from pipeline.inputs.known_cameras import KnownCamera, lens_of, posed
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, write_json
 
@@ -92,7 +92,7 @@ def _record3d(folder: Path) -> list[KnownCamera]:
     found = []
     for photo in photos:
         number = int(photo.stem)
-        lens = each[number] if each else (same[0, 0], same[1, 1], same[0, 2], same[1, 2])
+        fx, fy, cx, cy = map(float, each[number] if each else (same[0, 0], same[1, 1], same[0, 2], same[1, 2]))
         x, y, z, w, *position = about["poses"][number]
         pose = np.column_stack([Rotation.from_quat([x, y, z, w]).as_matrix(), position])
         exr, raw, sure = folder / "depth" / f"{number}.exr", photo.with_suffix(".depth"), photo.with_suffix(".conf")
@@ -101,7 +101,8 @@ def _record3d(folder: Path) -> list[KnownCamera]:
             depth = DepthFile(exr)
         elif raw.is_file():
             depth = DepthFile(raw, None, sure if sure.is_file() else None, shape)
-        found.append(pinhole(photo.relative_to(folder).as_posix(), (width, height), lens, pose, depth))
+        name = photo.relative_to(folder).as_posix()
+        found.append(posed(name, (width, height), lens_of(fx, fy, cx, cy), pose, depth=depth))
     return found
 
 
@@ -117,10 +118,11 @@ def _polycam(folder: Path) -> list[KnownCamera]:
             continue
         pose = np.array([[about[f"t_{row}{column}"] for column in range(4)] for row in range(3)], float)
         depth, sure = (folder / name / f"{path.stem}.png" for name in ("depth", "confidence"))
-        found.append(pinhole(
+        fx, fy, cx, cy = (float(about[key]) for key in ("fx", "fy", "cx", "cy"))
+        found.append(posed(
             photo.relative_to(folder).as_posix(), (int(about["width"]), int(about["height"])),
-            (about["fx"], about["fy"], about["cx"], about["cy"]), pose,
-            DepthFile(depth, None, sure if sure.is_file() else None) if depth.is_file() else None,
+            lens_of(fx, fy, cx, cy), pose,
+            depth=DepthFile(depth, None, sure if sure.is_file() else None) if depth.is_file() else None,
         ))  # fmt: skip
     return found
 
@@ -172,19 +174,9 @@ def save_capture(capture: Capture, folder: Path) -> None:
 
 
 def load_capture(folder: Path) -> Capture | None:
-    """What the capture behind a folder of prepared photos says; None: these were just photos.
-
-    Raises:
-        SdfsimError: damaged.
-    """
+    """What the capture behind a folder of prepared photos says; None: these were just photos."""
     path = Path(folder) / CAPTURE
     if not path.exists():
         return None
-    content = read_json(path)
-    try:
-        if content["up"] is None:
-            return Capture(str(content["app"]), None)
-        x, y, z = map(float, content["up"])
-        return Capture(str(content["app"]), (x, y, z))
-    except (KeyError, TypeError, ValueError) as error:
-        raise SdfsimError(f"{path}: damaged", "run the photos stage again") from error
+    content = read_json(path, "run the photos stage again")
+    return Capture(content["app"], content["up"] and tuple(content["up"]))

@@ -58,14 +58,12 @@ def read_depth(file: DepthFile) -> np.ndarray:
 
 def _edges(depth: np.ndarray) -> np.ndarray:
     """Pixels [H, W] one of whose four neighbours is much nearer or farther."""
-    found = np.zeros(depth.shape, bool)
-    for axis in (0, 1):
-        a, b = (np.moveaxis(depth, axis, 0)[part] for part in (slice(None, -1), slice(1, None)))
-        jump = (a > 0) & (b > 0) & (np.abs(a - b) > EDGE * np.minimum(a, b))
-        at = np.moveaxis(found, axis, 0)
-        at[:-1] |= jump
-        at[1:] |= jump
-    return found
+    from scipy import ndimage
+
+    cross = ndimage.generate_binary_structure(2, 1)
+    far = ndimage.maximum_filter(depth, footprint=cross)
+    near = ndimage.minimum_filter(np.where(depth > 0, depth, np.inf), footprint=cross)
+    return (far - depth > EDGE * depth) | (depth - near > EDGE * near)
 
 
 def _read(path: Path, shape: tuple[int, int] | None, raw: type) -> np.ndarray:

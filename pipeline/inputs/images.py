@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -122,44 +120,38 @@ def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
     Raises:
         SdfsimError: it cannot be read, or is not shaped like the photo.
     """
-    stored, _, _, _ = decoded(path, max(size))
+    image = turned_like(decoded(path, max(size))[0], size, path)
+    grey = image.getchannel("A") if image.mode == "RGBA" else image.convert("L")
+    return np.asarray(grey.resize(size, Image.Resampling.BOX))
+
+
+def turned_like(stored: Image.Image, size: tuple[int, int], path: Path) -> Image.Image:
+    """A mask as its photo of this size (width, height) is turned: upright, or as stored.
+
+    Raises:
+        SdfsimError: neither is shaped like the photo.
+    """
     for image in (ImageOps.exif_transpose(stored), stored):
         if off(image, size[0] / size[1]) < 0.02:
-            grey = image.getchannel("A") if image.mode == "RGBA" else image.convert("L")
-            return np.asarray(grey.resize(size, Image.Resampling.BOX))
+            return image
     raise SdfsimError(
         f"{path}: a mask of {stored.width} x {stored.height} does not fit its photo, shaped {size[0]} x {size[1]}",
-        "masks have to be as large as their photos, and upright",
+        "masks and label images have to be as large as their photos, and upright",
     )
 
 
-@contextlib.contextmanager
-def opened(path: Path) -> Iterator[Image.Image]:
-    """One of the user's photos or masks, not decoded yet; PIL's own limit does not hold within.
-
-    Raises:
-        SdfsimError: too large; OSError and others of PIL where it is no image.
-    """
+def decoded(path: Path, long_side: int) -> tuple[Image.Image, tuple[int, int], float | None, str]:
+    """A decoded image, its size in the file, its focal length in longer sides, and its camera."""
     limit = Image.MAX_IMAGE_PIXELS
     Image.MAX_IMAGE_PIXELS = None  # Our own limit below, before anything is decoded.
     try:
         with Image.open(path, formats=FORMATS) as image:
-            width, height = image.size
+            width, height = size = image.size
             if width * height > MAX_PIXELS:
                 raise SdfsimError(
                     f"{path}: too large ({width} x {height}, at most {MAX_PIXELS // 1_000_000} megapixels)",
                     "scale it down first",
                 )
-            yield image
-    finally:
-        Image.MAX_IMAGE_PIXELS = limit
-
-
-def decoded(path: Path, long_side: int) -> tuple[Image.Image, tuple[int, int], float | None, str]:
-    """A decoded image, its size in the file, its focal length in longer sides, and its camera."""
-    try:
-        with opened(path) as image:
-            width, height = size = image.size
             if min(size) < MIN_SIDE:
                 raise SdfsimError(f"{path}: too small ({width} x {height}, at least {MIN_SIDE} px a side)")
             focal, camera = exif_focal(image)
@@ -173,6 +165,8 @@ def decoded(path: Path, long_side: int) -> tuple[Image.Image, tuple[int, int], f
     except (OSError, SyntaxError, ValueError, EOFError) as error:
         what = "truncated" if "truncated" in str(error) else f"cannot be decoded ({error})"
         raise SdfsimError(f"{path}: {what}", "copy it again from the camera, or remove it") from error
+    finally:
+        Image.MAX_IMAGE_PIXELS = limit
 
 
 def off(image: Image.Image, shape: float) -> float:
@@ -185,18 +179,6 @@ def _eight_bits(image: Image.Image) -> Image.Image:
     if image.mode.startswith("I"):
         return Image.fromarray((np.asarray(image).astype(np.uint32) >> 8).astype(np.uint8))
     return image
-
-
-def halved(grey: np.ndarray) -> np.ndarray:
-    """A grey picture [H, W] at half its size, each value the mean of four."""
-    even = grey[: grey.shape[0] // 2 * 2, : grey.shape[1] // 2 * 2]
-    return (even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2]) / 4
-
-
-def edges(grey: np.ndarray) -> np.ndarray:
-    """Squared Laplacian [H - 2, W - 2] of a grey picture [H, W]."""
-    inner = grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:] - 4 * grey[1:-1, 1:-1]
-    return inner**2
 
 
 def block_means(values: np.ndarray, blocks: int) -> np.ndarray:
@@ -215,10 +197,13 @@ def sharpness(pixels: np.ndarray) -> float:
     Args:
         pixels: RGB [H, W, 3] uint8, at least 64 px a side.
     """
+    import cv2
+
     grey = pixels.astype(np.float32).mean(-1) / 255
-    rough = edges(halved(halved(halved(grey))))
-    blocks = min(BLOCKS, *rough.shape)
-    coarse, fine = block_means(rough, blocks), block_means(edges(grey), blocks)
+    rows, columns = (side // 8 for side in grey.shape)
+    rough = cv2.resize(grey[: 8 * rows, : 8 * columns], (columns, rows), interpolation=cv2.INTER_AREA)
+    blocks = min(BLOCKS, rows - 2, columns - 2)
+    coarse, fine = (block_means(cv2.Laplacian(at, -1)[1:-1, 1:-1] ** 2, blocks) for at in (rough, grey))
     chosen = np.argsort(coarse)[-max(1, len(fine) // 10) :]
     strong = float(coarse[chosen].mean())
     return float(np.sqrt(fine[chosen].mean() / strong)) if strong > 1e-6 else 0.0

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -31,16 +32,48 @@ CENTRE = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 
 
 @dataclass(frozen=True)
+class Lens:
+    """What bends a photo of some size.
+
+    Attributes:
+        matrix: rows of the intrinsics [3, 3], pixel centres at +0.5.
+        distortion: OpenCV's coefficients (k1, k2, p1, p2, k3, ...), or four of its fisheye model.
+        fisheye: which of the two.
+    """
+
+    matrix: tuple[tuple[float, ...], ...]
+    distortion: tuple[float, ...]
+    fisheye: bool
+
+    def straight(self, pixels: np.ndarray, view: View) -> np.ndarray:
+        """Where the straight photo of `view` shows what pixels [P, 2] of the bent one show; may lie outside it."""
+        import cv2
+
+        until = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-10)
+        undistort = cv2.fisheye.undistortPoints if self.fisheye else cv2.undistortPoints
+        new = np.array([[view.focal, 0, view.cx], [0, view.focal, view.cy], [0, 0, 1]])
+        points = np.ascontiguousarray(pixels, float)[:, None]
+        return undistort(points, np.array(self.matrix), np.array(self.distortion), P=new, criteria=until)[:, 0]
+
+
+def lens_of(
+    fx: float, fy: float, cx: float, cy: float, bends: Mapping[str, float] = MappingProxyType({}), fisheye: bool = False
+) -> Lens:
+    """The lens of two focal lengths and a middle, px, and of coefficients by their names in OpenCV."""
+    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    distortion = tuple(float(bends.get(name, 0.0)) for name in names)
+    return Lens(((fx, 0, cx), (0, fy, cy), (0, 0, 1)), distortion, fisheye)
+
+
+@dataclass(frozen=True)
 class KnownCamera:
     """A camera that was found elsewhere.
 
     Attributes:
         name: of its photo, as the file says it.
-        width: px of the photo that the intrinsics are for.
+        width: px of the photo that the lens is for.
         height: px.
-        matrix: [3, 3] intrinsics, pixel centres at +0.5.
-        distortion: OpenCV's coefficients (k1, k2, p1, p2, k3, ...), or four of its fisheye model.
-        fisheye: which of the two.
+        lens: of a photo of this size.
         rotation: [3, 3] world to camera; x right, y down, z forward.
         translation: [3].
         mask: file name of its mask, or None.
@@ -50,9 +83,7 @@ class KnownCamera:
     name: str
     width: int
     height: int
-    matrix: np.ndarray
-    distortion: tuple[float, ...]
-    fisheye: bool
+    lens: Lens
     rotation: np.ndarray
     translation: np.ndarray
     mask: str | None = None
@@ -64,29 +95,18 @@ class KnownCamera:
         return -self.rotation.T @ self.translation
 
 
-def pinhole(name: str, size: tuple[int, int], lens: Sequence[float], pose: np.ndarray,
-            depth: DepthFile | None = None) -> KnownCamera:  # fmt: skip
-    """A camera without distortion.
+def posed(name: str, size: tuple[int, int], lens: Lens, pose: np.ndarray, mask: str | None = None,
+          depth: DepthFile | None = None) -> KnownCamera:  # fmt: skip
+    """A camera by its pose [3, 4], camera to world, OpenGL axes (x right, y up, z backwards).
 
-    Args:
-        name: of its photo.
-        size: width and height, px.
-        lens: focal lengths and middle, fx, fy, cx, cy, px.
-        pose: [3, 4] camera to world, OpenGL axes (x right, y up, z backwards).
-        depth: of its photo.
+    Raises:
+        SdfsimError: it is no pose.
     """
-    if not np.isfinite(pose).all() or abs(np.linalg.det(pose[:3, :3])) < 1e-6:
+    turn, place = pose[:, :3], pose[:, 3]
+    if not np.isfinite(pose).all() or abs(np.linalg.det(turn)) < 1e-6:
         raise SdfsimError(f"{name}: its matrix is not a pose")
-    fx, fy, cx, cy = map(float, lens)
-    rotation, translation = world_to_camera(pose)
-    return KnownCamera(name, *size, _matrix(fx, fy, cx, cy), (), False, rotation, translation, depth=depth)
-
-
-def world_to_camera(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation [3, 3] and translation [3], axes x right, y down, z forward, of a pose [3 or 4, 4] with OpenGL axes."""
-    turn = pose[:3, :3] / np.cbrt(np.linalg.det(pose[:3, :3]))
-    rotation = np.diag([1.0, -1, -1]) @ turn.T
-    return rotation, -rotation @ pose[:3, 3]
+    rotation = np.diag([1.0, -1, -1]) @ (turn / np.cbrt(np.linalg.det(turn))).T
+    return KnownCamera(name, *size, lens, rotation, -rotation @ place, mask, depth)
 
 
 def read_cameras(path: Path) -> list[KnownCamera]:
@@ -106,12 +126,13 @@ def read_transforms(path: Path) -> list[KnownCamera]:
     """Cameras of a transforms.json: camera-to-world matrices with OpenGL axes; intrinsics for all or in each frame."""
     about = json.loads(path.read_text(encoding="utf-8"))
     found = []
-    _check_lens(about, str(path))
     for frame in about["frames"]:
         values = {**about, **frame}
         where = f"{path}: {frame['file_path']}"
-        _check_lens(values, where)
-        fisheye = values.get("camera_model") == "OPENCV_FISHEYE" or bool(values.get("is_fisheye"))
+        model = values.get("camera_model", LENSES[0])
+        if model not in LENSES:
+            raise SdfsimError(f"{where}: camera_model: {model!r} is not read", f"allowed: {', '.join(LENSES)}")
+        fisheye = model == "OPENCV_FISHEYE" or bool(values.get("is_fisheye"))
         width, height = int(values.get("w", 0)), int(values.get("h", 0))
         if "fl_x" in values:
             if width <= 0 or height <= 0:
@@ -125,16 +146,12 @@ def read_transforms(path: Path) -> list[KnownCamera]:
             width, height, fx = 1, 0, 0.5 / np.tan(0.5 * float(values["camera_angle_x"]))
         fy = float(values.get("fl_y", fx))
         cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
-        pose = np.array(frame["transform_matrix"], float).reshape(4, 4)
-        if not np.isfinite(pose).all() or abs(np.linalg.det(pose[:3, :3])) < 1e-6:
-            raise SdfsimError(f"{where}: transform_matrix is not a pose")
-        rotation, translation = world_to_camera(pose)
-        names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
-        lens = tuple(float(values.get(name, 0.0)) for name in names)
-        found.append(
-            KnownCamera(str(frame["file_path"]), width, height, _matrix(fx, fy, cx, cy), lens, fisheye,
-                  rotation, translation, frame.get("mask_path"), _depth_of(values, path.parent))
-        )  # fmt: skip
+        pose = np.array(frame["transform_matrix"], float).reshape(4, 4)[:3]
+        # Where not of a fisheye, what others call k4 is not OpenCV's.
+        bends = values if fisheye else {**values, "k4": 0, "k5": 0, "k6": 0}
+        lens = lens_of(fx, fy, cx, cy, bends, fisheye)
+        depth = _depth_of(values, path.parent)
+        found.append(posed(str(frame["file_path"]), (width, height), lens, pose, frame.get("mask_path"), depth))
     return found
 
 
@@ -147,15 +164,10 @@ def _depth_of(values: dict, folder: Path) -> DepthFile | None:
     return DepthFile(folder / str(name), None if unit is None else float(unit))
 
 
-def _check_lens(values: dict, where: str) -> None:
-    """Raises SdfsimError for a lens that is none of `LENSES`."""
-    model = values.get("camera_model", LENSES[0])
-    if model not in LENSES:
-        raise SdfsimError(f"{where}: camera_model: {model!r} is not read", f"allowed: {', '.join(LENSES)}")
-
-
 def read_model(folder: Path) -> list[KnownCamera]:
     """Cameras of a COLMAP model (its documentation, "Output Format")."""
+    from scipy.spatial.transform import Rotation
+
     binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
     cameras = dict((_cameras_binary if binary else _cameras_text)(folder))
     found = []
@@ -163,13 +175,9 @@ def read_model(folder: Path) -> list[KnownCamera]:
         model, width, height, values = cameras[camera]
         known = dict(zip(_parameters(folder, model), values, strict=True))
         fx = known.get("fx", known.get("f", 0.0))
-        fisheye = model.endswith("FISHEYE")
-        names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-        lens = tuple(known.get(key, 0.0) for key in names)
-        found.append(
-            KnownCamera(name, width, height, _matrix(fx, known.get("fy", fx), known["cx"], known["cy"]),
-                  lens, fisheye, _rotation(quaternion), np.array(translation))
-        )  # fmt: skip
+        lens = lens_of(fx, known.get("fy", fx), known["cx"], known["cy"], known, model.endswith("FISHEYE"))
+        rotation = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
+        found.append(KnownCamera(name, width, height, lens, rotation, np.array(translation)))
     return found
 
 
@@ -179,17 +187,6 @@ def _parameters(folder: Path, model: str) -> list[str]:
         readable = ", ".join(name for name, parameters in MODELS.values() if parameters)
         raise SdfsimError(f"{folder}: the camera model {model} is not read", f"allowed: {readable}")
     return names.split()
-
-
-def _matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-
-
-def _rotation(wxyz: tuple[float, ...]) -> np.ndarray:
-    from scipy.spatial.transform import Rotation
-
-    w, x, y, z = wxyz
-    return Rotation.from_quat([x, y, z, w]).as_matrix()
 
 
 def _lines(path: Path) -> list[str]:
@@ -236,37 +233,12 @@ def _images_binary(folder: Path) -> Iterator[tuple[str, int, tuple[float, ...], 
         yield name, values[8], values[1:5], values[5:8]
 
 
-@dataclass(frozen=True)
-class Lens:
-    """What bent a photo before it was made straight.
-
-    Attributes:
-        matrix: rows of the intrinsics [3, 3] for the prepared photo's size, pixel centres at +0.5.
-        distortion: see `KnownCamera`.
-        fisheye: see `KnownCamera`.
-    """
-
-    matrix: tuple[tuple[float, ...], ...]
-    distortion: tuple[float, ...]
-    fisheye: bool
-
-    def straight(self, pixels: np.ndarray, view: View) -> np.ndarray:
-        """Where the straight photo of `view` shows what pixels [P, 2] of the bent one show; may lie outside it."""
-        import cv2
-
-        until = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-10)
-        undistort = cv2.fisheye.undistortPoints if self.fisheye else cv2.undistortPoints
-        new = np.array([[view.focal, 0, view.cx], [0, view.focal, view.cy], [0, 0, 1]])
-        points = np.ascontiguousarray(pixels, float)[:, None]
-        return undistort(points, np.array(self.matrix), np.array(self.distortion), P=new, criteria=until)[:, 0]
-
-
 def scaled(known: KnownCamera, width: int, height: int) -> np.ndarray:
     """The camera's matrix [3, 3] for its photo at another size, px."""
     if not known.height:  # Only a field of view is known.
-        return np.array([[known.matrix[0, 0] * width, 0, width / 2], [0, known.matrix[1, 1] * width, height / 2],
-                         [0, 0, 1]])  # fmt: skip
-    return np.diag([width / known.width, height / known.height, 1.0]) @ known.matrix
+        focal = known.lens.matrix[0][0] * width
+        return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return np.diag([width / known.width, height / known.height, 1.0]) @ known.lens.matrix
 
 
 def rectified(picture: Picture, known: KnownCamera, name: str, source: str) -> tuple[Picture, View, Lens | None]:
@@ -282,24 +254,24 @@ def rectified(picture: Picture, known: KnownCamera, name: str, source: str) -> t
         source: the user's name of it.
     """
     height, width = picture.pixels.shape[:2]
-    matrix, lens = scaled(known, width, height), None
+    matrix, bent, lens = scaled(known, width, height), known.lens, None
     pixels, mask, labels = picture.pixels, picture.mask, picture.labels
     # A fisheye bends also where all its coefficients are 0.
-    if known.fisheye or any(known.distortion) or abs(matrix[0, 0] / matrix[1, 1] - 1) > SQUARE:
+    if bent.fisheye or any(bent.distortion) or abs(matrix[0, 0] / matrix[1, 1] - 1) > SQUARE:
         import cv2
 
-        lens = Lens(tuple(map(tuple, matrix.tolist())), known.distortion, known.fisheye)
-        bent, size = np.array(known.distortion), (width, height)
+        lens = replace(bent, matrix=tuple(map(tuple, matrix.tolist())))
+        curve, size = np.array(bent.distortion), (width, height)
         old = matrix - CENTRE
-        if known.fisheye:
-            new = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(old, bent, size, np.eye(3), balance=0.0)
+        if bent.fisheye:
+            new = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(old, curve, size, np.eye(3), balance=0.0)
         else:
-            new, _ = cv2.getOptimalNewCameraMatrix(old, bent, size, 0.0)
+            new, _ = cv2.getOptimalNewCameraMatrix(old, curve, size, 0.0)
         new = np.array(new, float)
         new[0, 0] = new[1, 1] = max(new[0, 0], new[1, 1])
         new[0, 1] = 0.0
-        make = cv2.fisheye.initUndistortRectifyMap if known.fisheye else cv2.initUndistortRectifyMap
-        x, y = make(old, bent, np.eye(3), new, size, cv2.CV_32FC1)
+        make = cv2.fisheye.initUndistortRectifyMap if bent.fisheye else cv2.initUndistortRectifyMap
+        x, y = make(old, curve, np.eye(3), new, size, cv2.CV_32FC1)
         pixels = cv2.remap(pixels, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         if mask is not None:
             mask = cv2.remap(mask, x, y, cv2.INTER_LINEAR)

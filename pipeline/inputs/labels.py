@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from PIL import Image, ImageOps
+from PIL import Image
 
-from pipeline.inputs.images import decoded, off, read_mask
+from pipeline.inputs.images import decoded, read_mask, turned_like
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, write_json
 
@@ -74,25 +74,33 @@ def names_for(photo: Path) -> list[str]:
     return [photo.name + ".png", *(photo.stem + suffix for suffix in MASK_SUFFIXES)]
 
 
+def find_masks(photos: list[Path]) -> dict[Path, Path]:
+    """The mask file of each photo that has one in a folder `masks` in or beside the photo's folder."""
+    masks: dict[Path, Path] = {}
+    for root in _roots(photos):
+        masks = {**_of_photos(root, root / "masks", photos)[0], **masks}
+    return masks
+
+
 def find_labels(photos: list[Path]) -> Labels:
     """Looks for `masks/NAME/` and `labels/` in and beside the photos' folders.
 
     Raises:
         SdfsimError: both are given, a name that no body can have, or files of which none belongs to a photo.
     """
-    roots = list(dict.fromkeys(root for photo in photos for root in (photo.parent, photo.parent.parent)))
-    folders = [(root / "masks", path) for root in roots for path in _folders(root / "masks")]
+    roots = _roots(photos)
+    folders = [(root, path) for root in roots for path in _folders(root / "masks")]
     folders = [(root, path) for root, path in folders if path not in [photo.parent for photo in photos]]
     images, notes = {}, []
     for root in roots:
-        if (root / FOLDER).is_dir() and root / FOLDER not in [photo.parent for photo in photos]:
-            found, more = _of_photos(root / FOLDER, photos)
+        if root / FOLDER not in [photo.parent for photo in photos]:
+            found, more = _of_photos(root, root / FOLDER, photos)
             images, notes = {**found, **images}, [*notes, *more]
     if images and folders:
         raise SdfsimError(f"{folders[0][1]}: there are label images as well", "keep only one of masks/NAME and labels")
     masks: dict[Path, dict[str, Path]] = {}
-    for _, folder in folders:
-        found, more = _of_photos(folder, photos)
+    for root, folder in folders:
+        found, more = _of_photos(root, folder, photos)
         notes += more
         known = NAME.fullmatch(folder.name) and yaml.safe_load(folder.name) == folder.name  # "no" would be False
         if found and (not known or folder.name in TAKEN):
@@ -120,14 +128,20 @@ def _folders(root: Path) -> list[Path]:
     return sorted(p for p in root.iterdir() if p.is_dir() and not p.name.startswith(".")) if root.is_dir() else []
 
 
-def _of_photos(folder: Path, photos: list[Path]) -> tuple[dict[Path, Path], list[str]]:
-    """The file of each photo in a folder, and a note on what belongs to none."""
+def _roots(photos: list[Path]) -> list[Path]:
+    """The folders in which `masks` and `labels` may lie: those of the photos, and those above them."""
+    return list(dict.fromkeys(root for photo in photos for root in (photo.parent, photo.parent.parent)))
+
+
+def _of_photos(root: Path, folder: Path, photos: list[Path]) -> tuple[dict[Path, Path], list[str]]:
+    """The file of each photo in or beside `root` in a folder below it, and a note on what belongs to none."""
+    if not folder.is_dir():
+        return {}, []
     there = {path.name for path in folder.iterdir() if path.is_file() and path.suffix.lower() in MASK_SUFFIXES}
     found = {}
     for photo in photos:
-        near = folder.is_relative_to(photo.parent) or folder.is_relative_to(photo.parent.parent)
-        name = near and next((name for name in names_for(photo) if name in there), None)
-        if name:
+        name = next((name for name in names_for(photo) if name in there), None)
+        if name and root in (photo.parent, photo.parent.parent):
             found[photo] = folder / name
     rest = sorted(there - {path.name for path in found.values()})
     called = f"{folder.parent.name}/{folder.name}" if folder.name != FOLDER else FOLDER
@@ -150,15 +164,9 @@ def read_label_image(path: Path, size: tuple[int, int] | None = None) -> np.ndar
                           "write it as a palette PNG, or in grey of 8 or 16 bits")  # fmt: skip
     if size is None:
         return np.asarray(stored).astype(np.int64)
-    for image in (ImageOps.exif_transpose(stored), stored):
-        if off(image, size[0] / size[1]) < 0.02:
-            rows, columns = ((np.arange(n) + 0.5) / n for n in size[::-1])
-            found = np.asarray(image).astype(np.int64)
-            return found[np.ix_((rows * image.height).astype(int), (columns * image.width).astype(int))]
-    raise SdfsimError(
-        f"{path}: labels of {stored.width} x {stored.height} do not fit their photo, shaped {size[0]} x {size[1]}",
-        "label images have to be as large as their photos, and upright",
-    )
+    found = np.asarray(turned_like(stored, size, path)).astype(np.int64)
+    rows, columns = ((np.arange(n) + 0.5) / n for n in size[::-1])
+    return found[np.ix_((rows * found.shape[0]).astype(int), (columns * found.shape[1]).astype(int))]
 
 
 def save_labels(labels: np.ndarray, folder: Path, name: str) -> None:

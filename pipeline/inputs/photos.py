@@ -96,23 +96,26 @@ def prepare_photos(
     photos: list[Photo] = []
     shares: list[tuple[float, float]] = []
     views: list[View] = []
-    for origin, picture, known, view, lens, fraction in _pictures(source, long_side):
-        name = f"{len(photos):04d}.jpg"
+    for origin, picture, known, fraction in _pictures(source, long_side):
+        name, lens = f"{len(photos):04d}.jpg", None
+        if known:
+            picture, view, lens = rectified(picture, known, name, origin)
+            views.append(view)
         Image.fromarray(picture.pixels).save(out / "images" / name, quality=95, subsampling=0)
         if picture.mask is not None:
             (out / "masks").mkdir(exist_ok=True)
             Image.fromarray(picture.mask).save(out / "masks" / (name + ".png"))
         if known and known.depth:
+            depth = read_depth(known.depth)
+            _check_shape(known.depth.path, depth.shape[::-1], known)
             (out / "depth").mkdir(exist_ok=True)
-            np.save(out / "depth" / (name + ".npy"), _depth_of(known))
+            np.save(out / "depth" / (name + ".npy"), depth)
         if picture.labels is not None:
             save_labels(picture.labels, out, name)
-        if view is not None:
-            views.append(replace(view, name=name))
         height, width = picture.pixels.shape[:2]
         sharp = round(sharpness(picture.pixels), 4)
         shares.append(exposure(picture.pixels))
-        focal = picture.focal if view is None else None  # A known camera is no prior.
+        focal = None if known else picture.focal  # A known camera is no prior.
         photos.append(
             Photo(name, origin, width, height, picture.original, lens, focal, picture.camera,
                   picture.mask is not None, sharp, depth=bool(known and known.depth))
@@ -134,42 +137,25 @@ def prepare_photos(
     return photos, [*source.notes, *notes_on(photos, len(source.masks))]
 
 
-def _pictures(
-    source: Source, long_side: int
-) -> Iterator[tuple[str, Picture, KnownCamera | None, View | None, Lens | None, float]]:
-    """Name, picture, camera where it is known, the same as a view of the straight photo, lens, and share done."""
+def _pictures(source: Source, long_side: int) -> Iterator[tuple[str, Picture, KnownCamera | None, float]]:
+    """Name, picture, camera where it is known, and share done."""
     if source.video:
         from pipeline.inputs.video import chosen_frames
 
         for name, pixels, fraction in chosen_frames(source.video):
             image = Image.fromarray(pixels)
             image.thumbnail((long_side, long_side), Image.Resampling.LANCZOS)
-            yield name, Picture(np.asarray(image), image.size), None, None, None, fraction
+            yield name, Picture(np.asarray(image), image.size), None, fraction
         return
     masks = _masks_that_count(source, long_side)
     for index, path in enumerate(source.photos):
         camera = source.frames.get(path)
         shape = camera.width / camera.height if camera and camera.height else None
-        name, view, lens = source.name_of(path), None, None
         picture = read_photo(path, long_side, masks.get(path), shape)
-        picture = replace(picture, labels=source.labels.of(path, picture.pixels.shape[1::-1]))
-        if camera:
-            _check_shape(path, picture, shape)
-            picture, view, lens = rectified(picture, camera, path.name, name)
-        yield name, picture, camera, view, lens, (index + 1) / len(source.photos)
-
-
-def _depth_of(camera: KnownCamera) -> np.ndarray:
-    """Depth [H, W] m, shaped like the photo of its camera."""
-    assert camera.depth is not None
-    depth = read_depth(camera.depth)
-    height, width = depth.shape
-    if camera.height and abs(width / height / (camera.width / camera.height) - 1) > 0.02:
-        raise SdfsimError(
-            f"{camera.depth.path}: shaped {width} x {height}, its photo {camera.width} x {camera.height}",
-            "depth has to show what its photo shows, turned the same way",
-        )
-    return depth
+        size = picture.pixels.shape[1::-1]
+        _check_shape(path, size, camera)
+        picture = replace(picture, labels=source.labels.of(path, size))
+        yield source.name_of(path), picture, camera, (index + 1) / len(source.photos)
 
 
 def _masks_that_count(source: Source, long_side: int) -> dict[Path, Path]:
@@ -180,12 +166,12 @@ def _masks_that_count(source: Source, long_side: int) -> dict[Path, Path]:
     return {}
 
 
-def _check_shape(path: Path, picture: Picture, shape: float | None) -> None:
-    height, width = picture.pixels.shape[:2]
-    if shape is not None and abs(width / height / shape - 1) > 0.02:
+def _check_shape(path: Path, size: tuple[int, int], camera: KnownCamera | None) -> None:
+    """Checks that a photo, or its depth, of this width and height is shaped like the photo of its camera."""
+    if camera and camera.height and abs(size[0] / size[1] / (camera.width / camera.height) - 1) > 0.02:
         raise SdfsimError(
-            f"{path}: shaped {width} x {height}, but its camera has {shape:.3f} times as many columns as rows",
-            "the photos have to be those that the cameras were found for, uncropped",
+            f"{path}: shaped {size[0]} x {size[1]}, but its camera's photo {camera.width} x {camera.height}",
+            "photos and depth have to be those that the cameras were found for, uncropped, and turned the same way",
         )
 
 
@@ -207,8 +193,8 @@ def notes_on(photos: list[Photo], mask_files: int) -> list[str]:
     for word in ("blurred", "too dark", "burnt out"):
         names = [p.source for p in photos if p.fault == word]
         if names:
-            more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-            notes.append(f"{len(names)} of {len(photos)} photos are {word}: {', '.join(names[:NAMED])}{more}")
+            named = ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
+            notes.append(f"{len(names)} of {len(photos)} photos are {word}, take them again: {named}")
     return notes
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pipeline.inputs.captures import ARCHIVES, Capture, find_capture, read_capture
 from pipeline.inputs.known_cameras import KnownCamera, read_cameras
-from pipeline.inputs.labels import Labels, find_labels, names_for
+from pipeline.inputs.labels import Labels, find_labels, find_masks
 from sdfsim.errors import SdfsimError
 
 MIN_PHOTOS = 3
@@ -136,18 +136,6 @@ def find_photos(folder: Path) -> tuple[list[Path], list[str]]:
             or "take photos around the object, each overlapping the one before by two thirds",
         )
     return found, notes
-
-
-def find_masks(photos: list[Path]) -> dict[Path, Path]:
-    """The mask file of each photo that has one in a folder `masks` in or beside the photo's folder."""
-    masks = {}
-    for photo in photos:
-        folders = [photo.parent / "masks", photo.parent.parent / "masks"]
-        names = [folder / name for folder in folders for name in names_for(photo)]
-        found = next((path for path in names if path.is_file()), None)
-        if found:
-            masks[photo] = found
-    return masks
 
 
 def is_model(folder: Path) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,6 +16,8 @@ SMALL, MIDDLE = 256, 960  # px, longer side of the frames that motion and sharpn
 STEP = 0.07  # of the picture's width: motion from one chosen frame to the next
 FEWEST, MOST = 24, 100
 LEAST_MOTION = 0.5  # picture widths in all: less is no walk around anything
+# Else the decoder prints what it thinks of damaged files, past Python.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 
 @dataclass(frozen=True)
@@ -42,37 +43,19 @@ def frames_of(path: Path) -> tuple[Iterator[np.ndarray], float]:
     """
     import cv2
 
-    with _quiet():
-        video = cv2.VideoCapture(str(path))
+    video = cv2.VideoCapture(str(path))
     if not video.isOpened():
         raise SdfsimError(f"{path}: cannot be decoded as a video", "convert it to MP4 (H.264)")
     rate = float(video.get(cv2.CAP_PROP_FPS)) or 30.0
 
     def read() -> Iterator[np.ndarray]:
-        try:
-            while True:
-                with _quiet():
-                    good, frame = video.read()
-                if not good:
-                    return
-                yield frame[..., ::-1]
-        finally:
-            video.release()
+        while True:
+            good, frame = video.read()
+            if not good:
+                return
+            yield frame[..., ::-1]
 
     return read(), rate
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Keeps what the decoder prints about damaged files, past Python, off the user's terminal."""
-    saved, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(null, 2)
-        yield
-    finally:
-        os.dup2(saved, 2)
-        os.close(saved)
-        os.close(null)
 
 
 def reduced(frame: np.ndarray, longest: int) -> np.ndarray:

@@ -193,8 +193,9 @@ def find_bodies(surface: Surface, levels: list[Level], layer: float, smallest: f
         label = np.empty(solid.shape, np.int32)
         count = int(ndimage.label(solid & (height > layer), output=label))  # type: ignore[arg-type]
         others = [other for other in levels if other is not level and level.above(other.height * other.normal) > layer]
-        boxes = ndimage.find_objects(label, count)
-        for number, box in enumerate(boxes, start=1):
+        samples = np.bincount(label.ravel())
+        hangs = np.asarray(ndimage.minimum(height, label, np.arange(count + 1))) > layer + 1.5 * volume.cell
+        for number, box in enumerate(ndimage.find_objects(label, count), start=1):
             mine = label[box] == number
             if (at_rim[box] & mine).any() or (taken[box] & mine).any() or mine.sum() < 8:
                 continue
@@ -210,39 +211,10 @@ def find_bodies(surface: Surface, levels: list[Level], layer: float, smallest: f
                 continue
             if _share_seen(place, vertices, seen) < SEEN_SHARE and not known:
                 continue
-            crumbs = _crumbs(label, boxes, number, height, layer, volume.cell)
-            axes = zip(*(boxes[k - 1] for k in (number, *crumbs)), strict=True)
-            box = tuple(slice(min(p.start for p in parts), max(p.stop for p in parts)) for parts in axes)
-            mine = np.isin(label[box], [number, *crumbs])
             taken[box] |= mine
-            standing = solid & (height > layer)
+            crumbs = hangs & (samples < CRUMB * samples[number])
+            standing = (label > 0) & ~crumbs[label]
             found.append(_body(volume, standing, box, mine, level, layer, float(sides.max())))
-    return found
-
-
-def _crumbs(label: np.ndarray, boxes: list[tuple[slice, ...]], number: int, height: np.ndarray, layer: float,
-            cell: float) -> list[int]:  # fmt: skip
-    """Numbers of the components next to component `number` that reach no plane and are far smaller than it.
-
-    Args:
-        label: [X, Y, Z] component of each sample.
-        boxes: of the components, in their order.
-        number: of the component.
-        height: [X, Y, Z] of the samples above the plane.
-        layer: thickness of the contact layer.
-        cell: between samples.
-    """
-    margin = int(np.ceil(FILLET * layer / cell))
-    box = boxes[number - 1]
-    wide = tuple(slice(max(part.start - margin, 0), part.stop + margin) for part in box)
-    around, size = label[wide], int((label[box] == number).sum())
-    found = []
-    for other in np.setdiff1d(np.unique(around), [0, number]):
-        own = boxes[other - 1]
-        inside = all(w.start <= o.start and o.stop <= w.stop for w, o in zip(wide, own, strict=True))
-        samples = label[own] == other
-        if inside and samples.sum() < CRUMB * size and height[own][samples].min() > layer + 1.5 * cell:
-            found.append(int(other))
     return found
 
 

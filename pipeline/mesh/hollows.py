@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.mesh.visibility import Caster
+from pipeline.mesh.visibility import Above
 from sdfsim.shape.mesh import Mesh
 
 PLACES = 64  # looked at along a body's longest side
@@ -24,11 +24,10 @@ def hollow(mesh: Mesh, least: float) -> tuple[float, float] | None:
 
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
     step = float((high - low)[:2].max()) / PLACES
-    x, y = np.meshgrid(*(np.arange(low[k] - step, high[k] + 2 * step, step) for k in range(2)), indexing="ij")
-    start = np.stack([x.ravel(), y.ravel(), np.full(x.size, high[2] + step)], 1)
-    away = Caster(mesh).hits(start, np.tile([0.0, 0.0, -1.0], (len(start), 1)))[0].reshape(x.shape)
-    through = ~np.isfinite(away)
-    height = np.where(through, low[2], high[2] + step - away)
+    axes = [np.arange(low[k] - step, high[k] + 2 * step, step) for k in range(2)]
+    height = Above(mesh).heights(np.stack(np.meshgrid(*axes, indexing="ij"), -1))
+    through = np.isnan(height)
+    height = np.where(through, low[2], height)
     water = reconstruction(np.where(through, height, height.max()), height, method="erosion")
     depth = water - height
     deep = depth > 0.5 * depth.max()

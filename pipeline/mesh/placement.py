@@ -7,11 +7,11 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
-from pipeline.cameras import Similarity, View, camera_up, frame_of
+from pipeline.cameras import Similarity, Up, View, camera_up, frame_of
 from pipeline.inputs.photos import Photo
 from pipeline.mesh.cleaning import face_normals
 from pipeline.mesh.visibility import Caster
@@ -23,6 +23,9 @@ from sdfsim.shape.mesh import Mesh
 CONFIDENT = {"high": 2.0, "medium": 6.0}
 GRAVITY = 1.0  # degrees within which a phone knows it
 FLOORS = 0.5  # degrees within which floors and tables are level
+# Largest angle (degrees) between cameras' up and the normal of a plane that tells up, and its least share of the area.
+MAX_ANGLE, MIN_SHARE = 25.0, 0.08
+LEVEL_NORMAL, MIN_FLOOR = 0.95, 0.05  # least z of a level face's normal, and share of the area that a floor has
 # A pixel may miss what it is meant to show by these shares of the width; farther off by the factor is behind it.
 NEARBY, BEHIND = (0.0, 0.008, 0.016, 0.024), 1.1
 
@@ -73,47 +76,36 @@ def load_placement(mesh_folder: Path) -> Placement:
         raise SdfsimError(f"{path}: damaged", "run the mesh stage again") from error
 
 
-class Up(NamedTuple):
-    """Up in normalised space: a unit vector [3], where it is from, and degrees within which it can be trusted."""
-
-    direction: np.ndarray
-    source: str
-    within: float
-
-
 def find_up(shown: Mesh, views: list[View]) -> Up:
     """Up from the largest nearly level plane, else from the cameras; how far they disagree counts as doubt."""
     cameras = camera_up(views)
     normals, areas = face_normals(shown)
     centers = shown.vertices[shown.faces].mean(1)
-    plane = plane_up(centers, normals, areas, cameras.normal, tolerance=0.02)
+    plane = plane_up(centers, normals, areas, cameras.direction, tolerance=0.02)
     if plane is None:
-        return Up(cameras.normal, "cameras", cameras.within)
+        return cameras
     normal, slope = plane
     within = float(np.hypot(FLOORS, slope))
-    apart = float(np.degrees(np.arccos(np.clip(normal @ cameras.normal, -1, 1))))
+    apart = float(np.degrees(np.arccos(np.clip(normal @ cameras.direction, -1, 1))))
     return Up(normal, "plane", within if apart < 3 * cameras.within else max(within, apart))
 
 
 def plane_up(
-    points: np.ndarray, normals: np.ndarray, weights: np.ndarray, guess: np.ndarray, tolerance: float, *,
-    max_angle: float = 25.0, min_share: float = 0.08,
-) -> tuple[np.ndarray, float] | None:  # fmt: skip
+    points: np.ndarray, normals: np.ndarray, weights: np.ndarray, guess: np.ndarray, tolerance: float
+) -> tuple[np.ndarray, float] | None:
     """The largest plane among surface samples whose normal is near a guess (RANSAC).
 
     Args:
         points: [P, 3].
         normals: [P, 3] unit, outwards.
         weights: [P] area of each sample.
-        guess: [3] unit; only planes within `max_angle` degrees of it count.
+        guess: [3] unit; only planes within `MAX_ANGLE` of it count.
         tolerance: distance within which a sample belongs to a plane.
-        max_angle: degrees.
-        min_share: share of all the area that a plane needs.
 
     Returns:
         Its unit normal [3] and the slope in degrees that its unevenness amounts to; None where none is large enough.
     """
-    near = normals @ guess > np.cos(np.radians(max_angle))
+    near = normals @ guess > np.cos(np.radians(MAX_ANGLE))
     if near.sum() <= 10:
         return None
     p, n, w = points[near], normals[near], weights[near]
@@ -123,7 +115,7 @@ def plane_up(
         member = (np.abs((p - p[pick]) @ n[pick]) < tolerance) & (n @ n[pick] > 0.9)
         if w[member].sum() > best:
             best, inside = float(w[member].sum()), member
-    if inside is None or best < min_share * weights.sum():
+    if inside is None or best < MIN_SHARE * weights.sum():
         return None
     for _ in range(3):
         center = np.average(p[inside], axis=0, weights=w[inside])
@@ -133,33 +125,26 @@ def plane_up(
         inside = (np.abs((p - center) @ normal) < tolerance) & (n @ normal > 0.9)
         if inside.sum() < 10:
             return None
-    if normal @ guess < np.cos(np.radians(max_angle)):
+    if normal @ guess < np.cos(np.radians(MAX_ANGLE)):
         return None
     return normal, float(np.degrees(np.arctan(np.sqrt(max(spread[0], 0) / max(spread[1], 1e-30)))))
 
 
-def resting_height(mesh: Mesh, *, level: float = 0.95, share: float = 0.05) -> float:
-    """Height of the lowest level surface with at least `share` of the mesh's area; without one, the mesh's lowest part.
-
-    Args:
-        mesh: z up.
-        level: least z of a normal that counts as level.
-        share: of all the area.
-    """
+def resting_height(mesh: Mesh) -> float:
+    """Height of the lowest level surface of a mesh, z up, that counts by its area; without one, of its lowest part."""
     normals, areas = face_normals(mesh)
     height = mesh.vertices[mesh.faces][:, :, 2].mean(1)
-    flat = normals[:, 2] > level
+    flat = normals[:, 2] > LEVEL_NORMAL
     if flat.any():
         width = 0.01 * float(np.ptp(mesh.vertices, axis=0).max())
         bins = ((height[flat] - height[flat].min()) / width).astype(int)
         area = np.bincount(bins, areas[flat])
         # A plane that lies across the border of two bins must not be missed.
-        enough = np.flatnonzero(area + np.append(area[1:], 0) > share * areas.sum())
+        enough = np.flatnonzero(area + np.append(area[1:], 0) > MIN_FLOOR * areas.sum())
         if len(enough):
             chosen = (bins == enough[0]) | (bins == enough[0] + 1)
-            order = np.argsort(height[flat][chosen])
-            total = np.cumsum(areas[flat][chosen][order])
-            return float(height[flat][chosen][order][np.searchsorted(total, total[-1] / 2)])
+            weights = areas[flat][chosen]
+            return float(np.quantile(height[flat][chosen], 0.5, weights=weights, method="inverted_cdf"))
     return float(np.quantile(mesh.vertices[:, 2], 0.002))
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 from scipy.signal import fftconvolve
-from scipy.sparse import coo_matrix, csr_array, diags, identity
+from scipy.sparse import coo_matrix, diags, identity
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import eigsh
 from scipy.spatial import ConvexHull, KDTree
@@ -25,7 +25,6 @@ from pipeline.mesh.extraction import Volume
 from pipeline.mesh.visibility import Visibility
 from sdfsim.shape.mesh import Mesh
 
-SMOOTHING = 2  # times that votes are averaged over neighbours on the surface
 # A patch of one label that is smaller than this share of the label's largest is a mistake of some mask.
 STRAY = 0.1
 # What masks do not name is a part of its own from this share of the surface on; a name from that.
@@ -99,13 +98,8 @@ def count_votes(sight: Visibility, faces: np.ndarray, views: list[View], photos_
         votes[index[said], found[said]] += weight[said]
     total = votes.sum(1, keepdims=True)
     share = votes / np.where(total > 0, total, 1)
-    near = _neighbours(faces, len(share))
-    for _ in range(SMOOTHING):
-        voting = near @ (share.sum(1) > 0).astype(float)
-        mean = (near @ share) / np.maximum(voting, 1)[:, None]
-        share = np.where(total > 0, mean, 0)
     winner = np.where(total[:, 0] > 0, share.argmax(1), -1)
-    patch = _patches(faces, winner, len(winner))
+    patch = _patches(faces, winner)
     size = np.bincount(patch)
     largest = np.zeros(len(names) + 2)
     np.maximum.at(largest, winner, size[patch])
@@ -113,21 +107,11 @@ def count_votes(sight: Visibility, faces: np.ndarray, views: list[View], photos_
     return Votes(names, share)
 
 
-def _neighbours(faces: np.ndarray, count: int) -> csr_array:
-    """Which vertices share an edge, each one with itself: [V, V] of ones."""
-    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    own = np.arange(count)
-    rows, columns = np.concatenate([ends[:, 0], ends[:, 1], own]), np.concatenate([ends[:, 1], ends[:, 0], own])
-    found = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count)).tocsr()
-    found.data[:] = 1
-    return found
-
-
-def _patches(faces: np.ndarray, label: np.ndarray, count: int) -> np.ndarray:
-    """Number [V] of the connected patch of vertices of one label [V] that each of `count` vertices is in."""
+def _patches(faces: np.ndarray, label: np.ndarray) -> np.ndarray:
+    """Number [V] of the connected patch of vertices of one label [V] that each vertex is in."""
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     ends = ends[label[ends[:, 0]] == label[ends[:, 1]]]
-    graph = coo_matrix((np.ones(len(ends), np.int8), tuple(ends.T)), shape=(count, count))
+    graph = coo_matrix((np.ones(len(ends), np.int8), tuple(ends.T)), shape=(len(label),) * 2)
     return connected_components(graph, directed=False)[1]
 
 

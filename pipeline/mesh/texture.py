@@ -16,7 +16,7 @@ from PIL import Image
 from pipeline.cameras import View
 from pipeline.inputs.photos import Photo
 from pipeline.mesh.cleaning import face_normals, joined, keep_faces, vertex_normals
-from pipeline.mesh.visibility import FLATTEST, Caster, bilinear, to_bytes
+from pipeline.mesh.visibility import FLATTEST, Caster, bilinear, framed, to_bytes
 from pipeline.progress import Progress, quiet, share_of
 from sdfsim.shape.mesh import Mesh, sample_surface
 
@@ -108,21 +108,14 @@ def texture_parts(meshes: dict[str, Mesh], shots: Shots, on_progress: Progress =
     }
 
 
-def textured(mesh: Mesh, shots: Shots, on_progress: Progress = quiet, *, power: float = POWER) -> Mesh:
-    """One mesh with a texture, see `texture_parts`.
-
-    Args:
-        mesh: with vertex colours.
-        shots: photos.
-        on_progress: called with the share done.
-        power: of the weights; 1 gives the plain mean over photos.
-    """
+def textured(mesh: Mesh, shots: Shots, on_progress: Progress = quiet) -> Mesh:
+    """One mesh with a texture, see `texture_parts`."""
     on_progress(0.0, "unfolding the surface")
     points, normals = sample_surface(mesh, 4000, np.random.default_rng(0))
     coarse = fewer(mesh, FACES)
     flat, origin, shape = unfold(coarse, shots.density(points, normals))
     texels = rasterise(flat, vertex_normals(coarse)[origin], shape)
-    return replace(flat, colors=None, texture=bake(texels, shots, share_of(on_progress, 0.3, 0.7), power=power))
+    return replace(flat, colors=None, texture=bake(texels, shots, share_of(on_progress, 0.3, 0.7)))
 
 
 def fewer(mesh: Mesh, most: int) -> Mesh:
@@ -232,7 +225,7 @@ def rasterise(flat: Mesh, normals: np.ndarray, shape: tuple[int, int]) -> Texels
     return Texels(shape, at, spread(flat.vertices), spread(normals), spread(colors))
 
 
-def bake(texels: Texels, shots: Shots, on_progress: Progress = quiet, *, power: float = POWER) -> np.ndarray:
+def bake(texels: Texels, shots: Shots, on_progress: Progress = quiet) -> np.ndarray:
     """The texture [H, W, 3] uint8: of each texel the colour in the photos that show it best.
 
     A view counts by its pixels on the surface, by how straight it looks and how sharp its photo is. Within two blocks
@@ -282,10 +275,10 @@ def bake(texels: Texels, shots: Shots, on_progress: Progress = quiet, *, power: 
         on_progress(0.5 * (number + 1) / len(shots.views), f"what photo {number + 1} of {len(shots.views)} shows")
     total = np.zeros(small, np.float32)
     for score in scores:
-        total += score.astype(np.float32) ** power
+        total += score.astype(np.float32) ** POWER
     color, weight = FAINT * texels.colors, np.full(len(texels.at), FAINT, np.float32)
     for number, view in enumerate(shots.views):
-        share = np.maximum(scores[number].astype(np.float32) ** power / np.maximum(total, 1e-37) - LEAST, 0)
+        share = np.maximum(scores[number].astype(np.float32) ** POWER / np.maximum(total, 1e-37) - LEAST, 0)
         if not share.any():
             continue
         own = cv2.resize(share, (columns, rows), interpolation=cv2.INTER_LINEAR).reshape(-1)[texels.at]
@@ -316,8 +309,7 @@ def _facing(view: View, points: np.ndarray, normals: np.ndarray) -> tuple[np.nda
     away = np.maximum(np.linalg.norm(towards, axis=1), 1e-12)
     cosine = (towards * normals).sum(1) / away
     index = np.flatnonzero(cosine > FLATTEST)
-    pixels, depth = view.project(points[index])
-    inside = (depth > 0) & (pixels > 1).all(1) & (pixels < [view.width - 1, view.height - 1]).all(1)
+    pixels, inside = framed(view, points[index])
     index = index[inside]
     return index, cosine[index] * view.focal / away[index], pixels[inside]
 

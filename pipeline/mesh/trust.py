@@ -120,20 +120,16 @@ def summary(mesh: Mesh, support: Support) -> dict:
     """
     area, uncertainty = vertex_areas(mesh), support.uncertainty
     known = np.isfinite(uncertainty)
+    median = None
+    if known.any():
+        median = float(np.quantile(uncertainty[known], 0.5, weights=area[known], method="inverted_cdf"))
     seen_by = np.bincount(np.minimum(support.views, FEW), area, minlength=FEW + 1) / area.sum()
     return {
         "area_m2": float(area.sum()), "seen_by": [round(float(share), 4) for share in seen_by],
         "guessed": round(float(area[~known].sum() / area.sum()), 4),
-        "uncertainty_m": weighted_quantile(uncertainty[known], area[known], 0.5) if known.any() else None,
+        "uncertainty_m": median,
         "where": guessed_sides(mesh, np.where(known, 0, area)),
     }  # fmt: skip
-
-
-def weighted_quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
-    """The value of values [N] below which this share of their weights [N] lies."""
-    order = np.argsort(values)
-    total = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(total, share * total[-1])])
 
 
 def guessed_sides(mesh: Mesh, weights: np.ndarray) -> list[str]:
@@ -157,7 +153,8 @@ def color_range(mesh: Mesh, uncertainty: np.ndarray) -> tuple[float, float]:
     known = np.isfinite(uncertainty)
     if not known.any():
         return 1e-3, 1e-2
-    low, high = (weighted_quantile(uncertainty[known], vertex_areas(mesh)[known], share) for share in (0.05, 0.95))
+    areas = vertex_areas(mesh)[known]
+    low, high = np.quantile(uncertainty[known], [0.05, 0.95], weights=areas, method="inverted_cdf").tolist()
     return low, max(high, 1.01 * low)
 
 

@@ -62,6 +62,20 @@ class Caster:
         return self.scene.test_occlusions(self.tensor(rays), tnear=0.0, tfar=1.0).numpy()
 
 
+class Above:
+    """Heights of a mesh's topmost surface."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        self.caster = Caster(mesh)
+        self.top = float(mesh.vertices[:, 2].max() + 0.1 * np.ptp(mesh.vertices, axis=0).max())
+
+    def heights(self, at: np.ndarray) -> np.ndarray:
+        """Heights [...] m over the points `at` [..., 2] m; NaN where there is no surface."""
+        origin = np.insert(at.reshape(-1, 2), 2, self.top, axis=1)
+        distance, _ = self.caster.hits(origin, np.broadcast_to([0.0, 0.0, -1.0], origin.shape))
+        return np.where(np.isfinite(distance), self.top - distance, np.nan).reshape(at.shape[:-1])
+
+
 class Visibility:
     """Which vertices of a mesh which views see.
 

@@ -115,14 +115,11 @@ def check(result: dict, photos: list[Photo], ordinary: dict | None = None) -> di
             failures.append(f"the cameras stand too close together ({angle:.1f} degrees apart as seen from the scene)")
         elif around < ONE_SIDE:
             warnings.append(f"the photos show the scene from one side ({around:.0f} degrees around it): what they do "
-                            "not show is guessed, so a closed object cannot come of it")  # fmt: skip
+                            "not show is guessed, so no closed object can come of it: walk further around")  # fmt: skip
     return {
-        "photos": len(photos), "posed": len(posed), "needed": needed, "left_out": left_out,
+        "photos": len(photos), "posed": len(posed), "left_out": left_out,
         "mean_error": round(result.get("mean_error", 0.0), 4), "points": result.get("points", 0),
-        "track_length": round(result.get("track_length", 0.0), 2), "models": [len(m) for m in result["models"]],
-        "field_of_view": sorted({round(view.fov, 2) for view in views}),
-        "focal": sorted({round(view.focal, 2) for view in views}),
-        "spread_angle": round(angle, 2), "span_degrees": round(around, 1),
+        "field_of_view": sorted({round(view.fov, 2) for view in views}), "span_degrees": round(around, 1),
         "contradictions": round(contradicting(result), 4), "components": [len(c) for c in found.components],
         "still_pairs": round(found.still, 3), "turn_only_pairs": round(found.rotation_only, 3),
         "causes": diagnose(result, found, failures), "failures": failures, "warnings": warnings,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 import sqlite3
@@ -37,7 +38,7 @@ ATTEMPTS = {
     },
 }  # fmt: skip
 
-
+EXHAUSTIVE_UP_TO = 150  # photos; of more, only neighbours in name order are matched
 WIDEST_PAIR = 60.0  # degrees between the optical axes of known cameras whose photos are matched
 
 
@@ -62,7 +63,7 @@ def size_groups(photos: list[Photo]) -> list[dict]:
 
 
 def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0, timeout: float = 1800.0,
-          exhaustive_up_to: int = 150, on_progress: Progress = quiet) -> dict:  # fmt: skip
+          on_progress: Progress = quiet) -> dict:  # fmt: skip
     """Finds the poses of `photos` and writes `cameras.json`, `sparse.npz`, `checks.json` to `out`.
 
     Makes `ATTEMPTS` until poses can be trusted; each has a folder of its own, in which a killed run goes on. Where the
@@ -74,7 +75,6 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
         out: existing folder.
         seed: of every random choice in matching and mapping.
         timeout: s for each attempt.
-        exhaustive_up_to: with more photos than this only neighbours in name order are matched.
 
     Returns:
         The checks (also in checks.json): posed, left_out with reasons, mean_error px, warnings, and the attempts.
@@ -88,7 +88,7 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
         "images": str(photos_folder / "images"), "count": len(photos), "groups": size_groups(photos), "seed": seed,
         "masks": str(photos_folder / "masks") if all(p.mask for p in photos) else "",
         "known_cameras": str(known) if known.exists() else "", "refine": load_capture(photos_folder) is not None,
-        "pairs": seen_together(load_views(known)) if known.exists() else None, "exhaustive_up_to": exhaustive_up_to,
+        "pairs": seen_together(load_views(known)) if known.exists() else None, "exhaustive_up_to": EXHAUSTIVE_UP_TO,
     }  # fmt: skip
     tries: list[tuple[dict, Path, dict]] = []
     told: list[dict] = []
@@ -222,9 +222,8 @@ def crash_reason(code: int, log: Path) -> str:
 def estimate(folder: Path, lines: Path, job: dict) -> tuple[float, str]:
     """Fraction done and a message, from the child's lines and the row counts of its database."""
     count = job["count"]
-    said = lines.read_text(errors="replace").splitlines()
-    phase = next((line.split()[1] for line in reversed(said) if line.startswith("phase")), "features")
-    placed = next((int(line.split()[1]) for line in reversed(said) if line.startswith("placed")), 0)
+    said = dict(re.findall(r"^(phase|placed) (\w+)$", lines.read_text(errors="replace"), re.MULTILINE))
+    phase, placed = said.get("phase", "features"), int(said.get("placed", 0))
     if phase == "mapping":
         return 0.75 + 0.25 * min(1.0, placed / count), f"placing cameras, {placed} of {count}"
     if phase == "done":

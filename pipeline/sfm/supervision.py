@@ -141,13 +141,6 @@ def point_weights(sparse: Sparse, count: int) -> np.ndarray:
     return seen / (1 + np.maximum(sparse.error, 0) ** 2)
 
 
-def weighted_quantile(values: np.ndarray, weights: np.ndarray, q: float) -> float:
-    """Quantile of `values` [P] with `weights` [P]."""
-    order = np.argsort(values)
-    total = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(total, q * total[-1])])
-
-
 def unit_sphere_of(views: list[View], sparse: Sparse, *, masked: bool = False) -> Similarity:
     """The similarity that puts what the cameras look at into the unit sphere.
 
@@ -163,22 +156,23 @@ def unit_sphere_of(views: list[View], sparse: Sparse, *, masked: bool = False) -
     axes = np.array([v.rotation[2] for v in views])
     weights = point_weights(sparse, len(sparse.xyz))
 
-    def quantiles(q: float) -> np.ndarray:
-        return np.array([weighted_quantile(sparse.xyz[:, k], weights, q) for k in range(3)])
+    def quantile(values: np.ndarray, q: float) -> np.ndarray:
+        """Of values [P] or [P, 3], by the weights."""
+        return np.quantile(values, q, axis=0, weights=weights, method="inverted_cdf")
 
     if masked:
-        center = (quantiles(0.005) + quantiles(0.995)) / 2
-        radius = 1.15 * weighted_quantile(np.linalg.norm(sparse.xyz - center, axis=1), weights, 0.99)
+        center = (quantile(sparse.xyz, 0.005) + quantile(sparse.xyz, 0.995)) / 2
+        radius = 1.15 * float(quantile(np.linalg.norm(sparse.xyz - center, axis=1), 0.99))
     else:
-        center = nearest_to_axes(centers, axes, anchor=quantiles(0.5))
+        center = nearest_to_axes(centers, axes, anchor=quantile(sparse.xyz, 0.5))
         in_front = ((center - centers) * axes).sum(1) > 0
         if in_front.mean() < 0.8:  # Axes that meet behind the cameras (a capture looking outwards) say nothing.
-            center = quantiles(0.5)
+            center = quantile(sparse.xyz, 0.5)
         away = np.linalg.norm(centers - center, axis=1)
         half = np.array([np.arctan(0.5 * max(v.width, v.height) / v.focal) for v in views])
         points = np.linalg.norm(sparse.xyz - center, axis=1)
         radius = min(
-            float(np.median(away * np.sin(half))), 1.25 * weighted_quantile(points, weights, 0.95),
+            float(np.median(away * np.sin(half))), 1.25 * float(quantile(points, 0.95)),
             0.9 * float(np.quantile(away, 0.05)),
         )  # fmt: skip
         radius = max(radius, 1e-9)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,14 +13,18 @@ from PIL import Image
 from pipeline import stages
 
 
+def noise(folder: Path, names: Sequence[str], size: tuple[int, int] = (120, 90)) -> Path:
+    """Writes photos of noise, width x height, into a folder that is made where missing."""
+    for k, name in enumerate(names):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        pixels = np.random.default_rng(k).integers(0, 255, (*size[::-1], 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(folder / name)
+    return folder
+
+
 @pytest.fixture
 def photos(tmp_path) -> Path:
-    folder = tmp_path / "photos"
-    folder.mkdir()
-    for k in range(3):
-        pixels = np.random.default_rng(k).integers(0, 255, (80, 80, 3), dtype=np.uint8)
-        Image.fromarray(pixels).save(folder / f"{k}.png")
-    return folder
+    return noise(tmp_path / "photos", ["0.png", "1.png", "2.png"], (80, 80))
 
 
 @pytest.fixture

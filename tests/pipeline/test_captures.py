@@ -14,7 +14,7 @@ from PIL import Image
 from pipeline.cameras import Similarity, Sparse, View, load_views
 from pipeline.inputs.captures import UP, load_capture, spread
 from pipeline.inputs.depth import DepthFile, read_depth
-from pipeline.inputs.known_cameras import pinhole
+from pipeline.inputs.known_cameras import lens_of, posed
 from pipeline.inputs.photos import KNOWN_CAMERAS, Photo, load_photos, prepare_photos
 from pipeline.inputs.sources import find_source
 from pipeline.mesh.placement import Up, place
@@ -198,7 +198,7 @@ def test_a_long_recording_is_thinned_along_its_way_to_its_sharpest_frames(tmp_pa
         # The camera stands still for a while: these frames are one stretch.
         pose = np.column_stack([np.eye(3), [max(0, number - 20), 0.0, 0.0]])
         photos.append(path)
-        cameras[path] = pinhole(path.name, (128, 96), (100, 100, 64, 48), pose)
+        cameras[path] = posed(path.name, (128, 96), lens_of(100, 100, 64, 48), pose)
     chosen = [photos.index(path) for path in spread(photos, cameras, most=5)]
     assert len(chosen) == 5 and chosen[0] <= 23 and chosen == sorted(set(chosen))
     assert all(number % 4 == 3 for number in chosen)

@@ -10,9 +10,10 @@ import pytest
 import yaml
 
 from pipeline.cameras import Similarity
-from pipeline.export import LEVEL, Above, choose_slab, fit_parts, scene_text, write_scene
+from pipeline.export import LEVEL, choose_slab, fit_parts, scene_text, write_scene
 from pipeline.materials import ASSUMED, MATERIALS, choose
 from pipeline.mesh.placement import Placement
+from pipeline.mesh.visibility import Above
 from sdfsim.errors import SdfsimError
 from sdfsim.files import write_json
 from sdfsim.scene.scene_file import load_scene
@@ -131,7 +132,11 @@ def test_every_part_is_fitted_in_its_own_frame_and_kept_when_killed(meshes, tmp_
 
     def fit_mesh(solid: Mesh, *, name: str, **options) -> Shape:
         fits.append((name, solid, options["budget"]))
-        certificate = {"passed": name != "object1", "reason": "too thin" if name == "object1" else "", "caveat": ""}
+        certificate = {
+            "passed": name != "object1",
+            "reason": "too thin" if name == "object1" else "",
+            "caveat": "rough",
+        }
         return replace(analytic_shape("box", size=(0.2, 0.2, 0.2), name=name), mesh=solid, certificate=certificate)
 
     monkeypatch.setattr("sdfsim.shape.fit.fit_mesh", fit_mesh)
@@ -141,20 +146,9 @@ def test_every_part_is_fitted_in_its_own_frame_and_kept_when_killed(meshes, tmp_
     assert [(name, budget) for name, _, budget in fits] == [("scene", 20.0), ("object1", 10.0)]
     np.testing.assert_allclose(fits[1][1].vertices.min(0), [-0.1, -0.1, 0.0], atol=1e-6)
     assert report["passed"] is False and report["reason"] == "object1: too thin"
+    assert report["caveats"] == ["scene: rough", "object1: rough"]
+    assert sorted(path.name for path in out.iterdir()) == ["object1", "scene"]
     assert fit_parts(meshes, out, budget=30.0) == report and len(fits) == 2
-
-
-def test_a_checkpoint_that_a_kill_left_beside_its_shape_goes(meshes, tmp_path, monkeypatch):
-    def fit_mesh(solid: Mesh, *, name: str, device: str, **options) -> Shape:
-        certificate = {"passed": True, "reason": "", "caveat": "rough"}
-        return replace(analytic_shape("box", size=(0.2, 0.2, 0.2), name=name), mesh=solid, certificate=certificate)
-
-    monkeypatch.setattr("sdfsim.shape.fit.fit_mesh", fit_mesh)
-    out = tmp_path / "assets"
-    out.mkdir()
-    report = fit_parts(meshes, out, budget=None)
-    assert report["passed"] and report["caveats"] == ["scene: rough", "object1: rough"]
-    assert sorted(p.name for p in out.iterdir()) == ["object1", "scene"]
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1e5])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +12,10 @@ from pipeline.inputs.labels import UNKNOWN, load_labels, load_names
 from pipeline.inputs.photos import prepare_photos
 from pipeline.inputs.sources import find_source
 from sdfsim.errors import SdfsimError
+from tests.pipeline.conftest import noise
+from tests.pipeline.test_sources import write_transforms
 
-
-def photos(folder: Path, count: int = 3) -> Path:
-    folder.mkdir(parents=True)
-    for k in range(count):
-        pixels = np.random.default_rng(k).integers(0, 255, (90, 120, 3), dtype=np.uint8)
-        Image.fromarray(pixels).save(folder / f"{k}.jpg")
-    return folder
+NAMES = ["0.jpg", "1.jpg", "2.jpg"]
 
 
 def mask(path: Path, columns: slice) -> None:
@@ -31,7 +26,7 @@ def mask(path: Path, columns: slice) -> None:
 
 
 def test_masks_by_object_become_labels_and_say_nothing_where_there_are_none(tmp_path):
-    folder = photos(tmp_path / "in" / "images")
+    folder = noise(tmp_path / "in" / "images", NAMES)
     mask(tmp_path / "in" / "masks" / "cup" / "0.png", slice(0, 60))
     mask(tmp_path / "in" / "masks" / "vase" / "0.jpg.png", slice(50, 100))
     mask(tmp_path / "in" / "masks" / "vase" / "1.png", slice(50, 100))
@@ -52,7 +47,7 @@ def test_masks_by_object_become_labels_and_say_nothing_where_there_are_none(tmp_
 
 @pytest.mark.parametrize("kind", ["palette", "8 bits", "16 bits"])
 def test_label_images_keep_their_numbers_as_names(tmp_path, kind):
-    folder = photos(tmp_path / "in")
+    folder = noise(tmp_path / "in", NAMES)
     values = np.zeros((90, 120), np.uint16 if kind == "16 bits" else np.uint8)
     values[:40], values[40:60] = 7, 1000 if kind == "16 bits" else 9
     image = Image.fromarray(values)
@@ -68,7 +63,7 @@ def test_label_images_keep_their_numbers_as_names(tmp_path, kind):
 
 
 def test_labels_turn_with_their_photo(tmp_path):
-    folder = photos(tmp_path / "in")
+    folder = noise(tmp_path / "in", NAMES)
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = 6
     with Image.open(folder / "0.jpg") as image:
@@ -83,20 +78,13 @@ def test_labels_turn_with_their_photo(tmp_path):
 
 def test_labels_are_straightened_with_the_lens(tmp_path):
     """A grey photo that shows the labels themselves has them in the same places afterwards."""
-    folder = photos(tmp_path / "in")
+    folder = noise(tmp_path / "in", NAMES)
     pixels = np.zeros((90, 120), np.uint8)
     pixels[20:70, 30:100] = 200
     Image.fromarray(pixels).convert("RGB").save(folder / "0.jpg", quality=98)
     (folder / "labels").mkdir()
     Image.fromarray(pixels).save(folder / "labels" / "0.png")
-    frames = []
-    for k in range(3):
-        pose = np.eye(4)
-        pose[0, 3] = k
-        frames.append({"file_path": f"{k}.jpg", "transform_matrix": pose.tolist()})
-    about = {"fl_x": 100.0, "w": 120, "h": 90, "k1": 0.2, "k2": -0.05, "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(about))
-    prepare_photos(folder / "transforms.json", tmp_path)
+    prepare_photos(write_transforms(folder, NAMES, k1=0.2, k2=-0.05), tmp_path)
     found = load_labels(tmp_path, "0000.jpg")
     with Image.open(tmp_path / "images" / "0000.jpg") as image:
         shown = np.asarray(image.convert("L")) > 100
@@ -110,14 +98,14 @@ def test_labels_are_straightened_with_the_lens(tmp_path):
      ("no", "0.png", "no body can have this name"), ("scene", "0.png", "no body can have this name")],
 )  # fmt: skip
 def test_masks_of_no_use_are_refused(tmp_path, name, file, why):
-    folder = photos(tmp_path / "in")
+    folder = noise(tmp_path / "in", NAMES)
     mask(folder / "masks" / name / file, slice(0, 9))
     with pytest.raises(SdfsimError, match=why):
         find_source(folder)
 
 
 def test_label_images_in_colour_or_of_nothing_are_refused(tmp_path):
-    folder = photos(tmp_path / "in")
+    folder = noise(tmp_path / "in", NAMES)
     (folder / "labels").mkdir()
     Image.new("RGB", (120, 90)).save(folder / "labels" / "0.png")
     with pytest.raises(SdfsimError, match="one number a pixel"):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -12,77 +14,55 @@ from PIL import ExifTags, Image, ImageOps
 from pipeline.inputs.images import read_photo
 from pipeline.inputs.photos import load_photos, prepare_photos
 from sdfsim.errors import EXIT_ERROR, SdfsimError
+from tests.pipeline.conftest import noise
 
 
 def picture(width: int = 120, height: int = 80, seed: int = 0) -> Image.Image:
     return Image.fromarray(np.random.default_rng(seed).integers(0, 255, (height, width, 3), dtype=np.uint8))
 
 
-def fill(folder: Path, count: int = 3, **keywords) -> None:
-    folder.mkdir(exist_ok=True)
-    for k in range(count):
-        picture(seed=k, **keywords).save(folder / f"{k}.jpg")
+def fill(folder: Path, count: int = 3) -> None:
+    noise(folder, [f"{k}.jpg" for k in range(count)], (120, 80))
 
 
-def failure(folder: Path, out: Path) -> SdfsimError:
-    with pytest.raises(SdfsimError) as caught:
-        prepare_photos(folder, out, long_side=100)
-    assert "\n" not in caught.value.message
-    assert caught.value.exit_code == EXIT_ERROR
-    return caught.value
-
-
-def test_missing_folder(tmp_path):
-    assert "no such folder" in failure(tmp_path / "none", tmp_path).message
-
-
-def test_empty_folder(tmp_path):
-    (tmp_path / "empty").mkdir()
-    message = failure(tmp_path / "empty", tmp_path).message
-    assert "no photos" in message and "at least 3" in message
-
-
-def test_two_photos(tmp_path):
-    fill(tmp_path / "two", 2)
-    assert "2 photos found, at least 3 are needed" in failure(tmp_path / "two", tmp_path).message
-
-
-def test_text_named_jpg(tmp_path):
-    fill(tmp_path / "in")
-    (tmp_path / "in" / "9.jpg").write_text("hello")
-    message = failure(tmp_path / "in", tmp_path).message
-    assert "9.jpg: not an image" in message
-
-
-@pytest.mark.parametrize("suffix", ["jpg", "png"])
-def test_truncated_photo_is_named(tmp_path, suffix):
-    fill(tmp_path / "in")
+def encoded(kind: str, width: int, height: int) -> bytes:
     data = io.BytesIO()
-    picture(400, 300).save(data, "JPEG" if suffix == "jpg" else "PNG")
-    (tmp_path / "in" / f"cut.{suffix}").write_bytes(data.getvalue()[: len(data.getvalue()) // 2])
-    message = failure(tmp_path / "in", tmp_path).message
-    assert f"cut.{suffix}: " in message and "truncated" in message
+    picture(width, height).save(data, kind)
+    return data.getvalue()
 
 
-def test_absurdly_large_photo_is_refused_before_decoding(tmp_path):
-    import struct
-    import zlib
+def absurd() -> bytes:
+    """A PNG of a few bytes that claims 100,000 px a side."""
 
     def chunk(kind: bytes, body: bytes) -> bytes:
         return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
-    fill(tmp_path / "in")
     header = struct.pack(">IIBBBBB", 100_000, 100_000, 8, 2, 0, 0, 0)
-    (tmp_path / "in" / "bomb.png").write_bytes(
-        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0")) + chunk(b"IEND", b"")
-    )
-    assert "bomb.png: too large (100000 x 100000" in failure(tmp_path / "in", tmp_path).message
+    parts = chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(b"\0")), chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 
-def test_tiny_photo_is_refused(tmp_path):
-    fill(tmp_path / "in")
-    picture(20, 20).save(tmp_path / "in" / "x.png")
-    assert "too small" in failure(tmp_path / "in", tmp_path).message
+@pytest.mark.parametrize(
+    ("count", "name", "content", "words"),
+    [
+        (0, "", b"", "no photos found, at least 3"),
+        (2, "", b"", "2 photos found, at least 3 are needed"),
+        (3, "9.jpg", b"hello", "9.jpg: not an image"),
+        (3, "cut.jpg", encoded("JPEG", 400, 300)[:40_000], "cut.jpg: truncated"),
+        (3, "cut.png", encoded("PNG", 400, 300)[:40_000], "cut.png: truncated"),
+        (3, "bomb.png", absurd(), "bomb.png: too large (100000 x 100000"),
+        (3, "x.png", encoded("PNG", 20, 20), "x.png: too small"),
+    ],
+)
+def test_what_cannot_be_used_is_one_clear_line(tmp_path, count, name, content, words):
+    (tmp_path / "in").mkdir()
+    fill(tmp_path / "in", count)
+    if name:
+        (tmp_path / "in" / name).write_bytes(content)
+    with pytest.raises(SdfsimError) as caught:
+        prepare_photos(tmp_path / "in", tmp_path, long_side=100)
+    assert words in caught.value.message and "\n" not in caught.value.message
+    assert caught.value.exit_code == EXIT_ERROR
 
 
 def test_other_files_are_noted_and_sizes_may_differ(tmp_path):

@@ -58,4 +58,7 @@ def test_faulty_photos_are_named(tmp_path, photo):
     Image.fromarray((np.asarray(photo) * 0.05).astype(np.uint8)).save(folder / "night.png")
     photos, notes = prepare_photos(folder, tmp_path)
     assert {p.source: p.fault for p in photos if p.fault} == {"soft.png": "blurred", "night.png": "too dark"}
-    assert "1 of 6 photos are blurred: soft.png" in notes and "1 of 6 photos are too dark: night.png" in notes
+    assert (
+        "1 of 6 photos are blurred, take them again: soft.png" in notes
+        and "1 of 6 photos are too dark, take them again: night.png" in notes
+    )

@@ -299,7 +299,7 @@ def test_a_device_that_is_not_there_is_refused_before_any_stage(photos, tmp_path
     assert not (tmp_path / "out").exists()
     reconstruct(photos, tmp_path / "out")
     with pytest.raises(SdfsimError, match="no CUDA device here"):
-        run_stage("mesh", tmp_path / "out", device="cuda", again=True)
+        run_stage("mesh", tmp_path / "out", device="cuda")
 
 
 def test_poses_of_a_folder_in_work_keep_its_other_options(photos, tmp_path, calls, monkeypatch):

@@ -164,7 +164,7 @@ def test_the_unit_sphere_holds_the_object_and_moves_cameras_along():
 def test_up_from_level_cameras():
     for views in (ring(), ring()[:4]):
         up = camera_up(views)
-        np.testing.assert_allclose(up.normal, [0, 0, 1], atol=1e-6)
+        np.testing.assert_allclose(up.direction, [0, 0, 1], atol=1e-6)
         assert up.within == pytest.approx(CAREFUL)
     assert camera_up(ring()[:1]).within == UNKNOWN
 
