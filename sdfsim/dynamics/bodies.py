@@ -146,7 +146,7 @@ class State:
         velocity: [N, 3] float64, of the centres of mass.
         angular_velocity: [N, 3] float64, world frame.
         earlier_position, earlier_orientation: [2, N, 3] and [2, N, 4], the two poses before (oldest first),
-            for the *paper* network; None where nobody needs them.
+            for networks on surface nodes; None where nobody needs them.
         touch: contacts and sleep of the solve; None before its first step.
         load: [N, 6] force at the centre of mass and torque that pull at a body, world axes; None where nothing does.
         time: since the start.

@@ -1,4 +1,4 @@
-"""The two earlier poses that the *paper* network reads velocities from."""
+"""The two earlier poses that networks on surface nodes read velocities from."""
 
 from __future__ import annotations
 
