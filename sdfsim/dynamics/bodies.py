@@ -99,12 +99,6 @@ class Bodies:
     def device(self) -> torch.device:
         return self.shape.device
 
-    def may_meet(self, a: Tensor, b: Tensor) -> Tensor:
-        """[P] bool: whether bodies `a` [P] and `b` [P] may touch; at least one of a pair is dynamic."""
-        one, other = self.world[a], self.world[b]
-        together = (one == other) | (one < 0) | (other < 0)
-        return together & (self.moves[a] | self.moves[b]) & self.allowed[self.group[a], self.group[b]]
-
 
 @dataclass(frozen=True)
 class Touch:
