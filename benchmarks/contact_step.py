@@ -51,7 +51,7 @@ def solved(scene: Scene, steps: int, dt: float | None = None, *, sleep: bool = F
     counts: tuple[int, ...] = ()
     began = time.perf_counter()
     for _ in range(steps):
-        manifolds, counts = inside.run(motion, manifolds, rules)
+        manifolds, _, counts = inside.run(motion, manifolds, rules)
     return 1e3 * (time.perf_counter() - began) / steps, counts
 
 

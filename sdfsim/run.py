@@ -384,7 +384,7 @@ class Checkpoint:
             self._parts = int(kept["parts"])
             simulator.state = _state(kept, simulator.device)
             simulator.steps_done = int(kept["steps_done"])
-            self.rest = Rest(torch.as_tensor(kept["rest.anchor"], device=simulator.device), int(kept["rest.quiet"]))
+            self.rest = Rest(kept["rest.anchor"], int(kept["rest.quiet"]))
         except (KeyError, TypeError, ValueError) as error:
             raise SdfsimError(f"{self._folder / _STATE}: not a checkpoint of this version ({error})", _ANEW) from error
         return [Rollout.load(self._folder / _part(k)) for k in range(self._parts)]
@@ -460,8 +460,8 @@ def _arrays(state: State, rest: Rest) -> dict[str, np.ndarray]:
     for prefix, of in (("", state), ("touch.", state.touch), ("rest.", rest)):
         for field in fields(of) if of is not None else ():
             value = getattr(of, field.name)
-            if isinstance(value, torch.Tensor):
-                found[prefix + field.name] = value.cpu().numpy()
+            if isinstance(value, torch.Tensor | np.ndarray):
+                found[prefix + field.name] = np.asarray(value.cpu() if isinstance(value, torch.Tensor) else value)
     return found
 
 

@@ -142,7 +142,7 @@ class BodyHandle:
             torque: [3] N m, on top of that moment.
 
         Raises:
-            SdfsimError: the body does not move by itself, or the model is a network on surface nodes: it knows no forces.
+            SdfsimError: the body does not move by itself, or the model is a network on surface nodes.
         """
         self._must_move("be pulled")
         sim = self._simulator

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import torch
-from torch import Tensor
+import numpy as np
 
 from sdfsim.dynamics.bodies import Bodies, State
 
@@ -22,7 +21,7 @@ class Rest:
         quiet: for how many steps.
     """
 
-    anchor: Tensor | None = None
+    anchor: np.ndarray | None = None
     quiet: int = 0
 
     @property
@@ -32,14 +31,15 @@ class Rest:
 
     def after(self, bodies: Bodies, state: State) -> Rest:
         """What is so with `state`, the one that follows."""
-        pose = torch.cat([state.position, state.orientation], -1)[bodies.moves]
-        if self.anchor is None or bool((_strayed(self.anchor, pose, bodies.radius[bodies.moves]) >= STRAY).any()):
+        moves = bodies.moves.cpu().numpy()
+        pose = np.concatenate([state.position.cpu().numpy(), state.orientation.cpu().numpy()], -1)[moves]
+        if self.anchor is None or (_strayed(self.anchor, pose, bodies.radius.cpu().numpy()[moves]) >= STRAY).any():
             return Rest(pose)
         return replace(self, quiet=self.quiet + 1)
 
 
-def _strayed(before: Tensor, now: Tensor, radius: Tensor) -> Tensor:
+def _strayed(before: np.ndarray, now: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """Upper bound [A] on how far any point within `radius` [A] is from where it was, for poses [A, 7]."""
     cosine = (before[:, 3:] * now[:, 3:]).sum(-1)
-    chord = 2.0 * (1.0 - cosine * cosine).clamp_min(0.0).sqrt()
-    return (now[:, :3] - before[:, :3]).norm(dim=-1) + chord * radius
+    chord = 2.0 * np.sqrt(np.maximum(1.0 - cosine * cosine, 0.0))
+    return np.sqrt(np.square(now[:, :3] - before[:, :3]).sum(-1)) + chord * radius

@@ -131,9 +131,9 @@ class Simulator:
         if self.model.on_surfaces:
             self.state = with_history(self.state, self.bodies, self.rules)
         self.memory = Memory()
-        self._dynamic = self.bodies.moves.nonzero()[:, 0]
-        weight = self.bodies.mass[self._dynamic] * self.rules.gravity.norm()
-        self._lift = float((weight * self.bodies.size[self._dynamic]).sum()) * self.units.energy
+        dynamic = self.bodies.moves
+        weight = self.bodies.mass[dynamic] * self.rules.gravity.norm()
+        self._lift = float((weight * self.bodies.size[dynamic]).sum()) * self.units.energy
         self.contacts: Near | None = None
         self.steps_done = 0
         if broken := self._fault(self.state, everybody(self.bodies)):
@@ -349,19 +349,14 @@ class Simulator:
 
     def _energies(self) -> dict[str, float]:
         """Kinetic and potential energy in joules of all dynamic bodies."""
-        rows = self._dynamic
-        s = self.state
-        moving = kinetic(self.bodies, rows, s).sum()
-        potential = -(self.bodies.mass[rows] * (s.position[rows] @ self.rules.gravity)).sum()
-        joule = self.units.energy
+        s, b, joule = self.state, self.bodies, self.units.energy
+        velocity, mass, inertia = (t.cpu().numpy() for t in (s.velocity, b.mass, b.inertia))
+        # Bodies that are not dynamic have no mass, and an inertia that means nothing.
+        spin = s.angular_velocity.cpu().numpy()[:, None] @ pose.to_matrix(s.orientation).cpu().numpy()
+        turning = ((spin @ inertia)[:, 0] * spin[:, 0]).sum(-1)[b.moves.cpu().numpy()]
+        moving = 0.5 * (mass @ np.square(velocity).sum(-1) + turning.sum())
+        potential = -mass @ (s.position.cpu().numpy() @ self.rules.gravity.cpu().numpy())
         return {"kinetic_energy": float(moving) * joule, "potential_energy": float(potential) * joule}
-
-
-def kinetic(bodies: Bodies, rows: torch.Tensor, state: State) -> torch.Tensor:
-    """[R] kinetic energy of bodies `rows` [R] of a state."""
-    spin = pose.rotate(pose.conjugate(state.orientation[rows]), state.angular_velocity[rows])
-    turning = (spin * (bodies.inertia[rows] @ spin[..., None])[..., 0]).sum(-1)
-    return 0.5 * (bodies.mass[rows] * state.velocity[rows].square().sum(-1) + turning)
 
 
 def _rows(limits: Limits) -> int | None:

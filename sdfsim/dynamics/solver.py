@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -39,13 +39,15 @@ class SolverRules:
     """What the solve is made of; lengths and speeds in model units, in which the smallest bodies are about 1.4 wide.
 
     Attributes:
-        reach: contacts are kept up to this distance; look: new ones are looked for up to this one.
+        reach: contacts are kept up to this distance, and while they have slid by no more; look: new ones are looked
+            for up to this one.
         still: pairs that have moved by less within a step are not looked at again.
         together: points that are deeper than the deepest less this meet in one impact.
         erp: the share of a penetration that an inner step resolves, through velocity.
         slop: penetration that is left as it is, so that what rests has contacts that do not come and go.
         split: deeper penetration than this is resolved without a lasting velocity.
-        slow: g times the inner step times this is the approach that ends at the surface without a rebound.
+        slow: g times the inner step times this is the approach that ends at the surface without a rebound (in
+            `kernels.world.Rules` it is that speed).
         rounds: of sequential impulses at most.
         exact: they end when no impulse changes a velocity by more.
         apart: points of a manifold are at least so far from each other.
@@ -145,9 +147,15 @@ class Acts:
         return len(self.first)
 
 
+_nobody, _nothing, _nowhere = torch.zeros(0, dtype=torch.int64), torch.zeros(0), torch.zeros(0, 3)
+NO_ACTS = Acts(_nobody, _nobody, _nowhere, _nowhere, _nowhere, _nowhere, _nothing, _nothing)
+
+
 def acts_of(edges: record.Edges, steps: int) -> Acts:
     """What the compiled step noted, `steps` inner steps long."""
     count = int(edges.count[0])
+    if not count:
+        return NO_ACTS
     pair, value = torch.from_numpy(edges.pair[:count]), torch.from_numpy(edges.value[:count])
 
     def vector(column: int) -> torch.Tensor:
@@ -231,7 +239,7 @@ def taken_up(
     """Copies of a state as the compiled step writes to them; whoever was changed from outside is awake, and so are
     those that slept with it or on it."""
     position, orientation, velocity, angular = (
-        np.array(t.cpu().numpy(), dtype=np.float64)
+        np.array(t.cpu().numpy(), dtype=np.float64, order="C")
         for t in (state.position, state.orientation, state.velocity, state.angular_velocity)
     )
     n, touch = len(position), state.touch
@@ -242,9 +250,9 @@ def taken_up(
         return motion, no_manifolds()
     island, quiet = np.array(touch.island.numpy()), np.array(touch.quiet.numpy())
     touching = np.array(touch.touching.numpy())
-    if not torch.equal(touch.gravity, torch.from_numpy(rules.gravity)):
+    if (touch.gravity.numpy() != rules.gravity).any():
         island[:], quiet[:] = -1, 0
-    changed = (held(state) != touch.held).any(-1).numpy()
+    changed = (np.concatenate([position, orientation, velocity, angular], -1) != touch.held.numpy()).any(-1)
     if scene.world.scripted.any():
         changed &= ~scene.world.scripted
     if changed.any():
@@ -292,15 +300,16 @@ def contact_points(state: State) -> Touching:
     if touch is None or not len(touch.pair):
         nothing = np.zeros((0, 3))
         return Touching(np.zeros((0, 2), np.int64), nothing, nothing, nothing, nothing[:, 0])
-    there = torch.arange(compiled.POINTS)[None] < touch.count[:, None]
-    pair, point = touch.pair[:, None].expand(-1, compiled.POINTS, 2)[there], touch.point[there]
-    close = point[:, compiled.GAP] <= TOUCHING
-    pair, point = pair[close], point[close]
+    point = touch.point.numpy()
+    there = np.arange(compiled.POINTS) < touch.count.numpy()[:, None]
+    m, k = (there & (point[..., compiled.GAP] <= TOUCHING)).nonzero()
+    pair, point = touch.pair.numpy()[m], point[m, k]
     first = pair[:, 0]
-    place = state.position[first] + pose.rotate(state.orientation[first], point[:, :3])
+    turn = pose.to_matrix(state.orientation).numpy()[first]
+    place = state.position.numpy()[first] + (turn @ point[:, :3, None])[..., 0]
     normal = point[:, compiled.NORMAL : compiled.NORMAL + 3]
     impulse = normal * point[:, compiled.PUSH, None] + point[:, compiled.DRAG : compiled.DRAG + 3]
-    return Touching(*(t.numpy() for t in (pair, place, normal, impulse, point[:, compiled.GAP])))
+    return Touching(pair, place, normal, impulse, point[:, compiled.GAP])
 
 
 def compiled_rules(
@@ -311,13 +320,12 @@ def compiled_rules(
     """The rules of a run, model units."""
     own = own or SolverRules()
     inner = dt / substeps
+    slow = own.slow * float(np.linalg.norm(gravity)) * inner
+    made: dict[str, Any] = vars(own) | {"look": own.look + 2.0 * margin, "slow": slow}
     return compiled.Rules(
         gravity=np.asarray(gravity, dtype=np.float64), inner=inner, steps=substeps, friction=friction,
-        restitution=restitution, rotation=rotation, sleep=sleep, reach=own.reach, look=own.look + 2.0 * margin,
-        still=own.still, together=own.together, erp=own.erp, slop=own.slop, split=own.split,
-        slow=own.slow * float(np.linalg.norm(gravity)) * inner, rounds=own.rounds, exact=own.exact, apart=own.apart,
-        stray=own.stray, rest=own.rest, margin=margin, adds=adds, note=note,
-        ahead=inner if note and inner > COARSE else 0.0,
+        restitution=restitution, rotation=rotation, sleep=sleep, margin=margin, adds=adds, note=note,
+        ahead=inner if note and inner > COARSE else 0.0, **made,
     )  # fmt: skip
 
 

@@ -17,7 +17,7 @@ from sdfsim.dynamics.simulator import Simulator
 from sdfsim.scene.scene import Effects, Scene, Waypoints
 from sdfsim.shape.shape import analytic_shape
 from tests.dynamics.conftest import make_body, random_model
-from tests.dynamics.test_paper import paper_model
+from tests.dynamics.test_surface_networks import surface_model
 
 
 def same(one, other) -> bool:
@@ -168,7 +168,7 @@ def test_the_impulse_network_sees_only_bodies_that_met_somebody(dropped, graphs)
 
 
 def test_the_paper_network_sees_only_bodies_with_an_edge_and_answers_as_for_all(dropped):
-    model = paper_model(push=1e-2)
+    model = surface_model(push=1e-2)
     sim = Simulator(dropped, model)
     contacts = find_contacts(sim.bodies, sim.state, sim.rules.gravity, sim.model.reach, sim.rules.dt)
     whole = predict(model.network, sim.bodies, sim.state, contacts, sim.rules.dt)
@@ -183,7 +183,7 @@ def test_the_paper_network_sees_only_bodies_with_an_edge_and_answers_as_for_all(
 
 
 def test_with_everything_active_nothing_is_copied(dropped):
-    sim = Simulator(dropped, paper_model())
+    sim = Simulator(dropped, surface_model())
     contacts = find_contacts(sim.bodies, sim.state, sim.rules.gravity, sim.model.reach, sim.rules.dt)
     made = compact(sim.bodies, sim.state, contacts, torch.arange(len(sim.bodies)))
     assert made[0] is sim.bodies and made[1] is sim.state and made[2] is contacts
@@ -195,7 +195,7 @@ def test_with_everything_active_nothing_is_copied(dropped):
 
 def test_learned_free_flight_needs_no_search_with_contact_off(dropped, forbid):
     forbid(nodes, "nodes_within")
-    sim = Simulator(replace(dropped, effects=Effects(contact="off")), paper_model(), free_flight="learned")
+    sim = Simulator(replace(dropped, effects=Effects(contact="off")), surface_model(), free_flight="learned")
     rollout = sim.run(steps=3)
     assert rollout.counters["active"][1:].tolist() == [3, 3, 3] and rollout.contact_count.sum() == 0
 

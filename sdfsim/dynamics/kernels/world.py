@@ -139,18 +139,7 @@ class Rules(NamedTuple):
         inner: the inner step.
         steps: inner steps in a step.
         friction, restitution, rotation, sleep: whether they are.
-        reach: contacts are kept up to this distance, and while they have slid by no more.
-        look: new points are looked for up to this distance.
-        still: pairs that have moved by less since new points were looked for keep those that they have.
-        together: points that are deeper than the deepest less this meet in one impact.
-        erp: the share of a penetration that an inner step resolves.
-        slop: penetration that is left as it is, so that what rests has contacts that do not come and go.
-        split: deeper penetration is resolved without a lasting velocity.
-        slow: approaches slower than this end at the surface, without a rebound.
-        rounds: of the solver at most.
-        exact: it ends when no impulse changes a velocity by more.
-        apart: points of a manifold are at least so far from each other.
-        stray: who stays within this of its anchor is quiet; rest: for so many steps, and it falls asleep.
+        reach to rest: as `solver.SolverRules` has them, for this run.
         margin: all bodies but planes are larger by this than their distances say.
         adds: whether what is pushed out adds to the speed of a rebound.
         note: whether what contacts did in the step is wanted, see `record`.
