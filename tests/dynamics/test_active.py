@@ -120,7 +120,7 @@ def with_scenery(scene: Scene, count: int) -> Scene:
     return replace(scene, bodies=scene.bodies + far)
 
 
-@pytest.mark.parametrize("make", [lambda: random_model("impulse"), paper_model])
+@pytest.mark.parametrize("make", [lambda: random_model("impulse"), surface_model])
 def test_scenery_far_away_is_never_asked(dropped, make):
     few, many = Simulator(with_scenery(dropped, 3), make()), Simulator(with_scenery(dropped, 400), make())
     one, other = few.run(steps=8), many.run(steps=8)
@@ -230,7 +230,7 @@ def paddle(scene: Scene) -> Scene:
     return replace(scene, bodies=(*scene.bodies, body))
 
 
-@pytest.mark.parametrize("make", [lambda: random_model("impulse", push=0.1), paper_model])
+@pytest.mark.parametrize("make", [lambda: random_model("impulse", push=0.1), surface_model])
 def test_a_body_on_a_path_pushes_and_is_not_pushed(dropped, make):
     sim = Simulator(paddle(dropped), make())
     rollout = sim.run(steps=max(4, round(0.25 / sim.dt)))

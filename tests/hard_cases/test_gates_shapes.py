@@ -14,7 +14,7 @@ from sdfsim.errors import SdfsimError
 from sdfsim.shape.sdf import BoxSdf, SphereSdf
 from sdfsim.shape.shape import analytic_shape, with_sdf
 from tests.dynamics.conftest import random_model
-from tests.dynamics.test_paper import paper_model
+from tests.dynamics.test_surface_networks import surface_model
 from tests.hard_cases import gates
 
 LINE = np.linspace(-0.5, 0.5, 6)[:, None] * [1.0, 0.5, 0.0]
@@ -27,7 +27,7 @@ def dropped(nodes: np.ndarray, shape=gates.CUBE):
     return replace(scene, shapes=(replace(shape, nodes=nodes), *scene.shapes[1:]))
 
 
-@pytest.mark.parametrize("make", [lambda: random_model("impulse", push=0.1), paper_model], ids=["impulse", "paper"])
+@pytest.mark.parametrize("make", [lambda: random_model("impulse", push=0.1), surface_model], ids=["impulse", "paper"])
 def test_coplanar_nodes_run(make):
     rollout = Simulator(dropped(FLAT), make()).run(steps=12)
     gates.assert_sound(rollout)
