@@ -30,17 +30,11 @@ def ballistic(model: Model, group: list[Trajectory], shapes: dict[str, Shape], s
 
 
 def chaos_floor(data: Path, trajectories: list[Trajectory], steps: int, seed: int = 0) -> dict[str, list[Trajectory]]:
-    """Run the teacher again from the recorded starts.
-
-    Args:
-        data: dataset folder (or one split of it) whose `shapes/engine` holds a URDF for every shape.
-        trajectories: recorded ones, with velocities as recorded.
-        steps: how far.
-        seed: of the directions of the perturbations.
+    """Run the teacher again from recorded starts (velocities as recorded) of a dataset with a URDF for every shape.
 
     Returns:
-        name in `PERTURBATIONS` -> the same bodies in the motion (steps + 1 frames) that follows when the velocity of
-        each that moves is changed by so much in a random direction.
+        name in `PERTURBATIONS` -> the motions (steps + 1 frames) that follow when the velocity of each body that moves
+        is changed by so much in a random direction.
 
     Raises:
         SdfsimError: PyBullet or an engine file is absent, or the recording is not this teacher's.

@@ -58,12 +58,9 @@ class Timing:
 
 
 def start_of_scene(scene: Scene, folder: Path, units: Units | None = None) -> Start:
-    """A scene whose only plane, if any, is a level floor.
+    """A scene whose only plane, if any, is a level floor; shapes are called by their index in it.
 
-    Args:
-        scene: what is to move; the shapes are called by their index in it.
-        folder: of the engine's files, which are written where they are not there yet.
-        units: in which the engine has it; SI units where there are none.
+    The engine's files are written to `folder` where they are not there yet. Units are SI unless given.
 
     Raises:
         SdfsimError: bodies on a path, or planes other than one level floor.

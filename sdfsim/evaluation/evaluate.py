@@ -268,14 +268,9 @@ def error_rows(
     intervals: bool = True,
     extra: dict[str, dict] | None = None,
 ) -> Rows:
-    """Errors at every horizon: the model, others, the teacher run again, and flight without contact. The head first.
+    """Errors at every horizon, the head first: the model, `extra` by name, the teacher again, flight without contact.
 
-    Args:
-        report: of `evaluate`.
-        name: what the model is called.
-        at_frame: errors in a frame alone, at those of `metrics.FRAMES`; else over all steps up to a horizon.
-        intervals: with those of 95 %.
-        extra: errors of others by name.
+    `at_frame` takes those in a frame alone, at `metrics.FRAMES`; else they are over all steps up to a horizon.
     """
     again = {f"teacher, {size} m/s off": found for size, found in _perturbed(report).items()}
     rows = {name: report["model"], **(extra or {}), **again, "ballistic": report["ballistic"]}

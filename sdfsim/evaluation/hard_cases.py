@@ -60,11 +60,9 @@ OFFSETS = (-6.0, -4.0, -2.0, 0.0, 2.0, 4.0, 6.0)  # degrees from the angle at wh
 
 @dataclass(frozen=True)
 class Run:
-    """One motion of one scene.
+    """One motion of one scene: of its bodies but for planes, up to the last good state.
 
     Attributes:
-        scene: what moved.
-        motion: its bodies but for planes, up to the last good state.
         broke: why it ended early, else empty.
         rollout: the simulator's own record; None of the teacher.
     """
@@ -93,8 +91,6 @@ class Figure:
     """One number that a case gives.
 
     Attributes:
-        name: as the measure calls it.
-        unit: of the number.
         digits: shown after the point; differences that are not shown do not count.
         limit: what is wanted is at most this; None where only the teacher says how good one can be.
         largest: of several repetitions the largest counts, not the mean.
@@ -113,16 +109,11 @@ class Figure:
 
 @dataclass(frozen=True)
 class Case:
-    """One case.
+    """One case, by a name that is fit for a file.
 
     Attributes:
-        name: unique, fit for a file.
-        group: name of the `Group` it belongs to.
-        title: what it is.
         scenes: the scenes of one repetition, given its number; repetition 0 is the case as it is meant.
-        measure: of the motions of these scenes, in their order.
-        figures: what `measure` gives.
-        seconds: how long.
+        measure: of the motions of these scenes, in their order; gives `figures`.
         repeats: repetitions, from starts slightly off or with other random scenes: their spread is the noise.
         cuda: the scenes are simulated a second time there, behind the first.
         teacher: whether the teacher can take part.
@@ -147,7 +138,6 @@ class Group:
     """Cases of one kind.
 
     Attributes:
-        title: what they have in common.
         axis: label of the cases' `x`.
         about: the quantity of a model's ranges that the cases are about: one that never varied was not learned.
     """
@@ -211,14 +201,9 @@ def on_floor(
     restitution: float = FLOOR_RESTITUTION,
     sleep: bool = False,
 ) -> Scene:
-    """Bodies above the plane z = 0, which is the last of them.
+    """Bodies above the plane z = 0, which is the last of them; friction and restitution are the floor's.
 
-    Args:
-        shapes: of the bodies.
-        bodies: all but the floor.
-        tilt: degrees; instead of the floor it is gravity that leans, towards +x, which is the same.
-        friction, restitution: of the floor.
-        sleep: whether bodies may fall asleep.
+    A `tilt` in degrees leans gravity towards +x, not the floor, which is the same.
     """
     fields: Any = {"motion": "static", "mass": 0.0, "friction": friction, "restitution": restitution}
     floor = body("floor", len(shapes), [0, 0, 0], **fields)
@@ -235,9 +220,7 @@ def on_floor(
 def nudged(scene: Scene, repeat: int) -> Scene:
     """The same scene started slightly off: bodies shifted sideways by up to `NUDGE` and turned about z by as much.
 
-    Args:
-        scene: as it is meant.
-        repeat: the seed; 0 leaves the scene exactly as it is.
+    Repetition 0 is the scene exactly as it is.
     """
     if repeat == 0:
         return scene

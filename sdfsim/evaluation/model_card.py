@@ -17,13 +17,7 @@ MODEL = "this model"  # in the tables of a card
 
 
 def bundle(path: Path, data: Path, name: str, folder: Path = BUNDLED) -> dict:
-    """Evaluate a trained model on the test split of `data`, then write `NAME.safetensors` and its card `NAME.md`.
-
-    Args:
-        path: what `sdfsim train` wrote.
-        data: dataset folder with test/.
-        name: the bundled model's name.
-        folder: of the bundled models.
+    """Evaluate what `sdfsim train` wrote on the test split of `data`; write `NAME.safetensors` and its card `NAME.md`.
 
     Returns:
         The evaluation's report; `as_published` are the errors of a paper network that predicts free flight too (None

@@ -44,7 +44,6 @@ class Study:
     """All results of the hard cases.
 
     Attributes:
-        cases: what was run, in order.
         who: models, then the teacher where PyBullet is installed.
         results: (case, who) -> figures (name -> a value a repetition), broke and outside (lines) and recording (a
             path in the folder, or None); nothing for a case that one cannot take part in.
@@ -67,14 +66,12 @@ def stress(
     record: Record | None = None,
     on_progress: Progress | None = None,
 ) -> Study:
-    """Run every case that `out` does not hold the result of yet.
+    """Run every case that `out` does not hold the result of yet; it holds results/, recordings/ and the engine's files.
 
     Args:
-        out: folder for results/, recordings/ and the engine's files.
         models: names or paths; none for the solver and all bundled networks.
         quick: fewer and shorter cases.
         shapes: folder of meshes that are to rest on the floor too, or name of a public set (see `public_folder`).
-        device: cpu, cuda or auto.
         record: writes a motion of each case that is not as wanted into a file; None for no recordings.
 
     Raises:

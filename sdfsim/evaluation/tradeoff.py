@@ -155,14 +155,8 @@ def load_cases(data: Path, *, quick: bool) -> Cases:
 def cases_of_scene(scene: Scene, model: str, folder: Path, *, quick: bool) -> Cases:
     """The one case that a scene makes: the teacher simulates it, and that is what contenders are judged by.
 
-    Lengths, times and masses are the model's (Froude scaling), so that the teacher, whose steps and margins are meant
-    for bodies of about a metre, serves scenes of any size.
-
-    Args:
-        scene: what moves.
-        model: whose units are taken.
-        folder: of the engines' files.
-        quick: a shorter course.
+    Lengths, times and masses are those of `model` (Froude scaling), so that the teacher, whose steps and margins are
+    meant for bodies of about a metre, serves scenes of any size. The engines' files go to `folder`.
 
     Raises:
         SdfsimError: a floor other than one level plane, bodies on a path, bodies that may not touch all others, effects
@@ -311,13 +305,7 @@ def measure_engine(name: str, substeps: int, off: float, cases: Cases) -> dict[s
 
 
 def _judged(motions: list[Trajectory], cases: Cases, stride: int = 1) -> dict[str, Any]:
-    """Errors of motions in the scene's metres, penetration, energy gain, and whether they blew up.
-
-    Args:
-        motions: of every case.
-        cases: what they are judged by.
-        stride: recorded steps in one of theirs.
-    """
+    """Errors of motions in the scene's metres, penetration, energy gain, and whether they blew up."""
     if not all(np.isfinite(m.position).all() and np.isfinite(m.quat_xyzw).all() for m in motions):
         raise SdfsimError("a state is not finite")
     there = errors(motions, [every(first_frames(t, cases.steps + 1), stride) for t in cases.recorded])

@@ -180,13 +180,8 @@ def fit_solids(
 ) -> list[Shape]:
     """Fit several solids side by side in one batched optimiser, which is what a GPU is good at.
 
-    Args:
-        solids: by name, from `MeshDistance(solidify(mesh))`.
-        budget: seconds of training for all of them.
-        recipe, seed, on_progress, device: as for `fit_mesh`.
-
-    Returns:
-        Shapes in the order of `solids`, as `fit_mesh` gives them.
+    Takes `MeshDistance(solidify(mesh))` by name, and a budget for all of them; other arguments are those of `fit_mesh`,
+    and so are the shapes, which come in the order of `solids`.
     """
 
     def pick(sdf: Sdf, oracle: MeshDistance) -> np.ndarray:
@@ -211,17 +206,9 @@ def fit_pieces(
 ) -> Shape:
     """Fit the compact SDF network to the union of convex pieces: the body that a rigid-body engine collides.
 
-    Nodes are the pieces' own vertices first (without repetitions and those inside another piece), because contact
-    with a flat floor is exact only there; then points along their sharp edges, then points all over the surface.
-
-    Args:
-        pieces: convex closed meshes, metres (see `load_pieces`).
-        name: of the shape.
-        display: the mesh to show; by default the boundary of the union.
-        nodes: surface nodes at most.
-
-    Returns:
-        Shape; its mass properties are those of the union.
+    At most `nodes` are the pieces' own vertices first (without repetitions and those inside another piece), because
+    contact with a flat floor is exact only there; then points along their sharp edges, then all over the surface.
+    Mass properties are those of the union, and so is the mesh to show unless `display` is given.
 
     Raises:
         SdfsimError: no pieces.
@@ -315,13 +302,7 @@ class Pool(NamedTuple):
 
 
 class Subject:
-    """One solid to be fitted: its frame, its mirror planes, and samples of it.
-
-    Args:
-        oracle: true distances, metres.
-        plan: the recipe.
-        seed: of the points.
-    """
+    """One solid to be fitted: its frame, its mirror planes, and samples of it."""
 
     def __init__(self, oracle: DistanceOracle, plan: Plan, seed: int) -> None:
         self.oracle, self._plan, self._seed = oracle, plan, seed

@@ -83,12 +83,8 @@ def wave(before: torch.Tensor, slope: torch.Tensor, spare: torch.Tensor) -> None
     """The periodic activation: parabolic arcs r (1 - 2 |r|) with r = x - round(x), of period 1 and height 1/8.
 
     Like a sine it is odd, smooth to first order and bounded, and keeps fine detail that ReLU networks smear; value and
-    slope cost a quarter of a sine and a cosine.
-
-    Args:
-        before: x; becomes the value.
-        slope: becomes the derivative 1 - 4 |r|.
-        spare: overwritten.
+    slope cost a quarter of a sine and a cosine. `before`, x, becomes the value, `slope` the derivative 1 - 4 |r|;
+    `spare` is overwritten.
     """
     torch.round(before, out=spare)
     before.sub_(spare)
@@ -109,13 +105,8 @@ ACTIVATIONS = {"wave": wave, "relu": relu}
 class Tape:
     """Working memory of the sweeps over a stack of S networks, for up to a number of points in all.
 
-    A layer is `act(W x + b)`; the last one is linear with one output.
-
-    Args:
-        activation: of the hidden layers.
-        width: of the hidden layers.
-        layers: linear layers, the last one included.
-        like: a tensor of the device and dtype to compute in.
+    A layer is `act(W x + b)`; the last one, which `layers` counts too, is linear with one output. Computes on the
+    device and in the dtype of `like`.
     """
 
     def __init__(self, activation: Activation, width: int, layers: int, like: torch.Tensor) -> None:
@@ -136,12 +127,9 @@ class Tape:
     def forward(
         self, weights: Sequence[torch.Tensor], biases: Sequence[torch.Tensor], points: torch.Tensor
     ) -> torch.Tensor:
-        """Values [S, T] at `points` [S, T, 3]; each network at its own.
+        """Values [S, T] at normalised `points` [S, T, 3], each network at its own.
 
-        Args:
-            weights: per layer [S, out, in].
-            biases: per layer [S, out].
-            points: in the networks' own (normalised) coordinates.
+        Weights are [S, out, in] and biases [S, out], one a layer.
         """
         self._views(*points.shape[:2])
         below = points
@@ -167,14 +155,9 @@ class Tape:
         into_weights: Sequence[torch.Tensor],
         into_biases: Sequence[torch.Tensor],
     ) -> None:
-        """Gradients of a loss in the parameters, after `forward` at the same points.
+        """Gradients of a loss in the parameters, after `forward` with the same weights at the same points.
 
-        Args:
-            weights: as for `forward`.
-            points: as for `forward`.
-            error: [S, T] derivative of the loss in each value.
-            into_weights: per layer [S, out, in], overwritten.
-            into_biases: per layer [S, out], overwritten.
+        `error` [S, T] is the derivative of the loss in each value; `into_weights` and `into_biases` are overwritten.
         """
         last = len(weights) - 1
         torch.bmm(error[:, None], self.hidden[-1], out=into_weights[last])
@@ -205,8 +188,7 @@ def value_and_gradient(
     costs as much as the forward one. Memory is bounded by `SWEPT`, whatever the number of points.
 
     Args:
-        weights: per layer [S, out, in].
-        biases: per layer [S, out].
+        weights, biases: per layer [S, out, in] and [S, out].
         activation: of the hidden layers.
         points: [S, T, 3], in the networks' own (normalised) coordinates.
 

@@ -85,11 +85,7 @@ def accepts_numpy(call: Callable[..., tuple[torch.Tensor, torch.Tensor]]) -> Cal
 
 
 class ClosedForm:
-    """A solid about the origin with an exact distance; `measure` asks many of one kind at once.
-
-    Attributes:
-        KIND: its name in files.
-        COUNT: how many sizes it has.
+    """A solid about the origin with an exact distance and `COUNT` sizes; `measure` asks many of one `KIND` at once.
 
     Raises:
         SdfsimError: a size is not a positive finite number.
@@ -283,19 +279,12 @@ def _up(points: torch.Tensor) -> torch.Tensor:
 
 
 def trilinear(values: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Interpolate a grid over [-BOX, BOX]^3, and differentiate what comes out.
+    """Value [P] and gradient [P, 3] of a grid [R, R, R] over [-BOX, BOX]^3 at points [P, 3] in it; NaN for NaN.
 
     The gradient is the exact one of the interpolant, not an interpolation of central differences: the step
     x - f grad f then leads to the level that the value has (which is what contact points and nodes are made of), and
     it takes the eight samples that the value takes anyway, not thirty-two. It jumps from cell to cell, by about
     the cell over the radius of curvature.
-
-    Args:
-        values: [R, R, R] float32 distances; the outermost samples lie on the faces of the box.
-        points: [P, 3] float32 within the box; from a NaN comes a NaN.
-
-    Returns:
-        value [P] and gradient [P, 3].
     """
     side = values.shape[-1]
     per_cell = (side - 1) / (2 * BOX)
