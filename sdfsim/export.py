@@ -24,7 +24,7 @@ from sdfsim.errors import SdfsimError
 from sdfsim.files import check_writable, replacing, write_text
 from sdfsim.identify import COLUMNS
 from sdfsim.parallel import StageProgress
-from sdfsim.recording import distinct_colors, framed, sheet, with_normals
+from sdfsim.recording import body_colors, framed, sheet, with_normals
 from sdfsim.run import read_run
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Body, Scene
@@ -37,8 +37,6 @@ from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape, own_pieces
 DENSITY = 1000.0  # kg/m^3 of a shape on its own, as of a body that a scene says nothing about
 FRICTION = RESTITUTION = 0.5  # likewise
 GRAVITY = (0.0, 0.0, -9.81)  # m/s^2, likewise
-STATIC_COLOR = (150, 150, 155)
-HUES = 32  # colours that bodies take in turn
 # Concavity relative to the size; and a search a third as long as CoACD's own, which finds pieces as good.
 COACD = {"threshold": 0.05, "mcts_iterations": 60, "mcts_nodes": 10, "resolution": 1000, "seed": 0}
 RATE = 60.0  # USD time codes in a second; programs step through the whole ones
@@ -195,11 +193,7 @@ def _alone(shape: Shape) -> Scene:
 
 
 def _take(scene: Scene, time: np.ndarray, position: np.ndarray, quat: np.ndarray) -> Take:
-    moving = [k for k, body in enumerate(scene.bodies) if body.motion != "static"]
-    colors = np.tile(np.array(STATIC_COLOR, dtype=np.uint8), (len(scene.bodies), 1))
-    hues = list(distinct_colors(min(len(moving), HUES)))
-    for count, k in enumerate(moving):
-        colors[k] = hues[count % HUES]
+    colors = np.array(body_colors(scene), dtype=np.uint8)
     names = _plain_names([body.name for body in scene.bodies])
     return Take(scene, names, _plain_names([s.name for s in scene.shapes]), colors, time, position, quat)
 
@@ -487,6 +481,7 @@ def _usd_geometry(take: Take, shape: Shape, dynamic: bool, stage: Any, path: str
 
 def _usd_mesh(stage: Any, path: str, mesh: Mesh) -> Any:
     geom, vt = _extra("pxr.UsdGeom"), _extra("pxr.Vt")
+    mesh, normals = with_normals(mesh)
     prim = geom.Mesh.Define(stage, path)
     points = vt.Vec3fArray.FromNumpy(mesh.vertices.astype(np.float32))
     prim.CreatePointsAttr(points)
@@ -495,10 +490,8 @@ def _usd_mesh(stage: Any, path: str, mesh: Mesh) -> Any:
     prim.CreateFaceVertexIndicesAttr(vt.IntArray.FromNumpy(mesh.faces.reshape(-1).astype(np.int32)))
     prim.CreateSubdivisionSchemeAttr(geom.Tokens.none)
     prim.CreateDoubleSidedAttr(True)
-    split, normals = with_normals(mesh)
     prim.CreateNormalsAttr(vt.Vec3fArray.FromNumpy(normals.astype(np.float32)))
-    # Split along its creases a mesh has a vertex, so a normal, for every corner of a face.
-    prim.SetNormalsInterpolation(geom.Tokens.vertex if split is mesh else geom.Tokens.faceVarying)
+    prim.SetNormalsInterpolation(geom.Tokens.vertex)
     if mesh.colors is not None:
         shown = prim.CreateDisplayColorPrimvar(geom.Tokens.vertex)
         shown.Set(vt.Vec3fArray.FromNumpy(_linear(mesh.colors).astype(np.float32)))
