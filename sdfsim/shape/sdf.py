@@ -85,7 +85,7 @@ def accepts_numpy(call: Callable[..., tuple[torch.Tensor, torch.Tensor]]) -> Cal
 
 
 class ClosedForm:
-    """A solid about the origin with an exact distance and `COUNT` sizes; `measure` asks many of one `KIND` at once.
+    """A solid about the origin with an exact distance; its fields are its `COUNT` sizes, m.
 
     Raises:
         SdfsimError: a size is not a positive finite number.
@@ -103,6 +103,16 @@ class ClosedForm:
     @property
     def sizes(self) -> tuple[float, ...]:
         """[COUNT] m."""
+        return tuple(np.hstack([*vars(self).values()]).tolist()) if vars(self) else ()
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """[2, 3] float64 m, the box that holds the solid."""
+        return np.outer([-1.0, 1.0], self.reach)
+
+    @property
+    def reach(self) -> tuple[float, ...]:
+        """(x, y, z) m, its half extents."""
         raise NotImplementedError
 
     @staticmethod
@@ -132,10 +142,6 @@ class PlaneSdf(ClosedForm):
     KIND, COUNT = "plane", 0
 
     @property
-    def sizes(self) -> tuple[float, ...]:
-        return ()
-
-    @property
     def bounds(self) -> np.ndarray:
         """[2, 3] m: infinite but for the top."""
         return np.array([[-np.inf] * 3, [np.inf, np.inf, 0.0]])
@@ -153,13 +159,8 @@ class SphereSdf(ClosedForm):
     radius: float
 
     @property
-    def sizes(self) -> tuple[float, ...]:
-        return (self.radius,)
-
-    @property
-    def bounds(self) -> np.ndarray:
-        """[2, 3] m."""
-        return np.array([[-self.radius] * 3, [self.radius] * 3], dtype=np.float64)
+    def reach(self) -> tuple[float, ...]:
+        return (self.radius,) * 3
 
     @staticmethod
     def measure(points: torch.Tensor, sizes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -181,13 +182,8 @@ class BoxSdf(ClosedForm):
     half: tuple[float, float, float]
 
     @property
-    def sizes(self) -> tuple[float, ...]:
+    def reach(self) -> tuple[float, ...]:
         return self.half
-
-    @property
-    def bounds(self) -> np.ndarray:
-        """[2, 3] m."""
-        return np.array([[-value for value in self.half], list(self.half)], dtype=np.float64)
 
     @staticmethod
     def measure(points: torch.Tensor, sizes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -212,14 +208,8 @@ class CapsuleSdf(ClosedForm):
     half: float
 
     @property
-    def sizes(self) -> tuple[float, ...]:
-        return self.radius, self.half
-
-    @property
-    def bounds(self) -> np.ndarray:
-        """[2, 3] m."""
-        high = np.array([self.radius, self.radius, self.half + self.radius])
-        return np.stack([-high, high])
+    def reach(self) -> tuple[float, ...]:
+        return self.radius, self.radius, self.half + self.radius
 
     @staticmethod
     def measure(points: torch.Tensor, sizes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -240,14 +230,8 @@ class CylinderSdf(ClosedForm):
     half: float
 
     @property
-    def sizes(self) -> tuple[float, ...]:
-        return self.radius, self.half
-
-    @property
-    def bounds(self) -> np.ndarray:
-        """[2, 3] m."""
-        high = np.array([self.radius, self.radius, self.half])
-        return np.stack([-high, high])
+    def reach(self) -> tuple[float, ...]:
+        return self.radius, self.radius, self.half
 
     @staticmethod
     def measure(points: torch.Tensor, sizes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
