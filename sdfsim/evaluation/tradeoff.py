@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -33,7 +34,7 @@ from sdfsim.dynamics.models.contact_graph import SUBSTEPS
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.baselines import perturbed
-from sdfsim.evaluation.engines import Start, Timing, bullet, dataset_urdf, mujoco, start_of_scene
+from sdfsim.evaluation.engines import Start, Timing, bullet, dataset_urdf, mujoco, start_of_scene, timed
 from sdfsim.evaluation.evaluate import energy_gain, errors
 from sdfsim.evaluation.hard_cases import tossed
 from sdfsim.evaluation.harness import (
@@ -280,15 +281,8 @@ def _time_simulator(setting: Setting, model: Model, shapes: dict[str, Shape], ca
     simulator = Simulator(replace(scene, effects=effects), model, dt=start.dt)
     simulator.rules = replace(simulator.rules, substeps=model.inner or setting.substeps)
     steps = min(TIMED, cases.steps // setting.stride)
-    began = time.perf_counter()
-    next(simulator.steps(1))
-    first_ms = 1e3 * (time.perf_counter() - began)
-    wall, cpu = time.perf_counter(), time.process_time()
-    for _ in simulator.steps(steps - 1):
-        pass
-    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    done = setting.stride * (steps - 1)
-    return Timing(first_ms, 1e3 * wall / done, 1e3 * cpu / done)
+    taken = timed(lambda count: deque(simulator.steps(count), maxlen=0), steps)
+    return Timing(taken.first_ms, taken.wall_ms / setting.stride, taken.cpu_ms / setting.stride)
 
 
 def measure_engine(name: str, substeps: int, off: float, cases: Cases) -> dict[str, Any]:
