@@ -250,7 +250,7 @@ def report_lines(report: dict[str, Any]) -> list[str]:
         *columns(error_rows(report, name=name)),
         "",
         "Errors at a frame alone: translation is the mean over trajectories of the RMSE over bodies",
-        *columns(error_rows(report, name=name, at_frame=True, intervals=False)),
+        *columns(error_rows(report, name=name, at_frame=True)),
         "",
         *columns(quality_rows(report, name=name)),
         "",
@@ -260,20 +260,13 @@ def report_lines(report: dict[str, Any]) -> list[str]:
     ]
 
 
-def error_rows(
-    report: dict[str, Any],
-    *,
-    name: str,
-    at_frame: bool = False,
-    intervals: bool = True,
-    extra: dict[str, dict] | None = None,
-) -> Rows:
-    """Errors at every horizon, the head first: the model, `extra` by name, the teacher again, flight without contact.
+def error_rows(report: dict[str, Any], *, name: str, at_frame: bool = False) -> Rows:
+    """Errors up to every horizon, or at each of `metrics.FRAMES` alone; the head first.
 
-    `at_frame` takes those in a frame alone, at `metrics.FRAMES`; else they are over all steps up to a horizon.
+    Rows are the model, the teacher again, and flight without contact. Intervals go with the horizons.
     """
     again = {f"teacher, {size} m/s off": found for size, found in _perturbed(report).items()}
-    rows = {name: report["model"], **(extra or {}), **again, "ballistic": report["ballistic"]}
+    rows = {name: report["model"], **again, "ballistic": report["ballistic"]}
     longest = max(map(int, report["model"]))
     shown = [h for h in report["model"] if int(h) in (FRAMES if at_frame else (*HORIZONS, longest))]
     head, table = [""], []
@@ -286,7 +279,7 @@ def error_rows(
             found = horizons[steps]["at_frame"] if at_frame else horizons[steps]
             for what, digits in (("translation_rmse", 3), ("rotation_error", 1)):
                 low, high = (f"{end:.{digits}f}" for end in found[f"{what}_95"])
-                cells.append(f"{found[what]:.{digits}f}" + (f" ({low} to {high})" if intervals else ""))
+                cells.append(f"{found[what]:.{digits}f}" + (f" ({low} to {high})" if not at_frame else ""))
         table.append(tuple(cells))
     return [tuple(head), *table]
 

@@ -20,15 +20,11 @@ def bundle(path: Path, data: Path, name: str, folder: Path = BUNDLED) -> dict:
     """Evaluate what `sdfsim train` wrote on the test split of `data`; write `NAME.safetensors` and its card `NAME.md`.
 
     Returns:
-        The evaluation's report; `as_published` are the errors of a paper network that predicts free flight too (None
-        for others).
+        The evaluation's report.
     """
     model = load_model(path)
     report = evaluate(data, model=model, chaos_floor=True)
-    report["as_published"] = None
-    if model.kind == "paper":
-        report["as_published"] = evaluate(data, model=model, free_flight="learned", errors_only=True)["model"]
-    kept = ("model", "ballistic", "as_published", "chaos_floor", "median_survival_s")
+    kept = ("model", "ballistic", "chaos_floor", "median_survival_s")
     kept += ("penetration", "energy_gain", "resting_speed")
     results = {"errors": {what: report[what] for what in kept}, "test_trajectories": report["trajectories"]}
     model = replace(model, name=name, card=model.card | results)
@@ -40,9 +36,8 @@ def bundle(path: Path, data: Path, name: str, folder: Path = BUNDLED) -> dict:
 
 def card_text(model: Model, report: dict) -> str:
     """The model card as Markdown."""
-    card, preset, published = model.card, model.card["preset"], report["as_published"]
+    card, preset = model.card, model.card["preset"]
     parameters = sum(p.numel() for p in model.network.parameters())
-    extra = {"this model, free flight learned too (as published)": published} if published else None
     told = ("recipe", "fps", "seed", "trajectories", "random_solids", "bodies", "engine")
     data = [", ".join(f"{key} {made[key]}" for key in told if made.get(key)) for made in card["data"]]
     cost = {
@@ -71,7 +66,7 @@ def card_text(model: Model, report: dict) -> str:
         f"{report['trajectories']} test trajectories ({report['bodies']} bodies) of the same recipe, all rolled out\n"
         "from their first frame: translation RMSE and mean rotation error; 95 % intervals over trajectories.\n"
         "Ballistic: every body flies on without contact.",
-        markdown(error_rows(report, name=MODEL, extra=extra)),
+        markdown(error_rows(report, name=MODEL)),
         "## Quality of the motion",
         markdown(quality_rows(report, name=MODEL)),
         "\n".join(f"- {line}" for line in notes(report)),
