@@ -10,7 +10,7 @@ import csv
 import importlib
 import io
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -26,6 +26,7 @@ from sdfsim.identify import COLUMNS
 from sdfsim.parallel import StageProgress
 from sdfsim.recording import body_colors, framed, sheet, with_normals
 from sdfsim.run import read_run
+from sdfsim.scene import written
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.scene.scene_file import load_scene
@@ -34,9 +35,6 @@ from sdfsim.shape.mesh import Mesh, convex_hull, wavefront
 from sdfsim.shape.sdf import BoxSdf, CapsuleSdf, ClosedForm, CylinderSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape, own_pieces
 
-DENSITY = 1000.0  # kg/m^3 of a shape on its own, as of a body that a scene says nothing about
-FRICTION = RESTITUTION = 0.5  # likewise
-GRAVITY = (0.0, 0.0, -9.81)  # m/s^2, likewise
 # Concavity relative to the size; and a search a third as long as CoACD's own, which finds pieces as good.
 COACD = {"threshold": 0.05, "mcts_iterations": 60, "mcts_nodes": 10, "resolution": 1000, "seed": 0}
 RATE = 60.0  # USD time codes in a second; programs step through the whole ones
@@ -163,7 +161,9 @@ def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progres
     if scene_file is not None:
         raise SdfsimError(f"{source}: only a run has a scene beside it", "leave --scene away")
     if (source / RECORD_FILE).is_file():
-        scene = _alone(load_shape(source))
+        shape = load_shape(source)
+        moves = "dynamic" if shape.volume > 0 else "static"
+        scene = written.Scene().add(shape.name, asset=source, motion=moves).load(told)
     elif source.suffix.lower() in (".yaml", ".yml"):
         scene = load_scene(source, told, allow_outside=allow_outside)
     else:
@@ -173,29 +173,9 @@ def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progres
     return _take(scene, np.zeros(1), position[None], np.array([body.quat_xyzw for body in scene.bodies])[None])
 
 
-def _alone(shape: Shape) -> Scene:
-    """A shape as the one body of a scene."""
-    moves = shape.volume > 0
-    body = Body(
-        name=shape.name,
-        shape=0,
-        motion="dynamic" if moves else "static",
-        scale=1.0,
-        position=np.zeros(3),
-        quat_xyzw=np.array([0.0, 0.0, 0.0, 1.0]),
-        velocity=np.zeros(3),
-        angular_velocity=np.zeros(3),
-        mass=DENSITY * shape.volume if moves else 0.0,
-        friction=FRICTION,
-        restitution=RESTITUTION,
-    )
-    return Scene((shape,), (body,), np.array(GRAVITY), 0.0)
-
-
 def _take(scene: Scene, time: np.ndarray, position: np.ndarray, quat: np.ndarray) -> Take:
-    colors = np.array(body_colors(scene), dtype=np.uint8)
-    names = _plain_names([body.name for body in scene.bodies])
-    return Take(scene, names, _plain_names([s.name for s in scene.shapes]), colors, time, position, quat)
+    names, shapes = (_plain_names([one.name for one in ones]) for ones in (scene.bodies, scene.shapes))
+    return Take(scene, names, shapes, np.array(body_colors(scene), dtype=np.uint8), time, position, quat)
 
 
 def _plain_names(names: list[str]) -> list[str]:
@@ -564,13 +544,14 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
     # Between bodies of one material the square is the product. Other pairs are told one by one, while they are few:
     # those of few geoms first, since the floor is one.
     pairs = []
-    for i, j in _unlike(scene.bodies, sorted(range(len(geoms)), key=lambda k: len(geoms[k]))):
-        if not allowed[group[i], group[j]]:
+    for i, j in combinations(sorted(range(len(geoms)), key=lambda k: len(geoms[k])), 2):
+        one, other = scene.bodies[i], scene.bodies[j]
+        alike = (one.friction, one.restitution) == (other.friction, other.restitution)
+        if alike or "dynamic" not in (one.motion, other.motion) or not allowed[group[i], group[j]]:
             continue
         if len(pairs) + len(geoms[i]) * len(geoms[j]) > MOST_PAIRS:
             left_out.append("friction and restitution of some unlike bodies: the larger friction of the two counts")
             break
-        one, other = scene.bodies[i], scene.bodies[j]
         surface = _mjcf_surface(one.friction * other.friction, one.restitution * other.restitution, pair=True)
         pairs += [{"geom1": a, "geom2": b, "condim": "3", **surface} for a in geoms[i] for b in geoms[j]]
     contact = _add(root, "contact") if pairs else root
@@ -580,16 +561,6 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
         _add(_add(root, "keyframe"), "key", name="start", qpos=" ".join(places), qvel=" ".join(speeds))
     _write_xml(out, root)
     return Written([out, *shown.values(), *(file for files in cut.values() for file in files)], left_out)
-
-
-def _unlike(bodies: Sequence[Body], order: list[int]) -> Iterator[tuple[int, int]]:
-    """Pairs of bodies with other coefficients than each other, of which one at least is dynamic."""
-    surfaces = [(body.friction, body.restitution) for body in bodies]
-    if len(set(surfaces)) == 1:
-        return
-    for i, j in combinations(order, 2):
-        if surfaces[i] != surfaces[j] and "dynamic" in (bodies[i].motion, bodies[j].motion):
-            yield i, j
 
 
 def _mjcf_surface(friction: float, restitution: float, *, pair: bool = False) -> dict[str, str]:
