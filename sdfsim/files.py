@@ -26,6 +26,11 @@ CONFIG = "config.yaml"
 FREELY, MOST_GROWTH = 2**30, 100
 
 
+def user_cache(name: str) -> Path:
+    """The folder `sdfsim/NAME` in the user's cache folder."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sdfsim" / name
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary path beside `path` to write to; it takes the final name when the block ends without an error.

@@ -12,7 +12,7 @@ from sdfsim.dynamics.bodies import largest_extent
 from sdfsim.dynamics.simulator import pick_device
 from sdfsim.errors import SdfsimError
 from sdfsim.files import check_writable, locked, read_json
-from sdfsim.parallel import Progress, parallel
+from sdfsim.parallel import Progress, parallel, silent
 from sdfsim.scene.scene_file import UNITS
 from sdfsim.shape.baked_grid import grid_certificate
 from sdfsim.shape.fit import FIT_VERSION, Recipe, fit_mesh
@@ -177,7 +177,7 @@ def _verdict(report: dict[str, Any]) -> str:
 def _fit_one(file: Path, folder: Path, options: Options, device: str) -> dict[str, Any]:
     """A report, or the error; whatever happens to one mesh must not stop the others."""
     try:
-        return fit(file, folder, options, device=device, on_progress=lambda fraction, message: None)
+        return fit(file, folder, options, device=device, on_progress=silent)
     except SdfsimError as error:
         return {"error": error.message, "hint": error.hint}
     except Exception as error:

@@ -23,7 +23,7 @@ from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.model import SOLVER, load_model
 from sdfsim.dynamics.step import Rules, step
 from sdfsim.errors import SdfsimError
-from sdfsim.parallel import Progress
+from sdfsim.parallel import Progress, silent
 from sdfsim.run import read_run
 from sdfsim.scene.scene import Scene
 from sdfsim.scene.scene_file import load_scene
@@ -116,7 +116,7 @@ class Identified:
 
 
 def load_recording(
-    path: Path, scene_file: Path | None = None, *, allow_outside: bool = False, on_progress: Progress | None = None
+    path: Path, scene_file: Path | None = None, *, allow_outside: bool = False, on_progress: Progress = silent
 ) -> tuple[Recording, Scene]:
     """A recording of the bodies of a scene that move, and the scene.
 
@@ -201,7 +201,7 @@ def _from_poses(names: list[str], dt: float, origin: np.ndarray, orientation: np
     return Recording(tuple(names), dt, position, turn.numpy(), velocity, angular, known)
 
 
-def identify(recording: Recording, scene: Scene, *, on_progress: Progress | None = None) -> Identified:
+def identify(recording: Recording, scene: Scene, *, on_progress: Progress = silent) -> Identified:
     """Find the coefficients and masses with which the contact solve repeats a recording.
 
     Args:
@@ -215,7 +215,6 @@ def identify(recording: Recording, scene: Scene, *, on_progress: Progress | None
 
     if any(b.motion == "kinematic" for b in scene.bodies):
         raise SdfsimError("bodies on paths: identify works on bodies that move freely and those that are static")
-    tell = on_progress or (lambda fraction, message: None)
     windows = Windows(recording, scene)
     start = windows.start()
     best = start
@@ -226,12 +225,12 @@ def identify(recording: Recording, scene: Scene, *, on_progress: Progress | None
         trial = windows.start(friction, restitution)
         costs.append(float(np.minimum(np.abs(windows.errors(trial)), 10.0).sum()))
         best = trial if costs[-1] == min(costs) else best
-        tell(0.3 * k / len(tried), "a first sweep over friction and restitution")
+        on_progress(0.3 * k / len(tried), "a first sweep over friction and restitution")
     count = [0]
 
     def errors(parameters: np.ndarray) -> np.ndarray:
         count[0] += 1
-        tell(min(0.95, 0.3 + 0.005 * count[0]), f"fit, run {count[0]} of all windows")
+        on_progress(min(0.95, 0.3 + 0.005 * count[0]), f"fit, run {count[0]} of all windows")
         return np.concatenate([windows.errors(parameters), WEAK * (parameters - start)])
 
     slope: Any = lambda parameters: windows.jacobian(parameters, errors)  # noqa: E731

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.errors import SdfsimError
 from sdfsim.files import replacing
-from sdfsim.parallel import Progress
+from sdfsim.parallel import Progress, silent
 from sdfsim.recording import Eye, Place, body_colors, eye_of, framed, sheet, with_normals
 from sdfsim.scene.scene import Scene
 
@@ -33,7 +33,7 @@ _GRID = np.stack(np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
 
 def render(
     scene: Scene | written.Scene, rollout: Rollout, out: Path | str, *, camera: Place | None = None,
-    look_at: Place | None = None, at: float | None = None, on_progress: Progress = lambda fraction, message: None,
+    look_at: Place | None = None, at: float | None = None, on_progress: Progress = silent,
 ) -> None:  # fmt: skip
     """Write a movie (.mp4, H.264, as long as the run) or a picture (.png) of a run.
 

@@ -35,7 +35,7 @@ from sdfsim.files import (
     write_json,
     write_text,
 )
-from sdfsim.parallel import Progress, StageProgress
+from sdfsim.parallel import Progress, StageProgress, silent
 from sdfsim.recording import Place, Playback, eye_of, framed, save_rollout
 from sdfsim.scene.scene import Scene
 from sdfsim.scene.scene_file import load_scene
@@ -209,7 +209,7 @@ def _live(live: Playback, viewer: Viewer, first: Rollout, say: Callable[[str], N
 
 
 def read_run(
-    path: Path, scene_file: Path | None = None, *, allow_outside: bool = False, on_progress: Progress | None = None
+    path: Path, scene_file: Path | None = None, *, allow_outside: bool = False, on_progress: Progress = silent
 ) -> tuple[Scene, Rollout]:
     """A finished or interrupted run, and its scene.
 

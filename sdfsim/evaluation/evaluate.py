@@ -21,8 +21,8 @@ from sdfsim.dynamics.simulator import pick_device
 from sdfsim.dynamics.step import FreeFlight
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.baselines import ballistic, chaos_floor
-from sdfsim.evaluation.harness import Progress
 from sdfsim.evaluation.penetration import EVERY, Solid, exact_solids, penetration
+from sdfsim.parallel import Progress, silent
 from sdfsim.shape.shape import Shape
 from sdfsim.training.contact_cache import inner_steps
 
@@ -46,7 +46,7 @@ def evaluate(
     substeps: int | None = None,
     chaos_floor: bool = False,
     errors_only: bool = False,
-    on_progress: Progress | None = None,
+    on_progress: Progress = silent,
 ) -> dict:
     """Roll a model out from the first frame of every trajectory and compare, beside the ballistic baseline.
 
@@ -75,7 +75,6 @@ def evaluate(
     Raises:
         SdfsimError: no or unreadable trajectories or shapes; exit code 3 when a rollout is not finite.
     """
-    tell = on_progress or (lambda fraction, message: None)
     place = pick_device(device)
     used = (model if isinstance(model, Model) else load_model(model)).to(place)
     if free_flight == "learned" and used.kind != "paper":
@@ -93,7 +92,7 @@ def evaluate(
     inner, seconds = substeps or stride * inner_steps(as_recorded[0].dt, substep), 0.0
     used = replace(used, inner=substeps or used.inner)
     for k, group in enumerate(groups):
-        tell(0.8 * k / len(groups), f"{used.name}: batch {k + 1} of {len(groups)}, {longest} steps")
+        on_progress(0.8 * k / len(groups), f"{used.name}: batch {k + 1} of {len(groups)}, {longest} steps")
         started = time.perf_counter()
         contenders["model"] += roll_out(
             used, group, known, longest, place, free_flight, substeps=inner, as_teacher=True
@@ -102,7 +101,7 @@ def evaluate(
         contenders["ballistic"] += ballistic(used, group, known, longest)
     again, floor_report = {}, {}
     if chaos_floor:
-        tell(0.8, "teacher, from starts that differ slightly")
+        on_progress(0.8, "teacher, from starts that differ slightly")
         again, floor_report = _teacher_again(data, split, longest, stride)
     scenes = [scene_of([t], [0], shapes)[0] for t in recorded]
     report = {
@@ -123,10 +122,10 @@ def evaluate(
         "median_survival_s": {who: _survival(motions, recorded) for who, motions in (contenders | again).items()},
     }
     if not errors_only:
-        tell(0.9, "penetration, energy and rest")
+        on_progress(0.9, "penetration, energy and rest")
         solids = exact_solids(data, shapes)
         report |= _quality(contenders["model"], recorded, solids)
-    tell(1.0, "done")
+    on_progress(1.0, "done")
     return report
 
 

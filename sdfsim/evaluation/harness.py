@@ -21,7 +21,7 @@ import torch
 import sdfsim
 from sdfsim.errors import SdfsimError
 from sdfsim.files import digest, read_json, replacing, write_json
-from sdfsim.parallel import Progress, parallel
+from sdfsim.parallel import Progress, parallel, silent
 
 Results = dict[tuple[str, str], dict[str, Any]]
 FAILURES = (SdfsimError, RuntimeError, MemoryError)
@@ -50,7 +50,7 @@ def measure(
     folder: Path,
     *,
     where: Literal["here", "cores", "fresh"] = "here",
-    on_progress: Progress | None = None,
+    on_progress: Progress = silent,
 ) -> Results:
     """The results of all jobs by (case, method): kept ones where they still hold, new ones elsewhere.
 
@@ -62,7 +62,6 @@ def measure(
         where: "here", one after the other in this process; "cores", on all of them, the longest first; "fresh", each in
             a process of its own, whose peak memory is then the job's.
     """
-    tell = on_progress or (lambda fraction, message: None)
     files = [folder / job.method / f"{job.case}.json" for job in jobs]
     marks = [digest(job.content, sdfsim.__version__) for job in jobs]
     results = {}
@@ -80,8 +79,8 @@ def measure(
         job = todo[index][0]
         results[job.case, job.method] = result
         done += job.weight
-        tell(done / total, f"{job.case} with {job.method}")
-    tell(1.0, f"{len(todo)} results measured, {len(jobs) - len(todo)} kept from before")
+        on_progress(done / total, f"{job.case} with {job.method}")
+    on_progress(1.0, f"{len(todo)} results measured, {len(jobs) - len(todo)} kept from before")
     return {(job.case, job.method): results[job.case, job.method] for job in jobs}
 
 

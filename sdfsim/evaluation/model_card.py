@@ -36,36 +36,24 @@ def bundle(path: Path, data: Path, name: str, folder: Path = BUNDLED) -> dict:
 
 def card_text(model: Model, report: dict) -> str:
     """The model card as Markdown."""
-    card, preset = model.card, model.card["preset"]
-    parameters = sum(p.numel() for p in model.network.parameters())
+    card, parameters = model.card, sum(p.numel() for p in model.network.parameters())
     told = ("recipe", "fps", "seed", "trajectories", "random_solids", "bodies", "engine")
     data = [", ".join(f"{key} {made[key]}" for key in told if made.get(key)) for made in card["data"]]
-    cost = {
-        "parameters": f"{parameters:,}",
-        "preset": card["preset_name"],
-        "seed": str(card.get("seed", 0)),
-        "optimiser steps": f"{card['optimiser_steps']:,}",
-        "batch": str(preset["batch"]),
-        "time": f"{card['seconds']:,} s = {card['seconds'] / 3600:.2f} h",
-        "where": f"{card['device']}, {card.get('processes', 1)} process(es) of {card['threads']} thread(s)",
-    }
     ranges = [(name.replace("_", " "), f"{low:.3g}", f"{high:.3g}") for name, (low, high) in model.ranges.items()]
     parts = [
         f"# {model.name}",
-        f"The *{model.kind}* network, {parameters:,} parameters, {json.dumps(preset['config'])}; step {model.dt} s at\n"
-        f"{model.gravity:g} m/s^2 for bodies of {model.length:.2f} m (the middle of the sizes it has seen), rescaled\n"
-        "to any scene (Froude).",
+        f"The *{model.kind}* network, {parameters:,} parameters, {json.dumps(card['preset']['config'])};\n"
+        f"step {model.dt} s at {model.gravity:g} m/s^2 for bodies of {model.length:.2f} m, rescaled to any scene (Froude).",
         "## Training",
         "\n".join(f"- `sdfsim dataset`: {line}" for line in data),
-        "Surfaces and nodes are those of the convex pieces that the engine collides.",
-        markdown([tuple(cost), tuple(cost.values())]),
+        f"Preset {card['preset_name']}, seed {card.get('seed', 0)}: {card['optimiser_steps']:,} steps of\n"
+        f"{card['preset']['batch']} frames in {card['seconds']:,} s on {card['device']}.",
         "## Ranges it has seen",
         markdown([("quantity", "from", "to"), *ranges]),
         "Friction and restitution are products of two bodies' coefficients; sizes in m, speeds in m/s.",
         "## Errors",
-        f"{report['trajectories']} test trajectories ({report['bodies']} bodies) of the same recipe, all rolled out\n"
-        "from their first frame: translation RMSE and mean rotation error; 95 % intervals over trajectories.\n"
-        "Ballistic: every body flies on without contact.",
+        f"{report['trajectories']} test trajectories ({report['bodies']} bodies): translation RMSE and mean rotation\n"
+        "error, with 95 % intervals over trajectories. Ballistic: every body flies on without contact.",
         markdown(error_rows(report, name=MODEL)),
         "## Quality of the motion",
         markdown(quality_rows(report, name=MODEL)),

@@ -20,8 +20,9 @@ from sdfsim.dynamics.simulator import SimulationError, Simulator, pick_device
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.engines import bullet, rollout_motion, shape_urdf, start_of_scene
 from sdfsim.evaluation.hard_cases import GROUPS, Case, Figure, Run, cases, ran_away
-from sdfsim.evaluation.harness import Job, Line, Panel, Progress, Results, check_matplotlib, draw, markdown, measure
+from sdfsim.evaluation.harness import Job, Line, Panel, Results, check_matplotlib, draw, markdown, measure
 from sdfsim.files import locked, write_json, write_text
+from sdfsim.parallel import Progress, silent
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.sdf import PlaneSdf
 
@@ -64,7 +65,7 @@ def stress(
     shapes: Path | None = None,
     device: str = "cpu",
     record: Record | None = None,
-    on_progress: Progress | None = None,
+    on_progress: Progress = silent,
 ) -> Study:
     """Run every case that `out` does not hold the result of yet; it holds results/, recordings/ and the engine's files.
 

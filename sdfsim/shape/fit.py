@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from sdfsim.errors import SdfsimError
-from sdfsim.parallel import Progress, choose_threads
+from sdfsim.parallel import Progress, choose_threads, silent
 from sdfsim.shape.distance import DistanceOracle, MeshDistance, PiecesDistance
 from sdfsim.shape.far_field import BOX
 from sdfsim.shape.fit_metrics import SIGN_FROM, certify
@@ -136,7 +136,7 @@ def fit_mesh(
     seed: int = 0,
     cap: bool = False,
     thicken: float | None = None,
-    on_progress: Progress | None = None,
+    on_progress: Progress = silent,
     device: torch.device | str = "cpu",
 ) -> Shape:
     """Fit the compact SDF network to the solid that a triangle mesh bounds (see `solidify`).
@@ -207,7 +207,7 @@ def fit_pieces(
         own = hull_nodes(vertices, round(OWN_SHARE * nodes))
         return thin(sample_nodes(sdf), nodes, keep=thin(edges, round(EDGE_SHARE * nodes), keep=own))
 
-    sdf, points, certificate = _fit(oracle, "default", None, 0, pick, None, "cpu")
+    sdf, points, certificate = _fit(oracle, "default", None, 0, pick, silent, "cpu")
     single = len(pieces) == 1 and is_closed(pieces[0])
     volume, com, inertia = mass_properties(pieces[0]) if single else mass_properties_of_sdf(oracle)
     mesh = display if display is not None else clean(oracle.surface, name=name)
@@ -222,15 +222,14 @@ def _fit(
     budget: float | None,
     seed: int,
     pick: Callable[[Sdf], np.ndarray],
-    on_progress: Progress | None,
+    on_progress: Progress,
     device: torch.device | str,
 ) -> tuple[MlpSdf, np.ndarray, dict]:
     """The network, nodes [K, 3] m as `pick` takes them from it, and the certificate."""
     if budget is not None and not budget > 0:
         raise SdfsimError(f"the budget of a fit must be > 0 seconds (got {budget})")
     started, plan = time.monotonic(), PLANS[recipe]
-    tell = on_progress or (lambda fraction, message: None)
-    tell(0.0, "sampling distances")
+    on_progress(0.0, "sampling distances")
     run = _Run(oracle, plan, seed, torch.device(device))
     if run.device.type == "cpu":
         choose_threads(partial(run.differentiate, torch.arange(plan.batch) % plan.pool))
@@ -244,15 +243,15 @@ def _fit(
             left = budget - min(0.1 * budget + RESERVE, 0.5 * budget) - (time.monotonic() - started)
             run.hurry(run.step + int(left * run.step / (time.monotonic() - looping)))
         last = max(run.stop, 1)
-        tell(0.97 * run.step / last, f"step {run.step} of {last}, error {near:.2g} near, {far:.2g} in the box")
-    tell(0.98, "measuring")
+        on_progress(0.97 * run.step / last, f"step {run.step} of {last}, error {near:.2g} near, {far:.2g} in the box")
+    on_progress(0.98, "measuring")
     sdf = run.result()
     nodes = pick(sdf)
     certificate = certify(sdf, oracle, nodes=nodes)
     seconds = round(time.monotonic() - started, 2)
     certificate.update(recipe=recipe, seed=seed, steps=min(run.step, run.stop), seconds=seconds)
     but = certificate["reason"] or certificate["caveat"]
-    tell(1.0, f"fitted, but {but}" if but else "fitted")
+    on_progress(1.0, f"fitted, but {but}" if but else "fitted")
     return sdf, nodes, certificate
 
 

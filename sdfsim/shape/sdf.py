@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from sdfsim.errors import SdfsimError
-from sdfsim.parallel import Progress
+from sdfsim.parallel import Progress, silent
 from sdfsim.shape.distance import MeshDistance
 from sdfsim.shape.far_field import BOX, in_metres
 from sdfsim.shape.mesh import Frame, Mesh, normal_frame
@@ -345,7 +345,7 @@ def sample_grid(
     distance: Callable[[np.ndarray], tuple[Any, ...]],
     bounds: np.ndarray,
     resolution: int,
-    on_progress: Progress | None = None,
+    on_progress: Progress = silent,
 ) -> GridSdf:
     """Sample a signed distance on a voxel grid.
 
@@ -365,14 +365,13 @@ def sample_grid(
     axis = np.linspace(-BOX, BOX, resolution)
     values = np.empty((resolution, resolution, resolution), dtype=np.float32)
     layers = max(1, SAMPLED // resolution**2)
-    tell = on_progress or (lambda fraction, message: None)
     for start in range(0, resolution, layers):
-        tell(start / resolution, "sampling the distance")
+        on_progress(start / resolution, "sampling the distance")
         some = axis[start : start + layers]
         points = np.stack(np.meshgrid(some, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
         found = np.asarray(distance(frame.outward(points))[0])
         values[start : start + layers] = (found / frame.scale).reshape(len(some), resolution, resolution)
-    tell(1.0, "sampled")
+    on_progress(1.0, "sampled")
     return GridSdf(torch.from_numpy(values), frame, np.asarray(bounds, dtype=np.float64))
 
 

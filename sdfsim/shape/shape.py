@@ -14,8 +14,8 @@ import numpy as np
 import torch
 
 from sdfsim.errors import SdfsimError
-from sdfsim.files import read_json, replacing, write_json
-from sdfsim.parallel import Progress
+from sdfsim.files import read_json, replacing, user_cache, write_json
+from sdfsim.parallel import Progress, silent
 from sdfsim.shape import primitives
 from sdfsim.shape.distance import MeshDistance
 from sdfsim.shape.mass import mass_properties_of_sdf
@@ -317,7 +317,7 @@ def with_sdf(shape: Shape, kind: SdfKind, *, resolution: int = DEFAULT_RESOLUTIO
 
 
 def sdf_of_mesh(
-    mesh: Mesh, kind: Literal["grid", "mesh"], resolution: int, on_progress: Progress | None = None
+    mesh: Mesh, kind: Literal["grid", "mesh"], resolution: int, on_progress: Progress = silent
 ) -> tuple[Sdf, dict]:
     """A mesh's exact SDF or a grid of it, and what a shape's `source` says about it. Raises as `with_sdf` does."""
     if kind == "mesh":
@@ -354,7 +354,7 @@ def with_wall(shape: Shape, wall: float) -> Shape:
 def shape_from_mesh(
     path: str | Path, cache_dir: str | Path | None = None, *, name: str | None = None, units: float = 1.0,
     cap: bool = False, thicken: float | None = None, sdf: SdfKind = "mlp", resolution: int = DEFAULT_RESOLUTION,
-    on_progress: Progress | None = None,
+    on_progress: Progress = silent,
 ) -> Shape:  # fmt: skip
     """The shape of a mesh file: made on first use, then taken from a cache keyed by what the file describes.
 
@@ -383,7 +383,7 @@ def shape_from_mesh(
 
 def shape_from_primitive(
     kind: str, size: float = 1.0, cache_dir: str | Path | None = None, *, name: str | None = None,
-    sdf: SdfKind = "mlp", resolution: int = DEFAULT_RESOLUTION, on_progress: Progress | None = None,
+    sdf: SdfKind = "mlp", resolution: int = DEFAULT_RESOLUTION, on_progress: Progress = silent,
 ) -> Shape:  # fmt: skip
     """The shape of a procedural mesh of `primitives.PRIMITIVES`, made on first use and cached.
 
@@ -407,7 +407,7 @@ def shape_from_primitive(
 
 def mesh_shape(
     mesh: Mesh, *, name: str, kind: Literal["grid", "mesh"], cap: bool = False, thicken: float | None = None,
-    resolution: int = DEFAULT_RESOLUTION, on_progress: Progress | None = None,
+    resolution: int = DEFAULT_RESOLUTION, on_progress: Progress = silent,
 ) -> Shape:  # fmt: skip
     """The shape of a mesh (metres) without any fit: its exact SDF or a grid of it, nodes and mass as a fit has them.
 
@@ -426,12 +426,10 @@ def _cached(
         return mesh_shape(mesh, name=name, kind=kind, **how)
     from sdfsim.shape.fit import FIT_VERSION, fit_mesh
 
-    if cache_dir is None:
-        cache_dir = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sdfsim" / "shapes"
     variant = "-cap" if how.get("cap") else ""
     variant += "" if how.get("thicken") is None else f"-thick{how['thicken']:g}"
     variant += f"-grid{resolution}" if kind == "grid" else ""
-    folder = Path(cache_dir) / f"{key[:24]}{variant}-{FIT_VERSION}.{FORMAT_VERSION}"
+    folder = Path(cache_dir or user_cache("shapes")) / f"{key[:24]}{variant}-{FIT_VERSION}.{FORMAT_VERSION}"
     if folder.is_dir():
         try:
             return load_shape(folder)

@@ -31,7 +31,11 @@ def test_a_trained_model_is_bundled_with_its_errors(cube_data, trained, tmp_path
     assert len(first) == 6 and first[-1].strip().endswith(" s")
     assert f"| this model | {report['model']['50']['translation_rmse']:.3f} (" in card
     assert f"| teacher, 1e-3 m/s off | {_error(report, '1e-3'):.3f} (" in card
-    assert "m, 50 steps = 1 s" in card and "penetration 95 %" in card and "| tiny | 2 | 20 | 16 |" in card
+    assert (
+        "m, 50 steps = 1 s" in card
+        and "penetration 95 %" in card
+        and "Preset tiny, seed 2: 20 steps of\n16 frames" in card
+    )
     assert "recipe movi-b" in card and "seed 1" in card
 
 
