@@ -108,7 +108,6 @@ def export(
         source: a run folder or its rollout.npz, a scene.yaml, or a Shape folder.
         out: file to write, with one of the endings of `FORMATS`; its folder is made if missing.
         scene_file: of a run, None for the one that it was made from.
-        allow_outside: whether the scene may name files outside of its own folder.
 
     Returns:
         A report: format, bodies, frames, files and left_out.

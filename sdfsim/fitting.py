@@ -38,12 +38,6 @@ class Options:
 def fit(mesh_file: Path, out: Path, options: Options, *, device: str, on_progress: Progress) -> dict[str, Any]:
     """Fit a mesh file and write the shape folder `out`.
 
-    Args:
-        mesh_file: to be fitted.
-        out: shape folder.
-        options: of the fit.
-        device: cpu, cuda or auto.
-
     Returns:
         Folder, volume, number of nodes, what was done to the mesh, the certificate, and in `failed_checks` whether it
         was missed.
@@ -121,12 +115,6 @@ def fit_many(
     """Fit many mesh files into the shape folders `out`/NAME: in processes on CPUs, one after the other on a GPU.
 
     What an earlier call has fitted in the same way is kept, so that a call that was cut off is finished by the next.
-
-    Args:
-        meshes: files by name.
-        out: folder of shape folders.
-        options: of each fit.
-        device: cpu, cuda or auto.
 
     Returns:
         `shapes`, a report by name: that of `fit`, or the `error` that kept a mesh from being fitted; and in

@@ -124,7 +124,6 @@ def load_recording(
         path: a run folder, a `rollout.npz`, or a CSV of poses (`COLUMNS`), whose positions are those of
             the shapes' own origins, as in a scene file.
         scene_file: its scene; of a run the one that it was made from, if this is None.
-        allow_outside: whether the scene may name files outside of its own folder.
 
     Raises:
         SdfsimError: no scene, unreadable files, or a recording that is not of this scene.
@@ -205,7 +204,6 @@ def identify(recording: Recording, scene: Scene, *, on_progress: Progress = sile
     """Find the coefficients and masses with which the contact solve repeats a recording.
 
     Args:
-        recording: what happened.
         scene: shapes, sizes, masses and gravity; the coefficients of bodies that do not move are taken as they are.
 
     Raises:
@@ -242,10 +240,6 @@ class Windows:
     """All windows of a recording as one set of bodies, each window a world of its own.
 
     Parameters are friction and restitution of every body that touches another, then the logarithms of mass ratios.
-
-    Args:
-        recording: what happened.
-        scene: of it.
     """
 
     def __init__(self, recording: Recording, scene: Scene) -> None:

@@ -192,9 +192,6 @@ def save_rollout(
     """Write `rollout` as a rerun recording: to a temporary name first, then renamed.
 
     Args:
-        scene: of the run.
-        rollout: the run.
-        path: .rrd to write.
         camera, look_at: [3] m each, of the first view; None: see `eye_of`.
 
     Raises:
@@ -241,8 +238,6 @@ def save_reconstruction(
     With `trust` the viewer has a second tab that shows it in place of the surface.
 
     Args:
-        path: .rrd to write.
-        photos: posed cameras.
         points: [P, 3] m, sparse points.
         colors: [P, 3] uint8 RGB, or None.
         mesh: the reconstructed surface, if it is there already.
@@ -343,7 +338,6 @@ def eye_of(
     """From where a scene is looked at; what is not given is chosen so that all of it is in sight.
 
     Args:
-        scene: what is looked at.
         motion: how it moves, where that is known.
         camera: [3] m, where the eye is.
         look_at: [3] m, what it looks at.

@@ -38,9 +38,6 @@ def render(
     """Write a movie (.mp4, H.264, as long as the run) or a picture (.png) of a run.
 
     Args:
-        scene: of the run.
-        rollout: the run.
-        out: file to write.
         camera: [3] m, where it is; None: where all of the motion is in sight.
         look_at: [3] m, the point in its middle; None: the middle of all that moves or stands.
         at: s, the time of a picture (default: the end).
@@ -119,7 +116,6 @@ class _Cast:
     """The triangles of all bodies where they are now.
 
     Args:
-        models: of the bodies.
         places, turns: [B, 3] m and [B, 3, 3].
 
     Attributes:
@@ -169,8 +165,6 @@ class Studio:
     """A scene with a camera and a sun, of which pictures are taken.
 
     Args:
-        scene: what is shown.
-        eye: from where.
         radius: m, of all that is shown.
 
     Attributes:

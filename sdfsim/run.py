@@ -75,16 +75,13 @@ def simulate(
     """Simulate a scene and write config.yaml, report.json, rollout.npz and (unless `viewer` is none) rollout.rrd.
 
     Args:
-        scene_file: scene.yaml.
         out: run folder; made if missing, an earlier run in it is replaced, unless it is to `resume`.
         model: bundled name or path (None: what the scene says).
         seconds: simulated time in s (None: the scene's duration).
         seed: None: the scene's.
         viewer: where to watch: not at all, later from the file, or live in a window or a page.
-        device: cpu, cuda or auto.
         say: called with a line for the person: what was replaced, where the page of `viewer` web is.
         bind: address of this machine that a live viewer listens on.
-        allow_outside: whether the scene may name files outside of its own folder.
         until_settled: end as soon as everything has come to rest.
         resume: go on with the run in `out` that was interrupted; from the start where there is none. A finished one is
             left as it is, and its report is returned.
@@ -216,7 +213,6 @@ def read_run(
     Args:
         path: run folder, or the `rollout.npz` in one.
         scene_file: its scene; None: the one that the run was made from.
-        allow_outside: whether the scene may name files outside of its own folder.
 
     Raises:
         SdfsimError: no run, no scene, or another scene than that of the run.
@@ -349,10 +345,6 @@ def _number(value: Any) -> float | None:
 
 class Checkpoint:
     """What is kept of one run: its frames in parts, the state that the last part leads to, and how long all has rested.
-
-    Args:
-        folder: of the run.
-        simulator: at its start.
 
     Attributes:
         identity: of the run, see the function of this name.

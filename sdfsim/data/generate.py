@@ -42,16 +42,11 @@ def make_dataset(
     (see `split_of`), so that those of validation and test are never trained on.
 
     Args:
-        recipe: a name in `RECIPES`.
-        out: dataset folder.
-        trajectories: how many.
         shapes: folder of shapes (see `origins`) or name of a public set (see `public_folder`); movi-b takes NAME/
             folders alone.
         random_solids: how many of PyBullet's random solids there are beside them.
         bodies: how many move, instead of the recipe's range (bowl and pile).
         fps: recorded frames a second, in `RATES`.
-        seed: of the dataset.
-        split: "train", "validation" or "test".
 
     Returns:
         A report: dataset, split, trajectories, made_now, shapes (how many the split draws from), left_out (name ->
@@ -122,9 +117,6 @@ def make_trajectory(recipe: str, rng: np.random.Generator, cast: Cast, fps: int 
     """One trajectory of `STEPS` steps, with velocities as the engine gives them.
 
     Args:
-        recipe: a name in `RECIPES`.
-        rng: what the scene is drawn from.
-        cast: shapes and scenery.
         fps: recorded frames a second, in `RATES`.
 
     Raises:

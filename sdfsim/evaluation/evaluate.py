@@ -51,10 +51,8 @@ def evaluate(
     """Roll a model out from the first frame of every trajectory and compare, beside the ballistic baseline.
 
     Args:
-        data: a dataset folder (its `split`, else the trajectories in it).
         model: bundled name, path or `Model`.
         steps: how far; errors are reported at the horizons of `HORIZONS` and `FRAMES` up to there, and there.
-        split: which part of the dataset.
         device: "cpu", "cuda" or "auto".
         free_flight: "exact" or (paper network) "learned".
         stride: recorded steps in a step of the model; errors are then those of every so many-th frame.

@@ -43,7 +43,7 @@ def card_text(model: Model, report: dict) -> str:
     parts = [
         f"# {model.name}",
         f"The *{model.kind}* network, {parameters:,} parameters, {json.dumps(card['preset']['config'])};\n"
-        f"step {model.dt} s at {model.gravity:g} m/s^2 for bodies of {model.length:.2f} m, rescaled to any scene (Froude).",
+        f"step {model.dt} s at {model.gravity:g} m/s^2 for bodies of {model.length:.2f} m, rescaled to any scene.",
         "## Training",
         "\n".join(f"- `sdfsim dataset`: {line}" for line in data),
         f"Preset {card['preset_name']}, seed {card.get('seed', 0)}: {card['optimiser_steps']:,} steps of\n"

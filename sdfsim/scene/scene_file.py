@@ -644,10 +644,6 @@ def _nobody(name: str, known: Iterable[str]) -> str:
 class Document:
     """The YAML of a file, and the faults found in it, each with its line.
 
-    Args:
-        path: of the file.
-        text: what is in it; None reads it.
-
     Attributes:
         data: dicts, lists, texts and `Numeral`s; `NOTHING` where a key has no value.
 
@@ -736,9 +732,7 @@ def read_scene(path: Path, *, allow_outside: bool = False, text: str | None = No
     """Read and check a scene file; nothing is loaded yet.
 
     Args:
-        path: of the file.
         allow_outside: whether paths in it may lead out of its folder.
-        text: what is in it; None reads it.
 
     Returns:
         What it says, and its document, to tell of faults that show only later.

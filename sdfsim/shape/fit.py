@@ -146,14 +146,10 @@ def fit_mesh(
 
     Args:
         mesh: metres; or its distance oracle, when there is one already.
-        name: of the shape.
         recipe: "default" (waves, 64 wide, SOAP, seconds), "quick" (the same in 2,000 steps at most, not 5,000) or
             "paper" (ReLU, 128 wide, Adam 1e-5, 400k steps).
         budget: seconds of training at most; the schedule is shortened to fit.
-        seed: of sampling and initialisation.
-        cap: close openings of any size.
         thicken: m; the solid is all within half of this distance from the mesh instead.
-        device: to train on.
 
     Returns:
         Shape whose `certificate` tells the errors and whether it is usable (`passed`); what was done to the mesh is

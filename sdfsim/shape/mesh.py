@@ -289,10 +289,6 @@ def clean(mesh: Mesh, *, name: str = "mesh") -> Mesh:
 
     Of two faces back to back none stays where the rest is closed without them (a wall between touching cells).
 
-    Args:
-        mesh: metres.
-        name: how messages call it.
-
     Raises:
         SdfsimError: no faces (before or after), vertices that are not finite or absurdly far, or indices out of range.
     """

@@ -298,7 +298,6 @@ def with_sdf(shape: Shape, kind: SdfKind, *, resolution: int = DEFAULT_RESOLUTIO
         shape: any but a plane; "grid" and "mesh" are made from its mesh, whatever its SDF was.
         kind: "mlp" (the shape as it is, which must have a network), "grid" (samples of the exact distance to the
             mesh, see `sample_grid`) or "mesh" (that distance itself).
-        resolution: of a grid, samples along each side.
 
     Returns:
         Shape without a certificate, since nothing was fitted; its `source` notes the kind as `sdf`.
@@ -359,14 +358,10 @@ def shape_from_mesh(
     """The shape of a mesh file: made on first use, then taken from a cache keyed by what the file describes.
 
     Args:
-        path: a mesh file.
         cache_dir: where shapes are kept; by default `sdfsim/shapes` in the user's cache folder.
-        name: by default the file's.
         units: metres per unit of the file.
-        cap: close openings of any size.
         thicken: m; a thickness for an open sheet.
         sdf: "mlp" fits the network; "grid" and "mesh" fit nothing (see `mesh_shape`).
-        resolution: of a grid, samples along each side.
 
     Raises:
         SdfsimError: the mesh cannot be used.
@@ -467,7 +462,6 @@ def analytic_shape(
         radius: of the sphere, capsule or cylinder, m.
         height: of the capsule, its caps included, or cylinder, both along z; m.
         size: (x, y, z) full extents of the box, m.
-        name: by default the kind.
 
     Returns:
         Shape with exact mass properties (per unit density; those of the plane are 0), a mesh for display (of the

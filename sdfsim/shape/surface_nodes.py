@@ -30,7 +30,6 @@ def sample_nodes(sdf: Sdf, *, grid: int = DEFAULT_GRID, voxel: float = VOXEL) ->
     Lengths are relative to the largest extent of `sdf.bounds` (the frame in which the solid is within [-0.5, 0.5]).
 
     Args:
-        sdf: bounded.
         grid: points along each side of the sampling cube [-0.7, 0.7]^3.
         voxel: edge of the downsampling voxels, normalised; the point nearest a voxel's middle stays.
 
@@ -82,7 +81,6 @@ def thin(points: np.ndarray, count: int, *, keep: np.ndarray | None = None) -> n
 
     Args:
         points: [P, 3] candidates.
-        count: how many points to return at most.
         keep: [Q, 3] points that come first; when they alone exceed `count` they are thinned themselves.
 
     Returns:
@@ -126,7 +124,6 @@ def edge_nodes(piece: np.ndarray, spacing: float, sharp: float = SHARP) -> np.nd
     Two polyhedra often touch edge against edge, which their corners alone do not see.
 
     Args:
-        piece: [V, 3] m, its corners.
         spacing: m, between points at most; edges shorter than this get none.
         sharp: cosine of the angle between the normals of the two faces, above which an edge counts as flat.
 

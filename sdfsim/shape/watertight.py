@@ -84,8 +84,6 @@ def solidify(mesh: Mesh, *, name: str = "mesh", cap: bool = False, thicken: floa
 
     Args:
         mesh: metres, of any kind.
-        name: how messages call it.
-        cap: close openings of any size.
         thicken: m; the solid is all within half of this distance from the mesh instead.
 
     Raises:
