@@ -11,9 +11,8 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import torch
+from scipy.spatial.transform import Rotation
 
-from sdfsim.dynamics import pose
 from sdfsim.dynamics.memory import PHASES
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.errors import SdfsimError
@@ -407,7 +406,7 @@ def framed(scene: Scene, motion: Rollout | None = None) -> tuple[np.ndarray, flo
 
 def _turned(vectors: np.ndarray, quat_xyzw: np.ndarray) -> np.ndarray:
     """Vectors [..., 3] turned by a unit quaternion [4]."""
-    return vectors @ pose.to_matrix(torch.from_numpy(quat_xyzw)).numpy().T
+    return Rotation.from_quat(quat_xyzw).apply(vectors)
 
 
 def _shaded(rr: Any, mesh: Mesh, color: tuple[int, ...]) -> rr.Mesh3D:

@@ -77,7 +77,7 @@ def evaluate(
     used = (model if isinstance(model, Model) else load_model(model)).to(place)
     if free_flight == "learned" and used.kind != "paper":
         raise SdfsimError("free_flight 'learned' exists for the paper network only", "give a model of that kind")
-    recorded, shapes = _load(data, split)
+    recorded, shapes = load_recorded(data, split)
     longest = min(steps, *(len(t.position) - 1 for t in recorded))
     longest -= longest % stride
     as_recorded = [first_frames(t, longest + 1) for t in recorded]
@@ -170,9 +170,11 @@ def _compared(motion: Trajectory, truth: Trajectory, frames: slice) -> tuple[flo
     )
 
 
-def _load(data: Path, split: str, *, as_recorded: bool = False) -> tuple[Motions, dict[str, Shape]]:
+def load_recorded(
+    data: Path, split: str, *, most: int | None = None, as_recorded: bool = False
+) -> tuple[Motions, dict[str, Shape]]:
     """Trajectories in which something moves, those that can run together side by side, and their shapes."""
-    recorded = [Trajectory.load(f, as_recorded=as_recorded) for f in trajectory_files(data, split)]
+    recorded = [Trajectory.load(f, as_recorded=as_recorded) for f in trajectory_files(data, split)[:most]]
     recorded = [t for group in batches(recorded) for t in group if not t.static.all()]
     if not recorded:
         raise SdfsimError(f"{data}: nothing moves in any trajectory")
@@ -183,7 +185,7 @@ def _load(data: Path, split: str, *, as_recorded: bool = False) -> tuple[Motions
 
 def _teacher_again(data: Path, split: str, steps: int, stride: int) -> tuple[dict[str, Motions], dict]:
     """The teacher's motions from perturbed starts by "teacher NAME", and what the report says of them."""
-    recorded = [first_frames(t, stride * steps + 1) for t in _load(data, split, as_recorded=True)[0]]
+    recorded = [first_frames(t, stride * steps + 1) for t in load_recorded(data, split, as_recorded=True)[0]]
     try:
         again = chaos_floor(data, recorded, stride * steps)
     except SdfsimError as error:

@@ -16,16 +16,7 @@ import torch
 
 import sdfsim
 from sdfsim.data.batching import scene_of
-from sdfsim.data.dataset import (
-    FLOOR,
-    Trajectory,
-    check_alike,
-    floor_of,
-    home_of,
-    load_shapes,
-    read_info,
-    trajectory_files,
-)
+from sdfsim.data.dataset import FLOOR, Trajectory, check_alike, floor_of, home_of, read_info
 from sdfsim.data.pybullet_sim import DT, SUBSTEP
 from sdfsim.data.replay import every, first_frames, roll_out
 from sdfsim.dynamics.froude import scene_units
@@ -35,7 +26,7 @@ from sdfsim.dynamics.simulator import Simulator
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.baselines import perturbed
 from sdfsim.evaluation.engines import Start, Timing, bullet, dataset_urdf, mujoco, start_of_scene, timed
-from sdfsim.evaluation.evaluate import energy_gain, errors
+from sdfsim.evaluation.evaluate import energy_gain, errors, load_recorded
 from sdfsim.evaluation.hard_cases import tossed
 from sdfsim.evaluation.harness import (
     Job,
@@ -127,16 +118,13 @@ def load_cases(data: Path, *, quick: bool) -> Cases:
     Raises:
         SdfsimError: no or unreadable trajectories or shapes, or recordings of different steps or gravities.
     """
-    files = trajectory_files(data, "test")[: MOST_QUICK if quick else MOST]
-    starts = [t for t in map(Trajectory.load, files) if not t.static.all()]
+    most = MOST_QUICK if quick else MOST
     # The engine starts again from its own velocities, others from those at the instants of the positions.
-    recorded = [t for f in files if not (t := Trajectory.load(f, as_recorded=True)).static.all()]
-    if not recorded:
-        raise SdfsimError(f"{data}: nothing moves in any trajectory")
+    recorded, shapes = load_recorded(data, "test", most=most, as_recorded=True)
+    starts, _ = load_recorded(data, "test", most=most)
     check_alike(str(data), recorded)
     longest = min(STEPS_QUICK if quick else STEPS, *(len(t.position) - 1 for t in recorded))
     recorded = [first_frames(t, longest + 1) for t in recorded]
-    shapes = load_shapes(data, {str(n) for t in recorded for n in t.shape})
     urdfs = {}
     for name in shapes:
         try:

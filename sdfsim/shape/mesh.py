@@ -351,13 +351,9 @@ def without_doubles(faces: np.ndarray) -> np.ndarray:
 
 
 def is_closed(mesh: Mesh) -> bool:
-    """Whether every directed edge has exactly one opposite: watertight, with one consistent winding."""
-    edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
-    forward = edges[:, 0] * len(mesh.vertices) + edges[:, 1]
-    backward = edges[:, 1] * len(mesh.vertices) + edges[:, 0]
-    forward.sort()
-    backward.sort()
-    return bool(np.array_equal(forward, backward))
+    """Whether every directed edge has its opposite: watertight, with one winding, so that winding numbers are whole."""
+    edge, sign = directed_edges(mesh.faces)
+    return not np.bincount(edge, weights=sign).any()
 
 
 def signed_volume(mesh: Mesh) -> float:

@@ -69,11 +69,8 @@ def _one_per_voxel(points: np.ndarray, voxel: float) -> np.ndarray:
     # Voxels centred on the origin: the faces of a normalised box at 0.5 then run through their middles.
     cell = np.round(points / voxel).astype(np.int64)
     off_centre = np.square(points - cell * voxel).sum(1)
-    order = np.lexsort((off_centre, cell[:, 2], cell[:, 1], cell[:, 0]))
-    ordered = cell[order]
-    first = np.ones(len(order), dtype=bool)
-    first[1:] = (ordered[1:] != ordered[:-1]).any(1)
-    return points[order[first]]
+    order = np.argsort(off_centre, kind="stable")
+    return points[order[np.unique(cell[order], axis=0, return_index=True)[1]]]
 
 
 def thin(points: np.ndarray, count: int, *, keep: np.ndarray | None = None) -> np.ndarray:
@@ -93,13 +90,8 @@ def thin(points: np.ndarray, count: int, *, keep: np.ndarray | None = None) -> n
     nearest = np.full(len(points), np.inf)
     for point in chosen:
         np.minimum(nearest, np.square(points - point).sum(1), out=nearest)
-    if not chosen and len(points):
-        nearest = np.square(points - points.mean(0)).sum(1)
-        first = points[int(nearest.argmax())]
-        chosen.append(first)
-        nearest = np.square(points - first).sum(1)
     while len(chosen) < count and len(points):
-        far = int(nearest.argmax())
+        far = int((nearest if chosen else np.square(points - points.mean(0)).sum(1)).argmax())
         if nearest[far] <= 0:
             break
         chosen.append(points[far])
