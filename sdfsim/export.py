@@ -21,7 +21,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sdfsim.errors import SdfsimError
-from sdfsim.files import check_writable, replacing, write_text
+from sdfsim.files import check_writable, replacing, write_bytes, write_text
 from sdfsim.identify import COLUMNS
 from sdfsim.parallel import StageProgress
 from sdfsim.recording import body_colors, framed, sheet, with_normals
@@ -321,8 +321,7 @@ def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
                 samplers.append({"input": time, "output": file.array(values), "interpolation": "LINEAR"})
     if channels:
         file.animations.append({"name": "run", "samplers": samplers, "channels": channels})
-    with replacing(out) as partial:
-        partial.write_bytes(file.to_bytes())
+    write_bytes(out, file.to_bytes())
     unseen = ["masses, friction and all else that is not seen"]
     return Written([out], unseen + _missing(take, motion=True, textures=True))
 

@@ -56,6 +56,12 @@ def write_text(path: Path, text: str) -> None:
         partial.write_text(text, encoding="utf-8")
 
 
+def write_bytes(path: Path, content: bytes) -> None:
+    """A file of these bytes."""
+    with replacing(path) as partial:
+        partial.write_bytes(content)
+
+
 def write_json(path: Path, content: Any) -> None:
     """A JSON file, indented. NaN and infinity are refused: they are not JSON."""
     write_text(path, json.dumps(content, indent=2, allow_nan=False) + "\n")

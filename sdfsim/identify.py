@@ -43,7 +43,6 @@ class Recording:
     """T poses of D bodies, evenly spaced in time.
 
     Attributes:
-        names: of the bodies.
         dt: s.
         position: [T, D, 3] m, of the centres of mass.
         orientation: [T, D, 4] xyzw.
@@ -51,7 +50,6 @@ class Recording:
         known: [T] bool, whether the velocities are to be trusted.
     """
 
-    names: tuple[str, ...]
     dt: float
     position: np.ndarray
     orientation: np.ndarray
@@ -137,7 +135,6 @@ def load_recording(
     scene, rollout = read_run(path, scene_file, allow_outside=allow_outside, on_progress=on_progress)
     rows = [k for k, b in enumerate(scene.bodies) if b.motion == "dynamic"]
     recording = Recording(
-        names=tuple(scene.bodies[k].name for k in rows),
         dt=float(np.diff(rollout.time).mean()) if len(rollout) else 0.0,
         position=rollout.position[:, rows],
         orientation=rollout.orientation[:, rows],
@@ -197,7 +194,7 @@ def _from_poses(names: list[str], dt: float, origin: np.ndarray, orientation: np
     bend[1:-1] = np.linalg.norm(position[2:] - 2.0 * position[1:-1] + position[:-2], axis=-1) / dt**2
     known: np.ndarray = np.all(bend < SMOOTH * max(float(np.linalg.norm(scene.gravity)), 1.0), axis=-1)
     known[[0, -1]] = False
-    return Recording(tuple(names), dt, position, turn.numpy(), velocity, angular, known)
+    return Recording(dt, position, turn.numpy(), velocity, angular, known)
 
 
 def identify(recording: Recording, scene: Scene, *, on_progress: Progress = silent) -> Identified:

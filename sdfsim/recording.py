@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from sdfsim.dynamics.memory import PHASES
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.errors import SdfsimError
-from sdfsim.files import replacing
+from sdfsim.files import write_bytes
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.mesh import Mesh
 
@@ -304,8 +304,7 @@ def _thumbnail(path: Path, size: list[int]) -> np.ndarray:
 
 def _write(path: Path, encoded: Any) -> None:
     """All bytes of a rerun binary stream into `path`. We write them, since rerun's own sink only logs a full disk."""
-    with replacing(path) as partial:
-        partial.write_bytes(encoded.read() or b"")
+    write_bytes(path, encoded.read() or b"")
 
 
 @dataclass(frozen=True)

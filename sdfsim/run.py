@@ -236,7 +236,7 @@ def scene_of(folder: Path) -> Path:
 
 def summary(rollout: Rollout, wall: float) -> dict[str, Any]:
     """The numbers of a run that a person looks at first; None for one that is not finite."""
-    counters, heights = rollout.counters, rollout.position[..., 2]
+    counters = rollout.counters
     energy = counters["kinetic_energy"]
     taken = counters["step_ms"][1:]
     return {
@@ -250,7 +250,6 @@ def summary(rollout: Rollout, wall: float) -> dict[str, Any]:
         "worst_penetration_m": _number(counters["worst_penetration"].max()),
         "kinetic_energy_J": [_number(energy[0]), _number(energy[-1])],
         "energy_from_nothing": energy_from_nothing(rollout),
-        "lowest_m": _number(heights.min()) if heights.size else None,
         "outside_training": rollout.meta.get("outside_training", []),
         "cost": cost(rollout),
         "finite": bool(np.isfinite(rollout.position).all() and np.isfinite(rollout.orientation).all()),

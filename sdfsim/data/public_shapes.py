@@ -17,7 +17,7 @@ import zlib
 from pathlib import Path
 
 from sdfsim.errors import SdfsimError
-from sdfsim.files import FREELY, replacing, user_cache
+from sdfsim.files import FREELY, user_cache, write_bytes
 from sdfsim.parallel import Progress, silent
 
 KUBRIC = "https://storage.googleapis.com/kubric-public/assets/KuBasic"
@@ -91,9 +91,8 @@ def public_folder(shapes: Path, on_progress: Progress = silent) -> Path:
         for file in files:  # all of them before any is kept
             _check(content[file], SUMS[name][file], f"{url}: {Path(file).name}", hint)
         for file in files:
-            with replacing(folder / file) as partial:
-                partial.parent.mkdir(parents=True, exist_ok=True)
-                partial.write_bytes(content[file])
+            (folder / file).parent.mkdir(parents=True, exist_ok=True)
+            write_bytes(folder / file, content[file])
     return folder
 
 

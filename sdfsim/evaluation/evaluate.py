@@ -20,7 +20,7 @@ from sdfsim.dynamics.ranges import outside_training
 from sdfsim.dynamics.simulator import pick_device
 from sdfsim.dynamics.step import FreeFlight
 from sdfsim.errors import SdfsimError
-from sdfsim.evaluation.baselines import ballistic, chaos_floor
+from sdfsim.evaluation.baselines import chaos_floor
 from sdfsim.evaluation.penetration import EVERY, Solid, exact_solids, penetration
 from sdfsim.parallel import Progress, silent
 from sdfsim.shape.shape import Shape
@@ -96,7 +96,7 @@ def evaluate(
             used, group, known, longest, place, free_flight, substeps=inner, as_teacher=True
         )
         seconds += time.perf_counter() - started
-        contenders["ballistic"] += ballistic(used, group, known, longest)
+        contenders["ballistic"] += roll_out(used, group, known, longest, place, contact=False)
     again, floor_report = {}, {}
     if chaos_floor:
         on_progress(0.8, "teacher, from starts that differ slightly")

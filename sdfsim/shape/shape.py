@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from sdfsim.errors import SdfsimError
-from sdfsim.files import read_json, replacing, user_cache, write_json
+from sdfsim.files import read_json, user_cache, write_bytes, write_json
 from sdfsim.parallel import Progress, silent
 from sdfsim.shape import primitives
 from sdfsim.shape.distance import MeshDistance
@@ -121,21 +121,15 @@ class Shape:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             (folder / RECORD_FILE).unlink(missing_ok=True)
-            write(folder / WEIGHTS_FILE, to_bytes(tensors))
-            write(folder / MESH_FILE, write_ply(self.mesh))
+            write_bytes(folder / WEIGHTS_FILE, to_bytes(tensors))
+            write_bytes(folder / MESH_FILE, write_ply(self.mesh))
             (folder / SKIN_FILE).unlink(missing_ok=True)
             if self.skin is not None:
-                write(folder / SKIN_FILE, write_glb({self.name: self.skin}))
+                write_bytes(folder / SKIN_FILE, write_glb({self.name: self.skin}))
             write_json(folder / RECORD_FILE, record)
         except OSError as error:
             raise SdfsimError(f"{folder}: cannot write the shape ({error.strerror or error})") from error
         return folder
-
-
-def write(path: Path, content: bytes) -> None:
-    """Put `content` at `path` in one step: what was there before, or all of it, even when interrupted."""
-    with replacing(path) as partial:
-        partial.write_bytes(content)
 
 
 def load_shape(folder: str | Path) -> Shape:
