@@ -267,24 +267,43 @@ class Pool(NamedTuple):
     direction: torch.Tensor
 
 
-class Subject:
-    """One solid to be fitted: its frame, its mirror planes, and samples of it."""
+class _Run:
+    """A network in training, and samples of the solid that it learns.
 
-    def __init__(self, oracle: DistanceOracle, plan: Plan, seed: int) -> None:
-        self.oracle, self._plan, self._seed = oracle, plan, seed
+    Attributes:
+        frame: of the solid.
+        mirrors: its mirror planes.
+        step: updates made.
+        turn: the update at which the decay begins; an early stop or a short budget moves it forward.
+        stop: the update at which it ends.
+    """
+
+    def __init__(self, oracle: DistanceOracle, plan: Plan, seed: int, device: torch.device) -> None:
+        self.oracle, self.plan, self.device, self._seed = oracle, plan, device, seed
         self.frame = normal_frame(oracle.bounds)
         self.mirrors = self._mirrors() if plan.fold else (False, False, False)
+        self.pool, self.check = self._pool(0), self._check()
+        # Drawn on the CPU, so that points and first weights do not depend on the device.
+        self.generator = torch.Generator().manual_seed(seed)
+        self.parameters = [p.to(device) for p in _initial(plan, self.generator)]
+        for parameter in self.parameters:
+            parameter.grad = torch.zeros_like(parameter)
+        self.average = [parameter.clone() for parameter in self.parameters]
+        self.optimiser = (Soap if plan.optimiser == "soap" else torch.optim.Adam)(self.parameters, plan.lr)
+        self.step = 0
+        self.turn, self.stop = int(plan.steps * (1.0 - plan.decay)), plan.steps
+        self._tape = Tape(plan.activation, plan.width, plan.layers, self.parameters[0])
 
-    def pool(self, step: int) -> Pool:
+    def _pool(self, step: int) -> Pool:
         """Points to learn from, as drawn before update `step`."""
-        plan = self._plan
+        plan = self.plan
         rng = np.random.default_rng([self._seed, 0, step] if step else [self._seed, 0])
         near = int(plan.pool * plan.near)
         low, high = np.log(plan.sigmas)
         sigma = np.exp(rng.uniform(low, high, (near, 1)))
         return self._sample(sigma, plan.pool - near, rng)
 
-    def check(self) -> Pool:
+    def _check(self) -> Pool:
         """Points to judge by on the way: `CHECKED` of each of three kinds."""
         sigma = np.repeat(CHECKED_SIGMAS, CHECKED)[:, None]
         return self._sample(sigma, CHECKED, np.random.default_rng([self._seed, 1]))
@@ -297,19 +316,15 @@ class Subject:
         local = np.clip(local, -MARGIN * BOX, MARGIN * BOX)
         truth = self.oracle(self.frame.outward(local))
         distance = truth.distance / self.frame.scale
-        signed = truth.trusted | (self.oracle.closed and self._plan.sign_everywhere)
+        signed = truth.trusted | (self.oracle.closed and self.plan.sign_everywhere)
         # So close to the surface the direction from it is rounding.
         clear = np.abs(distance) > 1e-4
         offset = local - self.frame.inward(truth.closest)
         direction = np.where(clear[:, None], offset / np.where(clear, distance, 1.0)[:, None], 0.0)
         # What lies on the other side of a mirror plane is learned from its image.
         side = np.where(np.asarray(self.mirrors) & (local < 0), -1.0, 1.0)
-        return Pool(
-            torch.from_numpy(local * side).float(),
-            torch.from_numpy(distance).float(),
-            torch.from_numpy(signed),
-            torch.from_numpy(direction * side).float(),
-        )
+        where, away, along = (torch.from_numpy(x).float() for x in (local * side, distance, direction * side))
+        return Pool(*(part.to(self.device) for part in (where, away, torch.from_numpy(signed), along)))
 
     def _mirrors(self) -> tuple[bool, bool, bool]:
         """Across which planes of its frame the solid is its own mirror image, as far as sampled distances tell."""
@@ -324,39 +339,11 @@ class Subject:
 
         return same(0), same(1), same(2)
 
-
-class _Run:
-    """A network in training.
-
-    Attributes:
-        step: updates made.
-        turn: the update at which the decay begins; an early stop or a short budget moves it forward.
-        stop: the update at which it ends.
-    """
-
-    def __init__(self, oracle: DistanceOracle, plan: Plan, seed: int, device: torch.device) -> None:
-        self.plan, self.device = plan, device
-        self.subject = Subject(oracle, plan, seed)
-        self.pool, self.check = self._there(self.subject.pool(0)), self._there(self.subject.check())
-        # Drawn on the CPU, so that points and first weights do not depend on the device.
-        self.generator = torch.Generator().manual_seed(seed)
-        self.parameters = [p.to(device) for p in _initial(plan, self.generator)]
-        for parameter in self.parameters:
-            parameter.grad = torch.zeros_like(parameter)
-        self.average = [parameter.clone() for parameter in self.parameters]
-        self.optimiser = (Soap if plan.optimiser == "soap" else torch.optim.Adam)(self.parameters, plan.lr)
-        self.step = 0
-        self.turn, self.stop = int(plan.steps * (1.0 - plan.decay)), plan.steps
-        self._tape = Tape(plan.activation, plan.width, plan.layers, self.parameters[0])
-
-    def _there(self, pool: Pool) -> Pool:
-        return Pool(*(part.to(self.device) for part in pool))
-
     def update(self) -> None:
         """One step of the optimiser."""
         plan = self.plan
         if plan.resample and self.step and self.step % plan.resample == 0:
-            self.pool = self._there(self.subject.pool(self.step))
+            self.pool = self._pool(self.step)
         self.differentiate(torch.randint(plan.pool, (plan.batch,), generator=self.generator))
         factor = min(1.0, (self.step + 1) / WARMUP)
         if plan.decay:
@@ -420,9 +407,7 @@ class _Run:
         """The network."""
         parts = _layers(self.parameters, self.plan.activation)
         weights, biases = (tuple(part.cpu().clone() for part in layers) for layers in parts)
-        subject = self.subject
-        bounds = subject.oracle.bounds.copy()
-        return MlpSdf(weights, biases, self.plan.activation, subject.frame, bounds, subject.mirrors)
+        return MlpSdf(weights, biases, self.plan.activation, self.frame, self.oracle.bounds.copy(), self.mirrors)
 
 
 def _initial(plan: Plan, generator: torch.Generator) -> list[torch.Tensor]:

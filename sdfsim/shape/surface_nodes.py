@@ -110,14 +110,13 @@ def hull_nodes(vertices: np.ndarray, count: int) -> np.ndarray:
     return thin(rest, count, keep=vertices[outer])
 
 
-def edge_nodes(piece: np.ndarray, spacing: float, sharp: float = SHARP) -> np.ndarray:
+def edge_nodes(piece: np.ndarray, spacing: float) -> np.ndarray:
     """Points along the sharp edges of a convex polyhedron, its corners left out.
 
     Two polyhedra often touch edge against edge, which their corners alone do not see.
 
     Args:
         spacing: m, between points at most; edges shorter than this get none.
-        sharp: cosine of the angle between the normals of the two faces, above which an edge counts as flat.
 
     Returns:
         [K, 3] m.
@@ -128,7 +127,7 @@ def edge_nodes(piece: np.ndarray, spacing: float, sharp: float = SHARP) -> np.nd
     normals = hull.equations[:, :3]
     face, corner = np.nonzero(np.arange(len(hull.simplices))[:, None] < hull.neighbors)
     other = hull.neighbors[face, corner]
-    bent = (normals[face] * normals[other]).sum(1) < sharp
+    bent = (normals[face] * normals[other]).sum(1) < SHARP
     # The neighbour k of a face lies across the edge opposite to its corner k.
     points = [np.empty((0, 3))]
     for f, c in zip(face[bent], corner[bent], strict=True):
