@@ -28,6 +28,8 @@ _TALL = np.tan(np.radians(20.0))  # half of the field of view's height, at dista
 _SUN = np.array([0.35, -0.5, 0.8]) / np.linalg.norm([0.35, -0.5, 0.8])  # in a frame whose z is up
 _SKY, _SHADE = np.array([236.0, 240.0, 245.0]), 0.45  # what nothing is in front of; light where the sun does not shine
 _SUB = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]])  # px, where edges are looked at again
+# Columns of a layer: distance m, body, colours in the sun and in the shade, the ray to the sun, whether it is blocked.
+_AWAY, _BODY, _LIT, _SHADOWED, _SHADOW, _DARK = 0, 1, slice(2, 5), slice(5, 8), slice(8, 14), 14
 _GRID = np.stack(np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5), -1).reshape(-1, 2)  # px
 
 
@@ -113,16 +115,17 @@ class _Model:
 
 
 class _Cast:
-    """The triangles of all bodies where they are now.
+    """The triangles of some bodies where they are now.
 
     Args:
+        bodies: [B] their numbers in the scene.
         places, turns: [B, 3] m and [B, 3, 3].
 
     Attributes:
         body: [F] which one a face is of.
     """
 
-    def __init__(self, models: list[_Model], places: np.ndarray, turns: np.ndarray) -> None:
+    def __init__(self, models: list[_Model], bodies: np.ndarray, places: np.ndarray, turns: np.ndarray) -> None:
         import open3d as o3d
 
         starts = np.cumsum([0, *(len(m.vertices) for m in models)])
@@ -130,8 +133,8 @@ class _Cast:
         self._normals = np.concatenate([m.normals @ r.T for m, r in zip(models, turns, strict=True)])
         self._colors = np.concatenate([m.colors for m in models])
         self._faces = np.concatenate([m.faces + start for m, start in zip(models, starts, strict=False)])
-        self._textured = [(k, m.uv, m.texture, starts[k]) for k, m in enumerate(models)]
-        self.body = np.repeat(np.arange(len(models)), [len(m.faces) for m in models])
+        self._textured = [(k, m.uv, m.texture, start) for k, m, start in zip(bodies, models, starts, strict=False)]
+        self.body = np.repeat(bodies, [len(m.faces) for m in models])
         self._tensor: Any = o3d.core.Tensor
         self._scene = o3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(
@@ -187,13 +190,27 @@ class Studio:
         right /= np.linalg.norm(right)
         self.axes = np.stack([right, np.cross(forward, right), forward])
         self.sun = _SUN @ np.stack([right, np.cross(eye.up, right), eye.up])
+        self._moves = np.array([b.motion != "static" for b in scene.bodies])
+        still = [
+            b.position + Rotation.from_quat(b.quat_xyzw).apply(b.scale * s.com)
+            for b, s in zip(scene.bodies, shapes, strict=True)
+        ]
+        self._still = self._cast(~self._moves, np.array(still), np.array([b.quat_xyzw for b in scene.bodies]))
         self._through = self._rays(_GRID)
+        self._stands = self._layer(self._still, self._through)  # the same in every picture
+
+    def _cast(self, which: np.ndarray, position: np.ndarray, orientation: np.ndarray) -> _Cast | None:
+        bodies = np.flatnonzero(which)
+        turns = Rotation.from_quat(orientation).as_matrix()
+        return (
+            _Cast([self._models[k] for k in bodies], bodies, position[bodies], turns[bodies]) if len(bodies) else None
+        )
 
     def picture(self, position: np.ndarray, orientation: np.ndarray) -> np.ndarray:
         """[H, W, 3] uint8 of bodies with these centres of mass [N, 3] m and orientations [N, 4]."""
-        cast = _Cast(self._models, position, Rotation.from_quat(orientation).as_matrix())
+        moving = self._cast(self._moves, position, orientation)
         wide, tall = SIZE
-        pixels, label = self._look(cast, self._through)
+        pixels, label = self._look(moving, self._through, self._stands)
         pixels, label = pixels.reshape(tall, wide, 3), label.reshape(tall, wide)
         edge = np.zeros((tall, wide), bool)
         for axis in (0, 1):
@@ -201,7 +218,8 @@ class Studio:
             edge[: tall - (axis == 0), : wide - (axis == 1)] |= differs
             edge[axis == 0 :, axis == 1 :] |= differs
         if edge.any():
-            again, _ = self._look(cast, self._rays((_GRID[edge.reshape(-1)][:, None] + _SUB).reshape(-1, 2)))
+            rays = self._rays((_GRID[edge.reshape(-1)][:, None] + _SUB).reshape(-1, 2))
+            again, _ = self._look(moving, rays, self._layer(self._still, rays))
             pixels[edge] = again.reshape(-1, len(_SUB), 3).mean(1)
         return np.clip(pixels + 0.5, 0, 255).astype(np.uint8)
 
@@ -212,26 +230,46 @@ class Studio:
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         return np.concatenate([np.broadcast_to(self._eye.position, direction.shape), direction], 1, dtype=np.float32)
 
-    def _look(self, cast: _Cast, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Colours [R, 3] along rays [R, 6], and numbers [R] by which bodies, light and shade differ."""
-        pixels, label = np.tile(_SKY, (len(rays), 1)), np.full(len(rays), -1)
+    def _look(self, moving: _Cast | None, rays: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Colours [R, 3] along rays [R, 6], and numbers [R] by which bodies, light and shade differ.
+
+        `seen` is the layer of what stands still.
+        """
+        if moving is not None:
+            layer = self._layer(moving, rays)
+            seen = np.where((layer[:, _AWAY] < seen[:, _AWAY])[:, None], layer, seen)
+        dark = seen[:, _DARK] > 0.0
+        if moving is not None:
+            light = np.flatnonzero(~dark)
+            dark[light] = moving.blocked(seen[light, _SHADOW])
+        return np.where(dark[:, None], seen[:, _SHADOWED], seen[:, _LIT]), 2 * seen[:, _BODY] + dark
+
+    def _layer(self, cast: _Cast | None, rays: np.ndarray) -> np.ndarray:
+        """[R, 15] float32: what rays [R, 6] see of some bodies; columns as above."""
+        layer = np.zeros((len(rays), 15), np.float32)
+        layer[:, _AWAY], layer[:, _BODY], layer[:, _DARK] = np.inf, -1, 1.0
+        layer[:, _LIT] = layer[:, _SHADOWED] = _SKY
+        if cast is None:
+            return layer
         away, face, uv = cast.hits(rays)
         there = np.flatnonzero(np.isfinite(away))
         away, face, body, direction = away[there, None], face[there], cast.body[face[there]], rays[there, 3:]
         normal, color = cast.surface(face, uv[there])
         facing = np.where((normal * direction).sum(-1, keepdims=True) > 0.0, -normal, normal)
         point, toward = rays[there, :3] + away * direction, facing @ self.sun
-        start = point + 1e-3 * self._radius * facing
-        dark = toward <= 0.0
-        shadow = np.concatenate([start, np.broadcast_to(self.sun, start.shape)], 1, dtype=np.float32)
-        dark[~dark] = cast.blocked(shadow[~dark])
         # Infinite planes are checked, so that motion over them is seen.
         square = np.floor(point / 10.0 ** np.floor(np.log10(self._radius)) + 1e-4).sum(1)
         color[self._floors[body] & (square % 2 != 0)] *= 0.93
-        light = _SHADE + 0.1 * (facing @ self._eye.up) + np.where(dark, 0.0, (1.0 - _SHADE) * toward)
         # Far away the floor goes over into the sky.
         clear = 2.0 * (self._radius + np.linalg.norm(self._eye.target - self._eye.position))
         fog = np.clip((away / clear - 1.0) / 2.0, 0.0, 1.0)
-        pixels[there] = (1.0 - fog) * np.clip(light, 0.0, 1.1)[:, None] * color + fog * _SKY
-        label[there] = 2 * body + dark
-        return pixels, label
+        shade = _SHADE + 0.1 * (facing @ self._eye.up)
+        for part, light in ((_SHADOWED, shade), (_LIT, shade + (1.0 - _SHADE) * toward)):
+            layer[there, part] = (1.0 - fog) * np.clip(light, 0.0, 1.1)[:, None] * color + fog * _SKY
+        start = point + 1e-3 * self._radius * facing
+        layer[there, _SHADOW] = np.concatenate([start, np.broadcast_to(self.sun, start.shape)], 1)
+        dark = toward <= 0.0
+        if self._still:
+            dark |= self._still.blocked(layer[there, _SHADOW])
+        layer[there, _AWAY], layer[there, _BODY], layer[there, _DARK] = away[:, 0], body, dark
+        return layer
