@@ -542,10 +542,11 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
     # Between bodies of one material the square is the product. Other pairs are told one by one, while they are few:
     # those of few geoms first, since the floor is one.
     pairs = []
-    for i, j in combinations(sorted(range(len(geoms)), key=lambda k: len(geoms[k])), 2):
+    surfaces = [(b.friction, b.restitution) for b in scene.bodies]
+    order = sorted(range(len(geoms)), key=lambda k: len(geoms[k])) if len(set(surfaces)) > 1 else []
+    for i, j in combinations(order, 2):
         one, other = scene.bodies[i], scene.bodies[j]
-        alike = (one.friction, one.restitution) == (other.friction, other.restitution)
-        if alike or "dynamic" not in (one.motion, other.motion) or not allowed[group[i], group[j]]:
+        if surfaces[i] == surfaces[j] or "dynamic" not in (one.motion, other.motion) or not allowed[group[i], group[j]]:
             continue
         if len(pairs) + len(geoms[i]) * len(geoms[j]) > MOST_PAIRS:
             left_out.append("friction and restitution of some unlike bodies: the larger friction of the two counts")
