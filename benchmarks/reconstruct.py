@@ -25,10 +25,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from pipeline.cameras import View, load_views
+from pipeline.cameras import Similarity, View, load_views
 from pipeline.field.training import load_field
 from pipeline.mesh.meshing import read_parts
 from pipeline.mesh.placement import load_placement
@@ -41,17 +42,14 @@ PHOTOS = Path(__file__).resolve().parent.parent / "samples" / "photos" / "table_
 TABLE, VASE = 0.55, np.array([0.12, -0.05])  # m: the table's height, and the vase's axis
 RENDERED = ("touching", "shelf")
 NEAR_FLOOR = 0.03  # m, below which a surface is the floor's
-Similarity = tuple[float, np.ndarray, np.ndarray]  # scale, rotation [3, 3], translation [3]
 
 
 def similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
     """Least-squares similarity target = s R source + t of points [N, 3] (Umeyama, 1991)."""
     a, b = source - source.mean(0), target - target.mean(0)
-    u, d, vt = np.linalg.svd(b.T @ a / len(a))
-    sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
-    rotation = u @ sign @ vt
-    scale = float(np.trace(np.diag(d) @ sign) / (a**2).sum(1).mean())
-    return scale, rotation, target.mean(0) - scale * rotation @ source.mean(0)
+    rotation = Rotation.align_vectors(b, a)[0].as_matrix()
+    scale = float((b * (a @ rotation.T)).sum() / (a**2).sum())
+    return Similarity(scale, rotation, target.mean(0) - scale * rotation @ source.mean(0))
 
 
 def pose_errors(views: list[View], photos: Path) -> tuple[dict[str, float], Similarity]:
@@ -60,12 +58,12 @@ def pose_errors(views: list[View], photos: Path) -> tuple[dict[str, float], Simi
     # Record3D numbers its photos without zeros in front.
     truth = {Path(f["file_path"]).stem.lstrip("0"): np.array(f["transform_matrix"]) for f in about["frames"]}
     true = np.array([truth[Path(v.source).stem.lstrip("0")] for v in views])
-    move = scale, rotation, translation = similarity(np.array([v.center for v in views]), true[:, :3, 3])
-    moved = scale * np.array([v.center for v in views]) @ rotation.T + translation
+    centers = np.array([v.center for v in views])
+    move = similarity(centers, true[:, :3, 3])
     distance = np.linalg.norm(true[:, :3, 3] - [0, 0, about["table_height"]], axis=1)
-    error = 100 * np.linalg.norm(moved - true[:, :3, 3], axis=1) / distance
+    error = 100 * np.linalg.norm(move.points(centers) - true[:, :3, 3], axis=1) / distance
     flip = np.diag([1.0, -1, -1])
-    turns = [v.rotation @ rotation.T @ pose[:3, :3] @ flip for v, pose in zip(views, true, strict=True)]
+    turns = [v.rotation @ move.rotation.T @ pose[:3, :3] @ flip for v, pose in zip(views, true, strict=True)]
     angles = [np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))) for turn in turns]
     return {
         "posed": len(views),
@@ -80,8 +78,7 @@ def pose_errors(views: list[View], photos: Path) -> tuple[dict[str, float], Simi
 def to_truth(folder: Path, points: np.ndarray, move: Similarity) -> np.ndarray:
     """Points [P, 3] of a run's meshes, moved from its metres onto the true cameras."""
     place, to_unit = load_placement(folder / "mesh").to_metres, load_field(folder / "distill").to_unit
-    scale, rotation, translation = move
-    return scale * to_unit.inverse().points(place.inverse().points(points)) @ rotation.T + translation
+    return move.points(to_unit.inverse().points(place.inverse().points(points)))
 
 
 def trust_errors(folder: Path, photos: Path, move: Similarity) -> list[dict[str, Any]]:
@@ -136,8 +133,7 @@ def surface_errors(folder: Path, photos: Path, move: Similarity) -> dict[str, An
 
     about = json.loads((photos / "transforms.json").read_text())
     width, place = about["table_width"], load_placement(folder / "mesh").to_metres
-    to_unit = load_field(folder / "distill").to_unit
-    scale, rotation, _ = move
+    to_unit, rotation = load_field(folder / "distill").to_unit, move.rotation
 
     def read(name: str) -> Any:
         """A mesh of the mesh stage on the true cameras."""
@@ -177,7 +173,7 @@ def surface_errors(folder: Path, photos: Path, move: Similarity) -> dict[str, An
         "object": summary(errors[near]),
         "missing": summary(missing),
         "complete_percent": 100 * float((missing < 1.0).mean()),
-        "scale_error_percent": 100 * abs(place.scale * to_unit.scale / scale - 1),
+        "scale_error_percent": 100 * abs(place.scale * to_unit.scale / move.scale - 1),
         "tilt_degrees": float(np.degrees(np.arccos(min(1.0, float((rotation @ place.rotation[2])[2]))))),
         "bodies": list(objects),
         "vase": {name: vase_size(body) for name, body in vases.items()} | {"truth": vase_size(truth)},
@@ -228,16 +224,13 @@ def body_errors(folder: Path, photos: Path) -> dict[str, dict]:
     """Errors of every body of a run: of its sides x, y, z and its volume against the true body in the same place, %."""
     about = json.loads((photos / "images" / "transforms.json").read_text())
     truth = {f["file_path"]: np.array(f["transform_matrix"])[:3, 3] for f in about["frames"]}
-    views, place = load_views(folder / "poses"), load_placement(folder / "mesh").to_metres.inverse()
-    scale, rotation, translation = similarity(
-        np.array([v.center for v in views]), np.array([truth[v.source] for v in views])
-    )
-    back, found = load_field(folder / "distill").to_unit.inverse(), {}
+    views, found = load_views(folder / "poses"), {}
+    move = similarity(np.array([v.center for v in views]), np.array([truth[v.source] for v in views]))
     true = {path.stem: load_mesh(path) for path in sorted((photos / "truth").glob("*.ply"))}
     middles = {name: (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2 for name, mesh in true.items()}
     for entry in read_parts(folder / "mesh")["objects"]:
         mesh = load_mesh(folder / "mesh" / "objects" / f"{entry['name']}.ply")
-        at = scale * back.points(place.points(mesh.vertices)) @ rotation.T + translation
+        at = to_truth(folder, mesh.vertices, move)
         middle = (at.min(0) + at.max(0)) / 2
         name = min(true, key=lambda name: float(np.linalg.norm(middles[name] - middle)))
         sides = np.ptp(at, axis=0) / np.ptp(true[name].vertices, axis=0) - 1

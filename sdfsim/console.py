@@ -25,10 +25,6 @@ class Session:
 
     Errors inside become one line and a hint on stderr, and a `SystemExit`: see `sdfsim.errors` for the codes. With
     `as_json` stdout carries exactly one JSON object (also for an error), and what libraries print goes to stderr.
-
-    Args:
-        as_json: report as JSON.
-        verbose: show tracebacks.
     """
 
     def __init__(self, *, as_json: bool = False, verbose: bool = False) -> None:

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable
 
 EXIT_ERROR = 1
+EXIT_USAGE = 2
 EXIT_QUALITY = 3
 EXIT_INTERRUPTED = 130
 

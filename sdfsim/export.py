@@ -10,7 +10,7 @@ import csv
 import importlib
 import io
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -21,11 +21,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sdfsim.errors import SdfsimError
-from sdfsim.files import check_writable, replacing, write_text
+from sdfsim.files import check_writable, replacing, write_bytes, write_text
 from sdfsim.identify import COLUMNS
 from sdfsim.parallel import StageProgress
-from sdfsim.recording import distinct_colors, framed, sheet, with_normals
+from sdfsim.recording import body_colors, framed, sheet, with_normals
 from sdfsim.run import read_run
+from sdfsim.scene import written
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.scene.scene_file import load_scene
@@ -34,11 +35,6 @@ from sdfsim.shape.mesh import Mesh, convex_hull, wavefront
 from sdfsim.shape.sdf import BoxSdf, CapsuleSdf, ClosedForm, CylinderSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape, own_pieces
 
-DENSITY = 1000.0  # kg/m^3 of a shape on its own, as of a body that a scene says nothing about
-FRICTION = RESTITUTION = 0.5  # likewise
-GRAVITY = (0.0, 0.0, -9.81)  # m/s^2, likewise
-STATIC_COLOR = (150, 150, 155)
-HUES = 32  # colours that bodies take in turn
 # Concavity relative to the size; and a search a third as long as CoACD's own, which finds pieces as good.
 COACD = {"threshold": 0.05, "mcts_iterations": 60, "mcts_nodes": 10, "resolution": 1000, "seed": 0}
 RATE = 60.0  # USD time codes in a second; programs step through the whole ones
@@ -112,7 +108,6 @@ def export(
         source: a run folder or its rollout.npz, a scene.yaml, or a Shape folder.
         out: file to write, with one of the endings of `FORMATS`; its folder is made if missing.
         scene_file: of a run, None for the one that it was made from.
-        allow_outside: whether the scene may name files outside of its own folder.
 
     Returns:
         A report: format, bodies, frames, files and left_out.
@@ -165,7 +160,9 @@ def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progres
     if scene_file is not None:
         raise SdfsimError(f"{source}: only a run has a scene beside it", "leave --scene away")
     if (source / RECORD_FILE).is_file():
-        scene = _alone(load_shape(source))
+        shape = load_shape(source)
+        moves = "dynamic" if shape.volume > 0 else "static"
+        scene = written.Scene().add(shape.name, asset=source, motion=moves).load(told)
     elif source.suffix.lower() in (".yaml", ".yml"):
         scene = load_scene(source, told, allow_outside=allow_outside)
     else:
@@ -175,33 +172,9 @@ def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progres
     return _take(scene, np.zeros(1), position[None], np.array([body.quat_xyzw for body in scene.bodies])[None])
 
 
-def _alone(shape: Shape) -> Scene:
-    """A shape as the one body of a scene."""
-    moves = shape.volume > 0
-    body = Body(
-        name=shape.name,
-        shape=0,
-        motion="dynamic" if moves else "static",
-        scale=1.0,
-        position=np.zeros(3),
-        quat_xyzw=np.array([0.0, 0.0, 0.0, 1.0]),
-        velocity=np.zeros(3),
-        angular_velocity=np.zeros(3),
-        mass=DENSITY * shape.volume if moves else 0.0,
-        friction=FRICTION,
-        restitution=RESTITUTION,
-    )
-    return Scene((shape,), (body,), np.array(GRAVITY), 0.0)
-
-
 def _take(scene: Scene, time: np.ndarray, position: np.ndarray, quat: np.ndarray) -> Take:
-    moving = [k for k, body in enumerate(scene.bodies) if body.motion != "static"]
-    colors = np.tile(np.array(STATIC_COLOR, dtype=np.uint8), (len(scene.bodies), 1))
-    hues = list(distinct_colors(min(len(moving), HUES)))
-    for count, k in enumerate(moving):
-        colors[k] = hues[count % HUES]
-    names = _plain_names([body.name for body in scene.bodies])
-    return Take(scene, names, _plain_names([s.name for s in scene.shapes]), colors, time, position, quat)
+    names, shapes = (_plain_names([one.name for one in ones]) for ones in (scene.bodies, scene.shapes))
+    return Take(scene, names, shapes, np.array(body_colors(scene), dtype=np.uint8), time, position, quat)
 
 
 def _plain_names(names: list[str]) -> list[str]:
@@ -348,8 +321,7 @@ def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
                 samplers.append({"input": time, "output": file.array(values), "interpolation": "LINEAR"})
     if channels:
         file.animations.append({"name": "run", "samplers": samplers, "channels": channels})
-    with replacing(out) as partial:
-        partial.write_bytes(file.to_bytes())
+    write_bytes(out, file.to_bytes())
     unseen = ["masses, friction and all else that is not seen"]
     return Written([out], unseen + _missing(take, motion=True, textures=True))
 
@@ -487,6 +459,7 @@ def _usd_geometry(take: Take, shape: Shape, dynamic: bool, stage: Any, path: str
 
 def _usd_mesh(stage: Any, path: str, mesh: Mesh) -> Any:
     geom, vt = _extra("pxr.UsdGeom"), _extra("pxr.Vt")
+    mesh, normals = with_normals(mesh)
     prim = geom.Mesh.Define(stage, path)
     points = vt.Vec3fArray.FromNumpy(mesh.vertices.astype(np.float32))
     prim.CreatePointsAttr(points)
@@ -495,10 +468,8 @@ def _usd_mesh(stage: Any, path: str, mesh: Mesh) -> Any:
     prim.CreateFaceVertexIndicesAttr(vt.IntArray.FromNumpy(mesh.faces.reshape(-1).astype(np.int32)))
     prim.CreateSubdivisionSchemeAttr(geom.Tokens.none)
     prim.CreateDoubleSidedAttr(True)
-    split, normals = with_normals(mesh)
     prim.CreateNormalsAttr(vt.Vec3fArray.FromNumpy(normals.astype(np.float32)))
-    # Split along its creases a mesh has a vertex, so a normal, for every corner of a face.
-    prim.SetNormalsInterpolation(geom.Tokens.vertex if split is mesh else geom.Tokens.faceVarying)
+    prim.SetNormalsInterpolation(geom.Tokens.vertex)
     if mesh.colors is not None:
         shown = prim.CreateDisplayColorPrimvar(geom.Tokens.vertex)
         shown.Set(vt.Vec3fArray.FromNumpy(_linear(mesh.colors).astype(np.float32)))
@@ -571,13 +542,15 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
     # Between bodies of one material the square is the product. Other pairs are told one by one, while they are few:
     # those of few geoms first, since the floor is one.
     pairs = []
-    for i, j in _unlike(scene.bodies, sorted(range(len(geoms)), key=lambda k: len(geoms[k]))):
-        if not allowed[group[i], group[j]]:
+    surfaces = [(b.friction, b.restitution) for b in scene.bodies]
+    order = sorted(range(len(geoms)), key=lambda k: len(geoms[k])) if len(set(surfaces)) > 1 else []
+    for i, j in combinations(order, 2):
+        one, other = scene.bodies[i], scene.bodies[j]
+        if surfaces[i] == surfaces[j] or "dynamic" not in (one.motion, other.motion) or not allowed[group[i], group[j]]:
             continue
         if len(pairs) + len(geoms[i]) * len(geoms[j]) > MOST_PAIRS:
             left_out.append("friction and restitution of some unlike bodies: the larger friction of the two counts")
             break
-        one, other = scene.bodies[i], scene.bodies[j]
         surface = _mjcf_surface(one.friction * other.friction, one.restitution * other.restitution, pair=True)
         pairs += [{"geom1": a, "geom2": b, "condim": "3", **surface} for a in geoms[i] for b in geoms[j]]
     contact = _add(root, "contact") if pairs else root
@@ -587,16 +560,6 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
         _add(_add(root, "keyframe"), "key", name="start", qpos=" ".join(places), qvel=" ".join(speeds))
     _write_xml(out, root)
     return Written([out, *shown.values(), *(file for files in cut.values() for file in files)], left_out)
-
-
-def _unlike(bodies: Sequence[Body], order: list[int]) -> Iterator[tuple[int, int]]:
-    """Pairs of bodies with other coefficients than each other, of which one at least is dynamic."""
-    surfaces = [(body.friction, body.restitution) for body in bodies]
-    if len(set(surfaces)) == 1:
-        return
-    for i, j in combinations(order, 2):
-        if surfaces[i] != surfaces[j] and "dynamic" in (bodies[i].motion, bodies[j].motion):
-            yield i, j
 
 
 def _mjcf_surface(friction: float, restitution: float, *, pair: bool = False) -> dict[str, str]:

@@ -26,6 +26,11 @@ CONFIG = "config.yaml"
 FREELY, MOST_GROWTH = 2**30, 100
 
 
+def user_cache(name: str) -> Path:
+    """The folder `sdfsim/NAME` in the user's cache folder."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sdfsim" / name
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary path beside `path` to write to; it takes the final name when the block ends without an error.
@@ -49,6 +54,12 @@ def write_text(path: Path, text: str) -> None:
     """A UTF-8 text file."""
     with replacing(path) as partial:
         partial.write_text(text, encoding="utf-8")
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """A file of these bytes."""
+    with replacing(path) as partial:
+        partial.write_bytes(content)
 
 
 def write_json(path: Path, content: Any) -> None:

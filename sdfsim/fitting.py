@@ -12,17 +12,13 @@ from sdfsim.dynamics.bodies import largest_extent
 from sdfsim.dynamics.simulator import pick_device
 from sdfsim.errors import SdfsimError
 from sdfsim.files import check_writable, locked, read_json
-from sdfsim.parallel import Progress, parallel
+from sdfsim.parallel import Progress, parallel, silent
 from sdfsim.scene.scene_file import UNITS
 from sdfsim.shape.baked_grid import grid_certificate
-from sdfsim.shape.distance import MeshDistance
-from sdfsim.shape.fit import FIT_VERSION, Recipe, fit_mesh, fit_solids
+from sdfsim.shape.fit import FIT_VERSION, Recipe, fit_mesh
 from sdfsim.shape.mesh import MESH_SUFFIXES, Mesh, load_mesh
 from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape
-from sdfsim.shape.watertight import solidify
 
-# Shapes that one GPU trains side by side: some 40 MB each.
-STACK = 256
 # m, sizes that need no word.
 USUAL = (1e-3, 100.0)
 ERRORS = ("error_within_0.01", "error_within_0.1", "error_in_box", "projected_from_0.01", "sign_errors")
@@ -41,12 +37,6 @@ class Options:
 
 def fit(mesh_file: Path, out: Path, options: Options, *, device: str, on_progress: Progress) -> dict[str, Any]:
     """Fit a mesh file and write the shape folder `out`.
-
-    Args:
-        mesh_file: to be fitted.
-        out: shape folder.
-        options: of the fit.
-        device: cpu, cuda or auto.
 
     Returns:
         Folder, volume, number of nodes, what was done to the mesh, the certificate, and in `failed_checks` whether it
@@ -68,9 +58,12 @@ def fit(mesh_file: Path, out: Path, options: Options, *, device: str, on_progres
             on_progress=on_progress,
             device=pick_device(device),
         )
-        report = _save(shape, _request(mesh, options), out)
+        certificate = shape.certificate | grid_certificate(shape.sdf, shape.nodes)
+        source = shape.source | {"request": _request(mesh, options)}
+        shape = replace(shape, source=source, certificate=certificate)
+        shape.save(out)
     missed = [] if shape.certificate["passed"] else [f"fit: {shape.certificate['reason']}"]
-    return report | {"failed_checks": missed}
+    return _report(shape, out) | {"failed_checks": missed}
 
 
 def fit_lines(report: dict[str, Any]) -> list[str]:
@@ -119,15 +112,9 @@ def named_meshes(sources: list[Path]) -> dict[str, Path]:
 def fit_many(
     meshes: dict[str, Path], out: Path, options: Options, *, device: str, on_progress: Progress
 ) -> dict[str, Any]:
-    """Fit many mesh files into the shape folders `out`/NAME: in processes on CPUs, side by side on a GPU.
+    """Fit many mesh files into the shape folders `out`/NAME: in processes on CPUs, one after the other on a GPU.
 
     What an earlier call has fitted in the same way is kept, so that a call that was cut off is finished by the next.
-
-    Args:
-        meshes: files by name.
-        out: folder of shape folders.
-        options: of each fit.
-        device: cpu, cuda or auto.
 
     Returns:
         `shapes`, a report by name: that of `fit`, or the `error` that kept a mesh from being fitted; and in
@@ -144,11 +131,10 @@ def fit_many(
             reports[name] = kept
     todo = [(name, file) for name, file in meshes.items() if name not in reports]
     on_progress(0.0, f"{len(todo)} meshes to fit" + (f", {len(reports)} fitted before" if reports else ""))
-    if where.type == "cuda" and options.recipe != "paper":
-        made = _stacked(todo, out, options, str(where), on_progress)
-    else:
-        made = ((todo[i][0], found) for i, found in parallel(_fit_one, [(f, out / n, options) for n, f in todo]))
-    for done, (name, report) in enumerate(made, start=1):
+    jobs = [(file, out / name, options, str(where)) for name, file in todo]
+    made = enumerate(_fit_one(*job) for job in jobs) if where.type == "cuda" else parallel(_fit_one, jobs)
+    for done, (index, report) in enumerate(made, start=1):
+        name = todo[index][0]
         reports[name] = report
         on_progress(done / len(todo), f"{name}: {_verdict(report)}, {done} of {len(todo)}")
     missed = [f"{name}: {reports[name]['reason']}" for name in meshes if reports[name].get("passed") is False]
@@ -176,46 +162,14 @@ def _verdict(report: dict[str, Any]) -> str:
     return "fitted" if report["passed"] else "missed"
 
 
-def _fit_one(file: Path, folder: Path, options: Options) -> dict[str, Any]:
-    """In a worker: a report, or the error; whatever happens to one mesh must not stop the others."""
+def _fit_one(file: Path, folder: Path, options: Options, device: str) -> dict[str, Any]:
+    """A report, or the error; whatever happens to one mesh must not stop the others."""
     try:
-        return fit(file, folder, options, device="cpu", on_progress=lambda fraction, message: None)
+        return fit(file, folder, options, device=device, on_progress=silent)
     except SdfsimError as error:
         return {"error": error.message, "hint": error.hint}
     except Exception as error:
         return {"error": f"internal error: {type(error).__name__}: {error}", "hint": ""}
-
-
-def _stacked(todo: list[tuple[str, Path]], out: Path, options: Options, device: str, on_progress: Progress):
-    """Yield (name, report) of meshes that are trained side by side."""
-    for before in range(0, len(todo), STACK):
-        group = todo[before : before + STACK]
-        solids: dict[str, MeshDistance] = {}
-        requests: dict[str, str] = {}
-        for name, file in group:
-            try:
-                mesh = _load(file, options)
-                solids[name] = MeshDistance(solidify(mesh, name=name, cap=options.cap, thicken=options.thicken))
-                requests[name] = _request(mesh, options)
-            except SdfsimError as error:
-                yield name, {"error": error.message, "hint": error.hint}
-
-        def tell(fraction: float, message: str, before: int = before, count: int = len(group)) -> None:
-            on_progress((before + 0.99 * fraction * count) / len(todo), message)
-
-        if solids:
-            budget = None if options.budget is None else options.budget * len(solids)
-            shapes = fit_solids(solids, recipe=options.recipe, budget=budget, device=device, on_progress=tell)
-            for shape in shapes:
-                yield shape.name, _save(shape, requests[shape.name], out / shape.name)
-
-
-def _save(shape: Shape, request: str, folder: Path) -> dict[str, Any]:
-    """Write a shape with the `_request` that it was made for, and report on it."""
-    certificate = shape.certificate | grid_certificate(shape.sdf, shape.nodes)
-    shape = replace(shape, source=shape.source | {"request": request}, certificate=certificate)
-    shape.save(folder)
-    return _report(shape, folder)
 
 
 def _report(shape: Shape, folder: Path) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.model import SOLVER, load_model
 from sdfsim.dynamics.step import Rules, step
 from sdfsim.errors import SdfsimError
-from sdfsim.parallel import Progress
+from sdfsim.parallel import Progress, silent
 from sdfsim.run import read_run
 from sdfsim.scene.scene import Scene
 from sdfsim.scene.scene_file import load_scene
@@ -43,7 +43,6 @@ class Recording:
     """T poses of D bodies, evenly spaced in time.
 
     Attributes:
-        names: of the bodies.
         dt: s.
         position: [T, D, 3] m, of the centres of mass.
         orientation: [T, D, 4] xyzw.
@@ -51,7 +50,6 @@ class Recording:
         known: [T] bool, whether the velocities are to be trusted.
     """
 
-    names: tuple[str, ...]
     dt: float
     position: np.ndarray
     orientation: np.ndarray
@@ -116,7 +114,7 @@ class Identified:
 
 
 def load_recording(
-    path: Path, scene_file: Path | None = None, *, allow_outside: bool = False, on_progress: Progress | None = None
+    path: Path, scene_file: Path | None = None, *, allow_outside: bool = False, on_progress: Progress = silent
 ) -> tuple[Recording, Scene]:
     """A recording of the bodies of a scene that move, and the scene.
 
@@ -124,7 +122,6 @@ def load_recording(
         path: a run folder, a `rollout.npz`, or a CSV of poses (`COLUMNS`), whose positions are those of
             the shapes' own origins, as in a scene file.
         scene_file: its scene; of a run the one that it was made from, if this is None.
-        allow_outside: whether the scene may name files outside of its own folder.
 
     Raises:
         SdfsimError: no scene, unreadable files, or a recording that is not of this scene.
@@ -138,7 +135,6 @@ def load_recording(
     scene, rollout = read_run(path, scene_file, allow_outside=allow_outside, on_progress=on_progress)
     rows = [k for k, b in enumerate(scene.bodies) if b.motion == "dynamic"]
     recording = Recording(
-        names=tuple(scene.bodies[k].name for k in rows),
         dt=float(np.diff(rollout.time).mean()) if len(rollout) else 0.0,
         position=rollout.position[:, rows],
         orientation=rollout.orientation[:, rows],
@@ -198,14 +194,13 @@ def _from_poses(names: list[str], dt: float, origin: np.ndarray, orientation: np
     bend[1:-1] = np.linalg.norm(position[2:] - 2.0 * position[1:-1] + position[:-2], axis=-1) / dt**2
     known: np.ndarray = np.all(bend < SMOOTH * max(float(np.linalg.norm(scene.gravity)), 1.0), axis=-1)
     known[[0, -1]] = False
-    return Recording(tuple(names), dt, position, turn.numpy(), velocity, angular, known)
+    return Recording(dt, position, turn.numpy(), velocity, angular, known)
 
 
-def identify(recording: Recording, scene: Scene, *, on_progress: Progress | None = None) -> Identified:
+def identify(recording: Recording, scene: Scene, *, on_progress: Progress = silent) -> Identified:
     """Find the coefficients and masses with which the contact solve repeats a recording.
 
     Args:
-        recording: what happened.
         scene: shapes, sizes, masses and gravity; the coefficients of bodies that do not move are taken as they are.
 
     Raises:
@@ -215,7 +210,6 @@ def identify(recording: Recording, scene: Scene, *, on_progress: Progress | None
 
     if any(b.motion == "kinematic" for b in scene.bodies):
         raise SdfsimError("bodies on paths: identify works on bodies that move freely and those that are static")
-    tell = on_progress or (lambda fraction, message: None)
     windows = Windows(recording, scene)
     start = windows.start()
     best = start
@@ -226,12 +220,12 @@ def identify(recording: Recording, scene: Scene, *, on_progress: Progress | None
         trial = windows.start(friction, restitution)
         costs.append(float(np.minimum(np.abs(windows.errors(trial)), 10.0).sum()))
         best = trial if costs[-1] == min(costs) else best
-        tell(0.3 * k / len(tried), "a first sweep over friction and restitution")
+        on_progress(0.3 * k / len(tried), "a first sweep over friction and restitution")
     count = [0]
 
     def errors(parameters: np.ndarray) -> np.ndarray:
         count[0] += 1
-        tell(min(0.95, 0.3 + 0.005 * count[0]), f"fit, run {count[0]} of all windows")
+        on_progress(min(0.95, 0.3 + 0.005 * count[0]), f"fit, run {count[0]} of all windows")
         return np.concatenate([windows.errors(parameters), WEAK * (parameters - start)])
 
     slope: Any = lambda parameters: windows.jacobian(parameters, errors)  # noqa: E731
@@ -243,10 +237,6 @@ class Windows:
     """All windows of a recording as one set of bodies, each window a world of its own.
 
     Parameters are friction and restitution of every body that touches another, then the logarithms of mass ratios.
-
-    Args:
-        recording: what happened.
-        scene: of it.
     """
 
     def __init__(self, recording: Recording, scene: Scene) -> None:

@@ -16,6 +16,12 @@ from sdfsim.errors import SdfsimError
 
 Progress = Callable[[float, str], None]  # called with the fraction of the work that is done, and a message
 StageProgress = Callable[[str, float, str], None]  # the same, behind the name of one stage of several
+
+
+def silent(fraction: float, message: str) -> None:
+    """Progress that nobody is told."""
+
+
 _most = torch.get_num_threads()  # Before anything here has changed it.
 
 

@@ -33,10 +33,7 @@ def describe(
     """The plan of a scene with its units and the cost of a step, measured over the first few.
 
     Args:
-        scene_file: scene.yaml.
         model: bundled name or path (None: what the scene says).
-        device: cpu, cuda or auto.
-        allow_outside: whether the scene may name files outside of its own folder.
 
     Raises:
         SdfsimError: bad input.

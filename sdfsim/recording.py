@@ -5,18 +5,18 @@ from __future__ import annotations
 import colorsys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import cycle
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import torch
+from scipy.spatial.transform import Rotation
 
-from sdfsim.dynamics import pose
 from sdfsim.dynamics.memory import PHASES
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.errors import SdfsimError
-from sdfsim.files import replacing
+from sdfsim.files import write_bytes
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.mesh import Mesh
 
@@ -38,14 +38,14 @@ VIEWS = {
 }
 PLOTS = {key: legend for view in VIEWS.values() for key, legend in view.items()}
 STATIC_COLOR = (150, 150, 155)
+HUES = 32  # colours of bodies that move
 _NODE_COLOR = (20, 20, 20)
 _CONTACT_COLOR = (255, 40, 40)
 _PHOTO_PIXELS = 320
 _TEXTURE_PIXELS = 2048
 MANY = 24  # bodies of one shape that do not stay put, from which on they are a crowd
 COLORS = 4  # copies share their mesh's colour, so a crowd is split to be told apart
-_CREASE = np.cos(np.radians(40.0))
-_MOST_CORNER_PAIRS = 1_000_000  # more, about 10,000 vertices, and a mesh counts as smooth: splitting triples its size
+CREASE = np.radians(40.0)  # between the normals of neighbouring faces, from which on an edge is sharp
 FARTHEST = 1.0  # what leaves the scene for good must not make it a dot
 
 
@@ -191,9 +191,6 @@ def save_rollout(
     """Write `rollout` as a rerun recording: to a temporary name first, then renamed.
 
     Args:
-        scene: of the run.
-        rollout: the run.
-        path: .rrd to write.
         camera, look_at: [3] m each, of the first view; None: see `eye_of`.
 
     Raises:
@@ -240,8 +237,6 @@ def save_reconstruction(
     With `trust` the viewer has a second tab that shows it in place of the surface.
 
     Args:
-        path: .rrd to write.
-        photos: posed cameras.
         points: [P, 3] m, sparse points.
         colors: [P, 3] uint8 RGB, or None.
         mesh: the reconstructed surface, if it is there already.
@@ -309,8 +304,7 @@ def _thumbnail(path: Path, size: list[int]) -> np.ndarray:
 
 def _write(path: Path, encoded: Any) -> None:
     """All bytes of a rerun binary stream into `path`. We write them, since rerun's own sink only logs a full disk."""
-    with replacing(path) as partial:
-        partial.write_bytes(encoded.read() or b"")
+    write_bytes(path, encoded.read() or b"")
 
 
 @dataclass(frozen=True)
@@ -342,7 +336,6 @@ def eye_of(
     """From where a scene is looked at; what is not given is chosen so that all of it is in sight.
 
     Args:
-        scene: what is looked at.
         motion: how it moves, where that is known.
         camera: [3] m, where the eye is.
         look_at: [3] m, what it looks at.
@@ -373,8 +366,8 @@ def _around(centre: np.ndarray, radius: float, up: np.ndarray) -> Eye:
 
 
 def body_colors(scene: Scene) -> list[tuple[int, ...]]:
-    """An RGB colour (0 to 255) for every body: grey where it stays put, else a hue of its own."""
-    hues = distinct_colors(len(scene.bodies))
+    """An RGB colour (0 to 255) for every body: grey where it stays put, else one of `HUES`, in turn."""
+    hues = cycle(distinct_colors(HUES))
     return [STATIC_COLOR if body.motion == "static" else next(hues) for body in scene.bodies]
 
 
@@ -412,7 +405,7 @@ def framed(scene: Scene, motion: Rollout | None = None) -> tuple[np.ndarray, flo
 
 def _turned(vectors: np.ndarray, quat_xyzw: np.ndarray) -> np.ndarray:
     """Vectors [..., 3] turned by a unit quaternion [4]."""
-    return vectors @ pose.to_matrix(torch.from_numpy(quat_xyzw)).numpy().T
+    return Rotation.from_quat(quat_xyzw).apply(vectors)
 
 
 def _shaded(rr: Any, mesh: Mesh, color: tuple[int, ...]) -> rr.Mesh3D:
@@ -453,53 +446,17 @@ def distinct_colors(count: int) -> Iterator[tuple[int, ...]]:
 
 def with_normals(mesh: Mesh) -> tuple[Mesh, np.ndarray]:
     """The mesh with normals [V, 3]: smooth, its vertices split along creases so that boxes keep their edges."""
+    import trimesh
+
     if mesh.uv is not None:  # its vertices are doubled where its texture is cut, and that is no crease
         _, first, label = np.unique(mesh.vertices, axis=0, return_index=True, return_inverse=True)
-        return mesh, _smooth_normals(mesh.vertices[first], label.reshape(-1)[mesh.faces])[label.reshape(-1)]
-    normals = _corner_normals(mesh.vertices, mesh.faces)
-    if normals is None:
-        return mesh, _smooth_normals(mesh.vertices, mesh.faces)
-    colors = None if mesh.colors is None else mesh.colors[mesh.faces].reshape(-1, 3)
-    vertices = mesh.vertices[mesh.faces].reshape(-1, 3)
-    return Mesh(vertices, np.arange(len(vertices)).reshape(-1, 3), colors), normals
-
-
-def _face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """[F, 3], twice the area long."""
-    a, b, c = vertices[faces.T]
-    return np.cross(b - a, c - a)
-
-
-def _smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """[V, 3] area-weighted means of the faces around each vertex."""
-    total = np.zeros_like(vertices)
-    normal = _face_normals(vertices, faces)
-    for k in range(3):
-        np.add.at(total, faces[:, k], normal)
-    return _normalise(total)
-
-
-def _corner_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
-    """[3 F, 3] for every face corner the mean of the faces at its vertex that bend less than the crease angle.
-
-    None for a mesh so fine that it may pass as smooth.
-    """
-    owner = faces.reshape(-1)
-    order = np.argsort(owner, kind="stable")
-    valence = np.bincount(owner, minlength=len(vertices))
-    if (valence**2).sum() > _MOST_CORNER_PAIRS:
-        return None
-    start = np.cumsum(valence) - valence
-    repeats = valence[owner]
-    first = np.repeat(np.arange(len(owner)), repeats)
-    second = order[np.repeat(start[owner] - (np.cumsum(repeats) - repeats), repeats) + np.arange(repeats.sum())]
-    normal = _face_normals(vertices, faces)
-    unit = _normalise(normal)
-    near = (unit[first // 3] * unit[second // 3]).sum(1) >= _CREASE
-    total = np.zeros((len(owner), 3))
-    np.add.at(total, first[near], normal[second[near] // 3])
-    return _normalise(total)
-
-
-def _normalise(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)
+        whole = trimesh.Trimesh(mesh.vertices[first], label.reshape(-1)[mesh.faces], process=False)
+        return mesh, whole.vertex_normals[label.reshape(-1)]
+    whole = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    smooth = whole.face_adjacency[whole.face_adjacency_angles < CREASE]
+    patch = trimesh.graph.connected_component_labels(smooth, node_count=len(mesh.faces))
+    corners = np.stack([mesh.faces, np.broadcast_to(patch[:, None], mesh.faces.shape)], -1).reshape(-1, 2)
+    (vertex, _), label = (part.T for part in np.unique(corners, axis=0, return_inverse=True))
+    colors = None if mesh.colors is None else mesh.colors[vertex]
+    split = Mesh(mesh.vertices[vertex], label.reshape(-1, 3), colors)
+    return split, trimesh.Trimesh(split.vertices, split.faces, process=False).vertex_normals

@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.errors import SdfsimError
 from sdfsim.files import replacing
-from sdfsim.parallel import Progress
+from sdfsim.parallel import Progress, silent
 from sdfsim.recording import Eye, Place, body_colors, eye_of, framed, sheet, with_normals
 from sdfsim.scene.scene import Scene
 
@@ -27,19 +28,18 @@ _TALL = np.tan(np.radians(20.0))  # half of the field of view's height, at dista
 _SUN = np.array([0.35, -0.5, 0.8]) / np.linalg.norm([0.35, -0.5, 0.8])  # in a frame whose z is up
 _SKY, _SHADE = np.array([236.0, 240.0, 245.0]), 0.45  # what nothing is in front of; light where the sun does not shine
 _SUB = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]])  # px, where edges are looked at again
+# Columns of a layer: distance m, body, colours in the sun and in the shade, the ray to the sun, whether it is blocked.
+_AWAY, _BODY, _LIT, _SHADOWED, _SHADOW, _DARK = 0, 1, slice(2, 5), slice(5, 8), slice(8, 14), 14
 _GRID = np.stack(np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5), -1).reshape(-1, 2)  # px
 
 
 def render(
     scene: Scene | written.Scene, rollout: Rollout, out: Path | str, *, camera: Place | None = None,
-    look_at: Place | None = None, at: float | None = None, on_progress: Progress = lambda fraction, message: None,
+    look_at: Place | None = None, at: float | None = None, on_progress: Progress = silent,
 ) -> None:  # fmt: skip
     """Write a movie (.mp4, H.264, as long as the run) or a picture (.png) of a run.
 
     Args:
-        scene: of the run.
-        rollout: the run.
-        out: file to write.
         camera: [3] m, where it is; None: where all of the motion is in sight.
         look_at: [3] m, the point in its middle; None: the middle of all that moves or stands.
         at: s, the time of a picture (default: the end).
@@ -118,31 +118,33 @@ class _Cast:
     """The triangles of some bodies where they are now.
 
     Args:
-        models: of the bodies.
-        bodies: [B] their numbers.
+        bodies: [B] their numbers in the scene.
         places, turns: [B, 3] m and [B, 3, 3].
+
+    Attributes:
+        body: [F] which one a face is of.
     """
 
     def __init__(self, models: list[_Model], bodies: np.ndarray, places: np.ndarray, turns: np.ndarray) -> None:
         import open3d as o3d
 
         starts = np.cumsum([0, *(len(m.vertices) for m in models)])
-        self.vertices = np.concatenate([m.vertices @ r.T + t for m, r, t in zip(models, turns, places, strict=True)])
-        self.normals = np.concatenate([m.normals @ r.T for m, r in zip(models, turns, strict=True)])
-        self.colors = np.concatenate([m.colors for m in models])
-        self.faces = np.concatenate([m.faces + start for m, start in zip(models, starts, strict=False)])
+        vertices = np.concatenate([m.vertices @ r.T + t for m, r, t in zip(models, turns, places, strict=True)])
+        self._normals = np.concatenate([m.normals @ r.T for m, r in zip(models, turns, strict=True)])
+        self._colors = np.concatenate([m.colors for m in models])
+        self._faces = np.concatenate([m.faces + start for m, start in zip(models, starts, strict=False)])
         self._textured = [(k, m.uv, m.texture, start) for k, m, start in zip(bodies, models, starts, strict=False)]
         self.body = np.repeat(bodies, [len(m.faces) for m in models])
         self._tensor: Any = o3d.core.Tensor
         self._scene = o3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(
-            self._tensor(self.vertices.astype(np.float32)), self._tensor(self.faces.astype(np.uint32))
+            self._tensor(vertices.astype(np.float32)), self._tensor(self._faces.astype(np.uint32))
         )
 
     def hits(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Distances [R], inf where nothing is hit; faces [R]; where in the face [R, 2]."""
         found = self._scene.cast_rays(self._tensor(rays))
-        return tuple(found[key].numpy() for key in ("t_hit", "primitive_ids", "primitive_uvs"))  # type: ignore[return-value]
+        return found["t_hit"].numpy(), found["primitive_ids"].numpy(), found["primitive_uvs"].numpy()
 
     def blocked(self, rays: np.ndarray) -> np.ndarray:
         """[R] whether anything is hit."""
@@ -151,8 +153,8 @@ class _Cast:
     def surface(self, face: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Normals [R, 3] and colours [R, 3] at places of faces."""
         share = np.stack([1.0 - uv.sum(-1), uv[:, 0], uv[:, 1]], -1)[..., None]
-        corners = self.faces[face]
-        normal, color = (self.normals[corners] * share).sum(1), (self.colors[corners] * share).sum(1)
+        corners = self._faces[face]
+        normal, color = (self._normals[corners] * share).sum(1), (self._colors[corners] * share).sum(1)
         for body, places, texture, start in self._textured:
             if places is not None and texture is not None:
                 on = np.flatnonzero(self.body[face] == body)
@@ -162,42 +164,10 @@ class _Cast:
         return normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9), color
 
 
-@dataclass(frozen=True)
-class _Layer:
-    """What R rays see of some bodies.
-
-    Attributes:
-        away: [R] m, inf where they meet nothing.
-        body: [R] which, -1 where they meet nothing.
-        lit, shade: [R, 3] colours in the sun and out of it.
-        shadow: [R, 6] rays from there to the sun.
-        dark: [R] bool, whether the sun is known not to shine there.
-    """
-
-    away: np.ndarray
-    body: np.ndarray
-    lit: np.ndarray
-    shade: np.ndarray
-    shadow: np.ndarray
-    dark: np.ndarray
-
-    def behind(self, other: _Layer) -> _Layer:
-        """The nearer of both, ray by ray."""
-        near = other.away < self.away
-        return _Layer(
-            *(
-                np.where(near.reshape(-1, *[1] * (one.ndim - 1)), two, one)
-                for one, two in zip(vars(self).values(), vars(other).values(), strict=True)
-            )
-        )
-
-
 class Studio:
     """A scene with a camera and a sun, of which pictures are taken.
 
     Args:
-        scene: what is shown.
-        eye: from where.
         radius: m, of all that is shown.
 
     Attributes:
@@ -206,34 +176,39 @@ class Studio:
     """
 
     def __init__(self, scene: Scene, eye: Eye, radius: float) -> None:
-        self._scene, self._eye, self._radius = scene, eye, radius
-        self._floors = np.array([not np.isfinite(scene.shapes[b.shape].sdf.bounds).all() for b in scene.bodies])
-        colors = body_colors(scene)
-        self._models = [self._model(k, color) for k, color in enumerate(colors)]
-        self._com = [b.scale * scene.shapes[b.shape].com for b in scene.bodies]
-        self._moves = np.array([b.motion != "static" for b in scene.bodies])
+        self._eye, self._radius = eye, radius
+        shapes = [scene.shapes[b.shape] for b in scene.bodies]
+        self._floors = np.array([not np.isfinite(shape.sdf.bounds).all() for shape in shapes])
+        self._models = []
+        for body, shape, floor, color in zip(scene.bodies, shapes, self._floors, body_colors(scene), strict=True):
+            mesh, normals = with_normals(sheet(40.0 * radius) if floor else shape.shown)
+            colors = np.broadcast_to(color, mesh.vertices.shape) if mesh.colors is None else mesh.colors
+            vertices = body.scale * (mesh.vertices - shape.com)
+            self._models.append(_Model(vertices, normals, mesh.faces, colors.astype(float), mesh.uv, mesh.texture))
         forward = (eye.target - eye.position) / np.linalg.norm(eye.target - eye.position)
         right = np.cross(forward, eye.up)
-        self.axes = np.stack([right / np.linalg.norm(right), np.zeros(3), forward])
-        self.axes[1] = np.cross(forward, self.axes[0])  # down the picture
-        frame = np.stack([self.axes[0], np.cross(eye.up, self.axes[0]), eye.up])
-        self.sun = _SUN @ frame
-        still = np.flatnonzero(~self._moves)
-        at = np.array([scene.bodies[k].quat_xyzw for k in still]).reshape(-1, 4)
-        turns = _matrices(at)
-        places = [scene.bodies[k].position + r @ self._com[k] for k, r in zip(still, turns, strict=True)]
-        self._still = None
-        if len(still):
-            self._still = _Cast([self._models[k] for k in still], still, np.array(places), turns)
+        right /= np.linalg.norm(right)
+        self.axes = np.stack([right, np.cross(forward, right), forward])
+        self.sun = _SUN @ np.stack([right, np.cross(eye.up, right), eye.up])
+        self._moves = np.array([b.motion != "static" for b in scene.bodies])
+        still = [
+            b.position + Rotation.from_quat(b.quat_xyzw).apply(b.scale * s.com)
+            for b, s in zip(scene.bodies, shapes, strict=True)
+        ]
+        self._still = self._cast(~self._moves, np.array(still), np.array([b.quat_xyzw for b in scene.bodies]))
         self._through = self._rays(_GRID)
         self._stands = self._layer(self._still, self._through)  # the same in every picture
 
+    def _cast(self, which: np.ndarray, position: np.ndarray, orientation: np.ndarray) -> _Cast | None:
+        bodies = np.flatnonzero(which)
+        turns = Rotation.from_quat(orientation).as_matrix()
+        return (
+            _Cast([self._models[k] for k in bodies], bodies, position[bodies], turns[bodies]) if len(bodies) else None
+        )
+
     def picture(self, position: np.ndarray, orientation: np.ndarray) -> np.ndarray:
         """[H, W, 3] uint8 of bodies with these centres of mass [N, 3] m and orientations [N, 4]."""
-        goes = np.flatnonzero(self._moves)
-        moving = None
-        if len(goes):
-            moving = _Cast([self._models[k] for k in goes], goes, position[goes], _matrices(orientation[goes]))
+        moving = self._cast(self._moves, position, orientation)
         wide, tall = SIZE
         pixels, label = self._look(moving, self._through, self._stands)
         pixels, label = pixels.reshape(tall, wide, 3), label.reshape(tall, wide)
@@ -255,68 +230,46 @@ class Studio:
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         return np.concatenate([np.broadcast_to(self._eye.position, direction.shape), direction], 1, dtype=np.float32)
 
-    def _look(self, moving: _Cast | None, rays: np.ndarray, stands: _Layer) -> tuple[np.ndarray, np.ndarray]:
-        """Colours [R, 3] along rays, and numbers [R] by which bodies, light and shade differ."""
-        layer = stands if moving is None else stands.behind(self._layer(moving, rays))
-        dark = layer.dark.copy()
-        if moving is not None:
-            light = np.flatnonzero(~dark & (layer.body >= 0))
-            dark[light] = moving.blocked(layer.shadow[light])
-        return np.where(dark[:, None], layer.shade, layer.lit), 2 * layer.body + dark
+    def _look(self, moving: _Cast | None, rays: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Colours [R, 3] along rays [R, 6], and numbers [R] by which bodies, light and shade differ.
 
-    def _layer(self, cast: _Cast | None, rays: np.ndarray) -> _Layer:
-        """What rays [R, 6] see of some bodies, in the sun and in the shade that what stands still gives."""
-        count = len(rays)
-        sky = np.broadcast_to(_SKY.astype(np.float32), (count, 3))
-        layer = _Layer(
-            np.full(count, np.inf, np.float32), np.full(count, -1), sky.copy(), sky.copy(), np.zeros_like(rays),
-            np.ones(count, bool),
-        )  # fmt: skip
+        `seen` is the layer of what stands still.
+        """
+        if moving is not None:
+            layer = self._layer(moving, rays)
+            seen = np.where((layer[:, _AWAY] < seen[:, _AWAY])[:, None], layer, seen)
+        dark = seen[:, _DARK] > 0.0
+        if moving is not None:
+            light = np.flatnonzero(~dark)
+            dark[light] = moving.blocked(seen[light, _SHADOW])
+        return np.where(dark[:, None], seen[:, _SHADOWED], seen[:, _LIT]), 2 * seen[:, _BODY] + dark
+
+    def _layer(self, cast: _Cast | None, rays: np.ndarray) -> np.ndarray:
+        """[R, 15] float32: what rays [R, 6] see of some bodies; columns as above."""
+        layer = np.zeros((len(rays), 15), np.float32)
+        layer[:, _AWAY], layer[:, _BODY], layer[:, _DARK] = np.inf, -1, 1.0
+        layer[:, _LIT] = layer[:, _SHADOWED] = _SKY
         if cast is None:
             return layer
-        layer.away[:], face, uv = cast.hits(rays)
-        there = np.flatnonzero(np.isfinite(layer.away))
-        face, uv, direction, away = face[there], uv[there], rays[there, 3:], layer.away[there, None]
-        layer.body[there] = cast.body[face]
-        normal, color = cast.surface(face, uv)
+        away, face, uv = cast.hits(rays)
+        there = np.flatnonzero(np.isfinite(away))
+        away, face, body, direction = away[there, None], face[there], cast.body[face[there]], rays[there, 3:]
+        normal, color = cast.surface(face, uv[there])
         facing = np.where((normal * direction).sum(-1, keepdims=True) > 0.0, -normal, normal)
-        toward = facing @ self.sun
-        point = rays[there, :3] + away * direction
-        color = self._checked(point, color, layer.body[there])
+        point, toward = rays[there, :3] + away * direction, facing @ self.sun
+        # Infinite planes are checked, so that motion over them is seen.
+        square = np.floor(point / 10.0 ** np.floor(np.log10(self._radius)) + 1e-4).sum(1)
+        color[self._floors[body] & (square % 2 != 0)] *= 0.93
         # Far away the floor goes over into the sky.
         clear = 2.0 * (self._radius + np.linalg.norm(self._eye.target - self._eye.position))
         fog = np.clip((away / clear - 1.0) / 2.0, 0.0, 1.0)
-        least = _SHADE + 0.1 * (facing @ self._eye.up)
-        for found, light in ((layer.shade, least), (layer.lit, least + (1.0 - _SHADE) * toward)):
-            found[there] = (1.0 - fog) * np.clip(light, 0.0, 1.1)[:, None] * color + fog * _SKY
+        shade = _SHADE + 0.1 * (facing @ self._eye.up)
+        for part, light in ((_SHADOWED, shade), (_LIT, shade + (1.0 - _SHADE) * toward)):
+            layer[there, part] = (1.0 - fog) * np.clip(light, 0.0, 1.1)[:, None] * color + fog * _SKY
         start = point + 1e-3 * self._radius * facing
-        layer.shadow[there] = np.concatenate([start, np.broadcast_to(self.sun, start.shape)], 1)
-        layer.dark[there] = toward <= 0.0
+        layer[there, _SHADOW] = np.concatenate([start, np.broadcast_to(self.sun, start.shape)], 1)
+        dark = toward <= 0.0
         if self._still:
-            layer.dark[there] |= self._still.blocked(layer.shadow[there])
+            dark |= self._still.blocked(layer[there, _SHADOW])
+        layer[there, _AWAY], layer[there, _BODY], layer[there, _DARK] = away[:, 0], body, dark
         return layer
-
-    def _checked(self, point: np.ndarray, color: np.ndarray, body: np.ndarray) -> np.ndarray:
-        """Infinite planes are checked, so that motion over them is seen."""
-        on = np.flatnonzero(self._floors[body])
-        square = np.floor(point[on] / 10.0 ** np.floor(np.log10(self._radius)) + 1e-4)
-        color[on] *= np.where(square.sum(1) % 2 == 0, 1.0, 0.93)[:, None]
-        return color
-
-    def _model(self, k: int, color: tuple[int, ...]) -> _Model:
-        body = self._scene.bodies[k]
-        shape = self._scene.shapes[body.shape]
-        mesh = sheet(40.0 * self._radius) if self._floors[k] else shape.shown
-        mesh, normals = with_normals(mesh)
-        colors = np.broadcast_to(color, mesh.vertices.shape) if mesh.colors is None else mesh.colors
-        vertices = mesh.vertices * body.scale - body.scale * shape.com
-        return _Model(vertices, normals, mesh.faces, colors.astype(np.float64), mesh.uv, mesh.texture)
-
-
-def _matrices(quat: np.ndarray) -> np.ndarray:
-    """[B, 3, 3] rotations of unit quaternions [B, 4] xyzw."""
-    import torch
-
-    from sdfsim.dynamics import pose
-
-    return pose.to_matrix(torch.from_numpy(np.ascontiguousarray(quat, dtype=np.float64))).numpy()

@@ -35,7 +35,7 @@ from sdfsim.files import (
     write_json,
     write_text,
 )
-from sdfsim.parallel import Progress, StageProgress
+from sdfsim.parallel import Progress, StageProgress, silent
 from sdfsim.recording import Place, Playback, eye_of, framed, save_rollout
 from sdfsim.scene.scene import Scene
 from sdfsim.scene.scene_file import load_scene
@@ -75,16 +75,13 @@ def simulate(
     """Simulate a scene and write config.yaml, report.json, rollout.npz and (unless `viewer` is none) rollout.rrd.
 
     Args:
-        scene_file: scene.yaml.
         out: run folder; made if missing, an earlier run in it is replaced, unless it is to `resume`.
         model: bundled name or path (None: what the scene says).
         seconds: simulated time in s (None: the scene's duration).
         seed: None: the scene's.
         viewer: where to watch: not at all, later from the file, or live in a window or a page.
-        device: cpu, cuda or auto.
         say: called with a line for the person: what was replaced, where the page of `viewer` web is.
         bind: address of this machine that a live viewer listens on.
-        allow_outside: whether the scene may name files outside of its own folder.
         until_settled: end as soon as everything has come to rest.
         resume: go on with the run in `out` that was interrupted; from the start where there is none. A finished one is
             left as it is, and its report is returned.
@@ -209,14 +206,13 @@ def _live(live: Playback, viewer: Viewer, first: Rollout, say: Callable[[str], N
 
 
 def read_run(
-    path: Path, scene_file: Path | None = None, *, allow_outside: bool = False, on_progress: Progress | None = None
+    path: Path, scene_file: Path | None = None, *, allow_outside: bool = False, on_progress: Progress = silent
 ) -> tuple[Scene, Rollout]:
     """A finished or interrupted run, and its scene.
 
     Args:
         path: run folder, or the `rollout.npz` in one.
         scene_file: its scene; None: the one that the run was made from.
-        allow_outside: whether the scene may name files outside of its own folder.
 
     Raises:
         SdfsimError: no run, no scene, or another scene than that of the run.
@@ -240,7 +236,7 @@ def scene_of(folder: Path) -> Path:
 
 def summary(rollout: Rollout, wall: float) -> dict[str, Any]:
     """The numbers of a run that a person looks at first; None for one that is not finite."""
-    counters, heights = rollout.counters, rollout.position[..., 2]
+    counters = rollout.counters
     energy = counters["kinetic_energy"]
     taken = counters["step_ms"][1:]
     return {
@@ -254,7 +250,6 @@ def summary(rollout: Rollout, wall: float) -> dict[str, Any]:
         "worst_penetration_m": _number(counters["worst_penetration"].max()),
         "kinetic_energy_J": [_number(energy[0]), _number(energy[-1])],
         "energy_from_nothing": energy_from_nothing(rollout),
-        "lowest_m": _number(heights.min()) if heights.size else None,
         "outside_training": rollout.meta.get("outside_training", []),
         "cost": cost(rollout),
         "finite": bool(np.isfinite(rollout.position).all() and np.isfinite(rollout.orientation).all()),
@@ -349,10 +344,6 @@ def _number(value: Any) -> float | None:
 
 class Checkpoint:
     """What is kept of one run: its frames in parts, the state that the last part leads to, and how long all has rested.
-
-    Args:
-        folder: of the run.
-        simulator: at its start.
 
     Attributes:
         identity: of the run, see the function of this name.

@@ -113,7 +113,6 @@ def show(recording: Path, *, web: bool = False, bind: str = LOOPBACK) -> None:
     """Open a recording, and wait until the viewer is closed.
 
     Args:
-        recording: .rrd.
         web: as a page instead of a window.
         bind: address of this machine that the viewer listens on.
 
@@ -133,8 +132,6 @@ def screenshot(recording: Path, picture: Path, *, at: float | None = None) -> No
     """Write what the viewer shows of a recording as a PNG, without a screen.
 
     Args:
-        recording: .rrd.
-        picture: .png to write.
         at: time in s (default: the end of the recording).
 
     Raises:

@@ -1,4 +1,4 @@
-"""Many meshes at once: in processes, on a cluster, in one stack."""
+"""Many meshes at once: in processes, on a cluster."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 import cli
 from sdfsim import fitting
 from sdfsim.errors import SdfsimError
-from sdfsim.fitting import Options, fit_many, named_meshes
+from sdfsim.fitting import Options, named_meshes
 from sdfsim.parallel import cluster, parallel
 from sdfsim.scene.scene_file import UNITS
 from sdfsim.shape import primitives
@@ -85,21 +85,6 @@ def test_units_are_those_of_a_scene_file_and_odd_sizes_are_told(tmp_path: Path) 
         note = f"it is {told} m wide; where that is wrong, --units says what the file counts in"
         assert report["notes"] == ([note] if told else [])
         assert (f"box: {note}" in fitting.batch_lines({"folder": "", "shapes": {"box": report}})) == bool(told)
-
-
-def test_one_stack_gives_the_same_shapes_as_processes(
-    meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(fitting, "STACK", 2)
-    files = named_meshes([meshes])
-    told: list[float] = []
-    made = dict(fitting._stacked(list(files.items()), tmp_path / "s", QUICK, "cpu", lambda f, m: told.append(f)))
-    assert {name for name, report in made.items() if "error" in report} == {"holed", "torn"}
-    assert told == sorted(told) and told[-1] <= 1
-    assert load_shape(tmp_path / "s" / "ball").name == "ball"
-    # What the stack has made, processes do not make again.
-    report = fit_many(files, tmp_path / "s", QUICK, device="cpu", on_progress=lambda f, m: None)
-    assert report["shapes"]["box"]["steps"] == made["box"]["steps"]
 
 
 def test_names(meshes: Path, tmp_path: Path) -> None:

@@ -185,20 +185,21 @@ def test_what_is_proposed_and_how_far_to_trust_the_surface_are_things_of_their_o
     save_reconstruction(tmp_path / "r.rrd", [photo], np.zeros((0, 3)), None, box(), trust={"a box": tinted})
     found = read(tmp_path / "r.rrd")
     assert found["/world/cameras/next1!"]["Pinhole:color"][0][0] == 0xFF28C8FF
-    assert len(found[r"/world/trust/a\ box!"]["Mesh3D:vertex_colors"][0]) == 36
+    assert len(found[r"/world/trust/a\ box!"]["Mesh3D:vertex_colors"][0]) == 24
     assert "/world/surface!" in found
 
 
 def test_boxes_keep_their_edges_and_balls_stay_smooth():
     mesh, normals = with_normals(box())
-    assert len(mesh.vertices) == 36
+    assert len(mesh.vertices) == 24
     np.testing.assert_allclose(np.abs(normals).max(1), 1.0)
     mesh, normals = with_normals(sphere())
     np.testing.assert_allclose((normals * mesh.vertices).sum(1), 0.5, atol=1e-3)
     colored = box()
     colored = Mesh(colored.vertices, colored.faces, np.arange(24, dtype=np.uint8).reshape(8, 3))
     mesh, _ = with_normals(colored)
-    np.testing.assert_array_equal(mesh.colors, colored.colors[colored.faces].reshape(-1, 3))
+    assert mesh.colors is not None and colored.colors is not None
+    np.testing.assert_array_equal(mesh.colors[mesh.faces], colored.colors[colored.faces])
 
 
 def crowd(tmp_path, count: int, frames: int, name: str = "ball"):

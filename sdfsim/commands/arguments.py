@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 import re
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -54,12 +57,29 @@ Cluster = Annotated[
 ]
 
 
-def check_device(device: str) -> None:
-    """That the device is there, for commands that compute on none. Raises SdfsimError otherwise."""
-    if device == "cuda":
-        from sdfsim.dynamics.simulator import pick_device
+def command(work: Callable[..., None]) -> Callable[..., None]:
+    """A command: `work` with a `Session` made for it, and with the options --json, --device and -v.
 
-        pick_device(device)
+    Work that does not compute takes no `device`; that it is there is checked all the same.
+    """
+    given = inspect.signature(work, eval_str=True).parameters
+
+    @wraps(work)
+    def run(*, as_json: bool, device: str, verbose: bool, **options: Any) -> None:
+        with Session(as_json=as_json, verbose=verbose) as session:
+            if device == "cuda":
+                from sdfsim.dynamics.simulator import pick_device
+
+                pick_device(device)
+            work(session, **options, **({"device": device} if "device" in given else {}))
+
+    own = [parameter for name, parameter in given.items() if name not in ("session", "device")]
+    shared = (("as_json", Json, False), ("device", Device, "auto"), ("verbose", Verbose, False))
+    added = [inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY, default=d, annotation=a) for n, a, d in shared]
+    told: Any = run
+    told.__signature__ = inspect.Signature([*own, *added])
+    told.__annotations__ = work.__annotations__ | {name: kind for name, kind, _ in shared}
+    return run
 
 
 def tell_failed(session: Session, report: dict) -> None:

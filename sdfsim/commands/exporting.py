@@ -7,43 +7,29 @@ from typing import Annotated
 
 import typer
 
-from sdfsim.commands.arguments import Device, Json, Outside, Verbose, check_device
+from sdfsim.commands.arguments import Outside, command
 from sdfsim.console import Session
 
 
+@command
 def export(
-    source: Annotated[
-        Path,
-        typer.Argument(help="Run folder, rollout.npz, scene.yaml or Shape folder.", show_default=False),
-    ],
+    session: Session,
+    source: Annotated[Path, typer.Argument(help="Run folder, rollout.npz, scene.yaml or Shape folder.")],
     out: Annotated[
         Path,
-        typer.Option(
-            "-o",
-            "--out",
-            metavar="FILE",
-            help="Ends in .glb .usd .usda .usdc .xml .mjcf .urdf or .csv.",
-            show_default=False,
-        ),
+        typer.Option("-o", "--out", metavar="FILE", help="Ends in .glb .usd .usda .usdc .xml .mjcf .urdf or .csv."),
     ],
     scene: Annotated[Path | None, typer.Option(help="scene.yaml of a run (default: that of the run folder).")] = None,
     allow_outside: Outside = False,
-    as_json: Json = False,
-    device: Device = "auto",
-    verbose: Verbose = False,
 ) -> None:
     """Shape, scene or run -> a file of other programs (docs/export.md)."""
-    with Session(as_json=as_json, verbose=verbose) as session:
-        from sdfsim import export as room
+    from sdfsim import export as room
 
-        check_device(device)
-        report = room.export(
-            source, out, scene_file=scene, allow_outside=allow_outside, on_progress=session.stage_progress
-        )
-        files = report["files"]
-        lines = [
-            f"bodies {report['bodies']}, frames {report['frames']}",
-            f"wrote {files[0]}" + (f" and {len(files) - 1} files beside it" if len(files) > 1 else ""),
-            *(f"not in it: {line}" for line in report["left_out"]),
-        ]
-        session.report(report, lines)
+    report = room.export(source, out, scene_file=scene, allow_outside=allow_outside, on_progress=session.stage_progress)
+    files = report["files"]
+    lines = [
+        f"bodies {report['bodies']}, frames {report['frames']}",
+        f"wrote {files[0]}" + (f" and {len(files) - 1} files beside it" if len(files) > 1 else ""),
+        *(f"not in it: {line}" for line in report["left_out"]),
+    ]
+    session.report(report, lines)

@@ -7,11 +7,13 @@ from typing import Annotated, Literal
 
 import typer
 
-from sdfsim.commands.arguments import Cluster, Device, Json, Model, Out, Verbose, check_device
+from sdfsim.commands.arguments import Cluster, Model, Out, command
 from sdfsim.console import Session
 
 
+@command
 def dataset(
+    session: Session,
     recipe: Annotated[Literal["movi-b", "movi-c", "bowl", "pile", "varied"], typer.Argument(show_default=False)],
     out: Out,
     trajectories: Annotated[int, typer.Option(help="How many.", min=1, show_default=False)],
@@ -30,33 +32,30 @@ def dataset(
     seed: Annotated[int, typer.Option(min=0)] = 0,
     split: Literal["train", "validation", "test"] = "train",
     cluster: Cluster = None,
-    as_json: Json = False,
-    device: Device = "auto",
-    verbose: Verbose = False,
 ) -> None:
     """Trajectories of the teacher (PyBullet) to learn from."""
-    with Session(as_json=as_json, verbose=verbose) as session:
-        from sdfsim.data.generate import make_dataset, report_lines
-        from sdfsim.parallel import cluster as working_on
+    from sdfsim.data.generate import make_dataset, report_lines
+    from sdfsim.parallel import cluster as working_on
 
-        check_device(device)
-        with working_on(cluster):
-            report = make_dataset(
-                recipe,
-                out,
-                trajectories=trajectories,
-                shapes=shapes,
-                random_solids=random_solids,
-                bodies=bodies,
-                fps=int(fps),
-                seed=seed,
-                split=split,
-                on_progress=session.progress,
-            )
-        session.report(report, report_lines(report))
+    with working_on(cluster):
+        report = make_dataset(
+            recipe,
+            out,
+            trajectories=trajectories,
+            shapes=shapes,
+            random_solids=random_solids,
+            bodies=bodies,
+            fps=int(fps),
+            seed=seed,
+            split=split,
+            on_progress=session.progress,
+        )
+    session.report(report, report_lines(report))
 
 
+@command
 def train(
+    session: Session,
     data: Annotated[
         list[Path], typer.Option(help="Dataset folder; several are trained on together.", show_default=False)
     ],
@@ -65,20 +64,17 @@ def train(
         Literal["small", "long", "alone", "base", "paper"], typer.Option(help="Kind and size of the model.")
     ] = "small",
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in the folder.")] = False,
-    as_json: Json = False,
-    device: Device = "auto",
-    verbose: Verbose = False,
+    device: str = "auto",
 ) -> None:
     """Train a model on datasets."""
-    with Session(as_json=as_json, verbose=verbose) as session:
-        from sdfsim.training.train import train as run_training
+    from sdfsim.training.train import train as run_training
 
-        session.report(
-            run_training(data, out, preset=preset, resume=resume, device=device, on_progress=session.progress)
-        )
+    session.report(run_training(data, out, preset=preset, resume=resume, device=device, on_progress=session.progress))
 
 
+@command
 def evaluate(
+    session: Session,
     data: Annotated[Path, typer.Argument(help="Dataset folder, or one split of it.", show_default=False)],
     model: Model = None,
     steps: Annotated[int, typer.Option(help="Length of each rollout.", min=1)] = 50,
@@ -89,22 +85,19 @@ def evaluate(
         bool,
         typer.Option("--chaos-floor", help="Also the teacher again from starts slightly off (needs PyBullet)."),
     ] = False,
-    as_json: Json = False,
-    device: Device = "auto",
-    verbose: Verbose = False,
+    device: str = "auto",
 ) -> None:
     """Errors of a model's rollouts on recorded trajectories, and the quality of its motion."""
-    with Session(as_json=as_json, verbose=verbose) as session:
-        from sdfsim.evaluation.evaluate import evaluate as run_evaluation
-        from sdfsim.evaluation.evaluate import report_lines
+    from sdfsim.evaluation.evaluate import evaluate as run_evaluation
+    from sdfsim.evaluation.evaluate import report_lines
 
-        report = run_evaluation(
-            data,
-            model=model,
-            steps=steps,
-            device=device,
-            free_flight=free_flight,
-            chaos_floor=chaos_floor,
-            on_progress=session.progress,
-        )
-        session.report(report, report_lines(report))
+    report = run_evaluation(
+        data,
+        model=model,
+        steps=steps,
+        device=device,
+        free_flight=free_flight,
+        chaos_floor=chaos_floor,
+        on_progress=session.progress,
+    )
+    session.report(report, report_lines(report))

@@ -8,20 +8,9 @@ from typing import Annotated, Literal
 
 import typer
 
-from sdfsim.commands.arguments import (
-    Bind,
-    Camera,
-    Device,
-    Json,
-    LookAt,
-    Model,
-    Out,
-    Outside,
-    Verbose,
-    check_device,
-    tell_failed,
-)
+from sdfsim.commands.arguments import Bind, Camera, LookAt, Model, Out, Outside, command, tell_failed
 from sdfsim.console import Session, duration
+from sdfsim.errors import EXIT_USAGE, SdfsimError
 
 _PACKAGES = (
     *("torch", "numpy", "scipy", "open3d", "trimesh", "pycolmap", "opencv-python-headless", "rerun-sdk"),
@@ -29,11 +18,13 @@ _PACKAGES = (
 )
 
 
+@command
 def simulate(
+    session: Session,
     scene: Annotated[Path, typer.Argument(help="scene.yaml", show_default=False)],
     out: Out,
     model: Model = None,
-    seconds: Annotated[float | None, typer.Option(help="Simulated time (default: the scene's).")] = None,
+    seconds: Annotated[float | None, typer.Option(help="Simulated time (default: the scene's).", min=0)] = None,
     seed: Annotated[int | None, typer.Option(help="Default: the scene's.", min=0)] = None,
     viewer: Annotated[Literal["none", "file", "native", "web"], typer.Option(help="Where to watch.")] = "file",
     until_settled: Annotated[
@@ -44,99 +35,92 @@ def simulate(
     look_at: LookAt = None,
     bind: Bind = "127.0.0.1",
     allow_outside: Outside = False,
-    as_json: Json = False,
-    device: Device = "auto",
-    verbose: Verbose = False,
+    device: str = "auto",
 ) -> None:
     """Scene -> motion, in a run folder."""
-    if seconds is not None and not (0 <= seconds < float("inf")):
-        raise typer.BadParameter("--seconds must be >= 0")
-    with Session(as_json=as_json, verbose=verbose) as session:
-        from sdfsim import run
+    from sdfsim import run
 
-        report = run.simulate(
-            scene,
-            out,
-            model=model,
-            seconds=seconds,
-            seed=seed,
-            viewer=viewer,
-            bind=bind,
-            allow_outside=allow_outside,
-            until_settled=until_settled,
-            resume=resume,
-            camera=camera,
-            look_at=look_at,
-            device=device,
-            on_progress=session.stage_progress,
-            say=session.say,
-        )
-        median = report["step_ms_median"]
-        lines = [
-            f"{report['steps']} steps of {report['dt_s']:.4g} s in {duration(report['wall_s'])}"
-            + ("" if median is None else f" (median {median:.1f} ms a step)"),
-            f"mean contacts {report['contacts_mean']:.1f}, worst penetration {report['worst_penetration_m']:.2g} m",
-            *run.ending_lines(report),
-            *([] if report.get("settled", True) else ["not settled: give it more --seconds"]),
-            *(run.cost_lines(report) if verbose else []),
-            f"wrote {out}",
-            *(f"outside the model's training: {line}" for line in report["outside_training"]),
-            *(f"usable, not exact: {line}" for line in report["caveats"]),
-        ]
-        tell_failed(session, report)
-        if "recording" in report:
-            lines.append(f"watch it: sdfsim view {report['recording']}   (or: rerun {report['recording']})")
-        session.report(report, lines)
-        if viewer == "web":
-            session.hold("the page stays up until Ctrl-C")
+    report = run.simulate(
+        scene,
+        out,
+        model=model,
+        seconds=seconds,
+        seed=seed,
+        viewer=viewer,
+        bind=bind,
+        allow_outside=allow_outside,
+        until_settled=until_settled,
+        resume=resume,
+        camera=camera,
+        look_at=look_at,
+        device=device,
+        on_progress=session.stage_progress,
+        say=session.say,
+    )
+    median = report["step_ms_median"]
+    lines = [
+        f"{report['steps']} steps of {report['dt_s']:.4g} s in {duration(report['wall_s'])}"
+        + ("" if median is None else f" (median {median:.1f} ms a step)"),
+        f"mean contacts {report['contacts_mean']:.1f}, worst penetration {report['worst_penetration_m']:.2g} m",
+        *run.ending_lines(report),
+        *([] if report.get("settled", True) else ["not settled: give it more --seconds"]),
+        *(run.cost_lines(report) if session.verbose else []),
+        f"wrote {out}",
+        *(f"outside the model's training: {line}" for line in report["outside_training"]),
+        *(f"usable, not exact: {line}" for line in report["caveats"]),
+    ]
+    tell_failed(session, report)
+    if "recording" in report:
+        lines.append(f"watch it: sdfsim view {report['recording']}   (or: rerun {report['recording']})")
+    session.report(report, lines)
+    if viewer == "web":
+        session.hold("the page stays up until Ctrl-C")
 
 
+@command
 def plan(
+    session: Session,
     scene: Annotated[Path, typer.Argument(help="scene.yaml", show_default=False)],
     model: Model = None,
     allow_outside: Outside = False,
-    as_json: Json = False,
-    device: Device = "auto",
-    verbose: Verbose = False,
+    device: str = "auto",
 ) -> None:
     """Which effects are in play, why, and what a step costs."""
-    with Session(as_json=as_json, verbose=verbose) as session:
-        from sdfsim import planning
+    from sdfsim import planning
 
-        report = planning.describe(
-            scene, model=model, device=device, allow_outside=allow_outside, on_progress=session.stage_progress
-        )
-        for check in report["failed_checks"]:  # told, but a plan is as good with a shape that is less exact
-            session.say(f"failed check: {check}")
-        session.report(report, planning.plan_lines(report))
+    report = planning.describe(
+        scene, model=model, device=device, allow_outside=allow_outside, on_progress=session.stage_progress
+    )
+    for check in report["failed_checks"]:  # told, but a plan is as good with a shape that is less exact
+        session.say(f"failed check: {check}")
+    session.report(report, planning.plan_lines(report))
 
 
+@command
 def view(
+    session: Session,
     recording: Annotated[Path, typer.Argument(help="rollout.rrd", show_default=False)],
     web: Annotated[bool, typer.Option("--web", help="In the browser.")] = False,
     picture: Annotated[Path | None, typer.Option("--screenshot", help="Write a PNG instead; needs no screen.")] = None,
     at: Annotated[float | None, typer.Option(help="Time of the screenshot, s (default: the end).")] = None,
     bind: Bind = "127.0.0.1",
-    as_json: Json = False,
-    device: Device = "auto",
-    verbose: Verbose = False,
 ) -> None:
     """Watch a recording, or take a picture of it."""
     if at is not None and picture is None:
-        raise typer.BadParameter("--at goes with --screenshot")
-    with Session(as_json=as_json, verbose=verbose) as session:
-        from sdfsim import viewer
+        raise SdfsimError("--at goes with --screenshot", exit_code=EXIT_USAGE)
+    from sdfsim import viewer
 
-        check_device(device)
-        if picture is not None:
-            viewer.screenshot(recording, picture, at=at)
-            session.report({"screenshot": str(picture)})
-        else:
-            viewer.show(recording, web=web, bind=bind)
-            session.report({"recording": str(recording)})
+    if picture is not None:
+        viewer.screenshot(recording, picture, at=at)
+        session.report({"screenshot": str(picture)})
+    else:
+        viewer.show(recording, web=web, bind=bind)
+        session.report({"recording": str(recording)})
 
 
+@command
 def render(
+    session: Session,
     source: Annotated[Path, typer.Argument(help="Run folder or rollout.npz.", show_default=False)],
     out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help=".mp4 or .png.", show_default=False)],
     scene: Annotated[Path | None, typer.Option(help="scene.yaml (default: that of the run folder).")] = None,
@@ -144,70 +128,55 @@ def render(
     look_at: LookAt = None,
     at: Annotated[float | None, typer.Option(help="Time of a picture, s (default: the end).")] = None,
     allow_outside: Outside = False,
-    as_json: Json = False,
-    device: Device = "auto",
-    verbose: Verbose = False,
 ) -> None:
     """Run -> movie or picture, without a screen."""
     if at is not None and out.suffix != ".png":
-        raise typer.BadParameter("--at goes with a picture, -o FILE.png")
-    with Session(as_json=as_json, verbose=verbose) as session:
-        from sdfsim import render as room
-        from sdfsim.run import read_run
+        raise SdfsimError("--at goes with a picture, -o FILE.png", exit_code=EXIT_USAGE)
+    from sdfsim import render as room
+    from sdfsim.run import read_run
 
-        check_device(device)
-        room.check_format(out)
-        shapes, frames = partial(session.stage_progress, "shapes"), partial(session.stage_progress, "render")
-        loaded, rollout = read_run(source, scene, allow_outside=allow_outside, on_progress=shapes)
-        room.render(loaded, rollout, out, camera=camera, look_at=look_at, at=at, on_progress=frames)
-        session.report({"picture" if out.suffix == ".png" else "movie": str(out)}, [f"wrote {out}"])
+    room.check_format(out)
+    shapes, frames = partial(session.stage_progress, "shapes"), partial(session.stage_progress, "render")
+    loaded, rollout = read_run(source, scene, allow_outside=allow_outside, on_progress=shapes)
+    room.render(loaded, rollout, out, camera=camera, look_at=look_at, at=at, on_progress=frames)
+    session.report({"picture" if out.suffix == ".png" else "movie": str(out)}, [f"wrote {out}"])
 
 
+@command
 def identify(
+    session: Session,
     recording: Annotated[
         Path, typer.Argument(help="Run folder, rollout.npz or CSV of poses (docs/identify.md).", show_default=False)
     ],
     scene: Annotated[Path | None, typer.Option(help="scene.yaml (default: that of the run folder).")] = None,
     allow_outside: Outside = False,
-    as_json: Json = False,
-    device: Device = "auto",
-    verbose: Verbose = False,
 ) -> None:
     """Motion -> friction, restitution and mass ratios."""
-    with Session(as_json=as_json, verbose=verbose) as session:
-        from sdfsim import identify as room
+    from sdfsim import identify as room
 
-        check_device(device)
-        shapes, fit = partial(session.stage_progress, "shapes"), partial(session.stage_progress, "identify")
-        motion, known = room.load_recording(recording, scene, allow_outside=allow_outside, on_progress=shapes)
-        found = room.identify(motion, known, on_progress=fit)
-        session.report(found.report(), found.lines())
+    shapes, fit = partial(session.stage_progress, "shapes"), partial(session.stage_progress, "identify")
+    motion, known = room.load_recording(recording, scene, allow_outside=allow_outside, on_progress=shapes)
+    found = room.identify(motion, known, on_progress=fit)
+    session.report(found.report(), found.lines())
 
 
-def info(as_json: Json = False, device: Device = "auto", verbose: Verbose = False) -> None:
+@command
+def info(session: Session) -> None:
     """Versions, devices and bundled models."""
-    with Session(as_json=as_json, verbose=verbose) as session:
-        import platform
-        from importlib import metadata
+    import platform
+    from importlib import metadata
 
-        import torch
+    import torch
 
-        import sdfsim
-        from sdfsim.dynamics.model import model_names
+    import sdfsim
+    from sdfsim.dynamics.model import model_names
 
-        check_device(device)
-        versions = {"sdfsim": sdfsim.__version__, "python": platform.python_version()}
-        for name in _PACKAGES:
-            try:
-                versions[name] = metadata.version(name)
-            except metadata.PackageNotFoundError:
-                versions[name] = "missing"
-        gpus = [f"cuda:{i} {torch.cuda.get_device_name(i)}" for i in range(torch.cuda.device_count())]
-        session.report(
-            {
-                "versions": versions,
-                "devices": ["cpu", *gpus],
-                "cpu_threads": torch.get_num_threads(),
-                "models": model_names(),
-            }
-        )
+    versions = {"sdfsim": sdfsim.__version__, "python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            versions[name] = "missing"
+    gpus = [f"cuda:{i} {torch.cuda.get_device_name(i)}" for i in range(torch.cuda.device_count())]
+    threads = {"cpu_threads": torch.get_num_threads()}
+    session.report({"versions": versions, "devices": ["cpu", *gpus], **threads, "models": model_names()})

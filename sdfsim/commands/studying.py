@@ -3,78 +3,62 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from sdfsim.commands.arguments import Device, Json, Out, Verbose, check_device, folder_of, tell_failed
+from sdfsim.commands.arguments import Out, command, folder_of, tell_failed
 from sdfsim.console import Session, columns
 
+Models = Annotated[
+    list[str] | None, typer.Option(help="Bundled model or path; may be given again (default: all bundled ones).")
+]
 
+
+@command
 def tradeoff(
+    session: Session,
     out: Out,
     source: Annotated[
         Path | None,
         typer.Argument(metavar="SCENE|DATA_DIR", help="scene.yaml or dataset folder (default: a random scene)."),
     ] = None,
-    model: Annotated[
-        list[str] | None, typer.Option(help="Bundled model or path; may be given again (default: all bundled ones).")
-    ] = None,
+    model: Models = None,
     quick: Annotated[bool, typer.Option("--quick", help="A few settings, in minutes.")] = False,
-    as_json: Json = False,
-    device: Device = "auto",
-    verbose: Verbose = False,
 ) -> None:
     """What accuracy costs in time: knobs, models and engines on the same scenes; what is measured is kept in -o."""
-    with Session(as_json=as_json, verbose=verbose) as session:
-        from sdfsim.evaluation import tradeoff as study
-        from sdfsim.evaluation.harness import check_matplotlib
+    from sdfsim.evaluation import tradeoff as study
+    from sdfsim.evaluation.harness import check_matplotlib
 
-        check_device(device)
-        check_matplotlib()
-        report = study.tradeoff(source, out, models=model or [], quick=quick, on_progress=session.stage_progress)
-        rows, notes = study.told(report)
-        session.report(report, [*columns(rows), *notes])
+    check_matplotlib()
+    report = study.tradeoff(source, out, models=model or [], quick=quick, on_progress=session.stage_progress)
+    rows, notes = study.told(report)
+    session.report(report, [*columns(rows), *notes])
 
 
+@command
 def stress(
-    out: Annotated[
-        Path,
-        typer.Option(
-            "-o", "--out", parser=folder_of, metavar="PATH", help="Folder to write; finished cases in it are kept."
-        ),
-    ] = Path("stress"),
-    model: Annotated[
-        list[str] | None, typer.Option(help="Bundled model or path; may be given again (default: all bundled ones).")
-    ] = None,
+    session: Session,
+    out: Annotated[Path, typer.Option("-o", "--out", parser=folder_of, metavar="PATH", help="Folder to write.")] = Path(
+        "stress"
+    ),
+    model: Models = None,
     quick: Annotated[bool, typer.Option("--quick", help="Fewer and shorter cases, in minutes.")] = False,
     shapes: Annotated[
         Path | None, typer.Option(help="Folder of meshes that are to rest on the floor too, or ycb: downloaded once.")
     ] = None,
-    as_json: Json = False,
-    device: Device = "auto",
-    verbose: Verbose = False,
+    device: str = "auto",
 ) -> None:
     """The hard cases, with every model and the teacher: a table, plots, and recordings of what went wrong."""
-    with Session(as_json=as_json, verbose=verbose) as session:
-        from sdfsim.evaluation import stress as study
-        from sdfsim.evaluation.harness import check_matplotlib
-        from sdfsim.recording import save_rollout
+    from sdfsim.evaluation import stress as study
+    from sdfsim.evaluation.harness import check_matplotlib
+    from sdfsim.recording import save_rollout
 
-        check_matplotlib()
-        found = study.stress(
-            out,
-            models=model or [],
-            quick=quick,
-            shapes=shapes,
-            device=device,
-            record=save_rollout,
-            on_progress=session.progress,
-        )
-        report = study.write_report(found, out)
-        tell_failed(session, report)
-        lost = [
-            f"{who}: {', '.join(f'{n} {what}' for what, n in lost.items())}" for who, lost in report["models"].items()
-        ]
-        table = columns(study.rows(found, {"missed": "!", "behind": "<"}))
-        session.report(report, [*table, "! beyond what is wanted, < worse than the teacher", *lost, f"wrote {out}"])
+    check_matplotlib()
+    options: Any = {"models": model or [], "quick": quick, "shapes": shapes, "device": device}
+    found = study.stress(out, **options, record=save_rollout, on_progress=session.progress)
+    report = study.write_report(found, out)
+    tell_failed(session, report)
+    lost = [f"{who}: {', '.join(f'{n} {what}' for what, n in lost.items())}" for who, lost in report["models"].items()]
+    table = columns(study.rows(found, {"missed": "!", "behind": "<"}))
+    session.report(report, [*table, "! beyond what is wanted, < worse than the teacher", *lost, f"wrote {out}"])

@@ -14,7 +14,7 @@ from sdfsim.data.scenarios import RECIPES, Cast, Recipe
 from sdfsim.data.shape_assets import VHACD, Origin, fit_shapes, origins, prepare, split_of
 from sdfsim.errors import SdfsimError
 from sdfsim.files import locked, write_json
-from sdfsim.parallel import Progress, parallel
+from sdfsim.parallel import Progress, parallel, silent
 
 GRAVITY = (0.0, 0.0, -10.0)  # m/s^2
 STEPS = 100
@@ -33,7 +33,7 @@ def make_dataset(
     fps: int = FPS,
     seed: int = 0,
     split: str = "train",
-    on_progress: Progress | None = None,
+    on_progress: Progress = silent,
 ) -> dict:
     """Write `trajectories` files under `out/SPLIT/` and the Shape folders under `out/shapes/`.
 
@@ -42,16 +42,11 @@ def make_dataset(
     (see `split_of`), so that those of validation and test are never trained on.
 
     Args:
-        recipe: a name in `RECIPES`.
-        out: dataset folder.
-        trajectories: how many.
         shapes: folder of shapes (see `origins`) or name of a public set (see `public_folder`); movi-b takes NAME/
             folders alone.
         random_solids: how many of PyBullet's random solids there are beside them.
         bodies: how many move, instead of the recipe's range (bowl and pile).
         fps: recorded frames a second, in `RATES`.
-        seed: of the dataset.
-        split: "train", "validation" or "test".
 
     Returns:
         A report: dataset, split, trajectories, made_now, shapes (how many the split draws from), left_out (name ->
@@ -62,9 +57,8 @@ def make_dataset(
             fetched, PyBullet absent, another dataset in `out`, or another run writing to it.
     """
     plan = _checked(recipe, shapes, random_solids, bodies, fps)
-    tell = on_progress or (lambda fraction, message: None)
     engine = import_pybullet()
-    given = _origins(plan, shapes and public_folder(shapes, tell), random_solids)
+    given = _origins(plan, shapes and public_folder(shapes, on_progress), random_solids)
     info = {
         "recipe": recipe,
         "seed": seed,
@@ -81,7 +75,7 @@ def make_dataset(
     with locked(out):
         # Before anything is written: engine files of another dataset's shapes must stay what they are.
         _check_same(out, info)
-        found, left_out = prepare(given, out / "shapes" / "engine", lambda f, m: tell(0.1 * f, m))
+        found, left_out = prepare(given, out / "shapes" / "engine", lambda f, m: on_progress(0.1 * f, m))
         info["shapes"] = [source.name for source in found]
         if not plan.kubasic:
             info |= {"left_out": left_out, "vhacd": VHACD}
@@ -91,7 +85,7 @@ def make_dataset(
         mine = drawn if plan.kubasic else [source for source in drawn if split_of(source.name) == split]
         if plan.given and not mine:
             raise SdfsimError(f"none of the {len(drawn)} shapes belongs to the {split} split", "give more shapes")
-        fit_shapes([*mine, *scenery.values()], out / "shapes", lambda f, m: tell(0.1 + 0.4 * f, m))
+        fit_shapes([*mine, *scenery.values()], out / "shapes", lambda f, m: on_progress(0.1 + 0.4 * f, m))
         write_json(out / INFO, info)
         folder = out / split
         folder.mkdir(parents=True, exist_ok=True)
@@ -99,7 +93,7 @@ def make_dataset(
         todo = [job for job in files if not job[1].exists()]
         make_one = partial(_make_one, recipe, Cast(mine, scenery, bodies), fps, seed, split)
         for done, _ in enumerate(parallel(make_one, todo), start=1):
-            tell(0.5 + 0.5 * done / len(todo), f"trajectory {done} of {len(todo)}")
+            on_progress(0.5 + 0.5 * done / len(todo), f"trajectory {done} of {len(todo)}")
     return {
         "dataset": str(out),
         "split": split,
@@ -123,9 +117,6 @@ def make_trajectory(recipe: str, rng: np.random.Generator, cast: Cast, fps: int 
     """One trajectory of `STEPS` steps, with velocities as the engine gives them.
 
     Args:
-        recipe: a name in `RECIPES`.
-        rng: what the scene is drawn from.
-        cast: shapes and scenery.
         fps: recorded frames a second, in `RATES`.
 
     Raises:

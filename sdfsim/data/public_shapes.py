@@ -11,15 +11,14 @@ packing it anew changes no shape.
 from __future__ import annotations
 
 import hashlib
-import os
 import tarfile
 import tempfile
 import zlib
 from pathlib import Path
 
 from sdfsim.errors import SdfsimError
-from sdfsim.files import FREELY, replacing
-from sdfsim.parallel import Progress
+from sdfsim.files import FREELY, user_cache, write_bytes
+from sdfsim.parallel import Progress, silent
 
 KUBRIC = "https://storage.googleapis.com/kubric-public/assets/KuBasic"
 # One commit, so that nothing there can move.
@@ -65,7 +64,7 @@ SUMS = {
 }
 
 
-def public_folder(shapes: Path, on_progress: Progress | None = None) -> Path:
+def public_folder(shapes: Path, on_progress: Progress = silent) -> Path:
     """The folder that `--shapes` means: that of this path, or the public set of this name, fetched if need be.
 
     Args:
@@ -77,7 +76,7 @@ def public_folder(shapes: Path, on_progress: Progress | None = None) -> Path:
     name = str(shapes)
     if name not in SUMS or shapes.is_dir():
         return shapes
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sdfsim" / "public" / name
+    folder = user_cache("public") / name
     missing: dict[str, list[str]] = {}
     for file, expected in SUMS[name].items():
         if (folder / file).is_file():  # people may have put it there, so it is checked each time
@@ -86,16 +85,14 @@ def public_folder(shapes: Path, on_progress: Progress | None = None) -> Path:
             missing.setdefault(_url(file), []).append(file)
     hint = f"put these files into {folder} by hand: {', '.join(SUMS[name])}"
     for url, files in missing.items():
-        if on_progress is not None:
-            on_progress(0.0, f"fetching {url}")
+        on_progress(0.0, f"fetching {url}")
         found = _fetched(url, hint)
         content = {file: found.get(Path(file).name) or found.get("", b"") for file in files}
         for file in files:  # all of them before any is kept
             _check(content[file], SUMS[name][file], f"{url}: {Path(file).name}", hint)
         for file in files:
-            with replacing(folder / file) as partial:
-                partial.parent.mkdir(parents=True, exist_ok=True)
-                partial.write_bytes(content[file])
+            (folder / file).parent.mkdir(parents=True, exist_ok=True)
+            write_bytes(folder / file, content[file])
     return folder
 
 

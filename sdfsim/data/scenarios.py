@@ -262,7 +262,6 @@ def at_rest(teacher: Teacher, rng: np.random.Generator, bodies: Bodies, start: s
 
     Args:
         teacher: the world; the bodies come after those that it has.
-        rng: what is drawn from.
         bodies: of shapes whose largest extent is 1 m at scale 1.
         start: one of `STARTS`.
 
@@ -300,7 +299,6 @@ def set_moving(teacher: Teacher, rng: np.random.Generator, bodies: Bodies, motio
 
     Args:
         teacher: the world; the bodies come after those that it has.
-        rng: what is drawn from.
         bodies: of shapes whose largest extent is 1 m at scale 1; "head-on" takes two at a time.
         motion: one of `MOTIONS`.
 

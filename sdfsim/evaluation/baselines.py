@@ -1,7 +1,4 @@
-"""What a model's errors compare with: flight without contact, and how far the teacher departs from its own recording.
-
-The chaos floor is the teacher run again from starts that differ by next to nothing.
-"""
+"""How far the teacher departs from its own recording: run again from starts that differ by next to nothing."""
 
 from __future__ import annotations
 
@@ -9,38 +6,23 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from sdfsim.data.dataset import Trajectory, floor_of, home_of, read_info
 from sdfsim.data.pybullet_sim import engine_settings, import_pybullet, substeps_of
-from sdfsim.data.replay import roll_out
-from sdfsim.dynamics.model import Model
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.engines import Start, bullet, dataset_urdf
 from sdfsim.parallel import parallel
-from sdfsim.shape.shape import Shape
 
 # m/s; 0 tells what the recording alone does not bring back: an engine's state is more than its recorded frames.
 PERTURBATIONS = {"0": 0.0, "1e-6": 1e-6, "1e-3": 1e-3}
 
 
-def ballistic(model: Model, group: list[Trajectory], shapes: dict[str, Shape], steps: int) -> list[Trajectory]:
-    """The bodies of one batch of trajectories (see `roll_out`) in free flight, through each other and the floor."""
-    return roll_out(model, group, shapes, steps, torch.device("cpu"), contact=False)
-
-
 def chaos_floor(data: Path, trajectories: list[Trajectory], steps: int, seed: int = 0) -> dict[str, list[Trajectory]]:
-    """Run the teacher again from the recorded starts.
-
-    Args:
-        data: dataset folder (or one split of it) whose `shapes/engine` holds a URDF for every shape.
-        trajectories: recorded ones, with velocities as recorded.
-        steps: how far.
-        seed: of the directions of the perturbations.
+    """Run the teacher again from recorded starts (velocities as recorded) of a dataset with a URDF for every shape.
 
     Returns:
-        name in `PERTURBATIONS` -> the same bodies in the motion (steps + 1 frames) that follows when the velocity of
-        each that moves is changed by so much in a random direction.
+        name in `PERTURBATIONS` -> the motions (steps + 1 frames) that follow when the velocity of each body that moves
+        is changed by so much in a random direction.
 
     Raises:
         SdfsimError: PyBullet or an engine file is absent, or the recording is not this teacher's.

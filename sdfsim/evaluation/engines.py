@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -57,13 +57,22 @@ class Timing:
     cpu_ms: float
 
 
-def start_of_scene(scene: Scene, folder: Path, units: Units | None = None) -> Start:
-    """A scene whose only plane, if any, is a level floor.
+def timed(advance: Callable[[int], object], steps: int) -> Timing:
+    """How long `advance` takes for a first step, and then for the others together."""
+    began = time.perf_counter()
+    advance(1)
+    wall, cpu = time.perf_counter(), time.process_time()
+    first = wall - began
+    advance(steps - 1)
+    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    count = max(1, steps - 1)
+    return Timing(1e3 * first, 1e3 * wall / count, 1e3 * cpu / count)
 
-    Args:
-        scene: what is to move; the shapes are called by their index in it.
-        folder: of the engine's files, which are written where they are not there yet.
-        units: in which the engine has it; SI units where there are none.
+
+def start_of_scene(scene: Scene, folder: Path, units: Units | None = None) -> Start:
+    """A scene whose only plane, if any, is a level floor; shapes are called by their index in it.
+
+    The engine's files are written to `folder` where they are not there yet. Units are SI unless given.
 
     Raises:
         SdfsimError: bodies on a path, or planes other than one level floor.
@@ -125,16 +134,12 @@ def bullet(start: Start, steps: int, substeps: int | None = None) -> tuple[Traje
     Raises:
         SdfsimError: PyBullet is not installed, a step that is none of the teacher's, or another inertia than recorded.
     """
+    parts: list[dict[str, np.ndarray]] = []
     with bullet_at(start, substeps) as teacher:
-        began = time.perf_counter()
-        first = teacher.run(1)
-        first_ms = 1e3 * (time.perf_counter() - began)
-        wall, cpu = time.perf_counter(), time.process_time()
-        rest = teacher.run(steps - 1)
-        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+        timing = timed(lambda count: parts.append(teacher.run(count)), steps)
+    first, rest = parts
     motion = {name: np.concatenate([first[name][:1], rest[name]]) for name in first}
-    count = max(1, steps - 1)
-    return replace(start.motion, **motion), Timing(first_ms, 1e3 * wall / count, 1e3 * cpu / count)
+    return replace(start.motion, **motion), timing
 
 
 @contextmanager
@@ -184,29 +189,25 @@ def mujoco(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajecto
     place[:, :3], place[:, 3:] = t.position[0, moving], np.roll(t.quat_xyzw[0, moving], 1, axis=-1)
     turned = Rotation.from_quat(t.quat_xyzw[0, moving])
     speed[:, :3], speed[:, 3:] = t.velocity[0, moving], turned.inv().apply(t.angular_velocity[0, moving])
-    motion = {
-        "position": np.repeat(t.position[:1], steps + 1, axis=0),
-        "quat_xyzw": np.repeat(t.quat_xyzw[:1], steps + 1, axis=0),
-        "velocity": np.zeros((steps + 1, *t.velocity.shape[1:])),
-        "angular_velocity": np.zeros((steps + 1, *t.velocity.shape[1:])),
-    }
-    first_ms = wall = cpu = 0.0
-    for k in range(steps + 1):
-        began, ran = time.perf_counter(), time.process_time()
-        for _ in range(substeps if k else 0):
-            engine.mj_step(model, data)
-        motion["position"][k, moving] = place[:, :3]
-        motion["quat_xyzw"][k, moving] = np.roll(place[:, 3:], -1, axis=-1)
-        motion["velocity"][k, moving] = speed[:, :3]
-        turned = Rotation.from_quat(motion["quat_xyzw"][k, moving])
-        motion["angular_velocity"][k, moving] = turned.apply(speed[:, 3:])
-        took = time.perf_counter() - began
-        if k == 1:
-            first_ms = 1e3 * took
-        elif k:
-            wall, cpu = wall + took, cpu + time.process_time() - ran
-    count = max(1, steps - 1)
-    return replace(t, **motion), Timing(first_ms, 1e3 * wall / count, 1e3 * cpu / count)
+    frames = [(place.copy(), speed.copy())]
+
+    def advance(count: int) -> None:
+        for _ in range(count):
+            for _ in range(substeps):
+                engine.mj_step(model, data)
+            frames.append((place.copy(), speed.copy()))
+
+    timing = timed(advance, steps)
+    places, speeds = (np.array(kind) for kind in zip(*frames, strict=True))
+    still = np.zeros((steps + 1, *t.velocity.shape[1:]))
+    motion = {"position": still + t.position[0], "velocity": still, "angular_velocity": still.copy()}
+    motion["quat_xyzw"] = np.repeat(t.quat_xyzw[:1], steps + 1, axis=0)
+    motion["position"][:, moving] = places[..., :3]
+    motion["quat_xyzw"][:, moving] = np.roll(places[..., 3:], -1, axis=-1)
+    motion["velocity"][:, moving] = speeds[..., :3]
+    turned = Rotation.from_quat(motion["quat_xyzw"][:, moving].reshape(-1, 4))
+    motion["angular_velocity"][:, moving] = turned.apply(speeds[..., 3:].reshape(-1, 3)).reshape(len(speeds), -1, 3)
+    return replace(t, **motion), timing
 
 
 def _mujoco_model(engine: Any, start: Start, step: float) -> Any:

@@ -20,9 +20,9 @@ from sdfsim.dynamics.ranges import outside_training
 from sdfsim.dynamics.simulator import pick_device
 from sdfsim.dynamics.step import FreeFlight
 from sdfsim.errors import SdfsimError
-from sdfsim.evaluation.baselines import ballistic, chaos_floor
-from sdfsim.evaluation.harness import Progress
+from sdfsim.evaluation.baselines import chaos_floor
 from sdfsim.evaluation.penetration import EVERY, Solid, exact_solids, penetration
+from sdfsim.parallel import Progress, silent
 from sdfsim.shape.shape import Shape
 from sdfsim.training.contact_cache import inner_steps
 
@@ -46,15 +46,13 @@ def evaluate(
     substeps: int | None = None,
     chaos_floor: bool = False,
     errors_only: bool = False,
-    on_progress: Progress | None = None,
+    on_progress: Progress = silent,
 ) -> dict:
     """Roll a model out from the first frame of every trajectory and compare, beside the ballistic baseline.
 
     Args:
-        data: a dataset folder (its `split`, else the trajectories in it).
         model: bundled name, path or `Model`.
         steps: how far; errors are reported at the horizons of `HORIZONS` and `FRAMES` up to there, and there.
-        split: which part of the dataset.
         device: "cpu", "cuda" or "auto".
         free_flight: "exact" or (paper network) "learned".
         stride: recorded steps in a step of the model; errors are then those of every so many-th frame.
@@ -75,14 +73,13 @@ def evaluate(
     Raises:
         SdfsimError: no or unreadable trajectories or shapes; exit code 3 when a rollout is not finite.
     """
-    tell = on_progress or (lambda fraction, message: None)
     place = pick_device(device)
     used = (model if isinstance(model, Model) else load_model(model)).to(place)
     if free_flight == "learned" and not used.on_surfaces:
         raise SdfsimError(
             "free_flight 'learned' exists for networks on surface nodes only", "give a model of that kind"
         )
-    recorded, shapes = _load(data, split)
+    recorded, shapes = load_recorded(data, split)
     longest = min(steps, *(len(t.position) - 1 for t in recorded))
     longest -= longest % stride
     as_recorded = [first_frames(t, longest + 1) for t in recorded]
@@ -94,16 +91,16 @@ def evaluate(
     inner, seconds = substeps or stride * inner_steps(as_recorded[0].dt, substep), 0.0
     used = replace(used, inner=substeps or used.inner)
     for k, group in enumerate(groups):
-        tell(0.8 * k / len(groups), f"{used.name}: batch {k + 1} of {len(groups)}, {longest} steps")
+        on_progress(0.8 * k / len(groups), f"{used.name}: batch {k + 1} of {len(groups)}, {longest} steps")
         started = time.perf_counter()
         contenders["model"] += roll_out(
             used, group, shapes, longest, place, free_flight, substeps=inner, as_teacher=True
         )
         seconds += time.perf_counter() - started
-        contenders["ballistic"] += ballistic(used, group, shapes, longest)
+        contenders["ballistic"] += roll_out(used, group, shapes, longest, place, contact=False)
     again, floor_report = {}, {}
     if chaos_floor:
-        tell(0.8, "teacher, from starts that differ slightly")
+        on_progress(0.8, "teacher, from starts that differ slightly")
         again, floor_report = _teacher_again(data, split, longest, stride)
     scenes = [scene_of([t], [0], shapes)[0] for t in recorded]
     report = {
@@ -124,10 +121,10 @@ def evaluate(
         "median_survival_s": {who: _survival(motions, recorded) for who, motions in (contenders | again).items()},
     }
     if not errors_only:
-        tell(0.9, "penetration, energy and rest")
+        on_progress(0.9, "penetration, energy and rest")
         solids = exact_solids(data, shapes)
         report |= _quality(contenders["model"], recorded, solids)
-    tell(1.0, "done")
+    on_progress(1.0, "done")
     return report
 
 
@@ -174,9 +171,11 @@ def _compared(motion: Trajectory, truth: Trajectory, frames: slice) -> tuple[flo
     )
 
 
-def _load(data: Path, split: str, *, as_recorded: bool = False) -> tuple[Motions, dict[str, Shape]]:
+def load_recorded(
+    data: Path, split: str, *, most: int | None = None, as_recorded: bool = False
+) -> tuple[Motions, dict[str, Shape]]:
     """Trajectories in which something moves, those that can run together side by side, and their shapes."""
-    recorded = [Trajectory.load(f, as_recorded=as_recorded) for f in trajectory_files(data, split)]
+    recorded = [Trajectory.load(f, as_recorded=as_recorded) for f in trajectory_files(data, split)[:most]]
     recorded = [t for group in batches(recorded) for t in group if not t.static.all()]
     if not recorded:
         raise SdfsimError(f"{data}: nothing moves in any trajectory")
@@ -187,7 +186,7 @@ def _load(data: Path, split: str, *, as_recorded: bool = False) -> tuple[Motions
 
 def _teacher_again(data: Path, split: str, steps: int, stride: int) -> tuple[dict[str, Motions], dict]:
     """The teacher's motions from perturbed starts by "teacher NAME", and what the report says of them."""
-    recorded = [first_frames(t, stride * steps + 1) for t in _load(data, split, as_recorded=True)[0]]
+    recorded = [first_frames(t, stride * steps + 1) for t in load_recorded(data, split, as_recorded=True)[0]]
     try:
         again = chaos_floor(data, recorded, stride * steps)
     except SdfsimError as error:
@@ -251,7 +250,7 @@ def report_lines(report: dict[str, Any]) -> list[str]:
         *columns(error_rows(report, name=name)),
         "",
         "Errors at a frame alone: translation is the mean over trajectories of the RMSE over bodies",
-        *columns(error_rows(report, name=name, at_frame=True, intervals=False)),
+        *columns(error_rows(report, name=name, at_frame=True)),
         "",
         *columns(quality_rows(report, name=name)),
         "",
@@ -261,25 +260,13 @@ def report_lines(report: dict[str, Any]) -> list[str]:
     ]
 
 
-def error_rows(
-    report: dict[str, Any],
-    *,
-    name: str,
-    at_frame: bool = False,
-    intervals: bool = True,
-    extra: dict[str, dict] | None = None,
-) -> Rows:
-    """Errors at every horizon: the model, others, the teacher run again, and flight without contact. The head first.
+def error_rows(report: dict[str, Any], *, name: str, at_frame: bool = False) -> Rows:
+    """Errors up to every horizon, or at each of `metrics.FRAMES` alone; the head first.
 
-    Args:
-        report: of `evaluate`.
-        name: what the model is called.
-        at_frame: errors in a frame alone, at those of `metrics.FRAMES`; else over all steps up to a horizon.
-        intervals: with those of 95 %.
-        extra: errors of others by name.
+    Rows are the model, the teacher again, and flight without contact. Intervals go with the horizons.
     """
     again = {f"teacher, {size} m/s off": found for size, found in _perturbed(report).items()}
-    rows = {name: report["model"], **(extra or {}), **again, "ballistic": report["ballistic"]}
+    rows = {name: report["model"], **again, "ballistic": report["ballistic"]}
     longest = max(map(int, report["model"]))
     shown = [h for h in report["model"] if int(h) in (FRAMES if at_frame else (*HORIZONS, longest))]
     head, table = [""], []
@@ -292,7 +279,7 @@ def error_rows(
             found = horizons[steps]["at_frame"] if at_frame else horizons[steps]
             for what, digits in (("translation_rmse", 3), ("rotation_error", 1)):
                 low, high = (f"{end:.{digits}f}" for end in found[f"{what}_95"])
-                cells.append(f"{found[what]:.{digits}f}" + (f" ({low} to {high})" if intervals else ""))
+                cells.append(f"{found[what]:.{digits}f}" + (f" ({low} to {high})" if not at_frame else ""))
         table.append(tuple(cells))
     return [tuple(head), *table]
 

@@ -31,6 +31,7 @@ from sdfsim.shape.shape import Shape, analytic_shape, shape_from_mesh, shape_fro
 G = 10.0  # m/s^2
 FRICTION, RESTITUTION = 0.8, 0.5  # of a body
 FLOOR_FRICTION, FLOOR_RESTITUTION = 0.5, 0.5
+FIXED: dict[str, Any] = {"motion": "static", "mass": 0.0, "friction": FLOOR_FRICTION, "restitution": FLOOR_RESTITUTION}
 NUDGE = 1e-3  # m and rad: how far repetitions of a case start from the exact one
 PLATE = 0.01  # m, thickness of what fast bodies are thrown at
 BRICK = (1.0, 0.5, 0.4)  # m
@@ -60,11 +61,9 @@ OFFSETS = (-6.0, -4.0, -2.0, 0.0, 2.0, 4.0, 6.0)  # degrees from the angle at wh
 
 @dataclass(frozen=True)
 class Run:
-    """One motion of one scene.
+    """One motion of one scene: of its bodies but for planes, up to the last good state.
 
     Attributes:
-        scene: what moved.
-        motion: its bodies but for planes, up to the last good state.
         broke: why it ended early, else empty.
         rollout: the simulator's own record; None of the teacher.
     """
@@ -93,8 +92,6 @@ class Figure:
     """One number that a case gives.
 
     Attributes:
-        name: as the measure calls it.
-        unit: of the number.
         digits: shown after the point; differences that are not shown do not count.
         limit: what is wanted is at most this; None where only the teacher says how good one can be.
         largest: of several repetitions the largest counts, not the mean.
@@ -113,16 +110,11 @@ class Figure:
 
 @dataclass(frozen=True)
 class Case:
-    """One case.
+    """One case, by a name that is fit for a file.
 
     Attributes:
-        name: unique, fit for a file.
-        group: name of the `Group` it belongs to.
-        title: what it is.
         scenes: the scenes of one repetition, given its number; repetition 0 is the case as it is meant.
-        measure: of the motions of these scenes, in their order.
-        figures: what `measure` gives.
-        seconds: how long.
+        measure: of the motions of these scenes, in their order; gives `figures`.
         repeats: repetitions, from starts slightly off or with other random scenes: their spread is the noise.
         cuda: the scenes are simulated a second time there, behind the first.
         teacher: whether the teacher can take part.
@@ -147,7 +139,6 @@ class Group:
     """Cases of one kind.
 
     Attributes:
-        title: what they have in common.
         axis: label of the cases' `x`.
         about: the quantity of a model's ranges that the cases are about: one that never varied was not learned.
     """
@@ -211,17 +202,11 @@ def on_floor(
     restitution: float = FLOOR_RESTITUTION,
     sleep: bool = False,
 ) -> Scene:
-    """Bodies above the plane z = 0, which is the last of them.
+    """Bodies above the plane z = 0, which is the last of them; friction and restitution are the floor's.
 
-    Args:
-        shapes: of the bodies.
-        bodies: all but the floor.
-        tilt: degrees; instead of the floor it is gravity that leans, towards +x, which is the same.
-        friction, restitution: of the floor.
-        sleep: whether bodies may fall asleep.
+    A `tilt` in degrees leans gravity towards +x, not the floor, which is the same.
     """
-    fields: Any = {"motion": "static", "mass": 0.0, "friction": friction, "restitution": restitution}
-    floor = body("floor", len(shapes), [0, 0, 0], **fields)
+    floor = body("floor", len(shapes), [0, 0, 0], **FIXED | {"friction": friction, "restitution": restitution})
     angle = np.radians(tilt)
     return Scene(
         shapes=(*shapes, analytic_shape("plane")),
@@ -235,48 +220,39 @@ def on_floor(
 def nudged(scene: Scene, repeat: int) -> Scene:
     """The same scene started slightly off: bodies shifted sideways by up to `NUDGE` and turned about z by as much.
 
-    Args:
-        scene: as it is meant.
-        repeat: the seed; 0 leaves the scene exactly as it is.
+    Repetition 0 is the scene exactly as it is.
     """
     if repeat == 0:
         return scene
     rng = np.random.default_rng(repeat)
-    return replace(scene, bodies=tuple(_nudge(b, rng) if b.motion == "dynamic" else b for b in scene.bodies))
+
+    def nudge(one: Body) -> Body:
+        turn = Rotation.from_euler("z", rng.uniform(-NUDGE, NUDGE)) * Rotation.from_quat(one.quat_xyzw)
+        shift = np.array([*rng.uniform(-NUDGE, NUDGE, 2), 0.0])
+        return replace(one, position=one.position + shift, quat_xyzw=turn.as_quat())
+
+    return _moved(scene, nudge)
 
 
-def _nudge(one: Body, rng: np.random.Generator) -> Body:
-    turn = Rotation.from_euler("z", rng.uniform(-NUDGE, NUDGE)) * Rotation.from_quat(one.quat_xyzw)
-    shift = np.array([*rng.uniform(-NUDGE, NUDGE, 2), 0.0])
-    return replace(one, position=one.position + shift, quat_xyzw=turn.as_quat())
+def _moved(scene: Scene, change: Callable[[Body], Body]) -> Scene:
+    """The scene with its dynamic bodies changed."""
+    return replace(scene, bodies=tuple(change(b) if b.motion == "dynamic" else b for b in scene.bodies))
 
 
 def yawed(scene: Scene, degrees: float) -> Scene:
     """The whole scene turned about the z axis."""
     turn = Rotation.from_euler("z", degrees, degrees=True)
-    return replace(
-        scene,
-        gravity=turn.apply(scene.gravity),
-        bodies=tuple(
-            replace(
-                b,
-                position=turn.apply(b.position),
-                quat_xyzw=(turn * Rotation.from_quat(b.quat_xyzw)).as_quat(),
-                velocity=turn.apply(b.velocity),
-                angular_velocity=turn.apply(b.angular_velocity),
-            )
-            for b in scene.bodies
-        ),
-    )
+
+    def turned(b: Body) -> Body:
+        vectors = {name: turn.apply(getattr(b, name)) for name in ("position", "velocity", "angular_velocity")}
+        return replace(b, **vectors, quat_xyzw=(turn * Rotation.from_quat(b.quat_xyzw)).as_quat())
+
+    return replace(scene, gravity=turn.apply(scene.gravity), bodies=tuple(map(turned, scene.bodies)))
 
 
 def started_off(scene: Scene, speed: float) -> Scene:
     """The same with every dynamic body's velocity along x changed by `speed` m/s."""
-    off = np.array([speed, 0.0, 0.0])
-    return replace(
-        scene,
-        bodies=tuple(replace(b, velocity=b.velocity + off) if b.motion == "dynamic" else b for b in scene.bodies),
-    )
+    return _moved(scene, lambda b: replace(b, velocity=b.velocity + np.array([speed, 0.0, 0.0])))
 
 
 def overlapping(first: Shape, second: Shape, apart: float) -> Scene:
@@ -300,8 +276,7 @@ def thrown_at_plate(speed: float, repeat: int) -> Scene:
         place = np.array([0.6 * (k % 4) - 0.9, 0.6 * (k // 4) - 0.9, 0.5])
         turn = Rotation.random(rng=rng).as_quat()
         thrown.append(body(f"thrown[{k}]", k % 2, place, quat_xyzw=turn, velocity=-speed * UP))
-    static: Any = {"motion": "static", "mass": 0.0, "friction": FLOOR_FRICTION, "restitution": FLOOR_RESTITUTION}
-    plate = body("plate", 2, [0, 0, -PLATE / 2], **static)
+    plate = body("plate", 2, [0, 0, -PLATE / 2], **FIXED)
     shapes = (box(0.2), ball(0.2), box(3.0, 3.0, PLATE))
     return Scene(shapes, (*thrown, plate), gravity=-G * UP, duration=1.0)
 
@@ -350,16 +325,12 @@ def card_house() -> Scene:
     angle = np.radians(LEAN)
     aside = 0.5 * (length * np.sin(angle) + thick * np.cos(angle))
     height = 0.5 * (length * np.cos(angle) + thick * np.sin(angle))
-    cards = [
-        body(
-            name,
-            0,
-            [side * aside, 0, height],
-            quat_xyzw=Rotation.from_euler("y", -side * LEAN, degrees=True).as_quat(),
-        )
-        for name, side in (("left", -1), ("right", 1))
-    ]
-    return on_floor([box(*CARD)], cards)
+
+    def card(name: str, side: int) -> Body:
+        turn = Rotation.from_euler("y", -side * LEAN, degrees=True)
+        return body(name, 0, [side * aside, 0, height], quat_xyzw=turn.as_quat())
+
+    return on_floor([box(*CARD)], [card("left", -1), card("right", 1)])
 
 
 def heavy_on_light(ratio: float) -> Scene:
@@ -406,8 +377,7 @@ def piled(count: int, repeat: int) -> Scene:
     turns = Rotation.random(count, rng=rng).as_quat()
     shapes = (ball(BOWL_BALL), box(0.6 * BOWL_BALL), shape_from_primitive("bowl", sdf="grid", name="bowl"))
     bodies = [body(f"piled[{k}]", k % 2, p, quat_xyzw=turns[k]) for k, p in enumerate(places)]
-    static: Any = {"motion": "static", "mass": 0.0, "friction": FLOOR_FRICTION, "restitution": FLOOR_RESTITUTION}
-    vessel = body("bowl", 2, [0, 0, outer], scale=2 * outer, **static)
+    vessel = body("bowl", 2, [0, 0, outer], scale=2 * outer, **FIXED)
     return on_floor(shapes, [*bodies, vessel])
 
 

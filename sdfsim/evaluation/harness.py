@@ -21,7 +21,7 @@ import torch
 import sdfsim
 from sdfsim.errors import SdfsimError
 from sdfsim.files import digest, read_json, replacing, write_json
-from sdfsim.parallel import Progress, parallel
+from sdfsim.parallel import Progress, parallel, silent
 
 Results = dict[tuple[str, str], dict[str, Any]]
 FAILURES = (SdfsimError, RuntimeError, MemoryError)
@@ -29,13 +29,11 @@ FAILURES = (SdfsimError, RuntimeError, MemoryError)
 
 @dataclass(frozen=True)
 class Job:
-    """One case with one method.
+    """One case with one method, names fit for a file.
 
     Attributes:
-        case, method: names, fit for a file.
         content: all that the result depends on; see `digest`.
-        function: makes the result, which JSON can hold; called with `arguments`.
-        arguments: of the function.
+        function: called with `arguments`; makes the result, which JSON can hold.
         weight: about how long it takes, in no unit.
     """
 
@@ -52,7 +50,7 @@ def measure(
     folder: Path,
     *,
     where: Literal["here", "cores", "fresh"] = "here",
-    on_progress: Progress | None = None,
+    on_progress: Progress = silent,
 ) -> Results:
     """The results of all jobs by (case, method): kept ones where they still hold, new ones elsewhere.
 
@@ -64,7 +62,6 @@ def measure(
         where: "here", one after the other in this process; "cores", on all of them, the longest first; "fresh", each in
             a process of its own, whose peak memory is then the job's.
     """
-    tell = on_progress or (lambda fraction, message: None)
     files = [folder / job.method / f"{job.case}.json" for job in jobs]
     marks = [digest(job.content, sdfsim.__version__) for job in jobs]
     results = {}
@@ -82,8 +79,8 @@ def measure(
         job = todo[index][0]
         results[job.case, job.method] = result
         done += job.weight
-        tell(done / total, f"{job.case} with {job.method}")
-    tell(1.0, f"{len(todo)} results measured, {len(jobs) - len(todo)} kept from before")
+        on_progress(done / total, f"{job.case} with {job.method}")
+    on_progress(1.0, f"{len(todo)} results measured, {len(jobs) - len(todo)} kept from before")
     return {(job.case, job.method): results[job.case, job.method] for job in jobs}
 
 
@@ -139,12 +136,7 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def front(time: Sequence[float], error: Sequence[float]) -> list[int]:
-    """Indices, by time, of the points that no other beats: none is at most as slow and as wrong, and one of both less.
-
-    Args:
-        time: [P] finite.
-        error: [P] finite.
-    """
+    """Indices, by time, of points that no other beats: none is at most as slow and as wrong, and one of both less."""
     kept: list[int] = []
     for k in sorted(range(len(time)), key=lambda k: (time[k], error[k])):
         if not kept or error[k] < error[kept[-1]] or (time[k], error[k]) == (time[kept[-1]], error[kept[-1]]):
@@ -164,11 +156,9 @@ class Line:
 
 @dataclass(frozen=True)
 class Panel:
-    """One plot of several.
+    """One plot of several. Lines of one name have one colour in all panels.
 
     Attributes:
-        title, x, y: its labels.
-        lines: what it shows; lines of one name have one colour in all panels.
         log: of its axes: "", "x", "y" or "xy".
         limit: y of a dotted line: what is wanted.
     """
@@ -185,11 +175,7 @@ def draw(
     panels: Sequence[Panel], path: Path, *, wide: int = 4, dpi: int = 80, size: tuple[float, float] = (3.3, 2.5),
     key: Literal["inside", "outside"] = "inside",
 ) -> None:  # fmt: skip
-    """Write panels of `size` inches side by side, `wide` in a row, as a PNG.
-
-    Raises:
-        SdfsimError: matplotlib is not installed.
-    """
+    """Write panels of `size` inches, `wide` in a row, as a PNG. Raises SdfsimError when matplotlib is not installed."""
     pyplot = check_matplotlib()
     high, wide = -(-len(panels) // wide), min(wide, len(panels))
     across, up = size

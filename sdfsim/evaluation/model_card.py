@@ -17,24 +17,14 @@ MODEL = "this model"  # in the tables of a card
 
 
 def bundle(path: Path, data: Path, name: str, folder: Path = BUNDLED) -> dict:
-    """Evaluate a trained model on the test split of `data`, then write `NAME.safetensors` and its card `NAME.md`.
-
-    Args:
-        path: what `sdfsim train` wrote.
-        data: dataset folder with test/.
-        name: the bundled model's name.
-        folder: of the bundled models.
+    """Evaluate what `sdfsim train` wrote on the test split of `data`; write `NAME.safetensors` and its card `NAME.md`.
 
     Returns:
-        The evaluation's report; `as_published` are the errors of a paper network that predicts free flight too (None
-        for others).
+        The evaluation's report.
     """
     model = load_model(path)
     report = evaluate(data, model=model, chaos_floor=True)
-    report["as_published"] = None
-    if model.on_surfaces:
-        report["as_published"] = evaluate(data, model=model, free_flight="learned", errors_only=True)["model"]
-    kept = ("model", "ballistic", "as_published", "chaos_floor", "median_survival_s")
+    kept = ("model", "ballistic", "chaos_floor", "median_survival_s")
     kept += ("penetration", "energy_gain", "resting_speed")
     results = {"errors": {what: report[what] for what in kept}, "test_trajectories": report["trajectories"]}
     model = replace(model, name=name, card=model.card | results)
@@ -46,38 +36,25 @@ def bundle(path: Path, data: Path, name: str, folder: Path = BUNDLED) -> dict:
 
 def card_text(model: Model, report: dict) -> str:
     """The model card as Markdown."""
-    card, preset, published = model.card, model.card["preset"], report["as_published"]
-    parameters = sum(p.numel() for p in model.network.parameters())
-    extra = {"this model, free flight learned too (as published)": published} if published else None
+    card, parameters = model.card, sum(p.numel() for p in model.network.parameters())
     told = ("recipe", "fps", "seed", "trajectories", "random_solids", "bodies", "engine")
     data = [", ".join(f"{key} {made[key]}" for key in told if made.get(key)) for made in card["data"]]
-    cost = {
-        "parameters": f"{parameters:,}",
-        "preset": card["preset_name"],
-        "seed": str(card.get("seed", 0)),
-        "optimiser steps": f"{card['optimiser_steps']:,}",
-        "batch": str(preset["batch"]),
-        "time": f"{card['seconds']:,} s = {card['seconds'] / 3600:.2f} h",
-        "where": f"{card['device']}, {card.get('processes', 1)} process(es) of {card['threads']} thread(s)",
-    }
     ranges = [(name.replace("_", " "), f"{low:.3g}", f"{high:.3g}") for name, (low, high) in model.ranges.items()]
     parts = [
         f"# {model.name}",
-        f"The *{model.kind}* network, {parameters:,} parameters, {json.dumps(preset['config'])}; step {model.dt} s at\n"
-        f"{model.gravity:g} m/s^2 for bodies of {model.length:.2f} m (the middle of the sizes it has seen), rescaled\n"
-        "to any scene (Froude).",
+        f"The *{model.kind}* network, {parameters:,} parameters, {json.dumps(card['preset']['config'])};\n"
+        f"step {model.dt} s at {model.gravity:g} m/s^2 for bodies of {model.length:.2f} m, rescaled to any scene.",
         "## Training",
         "\n".join(f"- `sdfsim dataset`: {line}" for line in data),
-        "Surfaces and nodes are those of the convex pieces that the engine collides.",
-        markdown([tuple(cost), tuple(cost.values())]),
+        f"Preset {card['preset_name']}, seed {card.get('seed', 0)}: {card['optimiser_steps']:,} steps of\n"
+        f"{card['preset']['batch']} frames in {card['seconds']:,} s on {card['device']}.",
         "## Ranges it has seen",
         markdown([("quantity", "from", "to"), *ranges]),
         "Friction and restitution are products of two bodies' coefficients; sizes in m, speeds in m/s.",
         "## Errors",
-        f"{report['trajectories']} test trajectories ({report['bodies']} bodies) of the same recipe, all rolled out\n"
-        "from their first frame: translation RMSE and mean rotation error; 95 % intervals over trajectories.\n"
-        "Ballistic: every body flies on without contact.",
-        markdown(error_rows(report, name=MODEL, extra=extra)),
+        f"{report['trajectories']} test trajectories ({report['bodies']} bodies): translation RMSE and mean rotation\n"
+        "error, with 95 % intervals over trajectories. Ballistic: every body flies on without contact.",
+        markdown(error_rows(report, name=MODEL)),
         "## Quality of the motion",
         markdown(quality_rows(report, name=MODEL)),
         "\n".join(f"- {line}" for line in notes(report)),

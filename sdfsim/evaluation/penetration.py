@@ -52,17 +52,9 @@ def exact_solids(data: Path, shapes: dict[str, Shape]) -> dict[str, Solid]:
 
 
 def deepest(motion: Trajectory, solids: dict[str, Solid], every: int = EVERY) -> np.ndarray:
-    """The deepest node of any body in any other body, or in the floor z = 0, frame by frame.
+    """[F] m, signed distance of the deepest node of any body in any other, or in the floor z = 0, every so many frames.
 
-    Pairs of static bodies, and static bodies in the floor, do not count.
-
-    Args:
-        motion: T frames.
-        solids: of every name in use.
-        every: frame `every`, 2 `every`, ... are looked at.
-
-    Returns:
-        [F] m, signed distance of that node: negative inside; infinite where nothing touches.
+    Negative inside, infinite where nothing touches. Pairs of static bodies, and these in the floor, do not count.
     """
     kept = slice(every, None, every)
     position = motion.position[kept]
@@ -119,12 +111,9 @@ def _near(position: np.ndarray, turn: np.ndarray, bounds: np.ndarray, moving: np
 
 
 def depths(scene: Scene, motion: Trajectory, every: int = 5) -> np.ndarray:
-    """[F] m, depth of the deepest node in those of every so many frames in which anything touches.
+    """[F] m, depth of the deepest node in those of every so many frames (see `rollout_motion`) in which bodies touch.
 
-    Args:
-        scene: its only plane, if any, is the floor z = 0.
-        motion: see `start_motion`.
-        every: so many frames.
+    The only plane of the scene, if any, is the floor z = 0.
     """
     solids = {}
     for name in set(motion.shape.tolist()):

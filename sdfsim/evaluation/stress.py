@@ -20,8 +20,9 @@ from sdfsim.dynamics.simulator import SimulationError, Simulator, pick_device
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.engines import bullet, rollout_motion, shape_urdf, start_of_scene
 from sdfsim.evaluation.hard_cases import GROUPS, Case, Figure, Run, cases, ran_away
-from sdfsim.evaluation.harness import Job, Line, Panel, Progress, Results, check_matplotlib, draw, markdown, measure
+from sdfsim.evaluation.harness import Job, Line, Panel, Results, check_matplotlib, draw, markdown, measure
 from sdfsim.files import locked, write_json, write_text
+from sdfsim.parallel import Progress, silent
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.sdf import PlaneSdf
 
@@ -44,7 +45,6 @@ class Study:
     """All results of the hard cases.
 
     Attributes:
-        cases: what was run, in order.
         who: models, then the teacher where PyBullet is installed.
         results: (case, who) -> figures (name -> a value a repetition), broke and outside (lines) and recording (a
             path in the folder, or None); nothing for a case that one cannot take part in.
@@ -65,16 +65,14 @@ def stress(
     shapes: Path | None = None,
     device: str = "cpu",
     record: Record | None = None,
-    on_progress: Progress | None = None,
+    on_progress: Progress = silent,
 ) -> Study:
-    """Run every case that `out` does not hold the result of yet.
+    """Run every case that `out` does not hold the result of yet; it holds results/, recordings/ and the engine's files.
 
     Args:
-        out: folder for results/, recordings/ and the engine's files.
         models: names or paths; none for the solver and all bundled networks.
         quick: fewer and shorter cases.
         shapes: folder of meshes that are to rest on the floor too, or name of a public set (see `public_folder`).
-        device: cpu, cuda or auto.
         record: writes a motion of each case that is not as wanted into a file; None for no recordings.
 
     Raises:

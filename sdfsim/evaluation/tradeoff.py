@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -15,16 +16,7 @@ import torch
 
 import sdfsim
 from sdfsim.data.batching import scene_of
-from sdfsim.data.dataset import (
-    FLOOR,
-    Trajectory,
-    check_alike,
-    floor_of,
-    home_of,
-    load_shapes,
-    read_info,
-    trajectory_files,
-)
+from sdfsim.data.dataset import FLOOR, Trajectory, check_alike, floor_of, home_of, read_info
 from sdfsim.data.pybullet_sim import DT, SUBSTEP
 from sdfsim.data.replay import every, first_frames, roll_out
 from sdfsim.dynamics.froude import scene_units
@@ -33,8 +25,8 @@ from sdfsim.dynamics.models.contact_graph import SUBSTEPS
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.baselines import perturbed
-from sdfsim.evaluation.engines import Start, Timing, bullet, dataset_urdf, mujoco, start_of_scene
-from sdfsim.evaluation.evaluate import energy_gain, errors
+from sdfsim.evaluation.engines import Start, Timing, bullet, dataset_urdf, mujoco, start_of_scene, timed
+from sdfsim.evaluation.evaluate import energy_gain, errors, load_recorded
 from sdfsim.evaluation.hard_cases import tossed
 from sdfsim.evaluation.harness import (
     Job,
@@ -126,16 +118,13 @@ def load_cases(data: Path, *, quick: bool) -> Cases:
     Raises:
         SdfsimError: no or unreadable trajectories or shapes, or recordings of different steps or gravities.
     """
-    files = trajectory_files(data, "test")[: MOST_QUICK if quick else MOST]
-    starts = [t for t in map(Trajectory.load, files) if not t.static.all()]
+    most = MOST_QUICK if quick else MOST
     # The engine starts again from its own velocities, others from those at the instants of the positions.
-    recorded = [t for f in files if not (t := Trajectory.load(f, as_recorded=True)).static.all()]
-    if not recorded:
-        raise SdfsimError(f"{data}: nothing moves in any trajectory")
+    recorded, shapes = load_recorded(data, "test", most=most, as_recorded=True)
+    starts, _ = load_recorded(data, "test", most=most)
     check_alike(str(data), recorded)
     longest = min(STEPS_QUICK if quick else STEPS, *(len(t.position) - 1 for t in recorded))
     recorded = [first_frames(t, longest + 1) for t in recorded]
-    shapes = load_shapes(data, {str(n) for t in recorded for n in t.shape})
     urdfs = {}
     for name in shapes:
         try:
@@ -155,14 +144,8 @@ def load_cases(data: Path, *, quick: bool) -> Cases:
 def cases_of_scene(scene: Scene, model: str, folder: Path, *, quick: bool) -> Cases:
     """The one case that a scene makes: the teacher simulates it, and that is what contenders are judged by.
 
-    Lengths, times and masses are the model's (Froude scaling), so that the teacher, whose steps and margins are meant
-    for bodies of about a metre, serves scenes of any size.
-
-    Args:
-        scene: what moves.
-        model: whose units are taken.
-        folder: of the engines' files.
-        quick: a shorter course.
+    Lengths, times and masses are those of `model` (Froude scaling), so that the teacher, whose steps and margins are
+    meant for bodies of about a metre, serves scenes of any size. The engines' files go to `folder`.
 
     Raises:
         SdfsimError: a floor other than one level plane, bodies on a path, bodies that may not touch all others, effects
@@ -286,15 +269,8 @@ def _time_simulator(setting: Setting, model: Model, shapes: dict[str, Shape], ca
     simulator = Simulator(replace(scene, effects=effects), model, dt=start.dt)
     simulator.rules = replace(simulator.rules, substeps=model.inner or setting.substeps)
     steps = min(TIMED, cases.steps // setting.stride)
-    began = time.perf_counter()
-    next(simulator.steps(1))
-    first_ms = 1e3 * (time.perf_counter() - began)
-    wall, cpu = time.perf_counter(), time.process_time()
-    for _ in simulator.steps(steps - 1):
-        pass
-    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    done = setting.stride * (steps - 1)
-    return Timing(first_ms, 1e3 * wall / done, 1e3 * cpu / done)
+    taken = timed(lambda count: deque(simulator.steps(count), maxlen=0), steps)
+    return Timing(taken.first_ms, taken.wall_ms / setting.stride, taken.cpu_ms / setting.stride)
 
 
 def measure_engine(name: str, substeps: int, off: float, cases: Cases) -> dict[str, Any]:
@@ -311,13 +287,7 @@ def measure_engine(name: str, substeps: int, off: float, cases: Cases) -> dict[s
 
 
 def _judged(motions: list[Trajectory], cases: Cases, stride: int = 1) -> dict[str, Any]:
-    """Errors of motions in the scene's metres, penetration, energy gain, and whether they blew up.
-
-    Args:
-        motions: of every case.
-        cases: what they are judged by.
-        stride: recorded steps in one of theirs.
-    """
+    """Errors of motions in the scene's metres, penetration, energy gain, and whether they blew up."""
     if not all(np.isfinite(m.position).all() and np.isfinite(m.quat_xyzw).all() for m in motions):
         raise SdfsimError("a state is not finite")
     there = errors(motions, [every(first_frames(t, cases.steps + 1), stride) for t in cases.recorded])

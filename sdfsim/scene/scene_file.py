@@ -22,7 +22,7 @@ from pydantic import model_validator as validator_of_model
 from pydantic_core import InitErrorDetails, PydanticCustomError, core_schema
 
 from sdfsim.errors import SceneError, SdfsimError
-from sdfsim.parallel import Progress
+from sdfsim.parallel import Progress, silent
 from sdfsim.scene.scene import Body, Effects, Limits, Motion, Scene, Waypoints
 from sdfsim.shape.primitives import PRIMITIVES
 from sdfsim.shape.shape import (
@@ -644,10 +644,6 @@ def _nobody(name: str, known: Iterable[str]) -> str:
 class Document:
     """The YAML of a file, and the faults found in it, each with its line.
 
-    Args:
-        path: of the file.
-        text: what is in it; None reads it.
-
     Attributes:
         data: dicts, lists, texts and `Numeral`s; `NOTHING` where a key has no value.
 
@@ -736,9 +732,7 @@ def read_scene(path: Path, *, allow_outside: bool = False, text: str | None = No
     """Read and check a scene file; nothing is loaded yet.
 
     Args:
-        path: of the file.
         allow_outside: whether paths in it may lead out of its folder.
-        text: what is in it; None reads it.
 
     Returns:
         What it says, and its document, to tell of faults that show only later.
@@ -759,7 +753,7 @@ def read_scene(path: Path, *, allow_outside: bool = False, text: str | None = No
 
 
 def load_scene(
-    path: Path | str, on_progress: Progress | None = None, *, allow_outside: bool = False, text: str | None = None
+    path: Path | str, on_progress: Progress = silent, *, allow_outside: bool = False, text: str | None = None
 ) -> Scene:
     """Read a scene file, and load or fit the shapes that its bodies use.
 
@@ -776,7 +770,7 @@ def load_scene(
     """
     path = Path(path)
     table, document = read_scene(path, allow_outside=allow_outside, text=text)
-    shapes = _load_shapes(table, document, on_progress or (lambda fraction, message: None))
+    shapes = _load_shapes(table, document, on_progress)
     order = {key: i for i, key in enumerate(shapes)}
     groups = {body.name: body.names() for body in table.bodies}
     bodies: list[Body] = []

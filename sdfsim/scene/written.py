@@ -12,8 +12,9 @@ import yaml
 
 from sdfsim.errors import SceneError
 from sdfsim.files import write_text
+from sdfsim.parallel import Progress, silent
 from sdfsim.scene import scene
-from sdfsim.scene.scene_file import VERSION, BodyTable, Progress, SceneTable, ShapeTable, load_scene, nearest
+from sdfsim.scene.scene_file import VERSION, BodyTable, SceneTable, ShapeTable, load_scene, nearest
 
 _OF_SHAPE = [key for key in ShapeTable.model_fields if key not in BodyTable.model_fields]
 _PATHS = ("asset", "mesh")
@@ -61,7 +62,7 @@ class Scene:
         self._bodies.append(_plain({"name": name, **body}))
         return self
 
-    def load(self, on_progress: Progress | None = None) -> scene.Scene:
+    def load(self, on_progress: Progress = silent) -> scene.Scene:
         """What a simulator takes; `Simulator` calls it by itself. Shapes are loaded or fitted as `load_scene` does.
 
         Raises:

@@ -6,7 +6,6 @@ A network is what a shape is stored and shipped as; a look into a grid is a hund
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +14,7 @@ import numpy as np
 import torch
 
 from sdfsim.errors import SdfsimError
-from sdfsim.files import digest, read_arrays, write_arrays
+from sdfsim.files import digest, read_arrays, user_cache, write_arrays
 from sdfsim.shape.distance import PiecesDistance
 from sdfsim.shape.mesh import convex_hull
 from sdfsim.shape.mlp_sdf import MlpSdf
@@ -64,8 +63,7 @@ def baked(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = (), cache_
         pieces: vertices [V, 3] m of the convex pieces that the SDF was fitted to: the grid is then of their union.
         cache_dir: by default `sdfsim/baked` in the user's cache folder.
     """
-    if cache_dir is None:
-        cache_dir = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sdfsim" / "baked"
+    cache_dir = cache_dir or user_cache("baked")
     path = cache_dir / f"{digest(sdf, [*pieces], CELLS, FINEST)}-{BAKE_VERSION}.npz"
     if path.is_file():
         try:

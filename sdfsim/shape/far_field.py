@@ -25,14 +25,9 @@ Inner = Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
 def in_metres(
     inner: Inner, frame: Frame, bounds: np.ndarray, points: torch.Tensor, chunk: int
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Distance [P] m and gradient [P, 3] at `points` [P, 3] m; computed in float32, cast back.
+    """Distance [P] m and gradient [P, 3] at `points` [P, 3] m; computed in float32, `chunk` at once, and cast back.
 
-    Args:
-        inner: what is known in the box of the normalised frame.
-        frame: metres <-> normalised.
-        bounds: [2, 3] m of the solid.
-        points: metres.
-        chunk: points asked at once.
+    `inner` is what is known in the box of the normalised `frame`; `bounds` [2, 3] m are the solid's.
     """
     centre = torch.from_numpy(frame.centre).to(points)
     half = torch.from_numpy(np.abs(bounds - frame.centre).max(0) / frame.scale).to(points.device, torch.float32)
@@ -46,18 +41,11 @@ def in_metres(
 
 
 def everywhere(inner: Inner, points: torch.Tensor, half: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Distances inside the box and beyond it.
+    """Value [P] and gradient [P, 3] at normalised points [P, 3], inside the box and beyond it.
 
     The length of the gradient is kept within `SLOPE`; where it vanishes, it points away from the centre. Outside the
-    solid's bounding box the distance to that box is a lower bound that no error of the fit may undercut.
-
-    Args:
-        inner: what is known in the box.
-        points: [P, 3], normalised.
-        half: [3] half extents of the solid's bounding box, normalised.
-
-    Returns:
-        value [P] and gradient [P, 3] at `points`.
+    solid's bounding box, of half extents `half` [3], the distance to that box is a lower bound that no error of the fit
+    may undercut.
     """
     clamped = points.clamp(-BOX, BOX)
     value, gradient = inner(clamped)
@@ -77,17 +65,12 @@ def everywhere(inner: Inner, points: torch.Tensor, half: torch.Tensor) -> tuple[
 
 
 def _beyond(inner: Inner, points: torch.Tensor, first: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Distance and gradient outside the box.
+    """Distance and gradient at points [P, 3] outside the box, where `first` [P, 3] are feet from its nearest points.
 
     From a point q of the box with value f and direction g the nearest surface is at its foot c = q - f g. No |x - c| is
     shorter than the distance, so the shortest of several is taken: `first`, the foot from where the segment from x to
     that one enters the box, and the same two from where the segment from x to the middle enters it. The gradient
     points from the foot to x; so far out this is better than the fitted one.
-
-    Args:
-        inner: what is known in the box.
-        points: [P, 3] outside the box.
-        first: [P, 3] feet from the nearest points of the box.
     """
 
     def feet_towards(*goals: torch.Tensor) -> tuple[torch.Tensor, ...]:

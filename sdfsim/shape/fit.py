@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 
 from sdfsim.errors import SdfsimError
-from sdfsim.parallel import Progress, choose_threads
+from sdfsim.parallel import Progress, choose_threads, silent
 from sdfsim.shape.distance import DistanceOracle, MeshDistance, PiecesDistance
 from sdfsim.shape.far_field import BOX
 from sdfsim.shape.fit_metrics import SIGN_FROM, certify
@@ -27,8 +27,7 @@ from sdfsim.shape.surface_nodes import DEFAULT_COUNT, edge_nodes, hull_nodes, sa
 from sdfsim.shape.watertight import solidify
 
 Recipe = Literal["quick", "default", "paper"]
-Oracle = TypeVar("Oracle", bound=DistanceOracle)
-# Weights and biases per layer, [S, out, in] and [S, out].
+# Weights and biases per layer, [out, in] and [out].
 Layers = tuple[list[torch.Tensor], list[torch.Tensor]]
 
 # Changes whenever the same mesh would come out differently; part of every cache key.
@@ -137,7 +136,7 @@ def fit_mesh(
     seed: int = 0,
     cap: bool = False,
     thicken: float | None = None,
-    on_progress: Progress | None = None,
+    on_progress: Progress = silent,
     device: torch.device | str = "cpu",
 ) -> Shape:
     """Fit the compact SDF network to the solid that a triangle mesh bounds (see `solidify`).
@@ -147,14 +146,10 @@ def fit_mesh(
 
     Args:
         mesh: metres; or its distance oracle, when there is one already.
-        name: of the shape.
         recipe: "default" (waves, 64 wide, SOAP, seconds), "quick" (the same in 2,000 steps at most, not 5,000) or
             "paper" (ReLU, 128 wide, Adam 1e-5, 400k steps).
         budget: seconds of training at most; the schedule is shortened to fit.
-        seed: of sampling and initialisation.
-        cap: close openings of any size.
         thicken: m; the solid is all within half of this distance from the mesh instead.
-        device: to train on.
 
     Returns:
         Shape whose `certificate` tells the errors and whether it is usable (`passed`); what was done to the mesh is
@@ -165,41 +160,15 @@ def fit_mesh(
     """
     if isinstance(mesh, Mesh):
         mesh = MeshDistance(solidify(mesh, name=name, cap=cap, thicken=thicken))
-    options = {"recipe": recipe, "budget": budget, "seed": seed, "on_progress": on_progress, "device": device}
-    return fit_solids({name: mesh}, **options)[0]
+    solid = mesh.solid
 
+    def pick(sdf: Sdf) -> np.ndarray:
+        return surface_nodes(sdf, solid.surface, DEFAULT_COUNT)
 
-def fit_solids(
-    solids: dict[str, MeshDistance],
-    *,
-    recipe: Recipe = "default",
-    budget: float | None = None,
-    seed: int = 0,
-    on_progress: Progress | None = None,
-    device: torch.device | str = "cpu",
-) -> list[Shape]:
-    """Fit several solids side by side in one batched optimiser, which is what a GPU is good at.
-
-    Args:
-        solids: by name, from `MeshDistance(solidify(mesh))`.
-        budget: seconds of training for all of them.
-        recipe, seed, on_progress, device: as for `fit_mesh`.
-
-    Returns:
-        Shapes in the order of `solids`, as `fit_mesh` gives them.
-    """
-
-    def pick(sdf: Sdf, oracle: MeshDistance) -> np.ndarray:
-        return surface_nodes(sdf, oracle.surface, DEFAULT_COUNT)
-
-    fitted = _fit(list(solids.values()), recipe, budget, seed, pick, on_progress, device)
-    shapes = []
-    for (name, oracle), (sdf, points, certificate) in zip(solids.items(), fitted, strict=True):
-        solid = oracle.solid
-        source: dict[str, Any] = {"kind": "mesh", "recipe": recipe, "fit_version": FIT_VERSION}
-        source |= {"notes": list(solid.notes)} if solid.notes else {}
-        shapes.append(Shape(name, solid.surface, sdf, points, *solid.mass_properties(), certificate, source))
-    return shapes
+    sdf, points, certificate = _fit(mesh, recipe, budget, seed, pick, on_progress, device)
+    source: dict[str, Any] = {"kind": "mesh", "recipe": recipe, "fit_version": FIT_VERSION}
+    source |= {"notes": list(solid.notes)} if solid.notes else {}
+    return Shape(name, solid.surface, sdf, points, *solid.mass_properties(), certificate, source)
 
 
 def fit_pieces(
@@ -211,17 +180,9 @@ def fit_pieces(
 ) -> Shape:
     """Fit the compact SDF network to the union of convex pieces: the body that a rigid-body engine collides.
 
-    Nodes are the pieces' own vertices first (without repetitions and those inside another piece), because contact
-    with a flat floor is exact only there; then points along their sharp edges, then points all over the surface.
-
-    Args:
-        pieces: convex closed meshes, metres (see `load_pieces`).
-        name: of the shape.
-        display: the mesh to show; by default the boundary of the union.
-        nodes: surface nodes at most.
-
-    Returns:
-        Shape; its mass properties are those of the union.
+    At most `nodes` are the pieces' own vertices first (without repetitions and those inside another piece), because
+    contact with a flat floor is exact only there; then points along their sharp edges, then all over the surface.
+    Mass properties are those of the union, and so is the mesh to show unless `display` is given.
 
     Raises:
         SdfsimError: no pieces.
@@ -238,11 +199,11 @@ def fit_pieces(
     vertices = bare(np.concatenate([piece.vertices for piece in pieces]))
     edges = bare(np.concatenate([edge_nodes(piece.vertices, EDGE_SPACING * size) for piece in pieces]))
 
-    def pick(sdf: Sdf, oracle: PiecesDistance) -> np.ndarray:
+    def pick(sdf: Sdf) -> np.ndarray:
         own = hull_nodes(vertices, round(OWN_SHARE * nodes))
         return thin(sample_nodes(sdf), nodes, keep=thin(edges, round(EDGE_SHARE * nodes), keep=own))
 
-    sdf, points, certificate = _fit([oracle], "default", None, 0, pick, None, "cpu")[0]
+    sdf, points, certificate = _fit(oracle, "default", None, 0, pick, silent, "cpu")
     single = len(pieces) == 1 and is_closed(pieces[0])
     volume, com, inertia = mass_properties(pieces[0]) if single else mass_properties_of_sdf(oracle)
     mesh = display if display is not None else clean(oracle.surface, name=name)
@@ -252,27 +213,24 @@ def fit_pieces(
 
 
 def _fit(
-    oracles: Sequence[Oracle],
+    oracle: DistanceOracle,
     recipe: Recipe,
     budget: float | None,
     seed: int,
-    pick: Callable[[Sdf, Oracle], np.ndarray],
-    on_progress: Progress | None,
+    pick: Callable[[Sdf], np.ndarray],
+    on_progress: Progress,
     device: torch.device | str,
-) -> list[tuple[MlpSdf, np.ndarray, dict]]:
-    """Per oracle the network, nodes [K, 3] m as `pick` takes them from it, and the certificate.
-
-    The solids are trained in one batched optimiser; each comes out as it would alone, up to rounding.
-    """
+) -> tuple[MlpSdf, np.ndarray, dict]:
+    """The network, nodes [K, 3] m as `pick` takes them from it, and the certificate."""
     if budget is not None and not budget > 0:
         raise SdfsimError(f"the budget of a fit must be > 0 seconds (got {budget})")
     started, plan = time.monotonic(), PLANS[recipe]
-    tell = on_progress or (lambda fraction, message: None)
-    run = _Run(oracles, plan, seed, tell, torch.device(device))
+    on_progress(0.0, "sampling distances")
+    run = _Run(oracle, plan, seed, torch.device(device))
     if run.device.type == "cpu":
         choose_threads(partial(run.differentiate, torch.arange(plan.batch) % plan.pool))
     looping = time.monotonic()
-    while run.step < run.stop.max():
+    while run.step < run.stop:
         run.update()
         if run.step % CHECK_EVERY:
             continue
@@ -280,32 +238,27 @@ def _fit(
         if budget is not None:
             left = budget - min(0.1 * budget + RESERVE, 0.5 * budget) - (time.monotonic() - started)
             run.hurry(run.step + int(left * run.step / (time.monotonic() - looping)))
-        last = max(int(run.stop.max()), 1)
-        tell(0.97 * run.step / last, f"step {run.step} of {last}, error {near:.2g} near, {far:.2g} in the box")
-    trained = time.monotonic() - started
-    results = []
-    for done, (oracle, (sdf, steps)) in enumerate(zip(oracles, run.results(), strict=True), start=1):
-        tell(0.98 + 0.02 * (done - 1) / len(oracles), "measuring")
-        measuring = time.monotonic()
-        nodes = pick(sdf, oracle)
-        certificate = certify(sdf, oracle, nodes=nodes)
-        # Its share of the training that it had with others, and its own measuring.
-        seconds = trained / len(oracles) + time.monotonic() - measuring
-        certificate.update(recipe=recipe, seed=seed, steps=steps, seconds=round(seconds, 2))
-        but = certificate["reason"] or certificate["caveat"]
-        tell(0.98 + 0.02 * done / len(oracles), f"fitted, but {but}" if but else "fitted")
-        results.append((sdf, nodes, certificate))
-    return results
+        last = max(run.stop, 1)
+        on_progress(0.97 * run.step / last, f"step {run.step} of {last}, error {near:.2g} near, {far:.2g} in the box")
+    on_progress(0.98, "measuring")
+    sdf = run.result()
+    nodes = pick(sdf)
+    certificate = certify(sdf, oracle, nodes=nodes)
+    seconds = round(time.monotonic() - started, 2)
+    certificate.update(recipe=recipe, seed=seed, steps=min(run.step, run.stop), seconds=seconds)
+    but = certificate["reason"] or certificate["caveat"]
+    on_progress(1.0, f"fitted, but {but}" if but else "fitted")
+    return sdf, nodes, certificate
 
 
 class Pool(NamedTuple):
-    """Points of S shapes, P each, normalised.
+    """Normalised points.
 
     Attributes:
-        points: [S, P, 3].
-        distance: [S, P] signed.
-        signed: [S, P] bool, whether the sign of the distance counts.
-        direction: [S, P, 3] unit, from the surface outwards; zero on the surface itself.
+        points: [P, 3].
+        distance: [P] signed.
+        signed: [P] bool, whether the sign of the distance counts.
+        direction: [P, 3] unit, from the surface outwards; zero on the surface itself.
     """
 
     points: torch.Tensor
@@ -314,30 +267,43 @@ class Pool(NamedTuple):
     direction: torch.Tensor
 
 
-class Subject:
-    """One solid to be fitted: its frame, its mirror planes, and samples of it.
+class _Run:
+    """A network in training, and samples of the solid that it learns.
 
-    Args:
-        oracle: true distances, metres.
-        plan: the recipe.
-        seed: of the points.
+    Attributes:
+        frame: of the solid.
+        mirrors: its mirror planes.
+        step: updates made.
+        turn: the update at which the decay begins; an early stop or a short budget moves it forward.
+        stop: the update at which it ends.
     """
 
-    def __init__(self, oracle: DistanceOracle, plan: Plan, seed: int) -> None:
-        self.oracle, self._plan, self._seed = oracle, plan, seed
+    def __init__(self, oracle: DistanceOracle, plan: Plan, seed: int, device: torch.device) -> None:
+        self.oracle, self.plan, self.device, self._seed = oracle, plan, device, seed
         self.frame = normal_frame(oracle.bounds)
         self.mirrors = self._mirrors() if plan.fold else (False, False, False)
+        self.pool, self.check = self._pool(0), self._check()
+        # Drawn on the CPU, so that points and first weights do not depend on the device.
+        self.generator = torch.Generator().manual_seed(seed)
+        self.parameters = [p.to(device) for p in _initial(plan, self.generator)]
+        for parameter in self.parameters:
+            parameter.grad = torch.zeros_like(parameter)
+        self.average = [parameter.clone() for parameter in self.parameters]
+        self.optimiser = (Soap if plan.optimiser == "soap" else torch.optim.Adam)(self.parameters, plan.lr)
+        self.step = 0
+        self.turn, self.stop = int(plan.steps * (1.0 - plan.decay)), plan.steps
+        self._tape = Tape(plan.activation, plan.width, plan.layers, self.parameters[0])
 
-    def pool(self, step: int) -> Pool:
-        """Points to learn from, of one shape, as drawn before update `step`."""
-        plan = self._plan
+    def _pool(self, step: int) -> Pool:
+        """Points to learn from, as drawn before update `step`."""
+        plan = self.plan
         rng = np.random.default_rng([self._seed, 0, step] if step else [self._seed, 0])
         near = int(plan.pool * plan.near)
         low, high = np.log(plan.sigmas)
         sigma = np.exp(rng.uniform(low, high, (near, 1)))
         return self._sample(sigma, plan.pool - near, rng)
 
-    def check(self) -> Pool:
+    def _check(self) -> Pool:
         """Points to judge by on the way: `CHECKED` of each of three kinds."""
         sigma = np.repeat(CHECKED_SIGMAS, CHECKED)[:, None]
         return self._sample(sigma, CHECKED, np.random.default_rng([self._seed, 1]))
@@ -350,19 +316,15 @@ class Subject:
         local = np.clip(local, -MARGIN * BOX, MARGIN * BOX)
         truth = self.oracle(self.frame.outward(local))
         distance = truth.distance / self.frame.scale
-        signed = truth.trusted | (self.oracle.closed and self._plan.sign_everywhere)
+        signed = truth.trusted | (self.oracle.closed and self.plan.sign_everywhere)
         # So close to the surface the direction from it is rounding.
         clear = np.abs(distance) > 1e-4
         offset = local - self.frame.inward(truth.closest)
         direction = np.where(clear[:, None], offset / np.where(clear, distance, 1.0)[:, None], 0.0)
         # What lies on the other side of a mirror plane is learned from its image.
         side = np.where(np.asarray(self.mirrors) & (local < 0), -1.0, 1.0)
-        return Pool(
-            torch.from_numpy(local * side).float()[None],
-            torch.from_numpy(distance).float()[None],
-            torch.from_numpy(signed)[None],
-            torch.from_numpy(direction * side).float()[None],
-        )
+        where, away, along = (torch.from_numpy(x).float() for x in (local * side, distance, direction * side))
+        return Pool(*(part.to(self.device) for part in (where, away, torch.from_numpy(signed), along)))
 
     def _mirrors(self) -> tuple[bool, bool, bool]:
         """Across which planes of its frame the solid is its own mirror image, as far as sampled distances tell."""
@@ -377,58 +339,20 @@ class Subject:
 
         return same(0), same(1), same(2)
 
-
-class _Run:
-    """S networks in training.
-
-    Attributes:
-        step: updates made.
-        turn: [S] the update at which each one's decay begins; an early stop or a short budget moves it forward.
-        stop: [S] the update at which each one ends.
-    """
-
-    def __init__(
-        self, oracles: Sequence[DistanceOracle], plan: Plan, seed: int, tell: Progress, device: torch.device
-    ) -> None:
-        self.plan, self.device = plan, device
-        self.subjects, pools, checks = [], [], []
-        for done, oracle in enumerate(oracles, start=1):
-            tell(0.0, "sampling distances" + (f" of {done} of {len(oracles)}" if len(oracles) > 1 else ""))
-            subject = Subject(oracle, plan, seed)
-            self.subjects.append(subject)
-            pools.append(subject.pool(0))
-            checks.append(subject.check())
-        self.pool, self.check = self._stacked(pools), self._stacked(checks)
-        # Drawn on the CPU, so that points and first weights do not depend on the device.
-        self.generator = torch.Generator().manual_seed(seed)
-        self.parameters = [p.to(device) for p in _initial(plan, len(oracles), self.generator)]
-        for parameter in self.parameters:
-            parameter.grad = torch.zeros_like(parameter)
-        self.average = [parameter.clone() for parameter in self.parameters]
-        self.optimiser = (Soap if plan.optimiser == "soap" else torch.optim.Adam)(self.parameters, plan.lr)
-        self.step = 0
-        self.turn = np.full(len(oracles), int(plan.steps * (1.0 - plan.decay)))
-        self.stop = np.full(len(oracles), plan.steps)
-        self._tape = Tape(plan.activation, plan.width, plan.layers, self.parameters[0])
-
-    def _stacked(self, pools: list[Pool]) -> Pool:
-        return Pool(*(torch.cat(parts).to(self.device) for parts in zip(*pools, strict=True)))
-
     def update(self) -> None:
-        """One step of the optimiser for all that are not done."""
+        """One step of the optimiser."""
         plan = self.plan
         if plan.resample and self.step and self.step % plan.resample == 0:
-            self.pool = self._stacked([subject.pool(self.step) for subject in self.subjects])
+            self.pool = self._pool(self.step)
         self.differentiate(torch.randint(plan.pool, (plan.batch,), generator=self.generator))
-        factor = np.full(len(self.subjects), min(1.0, (self.step + 1) / WARMUP))
+        factor = min(1.0, (self.step + 1) / WARMUP)
         if plan.decay:
-            late = np.clip((self.step - self.turn) / np.maximum(self.stop - self.turn, 1), 0.0, 1.0)
-            factor = factor * 0.5 * (1.0 + np.cos(math.pi * late))
-        factor = np.where(self.step < self.stop, factor, 0.0)
+            late = min(max((self.step - self.turn) / max(self.stop - self.turn, 1), 0.0), 1.0)
+            factor *= 0.5 * (1.0 + math.cos(math.pi * late))
         if isinstance(self.optimiser, Soap):
-            self.optimiser.step(torch.from_numpy(factor).to(self.parameters[0]))
-        else:  # without an early stop the schedule of all networks is one
-            self.optimiser.param_groups[0]["lr"] = plan.lr * float(factor.max())
+            self.optimiser.step(factor)
+        else:
+            self.optimiser.param_groups[0]["lr"] = plan.lr * factor
             self.optimiser.step()
         self.step += 1
         for mean, parameter in zip(self.average, self.parameters, strict=True):
@@ -438,14 +362,9 @@ class _Run:
         """Weighted L1 of the signed distance, and of the unsigned one where the sign is not known; fills the gradients.
 
         Args:
-            chosen: [T] points of each pool.
+            chosen: [T] points of the pool.
         """
-        chosen = chosen.to(self.device)
-        points, distance, signed = (
-            self.pool.points[:, chosen],
-            self.pool.distance[:, chosen],
-            self.pool.signed[:, chosen],
-        )
+        points, distance, signed, _ = (part[chosen.to(self.device)] for part in self.pool)
         weights, biases = _layers(self.parameters, self.plan.activation)
         value = self._tape.forward(weights, biases, points)
         error = torch.where(signed, value - distance, value.abs() - distance.abs())
@@ -458,23 +377,20 @@ class _Run:
             gradient.mul_(scale)
 
     def judge(self) -> tuple[float, float]:
-        """Begin the decay of those that meet the goal. Returns mean errors near the surface and in the box, of all."""
+        """Begin the decay where the goal is met. Returns mean errors near the surface and in the box."""
         layers = _layers(self.average, self.plan.activation)
         value, gradient = value_and_gradient(*layers, self.plan.activation, self.check.points)
         distance, signed = self.check.distance, self.check.signed
         error = torch.where(signed, value - distance, value.abs() - distance.abs()).abs()
-        near, far = error[:, :CHECKED].mean(1), error[:, 2 * CHECKED :].mean(1)
-        if self.plan.goal is not None:
+        near, far = float(error[:CHECKED].mean()), float(error[2 * CHECKED :].mean())
+        if self.plan.goal is not None and self.step < self.turn:
             cosine = torch.nn.functional.cosine_similarity(gradient, self.check.direction, dim=-1)
-            turned = 1.0 - cosine[:, CHECKED : 2 * CHECKED].median(1).values
+            turned = 1.0 - float(cosine[CHECKED : 2 * CHECKED].median())
             clear = signed & (distance.abs() > SIGN_FROM)
-            wrong = (clear & (value * distance <= 0)).sum(1) / clear.sum(1).clamp_min(1)
-            errors = torch.stack([near, far, turned, wrong], -1)
-            met = (errors <= errors.new_tensor(self.plan.goal)).all(-1)
-            early = met.cpu().numpy() & (self.step < self.turn)
-            self.turn = np.where(early, self.step, self.turn)
-            self.stop = np.where(early, np.minimum(self.stop, self.step + self.plan.settle), self.stop)
-        return float(near.mean()), float(far.mean())
+            wrong = float((clear & (value * distance <= 0)).sum() / clear.sum().clamp_min(1))
+            if all(e <= most for e, most in zip((near, far, turned, wrong), self.plan.goal, strict=True)):
+                self.turn, self.stop = self.step, min(self.stop, self.step + self.plan.settle)
+        return near, far
 
     def hurry(self, possible: int) -> None:
         """Place decay and end so that `possible` updates in all suffice.
@@ -482,40 +398,28 @@ class _Run:
         Until the decay has begun the end moves both ways, since the first steps of a busy machine tell little; after
         that it only comes nearer.
         """
-        possible = max(possible, self.step)
         begun = self.step >= self.turn
-        self.stop = np.minimum(np.where(begun, self.stop, self.plan.steps), possible)
-        open_ended = np.maximum(self.step, (self.stop * (1.0 - self.plan.decay)).astype(int))
-        self.turn = np.where(begun, self.turn, open_ended)
+        self.stop = min(self.stop if begun else self.plan.steps, max(possible, self.step))
+        if not begun:
+            self.turn = max(self.step, int(self.stop * (1.0 - self.plan.decay)))
 
-    def results(self) -> list[tuple[MlpSdf, int]]:
-        """Every network and its updates, in the order of the solids."""
-        weights, biases = _layers(self.parameters, self.plan.activation)
-        found = []
-        for row, subject in enumerate(self.subjects):
-            sdf = MlpSdf(
-                tuple(weight[row].cpu().clone() for weight in weights),
-                tuple(bias[row].cpu().clone() for bias in biases),
-                self.plan.activation,
-                subject.frame,
-                subject.oracle.bounds.copy(),
-                subject.mirrors,
-            )
-            found.append((sdf, int(min(self.step, self.stop[row]))))
-        return found
+    def result(self) -> MlpSdf:
+        """The network."""
+        parts = _layers(self.parameters, self.plan.activation)
+        weights, biases = (tuple(part.cpu().clone() for part in layers) for layers in parts)
+        return MlpSdf(weights, biases, self.plan.activation, self.frame, self.oracle.bounds.copy(), self.mirrors)
 
 
-def _initial(plan: Plan, count: int, generator: torch.Generator) -> list[torch.Tensor]:
-    """First [1, S, W, 3], hidden [L - 2, S, W, W] and last [1, S, 1, W] weights; biases [L - 1, S, W, 1], [1, S, 1, 1].
+def _initial(plan: Plan, generator: torch.Generator) -> list[torch.Tensor]:
+    """First [1, W, 3], hidden [L - 2, W, W] and last [1, 1, W] weights; biases [L - 1, W, 1] and [1, 1, 1].
 
-    All `count` networks start alike. Equal layers are stacked for the optimiser. Periodic layers start with phases all
+    Equal layers are stacked for the optimiser. Periodic layers start with phases all
     around and the spread of inputs that sine layers have (Sitzmann et al. 2020); ReLU layers with He's variance.
     """
     width, hidden = plan.width, plan.layers - 2
 
     def uniform(bound: float, layers: int, *shape: int) -> torch.Tensor:
-        one = (2.0 * torch.rand((layers, 1, *shape), generator=generator) - 1.0) * bound
-        return one.repeat(1, count, 1, 1)
+        return (2.0 * torch.rand((layers, *shape), generator=generator) - 1.0) * bound
 
     periodic = plan.activation == "wave"
     return [

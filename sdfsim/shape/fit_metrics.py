@@ -51,11 +51,8 @@ def certify(
     doubt nothing is measured.
 
     Args:
-        sdf: metres; of any kind.
         oracle: the truth, in the same frame.
         nodes: [K, 3] m, surface nodes whose coverage is measured too.
-        points: how many of each of the three kinds.
-        seed: of the points.
 
     Returns:
         JSON-ready dict (None: could not be measured), lengths relative to the largest extent.
@@ -171,7 +168,6 @@ def coverage(nodes: np.ndarray, surface: DistanceOracle | Mesh, *, points: int =
         nodes: [K, 3] m.
         surface: the true surface, in the same frame: its oracle (which also knows what is hidden inside) or a mesh.
         points: samples, spread by area.
-        seed: of the samples.
 
     Returns:
         JSON-ready dict, lengths relative to the largest extent: `count` of nodes, `largest_hole` (largest distance to

@@ -33,7 +33,6 @@ def integrals(mesh: Mesh, weights: np.ndarray | float = 1.0) -> tuple[float, np.
     """`mass_properties` of a surface that is closed but for cracks: edges need not match, as after cutting its faces.
 
     Args:
-        mesh: metres.
         weights: of its faces, [F]; 1 / n where n of them lie on each other.
 
     Raises:

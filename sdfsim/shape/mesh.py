@@ -185,9 +185,7 @@ def _vertex_colors(loaded: Any, count: int) -> np.ndarray | None:
 def write_ply(mesh: Mesh, attributes: Mapping[str, np.ndarray] = MappingProxyType({})) -> bytes:
     """A mesh as binary PLY, vertices in double precision: what is read back is what was written, to the last bit.
 
-    Args:
-        mesh: any.
-        attributes: more properties of the vertices by name, [V] int32 or float32 each; most programs pass over them.
+    `attributes` are more properties of the vertices by name, [V] int32 or float32; most programs pass over them.
     """
     columns = [(axis, "<f8", "double") for axis in "xyz"]
     values = list(mesh.vertices.T)
@@ -291,10 +289,6 @@ def clean(mesh: Mesh, *, name: str = "mesh") -> Mesh:
 
     Of two faces back to back none stays where the rest is closed without them (a wall between touching cells).
 
-    Args:
-        mesh: metres.
-        name: how messages call it.
-
     Raises:
         SdfsimError: no faces (before or after), vertices that are not finite or absurdly far, or indices out of range.
     """
@@ -357,13 +351,9 @@ def without_doubles(faces: np.ndarray) -> np.ndarray:
 
 
 def is_closed(mesh: Mesh) -> bool:
-    """Whether every directed edge has exactly one opposite: watertight, with one consistent winding."""
-    edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
-    forward = edges[:, 0] * len(mesh.vertices) + edges[:, 1]
-    backward = edges[:, 1] * len(mesh.vertices) + edges[:, 0]
-    forward.sort()
-    backward.sort()
-    return bool(np.array_equal(forward, backward))
+    """Whether every directed edge has its opposite: watertight, with one winding, so that winding numbers are whole."""
+    edge, sign = directed_edges(mesh.faces)
+    return not np.bincount(edge, weights=sign).any()
 
 
 def signed_volume(mesh: Mesh) -> float:

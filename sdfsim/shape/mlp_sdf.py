@@ -1,4 +1,4 @@
-"""The compact SDF network, alone or in stacks, and its hand-written forward, gradient and training sweeps.
+"""The compact SDF network, and its hand-written forward, gradient and training sweeps.
 
 The sweeps work in memory that stays. Fresh memory is what they would otherwise wait for: an array of a megabyte is
 given back to the system and faulted in again at every operation, which costs more than the arithmetic.
@@ -22,7 +22,7 @@ Activation = Literal["wave", "relu"]
 
 # Points prepared and finished at once, a few hundred bytes each.
 PREPARED = 131_072
-# Points in one sweep of a stack. 64 wide and 8 layers are 4 kB a point: 33 MB on the CPU, of which the two layers at
+# Points in one sweep. 64 wide and 8 layers are 4 kB a point: 33 MB on the CPU, of which the two layers at
 # work stay in the cache; a GPU wants more at a time.
 SWEPT = {"cpu": 8192, "cuda": 131_072}
 
@@ -74,21 +74,16 @@ class MlpSdf:
         # -1 where the point is on the side of a mirror plane that the network does not know.
         mirrored = torch.tensor(self.mirrors, device=points.device)
         side = 1.0 - 2.0 * (mirrored & (points < 0)).to(points.dtype)
-        weights, biases = ([part[None] for part in parts] for parts in (self.weights, self.biases))
-        value, gradient = value_and_gradient(weights, biases, self.activation, (points * side)[None])
-        return value[0], gradient[0] * side
+        value, gradient = value_and_gradient(self.weights, self.biases, self.activation, points * side)
+        return value, gradient * side
 
 
 def wave(before: torch.Tensor, slope: torch.Tensor, spare: torch.Tensor) -> None:
     """The periodic activation: parabolic arcs r (1 - 2 |r|) with r = x - round(x), of period 1 and height 1/8.
 
     Like a sine it is odd, smooth to first order and bounded, and keeps fine detail that ReLU networks smear; value and
-    slope cost a quarter of a sine and a cosine.
-
-    Args:
-        before: x; becomes the value.
-        slope: becomes the derivative 1 - 4 |r|.
-        spare: overwritten.
+    slope cost a quarter of a sine and a cosine. `before`, x, becomes the value, `slope` the derivative 1 - 4 |r|;
+    `spare` is overwritten.
     """
     torch.round(before, out=spare)
     before.sub_(spare)
@@ -107,15 +102,10 @@ ACTIVATIONS = {"wave": wave, "relu": relu}
 
 
 class Tape:
-    """Working memory of the sweeps over a stack of S networks, for up to a number of points in all.
+    """Working memory of the sweeps, for up to a number of points.
 
-    A layer is `act(W x + b)`; the last one is linear with one output.
-
-    Args:
-        activation: of the hidden layers.
-        width: of the hidden layers.
-        layers: linear layers, the last one included.
-        like: a tensor of the device and dtype to compute in.
+    A layer is `act(W x + b)`; the last one, which `layers` counts too, is linear with one output. Weights are [out, in]
+    and biases [out], one a layer. Computes on the device and in the dtype of `like`.
     """
 
     def __init__(self, activation: Activation, width: int, layers: int, like: torch.Tensor) -> None:
@@ -124,40 +114,30 @@ class Tape:
         self._like = like.new_empty(0)
         self._room = 0
 
-    def _views(self, stack: int, points: int) -> None:
-        """Shape the memory as [S, T, W] arrays, and get more where it does not suffice."""
-        if stack * points > self._room:
-            self._room = stack * points
-            self._memory = self._like.new_empty(2 * self._layers, self._room * self._width)
-        views = self._memory[:, : stack * points * self._width].view(-1, stack, points, self._width)
-        self.hidden, self.slope = views[: self._layers - 1], views[self._layers - 1 : -2]
-        self._flow, self._spare = views[-2], views[-1]
-
     def forward(
         self, weights: Sequence[torch.Tensor], biases: Sequence[torch.Tensor], points: torch.Tensor
     ) -> torch.Tensor:
-        """Values [S, T] at `points` [S, T, 3]; each network at its own.
-
-        Args:
-            weights: per layer [S, out, in].
-            biases: per layer [S, out].
-            points: in the networks' own (normalised) coordinates.
-        """
-        self._views(*points.shape[:2])
+        """Values [T] at normalised `points` [T, 3]."""
+        if len(points) > self._room:
+            self._room = len(points)
+            self._memory = self._like.new_empty(2 * self._layers, self._room * self._width)
+        views = self._memory[:, : len(points) * self._width].view(-1, len(points), self._width)
+        self.hidden, self.slope = views[: self._layers - 1], views[self._layers - 1 : -2]
+        self._flow, self._spare = views[-2], views[-1]
         below = points
         for weight, bias, hidden, slope in zip(weights[:-1], biases[:-1], self.hidden, self.slope, strict=True):
-            torch.baddbmm(bias[:, None, :], below, weight.mT, out=hidden)
+            torch.addmm(bias, below, weight.T, out=hidden)
             self._act(hidden, slope, self._spare)
             below = hidden
-        return torch.baddbmm(biases[-1][:, None, :], below, weights[-1].mT)[..., 0]
+        return torch.addmm(biases[-1], below, weights[-1].T)[:, 0]
 
     def gradient(self, weights: Sequence[torch.Tensor]) -> torch.Tensor:
-        """Gradients [S, T, 3] of the values that `forward` gave; destroys what it left."""
+        """Gradients [T, 3] of the values that `forward` gave; destroys what it left."""
         # The last layer is one row, so its product with the slope broadcasts.
         flow = self.slope[-1].mul_(weights[-1])
         for layer in range(len(weights) - 2, 0, -1):
-            flow = torch.bmm(flow, weights[layer], out=self._free(layer)).mul_(self.slope[layer - 1])
-        return torch.bmm(flow, weights[0])
+            flow = torch.mm(flow, weights[layer], out=self._free(layer)).mul_(self.slope[layer - 1])
+        return flow @ weights[0]
 
     def parameter_gradients(
         self,
@@ -167,26 +147,21 @@ class Tape:
         into_weights: Sequence[torch.Tensor],
         into_biases: Sequence[torch.Tensor],
     ) -> None:
-        """Gradients of a loss in the parameters, after `forward` at the same points.
+        """Gradients of a loss in the parameters, after `forward` with the same weights at the same points.
 
-        Args:
-            weights: as for `forward`.
-            points: as for `forward`.
-            error: [S, T] derivative of the loss in each value.
-            into_weights: per layer [S, out, in], overwritten.
-            into_biases: per layer [S, out], overwritten.
+        `error` [T] is the derivative of the loss in each value; `into_weights` and `into_biases` are overwritten.
         """
         last = len(weights) - 1
-        torch.bmm(error[:, None], self.hidden[-1], out=into_weights[last])
-        into_biases[last].copy_(error.sum(1, keepdim=True))
-        flow = torch.mul(error[..., None], weights[last], out=self._free(last)).mul_(self.slope[-1])
+        torch.mm(error[None], self.hidden[-1], out=into_weights[last])
+        into_biases[last].copy_(error.sum())
+        flow = torch.mul(error[:, None], weights[last], out=self._free(last)).mul_(self.slope[-1])
         for layer in range(last - 1, -1, -1):
-            torch.sum(flow, dim=1, out=into_biases[layer])
+            torch.sum(flow, dim=0, out=into_biases[layer])
             if layer == 0:
-                torch.bmm(flow.mT, points, out=into_weights[0])
+                torch.mm(flow.T, points, out=into_weights[0])
             else:
-                torch.bmm(flow.mT, self.hidden[layer - 1], out=into_weights[layer])
-                flow = torch.bmm(flow, weights[layer], out=self._free(layer)).mul_(self.slope[layer - 1])
+                torch.mm(flow.T, self.hidden[layer - 1], out=into_weights[layer])
+                flow = torch.mm(flow, weights[layer], out=self._free(layer)).mul_(self.slope[layer - 1])
 
     def _free(self, layer: int) -> torch.Tensor:
         """The one of two arrays that the layer above does not hold its flow in."""
@@ -199,35 +174,24 @@ _kept = threading.local()
 def value_and_gradient(
     weights: Sequence[torch.Tensor], biases: Sequence[torch.Tensor], activation: Activation, points: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Evaluate a stack of networks of one architecture, each on its own points; no autograd graph is built.
+    """Evaluate a network (see `Tape`) at normalised points [T, 3]; no autograd graph is built.
 
     The forward sweep keeps each activation's derivative; one reverse sweep multiplies them back to the input, which
     costs as much as the forward one. Memory is bounded by `SWEPT`, whatever the number of points.
 
-    Args:
-        weights: per layer [S, out, in].
-        biases: per layer [S, out].
-        activation: of the hidden layers.
-        points: [S, T, 3], in the networks' own (normalised) coordinates.
-
     Returns:
-        value [S, T] and its gradient [S, T, 3], in the dtype of the weights.
+        value [T] and its gradient [T, 3], in the dtype of the weights.
     """
     tapes = _kept.__dict__.setdefault("tapes", {})
-    like, width = weights[0], weights[0].shape[1]
+    like, width = weights[0], len(weights[0])
     key = (activation, width, len(weights), like.device, like.dtype)
     if key not in tapes:
         tapes[key] = Tape(activation, width, len(weights), like)
-    tape, stack, count = tapes[key], *points.shape[:2]
-    room = SWEPT[like.device.type]
-    value, gradient = points.new_empty(stack, count, dtype=like.dtype), torch.empty_like(points, dtype=like.dtype)
-    rows = max(1, room // max(count, 1))
+    tape, room = tapes[key], SWEPT[like.device.type]
+    value, gradient = points.new_empty(len(points), dtype=like.dtype), torch.empty_like(points, dtype=like.dtype)
     with torch.no_grad():
-        for first in range(0, stack, rows):
-            some = slice(first, first + rows)
-            chosen, shift = [w[some] for w in weights], [b[some] for b in biases]
-            for start in range(0, count, room):
-                part = slice(start, start + room)
-                value[some, part] = tape.forward(chosen, shift, points[some, part])
-                gradient[some, part] = tape.gradient(chosen)
+        for start in range(0, len(points), room):
+            part = slice(start, start + room)
+            value[part] = tape.forward(weights, biases, points[part])
+            gradient[part] = tape.gradient(weights)
     return value, gradient

@@ -175,19 +175,16 @@ def _spin(profile: np.ndarray, turn: float) -> np.ndarray:
 def _revolve(profile: np.ndarray, segments: int, name: str) -> Mesh:
     """The solid of a profile [K, 2] of (radius, z), both ends on the axis, turned about z."""
     rings = np.stack([_spin(profile, turn) for turn in 2 * np.pi * np.arange(segments) / segments])
-    count = len(profile)
-    this, following = np.arange(segments)[:, None], ((np.arange(segments) + 1) % segments)[:, None]
-    low, high = np.arange(count - 1)[None], np.arange(1, count)[None]
-    corners = (this * count + low, following * count + low, following * count + high, this * count + high)
     # On the axis all turns of a point are one vertex and half of each quad vanishes: `clean` sees to both.
-    return clean(Mesh(rings.reshape(-1, 3), _quads(np.stack(corners, axis=-1).reshape(-1, 4))), name=name)
+    return _tube(rings, name, len(profile) - 1)
 
 
-def _tube(rings: np.ndarray, name: str) -> Mesh:
-    """The closed tube through rings [R, K, 3], the last joined to the first."""
+def _tube(rings: np.ndarray, name: str, strips: int | None = None) -> Mesh:
+    """The tube through rings [R, K, 3], the last joined to the first, of K strips around, or the first of these."""
     turns, sides = rings.shape[:2]
     this, following = np.arange(turns)[:, None], ((np.arange(turns) + 1) % turns)[:, None]
-    left, right = np.arange(sides)[None], (np.arange(sides) + 1)[None] % sides
+    left = np.arange(strips or sides)[None]
+    right = (left + 1) % sides
     corners = (this * sides + left, following * sides + left, following * sides + right, this * sides + right)
     return clean(Mesh(rings.reshape(-1, 3), _quads(np.stack(corners, axis=-1).reshape(-1, 4))), name=name)
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from sdfsim.errors import SdfsimError
-from sdfsim.parallel import Progress
+from sdfsim.parallel import Progress, silent
 from sdfsim.shape.distance import MeshDistance
 from sdfsim.shape.far_field import BOX, in_metres
 from sdfsim.shape.mesh import Frame, Mesh, normal_frame
@@ -85,11 +85,7 @@ def accepts_numpy(call: Callable[..., tuple[torch.Tensor, torch.Tensor]]) -> Cal
 
 
 class ClosedForm:
-    """A solid about the origin with an exact distance; `measure` asks many of one kind at once.
-
-    Attributes:
-        KIND: its name in files.
-        COUNT: how many sizes it has.
+    """A solid about the origin with an exact distance; its fields are its `COUNT` sizes, m.
 
     Raises:
         SdfsimError: a size is not a positive finite number.
@@ -107,6 +103,16 @@ class ClosedForm:
     @property
     def sizes(self) -> tuple[float, ...]:
         """[COUNT] m."""
+        return tuple(np.hstack([*vars(self).values()]).tolist()) if vars(self) else ()
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """[2, 3] float64 m, the box that holds the solid."""
+        return np.outer([-1.0, 1.0], self.reach)
+
+    @property
+    def reach(self) -> tuple[float, ...]:
+        """(x, y, z) m, its half extents."""
         raise NotImplementedError
 
     @staticmethod
@@ -136,10 +142,6 @@ class PlaneSdf(ClosedForm):
     KIND, COUNT = "plane", 0
 
     @property
-    def sizes(self) -> tuple[float, ...]:
-        return ()
-
-    @property
     def bounds(self) -> np.ndarray:
         """[2, 3] m: infinite but for the top."""
         return np.array([[-np.inf] * 3, [np.inf, np.inf, 0.0]])
@@ -157,13 +159,8 @@ class SphereSdf(ClosedForm):
     radius: float
 
     @property
-    def sizes(self) -> tuple[float, ...]:
-        return (self.radius,)
-
-    @property
-    def bounds(self) -> np.ndarray:
-        """[2, 3] m."""
-        return np.array([[-self.radius] * 3, [self.radius] * 3], dtype=np.float64)
+    def reach(self) -> tuple[float, ...]:
+        return (self.radius,) * 3
 
     @staticmethod
     def measure(points: torch.Tensor, sizes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -185,13 +182,8 @@ class BoxSdf(ClosedForm):
     half: tuple[float, float, float]
 
     @property
-    def sizes(self) -> tuple[float, ...]:
+    def reach(self) -> tuple[float, ...]:
         return self.half
-
-    @property
-    def bounds(self) -> np.ndarray:
-        """[2, 3] m."""
-        return np.array([[-value for value in self.half], list(self.half)], dtype=np.float64)
 
     @staticmethod
     def measure(points: torch.Tensor, sizes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -216,14 +208,8 @@ class CapsuleSdf(ClosedForm):
     half: float
 
     @property
-    def sizes(self) -> tuple[float, ...]:
-        return self.radius, self.half
-
-    @property
-    def bounds(self) -> np.ndarray:
-        """[2, 3] m."""
-        high = np.array([self.radius, self.radius, self.half + self.radius])
-        return np.stack([-high, high])
+    def reach(self) -> tuple[float, ...]:
+        return self.radius, self.radius, self.half + self.radius
 
     @staticmethod
     def measure(points: torch.Tensor, sizes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -244,14 +230,8 @@ class CylinderSdf(ClosedForm):
     half: float
 
     @property
-    def sizes(self) -> tuple[float, ...]:
-        return self.radius, self.half
-
-    @property
-    def bounds(self) -> np.ndarray:
-        """[2, 3] m."""
-        high = np.array([self.radius, self.radius, self.half])
-        return np.stack([-high, high])
+    def reach(self) -> tuple[float, ...]:
+        return self.radius, self.radius, self.half
 
     @staticmethod
     def measure(points: torch.Tensor, sizes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -283,19 +263,12 @@ def _up(points: torch.Tensor) -> torch.Tensor:
 
 
 def trilinear(values: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Interpolate a grid over [-BOX, BOX]^3, and differentiate what comes out.
+    """Value [P] and gradient [P, 3] of a grid [R, R, R] over [-BOX, BOX]^3 at points [P, 3] in it; NaN for NaN.
 
     The gradient is the exact one of the interpolant, not an interpolation of central differences: the step
     x - f grad f then leads to the level that the value has (which is what contact points and nodes are made of), and
     it takes the eight samples that the value takes anyway, not thirty-two. It jumps from cell to cell, by about
     the cell over the radius of curvature.
-
-    Args:
-        values: [R, R, R] float32 distances; the outermost samples lie on the faces of the box.
-        points: [P, 3] float32 within the box; from a NaN comes a NaN.
-
-    Returns:
-        value [P] and gradient [P, 3].
     """
     side = values.shape[-1]
     per_cell = (side - 1) / (2 * BOX)
@@ -372,7 +345,7 @@ def sample_grid(
     distance: Callable[[np.ndarray], tuple[Any, ...]],
     bounds: np.ndarray,
     resolution: int,
-    on_progress: Progress | None = None,
+    on_progress: Progress = silent,
 ) -> GridSdf:
     """Sample a signed distance on a voxel grid.
 
@@ -392,14 +365,13 @@ def sample_grid(
     axis = np.linspace(-BOX, BOX, resolution)
     values = np.empty((resolution, resolution, resolution), dtype=np.float32)
     layers = max(1, SAMPLED // resolution**2)
-    tell = on_progress or (lambda fraction, message: None)
     for start in range(0, resolution, layers):
-        tell(start / resolution, "sampling the distance")
+        on_progress(start / resolution, "sampling the distance")
         some = axis[start : start + layers]
         points = np.stack(np.meshgrid(some, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
         found = np.asarray(distance(frame.outward(points))[0])
         values[start : start + layers] = (found / frame.scale).reshape(len(some), resolution, resolution)
-    tell(1.0, "sampled")
+    on_progress(1.0, "sampled")
     return GridSdf(torch.from_numpy(values), frame, np.asarray(bounds, dtype=np.float64))
 
 

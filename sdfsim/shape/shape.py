@@ -14,8 +14,8 @@ import numpy as np
 import torch
 
 from sdfsim.errors import SdfsimError
-from sdfsim.files import read_json, replacing, write_json
-from sdfsim.parallel import Progress
+from sdfsim.files import read_json, user_cache, write_bytes, write_json
+from sdfsim.parallel import Progress, silent
 from sdfsim.shape import primitives
 from sdfsim.shape.distance import MeshDistance
 from sdfsim.shape.mass import mass_properties_of_sdf
@@ -121,21 +121,15 @@ class Shape:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             (folder / RECORD_FILE).unlink(missing_ok=True)
-            write(folder / WEIGHTS_FILE, to_bytes(tensors))
-            write(folder / MESH_FILE, write_ply(self.mesh))
+            write_bytes(folder / WEIGHTS_FILE, to_bytes(tensors))
+            write_bytes(folder / MESH_FILE, write_ply(self.mesh))
             (folder / SKIN_FILE).unlink(missing_ok=True)
             if self.skin is not None:
-                write(folder / SKIN_FILE, write_glb({self.name: self.skin}))
+                write_bytes(folder / SKIN_FILE, write_glb({self.name: self.skin}))
             write_json(folder / RECORD_FILE, record)
         except OSError as error:
             raise SdfsimError(f"{folder}: cannot write the shape ({error.strerror or error})") from error
         return folder
-
-
-def write(path: Path, content: bytes) -> None:
-    """Put `content` at `path` in one step: what was there before, or all of it, even when interrupted."""
-    with replacing(path) as partial:
-        partial.write_bytes(content)
 
 
 def load_shape(folder: str | Path) -> Shape:
@@ -298,7 +292,6 @@ def with_sdf(shape: Shape, kind: SdfKind, *, resolution: int = DEFAULT_RESOLUTIO
         shape: any but a plane; "grid" and "mesh" are made from its mesh, whatever its SDF was.
         kind: "mlp" (the shape as it is, which must have a network), "grid" (samples of the exact distance to the
             mesh, see `sample_grid`) or "mesh" (that distance itself).
-        resolution: of a grid, samples along each side.
 
     Returns:
         Shape without a certificate, since nothing was fitted; its `source` notes the kind as `sdf`.
@@ -317,7 +310,7 @@ def with_sdf(shape: Shape, kind: SdfKind, *, resolution: int = DEFAULT_RESOLUTIO
 
 
 def sdf_of_mesh(
-    mesh: Mesh, kind: Literal["grid", "mesh"], resolution: int, on_progress: Progress | None = None
+    mesh: Mesh, kind: Literal["grid", "mesh"], resolution: int, on_progress: Progress = silent
 ) -> tuple[Sdf, dict]:
     """A mesh's exact SDF or a grid of it, and what a shape's `source` says about it. Raises as `with_sdf` does."""
     if kind == "mesh":
@@ -354,19 +347,15 @@ def with_wall(shape: Shape, wall: float) -> Shape:
 def shape_from_mesh(
     path: str | Path, cache_dir: str | Path | None = None, *, name: str | None = None, units: float = 1.0,
     cap: bool = False, thicken: float | None = None, sdf: SdfKind = "mlp", resolution: int = DEFAULT_RESOLUTION,
-    on_progress: Progress | None = None,
+    on_progress: Progress = silent,
 ) -> Shape:  # fmt: skip
     """The shape of a mesh file: made on first use, then taken from a cache keyed by what the file describes.
 
     Args:
-        path: a mesh file.
         cache_dir: where shapes are kept; by default `sdfsim/shapes` in the user's cache folder.
-        name: by default the file's.
         units: metres per unit of the file.
-        cap: close openings of any size.
         thicken: m; a thickness for an open sheet.
         sdf: "mlp" fits the network; "grid" and "mesh" fit nothing (see `mesh_shape`).
-        resolution: of a grid, samples along each side.
 
     Raises:
         SdfsimError: the mesh cannot be used.
@@ -383,7 +372,7 @@ def shape_from_mesh(
 
 def shape_from_primitive(
     kind: str, size: float = 1.0, cache_dir: str | Path | None = None, *, name: str | None = None,
-    sdf: SdfKind = "mlp", resolution: int = DEFAULT_RESOLUTION, on_progress: Progress | None = None,
+    sdf: SdfKind = "mlp", resolution: int = DEFAULT_RESOLUTION, on_progress: Progress = silent,
 ) -> Shape:  # fmt: skip
     """The shape of a procedural mesh of `primitives.PRIMITIVES`, made on first use and cached.
 
@@ -407,7 +396,7 @@ def shape_from_primitive(
 
 def mesh_shape(
     mesh: Mesh, *, name: str, kind: Literal["grid", "mesh"], cap: bool = False, thicken: float | None = None,
-    resolution: int = DEFAULT_RESOLUTION, on_progress: Progress | None = None,
+    resolution: int = DEFAULT_RESOLUTION, on_progress: Progress = silent,
 ) -> Shape:  # fmt: skip
     """The shape of a mesh (metres) without any fit: its exact SDF or a grid of it, nodes and mass as a fit has them.
 
@@ -426,12 +415,10 @@ def _cached(
         return mesh_shape(mesh, name=name, kind=kind, **how)
     from sdfsim.shape.fit import FIT_VERSION, fit_mesh
 
-    if cache_dir is None:
-        cache_dir = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sdfsim" / "shapes"
     variant = "-cap" if how.get("cap") else ""
     variant += "" if how.get("thicken") is None else f"-thick{how['thicken']:g}"
     variant += f"-grid{resolution}" if kind == "grid" else ""
-    folder = Path(cache_dir) / f"{key[:24]}{variant}-{FIT_VERSION}.{FORMAT_VERSION}"
+    folder = Path(cache_dir or user_cache("shapes")) / f"{key[:24]}{variant}-{FIT_VERSION}.{FORMAT_VERSION}"
     if folder.is_dir():
         try:
             return load_shape(folder)
@@ -469,7 +456,6 @@ def analytic_shape(
         radius: of the sphere, capsule or cylinder, m.
         height: of the capsule, its caps included, or cylinder, both along z; m.
         size: (x, y, z) full extents of the box, m.
-        name: by default the kind.
 
     Returns:
         Shape with exact mass properties (per unit density; those of the plane are 0), a mesh for display (of the

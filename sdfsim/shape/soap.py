@@ -1,4 +1,4 @@
-"""SOAP, the optimiser of the fits: Adam in the eigenbasis of Shampoo's preconditioner, for stacks of small networks."""
+"""SOAP, the optimiser of the fits: Adam in the eigenbasis of Shampoo's preconditioner."""
 
 from __future__ import annotations
 
@@ -6,18 +6,17 @@ import torch
 
 
 class Soap:
-    """SOAP (Vyas et al., "SOAP: Improving and Stabilizing Shampoo using Adam", 2024) on a stack of S networks.
+    """SOAP (Vyas et al., "SOAP: Improving and Stabilizing Shampoo using Adam", 2024) on a small network.
 
     For each matrix gradient G it tracks averages of G G^T and G^T G, and runs Adam in the basis of their
     eigenvectors, which one step of orthogonal iteration follows every few updates. On these 64-wide networks that
     costs a tenth of the gradient itself, and reaches in a thousand steps what Adam does not in ten thousand.
 
-    The first step only sets up the bases. A dimension of size 1 is not rotated. Each network is updated as if it were
-    alone.
+    The first step only sets up the bases. A dimension of size 1 is not rotated.
 
     Args:
-        parameters: each [L, S, rows, columns]: L equal layers of S networks. Their `grad` is what `step` applies.
-        lr: step size; `step` takes factors on it.
+        parameters: each [L, rows, columns]: L equal layers. Their `grad` is what `step` applies.
+        lr: step size; `step` takes a factor on it.
     """
 
     MOMENTUM, SECOND, LEAST = 0.95, 0.95, 1e-10
@@ -35,23 +34,19 @@ class Soap:
         for side, size in (("left", parameter.shape[-2]), ("right", parameter.shape[-1])):
             if size > 1:
                 eye = torch.eye(size, dtype=parameter.dtype, device=parameter.device)
-                state[f"{side}_average"] = torch.zeros_like(eye).repeat(*parameter.shape[:2], 1, 1)
-                state[f"{side}_basis"] = eye.repeat(*parameter.shape[:2], 1, 1)
+                state[f"{side}_average"] = torch.zeros_like(eye).repeat(len(parameter), 1, 1)
+                state[f"{side}_basis"] = eye.repeat(len(parameter), 1, 1)
         return state
 
     @torch.no_grad()
-    def step(self, factor: torch.Tensor) -> None:
-        """Apply the gradients.
-
-        Args:
-            factor: [S], of the learning-rate schedule; 0 leaves a network as it is.
-        """
+    def step(self, factor: float) -> None:
+        """Apply the gradients; `factor` is of the learning-rate schedule."""
         self.count += 1
         for parameter, state in zip(self.parameters, self.state, strict=True):
             gradient = parameter.grad
             assert gradient is not None
             if self.count > 1:
-                parameter -= self.lr * factor[:, None, None] * self._direction(gradient, state)
+                parameter -= self.lr * factor * self._direction(gradient, state)
             self._follow(gradient, state)
 
     def _direction(self, gradient: torch.Tensor, state: dict[str, torch.Tensor]) -> torch.Tensor:

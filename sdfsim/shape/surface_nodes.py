@@ -30,7 +30,6 @@ def sample_nodes(sdf: Sdf, *, grid: int = DEFAULT_GRID, voxel: float = VOXEL) ->
     Lengths are relative to the largest extent of `sdf.bounds` (the frame in which the solid is within [-0.5, 0.5]).
 
     Args:
-        sdf: bounded.
         grid: points along each side of the sampling cube [-0.7, 0.7]^3.
         voxel: edge of the downsampling voxels, normalised; the point nearest a voxel's middle stays.
 
@@ -70,11 +69,8 @@ def _one_per_voxel(points: np.ndarray, voxel: float) -> np.ndarray:
     # Voxels centred on the origin: the faces of a normalised box at 0.5 then run through their middles.
     cell = np.round(points / voxel).astype(np.int64)
     off_centre = np.square(points - cell * voxel).sum(1)
-    order = np.lexsort((off_centre, cell[:, 2], cell[:, 1], cell[:, 0]))
-    ordered = cell[order]
-    first = np.ones(len(order), dtype=bool)
-    first[1:] = (ordered[1:] != ordered[:-1]).any(1)
-    return points[order[first]]
+    order = np.argsort(off_centre, kind="stable")
+    return points[order[np.unique(cell[order], axis=0, return_index=True)[1]]]
 
 
 def thin(points: np.ndarray, count: int, *, keep: np.ndarray | None = None) -> np.ndarray:
@@ -82,7 +78,6 @@ def thin(points: np.ndarray, count: int, *, keep: np.ndarray | None = None) -> n
 
     Args:
         points: [P, 3] candidates.
-        count: how many points to return at most.
         keep: [Q, 3] points that come first; when they alone exceed `count` they are thinned themselves.
 
     Returns:
@@ -95,13 +90,8 @@ def thin(points: np.ndarray, count: int, *, keep: np.ndarray | None = None) -> n
     nearest = np.full(len(points), np.inf)
     for point in chosen:
         np.minimum(nearest, np.square(points - point).sum(1), out=nearest)
-    if not chosen and len(points):
-        nearest = np.square(points - points.mean(0)).sum(1)
-        first = points[int(nearest.argmax())]
-        chosen.append(first)
-        nearest = np.square(points - first).sum(1)
     while len(chosen) < count and len(points):
-        far = int(nearest.argmax())
+        far = int((nearest if chosen else np.square(points - points.mean(0)).sum(1)).argmax())
         if nearest[far] <= 0:
             break
         chosen.append(points[far])
@@ -120,15 +110,13 @@ def hull_nodes(vertices: np.ndarray, count: int) -> np.ndarray:
     return thin(rest, count, keep=vertices[outer])
 
 
-def edge_nodes(piece: np.ndarray, spacing: float, sharp: float = SHARP) -> np.ndarray:
+def edge_nodes(piece: np.ndarray, spacing: float) -> np.ndarray:
     """Points along the sharp edges of a convex polyhedron, its corners left out.
 
     Two polyhedra often touch edge against edge, which their corners alone do not see.
 
     Args:
-        piece: [V, 3] m, its corners.
         spacing: m, between points at most; edges shorter than this get none.
-        sharp: cosine of the angle between the normals of the two faces, above which an edge counts as flat.
 
     Returns:
         [K, 3] m.
@@ -139,7 +127,7 @@ def edge_nodes(piece: np.ndarray, spacing: float, sharp: float = SHARP) -> np.nd
     normals = hull.equations[:, :3]
     face, corner = np.nonzero(np.arange(len(hull.simplices))[:, None] < hull.neighbors)
     other = hull.neighbors[face, corner]
-    bent = (normals[face] * normals[other]).sum(1) < sharp
+    bent = (normals[face] * normals[other]).sum(1) < SHARP
     # The neighbour k of a face lies across the edge opposite to its corner k.
     points = [np.empty((0, 3))]
     for f, c in zip(face[bent], corner[bent], strict=True):

@@ -84,8 +84,6 @@ def solidify(mesh: Mesh, *, name: str = "mesh", cap: bool = False, thicken: floa
 
     Args:
         mesh: metres, of any kind.
-        name: how messages call it.
-        cap: close openings of any size.
         thicken: m; the solid is all within half of this distance from the mesh instead.
 
     Raises:
@@ -108,10 +106,10 @@ def solidify(mesh: Mesh, *, name: str = "mesh", cap: bool = False, thicken: floa
 
     area = face_areas(vertices[faces]).sum()
     vertices, faces = _close(vertices, faces, SMALL * area, area, frame.scale, notes)
-    if cap and leaking(faces).any():
+    if cap and not is_closed(_plain(vertices, faces)):
         vertices, faces = _close(vertices, faces, np.inf, area, frame.scale, notes)
         faces = _outwards(vertices, *consistent(vertices, faces))
-    closed = not leaking(faces).any()
+    closed = is_closed(_plain(vertices, faces))
     winding = Winding(_plain(vertices, faces))
     if not closed:
         _require_tight(vertices, faces, winding, frame.scale, name)
@@ -322,13 +320,6 @@ def bodies(faces: np.ndarray, patch: np.ndarray) -> np.ndarray:
         label[rest] = patch.max() + 1 + components(faces[rest])
     _, label = np.unique(label, return_inverse=True)
     return label
-
-
-def leaking(faces: np.ndarray) -> np.ndarray:
-    """[F] bool: faces with an edge at which the surface ends. None: it is a cycle, winding numbers are whole."""
-    edge, sign = directed_edges(faces)
-    open_ = np.bincount(edge, weights=sign)[edge] != 0
-    return open_.reshape(3, -1).any(0)
 
 
 def openings(faces: np.ndarray) -> list[np.ndarray]:

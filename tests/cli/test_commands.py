@@ -111,7 +111,7 @@ def test_a_bad_scene_is_one_line_and_code_1(tmp_path, command, field, fault):
 )
 def test_wrong_usage_is_code_2(arguments):
     done = run(*arguments)
-    assert done.exit_code == 2 and "Error" in done.stderr
+    assert done.exit_code == 2 and "rror" in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -1,13 +1,11 @@
 """Replacing a bundled model: weights, errors and card come out of one call."""
 
-from dataclasses import replace
-
 import pytest
 
 pytest.importorskip("pybullet")
 
 from sdfsim.data.generate import make_dataset
-from sdfsim.dynamics.model import Model, load_model, new_network
+from sdfsim.dynamics.model import load_model
 from sdfsim.evaluation.model_card import bundle
 from sdfsim.training.train import train
 
@@ -33,19 +31,12 @@ def test_a_trained_model_is_bundled_with_its_errors(cube_data, trained, tmp_path
     assert len(first) == 6 and first[-1].strip().endswith(" s")
     assert f"| this model | {report['model']['50']['translation_rmse']:.3f} (" in card
     assert f"| teacher, 1e-3 m/s off | {_error(report, '1e-3'):.3f} (" in card
-    assert "m, 50 steps = 1 s" in card and "penetration 95 %" in card and "| tiny | 2 | 20 | 16 |" in card
+    assert (
+        "m, 50 steps = 1 s" in card
+        and "penetration 95 %" in card
+        and "Preset tiny, seed 2: 20 steps of\n16 frames" in card
+    )
     assert "recipe movi-b" in card and "seed 1" in card
-
-
-def test_a_paper_network_is_told_as_published_too(cube_data, trained, tmp_path):
-    plan = {"config": {"width": 8, "steps": 1}}
-    card = load_model(trained).card
-    paper = Model("p", "paper", new_network("paper", plan["config"]), 0.02, 10.0, 1.0, 0.1, nodes=8)
-    replace(paper, card=card | {"preset": card["preset"] | plan}).save(tmp_path / "paper.safetensors")
-    report = bundle(tmp_path / "paper.safetensors", cube_data, "mine", tmp_path / "models")
-    error = report["as_published"]["50"]["translation_rmse"]
-    card = (tmp_path / "models" / "mine.md").read_text()
-    assert f"| this model, free flight learned too (as published) | {error:.3f} (" in card
 
 
 def _error(report: dict, size: str) -> float:

@@ -11,13 +11,11 @@ import torch
 from sdfsim.errors import SdfsimError
 from sdfsim.shape import fit as fit_module
 from sdfsim.shape import primitives
-from sdfsim.shape.distance import MeshDistance
-from sdfsim.shape.fit import fit_mesh, fit_pieces, fit_solids
+from sdfsim.shape.fit import fit_mesh, fit_pieces
 from sdfsim.shape.mass import mass_properties, mass_properties_of_sdf
 from sdfsim.shape.mesh import Mesh, load_mesh, load_pieces
 from sdfsim.shape.mlp_sdf import MlpSdf
 from sdfsim.shape.shape import Shape
-from sdfsim.shape.watertight import solidify
 
 
 @pytest.fixture
@@ -139,37 +137,6 @@ def test_a_shape_with_mirror_planes_is_fitted_on_one_side(tiny: None) -> None:
     shoe = fit_mesh(primitives.shoe(), name="shoe").sdf
     assert isinstance(shoe, MlpSdf)
     assert shoe.mirrors == (False, False, False)
-
-
-def test_side_by_side_is_each_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    # The goals are met at different updates, and early, since rounding, which differs with the size of the stack, grows
-    # from update to update.
-    plan = replace(
-        fit_module.PLANS["default"],
-        width=16,
-        layers=4,
-        batch=256,
-        pool=5000,
-        goal=(6e-2, 1, 1, 1),
-        settle=20,
-        steps=300,
-    )
-    monkeypatch.setattr(fit_module, "CHECK_EVERY", 10)
-    monkeypatch.setitem(fit_module.PLANS, "default", plan)
-    meshes = {
-        "cone": primitives.cone(),
-        "shoe": primitives.shoe(),
-    }
-    solids = {name: MeshDistance(solidify(mesh, name=name)) for name, mesh in meshes.items()}
-    together = fit_solids(solids)
-    assert [shape.name for shape in together] == list(meshes)
-    assert len({shape.certificate["steps"] for shape in together}) >= 2
-    points = torch.rand(500, 3, dtype=torch.float64) - 0.5
-    for name, shape in zip(meshes, together, strict=True):
-        alone = fit_mesh(meshes[name], name=name)
-        assert shape.certificate["steps"] == alone.certificate["steps"]
-        assert shape.volume == alone.volume
-        torch.testing.assert_close(shape.sdf(points)[0], alone.sdf(points)[0], rtol=0, atol=1e-5)
 
 
 @pytest.mark.slow

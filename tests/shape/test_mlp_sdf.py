@@ -34,17 +34,21 @@ def act(before: torch.Tensor, activation: Activation) -> torch.Tensor:
 def forward(weights: list[torch.Tensor], biases: list[torch.Tensor], activation: Activation, points: torch.Tensor):
     hidden = points
     for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
-        hidden = act(torch.einsum("sti,soi->sto", hidden, weight) + bias[:, None], activation)
-    return (torch.einsum("sti,soi->sto", hidden, weights[-1]) + biases[-1][:, None])[..., 0]
+        hidden = act(hidden @ weight.T + bias, activation)
+    return (hidden @ weights[-1].T + biases[-1])[..., 0]
+
+
+def doubles(activation: Activation, width: int, layers: int) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+    """Weights and biases of a network."""
+    net = network(3, activation, width, layers)
+    return [weight.double() for weight in net.weights], [bias.double() for bias in net.biases]
 
 
 @pytest.mark.parametrize("activation", ["wave", "relu"])
 @pytest.mark.parametrize(("width", "layers"), [(64, 8), (7, 3), (16, 2)])
 def test_the_hand_written_sweep_is_autograd(activation: Activation, width: int, layers: int) -> None:
-    nets = [network(seed, activation, width, layers) for seed in range(3)]
-    weights = [torch.stack(layer).double() for layer in zip(*(net.weights for net in nets), strict=True)]
-    biases = [torch.stack(layer).double() for layer in zip(*(net.biases for net in nets), strict=True)]
-    points = torch.rand(3, 50, 3, dtype=torch.float64).requires_grad_()
+    weights, biases = doubles(activation, width, layers)
+    points = torch.rand(50, 3, dtype=torch.float64).requires_grad_()
     value, gradient = value_and_gradient(weights, biases, activation, points)
     assert not value.requires_grad
     expected = forward(weights, biases, activation, points)
@@ -56,10 +60,8 @@ def test_the_hand_written_sweep_is_autograd(activation: Activation, width: int, 
 @pytest.mark.parametrize("activation", ["wave", "relu"])
 @pytest.mark.parametrize(("width", "layers"), [(16, 5), (7, 2)])
 def test_the_hand_written_training_sweep_is_autograd(activation: Activation, width: int, layers: int) -> None:
-    nets = [network(seed, activation, width, layers) for seed in range(2)]
-    weights = [torch.stack(layer).double() for layer in zip(*(net.weights for net in nets), strict=True)]
-    biases = [torch.stack(layer).double() for layer in zip(*(net.biases for net in nets), strict=True)]
-    points, error = torch.rand(2, 40, 3, dtype=torch.float64), torch.randn(2, 40, dtype=torch.float64)
+    weights, biases = doubles(activation, width, layers)
+    points, error = torch.rand(40, 3, dtype=torch.float64), torch.randn(40, dtype=torch.float64)
     tape = Tape(activation, width, layers, weights[0])
     tape.forward(weights, biases, points)
     got = [torch.empty_like(part) for part in (*weights, *biases)]
@@ -98,14 +100,12 @@ def test_a_mirrored_network_is_the_same_on_both_sides() -> None:
 def test_metres_and_normalised_frame() -> None:
     net = network(2, "wave")
     local = torch.rand(100, 3, dtype=torch.float64) - 0.5
-    value, gradient = value_and_gradient(
-        [w[None] for w in net.weights], [b[None] for b in net.biases], "wave", local[None].float()
-    )
+    value, gradient = value_and_gradient(net.weights, net.biases, "wave", local.float())
     distance, slope = net(local * net.frame.scale + torch.from_numpy(net.frame.centre))
     assert distance.dtype == torch.float64
-    torch.testing.assert_close(distance.float(), value[0] * net.frame.scale, rtol=1e-4, atol=1e-4)
-    norm = gradient[0].norm(dim=1, keepdim=True)
-    torch.testing.assert_close(slope.float(), gradient[0] / norm * norm.clamp(*far_field.SLOPE), rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(distance.float(), value * net.frame.scale, rtol=1e-4, atol=1e-4)
+    norm = gradient.norm(dim=1, keepdim=True)
+    torch.testing.assert_close(slope.float(), gradient / norm * norm.clamp(*far_field.SLOPE), rtol=1e-3, atol=1e-3)
 
 
 def test_large_coordinates_leave_before_the_cast() -> None:

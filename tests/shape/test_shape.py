@@ -102,7 +102,7 @@ def test_a_failed_write_leaves_no_complete_looking_folder(tmp_path: Path, monkey
     def full(path: Path, content: bytes) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(shape_module, "write", full)
+    monkeypatch.setattr(shape_module, "write_bytes", full)
     with pytest.raises(SdfsimError, match="No space left"):
         fitted().save(tmp_path)
     with pytest.raises(SdfsimError, match=r"shape\.json is missing"):
