@@ -24,10 +24,10 @@ from benchmarks.scale import apart, with_nodes_cut
 from samples.large import write_scene
 from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import FLOOR, Trajectory, load_shapes, trajectory_files
-from sdfsim.dynamics.froude import scene_units
 from sdfsim.dynamics.model import load_model
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.dynamics.solver import Compiled, compiled_rules, taken_up
+from sdfsim.dynamics.units import scene_units
 from sdfsim.errors import run_main
 from sdfsim.evaluation.engines import Start, bullet, dataset_urdf, start_of_scene
 from sdfsim.scene.scene import Scene

@@ -20,9 +20,9 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from samples.large import write_scene
-from sdfsim.dynamics.froude import scene_units
 from sdfsim.dynamics.model import load_model
 from sdfsim.dynamics.simulator import SimulationError, Simulator, join
+from sdfsim.dynamics.units import scene_units
 from sdfsim.errors import run_main
 from sdfsim.evaluation.engines import bullet, mujoco, rollout_motion, start_of_scene
 from sdfsim.evaluation.hard_cases import body, box, on_floor

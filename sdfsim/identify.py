@@ -18,10 +18,10 @@ import torch
 
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import State, from_scene
-from sdfsim.dynamics.froude import scene_units
-from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.model import SOLVER, load_model
-from sdfsim.dynamics.step import Rules, step
+from sdfsim.dynamics.run_memory import Memory
+from sdfsim.dynamics.step import StepOptions, step
+from sdfsim.dynamics.units import scene_units
 from sdfsim.errors import SdfsimError
 from sdfsim.parallel import Progress, silent
 from sdfsim.run import read_run
@@ -255,7 +255,7 @@ class Windows:
             )
         inner = max(1, int(np.ceil(recording.dt / self.units.time / (model.dt / 5.0) - 0.01)))
         gravity = torch.from_numpy(np.asarray(scene.gravity) / self.units.acceleration)
-        self.rules = Rules(gravity, recording.dt / self.units.time, inner)
+        self.rules = StepOptions(gravity, recording.dt / self.units.time, inner)
         self.model = model
         self._build(begin)
         self.touched = self._touched()

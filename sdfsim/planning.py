@@ -12,8 +12,8 @@ import numpy as np
 
 from sdfsim.console import duration
 from sdfsim.dynamics.model import load_model
-from sdfsim.dynamics.ranges import constant_in_training
 from sdfsim.dynamics.simulator import Simulator, pick_device
+from sdfsim.dynamics.training_ranges import constant_in_training
 from sdfsim.parallel import StageProgress
 from sdfsim.scene.effects import Plan, plan
 from sdfsim.scene.scene import Effects, Scene

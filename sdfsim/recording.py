@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sdfsim.dynamics.memory import PHASES
 from sdfsim.dynamics.rollout import Rollout
+from sdfsim.dynamics.run_memory import PHASES
 from sdfsim.errors import SdfsimError
 from sdfsim.files import write_bytes
 from sdfsim.scene.scene import Scene

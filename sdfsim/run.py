@@ -16,12 +16,12 @@ import yaml
 
 from sdfsim.console import columns
 from sdfsim.dynamics.bodies import State, Touch, largest_extent
-from sdfsim.dynamics.froude import EARTH
-from sdfsim.dynamics.memory import COUNTS, PHASES
 from sdfsim.dynamics.model import Model, load_model
 from sdfsim.dynamics.rest import Rest
 from sdfsim.dynamics.rollout import Rollout, energy_from_nothing
+from sdfsim.dynamics.run_memory import COUNTS, PHASES
 from sdfsim.dynamics.simulator import SimulationError, Simulator, check_seconds, join, pick_device
+from sdfsim.dynamics.units import EARTH
 from sdfsim.errors import SdfsimError
 from sdfsim.files import (
     CONFIG,

@@ -10,9 +10,9 @@ import torch
 from typer.testing import CliRunner
 
 import cli
-from sdfsim.dynamics.memory import COUNTS, PHASES
 from sdfsim.dynamics.model import Model, load_model, new_network
 from sdfsim.dynamics.rollout import Rollout
+from sdfsim.dynamics.run_memory import COUNTS, PHASES
 from sdfsim.planning import describe, plan_lines
 from sdfsim.run import cost_lines
 

@@ -11,11 +11,11 @@ from sdfsim.data.batching import PLANE, merged
 from sdfsim.data.dataset import FLOOR, Trajectory
 from sdfsim.data.pybullet_sim import MARGIN
 from sdfsim.dynamics.bodies import Units
-from sdfsim.dynamics.history import with_history
-from sdfsim.dynamics.memory import Memory
+from sdfsim.dynamics.earlier_poses import with_history
 from sdfsim.dynamics.model import Model
 from sdfsim.dynamics.models.contact_graph import SUBSTEPS
-from sdfsim.dynamics.step import FreeFlight, Rules, step
+from sdfsim.dynamics.run_memory import Memory
+from sdfsim.dynamics.step import FreeFlight, StepOptions, step
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.shape.shape import Shape
 
@@ -62,7 +62,7 @@ def roll_out(
     known = {name: model.surface(shape) for name, shape in shapes.items()}
     bodies, state = merged(group, [0] * len(group), known, units, device, floor, model.surface(PLANE))
     gravity = torch.tensor(group[0].gravity / units.acceleration, dtype=torch.float64, device=device)
-    rules = Rules(
+    rules = StepOptions(
         gravity, group[0].dt / units.time, model.inner or substeps, contact=contact, free_flight=free_flight,
         sleep=sleep, margin=MARGIN / units.length if as_teacher else 0.0, adds=as_teacher,
     )  # fmt: skip

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sdfsim.dynamics import pose
-from sdfsim.dynamics.tracks import Tracks, from_paths
+from sdfsim.dynamics.kinematic_paths import Tracks, from_paths
 from sdfsim.errors import SdfsimError
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Scene

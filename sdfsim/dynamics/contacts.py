@@ -9,8 +9,8 @@ from torch import Tensor
 
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State
-from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.models.surfaces import Near
+from sdfsim.dynamics.run_memory import Memory
 from sdfsim.dynamics.solver import compiled_rules, taken_up
 
 

@@ -18,7 +18,7 @@ from sdfsim.dynamics.kernels.world import World
 from sdfsim.dynamics.models.contact_graph import REST_SPEED
 from sdfsim.dynamics.models.impulse import CALM, LIVELY, ImpulseNetwork, Round
 from sdfsim.dynamics.solver import Acts
-from sdfsim.dynamics.step import Rules
+from sdfsim.dynamics.step import StepOptions
 
 _log = logging.getLogger(__name__)
 
@@ -69,7 +69,7 @@ def _array(values: list[Tensor]) -> np.ndarray:
 
 
 def corrected(
-    weights: compiled.Weights, world: World, before: State, solved: State, acts: Acts, rules: Rules, *,
+    weights: compiled.Weights, world: World, before: State, solved: State, acts: Acts, rules: StepOptions, *,
     known: float,
 ) -> State:  # fmt: skip
     """What the network makes of a step of the solve.

@@ -17,16 +17,16 @@ import torch
 import sdfsim
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State, awake, from_scene
-from sdfsim.dynamics.check import check_nodes, check_sizes, fault
-from sdfsim.dynamics.froude import scene_units
-from sdfsim.dynamics.handles import BodyHandle, ContactPoint
-from sdfsim.dynamics.history import history_told, with_history
-from sdfsim.dynamics.memory import Memory
+from sdfsim.dynamics.body_handle import BodyHandle, ContactPoint
+from sdfsim.dynamics.earlier_poses import history_told, with_history
 from sdfsim.dynamics.model import Model, load_model
 from sdfsim.dynamics.models.contact_graph import SUBSTEPS
-from sdfsim.dynamics.ranges import deep_starts, outside_training
 from sdfsim.dynamics.rollout import Rollout, join
-from sdfsim.dynamics.step import FreeFlight, Rules, step
+from sdfsim.dynamics.run_memory import Memory
+from sdfsim.dynamics.step import FreeFlight, StepOptions, step
+from sdfsim.dynamics.training_ranges import deep_starts, outside_training
+from sdfsim.dynamics.units import scene_units
+from sdfsim.dynamics.validity import check_nodes, check_sizes, fault
 from sdfsim.dynamics.variants import Variant, rollouts
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.scene.effects import plan
@@ -106,7 +106,7 @@ class Simulator:
         self.dt = self.model.dt * self.units.time
         self.outside_training = outside_training([scene], self.model, self.units)
         gravity = torch.tensor(scene.gravity / self.units.acceleration, dtype=torch.float64, device=self.device)
-        self.rules = Rules(
+        self.rules = StepOptions(
             gravity=gravity,
             dt=self.model.dt,
             falls=effects.gravity.on,

@@ -22,8 +22,8 @@ from sdfsim.shape.sdf import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, Sdf, Sph
 from sdfsim.shape.surface_nodes import Surface, surface_of
 
 if TYPE_CHECKING:
-    from sdfsim.dynamics.memory import Memory
-    from sdfsim.dynamics.step import Rules
+    from sdfsim.dynamics.run_memory import Memory
+    from sdfsim.dynamics.step import StepOptions
 
 _log = logging.getLogger(__name__)
 ANALYTIC = PlaneSdf | SphereSdf | BoxSdf | CapsuleSdf | CylinderSdf
@@ -108,7 +108,7 @@ def warm() -> None:
     from sdfsim.dynamics.bodies import Units, from_scene
     from sdfsim.dynamics.model import Model
     from sdfsim.dynamics.models.impulse import ImpulseConfig, ImpulseNetwork
-    from sdfsim.dynamics.step import Rules, step
+    from sdfsim.dynamics.step import StepOptions, step
     from sdfsim.scene.scene import Body, Scene
     from sdfsim.shape.shape import analytic_shape
 
@@ -118,7 +118,9 @@ def warm() -> None:
     pair = Scene((analytic_shape("sphere", radius=0.5),), (one, other), still, 0.0)
     network = ImpulseNetwork(ImpulseConfig(width=1, rounds=1))
     model = Model("untrained", "impulse", network, dt=0.02, gravity=10.0, length=1.0, reach=0.0)
-    step(model, *from_scene(pair, Units(1.0, 1.0, 1.0), torch.device("cpu")), Rules(torch.zeros(3).double(), 0.02))
+    step(
+        model, *from_scene(pair, Units(1.0, 1.0, 1.0), torch.device("cpu")), StepOptions(torch.zeros(3).double(), 0.02)
+    )
 
 
 @dataclass(frozen=True)
@@ -174,7 +176,7 @@ def acts_of(edges: record.Edges, steps: int) -> Acts:
 
 
 def solver_step(
-    bodies: Bodies, state: State, rules: Rules, memory: Memory, *, note: bool = False
+    bodies: Bodies, state: State, rules: StepOptions, memory: Memory, *, note: bool = False
 ) -> tuple[State, Acts]:
     """Advance `state` by one step of the contact solve.
 

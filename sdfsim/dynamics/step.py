@@ -15,10 +15,10 @@ from torch import Tensor
 
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State, awake
-from sdfsim.dynamics.freeflight import ballistic, torque_free
-from sdfsim.dynamics.memory import Memory
+from sdfsim.dynamics.free_flight import ballistic, torque_free
 from sdfsim.dynamics.model import Model
 from sdfsim.dynamics.models.contact_graph import SUBSTEPS, ContactGraph, number_pairs
+from sdfsim.dynamics.run_memory import Memory
 
 if TYPE_CHECKING:
     from sdfsim.dynamics.models.families import Near
@@ -29,7 +29,7 @@ _POSE = ("position", "orientation", "velocity", "angular_velocity")
 
 
 @dataclass(frozen=True)
-class Rules:
+class StepOptions:
     """What is in play during a run, in model units.
 
     Attributes:
@@ -67,7 +67,7 @@ class Rules:
 
 @torch.no_grad()
 def step(
-    model: Model, bodies: Bodies, state: State, rules: Rules, memory: Memory | None = None
+    model: Model, bodies: Bodies, state: State, rules: StepOptions, memory: Memory | None = None
 ) -> tuple[State, Near | None]:
     """Advance `state` by one step.
 
@@ -95,7 +95,7 @@ def step(
     return after, contacts
 
 
-def drive(bodies: Bodies, state: State, rules: Rules) -> State:
+def drive(bodies: Bodies, state: State, rules: StepOptions) -> State:
     """Scripted bodies take the velocities that lead them along their paths in the coming step."""
     if bodies.tracks is None:
         return state
@@ -108,7 +108,7 @@ def drive(bodies: Bodies, state: State, rules: Rules) -> State:
     )
 
 
-def _solved_step(model: Model, bodies: Bodies, state: State, rules: Rules, memory: Memory) -> State:
+def _solved_step(model: Model, bodies: Bodies, state: State, rules: StepOptions, memory: Memory) -> State:
     """What the contact solve makes of the step, and on top of it the network, where the model is one."""
     from sdfsim.dynamics.solver import held, solver_step  # numba takes its time to load
 
@@ -131,7 +131,7 @@ def _solved_step(model: Model, bodies: Bodies, state: State, rules: Rules, memor
     return replace(after, touch=replace(after.touch, held=held(after)))
 
 
-def fly(bodies: Bodies, state: State, rules: Rules) -> State:
+def fly(bodies: Bodies, state: State, rules: StepOptions) -> State:
     """Free flight of every body that moves: exact, whatever the step. Scripted bodies go on along their paths."""
     rows = awake(bodies, state)
     now = {name: getattr(state, name) for name in _POSE}
@@ -176,7 +176,7 @@ def _turned(bodies: Bodies, state: State, rows: Tensor, dt: float) -> tuple[Tens
     return orientation, angular + twisted(orientation)
 
 
-def correct(model: Model, bodies: Bodies, state: State, solved: State, acts: Acts, rules: Rules) -> State:
+def correct(model: Model, bodies: Bodies, state: State, solved: State, acts: Acts, rules: StepOptions) -> State:
     """What the network makes of the solve: only bodies that have met somebody are in its graph.
 
     `inference.corrected` is the same, compiled, for the CPU.
@@ -205,7 +205,13 @@ def correct(model: Model, bodies: Bodies, state: State, solved: State, acts: Act
 
 
 def contact_graph(
-    bodies: Bodies, state: State, solved: State, acts: Acts, rules: Rules, dt: float, dtype: torch.dtype = torch.float32
+    bodies: Bodies,
+    state: State,
+    solved: State,
+    acts: Acts,
+    rules: StepOptions,
+    dt: float,
+    dtype: torch.dtype = torch.float32,
 ) -> tuple[Tensor, ContactGraph]:
     """The bodies [A] that met somebody, and the graph among them in `dtype`.
 
@@ -258,7 +264,7 @@ def contact_graph(
 
 
 def _surface_step(
-    model: Model, bodies: Bodies, state: State, rules: Rules, memory: Memory
+    model: Model, bodies: Bodies, state: State, rules: StepOptions, memory: Memory
 ) -> tuple[State, Near | None]:
     """A published step of the bodies that are near another; free flight, or its learned form, for the others."""
     from sdfsim.dynamics.models.families import FAMILIES

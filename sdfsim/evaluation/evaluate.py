@@ -16,9 +16,9 @@ from sdfsim.data.dataset import Trajectory, engine_substep, load_shapes, traject
 from sdfsim.data.metrics import FRAMES, HORIZONS
 from sdfsim.data.replay import batches, every, first_frames, model_units, roll_out
 from sdfsim.dynamics.model import Model, load_model
-from sdfsim.dynamics.ranges import outside_training
 from sdfsim.dynamics.simulator import pick_device
 from sdfsim.dynamics.step import FreeFlight
+from sdfsim.dynamics.training_ranges import outside_training
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.baselines import chaos_floor
 from sdfsim.evaluation.penetration import EVERY, Solid, exact_solids, penetration

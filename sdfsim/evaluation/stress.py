@@ -14,9 +14,9 @@ import sdfsim
 from sdfsim.data.public_shapes import public_folder
 from sdfsim.data.pybullet_sim import DT, SUBSTEPS, TEACHER_VERSION, engine_settings, import_pybullet
 from sdfsim.dynamics.model import SOLVER, Model, load_model, model_names
-from sdfsim.dynamics.ranges import constant_in_training
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.simulator import SimulationError, Simulator, pick_device
+from sdfsim.dynamics.training_ranges import constant_in_training
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.engines import bullet, rollout_motion, shape_urdf, start_of_scene
 from sdfsim.evaluation.hard_cases import GROUPS, Case, Figure, Run, cases, ran_away

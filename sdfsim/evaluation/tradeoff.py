@@ -19,10 +19,10 @@ from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import FLOOR, Trajectory, check_alike, floor_of, home_of, read_info
 from sdfsim.data.pybullet_sim import DT, SUBSTEP
 from sdfsim.data.replay import every, first_frames, roll_out
-from sdfsim.dynamics.froude import scene_units
 from sdfsim.dynamics.model import SOLVER, Model, load_model, model_names
 from sdfsim.dynamics.models.contact_graph import SUBSTEPS
 from sdfsim.dynamics.simulator import Simulator
+from sdfsim.dynamics.units import scene_units
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.baselines import perturbed
 from sdfsim.evaluation.engines import Start, Timing, bullet, dataset_urdf, mujoco, start_of_scene, timed

@@ -19,7 +19,7 @@ import torch
 from sdfsim.data.dataset import Trajectory, check_alike, engine_substep, load_shapes, trajectory_files
 from sdfsim.data.pybullet_sim import MARGIN
 from sdfsim.dynamics import pose
-from sdfsim.dynamics.freeflight import torque_free
+from sdfsim.dynamics.free_flight import torque_free
 from sdfsim.dynamics.models.contact_graph import SUBSTEPS
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_arrays, write_arrays
@@ -227,9 +227,9 @@ def _followed(files: list[Path], how: Solved) -> list[dict[str, np.ndarray]]:
     """Parts of the arrays, one for each draw and step: all trajectories of a group at that step."""
     from sdfsim.data.batching import merged  # needs the SDFs, hence more than torch and numpy
     from sdfsim.dynamics.bodies import Units
-    from sdfsim.dynamics.memory import Memory
+    from sdfsim.dynamics.run_memory import Memory
     from sdfsim.dynamics.solver import solver_step
-    from sdfsim.dynamics.step import Rules
+    from sdfsim.dynamics.step import StepOptions
 
     substep = engine_substep(files[0].parent)
     group = [Trajectory.load(file) for file in files]
@@ -237,7 +237,7 @@ def _followed(files: list[Path], how: Solved) -> list[dict[str, np.ndarray]]:
     bodies, start = merged(group, [0] * len(group), shapes, Units(1.0, 1.0, 1.0), torch.device("cpu"))
     inner = how.inner or how.stride * inner_steps(group[0].dt, substep)
     gravity = torch.from_numpy(np.asarray(group[0].gravity, dtype=np.float64))
-    rules = Rules(gravity, group[0].dt * how.stride, inner, margin=MARGIN, adds=True)
+    rules = StepOptions(gravity, group[0].dt * how.stride, inner, margin=MARGIN, adds=True)
     count = min(len(t.position) for t in group)
     parts = []
     for draw in range(how.draws):

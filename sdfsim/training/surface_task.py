@@ -14,10 +14,10 @@ from sdfsim.data.batching import PLANE, merged
 from sdfsim.data.dataset import FLOOR, Trajectory, check_alike, load_shapes, product_range, trajectory_files
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State, Units
-from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.models.families import FAMILIES
 from sdfsim.dynamics.models.message_passing import Graph, GraphNetwork, flipped
 from sdfsim.dynamics.models.surfaces import TARGET, node_owner, target_acceleration
+from sdfsim.dynamics.run_memory import Memory
 from sdfsim.training.distributed import ALONE, Team
 from sdfsim.training.presets import Preset
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from sdfsim.dynamics import freeflight, inference, solver
+from sdfsim.dynamics import free_flight, inference, solver
 from sdfsim.dynamics import step as step_module
 from sdfsim.dynamics.contacts import find_contacts
 from sdfsim.dynamics.kernels import impulse, nodes
-from sdfsim.dynamics.memory import COUNTS, PHASES
 from sdfsim.dynamics.model import Unread
 from sdfsim.dynamics.models.surfaces import compact, node_owner, predict
+from sdfsim.dynamics.run_memory import COUNTS, PHASES
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.scene.scene import Effects, Scene, Waypoints
 from sdfsim.shape.shape import analytic_shape
@@ -82,15 +82,15 @@ def test_without_a_dynamic_body_nothing_flies(dropped, forbid):
 
 
 def test_rotation_off_turns_nothing(dropped, forbid):
-    forbid(freeflight, "_rkmk4")
+    forbid(free_flight, "_rkmk4")
     rollout = Simulator(replace(dropped, effects=Effects(rotation="off")), random_model("impulse")).run(steps=6)
     assert rollout.contact_count.sum() > 0 and (rollout.orientation == rollout.orientation[0]).all()
 
 
 def test_what_does_not_turn_is_not_turned(dropped, monkeypatch):
     seen = []
-    real = freeflight._rkmk4
-    monkeypatch.setattr(freeflight, "_rkmk4", lambda q, *rest: seen.append(len(q)) or real(q, *rest))
+    real = free_flight._rkmk4
+    monkeypatch.setattr(free_flight, "_rkmk4", lambda q, *rest: seen.append(len(q)) or real(q, *rest))
     sim = Simulator(replace(dropped, effects=Effects(contact="off")), random_model("impulse"))
     rollout = sim.run(steps=3)
     assert set(seen) == {1}  # of three dynamic bodies one spins

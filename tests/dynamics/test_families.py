@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from sdfsim.dynamics.bodies import Bodies, State, Units, from_scene
-from sdfsim.dynamics.history import with_history
-from sdfsim.dynamics.memory import Memory
+from sdfsim.dynamics.earlier_poses import with_history
 from sdfsim.dynamics.models.collisions import closest_points, face_pairs, node_pairs
 from sdfsim.dynamics.models.families import FAMILIES
 from sdfsim.dynamics.models.nodes import vertices
 from sdfsim.dynamics.pose import rotate
-from sdfsim.dynamics.step import Rules
+from sdfsim.dynamics.run_memory import Memory
+from sdfsim.dynamics.step import StepOptions
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.shape import analytic_shape
 from tests.dynamics.conftest import make_body
@@ -40,7 +40,7 @@ def bodies_of(kind: str, seed: int = 0) -> tuple[Bodies, State]:
     worked_on = tuple(FAMILIES[kind].surface(shape, 30) for shape in shapes)
     scene = Scene(worked_on, tuple(bodies), gravity=GRAVITY.numpy(), duration=1.0)
     found, state = from_scene(scene, Units(1.0, 1.0, 1.0), CPU)
-    return found, with_history(state, found, Rules(gravity=GRAVITY, dt=DT))
+    return found, with_history(state, found, StepOptions(gravity=GRAVITY, dt=DT))
 
 
 def distances_by_projection(one: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -10,8 +10,8 @@ import pytest
 pytest.importorskip("pybullet")
 
 from sdfsim.data.pybullet_sim import Teacher, TeacherBody
-from sdfsim.dynamics.froude import scene_units
 from sdfsim.dynamics.model import load_model
+from sdfsim.dynamics.units import scene_units
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation import hard_cases
 from sdfsim.evaluation.engines import bullet, mujoco, shape_urdf, start_of_scene

@@ -1,6 +1,6 @@
 """Rows 1 to 5, 7 and 8: what every run of every bundled model keeps to, whatever it has learned.
 
-Of untrained networks the same is tested in tests/dynamics (test_freeflight.py, test_impulse.py).
+Of untrained networks the same is tested in tests/dynamics (test_free_flight.py, test_impulse.py).
 """
 
 from __future__ import annotations

@@ -10,12 +10,12 @@ import torch
 from sdfsim.data.batching import merged
 from sdfsim.data.pybullet_sim import MARGIN
 from sdfsim.dynamics.bodies import Units
-from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.model import load_model
 from sdfsim.dynamics.models.contact_graph import REST_SPEED
 from sdfsim.dynamics.models.impulse import Velocities
+from sdfsim.dynamics.run_memory import Memory
 from sdfsim.dynamics.solver import solver_step
-from sdfsim.dynamics.step import Rules, contact_graph
+from sdfsim.dynamics.step import StepOptions, contact_graph
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.evaluate import evaluate
 from sdfsim.training import contact_cache, validation
@@ -42,7 +42,7 @@ def test_cached_frames_equal_the_simulators_own_graph(ball_data, tmp_path):
     task = ImpulseTask(contact_frames(tmp_path, "train", ONCE), CPU)
     first = Trajectory.load(ball_data / "train" / "0.npz")
     bodies, state = merged([first], [0], load_shapes(ball_data, {"ball"}), Units(1.0, 1.0, 1.0), CPU)
-    rules = Rules(gravity=torch.tensor(first.gravity), dt=first.dt, margin=MARGIN, adds=True)
+    rules = StepOptions(gravity=torch.tensor(first.gravity), dt=first.dt, margin=MARGIN, adds=True)
     memory, touch, found = Memory(), None, []
     for frame in range(len(first.position) - 1):
         _, state = merged([first], [frame], load_shapes(ball_data, {"ball"}), Units(1.0, 1.0, 1.0), CPU)

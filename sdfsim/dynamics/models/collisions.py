@@ -14,8 +14,8 @@ from torch import Tensor
 
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State
-from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.models.surfaces import expanded, node_owner
+from sdfsim.dynamics.run_memory import Memory
 
 PIERCING = 1e-9  # relative: areas and denominators below count as none
 

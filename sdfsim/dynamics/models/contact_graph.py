@@ -79,8 +79,9 @@ class EdgeFrames:
     Attributes:
         speed: [E, 1], the scale that makes velocities dimensionless.
         mass: [E, 3] effective mass along each axis; 0 along those on which nothing may act.
-        read_first, read_second: [E, 3, 6] of a twist, the velocity of the contact point along each axis.
-        give_first, give_second: [E, 6, 3] the twist that a unit impulse along each axis gives, opposite to the second.
+        jacobian_first, jacobian_second: [E, 3, 6] J, it makes of a twist the velocity of the contact point along each axis.
+        response_first, response_second: [E, 6, 3] M^-1 J^T, the twist that a unit impulse along each axis gives,
+            opposite to the second.
         solved: [E, 3] impulse of the solve along each axis.
         slip: [E, 3] relative velocity at the start of the step along each axis.
         start: [E, EDGE_FEATURES] input features.
@@ -88,10 +89,10 @@ class EdgeFrames:
 
     speed: Tensor
     mass: Tensor
-    read_first: Tensor
-    read_second: Tensor
-    give_first: Tensor
-    give_second: Tensor
+    jacobian_first: Tensor
+    jacobian_second: Tensor
+    response_first: Tensor
+    response_second: Tensor
     solved: Tensor
     slip: Tensor
     start: Tensor
@@ -163,10 +164,10 @@ def edge_frames(graph: ContactGraph, *, mirrored: bool = False) -> EdgeFrames:
     return EdgeFrames(
         speed=speed,
         mass=torch.cat([mass[:, :1], mass[:, 1:] * tangential], -1),
-        read_first=torch.cat([axes, moment_first], -1),
-        read_second=torch.cat([axes, moment_second], -1),
-        give_first=torch.cat([axes * push_first[..., None], turn_first], -1).mT,
-        give_second=torch.cat([axes * push_second[..., None], turn_second], -1).mT.neg(),
+        jacobian_first=torch.cat([axes, moment_first], -1),
+        jacobian_second=torch.cat([axes, moment_second], -1),
+        response_first=torch.cat([axes * push_first[..., None], turn_first], -1).mT,
+        response_second=torch.cat([axes * push_second[..., None], turn_second], -1).mT.neg(),
         solved=solved,
         slip=in_frame[..., 0],
         start=start,

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from sdfsim.dynamics.bodies import Bodies, State
 from sdfsim.dynamics.contacts import find_contacts
-from sdfsim.dynamics.memory import Memory
 from sdfsim.dynamics.models import dpi, fignet, mgn, nodes, paper
 from sdfsim.dynamics.models.collisions import face_pairs, node_pairs
 from sdfsim.dynamics.models.message_passing import Graph, Layout
 from sdfsim.dynamics.models.surfaces import Near
+from sdfsim.dynamics.run_memory import Memory
 from sdfsim.shape.shape import Shape
 
 

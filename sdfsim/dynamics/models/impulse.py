@@ -95,13 +95,13 @@ class Round(nn.Module):
             return change
         return torch.cat([change, self.tangent_impulse(hidden).reshape(-1, 2, 2).mT], 1)
 
-    def tell(
+    def update(
         self, edge: Tensor, body: Tensor, hidden: Tensor, weight: Tensor, graph: ContactGraph
     ) -> tuple[Tensor, Tensor]:
         """Latents of edges and bodies for the next round."""
         to_first, to_second = (self.message(hidden) * weight).chunk(2, -1)
-        heard = torch.zeros_like(body).index_add_(0, graph.first, to_first).index_add_(0, graph.second, to_second)
-        body = body + self.body(torch.cat([body, heard], -1))
+        received = torch.zeros_like(body).index_add_(0, graph.first, to_first).index_add_(0, graph.second, to_second)
+        body = body + self.body(torch.cat([body, received], -1))
         # Scenery carries no message from one body to another.
         return edge + self.latent(hidden), body * (graph.inverse_mass > 0)[:, None]
 
@@ -151,8 +151,8 @@ class ImpulseNetwork(nn.Module):
             change = layer.impulse(hidden, friction) * weight[..., None]
             added = added + change * (frames.speed * frames.mass[:, : added.shape[1]])[..., None]
             twist = pushed(graph, frames, added, start)
-            if number < len(self.rounds):  # nobody reads what the last round would tell
-                edge, body = layer.tell(edge, body, hidden, weight, graph)
+            if number < len(self.rounds):  # nobody reads what comes after the last round
+                edge, body = layer.update(edge, body, hidden, weight, graph)
         if not alone:
             twist = pushed(graph, frames, bounded(graph, frames, added, start, trust), start)
         end, mean = twist.unbind(-1)
@@ -173,14 +173,14 @@ def without_solve(graph: ContactGraph) -> ContactGraph:
 
 def relative(graph: ContactGraph, frames: EdgeFrames, twist: Tensor) -> Tensor:
     """[E, 3, K] relative velocities at the contact points along the edges' axes, for twists [N, 6, K]."""
-    return frames.read_first @ twist[graph.first] - frames.read_second @ twist[graph.second]
+    return frames.jacobian_first @ twist[graph.first] - frames.jacobian_second @ twist[graph.second]
 
 
 def pushed(graph: ContactGraph, frames: EdgeFrames, impulse: Tensor, twist: Tensor) -> Tensor:
     """Twists [N, 6, K] after impulses [E, axis, K] on the first bodies, opposite on the second."""
     axes = impulse.shape[1]
-    twist = twist.index_add(0, graph.first, frames.give_first[..., :axes] @ impulse)
-    return twist.index_add(0, graph.second, frames.give_second[..., :axes] @ impulse)
+    twist = twist.index_add(0, graph.first, frames.response_first[..., :axes] @ impulse)
+    return twist.index_add(0, graph.second, frames.response_second[..., :axes] @ impulse)
 
 
 def bounded(graph: ContactGraph, frames: EdgeFrames, added: Tensor, start: Tensor, trust: float) -> Tensor:

@@ -160,8 +160,8 @@ class Step(nn.Module):
     def __init__(self, layout: Layout, width: int) -> None:
         super().__init__()
         self.edges = nn.ModuleDict({name: EdgeUpdate(width, kind.corners) for name, kind in layout.edges.items()})
-        heard = {name: 1 + sum(kind.receiver == name for kind in layout.edges.values()) for name in layout.nodes}
-        self.nodes = nn.ModuleDict({name: mlp(count * width, width, width) for name, count in heard.items()})
+        received = {name: 1 + sum(kind.receiver == name for kind in layout.edges.values()) for name in layout.nodes}
+        self.nodes = nn.ModuleDict({name: mlp(count * width, width, width) for name, count in received.items()})
 
 
 class GraphNetwork(nn.Module):
@@ -206,14 +206,14 @@ class GraphNetwork(nn.Module):
         node = {name: encoded(name, features) for name, features in graph.nodes.items()}
         edge = {name: encoded(name, edges.features) for name, edges in graph.edges.items()}
         for step in cast("Iterable[Step]", self.steps):
-            heard = {name: [latent] for name, latent in node.items()}
+            received = {name: [latent] for name, latent in node.items()}
             for name, kind in self.layout.edges.items():
                 ends, update = graph.edges[name], partial(step.edges[name], node[kind.sender], node[kind.receiver])
                 edge[name] = edge[name] + by_rows(update, rows, edge[name], ends.sender, ends.receiver)
-                told = torch.zeros_like(node[kind.receiver])
+                total = torch.zeros_like(node[kind.receiver])
                 messages = edge[name].reshape(-1, self.config.width)
-                heard[kind.receiver].append(told.index_add_(0, ends.receiver.flatten(), messages))
-            node = {name: node[name] + step.nodes[name](torch.cat(parts, -1)) for name, parts in heard.items()}
+                received[kind.receiver].append(total.index_add_(0, ends.receiver.flatten(), messages))
+            node = {name: node[name] + step.nodes[name](torch.cat(parts, -1)) for name, parts in received.items()}
         return self.decode(node["node"])
 
 

@@ -16,7 +16,7 @@ from sdfsim.dynamics.models.impulse import ImpulseNetwork
 if TYPE_CHECKING:
     from sdfsim.dynamics.kernels.impulse import Weights
     from sdfsim.dynamics.solver import Compiled
-    from sdfsim.dynamics.step import Rules
+    from sdfsim.dynamics.step import StepOptions
 
 COUNTS = {
     "pairs": "pairs of bodies that the broad phase let through",
@@ -55,7 +55,7 @@ class Memory:
             self._compiled = Compiled(bodies, state)
         return self._compiled
 
-    def weights(self, network: nn.Module, rules: Rules) -> Weights:
+    def weights(self, network: nn.Module, rules: StepOptions) -> Weights:
         """Those of an *impulse* network as compiled code wants them, taken once."""
         from sdfsim.dynamics.inference import packed
 

@@ -8,16 +8,16 @@ import torch
 from torch import Tensor
 
 from sdfsim.dynamics.bodies import Bodies, State
-from sdfsim.dynamics.step import Rules, fly
+from sdfsim.dynamics.step import StepOptions, fly
 
 
-def with_history(state: State, bodies: Bodies, rules: Rules) -> State:
+def with_history(state: State, bodies: Bodies, rules: StepOptions) -> State:
     """The same state with the two poses that it would have come from in free flight."""
     position, orientation = _flown_back(state, bodies, rules)
     return replace(state, earlier_position=position, earlier_orientation=orientation)
 
 
-def history_told(state: State, before: State, bodies: Bodies, rules: Rules) -> State:
+def history_told(state: State, before: State, bodies: Bodies, rules: StepOptions) -> State:
     """A state from outside, with earlier poses that go with it.
 
     Those that it shares with the state `before` are of that one's motion: bodies that were changed since get the poses
@@ -38,7 +38,7 @@ def history_told(state: State, before: State, bodies: Bodies, rules: Rules) -> S
     )
 
 
-def _flown_back(state: State, bodies: Bodies, rules: Rules) -> tuple[Tensor, Tensor]:
+def _flown_back(state: State, bodies: Bodies, rules: StepOptions) -> tuple[Tensor, Tensor]:
     """Positions [2, N, 3] and orientations [2, N, 4] two steps and one step before, in free flight."""
     back = replace(rules, dt=-rules.dt)
     one = fly(bodies, state, back)

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from sdfsim.dynamics import inference, pose
-from sdfsim.dynamics.freeflight import torque_free
+from sdfsim.dynamics.free_flight import torque_free
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.scene.scene import Scene
 from tests.dynamics.conftest import angle_between, make_body, random_model

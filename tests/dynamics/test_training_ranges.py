@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from sdfsim.dynamics.ranges import _products
 from sdfsim.dynamics.simulator import Simulator
+from sdfsim.dynamics.training_ranges import _products
 from sdfsim.errors import SdfsimError
 from sdfsim.scene.scene import Scene
 from tests.dynamics.conftest import make_body, random_model

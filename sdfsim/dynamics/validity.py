@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from sdfsim.dynamics.bodies import Bodies, State, Units
-from sdfsim.dynamics.freeflight import MOST_TURN
+from sdfsim.dynamics.free_flight import MOST_TURN
 from sdfsim.errors import SdfsimError
 from sdfsim.scene.scene import Scene
 
