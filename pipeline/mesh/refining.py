@@ -36,6 +36,7 @@ SPREAD = 3.0  # of the usual difference from the surface around it, at which a p
 NEAR, EVEN = 8, 0.3
 # Weights beside trust: of the surface's area, of its bending, and of where a vertex was.
 AREA, BENDING, STAY, PINNED = 0.2, 0.3, 0.002, 0.5
+SMOOTHED = 4  # times after each round
 # Within so many edges vertices need this mean trust around them, or they stay where they were.
 AROUND, TOLD = 20, 0.1 / EVERY
 
@@ -82,6 +83,8 @@ def refine(mesh: Mesh, pictures: list[Picture], blocking: Caster, lift: float, f
         height: of points [P, 3] above the plane that the body stands on.
         layer: below this height no photo tells the body from its plane; vertices there move along the plane only.
     """
+    if len(pictures) < FEWEST:
+        return mesh
     count = len(mesh.vertices)
     edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
     links = coo_matrix((np.ones(len(edges)), edges.T), shape=(count, count)).tocsr()
@@ -106,13 +109,21 @@ def refine(mesh: Mesh, pictures: list[Picture], blocking: Caster, lift: float, f
         for _ in range(NEAR):
             near = mean @ near
         weight = weight * (near / (EVEN / EVERY)).clip(0, 1)
-        moved = settled(mesh, along, mean, low, wanted, weight)
+        told = np.stack([weight, ~low], 1)
+        for _ in range(AROUND):
+            told = mean @ told
+        told = (told[:, 0] / (TOLD * told[:, 1]).clip(1e-6)).clip(0, 1)
+        stay = STAY + PINNED * (1 - told)
+        moved = settled(mesh, along, mean, wanted, weight, stay)
         # What the surface around it contradicts was a mistake.
         off = np.abs(moved - wanted)[picked]
         usual = np.median(off[trust > 0]) if (trust > 0).any() else 1.0
         weight[picked] *= np.exp(-((off / (SPREAD * usual + 1e-9)) ** 2))
-        moved = settled(mesh, along, mean, low, wanted, weight).clip(moves[0], moves[-1])
-        mesh = replace(mesh, vertices=mesh.vertices + moved[:, None] * along)
+        moved = settled(mesh, along, mean, wanted, weight, stay).clip(moves[0], moves[-1])
+        vertices = mesh.vertices + moved[:, None] * along
+        for _ in range(SMOOTHED):
+            vertices = vertices + 0.5 * (told * ~low)[:, None] * (mean @ vertices - vertices)
+        mesh = replace(mesh, vertices=vertices)
     return mesh
 
 
@@ -175,22 +186,18 @@ def best_places(score: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.nd
     return moves[middle] + shift * (moves[1] - moves[0]), np.where(best == middle, trust, 0)
 
 
-def settled(mesh: Mesh, normal: np.ndarray, mean: csr_matrix, low: np.ndarray, wanted: np.ndarray,
-            trust: np.ndarray) -> np.ndarray:  # fmt: skip
+def settled(mesh: Mesh, normal: np.ndarray, mean: csr_matrix, wanted: np.ndarray, trust: np.ndarray,
+            stay: np.ndarray) -> np.ndarray:  # fmt: skip
     """How far each vertex moves [V] along its normal [V, 3]: where it is wanted [V], by trust [V], or smooth between.
 
     Args:
         mesh: to move.
         normal: of the vertices; shorter where they shall move less.
         mean: [V, V] takes the mean of the neighbours.
-        low: [V] bool, vertices where nothing could be told; those above them decide.
         wanted: for each vertex.
         trust: in that.
+        stay: [V] trust in where the vertices are.
     """
-    around = np.stack([trust, ~low], 1)
-    for _ in range(AROUND):
-        around = mean @ around
-    stay = STAY + PINNED * (1 - around[:, 0] / (TOLD * around[:, 1]).clip(1e-6)).clip(0, 1)
     bend = mean - diags(np.ones(len(trust)))
     inwards = ((bend @ mesh.vertices) * normal).sum(1)
     matrix = diags(trust + stay) + BENDING * (bend.T @ bend) - AREA * (bend + bend.T) / 2
