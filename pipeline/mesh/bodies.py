@@ -17,6 +17,7 @@ from pipeline.cameras import View, frame_of
 from pipeline.inputs.labels import load_names
 from pipeline.mesh.cleaning import components, face_normals, islands, keep_faces
 from pipeline.mesh.extraction import FLOATER, RIM, Distance, Surface, Volume, sample, sample_box
+from pipeline.mesh.refining import load_pictures, refine
 from pipeline.mesh.seams import Part, Solid, Votes, count_votes, part_of_name, parts_by_shape, parts_by_votes, solid_of
 from pipeline.mesh.visibility import Caster, Visibility, look, spread_colors, to_bytes
 from sdfsim.shape.mesh import Mesh
@@ -386,10 +387,11 @@ def split(surface: Surface, distance: Distance, finest: float, views: list[View]
     called = _names(pieces)
     if not pieces:
         return Parts(surface.solid, surface.visible, {}, smallest, missing=names)
-    meshes = {}
+    meshes, pictures = {}, load_pictures(views, photos_folder)
     for name, body in sorted(zip(called, pieces, strict=True), key=lambda item: -item[1].size):
         mesh = body_mesh(body, distance, min(finest / FINER, surface.volume.cell))
         # Lifted clear of the surface in the way, which is sampled more coarsely.
+        mesh = refine(mesh, pictures, blocking, lift, finest, body.level.above, body.layer)
         seen = look(Visibility(mesh, lift, blocking), views, photos_folder)
         meshes[name] = colored(mesh, seen.color, seen.weight > 0)
     solid, shown = (None, None) if alone else scenery(surface, whole, distance)

@@ -14,9 +14,12 @@ from pipeline.cameras import Similarity, Sparse, View, load_views, save_views
 from pipeline.field.training import Trained
 from pipeline.inputs.photos import Photo, save_photos
 from pipeline.mesh import meshing
+from pipeline.mesh.extraction import sample_box
 from pipeline.mesh.meshing import make_meshes, read_parts, rounded, trust_meshes
 from pipeline.mesh.placement import load_placement
+from pipeline.mesh.refining import Picture, refine
 from pipeline.mesh.trust import GUESSED, WIDE
+from pipeline.mesh.visibility import Caster
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.mesh import is_closed, load_mesh, read_attributes, read_mesh
 from tests.pipeline.test_objects import TABLE, TOP, both, box
@@ -160,3 +163,29 @@ def test_lengths_of_a_tiny_scene_are_those_of_its_meshes(mesh):
     assert report["smallest_object_m"] / load_placement(folder).to_metres.scale == pytest.approx(
         4 * Drawn.finest, rel=1e-4
     )
+
+
+def test_a_body_that_came_out_too_small_and_bumpy_moves_to_where_the_photos_agree():
+    # A ball of radius 0.3 with a pattern of waves; the mesh to refine is 2 % smaller, with bumps as large.
+    rng = np.random.default_rng(0)
+    waves, phases = rng.normal(0, 50, (24, 3)), rng.uniform(0, 7, 24)
+    pictures = []
+    for view in cameras():
+        row, column = np.mgrid[0 : view.height, 0 : view.width] + 0.5
+        along = view.rays(column.ravel(), row.ravel())
+        middle = -(along @ view.center)
+        root = middle**2 - view.center @ view.center + 0.3**2
+        hit = view.center + (middle - np.sqrt(root.clip(0)))[:, None] * along
+        grey = 128 + 20 * np.sin(hit @ waves.T + phases).sum(1)
+        grey = np.where(root > 0, grey, 0).reshape(view.height, view.width)
+        pictures.append(Picture(view, 1.0, grey.astype(np.float32)))
+
+    def small(points: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(points, axis=1) - 0.294 + 0.006 * np.sin(60 * points).prod(1)
+
+    body = sample_box(small, np.full(3, -0.32), np.full(3, 0.32), 0.01).mesh()
+    found = refine(body, pictures, Caster(body), 0.005, 0.02, lambda points: points[:, 2] + 1, 0.03)
+    up = body.vertices[:, 2] > -0.1  # No camera looks from below.
+    before, after = (np.abs(np.linalg.norm(mesh.vertices[up], axis=1) - 0.3) for mesh in (body, found))
+    assert np.median(before) > 0.005 and np.median(after) < 0.4 * np.median(before)
+    assert np.array_equal(found.faces, body.faces)

@@ -1,0 +1,205 @@
+"""Moves the vertices of bodies to where photos agree best; the field's own surface is as exact as its cells are small.
+
+Around a vertex lies a patch in the tangent plane. Wherever the surface is, that patch looks the same in all photos
+that show it; so the patch is moved along the normal until it does (normalised cross-correlation). At edges patches say
+nothing: there the surface is the smallest one between what is known on both sides, which takes bulges away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from scipy.sparse import coo_matrix, csr_matrix, diags
+from scipy.sparse.linalg import cg
+
+from pipeline.cameras import View, frame_of
+from pipeline.mesh.cleaning import vertex_normals
+from pipeline.mesh.visibility import Caster, Visibility
+from sdfsim.shape.mesh import Mesh
+
+LONG_SIDE = 640  # px; larger photos are made smaller, or the right place would lie too many pixels away
+PHOTOS, FEWEST = 5, 3  # that a patch is compared in, those that look straightest; and how many there must be
+STRAIGHT = 0.35  # least cosine between the normal and a photo's line of sight
+HALF = 3  # a patch has this many pixels to each side of its middle
+PLACES = 25  # along the normal
+NOISE = 4.0  # variance of grey levels that is no texture
+# How far vertices are moved, in cells of the field's finest grid; the second round looks in half that range.
+REACH, ROUNDS = 1.3, 2
+EVERY = 4  # one vertex of so many is looked at, the others follow
+ALIKE, SURE = 0.35, 0.9  # correlations between which trust in a place rises
+SPREAD = 3.0  # of the usual difference from the surface around it, at which a place is no longer trusted
+# A place counts in full where the mean trust within so many edges is this: a lone match at an edge is a mistake.
+NEAR, EVEN = 8, 0.3
+# Weights beside trust: of the surface's area, of its bending, and of where a vertex was.
+AREA, BENDING, STAY, PINNED = 0.2, 0.3, 0.002, 0.5
+SMOOTHED = 4  # times after each round
+# Within so many edges vertices need this mean trust around them, or they stay where they were.
+AROUND, TOLD = 20, 0.1 / EVERY
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A photo to compare patches in.
+
+    Attributes:
+        view: its camera, for the pixels of the file.
+        scale: of the pixels of `grey` to those.
+        grey: [H, W] float32.
+    """
+
+    view: View
+    scale: float
+    grey: np.ndarray
+
+
+def load_pictures(views: list[View], photos_folder: Path) -> list[Picture]:
+    """The photos of some views, grey and no larger than `LONG_SIDE`."""
+    import cv2
+
+    found = []
+    for view in views:
+        with Image.open(Path(photos_folder) / "images" / view.name) as image:
+            grey = np.asarray(image.convert("L"), np.float32)
+        scale = min(1.0, LONG_SIDE / max(grey.shape))
+        size = round(view.width * scale), round(view.height * scale)
+        found.append(Picture(view, scale, cv2.resize(grey, size, interpolation=cv2.INTER_AREA)))
+    return found
+
+
+def refine(mesh: Mesh, pictures: list[Picture], blocking: Caster, lift: float, finest: float,
+           height: Callable[[np.ndarray], np.ndarray], layer: float) -> Mesh:  # fmt: skip
+    """A body whose vertices lie where the photos agree.
+
+    Args:
+        mesh: of the body, in the space of the views.
+        pictures: of all views.
+        blocking: what can stand in the way of a view.
+        lift: how far a vertex is lifted off the surface before a view looks for it.
+        finest: width of a cell of the field's finest grid.
+        height: of points [P, 3] above the plane that the body stands on.
+        layer: below this height no photo tells the body from its plane; vertices there move along the plane only.
+    """
+    if len(pictures) < FEWEST:
+        return mesh
+    count = len(mesh.vertices)
+    edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
+    links = coo_matrix((np.ones(len(edges)), edges.T), shape=(count, count)).tocsr()
+    links = ((links + links.T) > 0).astype(float)
+    mean = diags(1 / np.asarray(links.sum(1)).ravel()) @ links
+    low = height(mesh.vertices) < layer
+    upright = height(np.eye(3)) - height(np.zeros((1, 3))) if low.any() else np.zeros(3)
+    for number in range(ROUNDS):
+        normal = vertex_normals(mesh)
+        for _ in range(4):
+            normal = normal + mean @ normal
+            normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        picked = np.random.default_rng(number).permutation(count)[: count // EVERY]
+        moves = np.linspace(-1, 1, PLACES) * REACH * finest / 2**number
+        score = agreement(Visibility(mesh, lift, blocking).at(picked), normal[picked], pictures, moves)
+        place, trust = best_places(score, moves)
+        trust[low[picked]] = 0
+        along = np.where(low[:, None], normal - (normal @ upright)[:, None] * upright, normal)
+        wanted, weight = np.zeros(count), np.zeros(count)
+        wanted[picked], weight[picked] = place, trust
+        near = weight
+        for _ in range(NEAR):
+            near = mean @ near
+        weight = weight * (near / (EVEN / EVERY)).clip(0, 1)
+        told = np.stack([weight, ~low], 1)
+        for _ in range(AROUND):
+            told = mean @ told
+        told = (told[:, 0] / (TOLD * told[:, 1]).clip(1e-6)).clip(0, 1)
+        stay = STAY + PINNED * (1 - told)
+        moved = settled(mesh, along, mean, wanted, weight, stay)
+        # What the surface around it contradicts was a mistake.
+        off = np.abs(moved - wanted)[picked]
+        usual = np.median(off[trust > 0]) if (trust > 0).any() else 1.0
+        weight[picked] *= np.exp(-((off / (SPREAD * usual + 1e-9)) ** 2))
+        moved = settled(mesh, along, mean, wanted, weight, stay).clip(moves[0], moves[-1])
+        vertices = mesh.vertices + moved[:, None] * along
+        for _ in range(SMOOTHED):
+            vertices = vertices + 0.5 * (told * ~low)[:, None] * (mean @ vertices - vertices)
+        mesh = replace(mesh, vertices=vertices)
+    return mesh
+
+
+def agreement(sight: Visibility, normal: np.ndarray, pictures: list[Picture], moves: np.ndarray) -> np.ndarray:
+    """How alike photos show the patches [P, M] around vertices [P] that are moved [M] along normals [P, 3].
+
+    The mean correlation between any two of the photos, -1 where too few show a vertex.
+    """
+    count = len(normal)
+    cosine = np.zeros((len(pictures), count), np.float32)
+    for number, picture in enumerate(pictures):
+        index, _, straight = sight.of_view(picture.view)
+        cosine[number, index] = np.where(straight > STRAIGHT, straight, 0)
+    chosen = np.argsort(-cosine, 0)[:PHOTOS]
+    shown = np.take_along_axis(cosine, chosen, 0) > 0
+    centers = np.array([picture.view.center for picture in pictures])[chosen[0]]
+    pixel = np.array([1 / (picture.view.focal * picture.scale) for picture in pictures])[chosen[0]]
+    pixel = pixel * np.linalg.norm(centers - sight.vertices, axis=1)
+    frames = np.stack([frame_of(n)[:2] for n in normal])
+    grid = np.mgrid[-HALF : HALF + 1, -HALF : HALF + 1].reshape(2, -1)
+    patch = pixel[:, None, None] * np.einsum("kg,pkc->pgc", grid, frames)
+    result = np.full((count, len(moves)), -1.0)
+    for part in np.array_split(np.flatnonzero(shown.sum(0) >= FEWEST), count // 400 + 1):
+        middle = sight.vertices[part][:, None] + moves[:, None] * normal[part][:, None]
+        points = middle[:, :, None] + patch[part][:, None]
+        total = np.zeros(points.shape[:3], np.float32)
+        for number, there in zip(chosen[:, part], shown[:, part], strict=True):
+            for which in np.unique(number[there]):
+                mine = np.flatnonzero(there & (number == which))
+                total[mine] += normalised(pictures[which], points[mine])
+        used = shown[:, part].sum(0)[:, None]
+        result[part] = ((total**2).sum(2) - used) / (used * (used - 1))
+    return result
+
+
+def normalised(picture: Picture, points: np.ndarray) -> np.ndarray:
+    """Grey levels [..., G] of patches of points [..., G, 3] in a photo, with mean 0 and length 1."""
+    import cv2
+
+    pixels = (picture.view.project(points.reshape(-1, 3))[0] * picture.scale - 0.5).astype(np.float32)
+    columns, rows = (axis.reshape(-1, points.shape[-2]) for axis in pixels.T)
+    grey = cv2.remap(picture.grey, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    grey -= grey.mean(1, keepdims=True)
+    grey /= np.sqrt((grey**2).sum(1, keepdims=True) + NOISE * grey.shape[1])
+    return grey.reshape(points.shape[:-1])
+
+
+def best_places(score: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where the photos agree most [P], between the `moves` [M] that were tried, and how far that is to be trusted [P].
+
+    Args:
+        score: [P, M] from `agreement`.
+        moves: [M] evenly spaced.
+    """
+    best = score.argmax(1)
+    middle = best.clip(1, len(moves) - 2)
+    before, here, after = (score[np.arange(len(score)), middle + k] for k in (-1, 0, 1))
+    shift = ((after - before) / (2 * np.maximum(2 * here - before - after, 1e-6))).clip(-1, 1)
+    trust = ((here - ALIKE) / (SURE - ALIKE)).clip(0, 1) ** 2
+    return moves[middle] + shift * (moves[1] - moves[0]), np.where(best == middle, trust, 0)
+
+
+def settled(mesh: Mesh, normal: np.ndarray, mean: csr_matrix, wanted: np.ndarray, trust: np.ndarray,
+            stay: np.ndarray) -> np.ndarray:  # fmt: skip
+    """How far each vertex moves [V] along its normal [V, 3]: where it is wanted [V], by trust [V], or smooth between.
+
+    Args:
+        mesh: to move.
+        normal: of the vertices; shorter where they shall move less.
+        mean: [V, V] takes the mean of the neighbours.
+        wanted: for each vertex.
+        trust: in that.
+        stay: [V] trust in where the vertices are.
+    """
+    bend = mean - diags(np.ones(len(trust)))
+    inwards = ((bend @ mesh.vertices) * normal).sum(1)
+    matrix = diags(trust + stay) + BENDING * (bend.T @ bend) - AREA * (bend + bend.T) / 2
+    right = trust * wanted - BENDING * (bend.T @ inwards) + AREA * inwards
+    return cg(matrix.tocsr(), right, rtol=1e-3, maxiter=300)[0]
