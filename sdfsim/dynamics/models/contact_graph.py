@@ -79,7 +79,7 @@ class EdgeFrames:
     Attributes:
         speed: [E, 1], the scale that makes velocities dimensionless.
         mass: [E, 3] effective mass along each axis; 0 along those on which nothing may act.
-        jacobian_first, jacobian_second: [E, 3, 6] J, it makes of a twist the velocity of the contact point along each axis.
+        jacobian_first, jacobian_second: [E, 3, 6] J, from a twist to the velocity of the contact point along each axis.
         response_first, response_second: [E, 6, 3] M^-1 J^T, the twist that a unit impulse along each axis gives,
             opposite to the second.
         solved: [E, 3] impulse of the solve along each axis.
