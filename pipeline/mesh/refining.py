@@ -37,6 +37,7 @@ NEAR, EVEN = 8, 0.3
 # Weights beside trust: of the surface's area, of its bending, and of where a vertex was.
 AREA, BENDING, STAY, PINNED = 0.2, 0.3, 0.002, 0.5
 SMOOTHED = 4  # times after each round
+WALL = 0.25  # of the way to the surface opposite, inside or outside, that a vertex may move in a round
 # Within so many edges vertices need this mean trust around them, or they stay where they were.
 AROUND, TOLD = 20, 0.1 / EVERY
 
@@ -120,6 +121,10 @@ def refine(mesh: Mesh, pictures: list[Picture], blocking: Caster, lift: float, f
         usual = np.median(off[trust > 0]) if (trust > 0).any() else 1.0
         weight[picked] *= np.exp(-((off / (SPREAD * usual + 1e-9)) ** 2))
         moved = settled(mesh, along, mean, wanted, weight, stay).clip(moves[0], moves[-1])
+        # The two sides of a thin wall must not pass through each other.
+        caster, skin = Caster(mesh), 1e-3 * finest * normal
+        inwards, outwards = (caster.hits(mesh.vertices + way * skin, way * normal)[0] for way in (-1, 1))
+        moved = moved.clip(-WALL * inwards, WALL * outwards)
         vertices = mesh.vertices + moved[:, None] * along
         for _ in range(SMOOTHED):
             vertices = vertices + 0.5 * (told * ~low)[:, None] * (mean @ vertices - vertices)
