@@ -10,7 +10,7 @@ import torch
 from sdfsim.data.batching import merged
 from sdfsim.data.pybullet_sim import MARGIN
 from sdfsim.dynamics.bodies import Units
-from sdfsim.dynamics.model import load_model
+from sdfsim.dynamics.model import SURFACE, load_model
 from sdfsim.dynamics.models.contact_graph import REST_SPEED
 from sdfsim.dynamics.models.impulse import Velocities
 from sdfsim.dynamics.run_memory import Memory
@@ -22,7 +22,7 @@ from sdfsim.training import contact_cache, validation
 from sdfsim.training import train as train_module
 from sdfsim.training.contact_cache import Solved, contact_frames, join_frames
 from sdfsim.training.impulse_task import ImpulseTask
-from sdfsim.training.presets import PRESETS
+from sdfsim.training.presets import PRESETS, Preset
 from sdfsim.training.run import Run, held_out_loss
 from sdfsim.training.surface_task import SurfaceTask
 from sdfsim.training.train import train
@@ -84,6 +84,29 @@ def test_it_learns_and_the_model_file_gives_the_same_network(ball_data, presets,
     assert model.kind == plan.kind and model.dt == pytest.approx(0.02) and model.gravity == pytest.approx(10.0)
     assert model.ranges["restitution"][0] == pytest.approx(0.3 * 0.3)
     assert not list(place.glob("*.part")) and (place / "log.jsonl").exists()
+
+
+@pytest.mark.parametrize("kind", [kind for kind in SURFACE if kind != "paper"])
+def test_the_baselines_learn_and_move_bodies(ball_data, kind, tmp_path):
+    plan = Preset(kind, {"width": 16, "steps": 2}, steps=60, batch=2, rate=3e-3, nodes=30, noise=0.003)
+    task, held_out = train_module._tasks(plan, [ball_data], CPU, lambda f, m: None)
+    before = held_out_loss(Run(plan, task, plan.steps, 0, CPU), held_out, batches=2)
+    report = train(ball_data, tmp_path, preset=plan)
+    assert report["held_out_loss"] < 0.7 * before
+    model = load_model(tmp_path / "model.safetensors")
+    assert model.kind == kind and model.nodes == 30
+    judged = evaluate(ball_data, model=model, split="validation", steps=5, free_flight="learned", errors_only=True)
+    assert 0 < judged["model"]["5"]["translation_rmse"] < 1.0
+
+
+def test_a_budget_ends_a_run_early_and_resuming_ends_it_as_without(ball_data, presets, tmp_path):
+    train(ball_data, tmp_path / "whole", preset="tiny", steps=30)
+    early = train(ball_data, tmp_path / "parts", preset="tiny", steps=30, budget=1e-6)
+    assert early["steps"] == 1
+    train(ball_data, tmp_path / "parts", preset="tiny", steps=30, resume=True)
+    one, other = (load_model(tmp_path / k / "model.safetensors").network.state_dict() for k in ("whole", "parts"))
+    for name, weight in one.items():
+        torch.testing.assert_close(other[name], weight, rtol=0, atol=1e-4)  # up to rounding
 
 
 def test_an_interrupted_run_resumes_to_the_bit(ball_data, presets, tmp_path, monkeypatch):
