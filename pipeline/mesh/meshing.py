@@ -96,7 +96,7 @@ def make_meshes(
         alone = alone or not surface.reaches_rim
     on_progress(0.7, "looking for bodies")
     cut = lambda p: np.maximum(inner(p), limit(p))  # noqa: E731
-    parts = split(surface, cut, field.finest, views, photos, placement.to_metres.rotation[2], alone=alone)
+    parts = split(surface, cut, field.finest, views, points, photos, placement.to_metres.rotation[2], alone=alone)
     on_progress(0.8, "drawing objects.png")
     draw_names(parts, views, photos).save(out / "objects.png")
     metres = placement.to_metres.scale
@@ -116,7 +116,8 @@ def make_meshes(
     deep = {name: hollow(closed[name], 2 * surface.volume.cell * metres) for name in parts.bodies}
     hollows = {name: rounded(found).tolist() for name, found in deep.items() if found is not None}
     return {
-        **surface.report, "left_out_m": [float(rounded(length * metres)) for length in surface.report["left_out"]],
+        **surface.report,
+        "left_out_m": [float(rounded(length * metres)) for length in (*surface.report["left_out"], *parts.noise)],
         "extent_m": rounded(np.ptp(placement.mesh(surface.visible).vertices, axis=0)).tolist(),
         "up_from": placement.up_from, "up_within_degrees": round(placement.up_within, 2),
         "up_confidence": placement.up_confidence, "size": placement.size_from, "objects": list(parts.bodies),

@@ -44,6 +44,13 @@ class Contacts:
         return replace(self, owner=body[self.owner], body=body[self.body], node=node[self.node])
 
 
+def no_contacts(device: torch.device) -> Contacts:
+    """None at all."""
+    nobody = torch.zeros(0, dtype=torch.int64, device=device)
+    nothing = torch.zeros(0, 3, dtype=torch.float64, device=device)
+    return Contacts(nobody, nobody, nobody, nothing, nothing[:, 0], nothing)
+
+
 def find_contacts(
     bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, memory: Memory | None = None
 ) -> Contacts:

@@ -6,7 +6,6 @@ network's graph, and what sleeps is not looked at until something moves beside i
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
@@ -277,8 +276,9 @@ def _surface_step(
     if not rules.contact and not learned:
         return free, None
     with memory.timed("contact_ms"):
-        reach = model.reach if rules.contact else -math.inf
-        near = family.near(bodies, state, rules.gravity, reach, rules.dt, memory)
+        near = family.none(bodies.device)
+        if rules.contact:
+            near = family.near(bodies, state, rules.gravity, model.reach, rules.dt, memory)
     active = torch.cat([near.owner, near.body, *([awake(bodies, state)] if learned else [])])
     active = torch.unique(active)
     chosen = bodies.moves[active]

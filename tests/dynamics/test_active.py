@@ -11,6 +11,7 @@ from sdfsim.dynamics import step as step_module
 from sdfsim.dynamics.contacts import find_contacts
 from sdfsim.dynamics.kernels import impulse, nodes
 from sdfsim.dynamics.model import Unread
+from sdfsim.dynamics.models.paper import graph
 from sdfsim.dynamics.models.surfaces import compact, node_owner, predict
 from sdfsim.dynamics.run_memory import COUNTS, PHASES
 from sdfsim.dynamics.simulator import Simulator
@@ -171,12 +172,15 @@ def test_the_paper_network_sees_only_bodies_with_an_edge_and_answers_as_for_all(
     model = surface_model(push=1e-2)
     sim = Simulator(dropped, model)
     contacts = find_contacts(sim.bodies, sim.state, sim.rules.gravity, sim.model.reach, sim.rules.dt)
-    whole = predict(model.network, sim.bodies, sim.state, contacts, sim.rules.dt)
+    everything = graph(sim.bodies, sim.state, contacts)
+    whole = predict(model.network, everything, sim.bodies, sim.state, sim.rules.dt)  # type: ignore[arg-type]
     graphs = seen_by(model)
     rows = torch.cat([contacts.owner, contacts.body]).unique()
     sim.run(steps=1)
-    assert 0 < len(graphs[0].body) == len(rows) < len(dropped.bodies)
-    assert len(graphs[0].node) == sum(len(dropped.shapes[dropped.bodies[k].shape].nodes) for k in rows.tolist())
+    assert 0 < len(graphs[0].nodes["body"]) == len(rows) < len(dropped.bodies)
+    assert len(graphs[0].nodes["node"]) == sum(
+        len(dropped.shapes[dropped.bodies[k].shape].nodes) for k in rows.tolist()
+    )
     moving = rows[sim.bodies.moves[rows]]
     torch.testing.assert_close(sim.state.position[moving], whole.position[moving], rtol=0, atol=1e-7)
     torch.testing.assert_close(sim.state.angular_velocity[moving], whole.angular_velocity[moving], rtol=0, atol=1e-4)

@@ -58,6 +58,14 @@ class Pairs:
         return replace(self, **ends, first=node[self.first], second=node[self.second])
 
 
+def no_pairs(device: torch.device, corners: int) -> Pairs:
+    """None at all of nodes (one corner) or of faces (three)."""
+    nobody = torch.zeros(0, dtype=torch.int64, device=device)
+    parts, way = nobody.reshape(0, 1).expand(-1, corners), torch.zeros(0, 3, dtype=torch.float64, device=device)
+    arms = torch.zeros(0, corners, 3, dtype=torch.float64, device=device)
+    return Pairs(nobody, nobody, parts, parts, way[:, 0], way, arms, arms, way, way)
+
+
 def node_pairs(
     bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, memory: Memory | None = None
 ) -> Pairs:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
-from torch import Tensor
+from torch import Tensor, device
 
 from sdfsim.dynamics.bodies import Bodies, State
-from sdfsim.dynamics.contacts import find_contacts
+from sdfsim.dynamics.contacts import find_contacts, no_contacts
 from sdfsim.dynamics.models import dpi, fignet, mgn, nodes, paper
-from sdfsim.dynamics.models.collisions import face_pairs, node_pairs
+from sdfsim.dynamics.models.collisions import face_pairs, no_pairs, node_pairs
 from sdfsim.dynamics.models.message_passing import Graph, Layout
 from sdfsim.dynamics.models.surfaces import Near
 from sdfsim.dynamics.run_memory import Memory
@@ -26,19 +27,23 @@ class Family:
         layout: of its graphs.
         surface: a shape, with the nodes (at most so many, None for all) that the network works on.
         near: what of the bodies is near what, for bodies, state, gravity, reach, time step and what the run remembers.
+        none: the same of bodies that are near nothing.
         graph: the graph of bodies, their state and what is near.
     """
 
     layout: Layout
     surface: Callable[[Shape, int | None], Shape]
     near: Callable[[Bodies, State, Tensor, float, float, Memory], Near]
+    none: Callable[[device], Near]
     graph: Callable[[Bodies, State, Any], Graph]
 
 
+_no_faces, _no_nodes = partial(no_pairs, corners=3), partial(no_pairs, corners=1)
+
 FAMILIES = {
-    "paper": Family(paper.LAYOUT, nodes.points, find_contacts, paper.graph),
-    "fignet": Family(fignet.LAYOUT, nodes.vertices, face_pairs, fignet.graph),
-    "fignet-star": Family(fignet.STAR, nodes.vertices, face_pairs, fignet.star_graph),
-    "mgn": Family(mgn.LAYOUT, nodes.vertices, node_pairs, mgn.graph),
-    "dpi": Family(dpi.LAYOUT, nodes.particles, node_pairs, dpi.graph),
+    "paper": Family(paper.LAYOUT, nodes.points, find_contacts, no_contacts, paper.graph),
+    "fignet": Family(fignet.LAYOUT, nodes.vertices, face_pairs, _no_faces, fignet.graph),
+    "fignet-star": Family(fignet.STAR, nodes.vertices, face_pairs, _no_faces, fignet.star_graph),
+    "mgn": Family(mgn.LAYOUT, nodes.vertices, node_pairs, _no_nodes, mgn.graph),
+    "dpi": Family(dpi.LAYOUT, nodes.particles, node_pairs, _no_nodes, dpi.graph),
 }
