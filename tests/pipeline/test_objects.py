@@ -18,6 +18,7 @@ FINEST = 0.02
 TABLE = (0.5, 0.35, 0.05)  # half sides of the top and half its thickness
 TOP = 0.1  # height of the table's upper side
 WALL = 0.035
+NO_POINTS = np.zeros((0, 3))
 
 
 def box(points: np.ndarray, center, half) -> np.ndarray:
@@ -54,11 +55,13 @@ def surface_of(distance: Callable, seen: Callable | None = None, turn: np.ndarra
     return Surface(volume, raw, shown, np.ones(len(raw.faces), bool), faces, {})
 
 
-def parts_of(distance: Callable, turn: np.ndarray | None = None, seen: Callable | None = None) -> Parts:
+def parts_of(
+    distance: Callable, turn: np.ndarray | None = None, seen: Callable | None = None, points: np.ndarray = NO_POINTS
+) -> Parts:
     turn = np.eye(3) if turn is None else turn
     up = turn @ np.array([0.0, 0, 1])
     field = lambda p: distance(p @ turn).astype(np.float32)  # noqa: E731
-    return split(surface_of(distance, seen, turn), field, FINEST, [], Path(), up, alone=False)
+    return split(surface_of(distance, seen, turn), field, FINEST, [], points, Path(), up, alone=False)
 
 
 def some_rotation(seed: int) -> np.ndarray:
@@ -96,6 +99,27 @@ def test_where_the_cup_stood_the_table_is_whole():
         near = mesh.vertices[(np.hypot(mesh.vertices[:, 0] - 0.1, mesh.vertices[:, 1] + 0.05) < 0.2)]
         near = near[near[:, 2] > TOP - TABLE[2]]
         assert len(near) > 50 and np.abs(near[:, 2] - TOP).max() < 0.2 * FINEST
+
+
+def test_a_small_piece_without_sparse_points_is_noise_beside_bodies_that_have_them():
+    """With points of its own it is a body, and so it is where nothing has any."""
+    small = ((-0.25, 0.1, TOP + 0.06), (0.04, 0.04, 0.06))
+
+    def scene(p: np.ndarray) -> np.ndarray:
+        return np.minimum(both(p), box(p, *small))
+
+    rng = np.random.default_rng(0)
+    angle, height = rng.uniform(0, 2 * np.pi, 400), rng.uniform(0.03, 0.27, 400)
+    on_cup = np.stack([0.1 + 0.12 * np.cos(angle), -0.05 + 0.12 * np.sin(angle), TOP + height], 1)
+    on_box = np.array(small[0]) + [-0.04, 0, 0] + rng.uniform(-0.03, 0.03, (60, 3)) * [0, 1, 1]
+    without = parts_of(scene, points=on_cup)
+    assert list(without.bodies) == ["object1"] and len(without.noise) == 1 and without.noise[0] < 0.25
+    assert without.solid is not None and signed_volume(without.solid) == pytest.approx(
+        signed_volume(surface_of(table).solid), rel=2e-3
+    )
+    for points in (NO_POINTS, np.concatenate([on_cup, on_box])):
+        found = parts_of(scene, points=points)
+        assert len(found.bodies) == 2 and not found.noise
 
 
 def test_crumbs_that_hang_beside_a_body_do_not_stay_in_the_scenery():
@@ -163,7 +187,7 @@ def test_what_is_no_body_stays_scenery(scene, seen, why):
 def test_without_scenery_every_component_is_a_body():
     pair = lambda p: np.minimum(box(p, (0.3, 0, 0), (0.1, 0.2, 0.1)), box(p, (-0.4, 0, 0), (0.3, 0.2, 0.2)))  # noqa: E731
     surface = surface_of(pair)
-    parts = split(surface, pair, FINEST, [], Path(), np.array([0.0, 0, 1]), alone=True)
+    parts = split(surface, pair, FINEST, [], NO_POINTS, Path(), np.array([0.0, 0, 1]), alone=True)
     assert parts.solid is None and parts.shown is None
     volumes = [signed_volume(mesh) for mesh in parts.bodies.values()]
     np.testing.assert_allclose(volumes, [0.6 * 0.4 * 0.4, 0.2 * 0.4 * 0.2], rtol=0.05)

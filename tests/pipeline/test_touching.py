@@ -104,7 +104,8 @@ class Scene:
             save_labels(number[label], folder, view.name)
         if masks:
             save_names(tuple(masks), folder)
-        found = split(self.surface, self.distance, FINEST, self.views, folder, np.array([0, 0, 1.0]), alone=alone)
+        nothing, up = np.zeros((0, 3)), np.array([0, 0, 1.0])
+        found = split(self.surface, self.distance, FINEST, self.views, nothing, folder, up, alone=alone)
         back = self.to_unit.inverse()
         return replace(found, bodies={
             name: Mesh(back.points(mesh.vertices), mesh.faces) for name, mesh in found.bodies.items()
