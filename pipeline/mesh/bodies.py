@@ -18,7 +18,7 @@ from pipeline.cameras import View, frame_of
 from pipeline.inputs.labels import load_names
 from pipeline.mesh.cleaning import components, face_normals, islands, keep_faces
 from pipeline.mesh.extraction import FLOATER, RIM, Distance, Surface, Volume, sample, sample_box
-from pipeline.mesh.refining import load_pictures, refine
+from pipeline.mesh.photo_refining import load_pictures, refine
 from pipeline.mesh.seams import Part, Solid, Votes, count_votes, part_of_name, parts_by_shape, parts_by_votes, solid_of
 from pipeline.mesh.visibility import Caster, Visibility, look, spread_colors, to_bytes
 from sdfsim.shape.mesh import Mesh

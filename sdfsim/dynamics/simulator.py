@@ -309,7 +309,7 @@ class Simulator:
             points, pairs, count = found.point * u.length, found.pair, len(found.pair)
             depth = float((-found.gap).max(initial=0.0)) * u.length
         if c is not None and count:
-            from sdfsim.dynamics.contacts import where
+            from sdfsim.dynamics.models.paper_edges import where
 
             # The edges were found at the start of the step; their points are told where this frame has the bodies.
             points = (where(self.state, self.bodies, c) * u.length).cpu().numpy()

@@ -98,7 +98,7 @@ def deep_starts(bodies: Bodies, state: State, names: Sequence[str], metres: floa
         names: [N] of the bodies.
         metres: in a model unit.
     """
-    from sdfsim.dynamics.contacts import find_contacts  # numba takes its time to load
+    from sdfsim.dynamics.models.paper_edges import find_contacts  # numba takes its time to load
 
     nothing = torch.zeros(3, dtype=torch.float64, device=bodies.device)
     inside = find_contacts(bodies, state, nothing, reach=0.0, dt=0.0)

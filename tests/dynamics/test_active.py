@@ -8,10 +8,10 @@ import torch
 
 from sdfsim.dynamics import free_flight, inference, solver
 from sdfsim.dynamics import step as step_module
-from sdfsim.dynamics.contacts import find_contacts
 from sdfsim.dynamics.kernels import impulse, nodes
 from sdfsim.dynamics.model import Unread
 from sdfsim.dynamics.models.paper import graph
+from sdfsim.dynamics.models.paper_edges import find_contacts
 from sdfsim.dynamics.models.surfaces import compact, node_owner, predict
 from sdfsim.dynamics.run_memory import COUNTS, PHASES
 from sdfsim.dynamics.simulator import Simulator

@@ -16,8 +16,8 @@ from pipeline.inputs.photos import Photo, save_photos
 from pipeline.mesh import meshing
 from pipeline.mesh.extraction import sample_box
 from pipeline.mesh.meshing import make_meshes, read_parts, rounded, trust_meshes
+from pipeline.mesh.photo_refining import Picture, refine
 from pipeline.mesh.placement import load_placement
-from pipeline.mesh.refining import Picture, refine
 from pipeline.mesh.trust import GUESSED, WIDE
 from pipeline.mesh.visibility import Caster
 from sdfsim.errors import SdfsimError

@@ -15,9 +15,9 @@ Different from the paper, as far as its text says:
 from __future__ import annotations
 
 from sdfsim.dynamics.bodies import Bodies, State
-from sdfsim.dynamics.models.collisions import Pairs
 from sdfsim.dynamics.models.message_passing import EdgeKind, Graph, Layout
 from sdfsim.dynamics.models.mgn import WORLD, world_edges
+from sdfsim.dynamics.models.near_pairs import Pairs
 from sdfsim.dynamics.models.surfaces import INTRA, NODE, motion_features, star
 
 LAYOUT = Layout(

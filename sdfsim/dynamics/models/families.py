@@ -10,10 +10,10 @@ from typing import Any
 from torch import Tensor, device
 
 from sdfsim.dynamics.bodies import Bodies, State
-from sdfsim.dynamics.contacts import find_contacts, no_contacts
 from sdfsim.dynamics.models import dpi, fignet, mgn, nodes, paper
-from sdfsim.dynamics.models.collisions import face_pairs, no_pairs, node_pairs
 from sdfsim.dynamics.models.message_passing import Graph, Layout
+from sdfsim.dynamics.models.near_pairs import face_pairs, no_pairs, node_pairs
+from sdfsim.dynamics.models.paper_edges import find_contacts, no_contacts
 from sdfsim.dynamics.models.surfaces import Near
 from sdfsim.dynamics.run_memory import Memory
 from sdfsim.shape.shape import Shape

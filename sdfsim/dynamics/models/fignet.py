@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from sdfsim.dynamics.bodies import Bodies, State
-from sdfsim.dynamics.models.collisions import Pairs
 from sdfsim.dynamics.models.message_passing import EdgeKind, Features, Graph, Layout, both_ways
+from sdfsim.dynamics.models.near_pairs import Pairs
 from sdfsim.dynamics.models.surfaces import INTRA, NODE, mesh_edges, motion_features, star
 
 FACE = Features(34, (0, 4, 7, 10, 16, 19, 22, 28, 31))

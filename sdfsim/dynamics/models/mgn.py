@@ -15,8 +15,8 @@ from __future__ import annotations
 import torch
 
 from sdfsim.dynamics.bodies import Bodies, State
-from sdfsim.dynamics.models.collisions import Pairs
 from sdfsim.dynamics.models.message_passing import EdgeKind, Edges, Features, Graph, Layout, both_ways
+from sdfsim.dynamics.models.near_pairs import Pairs
 from sdfsim.dynamics.models.surfaces import INTRA, NODE, mesh_edges, motion_features
 
 WORLD = Features(4, (0,))

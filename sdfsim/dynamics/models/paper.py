@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from sdfsim.dynamics.bodies import Bodies, State
-from sdfsim.dynamics.contacts import Contacts
 from sdfsim.dynamics.models.message_passing import EdgeKind, Edges, Features, Graph, Layout
+from sdfsim.dynamics.models.paper_edges import Contacts
 from sdfsim.dynamics.models.surfaces import INTRA, NODE, motion_features, star
 
 CONTACT = Features(15, (0, 3, 6, 9))

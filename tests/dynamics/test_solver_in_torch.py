@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sdfsim.dynamics import twin
+from sdfsim.dynamics import solver_in_torch as twin
 from sdfsim.dynamics.bodies import Units, from_scene
 from sdfsim.dynamics.kernels.distance import distance as kernel_distance
 from sdfsim.dynamics.solver import Compiled, compiled_rules, no_manifolds, taken_up
