@@ -16,7 +16,7 @@ from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State, Units
 from sdfsim.dynamics.models.families import FAMILIES
 from sdfsim.dynamics.models.message_passing import Graph, GraphNetwork, flipped
-from sdfsim.dynamics.models.surfaces import TARGET, node_owner, target_acceleration
+from sdfsim.dynamics.models.surfaces import TARGET, Near, node_owner, target_acceleration
 from sdfsim.dynamics.run_memory import Memory
 from sdfsim.training.distributed import ALONE, Team
 from sdfsim.training.presets import Preset
@@ -79,6 +79,21 @@ class SurfaceTask:
 
     def draw(self, rng: np.random.Generator, count: int, team: Team = ALONE) -> Batch:
         """`count` recorded steps as one graph, or the part of them that falls to one of a team."""
+        bodies, state, after = self.scenes(rng, count, team)
+        # The target leads from the disturbed poses to the recorded one, so that errors are learnt to be undone.
+        target = target_acceleration(bodies, state, *after)
+        graph = self.family.graph(bodies, state, self.near(bodies, state, Memory()))
+        return Batch(graph, target.float(), bodies.moves[node_owner(bodies)])
+
+    def near(self, bodies: Bodies, state: State, memory: Memory) -> Near:
+        """What is near what; see `Family.near`."""
+        gravity = torch.tensor(self.trajectories[0].gravity, dtype=torch.float64, device=self.device)
+        return self.family.near(bodies, state, gravity, self.reach, self.dt, memory)
+
+    def scenes(
+        self, rng: np.random.Generator, count: int, team: Team = ALONE
+    ) -> tuple[Bodies, State, tuple[Tensor, Tensor]]:
+        """Bodies of `count` recorded steps side by side, how they move before, and their poses [N, *] after."""
         picked = [self.trajectories[i] for i in rng.integers(len(self.trajectories), size=count)]
         frames = [int(rng.integers(2, len(t.position) - 1)) for t in picked]
         yaw = pose.from_rotvec(torch.tensor([0.0, 0.0, rng.uniform(0, 2 * np.pi)], dtype=torch.float64))
@@ -96,12 +111,7 @@ class SurfaceTask:
             earlier_position=torch.stack([noisy[0][0], noisy[1][0]]),
             earlier_orientation=torch.stack([noisy[0][1], noisy[1][1]]),
         )
-        gravity = torch.tensor(picked[0].gravity, dtype=torch.float64, device=self.device)
-        near = self.family.near(bodies, state, gravity, self.reach, self.dt, Memory())
-        # The target leads from the disturbed poses to the recorded one, so that errors are learnt to be undone.
-        target = target_acceleration(bodies, state, *poses[3])
-        graph = self.family.graph(bodies, state, near)
-        return Batch(graph, target.float(), bodies.moves[node_owner(bodies)])
+        return bodies, state, poses[3]
 
     def loss(self, network: GraphNetwork, batch: Batch, *, mirrored: bool = False) -> Tensor:
         """Mean squared error of the standardised accelerations; a mirror image reverses the y axis of the world."""
