@@ -61,7 +61,8 @@ def train(
     ],
     out: Out,
     preset: Annotated[
-        Literal["small", "long", "alone", "base", "paper"], typer.Option(help="Kind and size of the model.")
+        Literal["small", "long", "alone", "base", "paper", "fignet", "fignet-star", "mgn", "mgn-large", "dpi"],
+        typer.Option(help="Kind and size of the model."),
     ] = "small",
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in the folder.")] = False,
     device: str = "auto",
@@ -79,7 +80,7 @@ def evaluate(
     model: Model = None,
     steps: Annotated[int, typer.Option(help="Length of each rollout.", min=1)] = 50,
     free_flight: Annotated[
-        Literal["exact", "learned"], typer.Option(help="Bodies without contact (learned: paper networks only).")
+        Literal["exact", "learned"], typer.Option(help="Bodies without contact (learned: of published networks).")
     ] = "exact",
     chaos_floor: Annotated[
         bool,
