@@ -45,7 +45,8 @@ _PHOTO_PIXELS = 320
 _TEXTURE_PIXELS = 2048
 MANY = 24  # bodies of one shape that do not stay put, from which on they are a crowd
 COLORS = 4  # copies share their mesh's colour, so a crowd is split to be told apart
-CREASE = np.radians(40.0)  # between the normals of neighbouring faces, from which on an edge is sharp
+_CREASE = np.cos(np.radians(40.0))
+_MOST_CORNER_PAIRS = 1_000_000  # more, about 10,000 vertices, and a mesh counts as smooth: splitting triples its size
 FARTHEST = 1.0  # what leaves the scene for good must not make it a dot
 
 
@@ -446,17 +447,53 @@ def distinct_colors(count: int) -> Iterator[tuple[int, ...]]:
 
 def with_normals(mesh: Mesh) -> tuple[Mesh, np.ndarray]:
     """The mesh with normals [V, 3]: smooth, its vertices split along creases so that boxes keep their edges."""
-    import trimesh
-
     if mesh.uv is not None:  # its vertices are doubled where its texture is cut, and that is no crease
         _, first, label = np.unique(mesh.vertices, axis=0, return_index=True, return_inverse=True)
-        whole = trimesh.Trimesh(mesh.vertices[first], label.reshape(-1)[mesh.faces], process=False)
-        return mesh, whole.vertex_normals[label.reshape(-1)]
-    whole = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    smooth = whole.face_adjacency[whole.face_adjacency_angles < CREASE]
-    patch = trimesh.graph.connected_component_labels(smooth, node_count=len(mesh.faces))
-    corners = np.stack([mesh.faces, np.broadcast_to(patch[:, None], mesh.faces.shape)], -1).reshape(-1, 2)
-    (vertex, _), label = (part.T for part in np.unique(corners, axis=0, return_inverse=True))
-    colors = None if mesh.colors is None else mesh.colors[vertex]
-    split = Mesh(mesh.vertices[vertex], label.reshape(-1, 3), colors)
-    return split, trimesh.Trimesh(split.vertices, split.faces, process=False).vertex_normals
+        return mesh, _smooth_normals(mesh.vertices[first], label.reshape(-1)[mesh.faces])[label.reshape(-1)]
+    normals = _corner_normals(mesh.vertices, mesh.faces)
+    if normals is None:
+        return mesh, _smooth_normals(mesh.vertices, mesh.faces)
+    colors = None if mesh.colors is None else mesh.colors[mesh.faces].reshape(-1, 3)
+    vertices = mesh.vertices[mesh.faces].reshape(-1, 3)
+    return Mesh(vertices, np.arange(len(vertices)).reshape(-1, 3), colors), normals
+
+
+def _face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """[F, 3], twice the area long."""
+    a, b, c = vertices[faces.T]
+    return np.cross(b - a, c - a)
+
+
+def _smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """[V, 3] area-weighted means of the faces around each vertex."""
+    total = np.zeros_like(vertices)
+    normal = _face_normals(vertices, faces)
+    for k in range(3):
+        np.add.at(total, faces[:, k], normal)
+    return _normalise(total)
+
+
+def _corner_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
+    """[3 F, 3] for every face corner the mean of the faces at its vertex that bend less than the crease angle.
+
+    None for a mesh so fine that it may pass as smooth.
+    """
+    owner = faces.reshape(-1)
+    order = np.argsort(owner, kind="stable")
+    valence = np.bincount(owner, minlength=len(vertices))
+    if (valence**2).sum() > _MOST_CORNER_PAIRS:
+        return None
+    start = np.cumsum(valence) - valence
+    repeats = valence[owner]
+    first = np.repeat(np.arange(len(owner)), repeats)
+    second = order[np.repeat(start[owner] - (np.cumsum(repeats) - repeats), repeats) + np.arange(repeats.sum())]
+    normal = _face_normals(vertices, faces)
+    unit = _normalise(normal)
+    near = (unit[first // 3] * unit[second // 3]).sum(1) >= _CREASE
+    total = np.zeros((len(owner), 3))
+    np.add.at(total, first[near], normal[second[near] // 3])
+    return _normalise(total)
+
+
+def _normalise(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)

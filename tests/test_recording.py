@@ -185,13 +185,13 @@ def test_what_is_proposed_and_how_far_to_trust_the_surface_are_things_of_their_o
     save_reconstruction(tmp_path / "r.rrd", [photo], np.zeros((0, 3)), None, box(), trust={"a box": tinted})
     found = read(tmp_path / "r.rrd")
     assert found["/world/cameras/next1!"]["Pinhole:color"][0][0] == 0xFF28C8FF
-    assert len(found[r"/world/trust/a\ box!"]["Mesh3D:vertex_colors"][0]) == 24
+    assert len(found[r"/world/trust/a\ box!"]["Mesh3D:vertex_colors"][0]) == 36
     assert "/world/surface!" in found
 
 
 def test_boxes_keep_their_edges_and_balls_stay_smooth():
     mesh, normals = with_normals(box())
-    assert len(mesh.vertices) == 24
+    assert len(mesh.vertices) == 36
     np.testing.assert_allclose(np.abs(normals).max(1), 1.0)
     mesh, normals = with_normals(sphere())
     np.testing.assert_allclose((normals * mesh.vertices).sum(1), 0.5, atol=1e-3)
