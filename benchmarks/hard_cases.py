@@ -15,7 +15,7 @@ from typing import Any
 
 from sdfsim.console import Session
 from sdfsim.evaluation.hard_cases import GROUPS
-from sdfsim.evaluation.stress import TEACHER, Study, draw_group, figures, stress, table, write_report
+from sdfsim.evaluation.stress import ENGINES, Study, draw_group, figures, stress, table, write_report
 from sdfsim.files import read_json, write_json, write_text
 from sdfsim.recording import save_rollout
 
@@ -43,7 +43,7 @@ def accepted(study: Study) -> dict[str, Any]:
     """What the ratchet file holds: each model's figures, and the cases in which it blew up."""
     models = {}
     for who, found in figures(study).items():
-        if who != TEACHER:
+        if who not in ENGINES:
             blown = [case for (case, one), result in study.results.items() if one == who and result["broke"]]
             models[who] = {"figures": found, "blew_up": blown}
     return {"quick": study.quick, "models": models}
@@ -78,7 +78,9 @@ def main() -> None:
     with Session() as session:
         for quick in (True,) if chosen.quick else (True, False):
             folder = chosen.out / "quick" if quick else chosen.out
-            study = stress(folder, quick=quick, record=save_rollout, on_progress=session.progress)
+            study = stress(
+                folder, quick=quick, engines=tuple(ENGINES), record=save_rollout, on_progress=session.progress
+            )
             write_report(study, folder)
             if quick:
                 write_json(RATCHET, accepted(study))

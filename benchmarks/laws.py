@@ -52,6 +52,20 @@ def cube(size: float) -> Shape:
     return analytic_shape("box", size=(size,) * 3)
 
 
+def plank(size: float) -> Shape:
+    """A plank `size` m long."""
+    return analytic_shape("box", size=(size, 0.2 * size, 0.1 * size))
+
+
+def tower_of_planks(size: float) -> list[Body]:
+    """Six layers of three planks."""
+    scale = size / hard_cases.PLANK[0]
+    return [
+        replace(plank, position=scale * plank.position, mass=20.0 * size**3)
+        for plank in hard_cases.planks().bodies[:-1]
+    ]
+
+
 def ball(size: float) -> Shape:
     """With a diameter of `size` m."""
     return analytic_shape("sphere", radius=size / 2)
@@ -163,9 +177,28 @@ def stacks(model: str, size: float) -> Iterator[Law]:
         motion = run(model, cube(size), bodies, 3.0 * sqrt(size))
         way = float(np.linalg.norm(motion.position[-1, :2] - motion.position[0, :2], axis=1).max() / size)
         yield (f"{ratio}:1 on top", "holds", f"moves {way:.2f} of its size", way < 0.1)
+    motion = run(model, plank(size), tower_of_planks(size), 5.0 * sqrt(size))
+    way = float(np.linalg.norm(motion.position[-1, :18] - motion.position[0, :18], axis=1).max() / size)
+    yield ("six layers of three planks", "none moves a tenth of its size", f"{way:.2f} of it", way < 0.1)
 
 
-LAWS: list[Callable[[str, float], Iterator[Law]]] = [rebounds, head_on, rolling, slopes, stops, rests, stacks]
+def weights(model: str, size: float) -> Iterator[Law]:
+    """Under the light and under the heavy, contacts push as much as the bodies above weigh."""
+    for ratio in (10, 30, 100):
+        bodies = [body(str(k), [0, 0, (k + 0.5) * size], size, mass=m * size**3) for k, m in enumerate((1.0, ratio))]
+        scene = replace(on_floor([cube(size)], bodies), effects=Effects(sleep="off"))
+        simulator = Simulator(scene, model)
+        simulator.run(3.0 * sqrt(size))
+        inner = simulator.dt / simulator.rules.substeps
+        wanted = {"floor": (1.0 + ratio) * size**3, "1": ratio * size**3}
+        off = 0.0
+        for name, mass in wanted.items():
+            pushed = sum(float(c.impulse[2]) for c in simulator.contact_points() if {c.first, c.second} == {"0", name})
+            off = max(off, abs(abs(pushed) / (mass * float(np.linalg.norm(scene.gravity)) * inner) - 1.0))
+        yield (f"{ratio}:1, impulses of contacts", "the weights within 2 %", f"{100 * off:.1f} % off", off < 0.02)
+
+
+LAWS: list[Callable[[str, float], Iterator[Law]]] = [rebounds, head_on, rolling, slopes, stops, rests, stacks, weights]
 
 
 def main() -> None:

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Makes .venv with the project in it, ready to run. Usage: bash scripts/setup.sh [EXTRA ...]   (extras: data, bench, test, cluster, export, record3d)
+# Makes .venv with the project in it, ready to run. Usage: bash scripts/setup.sh [EXTRA ...]   (extras: data, bench, test, cluster, export, record3d, rivals)
 # Run again it does nothing, unless pyproject.toml has changed or an extra is wanted that is not there yet.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."

@@ -199,7 +199,7 @@ def _inertia(body: Body, shape: Shape) -> np.ndarray:
     return body.inertia if body.inertia is not None else body.mass / shape.volume * body.scale**2 * shape.inertia
 
 
-def _pieces(shape: Shape) -> list[Mesh]:
+def convex_pieces(shape: Shape) -> list[Mesh]:
     """Convex pieces [m]: the shape's own, or those of CoACD. Raises SdfsimError where there are none."""
     if own := own_pieces(shape):
         return own
@@ -221,7 +221,7 @@ def _cut(take: Take, wanted: Callable[[Body], bool], on_progress: StageProgress)
     pieces = {}
     for done, k in enumerate(todo):
         on_progress("convex pieces", done / len(todo), f"of {take.scene.shapes[k].name}")
-        pieces[k] = _pieces(take.scene.shapes[k])
+        pieces[k] = convex_pieces(take.scene.shapes[k])
     if todo:
         on_progress("convex pieces", 1.0, f"{sum(map(len, pieces.values()))} of {len(todo)} shapes")
     return pieces

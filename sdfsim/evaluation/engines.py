@@ -1,13 +1,18 @@
-"""PyBullet (the teacher) and MuJoCo, run from one start: of a recording, or of a scene."""
+"""PyBullet (the teacher), MuJoCo, Drake and Newton, run from one start: of a recording, or of a scene.
+
+Each takes the geometry that it is made for: PyBullet and MuJoCo convex pieces, MuJoCo also a mesh as an SDF (its own
+octree), Drake tetrahedra and Newton triangles. Spheres and boxes are exact in all of them.
+"""
 
 from __future__ import annotations
 
 import importlib
 import re
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +34,10 @@ from sdfsim.shape.shape import Shape, own_pieces
 
 SAME_INERTIA = 1e-3  # relative
 SOFTEST = 3.0  # MuJoCo: time constant of a contact over the engine's step, at least 2 for it to be stable
+MODULUS = 1e7  # Pa, of Drake's compliant bodies: its own default
+TETRAHEDRA = 0.05  # their edges over the diagonal of a shape's box
+ITERATIONS = 10  # of Newton's XPBD in an inner step
+LONGEST = 60.0  # s of the processor that an engine may take for a motion
 
 
 @dataclass(frozen=True)
@@ -40,12 +49,14 @@ class Start:
         urdfs: the engine's file of each shape, by name.
         floor: friction and restitution of the floor z = 0, or None for no floor.
         own_inertia: the bodies get the inertias of `motion`; else the engine takes its own, which must be the same.
+        meshes: the surface of each shape about its centre of mass, by name: for engines that collide surfaces.
     """
 
     motion: Trajectory
     urdfs: dict[str, Path]
     floor: tuple[float, float] | None
     own_inertia: bool = False
+    meshes: dict[str, Mesh] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -58,7 +69,7 @@ class Timing:
 
 
 def timed(advance: Callable[[int], object], steps: int) -> Timing:
-    """How long `advance` takes for a first step, and then for the others together."""
+    """How long `advance(count)` takes for a first step, and then for the others together."""
     began = time.perf_counter()
     advance(1)
     wall, cpu = time.perf_counter(), time.process_time()
@@ -87,8 +98,15 @@ def start_of_scene(scene: Scene, folder: Path, units: Units | None = None) -> St
     units = units or Units(1.0, 1.0, 1.0)
     motion = start_motion(scene, units)
     motion.position[..., 2] -= planes[0].position[2] / units.length if planes else 0.0
-    urdfs = {name: shape_urdf(scene.shapes[int(name)], folder) for name in sorted(set(motion.shape.tolist()))}
-    return Start(motion, urdfs, (planes[0].friction, planes[0].restitution) if planes else None, own_inertia=True)
+    shapes = {name: scene.shapes[int(name)] for name in sorted(set(motion.shape.tolist()))}
+    urdfs = {name: shape_urdf(shape, folder) for name, shape in shapes.items()}
+    floor = (planes[0].friction, planes[0].restitution) if planes else None
+    return Start(motion, urdfs, floor, True, {name: centred_mesh(shape) for name, shape in shapes.items()})
+
+
+def centred_mesh(shape: Shape) -> Mesh:
+    """A shape's surface about its centre of mass."""
+    return Mesh(shape.mesh.vertices - shape.com, shape.mesh.faces)
 
 
 def start_motion(scene: Scene, units: Units = Units(1.0, 1.0, 1.0)) -> Trajectory:  # noqa: B008
@@ -167,8 +185,8 @@ def bullet_at(start: Start, substeps: int | None = None) -> Iterator[Teacher]:
 # --- MuJoCo ---
 
 
-def mujoco(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajectory, Timing]:
-    """MuJoCo's motion of the same geometry, masses, inertias and starts.
+def mujoco(start: Start, steps: int, substeps: int = SUBSTEPS, *, pieces: bool = True) -> tuple[Trajectory, Timing]:
+    """MuJoCo's motion of the same masses, inertias and starts; of the same convex pieces, or of meshes as SDFs.
 
     It takes the larger of two coefficients of friction where the teacher multiplies. So geoms that meet the floor carry
     the product with the floor's, and those that meet other bodies carry their square: exact for bodies of one material.
@@ -177,47 +195,78 @@ def mujoco(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajecto
     Raises:
         SdfsimError: MuJoCo is not installed, or a shape's engine file cannot be read.
     """
-    try:
-        engine: Any = importlib.import_module("mujoco")
-    except ImportError as error:
-        raise SdfsimError("MuJoCo is not installed", "pip install 'sdfsim[bench]'") from error
+    engine = _engine("mujoco", "MuJoCo", "bench")
     t = start.motion
-    model = _mujoco_model(engine, start, t.dt / substeps)
+    model = _mujoco_model(engine, start, t.dt / substeps, pieces)
     data: Any = engine.MjData(model)
     moving = np.flatnonzero(~t.static)
     place, speed = data.qpos.reshape(-1, 7), data.qvel.reshape(-1, 6)
     place[:, :3], place[:, 3:] = t.position[0, moving], np.roll(t.quat_xyzw[0, moving], 1, axis=-1)
     turned = Rotation.from_quat(t.quat_xyzw[0, moving])
     speed[:, :3], speed[:, 3:] = t.velocity[0, moving], turned.inv().apply(t.angular_velocity[0, moving])
-    frames = [(place.copy(), speed.copy())]
 
-    def advance(count: int) -> None:
+    def advance() -> None:
+        for _ in range(substeps):
+            engine.mj_step(model, data)
+
+    def state() -> tuple[np.ndarray, ...]:
+        quat = np.roll(place[:, 3:], -1, axis=-1)
+        return place[:, :3].copy(), quat, speed[:, :3].copy(), Rotation.from_quat(quat).apply(speed[:, 3:])
+
+    return _motion(t, steps, advance, state)
+
+
+def _engine(module: str, title: str, extra: str) -> Any:
+    """An optional package. Raises SdfsimError when it is not installed."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise SdfsimError(f"{title} is not installed", f"pip install 'sdfsim[{extra}]'") from error
+
+
+def _motion(
+    start: Trajectory, steps: int, advance: Callable[[], None], state: Callable[[], tuple[np.ndarray, ...]]
+) -> tuple[Trajectory, Timing]:
+    """The motion of an engine, and its time.
+
+    Args:
+        start: its first frame counts.
+        steps: to record.
+        advance: makes one recorded step.
+        state: positions [M, 3] m, quaternions [M, 4] xyzw, velocities [M, 3] m/s and rad/s of the bodies that move, in
+            the frame of the world.
+
+    Raises:
+        SdfsimError: the motion is not finite, or takes too long.
+    """
+    began = time.process_time()
+    frames = [state()]
+
+    def advanced(count: int) -> None:
         for _ in range(count):
-            for _ in range(substeps):
-                engine.mj_step(model, data)
-            frames.append((place.copy(), speed.copy()))
+            advance()
+            frames.append(state())
+            if not np.isfinite(frames[-1][0]).all():
+                raise SdfsimError(f"a position is not finite after {len(frames) - 1} steps")
+            if time.process_time() - began > LONGEST:
+                raise SdfsimError(f"{len(frames) - 1} of {steps} steps in {LONGEST:g} s")
 
-    timing = timed(advance, steps)
-    places, speeds = (np.array(kind) for kind in zip(*frames, strict=True))
-    still = np.zeros((steps + 1, *t.velocity.shape[1:]))
-    motion = {"position": still + t.position[0], "velocity": still, "angular_velocity": still.copy()}
-    motion["quat_xyzw"] = np.repeat(t.quat_xyzw[:1], steps + 1, axis=0)
-    motion["position"][:, moving] = places[..., :3]
-    motion["quat_xyzw"][:, moving] = np.roll(places[..., 3:], -1, axis=-1)
-    motion["velocity"][:, moving] = speeds[..., :3]
-    turned = Rotation.from_quat(motion["quat_xyzw"][:, moving].reshape(-1, 4))
-    motion["angular_velocity"][:, moving] = turned.apply(speeds[..., 3:].reshape(-1, 3)).reshape(len(speeds), -1, 3)
-    return replace(t, **motion), timing
+    timing = timed(advanced, steps)
+    names = ("position", "quat_xyzw", "velocity", "angular_velocity")
+    motion = {name: np.repeat(getattr(start, name)[:1], steps + 1, axis=0) for name in names}
+    for name, found in zip(names, zip(*frames, strict=True), strict=True):
+        motion[name][:, ~start.static] = found
+    return replace(start, **motion), timing
 
 
-def _mujoco_model(engine: Any, start: Start, step: float) -> Any:
+def _mujoco_model(engine: Any, start: Start, step: float, pieces: bool) -> Any:
     t, spec = start.motion, engine.MjSpec()
     spec.option.timestep, spec.option.gravity = step, t.gravity
     spec.memory = 2**31
     if start.floor:
         ground = spec.worldbody.add_geom(type=engine.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1.0])
         ground.contype, ground.conaffinity, ground.friction[0], ground.solmix = 0, 1, 0.0, 1e-6
-    forms = {name: _forms(engine, urdf) for name, urdf in start.urdfs.items()}
+    forms = {name: _forms(engine, urdf, None if pieces else start.meshes[name]) for name, urdf in start.urdfs.items()}
     for i, name in enumerate(t.shape):
         body = spec.worldbody.add_body(name=f"b{i}")
         if t.static[i]:
@@ -226,14 +275,15 @@ def _mujoco_model(engine: Any, start: Start, step: float) -> Any:
             body.add_freejoint()
             body.explicitinertial = True
             body.mass, body.inertia, body.ipos = float(t.mass[i]), t.inertia[i], np.zeros(3)
-        for k, (kind, size, vertices) in enumerate(forms[str(name)]):
+        for k, (kind, form) in enumerate(forms[str(name)]):
             shape: dict[str, Any] = {"type": kind}
-            if vertices is None:
-                shape["size"] = t.scale[i] * size
+            if not isinstance(form, dict):
+                shape["size"] = t.scale[i] * form
             else:
                 shape["meshname"] = f"{name}_{t.scale[i]:.9g}_{k}"
                 if spec.mesh(shape["meshname"]) is None:
-                    spec.add_mesh(name=shape["meshname"], uservert=(vertices * t.scale[i]).ravel())
+                    scaled = {"uservert": (form["uservert"] * t.scale[i]).ravel()}
+                    spec.add_mesh(name=shape["meshname"], **form | scaled)
             for other in (start.floor, (t.friction[i], t.restitution[i])):
                 if other is None:
                     continue
@@ -246,16 +296,187 @@ def _mujoco_model(engine: Any, start: Start, step: float) -> Any:
     return spec.compile()
 
 
-def _forms(engine: Any, urdf: Path) -> list[tuple[Any, np.ndarray, np.ndarray | None]]:
-    """MuJoCo's kind of geom, its size [3] m, and its vertices [V, 3] m where it is a mesh: one a convex piece."""
+def _forms(engine: Any, urdf: Path, mesh: Mesh | None) -> list[tuple[Any, np.ndarray | dict[str, Any]]]:
+    """MuJoCo's kind of geom, and its size [3] m or what makes its mesh: one a convex piece, or an SDF of `mesh`."""
     kind, sizes = form_of(urdf)
     if kind == "sphere":
-        return [(engine.mjtGeom.mjGEOM_SPHERE, np.array([*sizes, 0.0, 0.0]), None)]
+        return [(engine.mjtGeom.mjGEOM_SPHERE, np.array([*sizes, 0.0, 0.0]))]
     if kind == "box":
-        return [(engine.mjtGeom.mjGEOM_BOX, 0.5 * sizes, None)]
-    return [
-        (engine.mjtGeom.mjGEOM_MESH, np.zeros(3), piece.vertices) for piece in load_pieces(urdf.with_suffix(".obj"))
-    ]
+        return [(engine.mjtGeom.mjGEOM_BOX, 0.5 * sizes)]
+    if mesh is not None:
+        return [(engine.mjtGeom.mjGEOM_SDF, {"uservert": mesh.vertices, "userface": mesh.faces.ravel()})]
+    pieces = load_pieces(urdf.with_suffix(".obj"))
+    return [(engine.mjtGeom.mjGEOM_MESH, {"uservert": piece.vertices}) for piece in pieces]
+
+
+# --- Drake ---
+
+
+def drake(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajectory, Timing]:
+    """Drake's motion with hydroelastic contact: bodies that move are compliant tetrahedra, others rigid triangles.
+
+    It combines two coefficients of friction by their harmonic mean, where the teacher multiplies. So every body carries
+    its own square, and the floor what suits the median body: exact where all have one friction. Restitution is 0.
+
+    Raises:
+        SdfsimError: Drake or fTetWild are not installed, or the motion fails.
+    """
+    lib = _engine("pydrake.all", "Drake", "rivals")
+    t, builder = start.motion, lib.DiagramBuilder()
+    settings = lib.MultibodyPlantConfig(time_step=t.dt / substeps, contact_model="hydroelastic_with_fallback")
+    plant, _ = lib.AddMultibodyPlant(settings, builder)
+    plant.mutable_gravity_field().set_gravity_vector(t.gravity)
+
+    def surface(friction: float, compliant: bool, size: float) -> Any:
+        found = lib.ProximityProperties()
+        lib.AddContactMaterial(dissipation=None, friction=lib.CoulombFriction(friction, friction), properties=found)
+        if compliant:
+            lib.AddCompliantHydroelasticProperties(0.25 * size, MODULUS, found)
+        else:
+            lib.AddRigidHydroelasticProperties(0.25 * size, found)
+        return found
+
+    own = t.friction**2
+    if start.floor:
+        wanted = start.floor[0] * t.friction
+        friction = float(np.median(wanted * own / np.maximum(2.0 * own - wanted, 1e-3)))
+        world = (plant.world_body(), lib.RigidTransform())
+        plant.RegisterCollisionGeometry(*world, lib.HalfSpace(), "floor", surface(friction, False, 1.0))
+    bodies = []
+    with tempfile.TemporaryDirectory() as scratch:  # files are read when the simulator is made
+        for i, name in enumerate(map(str, t.shape)):
+            kind, sizes = form_of(start.urdfs[name])
+            place = lib.RigidTransform(lib.Quaternion(np.roll(t.quat_xyzw[0, i], 1)), t.position[0, i])
+            scale, moves = float(t.scale[i]), not t.static[i]
+            if kind == "sphere":
+                form: Any = lib.Sphere(scale * sizes[0])
+            elif kind == "box":
+                form = lib.Box(*(scale * sizes))
+            else:
+                file = Path(scratch) / (f"{name}.vtk" if moves else f"{name}.obj")
+                if not file.exists():
+                    mesh = start.meshes[name]
+                    write_text(file, _tetrahedra(mesh, start.urdfs[name]) if moves else wavefront([mesh]))
+                form = lib.Mesh(str(file), scale)
+            size = scale * float(sizes.min() if len(sizes) else np.ptp(start.meshes[name].vertices, axis=0).min())
+            properties = surface(float(own[i]), moves, size)
+            if not moves:
+                plant.RegisterCollisionGeometry(plant.world_body(), place, form, f"g{i}", properties)
+                continue
+            inertia = lib.UnitInertia(*(t.inertia[i] / t.mass[i]))
+            body = plant.AddRigidBody(f"b{i}", lib.SpatialInertia(float(t.mass[i]), np.zeros(3), inertia))
+            plant.RegisterCollisionGeometry(body, lib.RigidTransform(), form, f"g{i}", properties)
+            bodies.append((i, body, place))
+        plant.Finalize()
+        simulator = lib.Simulator(builder.Build())
+    context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    for i, body, place in bodies:
+        plant.SetFreeBodyPose(context, body, place)
+        speed = lib.SpatialVelocity(t.angular_velocity[0, i], t.velocity[0, i])
+        plant.SetFreeBodySpatialVelocity(context=context, body=body, V_JpJc=speed)
+    simulator.Initialize()
+    made = 0
+
+    def advance() -> None:
+        nonlocal made
+        made += 1
+        simulator.AdvanceTo(made * t.dt)
+
+    def state() -> tuple[np.ndarray, ...]:
+        places = [plant.EvalBodyPoseInWorld(context, body) for _, body, _ in bodies]
+        speeds = [plant.EvalBodySpatialVelocityInWorld(context, body) for _, body, _ in bodies]
+        quat = np.roll([place.rotation().ToQuaternion().wxyz() for place in places], -1, axis=-1)
+        velocity = [speed.translational() for speed in speeds]
+        return (
+            np.array([p.translation() for p in places]),
+            quat,
+            np.array(velocity),
+            np.array([speed.rotational() for speed in speeds]),
+        )
+
+    return _motion(t, steps, advance, state)
+
+
+def _tetrahedra(mesh: Mesh, beside: Path) -> str:
+    """A VTK file of tetrahedra that fill a closed mesh, kept beside the shape's URDF."""
+    kept = beside.with_suffix(".vtk")
+    if not kept.exists():
+        filler = _engine("pytetwild", "fTetWild", "rivals")
+        points, cells = filler.tetrahedralize(
+            mesh.vertices.astype(float), mesh.faces.astype(np.int32), edge_length_fac=TETRAHEDRA
+        )
+        corner = points[cells[:, 0], None]
+        volume = np.linalg.det(points[cells[:, 1:]] - corner)
+        cells = np.where(volume[:, None] < 0, cells[:, [0, 2, 1, 3]], cells)[np.abs(volume) > 0]
+        lines = ["# vtk DataFile Version 3.0", "tetrahedra", "ASCII", "DATASET UNSTRUCTURED_GRID"]
+        lines += [f"POINTS {len(points)} double", *(" ".join(f"{x:.9g}" for x in point) for point in points)]
+        lines += [f"CELLS {len(cells)} {5 * len(cells)}", *("4 " + " ".join(map(str, cell)) for cell in cells)]
+        lines += [f"CELL_TYPES {len(cells)}", *["10"] * len(cells)]
+        write_text(kept, "\n".join(lines) + "\n")
+    return kept.read_text(encoding="utf-8")
+
+
+# --- Newton ---
+
+
+def newton(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajectory, Timing]:
+    """Newton's motion on the CPU, by XPBD on triangle meshes, contacts searched in every inner step.
+
+    It takes the mean of two coefficients of friction. So every body carries its square, and the floor what suits the
+    median body: exact where all have one friction. Its kernels compile for a minute on a machine's first run.
+
+    Raises:
+        SdfsimError: Newton is not installed, or the motion fails.
+    """
+    warp, lib = (_engine(name, "Newton", "rivals") for name in ("warp", "newton"))
+    warp.config.quiet = True
+    t, builder = start.motion, lib.ModelBuilder(gravity=tuple(map(float, start.motion.gravity)))
+
+    def surface(friction: float) -> Any:
+        return lib.ModelBuilder.ShapeConfig(mu=friction, density=0.0)
+
+    own = t.friction**2
+    if start.floor:
+        builder.add_ground_plane(cfg=surface(max(0.0, float(np.median(2.0 * start.floor[0] * t.friction - own)))))
+    meshes, moving = {}, []
+    for i, name in enumerate(map(str, t.shape)):
+        kind, sizes = form_of(start.urdfs[name])
+        scale, body, place = float(t.scale[i]), -1, warp.transform(t.position[0, i], t.quat_xyzw[0, i])
+        if not t.static[i]:
+            inertia = warp.mat33(np.diag(t.inertia[i]))
+            body = builder.add_body(xform=place, mass=float(t.mass[i]), inertia=inertia, lock_inertia=True)
+            moving.append(i)
+        shape = {"cfg": surface(float(own[i])), "xform": place if body < 0 else None}
+        if kind == "sphere":
+            builder.add_shape_sphere(body, radius=scale * float(sizes[0]), **shape)
+        elif kind == "box":
+            half = 0.5 * scale * sizes
+            builder.add_shape_box(body, hx=half[0], hy=half[1], hz=half[2], **shape)
+        else:
+            if name not in meshes:
+                mesh = start.meshes[name]
+                meshes[name] = lib.Mesh(mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32).ravel())
+            builder.add_shape_mesh(body, mesh=meshes[name], scale=(scale,) * 3, **shape)
+    model = builder.finalize(device="cpu")
+    solver = lib.solvers.SolverXPBD(model, iterations=ITERATIONS)
+    pipeline = lib.CollisionPipeline(model)
+    contacts, now, then = pipeline.contacts(), model.state(), model.state()
+    speeds = np.concatenate([t.velocity[0, moving], t.angular_velocity[0, moving]], axis=1).astype(np.float32)
+    now.body_qd.assign(speeds)
+
+    def advance() -> None:
+        nonlocal now, then
+        for _ in range(substeps):
+            now.clear_forces()
+            pipeline.collide(now, contacts)
+            solver.step(now, then, None, contacts, t.dt / substeps)
+            now, then = then, now
+
+    def state() -> tuple[np.ndarray, ...]:
+        places, speeds = now.body_q.numpy().astype(float), now.body_qd.numpy().astype(float)
+        return places[:, :3], places[:, 3:], speeds[:, :3], speeds[:, 3:]
+
+    return _motion(t, steps, advance, state)
 
 
 # --- the engine's files ---

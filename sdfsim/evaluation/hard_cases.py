@@ -35,6 +35,7 @@ FIXED: dict[str, Any] = {"motion": "static", "mass": 0.0, "friction": FLOOR_FRIC
 NUDGE = 1e-3  # m and rad: how far repetitions of a case start from the exact one
 PLATE = 0.01  # m, thickness of what fast bodies are thrown at
 BRICK = (1.0, 0.5, 0.4)  # m
+PLANK = (1.0, 0.2, 0.1)  # m
 CARD = (0.06, 0.6, 1.0)  # m, thickness along x, standing
 LEAN = 20.0  # degrees from upright
 BALLS = 8  # dropped at once
@@ -117,7 +118,7 @@ class Case:
         measure: of the motions of these scenes, in their order; gives `figures`.
         repeats: repetitions, from starts slightly off or with other random scenes: their spread is the noise.
         cuda: the scenes are simulated a second time there, behind the first.
-        teacher: whether the teacher can take part.
+        engines: whether engines can take part.
         x: where it stands in its group's plot of the first figure; None for a case that is not one of a row.
     """
 
@@ -130,7 +131,7 @@ class Case:
     seconds: float = 3.0
     repeats: int = 3
     cuda: bool = False
-    teacher: bool = True
+    engines: bool = True
     x: float | None = None
 
 
@@ -317,6 +318,27 @@ def wall(layers: int = 5, length: int = 4) -> Scene:
             mass = 0.5 if shape else 1.0
             bricks.append(body(f"brick[{len(bricks)}]", shape, [x, 0, high * (0.5 + k)], mass=mass))
     return on_floor([box(*BRICK), box(long / 2, deep, high)], bricks)
+
+
+def planks(layers: int = 6) -> Scene:
+    """A Kapla tower: layers of three planks, every other one turned by a right angle."""
+    long, wide, high = PLANK
+    across = Rotation.from_euler("z", 90, degrees=True)
+    bodies = []
+    for k in range(3 * layers):
+        layer, side = k // 3, 0.4 * long * (k % 3 - 1)
+        turn = across if layer % 2 else Rotation.identity()
+        place = turn.apply([0.0, side, high * (0.5 + layer)])
+        bodies.append(body(f"plank[{k}]", 0, place, quat_xyzw=turn.as_quat()))
+    return on_floor([box(long, wide, high)], bodies)
+
+
+def slab_on_bowl() -> Scene:
+    """A slab of 2 cm that lies across the rim of a bowl, a mesh."""
+    vessel = shape_from_primitive("bowl", sdf="grid", name="bowl")
+    rim = float(vessel.mesh.vertices[:, 2].max())
+    still = body("bowl", 1, [0, 0, 0.5], **FIXED)
+    return on_floor([box(1.2, 1.2, 0.02), vessel], [body("slab", 0, [0, 0, 0.5 + rim + 0.01]), still])
 
 
 def card_house() -> Scene:
@@ -633,13 +655,17 @@ def cases(*, quick: bool = False, shapes: Path | None = None) -> list[Case]:
         add(f"rest-{name}", f"{name}, sleep off", awake, partial(rest, times=times), *drifts, speed, height,
             seconds=times[-1], repeats=2)  # fmt: skip
         add(f"rest-{name}-sleep", f"{name}, sleep on", asleep, partial(rest, times=times[:1]),
-            Figure("motion", "m", 9, limit=0.0), drifts[0], seconds=times[0], repeats=2, teacher=False)  # fmt: skip
+            Figure("motion", "m", 9, limit=0.0), drifts[0], seconds=times[0], repeats=2, engines=False)  # fmt: skip
 
+    speed = Figure("speed", "m/s", 4, limit=0.01)
+    add("rest-slab", "slab of 2 cm on a bowl, a mesh, sleep off", slab_on_bowl(), partial(rest, times=times[:1]),
+        drifts[0], speed, Figure("height", "%", 2, limit=5.0), seconds=times[0], repeats=2)  # fmt: skip
     fallen, shift = Figure("fallen", "bodies", 1, limit=0.0), Figure("shift", "% of size", 1)
     for n in TOWERS:
         add(f"tower-{n}", f"tower of {n}", tower(n), standing, fallen, shift, group="stack", x=float(n))
     add("pyramid", "pyramid of 10 cubes", pyramid(), standing, fallen, shift, group="stack")
     add("wall", "wall of 22 bricks", wall(), standing, fallen, shift, group="stack")
+    add("planks", "Kapla tower of six layers, 5 s", planks(), standing, fallen, shift, group="stack", seconds=5.0)
     add("cards", "two cards that lean on each other", card_house(), standing, fallen, shift, group="stack")
     for m in RATIOS:
         depth = Figure("worst depth", "% of size", 1)
@@ -674,7 +700,7 @@ def cases(*, quick: bool = False, shapes: Path | None = None) -> list[Case]:
 
     diverges = Figure("diverges after", "s", 2, longer=True)
     add("start-off", "start 1e-6 m/s off", off, diverged, diverges, group="precision", repeats=2)
-    add("cuda", "on CUDA", plain, diverged, diverges, group="precision", repeats=2, teacher=False, cuda=True)
+    add("cuda", "on CUDA", plain, diverged, diverges, group="precision", repeats=2, engines=False, cuda=True)
     return found
 
 

@@ -1,4 +1,4 @@
-"""Runs the hard cases with models and the teacher; their table, plots and report."""
+"""Runs the hard cases with models, the teacher and other engines; their table, plots and report."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.simulator import SimulationError, Simulator, pick_device
 from sdfsim.dynamics.training_ranges import constant_in_training
 from sdfsim.errors import SdfsimError
-from sdfsim.evaluation.engines import bullet, rollout_motion, shape_urdf, start_of_scene
+from sdfsim.evaluation.engines import bullet, drake, mujoco, rollout_motion, shape_urdf, start_motion, start_of_scene
 from sdfsim.evaluation.hard_cases import GROUPS, Case, Figure, Run, cases, ran_away
 from sdfsim.evaluation.harness import Job, Line, Panel, Results, check_matplotlib, draw, markdown, measure
 from sdfsim.files import locked, write_json, write_text
@@ -28,6 +28,7 @@ from sdfsim.shape.sdf import PlaneSdf
 
 VERSION = 3  # counts up when what is measured changes, so that kept results are measured again
 TEACHER = "teacher"
+ENGINES = {TEACHER: bullet, "MuJoCo": mujoco, "Drake": drake}
 OUTSIDE = "†"
 WATCHED = 10.0  # s of a recording
 LEGEND = (
@@ -45,7 +46,7 @@ class Study:
     """All results of the hard cases.
 
     Attributes:
-        who: models, then the teacher where PyBullet is installed.
+        who: models, then engines; the teacher where PyBullet is installed.
         results: (case, who) -> figures (name -> a value a repetition), broke and outside (lines) and recording (a
             path in the folder, or None); nothing for a case that one cannot take part in.
         quick: whether it is the short form.
@@ -64,6 +65,7 @@ def stress(
     quick: bool = False,
     shapes: Path | None = None,
     device: str = "cpu",
+    engines: Sequence[str] = (TEACHER,),
     record: Record | None = None,
     on_progress: Progress = silent,
 ) -> Study:
@@ -73,6 +75,7 @@ def stress(
         models: names or paths; none for the solver and all bundled networks.
         quick: fewer and shorter cases.
         shapes: folder of meshes that are to rest on the floor too, or name of a public set (see `public_folder`).
+        engines: of `ENGINES`.
         record: writes a motion of each case that is not as wanted into a file; None for no recordings.
 
     Raises:
@@ -85,7 +88,7 @@ def stress(
     if twice := {name for name in who if who.count(name) > 1}:
         raise SdfsimError(f"two models are called {min(twice)!r}", "rename a file: results are kept by name")
     found = cases(quick=quick, shapes=shapes and public_folder(shapes, on_progress))
-    with_teacher = _teacher_is_here()
+    engines = [name for name in engines if name != TEACHER or _teacher_is_here()]
     jobs, cut = [], {}
     for case in found:
         repeats = [case.scenes(repeat) for repeat in range(case.repeats)]
@@ -97,9 +100,9 @@ def stress(
             if not case.cuda or (model.kind != SOLVER and torch.cuda.is_available()):
                 arguments = (case, model, device, out, record)
                 jobs.append(Job(case.name, model.name, [content, model, device], _tried, arguments, weight))
-        if with_teacher and case.teacher:
-            settings, arguments = [TEACHER_VERSION, engine_settings(DT, SUBSTEPS)], (case, None, "", out, None)
-            jobs.append(Job(case.name, TEACHER, [content, settings], _tried, arguments, 0.05 * weight))
+        for name in engines if case.engines else []:
+            settings, arguments = [TEACHER_VERSION, engine_settings(DT, SUBSTEPS)], (case, name, "", out, None)
+            jobs.append(Job(case.name, name, [content, settings], _tried, arguments, 0.05 * weight))
             cut |= {id(shape): shape for scene in repeats[0] for shape in scene.shapes}
     with locked(out):
         for shape in cut.values():  # before the work is split up, so that no two processes cut one mesh into pieces
@@ -108,7 +111,7 @@ def stress(
         results = measure(jobs, out / "results", where="cores", on_progress=on_progress)
     if failed := [f"{case} with {one}: {r['failed']}" for (case, one), r in results.items() if "failed" in r]:
         raise SdfsimError(failed[0])
-    return Study(found, [*who, TEACHER] if with_teacher else who, results, quick)
+    return Study(found, [*who, *engines], results, quick)
 
 
 def _teacher_is_here() -> bool:
@@ -119,16 +122,16 @@ def _teacher_is_here() -> bool:
     return True
 
 
-def _tried(case: Case, model: Model | None, device: str, out: Path, record: Record | None) -> dict[str, Any]:
-    """All repetitions of a case with one model, or with the teacher: see `Study.results`."""
+def _tried(case: Case, model: Model | str, device: str, out: Path, record: Record | None) -> dict[str, Any]:
+    """All repetitions of a case with one model, or with an engine by name: see `Study.results`."""
     figures: dict[str, list[float]] = {figure.name: [] for figure in case.figures}
     result: dict[str, Any] = {"figures": figures, "broke": [], "outside": [], "recording": None}
-    if model and (about := GROUPS[case.group].about) in constant_in_training(model):
+    if isinstance(model, Model) and (about := GROUPS[case.group].about) in constant_in_training(model):
         result["outside"].append(f"{about} was constant in training, so it was not learned")
     for repeat in range(case.repeats):
         scenes = case.scenes(repeat)
-        if model is None:
-            runs = [taught(scene, out / "engine", case.seconds) for scene in scenes]
+        if isinstance(model, str):
+            runs = [by_engine(model, scene, out / "engine", case.seconds) for scene in scenes]
         else:
             places = [device, "cuda"] if case.cuda else [device]
             runs = [simulated(scene, model, place, case.seconds) for place in places for scene in scenes]
@@ -138,7 +141,7 @@ def _tried(case: Case, model: Model | None, device: str, out: Path, record: Reco
             values.append(float(measured[name]))
         result["broke"] += [run.broke for run in runs if run.broke]
         missed = any(f.limit is not None and measured[f.name] > f.limit for f in case.figures)
-        if record and model and result["recording"] is None and (result["broke"] or missed):
+        if record and isinstance(model, Model) and result["recording"] is None and (result["broke"] or missed):
             shown = next((run for run in runs if run.broke), runs[0])
             assert shown.rollout is not None
             path = Path("recordings") / model.name / f"{case.name}.rrd"
@@ -160,9 +163,14 @@ def simulated(scene: Scene, model: Model, device: str, seconds: float) -> Run:
     return run if broke else replace(run, broke=ran_away(run))
 
 
-def taught(scene: Scene, folder: Path, seconds: float) -> Run:
-    """The teacher's motion of a scene (see `start_of_scene`), with the engine's files in `folder`. It has no sleep."""
-    motion, _ = bullet(start_of_scene(scene, folder), max(1, round(seconds / DT)))
+def by_engine(name: str, scene: Scene, folder: Path, seconds: float) -> Run:
+    """An engine's motion of a scene (see `start_of_scene`), with its files in `folder`. It has no sleep."""
+    try:
+        motion, _ = ENGINES[name](start_of_scene(scene, folder), max(1, round(seconds / DT)))
+    except SdfsimError as error:
+        if name == TEACHER:
+            raise
+        return Run(scene, start_motion(scene), error.message)
     run = Run(scene, motion)
     return replace(run, broke=ran_away(run))
 
@@ -293,7 +301,7 @@ def write_report(study: Study, out: Path) -> dict[str, Any]:
         "failed_checks": [
             f"{case} with {who} blew up: {result['broke'][0]}"
             for (case, who), result in study.results.items()
-            if result["broke"] and who != TEACHER
+            if result["broke"] and who not in ENGINES
         ],
     }
     write_json(out / "report.json", report)

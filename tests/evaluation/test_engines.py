@@ -14,8 +14,8 @@ from sdfsim.dynamics.model import load_model
 from sdfsim.dynamics.units import scene_units
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation import hard_cases
-from sdfsim.evaluation.engines import bullet, mujoco, shape_urdf, start_of_scene
-from sdfsim.evaluation.stress import taught
+from sdfsim.evaluation.engines import bullet, drake, mujoco, newton, shape_urdf, start_of_scene
+from sdfsim.evaluation.stress import TEACHER, by_engine
 from sdfsim.scene.scene_file import load_scene
 from sdfsim.shape.mesh import load_pieces
 from sdfsim.shape.shape import analytic_shape, shape_from_primitive
@@ -50,11 +50,12 @@ def test_a_scene_is_a_start_in_the_model_s_units(tmp_path):
     np.testing.assert_allclose(motion.inertia, np.stack([cube] * 3, -1))
 
 
-@pytest.mark.parametrize("run", [bullet, mujoco])
 @pytest.mark.parametrize("substeps", [5, 2])
-def test_engines_fly_freely_and_rest(tmp_path, run, substeps):
-    if run is mujoco:
-        pytest.importorskip("mujoco")
+@pytest.mark.parametrize(
+    ("run", "package"), [(bullet, "pybullet"), (mujoco, "mujoco"), (drake, "pydrake"), (newton, "newton")]
+)
+def test_engines_fly_freely_and_rest(tmp_path, run, package, substeps):
+    pytest.importorskip(package)
     start, units = started(tmp_path)
     steps = round(0.4 / units.time / 0.02)
     motion, timing = run(start, steps, substeps)
@@ -71,7 +72,7 @@ def test_engines_fly_freely_and_rest(tmp_path, run, substeps):
 
 def test_the_teacher_has_the_scenes_own_masses_and_starts(tmp_path):
     scene = hard_cases.tossed((3,))
-    motion = taught(scene, tmp_path, 0.04).motion
+    motion = by_engine(TEACHER, scene, tmp_path, 0.04).motion
     bodies = scene.bodies[:-1]
     assert motion.position.shape == (3, len(bodies), 3)
     np.testing.assert_allclose(motion.position[0], [b.position for b in bodies], atol=1e-12)

@@ -1,0 +1,340 @@
+"""Our solver and what people would take instead, on shapes that are hard for them: RESULTS.md.
+
+    python benchmarks/rivals.py DATA -o DIR [--only CASE ...]
+
+DATA is a MOVi-B dataset. Every engine simulates every case with inner steps of 10, 4, 2 and 1 ms (of bodies of a
+metre; smaller ones in proportion to the root of their size), one thread, processor time. No engine is another's truth:
+an error is the distance from the same engine's motion at 1 ms. Depth is measured on the exact surfaces. Convex pieces
+are CoACD's, with one setting for all, where a shape has none of its own. Making them, tetrahedra and kernels is not
+timed. Restitution is 0, friction the same for all. DIR keeps results; the table in RESULTS.md is written from them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.results import write_section
+from samples.large import sample_shape, write_scene
+from sdfsim.data.batching import scene_of
+from sdfsim.data.dataset import FLOOR, Trajectory, load_shapes, trajectory_files
+from sdfsim.dynamics.bodies import largest_extent
+from sdfsim.dynamics.model import load_model
+from sdfsim.dynamics.simulator import Simulator, join
+from sdfsim.dynamics.units import scene_units
+from sdfsim.errors import SdfsimError, run_main
+from sdfsim.evaluation.engines import (
+    LONGEST,
+    bullet,
+    drake,
+    mujoco,
+    newton,
+    rollout_motion,
+    start_of_scene,
+    timed,
+)
+from sdfsim.evaluation.hard_cases import ball, body, box, on_floor
+from sdfsim.evaluation.harness import Job, Results, markdown, measure, number, peak_memory
+from sdfsim.evaluation.penetration import depths
+from sdfsim.export import convex_pieces
+from sdfsim.files import write_text
+from sdfsim.scene.scene import Effects, Scene
+from sdfsim.scene.scene_file import load_scene
+from sdfsim.shape.mesh import Mesh, clean, load_pieces, wavefront
+from sdfsim.shape.sdf import BoxSdf, PlaneSdf, SphereSdf
+from sdfsim.shape.shape import Shape, analytic_shape, mesh_shape, own_pieces, shape_from_mesh
+
+ENGINES: dict[str, Callable[..., tuple[Trajectory, Any]] | None] = {
+    "sdfsim": None,
+    "PyBullet, pieces": bullet,
+    "MuJoCo, pieces": mujoco,
+    "MuJoCo, SDF": lambda *arguments: mujoco(*arguments, pieces=False),
+    "Drake, hydroelastic": drake,
+    "Newton, XPBD": newton,
+}
+INNER = (2, 5, 10, 20)  # inner steps in one of 20 ms; the last is an engine's own truth
+USUAL = 5
+STEPS = 100
+COMPARED = 25  # steps over which an engine is compared with itself: later, chaos says more than the step
+HEAP_STEPS = 20  # of the large scenes: enough to time a step
+MOVI_B = 5  # trajectories
+DEEP = 0.01  # of the smallest body's size: "equal penetration"
+FRICTION = 0.7  # of everything: 0.49 where two meet
+BALLS = (16, 64, 512)
+
+
+# --- the cases ---
+
+
+def implicit(
+    name: str, field: Callable[[np.ndarray], np.ndarray], half: tuple[float, float, float], cell: float
+) -> Mesh:
+    """The surface where a field [P, 3] m -> [P] is 0, within a box of half-sizes m about the origin."""
+    from skimage.measure import marching_cubes
+
+    axes = [np.arange(-h - 2 * cell, h + 2.5 * cell, cell) for h in half]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+    values = field(points.reshape(-1, 3)).reshape(points.shape[:3])
+    vertices, faces, _, _ = marching_cubes(values, 0.0, spacing=(cell,) * 3)
+    mesh = Mesh(vertices.astype(np.float64) + [axis[0] for axis in axes], faces.astype(np.int64))
+    return clean(mesh, name=name)
+
+
+def mug() -> Mesh:
+    """A mug of 1 m without what it stands on: open at the top, its handle a ring at +x."""
+
+    def field(p: np.ndarray) -> np.ndarray:
+        radius = np.hypot(p[:, 0], p[:, 1])
+        outside = np.maximum(radius - 0.35, np.abs(p[:, 2]) - 0.5)
+        inside = np.maximum(radius - 0.29, -0.44 - p[:, 2])
+        ring = np.hypot(np.hypot(p[:, 0] - 0.36, p[:, 2]) - 0.24, p[:, 1]) - 0.05
+        return np.minimum(np.maximum(outside, -inside), np.maximum(ring, 0.32 - radius))
+
+    return implicit("mug", field, (0.66, 0.36, 0.51), 0.02)
+
+
+def rugged() -> Mesh:
+    """Ground 6 m wide of 200,000 triangles, in place of a scan: hills, an arch to fall through and noise of 2 mm."""
+    rng = np.random.default_rng(0)
+    waves = [(rng.uniform(1, 5, 2), rng.uniform(0, 6.3), rng.uniform(0.03, 0.12)) for _ in range(12)]
+
+    def field(p: np.ndarray) -> np.ndarray:
+        hills = sum(a * np.sin(p[:, 0] * k[0] + p[:, 1] * k[1] + phase) for k, phase, a in waves)
+        ground = np.maximum(np.abs(p[:, :2]).max(1) - 3.0, np.maximum(p[:, 2] - 0.3 * hills, -0.9 - p[:, 2]))
+        arch = np.hypot(np.hypot(p[:, 0], p[:, 2]) - 0.55, p[:, 1]) - 0.12
+        return np.minimum(ground, arch) + rng.normal(0.0, 0.002, len(p))
+
+    return implicit("ground", field, (3.0, 3.0, 1.0), 0.028)
+
+
+def fitted(mesh: Mesh, folder: Path) -> Shape:
+    """The learned shape of a mesh, by way of its file."""
+    file = folder / f"{mesh.digest()[:12]}.obj"
+    if not file.exists():
+        write_text(file, wavefront([mesh]))
+    return shape_from_mesh(file)
+
+
+def bowls(folder: Path) -> Scene:
+    """Six bowls fall into each other."""
+    rng = np.random.default_rng(1)
+    places = [(*rng.uniform(-0.05, 0.05, 2), 0.5 + 0.6 * k) for k in range(6)]
+    return on_floor([sample_shape("bowl")], [body(f"bowl{k}", 0, place) for k, place in enumerate(places)])
+
+
+def knots(folder: Path) -> Scene:
+    """Twelve torus knots fall into a heap."""
+    return load_scene(write_scene("knots", folder / "knots", 12))
+
+
+def mugs(folder: Path) -> Scene:
+    """Four mugs hang by their handles on pegs that slope a little; each falls 4 cm and swings."""
+    turned = Rotation.from_euler("x", 75, degrees=True).as_quat()  # a peg along z, tipped towards -y
+    bodies = []
+    for k in range(4):
+        bodies.append(body(f"peg{k}", 1, (1.5 * k, 0.0, 2.0), motion="static", mass=0.0, quat_xyzw=turned))
+        bodies.append(body(f"mug{k}", 0, (1.5 * k - 0.36, 0.0, 1.9), velocity=np.array([0.3 * k, 0.0, 0.0])))
+    return on_floor([fitted(mug(), folder), analytic_shape("capsule", radius=0.05, height=0.9)], bodies)
+
+
+def scan(folder: Path) -> Scene:
+    """Ten bodies fall onto `rugged` ground."""
+    shapes = [sample_shape(name) for name in ("bowl", "cone", "ring")]
+    shapes += [box(0.5), ball(0.5), mesh_shape(rugged(), name="ground", kind="mesh")]
+    rng = np.random.default_rng(2)
+    bodies = [
+        body(
+            f"b{k}", k % 5, (0.9 * (k % 4) - 1.35, 0.9 * (k // 4) - 0.9, 1.5), scale=0.6 if k % 5 < 3 else 1.0,
+            quat_xyzw=Rotation.random(rng=rng).as_quat(),
+        )
+        for k in range(10)
+    ]  # fmt: skip
+    return on_floor(shapes, [*bodies, body("ground", 5, (0.0, 0.0, 1.0), motion="static", mass=0.0)])
+
+
+def spheres(count: int) -> Callable[[Path], Scene]:
+    """So many of them in a bowl."""
+    return lambda folder: load_scene(write_scene("bowl", folder / f"bowl{count}", count))
+
+
+def heaps(folder: Path) -> Scene:
+    """380 bodies of eight shapes with 1.1 million nodes fall into heaps."""
+    return load_scene(write_scene("heaps", folder / "heaps"))
+
+
+CASES: dict[str, Callable[[Path], Scene]] = {
+    "bowls in bowls": bowls,
+    "torus knots": knots,
+    "mugs on pegs": mugs,
+    "scan of 200,000 triangles": scan,
+    **{f"{count} spheres in a bowl": spheres(count) for count in BALLS},
+    "heaps": heaps,
+}
+
+
+def alike(scene: Scene) -> Scene:
+    """The scene with one friction, no restitution and no sleep."""
+    bodies = tuple(replace(b, friction=FRICTION, restitution=0.0) for b in scene.bodies)
+    return replace(scene, bodies=bodies, effects=Effects(sleep="off"))
+
+
+def in_pieces(scene: Scene, folder: Path) -> Scene:
+    """The scene with convex pieces for every shape but spheres and boxes, kept in a folder."""
+    shapes = []
+    for shape in scene.shapes:
+        if not isinstance(shape.sdf, SphereSdf | BoxSdf | PlaneSdf) and not own_pieces(shape):
+            file = folder / f"{shape.mesh.digest()[:16]}.obj"
+            if not file.exists():
+                write_text(file, wavefront(convex_pieces(shape)))
+            shape = replace(shape, pieces=tuple(piece.vertices for piece in load_pieces(file)))
+        shapes.append(shape)
+    return replace(scene, shapes=tuple(shapes))
+
+
+def movi_b(data: Path) -> list[Scene]:
+    """Recorded starts, as scenes of their own."""
+    recorded = [Trajectory.load(file) for file in trajectory_files(data, "test")[:MOVI_B]]
+    shapes = load_shapes(data, {str(n) for t in recorded for n in t.shape})
+    return [scene_of([t], [0], shapes, FLOOR)[0] for t in recorded]
+
+
+# --- measuring ---
+
+
+def moved(name: str, scene: Scene, steps: int, inner: int, folder: Path) -> tuple[Trajectory, float, float]:
+    """An engine's motion of a scene in m and s, its ms per simulated second, and the seconds that preparing took."""
+    units = scene_units(scene, load_model("solver"))
+    began = time.perf_counter()
+    run = ENGINES[name]
+    if run is None:
+        simulator = Simulator(scene, "solver")
+        simulator.rules = replace(simulator.rules, substeps=inner)
+        frames = [next(simulator.frames(1))]
+        prepared = time.perf_counter() - began
+        simulator.reset()
+        frames, spent = [], time.process_time()
+
+        def advance(count: int) -> None:
+            for frame in simulator.frames(count):
+                frames.append(frame)
+                if time.process_time() - spent > LONGEST:
+                    raise SdfsimError(f"{len(frames)} of {steps} steps in {LONGEST:g} s")
+
+        timing = timed(advance, steps)
+        motion = rollout_motion(scene, join(frames))
+    else:
+        start = start_of_scene(in_pieces(scene, folder / "pieces"), folder / "engine", units)
+        prepared = time.perf_counter() - began
+        motion, timing = run(start, steps, inner)
+        lengths = {"position": units.length, "scale": units.length, "velocity": units.length / units.time}
+        motion = replace(motion, **{key: factor * getattr(motion, key) for key, factor in lengths.items()})
+    return motion, timing.cpu_ms / (0.02 * units.time), prepared
+
+
+def measured(name: str, case: str, data: Path, folder: Path) -> dict[str, Any]:
+    """What every inner step costs an engine in a case.
+
+    Returns:
+        by inner steps: ms per simulated second; deep, the 95th percentile of the depth, and away, the distance from
+        the engine's own finest motion, both over the smallest body's size; lost, bodies that are where they cannot be.
+        prepare_s and mib once.
+    """
+    torch.set_num_threads(1)
+    (folder / "pieces").mkdir(parents=True, exist_ok=True)
+    large = case == "heaps" or case.startswith("512")
+    scenes = [alike(s) for s in (movi_b(data) if case == "MOVi-B" else [CASES[case](folder)])]
+    steps, inners = (HEAP_STEPS, (USUAL,)) if large else (STEPS, INNER)
+    found: dict[int, dict[str, float]] = {}
+    motions: dict[int, list[Trajectory]] = {}
+    prepare, broken = 0.0, {}
+    with peak_memory() as memory:
+        for inner in sorted(inners, reverse=True):
+            try:
+                runs = [moved(name, scene, steps, inner, folder) for scene in scenes]
+            except SdfsimError as error:
+                broken[inner] = error.message
+                continue
+            motions[inner] = [motion for motion, _, _ in runs]
+            prepare = max(prepare, *(one for _, _, one in runs))
+            size = [
+                min(largest_extent(s.shapes[b.shape]) * b.scale for b in s.bodies if b.motion == "dynamic")
+                for s in scenes
+            ]
+            deep = np.concatenate([depths(s, m) / w for s, m, w in zip(scenes, motions[inner], size, strict=True)])
+            found[inner] = {
+                "ms": float(np.mean([ms for _, ms, _ in runs])),
+                "deep": float(np.percentile(deep, 95)) if len(deep) else 0.0,
+                "lost": sum(lost(case, motion, w) for motion, w in zip(motions[inner], size, strict=True)),
+            }
+            if (finest := motions.get(INNER[-1])) is not None and inner != INNER[-1]:
+                gaps = [
+                    np.linalg.norm((one.position - best.position)[: COMPARED + 1, ~one.static], axis=-1).ravel() / w
+                    for one, best, w in zip(motions[inner], finest, size, strict=True)
+                ]
+                found[inner]["away"] = float(np.sqrt(np.mean(np.concatenate(gaps) ** 2)))
+    return {"inner": found, "broken": broken, "prepare_s": prepare, "mib": memory["mib"]}
+
+
+def lost(case: str, motion: Trajectory, size: float) -> int:
+    """Bodies that fell off their pegs, through the floor, or flew off."""
+    height, start = motion.position[-1, ~motion.static, 2], motion.position[0, ~motion.static, 2]
+    gone = (height < -0.1 * size) | (height > start + 2.0 * size)
+    return int((gone | (height < 1.2)).sum() if case == "mugs on pegs" else gone.sum())
+
+
+def table(results: Results, cases: list[str]) -> str:
+    """A row a case and engine, by the usual inner step, and what equal depth costs."""
+    rows: list[tuple[str, ...]] = [(
+        "case", "engine", "ms per s at 4 ms", "depth, %", "away from itself at 1 ms, %", "lost",
+        f"ms per s where depth is at most {100 * DEEP:g} %", "prepared in, s", "MiB",
+    )]  # fmt: skip
+    for case in cases:
+        for name in ENGINES:
+            result = results[case, name]
+            if "failed" in result:
+                rows.append((case, name, result["failed"], *[""] * 6))
+                continue
+            usual = result["inner"].get(str(USUAL))
+            if usual is None:
+                rows.append((case, name, result["broken"][str(USUAL)], *[""] * 6))
+                continue
+            equal = [one["ms"] for one in result["inner"].values() if one["deep"] <= DEEP and not one["lost"]]
+            rows.append((
+                case, name, number(usual["ms"]), number(100 * usual["deep"], 2),
+                number(100 * usual.get("away", np.nan), 2),
+                str(usual["lost"]), number(min(equal)) if equal else "none", number(result["prepare_s"], 2),
+                number(result["mib"]),
+            ))  # fmt: skip
+    return markdown(rows)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("-o", "--out", type=Path, required=True)
+    parser.add_argument("--only", nargs="+", default=["MOVi-B", *CASES], help="cases")
+    chosen = parser.parse_args()
+    jobs = [
+        Job(case, name, [INNER, STEPS, COMPARED, HEAP_STEPS, MOVI_B, FRICTION], measured,
+            (name, case, chosen.data.resolve(), chosen.out / "scenes"))
+        for case in chosen.only for name in ENGINES
+    ]  # fmt: skip
+    results = measure(jobs, chosen.out / "results", where="fresh", on_progress=lambda _, m: print(m, flush=True))
+    print(table(results, chosen.only))
+    if set(chosen.only) == {"MOVi-B", *CASES}:
+        write_section("rivals", "python benchmarks/rivals.py DATA -o DIR", table(results, chosen.only))
+
+
+if __name__ == "__main__":
+    run_main(main)
