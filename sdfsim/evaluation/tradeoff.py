@@ -1,4 +1,4 @@
-"""How much error for how many milliseconds: our models and their knobs, beside PyBullet and MuJoCo."""
+"""How much error for how many milliseconds: our models and their knobs, beside other engines."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,18 @@ from sdfsim.dynamics.simulator import Simulator
 from sdfsim.dynamics.units import scene_units
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.baselines import perturbed
-from sdfsim.evaluation.engines import Start, Timing, bullet, dataset_urdf, mujoco, start_of_scene, timed
+from sdfsim.evaluation.engines import (
+    Start,
+    Timing,
+    bullet,
+    centred_mesh,
+    dataset_urdf,
+    drake,
+    mujoco,
+    newton,
+    start_of_scene,
+    timed,
+)
 from sdfsim.evaluation.evaluate import energy_gain, errors, load_recorded
 from sdfsim.evaluation.hard_cases import tossed
 from sdfsim.evaluation.harness import (
@@ -45,9 +57,10 @@ from sdfsim.files import locked, write_json, write_text
 from sdfsim.parallel import StageProgress
 from sdfsim.scene.scene import Scene
 from sdfsim.scene.scene_file import load_scene
+from sdfsim.shape.distance import MeshDistance, PiecesDistance
 from sdfsim.shape.mlp_sdf import MlpSdf
-from sdfsim.shape.sdf import GridSdf, MeshSdf
-from sdfsim.shape.shape import Shape, with_nodes
+from sdfsim.shape.sdf import ClosedForm, GridSdf, MeshSdf, sample_grid
+from sdfsim.shape.shape import Shape, own_pieces, with_nodes, with_sdf
 from sdfsim.shape.surface_nodes import hull_nodes
 
 VERSION = 1  # counts up when what is measured changes, so that kept results are measured again
@@ -59,9 +72,16 @@ EXPLODED = 1.0  # an energy gain of so many times the energy at the start is a m
 OFF = 1e-3  # m/s, by which the starts of the chaos floor differ from the recorded ones
 HORIZON = 50  # steps of the errors that are drawn
 # Steps of the engine in a recorded one.
-ENGINES = [*(("PyBullet", k) for k in (5, 4, 3, 2, 1)), *(("MuJoCo", k) for k in (10, 5, 2))]
+ENGINES = [
+    *(("PyBullet", k) for k in (5, 4, 3, 2, 1)),
+    *(("MuJoCo", k) for k in (10, 5, 2)),
+    *(("MuJoCo mesh SDF", k) for k in (10, 5, 2)),
+    *(("Drake", k) for k in (10, 5, 2)),
+    ("Newton", 5),
+]
 ENGINES_QUICK = [("PyBullet", 5), ("PyBullet", 1), ("MuJoCo", 5)]
 FLOOR_LABEL = "chaos floor: PyBullet 4 ms, starts 1 mm per s off"
+GRIDS = (32, 64, 128, 256)
 PHYSICAL = ("contact", "friction", "restitution", "rotation")  # effects that the engines always have
 CPU = torch.device("cpu")
 Rows = list[tuple[str, ...]]
@@ -109,7 +129,8 @@ class Cases:
         """One of `recorded` for an engine. Raises SdfsimError where an engine's file is not at hand."""
         if lacking := sorted({str(n) for n in motion.shape} - set(self.urdfs)):
             raise SdfsimError(f"no engine file of {', '.join(lacking)} at hand")
-        return Start(motion, self.urdfs, self.floor, self.own_inertia)
+        meshes = {name: centred_mesh(shape) for name, shape in self.shapes.items()}
+        return Start(motion, self.urdfs, self.floor, self.own_inertia, meshes)
 
 
 def load_cases(data: Path, *, quick: bool) -> Cases:
@@ -193,6 +214,8 @@ class Setting:
         model: name or path.
         nodes: "own", the shapes' own nodes; "thin K", K of them, outermost first; "grid N", sampled anew from N^3
             points.
+        sdf: "own", convex pieces where the shape has some; "mlp", its network alone; "grid N", samples of the exact
+            distance, N along each side; "mesh", the distance to the mesh that is shown.
         stride: recorded steps in a step.
         substeps: inner steps of the solve in a step, where the model does not say how many.
         contact: off is the ballistic baseline.
@@ -200,6 +223,7 @@ class Setting:
 
     model: str
     nodes: str = "own"
+    sdf: str = "own"
     stride: int = 1
     substeps: int = SUBSTEPS
     contact: bool = True
@@ -223,22 +247,35 @@ def settings(models: Sequence[str], *, quick: bool) -> list[Setting]:
         knobs += [{"nodes": f"grid {k}"} for k in ((7,) if quick else (5, 7, 10))]
         if load_model(name, weights=False).kind == SOLVER:
             knobs += [{"substeps": k} for k in ((2, 10) if quick else (1, 2, 3, 10, 20))]
+            knobs += [{"sdf": kind} for kind in (() if quick else ("mlp", *(f"grid {k}" for k in GRIDS), "mesh"))]
             knobs += [{"stride": 2, "substeps": k} for k in ((1,) if quick else (1, 2, 4))]
         chosen += [Setting(name, **knob) for knob in knobs]
     return [*chosen, Setting(models[0], contact=False)]
 
 
 def arranged(setting: Setting, cases: Cases) -> tuple[Model, dict[str, Shape]]:
-    """The model, and the shapes with the nodes that a setting wants."""
+    """The model, and the shapes with the nodes and distances that a setting wants."""
     model, shapes = load_model(setting.model), {}
     kind, _, count = setting.nodes.partition(" ")
     for name, shape in cases.shapes.items():
+        if setting.sdf != "own" and not isinstance(shape.sdf, ClosedForm):
+            shape = _measured_by(shape, setting.sdf)
         if kind == "thin":
             shape = replace(shape, nodes=hull_nodes(shape.nodes, int(count)))
         elif kind == "grid":
             shape = with_nodes(shape, int(count))
         shapes[name] = shape
     return model, shapes
+
+
+def _measured_by(shape: Shape, sdf: str) -> Shape:
+    """The shape with distances of one kind alone (see `Setting.sdf`)."""
+    kind, _, count = sdf.partition(" ")
+    if kind != "grid":
+        return with_sdf(replace(shape, pieces=()), kind)  # type: ignore[arg-type]
+    pieces = own_pieces(shape)
+    exact = PiecesDistance(pieces) if pieces else MeshDistance(shape.mesh)
+    return replace(shape, pieces=(), sdf=sample_grid(exact, exact.bounds, int(count)))
 
 
 # --- measuring ---
@@ -274,10 +311,13 @@ def _time_simulator(setting: Setting, model: Model, shapes: dict[str, Shape], ca
 
 
 def measure_engine(name: str, substeps: int, off: float, cases: Cases) -> dict[str, Any]:
-    """Errors and times of PyBullet or MuJoCo with so many of its steps in a recorded one, starts `off` m/s off."""
+    """Errors and times of an engine with so many of its steps in a recorded one, starts `off` m/s off."""
     if abs(cases.recorded[0].dt - DT) > 1e-9:
         raise SdfsimError(f"recorded with another step than {DT} s")
-    run: Callable[..., tuple[Trajectory, Timing]] = bullet if name == "PyBullet" else mujoco
+    run: Callable[..., tuple[Trajectory, Timing]] = {
+        "PyBullet": bullet, "MuJoCo": mujoco, "MuJoCo mesh SDF": partial(mujoco, pieces=False), "Drake": drake,
+        "Newton": newton,
+    }[name]  # fmt: skip
     recorded = cases.recorded if name == "PyBullet" else cases.starts
     starts = [cases.engine_start(perturbed(t, off, [0, k])) for k, t in enumerate(recorded)]
     with peak_memory() as memory:
