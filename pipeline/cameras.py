@@ -21,30 +21,18 @@ class View:
 
     A pixel (u, v), centres at +0.5, relates to the ray (x, y, 1) in camera axes (x right, y down, z forward) by
     u = focal (1 + k r^2) x + cx, v = focal (1 + k r^2) y + cy, r^2 = x^2 + y^2.
-
-    Attributes:
-        name: prepared photo.
-        source: the user's file name.
-        width: px.
-        height: px.
-        focal: px.
-        cx: px.
-        cy: px.
-        k: radial distortion.
-        rotation: [3, 3] world to camera.
-        translation: [3] world to camera, units of the reconstruction.
     """
 
-    name: str
-    source: str
-    width: int
-    height: int
-    focal: float
-    cx: float
-    cy: float
-    k: float
-    rotation: np.ndarray
-    translation: np.ndarray
+    name: str  # prepared photo
+    source: str  # the user's file name
+    width: int  # px
+    height: int  # px
+    focal: float  # px
+    cx: float  # px
+    cy: float  # px
+    k: float  # radial distortion
+    rotation: np.ndarray  # [3, 3] world to camera
+    translation: np.ndarray  # [3] world to camera, units of the reconstruction
 
     @property
     def center(self) -> np.ndarray:
@@ -77,17 +65,11 @@ class View:
 
 @dataclass(frozen=True)
 class Similarity:
-    """A change of scale, orientation and place: x -> scale * rotation x + translation.
+    """A change of scale, orientation and place: x -> scale * rotation x + translation."""
 
-    Attributes:
-        scale: > 0.
-        rotation: [3, 3].
-        translation: [3].
-    """
-
-    scale: float
-    rotation: np.ndarray
-    translation: np.ndarray
+    scale: float  # > 0
+    rotation: np.ndarray  # [3, 3]
+    translation: np.ndarray  # [3]
 
     def points(self, points: np.ndarray) -> np.ndarray:
         """Points [P, 3], moved."""
@@ -115,21 +97,13 @@ class Similarity:
 
 @dataclass(frozen=True)
 class Sparse:
-    """Points of structure-from-motion.
+    """Points of structure-from-motion."""
 
-    Attributes:
-        xyz: [P, 3] world.
-        rgb: [P, 3] uint8.
-        error: [P] mean reprojection error, px.
-        point_of: [O] point index of each observation.
-        view_of: [O] view index of each observation.
-    """
-
-    xyz: np.ndarray
-    rgb: np.ndarray
-    error: np.ndarray
-    point_of: np.ndarray
-    view_of: np.ndarray
+    xyz: np.ndarray  # [P, 3] world
+    rgb: np.ndarray  # [P, 3] uint8
+    error: np.ndarray  # [P] mean reprojection error, px
+    point_of: np.ndarray  # [O] point index of each observation
+    view_of: np.ndarray  # [O] view index of each observation
 
 
 def save_views(views: list[View], path: Path) -> None:

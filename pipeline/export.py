@@ -264,19 +264,12 @@ def _flow(content: dict | list) -> str:
 
 @dataclass(frozen=True)
 class Slab:
-    """A level slab above a place where it can lie.
+    """A level slab above a place where it can lie."""
 
-    Attributes:
-        side: m.
-        thickness: m.
-        position: [3] m, its centre at the start.
-        slope: of the surface below, degrees.
-    """
-
-    side: float
-    thickness: float
-    position: tuple[float, float, float]
-    slope: float
+    side: float  # m
+    thickness: float  # m
+    position: tuple[float, float, float]  # [3] m, its centre at the start
+    slope: float  # of the surface below, degrees
 
 
 def choose_slab(shown: Mesh, solid: Mesh) -> Slab:

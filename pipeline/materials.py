@@ -27,17 +27,12 @@ class Material:
     A contact takes the product of its two bodies' friction, and likewise of their restitution. So `friction` is the
     root of what the material has on itself, moved within the published range towards its other common pairs.
     `restitution` is such that the product with concrete's 0.8 is what a ball of the material has on a hard floor.
-
-    Attributes:
-        density: kg/m^3.
-        friction: Coulomb coefficient of the body itself.
-        restitution: of the body itself.
-        density_from, friction_from, restitution_from: the source; `rough` where the number is only plausible.
     """
 
-    density: float
-    friction: float
-    restitution: float
+    density: float  # kg/m^3
+    friction: float  # Coulomb coefficient of the body itself
+    restitution: float  # of the body itself
+    # density_from, friction_from, restitution_from: the source; `rough` where the number is only plausible
     density_from: str = ROUGH
     friction_from: str = ROUGH
     restitution_from: str = ROUGH
@@ -71,17 +66,11 @@ MATERIALS = {
 
 @dataclass(frozen=True)
 class Choice:
-    """What one body is made of.
+    """What one body is made of."""
 
-    Attributes:
-        name: in `MATERIALS`, or `assumed`.
-        material: its numbers.
-        wall: m, how thick the wall of a hollow body is; None of a solid one.
-    """
-
-    name: str = "assumed"
-    material: Material = ASSUMED
-    wall: float | None = None
+    name: str = "assumed"  # in `MATERIALS`, or `assumed`
+    material: Material = ASSUMED  # its numbers
+    wall: float | None = None  # m, how thick the wall of a hollow body is; None of a solid one
 
 
 def choose(given: dict[str, str]) -> dict[str, Choice]:

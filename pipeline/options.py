@@ -24,33 +24,21 @@ METRES = (1e-4, 1e5)  # smallest and largest length that can be given
 
 @dataclass
 class Options:
-    """Every option of a reconstruction, as written to config.yaml.
+    """Every option of a reconstruction, as written to config.yaml."""
 
-    Attributes:
-        photos: what the user gave, an absolute path.
-        preset: quick, standard, fine, or paper.
-        size: widest side of the scene, m; None: assumed to be 1 m.
-        budget: s for everything; None: what the preset takes.
-        seed: of everything random.
-        device: auto, cpu or cuda.
-        recipe: of the fit; None: quick for the preset quick, else the default one.
-        distance: two places and the metres between them; None: size counts. A place is `photo.jpg:x,y`, the point of
-            the surface that this pixel shows, or `photo.jpg`, the camera itself.
-        crop: m, corners x, y, z, x, y, z of the box that is kept; None: everything.
-        drop: what is dropped onto the scene: box, ball or none.
-        material: by body, what it is made of, such as `ceramic`, or `ceramic:4mm` for a hollow body's wall.
-    """
-
-    photos: str = ""
-    preset: str = "standard"
-    size: float | None = None
-    budget: float | None = None
-    seed: int = 0
-    device: str = "auto"
-    recipe: str | None = None
+    photos: str = ""  # what the user gave, an absolute path
+    preset: str = "standard"  # quick, standard, fine, or paper
+    size: float | None = None  # widest side of the scene, m; None: assumed to be 1 m
+    budget: float | None = None  # s for everything; None: what the preset takes
+    seed: int = 0  # of everything random
+    device: str = "auto"  # auto, cpu or cuda
+    recipe: str | None = None  # of the fit; None: quick for the preset quick, else the default one
+    # two places and the metres between them; None: size counts. A place is `photo.jpg:x,y`, the point of the surface
+    # that this pixel shows, or `photo.jpg`, the camera itself.
     distance: list | None = None
-    crop: list[float] | None = None
-    drop: str = "box"
+    crop: list[float] | None = None  # m, corners x, y, z, x, y, z of the box that is kept; None: everything
+    drop: str = "box"  # what is dropped onto the scene: box, ball or none
+    # by body, what it is made of, such as `ceramic`, or `ceramic:4mm` for a hollow body's wall
     material: dict[str, str] = field(default_factory=dict)
 
     def check(self) -> None:

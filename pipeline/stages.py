@@ -30,21 +30,14 @@ FIT_SHARE, AFTER_TRAINING = 0.15, 50.0
 
 @dataclass
 class Run:
-    """One call: where it works and what it was asked to do.
+    """One call: where it works and what it was asked to do."""
 
-    Attributes:
-        folder: of all stages.
-        options: as in its config.yaml.
-        progress: called with (stage, fraction, message).
-        own_budget: s for the one stage that is run; None: it has its share of the budget for everything.
-        started: when, on the monotonic clock.
-    """
-
-    folder: Path
-    options: Options
-    progress: Callable[[str, float, str], None] | None = None
+    folder: Path  # of all stages
+    options: Options  # as in its config.yaml
+    progress: Callable[[str, float, str], None] | None = None  # called with (stage, fraction, message)
+    # s for the one stage that is run; None: it has its share of the budget for everything
     own_budget: float | None = None
-    started: float = field(default_factory=time.monotonic)
+    started: float = field(default_factory=time.monotonic)  # when, on the monotonic clock
 
     def tell(self, stage: str) -> Progress:
         """What one stage tells its progress to."""
@@ -144,19 +137,13 @@ def do_scene(run: Run, work: Path) -> dict:
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage of the way.
+    """One stage of the way."""
 
-    Attributes:
-        run: makes the result in a folder that is there already; returns the stage's report.
-        folder: where the result lies in that of the run.
-        options: that the result depends on.
-        version: of the code. Raise it with every change after which the stage makes something else of the same inputs
-            and options. The stages after it follow by themselves.
-    """
-
-    run: Callable[[Run, Path], dict]
-    folder: str
-    options: tuple[str, ...] = ()
+    run: Callable[[Run, Path], dict]  # makes the result in a folder that is there already; returns the stage's report
+    folder: str  # where the result lies in that of the run
+    options: tuple[str, ...] = ()  # that the result depends on
+    # of the code. Raise it with every change after which the stage makes something else of the same inputs and options.
+    # The stages after it follow by themselves.
     version: int = 1
 
 

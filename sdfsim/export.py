@@ -48,25 +48,15 @@ XML = ElementTree.Element
 
 @dataclass(frozen=True)
 class Take:
-    """What is exported: N bodies at T times.
+    """What is exported: N bodies at T times."""
 
-    Attributes:
-        scene: the bodies as they are at the start.
-        names: [N] unique names of ASCII letters, digits and underscores.
-        shapes: names of the scene's shapes, likewise.
-        colors: [N, 3] uint8 sRGB, for bodies whose mesh has no colours.
-        time: [T] s.
-        position: [T, N, 3] m, of the shapes' own origins.
-        quat_xyzw: [T, N, 4], the nearer of the two signs from one time to the next.
-    """
-
-    scene: Scene
-    names: list[str]
-    shapes: list[str]
-    colors: np.ndarray
-    time: np.ndarray
-    position: np.ndarray
-    quat_xyzw: np.ndarray
+    scene: Scene  # the bodies as they are at the start
+    names: list[str]  # [N] unique names of ASCII letters, digits and underscores
+    shapes: list[str]  # names of the scene's shapes, likewise
+    colors: np.ndarray  # [N, 3] uint8 sRGB, for bodies whose mesh has no colours
+    time: np.ndarray  # [T] s
+    position: np.ndarray  # [T, N, 3] m, of the shapes' own origins
+    quat_xyzw: np.ndarray  # [T, N, 4], the nearer of the two signs from one time to the next
 
     @property
     def moving(self) -> bool:

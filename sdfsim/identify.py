@@ -40,22 +40,15 @@ COLUMNS = ("time", "body", "x", "y", "z", "qx", "qy", "qz", "qw")
 
 @dataclass(frozen=True)
 class Recording:
-    """T poses of D bodies, evenly spaced in time.
+    """T poses of D bodies, evenly spaced in time."""
 
-    Attributes:
-        dt: s.
-        position: [T, D, 3] m, of the centres of mass.
-        orientation: [T, D, 4] xyzw.
-        velocity, angular_velocity: [T, D, 3] m/s and rad/s.
-        known: [T] bool, whether the velocities are to be trusted.
-    """
-
-    dt: float
-    position: np.ndarray
-    orientation: np.ndarray
+    dt: float  # s
+    position: np.ndarray  # [T, D, 3] m, of the centres of mass
+    orientation: np.ndarray  # [T, D, 4] xyzw
+    # velocity, angular_velocity: [T, D, 3] m/s and rad/s
     velocity: np.ndarray
     angular_velocity: np.ndarray
-    known: np.ndarray
+    known: np.ndarray  # [T] bool, whether the velocities are to be trusted
 
 
 @dataclass(frozen=True)
@@ -68,21 +61,16 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Identified:
-    """What a recording tells.
+    """What a recording tells."""
 
-    Attributes:
-        friction, restitution: pair of body names -> product of the two bodies' coefficients.
-        own_friction, own_restitution: body -> its own, where that of what it touched is given by the scene.
-        mass: body -> kg, as the ratio to the first body that is touched by another that moves.
-        error_m: root mean square error of the windows that are left, m; windows: how many there were.
-    """
-
+    # friction, restitution: pair of body names -> product of the two bodies' coefficients
     friction: dict[tuple[str, str], Estimate]
     restitution: dict[tuple[str, str], Estimate]
+    # own_friction, own_restitution: body -> its own, where that of what it touched is given by the scene
     own_friction: dict[str, Estimate]
     own_restitution: dict[str, Estimate]
-    mass: dict[str, Estimate]
-    error_m: float
+    mass: dict[str, Estimate]  # body -> kg, as the ratio to the first body that is touched by another that moves
+    error_m: float  # root mean square error of the windows that are left, m; windows: how many there were
     windows: int
 
     def lines(self) -> list[str]:

@@ -159,17 +159,11 @@ class Playback:
 
 
 class Crowd(NamedTuple):
-    """Bodies drawn as copies of one mesh, whose poses at a step are one row.
+    """Bodies drawn as copies of one mesh, whose poses at a step are one row."""
 
-    Attributes:
-        path: entity path.
-        shape: index into `Scene.shapes`.
-        bodies: [C] int64, which.
-    """
-
-    path: str
-    shape: int
-    bodies: np.ndarray
+    path: str  # entity path
+    shape: int  # index into `Scene.shapes`
+    bodies: np.ndarray  # [C] int64, which
 
 
 def _crowds(scene: Scene) -> list[Crowd]:
@@ -206,27 +200,16 @@ def save_rollout(
 
 @dataclass(frozen=True)
 class PosedPhoto:
-    """One camera of a reconstruction.
+    """One camera of a reconstruction."""
 
-    Attributes:
-        name: what the viewer calls it.
-        image: photo file, or None to show the camera alone.
-        focal: px.
-        principal: (cx, cy) px.
-        size: (width, height) px.
-        rotation: [3, 3] world to camera (x right, y down, z forward).
-        translation: [3] m, world to camera.
-        color: RGB of its frame, or None for the viewer's own.
-    """
-
-    name: str
-    image: Path | None
-    focal: float
-    principal: tuple[float, float]
-    size: tuple[int, int]
-    rotation: np.ndarray
-    translation: np.ndarray
-    color: tuple[int, int, int] | None = None
+    name: str  # what the viewer calls it
+    image: Path | None  # photo file, or None to show the camera alone
+    focal: float  # px
+    principal: tuple[float, float]  # (cx, cy) px
+    size: tuple[int, int]  # (width, height) px
+    rotation: np.ndarray  # [3, 3] world to camera (x right, y down, z forward)
+    translation: np.ndarray  # [3] m, world to camera
+    color: tuple[int, int, int] | None = None  # RGB of its frame, or None for the viewer's own
 
 
 def save_reconstruction(
@@ -310,17 +293,11 @@ def _write(path: Path, encoded: Any) -> None:
 
 @dataclass(frozen=True)
 class Eye:
-    """From where a view looks.
+    """From where a view looks."""
 
-    Attributes:
-        position: [3] m.
-        target: [3] m, the point in the middle.
-        up: [3] unit vector.
-    """
-
-    position: np.ndarray
-    target: np.ndarray
-    up: np.ndarray
+    position: np.ndarray  # [3] m
+    target: np.ndarray  # [3] m, the point in the middle
+    up: np.ndarray  # [3] unit vector
 
     def controls(self) -> rrb.EyeControls3D:
         """As the viewer takes it."""

@@ -20,19 +20,12 @@ from pipeline.field.interpolation import interpolate
 
 @dataclass(frozen=True)
 class FieldSize:
-    """Resolution of a field.
+    """Resolution of a field."""
 
-    Attributes:
-        levels: grid points a side of each level, coarse to fine.
-        channels: features a level.
-        width: hidden width of both small networks.
-        background: grid points a side of the background.
-    """
-
-    levels: tuple[int, ...] = (16, 32, 64, 128)
-    channels: tuple[int, ...] = (4, 4, 4, 2)
-    width: int = 64
-    background: int = 64
+    levels: tuple[int, ...] = (16, 32, 64, 128)  # grid points a side of each level, coarse to fine
+    channels: tuple[int, ...] = (4, 4, 4, 2)  # features a level
+    width: int = 64  # hidden width of both small networks
+    background: int = 64  # grid points a side of the background
 
     def to_dict(self) -> dict:
         """Plain values for JSON."""
@@ -78,21 +71,13 @@ def contract(points: Tensor) -> Tensor:
 
 
 class Field(nn.Module, ABC):
-    """SDF and colour in the unit sphere, and a background outside; what both encodings have in common.
+    """SDF and colour in the unit sphere, and a background outside; what both encodings have in common."""
 
-    Attributes:
-        background: [n, n, n, 4], channel 0 density before softplus, channels 1 to 3 colour before sigmoid.
-        size: of the encoding, with `to_dict`.
-        start_radius: radius of the sphere that the SDF starts from.
-        active: how many levels of detail are in use.
-        view_dependence: how much colour changes with direction, 0 to 1.
-    """
-
-    background: nn.Parameter
-    size: Any
-    start_radius: float
-    active: int = 0
-    view_dependence: float = 1.0
+    background: nn.Parameter  # [n, n, n, 4], channel 0 density before softplus, channels 1 to 3 colour before sigmoid
+    size: Any  # of the encoding, with `to_dict`
+    start_radius: float  # radius of the sphere that the SDF starts from
+    active: int = 0  # how many levels of detail are in use
+    view_dependence: float = 1.0  # how much colour changes with direction, 0 to 1
 
     @property
     @abstractmethod

@@ -27,17 +27,11 @@ EMPTY = 0.9  # grey of pixels whose ray misses the trained spherefrom pipeline.p
 
 @dataclass(frozen=True)
 class Compared:
-    """A held-out photo against its render, over pixels whose ray meets the unit sphere.
+    """A held-out photo against its render, over pixels whose ray meets the unit sphere."""
 
-    Attributes:
-        psnr: dB.
-        overlap: of the silhouettes, intersection over union; None without masks.
-        picture: [H, W, 3] uint8, the render.
-    """
-
-    psnr: float
-    overlap: float | None
-    picture: np.ndarray
+    psnr: float  # dB
+    overlap: float | None  # of the silhouettes, intersection over union; None without masks
+    picture: np.ndarray  # [H, W, 3] uint8, the render
 
 
 class HeldOut:

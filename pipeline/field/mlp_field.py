@@ -17,23 +17,14 @@ SPAN = 3.0  # the networks see the unit sphere as the paper's, with radius 3: So
 
 @dataclass(frozen=True)
 class MlpSize:
-    """Size of the paper's two networks.
+    """Size of the paper's two networks."""
 
-    Attributes:
-        depth: hidden layers of the SDF network; the position enters again at the middle one.
-        width: of its layers, and of the features that it hands on.
-        frequencies: octaves of the positional encoding of positions.
-        color_depth: hidden layers of the colour network.
-        view_frequencies: octaves of the encoding of directions.
-        background: grid points a side of the background.
-    """
-
-    depth: int = 8
-    width: int = 256
-    frequencies: int = 6
-    color_depth: int = 4
-    view_frequencies: int = 4
-    background: int = 64
+    depth: int = 8  # hidden layers of the SDF network; the position enters again at the middle one
+    width: int = 256  # of its layers, and of the features that it hands on
+    frequencies: int = 6  # octaves of the positional encoding of positions
+    color_depth: int = 4  # hidden layers of the colour network
+    view_frequencies: int = 4  # octaves of the encoding of directions
+    background: int = 64  # grid points a side of the background
 
     def to_dict(self) -> dict:
         """Plain values for JSON."""

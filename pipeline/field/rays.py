@@ -17,27 +17,16 @@ from sdfsim.errors import SdfsimError
 
 @dataclass(frozen=True)
 class Rays:
-    """All pixels of some views whose ray meets the unit sphere.
+    """All pixels of some views whose ray meets the unit sphere."""
 
-    Attributes:
-        rgb: [N, 3] uint8.
-        mask: [N] uint8 (255 = object), or None.
-        view: [N] int16 index into the camera tables.
-        pixel: [N, 2] int16 column and row.
-        intrinsics: [V, 4] focal, cx, cy, k of the downscaled photos.
-        rotation: [V, 3, 3] world to camera.
-        center: [V, 3] camera centres.
-        sizes: [V, 2] width and height of the downscaled photos.
-    """
-
-    rgb: Tensor
-    mask: Tensor | None
-    view: Tensor
-    pixel: Tensor
-    intrinsics: Tensor
-    rotation: Tensor
-    center: Tensor
-    sizes: Tensor
+    rgb: Tensor  # [N, 3] uint8
+    mask: Tensor | None  # [N] uint8 (255 = object), or None
+    view: Tensor  # [N] int16 index into the camera tables
+    pixel: Tensor  # [N, 2] int16 column and row
+    intrinsics: Tensor  # [V, 4] focal, cx, cy, k of the downscaled photos
+    rotation: Tensor  # [V, 3, 3] world to camera
+    center: Tensor  # [V, 3] camera centres
+    sizes: Tensor  # [V, 2] width and height of the downscaled photos
 
     def __len__(self) -> int:
         return len(self.rgb)

@@ -64,21 +64,13 @@ def sphere_interval(origins: Tensor, directions: Tensor, near: float = 0.02) -> 
 
 @dataclass(frozen=True)
 class Samples:
-    """Where the field is asked along some rays.
+    """Where the field is asked along some rays."""
 
-    Attributes:
-        distance: [R, S] from the camera, in order, normalised units.
-        delta: [R, S] length of each sample's interval.
-        points: [R, S, 3].
-        directions: [R, 3] unit.
-        near_surface: [R, S] whether it was drawn by importance.
-    """
-
-    distance: Tensor
-    delta: Tensor
-    points: Tensor
-    directions: Tensor
-    near_surface: Tensor
+    distance: Tensor  # [R, S] from the camera, in order, normalised units
+    delta: Tensor  # [R, S] length of each sample's interval
+    points: Tensor  # [R, S, 3]
+    directions: Tensor  # [R, 3] unit
+    near_surface: Tensor  # [R, S] whether it was drawn by importance
 
 
 @torch.no_grad()

@@ -48,42 +48,26 @@ PACE = 25  # steps between looks at the clock
 
 @dataclass(frozen=True)
 class Settings:
-    """How a field is trained. Lengths are in normalised units (the scene is the unit sphere).
+    """How a field is trained. Lengths are in normalised units (the scene is the unit sphere)."""
 
-    Attributes:
-        size: resolutions of the grids, or of the MLP of the VolSDF paper.
-        start_radius: radius of the ball that training starts from. Small, because what is solid at first has to be
-            carved away, and shadowed parts hardly are.
-        iterations: steps of Adam.
-        rays: a step.
-        samples: along a ray inside the sphere.
-        long_side: of the photos used, px.
-        beta: density scale at the start and at the end.
-        rate: Adam's rate for the grids at the start (the networks use a quarter of it).
-        eikonal: weight of (|grad| - 1)^2.
-        curvature: weight of |Laplacian| at the start, in units of the finest active cell.
-        sparse: weight of |sdf| at the points of structure-from-motion.
-        depth: weight of |sdf| at the points of a depth sensor, at the start.
-        free: weight of what is solid between a camera and a point that it sees.
-        mask: weight of the opacity loss where photos have masks.
-        surface_points: points of the eikonal loss.
-    """
-
+    # resolutions of the grids, or of the MLP of the VolSDF paper
     size: FieldSize | MlpSize = FieldSize()  # noqa: RUF009  frozen
+    # radius of the ball that training starts from. Small, because what is solid at first has to be carved away, and
+    # shadowed parts hardly are.
     start_radius: float = 0.25
-    iterations: int = 4000
-    rays: int = 512
-    samples: int = 32
-    long_side: int = 480
-    beta: tuple[float, float] = (0.1, 0.004)
-    rate: float = 0.02
-    eikonal: float = 0.1
-    curvature: float = 0.01
-    sparse: float = 0.3
-    depth: float = 0.3
-    free: float = 1.0
-    mask: float = 0.3
-    surface_points: int = 512
+    iterations: int = 4000  # steps of Adam
+    rays: int = 512  # a step
+    samples: int = 32  # along a ray inside the sphere
+    long_side: int = 480  # of the photos used, px
+    beta: tuple[float, float] = (0.1, 0.004)  # density scale at the start and at the end
+    rate: float = 0.02  # Adam's rate for the grids at the start (the networks use a quarter of it)
+    eikonal: float = 0.1  # weight of (|grad| - 1)^2
+    curvature: float = 0.01  # weight of |Laplacian| at the start, in units of the finest active cell
+    sparse: float = 0.3  # weight of |sdf| at the points of structure-from-motion
+    depth: float = 0.3  # weight of |sdf| at the points of a depth sensor, at the start
+    free: float = 1.0  # weight of what is solid between a camera and a point that it sees
+    mask: float = 0.3  # weight of the opacity loss where photos have masks
+    surface_points: int = 512  # points of the eikonal loss
 
 
 PRESETS = {

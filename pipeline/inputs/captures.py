@@ -29,15 +29,10 @@ UP = (0.0, 1.0, 0.0)  # ARKit measures gravity, and its worlds have y up
 
 @dataclass(frozen=True)
 class Capture:
-    """What a capture with depth says about its world, whose unit is the metre.
+    """What a capture with depth says about its world, whose unit is the metre."""
 
-    Attributes:
-        app: what wrote it.
-        up: [3] against gravity, in the world of its cameras; None: not said.
-    """
-
-    app: str
-    up: tuple[float, float, float] | None
+    app: str  # what wrote it
+    up: tuple[float, float, float] | None  # [3] against gravity, in the world of its cameras; None: not said
 
 
 def find_capture(folder: Path) -> Path | None:

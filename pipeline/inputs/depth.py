@@ -18,19 +18,12 @@ EXTRA = "install what reads it: bash scripts/setup.sh record3d (or pip install '
 
 @dataclass(frozen=True)
 class DepthFile:
-    """Where the depth of a photo is kept.
+    """Where the depth of a photo is kept."""
 
-    Attributes:
-        path: PNG or TIFF of integers, EXR, NPY, or Record3D's compressed floats (`.depth`).
-        unit: m that a count stands for; None: integers are millimetres, floats metres.
-        confidence: file of the same shape, higher is better; None: there is none.
-        shape: rows and columns, of a `.depth` file, which does not say so itself.
-    """
-
-    path: Path
-    unit: float | None = None
-    confidence: Path | None = None
-    shape: tuple[int, int] | None = None
+    path: Path  # PNG or TIFF of integers, EXR, NPY, or Record3D's compressed floats (`.depth`)
+    unit: float | None = None  # m that a count stands for; None: integers are millimetres, floats metres
+    confidence: Path | None = None  # file of the same shape, higher is better; None: there is none
+    shape: tuple[int, int] | None = None  # rows and columns, of a `.depth` file, which does not say so itself
 
     def files(self) -> list[Path]:
         """The files that this depth is read from."""

@@ -25,23 +25,15 @@ BLOCKS = 12  # a side, fewer of small photos
 
 @dataclass(frozen=True)
 class Picture:
-    """A photo as it was read.
+    """A photo as it was read."""
 
-    Attributes:
-        pixels: RGB [H, W, 3] uint8.
-        original: width and height of the whole photo before it was made smaller, px; turned as `pixels` are.
-        mask: [H, W] uint8 (255 = object), or None.
-        focal: prior from EXIF, px of `pixels`, or None.
-        camera: make and model, empty where unknown.
-        labels: [H, W] uint8, see `Labels.of`, or None.
-    """
-
-    pixels: np.ndarray
+    pixels: np.ndarray  # RGB [H, W, 3] uint8
+    # width and height of the whole photo before it was made smaller, px; turned as `pixels` are
     original: tuple[int, int]
-    mask: np.ndarray | None = None
-    focal: float | None = None
-    camera: str = ""
-    labels: np.ndarray | None = None
+    mask: np.ndarray | None = None  # [H, W] uint8 (255 = object), or None
+    focal: float | None = None  # prior from EXIF, px of `pixels`, or None
+    camera: str = ""  # make and model, empty where unknown
+    labels: np.ndarray | None = None  # [H, W] uint8, see `Labels.of`, or None
 
 
 def exif_focal(image: Image.Image) -> tuple[float | None, str]:

@@ -33,17 +33,11 @@ CENTRE = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 
 @dataclass(frozen=True)
 class Lens:
-    """What bends a photo of some size.
+    """What bends a photo of some size."""
 
-    Attributes:
-        matrix: rows of the intrinsics [3, 3], pixel centres at +0.5.
-        distortion: OpenCV's coefficients (k1, k2, p1, p2, k3, ...), or four of its fisheye model.
-        fisheye: which of the two.
-    """
-
-    matrix: tuple[tuple[float, ...], ...]
-    distortion: tuple[float, ...]
-    fisheye: bool
+    matrix: tuple[tuple[float, ...], ...]  # rows of the intrinsics [3, 3], pixel centres at +0.5
+    distortion: tuple[float, ...]  # OpenCV's coefficients (k1, k2, p1, p2, k3, ...), or four of its fisheye model
+    fisheye: bool  # which of the two
 
     def straight(self, pixels: np.ndarray, view: View) -> np.ndarray:
         """Where the straight photo of `view` shows what pixels [P, 2] of the bent one show; may lie outside it."""
@@ -67,27 +61,16 @@ def lens_of(
 
 @dataclass(frozen=True)
 class KnownCamera:
-    """A camera that was found elsewhere.
+    """A camera that was found elsewhere."""
 
-    Attributes:
-        name: of its photo, as the file says it.
-        width: px of the photo that the lens is for.
-        height: px.
-        lens: of a photo of this size.
-        rotation: [3, 3] world to camera; x right, y down, z forward.
-        translation: [3].
-        mask: file name of its mask, or None.
-        depth: its depth, or None.
-    """
-
-    name: str
-    width: int
-    height: int
-    lens: Lens
-    rotation: np.ndarray
-    translation: np.ndarray
-    mask: str | None = None
-    depth: DepthFile | None = None
+    name: str  # of its photo, as the file says it
+    width: int  # px of the photo that the lens is for
+    height: int  # px
+    lens: Lens  # of a photo of this size
+    rotation: np.ndarray  # [3, 3] world to camera; x right, y down, z forward
+    translation: np.ndarray  # [3]
+    mask: str | None = None  # file name of its mask, or None
+    depth: DepthFile | None = None  # its depth, or None
 
     @property
     def center(self) -> np.ndarray:

@@ -24,21 +24,15 @@ NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 
 @dataclass(frozen=True)
 class Labels:
-    """Object masks, or label images, of a set of photos.
+    """Object masks, or label images, of a set of photos."""
 
-    Attributes:
-        masks: mask file of each object on each photo that has one: white is the object.
-        images: label image of each photo that has one.
-        names: of the objects; pixels of a prepared label image count from 1 in this order, 0 is none of them.
-        values: label of each object in `images`; none where masks are given.
-        notes: what was passed over, for the report.
-    """
-
+    # mask file of each object on each photo that has one: white is the object
     masks: dict[Path, dict[str, Path]] = field(default_factory=dict)
-    images: dict[Path, Path] = field(default_factory=dict)
+    images: dict[Path, Path] = field(default_factory=dict)  # label image of each photo that has one
+    # of the objects; pixels of a prepared label image count from 1 in this order, 0 is none of them
     names: tuple[str, ...] = ()
-    values: tuple[int, ...] = ()
-    notes: tuple[str, ...] = ()
+    values: tuple[int, ...] = ()  # label of each object in `images`; none where masks are given
+    notes: tuple[str, ...] = ()  # what was passed over, for the report
 
     def files(self) -> list[Path]:
         """Every file whose content the result depends on."""

@@ -28,36 +28,22 @@ NAMED = 8  # photos named one by one in a note
 
 @dataclass(frozen=True)
 class Photo:
-    """One prepared photo.
+    """One prepared photo."""
 
-    Attributes:
-        name: file name under `images/` (and, with `.png` added, under `masks/`).
-        source: the user's name of it, see `Source.name_of`, or the video's with a time; no two photos have the same.
-        width: prepared width, px.
-        height: prepared height, px.
-        original: width and height of the user's photo, px, turned as the prepared one is; of a frame of a video, which
-            nobody has as a file, those of the prepared photo.
-        lens: what the photo was freed from; None where nothing was straightened.
-        focal: focal length read from EXIF, px of the prepared photo; None where EXIF has none.
-        camera: make and model from EXIF, empty where unknown.
-        mask: whether a mask came with it, as alpha or as a file.
-        sharpness: see `quality.sharpness`; 0.2 to 0.6 for photos in focus.
-        fault: "blurred", "too dark", "burnt out", or nothing.
-        depth: whether depth came with it.
-    """
-
-    name: str
-    source: str
-    width: int
-    height: int
+    name: str  # file name under `images/` (and, with `.png` added, under `masks/`)
+    source: str  # the user's name of it, see `Source.name_of`, or the video's with a time; no two photos have the same
+    width: int  # prepared width, px
+    height: int  # prepared height, px
+    # width and height of the user's photo, px, turned as the prepared one is; of a frame of a video, which nobody has
+    # as a file, those of the prepared photo
     original: tuple[int, int]
-    lens: Lens | None
-    focal: float | None
-    camera: str
-    mask: bool
-    sharpness: float
-    fault: str = ""
-    depth: bool = False
+    lens: Lens | None  # what the photo was freed from; None where nothing was straightened
+    focal: float | None  # focal length read from EXIF, px of the prepared photo; None where EXIF has none
+    camera: str  # make and model from EXIF, empty where unknown
+    mask: bool  # whether a mask came with it, as alpha or as a file
+    sharpness: float  # see `quality.sharpness`; 0.2 to 0.6 for photos in focus
+    fault: str = ""  # "blurred", "too dark", "burnt out", or nothing
+    depth: bool = False  # whether depth came with it
 
     def prepared(self, pixels: np.ndarray, view: View) -> np.ndarray:
         """Pixels [P, 2] of the prepared photo, of camera `view`, from those of the user's photo."""

@@ -19,30 +19,18 @@ VIDEOS = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"}
 
 @dataclass(frozen=True)
 class Source:
-    """What is to be reconstructed.
+    """What is to be reconstructed."""
 
-    Attributes:
-        photos: photo files in name order; none where a video is given.
-        masks: mask file of each photo that has one.
-        labels: which object each pixel shows, where that is given.
-        video: the video, or None.
-        cameras: transforms.json, the folder of a COLMAP model or of a phone's capture, whose poses are to be used;
-            None: find them.
-        frames: camera of each photo in `cameras`.
-        capture: what a capture with depth says of its world; None where there is no depth.
-        archive: a zipped capture that has to be unpacked first; then there is nothing else.
-        notes: what was passed over, for the report.
-    """
-
-    photos: tuple[Path, ...] = ()
-    masks: dict[Path, Path] = field(default_factory=dict)
-    labels: Labels = field(default_factory=Labels)
-    video: Path | None = None
+    photos: tuple[Path, ...] = ()  # photo files in name order; none where a video is given
+    masks: dict[Path, Path] = field(default_factory=dict)  # mask file of each photo that has one
+    labels: Labels = field(default_factory=Labels)  # which object each pixel shows, where that is given
+    video: Path | None = None  # the video, or None
+    # transforms.json, the folder of a COLMAP model or of a phone's capture, whose poses are to be used; None: find them
     cameras: Path | None = None
-    frames: dict[Path, KnownCamera] = field(default_factory=dict)
-    capture: Capture | None = None
-    archive: Path | None = None
-    notes: tuple[str, ...] = ()
+    frames: dict[Path, KnownCamera] = field(default_factory=dict)  # camera of each photo in `cameras`
+    capture: Capture | None = None  # what a capture with depth says of its world; None where there is no depth
+    archive: Path | None = None  # a zipped capture that has to be unpacked first; then there is nothing else
+    notes: tuple[str, ...] = ()  # what was passed over, for the report
 
     @property
     def folder(self) -> Path:

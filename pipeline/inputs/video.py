@@ -22,17 +22,11 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 @dataclass(frozen=True)
 class Track:
-    """What a first pass over a video finds.
+    """What a first pass over a video finds."""
 
-    Attributes:
-        moved: [F] how far the picture has moved up to each frame, in picture widths.
-        sharp: [F] sharpness of each frame.
-        rate: frames a second.
-    """
-
-    moved: np.ndarray
-    sharp: np.ndarray
-    rate: float
+    moved: np.ndarray  # [F] how far the picture has moved up to each frame, in picture widths
+    sharp: np.ndarray  # [F] sharpness of each frame
+    rate: float  # frames a second
 
 
 def frames_of(path: Path) -> tuple[Iterator[np.ndarray], float]:

@@ -51,17 +51,11 @@ FINER = 3.0
 
 @dataclass(frozen=True)
 class Level:
-    """A level plane.
+    """A level plane."""
 
-    Attributes:
-        normal: [3] unit, upwards.
-        height: of the plane along it.
-        area: that photos show.
-    """
-
-    normal: np.ndarray
-    height: float
-    area: float
+    normal: np.ndarray  # [3] unit, upwards
+    height: float  # of the plane along it
+    area: float  # that photos show
 
     def above(self, points: np.ndarray) -> np.ndarray:
         """Height [...] of points [..., 3] above the plane."""
@@ -322,25 +316,17 @@ def without_bodies(volume: Volume, bodies: list[Body], field: Distance) -> Volum
 
 @dataclass(frozen=True)
 class Parts:
-    """What a scene is made of, in normalised space.
+    """What a scene is made of, in normalised space."""
 
-    Attributes:
-        solid: closed mesh of the scenery; None where there are bodies alone.
-        shown: what is displayed of it: its visible surface, and the places where bodies stood; None like `solid`.
-        bodies: closed mesh of each body by name, with colours; the largest first.
-        smallest: what rises less than this above its plane stayed part of the scenery.
-        touching: names of two bodies that touch, and "masks" or "shape", which told them apart.
-        missing: names of masks whose object has no surface of its own.
-        noise: longest sides of what was no body, see `_is_noise`.
-    """
-
-    solid: Mesh | None
+    solid: Mesh | None  # closed mesh of the scenery; None where there are bodies alone
+    # what is displayed of it: its visible surface, and the places where bodies stood; None like `solid`
     shown: Mesh | None
-    bodies: dict[str, Mesh]
-    smallest: float
+    bodies: dict[str, Mesh]  # closed mesh of each body by name, with colours; the largest first
+    smallest: float  # what rises less than this above its plane stayed part of the scenery
+    # names of two bodies that touch, and "masks" or "shape", which told them apart
     touching: list[tuple[str, str, str]] = field(default_factory=list)
-    missing: list[str] = field(default_factory=list)
-    noise: list[float] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)  # names of masks whose object has no surface of its own
+    noise: list[float] = field(default_factory=list)  # longest sides of what was no body, see `_is_noise`
 
 
 def split(surface: Surface, distance: Distance, finest: float, views: list[View], points: np.ndarray,

@@ -35,17 +35,11 @@ SPECK = 0.02
 
 @dataclass(frozen=True)
 class Volume:
-    """Samples of a signed distance.
+    """Samples of a signed distance."""
 
-    Attributes:
-        values: [X, Y, Z] float32.
-        low: [3] position of the first sample.
-        cell: between neighbouring samples.
-    """
-
-    values: np.ndarray
-    low: np.ndarray
-    cell: float
+    values: np.ndarray  # [X, Y, Z] float32
+    low: np.ndarray  # [3] position of the first sample
+    cell: float  # between neighbouring samples
 
     def axes(self) -> list[np.ndarray]:
         """Positions of the samples along x, y and z."""
@@ -147,23 +141,14 @@ def sample_box(distance: Distance, low: np.ndarray, high: np.ndarray, cell: floa
 
 @dataclass(frozen=True)
 class Surface:
-    """What was extracted, in normalised space.
+    """What was extracted, in normalised space."""
 
-    Attributes:
-        volume: the signed distance it comes from.
-        raw: all of the closed surface, with colours.
-        seen: [V] bool, vertices of it that photos show well enough.
-        kept: [F] bool, faces of it that belong.
-        shown: [F] bool, faces of it that belong and that photos show.
-        report: counts of what was left out, and why.
-    """
-
-    volume: Volume
-    raw: Mesh
-    seen: np.ndarray
-    kept: np.ndarray
-    shown: np.ndarray
-    report: dict
+    volume: Volume  # the signed distance it comes from
+    raw: Mesh  # all of the closed surface, with colours
+    seen: np.ndarray  # [V] bool, vertices of it that photos show well enough
+    kept: np.ndarray  # [F] bool, faces of it that belong
+    shown: np.ndarray  # [F] bool, faces of it that belong and that photos show
+    report: dict  # counts of what was left out, and why
 
     @property
     def visible(self) -> Mesh:

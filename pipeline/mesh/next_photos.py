@@ -29,19 +29,12 @@ NEARBY, SLIGHT = 35.0, 0.04  # degrees up to which a way is told in metres; shar
 
 @dataclass(frozen=True)
 class NextPhoto:
-    """A photo that would help.
+    """A photo that would help."""
 
-    Attributes:
-        view: its camera, metres, z up.
-        target: [3] m that it looks at.
-        gain: what it adds, as a share of all that photos from around could add.
-        words: where to stand and where to look.
-    """
-
-    view: View
-    target: np.ndarray
-    gain: float
-    words: str
+    view: View  # its camera, metres, z up
+    target: np.ndarray  # [3] m that it looks at
+    gain: float  # what it adds, as a share of all that photos from around could add
+    words: str  # where to stand and where to look
 
     def told(self) -> dict:
         """Plain values for the report."""
@@ -54,15 +47,10 @@ class NextPhoto:
 
 @dataclass(frozen=True)
 class Advice:
-    """What more photos could do.
+    """What more photos could do."""
 
-    Attributes:
-        photos: the best first; none where no photo helps `LEAST` of the surface.
-        weak: share that is weak, of the surface that the photos or a camera around could show.
-    """
-
-    photos: list[NextPhoto]
-    weak: float
+    photos: list[NextPhoto]  # the best first; none where no photo helps `LEAST` of the surface
+    weak: float  # share that is weak, of the surface that the photos or a camera around could show
 
 
 def next_photos(

@@ -44,17 +44,11 @@ AROUND, TOLD = 20, 0.1 / EVERY
 
 @dataclass(frozen=True)
 class Picture:
-    """A photo to compare patches in.
+    """A photo to compare patches in."""
 
-    Attributes:
-        view: its camera, for the pixels of the file.
-        scale: of the pixels of `grey` to those.
-        grey: [H, W] float32.
-    """
-
-    view: View
-    scale: float
-    grey: np.ndarray
+    view: View  # its camera, for the pixels of the file
+    scale: float  # of the pixels of `grey` to those
+    grey: np.ndarray  # [H, W] float32
 
 
 def load_pictures(views: list[View], photos_folder: Path) -> list[Picture]:

@@ -34,19 +34,12 @@ Named = TypeVar("Named", View, Photo)
 
 @dataclass(frozen=True)
 class Placement:
-    """Where a reconstruction stands in the world.
+    """Where a reconstruction stands in the world."""
 
-    Attributes:
-        to_metres: from normalised space to metres, z up.
-        up_from: "plane", "cameras", or in words what measured it.
-        size_from: where the scale comes from, in words.
-        up_within: degrees within which up can be trusted.
-    """
-
-    to_metres: Similarity
-    up_from: str
-    size_from: str
-    up_within: float = 0.0
+    to_metres: Similarity  # from normalised space to metres, z up
+    up_from: str  # "plane", "cameras", or in words what measured it
+    size_from: str  # where the scale comes from, in words
+    up_within: float = 0.0  # degrees within which up can be trusted
 
     @property
     def up_confidence(self) -> str:

@@ -53,14 +53,10 @@ WALL = 0.9
 
 @dataclass(frozen=True)
 class Votes:
-    """Which object each vertex of a surface belongs to.
+    """Which object each vertex of a surface belongs to."""
 
-    Attributes:
-        names: of the objects.
-        share: [V, 1 + names] share of the photos' votes for none of the objects, and for each; 0 where none votes.
-    """
-
-    names: list[str]
+    names: list[str]  # of the objects
+    # [V, 1 + names] share of the photos' votes for none of the objects, and for each; 0 where none votes
     share: np.ndarray
 
     @property
@@ -117,38 +113,23 @@ def _patches(faces: np.ndarray, label: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Part:
-    """One of the bodies that a solid is made of.
+    """One of the bodies that a solid is made of."""
 
-    Attributes:
-        number: of the name in `Votes`; 0: it has none.
-        seam: negative where the part is; zero at the seams. Its slope is that of a distance, roughly.
-        neighbours: index, in the list of the parts, of those that it touches.
-    """
-
-    number: int
-    seam: Volume
-    neighbours: list[int]
+    number: int  # of the name in `Votes`; 0: it has none
+    seam: Volume  # negative where the part is; zero at the seams. Its slope is that of a distance, roughly.
+    neighbours: list[int]  # index, in the list of the parts, of those that it touches
 
 
 @dataclass(frozen=True)
 class Seam:
-    """Where two parts meet, as far as it is one piece.
+    """Where two parts meet, as far as it is one piece."""
 
-    Attributes:
-        pair: numbers of the two parts.
-        rim: [R, 3] points on the surface where they meet.
-        point: [3] in the middle.
-        normal: [3] unit, from the first part to the second.
-        flat: whether the rim lies in a plane.
-        sides: [S, 3] the lines (a, b, c) around the seam in its plane: a x + b y + c <= 0 within.
-    """
-
-    pair: tuple[int, int]
-    rim: np.ndarray
-    point: np.ndarray
-    normal: np.ndarray
-    flat: bool
-    sides: np.ndarray
+    pair: tuple[int, int]  # numbers of the two parts
+    rim: np.ndarray  # [R, 3] points on the surface where they meet
+    point: np.ndarray  # [3] in the middle
+    normal: np.ndarray  # [3] unit, from the first part to the second
+    flat: bool  # whether the rim lies in a plane
+    sides: np.ndarray  # [S, 3] the lines (a, b, c) around the seam in its plane: a x + b y + c <= 0 within
 
     def beyond(self, points: np.ndarray) -> np.ndarray:
         """Distances [P] of points [P, 3] from the plane, positive towards the second part."""
@@ -162,23 +143,14 @@ class Seam:
 
 @dataclass(frozen=True)
 class Solid:
-    """One connected solid.
+    """One connected solid."""
 
-    Attributes:
-        volume: samples of the signed distance around it.
-        inside: [X, Y, Z] bool, those within it.
-        index: [P] its vertices in the mesh of everything.
-        points: [P, 3] these vertices.
-        normals: [P, 3] unit, outwards.
-        faces: [F, 3] between them.
-    """
-
-    volume: Volume
-    inside: np.ndarray
-    index: np.ndarray
-    points: np.ndarray
-    normals: np.ndarray
-    faces: np.ndarray
+    volume: Volume  # samples of the signed distance around it
+    inside: np.ndarray  # [X, Y, Z] bool, those within it
+    index: np.ndarray  # [P] its vertices in the mesh of everything
+    points: np.ndarray  # [P, 3] these vertices
+    normals: np.ndarray  # [P, 3] unit, outwards
+    faces: np.ndarray  # [F, 3] between them
 
     @property
     def border(self) -> np.ndarray:

@@ -37,21 +37,13 @@ FAINT = 1e-3  # weight of the vertex colours, which count where no photo does
 
 @dataclass(frozen=True)
 class Shots:
-    """Photos to take colours from.
+    """Photos to take colours from."""
 
-    Attributes:
-        views: cameras, metres.
-        sharpness: [N] of each photo, in any unit.
-        folder: of the photos stage.
-        blocking: what can stand in the way of a view.
-        lift: m, how far along its normal a place is lifted before looking from it.
-    """
-
-    views: list[View]
-    sharpness: np.ndarray
-    folder: Path
-    blocking: Caster
-    lift: float
+    views: list[View]  # cameras, metres
+    sharpness: np.ndarray  # [N] of each photo, in any unit
+    folder: Path  # of the photos stage
+    blocking: Caster  # what can stand in the way of a view
+    lift: float  # m, how far along its normal a place is lifted before looking from it
 
     def photo(self, view: View) -> np.ndarray:
         """Colours [H, W, 3] uint8."""
@@ -75,21 +67,13 @@ def shots_of(views: list[View], photos: list[Photo], folder: Path, meshes: Seque
 
 @dataclass(frozen=True)
 class Texels:
-    """The texels of a texture that lie on the surface.
+    """The texels of a texture that lie on the surface."""
 
-    Attributes:
-        shape: rows and columns of the texture, multiples of `BLOCK`.
-        at: [T] index of each in the flat texture.
-        positions: [T, 3] float32 m.
-        normals: [T, 3] float32, about unit.
-        colors: [T, 3] float32 in 0..255, those of the mesh's vertices.
-    """
-
-    shape: tuple[int, int]
-    at: np.ndarray
-    positions: np.ndarray
-    normals: np.ndarray
-    colors: np.ndarray
+    shape: tuple[int, int]  # rows and columns of the texture, multiples of `BLOCK`
+    at: np.ndarray  # [T] index of each in the flat texture
+    positions: np.ndarray  # [T, 3] float32 m
+    normals: np.ndarray  # [T, 3] float32, about unit
+    colors: np.ndarray  # [T, 3] float32 in 0..255, those of the mesh's vertices
 
 
 def texture_parts(meshes: dict[str, Mesh], shots: Shots, on_progress: Progress = quiet) -> dict[str, Mesh]:

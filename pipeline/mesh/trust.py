@@ -30,19 +30,12 @@ WIDE, LEGEND = 640, 44  # width of each half of a picture and height of its lege
 
 @dataclass(frozen=True)
 class Support:
-    """What photos tell of the places of some points.
+    """What photos tell of the places of some points."""
 
-    Attributes:
-        vertices: [V, 3] m, the points.
-        normals: [V, 3] unit, of the surface there.
-        views: [V] int, photos that see each.
-        information: [V, 3, 3] 1/m^2, see `information`; summed over these photos.
-    """
-
-    vertices: np.ndarray
-    normals: np.ndarray
-    views: np.ndarray
-    information: np.ndarray
+    vertices: np.ndarray  # [V, 3] m, the points
+    normals: np.ndarray  # [V, 3] unit, of the surface there
+    views: np.ndarray  # [V] int, photos that see each
+    information: np.ndarray  # [V, 3, 3] 1/m^2, see `information`; summed over these photos
 
     @property
     def uncertainty(self) -> np.ndarray:

@@ -21,17 +21,12 @@ FLATTEST = 0.08
 
 @dataclass(frozen=True)
 class Look:
-    """What the photos show of some points.
+    """What the photos show of some points."""
 
-    Attributes:
-        count: [V] how many views see each.
-        color: [V, 3] float in 0..255, the mean over photos, weighted towards those that look straight and from near.
-        weight: [V] behind the colour; 0: no photo shows the point.
-    """
-
-    count: np.ndarray
+    count: np.ndarray  # [V] how many views see each
+    # [V, 3] float in 0..255, the mean over photos, weighted towards those that look straight and from near
     color: np.ndarray
-    weight: np.ndarray
+    weight: np.ndarray  # [V] behind the colour; 0: no photo shows the point
 
 
 class Caster:

@@ -18,17 +18,11 @@ FEWEST = 50  # sparse points on pixels with depth that the scale needs
 
 @dataclass(frozen=True)
 class DepthPoints:
-    """Pixels with depth.
+    """Pixels with depth."""
 
-    Attributes:
-        xyz: [P, 3] in the world of the poses, as far away as the sensor says.
-        pixel: [P, 2] where the straight photo shows them.
-        view: [P] index of the view.
-    """
-
-    xyz: np.ndarray
-    pixel: np.ndarray
-    view: np.ndarray
+    xyz: np.ndarray  # [P, 3] in the world of the poses, as far away as the sensor says
+    pixel: np.ndarray  # [P, 2] where the straight photo shows them
+    view: np.ndarray  # [P] index of the view
 
 
 def depth_points(views: list[View], photos: list[Photo], folder: Path, *, scale: float = 1.0) -> DepthPoints:

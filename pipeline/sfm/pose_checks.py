@@ -26,19 +26,12 @@ COMPONENT_NAMED = 3
 
 @dataclass(frozen=True)
 class Findings:
-    """What the photos of a set have in common, whatever poses were found.
+    """What the photos of a set have in common, whatever poses were found."""
 
-    Attributes:
-        components: names of photos linked by verified matches, largest group first.
-        textureless: share of photos with too few features.
-        still: share of linked pairs whose matches mostly did not move.
-        rotation_only: share of linked pairs that a turn of the camera, without a step, explains.
-    """
-
-    components: list[list[str]]
-    textureless: float
-    still: float
-    rotation_only: float
+    components: list[list[str]]  # names of photos linked by verified matches, largest group first
+    textureless: float  # share of photos with too few features
+    still: float  # share of linked pairs whose matches mostly did not move
+    rotation_only: float  # share of linked pairs that a turn of the camera, without a step, explains
 
 
 def find(result: dict, photos: list[Photo]) -> Findings:

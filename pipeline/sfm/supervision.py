@@ -25,18 +25,12 @@ TRIES = 16  # places along each line at which filled free space is looked for
 
 @dataclass(frozen=True)
 class Supervision:
-    """Sparse points and free space in the unit sphere.
+    """Sparse points and free space in the unit sphere."""
 
-    Attributes:
-        points: [P, 3] surface points in the unit sphere.
-        weights: [P] how far each is trusted, mean 1.
-        sight: [L, 6] starts and ends of stretches of free space.
-        depth: [D, 3] points of a depth sensor in the unit sphere.
-    """
-
-    points: np.ndarray
-    weights: np.ndarray
-    sight: np.ndarray
+    points: np.ndarray  # [P, 3] surface points in the unit sphere
+    weights: np.ndarray  # [P] how far each is trusted, mean 1
+    sight: np.ndarray  # [L, 6] starts and ends of stretches of free space
+    # [D, 3] points of a depth sensor in the unit sphere
     depth: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
 
 

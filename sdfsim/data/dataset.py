@@ -38,37 +38,21 @@ _AXES = {  # T frames, N bodies
 
 @dataclass(frozen=True)
 class Trajectory:
-    """T recorded frames of N bodies above the static floor z = 0 (which is not among the N).
+    """T recorded frames of N bodies above the static floor z = 0 (which is not among the N)."""
 
-    Attributes:
-        position: [T, N, 3] m, body-frame origin = centre of mass.
-        quat_xyzw: [T, N, 4].
-        velocity: [T, N, 3] m/s, world, at the end of the step.
-        angular_velocity: [T, N, 3] rad/s, world, at the end of the step.
-        shape: [N] names of the Shape folders.
-        scale: [N] uniform size factors.
-        mass: [N] kg.
-        inertia: [N, 3] kg m^2, principal, body axes.
-        friction: [N].
-        restitution: [N].
-        static: [N] bool.
-        dt: s.
-        gravity: [3] m/s^2.
-    """
-
-    position: np.ndarray
-    quat_xyzw: np.ndarray
-    velocity: np.ndarray
-    angular_velocity: np.ndarray
-    shape: np.ndarray
-    scale: np.ndarray
-    mass: np.ndarray
-    inertia: np.ndarray
-    friction: np.ndarray
-    restitution: np.ndarray
-    static: np.ndarray
-    dt: float
-    gravity: np.ndarray
+    position: np.ndarray  # [T, N, 3] m, body-frame origin = centre of mass
+    quat_xyzw: np.ndarray  # [T, N, 4]
+    velocity: np.ndarray  # [T, N, 3] m/s, world, at the end of the step
+    angular_velocity: np.ndarray  # [T, N, 3] rad/s, world, at the end of the step
+    shape: np.ndarray  # [N] names of the Shape folders
+    scale: np.ndarray  # [N] uniform size factors
+    mass: np.ndarray  # [N] kg
+    inertia: np.ndarray  # [N, 3] kg m^2, principal, body axes
+    friction: np.ndarray  # [N]
+    restitution: np.ndarray  # [N]
+    static: np.ndarray  # [N] bool
+    dt: float  # s
+    gravity: np.ndarray  # [3] m/s^2
 
     def save(self, path: Path) -> None:
         """Write the file; its velocities are to be those that the engine recorded."""

@@ -75,21 +75,13 @@ URDF_TEMPLATE = """<robot name="body"><link name="base">
 
 @dataclass(frozen=True)
 class TeacherBody:
-    """One body as the engine needs it.
+    """One body as the engine needs it."""
 
-    Attributes:
-        urdf: file whose collision mesh is an OBJ with one convex piece per group, or whose body is an exact form.
-        scale: uniform size factor.
-        mass: kg (0 for static).
-        friction: lateral friction coefficient.
-        restitution: coefficient of restitution.
-    """
-
-    urdf: Path
-    scale: float
-    mass: float
-    friction: float
-    restitution: float
+    urdf: Path  # file whose collision mesh is an OBJ with one convex piece per group, or whose body is an exact form
+    scale: float  # uniform size factor
+    mass: float  # kg (0 for static)
+    friction: float  # lateral friction coefficient
+    restitution: float  # coefficient of restitution
 
 
 def import_pybullet():

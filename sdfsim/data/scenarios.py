@@ -86,37 +86,24 @@ Pose = tuple[np.ndarray, Rotation]  # [3] m of the centre of mass, and the orien
 
 @dataclass(frozen=True)
 class Cast:
-    """What a scene is made of.
+    """What a scene is made of."""
 
-    Attributes:
-        shapes: to draw bodies from.
-        scenery: the recipe's own shapes, by name.
-        bodies: how many bodies move, None for the recipe's own range.
-    """
-
-    shapes: list[ShapeSource]
-    scenery: dict[str, ShapeSource] = field(default_factory=dict)
-    bodies: int | None = None
+    shapes: list[ShapeSource]  # to draw bodies from
+    scenery: dict[str, ShapeSource] = field(default_factory=dict)  # the recipe's own shapes, by name
+    bodies: int | None = None  # how many bodies move, None for the recipe's own range
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """How scenes start.
+    """How scenes start."""
 
-    Attributes:
-        spawn: puts the bodies of a scene into the teacher's world and returns them in its order, those that are static
-            with mass 0; None where one found no room.
-        kubasic: takes NAME/ folders as they are, in all splits; otherwise shapes are split by name.
-        given: draws bodies from shapes that the caller gives.
-        counted: can make a fixed number of bodies.
-        scenery: the recipe's own shapes, name -> primitive.
-    """
-
+    # puts the bodies of a scene into the teacher's world and returns them in its order, those that are static with mass
+    # 0; None where one found no room
     spawn: Callable[[Teacher, np.random.Generator, Cast], Bodies | None]
-    kubasic: bool = False
-    given: bool = True
-    counted: bool = False
-    scenery: dict[str, str] = field(default_factory=dict)
+    kubasic: bool = False  # takes NAME/ folders as they are, in all splits; otherwise shapes are split by name
+    given: bool = True  # draws bodies from shapes that the caller gives
+    counted: bool = False  # can make a fixed number of bodies
+    scenery: dict[str, str] = field(default_factory=dict)  # the recipe's own shapes, name -> primitive
 
 
 def movi_b(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies | None:

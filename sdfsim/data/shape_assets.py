@@ -40,21 +40,13 @@ VHACD_TIME = 600  # s
 
 @dataclass(frozen=True)
 class Origin:
-    """Where a shape comes from.
+    """Where a shape comes from."""
 
-    Attributes:
-        name: of the Shape folder.
-        mesh: file of the solid, which is also what is shown.
-        pieces: OBJ with one convex piece a group; None: `mesh` is cut into pieces by V-HACD.
-        primitive: name of a primitive, in place of files.
-        as_is: keep size and origin of the files, as MOVi-B does. Other shapes get a largest extent of 1 m.
-    """
-
-    name: str
-    mesh: Path | None = None
-    pieces: Path | None = None
-    primitive: str = ""
-    as_is: bool = False
+    name: str  # of the Shape folder
+    mesh: Path | None = None  # file of the solid, which is also what is shown
+    pieces: Path | None = None  # OBJ with one convex piece a group; None: `mesh` is cut into pieces by V-HACD
+    primitive: str = ""  # name of a primitive, in place of files
+    as_is: bool = False  # keep size and origin of the files, as MOVi-B does. Other shapes get a largest extent of 1 m.
 
     @property
     def how(self) -> str:
@@ -72,28 +64,18 @@ class Origin:
 
 @dataclass(frozen=True)
 class ShapeSource:
-    """One shape as recipes and the fit need it.
+    """One shape as recipes and the fit need it."""
 
-    Attributes:
-        name: of the Shape folder.
-        urdf: engine file, its base frame at the centre of mass.
-        volume: m^3 at scale 1.
-        vertices: [V, 3] m about the centre of mass, at scale 1.
-        pieces: OBJ of the convex pieces, in the frame of the engine.
-        display: mesh file to show, or None for the pieces' own boundary.
-        com, size: the displayed mesh comes into the engine's frame by (vertex - com [3]) / size.
-        sphere: the engine's body is an exact sphere of diameter 1 m, `pieces` a hull of points on it.
-    """
-
-    name: str
-    urdf: Path
-    volume: float
-    vertices: np.ndarray
-    pieces: Path
-    display: Path | None
+    name: str  # of the Shape folder
+    urdf: Path  # engine file, its base frame at the centre of mass
+    volume: float  # m^3 at scale 1
+    vertices: np.ndarray  # [V, 3] m about the centre of mass, at scale 1
+    pieces: Path  # OBJ of the convex pieces, in the frame of the engine
+    display: Path | None  # mesh file to show, or None for the pieces' own boundary
+    # com, size: the displayed mesh comes into the engine's frame by (vertex - com [3]) / size
     com: np.ndarray
     size: float
-    sphere: bool = False
+    sphere: bool = False  # the engine's body is an exact sphere of diameter 1 m, `pieces` a hull of points on it
 
 
 def split_of(name: str) -> str:

@@ -47,52 +47,32 @@ class Units:
 
 @dataclass(frozen=True)
 class Bodies:
-    """N bodies with M surface nodes; lengths, times and masses in model units.
+    """N bodies with M surface nodes; lengths, times and masses in model units."""
 
-    Attributes:
-        shape: [N] int64 index into `sdfs`, -1 for a body that nothing may touch.
-        scale: [N] float64, shape metres -> model lengths.
-        com: [N, 3] float64, centre of mass from the shape's origin (shape axes, scaled).
-        mass: [N] float64 (0 unless dynamic).
-        inverse_mass: [N] float64, 0 unless dynamic.
-        inertia: [N, 3, 3] float64 about the centre of mass, shape axes (identity unless dynamic).
-        friction, restitution: [N] float64.
-        moves: [N] bool, True for dynamic bodies: they fly, and contacts push them.
-        bounds: [N, 2, 3] float64, box of the solid about the centre of mass, shape axes, scaled.
-        size: [N] float64, largest side of `bounds` (infinite for a plane).
-        radius: [N] float64, how far `bounds` reach from the centre of mass (infinite for a plane).
-        node: [M, 3] float64, surface nodes about the centre of mass, shape axes, scaled.
-        node_start: [N + 1] int64, body k owns nodes node_start[k] : node_start[k + 1].
-        face: [F, 3] int64, corners of the surfaces' triangles, indices into `node`; none where nodes are points alone.
-        group: [N] int64, what `collides_with` makes of a body.
-        allowed: [G, G] bool, whether bodies of two groups may touch.
-        world: [N] int64: bodies of two worlds never meet; -1 is in all of them.
-        sdfs: signed distances of the shapes that may be touched.
-        pieces: of each of these the vertices of its convex pieces, shape frame in m; none of most.
-        tracks: the paths of kinematic bodies, None where there are none.
-    """
-
-    shape: Tensor
-    scale: Tensor
-    com: Tensor
-    mass: Tensor
-    inverse_mass: Tensor
-    inertia: Tensor
+    shape: Tensor  # [N] int64 index into `sdfs`, -1 for a body that nothing may touch
+    scale: Tensor  # [N] float64, shape metres -> model lengths
+    com: Tensor  # [N, 3] float64, centre of mass from the shape's origin (shape axes, scaled)
+    mass: Tensor  # [N] float64 (0 unless dynamic)
+    inverse_mass: Tensor  # [N] float64, 0 unless dynamic
+    inertia: Tensor  # [N, 3, 3] float64 about the centre of mass, shape axes (identity unless dynamic)
+    # friction, restitution: [N] float64
     friction: Tensor
     restitution: Tensor
-    moves: Tensor
-    bounds: Tensor
-    size: Tensor
-    radius: Tensor
-    node: Tensor
-    node_start: Tensor
+    moves: Tensor  # [N] bool, True for dynamic bodies: they fly, and contacts push them
+    bounds: Tensor  # [N, 2, 3] float64, box of the solid about the centre of mass, shape axes, scaled
+    size: Tensor  # [N] float64, largest side of `bounds` (infinite for a plane)
+    radius: Tensor  # [N] float64, how far `bounds` reach from the centre of mass (infinite for a plane)
+    node: Tensor  # [M, 3] float64, surface nodes about the centre of mass, shape axes, scaled
+    node_start: Tensor  # [N + 1] int64, body k owns nodes node_start[k] : node_start[k + 1]
+    # [F, 3] int64, corners of the surfaces' triangles, indices into `node`; none where nodes are points alone
     face: Tensor
-    group: Tensor
-    allowed: Tensor
-    world: Tensor
-    sdfs: tuple[Sdf, ...]
+    group: Tensor  # [N] int64, what `collides_with` makes of a body
+    allowed: Tensor  # [G, G] bool, whether bodies of two groups may touch
+    world: Tensor  # [N] int64: bodies of two worlds never meet; -1 is in all of them
+    sdfs: tuple[Sdf, ...]  # signed distances of the shapes that may be touched
+    # of each of these the vertices of its convex pieces, shape frame in m; none of most
     pieces: tuple[tuple[np.ndarray, ...], ...] = ()
-    tracks: Tracks | None = None
+    tracks: Tracks | None = None  # the paths of kinematic bodies, None where there are none
 
     def __len__(self) -> int:
         return len(self.shape)
@@ -110,30 +90,20 @@ class Bodies:
 
 @dataclass(frozen=True)
 class Touch:
-    """What the contact solve knows of N bodies from one step to the next.
+    """What the contact solve knows of N bodies from one step to the next."""
 
-    Attributes:
-        touching: [N] bool, whether contacts acted in the last inner step.
-        quiet: [N] int64, for how many steps a body in contact has stayed near its anchor.
-        anchor: [N, 7] float64, position and orientation that it has stayed near.
-        island: [N] int64, a number shared by the bodies that fell asleep together; -1 for all that are awake.
-        pair: [P, 2] int64, bodies with contact points; count: [P] int64, how many each pair has.
-        point: [P, 24, 16] float64: where a point is on either body (about its centre of mass, in its axes), the normal
-            from the second to the first, the distance, the impulse along the normal and the tangential one [3], the two
-            patches that meet.
-        held: [N, 13] float64, position, orientation and velocities that the last step ended with.
-        gravity: [3], what it was made under.
-    """
-
-    touching: Tensor
-    quiet: Tensor
-    anchor: Tensor
-    island: Tensor
-    pair: Tensor
+    touching: Tensor  # [N] bool, whether contacts acted in the last inner step
+    quiet: Tensor  # [N] int64, for how many steps a body in contact has stayed near its anchor
+    anchor: Tensor  # [N, 7] float64, position and orientation that it has stayed near
+    island: Tensor  # [N] int64, a number shared by the bodies that fell asleep together; -1 for all that are awake
+    pair: Tensor  # [P, 2] int64, bodies with contact points; count: [P] int64, how many each pair has
     count: Tensor
+    # [P, 24, 16] float64: where a point is on either body (about its centre of mass, in its axes), the normal from the
+    # second to the first, the distance, the impulse along the normal and the tangential one [3], the two patches that
+    # meet
     point: Tensor
-    held: Tensor
-    gravity: Tensor
+    held: Tensor  # [N, 13] float64, position, orientation and velocities that the last step ended with
+    gravity: Tensor  # [3], what it was made under
 
 
 @dataclass(frozen=True)

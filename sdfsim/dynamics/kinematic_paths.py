@@ -15,21 +15,13 @@ from sdfsim.scene.scene import Waypoints
 
 @dataclass(frozen=True)
 class Tracks:
-    """The paths of K kinematic bodies with up to P poses each, model units.
+    """The paths of K kinematic bodies with up to P poses each, model units."""
 
-    Attributes:
-        body: [K] int64 the bodies they move.
-        time: [K, P] float64, increasing; infinite beyond the last pose of a path.
-        origin: [K, P, 3] float64, of the shapes' own origins.
-        orientation: [K, P, 4] float64 xyzw.
-        com: [K, 3] float64, centre of mass from the shape's origin (shape axes).
-    """
-
-    body: Tensor
-    time: Tensor
-    origin: Tensor
-    orientation: Tensor
-    com: Tensor
+    body: Tensor  # [K] int64 the bodies they move
+    time: Tensor  # [K, P] float64, increasing; infinite beyond the last pose of a path
+    origin: Tensor  # [K, P, 3] float64, of the shapes' own origins
+    orientation: Tensor  # [K, P, 4] float64 xyzw
+    com: Tensor  # [K, 3] float64, centre of mass from the shape's origin (shape axes)
 
     def at(self, time: float) -> tuple[Tensor, Tensor]:
         """Centres of mass [K, 3] and orientations [K, 4] at `time`."""

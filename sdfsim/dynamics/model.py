@@ -26,34 +26,23 @@ SURFACE = ("paper", "fignet", "fignet-star", "mgn", "dpi")  # networks whose mes
 
 @dataclass(frozen=True)
 class Model:
-    """Weights with everything needed to use them.
+    """Weights with everything needed to use them."""
 
-    Attributes:
-        name: bundled name or file stem.
-        kind: "solver", "impulse" or one of `SURFACE`.
-        network: in evaluation mode; the solver has none.
-        dt: s, the step of the training data, or of the solver for bodies of `length` at `gravity`.
-        gravity: m/s^2, its magnitude in the training data.
-        length: m, the middle of the range of training bodies' largest extents; other scenes are rescaled to it. The
-            solver is rescaled to the smallest body that moves.
-        reach: m, contact radius D.
-        nodes: surface nodes a body it was trained with, see `surface`; None for all.
-        inner: inner steps of the solve in a step; 0 for those of the recording engine (5 where none has recorded).
-        ranges: name -> [low, high] of what training saw (friction, restitution, mass_ratio, speed, size).
-        card: training record (data, steps, seconds, errors).
-    """
-
-    name: str
-    kind: str
-    network: nn.Module
-    dt: float
-    gravity: float
+    name: str  # bundled name or file stem
+    kind: str  # "solver", "impulse" or one of `SURFACE`
+    network: nn.Module  # in evaluation mode; the solver has none
+    dt: float  # s, the step of the training data, or of the solver for bodies of `length` at `gravity`
+    gravity: float  # m/s^2, its magnitude in the training data
+    # m, the middle of the range of training bodies' largest extents; other scenes are rescaled to it. The solver is
+    # rescaled to the smallest body that moves.
     length: float
-    reach: float
-    nodes: int | None = None
+    reach: float  # m, contact radius D
+    nodes: int | None = None  # surface nodes a body it was trained with, see `surface`; None for all
+    # inner steps of the solve in a step; 0 for those of the recording engine (5 where none has recorded)
     inner: int = 0
+    # name -> [low, high] of what training saw (friction, restitution, mass_ratio, speed, size)
     ranges: dict[str, list[float]] = field(default_factory=dict)
-    card: dict[str, Any] = field(default_factory=dict)
+    card: dict[str, Any] = field(default_factory=dict)  # training record (data, steps, seconds, errors)
 
     @property
     def on_surfaces(self) -> bool:

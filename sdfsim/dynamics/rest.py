@@ -14,15 +14,11 @@ STRAY = 0.05  # model lengths: within so much of where it was, its farthest poin
 
 @dataclass(frozen=True)
 class Rest:
-    """For how long everything has rested: no point of a dynamic body has gone beyond `STRAY` of where it was.
+    """For how long everything has rested: no point of a dynamic body has gone beyond `STRAY` of where it was."""
 
-    Attributes:
-        anchor: [D, 7] float64, the poses of the dynamic bodies that they have stayed near; None before the first state.
-        quiet: for how many steps.
-    """
-
+    # [D, 7] float64, the poses of the dynamic bodies that they have stayed near; None before the first state
     anchor: np.ndarray | None = None
-    quiet: int = 0
+    quiet: int = 0  # for how many steps
 
     @property
     def settled(self) -> bool:

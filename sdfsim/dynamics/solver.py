@@ -36,35 +36,24 @@ INWARD = 0.004  # of a solid's largest extent, from where its nodes look out
 
 @dataclass(frozen=True)
 class SolverRules:
-    """What the solve is made of; lengths and speeds in model units, in which the smallest bodies are about 1.4 wide.
+    """What the solve is made of; lengths and speeds in model units, in which the smallest bodies are about 1.4 wide."""
 
-    Attributes:
-        reach: contacts are kept up to this distance, and while they have slid by no more; look: new ones are looked
-            for up to this one.
-        still: pairs that have moved by less within a step are not looked at again.
-        together: points that are deeper than the deepest less this meet in one impact.
-        erp: the share of a penetration that an inner step resolves, through velocity.
-        slop: penetration that is left as it is, so that what rests has contacts that do not come and go.
-        split: deeper penetration than this is resolved without a lasting velocity.
-        slow: g times the inner step times this is the approach that ends at the surface without a rebound (in
-            `kernels.world.Rules` it is that speed).
-        rounds: of sequential impulses at most.
-        exact: they end when no impulse changes a velocity by more.
-        apart: points of a manifold are at least so far from each other.
-        stray, rest: who stays within `stray` for so many steps falls asleep.
-    """
-
+    # contacts are kept up to this distance, and while they have slid by no more; look: new ones are looked for up to
+    # this one
     reach: float = 0.02
     look: float = 0.004
-    still: float = 1e-4
-    together: float = 1e-4
-    erp: float = 0.08
-    slop: float = 5e-4
-    split: float = 0.04
+    still: float = 1e-4  # pairs that have moved by less within a step are not looked at again
+    together: float = 1e-4  # points that are deeper than the deepest less this meet in one impact
+    erp: float = 0.08  # the share of a penetration that an inner step resolves, through velocity
+    slop: float = 5e-4  # penetration that is left as it is, so that what rests has contacts that do not come and go
+    split: float = 0.04  # deeper penetration than this is resolved without a lasting velocity
+    # g times the inner step times this is the approach that ends at the surface without a rebound (in
+    # `kernels.world.Rules` it is that speed)
     slow: float = 2.0
-    rounds: int = 50
-    exact: float = 1e-4
-    apart: float = 0.03
+    rounds: int = 50  # of sequential impulses at most
+    exact: float = 1e-4  # they end when no impulse changes a velocity by more
+    apart: float = 0.03  # points of a manifold are at least so far from each other
+    # stray, rest: who stays within `stray` for so many steps falls asleep
     stray: float = 0.005
     rest: int = 25
 
@@ -125,25 +114,18 @@ def warm() -> None:
 
 @dataclass(frozen=True)
 class Acts:
-    """What contacts did in a step, at E places where bodies met or nearly met; model units, world axes.
+    """What contacts did in a step, at E places where bodies met or nearly met; model units, world axes."""
 
-    Attributes:
-        first, second: [E] int64, the two bodies; the first one moves.
-        arm_first, arm_second: [E, 3] from their centres of mass to the contact.
-        normal: [E, 3] from the second to the first.
-        impulse: [E, 3] on the first, opposite on the second; 0 where they only were near.
-        gap: [E] the distance when it was first looked at.
-        when: [E] the part of the step that was over by then.
-    """
-
+    # first, second: [E] int64, the two bodies; the first one moves
     first: torch.Tensor
     second: torch.Tensor
+    # arm_first, arm_second: [E, 3] from their centres of mass to the contact
     arm_first: torch.Tensor
     arm_second: torch.Tensor
-    normal: torch.Tensor
-    impulse: torch.Tensor
-    gap: torch.Tensor
-    when: torch.Tensor
+    normal: torch.Tensor  # [E, 3] from the second to the first
+    impulse: torch.Tensor  # [E, 3] on the first, opposite on the second; 0 where they only were near
+    gap: torch.Tensor  # [E] the distance when it was first looked at
+    when: torch.Tensor  # [E] the part of the step that was over by then
 
     def __len__(self) -> int:
         return len(self.first)
@@ -280,20 +262,13 @@ def held(state: State) -> torch.Tensor:
 
 @dataclass(frozen=True)
 class Touching:
-    """E places where bodies touch, model units.
+    """E places where bodies touch, model units."""
 
-    Attributes:
-        pair: [E, 2] int64, the two bodies.
-        point: [E, 3] on the first, world; normal: [E, 3] from the second to the first.
-        impulse: [E, 3] on the first in the last inner step.
-        gap: [E] below 0 where they are in each other.
-    """
-
-    pair: np.ndarray
-    point: np.ndarray
+    pair: np.ndarray  # [E, 2] int64, the two bodies
+    point: np.ndarray  # [E, 3] on the first, world; normal: [E, 3] from the second to the first
     normal: np.ndarray
-    impulse: np.ndarray
-    gap: np.ndarray
+    impulse: np.ndarray  # [E, 3] on the first in the last inner step
+    gap: np.ndarray  # [E] below 0 where they are in each other
 
 
 def contact_points(state: State) -> Touching:

@@ -29,39 +29,25 @@ _POSE = ("position", "orientation", "velocity", "angular_velocity")
 
 @dataclass(frozen=True)
 class StepOptions:
-    """What is in play during a run, in model units.
+    """What is in play during a run, in model units."""
 
-    Attributes:
-        gravity: [3] float64.
-        dt: the step.
-        substeps: inner steps of the solve in it.
-        falls: False where gravity is zero: free flight without acceleration.
-        contact: False leaves every body in free flight.
-        friction: False computes no tangential impulse.
-        restitution: False makes every contact one of restitution 0.
-        rotation: False lets bodies translate only.
-        free_flight: "exact", or "learned" where a network on surface nodes predicts all of every body's motion.
-        rows: how many edges such a network works on at once; None for all.
-        sleep: whether the solve freezes what rests.
-        margin: by which all bodies but planes are larger for the solve than their distances say; adds: whether what
-            it pushes out adds to the speed of a rebound. Both are habits of the teacher, for comparisons with it.
-        trust: in what the network adds to the solve; 0 where a scene is beyond its training.
-    """
-
-    gravity: Tensor
-    dt: float
-    substeps: int = SUBSTEPS
-    falls: bool = True
-    contact: bool = True
-    friction: bool = True
-    restitution: bool = True
-    rotation: bool = True
+    gravity: Tensor  # [3] float64
+    dt: float  # the step
+    substeps: int = SUBSTEPS  # inner steps of the solve in it
+    falls: bool = True  # False where gravity is zero: free flight without acceleration
+    contact: bool = True  # False leaves every body in free flight
+    friction: bool = True  # False computes no tangential impulse
+    restitution: bool = True  # False makes every contact one of restitution 0
+    rotation: bool = True  # False lets bodies translate only
+    # "exact", or "learned" where a network on surface nodes predicts all of every body's motion
     free_flight: FreeFlight = "exact"
-    rows: int | None = None
-    sleep: bool = False
+    rows: int | None = None  # how many edges such a network works on at once; None for all
+    sleep: bool = False  # whether the solve freezes what rests
+    # by which all bodies but planes are larger for the solve than their distances say; adds: whether what it pushes out
+    # adds to the speed of a rebound. Both are habits of the teacher, for comparisons with it.
     margin: float = 0.0
     adds: bool = False
-    trust: float = 1.0
+    trust: float = 1.0  # in what the network adds to the solve; 0 where a scene is beyond its training
 
 
 @torch.no_grad()

@@ -26,19 +26,13 @@ EVERY = 10  # frames between two that are looked at
 
 @dataclass(frozen=True)
 class Solid:
-    """A shape's exact geometry about its centre of mass, at scale 1.
+    """A shape's exact geometry about its centre of mass, at scale 1."""
 
-    Attributes:
-        nodes: [K, 3] m, surface nodes.
-        bounds: [2, 3] m, box of the solid (infinite for a plane).
-        distance: [P, 3] m -> [P] m, negative inside.
-        kind: "pieces" (the convex pieces that an engine collides), "mesh" (the shape's), "shown mesh" (the same, where
-            the engine collides pieces that are not at hand) or "closed form".
-    """
-
-    nodes: np.ndarray
-    bounds: np.ndarray
-    distance: Callable[[np.ndarray], np.ndarray]
+    nodes: np.ndarray  # [K, 3] m, surface nodes
+    bounds: np.ndarray  # [2, 3] m, box of the solid (infinite for a plane)
+    distance: Callable[[np.ndarray], np.ndarray]  # [P, 3] m -> [P] m, negative inside
+    # "pieces" (the convex pieces that an engine collides), "mesh" (the shape's), "shown mesh" (the same, where the
+    # engine collides pieces that are not at hand) or "closed form"
     kind: str
 
 

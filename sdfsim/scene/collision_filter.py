@@ -12,23 +12,14 @@ from sdfsim.scene.scene import Body
 
 @dataclass(frozen=True)
 class Pairs:
-    """The unordered pairs of bodies of a scene.
+    """The unordered pairs of bodies of a scene."""
 
-    Attributes:
-        total: all there are.
-        unmoved: of these, without a dynamic body: they may overlap as they like.
-        excluded: of the others, those that `collides_with` keeps apart.
-        possible: what is left.
-        frictional: of the possible ones, with a friction product above zero.
-        bouncy: likewise with a restitution product above zero.
-    """
-
-    total: int
-    unmoved: int
-    excluded: int
-    possible: int
-    frictional: int
-    bouncy: int
+    total: int  # all there are
+    unmoved: int  # of these, without a dynamic body: they may overlap as they like
+    excluded: int  # of the others, those that `collides_with` keeps apart
+    possible: int  # what is left
+    frictional: int  # of the possible ones, with a friction product above zero
+    bouncy: int  # likewise with a restitution product above zero
 
 
 def contact_groups(bodies: Sequence[Body]) -> tuple[np.ndarray, np.ndarray]:

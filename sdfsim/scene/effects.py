@@ -12,30 +12,18 @@ from sdfsim.scene.scene import Scene
 
 @dataclass(frozen=True)
 class Effect:
-    """One decision.
+    """One decision."""
 
-    Attributes:
-        on: whether it is in play.
-        why: the reason in a few words.
-        field: what to edit in the scene file to change it.
-    """
-
-    on: bool
-    why: str
-    field: str
+    on: bool  # whether it is in play
+    why: str  # the reason in a few words
+    field: str  # what to edit in the scene file to change it
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What the simulator has to do for one scene.
+    """What the simulator has to do for one scene."""
 
-    Attributes:
-        gravity, free_flight, contact, scenery, kinematic, rotation, friction, restitution, sleep: the decisions.
-        static, dynamic, kinematic_bodies: names of the bodies by how they move.
-        pairs: which pairs of bodies may touch.
-        nodes: surface nodes of all bodies, the infinite planes having none.
-    """
-
+    # gravity, free_flight, contact, scenery, kinematic, rotation, friction, restitution, sleep: the decisions
     gravity: Effect
     free_flight: Effect
     contact: Effect
@@ -45,11 +33,12 @@ class Plan:
     friction: Effect
     restitution: Effect
     sleep: Effect
+    # static, dynamic, kinematic_bodies: names of the bodies by how they move
     static: tuple[str, ...]
     dynamic: tuple[str, ...]
     kinematic_bodies: tuple[str, ...]
-    pairs: Pairs
-    nodes: int
+    pairs: Pairs  # which pairs of bodies may touch
+    nodes: int  # surface nodes of all bodies, the infinite planes having none
 
     def effects(self) -> dict[str, Effect]:
         """Every decision by its name."""

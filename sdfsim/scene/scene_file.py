@@ -109,18 +109,13 @@ def _told(error: Any) -> tuple[str, str]:
 
 @dataclass(frozen=True)
 class Number:
-    """A finite number, read from its text: above < x, least <= x <= most.
+    """A finite number, read from its text: above < x, least <= x <= most."""
 
-    Attributes:
-        unit: its SI unit, or an empty string.
-        whole: it has no fraction.
-    """
-
-    unit: str = ""
+    unit: str = ""  # its SI unit, or an empty string
     above: float | None = None
     least: float | None = None
     most: float | None = None
-    whole: bool = False
+    whole: bool = False  # it has no fraction
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> core_schema.CoreSchema:
         return core_schema.no_info_plain_validator_function(self.read)
@@ -151,17 +146,11 @@ class Number:
 
 @dataclass(frozen=True)
 class Vector:
-    """A list of numbers -> float64 [length].
+    """A list of numbers -> float64 [length]."""
 
-    Attributes:
-        of: each of them.
-        length: how many.
-        direction: why it may not be zero, where only its direction counts: it is made one long.
-    """
-
-    of: Number = Number()
-    length: int = 3
-    direction: str = ""
+    of: Number = Number()  # each of them
+    length: int = 3  # how many
+    direction: str = ""  # why it may not be zero, where only its direction counts: it is made one long
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> core_schema.CoreSchema:
         entries = core_schema.list_schema(core_schema.no_info_plain_validator_function(self.of.read))

@@ -33,25 +33,15 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class BakedGrid:
-    """Distances around one solid, in metres of the shape's own frame.
+    """Distances around one solid, in metres of the shape's own frame."""
 
-    Attributes:
-        low: [3] the first sample.
-        cell: m between two samples.
-        coarse: [X + 1, Y + 1, Z + 1] float32 m, at the corners of bricks.
-        brick: [X, Y, Z] int32, which of `fine` holds a brick; -1 far from the surface.
-        fine: [B, 9, 9, 9] float32 m.
-        thickness: m, of the thinnest walls (twentieth part of the surface).
-        error: m, the largest difference from what was baked, at random places in the bricks of the surface.
-    """
-
-    low: np.ndarray
-    cell: float
-    coarse: np.ndarray
-    brick: np.ndarray
-    fine: np.ndarray
-    thickness: float
-    error: float
+    low: np.ndarray  # [3] the first sample
+    cell: float  # m between two samples
+    coarse: np.ndarray  # [X + 1, Y + 1, Z + 1] float32 m, at the corners of bricks
+    brick: np.ndarray  # [X, Y, Z] int32, which of `fine` holds a brick; -1 far from the surface
+    fine: np.ndarray  # [B, 9, 9, 9] float32 m
+    thickness: float  # m, of the thinnest walls (twentieth part of the surface)
+    error: float  # m, the largest difference from what was baked, at random places in the bricks of the surface
 
 
 def baked(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = (), cache_dir: Path | None = None) -> BakedGrid:

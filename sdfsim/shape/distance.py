@@ -21,31 +21,19 @@ BLOCK = 512
 
 
 class Reference(NamedTuple):
-    """What is known about query points.
+    """What is known about query points."""
 
-    Attributes:
-        distance: [P] float64 m, positive outside.
-        closest: [P, 3] float64 m, the nearest point of the surface.
-        trusted: [P] bool, where the sign of `distance` may be used.
-    """
-
-    distance: np.ndarray
-    closest: np.ndarray
-    trusted: np.ndarray
+    distance: np.ndarray  # [P] float64 m, positive outside
+    closest: np.ndarray  # [P, 3] float64 m, the nearest point of the surface
+    trusted: np.ndarray  # [P] bool, where the sign of `distance` may be used
 
 
 class DistanceOracle(Protocol):
-    """Something that knows true distances: what the fit learns from.
+    """Something that knows true distances: what the fit learns from."""
 
-    Attributes:
-        surface: the boundary as triangles, for sampling points on it.
-        closed: whether signs are reliable everywhere, not only where `Reference.trusted` says so.
-        bounds: [2, 3] float64 m, the box of the surface.
-    """
-
-    surface: Mesh
-    closed: bool
-    bounds: np.ndarray
+    surface: Mesh  # the boundary as triangles, for sampling points on it
+    closed: bool  # whether signs are reliable everywhere, not only where `Reference.trusted` says so
+    bounds: np.ndarray  # [2, 3] float64 m, the box of the surface
 
     def __call__(self, points: np.ndarray) -> Reference: ...
 

@@ -56,48 +56,32 @@ class Plan:
 
     Lengths are relative to the shape's largest extent. The box gets its share of points and the loss stays soft up to
     some hundredths of the size, without which the far field is off by as much.
-
-    Attributes:
-        activation: of the hidden layers ("wave" or "relu").
-        width: of the hidden layers.
-        layers: linear layers, the last one included.
-        first: first-layer weights are uniform in +-first (periodic; it sets the finest scale the fit starts with).
-        optimiser: "soap" or "adam".
-        lr: step size.
-        decay: the part of the steps over which it falls to zero, at the end (0: constant).
-        steps: updates.
-        batch: points an update.
-        sigmas: points lie this far from the surface (standard deviation, log-uniform between the two).
-        near: fraction of points near the surface; the others are uniform in the box.
-        resample: updates between fresh pools of points (0: one pool).
-        pool: points in a pool.
-        soften: errors count with soften / (|distance| + soften); None counts all alike.
-        sign_everywhere: use the parity sign everywhere on closed surfaces, not only where the paper's rule trusts it.
-        goal: errors of the averaged weights at which the decay begins early, which halves them: of the distance (means
-            within 0.01 and in the box), of the gradient (median cosine distance within 0.1) and of the sign (fraction
-            wrong farther than 0.002). None never stops early.
-        settle: steps of an early decay.
-        fold: fit a solid that is its own mirror image on one side only.
     """
 
-    activation: Activation = "wave"
-    width: int = 64
-    layers: int = 6
+    activation: Activation = "wave"  # of the hidden layers ("wave" or "relu")
+    width: int = 64  # of the hidden layers
+    layers: int = 6  # linear layers, the last one included
+    # first-layer weights are uniform in +-first (periodic; it sets the finest scale the fit starts with)
     first: float = 8.0
-    optimiser: Literal["soap", "adam"] = "soap"
-    lr: float = 1e-2
-    decay: float = 0.5
-    steps: int = 5000
-    batch: int = 4096
+    optimiser: Literal["soap", "adam"] = "soap"  # "soap" or "adam"
+    lr: float = 1e-2  # step size
+    decay: float = 0.5  # the part of the steps over which it falls to zero, at the end (0: constant)
+    steps: int = 5000  # updates
+    batch: int = 4096  # points an update
+    # points lie this far from the surface (standard deviation, log-uniform between the two)
     sigmas: tuple[float, float] = (0.002, 0.15)
-    near: float = 0.8
-    resample: int = 0
-    pool: int = 400_000
-    soften: float | None = 0.04
+    near: float = 0.8  # fraction of points near the surface; the others are uniform in the box
+    resample: int = 0  # updates between fresh pools of points (0: one pool)
+    pool: int = 400_000  # points in a pool
+    soften: float | None = 0.04  # errors count with soften / (|distance| + soften); None counts all alike
+    # use the parity sign everywhere on closed surfaces, not only where the paper's rule trusts it
     sign_everywhere: bool = True
+    # errors of the averaged weights at which the decay begins early, which halves them: of the distance (means within
+    # 0.01 and in the box), of the gradient (median cosine distance within 0.1) and of the sign (fraction wrong farther
+    # than 0.002). None never stops early.
     goal: tuple[float, float, float, float] | None = (7e-4, 6e-3, 4e-3, 1.3e-3)
-    settle: int = 1000
-    fold: bool = True
+    settle: int = 1000  # steps of an early decay
+    fold: bool = True  # fit a solid that is its own mirror image on one side only
 
 
 PLANS = {
@@ -252,19 +236,12 @@ def _fit(
 
 
 class Pool(NamedTuple):
-    """Normalised points.
+    """Normalised points."""
 
-    Attributes:
-        points: [P, 3].
-        distance: [P] signed.
-        signed: [P] bool, whether the sign of the distance counts.
-        direction: [P, 3] unit, from the surface outwards; zero on the surface itself.
-    """
-
-    points: torch.Tensor
-    distance: torch.Tensor
-    signed: torch.Tensor
-    direction: torch.Tensor
+    points: torch.Tensor  # [P, 3]
+    distance: torch.Tensor  # [P] signed
+    signed: torch.Tensor  # [P] bool, whether the sign of the distance counts
+    direction: torch.Tensor  # [P, 3] unit, from the surface outwards; zero on the surface itself
 
 
 class _Run:

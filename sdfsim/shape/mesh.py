@@ -55,15 +55,10 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Frame:
-    """The normalised frame of a shape: `normalised = (metres - centre) / scale`, the solid within [-0.5, 0.5].
+    """The normalised frame of a shape: `normalised = (metres - centre) / scale`, the solid within [-0.5, 0.5]."""
 
-    Attributes:
-        centre: [3] float64 m, centre of the bounding box.
-        scale: m, its largest extent.
-    """
-
-    centre: np.ndarray
-    scale: float
+    centre: np.ndarray  # [3] float64 m, centre of the bounding box
+    scale: float  # m, its largest extent
 
     def inward(self, points: np.ndarray) -> np.ndarray:
         """Metres -> normalised, [P, 3]."""

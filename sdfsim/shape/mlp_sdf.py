@@ -29,23 +29,15 @@ SWEPT = {"cpu": 8192, "cuda": 131_072}
 
 @dataclass(frozen=True, eq=False)
 class MlpSdf:
-    """A signed distance as a small network on the shape normalised to [-0.5, 0.5].
+    """A signed distance as a small network on the shape normalised to [-0.5, 0.5]."""
 
-    Attributes:
-        weights: per layer [out, in] float32.
-        biases: per layer [out] float32.
-        activation: of the hidden layers (the frequency of the periodic ones is part of the weights).
-        frame: metres <-> normalised.
-        bounds: [2, 3] float64 m, the box that holds the solid.
-        mirrors: across which of the frame's planes x = 0, y = 0, z = 0 the solid is its own mirror image; the network
-            knows the positive side only.
-    """
-
-    weights: tuple[torch.Tensor, ...]
-    biases: tuple[torch.Tensor, ...]
-    activation: Activation
-    frame: Frame
-    bounds: np.ndarray
+    weights: tuple[torch.Tensor, ...]  # per layer [out, in] float32
+    biases: tuple[torch.Tensor, ...]  # per layer [out] float32
+    activation: Activation  # of the hidden layers (the frequency of the periodic ones is part of the weights)
+    frame: Frame  # metres <-> normalised
+    bounds: np.ndarray  # [2, 3] float64 m, the box that holds the solid
+    # across which of the frame's planes x = 0, y = 0, z = 0 the solid is its own mirror image; the network knows the
+    # positive side only
     mirrors: tuple[bool, bool, bool] = (False, False, False)
 
     @property

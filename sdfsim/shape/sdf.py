@@ -295,19 +295,15 @@ def trilinear(values: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor,
 class GridSdf:
     """A signed distance sampled on the box [-0.7, 0.7]^3 of the normalised frame, trilinear between the samples.
 
-    Attributes:
-        values: [R, R, R] float32 normalised distances at R >= 2 evenly spaced places along x, y and z, the
-            outermost on the faces of the box.
-        frame: metres <-> normalised.
-        bounds: [2, 3] float64 m, the box that holds the solid.
-
     Raises:
         ValueError: `values` is not a cube of at least two samples a side.
     """
 
+    # [R, R, R] float32 normalised distances at R >= 2 evenly spaced places along x, y and z, the outermost on the faces
+    # of the box
     values: torch.Tensor
-    frame: Frame
-    bounds: np.ndarray
+    frame: Frame  # metres <-> normalised
+    bounds: np.ndarray  # [2, 3] float64 m, the box that holds the solid
 
     def __post_init__(self) -> None:
         shape = tuple(self.values.shape)
@@ -382,14 +378,11 @@ class MeshSdf:
     Distances are good to about 1e-7 of the mesh's size. The hierarchy lives on the CPU; points on another device are
     brought there and the answers back.
 
-    Attributes:
-        mesh: metres.
-
     Raises:
         SdfsimError: the mesh has no faces.
     """
 
-    mesh: Mesh
+    mesh: Mesh  # metres
 
     def __post_init__(self) -> None:
         if len(self.mesh.faces) == 0:

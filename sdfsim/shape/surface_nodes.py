@@ -143,19 +143,13 @@ OUTSIDE = 1e-3  # of the extent: vertices that lie deeper in the union are not o
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Nodes of one shape and its patches, in the shape's own frame at scale 1.
+    """Nodes of one shape and its patches, in the shape's own frame at scale 1."""
 
-    Attributes:
-        nodes: [K, 3] m.
-        patch: [K] int64, the patch of each.
-        nearest: [X, Y, Z] int16, the patch that is nearest to the places of a lattice; None for a single patch.
-        low: [3] m, the first of these places; cell: m between two.
-    """
-
-    nodes: np.ndarray
-    patch: np.ndarray
+    nodes: np.ndarray  # [K, 3] m
+    patch: np.ndarray  # [K] int64, the patch of each
+    # [X, Y, Z] int16, the patch that is nearest to the places of a lattice; None for a single patch
     nearest: np.ndarray | None
-    low: np.ndarray
+    low: np.ndarray  # [3] m, the first of these places; cell: m between two
     cell: float
 
 

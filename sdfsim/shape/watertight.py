@@ -37,25 +37,17 @@ Side = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Solid:
-    """A body bounded by triangles.
+    """A body bounded by triangles."""
 
-    Attributes:
-        surface: its boundary, wound outwards: for distances, samples and display. Edges need not match where faces
-            were cut along the line in which they cross others.
-        body: what winding numbers, or the distance of a thickened solid, are taken of: the whole mesh, repaired.
-        notes: what was done to the mesh, a plain line each.
-        thickness: m, of the sheet that `body` then is; 0 if it is none.
-        closed: whether it has an inside without doubt; cracks and pinholes leave some.
-        simple: whether `surface` is one clean boundary, for which ray parity is exact.
-        layers: [F] int, how many faces of `surface` lie on each other where each is; None: one everywhere.
-    """
-
+    # its boundary, wound outwards: for distances, samples and display. Edges need not match where faces were cut along
+    # the line in which they cross others.
     surface: Mesh
-    body: Mesh
-    notes: tuple[str, ...] = ()
-    thickness: float = 0.0
-    closed: bool = True
-    simple: bool = False
+    body: Mesh  # what winding numbers, or the distance of a thickened solid, are taken of: the whole mesh, repaired
+    notes: tuple[str, ...] = ()  # what was done to the mesh, a plain line each
+    thickness: float = 0.0  # m, of the sheet that `body` then is; 0 if it is none
+    closed: bool = True  # whether it has an inside without doubt; cracks and pinholes leave some
+    simple: bool = False  # whether `surface` is one clean boundary, for which ray parity is exact
+    # [F] int, how many faces of `surface` lie on each other where each is; None: one everywhere
     layers: np.ndarray | None = None
 
     def mass_properties(self) -> tuple[float, np.ndarray, np.ndarray]:

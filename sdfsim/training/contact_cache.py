@@ -37,19 +37,13 @@ _SMALL = {"first": np.int16, "second": np.int16}
 
 @dataclass(frozen=True)
 class Solved:
-    """How recordings are followed.
+    """How recordings are followed."""
 
-    Attributes:
-        stride: recorded steps in a step of the network.
-        inner: inner steps of the solve in it; 0 for those of the recording engine.
-        draws: how often every recording is followed: first from the states as they are, then from disturbed ones.
-        shift, speed: m and m/s, standard deviations of the disturbance of a body's place and velocity, and by turning
-            and spinning of its surface. Every body's is a part of it, log-uniform from `least` to all.
-    """
-
-    stride: int = 1
-    inner: int = 0
-    draws: int = 2
+    stride: int = 1  # recorded steps in a step of the network
+    inner: int = 0  # inner steps of the solve in it; 0 for those of the recording engine
+    draws: int = 2  # how often every recording is followed: first from the states as they are, then from disturbed ones
+    # shift, speed: m and m/s, standard deviations of the disturbance of a body's place and velocity, and by turning and
+    # spinning of its surface. Every body's is a part of it, log-uniform from `least` to all.
     shift: float = 0.003
     speed: float = 0.03
     least: float = 0.05
@@ -65,54 +59,44 @@ class ContactFrames:
 
     A frame holds its trajectory's bodies that move or not, at the start of a step (rows of the body arrays), and
     its contact edges. `second` = -1 means the floor.
-
-    Attributes:
-        body_start, edge_start: [F + 1] int64, frame k owns rows body_start[k] : body_start[k + 1].
-        orientation: [B, 4]; velocity, angular: [B, 3] at the start of the step.
-        free_angular: [B, 3] rad/s at its end in free flight.
-        solved_velocity, solved_angular, solved_moved, solved_turned: [B, 3] what the solve makes of the step:
-            velocities at its end, and mean linear and angular velocity over it.
-        end_velocity, end_angular, moved, turned: [B, 3] the same as recorded.
-        mass: [B] kg, 0 for static bodies; inertia: [B, 3]; friction, restitution, size: [B].
-        first, second: [E] int16, bodies within the frame.
-        arm_first, arm_second: [E, 3] m, from the centres of mass (the floor's: its origin) to the contact.
-        normal: [E, 3] from the second to the first.
-        impulse: [E, 3] kg m/s, of the solve on the first body.
-        gap: [E] m; when: [E] part of the step that was over when it was met.
-        dt: s, `STEP`; gravity: [3] m/s^2.
-        trajectories: [K] int64, how many were followed, of each of the K sets that were joined.
     """
 
+    # body_start, edge_start: [F + 1] int64, frame k owns rows body_start[k] : body_start[k + 1]
     body_start: np.ndarray
     edge_start: np.ndarray
-    orientation: np.ndarray
+    orientation: np.ndarray  # [B, 4]; velocity, angular: [B, 3] at the start of the step
     velocity: np.ndarray
     angular: np.ndarray
-    free_angular: np.ndarray
+    free_angular: np.ndarray  # [B, 3] rad/s at its end in free flight
+    # solved_velocity, solved_angular, solved_moved, solved_turned: [B, 3] what the solve makes of the step: velocities
+    # at its end, and mean linear and angular velocity over it
     solved_velocity: np.ndarray
     solved_angular: np.ndarray
     solved_moved: np.ndarray
     solved_turned: np.ndarray
+    # end_velocity, end_angular, moved, turned: [B, 3] the same as recorded
     end_velocity: np.ndarray
     end_angular: np.ndarray
     moved: np.ndarray
     turned: np.ndarray
-    mass: np.ndarray
+    mass: np.ndarray  # [B] kg, 0 for static bodies; inertia: [B, 3]; friction, restitution, size: [B]
     inertia: np.ndarray
     friction: np.ndarray
     restitution: np.ndarray
     size: np.ndarray
+    # first, second: [E] int16, bodies within the frame
     first: np.ndarray
     second: np.ndarray
+    # arm_first, arm_second: [E, 3] m, from the centres of mass (the floor's: its origin) to the contact
     arm_first: np.ndarray
     arm_second: np.ndarray
-    normal: np.ndarray
-    impulse: np.ndarray
-    gap: np.ndarray
+    normal: np.ndarray  # [E, 3] from the second to the first
+    impulse: np.ndarray  # [E, 3] kg m/s, of the solve on the first body
+    gap: np.ndarray  # [E] m; when: [E] part of the step that was over when it was met
     when: np.ndarray
-    dt: float
+    dt: float  # s, `STEP`; gravity: [3] m/s^2
     gravity: np.ndarray
-    trajectories: np.ndarray
+    trajectories: np.ndarray  # [K] int64, how many were followed, of each of the K sets that were joined
 
     def __len__(self) -> int:
         return len(self.edge_start) - 1

@@ -13,15 +13,10 @@ from torch import Tensor, nn
 
 @dataclass(frozen=True)
 class Team:
-    """One of `size` processes that share every batch: each works on its part, gradients are added up.
+    """One of `size` processes that share every batch: each works on its part, gradients are added up."""
 
-    Attributes:
-        rank: 0 ... size - 1; the first writes all files.
-        size: how many there are.
-    """
-
-    rank: int = 0
-    size: int = 1
+    rank: int = 0  # 0 ... size - 1; the first writes all files.
+    size: int = 1  # how many there are
 
     @property
     def leads(self) -> bool:

@@ -21,19 +21,12 @@ CALM_SHARE = 0.2  # how often frames in which nothing is hit are drawn, against 
 
 @dataclass(frozen=True)
 class Batch:
-    """A graph, what happened, and which bodies count.
+    """A graph, what happened, and which bodies count."""
 
-    Attributes:
-        graph: the input.
-        truth: recorded velocities.
-        size: [N] m, turns an angular error into a speed.
-        counts: [N] bool, bodies that move and have a contact edge.
-    """
-
-    graph: ContactGraph
-    truth: Velocities
-    size: Tensor
-    counts: Tensor
+    graph: ContactGraph  # the input
+    truth: Velocities  # recorded velocities
+    size: Tensor  # [N] m, turns an angular error into a speed
+    counts: Tensor  # [N] bool, bodies that move and have a contact edge
 
 
 class ImpulseTask:

@@ -7,33 +7,21 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Preset:
-    """One way to train one network.
+    """One way to train one network."""
 
-    Attributes:
-        kind: "impulse", or a network on surface nodes: "paper", "fignet", "fignet-star", "mgn", "dpi".
-        config: sizes of the network.
-        steps: of the optimiser.
-        batch: contact frames (impulse) or recorded steps (others) a step.
-        rate: peak learning rate of Adam; it falls to a hundredth along a cosine.
-        matrix_rate: the same of Muon, which then trains the hidden matrices; None leaves all to Adam, as published.
-        reach: m, contact radius D.
-        strides: recorded steps in a step (impulse); several for a network of several step lengths.
-        inner: inner steps of the solve in a step; 0 for those of the recording engine.
-        nodes: surface nodes a body of networks on surface nodes (meshes: about so many vertices); None for all.
-        noise: m, standard deviation of their pose noise (None: none); *impulse* has its own.
-    """
-
-    kind: str
-    config: dict[str, int]
-    steps: int
-    batch: int
-    rate: float
-    reach: float = 0.1
+    kind: str  # "impulse", or a network on surface nodes: "paper", "fignet", "fignet-star", "mgn", "dpi"
+    config: dict[str, int]  # sizes of the network
+    steps: int  # of the optimiser
+    batch: int  # contact frames (impulse) or recorded steps (others) a step
+    rate: float  # peak learning rate of Adam; it falls to a hundredth along a cosine
+    reach: float = 0.1  # m, contact radius D
+    # surface nodes a body of networks on surface nodes (meshes: about so many vertices); None for all
     nodes: int | None = None
-    noise: float | None = None
+    noise: float | None = None  # m, standard deviation of their pose noise (None: none); *impulse* has its own
+    # the same of Muon, which then trains the hidden matrices; None leaves all to Adam, as published
     matrix_rate: float | None = None
-    strides: tuple[int, ...] = (1,)
-    inner: int = 0
+    strides: tuple[int, ...] = (1,)  # recorded steps in a step (impulse); several for a network of several step lengths
+    inner: int = 0  # inner steps of the solve in a step; 0 for those of the recording engine
 
 
 PUBLISHED = {"width": 128, "steps": 10}  # sizes of SDF-Sim's network

@@ -30,19 +30,12 @@ STEPS = 50
 
 @dataclass(frozen=True)
 class Rollouts:
-    """Held-out trajectories and what is needed to roll them out.
+    """Held-out trajectories and what is needed to roll them out."""
 
-    Attributes:
-        recorded: their first frames.
-        shapes: by name.
-        substep: s, the recording engine's inner step.
-        device: where to simulate.
-    """
-
-    recorded: list[Trajectory]
-    shapes: dict[str, Shape]
-    substep: float
-    device: torch.device
+    recorded: list[Trajectory]  # their first frames
+    shapes: dict[str, Shape]  # by name
+    substep: float  # s, the recording engine's inner step
+    device: torch.device  # where to simulate
 
     def __call__(self, run: Run) -> dict[str, float]:
         """Translation RMSE in m and mean rotation error in degrees of the averaged weights; NaN where they blow up.

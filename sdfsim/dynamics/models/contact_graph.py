@@ -18,50 +18,38 @@ SUBSTEPS = 5  # inner steps in one step of the engine that the training data com
 
 @dataclass(frozen=True)
 class ContactGraph:
-    """N bodies and E places where the contact solve had them meet or nearly meet, in single precision.
+    """N bodies and E places where the contact solve had them meet or nearly meet, in single precision."""
 
-    Attributes:
-        inverse_mass: [N], 0 for bodies that do not move.
-        inverse_inertia: [N, 3, 3], world axes, 0 for bodies that do not move.
-        velocity, angular: [N, 3] at the start of the step.
-        free_velocity, free_angular: [N, 3] at its end in free flight.
-        solved_velocity, solved_angular: [N, 3] at its end as the solve has it.
-        mean_velocity, mean_angular: [N, 3] the mean over the step as the solve has it.
-        first, second: [E] int64.
-        pair: [E] int64, number of the unordered pair of bodies, 0 ... pairs - 1.
-        pairs: how many pairs there are.
-        normal: [E, 3], from `second` to `first`.
-        arm_first, arm_second: [E, 3] from the centres of mass.
-        impulse: [E, 3] that the solve gave `first`, and opposite `second`.
-        gap: [E] signed distance when the place was first looked at.
-        when: [E] the part of the step that was over by then.
-        friction, restitution: [E] products of the two bodies' coefficients.
-        dt: the step.
-    """
-
-    inverse_mass: Tensor
-    inverse_inertia: Tensor
+    inverse_mass: Tensor  # [N], 0 for bodies that do not move
+    inverse_inertia: Tensor  # [N, 3, 3], world axes, 0 for bodies that do not move
+    # velocity, angular: [N, 3] at the start of the step
     velocity: Tensor
     angular: Tensor
+    # free_velocity, free_angular: [N, 3] at its end in free flight
     free_velocity: Tensor
     free_angular: Tensor
+    # solved_velocity, solved_angular: [N, 3] at its end as the solve has it
     solved_velocity: Tensor
     solved_angular: Tensor
+    # mean_velocity, mean_angular: [N, 3] the mean over the step as the solve has it
     mean_velocity: Tensor
     mean_angular: Tensor
+    # first, second: [E] int64
     first: Tensor
     second: Tensor
-    pair: Tensor
-    pairs: int
-    normal: Tensor
+    pair: Tensor  # [E] int64, number of the unordered pair of bodies, 0 ... pairs - 1.
+    pairs: int  # how many pairs there are
+    normal: Tensor  # [E, 3], from `second` to `first`
+    # arm_first, arm_second: [E, 3] from the centres of mass
     arm_first: Tensor
     arm_second: Tensor
-    impulse: Tensor
-    gap: Tensor
-    when: Tensor
+    impulse: Tensor  # [E, 3] that the solve gave `first`, and opposite `second`
+    gap: Tensor  # [E] signed distance when the place was first looked at
+    when: Tensor  # [E] the part of the step that was over by then
+    # friction, restitution: [E] products of the two bodies' coefficients
     friction: Tensor
     restitution: Tensor
-    dt: float
+    dt: float  # the step
 
     def to(self, device: torch.device) -> ContactGraph:
         """The same on another device."""
@@ -75,27 +63,20 @@ class EdgeFrames:
 
     A body's twist is its velocity and angular velocity, stacked. Rows and columns of three are the edge's axes: normal,
     tangent, binormal.
-
-    Attributes:
-        speed: [E, 1], the scale that makes velocities dimensionless.
-        mass: [E, 3] effective mass along each axis; 0 along those on which nothing may act.
-        jacobian_first, jacobian_second: [E, 3, 6] J, from a twist to the velocity of the contact point along each axis.
-        response_first, response_second: [E, 6, 3] M^-1 J^T, the twist that a unit impulse along each axis gives,
-            opposite to the second.
-        solved: [E, 3] impulse of the solve along each axis.
-        slip: [E, 3] relative velocity at the start of the step along each axis.
-        start: [E, EDGE_FEATURES] input features.
     """
 
-    speed: Tensor
-    mass: Tensor
+    speed: Tensor  # [E, 1], the scale that makes velocities dimensionless
+    mass: Tensor  # [E, 3] effective mass along each axis; 0 along those on which nothing may act
+    # jacobian_first, jacobian_second: [E, 3, 6] J, from a twist to the velocity of the contact point along each axis
     jacobian_first: Tensor
     jacobian_second: Tensor
+    # response_first, response_second: [E, 6, 3] M^-1 J^T, the twist that a unit impulse along each axis gives, opposite
+    # to the second
     response_first: Tensor
     response_second: Tensor
-    solved: Tensor
-    slip: Tensor
-    start: Tensor
+    solved: Tensor  # [E, 3] impulse of the solve along each axis
+    slip: Tensor  # [E, 3] relative velocity at the start of the step along each axis
+    start: Tensor  # [E, EDGE_FEATURES] input features
 
 
 def number_pairs(first: Tensor, second: Tensor, bodies: int) -> tuple[Tensor, int]:

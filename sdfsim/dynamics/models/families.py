@@ -21,21 +21,15 @@ from sdfsim.shape.shape import Shape
 
 @dataclass(frozen=True)
 class Family:
-    """What is a network's own beside its weights.
+    """What is a network's own beside its weights."""
 
-    Attributes:
-        layout: of its graphs.
-        surface: a shape, with the nodes (at most so many, None for all) that the network works on.
-        near: what of the bodies is near what, for bodies, state, gravity, reach, time step and what the run remembers.
-        none: the same of bodies that are near nothing.
-        graph: the graph of bodies, their state and what is near.
-    """
-
-    layout: Layout
+    layout: Layout  # of its graphs
+    # a shape, with the nodes (at most so many, None for all) that the network works on
     surface: Callable[[Shape, int | None], Shape]
+    # what of the bodies is near what, for bodies, state, gravity, reach, time step and what the run remembers
     near: Callable[[Bodies, State, Tensor, float, float, Memory], Near]
-    none: Callable[[device], Near]
-    graph: Callable[[Bodies, State, Any], Graph]
+    none: Callable[[device], Near]  # the same of bodies that are near nothing
+    graph: Callable[[Bodies, State, Any], Graph]  # the graph of bodies, their state and what is near
 
 
 _no_faces, _no_nodes = partial(no_pairs, corners=3), partial(no_pairs, corners=1)

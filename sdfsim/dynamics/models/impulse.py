@@ -27,17 +27,12 @@ CALM, LIVELY = 0.05, 0.5
 
 @dataclass(frozen=True)
 class ImpulseConfig:
-    """Sizes of the network.
+    """Sizes of the network."""
 
-    Attributes:
-        width: of every latent and hidden layer.
-        rounds: of message passing, each with weights of its own.
-        alone: 1 for a network that is given where contacts are but not what the solve makes of them, and that nothing
-            bounds: what learning alone gives, for comparison.
-    """
-
-    width: int = 64
-    rounds: int = 6
+    width: int = 64  # of every latent and hidden layer
+    rounds: int = 6  # of message passing, each with weights of its own
+    # 1 for a network that is given where contacts are but not what the solve makes of them, and that nothing bounds:
+    # what learning alone gives, for comparison
     alone: int = 0
 
     def __post_init__(self) -> None:
@@ -47,15 +42,12 @@ class ImpulseConfig:
 
 @dataclass(frozen=True)
 class Velocities:
-    """What the network predicts for N bodies, model units, world frame.
+    """What the network predicts for N bodies, model units, world frame."""
 
-    Attributes:
-        velocity, angular: [N, 3] at the end of the step.
-        mean_velocity, mean_angular: [N, 3] over the step: they move position and orientation.
-    """
-
+    # velocity, angular: [N, 3] at the end of the step
     velocity: Tensor
     angular: Tensor
+    # mean_velocity, mean_angular: [N, 3] over the step: they move position and orientation
     mean_velocity: Tensor
     mean_angular: Tensor
 

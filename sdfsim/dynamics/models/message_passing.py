@@ -43,29 +43,20 @@ class Layout:
 
 @dataclass(frozen=True)
 class Edges:
-    """E edges of one kind.
+    """E edges of one kind."""
 
-    Attributes:
-        features: [E, F] float32.
-        sender, receiver: [E, corners] int64, in the sets that the kind names.
-    """
-
-    features: Tensor
+    features: Tensor  # [E, F] float32
+    # sender, receiver: [E, corners] int64, in the sets that the kind names
     sender: Tensor
     receiver: Tensor
 
 
 @dataclass(frozen=True)
 class Graph:
-    """A graph of some layout.
+    """A graph of some layout."""
 
-    Attributes:
-        nodes: features [n, F] float32 of each set.
-        edges: of each kind.
-    """
-
-    nodes: dict[str, Tensor]
-    edges: dict[str, Edges]
+    nodes: dict[str, Tensor]  # features [n, F] float32 of each set
+    edges: dict[str, Edges]  # of each kind
 
     def __len__(self) -> int:
         """How many nodes there are."""
@@ -99,15 +90,10 @@ def both_ways(forth: Tensor, back: Tensor, first: Tensor, second: Tensor) -> Edg
 
 @dataclass(frozen=True)
 class GraphConfig:
-    """Sizes of a network (published, all of them: width 128; SDF-Sim, FIGNet, MeshGraphNets: 10 to 15 steps).
+    """Sizes of a network (published, all of them: width 128; SDF-Sim, FIGNet, MeshGraphNets: 10 to 15 steps)."""
 
-    Attributes:
-        width: of every latent and hidden layer.
-        steps: of message passing, each with weights of its own.
-    """
-
-    width: int = 128
-    steps: int = 10
+    width: int = 128  # of every latent and hidden layer
+    steps: int = 10  # of message passing, each with weights of its own
 
 
 def by_rows(function: Callable[..., Tensor], rows: int | None, *inputs: Tensor) -> Tensor:

@@ -22,25 +22,20 @@ PIERCING = 1e-9  # relative: areas and denominators below count as none
 
 @dataclass(frozen=True)
 class Pairs:
-    """E pairs of nodes (C = 1) or faces (C = 3) of two bodies, each pair once; model units, world frame.
+    """E pairs of nodes (C = 1) or faces (C = 3) of two bodies, each pair once; model units, world frame."""
 
-    Attributes:
-        owner, body: [E] int64, the bodies of the first and of the second; a plane is always a second.
-        first, second: [E, C] int64, indices into `Bodies.node`; corners of faces by distance to the closest point.
-        distance: [E] float64; negative only behind a plane.
-        way: [E, 3] float64, from the closest point of the first to that of the second.
-        from_first, from_second: [E, C, 3] float64, corners from their own closest point (0 for a plane).
-        normal_first, normal_second: [E, 3] float64, unit normals of the faces; 0 for nodes.
-    """
-
+    # owner, body: [E] int64, the bodies of the first and of the second; a plane is always a second
     owner: Tensor
     body: Tensor
+    # first, second: [E, C] int64, indices into `Bodies.node`; corners of faces by distance to the closest point
     first: Tensor
     second: Tensor
-    distance: Tensor
-    way: Tensor
+    distance: Tensor  # [E] float64; negative only behind a plane
+    way: Tensor  # [E, 3] float64, from the closest point of the first to that of the second
+    # from_first, from_second: [E, C, 3] float64, corners from their own closest point (0 for a plane)
     from_first: Tensor
     from_second: Tensor
+    # normal_first, normal_second: [E, 3] float64, unit normals of the faces; 0 for nodes
     normal_first: Tensor
     normal_second: Tensor
 

@@ -16,25 +16,15 @@ from sdfsim.dynamics.solver import compiled_rules, taken_up
 
 @dataclass(frozen=True)
 class Contacts:
-    """E contact edges, each from a surface node to the closest point on another body; model units, world frame.
+    """E contact edges, each from a surface node to the closest point on another body; model units, world frame."""
 
-    Attributes:
-        owner: [E] int64, the body whose node it is.
-        node: [E] int64, index into `Bodies.node`.
-        body: [E] int64, the body it meets.
-        seen: [E, 3] float64, the node from the centre of mass of `body`.
-        distance: [E] float64, signed distance of the node from `body`.
-        normal: [E, 3] float64, unit outward normal of `body` at the closest point.
-        queries: how many signed distances were evaluated to find them.
-    """
-
-    owner: Tensor
-    node: Tensor
-    body: Tensor
-    seen: Tensor
-    distance: Tensor
-    normal: Tensor
-    queries: int = 0
+    owner: Tensor  # [E] int64, the body whose node it is
+    node: Tensor  # [E] int64, index into `Bodies.node`
+    body: Tensor  # [E] int64, the body it meets
+    seen: Tensor  # [E, 3] float64, the node from the centre of mass of `body`
+    distance: Tensor  # [E] float64, signed distance of the node from `body`
+    normal: Tensor  # [E, 3] float64, unit outward normal of `body` at the closest point
+    queries: int = 0  # how many signed distances were evaluated to find them
 
     def __len__(self) -> int:
         return len(self.owner)
