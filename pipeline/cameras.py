@@ -135,11 +135,7 @@ def load_views(path: Path) -> list[View]:
 
 
 def load_sparse(folder: Path) -> Sparse:
-    """Reads the sparse points of a poses folder.
-
-    Raises:
-        SdfsimError: no readable `sparse.npz`.
-    """
+    """Reads the sparse points of a poses folder. Raises SdfsimError: no readable `sparse.npz`."""
     path = Path(folder) / "sparse.npz"
     data = read_arrays(path, "sparse points", "run the poses stage again")
     try:

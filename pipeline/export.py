@@ -43,12 +43,7 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
     origin is the middle of its base. Folders that are there already are kept.
 
     Args:
-        mesh_folder: of the mesh stage.
-        out: existing folder.
         budget: s of fitting, for all.
-        recipe: of the fits.
-        seed: of the fits.
-        device: where to compute.
 
     Returns:
         `shapes`: a certificate each; `passed`, `reason` and `caveats` (a line each) for all of them.
@@ -120,12 +115,10 @@ def write_scene(
     A scene file that the user has changed is kept beside it as `scene.yaml.bak`.
 
     Args:
-        mesh_folder: of the mesh stage.
         scene_file: to write, in the folder that holds `assets` of the fit stage.
         drop: what falls onto the scene: box, ball or none.
         materials: by the name of a body in scene.yaml, what it is made of; all others are assumed.
         written: hash of the scene file as this function last wrote it; None where it never did.
-        seed: of the scene.
 
     Raises:
         SdfsimError: the mesh or the fit stage has not run, or a material is for a body that there is not.
@@ -169,7 +162,6 @@ def bodies_of(scene: Scene, materials: dict[str, Choice]) -> dict[str, dict]:
     """What the report says of each body that can move or has a material.
 
     Args:
-        scene: as loaded.
         materials: by body; all others are assumed.
 
     Returns:
@@ -202,13 +194,9 @@ def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab 
     """The text of scene.yaml: a floor, the scenery, the bodies that were found, and one dropped from above.
 
     Args:
-        placement: of the meshes.
         origins: [3] m of each body that was found, by the name of its asset.
         slab: where the dropped body starts; None leaves it out.
-        scenery: whether there is any.
-        drop: shape of what is dropped, box or ball.
         materials: by body; those of no body are passed over.
-        seed: of the scene.
     """
     source = {"plane": "the dominant plane", "cameras": "the cameras"}.get(placement.up_from, placement.up_from)
     assumed = " (give --size or --distance for true metres)" if placement.size_from.startswith("assumed") else ""

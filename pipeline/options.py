@@ -80,11 +80,7 @@ def write_config(options: Options, folder: Path) -> None:
 
 
 def read_config(folder: Path) -> Options:
-    """Reads config.yaml.
-
-    Raises:
-        SdfsimError: it is missing or not one of ours.
-    """
+    """Reads config.yaml. Raises SdfsimError: it is missing or not one of ours."""
     try:
         data = yaml.safe_load((folder / CONFIG).read_text(encoding="utf-8"))
         return Options(**{key: value for key, value in data.items() if key not in ("version", "command")})

@@ -34,9 +34,6 @@ def write_report(
     """Writes report.json and report.md; returns the former.
 
     Args:
-        folder: of the run.
-        options: of the run.
-        records: of the current stages.
         failed: the stage that ended in an error, and the error.
     """
     stages = {stage: known["report"] for stage, known in records.items()}
@@ -254,10 +251,6 @@ def write_recording(folder: Path, done: Collection[str]) -> Path | None:
 
     Before the mesh stage it is in the units of the camera poses, with z up as far as the cameras tell; from then on in
     metres with z up.
-
-    Args:
-        folder: of the run.
-        done: the stages whose results are current.
 
     Returns:
         Its path, or None before the poses stage.

@@ -48,11 +48,7 @@ class Run:
         return self.folder / STAGES[stage].folder
 
     def device(self) -> str:
-        """Where to compute, as torch names it.
-
-        Raises:
-            SdfsimError: cuda was asked for and is not there.
-        """
+        """Where to compute, as torch names it. Raises SdfsimError: cuda was asked for and is not there."""
         from sdfsim.dynamics.simulator import pick_device
 
         return str(pick_device(self.options.device))
@@ -169,9 +165,6 @@ def reconstruct(
     Args:
         photos: folder of photos, video, transforms.json or COLMAP model; never written to.
         out: folder to write; made where missing.
-        from_stage: do this stage and all after it again.
-        until_stage: stop after this stage.
-        progress: called with (stage, fraction, message).
         **options: see `Options`.
 
     Returns:
@@ -200,8 +193,6 @@ def find_poses(photos: str | Path, out: str | Path, *, progress: Callable[[str, 
 
     Args:
         photos: as for `reconstruct`.
-        out: folder to write.
-        progress: called with (stage, fraction, message).
         **changes: options that differ from those in the folder's config.yaml, where there is one; None changes nothing.
 
     Returns:
@@ -223,7 +214,6 @@ def run_stage(
     Args:
         name: one of `STAGES`.
         folder: of an earlier `reconstruct`.
-        progress: called with (stage, fraction, message).
         **changes: options that differ from those in the folder's config.yaml (see `Options`), from then on kept there;
             None changes nothing. A budget is that of this stage and this call alone, and not kept.
 
@@ -382,13 +372,7 @@ def check_replaceable(place: Path) -> None:
 
 
 def begin(work: Path, wanted: str, *, fresh: bool) -> Path:
-    """A folder to work in: the one that a killed run left for the same fingerprint, else an empty one.
-
-    Args:
-        work: its place.
-        wanted: fingerprint of the stage.
-        fresh: never go on from a killed run.
-    """
+    """A folder to work in: the one that a killed run left for the same fingerprint, else an empty one."""
     try:
         left = json.loads((work / RECORD).read_text(encoding="utf-8"))["fingerprint"]
     except (OSError, ValueError, KeyError, TypeError):
@@ -411,11 +395,6 @@ def finish(work: Path, place: Path, wanted: str, inputs: str, report: dict, seco
 
     Args:
         work: the folder that `begin` gave.
-        place: where the result belongs.
-        wanted: fingerprint of the stage.
-        inputs: name of the result that it read.
-        report: of the stage.
-        seconds: that it took.
 
     Raises:
         SdfsimError: a stage did not write what lies at the place.

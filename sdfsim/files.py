@@ -156,8 +156,6 @@ def check_own(folder: Path, command: str, *names: str) -> None:
 
     Args:
         folder: that the run writes to; need not exist.
-        command: as config.yaml names it.
-        *names: of files that the run replaces besides config.yaml.
 
     Raises:
         SdfsimError: something else lies there.

@@ -92,7 +92,6 @@ def choose_threads(work: Callable[[], object], threads: int | None = None, *, re
 
     Args:
         work: a typical piece of work, tens of milliseconds.
-        threads: take this number without comparing.
         repeat: timed calls for each number, after one that is not timed.
 
     Returns:

@@ -54,7 +54,6 @@ class Playback:
     """One recording of one scene, to be written to a file, or streamed to a viewer.
 
     Args:
-        scene: what moves.
         motion: how it does, where that is known already: the first view shows all of it.
         camera, look_at: [3] m each, of the first view; None: see `eye_of`.
     """
@@ -223,7 +222,6 @@ def save_reconstruction(
     Args:
         points: [P, 3] m, sparse points.
         colors: [P, 3] uint8 RGB, or None.
-        mesh: the reconstructed surface, if it is there already.
         skins: its parts with their textures, by name, shown in its place where there are any.
         trust: its parts in colours that tell how far each place can be trusted, by name.
 
@@ -314,7 +312,6 @@ def eye_of(
     """From where a scene is looked at; what is not given is chosen so that all of it is in sight.
 
     Args:
-        motion: how it moves, where that is known.
         camera: [3] m, where the eye is.
         look_at: [3] m, what it looks at.
 

@@ -82,7 +82,6 @@ def simulate(
         viewer: where to watch: not at all, later from the file, or live in a window or a page.
         say: called with a line for the person: what was replaced, where the page of `viewer` web is.
         bind: address of this machine that a live viewer listens on.
-        until_settled: end as soon as everything has come to rest.
         resume: go on with the run in `out` that was interrupted; from the start where there is none. A finished one is
             left as it is, and its report is returned.
         camera, look_at: [3] m each, of the first view in the recording; None: all of the motion is in sight.
@@ -410,9 +409,6 @@ def finished(report_file: Path, identity: str, steps: int, *, until_settled: boo
     """The report of a run that is finished; None where it was interrupted or is not there.
 
     Args:
-        report_file: report.json of the run folder.
-        identity: of the run that is asked for.
-        steps: that it takes at most.
         until_settled: whether it ends as soon as everything has come to rest.
 
     Raises:

@@ -33,9 +33,7 @@ def stream_to_viewer(playback: Playback, kind: Literal["native", "web"], *, bind
     """Send everything that `playback` logs from now on to a viewer.
 
     Args:
-        playback: nothing logged yet.
         kind: a window, or a page that is there for as long as this process runs.
-        bind: address of this machine that the viewer listens on.
 
     Returns:
         The address of the page, or an empty string for a window.
@@ -111,10 +109,6 @@ def _has_screen() -> bool:
 
 def show(recording: Path, *, web: bool = False, bind: str = LOOPBACK) -> None:
     """Open a recording, and wait until the viewer is closed.
-
-    Args:
-        web: as a page instead of a window.
-        bind: address of this machine that the viewer listens on.
 
     Raises:
         SdfsimError: no such recording, or the viewer fails.

@@ -123,8 +123,6 @@ class GridField(Field):
     """SDF and colour in the unit sphere, and a background outside.
 
     Args:
-        size: resolutions.
-        seed: of the initial weights.
         start_radius: radius of the sphere that the SDF starts from.
     """
 

@@ -44,9 +44,6 @@ class HeldOut:
 
     Args:
         views: in normalised space.
-        photos_folder: of the photos stage.
-        trainer: of the field to look at.
-        masked: every photo has a mask.
     """
 
     def __init__(self, views: list[View], photos_folder: Path, trainer: Trainer, *, masked: bool) -> None:
@@ -87,10 +84,6 @@ class HeldOut:
 
 def score(held: HeldOut, out: Path, on_progress: Progress = quiet) -> dict:
     """PSNR (and, with masks, overlap of silhouettes) of the held-out views; writes the renders to `out`/held_out.
-
-    Args:
-        held: the views.
-        out: folder of the stage.
 
     Returns:
         For the report; empty where no view shows anything of the unit sphere.

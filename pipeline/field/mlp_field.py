@@ -42,8 +42,6 @@ class MlpField(Field):
     """SDF and colour by the paper's networks, and a background outside the unit sphere.
 
     Args:
-        size: of the networks.
-        seed: of the initial weights.
         start_radius: radius of the sphere that the SDF starts from.
     """
 

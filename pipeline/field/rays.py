@@ -65,7 +65,6 @@ def load_rays(views: list[View], photos_folder: Path, long_side: int, *, masks: 
 
     Args:
         views: posed cameras whose world is normalised space.
-        photos_folder: of the photos stage.
         long_side: limit of the longer side, px.
         masks: read masks; a view without one counts as all object.
 

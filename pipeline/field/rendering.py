@@ -28,7 +28,6 @@ def sdf_cache(field: Field, resolution: int, coarse: int = 4) -> Tensor:
     space and deep inside, they are interpolated.
 
     Args:
-        field: the field.
         resolution: n, a multiple of `coarse` plus 1.
         coarse: see above.
     """
@@ -85,8 +84,6 @@ def choose_samples(
         directions: [R, 3] unit.
         beta: of the density, normalised units.
         uniforms: [R, S] random in 0..1, S = number of samples.
-        bins: even steps at which the cache is read.
-        plain: how many of the S samples are evenly spread.
     """
     enter, leave = sphere_interval(origins, directions)
     length = (leave - enter)[:, None]
@@ -118,10 +115,7 @@ def composite(
     """Renders rays from the field's values at their samples.
 
     Args:
-        field: the field.
-        samples: of the rays.
         geometry: what `field.geometry_at` gave at `samples.points`.
-        beta: of the density.
         behind: [R, 3] or [3] colour behind the unit sphere.
 
     Returns:
@@ -152,12 +146,9 @@ def render(
     """Renders rays for looking at, without gradients and the same every time.
 
     Args:
-        field: the field.
         cache: from `sdf_cache`.
         origins: [R, 3] normalised units.
         directions: [R, 3] unit.
-        beta: of the density.
-        samples: along each ray inside the sphere.
         backdrop: [3] a constant colour in place of the background model.
 
     Returns:
@@ -253,7 +244,6 @@ def bounded_samples(
         sdf_at: SDF [A, S] at distances [A, S] along the rays with indices [A].
         enter: [R] distance at which each ray enters the trained space.
         leave: [R] and leaves it.
-        beta: scalar, of the density.
         uniforms: [R, M] in 0..1.
 
     Returns:

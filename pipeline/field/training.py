@@ -102,11 +102,8 @@ class Trainer:
     """One training run of the grids.
 
     Args:
-        settings: how.
         rays: pixels, in the space of the unit sphere.
         supervision: sparse points and lines of sight in the same space.
-        seed: of everything random.
-        device: where to compute.
     """
 
     def __init__(self, settings: Settings, rays: Rays, supervision: Supervision, seed: int, device: str = "cpu"):
@@ -375,13 +372,9 @@ def train(
     Args:
         views: posed cameras in the world of the poses.
         sparse: points in the same world.
-        photos_folder: of the photos stage.
-        out: existing folder.
         settings: see `PRESETS`.
         budget: s of training, those before a kill included; the number of steps is cut to what fits, measured after
             the first steps.
-        seed: of everything random.
-        device: where to compute.
         threads: of the CPU; None takes what is fastest now (a second thread only slows things down where another
             program uses the core).
         checkpoint_every: s.
@@ -460,11 +453,8 @@ def paced(trainer: Trainer, settings: Settings, budget: float, elapsed: float, d
     """Steps that fit into the time: the measured pace may be another than before training, when other work goes on.
 
     Args:
-        trainer: in training.
-        settings: whose number of steps is never exceeded.
         budget: s, for the steps of this run.
         elapsed: s since it began.
-        done: steps since it began.
     """
     left = int((budget - elapsed) / (elapsed / done))
     least = max(trainer.iteration, min(FEWEST_STEPS, settings.iterations))
@@ -490,11 +480,7 @@ def save_field(trained: Trained, folder: Path) -> None:
 
 
 def load_field(folder: Path) -> Trained:
-    """Reads what `train` wrote.
-
-    Raises:
-        SdfsimError: no readable field in `folder`.
-    """
+    """Reads what `train` wrote. Raises SdfsimError: no readable field in `folder`."""
     try:
         about = json.loads((Path(folder) / "field.json").read_text(encoding="utf-8"))
         size, radius = about["size"], float(about["start_radius"])

@@ -71,7 +71,6 @@ def read_photo(path: Path, long_side: int, mask: Path | None = None, shape: floa
     """Reads one photo upright and no larger than `long_side`.
 
     Args:
-        path: the file.
         long_side: limit of the longer side, px; smaller photos stay as they are.
         mask: file of its mask, which goes before an alpha channel; white is the object.
         shape: width over height that a known camera has: the photo is turned upright only where it then fits that.
@@ -211,7 +210,6 @@ def fault(sharp: float, dark: float, burnt: float, *, typical: float, masked: bo
     """What is wrong with a photo in a word or two, or nothing.
 
     Args:
-        sharp: its sharpness.
         dark: share that is nearly black.
         burnt: share that is nearly white.
         typical: sharpness of the sharper photos of the set: a blur that all have in common may be the scene's.

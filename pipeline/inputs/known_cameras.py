@@ -231,9 +231,6 @@ def rectified(picture: Picture, known: KnownCamera, name: str, source: str) -> t
     lens shows of the pinhole's picture all over.
 
     Args:
-        picture: upright, sized.
-        known: its camera, intrinsics at any size.
-        name: of the prepared photo.
         source: the user's name of it.
     """
     height, width = picture.pixels.shape[:2]

@@ -62,7 +62,6 @@ def prepare_photos(
 
     Args:
         given: what the user gave, see `find_source`; never written to.
-        out: an existing folder.
         long_side: limit of the longer side, px.
 
     Returns:

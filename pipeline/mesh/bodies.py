@@ -134,9 +134,7 @@ def find_levels(shown: Mesh, up: np.ndarray, width: float) -> list[Level]:
     """Level planes of a surface, largest first.
 
     Args:
-        shown: what photos show.
         up: [3] unit.
-        width: within which faces belong to one plane.
     """
     normals, areas = face_normals(shown)
     centers = shown.vertices[shown.faces].mean(1)
@@ -169,9 +167,6 @@ def find_bodies(surface: Surface, levels: list[Level], layer: float, smallest: f
     What carries a level plane itself, as a table does, is scenery, and so is what reaches the end of the trained space.
 
     Args:
-        surface: extracted.
-        levels: of its visible part.
-        layer: thickness of the contact layer.
         smallest: what rises less than this above its plane stays part of it, unless masks name it.
         named: [V] bool, vertices of the surface that masks name.
 
@@ -289,8 +284,6 @@ def without_bodies(volume: Volume, bodies: list[Body], field: Distance) -> Volum
     """The scenery alone: what bodies leave behind is empty, and their plane goes on below them.
 
     Args:
-        volume: of everything.
-        bodies: that stand on it.
         field: the signed distance that `volume` holds samples of.
     """
     values = volume.values.copy()
@@ -334,12 +327,10 @@ def split(surface: Surface, distance: Distance, finest: float, views: list[View]
     """Finds bodies, takes them out of the scenery and tells those that touch apart.
 
     Args:
-        surface: extracted.
         distance: signed distance of the field that it was extracted from.
         finest: width of a cell of the field's finest grid.
         views: cameras in normalised space.
         points: [P, 3] sparse points in normalised space.
-        photos_folder: of the photos stage.
         up: [3] unit, in normalised space.
         alone: there is no scenery: all there is are bodies.
     """

@@ -62,7 +62,6 @@ def belonging(mesh: Mesh, seen: np.ndarray, share: float, speck: float) -> tuple
         mesh: closed, wound outwards.
         seen: [F] bool, faces that photos show.
         share: a component with less than this share of all the area is a floater.
-        speck: components shorter than this are only counted.
 
     Returns:
         The faces that belong [F] bool, the longest sides of the others from the largest down, and counts of these.
@@ -92,7 +91,6 @@ def islands(mesh: Mesh, faces: np.ndarray, share: float) -> np.ndarray:
     """Of some faces [F] bool those [F] bool that lie together: patches too small to mean anything are left out.
 
     Args:
-        mesh: any.
         faces: [F] bool.
         share: a patch needs this share of the area of all the faces, or of those of its own component of the mesh.
     """

@@ -103,7 +103,6 @@ def sample_volume(
     Args:
         distance: [P] at points [P, 3], float32.
         resolution: samples a side, rounded up to a multiple of `coarse` plus 1.
-        extent: half the side.
         coarse: see above.
     """
     from scipy.ndimage import zoom
@@ -207,10 +206,8 @@ def surface_of(
 
     Args:
         volume: samples of the field within `limit`.
-        field: trained.
         views: cameras in normalised space.
         points: [P, 3] sparse points in normalised space.
-        photos_folder: of the photos stage.
         limit: distance [P] from the body that the solid was cut off at.
 
     Raises:

@@ -49,15 +49,9 @@ def make_meshes(
     `trust.jpg` draws the latter, and `next_photos.json` has the cameras of the photos that would help most.
 
     Args:
-        distill: folder of that stage.
-        poses: folder of that stage.
-        photos: folder of that stage.
-        out: an existing folder.
-        preset: quick, standard or fine.
         size: see `Options`; so are `distance` and `crop`.
         distance: sets the scale in place of `size`.
         crop: [6] m.
-        device: where the field is sampled.
 
     Returns:
         The stage's report.
@@ -134,9 +128,7 @@ def trust(
     Args:
         closed: what the scene is made of, by name, metres.
         displayed: what is shown of it, of vertices of `closed`.
-        shots: the photos.
         counted: [V] bool, vertices of `closed` where it was not cut off.
-        out: of the stage.
 
     Returns:
         What the photos tell of the vertices of `closed`, one mesh after the other; and what the report says of it.
@@ -203,11 +195,7 @@ def write_parts(parts: Parts, visible: Mesh, placement: Placement, support: Supp
 
 
 def read_parts(mesh_folder: Path) -> dict:
-    """What `write_parts` wrote to `parts.json`.
-
-    Raises:
-        SdfsimError: the mesh stage has not run.
-    """
+    """What `write_parts` wrote to `parts.json`. Raises SdfsimError: the mesh stage has not run."""
     return read_json(Path(mesh_folder) / "parts.json", "run the mesh stage first")
 
 
@@ -231,8 +219,6 @@ def draw_names(parts: Parts, views: list[View], photos_folder: Path) -> Image.Im
 
     Args:
         parts: in the space of the views.
-        views: cameras.
-        photos_folder: of the photos stage.
     """
     meshes = list(parts.bodies.values())
     caster = Caster(joined(meshes if parts.solid is None else [*meshes, parts.solid]))

@@ -66,9 +66,6 @@ def next_photos(
 
     Args:
         meshes: closed, with z up and the floor at z = 0, metres, by name.
-        support: of their vertices, one mesh after the other.
-        sight: of the same vertices.
-        solid: rays against all of the meshes.
         views: given cameras, metres.
         counted: [V] bool, vertices that matter; others are where the solid was cut off.
     """
@@ -130,11 +127,9 @@ def _best(
     """The photo that helps most: how much, its camera, what it looks at [3] m, and the places [S] that it helps.
 
     Args:
-        now: of the samples.
         poor: [V] bool, samples that are weak.
         tried: where a camera could be [3] m, each with the samples [S] in sight, all around.
         middle: [3] m; a camera looks there, or at the middle of the weak places in sight.
-        lens: view whose lens a camera has.
     """
     best = None
     for place, around in tried:

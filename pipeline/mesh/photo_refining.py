@@ -71,8 +71,6 @@ def refine(mesh: Mesh, pictures: list[Picture], blocking: Caster, lift: float, f
 
     Args:
         mesh: of the body, in the space of the views.
-        pictures: of all views.
-        blocking: what can stand in the way of a view.
         lift: how far a vertex is lifted off the surface before a view looks for it.
         finest: width of a cell of the field's finest grid.
         height: of points [P, 3] above the plane that the body stands on.
@@ -190,11 +188,8 @@ def settled(mesh: Mesh, normal: np.ndarray, mean: csr_matrix, wanted: np.ndarray
     """How far each vertex moves [V] along its normal [V, 3]: where it is wanted [V], by trust [V], or smooth between.
 
     Args:
-        mesh: to move.
         normal: of the vertices; shorter where they shall move less.
         mean: [V, V] takes the mean of the neighbours.
-        wanted: for each vertex.
-        trust: in that.
         stay: [V] trust in where the vertices are.
     """
     bend = mean - diags(np.ones(len(trust)))

@@ -56,11 +56,7 @@ class Placement:
 
 
 def load_placement(mesh_folder: Path) -> Placement:
-    """Reads `placement.json`.
-
-    Raises:
-        SdfsimError: the mesh stage has not run.
-    """
+    """Reads `placement.json`. Raises SdfsimError: the mesh stage has not run."""
     path = Path(mesh_folder) / "placement.json"
     content = read_json(path, "run the mesh stage first")
     try:
@@ -93,7 +89,6 @@ def plane_up(
         normals: [P, 3] unit, outwards.
         weights: [P] area of each sample.
         guess: [3] unit; only planes within `MAX_ANGLE` of it count.
-        tolerance: distance within which a sample belongs to a plane.
 
     Returns:
         Its unit normal [3] and the slope in degrees that its unevenness amounts to; None where none is large enough.

@@ -75,11 +75,8 @@ def count_votes(sight: Visibility, faces: np.ndarray, views: list[View], photos_
     """Lets every photo with labels vote for the vertices that it sees, weighted as in `look`; strays are left out.
 
     Args:
-        sight: of the surface.
         faces: [F, 3] of it.
         views: cameras in the space of the surface.
-        photos_folder: of the photos stage.
-        names: of the objects in the label images.
     """
     votes = np.zeros((len(sight.vertices), len(names) + 1))
     for view in views:
@@ -174,10 +171,6 @@ def solid_of(volume: Volume, inside: np.ndarray, mesh: Mesh) -> Solid:
 def parts_by_votes(solid: Solid, votes: Votes) -> tuple[list[Part], int]:
     """The parts of a solid that masks tell apart.
 
-    Args:
-        solid: to take apart.
-        votes: for all vertices.
-
     Returns:
         The parts, none where there are no two, and the name's number of the whole solid where it has one, else 0.
     """
@@ -197,8 +190,6 @@ def part_of_name(solid: Solid, votes: Votes, number: int) -> Part | None:
 
     Args:
         solid: in the box, whose border is left empty.
-        votes: for all vertices.
-        number: of the name.
     """
     mine = votes.share[solid.index, number]
     if not mine.any():
@@ -213,7 +204,6 @@ def parts_by_shape(solid: Solid, colors: np.ndarray, least: float) -> list[Part]
     """The parts of a solid that meet in a groove all along, and whose seam is narrow or whose colours differ.
 
     Args:
-        solid: to take apart.
         colors: [P, 3] of its vertices, 0..255.
         least: what is shorter than this in any direction is no part.
 

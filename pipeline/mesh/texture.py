@@ -81,8 +81,6 @@ def texture_parts(meshes: dict[str, Mesh], shots: Shots, on_progress: Progress =
 
     Args:
         meshes: with vertex colours, which stay wherever no photo shows the surface.
-        shots: photos.
-        on_progress: called with the share done.
     """
     sizes = np.array([len(mesh.faces) for mesh in meshes.values()], float)
     ends = np.cumsum(sizes) / max(sizes.sum(), 1)
@@ -123,7 +121,6 @@ def unfold(mesh: Mesh, density: float) -> tuple[Mesh, np.ndarray, tuple[int, int
     """Places for the faces of a mesh in a texture.
 
     Args:
-        mesh: any.
         density: wanted texels a metre; fewer where the texture would be too large.
 
     Returns:
@@ -182,7 +179,6 @@ def rasterise(flat: Mesh, normals: np.ndarray, shape: tuple[int, int]) -> Texels
     Args:
         flat: with `uv` and perhaps colours.
         normals: [V, 3] of its vertices.
-        shape: rows and columns of the texture.
     """
     assert flat.uv is not None
     rows, columns = shape

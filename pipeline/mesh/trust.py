@@ -64,7 +64,6 @@ def information(view: View, points: np.ndarray) -> np.ndarray:
     projection's Jacobian J (Hartley and Zisserman, Multiple View Geometry, 5.2). Lens distortion is left out.
 
     Args:
-        view: camera.
         points: [P, 3] in front of it.
 
     Returns:

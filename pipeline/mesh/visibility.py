@@ -75,7 +75,6 @@ class Visibility:
     """Which vertices of a mesh which views see.
 
     Args:
-        mesh: whose vertices are looked at.
         offset: how far along its normal a vertex is lifted before looking from it.
         blocking: what can stand in the way; the mesh itself by default.
     """

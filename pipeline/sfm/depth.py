@@ -31,7 +31,6 @@ def depth_points(views: list[View], photos: list[Photo], folder: Path, *, scale:
     Args:
         views: posed cameras in the world of the poses, whose unit is the metre as far as the cameras know.
         photos: what the photos stage prepared in `folder`.
-        folder: of the photos stage.
         scale: factor of the depth, see `depth_scale`.
 
     Raises:

@@ -76,8 +76,6 @@ def check(result: dict, photos: list[Photo], ordinary: dict | None = None) -> di
     focal length, the reprojection error, the spread of points, or in pairs that contradict the poses.
 
     Args:
-        result: of the worker.
-        photos: all photos.
         ordinary: of the worker at ordinary thresholds, if `result` is not. Its matches tell best how the camera moved:
             looser thresholds take unlike places for alike, and others leave out what stands still.
 

@@ -72,8 +72,6 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
     Args:
         photos: what the photos stage prepared, in `photos_folder`.
         photos_folder: holds `images/` (and `masks/`, `known_cameras.json`).
-        out: existing folder.
-        seed: of every random choice in matching and mapping.
         timeout: s for each attempt.
 
     Returns:

@@ -42,7 +42,6 @@ def supervision_of(
     Args:
         sparse: in the world of the poses.
         views: in the space of the unit sphere.
-        to_unit: from one to the other.
         depth: of a sensor, in the world of the poses; its pixels are lines of sight as well.
         noise: median share by which that depth is off; its lines end as much earlier.
     """
@@ -84,7 +83,6 @@ class FreeSpace:
 
     Args:
         sight: [L, 6] starts and ends of stretches of free space, normalised units.
-        device: of the points.
     """
 
     def __init__(self, sight: np.ndarray, device: str) -> None:
@@ -142,8 +140,6 @@ def unit_sphere_of(views: list[View], sparse: Sparse, *, masked: bool = False) -
     side of most photos, less where nearly all points are nearer, and never past the nearest cameras.
 
     Args:
-        views: posed cameras.
-        sparse: points of the same reconstruction.
         masked: every photo has a mask, so all points lie on the object.
     """
     centers = np.array([v.center for v in views])

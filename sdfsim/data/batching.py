@@ -30,13 +30,9 @@ def merged(
     inverse masses are inputs of networks on surface nodes.
 
     Args:
-        trajectories: W of them.
         frames: [W] the frame each is taken at.
         shapes: Shape of every name in use. The dataset's body frames sit at the centre of mass, so do these.
         units: model units of length and time; its mass is to be 1.
-        device: of the tensors.
-        floor: its friction and restitution.
-        plane: its shape.
     """
     means = [1.0 if t.static.all() else float(t.mass[~t.static].mean()) for t in trajectories]
     relative = [replace(t, mass=t.mass / m, inertia=t.inertia / m) for t, m in zip(trajectories, means, strict=True)]

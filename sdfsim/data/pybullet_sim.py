@@ -124,7 +124,6 @@ class Teacher:
         gravity: [3] m/s^2.
         floor: (friction, restitution) of the floor, or None for no floor.
         step: s, one recorded step.
-        substeps: of the engine in one recorded step.
     """
 
     def __init__(

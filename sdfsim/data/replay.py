@@ -39,18 +39,11 @@ def roll_out(
     """Simulate one batch from its first frames.
 
     Args:
-        model: what simulates.
         group: trajectories of one step and one gravity; only their first frames are used.
-        shapes: of every name in use.
-        steps: how many.
-        device: where to compute.
         free_flight: "exact", or "learned" for networks on surface nodes.
-        contact: False leaves every body in free flight.
-        sleep: freeze what has come to rest.
         substeps: inner steps that the recording engine makes in one step.
         as_teacher: the solver takes over two habits of the teacher: bodies are larger by `MARGIN` than their shapes,
             and what is pushed out adds to the speed of a rebound.
-        floor: its friction and restitution.
 
     Returns:
         For each of the group, the same bodies in the predicted motion: steps + 1 frames.

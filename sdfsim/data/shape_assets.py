@@ -89,7 +89,6 @@ def origins(shapes: Path | None, random_solids: int = 0, *, as_is: bool = False)
 
     Args:
         shapes: folder of NAME/ folders, each with `visual_geometry.obj` and `collision_geometry.obj`, and mesh files.
-        random_solids: how many of the solids.
         as_is: take the NAME/ folders alone, in their own size (Kubric's assets have their centre of mass at 0).
 
     Raises:
@@ -124,7 +123,6 @@ def prepare(found: list[Origin], engine: Path, on_progress: Progress) -> tuple[l
 
     Args:
         found: from `origins`, or primitives.
-        engine: folder for NAME.obj (the pieces), NAME.urdf and NAME.json.
 
     Returns:
         The usable shapes in the order of `found`; and the others, name -> why.

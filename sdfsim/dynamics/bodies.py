@@ -143,9 +143,7 @@ def from_scene(scene: Scene, units: Units, device: torch.device) -> tuple[Bodies
     """Bodies and initial state of a scene, in model units on `device`.
 
     Args:
-        scene: what is to be simulated.
         units: model units.
-        device: of the tensors.
 
     Raises:
         SdfsimError: a body that moves has no mass or no surface nodes.

@@ -41,10 +41,6 @@ class ContactPoint:
 class BodyHandle:
     """One body of a simulator: read it, set it, push and pull it. What is set counts from the next step on.
 
-    Args:
-        simulator: whose body.
-        row: which.
-
     Attributes:
         name: of the body.
     """

@@ -24,12 +24,7 @@ _log = logging.getLogger(__name__)
 
 
 def packed(network: ImpulseNetwork, *, friction: bool) -> compiled.Weights:
-    """Copies of the weights of a network.
-
-    Args:
-        network: on any device.
-        friction: False leaves out what decodes tangential impulses.
-    """
+    """Copies of the weights of a network."""
     if not kernels.compiled("impulse.correct"):
         _log.warning("compiling the network, once for this version: about half a minute")
     rounds = list(cast("Iterable[Round]", network.rounds))
@@ -76,12 +71,7 @@ def corrected(
 
     Args:
         weights: see `packed`.
-        world: the scene.
-        before: the state at the start of the step.
-        solved: what the solve makes of it.
         acts: its edges, at least one; those of a pair of bodies stand together.
-        rules: what is in play.
-        known: the step that the network knows.
     """
     pair = torch.stack([acts.first, acts.second], 1).numpy()
     vectors = [acts.arm_first, acts.arm_second, acts.normal, acts.impulse]

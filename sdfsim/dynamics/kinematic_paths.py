@@ -51,7 +51,6 @@ def from_paths(
         com: [N, 3] centre of mass of every body from its shape's origin, model units.
         length: m per model unit.
         time: s per model unit.
-        device: of the tensors.
 
     Returns:
         The tracks, or None where there is no path.

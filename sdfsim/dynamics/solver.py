@@ -63,7 +63,6 @@ class Compiled:
 
     Args:
         bodies: of the scene, model units.
-        state: its start.
     """
 
     def __init__(self, bodies: Bodies, state: State) -> None:
@@ -163,9 +162,7 @@ def solver_step(
     """Advance `state` by one step of the contact solve.
 
     Args:
-        bodies: N bodies.
         state: theirs; scripted bodies have the velocities of the coming step.
-        rules: what is in play.
         memory: of the run; it holds the compiled scene.
         note: whether what contacts did is wanted; there is none otherwise.
     """

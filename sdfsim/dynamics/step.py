@@ -57,10 +57,6 @@ def step(
     """Advance `state` by one step.
 
     Args:
-        model: what predicts contact.
-        bodies: N bodies.
-        state: theirs.
-        rules: what is in play.
         memory: of the run; without one every step starts from nothing, with the same result.
 
     Returns:

@@ -93,8 +93,6 @@ def deep_starts(bodies: Bodies, state: State, names: Sequence[str], metres: floa
     """A line where pairs are deeper inside one another than any that models were trained on; empty where none is.
 
     Args:
-        bodies: N bodies.
-        state: theirs.
         names: [N] of the bodies.
         metres: in a model unit.
     """

@@ -19,8 +19,6 @@ def scene_units(scene: Scene, model: Model, dt: float | None = None) -> Units:
     """Model units for a scene: bodies of the model's size, at the model's gravity (Froude scaling).
 
     Args:
-        scene: what is to be simulated.
-        model: knows the size and gravity it was trained at.
         dt: s, fixes the scale by the wanted step instead of by the bodies' size.
 
     Raises:
@@ -46,7 +44,6 @@ def _check_sizes(names: list[str], sizes: np.ndarray) -> None:
     """That no body is far wider than most. Of the two that are compared the less ordinary one is to blame.
 
     Args:
-        names: of N bodies that move, at least one.
         sizes: [N] m.
 
     Raises:

@@ -29,10 +29,7 @@ def fault(
 
     Args:
         state: N bodies, model units.
-        rows: which of them to look at.
         dt: the step, model units.
-        units: what messages are told in.
-        before: the state a step earlier, if there is one.
     """
     turned = (state.orientation[rows].square().sum(-1) - 1.0).abs()
     limits = [
@@ -67,7 +64,6 @@ def check_sizes(bodies: Bodies, names: Sequence[str], metres: float) -> None:
     """That the surface of every body keeps to where points are placed exactly.
 
     Args:
-        bodies: N bodies.
         names: [N] of them.
         metres: in a model unit.
 
@@ -86,9 +82,6 @@ def check_sizes(bodies: Bodies, names: Sequence[str], metres: float) -> None:
 
 def check_nodes(scene: Scene) -> None:
     """That every dynamic body has nodes that tell how it is turned.
-
-    Args:
-        scene: what is to be simulated.
 
     Raises:
         SdfsimError: its nodes are one place or one line.

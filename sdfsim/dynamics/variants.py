@@ -25,7 +25,6 @@ def varied(scene: Scene, variant: Variant) -> Scene:
     """The scene with some values of some bodies changed.
 
     Args:
-        scene: as it is.
         variant: body -> field -> value, of the fields of `VECTORS` and `NUMBERS` in SI units. An inertia of its own
             grows with the mass.
 

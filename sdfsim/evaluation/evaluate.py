@@ -53,12 +53,10 @@ def evaluate(
     Args:
         model: bundled name, path or `Model`.
         steps: how far; errors are reported at the horizons of `HORIZONS` and `FRAMES` up to there, and there.
-        device: "cpu", "cuda" or "auto".
         free_flight: "exact" or (paper network) "learned".
         stride: recorded steps in a step of the model; errors are then those of every so many-th frame.
         substeps: inner steps of the solve in a step; None for the model's, else for those of the recording engine.
         chaos_floor: also run the teacher again from starts that differ slightly (see `baselines.PERTURBATIONS`).
-        errors_only: leave out penetration, energy and rest.
 
     Returns:
         A report:

@@ -48,7 +48,6 @@ def baked(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = (), cache_
     """The grid of an SDF, baked on first use and then taken from the cache.
 
     Args:
-        sdf: of a solid that has an end.
         nodes: [K, 3] m on its surface, where the thickness of its walls is measured.
         pieces: vertices [V, 3] m of the convex pieces that the SDF was fitted to: the grid is then of their union.
         cache_dir: by default `sdfsim/baked` in the user's cache folder.

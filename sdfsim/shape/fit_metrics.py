@@ -51,7 +51,6 @@ def certify(
     doubt nothing is measured.
 
     Args:
-        oracle: the truth, in the same frame.
         nodes: [K, 3] m, surface nodes whose coverage is measured too.
 
     Returns:
@@ -167,7 +166,6 @@ def coverage(nodes: np.ndarray, surface: DistanceOracle | Mesh, *, points: int =
     Args:
         nodes: [K, 3] m.
         surface: the true surface, in the same frame: its oracle (which also knows what is hidden inside) or a mesh.
-        points: samples, spread by area.
 
     Returns:
         JSON-ready dict, lengths relative to the largest extent: `count` of nodes, `largest_hole` (largest distance to

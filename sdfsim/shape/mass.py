@@ -64,7 +64,6 @@ def mass_properties_of_sdf(
 
     Args:
         sdf: bounded; metres.
-        cells: along the longest side of its bounds.
         wall: m; only what is nearer to the surface than this counts.
 
     Raises:

@@ -247,11 +247,7 @@ def write_glb(meshes: dict[str, Mesh]) -> bytes:
 
 
 def read_glb(path: Path) -> dict[str, Mesh]:
-    """The meshes that `write_glb` wrote, z up, by their names.
-
-    Raises:
-        SdfsimError: not readable.
-    """
+    """The meshes that `write_glb` wrote, z up, by their names. Raises SdfsimError: not readable."""
     import trimesh
 
     try:

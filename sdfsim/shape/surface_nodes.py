@@ -157,7 +157,6 @@ def surface_of(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray]) -> Sur
     """The nodes that carry contact, with the vertices of convex pieces, where the shape has some, and their patches.
 
     Args:
-        sdf: of the shape.
         nodes: [K, 3] m on its surface.
         pieces: the vertices [V, 3] m of each.
     """

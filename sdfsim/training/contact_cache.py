@@ -108,11 +108,7 @@ class ContactFrames:
 
     @classmethod
     def load(cls, path: Path) -> ContactFrames:
-        """Read a cache file.
-
-        Raises:
-            SdfsimError: not contact frames, or not of this version.
-        """
+        """Read a cache file. Raises SdfsimError: not contact frames, or not of this version."""
         arrays: dict[str, Any] = read_arrays(path, "contact frames", "delete it to have it made again")
         if int(arrays.pop("version", 0)) != FRAMES_VERSION or set(arrays) != {f.name for f in fields(cls)}:
             raise SdfsimError(
@@ -166,11 +162,7 @@ def contact_frames(
 
 
 def join_frames(sets: list[ContactFrames]) -> ContactFrames:
-    """Several sets of frames as one.
-
-    Raises:
-        SdfsimError: they differ in gravity.
-    """
+    """Several sets of frames as one. Raises SdfsimError: they differ in gravity."""
     one = sets[0]
     if any(not np.allclose(one.gravity, other.gravity) for other in sets[1:]):
         raise SdfsimError("datasets that are trained on together must share gravity")

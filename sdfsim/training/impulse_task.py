@@ -30,12 +30,7 @@ class Batch:
 
 
 class ImpulseTask:
-    """Draws batches from contact frames, hard ones more often.
-
-    Args:
-        frames: of one split.
-        device: where batches are made.
-    """
+    """Draws batches from contact frames, hard ones more often."""
 
     def __init__(self, frames: ContactFrames, device: torch.device) -> None:
         self.frames = frames

@@ -15,10 +15,6 @@ class Optimiser:
 
     Muon (Jordan et al., 2024) takes steps along the nearest orthogonal matrix to the momentum, so that every direction
     of a hidden matrix learns at one pace. On contact frames a step of it was worth more than three of Adam's.
-
-    Args:
-        network: to be trained.
-        plan: says the peak learning rates.
     """
 
     def __init__(self, network: nn.Module, plan: Preset) -> None:

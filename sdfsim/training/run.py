@@ -42,11 +42,7 @@ class Run:
     """Everything that changes while training, and how to save it.
 
     Args:
-        plan: preset.
-        task: gives batches and losses.
         total: optimiser steps of the whole run (the learning rate depends on it).
-        seed: of weights and batches.
-        device: of weights and batches.
         team: who shares the work.
     """
 

@@ -37,10 +37,8 @@ class SurfaceTask:
     """Draws recorded steps of random trajectories, turned by a random yaw, with rigid pose noise.
 
     Args:
-        data: dataset folder.
         split: "train" or "validation".
         plan: which network, its surface nodes and its contact radius.
-        device: where batches are made.
         noisy: with the noise of the plan on the input poses; else they are exact.
     """
 

@@ -49,14 +49,10 @@ def train(
 
     Args:
         data: dataset folders with train/ and validation/; several (impulse only) are drawn from as if they were one.
-        out: training folder.
         preset: name in `PRESETS`, or one of your own.
         resume: go on from the checkpoint in `out`; the result equals an uninterrupted run's.
         steps: of the optimiser, instead of the preset's.
-        seed: of initial weights and batches.
-        device: "cpu", "cuda" or "auto".
         budget: seconds of processor time, all cores together, after which it stops early; `resume` goes on from there.
-        on_progress: called with the fraction done and a message.
 
     Returns:
         A report: paths, losses, seconds of processor time.

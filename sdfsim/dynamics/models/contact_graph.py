@@ -90,7 +90,6 @@ def edge_frames(graph: ContactGraph, *, mirrored: bool = False) -> EdgeFrames:
     """Frames, effective masses and input features of all edges.
 
     Args:
-        graph: bodies and edges.
         mirrored: use left-handed frames, which is what the mirror image of the scene would show (augmentation).
     """
     g = graph

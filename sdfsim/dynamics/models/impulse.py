@@ -99,11 +99,7 @@ class Round(nn.Module):
 
 
 class ImpulseNetwork(nn.Module):
-    """Encode edges, then `rounds` of pushing; see the module's docstring.
-
-    Args:
-        config: sizes.
-    """
+    """Encode edges, then `rounds` of pushing; see the module's docstring."""
 
     def __init__(self, config: ImpulseConfig) -> None:
         super().__init__()
@@ -122,8 +118,6 @@ class ImpulseNetwork(nn.Module):
         """Velocities after the contacts have acted.
 
         Args:
-            graph: bodies and edges.
-            friction: False computes no tangential impulse at all.
             mirrored: see `edge_frames`.
             trust: of the trust region; at 0 the solve stands alone.
         """
@@ -185,8 +179,6 @@ def bounded(graph: ContactGraph, frames: EdgeFrames, added: Tensor, start: Tenso
     - No more kinetic energy than the solve took, island by island.
 
     Args:
-        graph: bodies and edges.
-        frames: of the edges.
         added: [E, axis, 2] impulses: at the end of the step, and those that move bodies in it.
         start: [N, 6, 2] twists from the solve.
         trust: 0 to 1.

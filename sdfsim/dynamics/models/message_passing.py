@@ -151,12 +151,7 @@ class Step(nn.Module):
 
 
 class GraphNetwork(nn.Module):
-    """Encode, `steps` of message passing, decode; inputs and targets are normalised by statistics of the training data.
-
-    Args:
-        layout: of the graphs.
-        config: sizes.
-    """
+    """Encode, `steps` of message passing, decode; inputs and targets are normalised by statistics of training data."""
 
     def __init__(self, layout: Layout, config: GraphConfig) -> None:
         super().__init__()

@@ -30,7 +30,6 @@ def vertices(shape: Shape, count: int | None) -> Shape:
     vertices, and what the reduction takes off a body (up to 5 cm of the shapes of MOVi-B at 64) its mesh lacks.
 
     Args:
-        shape: any.
         count: vertices at most, about; None for all.
     """
     if _endless(shape):

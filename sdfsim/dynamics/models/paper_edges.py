@@ -50,11 +50,8 @@ def find_contacts(
     inside one step without ever having had an edge.
 
     Args:
-        bodies: N bodies.
-        state: their state.
         gravity: [3], model units.
         reach: contact radius D, model length.
-        dt: the step, model time.
         memory: of the run; it keeps the compiled bodies.
     """
     from sdfsim.dynamics.kernels.nodes import nodes_within
