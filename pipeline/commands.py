@@ -7,9 +7,9 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from sdfsim.commands.arguments import Budget, Cluster, Device, Json, Out, Verbose, tell_failed
+from sdfsim.commands.arguments import Budget, Cluster, Out, command, tell_failed
 from sdfsim.console import Session, duration
-from sdfsim.errors import EXIT_ERROR
+from sdfsim.errors import EXIT_ERROR, EXIT_USAGE, SdfsimError
 
 Preset = Annotated[
     Literal["quick", "standard", "fine", "paper"],
@@ -50,7 +50,9 @@ Materials = Annotated[
 DropShape = Annotated[Literal["box", "ball", "none"], typer.Option("--drop", help="What falls onto the scene.")]
 
 
+@command
 def reconstruct(
+    session: Session,
     photos: Photos,
     out: Out,
     preset: Preset = "standard",
@@ -62,76 +64,54 @@ def reconstruct(
     drop: DropShape = "box",
     material: Materials = None,
     budget: Budget = None,
-    as_json: Json = False,
-    device: Device = "auto",
-    verbose: Verbose = False,
+    device: str = "auto",
 ) -> None:
     """Photos -> a scene that can be simulated, by all stages."""
     corners, materials = _corners(crop), _by_body(material or [])
-    with Session(as_json=as_json, verbose=verbose) as session:
-        from pipeline import stages
+    from pipeline import stages
 
-        report = stages.reconstruct(
-            photos,
-            out,
-            preset=preset,
-            size=size,
-            distance=list(distance) if distance else None,
-            crop=corners,
-            drop=drop,
-            material=materials,
-            budget=budget,
-            from_stage=first,
-            until_stage=last,
-            device=device,
-            progress=session.stage_progress,
-        )
-        _report_stages(session, report, out)
+    report = stages.reconstruct(
+        photos, out, preset=preset, size=size, distance=list(distance) if distance else None, crop=corners, drop=drop,
+        material=materials, budget=budget, from_stage=first, until_stage=last, device=device,
+        progress=session.stage_progress,
+    )  # fmt: skip
+    _report_stages(session, report, out)
 
 
-def poses(
-    photos: Photos,
-    out: Out,
-    preset: KeptPreset = None,
-    as_json: Json = False,
-    device: Device = "auto",
-    verbose: Verbose = False,
-) -> None:
+@command
+def poses(session: Session, photos: Photos, out: Out, preset: KeptPreset = None, device: str = "auto") -> None:
     """Photos -> camera poses and sparse points."""
-    with Session(as_json=as_json, verbose=verbose) as session:
-        from pipeline import stages
+    from pipeline import stages
 
-        report = stages.find_poses(photos, out, preset=preset, device=device, progress=session.stage_progress)
-        _report_stages(session, report, out)
+    report = stages.find_poses(photos, out, preset=preset, device=device, progress=session.stage_progress)
+    _report_stages(session, report, out)
 
 
+@command
 def distill(
+    session: Session,
     folder: Annotated[Path, typer.Argument(help="Folder that poses has written.", show_default=False)],
     preset: KeptPreset = None,
     budget: Budget = None,
-    as_json: Json = False,
-    device: Device = "auto",
-    verbose: Verbose = False,
+    device: str = "auto",
 ) -> None:
     """Posed photos -> a signed-distance and colour field."""
-    _stage("distill", folder, as_json, verbose, preset=preset, budget=budget, device=device)
+    _stage(session, "distill", folder, preset=preset, budget=budget, device=device)
 
 
+@command
 def mesh(
+    session: Session,
     folder: Annotated[Path, typer.Argument(help="Folder that distill has written.", show_default=False)],
     preset: KeptPreset = None,
     size: Size = None,
     distance: Distance = None,
     crop: Crop = None,
-    as_json: Json = False,
-    device: Device = "auto",
-    verbose: Verbose = False,
+    device: str = "auto",
 ) -> None:
     """Field -> upright meshes of the scenery and of the bodies that stand on it."""
     known = list(distance) if distance else None
-    _stage(
-        "mesh", folder, as_json, verbose, preset=preset, size=size, distance=known, crop=_corners(crop), device=device,
-    )  # fmt: skip
+    _stage(session, "mesh", folder, preset=preset, size=size, distance=known, crop=_corners(crop), device=device)
 
 
 def _corners(crop: tuple[str, str] | None) -> list[float] | None:
@@ -143,7 +123,7 @@ def _corners(crop: tuple[str, str] | None) -> list[float] | None:
     except ValueError:
         corners = []
     if [len(corner) for corner in corners] != [3, 3]:
-        raise typer.BadParameter(f"--crop takes two corners X,Y,Z in metres (got {' '.join(crop)})")
+        raise SdfsimError(f"--crop takes two corners X,Y,Z in metres (got {' '.join(crop)})", exit_code=EXIT_USAGE)
     return corners[0] + corners[1]
 
 
@@ -152,13 +132,17 @@ def _by_body(materials: list[str]) -> dict[str, str]:
     pairs = [text.partition("=") for text in materials]
     for text, (body, _, material) in zip(materials, pairs, strict=True):
         if not body or not material:
-            raise typer.BadParameter(f"--material takes BODY=MATERIAL, such as object1=wood (got {text})")
+            raise SdfsimError(
+                f"--material takes BODY=MATERIAL, such as object1=wood (got {text})", exit_code=EXIT_USAGE
+            )
     if len({body for body, _, _ in pairs}) < len(pairs):
-        raise typer.BadParameter(f"--material names a body twice (got {' '.join(materials)})")
+        raise SdfsimError(f"--material names a body twice (got {' '.join(materials)})", exit_code=EXIT_USAGE)
     return {body: material for body, _, material in pairs}
 
 
+@command
 def fit(
+    session: Session,
     sources: Annotated[
         list[Path],
         typer.Argument(
@@ -179,9 +163,7 @@ def fit(
     ] = None,
     units: Annotated[Literal["m", "cm", "mm", "in"], typer.Option(help="Of the mesh files (with -o).")] = "m",
     cluster: Cluster = None,
-    as_json: Json = False,
-    device: Device = "auto",
-    verbose: Verbose = False,
+    device: str = "auto",
 ) -> None:
     """Mesh -> compact SDF network, its errors certified.
 
@@ -190,39 +172,37 @@ def fit(
     """
     if out is None:
         if len(sources) > 1 or not sources[0].is_dir():
-            raise typer.BadParameter("a mesh file needs -o SHAPE_DIR")
+            raise SdfsimError("a mesh file needs -o SHAPE_DIR", exit_code=EXIT_USAGE)
         if cap or thicken is not None or units != "m" or cluster is not None:
-            raise typer.BadParameter("--cap, --thicken, --units and --cluster go with -o")
-        _stage("fit", sources[0], as_json, verbose, then="scene", budget=budget, recipe=recipe, device=device)
+            raise SdfsimError("--cap, --thicken, --units and --cluster go with -o", exit_code=EXIT_USAGE)
+        _stage(session, "fit", sources[0], then="scene", budget=budget, recipe=recipe, device=device)
         return
-    with Session(as_json=as_json, verbose=verbose) as session:
-        from sdfsim import fitting
-        from sdfsim.parallel import cluster as working_on
+    from sdfsim import fitting
+    from sdfsim.parallel import cluster as working_on
 
-        options = fitting.Options(recipe or "default", budget, cap, thicken, units)
-        if len(sources) == 1 and not sources[0].is_dir():
-            report = fitting.fit(sources[0], out, options, device=device, on_progress=session.progress)
-            lines = fitting.fit_lines(report)
-        else:
-            meshes = fitting.named_meshes(sources)
-            with working_on(cluster):
-                report = fitting.fit_many(meshes, out, options, device=device, on_progress=session.progress)
-            lines = fitting.batch_lines(report)
-        tell_failed(session, report)
-        if any("error" in shape for shape in report.get("shapes", {}).values()):
-            session.exit_code = EXIT_ERROR
-        session.report(report, lines)
+    options = fitting.Options(recipe or "default", budget, cap, thicken, units)
+    if len(sources) == 1 and not sources[0].is_dir():
+        report = fitting.fit(sources[0], out, options, device=device, on_progress=session.progress)
+        lines = fitting.fit_lines(report)
+    else:
+        meshes = fitting.named_meshes(sources)
+        with working_on(cluster):
+            report = fitting.fit_many(meshes, out, options, device=device, on_progress=session.progress)
+        lines = fitting.batch_lines(report)
+    tell_failed(session, report)
+    if any("error" in shape for shape in report.get("shapes", {}).values()):
+        session.exit_code = EXIT_ERROR
+    session.report(report, lines)
 
 
-def _stage(name: str, folder: Path, as_json: bool, verbose: bool, *, then: Stage | None = None, **options: Any) -> None:
+def _stage(session: Session, name: str, folder: Path, *, then: Stage | None = None, **options: Any) -> None:
     """Run one stage, and `then` another that costs next to nothing."""
-    with Session(as_json=as_json, verbose=verbose) as session:
-        from pipeline import stages
+    from pipeline import stages
 
-        report = stages.run_stage(name, folder, progress=session.stage_progress, **options)
-        if then is not None:
-            report = stages.run_stage(then, folder, progress=session.stage_progress)
-        _report_stages(session, report, folder)
+    report = stages.run_stage(name, folder, progress=session.stage_progress, **options)
+    if then is not None:
+        report = stages.run_stage(then, folder, progress=session.stage_progress)
+    _report_stages(session, report, folder)
 
 
 def _report_stages(session: Session, report: dict, folder: Path) -> None:
