@@ -121,9 +121,7 @@ def trust_lines(mesh: dict) -> list[str]:
     lines = []
     for name, part in mesh.get("trust", {}).items():
         if part["guessed"] > GUESSED_SHARE and name != "scene":
-            where = f": {', '.join(part['where'])}" if part["where"] else ""
-            share = f"{part['guessed']:.0%} of its surface is guessed"
-            lines.append(f"{name}: {share}, fewer than two photos see it{where}")
+            lines.append(f"{name}: {part['guessed']:.0%} of its surface is guessed, fewer than two photos see it")
     if "weak" in mesh:
         made_up = sum(photo["gain"] for photo in mesh["next_photos"])
         more = f"the photos proposed make up for {made_up:.0%} of that" if made_up else "no one photo would help much"
@@ -133,16 +131,15 @@ def trust_lines(mesh: dict) -> list[str]:
 
 
 def touching_lines(mesh: dict) -> list[str]:
-    """Which bodies touch, which masks have no body, and how deep hollows are, from the report of the mesh stage."""
-    from pipeline.mesh.hollows import hollow_line
-
+    """Which bodies touch, and which masks have no body, from the report of the mesh stage."""
     lines = []
     for first, second, by in mesh.get("touching", []):
         how = "split where their masks end" if by == "masks" else (
             "split along a seam by concavity and colour; give masks to be sure")  # fmt: skip
         lines.append(f"{first} and {second} touch; {how}")
-    lines += [f"masks of {name}: no surface corresponds to them" for name in mesh.get("masks_without_surface", [])]
-    return lines + [hollow_line(name, *found) for name, found in mesh.get("hollows_m", {}).items()]
+    return lines + [
+        f"masks of {name}: no surface corresponds to them" for name in mesh.get("masks_without_surface", [])
+    ]
 
 
 def notes(stages: dict[str, dict]) -> list[str]:
@@ -234,8 +231,6 @@ def page(report: dict, folder: Path) -> str:
     lines += ["## Numbers", "", "| | |", "| --- | --- |", *(f"| {name} | {value} |" for name, value in rows), ""]
     if (folder / "mesh" / "objects.png").exists() and mesh:
         lines += ["## What was found", "", "![bodies by name](mesh/objects.png)", ""]
-    if (folder / "mesh" / "trust.jpg").exists() and mesh:
-        lines += ["## How far to trust the surface", "", "![uncertainty](mesh/trust.jpg)", ""]
     files = {photo["photo"]: photo["file"] for photo in report["photos"]}
     held = [name for name in distill.get("held_out_photos", []) if name in files]
     if held:

@@ -18,11 +18,10 @@ from pipeline.inputs.photos import load_photos
 from pipeline.mesh.bodies import Parts, split
 from pipeline.mesh.cleaning import joined
 from pipeline.mesh.extraction import EXTENT, ball, field_distance, sample_volume, surface_of
-from pipeline.mesh.hollows import hollow
 from pipeline.mesh.next_photos import next_photos
 from pipeline.mesh.placement import GRAVITY, Placement, Up, measured_scale, place
 from pipeline.mesh.texture import Shots, shots_of, texture_parts
-from pipeline.mesh.trust import Support, color_range, colors_of, draw_trust, summary, support_of
+from pipeline.mesh.trust import Support, color_range, colors_of, summary, support_of
 from pipeline.mesh.visibility import Caster, Visibility, to_bytes
 from pipeline.progress import Progress, quiet, share_of
 from sdfsim.errors import SdfsimError
@@ -30,7 +29,7 @@ from sdfsim.files import read_json, replacing, write_json
 from sdfsim.shape.mesh import Mesh, read_attributes, read_mesh, write_glb, write_ply
 
 SCENERY = "scene"
-TEXTURED, TRUST, NEXT = "textured.glb", "trust.jpg", "next_photos.json"
+TEXTURED, NEXT = "textured.glb", "next_photos.json"
 RESOLUTION = {"quick": 192, "standard": 288, "fine": 448, "paper": 448}  # samples a side, by preset
 # The picture of names: at most so many photos, their width while they are chosen and in the picture, px, and the tint.
 PICTURES, THUMB, WIDE, TINT = 4, 80, 720, 0.45
@@ -46,7 +45,7 @@ def make_meshes(
     Writes `mesh.ply` (all that photos show), of the scenery `solid.ply` (closed) and `shown.ply` (what is displayed),
     `objects/NAME.ply` (closed) of each body, `parts.json`, `placement.json`, `objects.png`, and `textured.glb`: the
     scenery and each body with a texture. Vertices in the PLY files have `views` and `uncertainty`, see `Support`;
-    `trust.jpg` draws the latter, and `next_photos.json` has the cameras of the photos that would help most.
+    `next_photos.json` has the cameras of the photos that would help most.
 
     Args:
         size: see `Options`; so are `distance` and `crop`.
@@ -107,8 +106,6 @@ def make_meshes(
     textures = texture_parts(displayed, shots, share_of(on_progress, 0.87, 0.13))
     with replacing(out / TEXTURED) as partial:
         partial.write_bytes(write_glb(textures))
-    deep = {name: hollow(closed[name], 2 * surface.volume.cell * metres) for name in parts.bodies}
-    hollows = {name: rounded(found).tolist() for name, found in deep.items() if found is not None}
     return {
         **surface.report,
         "left_out_m": [float(rounded(length * metres)) for length in (*surface.report["left_out"], *parts.noise)],
@@ -116,14 +113,14 @@ def make_meshes(
         "up_from": placement.up_from, "up_within_degrees": round(placement.up_within, 2),
         "up_confidence": placement.up_confidence, "size": placement.size_from, "objects": list(parts.bodies),
         "smallest_object_m": float(rounded(parts.smallest * metres)), "touching": parts.touching,
-        "masks_without_surface": parts.missing, "hollows_m": hollows, **told,
+        "masks_without_surface": parts.missing, **told,
     }  # fmt: skip
 
 
 def trust(
     closed: dict[str, Mesh], displayed: dict[str, Mesh], shots: Shots, counted: np.ndarray, out: Path
 ) -> tuple[Support, dict]:
-    """How far the surface can be trusted, and which photos would help; writes `trust.jpg` and `next_photos.json`.
+    """How far the surface can be trusted, and which photos would help; writes `next_photos.json`.
 
     Args:
         closed: what the scene is made of, by name, metres.
@@ -139,16 +136,9 @@ def trust(
     shown = {name: support.nearest(mesh.vertices) for name, mesh in displayed.items()}
     advice = next_photos(closed, support, sight, shots.blocking, shots.views, counted)
     save_views([photo.view for photo in advice.photos], out / NEXT)
-    limits = color_range(whole, support.uncertainty)
-    drawn = {view.source: view for view in [shots.views[0], *(photo.view for photo in advice.photos[:1])]}
-    # Neither where the solid was cut off nor its side below the floor says anything.
-    told_of = (counted & (whole.vertices[:, 2] > -3 * shots.lift))[whole.faces].all(1)
-    draw_trust(replace(whole, faces=whole.faces[told_of]), support.uncertainty, drawn, limits).save(
-        out / TRUST, quality=90
-    )
     return support, {
         "trust": {name: summary(mesh, shown[name]) for name, mesh in displayed.items()},
-        "trust_colors_m": limits, "weak": round(advice.weak, 4),
+        "trust_colors_m": color_range(whole, support.uncertainty), "weak": round(advice.weak, 4),
         "next_photos": [photo.told() for photo in advice.photos],
     }  # fmt: skip
 

@@ -6,26 +6,22 @@ several directions together tell the rest. What fewer than two photos see is a g
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
 
 from pipeline.cameras import View
-from pipeline.mesh.cleaning import face_normals, vertex_normals
-from pipeline.mesh.visibility import Caster, Visibility, to_bytes
+from pipeline.mesh.cleaning import face_normals
+from pipeline.mesh.visibility import Visibility
 from pipeline.progress import Progress, quiet
 from sdfsim.shape.mesh import Mesh
 
 FEW = 3  # photos: what fewer see is weak
 PARALLEL = 1e-12  # of lines of sight: least determinant of their information, with its trace as unit
-# Guessed places of a body are told by their side, each with this share of them at least.
-WORTH_NAMING = 0.2
 # Colours from the surest to the least sure place (anchors of viridis), and of what is guessed.
 SCALE = np.array([[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], float)
 GUESSED = np.array([255.0, 45, 45])
-WIDE, LEGEND = 640, 44  # width of each half of a picture and height of its legend, px
 
 
 @dataclass(frozen=True)
@@ -108,7 +104,7 @@ def summary(mesh: Mesh, support: Support) -> dict:
 
     Returns:
         `area_m2`; `seen_by`, the shares of 0, 1, 2, and 3 or more photos; `guessed`, that of fewer than two or of
-        lines of sight that are parallel; `uncertainty_m`, None where all is guessed; `where`, see `guessed_sides`.
+        lines of sight that are parallel; `uncertainty_m`, None where all is guessed.
     """
     area, uncertainty = vertex_areas(mesh), support.uncertainty
     known = np.isfinite(uncertainty)
@@ -120,24 +116,7 @@ def summary(mesh: Mesh, support: Support) -> dict:
         "area_m2": float(area.sum()), "seen_by": [round(float(share), 4) for share in seen_by],
         "guessed": round(float(area[~known].sum() / area.sum()), 4),
         "uncertainty_m": median,
-        "where": guessed_sides(mesh, np.where(known, 0, area)),
     }  # fmt: skip
-
-
-def guessed_sides(mesh: Mesh, weights: np.ndarray) -> list[str]:
-    """Where on a body, z up and its front towards -y, most of some weights [V] lies, in words."""
-    chosen = np.flatnonzero(weights > 0)
-    if not len(chosen):
-        return []
-    points, normals = mesh.vertices[chosen], vertex_normals(mesh)[chosen]
-    clear = 1e-3 * float(np.ptp(mesh.vertices, axis=0).max())
-    faces_itself = np.isfinite(Caster(mesh).hits(points + clear * normals, normals)[0])
-    axis = np.abs(normals).argmax(1)
-    side = 2 * axis + (normals[np.arange(len(axis)), axis] > 0)
-    side[faces_itself] = 6
-    names = ["left (-x)", "right (+x)", "front (-y)", "back (+y)", "underside", "top", "hollow"]
-    share = np.bincount(side, weights[chosen], minlength=len(names)) / weights.sum()
-    return [names[k] for k in np.argsort(-share) if share[k] >= WORTH_NAMING]
 
 
 def color_range(mesh: Mesh, uncertainty: np.ndarray) -> tuple[float, float]:
@@ -157,52 +136,3 @@ def colors_of(uncertainty: np.ndarray, limits: tuple[float, float]) -> np.ndarra
     place = np.clip(position, 0, 1) * (len(SCALE) - 1)
     color = np.stack([np.interp(place, np.arange(len(SCALE)), channel) for channel in SCALE.T], -1)
     return np.where(known[:, None], color, GUESSED)
-
-
-def draw_trust(
-    mesh: Mesh, uncertainty: np.ndarray, views: Mapping[str, View], limits: tuple[float, float]
-) -> Image.Image:
-    """The uncertainty over a surface in colours, as some cameras see it, side by side above a legend.
-
-    Args:
-        mesh: metres.
-        uncertainty: [V] m.
-        views: cameras by what is written above them, metres.
-        limits: see `color_range`.
-    """
-    color = colors_of(uncertainty, limits)
-    normals, caster = face_normals(mesh)[0], Caster(mesh)
-    tiles = []
-    for title, view in views.items():
-        scale = WIDE / view.width
-        height = round(view.height * scale)
-        row, column = (axis.ravel() for axis in np.indices((height, WIDE)))
-        rays = view.rays((column + 0.5) / scale, (row + 0.5) / scale)
-        away, face = caster.hits(view.center, rays)
-        hit = np.isfinite(away)
-        pixels = np.full((len(rays), 3), 255.0)
-        shade = 0.55 + 0.45 * np.abs((normals[face[hit]] * rays[hit]).sum(1))
-        pixels[hit] = color[mesh.faces[face[hit]]].mean(1) * shade[:, None]
-        tiles.append(Image.fromarray(to_bytes(pixels.reshape(height, WIDE, 3))))
-        ImageDraw.Draw(tiles[-1]).text((6, 4), title, font=ImageFont.load_default(18), fill=(255, 255, 255),
-                                       stroke_width=2, stroke_fill=(0, 0, 0))  # fmt: skip
-    tall = max(tile.height for tile in tiles)
-    sheet = Image.new("RGB", (WIDE * len(tiles), tall + LEGEND), (255, 255, 255))
-    for number, tile in enumerate(tiles):
-        sheet.paste(tile, (number * WIDE, 0))
-    _legend(sheet, tall, limits)
-    return sheet
-
-
-def _legend(sheet: Image.Image, top: int, limits: tuple[float, float]) -> None:
-    """Writes below `top` px what the colours mean."""
-    low, high = limits
-    bar = colors_of(np.geomspace(low, high, 200), limits)
-    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(16)
-    text = {"font": font, "fill": (0, 0, 0), "anchor": "lm"}
-    middle = top + LEGEND // 2
-    draw.text((10, middle), f"{1000 * low:.2g} mm", **text)
-    sheet.paste(Image.fromarray(to_bytes(np.broadcast_to(bar, (16, 200, 3)))), (90, middle - 8))
-    draw.text((300, middle), f"{1000 * high:.2g} mm", **text)
-    draw.rectangle((400, middle - 8, 424, middle + 8), fill=(255, 45, 45))
-    draw.text((432, middle), "guessed", **text)
