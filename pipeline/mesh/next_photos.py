@@ -103,9 +103,7 @@ def next_photos(
         now = replace(now, views=counts, information=matrices)
         poor = (counts < FEW) | (now.uncertainty > limit)
         most = int(np.bincount(part[seen]).argmax())
-        helped, name = seen[part[seen] == most], list(meshes)[most]
-        aim = spot(name, meshes[name], now.vertices[helped], now.normals[helped])
-        words = f"{way_to(view.center, views, middle)}, looking at {aim}"
+        words = f"{way_to(view.center, views, middle)}, looking at {list(meshes)[most]}"
         chosen.append(NextPhoto(view, target, gain / lacking, words))
         turned = (places - middle) @ (view.center - middle)
         turned /= np.linalg.norm(places - middle, axis=1) * np.linalg.norm(view.center - middle)
@@ -195,20 +193,5 @@ def way_to(place: np.ndarray, views: Sequence[View], middle: np.ndarray) -> str:
         ways = [(step @ right, "to the right", "to the left"), (step @ forward, "forward", "back"), *ways]
     slight = SLIGHT * float(np.linalg.norm(place - middle))
     told = [f"{abs(size):.2g} m {one if size > 0 else other}" for size, one, other in ways if abs(size) > slight]
-    side = place - middle
-    names = ["left" if side[0] < 0 else "right", "front" if side[1] < 0 else "back"]
-    keep = np.abs(side[:2]) > 0.4 * np.linalg.norm(side[:2])
-    corner = " ".join(name for name, kept in zip(names[::-1], keep[::-1], strict=True) if kept)
     moved = around + (", ".join(told) or ("at the same height" if around else "from the same place"))
-    return f"from the {corner} of the scene: stand where {nearest.source} was taken, {moved}"
-
-
-def spot(name: str, mesh: Mesh, points: np.ndarray, normals: np.ndarray) -> str:
-    """What of a mesh lies at points [P, 3] that face along normals [P, 3], in words."""
-    low, high = mesh.vertices[:, 2].min(), mesh.vertices[:, 2].max()
-    height, facing = float(np.median(points[:, 2])), float(np.median(normals[:, 2]))
-    below = "the underside of " if facing < -0.5 else ""
-    if name == "scene":
-        return "the floor" if height < 0.05 * (high - low) else f"{below}the scenery {height:.2g} m above the floor"
-    third = min(int(3 * (height - low) / max(high - low, 1e-12)), 2)
-    return f"{below or ('the foot of ', 'the middle of ', 'the top of ')[third]}{name}"
+    return f"stand where {nearest.source} was taken, {moved}"

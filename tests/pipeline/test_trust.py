@@ -169,7 +169,7 @@ def test_photos_of_one_half_ask_for_the_other_half():
     assert before > 0.2 and after < 0.5 * before
     for photo in found.photos:
         assert "stand where 0" in photo.words and "around the scene to your" in photo.words
-        assert "looking at the" in photo.words
+        assert "looking at " in photo.words
         # The camera does look there.
         pixels, depth = photo.view.project(photo.target[None])
         np.testing.assert_allclose(pixels[0], [photo.view.cx, photo.view.cy], atol=1e-6)
