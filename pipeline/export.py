@@ -13,7 +13,6 @@ import numpy as np
 import yaml
 
 from pipeline.materials import Choice
-from pipeline.mesh.cleaning import joined
 from pipeline.mesh.meshing import SCENERY, TEXTURED, read_parts, rounded
 from pipeline.mesh.placement import Placement, load_placement
 from pipeline.mesh.visibility import Above
@@ -22,7 +21,7 @@ from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.files import write_text
 from sdfsim.scene.scene import Scene
 from sdfsim.scene.scene_file import load_scene, nearest
-from sdfsim.shape.mesh import Mesh, load_mesh, read_glb
+from sdfsim.shape.mesh import Mesh, joined, load_mesh, read_glb
 
 SCENERY_SHARE = 2  # Of a budget the scenery gets as much as this many bodies: it has more to it.
 SIDE = 0.06  # of the dropped slab, as a share of the scenery's widest side

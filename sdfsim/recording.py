@@ -18,7 +18,7 @@ from sdfsim.dynamics.run_memory import PHASES
 from sdfsim.errors import SdfsimError
 from sdfsim.files import write_bytes
 from sdfsim.scene.scene import Scene
-from sdfsim.shape.mesh import Mesh
+from sdfsim.shape.mesh import Mesh, face_normals, vertex_normals
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -423,51 +423,31 @@ def with_normals(mesh: Mesh) -> tuple[Mesh, np.ndarray]:
     """The mesh with normals [V, 3]: smooth, its vertices split along creases so that boxes keep their edges."""
     if mesh.uv is not None:  # its vertices are doubled where its texture is cut, and that is no crease
         _, first, label = np.unique(mesh.vertices, axis=0, return_index=True, return_inverse=True)
-        return mesh, _smooth_normals(mesh.vertices[first], label.reshape(-1)[mesh.faces])[label.reshape(-1)]
-    normals = _corner_normals(mesh.vertices, mesh.faces)
+        return mesh, vertex_normals(Mesh(mesh.vertices[first], label.reshape(-1)[mesh.faces]))[label.reshape(-1)]
+    normals = _corner_normals(mesh)
     if normals is None:
-        return mesh, _smooth_normals(mesh.vertices, mesh.faces)
+        return mesh, vertex_normals(mesh)
     colors = None if mesh.colors is None else mesh.colors[mesh.faces].reshape(-1, 3)
     vertices = mesh.vertices[mesh.faces].reshape(-1, 3)
     return Mesh(vertices, np.arange(len(vertices)).reshape(-1, 3), colors), normals
 
 
-def _face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """[F, 3], twice the area long."""
-    a, b, c = vertices[faces.T]
-    return np.cross(b - a, c - a)
-
-
-def _smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """[V, 3] area-weighted means of the faces around each vertex."""
-    total = np.zeros_like(vertices)
-    normal = _face_normals(vertices, faces)
-    for k in range(3):
-        np.add.at(total, faces[:, k], normal)
-    return _normalise(total)
-
-
-def _corner_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
+def _corner_normals(mesh: Mesh) -> np.ndarray | None:
     """[3 F, 3] for every face corner the mean of the faces at its vertex that bend less than the crease angle.
 
     None for a mesh so fine that it may pass as smooth.
     """
-    owner = faces.reshape(-1)
+    owner = mesh.faces.reshape(-1)
     order = np.argsort(owner, kind="stable")
-    valence = np.bincount(owner, minlength=len(vertices))
+    valence = np.bincount(owner, minlength=len(mesh.vertices))
     if (valence**2).sum() > _MOST_CORNER_PAIRS:
         return None
     start = np.cumsum(valence) - valence
     repeats = valence[owner]
     first = np.repeat(np.arange(len(owner)), repeats)
     second = order[np.repeat(start[owner] - (np.cumsum(repeats) - repeats), repeats) + np.arange(repeats.sum())]
-    normal = _face_normals(vertices, faces)
-    unit = _normalise(normal)
+    unit, area = face_normals(mesh)
     near = (unit[first // 3] * unit[second // 3]).sum(1) >= _CREASE
     total = np.zeros((len(owner), 3))
-    np.add.at(total, first[near], normal[second[near] // 3])
-    return _normalise(total)
-
-
-def _normalise(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)
+    np.add.at(total, first[near], (area[:, None] * unit)[second[near] // 3])
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)

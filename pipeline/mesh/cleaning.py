@@ -1,32 +1,13 @@
-"""Parts of meshes: normals, connected components, and which of those belong."""
+"""Parts of meshes: connected components, and which of them belong."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from sdfsim.shape.mesh import Mesh
+from sdfsim.shape.mesh import Mesh, face_normals
 
 # A component of whose area photos show less than this share is matter behind the scenery.
 UNSEEN = 0.05
-
-
-def face_normals(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """Unit normals [F, 3] and areas [F]."""
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    cross = np.cross(b - a, c - a)
-    double = np.linalg.norm(cross, axis=1)
-    return cross / np.maximum(double, 1e-30)[:, None], double / 2
-
-
-def vertex_normals(mesh: Mesh) -> np.ndarray:
-    """Area-weighted unit normals [V, 3]."""
-    normals, areas = face_normals(mesh)
-    total = np.zeros_like(mesh.vertices)
-    for k in range(3):
-        np.add.at(total, mesh.faces[:, k], normals * areas[:, None])
-    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
 
 
 def keep_faces(mesh: Mesh, keep: np.ndarray) -> Mesh:
@@ -35,13 +16,6 @@ def keep_faces(mesh: Mesh, keep: np.ndarray) -> Mesh:
     used, inverse = np.unique(faces, return_inverse=True)
     colors = None if mesh.colors is None else mesh.colors[used]
     return Mesh(mesh.vertices[used], inverse.reshape(-1, 3).astype(np.int64), colors)
-
-
-def joined(meshes: Sequence[Mesh]) -> Mesh:
-    """Several meshes as one, without colours."""
-    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
-    return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))
 
 
 def components(mesh: Mesh) -> np.ndarray:

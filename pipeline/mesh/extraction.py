@@ -11,11 +11,11 @@ import torch
 
 from pipeline.cameras import View
 from pipeline.field.grid_field import Field
-from pipeline.mesh.cleaning import belonging, face_normals, islands, keep_faces, vertex_normals
+from pipeline.mesh.cleaning import belonging, islands, keep_faces
 from pipeline.mesh.visibility import Visibility, look, to_bytes
 from pipeline.progress import Progress, quiet
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
-from sdfsim.shape.mesh import Mesh
+from sdfsim.shape.mesh import Mesh, face_normals, vertex_normals
 
 Distance = Callable[[np.ndarray], np.ndarray]
 

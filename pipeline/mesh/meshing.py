@@ -16,7 +16,6 @@ from pipeline.field.training import load_field
 from pipeline.inputs.captures import load_capture
 from pipeline.inputs.photos import load_photos
 from pipeline.mesh.bodies import Parts, split
-from pipeline.mesh.cleaning import joined
 from pipeline.mesh.extraction import EXTENT, ball, field_distance, sample_volume, surface_of
 from pipeline.mesh.next_photos import next_photos
 from pipeline.mesh.placement import GRAVITY, Placement, Up, measured_scale, place
@@ -26,7 +25,7 @@ from pipeline.mesh.visibility import Caster, Visibility, to_bytes
 from pipeline.progress import Progress, quiet, share_of
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, replacing, write_json
-from sdfsim.shape.mesh import Mesh, read_attributes, read_mesh, write_glb, write_ply
+from sdfsim.shape.mesh import Mesh, joined, read_attributes, read_mesh, write_glb, write_ply
 
 SCENERY = "scene"
 TEXTURED, NEXT = "textured.glb", "next_photos.json"

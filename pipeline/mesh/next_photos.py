@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.cameras import View, focus
-from pipeline.mesh.cleaning import joined
 from pipeline.mesh.trust import FEW, Support, information, sigma_along, vertex_areas
 from pipeline.mesh.visibility import Caster, Visibility, framed
-from sdfsim.shape.mesh import Mesh
+from sdfsim.shape.mesh import Mesh, joined
 
 WANTED = 3  # photos that are proposed
 SAMPLES = 6000  # of the surface

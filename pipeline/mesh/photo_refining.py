@@ -17,9 +17,8 @@ from scipy.sparse import coo_matrix, csr_matrix, diags
 from scipy.sparse.linalg import cg
 
 from pipeline.cameras import View, frame_of
-from pipeline.mesh.cleaning import vertex_normals
 from pipeline.mesh.visibility import Caster, Visibility
-from sdfsim.shape.mesh import Mesh
+from sdfsim.shape.mesh import Mesh, vertex_normals
 
 LONG_SIDE = 640  # px; larger photos are made smaller, or the right place would lie too many pixels away
 PHOTOS, FEWEST = 5, 3  # that a patch is compared in, those that look straightest; and how many there must be

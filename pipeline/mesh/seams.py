@@ -20,10 +20,9 @@ from scipy.spatial import ConvexHull, KDTree
 
 from pipeline.cameras import View, frame_of
 from pipeline.inputs.labels import UNKNOWN, load_labels
-from pipeline.mesh.cleaning import vertex_normals
 from pipeline.mesh.extraction import Volume
 from pipeline.mesh.visibility import Visibility
-from sdfsim.shape.mesh import Mesh
+from sdfsim.shape.mesh import Mesh, vertex_normals
 
 # A patch of one label that is smaller than this share of the label's largest is a mistake of some mask.
 STRAY = 0.1

@@ -15,10 +15,10 @@ from PIL import Image
 
 from pipeline.cameras import View
 from pipeline.inputs.photos import Photo
-from pipeline.mesh.cleaning import face_normals, joined, keep_faces, vertex_normals
+from pipeline.mesh.cleaning import keep_faces
 from pipeline.mesh.visibility import FLATTEST, Caster, bilinear, framed, to_bytes
 from pipeline.progress import Progress, quiet, share_of
-from sdfsim.shape.mesh import Mesh, sample_surface
+from sdfsim.shape.mesh import Mesh, face_normals, joined, sample_surface, vertex_normals
 
 FACES = 40_000  # of a textured mesh: finer detail is in its texture
 # The time of xatlas grows with the square of the faces of a chart: it gets the mesh in pieces of so many.

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.cameras import View
-from pipeline.mesh.cleaning import face_normals
 from pipeline.mesh.visibility import Visibility
 from pipeline.progress import Progress, quiet
-from sdfsim.shape.mesh import Mesh
+from sdfsim.shape.mesh import Mesh, face_normals
 
 FEW = 3  # photos: what fewer see is weak
 PARALLEL = 1e-12  # of lines of sight: least determinant of their information, with its trace as unit

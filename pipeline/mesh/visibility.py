@@ -11,9 +11,8 @@ import numpy as np
 from PIL import Image
 
 from pipeline.cameras import View
-from pipeline.mesh.cleaning import vertex_normals
 from pipeline.progress import Progress, quiet
-from sdfsim.shape.mesh import Mesh
+from sdfsim.shape.mesh import Mesh, vertex_normals
 
 # A point seen at a flatter angle than this (cosine) does not count as seen.
 FLATTEST = 0.08

@@ -8,7 +8,7 @@ import numpy as np
 
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.bvh import ClosestPoint, Winding
-from sdfsim.shape.mesh import Mesh
+from sdfsim.shape.mesh import Mesh, joined
 from sdfsim.shape.watertight import Solid, as_it_is, exposed
 
 # The paper trusts a sign only where the offset to the surface is less than 75 degrees from the normal's line.
@@ -113,7 +113,7 @@ class PiecesDistance:
             raise SdfsimError("a shape of convex pieces needs at least one piece")
         self.pieces = pieces
         self.closed = True
-        everything = merge(pieces)
+        everything = joined(pieces)
         self.bounds = np.stack([everything.vertices.min(0), everything.vertices.max(0)])
         size = float((self.bounds[1] - self.bounds[0]).max())
         # Pieces that touch leave seams of no width between them: a hair's breadth outside still counts as inside.
@@ -164,15 +164,6 @@ class PiecesDistance:
 
         triangles = exposed(everything.vertices[everything.faces] / size, bare)[0] * size
         return Mesh(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3))
-
-
-def merge(pieces: list[Mesh]) -> Mesh:
-    """All pieces in one mesh (faces concatenated, nothing cut away)."""
-    starts = np.cumsum([0] + [len(piece.vertices) for piece in pieces[:-1]])
-    return Mesh(
-        np.concatenate([piece.vertices for piece in pieces]),
-        np.concatenate([piece.faces + start for piece, start in zip(pieces, starts, strict=True)]),
-    )
 
 
 def half_spaces(piece: Mesh) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Triangle meshes: reading and writing files, cleaning, convex hulls, and points on surfaces."""
+"""Triangle meshes: reading and writing files, cleaning, convex hulls, normals, and points on surfaces."""
 
 from __future__ import annotations
 
@@ -430,22 +430,42 @@ def convex_hull(points: np.ndarray) -> Mesh:
     except QhullError as error:
         raise SdfsimError("a convex piece is flat") from error
     faces = hull.simplices.astype(np.int64)
-    corners = points[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    inward = np.einsum("fi,fi->f", normal, hull.equations[:, :3]) < 0
+    inward = np.einsum("fi,fi->f", face_normals(Mesh(points, faces))[0], hull.equations[:, :3]) < 0
     faces[inward] = faces[inward][:, ::-1]
     used, label = np.unique(faces, return_inverse=True)
     return Mesh(np.asarray(points, dtype=np.float64)[used], label.reshape(-1, 3))
 
 
+def face_normals(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Unit normals [F, 3] and areas [F]."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    cross = np.cross(b - a, c - a)
+    double = np.linalg.norm(cross, axis=1)
+    return cross / np.maximum(double, 1e-30)[:, None], double / 2
+
+
+def vertex_normals(mesh: Mesh) -> np.ndarray:
+    """Area-weighted unit normals [V, 3]."""
+    normals, areas = face_normals(mesh)
+    total = np.zeros_like(mesh.vertices)
+    for k in range(3):
+        np.add.at(total, mesh.faces[:, k], normals * areas[:, None])
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
+
+
+def joined(meshes: Sequence[Mesh]) -> Mesh:
+    """Several meshes as one, without colours."""
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
+    return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))
+
+
 def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Points spread evenly by area: [P, 3] m, with the unit normals [P, 3] of their faces."""
-    corners = mesh.vertices[mesh.faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(normal, axis=1)
+    normal, area = face_normals(mesh)
     face = rng.choice(len(area), size=count, p=area / area.sum())
     u, v = rng.random((2, count, 1))
     flip = u + v > 1
     u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
-    first, second, third = corners[face, 0], corners[face, 1], corners[face, 2]
-    return first + u * (second - first) + v * (third - first), normal[face] / area[face, None]
+    first, second, third = (mesh.vertices[mesh.faces[face, k]] for k in range(3))
+    return first + u * (second - first) + v * (third - first), normal[face]

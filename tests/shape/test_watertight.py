@@ -7,8 +7,8 @@ import pytest
 
 from sdfsim.errors import SdfsimError
 from sdfsim.shape import primitives
-from sdfsim.shape.distance import MeshDistance, merge
-from sdfsim.shape.mesh import Mesh, is_closed, load_mesh, sample_surface, signed_volume
+from sdfsim.shape.distance import MeshDistance
+from sdfsim.shape.mesh import Mesh, is_closed, joined, load_mesh, sample_surface, signed_volume
 from sdfsim.shape.sdf import BoxSdf
 from sdfsim.shape.watertight import solidify
 
@@ -25,7 +25,7 @@ def inverted(mesh: Mesh) -> Mesh:
 
 
 def both(*meshes: Mesh) -> Mesh:
-    return merge(list(meshes))
+    return joined(list(meshes))
 
 
 def sheet(*corners: tuple[float, float, float]) -> Mesh:
@@ -57,7 +57,7 @@ def finer_cube(count: int) -> Mesh:
         for sign in (1, -1):
             side = np.roll(np.stack([u, v, np.full(len(u), 0.5 * sign)], 1), axis_, axis=1)
             sides.append(Mesh(side, faces if sign == 1 else faces[:, ::-1]))
-    return merge(sides)
+    return joined(sides)
 
 
 def box_distance(points: np.ndarray, half=(0.5, 0.5, 0.5), centre=(0.0, 0.0, 0.0)) -> np.ndarray:
