@@ -117,11 +117,8 @@ def save_views(views: list[View], path: Path) -> None:
 
 
 def load_views(path: Path) -> list[View]:
-    """Reads the views of a poses folder, or of a file that `save_views` wrote.
-
-    Raises:
-        SdfsimError: it is absent or damaged.
-    """
+    """The views of a poses folder, or of a file that `save_views` wrote. Raises SdfsimError where it is absent or
+    damaged."""
     path = Path(path)
     path = path / "cameras.json" if path.is_dir() else path
     data = read_json(path, "run the poses stage first")
@@ -152,13 +149,8 @@ def frame_of(normal: np.ndarray) -> np.ndarray:
 
 
 def nearest_to_axes(centers: np.ndarray, axes: np.ndarray, anchor: np.ndarray | None = None) -> np.ndarray:
-    """The point [3] nearest to all lines (centre + t axis) in the least-squares sense.
-
-    Args:
-        centers: [N, 3] points on the lines.
-        axes: [N, 3] unit directions.
-        anchor: [3] drawn to weakly, which settles the depth where the lines are nearly parallel.
-    """
+    """The point [3] nearest to all lines through `centers` [N, 3] along unit `axes` [N, 3], by least squares; an
+    `anchor` [3] draws it weakly, which settles the depth where the lines are nearly parallel."""
     projector = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     matrix, right = projector.sum(0), (projector @ centers[:, :, None]).sum(0)[:, 0]
     weight = 1e-6 if anchor is None else 0.02
@@ -178,8 +170,7 @@ class Up(NamedTuple):
 def camera_up(views: list[View]) -> Up:
     """Up from the cameras alone: people hold cameras level, so their right axes are horizontal.
 
-    The direction with the least spread of the right axes, with the sign of the mean image up. Where the right axes
-    span no plane (a single viewpoint, or photos turned by 90 degrees) the mean image up itself.
+    It is the direction with the least spread of the right axes; where these span no plane, the mean image up.
     """
     right = np.array([v.rotation[0] for v in views])
     mean = -np.mean([v.rotation[1] for v in views], axis=0)

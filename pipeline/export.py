@@ -37,18 +37,11 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
               device: str = "cpu", on_progress: Progress = quiet) -> dict:  # fmt: skip
     """Fits a compact SDF to the scenery and to every body, each a Shape folder in `out` that goes by its name.
 
-    The scenery's solid is closed (capped where the trained space ends), so the sign of its distance is right
-    everywhere, also above the open scenery where bodies come from; what is shown of it is its visible surface. A body's
-    origin is the middle of its base. Folders that are there already are kept.
+    The scenery's solid is closed, so the sign of its distance is right everywhere; what is shown of it is its visible
+    surface. A body's origin is the middle of its base. Folders that are there already are kept.
 
-    Args:
-        budget: s of fitting, for all.
-
-    Returns:
-        `shapes`: a certificate each; `passed`, `reason` and `caveats` (a line each) for all of them.
-
-    Raises:
-        SdfsimError: the mesh stage has not run, or a mesh cannot be used.
+    Returns a certificate for each of `shapes`, and `passed`, `reason` and `caveats` for all of them; raises SdfsimError
+    where the mesh stage has not run or a mesh cannot be used. The budget is in s, for all.
     """
     from sdfsim.shape.baked_grid import grid_certificate
     from sdfsim.shape.fit import fit_mesh
@@ -111,16 +104,9 @@ def write_scene(
 ) -> dict:  # fmt: skip
     """Writes scene.yaml for the meshes of a mesh folder and the shapes beside it; returns the stage's report.
 
-    A scene file that the user has changed is kept beside it as `scene.yaml.bak`.
-
-    Args:
-        scene_file: to write, in the folder that holds `assets` of the fit stage.
-        drop: what falls onto the scene: box, ball or none.
-        materials: by the name of a body in scene.yaml, what it is made of; all others are assumed.
-        written: hash of the scene file as this function last wrote it; None where it never did.
-
-    Raises:
-        SdfsimError: the mesh or the fit stage has not run, or a material is for a body that there is not.
+    A file that the user has changed (it has another hash than `written`, that of what this function last wrote) is kept
+    as `scene.yaml.bak`. Bodies without an entry in `materials` get an assumed one. Raises SdfsimError where the mesh or
+    fit stage has not run, or a material is for a body that there is not.
     """
     mesh_folder = Path(mesh_folder)
     parts, placement = read_parts(mesh_folder), load_placement(mesh_folder)
@@ -158,15 +144,8 @@ def write_scene(
 
 
 def bodies_of(scene: Scene, materials: dict[str, Choice]) -> dict[str, dict]:
-    """What the report says of each body that can move or has a material.
-
-    Args:
-        materials: by body; all others are assumed.
-
-    Returns:
-        By body: `material`, `friction`, `restitution`; of those that can move also `density` kg/m^3, `wall` m (None of
-        solid ones), `volume` m^3 of what has mass, and `mass` kg.
-    """
+    """What the report says of each body that can move or has a material: `material`, `friction`, `restitution`; of
+    those that can move also `density` kg/m^3, `wall` m (None: solid), `volume` m^3 of what has mass, `mass` kg."""
     found = {}
     for body in scene.bodies:
         choice = materials.get(body.name, Choice())
@@ -190,13 +169,8 @@ def content_hash(content: bytes) -> str:
 
 def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab | None, *, scenery: bool = True,
                drop: str = "box", materials: dict[str, Choice] | None = None, seed: int = 0) -> str:  # fmt: skip
-    """The text of scene.yaml: a floor, the scenery, the bodies that were found, and one dropped from above.
-
-    Args:
-        origins: [3] m of each body that was found, by the name of its asset.
-        slab: where the dropped body starts; None leaves it out.
-        materials: by body; those of no body are passed over.
-    """
+    """The text of scene.yaml: a floor, the scenery, the bodies that were found at their origins [3] m, and one dropped
+    from above where there is a slab."""
     source = {"plane": "the dominant plane", "cameras": "the cameras"}.get(placement.up_from, placement.up_from)
     assumed = " (give --size or --distance for true metres)" if placement.size_from.startswith("assumed") else ""
     made = materials or {}
@@ -260,15 +234,8 @@ class Slab:
 
 
 def choose_slab(shown: Mesh, solid: Mesh) -> Slab:
-    """Chooses a place for a slab from geometry alone: level, flat, seen in the photos, high and central.
-
-    Args:
-        shown: visible surface, metres, z up; the slab has to land on it.
-        solid: closed surface, also what no photo shows.
-
-    Raises:
-        SdfsimError: (exit code 3) there is no place at all.
-    """
+    """Chooses a place for a slab from geometry alone: level, flat, seen in the photos, high and central. Both meshes
+    are in metres, z up; `solid` is closed. Raises SdfsimError (exit code 3) where there is no place at all."""
     low, high = shown.vertices.min(0), shown.vertices.max(0)
     side = SIDE * float((high - low).max())
     axes = [np.arange(low[k], high[k] + side / 4, side / 2) for k in range(2)]

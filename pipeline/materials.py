@@ -74,15 +74,9 @@ class Choice:
 
 
 def choose(given: dict[str, str]) -> dict[str, Choice]:
-    """Looks up what bodies are made of.
-
-    Args:
-        given: by the body's name, a name in `MATERIALS`, perhaps with the thickness of a hollow body's wall:
-            `ceramic` or `ceramic:4mm`. Units are mm, cm and m.
-
-    Raises:
-        SdfsimError: no such material, no such thickness, or a thickness of what does not move.
-    """
+    """Looks up what bodies are made of: by the body's name, a name in `MATERIALS`, perhaps with the thickness of a
+    hollow body's wall, such as `ceramic:4mm` (mm, cm or m). Raises SdfsimError where there is no such material or
+    thickness, or of a thickness of what does not move."""
     found = {}
     for body, text in given.items():
         name, colon, thickness = text.partition(":")

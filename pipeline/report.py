@@ -31,11 +31,8 @@ GUESSED_SHARE = 0.01  # of a body's surface, from which on a note says so
 def write_report(
     folder: Path, options: Options, records: dict[str, dict], failed: tuple[str, SdfsimError] | None = None
 ) -> dict:
-    """Writes report.json and report.md; returns the former.
-
-    Args:
-        failed: the stage that ended in an error, and the error.
-    """
+    """Writes report.json and report.md; returns the former. `failed` is the stage that ended in an error, and the
+    error."""
     stages = {stage: known["report"] for stage, known in records.items()}
     seconds = {stage: round(known["seconds"], 1) for stage, known in records.items()}
     fit = stages.get("fit", {})
@@ -245,13 +242,8 @@ def write_recording(folder: Path, done: Collection[str]) -> Path | None:
     """Writes `reconstruction.rrd`: cameras with their photos, sparse points, the surface, how far it can be trusted.
 
     Before the mesh stage it is in the units of the camera poses, with z up as far as the cameras tell; from then on in
-    metres with z up.
-
-    Returns:
-        Its path, or None before the poses stage.
-
-    Raises:
-        SdfsimError: a stage's folder is damaged, or the file cannot be written.
+    metres with z up. Returns its path, or None before the poses stage. Raises SdfsimError where a stage's folder is
+    damaged, or the file cannot be written.
     """
     from pipeline.field.training import load_field
     from pipeline.mesh.meshing import NEXT, TEXTURED, trust_meshes

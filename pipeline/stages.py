@@ -159,19 +159,11 @@ def reconstruct(
 ) -> dict:  # fmt: skip
     """Photos -> a scene that can be simulated.
 
-    Writes one folder a stage, Shape folders in `assets/`, `scene.yaml`, `config.yaml`, `report.json` and `report.md`
-    to `out`. Skips a stage whose inputs, options and version are those of its last run, and goes on with a killed one.
-
-    Args:
-        photos: folder of photos, video, transforms.json or COLMAP model; never written to.
-        out: folder to write; made where missing.
-        **options: see `Options`.
-
-    Returns:
-        The report, as in report.json.
-
-    Raises:
-        SdfsimError: bad photos or options (exit code 1), poses or surface not good enough (exit code 3).
+    Writes one folder a stage, Shape folders in `assets/`, `scene.yaml`, `config.yaml`, `report.json` and `report.md` to
+    `out`, and returns the report. Skips a stage whose inputs, options (see `Options`) and version are those of its last
+    run, and goes on with a killed one. Photos, in a folder, a video, a transforms.json or a COLMAP model, are never
+    written to. Raises SdfsimError of bad photos or options (exit code 1), or where poses or surface are not good enough
+    (3).
     """
     resolved = Options(str(Path(photos).absolute()), **options)
     resolved.check()
@@ -189,18 +181,8 @@ def reconstruct(
 
 def find_poses(photos: str | Path, out: str | Path, *, progress: Callable[[str, float, str], None] | None = None,
                **changes: Any) -> dict:  # fmt: skip
-    """Photos -> camera poses: the first two stages.
-
-    Args:
-        photos: as for `reconstruct`.
-        **changes: options that differ from those in the folder's config.yaml, where there is one; None changes nothing.
-
-    Returns:
-        The report, as in report.json.
-
-    Raises:
-        SdfsimError: as `reconstruct`.
-    """
+    """Photos -> camera poses: the first two stages, as `reconstruct` does them; options that are not given (None) are
+    those of the folder's config.yaml, where there is one."""
     kept = asdict(read_config(Path(out))) if (Path(out) / CONFIG).exists() else {}
     given = {key: value for key, value in changes.items() if value is not None}
     return reconstruct(**{**kept, **given, "photos": photos}, out=out, until_stage="poses", progress=progress)
@@ -209,19 +191,9 @@ def find_poses(photos: str | Path, out: str | Path, *, progress: Callable[[str, 
 def run_stage(
     name: str, folder: str | Path, *, progress: Callable[[str, float, str], None] | None = None, **changes: Any
 ) -> dict:  # fmt: skip
-    """Runs one stage in a folder that the stages before it have written.
+    """Runs one stage in a folder that the stages before it have written; returns and raises as `reconstruct` does.
 
-    Args:
-        name: one of `STAGES`.
-        folder: of an earlier `reconstruct`.
-        **changes: options that differ from those in the folder's config.yaml (see `Options`), from then on kept there;
-            None changes nothing. A budget is that of this stage and this call alone, and not kept.
-
-    Returns:
-        The report, as in report.json.
-
-    Raises:
-        SdfsimError: a stage before has not run; else as `reconstruct`.
+    Options that are given (not None) are kept in the folder's config.yaml; a budget is that of this call alone.
     """
     _check_name(name)
     kept = read_config(Path(folder))
@@ -244,12 +216,8 @@ def _check_name(name: str) -> None:
 
 
 def run_all(run: Run, stages: dict[str, bool]) -> dict:
-    """Runs stages, those whose value is True also when nothing changed, and returns the report.
-
-    Raises:
-        SdfsimError: before anything is written where there is no such device, or where something that is not ours lies
-            where a stage's result belongs.
-    """
+    """Runs stages, those whose value is True also when nothing changed, and returns the report. Raises SdfsimError
+    before anything is written where there is no such device, or where something not ours lies in a result's place."""
     if run.options.device == "cuda":
         run.device()
     check_own(run.folder, COMMAND, "report.json", "report.md")
@@ -263,11 +231,7 @@ def run_all(run: Run, stages: dict[str, bool]) -> dict:
 
 
 def check_apart(run: Run) -> None:
-    """Checks that no file of the user's lies where a result will replace it.
-
-    Raises:
-        SdfsimError: one does, or there are no photos.
-    """
+    """Raises SdfsimError where there are no photos, or a file of the user's lies where a result will replace it."""
     from pipeline.inputs.sources import find_source
 
     given = Path(run.options.photos)
@@ -359,11 +323,7 @@ def read_record(place: Path) -> dict | None:
 
 
 def check_replaceable(place: Path) -> None:
-    """Checks that nothing lies at a stage's place but an earlier result of it.
-
-    Raises:
-        SdfsimError: something else does, which is never replaced.
-    """
+    """Raises SdfsimError where anything but an earlier result lies at a stage's place: that is never replaced."""
     if os.path.lexists(place) and read_record(place) is None:
         raise SdfsimError(
             f"{place}: in the way, and not replaced: sdfsim did not write it (it holds no {RECORD})",
@@ -391,13 +351,8 @@ def begin(work: Path, wanted: str, *, fresh: bool) -> Path:
 def finish(work: Path, place: Path, wanted: str, inputs: str, report: dict, seconds: float) -> None:
     """Writes the record and moves the finished folder to its place, in place of an earlier result of the stage.
 
-    Each result gets a name of its own, `made`: two of the same fingerprint may differ (time budgets, GPUs).
-
-    Args:
-        work: the folder that `begin` gave.
-
-    Raises:
-        SdfsimError: a stage did not write what lies at the place.
+    Each result gets a name of its own, `made`: two of the same fingerprint may differ (time budgets, GPUs). Raises
+    SdfsimError where a stage did not write what lies at the place.
     """
     check_replaceable(place)
     # Where the record cannot be written, the one with the fingerprint alone stays, and the next run goes on from here.
@@ -421,11 +376,7 @@ def _old(place: Path) -> Path:
 
 @contextlib.contextmanager
 def readable_errors(folder: Path) -> Iterator[None]:
-    """Turns a full disk or a folder that cannot be written into one clear line.
-
-    Raises:
-        SdfsimError: in place of such an OSError.
-    """
+    """Turns a full disk or a folder that cannot be written into an SdfsimError of one clear line."""
     try:
         yield
     except OSError as error:

@@ -43,15 +43,8 @@ def laplace_density(sdf: Tensor, beta: float | Tensor) -> Tensor:
 
 
 def render_weights(density: Tensor, delta: Tensor) -> tuple[Tensor, Tensor]:
-    """Quadrature of the volume rendering integral.
-
-    Args:
-        density: [R, S] at the samples along each ray, near to far.
-        delta: [R, S] length of each sample's interval.
-
-    Returns:
-        Weight [R, S] of each sample and transmittance [R] that is left behind the last one.
-    """
+    """Quadrature of the volume rendering integral, from densities [R, S] near to far and lengths [R, S] of their
+    intervals: the weight [R, S] of each sample, and the transmittance [R] that is left behind the last one."""
     depth = torch.cumsum(density * delta, 1)
     before = torch.cat([torch.zeros_like(depth[:, :1]), depth[:, :-1]], 1)
     weights = torch.exp(-before) * -torch.expm1(-(density * delta))
@@ -97,13 +90,8 @@ class Field(nn.Module, ABC):
         return self.geometry_at(points)[0]
 
     def background_along(self, origins: Tensor, directions: Tensor, jitter: Tensor) -> Tensor:
-        """RGB [R, 3] of what lies behind the unit sphere, by rendering its grid.
-
-        Args:
-            origins: [R, 3].
-            directions: [R, 3] unit.
-            jitter: [R, S] in 0..1, place of each sample within its step of inverse radius.
-        """
+        """RGB [R, 3] of what lies behind the unit sphere along rays [R, 3], by rendering its grid; `jitter` [R, S] in
+        0..1 is the place of each sample within its step of inverse radius."""
         count = jitter.shape[1]
         inverse = 1 - (torch.arange(count, device=jitter.device) + jitter) / count * 0.995
         radius = 1 / inverse
@@ -120,11 +108,7 @@ class Field(nn.Module, ABC):
 
 
 class GridField(Field):
-    """SDF and colour in the unit sphere, and a background outside.
-
-    Args:
-        start_radius: radius of the sphere that the SDF starts from.
-    """
+    """SDF and colour in the unit sphere, and a background outside; the SDF starts as a sphere of `start_radius`."""
 
     def __init__(self, size: FieldSize, seed: int = 0, start_radius: float = 0.5) -> None:
         super().__init__()
@@ -191,11 +175,9 @@ def stencil(points: Tensor, step: float) -> Tensor:
 
 
 def differences(values: Tensor, step: float) -> tuple[Tensor, Tensor]:
-    """Gradient [P, 3] and Laplacian [P] by central differences from values [P, 7] on a `stencil`.
-
-    Differences over one grid cell reach all the cell's corners; an analytic gradient would only touch its own
-    (Li et al., Neuralangelo, 2023, eq. 3).
-    """
+    """Gradient [P, 3] and Laplacian [P] by central differences from values [P, 7] on a `stencil`: over one grid cell
+    they reach all the cell's corners, where an analytic gradient touches its own (Li et al., Neuralangelo, 2023, eq.
+    3)."""
     gradient = (values[:, :3] - values[:, 3:6]) / (2 * step)
     return gradient, (values[:, :6].sum(1) - 6 * values[:, 6]) / (step * step)
 

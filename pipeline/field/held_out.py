@@ -35,15 +35,9 @@ class Compared:
 
 
 class HeldOut:
-    """The photos that were not trained on, at a third of the training resolution.
+    """The photos that were not trained on, at a third of the training resolution; views are in normalised space.
 
-    Those that show nothing of the unit sphere are passed over: there is nothing to compare.
-
-    Attributes:
-        shown: index of each view that shows some of it.
-
-    Args:
-        views: in normalised space.
+    Those that show nothing of the unit sphere are passed over; `shown` has the indices of the others.
     """
 
     def __init__(self, views: list[View], photos_folder: Path, trainer: Trainer, *, masked: bool) -> None:
@@ -83,11 +77,8 @@ class HeldOut:
 
 
 def score(held: HeldOut, out: Path, on_progress: Progress = quiet) -> dict:
-    """PSNR (and, with masks, overlap of silhouettes) of the held-out views; writes the renders to `out`/held_out.
-
-    Returns:
-        For the report; empty where no view shows anything of the unit sphere.
-    """
+    """PSNR (and, with masks, overlap of silhouettes) of the held-out views for the report, empty where none shows
+    anything of the unit sphere; writes the renders to `out`/held_out."""
     if not held.shown:
         return {}
     (out / FOLDER).mkdir(exist_ok=True)

@@ -14,14 +14,8 @@ from torch.nn import functional
 
 
 def interpolate(grid: Tensor, points: Tensor) -> Tensor:
-    """Trilinear values [P, C] of a grid [n, n, n, C] (z, y, x order) over [-1, 1]^3, outside those of its border.
-
-    Differentiable in the grid, not in the points.
-
-    Args:
-        grid: n at least 2; its outermost samples lie on the faces of the cube.
-        points: [P, 3] x, y, z.
-    """
+    """Trilinear values [P, C] of a grid [n, n, n, C] (z, y, x order) over [-1, 1]^3 at points [P, 3] (x, y, z), outside
+    those of its border. Differentiable in the grid, not in the points."""
     side, channels = grid.shape[0], grid.shape[3]
     place = ((points.detach().t() + 1) * (0.5 * (side - 1))).clamp(0, side - 1)
     cell = place.long().clamp_max(side - 2)

@@ -39,11 +39,7 @@ def encoded(values: Tensor, frequencies: int) -> Tensor:
 
 
 class MlpField(Field):
-    """SDF and colour by the paper's networks, and a background outside the unit sphere.
-
-    Args:
-        start_radius: radius of the sphere that the SDF starts from.
-    """
+    """SDF and colour by the paper's networks, and a background outside; its SDF starts as a sphere of that radius."""
 
     size: MlpSize
 

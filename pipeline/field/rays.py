@@ -61,16 +61,8 @@ def camera_rays(intrinsics: Tensor, rotation: Tensor, center: Tensor, uv: Tensor
 
 
 def load_rays(views: list[View], photos_folder: Path, long_side: int, *, masks: bool) -> Rays:
-    """Reads the photos of `views` (in normalised space), downscaled to `long_side` px.
-
-    Args:
-        views: posed cameras whose world is normalised space.
-        long_side: limit of the longer side, px.
-        masks: read masks; a view without one counts as all object.
-
-    Raises:
-        SdfsimError: a photo is missing.
-    """
+    """Reads the photos of `views` (in normalised space), downscaled to `long_side` px. With masks, a view without one
+    counts as all object. Raises SdfsimError where a photo is missing."""
     rgb, mask, view_of, pixel, intrinsics, sizes = [], [], [], [], [], []
     for index, view in enumerate(views):
         try:

@@ -24,12 +24,8 @@ ROUNDS, BISECTIONS = 5, 10
 def sdf_cache(field: Field, resolution: int, coarse: int = 4) -> Tensor:
     """The SDF on a grid [n, n, n, 1] over [-1, 1]^3 (z, y, x order), from which samples along rays are chosen.
 
-    Every `coarse`-th value is the field's, the others only in blocks that the surface may cross; elsewhere, in empty
-    space and deep inside, they are interpolated.
-
-    Args:
-        resolution: n, a multiple of `coarse` plus 1.
-        coarse: see above.
+    Every `coarse`-th value is the field's, the others only in blocks that the surface may cross; elsewhere they are
+    interpolated. `resolution` n is a multiple of `coarse` plus 1.
     """
     device = field.background.device
     line = torch.linspace(-1, 1, resolution, device=device)
@@ -76,15 +72,8 @@ class Samples:
 def choose_samples(
     cache: Tensor, origins: Tensor, directions: Tensor, beta: float, uniforms: Tensor, *, bins: int = 96, plain: int = 8
 ) -> Samples:
-    """Distances of the samples along each ray: some evenly spread, most where the cached SDF has its surface.
-
-    Args:
-        cache: from `sdf_cache`.
-        origins: [R, 3].
-        directions: [R, 3] unit.
-        beta: of the density, normalised units.
-        uniforms: [R, S] random in 0..1, S = number of samples.
-    """
+    """Samples along rays [R, 3], one for each of `uniforms` [R, S] in 0..1: `plain` of them evenly spread, the others
+    where the cached SDF has its surface, read at `bins` even steps."""
     enter, leave = sphere_interval(origins, directions)
     length = (leave - enter)[:, None]
     steps = (torch.arange(bins, device=cache.device) + 0.5) / bins
@@ -112,15 +101,8 @@ def samples_at(distance: Tensor, enter: Tensor, leave: Tensor, origins: Tensor, 
 def composite(
     field: Field, samples: Samples, geometry: tuple[Tensor, Tensor, Tensor], beta: float | Tensor, behind: Tensor
 ) -> dict[str, Tensor]:
-    """Renders rays from the field's values at their samples.
-
-    Args:
-        geometry: what `field.geometry_at` gave at `samples.points`.
-        behind: [R, 3] or [3] colour behind the unit sphere.
-
-    Returns:
-        `rgb` [R, 3], `opacity` [R] inside the sphere, `depth` [R].
-    """
+    """Renders rays from what `field.geometry_at` gave at their samples, before a colour `behind` [R, 3] or [3]: `rgb`
+    [R, 3], `opacity` [R] inside the sphere, `depth` [R]."""
     sdf, features, grid = geometry
     shape = samples.distance.shape
     weights, left = render_weights(laplace_density(sdf, beta).view(shape), samples.delta)
@@ -143,17 +125,8 @@ def render(
     field: Field, cache: Tensor, origins: Tensor, directions: Tensor, beta: float, *,
     samples: int = 32, backdrop: Tensor | None = None,
 ) -> dict[str, Tensor]:  # fmt: skip
-    """Renders rays for looking at, without gradients and the same every time.
-
-    Args:
-        cache: from `sdf_cache`.
-        origins: [R, 3] normalised units.
-        directions: [R, 3] unit.
-        backdrop: [3] a constant colour in place of the background model.
-
-    Returns:
-        See `composite`.
-    """
+    """Renders rays [R, 3] as `composite` does, without gradients and the same every time; a `backdrop` [3] is a
+    constant colour in place of the background model."""
     middle = torch.full((len(origins), samples), 0.5, device=origins.device)
     chosen = choose_samples(cache, origins, directions, beta, middle)
     behind = backdrop
@@ -163,14 +136,11 @@ def render(
 
 
 def nearest(sdf: Tensor, delta: Tensor) -> Tensor:
-    """A lower bound [R, S - 1] of the distance to the surface within each interval of a ray (eq. 13, figure 5).
+    """A lower bound [R, S - 1] of the distance to the surface within each interval of a ray (eq. 13, figure 5), from
+    the SDF [R, S] at the samples and the intervals' lengths [R, S - 1].
 
     The balls around both ends hold no surface; what is left of the interval may come as near as the corner where the
     balls meet, and where they do not meet, anything may lie between.
-
-    Args:
-        sdf: [R, S] at the samples.
-        delta: [R, S - 1] lengths of the intervals.
     """
     a, b = sdf[:, :-1].abs(), sdf[:, 1:].abs()
     half = (a + b + delta) / 2
@@ -183,16 +153,8 @@ def nearest(sdf: Tensor, delta: Tensor) -> Tensor:
 
 
 def opacity_bound(distance: Tensor, sdf: Tensor, beta: Tensor) -> tuple[Tensor, Tensor]:
-    """Bound of the error of the opacity by the rectangle rule, for each interval [R, S - 1] (theorem 1, eq. 12, 14).
-
-    Args:
-        distance: [R, S] of the samples, in order.
-        sdf: [R, S] there.
-        beta: [R, 1] of the density, alpha = 1 / beta.
-
-    Returns:
-        The bound, and the optical depth [R, S - 1] in front of each interval.
-    """
+    """Bound of the error of the opacity by the rectangle rule, for each interval [R, S - 1] (theorem 1, eq. 12, 14),
+    and the optical depth in front of each; from distances and SDF [R, S] of the samples and beta [R, 1]."""
     delta = distance[:, 1:] - distance[:, :-1]
     density = laplace_density(sdf[:, :-1], beta)
     before = torch.cumsum(density * delta, 1) - density * delta
@@ -216,13 +178,8 @@ def _smallest_beta(distance: Tensor, sdf: Tensor, beta: Tensor, safe: Tensor) ->
 
 
 def draw(distance: Tensor, weights: Tensor, uniforms: Tensor) -> Tensor:
-    """Distances [R, M], in order, drawn from a density that is constant between samples [R, S].
-
-    Args:
-        distance: [R, S].
-        weights: [R, S - 1] of the intervals, not negative.
-        uniforms: [R, M] in 0..1.
-    """
+    """Distances [R, M], in order, drawn by uniforms [R, M] in 0..1 from a density that is constant between samples [R,
+    S], where it has weights [R, S - 1]."""
     weights = weights + 1e-5
     cumulative = torch.cumsum(weights / weights.sum(1, keepdim=True), 1)
     count = uniforms.shape[1]
@@ -238,16 +195,11 @@ def draw(distance: Tensor, weights: Tensor, uniforms: Tensor) -> Tensor:
 def bounded_samples(
     sdf_at: Callable[[Tensor, Tensor], Tensor], enter: Tensor, leave: Tensor, beta: Tensor, uniforms: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Samples along rays by algorithm 1.
+    """Samples along rays by algorithm 1: distances [R, M] in order, drawn by opacity with uniforms [R, M], and whether
+    each ray's error is below `EPSILON` [R].
 
-    Args:
-        sdf_at: SDF [A, S] at distances [A, S] along the rays with indices [A].
-        enter: [R] distance at which each ray enters the trained space.
-        leave: [R] and leaves it.
-        uniforms: [R, M] in 0..1.
-
-    Returns:
-        Distances [R, M] in order, drawn by opacity, and whether each ray's error is below `EPSILON` [R].
+    Rays enter and leave the trained space at distances [R]; `sdf_at` gives the SDF [A, S] at distances [A, S] along the
+    rays with indices [A].
     """
     count = len(enter)
     steps = torch.linspace(0, 1, START, device=enter.device, dtype=enter.dtype)

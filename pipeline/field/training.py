@@ -99,12 +99,7 @@ def active_levels(size: FieldSize, fraction: float) -> int:
 
 
 class Trainer:
-    """One training run of the grids.
-
-    Args:
-        rays: pixels, in the space of the unit sphere.
-        supervision: sparse points and lines of sight in the same space.
-    """
+    """One training run of the grids; rays, sparse points and lines of sight are in the space of the unit sphere."""
 
     def __init__(self, settings: Settings, rays: Rays, supervision: Supervision, seed: int, device: str = "cpu"):
         self.settings, self.rays, self.seed, self.device = settings, rays.to(device), seed, device
@@ -369,18 +364,9 @@ def train(
 ) -> Trained:  # fmt: skip
     """Trains a field and writes `field.safetensors` and `field.json` to `out`; resumes from `checkpoint.safetensors`.
 
-    Args:
-        views: posed cameras in the world of the poses.
-        sparse: points in the same world.
-        settings: see `PRESETS`.
-        budget: s of training, those before a kill included; the number of steps is cut to what fits, measured after
-            the first steps.
-        threads: of the CPU; None takes what is fastest now (a second thread only slows things down where another
-            program uses the core).
-        checkpoint_every: s.
-
-    Raises:
-        SdfsimError: the loss is no longer finite.
+    Views and sparse points are in the world of the poses. The budget, s, includes training before a kill: the number of
+    steps is cut to what fits. Without `threads` the CPU takes what is fastest now (a second thread only slows things
+    down where another program uses the core). Raises SdfsimError where the loss is no longer finite.
     """
     out = Path(out)
     photos = load_photos(photos_folder)
@@ -450,12 +436,8 @@ def calibrate(probe: Trainer, threads: int | None) -> float:
 
 
 def paced(trainer: Trainer, settings: Settings, budget: float, elapsed: float, done: int) -> int:
-    """Steps that fit into the time: the measured pace may be another than before training, when other work goes on.
-
-    Args:
-        budget: s, for the steps of this run.
-        elapsed: s since it began.
-    """
+    """Steps that fit into the budget (s) after `elapsed` s: the measured pace may be another than before training, when
+    other work goes on."""
     left = int((budget - elapsed) / (elapsed / done))
     least = max(trainer.iteration, min(FEWEST_STEPS, settings.iterations))
     if left <= 0:

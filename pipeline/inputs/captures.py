@@ -49,11 +49,8 @@ def find_capture(folder: Path) -> Path | None:
 
 
 def read_capture(folder: Path) -> tuple[Capture, list[KnownCamera]]:
-    """What a Record3D or Polycam export says of its world, and its cameras; their names are paths in `folder`.
-
-    Raises:
-        SdfsimError: damaged.
-    """
+    """What a Record3D or Polycam export says of its world, and its cameras; their names are paths in `folder`. Raises
+    SdfsimError where it is damaged."""
     try:
         if _metadata(folder).is_file():
             return Capture("Record3D", UP), _record3d(folder)
@@ -123,11 +120,8 @@ def _polycam(folder: Path) -> list[KnownCamera]:
 
 
 def unpack(archive: Path, folder: Path) -> None:
-    """Unpacks the files of a zipped capture.
-
-    Raises:
-        SdfsimError: not a zip, damaged, too large once unpacked, or with names that lead out of the folder.
-    """
+    """Unpacks the files of a zipped capture. Raises SdfsimError where it is damaged or no zip, too large once unpacked,
+    or has names that lead out of the folder."""
     try:
         with zipfile.ZipFile(archive) as file:
             entries = [entry for entry in file.infolist() if not entry.is_dir()]

@@ -31,11 +31,8 @@ class DepthFile:
 
 
 def read_depth(file: DepthFile) -> np.ndarray:
-    """Depth [H, W] m along the optical axis; 0 where the sensor had none, was not sure, or saw an edge.
-
-    Raises:
-        SdfsimError: the file is not there, damaged, or of a kind that needs a package which is not installed.
-    """
+    """Depth [H, W] m along the optical axis; 0 where the sensor had none, was not sure, or saw an edge. Raises
+    SdfsimError where the file is absent, damaged, or needs a package that is not installed."""
     counts = _read(file.path, file.shape, np.float32)
     unit = file.unit if file.unit is not None else (1e-3 if counts.dtype.kind in "ui" else 1.0)
     depth = counts.astype(np.float32) * np.float32(unit)

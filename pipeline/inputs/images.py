@@ -68,15 +68,11 @@ def exif_focal(image: Image.Image) -> tuple[float | None, str]:
 
 
 def read_photo(path: Path, long_side: int, mask: Path | None = None, shape: float | None = None) -> Picture:
-    """Reads one photo upright and no larger than `long_side`.
+    """Reads one photo upright and no larger than `long_side` px.
 
-    Args:
-        long_side: limit of the longer side, px; smaller photos stay as they are.
-        mask: file of its mask, which goes before an alpha channel; white is the object.
-        shape: width over height that a known camera has: the photo is turned upright only where it then fits that.
-
-    Raises:
-        SdfsimError: not an image, truncated, too small or too large; the message names the file.
+    A mask file goes before an alpha channel; white is the object. Where a known camera has another `shape`, width over
+    height, than the upright photo, the photo stays as stored. Raises SdfsimError, with the file's name, where it is no
+    image, truncated, too small or too large.
     """
     image, original, focal, camera = decoded(path, long_side)
     turned = ImageOps.exif_transpose(image)
@@ -107,21 +103,15 @@ def read_photo(path: Path, long_side: int, mask: Path | None = None, shape: floa
 
 def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
     """A mask [H, W] uint8, grey or with alpha, white is the object, at the size (width, height) of its upright photo.
-
-    Raises:
-        SdfsimError: it cannot be read, or is not shaped like the photo.
-    """
+    Raises SdfsimError where it cannot be read or is not shaped like the photo."""
     image = turned_like(decoded(path, max(size))[0], size, path)
     grey = image.getchannel("A") if image.mode == "RGBA" else image.convert("L")
     return np.asarray(grey.resize(size, Image.Resampling.BOX))
 
 
 def turned_like(stored: Image.Image, size: tuple[int, int], path: Path) -> Image.Image:
-    """A mask as its photo of this size (width, height) is turned: upright, or as stored.
-
-    Raises:
-        SdfsimError: neither is shaped like the photo.
-    """
+    """A mask as its photo of this size (width, height) is turned: upright, or as stored. Raises SdfsimError where
+    neither is shaped like the photo."""
     for image in (ImageOps.exif_transpose(stored), stored):
         if off(image, size[0] / size[1]) < 0.02:
             return image
@@ -180,13 +170,10 @@ def block_means(values: np.ndarray, blocks: int) -> np.ndarray:
 
 
 def sharpness(pixels: np.ndarray) -> float:
-    """How strong edges are at the finest scale against a scale eight times as coarse; does not depend on contrast.
+    """How strong edges are at the finest scale against a scale eight times as coarse, in RGB [H, W, 3] uint8.
 
-    Looks only where there are edges: the tenth of the picture's blocks with the most of them, so that an object in
-    focus before a soft background counts as sharp. 0 where there is nothing to see.
-
-    Args:
-        pixels: RGB [H, W, 3] uint8, at least 64 px a side.
+    Looks only at the tenth of the picture's blocks with the most edges, so that an object in focus before a soft
+    background counts as sharp. 0 where there is nothing to see.
     """
     import cv2
 
@@ -207,14 +194,9 @@ def exposure(pixels: np.ndarray) -> tuple[float, float]:
 
 
 def fault(sharp: float, dark: float, burnt: float, *, typical: float, masked: bool) -> str:
-    """What is wrong with a photo in a word or two, or nothing.
-
-    Args:
-        dark: share that is nearly black.
-        burnt: share that is nearly white.
-        typical: sharpness of the sharper photos of the set: a blur that all have in common may be the scene's.
-        masked: it has a mask: what lies outside says nothing about the exposure.
-    """
+    """What is wrong with a photo in a word or two, or nothing, from its shares of nearly black and nearly white.
+    Sharpness is relative to that `typical` of the set: a blur that all have in common may be the scene's. What lies
+    outside a mask says nothing about the exposure."""
     if not masked and dark > MOSTLY:
         return "too dark"
     if not masked and burnt > MOSTLY:

@@ -80,11 +80,8 @@ class KnownCamera:
 
 def posed(name: str, size: tuple[int, int], lens: Lens, pose: np.ndarray, mask: str | None = None,
           depth: DepthFile | None = None) -> KnownCamera:  # fmt: skip
-    """A camera by its pose [3, 4], camera to world, OpenGL axes (x right, y up, z backwards).
-
-    Raises:
-        SdfsimError: it is no pose.
-    """
+    """A camera by its pose [3, 4], camera to world, OpenGL axes (x right, y up, z backwards). Raises SdfsimError: no
+    pose."""
     turn, place = pose[:, :3], pose[:, 3]
     if not np.isfinite(pose).all() or abs(np.linalg.det(turn)) < 1e-6:
         raise SdfsimError(f"{name}: its matrix is not a pose")
@@ -93,11 +90,8 @@ def posed(name: str, size: tuple[int, int], lens: Lens, pose: np.ndarray, mask: 
 
 
 def read_cameras(path: Path) -> list[KnownCamera]:
-    """The cameras of a transforms.json or of a COLMAP model's folder, in the order of their names.
-
-    Raises:
-        SdfsimError: not such a file, damaged, or a lens that is not known.
-    """
+    """The cameras of a transforms.json or of a COLMAP model's folder, in the order of their names. Raises SdfsimError
+    where it is damaged or no such file, or where a lens is not known."""
     read = read_model if path.is_dir() else read_transforms
     try:
         return sorted(read(path), key=lambda camera: camera.name)
@@ -229,9 +223,6 @@ def rectified(picture: Picture, known: KnownCamera, name: str, source: str) -> t
 
     Nothing is resampled where the lens has no distortion: then there is no lens. Elsewhere the photo is cut to what the
     lens shows of the pinhole's picture all over.
-
-    Args:
-        source: the user's name of it.
     """
     height, width = picture.pixels.shape[:2]
     matrix, bent, lens = scaled(known, width, height), known.lens, None

@@ -42,9 +42,7 @@ class Labels:
         """Number of the object at each pixel [H, W] uint8 of a photo that is width x height upright; None: not given.
 
         Where some objects have no mask of this photo, a pixel outside the others is `UNKNOWN`; so is one in two masks.
-
-        Raises:
-            SdfsimError: a file cannot be read, or is not shaped like the photo.
+        Raises SdfsimError where a file cannot be read or is not shaped like the photo.
         """
         if photo in self.images:
             found = read_label_image(self.images[photo], size)
@@ -77,11 +75,8 @@ def find_masks(photos: list[Path]) -> dict[Path, Path]:
 
 
 def find_labels(photos: list[Path]) -> Labels:
-    """Looks for `masks/NAME/` and `labels/` in and beside the photos' folders.
-
-    Raises:
-        SdfsimError: both are given, a name that no body can have, or files of which none belongs to a photo.
-    """
+    """Looks for `masks/NAME/` and `labels/` in and beside the photos' folders. Raises SdfsimError where both are given,
+    for a name that no body can have, or where no file belongs to a photo."""
     roots = _roots(photos)
     folders = [(root, path) for root in roots for path in _folders(root / "masks")]
     folders = [(root, path) for root, path in folders if path not in [photo.parent for photo in photos]]
@@ -145,13 +140,8 @@ def _of_photos(root: Path, folder: Path, photos: list[Path]) -> tuple[dict[Path,
 
 
 def read_label_image(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
-    """A label image [H, W] int, palette or grey of 8 or 16 bits, at the size (width, height) of its upright photo.
-
-    Without a size it stays as it is stored.
-
-    Raises:
-        SdfsimError: it cannot be read, is in colour, or is not shaped like the photo.
-    """
+    """A label image [H, W] int, palette or grey of 8 or 16 bits, at the size (width, height) of its upright photo, else
+    as stored. Raises SdfsimError where it cannot be read, is in colour, or is not shaped like the photo."""
     stored = decoded(path, 1 << 20)[0]
     if stored.mode not in ("1", "L", "P") and not stored.mode.startswith("I"):
         raise SdfsimError(f"{path}: a label image has one number a pixel, this one is {stored.mode}",

@@ -54,21 +54,12 @@ class Photo:
 def prepare_photos(
     given: Path, out: Path, *, long_side: int = LONG_SIDE, on_progress: Progress = quiet
 ) -> tuple[list[Photo], list[str]]:
-    """Reads every photo and writes upright, sized copies to `out`.
+    """Reads every photo (see `find_source`) and writes upright copies of at most `long_side` px to `out`.
 
-    Writes `images/NNNN.jpg`, for photos with a mask `masks/NNNN.jpg.png`, with depth `depth/NNNN.jpg.npy` (see
-    `read_depth`), where objects have masks `labels/NNNN.jpg.png` with their names, `photos.json`, where the cameras
-    are known `known_cameras.json`, and of a capture `capture.json`.
-
-    Args:
-        given: what the user gave, see `find_source`; never written to.
-        long_side: limit of the longer side, px.
-
-    Returns:
-        The photos in order, and notes for the report.
-
-    Raises:
-        SdfsimError: see `find_source`, `read_photo` and `chosen_frames`.
+    Writes `images/NNNN.jpg`, for photos with a mask `masks/NNNN.jpg.png`, with depth `depth/NNNN.jpg.npy`, where
+    objects have masks `labels/NNNN.jpg.png` with their names, `photos.json`, where the cameras are known
+    `known_cameras.json`, and of a capture `capture.json`. Returns the photos in order, and notes for the report. Raises
+    SdfsimError as `find_source`, `read_photo` and `chosen_frames` do.
     """
     source, out = find_source(given), Path(out)
     unpacked = out / ".capture"
@@ -189,11 +180,7 @@ def save_photos(photos: list[Photo], folder: Path) -> None:
 
 
 def load_photos(folder: Path) -> list[Photo]:
-    """Reads the photos that `prepare_photos` wrote to `folder`.
-
-    Raises:
-        SdfsimError: the folder was not written by the photos stage.
-    """
+    """The photos that `prepare_photos` wrote to `folder`. Raises SdfsimError where the photos stage has not run."""
     path = Path(folder) / "photos.json"
     data = read_json(path, "run the photos stage first")
     try:

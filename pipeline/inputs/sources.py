@@ -62,10 +62,7 @@ def find_source(given: Path) -> Source:
     capture (see `find_capture`); a file is a video, a transforms.json, or a zipped capture. Masks lie in a folder
     `masks` in or beside that of the photos, named like the photo, or like the photo with `.png` behind it, as COLMAP
     has them; white is the object. A folder in `masks` is about the object of its name alone; a folder `labels` has
-    label images.
-
-    Raises:
-        SdfsimError: nothing there, fewer than three photos, or two cameras of one photo.
+    label images. Raises SdfsimError where nothing is there, of fewer than three photos, or of two cameras of one photo.
     """
     given = Path(given)
     if not given.exists():
@@ -92,13 +89,8 @@ def find_source(given: Path) -> Source:
 
 
 def find_photos(folder: Path) -> tuple[list[Path], list[str]]:
-    """The photo files of a folder in name order, and notes on what was passed over.
-
-    A folder whose photos all lie in a subfolder `images` is read there.
-
-    Raises:
-        SdfsimError: the folder holds no photos, or fewer than three.
-    """
+    """The photo files of a folder, or of its subfolder `images` where all are there, in name order, and notes on what
+    was passed over. Raises SdfsimError of fewer than three."""
     try:
         entries = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
     except OSError as error:

@@ -30,11 +30,7 @@ class Track:
 
 
 def frames_of(path: Path) -> tuple[Iterator[np.ndarray], float]:
-    """The frames of a video, upright RGB [H, W, 3] uint8, and their number a second.
-
-    Raises:
-        SdfsimError: it cannot be decoded.
-    """
+    """The frames of a video, upright RGB [H, W, 3] uint8, and their number a second. Raises SdfsimError: unreadable."""
     import cv2
 
     video = cv2.VideoCapture(str(path))
@@ -89,11 +85,8 @@ def follow(path: Path) -> Track:
 
 
 def choose(track: Track) -> list[int]:
-    """Frames to use: the motion is cut into equal stretches, and the sharpest frame of each is taken.
-
-    Returns:
-        Indices in order; at least `FEWEST` where there are as many frames, at most `MOST`.
-    """
+    """Frames to use, in order: the motion is cut into equal stretches, and the sharpest frame of each is taken; at
+    least `FEWEST` where there are as many, at most `MOST`."""
     total = float(track.moved[-1])
     count = int(np.clip(round(total / STEP) + 1, FEWEST, MOST))
     stretch = np.minimum((track.moved / max(total, 1e-9) * count).astype(int), count - 1)
@@ -101,11 +94,8 @@ def choose(track: Track) -> list[int]:
 
 
 def chosen_frames(path: Path) -> Iterator[tuple[str, np.ndarray, float]]:
-    """Name, pixels RGB [H, W, 3] uint8 and share done of each frame worth using.
-
-    Raises:
-        SdfsimError: it cannot be decoded, has hardly any frames, or (exit code 3) hardly moves.
-    """
+    """Name, pixels RGB [H, W, 3] uint8 and share done of each frame worth using. Raises SdfsimError where the video
+    cannot be decoded, has hardly any frames, or (exit code 3) hardly moves."""
     track = follow(path)
     if len(track.sharp) < FEWEST:
         raise SdfsimError(

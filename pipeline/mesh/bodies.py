@@ -131,11 +131,7 @@ def nothing(up: np.ndarray) -> Level:
 
 
 def find_levels(shown: Mesh, up: np.ndarray, width: float) -> list[Level]:
-    """Level planes of a surface, largest first.
-
-    Args:
-        up: [3] unit.
-    """
+    """Level planes of a surface, largest first; `up` [3] is unit, and faces within `width` belong to one plane."""
     normals, areas = face_normals(shown)
     centers = shown.vertices[shown.faces].mean(1)
     flat = normals @ up > LEVEL_NORMAL
@@ -162,16 +158,10 @@ def find_levels(shown: Mesh, up: np.ndarray, width: float) -> list[Level]:
 
 def find_bodies(surface: Surface, levels: list[Level], layer: float, smallest: float,
                 named: np.ndarray | None = None) -> list[Body]:  # fmt: skip
-    """Bodies that stand on level planes, wholly within the trained space; those that touch are one.
+    """Bodies without names that stand on level planes, wholly within the trained space; those that touch are one.
 
     What carries a level plane itself, as a table does, is scenery, and so is what reaches the end of the trained space.
-
-    Args:
-        smallest: what rises less than this above its plane stays part of it, unless masks name it.
-        named: [V] bool, vertices of the surface that masks name.
-
-    Returns:
-        The bodies, without names.
+    What rises less than `smallest` above its plane stays part of it, unless its vertices are `named` [V] bool by masks.
     """
     volume = surface.volume
     solid = volume.values < 0
@@ -281,11 +271,8 @@ def body_mesh(body: Body, field: Distance, cell: float) -> Mesh:
 
 
 def without_bodies(volume: Volume, bodies: list[Body], field: Distance) -> Volume:
-    """The scenery alone: what bodies leave behind is empty, and their plane goes on below them.
-
-    Args:
-        field: the signed distance that `volume` holds samples of.
-    """
+    """The scenery alone: what bodies leave behind is empty, and their plane goes on below them. `volume` holds samples
+    of `field`, the signed distance."""
     values = volume.values.copy()
     for body in bodies:
         start = np.round((body.low - volume.low) / volume.cell).astype(int)
@@ -326,13 +313,8 @@ def split(surface: Surface, distance: Distance, finest: float, views: list[View]
           photos_folder: Path, up: np.ndarray, *, alone: bool) -> Parts:  # fmt: skip
     """Finds bodies, takes them out of the scenery and tells those that touch apart.
 
-    Args:
-        distance: signed distance of the field that it was extracted from.
-        finest: width of a cell of the field's finest grid.
-        views: cameras in normalised space.
-        points: [P, 3] sparse points in normalised space.
-        up: [3] unit, in normalised space.
-        alone: there is no scenery: all there is are bodies.
+    All is in normalised space: views, sparse points [P, 3], `up` [3] and the signed distance that the surface is of;
+    `finest` is the width of a cell of the field's finest grid. `alone`: there is no scenery, all there is are bodies.
     """
     smallest, layer, lift = max(SMALLEST, SMALLEST_CELLS * finest), LAYER * finest, 0.75 * surface.volume.cell
     names = load_names(photos_folder)

@@ -30,16 +30,9 @@ def components(mesh: Mesh) -> np.ndarray:
 
 
 def belonging(mesh: Mesh, seen: np.ndarray, share: float, speck: float) -> tuple[np.ndarray, list[float], dict]:
-    """Which connected components of a closed mesh belong: those that photos show and that are not floaters.
-
-    Args:
-        mesh: closed, wound outwards.
-        seen: [F] bool, faces that photos show.
-        share: a component with less than this share of all the area is a floater.
-
-    Returns:
-        The faces that belong [F] bool, the longest sides of the others from the largest down, and counts of these.
-    """
+    """Which faces [F] bool of a closed mesh belong, by connected components: those that photos show (`seen` [F] bool)
+    and that have at least this share of all the area. Also the longest sides of the other components from the largest
+    down, without those shorter than `speck`, and counts of these."""
     label = components(mesh)
     _, area = face_normals(mesh)
     total, shown = np.bincount(label, area), np.bincount(label, area * seen)
@@ -62,12 +55,8 @@ def belonging(mesh: Mesh, seen: np.ndarray, share: float, speck: float) -> tuple
 
 
 def islands(mesh: Mesh, faces: np.ndarray, share: float) -> np.ndarray:
-    """Of some faces [F] bool those [F] bool that lie together: patches too small to mean anything are left out.
-
-    Args:
-        faces: [F] bool.
-        share: a patch needs this share of the area of all the faces, or of those of its own component of the mesh.
-    """
+    """Of some faces [F] bool those that lie together: a patch needs this share of the area of all the faces, or of
+    those of its own component of the mesh."""
     _, area = face_normals(mesh)
     area = np.where(faces, area, 0)
     index = np.flatnonzero(faces)

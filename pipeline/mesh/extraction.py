@@ -69,11 +69,8 @@ class Volume:
         return replace(self, values=values)
 
     def mesh(self) -> Mesh:
-        """The zero surface by marching cubes, faces counter-clockwise from outside.
-
-        Raises:
-            SdfsimError: (exit code 3) the values have one sign everywhere.
-        """
+        """The zero surface by marching cubes, faces counter-clockwise from outside. Raises SdfsimError (exit code 3)
+        where the values have one sign everywhere."""
         if not self.values.min() < 0 < self.values.max():
             raise SdfsimError("mesh: the field holds no surface", "try --preset standard", exit_code=EXIT_QUALITY)
         from skimage.measure import marching_cubes
@@ -94,16 +91,12 @@ def sample(distance: Distance, points: np.ndarray) -> np.ndarray:
 def sample_volume(
     distance: Distance, resolution: int, *, extent: float = 1.02, coarse: int = 4, on_progress: Progress = quiet
 ) -> Volume:
-    """Samples over [-extent, extent]^3, fine only near the surface.
+    """Samples over [-extent, extent]^3, `resolution` a side (rounded up to a multiple of `coarse` plus 1), fine only
+    near the surface of a distance [P] at points [P, 3].
 
     Evaluates every `coarse`-th point first and all points only in blocks that can hold the surface, since an SDF
     changes by no more than the distance moved (a factor of 2 is left for fields that are not quite SDFs). Elsewhere
     values are interpolated.
-
-    Args:
-        distance: [P] at points [P, 3], float32.
-        resolution: samples a side, rounded up to a multiple of `coarse` plus 1.
-        coarse: see above.
     """
     from scipy.ndimage import zoom
 
@@ -182,13 +175,8 @@ def field_distance(field: Field) -> Distance:
 
 
 def trusted_vertices(mesh: Mesh, count: np.ndarray, at_limit: np.ndarray) -> np.ndarray:
-    """Vertices [V] that enough views see and that are not where the solid was cut off; small gaps are closed.
-
-    Args:
-        mesh: closed.
-        count: [V] how many views see each.
-        at_limit: [V] bool, vertices where the solid was cut off.
-    """
+    """Vertices [V] bool of a closed mesh that enough views see (`count` [V]) and where the solid was not cut off
+    (`at_limit` [V] bool); small gaps are closed."""
     trusted = (count >= MIN_SEEN) & ~at_limit
     edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
     degree = np.maximum(np.bincount(edges[:, 0], minlength=len(trusted)), 1)
@@ -202,17 +190,9 @@ def surface_of(
     volume: Volume, field: Field, views: list[View], points: np.ndarray, photos_folder: Path, limit: Distance, *,
     on_progress: Progress = quiet,
 ) -> Surface:  # fmt: skip
-    """The solid of a sampled field and its visible surface.
-
-    Args:
-        volume: samples of the field within `limit`.
-        views: cameras in normalised space.
-        points: [P, 3] sparse points in normalised space.
-        limit: distance [P] from the body that the solid was cut off at.
-
-    Raises:
-        SdfsimError: (exit code 3) the field has no surface, or hardly any of it is in the photos.
-    """
+    """The solid of a sampled field within a `limit`, given by its distance [P], and its visible surface; views and
+    sparse points [P, 3] are in normalised space. Raises SdfsimError (exit code 3) where the field has no surface, or
+    hardly any of it is in the photos."""
     from scipy.spatial import KDTree
 
     raw = volume.mesh()

@@ -39,23 +39,14 @@ def make_meshes(
     distance: Sequence | None = None, crop: Sequence[float] | None = None, device: str = "cpu",
     on_progress: Progress = quiet,
 ) -> dict:  # fmt: skip
-    """Extracts surfaces and writes them to `out`.
+    """Extracts surfaces, writes them to `out` and returns the stage's report; `size`, `distance` and `crop` as in
+    `Options`.
 
     Writes `mesh.ply` (all that photos show), of the scenery `solid.ply` (closed) and `shown.ply` (what is displayed),
     `objects/NAME.ply` (closed) of each body, `parts.json`, `placement.json`, `objects.png`, and `textured.glb`: the
     scenery and each body with a texture. Vertices in the PLY files have `views` and `uncertainty`, see `Support`;
-    `next_photos.json` has the cameras of the photos that would help most.
-
-    Args:
-        size: see `Options`; so are `distance` and `crop`.
-        distance: sets the scale in place of `size`.
-        crop: [6] m.
-
-    Returns:
-        The stage's report.
-
-    Raises:
-        SdfsimError: (exit code 3) no surface worth the name; (exit code 1) a distance or box that makes no sense.
+    `next_photos.json` has the cameras of the photos that would help most. Raises SdfsimError (exit code 3) where there
+    is no surface worth the name, or (1) of a distance or box that makes no sense.
     """
 
     trained = load_field(distill)
@@ -121,13 +112,8 @@ def trust(
 ) -> tuple[Support, dict]:
     """How far the surface can be trusted, and which photos would help; writes `next_photos.json`.
 
-    Args:
-        closed: what the scene is made of, by name, metres.
-        displayed: what is shown of it, of vertices of `closed`.
-        counted: [V] bool, vertices of `closed` where it was not cut off.
-
-    Returns:
-        What the photos tell of the vertices of `closed`, one mesh after the other; and what the report says of it.
+    What is `displayed` has vertices of the `closed` meshes (by name, metres); those are `counted` [V] bool where they
+    were not cut off. Returns what the photos tell of them, one mesh after the other, and what the report says of it.
     """
     whole = joined(list(closed.values()))
     sight = Visibility(whole, shots.lift, shots.blocking)
@@ -189,11 +175,8 @@ def read_parts(mesh_folder: Path) -> dict:
 
 
 def trust_meshes(mesh_folder: Path) -> dict[str, Mesh]:
-    """The meshes that the scene is made of, by name, in the colours of `colors_of` their uncertainty.
-
-    Raises:
-        SdfsimError: the mesh stage has not run, or its files are damaged.
-    """
+    """The meshes that the scene is made of, by name, in the colours of `colors_of` their uncertainty. Raises
+    SdfsimError where the mesh stage has not run or its files are damaged."""
     known = read_parts(mesh_folder)
     files = {SCENERY: "solid.ply"} if known["scenery"] else {}
     files |= {entry["name"]: f"objects/{entry['name']}.ply" for entry in known["objects"]}
@@ -204,11 +187,7 @@ def trust_meshes(mesh_folder: Path) -> dict[str, Mesh]:
 
 
 def draw_names(parts: Parts, views: list[View], photos_folder: Path) -> Image.Image:
-    """A picture that tells which body has which name: the photos that show them best, each body tinted and labelled.
-
-    Args:
-        parts: in the space of the views.
-    """
+    """A picture that tells which body has which name: the photos that show them best, each body tinted and labelled."""
     meshes = list(parts.bodies.values())
     caster = Caster(joined(meshes if parts.solid is None else [*meshes, parts.solid]))
     borders = np.cumsum([len(mesh.faces) for mesh in meshes])

@@ -63,10 +63,8 @@ def next_photos(
     tried on a shell around the scene, at the median distance of the given ones, in free space, in sight of a given
     camera, and with something in the picture that is known well.
 
-    Args:
-        meshes: closed, with z up and the floor at z = 0, metres, by name.
-        views: given cameras, metres.
-        counted: [V] bool, vertices that matter; others are where the solid was cut off.
+    Meshes are closed, by name; all is in metres with the floor at z = 0. Vertices that are not `counted` [V] bool,
+    where the solid was cut off, do not matter.
     """
     if not counted.any():
         return Advice([], 0.0)
@@ -123,10 +121,8 @@ def _best(
 ) -> tuple[float, View, np.ndarray, np.ndarray] | None:
     """The photo that helps most: how much, its camera, what it looks at [3] m, and the places [S] that it helps.
 
-    Args:
-        poor: [V] bool, samples that are weak.
-        tried: where a camera could be [3] m, each with the samples [S] in sight, all around.
-        middle: [3] m; a camera looks there, or at the middle of the weak places in sight.
+    Samples are weak where `poor` [V] bool. `tried` are places [3] m with the samples [S] in sight, all around; a camera
+    looks at the `middle` [3] m, or at the middle of the weak places in sight.
     """
     best = None
     for place, around in tried:

@@ -66,14 +66,11 @@ def load_pictures(views: list[View], photos_folder: Path) -> list[Picture]:
 
 def refine(mesh: Mesh, pictures: list[Picture], blocking: Caster, lift: float, finest: float,
            height: Callable[[np.ndarray], np.ndarray], layer: float) -> Mesh:  # fmt: skip
-    """A body whose vertices lie where the photos agree.
+    """A body whose vertices lie where the photos agree; all is in the space of the views.
 
-    Args:
-        mesh: of the body, in the space of the views.
-        lift: how far a vertex is lifted off the surface before a view looks for it.
-        finest: width of a cell of the field's finest grid.
-        height: of points [P, 3] above the plane that the body stands on.
-        layer: below this height no photo tells the body from its plane; vertices there move along the plane only.
+    Vertices are lifted by `lift` off the surface before a view looks for them, and move by cells of width `finest`.
+    Below `layer` of `height`, above the plane that the body stands on, no photo tells the body from its plane; vertices
+    there move along the plane only.
     """
     if len(pictures) < FEWEST:
         return mesh
@@ -168,12 +165,8 @@ def normalised(picture: Picture, points: np.ndarray) -> np.ndarray:
 
 
 def best_places(score: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where the photos agree most [P], between the `moves` [M] that were tried, and how far that is to be trusted [P].
-
-    Args:
-        score: [P, M] from `agreement`.
-        moves: [M] evenly spaced.
-    """
+    """Where the photos agree most [P], between the evenly spaced `moves` [M] with scores [P, M] from `agreement`, and
+    how far that is to be trusted [P]."""
     best = score.argmax(1)
     middle = best.clip(1, len(moves) - 2)
     before, here, after = (score[np.arange(len(score)), middle + k] for k in (-1, 0, 1))
@@ -186,10 +179,8 @@ def settled(mesh: Mesh, normal: np.ndarray, mean: csr_matrix, wanted: np.ndarray
             stay: np.ndarray) -> np.ndarray:  # fmt: skip
     """How far each vertex moves [V] along its normal [V, 3]: where it is wanted [V], by trust [V], or smooth between.
 
-    Args:
-        normal: of the vertices; shorter where they shall move less.
-        mean: [V, V] takes the mean of the neighbours.
-        stay: [V] trust in where the vertices are.
+    Normals are shorter where vertices shall move less; `mean` [V, V] takes the mean of the neighbours, `stay` [V] is
+    the trust in where the vertices are.
     """
     bend = mean - diags(np.ones(len(trust)))
     inwards = ((bend @ mesh.vertices) * normal).sum(1)

@@ -81,17 +81,9 @@ def find_up(shown: Mesh, views: list[View]) -> Up:
 def plane_up(
     points: np.ndarray, normals: np.ndarray, weights: np.ndarray, guess: np.ndarray, tolerance: float
 ) -> tuple[np.ndarray, float] | None:
-    """The largest plane among surface samples whose normal is near a guess (RANSAC).
-
-    Args:
-        points: [P, 3].
-        normals: [P, 3] unit, outwards.
-        weights: [P] area of each sample.
-        guess: [3] unit; only planes within `MAX_ANGLE` of it count.
-
-    Returns:
-        Its unit normal [3] and the slope in degrees that its unevenness amounts to; None where none is large enough.
-    """
+    """The largest plane (RANSAC) among surface samples [P, 3] with unit normals [P, 3] and areas [P], whose normal is
+    within `MAX_ANGLE` of a unit guess [3] and whose samples lie within `tolerance`: its unit normal [3] and the slope
+    in degrees that its unevenness amounts to; None where none is large enough."""
     near = normals @ guess > np.cos(np.radians(MAX_ANGLE))
     if near.sum() <= 10:
         return None
@@ -152,13 +144,9 @@ def place(shown: Mesh, views: list[View], scale: tuple[float, str] | None = None
           alone: bool = False, up: Up | None = None) -> Placement:  # fmt: skip
     """Chooses up, scale and origin: the floor is z = 0 and the middle of the visible surface is over the origin.
 
-    Args:
-        shown: visible surface in normalised space.
-        views: cameras in normalised space.
-        scale: metres a normalised unit and where that comes from, if it is known; else `size` sets it.
-        size: widest side of the box around the visible surface, m; None means 1 m, and says so in `size_from`.
-        alone: there is no scenery: the floor is where the lowest point is.
-        up: where it was measured; else it is looked for.
+    Surface and views are in normalised space. `scale`, where known, is metres a normalised unit and where that comes
+    from; else `size` m is the widest side, 1 m where it is None. `alone`: without scenery the floor is where the lowest
+    point is. `up` is looked for where it was not measured.
     """
     up = up or find_up(shown, views)
     rotation = level(shown, views, up.direction)
@@ -175,17 +163,9 @@ def place(shown: Mesh, views: list[View], scale: tuple[float, str] | None = None
 
 
 def measured_scale(distance: Sequence, views: list[View], photos: list[Photo], surface: Caster) -> tuple[float, str]:
-    """Metres a normalised unit at which a known distance is what it should be, and where that comes from, in words.
-
-    Args:
-        distance: see `Options`.
-        views: cameras in normalised space.
-        photos: what the views' photos were made of; pixels are those of the user's own photos.
-        surface: in normalised space.
-
-    Raises:
-        SdfsimError: no such posed photo or several, a pixel outside it, or one that shows nothing of the surface.
-    """
+    """Metres a normalised unit at which a known distance (see `Options`) is what it should be, and where that comes
+    from, in words. Pixels are those of the user's own photos. Raises SdfsimError of no such posed photo or several, a
+    pixel outside it, or one that shows nothing of the surface."""
     first, second, metres = distance
     start, end = (_locate(text, views, photos, surface) for text in (first, second))
     found = float(np.linalg.norm(end - start))
@@ -195,11 +175,8 @@ def measured_scale(distance: Sequence, views: list[View], photos: list[Photo], s
 
 
 def check_distance(distance: Sequence, photos: list[Photo]) -> None:
-    """Checks what can be known of a distance's ends before there are poses.
-
-    Raises:
-        SdfsimError: no such photo or several, or a pixel outside it.
-    """
+    """Checks what can be known of a distance's ends before there are poses. Raises SdfsimError of no such photo or
+    several, or of a pixel outside it."""
     for text in distance[:2]:
         name, pixel = _parts(text)
         _check_pixel(text, pixel, _called(name, photos, "photo"))

@@ -71,12 +71,7 @@ class Votes:
 
 def count_votes(sight: Visibility, faces: np.ndarray, views: list[View], photos_folder: Path,
                 names: list[str]) -> Votes:  # fmt: skip
-    """Lets every photo with labels vote for the vertices that it sees, weighted as in `look`; strays are left out.
-
-    Args:
-        faces: [F, 3] of it.
-        views: cameras in the space of the surface.
-    """
+    """Lets every photo with labels vote for the vertices that it sees, weighted as in `look`; strays are left out."""
     votes = np.zeros((len(sight.vertices), len(names) + 1))
     for view in views:
         labels = load_labels(photos_folder, view.name)
@@ -168,11 +163,8 @@ def solid_of(volume: Volume, inside: np.ndarray, mesh: Mesh) -> Solid:
 
 
 def parts_by_votes(solid: Solid, votes: Votes) -> tuple[list[Part], int]:
-    """The parts of a solid that masks tell apart.
-
-    Returns:
-        The parts, none where there are no two, and the name's number of the whole solid where it has one, else 0.
-    """
+    """The parts of a solid that masks tell apart, none where there are no two; and the name's number of the whole solid
+    where it has one, else 0."""
     winner = votes.winner[solid.index]
     count = np.bincount(winner[winner >= 0], minlength=len(votes.names) + 1)
     least = np.full(len(count), NAMED)
@@ -185,11 +177,7 @@ def parts_by_votes(solid: Solid, votes: Votes) -> tuple[list[Part], int]:
 
 
 def part_of_name(solid: Solid, votes: Votes, number: int) -> Part | None:
-    """What masks name of a larger solid, of which a box shows a part; None: there is nothing.
-
-    Args:
-        solid: in the box, whose border is left empty.
-    """
+    """What masks name of a larger solid, of which a box with an empty border shows a part; None: there is nothing."""
     mine = votes.share[solid.index, number]
     if not mine.any():
         return None
@@ -200,15 +188,8 @@ def part_of_name(solid: Solid, votes: Votes, number: int) -> Part | None:
 
 
 def parts_by_shape(solid: Solid, colors: np.ndarray, least: float) -> list[Part]:
-    """The parts of a solid that meet in a groove all along, and whose seam is narrow or whose colours differ.
-
-    Args:
-        colors: [P, 3] of its vertices, 0..255.
-        least: what is shorter than this in any direction is no part.
-
-    Returns:
-        The parts; none where the solid is one.
-    """
+    """The parts of a solid that meet in a groove all along, and whose seam is narrow or whose colours [P, 3] differ;
+    none where it is one. What is shorter than `least` in any direction is no part."""
     groove = _solid_around(solid) - 0.5
     label = np.zeros(len(groove), int)
     waiting = [0]

@@ -77,11 +77,8 @@ class Texels:
 
 
 def texture_parts(meshes: dict[str, Mesh], shots: Shots, on_progress: Progress = quiet) -> dict[str, Mesh]:
-    """Each mesh with a texture, fewer faces where it has many, and vertices doubled where its charts meet.
-
-    Args:
-        meshes: with vertex colours, which stay wherever no photo shows the surface.
-    """
+    """Each mesh with a texture, fewer faces where it has many, and vertices doubled where its charts meet; its vertex
+    colours stay wherever no photo shows the surface."""
     sizes = np.array([len(mesh.faces) for mesh in meshes.values()], float)
     ends = np.cumsum(sizes) / max(sizes.sum(), 1)
     return {
@@ -118,15 +115,9 @@ def fewer(mesh: Mesh, most: int) -> Mesh:
 
 
 def unfold(mesh: Mesh, density: float) -> tuple[Mesh, np.ndarray, tuple[int, int]]:
-    """Places for the faces of a mesh in a texture.
-
-    Args:
-        density: wanted texels a metre; fewer where the texture would be too large.
-
-    Returns:
-        The mesh with `uv`, its vertices doubled where charts meet; the vertex [V'] each of them was; and the rows and
-        columns of the texture, multiples of `BLOCK`.
-    """
+    """Places for the faces of a mesh in a texture of `density` texels a metre, or fewer where it would be too large:
+    the mesh with `uv`, its vertices doubled where charts meet; the vertex [V'] each of them was; and the rows and
+    columns of the texture, multiples of `BLOCK`."""
     import xatlas
 
     pieces = _pieces(mesh.vertices[mesh.faces].mean(1))
@@ -174,12 +165,7 @@ def _pieces(places: np.ndarray) -> list[np.ndarray]:
 
 
 def rasterise(flat: Mesh, normals: np.ndarray, shape: tuple[int, int]) -> Texels:
-    """Where on the surface the texels of a texture lie.
-
-    Args:
-        flat: with `uv` and perhaps colours.
-        normals: [V, 3] of its vertices.
-    """
+    """Where the texels of a texture lie on a surface with `uv`, perhaps colours, and vertex normals [V, 3]."""
     assert flat.uv is not None
     rows, columns = shape
     # The charts lie in a plane, and a ray through each texel's centre tells which face covers it, and where.
@@ -209,9 +195,8 @@ def bake(texels: Texels, shots: Shots, on_progress: Progress = quiet) -> np.ndar
     """The texture [H, W, 3] uint8: of each texel the colour in the photos that show it best.
 
     A view counts by its pixels on the surface, by how straight it looks and how sharp its photo is. Within two blocks
-    of where something stands in its way, or its photo ends, it fades out: edges of the reconstruction are not so exact
-    that what is just beside them could be told. Photos differ in exposure, so what is larger than a few blocks has the
-    mean colour of all photos, and only what is smaller that of the best.
+    of where something stands in its way, or its photo ends, it fades out, as edges of the reconstruction are not exact.
+    Photos differ in exposure, so what is larger than a few blocks has the mean colour of all photos.
     """
     import cv2
 
@@ -280,11 +265,8 @@ def bake(texels: Texels, shots: Shots, on_progress: Progress = quiet) -> np.ndar
 
 
 def _facing(view: View, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points [S] of [P, 3] that lie in a view's photo and face it, if nothing is in the way; and how they show.
-
-    The second is pixels a metre of the surface [S], where it is seen at an angle those along its shorter side; the
-    third are the places [S, 2] in the photo, px.
-    """
+    """Points [S] of [P, 3] that lie in a view's photo and face it; the pixels a metre of the surface [S] that they
+    have, along the shorter side where seen at an angle; and their places [S, 2] in the photo, px."""
     towards = view.center - points
     away = np.maximum(np.linalg.norm(towards, axis=1), 1e-12)
     cosine = (towards * normals).sum(1) / away

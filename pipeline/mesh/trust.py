@@ -53,16 +53,11 @@ class Support:
 
 
 def information(view: View, points: np.ndarray) -> np.ndarray:
-    """How exactly one photo tells where points are: the inverse of the covariance of the place.
+    """How exactly one photo tells where points [P, 3] in front of it are: the inverse [P, 3, 3] of the covariance of
+    the place, in 1 / (unit of the points)^2, of rank two.
 
     The photo is taken to be off by a standard deviation of 1 px on both axes, its camera to be exact: J^T J of the
     projection's Jacobian J (Hartley and Zisserman, Multiple View Geometry, 5.2). Lens distortion is left out.
-
-    Args:
-        points: [P, 3] in front of it.
-
-    Returns:
-        [P, 3, 3], rank two, in 1 / (unit of the points)^2.
     """
     local = points @ view.rotation.T + view.translation
     depth = local[:, 2, None, None]
@@ -99,11 +94,8 @@ def vertex_areas(mesh: Mesh) -> np.ndarray:
 
 
 def summary(mesh: Mesh, support: Support) -> dict:
-    """Shares of a mesh's area by how many photos see it, and the median uncertainty of what is not guessed.
-
-    Returns:
-        `area_m2`; `seen_by`, the shares of 0, 1, 2, and 3 or more photos; `guessed`, that of fewer than two or of
-        lines of sight that are parallel; `uncertainty_m`, None where all is guessed.
+    """Of a mesh's area: `area_m2`; `seen_by`, the shares of 0, 1, 2, and 3 or more photos; `guessed`, that of fewer
+    than two or of lines of sight that are parallel; `uncertainty_m`, the median of the rest, None where all is guessed.
     """
     area, uncertainty = vertex_areas(mesh), support.uncertainty
     known = np.isfinite(uncertainty)

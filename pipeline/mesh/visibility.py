@@ -71,12 +71,8 @@ class Above:
 
 
 class Visibility:
-    """Which vertices of a mesh which views see.
-
-    Args:
-        offset: how far along its normal a vertex is lifted before looking from it.
-        blocking: what can stand in the way; the mesh itself by default.
-    """
+    """Which vertices of a mesh which views see, lifted by `offset` along their normals, with `blocking` (or the mesh
+    itself) in the way."""
 
     def __init__(self, mesh: Mesh, offset: float, blocking: Caster | None = None) -> None:
         self.vertices, self.normals = mesh.vertices, vertex_normals(mesh)

@@ -26,16 +26,8 @@ class DepthPoints:
 
 
 def depth_points(views: list[View], photos: list[Photo], folder: Path, *, scale: float = 1.0) -> DepthPoints:
-    """All pixels with depth.
-
-    Args:
-        views: posed cameras in the world of the poses, whose unit is the metre as far as the cameras know.
-        photos: what the photos stage prepared in `folder`.
-        scale: factor of the depth, see `depth_scale`.
-
-    Raises:
-        SdfsimError: a file is missing.
-    """
+    """All pixels with depth, times `scale`, in the world of the poses, whose unit is the metre as far as the cameras
+    know. Raises SdfsimError where a file of the photos stage is missing."""
     by_name = {photo.name: photo for photo in photos}
     xyz, pixel, index = [np.zeros((0, 3))], [np.zeros((0, 2))], [np.zeros(0, np.int32)]
     for number, view in enumerate(views):
@@ -61,12 +53,9 @@ def depth_points(views: list[View], photos: list[Photo], folder: Path, *, scale:
 def depth_scale(views: list[View], sparse: Sparse, points: DepthPoints) -> dict[str, float]:
     """Compares depth with the triangulated points that lie on the same pixels.
 
-    Returns:
-        `scale`: factor of the depth that makes both agree; `spread`: the median share by which a pixel differs after
-        that; `points`: how many were compared. With fewer than `FEWEST` points the depth is taken as it is.
-
-    Raises:
-        SdfsimError: they differ by more than `APART`, so that the depth cannot be that of these photos in metres.
+    Returns `scale`, the factor of the depth that makes both agree; `spread`, the median share by which a pixel differs
+    after that; `points`, how many were compared: with fewer than `FEWEST` the depth is taken as it is. Raises
+    SdfsimError where they differ by more than `APART`, so that the depth cannot be that of these photos in metres.
     """
     from scipy.spatial import KDTree
 

@@ -70,17 +70,12 @@ def views_of(result: dict, photos: list[Photo]) -> list[View]:
 
 
 def check(result: dict, photos: list[Photo], ordinary: dict | None = None) -> dict:
-    """Decides whether a reconstruction can be trusted.
+    """Decides whether a reconstruction can be trusted, for the report: `failures` is empty when the poses may be used,
+    `warnings` are for the reader.
 
-    "All registered" is not "right": repeating textures give complete but wrong reconstructions, which show in the
-    focal length, the reprojection error, the spread of points, or in pairs that contradict the poses.
-
-    Args:
-        ordinary: of the worker at ordinary thresholds, if `result` is not. Its matches tell best how the camera moved:
-            looser thresholds take unlike places for alike, and others leave out what stands still.
-
-    Returns:
-        A dict for the report; `failures` is empty when the poses may be used, `warnings` are for the reader.
+    "All registered" is not "right": repeating textures give complete but wrong reconstructions, which show in the focal
+    length, the reprojection error, the spread of points, or in pairs that contradict the poses. `ordinary` is the
+    result at ordinary thresholds, if `result` is not: its matches tell best how the camera moved.
     """
     views = views_of(result, photos)
     posed = {view.name for view in views}

@@ -64,21 +64,11 @@ def size_groups(photos: list[Photo]) -> list[dict]:
 
 def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0, timeout: float = 1800.0,
           on_progress: Progress = quiet) -> dict:  # fmt: skip
-    """Finds the poses of `photos` and writes `cameras.json`, `sparse.npz`, `checks.json` to `out`.
+    """Finds the poses of `photos` and writes `cameras.json`, `sparse.npz`, `checks.json` to `out`; returns the checks.
 
-    Makes `ATTEMPTS` until poses can be trusted; each has a folder of its own, in which a killed run goes on. Where the
-    photos came with cameras these are kept, checked against the photos, and given sparse points.
-
-    Args:
-        photos: what the photos stage prepared, in `photos_folder`.
-        photos_folder: holds `images/` (and `masks/`, `known_cameras.json`).
-        timeout: s for each attempt.
-
-    Returns:
-        The checks (also in checks.json): posed, left_out with reasons, mean_error px, warnings, and the attempts.
-
-    Raises:
-        SdfsimError: (exit code 3) too few photos could be posed, or the result is not plausible.
+    Makes `ATTEMPTS` until poses can be trusted, for at most `timeout` s each; each has a folder of its own, in which a
+    killed run goes on. Where the photos came with cameras these are kept, checked against the photos, and given sparse
+    points. Raises SdfsimError (exit code 3) where too few photos could be posed, or the result is not plausible.
     """
     out, photos_folder = Path(out), Path(photos_folder)
     known = photos_folder / KNOWN_CAMERAS
@@ -163,14 +153,8 @@ def read_if_there(path: Path) -> Any:
 
 
 def run_worker(job: dict, folder: Path, timeout: float, on_progress: Progress) -> dict:
-    """Runs the COLMAP child process on one job, unless the folder holds the result of the same job already.
-
-    Returns:
-        What it wrote to `result.json`.
-
-    Raises:
-        SdfsimError: it crashed or ran out of time; the message names its log.
-    """
+    """Runs the COLMAP child process on one job, unless the folder holds its result already; returns `result.json`.
+    Raises SdfsimError, which names its log, where it crashed or ran out of time."""
     if read_if_there(folder / "job.json") != job:
         shutil.rmtree(folder, ignore_errors=True)  # Of other photos or settings.
     elif (done := read_if_there(folder / "result.json")) is not None:

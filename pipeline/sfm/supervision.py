@@ -39,11 +39,8 @@ def supervision_of(
 ) -> Supervision:
     """Sparse points seen by three views or more with a small error, and their lines of sight within the sphere.
 
-    Args:
-        sparse: in the world of the poses.
-        views: in the space of the unit sphere.
-        depth: of a sensor, in the world of the poses; its pixels are lines of sight as well.
-        noise: median share by which that depth is off; its lines end as much earlier.
+    Sparse points and a sensor's depth are in the world of the poses, views in that of the unit sphere. Pixels with
+    depth are lines of sight as well, which end earlier by `noise`, the median share by which the depth is off.
     """
     points = to_unit.points(sparse.xyz)
     seen = np.bincount(sparse.point_of, minlength=len(points))
@@ -76,13 +73,11 @@ def supervision_of(
 
 
 class FreeSpace:
-    """Points between cameras and what they see, which must be empty whatever the colours say.
+    """Points between cameras and what they see, on lines [L, 6] from start to end, which must be empty whatever colours
+    say.
 
     Half of those handed out are where the field is solid all the same: a vase's mouth is crossed by one line of sight
     in hundreds, and would stay filled if lines were drawn evenly.
-
-    Args:
-        sight: [L, 6] starts and ends of stretches of free space, normalised units.
     """
 
     def __init__(self, sight: np.ndarray, device: str) -> None:
@@ -134,13 +129,10 @@ def point_weights(sparse: Sparse, count: int) -> np.ndarray:
 
 
 def unit_sphere_of(views: list[View], sparse: Sparse, *, masked: bool = False) -> Similarity:
-    """The similarity that puts what the cameras look at into the unit sphere.
+    """The similarity that puts what the cameras look at into the unit sphere; `masked`: all points lie on the object.
 
     The centre is where the optical axes meet, drawn weakly to the points' median. The radius is what fits the longer
     side of most photos, less where nearly all points are nearer, and never past the nearest cameras.
-
-    Args:
-        masked: every photo has a mask, so all points lie on the object.
     """
     centers = np.array([v.center for v in views])
     axes = np.array([v.rotation[2] for v in views])

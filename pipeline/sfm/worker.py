@@ -278,15 +278,9 @@ def findings(job: dict, features: dict[str, int], pairs: list) -> dict:
 
 
 def turn_only(pairs: list[tuple[dict, np.ndarray, np.ndarray]], least: float = 2.0) -> float:
-    """Share of pairs of photos whose matches a turn of the camera on the spot explains.
-
-    A turn moves rays, not points: with the right focal length one rotation maps the rays of all matches. The focal
-    length is the one that explains most pairs so.
-
-    Args:
-        pairs: width and height of the photos, and matched pixels [M, 2] of both.
-        least: px, median error below which a turn explains a pair.
-    """
+    """Share of pairs of photos, of matched pixels [M, 2] each, whose matches a turn of the camera on the spot explains
+    to a median of `least` px: with the right focal length, that which explains most pairs, one rotation maps the rays
+    of all matches."""
     best = 0.0
     for ratio in np.geomspace(0.4, 4.0, 24):
         explained = 0
@@ -305,8 +299,7 @@ def turn_only(pairs: list[tuple[dict, np.ndarray, np.ndarray]], least: float = 2
 def contradictions(pairs: list, views: list[dict]) -> list[dict]:
     """Pairs of posed photos, with how far their matches are from the lines that the poses put them on.
 
-    Each pair was matched and verified on its own. Where poses are right nearly all pairs agree with them; photos of
-    repeating things match well in many places, and no poses agree with all of it.
+    Each pair was matched on its own: where poses are right nearly all agree; no poses agree with repeating things.
     """
     posed = {view["name"]: view for view in views}
     found = []
@@ -338,11 +331,8 @@ def epipolar_errors(a: dict, b: dict, first: np.ndarray, second: np.ndarray) -> 
 
 
 def focal_of_pairs(pycolmap, job: dict, database: Path, out: Path) -> dict[str, float]:
-    """Focal length (px) of each photo's camera from the pairs' fundamental matrices alone, where they tell it.
-
-    An estimate that owes nothing to the mapping: a second opinion on its focal length (view graph calibration, Sweeney
-    et al., 2015).
-    """
+    """Focal length (px) of each photo's camera from the pairs' fundamental matrices alone, where they tell it: a second
+    opinion on that of the mapping (view graph calibration, Sweeney et al., 2015)."""
     copy = out / "focal.db"
     shutil.copyfile(database, copy)
     try:
