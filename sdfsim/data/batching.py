@@ -24,15 +24,10 @@ def merged(
     floor: tuple[float, float] = FLOOR,
     plane: Shape = PLANE,
 ) -> tuple[Bodies, State]:
-    """Bodies of all trajectories, each at its frame, then one floor they share; worlds do not touch each other.
+    """Bodies of all trajectories, each at its frame of [W], then one floor they share; worlds do not touch each other.
 
     Masses and inertias are relative to the mean mass of the bodies that move in the trajectory, as in `Simulator`:
-    inverse masses are inputs of networks on surface nodes.
-
-    Args:
-        frames: [W] the frame each is taken at.
-        shapes: Shape of every name in use. The dataset's body frames sit at the centre of mass, so do these.
-        units: model units of length and time; its mass is to be 1.
+    inverse masses are inputs of networks on surface nodes. Units are of length and time; their mass is to be 1.
     """
     means = [1.0 if t.static.all() else float(t.mass[~t.static].mean()) for t in trajectories]
     relative = [replace(t, mass=t.mass / m, inertia=t.inertia / m) for t, m in zip(trajectories, means, strict=True)]

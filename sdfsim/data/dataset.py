@@ -60,15 +60,9 @@ class Trajectory:
 
     @classmethod
     def load(cls, path: Path, *, as_recorded: bool = False) -> Trajectory:
-        """Read and check one file.
-
-        Args:
-            path: of the file; the `dataset.json` beside it, or in the folder above, tells the engine's inner step.
-            as_recorded: leave velocities as the engine recorded them: it goes on from those when it is started again.
-
-        Raises:
-            SdfsimError: names the file and the field that is wrong.
-        """
+        """Read and check one file. The `dataset.json` beside it, or in the folder above, tells the engine's inner step;
+        `as_recorded` leaves velocities as the engine recorded them, from which it goes on when it is started again.
+        Raises SdfsimError with the file and the field that is wrong."""
         arrays = read_arrays(path, "a trajectory")
         if missing := [name for name in _AXES if name not in arrays]:
             raise SdfsimError(f"{path}: missing field(s) {', '.join(missing)}")
@@ -96,10 +90,7 @@ def at_instants(recorded: Trajectory, substep: float) -> Trajectory:
 
 def engine_substep(data: Path) -> float:
     """The recording engine's inner step in s, where the dataset (a folder or one of its splits) tells it; 0 elsewhere.
-
-    Raises:
-        SdfsimError: the `dataset.json` holds something else there.
-    """
+    Raises SdfsimError where the `dataset.json` holds something else there."""
     home = home_of(data)
     if home is None:
         return 0.0
@@ -165,11 +156,8 @@ def check_alike(where: str, trajectories: Iterable[Trajectory]) -> None:
 
 
 def read_info(folder: Path) -> dict:
-    """`dataset.json` of a dataset folder.
-
-    Raises:
-        SdfsimError: absent, not a JSON object, or of `sdfsim dataset` with another version of the teacher.
-    """
+    """`dataset.json` of a dataset folder. Raises SdfsimError where it is absent, no JSON object, or of `sdfsim dataset`
+    with another version of the teacher."""
     info = read_json(folder / INFO, "a dataset folder is what `sdfsim dataset` writes")
     if not isinstance(info, dict):
         raise SdfsimError(f"{folder / INFO}: must be a JSON object")
@@ -201,11 +189,8 @@ def product_range(values: np.ndarray, floor: float) -> list[float]:
 
 
 def trajectory_files(folder: Path, split: str) -> list[Path]:
-    """Trajectory files of a dataset in name order: of `folder/split/`, or of `folder` where nothing is split.
-
-    Raises:
-        SdfsimError: when there are none, or the dataset has other splits but not this one.
-    """
+    """Trajectory files of a dataset in name order: of `folder/split/`, or of `folder` where nothing is split. Raises
+    SdfsimError where there are none, or other splits but not this one."""
     split_up = [name for name in SPLITS if (folder / name).is_dir()]
     if split_up and split not in split_up:
         raise SdfsimError(f"{folder}: no {split} split here, only {', '.join(split_up)}")

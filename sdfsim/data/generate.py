@@ -35,26 +35,16 @@ def make_dataset(
     split: str = "train",
     on_progress: Progress = silent,
 ) -> dict:
-    """Write `trajectories` files under `out/SPLIT/` and the Shape folders under `out/shapes/`.
+    """Write `trajectories` files under `out/SPLIT/` and the Shape folders under `out/shapes/`; returns a report.
 
-    Files that exist are kept, so that an interrupted run goes on where it was. With the same shapes, trajectory k of
-    a split depends on (seed, split, k) alone. Every recipe but movi-b draws a split's bodies from that split's shapes
+    Files that exist are kept, so that an interrupted run goes on where it was. With the same shapes, trajectory k of a
+    split depends on (seed, split, k) alone. Every recipe but movi-b draws a split's bodies from that split's shapes
     (see `split_of`), so that those of validation and test are never trained on.
 
-    Args:
-        shapes: folder of shapes (see `origins`) or name of a public set (see `public_folder`); movi-b takes NAME/
-            folders alone.
-        random_solids: how many of PyBullet's random solids there are beside them.
-        bodies: how many move, instead of the recipe's range (bowl and pile).
-        fps: recorded frames a second, in `RATES`.
-
-    Returns:
-        A report: dataset, split, trajectories, made_now, shapes (how many the split draws from), left_out (name ->
-        why).
-
-    Raises:
-        SdfsimError: unknown recipe or rate, an option that the recipe has no use for, no usable shapes or none to be
-            fetched, PyBullet absent, another dataset in `out`, or another run writing to it.
+    Shapes are a folder (see `origins`; movi-b takes NAME/ folders alone) or the name of a public set; so many
+    `random_solids` of PyBullet go beside them. `bodies` move instead of the recipe's range (bowl and pile), at `fps` in
+    `RATES`. Raises SdfsimError of an unknown recipe or rate, an option that the recipe has no use for, no usable shapes
+    or none to be fetched, PyBullet absent, another dataset in `out`, or another run writing to it.
     """
     plan = _checked(recipe, shapes, random_solids, bodies, fps)
     engine = import_pybullet()
@@ -114,14 +104,8 @@ def report_lines(report: dict) -> list[str]:
 
 
 def make_trajectory(recipe: str, rng: np.random.Generator, cast: Cast, fps: int = FPS) -> Trajectory:
-    """One trajectory of `STEPS` steps, with velocities as the engine gives them.
-
-    Args:
-        fps: recorded frames a second, in `RATES`.
-
-    Raises:
-        SdfsimError: no scene of `REDRAWS` had room for its bodies.
-    """
+    """One trajectory of `STEPS` steps, with velocities as the engine gives them, at `fps` in `RATES`. Raises
+    SdfsimError where no scene of `REDRAWS` had room for its bodies."""
     for _ in range(REDRAWS):
         with Teacher(np.array(GRAVITY), FLOOR, step=1.0 / fps, substeps=RATES[fps]) as teacher:
             placed = RECIPES[recipe].spawn(teacher, rng, cast)

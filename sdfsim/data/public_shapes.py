@@ -65,14 +65,8 @@ SUMS = {
 
 
 def public_folder(shapes: Path, on_progress: Progress = silent) -> Path:
-    """The folder that `--shapes` means: that of this path, or the public set of this name, fetched if need be.
-
-    Args:
-        shapes: a folder, or the name of a set in `SUMS`; a folder of that name comes first.
-
-    Raises:
-        SdfsimError: a download failed, or a file is not the one expected.
-    """
+    """The folder that `--shapes` means: of this path, else the public set of this name in `SUMS`, fetched if need be.
+    Raises SdfsimError where a download failed or a file is not the one expected."""
     name = str(shapes)
     if name not in SUMS or shapes.is_dir():
         return shapes

@@ -118,13 +118,8 @@ def substeps_of(step: float) -> int:
 
 
 class Teacher:
-    """A PyBullet world with an optional infinite floor at z = 0.
-
-    Args:
-        gravity: [3] m/s^2.
-        floor: (friction, restitution) of the floor, or None for no floor.
-        step: s, one recorded step.
-    """
+    """A PyBullet world under gravity [3] m/s^2 with recorded steps of `step` s in `substeps` inner ones, and an
+    infinite floor at z = 0 with this friction and restitution, unless it is None."""
 
     def __init__(
         self, gravity: np.ndarray, floor: tuple[float, float] | None = (0.3, 0.5), *, step: float = DT,
@@ -188,12 +183,8 @@ class Teacher:
         self._call("resetBaseVelocity", self.bodies[index], list(velocity), list(angular_velocity))
 
     def run(self, steps: int) -> dict[str, np.ndarray]:
-        """Simulate `steps` recorded steps.
-
-        Returns:
-            position [steps+1, N, 3] m, quat_xyzw [steps+1, N, 4], velocity and angular_velocity
-            [steps+1, N, 3] in m/s and rad/s; entry 0 is the state at the call.
-        """
+        """Simulate `steps` recorded steps: position [steps+1, N, 3] m, quat_xyzw [steps+1, N, 4], velocity and
+        angular_velocity [steps+1, N, 3] in m/s and rad/s; entry 0 is the state at the call."""
         if not self._settled:
             self._settle()
         frames = [self._state()]

@@ -36,20 +36,13 @@ def roll_out(
     as_teacher: bool = False,
     floor: tuple[float, float] = FLOOR,
 ) -> list[Trajectory]:
-    """Simulate one batch from its first frames.
+    """Simulate one batch of trajectories of one step and one gravity from their first frames; the same bodies in the
+    predicted motion, steps + 1 frames.
 
-    Args:
-        group: trajectories of one step and one gravity; only their first frames are used.
-        free_flight: "exact", or "learned" for networks on surface nodes.
-        substeps: inner steps that the recording engine makes in one step.
-        as_teacher: the solver takes over two habits of the teacher: bodies are larger by `MARGIN` than their shapes,
-            and what is pushed out adds to the speed of a rebound.
-
-    Returns:
-        For each of the group, the same bodies in the predicted motion: steps + 1 frames.
-
-    Raises:
-        SdfsimError: a state that is not finite (exit code 3).
+    The recording engine makes `substeps` inner steps in one. `as_teacher` the solver takes over two habits of the
+    teacher: bodies are larger by `MARGIN` than their shapes, and what is pushed out adds to the speed of a rebound.
+    "learned" free flight is for networks on surface nodes. Raises SdfsimError (exit code 3) of a state that is not
+    finite.
     """
     units = model_units(model, group[0])
     known = {name: model.surface(shape) for name, shape in shapes.items()}

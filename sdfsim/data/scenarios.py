@@ -243,17 +243,10 @@ def _toss(teacher: Teacher, rng: np.random.Generator, cast: Cast, draw: Draw) ->
 
 
 def at_rest(teacher: Teacher, rng: np.random.Generator, bodies: Bodies, start: str) -> bool:
-    """Put bodies down: all at rest, all dropped from `DROP` at most, all given a nudge, or pressed into one another.
+    """Put bodies down, after those that the teacher has: all at rest, all dropped from `DROP` at most, all given a
+    nudge, or pressed into one another, as `start` says. False when one found no room.
 
-    Only the last overlap; models learn from them how bodies part.
-
-    Args:
-        teacher: the world; the bodies come after those that it has.
-        bodies: of shapes whose largest extent is 1 m at scale 1.
-        start: one of `STARTS`.
-
-    Returns:
-        False when one found no room.
+    Only the last overlap; models learn from them how bodies part. Shapes have a largest extent of 1 m at scale 1.
     """
     first, below, top = len(teacher.bodies), np.zeros(2), 0.0
     poses: list[Pose] = []
@@ -279,18 +272,11 @@ def at_rest(teacher: Teacher, rng: np.random.Generator, bodies: Bodies, start: s
 
 
 def set_moving(teacher: Teacher, rng: np.random.Generator, bodies: Bodies, motion: str) -> bool:
-    """Put bodies into the world, all in one kind of motion.
+    """Put bodies into the world, after those that it has, all in one kind of motion. False when one found no room.
 
     Bodies that roll must be balls: half go along x or y, half have the spin of their speed and the others any. Bodies
-    that slide do not turn at first. Bodies that spin or fall have no other velocity.
-
-    Args:
-        teacher: the world; the bodies come after those that it has.
-        bodies: of shapes whose largest extent is 1 m at scale 1; "head-on" takes two at a time.
-        motion: one of `MOTIONS`.
-
-    Returns:
-        False when one found no room.
+    that slide do not turn at first. Bodies that spin or fall have no other velocity. "head-on" takes two at a time.
+    Shapes have a largest extent of 1 m at scale 1.
     """
     if motion == "head-on":
         for k in range(0, len(bodies) - 1, 2):
@@ -395,11 +381,8 @@ def _standing(source: ShapeSource, rng: np.random.Generator) -> Rotation:
 
 
 def steady_faces(vertices: np.ndarray) -> np.ndarray:
-    """Outward unit normals [K, 3] of the faces of the convex hull on which a body stands without tipping over.
-
-    Args:
-        vertices: [V, 3] about the centre of mass.
-    """
+    """Outward unit normals [K, 3] of the faces of the convex hull on which a body of vertices [V, 3] about its centre
+    of mass stands without tipping over."""
     hull = ConvexHull(vertices)
     extent = float(np.ptp(vertices, axis=0).max())
     corners = vertices[hull.vertices]

@@ -85,14 +85,11 @@ def split_of(name: str) -> str:
 
 
 def origins(shapes: Path | None, random_solids: int = 0, *, as_is: bool = False) -> list[Origin]:
-    """Shapes of a folder, then the first of PyBullet's random solids.
+    """Shapes of a folder (NAME/ folders with `visual_geometry.obj` and `collision_geometry.obj`, and mesh files), then
+    the first of PyBullet's random solids.
 
-    Args:
-        shapes: folder of NAME/ folders, each with `visual_geometry.obj` and `collision_geometry.obj`, and mesh files.
-        as_is: take the NAME/ folders alone, in their own size (Kubric's assets have their centre of mass at 0).
-
-    Raises:
-        SdfsimError: no shapes, more solids than there are, one name twice, or one that no Shape folder can have.
+    `as_is` takes the NAME/ folders alone, in their own size (Kubric's assets have their centre of mass at 0). Raises
+    SdfsimError of no shapes, more solids than there are, one name twice, or one that no Shape folder can have.
     """
     found = []
     if shapes is not None:
@@ -121,14 +118,8 @@ def origins(shapes: Path | None, random_solids: int = 0, *, as_is: bool = False)
 def prepare(found: list[Origin], engine: Path, on_progress: Progress) -> tuple[list[ShapeSource], dict[str, str]]:
     """Engine files of all shapes, about their centres of mass; files that are there already are kept.
 
-    Args:
-        found: from `origins`, or primitives.
-
-    Returns:
-        The usable shapes in the order of `found`; and the others, name -> why.
-
-    Raises:
-        SdfsimError: a shape that is to be taken as it is cannot be used.
+    Returns the usable shapes in the order of `found`; and the others, name -> why. Raises SdfsimError where a shape
+    that is to be taken as it is cannot be used.
     """
     engine.mkdir(parents=True, exist_ok=True)
     records: list[dict[str, Any]] = [{}] * len(found)
@@ -205,15 +196,8 @@ def _source(origin: Origin, record: dict[str, Any], engine: Path) -> ShapeSource
 
 
 def decompose(mesh: Mesh, scratch: Path) -> list[Mesh]:
-    """Convex pieces of a solid by V-HACD.
-
-    Args:
-        mesh: the boundary of a solid, metres.
-        scratch: a path for its files, which are removed; gets endings.
-
-    Raises:
-        SdfsimError: V-HACD failed on it.
-    """
+    """Convex pieces of a solid, given by its boundary in metres, by V-HACD; its files, `scratch` with endings, are
+    removed. Raises SdfsimError where it failed."""
     before, after, log = (scratch.with_name(f".{scratch.name}.{end}") for end in ("in.obj", "out.obj", "log"))
     try:
         write_text(before, wavefront([mesh]))

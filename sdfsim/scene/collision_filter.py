@@ -23,11 +23,8 @@ class Pairs:
 
 
 def contact_groups(bodies: Sequence[Body]) -> tuple[np.ndarray, np.ndarray]:
-    """Bodies that list the same names and are listed by the same bodies are one group.
-
-    Returns:
-        The group [N] int64 of every body, and [G, G] bool: whether `collides_with` of both lets two groups touch.
-    """
+    """Bodies that list the same names and are listed by the same bodies are one group: the group [N] int64 of every
+    body, and [G, G] bool, whether `collides_with` of both lets two groups touch."""
     lists = {id(b.collides_with): set(b.collides_with) for b in bodies if b.collides_with is not None}
     found: dict[tuple, int] = {}
     group = np.empty(len(bodies), dtype=np.int64)

@@ -26,11 +26,7 @@ class Effects:
 
 @dataclass(frozen=True)
 class Limits:
-    """What a run must keep to.
-
-    Attributes:
-        memory_gib: GiB that one step may take for distances and edges; None for no limit.
-    """
+    """What a run must keep to: `memory_gib`, GiB that one step may take for distances and edges; None for no limit."""
 
     memory_gib: float | None = None
 

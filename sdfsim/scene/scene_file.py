@@ -633,12 +633,8 @@ def _nobody(name: str, known: Iterable[str]) -> str:
 class Document:
     """The YAML of a file, and the faults found in it, each with its line.
 
-    Attributes:
-        data: dicts, lists, texts and `Numeral`s; `NOTHING` where a key has no value.
-
-    Raises:
-        SceneError: the file is missing, too large, not UTF-8, not YAML (with the line), or empty, or its aliases
-            multiply it.
+    `data` are dicts, lists, texts and `Numeral`s; `NOTHING` where a key has no value. Raises SceneError where the file
+    is missing, too large, not UTF-8, not YAML (with the line), or empty, or its aliases multiply it.
     """
 
     def __init__(self, path: Path, text: str | None = None) -> None:
@@ -718,17 +714,8 @@ def _compose(path: Path, text: str) -> yaml.Node:
 
 
 def read_scene(path: Path, *, allow_outside: bool = False, text: str | None = None) -> tuple[SceneTable, Document]:
-    """Read and check a scene file; nothing is loaded yet.
-
-    Args:
-        allow_outside: whether paths in it may lead out of its folder.
-
-    Returns:
-        What it says, and its document, to tell of faults that show only later.
-
-    Raises:
-        SceneError: with every fault found.
-    """
+    """Read and check a scene file; nothing is loaded yet. Returns what it says, and its document, to tell of faults
+    that show only later. Raises SceneError with every fault found."""
     document, context = Document(path, text), {"folder": path.parent, "allow_outside": allow_outside}
     try:
         table = SceneTable.model_validate(document.data, context=context)
@@ -744,18 +731,11 @@ def read_scene(path: Path, *, allow_outside: bool = False, text: str | None = No
 def load_scene(
     path: Path | str, on_progress: Progress = silent, *, allow_outside: bool = False, text: str | None = None
 ) -> Scene:
-    """Read a scene file, and load or fit the shapes that its bodies use.
+    """Read a scene file, and load or fit the shapes that its bodies use; the scene is in SI units.
 
-    Args:
-        path: of the scene.yaml; paths inside it are taken from its folder.
-        allow_outside: whether meshes, shape folders and models that the file names may lie outside of its folder.
-        text: what is in the file, where it is not written yet.
-
-    Returns:
-        The scene in SI units.
-
-    Raises:
-        SceneError: with one line `FILE:LINE: FIELD: what is wrong` for every fault found.
+    Paths inside the file are taken from its folder; unless `allow_outside`, they may not lead out of it. `text` is what
+    is in the file, where it is not written yet. Raises SceneError with one line `FILE:LINE: FIELD: what is wrong` for
+    every fault found.
     """
     path = Path(path)
     table, document = read_scene(path, allow_outside=allow_outside, text=text)

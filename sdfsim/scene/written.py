@@ -22,14 +22,8 @@ _HERE = "<scene>"  # what messages call a scene that is in no file
 
 
 class Scene:
-    """A scene that is being written. `print` shows it as the file that `save` writes.
-
-    Args:
-        settings: keys of the file itself: gravity, duration, seed, model, effects, limits.
-
-    Raises:
-        SceneError: no such key.
-    """
+    """A scene that is being written. `print` shows it as the file that `save` writes. Settings are keys of the file
+    itself: gravity, duration, seed, model, effects, limits; raises SceneError of no such key."""
 
     def __init__(self, **settings: Any) -> None:
         known = [key for key in SceneTable.model_fields if key not in ("version", "shapes", "bodies")]
@@ -39,19 +33,12 @@ class Scene:
         self._bodies: list[dict[str, Any]] = []
 
     def add(self, name: str, **keys: Any) -> Scene:
-        """Add a body, or many copies of one.
+        """Add a body, or many copies of one, and return the scene.
 
-        Args:
-            name: of the body, and of its shape.
-            keys: of the body and of its shape, as docs/scene.md has them, such as sphere={"radius": 0.1},
-                position=(0, 0, 1). Paths of meshes and folders start at the current folder. A body that looks like an
-                earlier one takes shape="name of that one".
-
-        Returns:
-            The scene itself.
-
-        Raises:
-            SceneError: no such key. What values may be is checked by `load`, all at once.
+        Keys are of the body and of its shape, which has the same name, as docs/scene.md has them, such as
+        sphere={"radius": 0.1}, position=(0, 0, 1). Paths of meshes and folders start at the current folder. A body that
+        looks like an earlier one takes shape="name of that one". Raises SceneError of no such key; values are checked
+        by `load`, all at once.
         """
         _check(keys, [*_OF_SHAPE, *(key for key in BodyTable.model_fields if key != "name")], f"body {name!r}")
         shape = {key: value for key, value in keys.items() if key in _OF_SHAPE}
@@ -64,19 +51,13 @@ class Scene:
 
     def load(self, on_progress: Progress = silent) -> scene.Scene:
         """What a simulator takes; `Simulator` calls it by itself. Shapes are loaded or fitted as `load_scene` does.
-
-        Raises:
-            SceneError: one line for every fault, with the line that `print` shows it in.
-        """
+        Raises SceneError with one line for every fault, with the line that `print` shows it in."""
         found = load_scene(Path(_HERE), on_progress, allow_outside=True, text=str(self))
         return replace(found, path=None)
 
     def save(self, path: Path | str) -> Path:
-        """Write a scene.yaml; paths in it start at its folder. Nothing is checked: `load_scene` does that.
-
-        Raises:
-            SdfsimError: the file cannot be written.
-        """
+        """Write a scene.yaml; paths in it start at its folder. Nothing is checked: `load_scene` does that. Raises
+        SdfsimError where the file cannot be written."""
         path = Path(path)
         write_text(path, self._text(path.resolve().parent))
         return path

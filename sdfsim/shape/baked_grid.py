@@ -45,13 +45,8 @@ class BakedGrid:
 
 
 def baked(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = (), cache_dir: Path | None = None) -> BakedGrid:
-    """The grid of an SDF, baked on first use and then taken from the cache.
-
-    Args:
-        nodes: [K, 3] m on its surface, where the thickness of its walls is measured.
-        pieces: vertices [V, 3] m of the convex pieces that the SDF was fitted to: the grid is then of their union.
-        cache_dir: by default `sdfsim/baked` in the user's cache folder.
-    """
+    """The grid of an SDF (or of the union of the convex pieces, vertices [V, 3] m each, that it was fitted to), baked
+    on first use and then taken from the cache. The thickness of walls is measured at `nodes` [K, 3] m."""
     cache_dir = cache_dir or user_cache("baked")
     path = cache_dir / f"{digest(sdf, [*pieces], CELLS, FINEST)}-{BAKE_VERSION}.npz"
     if path.is_file():
@@ -71,12 +66,8 @@ def baked(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = (), cache_
 
 
 def grid_certificate(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = ()) -> dict[str, float]:
-    """What the grid adds to the certificate of a fit; it stays in the cache for the first simulation.
-
-    Returns:
-        `baked_cell` and `baked_error` (see `BakedGrid`), as fractions of the largest extent; nothing of what was not
-        fitted.
-    """
+    """What the grid adds to the certificate of a fit, as fractions of the largest extent: `baked_cell` and
+    `baked_error` (see `BakedGrid`). It stays in the cache for the first simulation."""
     if not isinstance(sdf, MlpSdf):
         return {}
     grid, extent = baked(sdf, nodes, pieces), float(np.ptp(sdf.bounds, axis=0).max())

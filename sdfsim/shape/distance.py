@@ -39,18 +39,14 @@ class DistanceOracle(Protocol):
 
 
 class MeshDistance:
-    """Signed distance to a solid that is bounded by triangles, or to a mesh as it is.
+    """Signed distance to a solid that is bounded by triangles (see `solidify`), or to a mesh as it is: a sheet has no
+    inside.
 
-    The sign is that of the solid's winding number: inside where the surface goes around a point more than half a
-    time. Where a single clean surface bounds the solid, ray parity says the same and is faster. `trusted` follows the
-    paper (appendix on SDF training): the angle between (point - closest) and the face normal is below 75 or above
-    105 degrees; where the surface does not quite close, the winding number must also be clear.
-
-    Args:
-        body: from `solidify`; or a mesh, metres, which is taken as it is, whatever it is: a sheet has no inside.
-
-    Raises:
-        SdfsimError: the mesh has no faces.
+    The sign is that of the solid's winding number: inside where the surface goes around a point more than half a time.
+    Where a single clean surface bounds the solid, ray parity says the same and is faster. `trusted` follows the paper
+    (appendix on SDF training): the angle between (point - closest) and the face normal is below 75 or above 105
+    degrees; where the surface does not quite close, the winding number must also be clear. Raises SdfsimError where the
+    mesh has no faces.
     """
 
     def __init__(self, body: Solid | Mesh) -> None:
@@ -95,17 +91,11 @@ class MeshDistance:
 
 
 class PiecesDistance:
-    """Signed distance to a union of convex pieces: the exact body that a rigid-body engine collides.
+    """Signed distance to a union of convex closed pieces, metres: the exact body that a rigid-body engine collides.
 
     Whether a point is inside is exact (half-spaces of each piece). Outside, the distance is the minimum over the
-    pieces. Inside, it is the distance to the boundary of the *union*: faces that another piece covers are left out,
-    so that the seams between touching pieces do not show up as a surface within the solid.
-
-    Args:
-        pieces: convex closed meshes, metres.
-
-    Raises:
-        SdfsimError: no pieces.
+    pieces. Inside, it is the distance to the boundary of the *union*: faces that another piece covers are left out, so
+    that the seams between touching pieces do not show up as a surface. Raises SdfsimError where there are no pieces.
     """
 
     def __init__(self, pieces: list[Mesh]) -> None:

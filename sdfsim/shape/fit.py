@@ -123,24 +123,13 @@ def fit_mesh(
     on_progress: Progress = silent,
     device: torch.device | str = "cpu",
 ) -> Shape:
-    """Fit the compact SDF network to the solid that a triangle mesh bounds (see `solidify`).
+    """Fit the compact SDF network to the solid that a triangle mesh in metres (or its distance oracle) bounds, see
+    `solidify`.
 
-    The result depends on the mesh, the recipe and the seed only (up to rounding, which the number of threads and the
-    device change), unless the budget cuts the training short.
-
-    Args:
-        mesh: metres; or its distance oracle, when there is one already.
-        recipe: "default" (waves, 64 wide, SOAP, seconds), "quick" (the same in 2,000 steps at most, not 5,000) or
-            "paper" (ReLU, 128 wide, Adam 1e-5, 400k steps).
-        budget: seconds of training at most; the schedule is shortened to fit.
-        thicken: m; the solid is all within half of this distance from the mesh instead.
-
-    Returns:
-        Shape whose `certificate` tells the errors and whether it is usable (`passed`); what was done to the mesh is
-        in `source["notes"]`.
-
-    Raises:
-        SdfsimError: the mesh cannot be used, or bounds no solid.
+    The result depends on the mesh, the recipe (see `PLANS`) and the seed only (up to rounding, which the number of
+    threads and the device change), unless the budget in s cuts the training short. The shape's `certificate` tells the
+    errors and whether it is usable (`passed`), `source["notes"]` what was done to the mesh. Raises SdfsimError where
+    the mesh cannot be used or bounds no solid.
     """
     if isinstance(mesh, Mesh):
         mesh = MeshDistance(solidify(mesh, name=name, cap=cap, thicken=thicken))
@@ -165,11 +154,8 @@ def fit_pieces(
     """Fit the compact SDF network to the union of convex pieces: the body that a rigid-body engine collides.
 
     At most `nodes` are the pieces' own vertices first (without repetitions and those inside another piece), because
-    contact with a flat floor is exact only there; then points along their sharp edges, then all over the surface.
-    Mass properties are those of the union, and so is the mesh to show unless `display` is given.
-
-    Raises:
-        SdfsimError: no pieces.
+    contact with a flat floor is exact only there; then points along their sharp edges, then all over the surface. Mass
+    properties are those of the union, and so is the mesh to show unless `display` is given.
     """
     oracle = PiecesDistance(pieces)
     size = float(np.ptp(oracle.bounds, axis=0).max())
@@ -336,11 +322,8 @@ class _Run:
             mean.lerp_(parameter, 0.02)
 
     def differentiate(self, chosen: torch.Tensor) -> None:
-        """Weighted L1 of the signed distance, and of the unsigned one where the sign is not known; fills the gradients.
-
-        Args:
-            chosen: [T] points of the pool.
-        """
+        """Weighted L1 of the signed distance, and of the unsigned one where the sign is not known, at the points of the
+        pool that are chosen [T]; fills the gradients."""
         points, distance, signed, _ = (part[chosen.to(self.device)] for part in self.pool)
         weights, biases = _layers(self.parameters, self.plan.activation)
         value = self._tape.forward(weights, biases, points)

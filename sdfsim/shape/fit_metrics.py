@@ -44,25 +44,18 @@ EXPOSED_STEP = 5e-4  # a surface sample is hidden where this far along its norma
 def certify(
     sdf: Sdf, oracle: DistanceOracle, *, nodes: np.ndarray | None = None, points: int = 10_000, seed: int = 1
 ) -> dict:
-    """Errors of `sdf` on held-out points near the surface, in the fitted box and beyond it.
+    """Errors of `sdf` on held-out points near the surface, in the fitted box and beyond it, ready for JSON (None: could
+    not be measured, as where an open mesh leaves the sign in doubt); lengths relative to the largest extent.
 
     Points within 0.01 and within 0.1 are spread over the surface by area and moved by normal noise of 0.006 and 0.06;
-    those of the box are uniform in [-0.7, 0.7]^3 of the normalised frame. Where an open mesh leaves the sign in
-    doubt nothing is measured.
+    those of the box are uniform in [-0.7, 0.7]^3 of the normalised frame.
 
-    Args:
-        nodes: [K, 3] m, surface nodes whose coverage is measured too.
-
-    Returns:
-        JSON-ready dict (None: could not be measured), lengths relative to the largest extent.
-
-        Mean absolute errors `error_within_0.01`, `error_within_0.1` and `error_in_box`; `gradient_within_0.1`, the
-        median cosine distance (1 - cosine) of the gradient from the true direction; `projected_from_0.01` and
-        `projected_from_0.1`, mean distance from the surface of x - f grad f / |grad f|^2; `sign_errors`, the fraction
-        of points farther than 0.002 whose sign is wrong; `far_field_ratio`, the largest f / true distance farther
-        than 0.1, out to [-2, 2]^3 (a step as long as f goes through the surface where it is above 1).
-
-        `coverage` of the nodes as in `coverage`, if there are any; and `passed`, `reason` and `caveat` of `verdict`.
+    Mean absolute errors `error_within_0.01`, `error_within_0.1` and `error_in_box`; `gradient_within_0.1`, the median
+    cosine distance (1 - cosine) of the gradient from the true direction; `projected_from_0.01` and
+    `projected_from_0.1`, mean distance from the surface of x - f grad f / |grad f|^2; `sign_errors`, the fraction of
+    points farther than 0.002 whose sign is wrong; `far_field_ratio`, the largest f / true distance farther than 0.1,
+    out to [-2, 2]^3 (a step as long as f goes through the surface where it is above 1); `coverage` of the nodes [K, 3]
+    m, if there are any; and what `verdict` says.
     """
     # A stream of its own, so that no seed of the fit draws these points.
     rng = np.random.default_rng([seed, 0xCE47])
@@ -120,12 +113,8 @@ def certify(
 
 
 def verdict(errors: dict) -> dict:
-    """What a simulation can make of a field with such errors.
-
-    Returns:
-        `passed`: it is usable; `reason`: the first limit of `USABLE` that it misses, else empty; `caveat`: the first
-        limit of `EXACT` that a usable field misses, else empty.
-    """
+    """What a simulation can make of a field with such errors: `passed` if usable, else `reason`, the first limit of
+    `USABLE` that it misses; `caveat`, the first limit of `EXACT` that a usable field misses."""
 
     def missed(limits: dict[str, float], word: str) -> str:
         # Written so that NaN misses too.
@@ -161,19 +150,12 @@ def thin_share(oracle: DistanceOracle, thin: float = THIN, *, points: int = 2000
 
 
 def coverage(nodes: np.ndarray, surface: DistanceOracle | Mesh, *, points: int = 20_000, seed: int = 1) -> dict:
-    """How evenly nodes stand for a surface, by straight distances from surface samples to their nearest node.
+    """How evenly nodes [K, 3] m stand for a surface (its oracle, which knows what is hidden inside, or a mesh), by
+    straight distances from surface samples to their nearest node; raises SdfsimError where it has no faces or extent.
 
-    Args:
-        nodes: [K, 3] m.
-        surface: the true surface, in the same frame: its oracle (which also knows what is hidden inside) or a mesh.
-
-    Returns:
-        JSON-ready dict, lengths relative to the largest extent: `count` of nodes, `largest_hole` (largest distance to
-        the nearest node), `uncovered` (fraction of the surface farther than 0.1 from every node) and `off_surface` (the
-        largest distance of a node from the surface). Without nodes the distances are None.
-
-    Raises:
-        SdfsimError: the surface has no faces or no extent.
+    Returns, ready for JSON and relative to the largest extent, the `count` of nodes, `largest_hole` (largest distance
+    to the nearest node), `uncovered` (fraction of the surface farther than 0.1 from every node) and `off_surface`
+    (largest distance of a node from the surface). Without nodes the distances are None.
     """
     from scipy.spatial import KDTree
 

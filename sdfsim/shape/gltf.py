@@ -16,12 +16,8 @@ _UNLIT = "KHR_materials_unlit"
 
 
 class Gltf:
-    """A file in the making. Nodes hang below one that turns z up to glTF's y up.
-
-    Attributes:
-        nodes: of the bodies; keys as glTF has them.
-        meshes, materials, animations: likewise.
-    """
+    """A file in the making: nodes, meshes, materials and animations with keys as glTF has them. Nodes hang below one
+    that turns z up to glTF's y up."""
 
     def __init__(self) -> None:
         self.nodes: list[dict[str, Any]] = []

@@ -15,15 +15,9 @@ if TYPE_CHECKING:  # sdf.py measures meshes, and so imports this file
 
 
 def mass_properties(mesh: Mesh) -> tuple[float, np.ndarray, np.ndarray]:
-    """Exact volume integrals of a closed mesh, as a sum over signed tetrahedra.
-
-    Returns:
-        volume m^3, centre of mass [3] m, and inertia [3, 3] m^5 (per unit density) about the centre of mass.
-
-    Raises:
-        SdfsimError: the volume cannot be trusted: the mesh is open, or encloses nothing.
-            `mass_properties_of_sdf` serves those.
-    """
+    """Volume m^3, centre of mass [3] m, and inertia [3, 3] m^5 (per unit density) about it of a closed mesh, exactly,
+    as a sum over signed tetrahedra. Raises SdfsimError where it is open or encloses nothing: see
+    `mass_properties_of_sdf`."""
     if not is_closed(mesh):
         raise SdfsimError("mesh is not closed, so it has no exact volume")
     return integrals(mesh)
@@ -31,13 +25,7 @@ def mass_properties(mesh: Mesh) -> tuple[float, np.ndarray, np.ndarray]:
 
 def integrals(mesh: Mesh, weights: np.ndarray | float = 1.0) -> tuple[float, np.ndarray, np.ndarray]:
     """`mass_properties` of a surface that is closed but for cracks: edges need not match, as after cutting its faces.
-
-    Args:
-        weights: of its faces, [F]; 1 / n where n of them lie on each other.
-
-    Raises:
-        SdfsimError: the mesh encloses nothing.
-    """
+    These have weights [F], 1 / n where n of them lie on each other. Raises SdfsimError where it encloses nothing."""
     # Moments about the vertices' mean: far from the origin the products of large coordinates would cancel.
     shift = mesh.vertices.mean(0)
     corners = mesh.vertices[mesh.faces] - shift
@@ -57,17 +45,11 @@ def integrals(mesh: Mesh, weights: np.ndarray | float = 1.0) -> tuple[float, np.
 def mass_properties_of_sdf(
     sdf: Sdf | DistanceOracle, *, cells: int = 64, wall: float = np.inf
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """The integrals of `mass_properties`, taken on a grid over the inside of any bounded SDF.
+    """The integrals of `mass_properties`, taken on a grid over the inside of any bounded SDF, or of a wall, m, within
+    it.
 
-    A cell at distance f from the surface counts with the fraction 0.5 - f / cell (clamped), so the error is of
-    second order in the cell. Of a wall, the hollow below it is taken off in the same way.
-
-    Args:
-        sdf: bounded; metres.
-        wall: m; only what is nearer to the surface than this counts.
-
-    Raises:
-        SdfsimError: the SDF is unbounded, or negative nowhere.
+    A cell at distance f from the surface counts with the fraction 0.5 - f / cell (clamped), so the error is of second
+    order in the cell. Raises SdfsimError where the SDF is unbounded, or negative nowhere.
     """
     low, high = np.asarray(sdf.bounds, dtype=np.float64)
     if not np.isfinite([low, high]).all():

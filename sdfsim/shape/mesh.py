@@ -70,11 +70,8 @@ class Frame:
 
 
 def normal_frame(bounds: np.ndarray) -> Frame:
-    """The frame in which a box `bounds` [2, 3] m becomes [-0.5, 0.5] along its largest extent.
-
-    Raises:
-        SdfsimError: the box has no extent, or is not finite.
-    """
+    """The frame in which a box `bounds` [2, 3] m becomes [-0.5, 0.5] along its largest extent. Raises SdfsimError where
+    it has no extent or is not finite."""
     extent = float((bounds[1] - bounds[0]).max())
     if not np.isfinite(extent) or extent <= 0:
         raise SdfsimError("the shape has no extent", "all of its vertices are at one point")
@@ -82,12 +79,8 @@ def normal_frame(bounds: np.ndarray) -> Frame:
 
 
 def load_mesh(path: str | Path) -> Mesh:
-    """Read a triangle mesh (obj, ply, glb, gltf, stl, off), cleaned by `clean`.
-
-    Raises:
-        SdfsimError: missing file, not a mesh, cut short, no faces, vertices that are not finite, or indices out of
-            range.
-    """
+    """Read a triangle mesh (obj, ply, glb, gltf, stl, off), cleaned by `clean`. Raises SdfsimError where it is missing,
+    cut short, no mesh, or has no faces, vertices that are not finite, or indices out of range."""
     path = Path(path)
     if not path.is_file():
         raise SdfsimError(f"{path}: no such mesh file")
@@ -202,11 +195,7 @@ def write_ply(mesh: Mesh, attributes: Mapping[str, np.ndarray] = MappingProxyTyp
 
 
 def read_mesh(path: Path) -> Mesh:
-    """The mesh of a shape folder as `write_ply` wrote it: not cleaned, not reordered.
-
-    Raises:
-        SdfsimError: not readable.
-    """
+    """The mesh of a shape folder as `write_ply` wrote it: not cleaned, not reordered. Raises SdfsimError: damaged."""
     try:
         loaded = _read(path)
         mesh = Mesh(np.array(loaded.vertices, dtype=np.float64), _faces(loaded), None)
@@ -219,11 +208,8 @@ def read_mesh(path: Path) -> Mesh:
 
 
 def read_attributes(path: Path, names: Sequence[str]) -> list[np.ndarray]:
-    """Properties of the vertices [V] of a PLY file that `write_ply` wrote, by their names; see `read_mesh`.
-
-    Raises:
-        SdfsimError: not readable, or it has no such property.
-    """
+    """Properties of the vertices [V] of a PLY file that `write_ply` wrote, by their names. Raises SdfsimError where it
+    is not readable or has no such property."""
     try:
         vertices = _read(path).metadata["_ply_raw"]["vertex"]["data"]
         return [np.array(vertices[name]) for name in names]
@@ -278,10 +264,8 @@ def _check_read(mesh: Mesh) -> None:
 def clean(mesh: Mesh, *, name: str = "mesh") -> Mesh:
     """Merge equal vertices, drop degenerate and doubled faces and unused vertices, turn a closed mesh right side out.
 
-    Of two faces back to back none stays where the rest is closed without them (a wall between touching cells).
-
-    Raises:
-        SdfsimError: no faces (before or after), vertices that are not finite or absurdly far, or indices out of range.
+    Of two faces back to back none stays where the rest is closed without them (a wall between touching cells). Raises
+    SdfsimError where there are no faces, vertices that are not finite or absurdly far, or indices out of range.
     """
     vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
     if len(faces) == 0:
@@ -375,11 +359,8 @@ def directed_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def load_pieces(path: str | Path) -> list[Mesh]:
-    """The convex pieces of a collision geometry in Wavefront OBJ: the convex hull of each `o` group's vertices.
-
-    Raises:
-        SdfsimError: missing or unreadable file, no pieces, or a piece that is flat.
-    """
+    """The convex pieces of a collision geometry in Wavefront OBJ: the convex hull of each `o` group's vertices. Raises
+    SdfsimError where it cannot be read, has no pieces, or a piece is flat."""
     path = Path(path)
     if not path.is_file():
         raise SdfsimError(f"{path}: no such mesh file")
@@ -416,11 +397,8 @@ def wavefront(pieces: list[Mesh]) -> str:
 
 
 def convex_hull(points: np.ndarray) -> Mesh:
-    """Convex hull of `points` [P, 3] m, outward faces.
-
-    Raises:
-        SdfsimError: fewer than four points, not finite, or all in one plane.
-    """
+    """Convex hull of `points` [P, 3] m, outward faces. Raises SdfsimError of fewer than four points, or where they are
+    not finite or all in one plane."""
     from scipy.spatial import ConvexHull, QhullError
 
     if len(points) < 4 or not np.isfinite(points).all():

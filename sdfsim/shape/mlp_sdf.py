@@ -166,13 +166,10 @@ _kept = threading.local()
 def value_and_gradient(
     weights: Sequence[torch.Tensor], biases: Sequence[torch.Tensor], activation: Activation, points: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Evaluate a network (see `Tape`) at normalised points [T, 3]; no autograd graph is built.
+    """Value [T] and gradient [T, 3] of a network (see `Tape`) at normalised points [T, 3]; no autograd graph is built.
 
     The forward sweep keeps each activation's derivative; one reverse sweep multiplies them back to the input, which
     costs as much as the forward one. Memory is bounded by `SWEPT`, whatever the number of points.
-
-    Returns:
-        value [T] and its gradient [T, 3], in the dtype of the weights.
     """
     tapes = _kept.__dict__.setdefault("tapes", {})
     like, width = weights[0], len(weights[0])

@@ -61,11 +61,8 @@ class Sdf(Protocol):
 def accepts_numpy(call: Callable[..., tuple[torch.Tensor, torch.Tensor]]) -> Callable[..., tuple[Any, Any]]:
     """Let an Sdf's `__call__` also take what makes a NumPy array [P, 3], and then answer in NumPy of the same dtype.
 
-    Whole numbers become float64. An object with a `device` attribute is evaluated there; the answer comes back to the
-    host.
-
-    Raises:
-        ValueError: (from the wrapped call) `points` is not [P, 3].
+    Whole numbers become float64. An object with a `device` attribute is evaluated there. Raises ValueError of other
+    shapes.
     """
 
     @wraps(call)
@@ -85,11 +82,8 @@ def accepts_numpy(call: Callable[..., tuple[torch.Tensor, torch.Tensor]]) -> Cal
 
 
 class ClosedForm:
-    """A solid about the origin with an exact distance; its fields are its `COUNT` sizes, m.
-
-    Raises:
-        SdfsimError: a size is not a positive finite number.
-    """
+    """A solid about the origin with an exact distance; its fields are its `COUNT` sizes, m, positive (else
+    SdfsimError)."""
 
     KIND: ClassVar[str]
     COUNT: ClassVar[int]
@@ -265,10 +259,9 @@ def _up(points: torch.Tensor) -> torch.Tensor:
 def trilinear(values: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Value [P] and gradient [P, 3] of a grid [R, R, R] over [-BOX, BOX]^3 at points [P, 3] in it; NaN for NaN.
 
-    The gradient is the exact one of the interpolant, not an interpolation of central differences: the step
-    x - f grad f then leads to the level that the value has (which is what contact points and nodes are made of), and
-    it takes the eight samples that the value takes anyway, not thirty-two. It jumps from cell to cell, by about
-    the cell over the radius of curvature.
+    The gradient is the exact one of the interpolant, not an interpolation of central differences: the step x - f grad f
+    then leads to the level that the value has, and it takes the eight samples that the value takes anyway, not
+    thirty-two. It jumps from cell to cell, by about the cell over the radius of curvature.
     """
     side = values.shape[-1]
     per_cell = (side - 1) / (2 * BOX)
@@ -293,11 +286,7 @@ def trilinear(values: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor,
 
 @dataclass(frozen=True, eq=False)
 class GridSdf:
-    """A signed distance sampled on the box [-0.7, 0.7]^3 of the normalised frame, trilinear between the samples.
-
-    Raises:
-        ValueError: `values` is not a cube of at least two samples a side.
-    """
+    """A signed distance sampled on the box [-0.7, 0.7]^3 of the normalised frame, trilinear between the samples."""
 
     # [R, R, R] float32 normalised distances at R >= 2 evenly spaced places along x, y and z, the outermost on the faces
     # of the box
@@ -343,17 +332,11 @@ def sample_grid(
     resolution: int,
     on_progress: Progress = silent,
 ) -> GridSdf:
-    """Sample a signed distance on a voxel grid.
+    """Sample a signed distance (a `DistanceOracle` or an Sdf) of a solid within `bounds` [2, 3] m on a voxel grid.
 
-    Args:
-        distance: a `DistanceOracle` or an Sdf: of what it answers to points [P, 3] float64 m, the distances [P] m come
-            first. Signs are taken as they are.
-        bounds: [2, 3] float64 m, the box that holds the solid.
-        resolution: samples along each side of the cube 1.4 times as wide as the solid: `resolution`^3 in all,
-            4 bytes each, 1.4 / (resolution - 1) of the solid's largest extent apart.
-
-    Raises:
-        SdfsimError: fewer than two samples a side, or bounds that have no extent or are not finite.
+    There are `resolution`^3 samples over a cube 1.4 times as wide as the solid, of 4 bytes each, 1.4 / (resolution - 1)
+    of its largest extent apart. Raises SdfsimError of fewer than two samples a side, or bounds without extent or not
+    finite.
     """
     if resolution < 2:
         raise SdfsimError(f"a grid needs at least two samples along each side (got {resolution})")
@@ -373,13 +356,10 @@ def sample_grid(
 
 @dataclass(frozen=True, eq=False)
 class MeshSdf:
-    """The signed distance of a triangle mesh, with the sign of `MeshDistance`.
+    """The signed distance of a triangle mesh, with the sign of `MeshDistance`, good to about 1e-7 of the mesh's size.
 
-    Distances are good to about 1e-7 of the mesh's size. The hierarchy lives on the CPU; points on another device are
-    brought there and the answers back.
-
-    Raises:
-        SdfsimError: the mesh has no faces.
+    The hierarchy lives on the CPU; points on another device are brought there and the answers back. Raises SdfsimError
+    where the mesh has no faces.
     """
 
     mesh: Mesh  # metres

@@ -86,16 +86,12 @@ class Shape:
         return self.mesh if self.skin is None else self.skin
 
     def save(self, folder: str | Path) -> Path:
-        """Write the shape folder: shape.safetensors, mesh.ply, perhaps textured.glb and, last, shape.json.
+        """Write the shape folder and return it: shape.safetensors, mesh.ply, perhaps textured.glb and, last,
+        shape.json.
 
-        Each file appears complete or not at all, and shape.json only beside the files it describes.
-
-        Returns:
-            the folder.
-
-        Raises:
-            SdfsimError: the folder cannot be written, or the SDF has no file format: its kind has none, or it is exact
-                and not of this shape's mesh.
+        Each file appears complete or not at all, and shape.json only beside the files it describes. Raises SdfsimError
+        where the folder cannot be written, or the SDF has no file format: its kind has none, or it is exact and of
+        another mesh.
         """
         from safetensors.torch import save as to_bytes
 
@@ -133,11 +129,8 @@ class Shape:
 
 
 def load_shape(folder: str | Path) -> Shape:
-    """Read a folder written by `Shape.save` (or by `fit` or `reconstruct`).
-
-    Raises:
-        SdfsimError: a file is missing, cut short, of another version, or holds what it should not.
-    """
+    """Read a folder written by `Shape.save` (or by `fit` or `reconstruct`). Raises SdfsimError where a file is missing,
+    cut short, of another version, or holds what it should not."""
     from safetensors import SafetensorError
     from safetensors.torch import load as from_bytes
 
@@ -248,11 +241,8 @@ def _finite(value: Any, what: str, *shape: int) -> np.ndarray:
 
 
 def scaled(shape: Shape, factor: float) -> Shape:
-    """The same shape `factor` times as large, about its own origin.
-
-    Raises:
-        SdfsimError: the factor is not a positive finite number, or the SDF is of a kind that cannot be scaled.
-    """
+    """The same shape `factor` times as large, about its own origin. Raises SdfsimError where the factor is not positive
+    and finite, or the SDF of a kind that cannot be scaled."""
     if not (np.isfinite(factor) and factor > 0):
         raise SdfsimError(f"{shape.name}: scale must be > 0 (got {factor})")
     if factor == 1.0:
@@ -288,16 +278,9 @@ def own_pieces(shape: Shape) -> list[Mesh]:
 def with_sdf(shape: Shape, kind: SdfKind, *, resolution: int = DEFAULT_RESOLUTION) -> Shape:
     """The same shape with its distances taken from another source; mesh, nodes and mass properties stay.
 
-    Args:
-        shape: any but a plane; "grid" and "mesh" are made from its mesh, whatever its SDF was.
-        kind: "mlp" (the shape as it is, which must have a network), "grid" (samples of the exact distance to the
-            mesh, see `sample_grid`) or "mesh" (that distance itself).
-
-    Returns:
-        Shape without a certificate, since nothing was fitted; its `source` notes the kind as `sdf`.
-
-    Raises:
-        SdfsimError: there is no network, the shape is a plane, or the grid has fewer than two samples a side.
+    Kinds: "mlp" (the shape as it is, which must have a network), "grid" (samples of the exact distance to the mesh, see
+    `sample_grid`) or "mesh" (that distance itself). There is no certificate then; `source` notes the kind as `sdf`.
+    Raises SdfsimError where there is no network, of a plane, or of fewer than two samples a side.
     """
     if kind == "mlp":
         if not isinstance(shape.sdf, MlpSdf):
@@ -335,10 +318,7 @@ def with_wall(shape: Shape, wall: float) -> Shape:
 
     Volume, centre of mass and inertia are then those of the wall, taken from the SDF on a grid. Where the SDF is exact
     and the wall at least 1/100 of the shape's longest side, the volume is within 1 % and the inertia within 4 %. A wall
-    that is thicker than the shape makes it solid. Contacts see the same surface, and nothing gets in.
-
-    Raises:
-        SdfsimError: the shape is a plane.
+    that is thicker than the shape makes it solid. Contacts see the same surface. Raises SdfsimError of a plane.
     """
     volume, com, inertia = mass_properties_of_sdf(shape.sdf, wall=wall)
     return replace(shape, volume=volume, com=com, inertia=inertia, source=shape.source | {"wall": wall})
@@ -349,16 +329,11 @@ def shape_from_mesh(
     cap: bool = False, thicken: float | None = None, sdf: SdfKind = "mlp", resolution: int = DEFAULT_RESOLUTION,
     on_progress: Progress = silent,
 ) -> Shape:  # fmt: skip
-    """The shape of a mesh file: made on first use, then taken from a cache keyed by what the file describes.
+    """The shape of a mesh file: made on first use, then taken from a cache (by default `sdfsim/shapes` in the user's
+    cache folder) keyed by what the file describes.
 
-    Args:
-        cache_dir: where shapes are kept; by default `sdfsim/shapes` in the user's cache folder.
-        units: metres per unit of the file.
-        thicken: m; a thickness for an open sheet.
-        sdf: "mlp" fits the network; "grid" and "mesh" fit nothing (see `mesh_shape`).
-
-    Raises:
-        SdfsimError: the mesh cannot be used.
+    `units` are metres per unit of the file, `thicken` m is a thickness for an open sheet; of `sdf`, "mlp" fits the
+    network, "grid" and "mesh" fit nothing (see `mesh_shape`). Raises SdfsimError where the mesh cannot be used.
     """
     path = Path(path)
     mesh = load_mesh(path)
@@ -374,16 +349,8 @@ def shape_from_primitive(
     kind: str, size: float = 1.0, cache_dir: str | Path | None = None, *, name: str | None = None,
     sdf: SdfKind = "mlp", resolution: int = DEFAULT_RESOLUTION, on_progress: Progress = silent,
 ) -> Shape:  # fmt: skip
-    """The shape of a procedural mesh of `primitives.PRIMITIVES`, made on first use and cached.
-
-    Args:
-        kind: name in `PRIMITIVES`.
-        size: its largest extent, m.
-        cache_dir, name, sdf, resolution, on_progress: as for `shape_from_mesh`.
-
-    Raises:
-        SdfsimError: no such primitive.
-    """
+    """The shape of a procedural mesh of `primitives.PRIMITIVES`, its largest extent `size` m, made on first use and
+    cached; other arguments as of `shape_from_mesh`. Raises SdfsimError of no such primitive."""
     if kind not in primitives.PRIMITIVES:
         raise SdfsimError(f"no primitive called {kind!r}", "there are " + ", ".join(primitives.PRIMITIVES))
     mesh = primitives.PRIMITIVES[kind]()
@@ -449,21 +416,13 @@ def analytic_shape(
     size: Sequence[float] | np.ndarray | None = None,
     name: str | None = None,
 ) -> Shape:
-    """A shape with an exact SDF, about the origin.
+    """A shape with an exact SDF, about the origin: "plane" (z = 0, +z outside, infinite), "sphere", "capsule",
+    "cylinder" or "box".
 
-    Args:
-        kind: "plane" (z = 0, +z outside, infinite), "sphere", "capsule", "cylinder" or "box".
-        radius: of the sphere, capsule or cylinder, m.
-        height: of the capsule, its caps included, or cylinder, both along z; m.
-        size: (x, y, z) full extents of the box, m.
-
-    Returns:
-        Shape with exact mass properties (per unit density; those of the plane are 0), a mesh for display (of the
-        plane: a 20 m square) and nodes: sphere 128 spread as a Fibonacci spiral, capsule and cylinder rings,
-        box 8 corners and points along edges and on faces, plane none.
-
-    Raises:
-        SdfsimError: unknown kind, or a size that is missing or not positive.
+    Radius and height (along z, of a capsule with its caps) are in m, and so is the box's size, full extents along x, y,
+    z. Mass properties are exact (of the plane 0); the plane shows a 20 m square. Nodes: sphere 128 spread as a
+    Fibonacci spiral, capsule and cylinder rings, box 8 corners and points along edges and on faces, plane none. Raises
+    SdfsimError of an unknown kind, or a size that is missing or not positive.
     """
     source = {"kind": kind}
     if kind == "plane":

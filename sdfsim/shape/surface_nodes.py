@@ -25,19 +25,11 @@ SHARP = 0.94
 
 
 def sample_nodes(sdf: Sdf, *, grid: int = DEFAULT_GRID, voxel: float = VOXEL) -> np.ndarray:
-    """Nodes on the zero level of an SDF, as in the paper: grid, project, filter, voxel downsample. Deterministic.
+    """Nodes [K, 3] m on the zero level of an SDF, as in the paper: grid, project, filter, voxel downsample.
+    Deterministic.
 
-    Lengths are relative to the largest extent of `sdf.bounds` (the frame in which the solid is within [-0.5, 0.5]).
-
-    Args:
-        grid: points along each side of the sampling cube [-0.7, 0.7]^3.
-        voxel: edge of the downsampling voxels, normalised; the point nearest a voxel's middle stays.
-
-    Returns:
-        [K, 3] float64 m.
-
-    Raises:
-        SdfsimError: the SDF is unbounded, or no point reached its surface.
+    The cube [-0.7, 0.7]^3 of the normalised frame has `grid` points a side; the point nearest the middle of each voxel
+    of width `voxel` stays. Raises SdfsimError where the SDF is unbounded, or no point reached its surface.
     """
     frame = normal_frame(sdf.bounds)
     axis = np.linspace(-GRID_HALF, GRID_HALF, grid)
@@ -74,16 +66,8 @@ def _one_per_voxel(points: np.ndarray, voxel: float) -> np.ndarray:
 
 
 def thin(points: np.ndarray, count: int, *, keep: np.ndarray | None = None) -> np.ndarray:
-    """At most `count` points: all of `keep`, then the farthest remaining point again and again.
-
-    Args:
-        points: [P, 3] candidates.
-        keep: [Q, 3] points that come first; when they alone exceed `count` they are thinned themselves.
-
-    Returns:
-        [min(count, P + Q), 3], `keep` first. Deterministic: it starts (without `keep`) at the point farthest
-        from the centroid.
-    """
+    """At most `count` of points [P, 3]: all of `keep` [Q, 3], which are thinned themselves where they are more, then
+    the farthest remaining point again and again, starting (without `keep`) at that farthest from the centroid."""
     if keep is not None and len(keep) >= count:
         return thin(keep, count) if len(keep) > count else keep.copy()
     chosen: list[np.ndarray] = [] if keep is None else list(keep)
@@ -100,27 +84,16 @@ def thin(points: np.ndarray, count: int, *, keep: np.ndarray | None = None) -> n
 
 
 def hull_nodes(vertices: np.ndarray, count: int) -> np.ndarray:
-    """At most `count` of a polyhedral body's own vertices [V, 3] m.
-
-    The vertices of the convex hull of all come first, for only they can touch a flat floor; the others follow
-    farthest first.
-    """
+    """At most `count` of a polyhedral body's own vertices [V, 3] m: first those of the convex hull, for only they can
+    touch a flat floor; the others farthest first."""
     outer = _outer(vertices)
     rest = np.delete(vertices, outer, axis=0)
     return thin(rest, count, keep=vertices[outer])
 
 
 def edge_nodes(piece: np.ndarray, spacing: float) -> np.ndarray:
-    """Points along the sharp edges of a convex polyhedron, its corners left out.
-
-    Two polyhedra often touch edge against edge, which their corners alone do not see.
-
-    Args:
-        spacing: m, between points at most; edges shorter than this get none.
-
-    Returns:
-        [K, 3] m.
-    """
+    """Points [K, 3] m along the sharp edges of a convex polyhedron, at most `spacing` m apart, its corners left out:
+    two polyhedra often touch edge against edge, which their corners alone do not see."""
     from scipy.spatial import ConvexHull
 
     hull = ConvexHull(piece)
@@ -154,12 +127,8 @@ class Surface:
 
 
 def surface_of(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray]) -> Surface:
-    """The nodes that carry contact, with the vertices of convex pieces, where the shape has some, and their patches.
-
-    Args:
-        nodes: [K, 3] m on its surface.
-        pieces: the vertices [V, 3] m of each.
-    """
+    """The nodes that carry contact, [K, 3] m, with the vertices [V, 3] m of convex pieces, where the shape has some,
+    and their patches."""
     if len(pieces) == 0:
         return Surface(nodes, np.zeros(len(nodes), np.int64), None, np.zeros(3), 1.0)
     extent = float(np.ptp(sdf.bounds, axis=0).max())

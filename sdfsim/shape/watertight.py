@@ -51,13 +51,8 @@ class Solid:
     layers: np.ndarray | None = None
 
     def mass_properties(self) -> tuple[float, np.ndarray, np.ndarray]:
-        """Volume m^3, centre of mass [3] m, and inertia [3, 3] m^5 (per unit density) about it.
-
-        Exact to rounding for a surface that was not cut, to about 0.1 % otherwise.
-
-        Raises:
-            SdfsimError: it encloses nothing.
-        """
+        """Volume m^3, centre of mass [3] m, and inertia [3, 3] m^5 (per unit density) about it: exact to rounding for a
+        surface that was not cut, to about 0.1 % otherwise. Raises SdfsimError where it encloses nothing."""
         return integrals(self.surface, 1.0 if self.layers is None else 1.0 / self.layers)
 
 
@@ -68,18 +63,12 @@ def as_it_is(mesh: Mesh) -> Solid:
 
 
 def solidify(mesh: Mesh, *, name: str = "mesh", cap: bool = False, thicken: float | None = None) -> Solid:
-    """The solid that `mesh` bounds.
+    """The solid that `mesh`, in metres, bounds; or all within half of `thicken` m from it.
 
     Inside is what the surface goes around, once or more (winding number above one half): overlapping parts are one
     body, shells inside it do not count unless they are wound the other way (cavities). Windings are made consistent,
-    small openings closed, and everything within the solid left out.
-
-    Args:
-        mesh: metres, of any kind.
-        thicken: m; the solid is all within half of this distance from the mesh instead.
-
-    Raises:
-        SdfsimError: the mesh encloses no volume, is open beyond small holes, or `thicken` is too small or too large.
+    small openings closed, and everything within the solid left out. Raises SdfsimError where the mesh encloses no
+    volume or is open beyond small holes, or `thicken` is too small or too large.
     """
     mesh = clean(mesh, name=name)
     frame = normal_frame(np.stack([mesh.vertices.min(0), mesh.vertices.max(0)]))
@@ -283,11 +272,8 @@ def _thickened(mesh: Mesh, frame: Frame, name: str, thickness: float) -> Solid:
 
 
 def consistent(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Wind neighbours alike within each patch (faces joined by edges of two faces), as most of its area was wound.
-
-    Returns:
-        faces [F, 3] and the patch [F] of each.
-    """
+    """Wind neighbours alike within each patch (faces joined by edges of two faces), as most of its area was wound:
+    faces [F, 3] and the patch [F] of each."""
     import igl
 
     oriented: tuple[Any, Any] = igl.bfs_orient(np.ascontiguousarray(faces, dtype=np.int64))

@@ -39,12 +39,8 @@ class Task(Protocol):
 
 
 class Run:
-    """Everything that changes while training, and how to save it.
-
-    Args:
-        total: optimiser steps of the whole run (the learning rate depends on it).
-        team: who shares the work.
-    """
+    """Everything that changes while training, and how to save it. The learning rate depends on `total`, the optimiser's
+    steps of the whole run; a `team` shares the work."""
 
     def __init__(
         self, plan: Preset, task: Any, total: int, seed: int, device: torch.device, team: Team = ALONE

@@ -34,13 +34,8 @@ class Batch:
 
 
 class SurfaceTask:
-    """Draws recorded steps of random trajectories, turned by a random yaw, with rigid pose noise.
-
-    Args:
-        split: "train" or "validation".
-        plan: which network, its surface nodes and its contact radius.
-        noisy: with the noise of the plan on the input poses; else they are exact.
-    """
+    """Draws recorded steps of random trajectories, turned by a random yaw, with rigid noise on the input poses where
+    `noisy`."""
 
     def __init__(self, data: Path, split: str, plan: Preset, device: torch.device, *, noisy: bool = False) -> None:
         self.trajectories = [Trajectory.load(f) for f in trajectory_files(data, split)]
@@ -153,11 +148,8 @@ class SurfaceTask:
         return pose.rotate(yaw, place).to(self.device), pose.multiply(yaw, turn).to(self.device)
 
     def _noise(self, picked: list[Trajectory], rng: np.random.Generator, team: Team) -> Tensor | None:
-        """Noise of the whole batch, so that it does not depend on the team's size; then this one's part of it.
-
-        Returns:
-            [3, 2, N + 1, 3] m: of each input pose, shifts and turns at the surface, of its bodies and the floor.
-        """
+        """Noise [3, 2, N + 1, 3] m of each input pose, shifts and turns at the surface, of its bodies and the floor:
+        that of the whole batch, so that it does not depend on the team's size; then this one's part of it."""
         if self.noise is None:
             return None
         ends = np.cumsum([0] + [t.position.shape[1] for t in picked])

@@ -47,19 +47,11 @@ def train(
 ) -> dict:
     """Train a preset on one dataset or several; write `model.safetensors`, `log.jsonl` and a checkpoint under `out`.
 
-    Args:
-        data: dataset folders with train/ and validation/; several (impulse only) are drawn from as if they were one.
-        preset: name in `PRESETS`, or one of your own.
-        resume: go on from the checkpoint in `out`; the result equals an uninterrupted run's.
-        steps: of the optimiser, instead of the preset's.
-        budget: seconds of processor time, all cores together, after which it stops early; `resume` goes on from there.
-
-    Returns:
-        A report: paths, losses, seconds of processor time.
-
-    Raises:
-        SdfsimError: unknown preset, unusable data, a checkpoint in `out` without `resume`, another run writing
-            to it, diverged training.
+    Datasets have train/ and validation/; several (impulse only) are drawn from as if they were one. The preset is a
+    name in `PRESETS`, or one of your own, with other `steps` if given. `resume` goes on from the checkpoint in `out`,
+    with the result of an uninterrupted run; `budget` is seconds of processor time, all cores together, after which it
+    stops early. Returns paths, losses and processor time. Raises SdfsimError of an unknown preset, unusable data, a
+    checkpoint in `out` without `resume`, another run writing to it, or diverged training.
     """
     from sdfsim.dynamics.simulator import pick_device
 

@@ -83,11 +83,8 @@ def held_out_rollouts(data: Path, device: torch.device, tell: Callable[[str], No
 
 
 def draw(run: Path, picture: Path) -> None:
-    """Curves of RUN/log.jsonl as a picture (needs matplotlib).
-
-    Raises:
-        SdfsimError: no log there, or not one of training; matplotlib is not installed.
-    """
+    """Curves of RUN/log.jsonl as a picture. Raises SdfsimError where there is no such log or matplotlib is not
+    installed."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
