@@ -37,11 +37,8 @@ class SdfsimError(Exception):
 
 
 class SceneError(SdfsimError):
-    """A scene file that cannot be used; `problems` lists every fault found in it.
-
-    Args:
-        problems: one line each, `FILE:LINE: FIELD: what is wrong (what is allowed)`.
-    """
+    """A scene file that cannot be used; `problems` lists every fault found in it, one line each: `FILE:LINE: FIELD:
+    what is wrong (what is allowed)`."""
 
     def __init__(self, problems: list[str], hint: str = "") -> None:
         self.problems = [printable(problem) for problem in problems]

@@ -33,11 +33,8 @@ def user_cache(name: str) -> Path:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path` to write to; it takes the final name when the block ends without an error.
-
-    Raises:
-        SdfsimError: the disk is full or the folder not writable.
-    """
+    """A temporary path beside `path` to write to; it takes the final name when the block ends without an error. Raises
+    SdfsimError where the disk is full or the folder not writable."""
     partial = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         yield partial
@@ -82,11 +79,8 @@ def write_arrays(path: Path, arrays: dict[str, Any], *, compressed: bool = True)
 
 
 def read_arrays(path: Path, what: str, hint: str = "") -> dict[str, np.ndarray]:
-    """All arrays of an `.npz` file; `what` says in the message what it should have been.
-
-    Raises:
-        SdfsimError: absent, cut short, not such a file, or one that claims an absurd size.
-    """
+    """All arrays of an `.npz` file; `what` says in the message what it should have been. Raises SdfsimError where it is
+    absent, cut short, no such file, or claims an absurd size."""
     try:
         _check_sizes(path)
         with np.load(path, allow_pickle=False) as data:
@@ -108,10 +102,7 @@ def locked(folder: Path) -> Iterator[None]:
     """Make a folder, keep other runs out of it inside the block, and clear away what a killed one left half-written.
 
     The system lifts the lock when this process ends, however it ends. A folder made here goes again if nothing came
-    into it.
-
-    Raises:
-        SdfsimError: another run is in there, or the folder cannot be written.
+    into it. Raises SdfsimError where another run is in there, or the folder cannot be written.
     """
     path, made = folder / LOCK, not folder.exists()
     try:
@@ -152,14 +143,8 @@ def check_writable(folder: Path) -> None:
 
 
 def check_own(folder: Path, command: str, *names: str) -> None:
-    """That what a run replaces in a folder comes from an earlier run of the same command, as its config.yaml tells.
-
-    Args:
-        folder: that the run writes to; need not exist.
-
-    Raises:
-        SdfsimError: something else lies there.
-    """
+    """Raises SdfsimError where what a run replaces in a folder, config.yaml and the files `names`, does not come from
+    an earlier run of the same command."""
     there = [name for name in (CONFIG, *names) if os.path.lexists(folder / name)]
     if not there:
         return

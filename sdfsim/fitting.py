@@ -36,15 +36,9 @@ class Options:
 
 
 def fit(mesh_file: Path, out: Path, options: Options, *, device: str, on_progress: Progress) -> dict[str, Any]:
-    """Fit a mesh file and write the shape folder `out`.
-
-    Returns:
-        Folder, volume, number of nodes, what was done to the mesh, the certificate, and in `failed_checks` whether it
-        was missed.
-
-    Raises:
-        SdfsimError: the mesh cannot be used, the folder cannot be written, or another run is writing to it.
-    """
+    """Fit a mesh file and write the shape folder `out`; the report has the folder, volume, number of nodes, what was
+    done to the mesh, the certificate, and in `failed_checks` whether it was missed. Raises SdfsimError where the mesh
+    cannot be used, the folder cannot be written, or another run is writing to it."""
     mesh = _load(mesh_file, options)
     check_writable(out)
     with locked(out):
@@ -78,17 +72,8 @@ def fit_lines(report: dict[str, Any]) -> list[str]:
 
 
 def named_meshes(sources: list[Path]) -> dict[str, Path]:
-    """Mesh files by the names their shapes get.
-
-    Args:
-        sources: mesh files, and folders of which every mesh file is taken.
-
-    Returns:
-        The file's own name without suffix; where several files share it, the name of the folder they lie in.
-
-    Raises:
-        SdfsimError: no meshes, or two of one name.
-    """
+    """Mesh files, and those of folders, by the names their shapes get: the file's own name without suffix; where
+    several files share it, the name of the folder they lie in. Raises SdfsimError of no meshes, or two of one name."""
     files: list[Path] = []
     for source in sources:
         if source.is_dir():
@@ -114,14 +99,8 @@ def fit_many(
 ) -> dict[str, Any]:
     """Fit many mesh files into the shape folders `out`/NAME: in processes on CPUs, one after the other on a GPU.
 
-    What an earlier call has fitted in the same way is kept, so that a call that was cut off is finished by the next.
-
-    Returns:
-        `shapes`, a report by name: that of `fit`, or the `error` that kept a mesh from being fitted; and in
-        `failed_checks` what missed its certificate.
-
-    Raises:
-        SdfsimError: the folder cannot be written.
+    What an earlier call has fitted in the same way is kept. Returns `shapes`, by name the report of `fit` or the
+    `error` that kept a mesh from being fitted; and in `failed_checks` what missed its certificate.
     """
     where = pick_device(device)
     check_writable(out)

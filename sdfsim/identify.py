@@ -104,16 +104,9 @@ class Identified:
 def load_recording(
     path: Path, scene_file: Path | None = None, *, allow_outside: bool = False, on_progress: Progress = silent
 ) -> tuple[Recording, Scene]:
-    """A recording of the bodies of a scene that move, and the scene.
-
-    Args:
-        path: a run folder, a `rollout.npz`, or a CSV of poses (`COLUMNS`), whose positions are those of
-            the shapes' own origins, as in a scene file.
-        scene_file: its scene; of a run the one that it was made from, if this is None.
-
-    Raises:
-        SdfsimError: no scene, unreadable files, or a recording that is not of this scene.
-    """
+    """A recording of the bodies of a scene that move, and the scene: of a run folder or a `rollout.npz`, whose scene is
+    known; or a CSV of poses (`COLUMNS`), whose positions are those of the shapes' own origins, as in a scene file.
+    Raises SdfsimError of no scene, unreadable files, or a recording that is not of this scene."""
     if path.suffix == ".csv":
         if scene_file is None:
             raise SdfsimError(f"{path}: a recording without its scene", "give it: --scene scene.yaml")
@@ -186,14 +179,9 @@ def _from_poses(names: list[str], dt: float, origin: np.ndarray, orientation: np
 
 
 def identify(recording: Recording, scene: Scene, *, on_progress: Progress = silent) -> Identified:
-    """Find the coefficients and masses with which the contact solve repeats a recording.
-
-    Args:
-        scene: shapes, sizes, masses and gravity; the coefficients of bodies that do not move are taken as they are.
-
-    Raises:
-        SdfsimError: bodies on paths, a recording too short, or one in which nothing touches.
-    """
+    """Find the coefficients and masses with which the contact solve repeats a recording; those of bodies that do not
+    move are taken from the scene. Raises SdfsimError of bodies on paths, a recording too short, or one in which nothing
+    touches."""
     from scipy.optimize import least_squares
 
     if any(b.motion == "kinematic" for b in scene.bodies):

@@ -52,14 +52,11 @@ def _one(function: Callable[..., Any], index: int, job: tuple, caller: int) -> t
 
 @contextmanager
 def cluster(address: str | None) -> Iterator[None]:
-    """Let `parallel` work on a Dask cluster inside the block; None leaves it on this machine.
+    """Let `parallel` work on the Dask cluster of a scheduler, such as tcp://host:8786, inside the block; None leaves it
+    on this machine.
 
-    Args:
-        address: of the scheduler, such as tcp://host:8786. Its workers need this package, and see the files of a job
-            under the same paths.
-
-    Raises:
-        SdfsimError: Dask is not installed, or no scheduler answers.
+    Its workers need this package, and see the files of a job under the same paths. Raises SdfsimError where Dask is not
+    installed, or no scheduler answers.
     """
     if address is None:
         yield
@@ -86,16 +83,10 @@ def limit_threads(count: int) -> None:
 
 
 def choose_threads(work: Callable[[], object], threads: int | None = None, *, repeat: int = 3) -> float:
-    """Time `work` with one thread and with all, and leave torch set to the faster.
+    """Time `work`, typically of tens of milliseconds, with one thread and with all, `repeat` times after one that is
+    not timed; leave torch set to the faster (or to `threads`), and return the seconds that one call takes.
 
     On a busy machine a second thread slows a computation down by up to ten times.
-
-    Args:
-        work: a typical piece of work, tens of milliseconds.
-        repeat: timed calls for each number, after one that is not timed.
-
-    Returns:
-        Seconds that one call takes with the chosen number.
     """
     took = {}
     for count in sorted({threads} if threads else {1, _most}):

@@ -30,14 +30,8 @@ def describe(
     on_progress: StageProgress,
     allow_outside: bool = False,
 ) -> dict[str, Any]:
-    """The plan of a scene with its units and the cost of a step, measured over the first few.
-
-    Args:
-        model: bundled name or path (None: what the scene says).
-
-    Raises:
-        SdfsimError: bad input.
-    """
+    """The plan of a scene with its units and the cost of a step, measured over the first few. Raises SdfsimError: bad
+    input."""
     pick_device(device)
     if model:
         load_model(model, weights=False)

@@ -51,12 +51,8 @@ FARTHEST = 1.0  # what leaves the scene for good must not make it a dot
 
 
 class Playback:
-    """One recording of one scene, to be written to a file, or streamed to a viewer.
-
-    Args:
-        motion: how it does, where that is known already: the first view shows all of it.
-        camera, look_at: [3] m each, of the first view; None: see `eye_of`.
-    """
+    """One recording of one scene, to be written to a file, or streamed to a viewer. Its first view is from `eye_of`;
+    where the motion is known already, it shows all of it."""
 
     def __init__(
         self, scene: Scene, motion: Rollout | None = None, camera: Place | None = None, look_at: Place | None = None
@@ -182,14 +178,8 @@ def _crowds(scene: Scene) -> list[Crowd]:
 def save_rollout(
     scene: Scene, rollout: Rollout, path: Path, camera: Place | None = None, look_at: Place | None = None
 ) -> None:
-    """Write `rollout` as a rerun recording: to a temporary name first, then renamed.
-
-    Args:
-        camera, look_at: [3] m each, of the first view; None: see `eye_of`.
-
-    Raises:
-        SdfsimError: the file cannot be written.
-    """
+    """Write `rollout` as a rerun recording: to a temporary name first, then renamed. Camera and what it looks at, [3] m
+    each, are of the first view, see `eye_of`. Raises SdfsimError where the file cannot be written."""
     playback = Playback(scene, rollout, camera, look_at)
     encoded = playback.stream.binary_stream()
     playback.log_static()
@@ -215,18 +205,11 @@ def save_reconstruction(
     path: Path, photos: list[PosedPhoto], points: np.ndarray, colors: np.ndarray | None, mesh: Mesh | None,
     skins: Mapping[str, Mesh] = MappingProxyType({}), trust: Mapping[str, Mesh] = MappingProxyType({}),
 ) -> None:  # fmt: skip
-    """Write cameras with their photos, sparse points and the surface as one rerun recording.
+    """Write cameras with their photos, sparse points [P, 3] m with colours [P, 3] uint8, and the surface as one rerun
+    recording; raises SdfsimError where it cannot be written.
 
-    With `trust` the viewer has a second tab that shows it in place of the surface.
-
-    Args:
-        points: [P, 3] m, sparse points.
-        colors: [P, 3] uint8 RGB, or None.
-        skins: its parts with their textures, by name, shown in its place where there are any.
-        trust: its parts in colours that tell how far each place can be trusted, by name.
-
-    Raises:
-        SdfsimError: the file cannot be written.
+    Parts with textures (`skins`, by name) are shown in place of the mesh. With `trust`, parts in colours that tell how
+    far each place can be trusted, the viewer has a second tab that shows these.
     """
     import rerun as rr
     import rerun.blueprint as rrb
@@ -309,15 +292,8 @@ class Eye:
 def eye_of(
     scene: Scene, motion: Rollout | None = None, camera: Place | None = None, look_at: Place | None = None
 ) -> Eye:
-    """From where a scene is looked at; what is not given is chosen so that all of it is in sight.
-
-    Args:
-        camera: [3] m, where the eye is.
-        look_at: [3] m, what it looks at.
-
-    Raises:
-        SdfsimError: the eye is where it looks at, or not at a finite place.
-    """
+    """From where a scene is looked at; of the eye and what it looks at, [3] m each, what is not given is chosen so that
+    all of the scene is in sight. Raises SdfsimError where the eye is where it looks at, or not at a finite place."""
     centre, radius = framed(scene, motion)
     given = _around(centre if look_at is None else np.array(look_at, dtype=float), radius, -scene.gravity)
     eye = given if camera is None else replace(given, position=np.array(camera, dtype=float))

@@ -37,16 +37,10 @@ def render(
     scene: Scene | written.Scene, rollout: Rollout, out: Path | str, *, camera: Place | None = None,
     look_at: Place | None = None, at: float | None = None, on_progress: Progress = silent,
 ) -> None:  # fmt: skip
-    """Write a movie (.mp4, H.264, as long as the run) or a picture (.png) of a run.
+    """Write a movie (.mp4, H.264, as long as the run) or a picture (.png, `at` s, by default the end) of a run.
 
-    Args:
-        camera: [3] m, where it is; None: where all of the motion is in sight.
-        look_at: [3] m, the point in its middle; None: the middle of all that moves or stands.
-        at: s, the time of a picture (default: the end).
-
-    Raises:
-        SdfsimError: another ending, a time outside of the run, a camera where it looks at, or a file that cannot be
-            written.
+    Camera and what it looks at, [3] m each, are as in `eye_of`. Raises SdfsimError of another ending, a time outside of
+    the run, a camera where it looks at, or a file that cannot be written.
     """
     out, scene = Path(out), scene if isinstance(scene, Scene) else scene.load()
     check_format(out)
@@ -115,15 +109,8 @@ class _Model:
 
 
 class _Cast:
-    """The triangles of some bodies where they are now.
-
-    Args:
-        bodies: [B] their numbers in the scene.
-        places, turns: [B, 3] m and [B, 3, 3].
-
-    Attributes:
-        body: [F] which one a face is of.
-    """
+    """The triangles of some bodies, numbers [B] in the scene, at places [B, 3] m and turns [B, 3, 3]; `body` [F] is
+    which one a face is of."""
 
     def __init__(self, models: list[_Model], bodies: np.ndarray, places: np.ndarray, turns: np.ndarray) -> None:
         import open3d as o3d
@@ -165,14 +152,9 @@ class _Cast:
 
 
 class Studio:
-    """A scene with a camera and a sun, of which pictures are taken.
+    """A scene with a camera and a sun, of which pictures are taken; `radius` m is that of all that is shown.
 
-    Args:
-        radius: m, of all that is shown.
-
-    Attributes:
-        axes: [3, 3] unit vectors: right and down in the picture, and into it.
-        sun: [3] unit vector towards the sun.
+    `axes` [3, 3] are unit vectors right and down in the picture, and into it; `sun` [3] is one towards the sun.
     """
 
     def __init__(self, scene: Scene, eye: Eye, radius: float) -> None:

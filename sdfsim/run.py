@@ -72,29 +72,19 @@ def simulate(
     camera: Place | None = None,
     look_at: Place | None = None,
 ) -> dict[str, Any]:
-    """Simulate a scene and write config.yaml, report.json, rollout.npz and (unless `viewer` is none) rollout.rrd.
+    """Simulate a scene and write config.yaml, report.json, rollout.npz and (unless `viewer` is none) rollout.rrd; an
+    earlier run in `out` is replaced. Returns the report; of the shapes that were fitted for this scene, `failed_checks`
+    names those that are not usable, and `caveats` those that are not exact.
 
-    Args:
-        out: run folder; made if missing, an earlier run in it is replaced, unless it is to `resume`.
-        model: bundled name or path (None: what the scene says).
-        seconds: simulated time in s (None: the scene's duration).
-        seed: None: the scene's.
-        viewer: where to watch: not at all, later from the file, or live in a window or a page.
-        say: called with a line for the person: what was replaced, where the page of `viewer` web is.
-        bind: address of this machine that a live viewer listens on.
-        resume: go on with the run in `out` that was interrupted; from the start where there is none. A finished one is
-            left as it is, and its report is returned.
-        camera, look_at: [3] m each, of the first view in the recording; None: all of the motion is in sight.
+    What is None is as the scene says: model, `seconds` of simulated time, seed; and the first view of the recording,
+    from `camera` [3] m to `look_at` [3] m, has all of the motion in sight. `until_settled` ends the run as soon as
+    everything rests. `resume` goes on with the run in `out` that was interrupted, from the start where there is none; a
+    finished one is left as it is, and its report is returned. `say` is called with lines for the person; live viewers
+    listen on `bind`.
 
-    Returns:
-        The content of report.json; of the shapes that were fitted for this scene, `failed_checks` names those that are
-        not usable, and `caveats` those that are not exact.
-
-    Raises:
-        SdfsimError: bad input, an output that cannot be written, another run that writes to the same folder, or a
-            finished run to resume that is another one than this.
-        SimulationError: the state broke; what was computed before is in the folder.
-        KeyboardInterrupt: likewise.
+    Raises SdfsimError of bad input, an output that cannot be written, another run that writes to the same folder, or a
+    finished run to resume that is another one than this; SimulationError where the state broke, and KeyboardInterrupt:
+    what was computed before is in the folder.
     """
     # Everything that can be wrong from the start, before shapes are fitted for minutes or earlier results are deleted.
     pick_device(device)
@@ -207,15 +197,8 @@ def _live(live: Playback, viewer: Viewer, first: Rollout, say: Callable[[str], N
 def read_run(
     path: Path, scene_file: Path | None = None, *, allow_outside: bool = False, on_progress: Progress = silent
 ) -> tuple[Scene, Rollout]:
-    """A finished or interrupted run, and its scene.
-
-    Args:
-        path: run folder, or the `rollout.npz` in one.
-        scene_file: its scene; None: the one that the run was made from.
-
-    Raises:
-        SdfsimError: no run, no scene, or another scene than that of the run.
-    """
+    """A finished or interrupted run, by its folder or `rollout.npz`, and its scene: a scene file, or that the run was
+    made from. Raises SdfsimError of no run, no scene, or another scene than that of the run."""
     file = path / "rollout.npz" if path.is_dir() else path
     rollout = Rollout.load(file)
     scene = load_scene(scene_file or scene_of(file.parent), on_progress, allow_outside=allow_outside)
@@ -259,12 +242,10 @@ def summary(rollout: Rollout, wall: float) -> dict[str, Any]:
 def ended(scene: Scene, rollout: Rollout) -> dict[str, Any]:
     """Where the bodies that move by themselves are in the end.
 
-    Returns:
-        bodies: of the first `TOLD` of them the name, the place of the centre of mass in m, the speed in m/s and whether
-            they rest.
-        rest: how many do: they move by less than `STILL` of their size in the time that they take to fall that far.
-        moving: names of those that do not, the fastest first; left: names of those that have left the scene for good.
-        driven: whether bodies on paths do work.
+    `bodies`: of the first `TOLD` the name, the place of the centre of mass in m, the speed in m/s and whether they
+    rest, as `rest` do: they move by less than `STILL` of their size in the time that they take to fall that far.
+    `moving`: names of those that do not, the fastest first; `left`: of those that have left the scene for good.
+    `driven`: whether bodies on paths do work.
     """
     rows = [k for k, body in enumerate(scene.bodies) if body.motion == "dynamic"]
     sizes = [scene.bodies[k].scale * largest_extent(scene.shapes[scene.bodies[k].shape]) for k in rows]
@@ -342,12 +323,8 @@ def _number(value: Any) -> float | None:
 
 
 class Checkpoint:
-    """What is kept of one run: its frames in parts, the state that the last part leads to, and how long all has rested.
-
-    Attributes:
-        identity: of the run, see the function of this name.
-        rest: for how long everything has rested.
-    """
+    """What is kept of one run: its `identity`, its frames in parts, the state that the last part leads to, and for how
+    long everything has rested (`rest`)."""
 
     def __init__(self, folder: Path, simulator: Simulator) -> None:
         self._folder = folder / CHECKPOINT
@@ -359,11 +336,8 @@ class Checkpoint:
         self._saved = time.monotonic()
 
     def restore(self) -> list[Rollout]:
-        """The frames so far, the simulator's state brought to the last of them; none where nothing was kept.
-
-        Raises:
-            SdfsimError: what is kept is of another scene, model or seed, or damaged.
-        """
+        """The frames so far, the simulator's state brought to the last of them; none where nothing was kept. Raises
+        SdfsimError where that is of another scene, model or seed, or damaged."""
         if not (self._folder / _STATE).exists():
             return []
         kept = read_arrays(self._folder / _STATE, "a checkpoint", _ANEW)
@@ -406,14 +380,8 @@ class Checkpoint:
 
 
 def finished(report_file: Path, identity: str, steps: int, *, until_settled: bool) -> dict[str, Any] | None:
-    """The report of a run that is finished; None where it was interrupted or is not there.
-
-    Args:
-        until_settled: whether it ends as soon as everything has come to rest.
-
-    Raises:
-        SdfsimError: the finished run is another one or of another length, or its state broke.
-    """
+    """The report of a run that is finished; None where it was interrupted or is not there. Raises SdfsimError where it
+    is another run, of another length (unless it ended `until_settled`), or its state broke."""
     if not report_file.exists():
         return None
     report, folder = read_json(report_file, _ANEW), report_file.parent

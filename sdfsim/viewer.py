@@ -30,16 +30,8 @@ _NO_GRAPHICS = "pictures need a Vulkan driver: apt-get install mesa-vulkan-drive
 
 
 def stream_to_viewer(playback: Playback, kind: Literal["native", "web"], *, bind: str = LOOPBACK) -> str:
-    """Send everything that `playback` logs from now on to a viewer.
-
-    Args:
-        kind: a window, or a page that is there for as long as this process runs.
-
-    Returns:
-        The address of the page, or an empty string for a window.
-
-    Raises:
-        SdfsimError: no screen, or the viewer does not start.
+    """Send everything that `playback` logs from now on to a viewer: a window, or a page that is there for as long as
+    this process runs, whose address is returned. Raises SdfsimError of no screen, or where the viewer does not start.
     """
     check_screen(kind)
     serving = _Serving(bind)
@@ -55,14 +47,8 @@ def stream_to_viewer(playback: Playback, kind: Literal["native", "web"], *, bind
 
 
 class _Serving:
-    """Ports for a viewer, and how they are told to it. Its own default would let the whole network in.
-
-    Args:
-        bind: address to listen on; 0.0.0.0 is every address of this machine.
-
-    Raises:
-        SdfsimError: not an address.
-    """
+    """Ports for a viewer that listens on `bind` (0.0.0.0 is every address of this machine), and how they are told to
+    it; its own default would let the whole network in. Raises SdfsimError where that is not an address."""
 
     def __init__(self, bind: str) -> None:
         try:
@@ -108,11 +94,8 @@ def _has_screen() -> bool:
 
 
 def show(recording: Path, *, web: bool = False, bind: str = LOOPBACK) -> None:
-    """Open a recording, and wait until the viewer is closed.
-
-    Raises:
-        SdfsimError: no such recording, or the viewer fails.
-    """
+    """Open a recording, and wait until the viewer is closed. Raises SdfsimError of no such recording, or where it
+    fails."""
     serving = _Serving(bind)
     command = [_executable(), str(_existing(recording)), *serving.options]
     if web:
@@ -123,14 +106,8 @@ def show(recording: Path, *, web: bool = False, bind: str = LOOPBACK) -> None:
 
 
 def screenshot(recording: Path, picture: Path, *, at: float | None = None) -> None:
-    """Write what the viewer shows of a recording as a PNG, without a screen.
-
-    Args:
-        at: time in s (default: the end of the recording).
-
-    Raises:
-        SdfsimError: no such recording, no such time in it, no graphics driver, or the file cannot be written.
-    """
+    """Write what the viewer shows of a recording `at` a time in s (default: the end) as a PNG, without a screen. Raises
+    SdfsimError of no such recording or time, no graphics driver, or a file that cannot be written."""
     _existing(recording)
     if not picture.parent.is_dir() or not os.access(picture.parent, os.W_OK):
         raise SdfsimError(f"{picture}: the folder is missing or not writable")

@@ -140,14 +140,8 @@ def awake(bodies: Bodies, state: State) -> Tensor:
 
 
 def from_scene(scene: Scene, units: Units, device: torch.device) -> tuple[Bodies, State]:
-    """Bodies and initial state of a scene, in model units on `device`.
-
-    Args:
-        units: model units.
-
-    Raises:
-        SdfsimError: a body that moves has no mass or no surface nodes.
-    """
+    """Bodies and initial state of a scene, in model units on `device`. Raises SdfsimError where a body that moves has
+    no mass or no surface nodes."""
     shapes = [scene.shapes[b.shape] for b in scene.bodies]
     for body, shape in zip(scene.bodies, shapes, strict=True):
         if body.motion == "dynamic" and (not body.mass > 0 or len(shape.nodes) == 0 or not shape.volume > 0):

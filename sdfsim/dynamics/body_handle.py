@@ -39,11 +39,8 @@ class ContactPoint:
 
 
 class BodyHandle:
-    """One body of a simulator: read it, set it, push and pull it. What is set counts from the next step on.
-
-    Attributes:
-        name: of the body.
-    """
+    """One body of a simulator, by its `name`: read it, set it, push and pull it. What is set counts from the next step
+    on."""
 
     __slots__ = ("_row", "_simulator", "name")  # so that a name that is misspelt is no new attribute
 
@@ -109,15 +106,8 @@ class BodyHandle:
         return touch is not None and bool(touch.island[self._row] >= 0)
 
     def push(self, impulse: Numbers, at: Numbers | None = None) -> None:
-        """Change its velocities by an impulse, now.
-
-        Args:
-            impulse: [3] N s.
-            at: [3] m, where it acts, world; None for the centre of mass.
-
-        Raises:
-            SdfsimError: the body does not move by itself.
-        """
+        """Change its velocities by an impulse [3] N s, now, that acts `at` [3] m, world, or at the centre of mass.
+        Raises SdfsimError where the body does not move by itself."""
         self._must_move("be pushed")
         given = _vector("impulse", impulse)
         self.velocity = self.velocity + given / self.mass
@@ -129,16 +119,12 @@ class BodyHandle:
             self.angular_velocity = self.angular_velocity + np.linalg.solve(inertia, turn)
 
     def pull(self, force: Numbers, at: Numbers | None = None, torque: Numbers = (0.0, 0.0, 0.0)) -> None:
-        """Let a force and a torque act from now on, in world axes, until the next call or `reset`; zero ends them.
+        """Let a force [3] N and a torque [3] N m act from now on, in world axes, until the next call or `reset`; zero
+        ends them.
 
-        Args:
-            force: [3] N.
-            at: [3] m, the point that it acts on now, world; None for the centre of mass. Its moment about the centre of
-                mass stays as it is, however the body moves: pull again after a step to follow the point.
-            torque: [3] N m, on top of that moment.
-
-        Raises:
-            SdfsimError: the body does not move by itself, or the model is a network on surface nodes.
+        The force acts `at` [3] m, world, now, or at the centre of mass. Its moment about the centre of mass stays as it
+        is, however the body moves: pull again after a step to follow the point. The torque comes on top of it. Raises
+        SdfsimError where the body does not move by itself, or the model is a network on surface nodes.
         """
         self._must_move("be pulled")
         sim = self._simulator

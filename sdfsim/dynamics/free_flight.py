@@ -20,20 +20,12 @@ def ballistic(position: Tensor, velocity: Tensor, gravity: Tensor, dt: float) ->
 
 
 def torque_free(orientation: Tensor, angular_velocity: Tensor, inertia: Tensor, dt: float) -> tuple[Tensor, Tensor]:
-    """Rotation of bodies on which no torque acts.
+    """Rotation of bodies on which no torque acts: orientation [N, 4] and angular velocity [N, 3] rad/s, world, after
+    `dt` s, by inertias [N, 3, 3] kg m^2 in body axes.
 
     The world angular momentum is held exactly; the orientation follows dR/dt = [R I^-1 R^T L] R by a
     Runge-Kutta-Munthe-Kaas method of order 4, each inner step turning at most `MAX_TURN`. Beyond `MOST_TURN` in all it
     is no longer exact.
-
-    Args:
-        orientation: [N, 4] xyzw, body -> world.
-        angular_velocity: [N, 3] rad/s, world.
-        inertia: [N, 3, 3] kg m^2, body axes.
-        dt: s.
-
-    Returns:
-        Orientation [N, 4] and angular velocity [N, 3] rad/s after `dt`.
     """
     turning = (angular_velocity != 0).any(-1).nonzero()[:, 0]
     if len(turning) < len(orientation):  # what does not turn stays as it is

@@ -67,12 +67,8 @@ def corrected(
     weights: compiled.Weights, world: World, before: State, solved: State, acts: Acts, rules: StepOptions, *,
     known: float,
 ) -> State:  # fmt: skip
-    """What the network makes of a step of the solve.
-
-    Args:
-        weights: see `packed`.
-        acts: its edges, at least one; those of a pair of bodies stand together.
-    """
+    """What the network makes of a step of the solve, whose `acts`, at least one, are its edges; those of a pair of
+    bodies stand together."""
     pair = torch.stack([acts.first, acts.second], 1).numpy()
     vectors = [acts.arm_first, acts.arm_second, acts.normal, acts.impulse]
     value = torch.cat([*vectors, acts.gap[:, None], acts.when[:, None]], 1).numpy()

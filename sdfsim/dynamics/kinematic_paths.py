@@ -44,17 +44,8 @@ class Tracks:
 def from_paths(
     paths: Sequence[tuple[int, Waypoints]], com: np.ndarray, *, length: float, time: float, device: torch.device
 ) -> Tracks | None:
-    """The paths of a scene.
-
-    Args:
-        paths: number of the body, and its path in SI units.
-        com: [N, 3] centre of mass of every body from its shape's origin, model units.
-        length: m per model unit.
-        time: s per model unit.
-
-    Returns:
-        The tracks, or None where there is no path.
-    """
+    """The paths of a scene, in SI units by the number of the body, as tracks; None where there are none. Centres of
+    mass [N, 3] from the shapes' origins are in model units, of which one is `length` m and `time` s."""
     if not paths:
         return None
     most = 1 + max(len(path.time) for _, path in paths)

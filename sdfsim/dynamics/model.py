@@ -109,15 +109,8 @@ class Unread(nn.Module):
 
 
 def load_model(name: str | Path | None = None, *, weights: bool = True) -> Model:
-    """A bundled model by name, or any model file by path.
-
-    Args:
-        name: None for the solver.
-        weights: False reads only what the model says of itself; its network is then `Unread`.
-
-    Raises:
-        SdfsimError: unknown name, unreadable or foreign file.
-    """
+    """A bundled model by name (None: the solver), or any model file by path; without `weights` its network is `Unread`.
+    Raises SdfsimError of an unknown name, or an unreadable or foreign file."""
     from safetensors import SafetensorError, safe_open
 
     if name is None or name == SOLVER:

@@ -86,14 +86,10 @@ _PER_FRAME = ("time", "position", "orientation", "velocity", "angular_velocity",
 
 
 def energy_from_nothing(rollout: Rollout) -> dict[str, float]:
-    """By how much mechanical energy has grown, which only bodies on paths may make it do.
-
-    Returns:
-        sum_J: over all steps in which it grew.
-        worst: of a step, as a part of the energy in play: the largest kinetic energy so far, and what would lift every
-            dynamic body by its own size.
-        steps_above_1_percent: the part of the steps in which it was more than 0.01 of that.
-    """
+    """By how much mechanical energy has grown, which only bodies on paths may make it do: `sum_J` over all steps in
+    which it did; `worst` of a step, as a part of the energy in play (the largest kinetic energy so far, and what would
+    lift every dynamic body by its own size); `steps_above_1_percent`, the part of the steps with more than 0.01 of
+    that."""
     kinetic, potential = rollout.counters["kinetic_energy"], rollout.counters["potential_energy"]
     gain = np.diff(kinetic + potential).clip(min=0.0)
     in_play = np.maximum.accumulate(kinetic)[1:] + rollout.meta["lift_energy"]

@@ -35,11 +35,8 @@ PHASES = {
 
 
 class Memory:
-    """Of one run: the compiled scene, the packed network, counters and timers.
-
-    Attributes:
-        counts: what the present step has counted so far, by the names of `COUNTS` and `PHASES` (ms).
-    """
+    """Of one run: the compiled scene, the packed network, and `counts` of the present step, by the names of `COUNTS`
+    and `PHASES` (ms)."""
 
     def __init__(self) -> None:
         self.counts = dict.fromkeys((*COUNTS, *PHASES), 0.0)

@@ -40,12 +40,7 @@ BYTES_AN_EDGE = 4096  # of the network, while it is worked on
 
 
 class SimulationError(SdfsimError):
-    """The state broke; `rollout` holds what was computed before that.
-
-    Args:
-        message: names the step and the body.
-        rollout: everything up to the last good state.
-    """
+    """The state broke: the message names the step and the body, `rollout` has everything up to the last good state."""
 
     def __init__(self, message: str, rollout: Rollout) -> None:
         super().__init__(
@@ -141,11 +136,8 @@ class Simulator:
         self._good = self._start = self.state
 
     def steps(self, count: int) -> Iterator[State]:
-        """Advance by `count` steps, yielding the state after each (SI units).
-
-        Raises:
-            SimulationError: a state that cannot be; its `rollout` is one frame here, the last good state.
-        """
+        """Advance by `count` steps, yielding the state after each (SI units). Raises SimulationError of a state that
+        cannot be; its `rollout` is one frame here, the last good state."""
         for _ in range(count):
             self._step()
             yield self.si_state()
@@ -177,11 +169,8 @@ class Simulator:
         return BodyHandle(self, self._names.index(name))
 
     def contact_points(self) -> list[ContactPoint]:
-        """Where bodies touch in the present state, as the last step of the contact solve has left it.
-
-        Raises:
-            SdfsimError: the model is a network on surface nodes, which knows no impulses.
-        """
+        """Where bodies touch in the present state, as the last step of the contact solve has left it. Raises
+        SdfsimError of networks on surface nodes, which know no impulses."""
         if self.model.on_surfaces:
             raise SdfsimError(
                 "networks on surface nodes tell no impulses", "take the solver, or a network on top of it"
@@ -204,33 +193,20 @@ class Simulator:
     def rollouts(
         self, variants: Sequence[Variant], seconds: float | None = None, steps: int | None = None
     ) -> list[Rollout]:
-        """The scene from its start with some values changed, once for each variant, on all cores.
+        """The scene from its start with some values changed, once for each variant, on all cores; the same as `run` of
+        a `Simulator` of each changed scene.
 
-        Args:
-            variants: each maps names of bodies to changed fields: position, quat_xyzw, velocity, angular_velocity,
-                mass, friction, restitution (SI units), such as {"ball": {"velocity": (1, 0, 0)}}.
-            seconds: how long (default: the scene's duration).
-            steps: how many steps instead.
-
-        Returns:
-            A rollout each, in order; the same as of a `Simulator` of the changed scene.
-
-        Raises:
-            SdfsimError: no such body or field, or a value that it cannot have.
-            SimulationError: a state broke.
+        Variants map names of bodies to changed fields: position, quat_xyzw, velocity, angular_velocity, mass, friction,
+        restitution (SI units), such as {"ball": {"velocity": (1, 0, 0)}}. Raises SdfsimError of no such body or field,
+        or a value that it cannot have; SimulationError where a state broke.
         """
         return rollouts(self.scene, variants, self.model, seconds=seconds, steps=steps, dt=self._dt)
 
     def run(self, seconds: float | None = None, steps: int | None = None) -> Rollout:
-        """Simulate and keep everything.
+        """Simulate for so many seconds (default: the scene's duration; see `steps_in`) or steps, and keep everything.
 
-        Args:
-            seconds: how long (default: the scene's duration); see `steps_in`.
-            steps: how many steps instead.
-
-        Raises:
-            SdfsimError: a length of time that is negative or not finite.
-            SimulationError: the state broke; what was computed is in its `rollout`.
+        Raises SdfsimError of a length of time that is negative or not finite; SimulationError where the state broke,
+        with what was computed in its `rollout`.
         """
         if steps is None:
             steps = self.steps_in(self.scene.duration if seconds is None else seconds)
@@ -243,11 +219,8 @@ class Simulator:
         return join(frames)
 
     def steps_in(self, seconds: float) -> int:
-        """The number of steps that comes nearest to `seconds`: none for 0 s, else at least one.
-
-        Raises:
-            SdfsimError: `seconds` is negative or not finite.
-        """
+        """The number of steps that comes nearest to `seconds`: none for 0 s, else at least one. Raises SdfsimError
+        where that is negative or not finite."""
         check_seconds(seconds)
         return max(1, round(seconds / self.dt)) if seconds else 0
 
@@ -376,11 +349,7 @@ def check_seconds(seconds: float) -> None:
 
 
 def pick_device(name: str) -> torch.device:
-    """ "auto", "cpu", "cuda" or "cuda:0" as a device.
-
-    Raises:
-        SdfsimError: another name, or CUDA is asked for and absent.
-    """
+    """A device: "auto", "cpu", "cuda" or "cuda:0". Raises SdfsimError of another name, or where there is no CUDA."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if not re.fullmatch(r"cpu|cuda(:\d+)?", name, re.ASCII):

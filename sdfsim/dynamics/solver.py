@@ -59,11 +59,7 @@ class SolverRules:
 
 
 class Compiled:
-    """One scene as the compiled step wants it.
-
-    Args:
-        bodies: of the scene, model units.
-    """
+    """One scene, its bodies in model units, as the compiled step wants it."""
 
     def __init__(self, bodies: Bodies, state: State) -> None:
         if not kernels.compiled():
@@ -159,13 +155,8 @@ def acts_of(edges: record.Edges, steps: int) -> Acts:
 def solver_step(
     bodies: Bodies, state: State, rules: StepOptions, memory: Memory, *, note: bool = False
 ) -> tuple[State, Acts]:
-    """Advance `state` by one step of the contact solve.
-
-    Args:
-        state: theirs; scripted bodies have the velocities of the coming step.
-        memory: of the run; it holds the compiled scene.
-        note: whether what contacts did is wanted; there is none otherwise.
-    """
+    """Advance `state` by one step of the contact solve; scripted bodies have the velocities of the coming step. What
+    contacts did is told where it is wanted (`note`)."""
     scene = memory.compiled(bodies, state)
     inside = compiled_rules(
         rules.gravity.cpu().numpy(), rules.dt, rules.substeps, friction=rules.friction,

@@ -54,14 +54,8 @@ class StepOptions:
 def step(
     model: Model, bodies: Bodies, state: State, rules: StepOptions, memory: Memory | None = None
 ) -> tuple[State, Near | None]:
-    """Advance `state` by one step.
-
-    Args:
-        memory: of the run; without one every step starts from nothing, with the same result.
-
-    Returns:
-        The next state, and where a network on surface nodes saw bodies near each other, None for other models.
-    """
+    """Advance `state` by one step: the next state, and where a network on surface nodes saw bodies near each other,
+    None for other models. Without the run's `memory` every step starts from nothing, with the same result."""
     memory = memory or Memory()
     memory.begin(bodies)
     state, contacts = drive(bodies, state, rules), None

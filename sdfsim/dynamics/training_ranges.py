@@ -91,11 +91,7 @@ def _products(scene: Scene, name: str) -> list[float]:
 
 def deep_starts(bodies: Bodies, state: State, names: Sequence[str], metres: float) -> list[str]:
     """A line where pairs are deeper inside one another than any that models were trained on; empty where none is.
-
-    Args:
-        names: [N] of the bodies.
-        metres: in a model unit.
-    """
+    Bodies have `names` [N]; a model unit is so many `metres`."""
     from sdfsim.dynamics.models.paper_edges import find_contacts  # numba takes its time to load
 
     nothing = torch.zeros(3, dtype=torch.float64, device=bodies.device)

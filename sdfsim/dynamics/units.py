@@ -16,14 +16,9 @@ MOST_WIDER = 1e4
 
 
 def scene_units(scene: Scene, model: Model, dt: float | None = None) -> Units:
-    """Model units for a scene: bodies of the model's size, at the model's gravity (Froude scaling).
-
-    Args:
-        dt: s, fixes the scale by the wanted step instead of by the bodies' size.
-
-    Raises:
-        SdfsimError: a step that is no positive number, or bodies of sizes that no step serves.
-    """
+    """Model units for a scene: bodies of the model's size, at the model's gravity (Froude scaling); `dt` s fixes the
+    scale by the wanted step instead. Raises SdfsimError of a step that is not positive, or bodies of sizes that no step
+    serves."""
     if dt is not None and not 0.0 < dt < np.inf:
         raise SdfsimError(f"dt: must be > 0 s and finite (got {dt:g})")
     strength = float(np.linalg.norm(scene.gravity)) or EARTH
@@ -41,14 +36,8 @@ def scene_units(scene: Scene, model: Model, dt: float | None = None) -> Units:
 
 
 def _check_sizes(names: list[str], sizes: np.ndarray) -> None:
-    """That no body is far wider than most. Of the two that are compared the less ordinary one is to blame.
-
-    Args:
-        sizes: [N] m.
-
-    Raises:
-        SdfsimError: one is.
-    """
+    """Raises SdfsimError where a body of `sizes` [N] m is far wider than most. Of the two that are compared the less
+    ordinary one is to blame."""
     order = np.argsort(sizes, kind="stable")
     usual, widest = order[(len(order) - 1) // 2], order[-1]
     if not MOST_WIDER * sizes[usual] < sizes[widest] < np.inf:

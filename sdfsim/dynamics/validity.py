@@ -26,11 +26,7 @@ def fault(
     state: State, rows: torch.Tensor, dt: float, units: Units, before: State | None = None
 ) -> tuple[int, str] | None:
     """The first of bodies `rows` [R] int64 whose state cannot be, and what is wrong with it; None when all are sound.
-
-    Args:
-        state: N bodies, model units.
-        dt: the step, model units.
-    """
+    State and `dt` are in model units."""
     turned = (state.orientation[rows].square().sum(-1) - 1.0).abs()
     limits = [
         (state.position, FARTHEST, units.length, "m from the origin, too far to be placed exactly"),
@@ -61,15 +57,8 @@ def fault(
 
 
 def check_sizes(bodies: Bodies, names: Sequence[str], metres: float) -> None:
-    """That the surface of every body keeps to where points are placed exactly.
-
-    Args:
-        names: [N] of them.
-        metres: in a model unit.
-
-    Raises:
-        SdfsimError: a body that has an end is too large.
-    """
+    """Raises SdfsimError where a body that has an end is too large for its surface to keep to where points are placed
+    exactly; a model unit is so many `metres`."""
     large = ((bodies.size > FARTHEST) & bodies.size.isfinite()).nonzero()[:, 0]
     if len(large):
         size = float(bodies.size[large[0]]) * metres
@@ -81,11 +70,7 @@ def check_sizes(bodies: Bodies, names: Sequence[str], metres: float) -> None:
 
 
 def check_nodes(scene: Scene) -> None:
-    """That every dynamic body has nodes that tell how it is turned.
-
-    Raises:
-        SdfsimError: its nodes are one place or one line.
-    """
+    """Raises SdfsimError where a dynamic body's nodes are one place or one line, and do not tell how it is turned."""
     told = set()
     for body in scene.bodies:
         if body.motion != "dynamic" or body.shape in told:

@@ -20,12 +20,9 @@ PERTURBATIONS = {"0": 0.0, "1e-6": 1e-6, "1e-3": 1e-3}
 def chaos_floor(data: Path, trajectories: list[Trajectory], steps: int, seed: int = 0) -> dict[str, list[Trajectory]]:
     """Run the teacher again from recorded starts (velocities as recorded) of a dataset with a URDF for every shape.
 
-    Returns:
-        name in `PERTURBATIONS` -> the motions (steps + 1 frames) that follow when the velocity of each body that moves
-        is changed by so much in a random direction.
-
-    Raises:
-        SdfsimError: PyBullet or an engine file is absent, or the recording is not this teacher's.
+    Returns, by the names of `PERTURBATIONS`, the motions (steps + 1 frames) that follow when the velocity of each body
+    that moves is changed by so much in a random direction. Raises SdfsimError where PyBullet or an engine file is
+    absent, or the recording is not this teacher's.
     """
     import_pybullet()
     info = read_info(home_of(data) or data.parent)

@@ -17,11 +17,8 @@ MODEL = "this model"  # in the tables of a card
 
 
 def bundle(path: Path, data: Path, name: str, folder: Path = BUNDLED) -> dict:
-    """Evaluate what `sdfsim train` wrote on the test split of `data`; write `NAME.safetensors` and its card `NAME.md`.
-
-    Returns:
-        The evaluation's report.
-    """
+    """Evaluate what `sdfsim train` wrote on the test split of `data`; write `NAME.safetensors` and its card `NAME.md`;
+    return the evaluation's report."""
     model = load_model(path)
     report = evaluate(data, model=model, chaos_floor=True)
     kept = ("model", "ballistic", "chaos_floor", "median_survival_s")

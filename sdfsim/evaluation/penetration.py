@@ -78,12 +78,8 @@ def deepest(motion: Trajectory, solids: dict[str, Solid], every: int = EVERY) ->
 
 
 def penetration(motions: list[Trajectory], solids: dict[str, Solid]) -> dict:
-    """Penetration m over the frames of all `motions` in which something touches.
-
-    Returns:
-        percentile_95 and worst of the depth of a frame's deepest node (None where nothing touches), and
-        steps_with_contact.
-    """
+    """Penetration m over the frames of all `motions` in which something touches: percentile_95 and worst of the depth
+    of a frame's deepest node (None where nothing touches), and steps_with_contact."""
     depth = penetrations(np.concatenate([deepest(motion, solids) for motion in motions]))
     return {
         "percentile_95": float(np.percentile(depth, 95)) if len(depth) else None,

@@ -87,11 +87,8 @@ def number_pairs(first: Tensor, second: Tensor, bodies: int) -> tuple[Tensor, in
 
 
 def edge_frames(graph: ContactGraph, *, mirrored: bool = False) -> EdgeFrames:
-    """Frames, effective masses and input features of all edges.
-
-    Args:
-        mirrored: use left-handed frames, which is what the mirror image of the scene would show (augmentation).
-    """
+    """Frames, effective masses and input features of all edges; `mirrored` frames are left-handed, as the mirror image
+    of the scene would show them (augmentation)."""
     g = graph
     slip = relative_velocity(g, g.velocity, g.angular)
     lift = relative_velocity(g, g.free_velocity, g.free_angular) - slip  # what gravity and free spin add

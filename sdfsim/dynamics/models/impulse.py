@@ -115,12 +115,8 @@ class ImpulseNetwork(nn.Module):
         mirrored: bool = False,
         trust: float = 1.0,
     ) -> Velocities:
-        """Velocities after the contacts have acted.
-
-        Args:
-            mirrored: see `edge_frames`.
-            trust: of the trust region; at 0 the solve stands alone.
-        """
+        """Velocities after the contacts have acted; `mirrored` as for `edge_frames`. At a `trust` of 0 the solve stands
+        alone."""
         alone = bool(self.config.alone)
         graph = without_solve(graph) if alone else graph
         frames = edge_frames(graph, mirrored=mirrored)
@@ -170,18 +166,16 @@ def pushed(graph: ContactGraph, frames: EdgeFrames, impulse: Tensor, twist: Tens
 
 
 def bounded(graph: ContactGraph, frames: EdgeFrames, added: Tensor, start: Tensor, trust: float) -> Tensor:
-    """What may be added to the solve, of what the network would add.
+    """What may be added to the solve, of what the network would add: impulses [E, axis, 2] at the end of the step, and
+    those that move bodies in it. `start` are twists [N, 6, 2] from the solve, `trust` is 0 to 1.
 
     - Only where surfaces moved against each other before the step, see `CALM`.
-    - Solve and network together never pull, push no more than twice as hard as the solve, or than it takes to part
-      surfaces that would be inside each other at the end of the step as restitution allows, and keep to the friction
-      cone.
-    - No more kinetic energy than the solve took, island by island.
 
-    Args:
-        added: [E, axis, 2] impulses: at the end of the step, and those that move bodies in it.
-        start: [N, 6, 2] twists from the solve.
-        trust: 0 to 1.
+    - Solve and network together never pull, push no more than twice as hard as the solve, or than it takes to part
+    surfaces that would be inside each other at the end of the step as restitution allows, and keep to the friction
+    cone.
+
+    - No more kinetic energy than the solve took, island by island.
     """
     lively = ((frames.slip.norm(dim=-1) - CALM) / (LIVELY - CALM)).clamp(0.0, 1.0) * trust
     added = added * lively[:, None, None]

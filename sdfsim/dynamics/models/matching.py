@@ -13,21 +13,14 @@ STAY = 1e-12
 
 
 def match_shapes(rest: Tensor, moved: Tensor, owner: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
-    """Best rigid pose of every body from its nodes.
+    """Best rigid pose of every body from its nodes: position [N, 3] of the centres of mass and orientation [N, 4] xyzw,
+    on the same side as `start`; NaN for a body with a node that is not finite.
+
+    Nodes were at `rest` [M, 3] about each body's centre of mass, body axes; the network `moved` them, [M, 3] world.
+    Turns that the nodes leave open (about a line of them, any of a single one) stay as in `start` [N, 4].
 
     Of all rotations q the one with the largest sum of moved . (q rest) is the main eigenvector of a symmetric matrix of
     four rows (Horn, 1987). So it is a rotation whatever the nodes are: flat, mirrored by noise, all in one place.
-
-    Args:
-        rest: [M, 3] nodes about each body's centre of mass, body axes.
-        moved: [M, 3] where the network put them, world.
-        owner: [M] int64.
-        start: [N, 4] xyzw unit quaternions, orientations before. Turns that the nodes leave open (about the line of
-            collinear nodes, any turn of a single one) stay as they are there.
-
-    Returns:
-        Position [N, 3] of the centres of mass and orientation [N, 4] xyzw, on the same side as `start`; NaN for a body
-        with a node that is not finite.
     """
     bodies = len(start)
 

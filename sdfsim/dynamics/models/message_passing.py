@@ -174,12 +174,8 @@ class GraphNetwork(nn.Module):
             cast("Normaliser", self.scale[name]).observe(edges.features)
 
     def forward(self, graph: Graph, *, rows: int | None = None) -> Tensor:
-        """Standardised accelerations (change of displacement a step) of the set "node", [n, 3].
-
-        Args:
-            graph: of the network's layout.
-            rows: update no more than that many edges at once; None for all.
-        """
+        """Standardised accelerations (change of displacement a step) of the set "node", [n, 3]; updates no more than
+        `rows` edges at once."""
 
         def encoded(name: str, features: Tensor) -> Tensor:
             return by_rows(lambda part: self.encode[name](self.scale[name](part)), rows, features)

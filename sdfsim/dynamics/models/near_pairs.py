@@ -195,16 +195,10 @@ def _inside(
 
 
 def closest_points(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
-    """Closest points of pairs of triangles.
+    """Closest points [E, 3] on either of pairs of triangles, [E, 3, 3] float64 with corners in rows.
 
     They are a corner and a point inside the other triangle, or points on two sides; where the triangles cross, a point
     that a side of one has in common with the other.
-
-    Args:
-        one, other: [E, 3, 3] float64, corners in rows.
-
-    Returns:
-        The points on `one` and on `other`, [E, 3] each.
     """
     side_one, side_other = one.roll(-1, 1) - one, other.roll(-1, 1) - other
     firsts, seconds, distances = [], [], []

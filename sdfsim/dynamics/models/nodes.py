@@ -22,15 +22,13 @@ def particles(shape: Shape, count: int | None) -> Shape:
 
 
 def vertices(shape: Shape, count: int | None) -> Shape:
-    """The shape with the vertices of a mesh as nodes; an infinite plane is one node and one face.
+    """The shape with the vertices of a mesh as nodes, about `count` at most; an infinite plane is one node and one
+    face.
 
     The mesh is that of the hulls of the convex pieces, where a shape was made of such and they have no more vertices
     than wanted: what the teacher collides, and as many vertices as the published graphs have (their sizes fit 440 a
     body). Else it is the shown mesh, reduced by quadric error to 2 `count` - 4 faces: 76 hulls have no mesh of 64
     vertices, and what the reduction takes off a body (up to 5 cm of the shapes of MOVi-B at 64) its mesh lacks.
-
-    Args:
-        count: vertices at most, about; None for all.
     """
     if _endless(shape):
         return replace(shape, nodes=np.zeros((1, 3)), faces=np.zeros((1, 3), dtype=np.int64))

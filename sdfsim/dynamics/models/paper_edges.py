@@ -44,15 +44,10 @@ def no_contacts(device: torch.device) -> Contacts:
 def find_contacts(
     bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, memory: Memory | None = None
 ) -> Contacts:
-    """All contact edges of a state.
+    """All contact edges of a state within `reach`, the contact radius D, under gravity [3]; all in model units.
 
     An edge exists where d + min(0, closing velocity * dt) <= reach: a fixed threshold would let a fast body bounce
     inside one step without ever having had an edge.
-
-    Args:
-        gravity: [3], model units.
-        reach: contact radius D, model length.
-        memory: of the run; it keeps the compiled bodies.
     """
     from sdfsim.dynamics.kernels.nodes import nodes_within
 
