@@ -10,12 +10,16 @@ what the slow test runs. With --quick the table is that of the short form too.
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.results import write_section
 from sdfsim.console import Session
 from sdfsim.evaluation.hard_cases import GROUPS
-from sdfsim.evaluation.stress import ENGINES, Study, draw_group, figures, stress, table, write_report
+from sdfsim.evaluation.stress import ENGINES, Study, draw_group, figures, losses, stress, table, write_report
 from sdfsim.files import read_json, write_json, write_text
 from sdfsim.recording import save_rollout
 
@@ -85,6 +89,11 @@ def main() -> None:
             if quick:
                 write_json(RATCHET, accepted(study))
         write_document(study)
+        command = f"python benchmarks/hard_cases.py -o DIR{' --quick' if chosen.quick else ''}"
+        lost = [
+            f"- {who}: {', '.join(f'{n} {what}' for what, n in found.items())}" for who, found in losses(study).items()
+        ]
+        write_section("hard cases", command, "\n".join(lost))
         session.report({"document": str(DOCUMENT), "ratchet": str(RATCHET)})
 
 

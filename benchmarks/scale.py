@@ -1,26 +1,40 @@
-"""What large scenes cost against bodies, nodes and contacts, beside the paper's network and two engines.
+"""What large scenes cost, and many scenes at once: RESULTS.md.
 
-    python benchmarks/scale.py -o DIR [--paper PAPER.safetensors] [--largest 512]
+    python benchmarks/scale.py growth -o DIR [--paper PAPER.safetensors] [--largest 512]
+        bowls of spheres, boxes far apart and knots against bodies, nodes and contacts, beside networks and two engines
+    python benchmarks/scale.py large -o DIR
+        heaps, shoes and knots to the end on all cores, each with a movie
+    python benchmarks/scale.py many DATA [--scenes 1000]
+        scenes of a MOVi-B dataset at once, on Dask clusters of 1, 2 ... workers on this machine
 
-Every case runs in a process of its own on one thread; what DIR holds is not measured again. Times are those of the
-processor. Writes DIR/table.md and DIR/scale.png. The *paper* network predicts all motion of all bodies, as published.
+Every case of the first runs in a process of its own on one thread; its times are those of the processor. What DIR
+holds is not measured again. The *paper* network predicts all motion of all bodies, as published.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
+import resource
+import subprocess
 import sys
 import time
+from collections import deque
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from samples.large import write_scene
+from benchmarks.results import write_section
+from samples.large import HEAPS, write_scene
+from sdfsim.data.batching import scene_of
+from sdfsim.data.dataset import FLOOR, Trajectory, load_shapes, trajectory_files
 from sdfsim.dynamics.model import load_model
+from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.simulator import SimulationError, Simulator, join
 from sdfsim.dynamics.units import scene_units
 from sdfsim.errors import run_main
@@ -28,13 +42,14 @@ from sdfsim.evaluation.engines import bullet, mujoco, rollout_motion, start_of_s
 from sdfsim.evaluation.hard_cases import body, box, on_floor
 from sdfsim.evaluation.harness import Job, Line, Panel, Results, draw, markdown, measure, number, peak_memory
 from sdfsim.evaluation.penetration import depths
-from sdfsim.files import write_text
+from sdfsim.parallel import cluster, parallel
 from sdfsim.scene.scene import Scene
 from sdfsim.scene.scene_file import load_scene
 
 BOWLS = (1, 16, 64, 256, 512)
 APART = (125, 500, 2000)
 PARTS = (16, 4, 1)  # of the nodes of a knot
+DISTINCT, CHUNK, STEPS = 100, 10, 96  # scenes that differ, scenes of a job, steps of a scene
 COUNTS = ("pairs", "contacts", "edges")
 COLUMNS = {"ms": "ms a step", "peak_mib": "MiB", "contacts": "contacts", "depth_95": "deepest 95 %, mm", "lost": "lost"}
 
@@ -135,14 +150,10 @@ def table(results: Results) -> str:
     return markdown(rows)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--out", type=Path, required=True)
-    parser.add_argument("--paper", help="weights of a paper network")
-    parser.add_argument("--largest", type=int, default=512, help="bodies in the bowl")
-    chosen = parser.parse_args()
-    jobs = jobs_of(chosen.out, chosen.paper, chosen.largest)
-    results = measure(jobs, chosen.out / "results", where="fresh", on_progress=lambda _, message: print(message))
+def growth(out: Path, paper: str | None, largest: int) -> None:
+    """Write the section and scale.png."""
+    jobs = jobs_of(out, paper, largest)
+    results = measure(jobs, out / "results", where="fresh", on_progress=told)
     bowls = {key: found for key, found in results.items() if "bowl" in key[0] and "failed" not in found}
     panels = []
     for name in ("ms", "peak_mib"):
@@ -151,9 +162,105 @@ def main() -> None:
             mine = [found for (_, one), found in bowls.items() if one == method]
             lines.append(Line(method, [found["bodies"] for found in mine], [found[name] for found in mine]))
         panels.append(Panel("spheres in a bowl", "spheres", COLUMNS[name], lines, "xy"))
-    draw(panels, chosen.out / "scale.png", dpi=110)
-    write_text(chosen.out / "table.md", table(results))
+    draw(panels, out / "scale.png", dpi=110)
     print(table(results))
+    write_section("growth", "python benchmarks/scale.py growth -o DIR", table(results))
+
+
+def to_the_end(name: str, home: Path) -> dict[str, Any]:
+    """A large scene as a user runs it: the command, its recording, and a movie of it."""
+    scene, run = home / name / "scene.yaml", home / name / "run"
+    if not scene.exists():
+        write_scene(name, home / name)
+    began = time.perf_counter()
+    command = [sys.executable, "-c", "import cli; cli.app()"]
+    subprocess.run([*command, "simulate", str(scene), "-o", str(run)], check=True, capture_output=True)
+    seconds = time.perf_counter() - began
+    mib = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
+    subprocess.run([*command, "render", str(run), "-o", str(home / f"{name}.mp4")], check=True, capture_output=True)
+    loaded, rollout = load_scene(scene), Rollout.load(run / "rollout.npz")
+    depth = depths(loaded, rollout_motion(loaded, rollout), every=20)
+    moving = [k for k, b in enumerate(loaded.bodies) if b.motion == "dynamic"]
+    return {
+        "bodies": len(moving),
+        "nodes": sum(len(loaded.shapes[loaded.bodies[k].shape].nodes) for k in moving),
+        "steps": len(rollout) - 1,
+        "s": seconds,
+        "mib": mib,
+        "worst": 1e3 * float(depth.max()),
+        "lost": int((rollout.position[-1, moving, 2] < -0.1).sum()),
+    }
+
+
+def large(out: Path) -> None:
+    """Write the section and a movie each."""
+    jobs = [Job("to the end", name, [name], to_the_end, (name, out)) for name in HEAPS]
+    results = measure(jobs, out / "large", where="fresh", on_progress=told)
+    titles = {"bodies": "bodies", "nodes": "nodes", "steps": "steps", "s": "s from command to recording", "mib": "MiB",
+              "worst": "deepest, mm", "lost": "below the floor"}  # fmt: skip
+    rows = [
+        ("", *titles.values()),
+        *((name, *(number(results["to the end", name][k]) for k in titles)) for name in HEAPS),
+    ]
+    print(markdown(rows))
+    write_section("large scenes", "python benchmarks/scale.py large -o DIR", markdown(rows))
+
+
+def simulated(scenes: list[Scene], steps: int) -> int:
+    """How many bodies moved."""
+    for scene in scenes:
+        Simulator(scene).run(steps=steps)
+    return sum(b.motion == "dynamic" for scene in scenes for b in scene.bodies)
+
+
+def many(data: Path, count: int) -> None:
+    """Write the section: scenes a second by workers."""
+    from distributed import LocalCluster
+
+    recorded = [Trajectory.load(file) for file in trajectory_files(data, "train")[:DISTINCT]]
+    shapes = load_shapes(data, {str(n) for t in recorded for n in t.shape})
+    distinct = [scene_of([t], [0], shapes, FLOOR)[0] for t in recorded]
+    scenes = [distinct[k % len(distinct)] for k in range(count)]
+    jobs = [(scenes[k : k + CHUNK], STEPS) for k in range(0, count, CHUNK)]
+    rows, first = [("workers", "scenes a second", "times one worker")], 0.0
+    for workers in range(1, (os.cpu_count() or 1) + 1):
+        local: Any = LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address="")
+        with local:
+            with cluster(local.scheduler_address):
+                deque(parallel(simulated, jobs[:workers]), maxlen=0)  # not timed: the workers load what is compiled
+                began = time.perf_counter()
+                deque(parallel(simulated, jobs), maxlen=0)
+                rate = count / (time.perf_counter() - began)
+        first = first or rate
+        rows.append((str(workers), number(rate), f"{rate / first:.2f}"))
+    print(markdown(rows))
+    write_section("many scenes", f"python benchmarks/scale.py many DATA --scenes {count}", markdown(rows))
+
+
+def told(_: float, message: str) -> None:
+    print(message, flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(dest="command", required=True)
+    for name in ("growth", "large", "many"):
+        command = commands.add_parser(name)
+        if name == "many":
+            command.add_argument("data", type=Path)
+            command.add_argument("--scenes", type=int, default=1000)
+        else:
+            command.add_argument("-o", "--out", type=Path, required=True)
+        if name == "growth":
+            command.add_argument("--paper", help="weights of a paper network")
+            command.add_argument("--largest", type=int, default=512, help="bodies in the bowl")
+    chosen = parser.parse_args()
+    if chosen.command == "growth":
+        growth(chosen.out, chosen.paper, chosen.largest)
+    elif chosen.command == "large":
+        large(chosen.out)
+    else:
+        many(chosen.data, chosen.scenes)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,67 @@
+"""What each effect costs when it is on and off: RESULTS.md.
+
+    python benchmarks/effects.py
+
+Sample scenes with one effect at a time switched off; one thread, processor time, medians of five runs of 300 steps.
+"The same" says whether the bodies end, to a hundredth of their size, where they end with all effects on.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from dataclasses import fields, replace
+from pathlib import Path
+
+if __name__ == "__main__":
+    os.environ["NUMBA_NUM_THREADS"] = "1"  # before the first import of numba
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.results import write_section
+from sdfsim.dynamics.bodies import largest_extent
+from sdfsim.dynamics.simulator import Simulator
+from sdfsim.errors import run_main
+from sdfsim.evaluation.harness import markdown, number, one_thread
+from sdfsim.scene.scene import Scene
+from sdfsim.scene.scene_file import load_scene
+
+SAMPLES = Path(__file__).resolve().parents[1] / "samples"
+SCENES = ("pile", "tower", "spheres_in_bowl")
+STEPS, REPEATS = 300, 5
+
+
+def cost(scene: Scene) -> tuple[float, np.ndarray]:
+    """Milliseconds a step, and [N, 3] m where the bodies end."""
+    simulator, taken, end = Simulator(scene), [], np.zeros((0, 3))
+    simulator.run(steps=2)
+    for _ in range(REPEATS):
+        simulator.reset()
+        began = time.process_time()
+        end = simulator.run(steps=STEPS).position[-1]
+        taken.append(1e3 * (time.process_time() - began) / STEPS)
+    return float(np.median(taken)), end
+
+
+def main() -> None:
+    rows = [("scene", "off", "ms a step", "of all on", "bodies end")]
+    for name in SCENES:
+        scene = load_scene(SAMPLES / f"{name}.yaml")
+        size = min(largest_extent(scene.shapes[b.shape]) * b.scale for b in scene.bodies if b.motion == "dynamic")
+        with one_thread():
+            usual, there = cost(scene)
+            rows.append((name, "nothing", number(usual), "1", ""))
+            for effect in (field.name for field in fields(scene.effects)):
+                ms, end = cost(replace(scene, effects=replace(scene.effects, **{effect: "off"})))
+                away = float(np.linalg.norm(end - there, axis=1).max()) / size
+                told = "the same" if away < 0.01 else f"up to {number(away, 2)} sizes away"
+                rows.append((name, effect, number(ms), number(ms / usual, 2), told))
+    print(markdown(rows))
+    write_section("effects", "python benchmarks/effects.py", markdown(rows))
+
+
+if __name__ == "__main__":
+    run_main(main)
