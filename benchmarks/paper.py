@@ -5,7 +5,7 @@
     python benchmarks/paper.py growth -o DIR
         the same with 2 to 512 spheres in a bowl, and where memory ends
     python benchmarks/paper.py accuracy DATA -o DIR [--minutes 5 15 30 60]
-        trains all of them on one core for equal times, then rolls them out
+        trains all of them on one core for equal times, SDF-Sim also on unsigned distances, then rolls them out
     python benchmarks/paper.py sdf DATA -o DIR
         rollouts of the solver on networks of distances of several widths
 
@@ -56,6 +56,7 @@ from sdfsim.scene.scene import Body, Scene
 from sdfsim.scene.scene_file import load_scene
 from sdfsim.shape.fit import PLANS, fit_pieces
 from sdfsim.shape.mesh import convex_hull
+from sdfsim.shape.sdf import sample_grid
 from sdfsim.shape.shape import Shape, load_shape
 from sdfsim.training.contact_cache import inner_steps
 from sdfsim.training.presets import PRESETS, Preset
@@ -143,6 +144,10 @@ def grown(name: str, scene_file: Path) -> dict[str, float]:
     return seen(name, [replace(scene, bodies=bodies)], 64)
 
 
+UNSIGNED = 64  # samples along each side
+COMPARED = NAMES | {"paper-unsigned": "SDF-Sim, unsigned distances"}
+
+
 def trained(name: str, data: Path, place: Path, minutes: float) -> Path:
     """The model of a network after so many minutes of one core."""
     torch.set_num_threads(1)
@@ -154,7 +159,7 @@ def trained(name: str, data: Path, place: Path, minutes: float) -> Path:
 
 def plan_of(name: str) -> Preset:
     """How a network is trained for the comparison: at equal sizes, with the schedule of the published ones."""
-    return replace(PRESETS[name], config=TRAINED, batch=BATCH, nodes=NODES)
+    return replace(PRESETS[name.removesuffix("-unsigned")], config=TRAINED, batch=BATCH, nodes=NODES)
 
 
 def judged(model: Path, data: Path, split: str, free_flight: str) -> dict[str, Any]:
@@ -166,6 +171,20 @@ def judged(model: Path, data: Path, split: str, free_flight: str) -> dict[str, A
 
 def told(fraction: float, message: str) -> None:
     print(f"{fraction:6.1%}  {message}", flush=True)
+
+
+def unsigned(data: Path, home: Path) -> Path:
+    """The dataset with unsigned distances: its shapes as grids of |d|, which know no inside."""
+    (home / "shapes").mkdir(parents=True, exist_ok=True)
+    for there in data.iterdir():
+        if there.name != "shapes" and not (home / there.name).exists():
+            (home / there.name).symlink_to(there.resolve())
+    for folder in (data / "shapes").iterdir():
+        if (folder / "shape.json").exists() and not (home / "shapes" / folder.name / "shape.json").exists():
+            shape = load_shape(folder)
+            grid = sample_grid(shape.sdf, shape.sdf.bounds, UNSIGNED)
+            replace(shape, sdf=replace(grid, values=grid.values.abs()), pieces=()).save(home / "shapes" / folder.name)
+    return home
 
 
 def graphs(data: Path, out: Path) -> None:
@@ -224,23 +243,24 @@ def accuracy(data: Path, out: Path, minutes: list[float]) -> None:
     """Train everything a little, then a little more, and write accuracy.md and accuracy.png."""
     results: Results = {}
     for spent in sorted(minutes):
-        for name in NAMES:
+        for name in COMPARED:
             place = out / "runs" / name
+            seen_by = unsigned(data, out / "unsigned") if name.endswith("unsigned") else data
             case = f"{name} after {spent:g} minutes"
             content = [plan_of(name), spent, read_info(data)]
             for way in ("exact", "learned"):
                 file = out / "models" / f"{name}-{spent:g}.safetensors"
                 if not file.exists():
                     file.parent.mkdir(parents=True, exist_ok=True)
-                    trained(name, data, place, spent).rename(file)
+                    trained(name, seen_by, place, spent).rename(file)
                 splits = ("validation", "test") if spent == max(minutes) else ("validation",)
-                jobs = [Job(f"{split}, {way}", case, content, judged, (file, data, split, way)) for split in splits]
+                jobs = [Job(f"{split}, {way}", case, content, judged, (file, seen_by, split, way)) for split in splits]
                 results |= measure(jobs, out / "accuracy")
         written(out / "accuracy.md", accuracy_table(results, sorted(minutes)))
     panels = []
     for way in ("exact", "learned"):
         lines = []
-        for name, title in NAMES.items():
+        for name, title in COMPARED.items():
             found = [
                 results.get((f"validation, {way}", f"{name} after {spent:g} minutes"), {}) for spent in sorted(minutes)
             ]
@@ -302,7 +322,7 @@ def accuracy_table(results: Results, minutes: list[float]) -> str:
     for way in ("exact", "learned"):
         told_of = (*(f"{m:g} min" for m in minutes), "by a power law at 10 h", f"test, {minutes[-1]:g} min")
         rows: list[tuple[str, ...]] = [(f"free flight {way}", *told_of)]
-        for name, title in NAMES.items():
+        for name, title in COMPARED.items():
             found = [results.get((f"validation, {way}", f"{name} after {m:g} minutes")) for m in minutes]
             test = results.get((f"test, {way}", f"{name} after {minutes[-1]:g} minutes"))
             rows.append((title, *map(_cell, found), _power_law(minutes, found), _cell(test)))
