@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from sdfsim.dynamics import solver_in_torch as twin
 from sdfsim.dynamics.bodies import Units, from_scene
 from sdfsim.dynamics.kernels.distance import distance as kernel_distance
 from sdfsim.dynamics.solver import Compiled, compiled_rules, no_manifolds, taken_up
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.primitives import convex_pieces
 from sdfsim.shape.shape import analytic_shape, load_shape
-from tests.dynamics import solver_in_torch as twin
 from tests.dynamics.test_laws import ball, body, cube
 from tests.dynamics.test_scale import SHAPES
 from tests.dynamics.test_solver import heap
