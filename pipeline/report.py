@@ -128,15 +128,16 @@ def trust_lines(mesh: dict) -> list[str]:
 
 
 def touching_lines(mesh: dict) -> list[str]:
-    """Which bodies touch, and which masks have no body, from the report of the mesh stage."""
+    """Which bodies touch, which masks have no body, and how deep hollows are, from the report of the mesh stage."""
+    from pipeline.mesh.hollows import hollow_line
+
     lines = []
     for first, second, by in mesh.get("touching", []):
         how = "split where their masks end" if by == "masks" else (
             "split along a seam by concavity and colour; give masks to be sure")  # fmt: skip
         lines.append(f"{first} and {second} touch; {how}")
-    return lines + [
-        f"masks of {name}: no surface corresponds to them" for name in mesh.get("masks_without_surface", [])
-    ]
+    lines += [f"masks of {name}: no surface corresponds to them" for name in mesh.get("masks_without_surface", [])]
+    return lines + [hollow_line(name, *found) for name, found in mesh.get("hollows_m", {}).items()]
 
 
 def notes(stages: dict[str, dict]) -> list[str]:
