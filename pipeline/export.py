@@ -17,10 +17,10 @@ from pipeline.mesh.meshing import SCENERY, TEXTURED, read_parts, rounded
 from pipeline.mesh.placement import Placement, load_placement
 from pipeline.mesh.visibility import Above
 from pipeline.progress import Progress, quiet, share_of
-from sdfsim.errors import EXIT_QUALITY, SdfsimError
+from sdfsim.errors import EXIT_QUALITY, SdfsimError, nearest
 from sdfsim.files import write_text
 from sdfsim.scene.scene import Scene
-from sdfsim.scene.scene_file import load_scene, nearest
+from sdfsim.scene.scene_file import load_scene
 from sdfsim.shape.mesh import Mesh, joined, load_mesh, read_glb
 
 SCENERY_SHARE = 2  # Of a budget the scenery gets as much as this many bodies: it has more to it.

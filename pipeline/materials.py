@@ -8,8 +8,8 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from sdfsim.errors import SdfsimError
-from sdfsim.scene.scene_file import UNITS, nearest
+from sdfsim.errors import SdfsimError, nearest
+from sdfsim.scene.scene_file import UNITS
 
 CRC = "CRC Handbook of Chemistry and Physics"
 TOOLBOX = "Engineering ToolBox"

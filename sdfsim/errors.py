@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
+import itertools
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 EXIT_ERROR = 1
 EXIT_USAGE = 2
@@ -14,6 +16,12 @@ EXIT_INTERRUPTED = 130
 def printable(text: str) -> str:
     """`text` with escapes for what is not printable: file names and keys of strangers may hold terminal codes."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """` (did you mean 'x'?)` with the nearest known name, or an empty string."""
+    match = difflib.get_close_matches(name[:100], itertools.islice(known, 1000), n=1, cutoff=0.55)
+    return f" (did you mean '{match[0]}'?)" if match else ""
 
 
 class SdfsimError(Exception):

@@ -17,6 +17,8 @@ from sdfsim.files import replacing
 from sdfsim.parallel import Progress, silent
 from sdfsim.recording import Eye, Place, body_colors, eye_of, framed, sheet, with_normals
 from sdfsim.scene.scene import Scene
+from sdfsim.shape.bvh import Caster
+from sdfsim.shape.mesh import Mesh
 
 if TYPE_CHECKING:
     from sdfsim.scene import written
@@ -113,8 +115,6 @@ class _Cast:
     which one a face is of."""
 
     def __init__(self, models: list[_Model], bodies: np.ndarray, places: np.ndarray, turns: np.ndarray) -> None:
-        import open3d as o3d
-
         starts = np.cumsum([0, *(len(m.vertices) for m in models)])
         vertices = np.concatenate([m.vertices @ r.T + t for m, r, t in zip(models, turns, places, strict=True)])
         self._normals = np.concatenate([m.normals @ r.T for m, r in zip(models, turns, strict=True)])
@@ -122,20 +122,7 @@ class _Cast:
         self._faces = np.concatenate([m.faces + start for m, start in zip(models, starts, strict=False)])
         self._textured = [(k, m.uv, m.texture, start) for k, m, start in zip(bodies, models, starts, strict=False)]
         self.body = np.repeat(bodies, [len(m.faces) for m in models])
-        self._tensor: Any = o3d.core.Tensor
-        self._scene = o3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(
-            self._tensor(vertices.astype(np.float32)), self._tensor(self._faces.astype(np.uint32))
-        )
-
-    def hits(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Distances [R], inf where nothing is hit; faces [R]; where in the face [R, 2]."""
-        found = self._scene.cast_rays(self._tensor(rays))
-        return found["t_hit"].numpy(), found["primitive_ids"].numpy(), found["primitive_uvs"].numpy()
-
-    def blocked(self, rays: np.ndarray) -> np.ndarray:
-        """[R] whether anything is hit."""
-        return self._scene.test_occlusions(self._tensor(rays)).numpy()
+        self.caster = Caster(Mesh(vertices, self._faces))
 
     def surface(self, face: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Normals [R, 3] and colours [R, 3] at places of faces."""
@@ -223,7 +210,7 @@ class Studio:
         dark = seen[:, _DARK] > 0.0
         if moving is not None:
             light = np.flatnonzero(~dark)
-            dark[light] = moving.blocked(seen[light, _SHADOW])
+            dark[light] = moving.caster.anything(seen[light, _SHADOW])
         return np.where(dark[:, None], seen[:, _SHADOWED], seen[:, _LIT]), 2 * seen[:, _BODY] + dark
 
     def _layer(self, cast: _Cast | None, rays: np.ndarray) -> np.ndarray:
@@ -233,7 +220,7 @@ class Studio:
         layer[:, _LIT] = layer[:, _SHADOWED] = _SKY
         if cast is None:
             return layer
-        away, face, uv = cast.hits(rays)
+        away, face, uv = cast.caster.cast(rays)
         there = np.flatnonzero(np.isfinite(away))
         away, face, body, direction = away[there, None], face[there], cast.body[face[there]], rays[there, 3:]
         normal, color = cast.surface(face, uv[there])
@@ -252,6 +239,6 @@ class Studio:
         layer[there, _SHADOW] = np.concatenate([start, np.broadcast_to(self.sun, start.shape)], 1)
         dark = toward <= 0.0
         if self._still:
-            dark |= self._still.blocked(layer[there, _SHADOW])
+            dark |= self._still.caster.anything(layer[there, _SHADOW])
         layer[there, _AWAY], layer[there, _BODY], layer[there, _DARK] = away[:, 0], body, dark
         return layer

@@ -20,7 +20,8 @@ from pipeline.mesh.cleaning import components, islands, keep_faces
 from pipeline.mesh.extraction import FLOATER, RIM, Distance, Surface, Volume, sample, sample_box
 from pipeline.mesh.photo_refining import load_pictures, refine
 from pipeline.mesh.seams import Part, Solid, Votes, count_votes, part_of_name, parts_by_shape, parts_by_votes, solid_of
-from pipeline.mesh.visibility import Caster, Visibility, look, spread_colors, to_bytes
+from pipeline.mesh.visibility import Visibility, look, spread_colors, to_bytes
+from sdfsim.shape.bvh import Caster
 from sdfsim.shape.mesh import Mesh, face_normals
 
 # A level plane smaller than this share of the largest one carries nothing: the lid of a box is no table.

@@ -22,10 +22,11 @@ from pipeline.mesh.next_photos import next_photos
 from pipeline.mesh.placement import GRAVITY, Placement, Up, measured_scale, place
 from pipeline.mesh.texture import Shots, shots_of, texture_parts
 from pipeline.mesh.trust import Support, color_range, colors_of, summary, support_of
-from pipeline.mesh.visibility import Caster, Visibility, to_bytes
+from pipeline.mesh.visibility import Visibility, to_bytes
 from pipeline.progress import Progress, quiet, share_of
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, replacing, write_json
+from sdfsim.shape.bvh import Caster
 from sdfsim.shape.mesh import Mesh, joined, read_attributes, read_mesh, write_glb, write_ply
 
 SCENERY = "scene"

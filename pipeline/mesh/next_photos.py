@@ -9,7 +9,8 @@ import numpy as np
 
 from pipeline.cameras import View, focus
 from pipeline.mesh.trust import FEW, Support, information, sigma_along, vertex_areas
-from pipeline.mesh.visibility import Caster, Visibility, framed
+from pipeline.mesh.visibility import Visibility, framed
+from sdfsim.shape.bvh import Caster
 from sdfsim.shape.mesh import Mesh, joined
 
 WANTED = 3  # photos that are proposed

@@ -17,7 +17,8 @@ from scipy.sparse import coo_matrix, csr_matrix, diags
 from scipy.sparse.linalg import cg
 
 from pipeline.cameras import View, frame_of
-from pipeline.mesh.visibility import Caster, Visibility
+from pipeline.mesh.visibility import Visibility
+from sdfsim.shape.bvh import Caster
 from sdfsim.shape.mesh import Mesh, vertex_normals
 
 LONG_SIDE = 640  # px; larger photos are made smaller, or the right place would lie too many pixels away

@@ -16,8 +16,9 @@ from PIL import Image
 from pipeline.cameras import View
 from pipeline.inputs.photos import Photo
 from pipeline.mesh.cleaning import keep_faces
-from pipeline.mesh.visibility import FLATTEST, Caster, bilinear, framed, to_bytes
+from pipeline.mesh.visibility import FLATTEST, bilinear, framed, to_bytes
 from pipeline.progress import Progress, quiet, share_of
+from sdfsim.shape.bvh import Caster
 from sdfsim.shape.mesh import Mesh, face_normals, joined, sample_surface, vertex_normals
 
 FACES = 40_000  # of a textured mesh: finer detail is in its texture
@@ -175,9 +176,9 @@ def rasterise(flat: Mesh, normals: np.ndarray, shape: tuple[int, int]) -> Texels
         texel = np.arange(first, min(first + BATCH, rows * columns))
         rays = np.tile(np.array([0, 0, 1, 0, 0, -1], np.float32), (len(texel), 1))
         rays[:, 0], rays[:, 1] = texel % columns + 0.5, texel // columns + 0.5
-        found = sheet.scene.cast_rays(sheet.tensor(rays))
-        hit = np.isfinite(found["t_hit"].numpy())
-        parts.append((texel[hit], *(found[key].numpy()[hit] for key in ("primitive_ids", "primitive_uvs"))))
+        away, face, places = sheet.cast(rays)
+        hit = np.isfinite(away)
+        parts.append((texel[hit], face[hit], places[hit]))
     at, face, places = (np.concatenate(part) for part in zip(*parts, strict=True))
     corners = flat.faces[face.astype(np.int64)]
     second, third = places.T

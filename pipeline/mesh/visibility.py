@@ -5,13 +5,13 @@ from __future__ import annotations
 from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from pipeline.cameras import View
 from pipeline.progress import Progress, quiet
+from sdfsim.shape.bvh import Caster
 from sdfsim.shape.mesh import Mesh, vertex_normals
 
 # A point seen at a flatter angle than this (cosine) does not count as seen.
@@ -26,34 +26,6 @@ class Look:
     # [V, 3] float in 0..255, the mean over photos, weighted towards those that look straight and from near
     color: np.ndarray
     weight: np.ndarray  # [V] behind the colour; 0: no photo shows the point
-
-
-class Caster:
-    """Rays against a mesh."""
-
-    def __init__(self, mesh: Mesh) -> None:
-        import open3d as o3d
-
-        self.tensor: Any = o3d.core.Tensor
-        self.scene = o3d.t.geometry.RaycastingScene()
-        self.scene.add_triangles(
-            self.tensor(mesh.vertices.astype(np.float32)), self.tensor(mesh.faces.astype(np.uint32))
-        )
-
-    def hits(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distances [R] along unit directions [R, 3], inf where nothing is hit, and the faces hit [R]."""
-        rays = np.concatenate([np.broadcast_to(origins, directions.shape), directions], 1).astype(np.float32)
-        found = self.scene.cast_rays(self.tensor(rays))
-        return found["t_hit"].numpy().astype(np.float64), found["primitive_ids"].numpy().astype(np.int64)
-
-    def clearance(self, points: np.ndarray) -> np.ndarray:
-        """Distances [P] of points [P, 3] from the surface, which is closed; negative inside."""
-        return self.scene.compute_signed_distance(self.tensor(points.astype(np.float32))).numpy()
-
-    def blocked(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """Whether something lies between points [R, 3] and [R, 3] or [3]."""
-        rays = np.concatenate([start, end - start], 1).astype(np.float32)
-        return self.scene.test_occlusions(self.tensor(rays), tnear=0.0, tfar=1.0).numpy()
 
 
 class Above:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from sdfsim.dynamics.pose import from_rotvec, multiply, normalise, to_matrix
+from sdfsim.dynamics.pose import apply, from_rotvec, multiply, normalise, to_matrix
 
 MAX_TURN = 0.1  # rad of rotation per inner step of the torque-free rotation
 MOST_TURN = 100.0  # rad of rotation that a step can follow
@@ -37,14 +37,14 @@ def torque_free(orientation: Tensor, angular_velocity: Tensor, inertia: Tensor, 
         return orientation, angular_velocity
     inverse = torch.linalg.inv(inertia)
     rotation = to_matrix(orientation)
-    momentum = _apply(rotation, _apply(inertia, _apply(rotation.mT, angular_velocity)))
+    momentum = apply(rotation, apply(inertia, apply(rotation.mT, angular_velocity)))
     fastest = float(angular_velocity.norm(dim=-1).max())
     steps = max(1, math.ceil(min(MOST_TURN, fastest * abs(dt)) / MAX_TURN))
     h = dt / steps
 
     def spin(q: Tensor) -> Tensor:
         r = to_matrix(q)
-        return _apply(r, _apply(inverse, _apply(r.mT, momentum)))
+        return apply(r, apply(inverse, apply(r.mT, momentum)))
 
     for _ in range(steps):
         orientation = normalise(_rkmk4(orientation, angular_velocity, spin, h))
@@ -66,7 +66,3 @@ def _rkmk4(q: Tensor, start: Tensor, spin: Callable[[Tensor], Tensor], h: float)
     k3 = slope(0.5 * k2)
     k4 = slope(k3)
     return multiply(from_rotvec((k1 + 2 * k2 + 2 * k3 + k4) / 6.0), q)
-
-
-def _apply(m: Tensor, v: Tensor) -> Tensor:
-    return (m @ v[..., None])[..., 0]

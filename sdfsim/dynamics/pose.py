@@ -32,6 +32,11 @@ def rotate(q: Tensor, v: Tensor) -> Tensor:
     return v + q[..., 3:] * t + torch.linalg.cross(q[..., :3], t)
 
 
+def apply(m: Tensor, v: Tensor) -> Tensor:
+    """Products [..., 3] of matrices [..., 3, 3] and vectors [..., 3]."""
+    return (m @ v[..., None])[..., 0]
+
+
 def to_matrix(q: Tensor) -> Tensor:
     """Rotation matrices [..., 3, 3] of unit quaternions [..., 4]."""
     products = (q[..., :, None] * q[..., None, :]).flatten(-2)

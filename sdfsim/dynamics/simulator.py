@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import platform
 import re
 import time
@@ -28,7 +27,7 @@ from sdfsim.dynamics.training_ranges import deep_starts, outside_training
 from sdfsim.dynamics.units import scene_units
 from sdfsim.dynamics.validity import check_nodes, check_sizes, fault
 from sdfsim.dynamics.variants import Variant, rollouts
-from sdfsim.errors import EXIT_QUALITY, SdfsimError
+from sdfsim.errors import EXIT_QUALITY, SdfsimError, nearest
 from sdfsim.scene.effects import plan
 from sdfsim.scene.scene import Limits, Scene
 
@@ -163,8 +162,7 @@ class Simulator:
     def __getitem__(self, name: str) -> BodyHandle:
         """A body by its name. Raises SdfsimError where there is none of that name."""
         if name not in self._names:
-            near = difflib.get_close_matches(name, self._names, n=1)
-            told = f" (did you mean {near[0]!r}?)" if near else ""
+            told = nearest(name, self._names)
             raise SdfsimError(f"there is no body {name!r}{told}", f"there are {', '.join(self._names[:20])}")
         return BodyHandle(self, self._names.index(name))
 

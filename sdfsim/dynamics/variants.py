@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 
 from sdfsim.dynamics.model import Model
 from sdfsim.dynamics.rollout import Rollout
-from sdfsim.errors import SdfsimError
+from sdfsim.errors import SdfsimError, nearest
 from sdfsim.parallel import parallel
 from sdfsim.scene.scene import Body, Scene
 
@@ -28,7 +27,7 @@ def varied(scene: Scene, variant: Variant) -> Scene:
     known = {body.name for body in scene.bodies}
     for name in variant:
         if name not in known:
-            raise SdfsimError(f"variant: there is no body {name!r}{_like(name, known)}")
+            raise SdfsimError(f"variant: there is no body {name!r}{nearest(name, known)}")
     return replace(scene, bodies=tuple(_changed(body, variant.get(body.name, {})) for body in scene.bodies))
 
 
@@ -73,7 +72,7 @@ def _changed(body: Body, fields: Mapping[str, Any]) -> Body:
                 raise SdfsimError(f"{where}: must be 0 to {NUMBERS[name]:g} (got {value!r})")
         else:
             allowed = (*VECTORS, *NUMBERS)
-            raise SdfsimError(f"{where}: no such field{_like(name, allowed)}; there are {', '.join(allowed)}")
+            raise SdfsimError(f"{where}: no such field{nearest(name, allowed)}; there are {', '.join(allowed)}")
     if "quat_xyzw" in new:
         new["quat_xyzw"] = new["quat_xyzw"] / max(np.linalg.norm(new["quat_xyzw"]), 1e-300)
     if body.motion != "dynamic" and (moving := {"velocity", "angular_velocity", "mass"} & new.keys()):
@@ -83,8 +82,3 @@ def _changed(body: Body, fields: Mapping[str, Any]) -> Body:
     if "mass" in new and body.inertia is not None:
         new["inertia"] = body.inertia * (new["mass"] / body.mass)
     return replace(body, **new)
-
-
-def _like(name: str, known: Any) -> str:
-    match = difflib.get_close_matches(name, list(known), n=1)
-    return f" (did you mean {match[0]!r}?)" if match else ""

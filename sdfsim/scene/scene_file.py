@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import difflib
 import errno
 import itertools
 import re
@@ -21,7 +20,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from pydantic import model_validator as validator_of_model
 from pydantic_core import InitErrorDetails, PydanticCustomError, core_schema
 
-from sdfsim.errors import SceneError, SdfsimError
+from sdfsim.errors import SceneError, SdfsimError, nearest
 from sdfsim.parallel import Progress, silent
 from sdfsim.scene.scene import Body, Effects, Limits, Motion, Scene, Waypoints
 from sdfsim.shape.primitives import PRIMITIVES
@@ -79,12 +78,6 @@ def _shown(value: Any) -> str:
         text = repr(str(value))
         return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "...'"
     return "nothing" if value is NOTHING else "a list" if isinstance(value, list) else "a mapping"
-
-
-def nearest(name: str, known: Iterable[str]) -> str:
-    """` (did you mean 'x'?)` with the nearest known name, or an empty string."""
-    match = difflib.get_close_matches(name[:100], itertools.islice(known, 1000), n=1, cutoff=0.55)
-    return f" (did you mean '{match[0]}'?)" if match else ""
 
 
 def _problem(text: str, kind: Any = "value") -> PydanticCustomError:

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import yaml
 
-from sdfsim.errors import SceneError
+from sdfsim.errors import SceneError, nearest
 from sdfsim.files import write_text
 from sdfsim.parallel import Progress, silent
 from sdfsim.scene import scene
-from sdfsim.scene.scene_file import VERSION, BodyTable, SceneTable, ShapeTable, load_scene, nearest
+from sdfsim.scene.scene_file import VERSION, BodyTable, SceneTable, ShapeTable, load_scene
 
 _OF_SHAPE = [key for key in ShapeTable.model_fields if key not in BodyTable.model_fields]
 _PATHS = ("asset", "mesh")

@@ -1,4 +1,4 @@
-"""Bounding-volume hierarchies over triangles: nearest point, ray parity, winding number."""
+"""Bounding-volume hierarchies over triangles: nearest point, ray parity, winding number, rays."""
 
 from __future__ import annotations
 
@@ -64,3 +64,38 @@ class Winding:
             return np.zeros(0)
         local = np.ascontiguousarray((points - self._centre) / self._size, dtype=np.float64)
         return np.asarray(igl.fast_winding_number(self._vertices, self._faces, local))
+
+
+class Caster:
+    """Rays [R, 6] float32, origins and directions, against a mesh."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        import open3d as o3d
+
+        self._tensor: Any = o3d.core.Tensor
+        self._scene = o3d.t.geometry.RaycastingScene()
+        vertices, faces = mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32)
+        self._scene.add_triangles(self._tensor(vertices), self._tensor(faces))
+
+    def cast(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Distances [R] in lengths of the directions, inf where nothing is hit; faces [R]; where in the face [R, 2]."""
+        found = self._scene.cast_rays(self._tensor(rays))
+        return found["t_hit"].numpy(), found["primitive_ids"].numpy(), found["primitive_uvs"].numpy()
+
+    def hits(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Distances [R] along unit directions [R, 3], inf where nothing is hit, and the faces hit [R]."""
+        rays = np.concatenate([np.broadcast_to(origins, directions.shape), directions], 1).astype(np.float32)
+        away, face, _ = self.cast(rays)
+        return away.astype(np.float64), face.astype(np.int64)
+
+    def clearance(self, points: np.ndarray) -> np.ndarray:
+        """Distances [P] of points [P, 3] from the surface, which is closed; negative inside."""
+        return self._scene.compute_signed_distance(self._tensor(points.astype(np.float32))).numpy()
+
+    def anything(self, rays: np.ndarray, most: float = np.inf) -> np.ndarray:
+        """[R] whether anything is hit, within so many lengths of the directions."""
+        return self._scene.test_occlusions(self._tensor(rays), tnear=0.0, tfar=most).numpy()
+
+    def blocked(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """Whether something lies between points [R, 3] and [R, 3] or [3]."""
+        return self.anything(np.concatenate([start, end - start], 1).astype(np.float32), 1.0)

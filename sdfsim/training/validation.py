@@ -1,12 +1,7 @@
-"""What is watched while a network is trained: rollouts of held-out trajectories, and curves of the log.
-
-`python -m sdfsim.training.validation RUN -o curves.png` draws the curves.
-"""
+"""What is watched while a network is trained: rollouts of held-out trajectories."""
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,8 +11,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from sdfsim.data.dataset import Trajectory, engine_substep, load_shapes, trajectory_files
-from sdfsim.errors import SdfsimError, run_main
-from sdfsim.files import replacing
+from sdfsim.errors import SdfsimError
 from sdfsim.training.contact_cache import inner_steps
 from sdfsim.training.run import Run
 
@@ -80,47 +74,3 @@ def held_out_rollouts(data: Path, device: torch.device, tell: Callable[[str], No
     steps = min(STEPS, *(len(t.position) - 1 for t in recorded)) if recorded else 0
     substep = engine_substep(data)
     return Rollouts([first_frames(t, steps + 1) for t in recorded], shapes, substep, device) if recorded else None
-
-
-def draw(run: Path, picture: Path) -> None:
-    """Curves of RUN/log.jsonl as a picture. Raises SdfsimError where there is no such log or matplotlib is not
-    installed."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise SdfsimError("curves need matplotlib", "pip install -e '.[bench]'") from error
-    path = run / "log.jsonl"
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
-        # A run that goes on, or was killed, may have written part of its last line.
-        log = [json.loads(line) for line in lines if line.endswith("\n")]
-        for name in ("step", "loss", "held_out_loss"):
-            _ = [float(entry[name]) for entry in log]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise SdfsimError(
-            f"{path}: not the log of a training run", "give the folder that `sdfsim train` wrote"
-        ) from error
-    figure = Figure(figsize=(9, 3.2), layout="constrained")
-    one, two = figure.subplots(1, 2)
-    one.plot([e["step"] for e in log], [e["loss"] for e in log], label="training (hard frames more often)")
-    one.plot([e["step"] for e in log], [e["held_out_loss"] for e in log], label="held out")
-    one.set(xlabel="optimiser step", ylabel="one-step loss", yscale="log")
-    one.legend()
-    rolled = [e for e in log if "rollout_m" in e]
-    two.plot([e["step"] for e in rolled], [e["rollout_m"] for e in rolled], "o-", color="C2")
-    two.set(xlabel="optimiser step", ylabel=f"rollout error, m (first {STEPS} steps)", ylim=(0, None))
-    with replacing(picture) as partial:
-        figure.savefig(partial, dpi=120, format="png")
-
-
-def main() -> None:
-    """Command line of this module."""
-    parser = argparse.ArgumentParser(description="Draw the curves of a training run.")
-    parser.add_argument("run", type=Path)
-    parser.add_argument("-o", "--out", type=Path, required=True)
-    args = parser.parse_args()
-    draw(args.run, args.out)
-
-
-if __name__ == "__main__":
-    run_main(main)

@@ -19,8 +19,8 @@ from pipeline.mesh.meshing import make_meshes, read_parts, rounded, trust_meshes
 from pipeline.mesh.photo_refining import Picture, refine
 from pipeline.mesh.placement import load_placement
 from pipeline.mesh.trust import GUESSED
-from pipeline.mesh.visibility import Caster
 from sdfsim.errors import SdfsimError
+from sdfsim.shape.bvh import Caster
 from sdfsim.shape.mesh import is_closed, load_mesh, read_attributes, read_mesh
 from tests.pipeline.test_objects import TABLE, TOP, both, box
 from tests.pipeline.test_surface import look_at

@@ -11,8 +11,8 @@ from pipeline.cameras import View
 from pipeline.inputs.known_cameras import Lens
 from pipeline.inputs.photos import Photo
 from pipeline.mesh.placement import check_distance, measured_scale
-from pipeline.mesh.visibility import Caster
 from sdfsim.errors import SdfsimError
+from sdfsim.shape.bvh import Caster
 from sdfsim.shape.mesh import joined
 from tests.pipeline.test_surface import cube, ring
 

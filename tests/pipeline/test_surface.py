@@ -9,9 +9,10 @@ from pipeline.cameras import CAREFUL, UNKNOWN, Similarity, Sparse, View, camera_
 from pipeline.mesh.cleaning import belonging, components, islands
 from pipeline.mesh.extraction import Volume, sample_box, sample_volume, trusted_vertices
 from pipeline.mesh.placement import find_up, load_placement, place, plane_up, resting_height
-from pipeline.mesh.visibility import Caster, Visibility, bilinear, spread_colors
+from pipeline.mesh.visibility import Visibility, bilinear, spread_colors
 from pipeline.sfm.supervision import unit_sphere_of
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
+from sdfsim.shape.bvh import Caster
 from sdfsim.shape.mesh import Mesh, is_closed, joined, signed_volume, vertex_normals
 
 

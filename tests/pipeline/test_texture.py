@@ -16,10 +16,11 @@ from pipeline.inputs.photos import Photo
 from pipeline.mesh import texture
 from pipeline.mesh.cleaning import components
 from pipeline.mesh.texture import BLOCK, Shots, fewer, rasterise, shots_of, textured, unfold
-from pipeline.mesh.visibility import Caster, Visibility, bilinear, look, to_bytes
+from pipeline.mesh.visibility import Visibility, bilinear, look, to_bytes
 from sdfsim.errors import SdfsimError
 from sdfsim.recording import Playback, save_reconstruction, with_normals
 from sdfsim.scene.scene import Body, Scene
+from sdfsim.shape.bvh import Caster
 from sdfsim.shape.mesh import Mesh, joined, read_glb, sample_surface, vertex_normals, write_glb, write_ply
 from sdfsim.shape.shape import analytic_shape, load_shape, scaled
 from tests.pipeline.test_surface import cube, look_at

@@ -11,9 +11,10 @@ import pytest
 from pipeline.cameras import View
 from pipeline.mesh.next_photos import Advice, next_photos
 from pipeline.mesh.trust import Support, information, sigma_along, summary, support_of
-from pipeline.mesh.visibility import Caster, Visibility
+from pipeline.mesh.visibility import Visibility
 from pipeline.report import improvements, notes
 from sdfsim.errors import SdfsimError
+from sdfsim.shape.bvh import Caster
 from sdfsim.shape.mesh import Mesh, joined, load_mesh, read_attributes, write_ply
 from tests.pipeline.photo_sets import orbit, still_life, studio
 from tests.pipeline.test_surface import cube, look_at

@@ -18,7 +18,7 @@ from sdfsim.dynamics.solver import solver_step
 from sdfsim.dynamics.step import StepOptions, contact_graph
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.evaluate import evaluate
-from sdfsim.training import contact_cache, validation
+from sdfsim.training import contact_cache
 from sdfsim.training import train as train_module
 from sdfsim.training.contact_cache import Solved, contact_frames, join_frames
 from sdfsim.training.impulse_task import ImpulseTask
@@ -194,20 +194,6 @@ def test_the_log_tells_rollouts_and_is_drawn(ball_data, presets, tmp_path):
     report = evaluate(ball_data, model=tmp_path / "run" / "model.safetensors", split="validation", errors_only=True)
     assert entries[-1]["rollout_m"] == pytest.approx(report["model"]["39"]["translation_rmse"], rel=1e-4)
     assert entries[-1]["rollout_degrees"] == pytest.approx(report["model"]["39"]["rotation_error"], rel=1e-4)
-    with open(tmp_path / "run" / "log.jsonl", "a") as log:
-        log.write('{"step": 21, "lo')  # a run that is still writing
-    validation.draw(tmp_path / "run", tmp_path / "curves.png")
-    assert (tmp_path / "curves.png").read_bytes()[:4] == b"\x89PNG"
-
-
-def test_curves_of_what_is_no_log_are_refused(tmp_path):
-    pytest.importorskip("matplotlib")
-    for text in (None, "nonsense\n", '{"step": 1}\n'):
-        if text is not None:
-            (tmp_path / "log.jsonl").write_text(text)
-        with pytest.raises(SdfsimError, match="not the log of a training run"):
-            validation.draw(tmp_path, tmp_path / "curves.png")
-    assert not (tmp_path / "curves.png").exists()
 
 
 @pytest.mark.parametrize("steps", [0, -5])

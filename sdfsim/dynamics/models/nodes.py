@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sdfsim.shape.mesh import Mesh, convex_hull
+from sdfsim.shape.mesh import Mesh, convex_hull, joined
 from sdfsim.shape.sdf import PlaneSdf
 from sdfsim.shape.shape import Shape
 
@@ -34,11 +34,7 @@ def vertices(shape: Shape, count: int | None) -> Shape:
         return replace(shape, nodes=np.zeros((1, 3)), faces=np.zeros((1, 3), dtype=np.int64))
     hulls = [convex_hull(piece) for piece in shape.pieces]
     if hulls and (count is None or sum(len(hull.vertices) for hull in hulls) <= count):
-        first = np.cumsum([0, *(len(hull.vertices) for hull in hulls[:-1])])
-        mesh = Mesh(
-            np.concatenate([hull.vertices for hull in hulls]),
-            np.concatenate([hull.faces + k for hull, k in zip(hulls, first, strict=True)]),
-        )
+        mesh = joined(hulls)
     else:
         mesh = _reduced(shape.mesh, count)
     return replace(shape, nodes=mesh.vertices, faces=mesh.faces)

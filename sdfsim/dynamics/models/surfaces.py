@@ -112,7 +112,7 @@ def motion_features(bodies: Bodies, state: State) -> dict[str, Tensor]:
 
     def moved(k: int) -> Tensor:
         """[M, 3] displacement of nodes from pose k to pose k + 1."""
-        return _apply((turns[k + 1] - turns[k])[owner], bodies.node) + (places[k + 1] - places[k])[owner]
+        return pose.apply((turns[k + 1] - turns[k])[owner], bodies.node) + (places[k + 1] - places[k])[owner]
 
     travel = [places[1] - places[0], places[2] - places[1]]
     fixed = (~bodies.moves).to(bodies.friction.dtype)
@@ -148,7 +148,7 @@ def _now_and_at_rest(now: Tensor, rest: Tensor) -> Tensor:
 
 def _arms(bodies: Bodies, state: State) -> Tensor:
     """[M, 3] nodes from their body's centre of mass, world axes."""
-    return _apply(pose.to_matrix(state.orientation)[node_owner(bodies)], bodies.node)
+    return pose.apply(pose.to_matrix(state.orientation)[node_owner(bodies)], bodies.node)
 
 
 def advance(bodies: Bodies, state: State, acceleration: Tensor, dt: float) -> State:
@@ -157,8 +157,8 @@ def advance(bodies: Bodies, state: State, acceleration: Tensor, dt: float) -> St
     owner = node_owner(bodies)
     now, before = pose.to_matrix(state.orientation), pose.to_matrix(earlier_orientation[1])
     # Relative to each body's own centre, so that a far origin costs no precision.
-    step = (state.position - earlier_position[1])[owner] + _apply((now - before)[owner], bodies.node)
-    moved = _apply(now[owner], bodies.node) + step + acceleration
+    step = (state.position - earlier_position[1])[owner] + pose.apply((now - before)[owner], bodies.node)
+    moved = pose.apply(now[owner], bodies.node) + step + acceleration
     offset, orientation = match_shapes(bodies.node, moved, owner, state.orientation)
     still = ~bodies.moves[:, None]
     offset = torch.where(still, torch.zeros_like(offset), offset)
@@ -184,7 +184,7 @@ def target_acceleration(bodies: Bodies, state: State, position: Tensor, orientat
     earlier_position, earlier_orientation = _history(state)
     owner = node_owner(bodies)
     turns = [pose.to_matrix(q) for q in (earlier_orientation[1], state.orientation, orientation)]
-    curl = _apply((turns[2] - 2 * turns[1] + turns[0])[owner], bodies.node)
+    curl = pose.apply((turns[2] - 2 * turns[1] + turns[0])[owner], bodies.node)
     return (position - 2 * state.position + earlier_position[1])[owner] + curl
 
 
@@ -192,7 +192,3 @@ def _history(state: State) -> tuple[Tensor, Tensor]:
     if state.earlier_position is None or state.earlier_orientation is None:
         raise ValueError("a network on surface nodes needs the two earlier poses")
     return state.earlier_position, state.earlier_orientation
-
-
-def _apply(m: Tensor, v: Tensor) -> Tensor:
-    return (m @ v[..., None])[..., 0]
