@@ -168,10 +168,8 @@ class Up(NamedTuple):
 
 
 def camera_up(views: list[View]) -> Up:
-    """Up from the cameras alone: people hold cameras level, so their right axes are horizontal.
-
-    It is the direction with the least spread of the right axes; where these span no plane, the mean image up.
-    """
+    """Up from the cameras alone: people hold cameras level, so their right axes are horizontal. It is the direction
+    with the least spread of the right axes; where these span no plane, the mean image up."""
     right = np.array([v.rotation[0] for v in views])
     mean = -np.mean([v.rotation[1] for v in views], axis=0)
     mean /= np.linalg.norm(mean) + 1e-12

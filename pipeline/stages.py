@@ -192,9 +192,7 @@ def run_stage(
     name: str, folder: str | Path, *, progress: Callable[[str, float, str], None] | None = None, **changes: Any
 ) -> dict:  # fmt: skip
     """Runs one stage in a folder that the stages before it have written; returns and raises as `reconstruct` does.
-
-    Options that are given (not None) are kept in the folder's config.yaml; a budget is that of this call alone.
-    """
+    Options that are given (not None) are kept in the folder's config.yaml; a budget is that of this call alone."""
     _check_name(name)
     kept = read_config(Path(folder))
     known = {key: value for key, value in changes.items() if value is not None}

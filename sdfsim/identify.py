@@ -210,10 +210,8 @@ def identify(recording: Recording, scene: Scene, *, on_progress: Progress = sile
 
 
 class Windows:
-    """All windows of a recording as one set of bodies, each window a world of its own.
-
-    Parameters are friction and restitution of every body that touches another, then the logarithms of mass ratios.
-    """
+    """All windows of a recording as one set of bodies, each window a world of its own. Parameters are friction and
+    restitution of every body that touches another, then the logarithms of mass ratios."""
 
     def __init__(self, recording: Recording, scene: Scene) -> None:
         self.scene, self.recording = scene, recording

@@ -409,10 +409,8 @@ def with_normals(mesh: Mesh) -> tuple[Mesh, np.ndarray]:
 
 
 def _corner_normals(mesh: Mesh) -> np.ndarray | None:
-    """[3 F, 3] for every face corner the mean of the faces at its vertex that bend less than the crease angle.
-
-    None for a mesh so fine that it may pass as smooth.
-    """
+    """[3 F, 3] for every face corner the mean of the faces at its vertex that bend less than the crease angle. None for
+    a mesh so fine that it may pass as smooth."""
     owner = mesh.faces.reshape(-1)
     order = np.argsort(owner, kind="stable")
     valence = np.bincount(owner, minlength=len(mesh.vertices))

@@ -139,10 +139,8 @@ class _Cast:
 
 
 class Studio:
-    """A scene with a camera and a sun, of which pictures are taken; `radius` m is that of all that is shown.
-
-    `axes` [3, 3] are unit vectors right and down in the picture, and into it; `sun` [3] is one towards the sun.
-    """
+    """A scene with a camera and a sun, of which pictures are taken; `radius` m is that of all that is shown. `axes` [3,
+    3] are unit vectors right and down in the picture, and into it; `sun` [3] is one towards the sun."""
 
     def __init__(self, scene: Scene, eye: Eye, radius: float) -> None:
         self._eye, self._radius = eye, radius
@@ -200,10 +198,8 @@ class Studio:
         return np.concatenate([np.broadcast_to(self._eye.position, direction.shape), direction], 1, dtype=np.float32)
 
     def _look(self, moving: _Cast | None, rays: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Colours [R, 3] along rays [R, 6], and numbers [R] by which bodies, light and shade differ.
-
-        `seen` is the layer of what stands still.
-        """
+        """Colours [R, 3] along rays [R, 6], and numbers [R] by which bodies, light and shade differ. `seen` is the
+        layer of what stands still."""
         if moving is not None:
             layer = self._layer(moving, rays)
             seen = np.where((layer[:, _AWAY] < seen[:, _AWAY])[:, None], layer, seen)

@@ -154,10 +154,8 @@ def _picture(viewer: subprocess.Popen, address: str, picture: Path, at: float | 
 
 
 def _moment(at: float | None, first: float, last: float, steps: int) -> float:
-    """The time in s to show, between the `first` and the `last` of a recording of so many steps.
-
-    A run is a whole number of steps, so it ends up to one before the time that was asked for: that is its end too.
-    """
+    """The time in s to show, between the `first` and the `last` of a recording of so many steps. A run is a whole
+    number of steps, so it ends up to one before the time that was asked for: that is its end too."""
     step = (last - first) / steps if steps else 0.0
     if at is not None and not first <= at <= last + max(step, 1e-6):
         raise SdfsimError(f"--at {at:g}: the recording holds {first:g} to {last:g} s")

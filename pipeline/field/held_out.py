@@ -35,10 +35,8 @@ class Compared:
 
 
 class HeldOut:
-    """The photos that were not trained on, at a third of the training resolution; views are in normalised space.
-
-    Those that show nothing of the unit sphere are passed over; `shown` has the indices of the others.
-    """
+    """The photos that were not trained on, at a third of the training resolution; views are in normalised space. Those
+    that show nothing of the unit sphere are passed over; `shown` has the indices of the others."""
 
     def __init__(self, views: list[View], photos_folder: Path, trainer: Trainer, *, masked: bool) -> None:
         self.views, self.trainer, self.masked = views, trainer, masked

@@ -58,11 +58,8 @@ def reduced(frame: np.ndarray, longest: int) -> np.ndarray:
 
 
 def follow(path: Path) -> Track:
-    """First pass: motion and sharpness of every frame.
-
-    Motion is the median displacement of corners that are found again by Lucas-Kanade tracking; where most are lost
-    (a cut, or a blur) it counts as a step of its own.
-    """
+    """First pass: motion and sharpness of every frame. Motion is the median displacement of corners that are found
+    again by Lucas-Kanade tracking; where most are lost (a cut, or a blur) it counts as a step of its own."""
     import cv2
 
     frames, rate = frames_of(path)

@@ -111,10 +111,8 @@ class Body:
         return inside
 
     def distance(self, field: Distance) -> Distance:
-        """Its signed distance, from the field's: the cross-section above the contact layer goes down to the plane.
-
-        What it goes around there is as the field has it: the floor of a cup, or nothing.
-        """
+        """Its signed distance, from the field's: the cross-section above the contact layer goes down to the plane. What
+        it goes around there is as the field has it: the floor of a cup, or nothing."""
 
         def value(points: np.ndarray) -> np.ndarray:
             lifted, holds = self.lifted(points), self.holds(points)

@@ -122,10 +122,8 @@ def refine(mesh: Mesh, pictures: list[Picture], blocking: Caster, lift: float, f
 
 
 def agreement(sight: Visibility, normal: np.ndarray, pictures: list[Picture], moves: np.ndarray) -> np.ndarray:
-    """How alike photos show the patches [P, M] around vertices [P] that are moved [M] along normals [P, 3].
-
-    The mean correlation between any two of the photos, -1 where too few show a vertex.
-    """
+    """How alike photos show the patches [P, M] around vertices [P] that are moved [M] along normals [P, 3]. The mean
+    correlation between any two of the photos, -1 where too few show a vertex."""
     count = len(normal)
     cosine = np.zeros((len(pictures), count), np.float32)
     for number, picture in enumerate(pictures):

@@ -208,10 +208,8 @@ def parts_by_shape(solid: Solid, colors: np.ndarray, least: float) -> list[Part]
 
 
 def _half(solid: Solid, mine: np.ndarray, groove: np.ndarray, colors: np.ndarray) -> np.ndarray:
-    """One side [N] of the best division of some vertices [P] bool in two, through grooves and where colours change.
-
-    The normalised cut of Shi and Malik (2000), from the second eigenvector of the surface's Laplacian.
-    """
+    """One side [N] of the best division of some vertices [P] bool in two, through grooves and where colours change. The
+    normalised cut of Shi and Malik (2000), from the second eigenvector of the surface's Laplacian."""
     place = np.cumsum(mine) - 1
     ends = np.concatenate([solid.faces[:, [0, 1]], solid.faces[:, [1, 2]], solid.faces[:, [2, 0]]])
     ends = ends[mine[ends].all(1)]

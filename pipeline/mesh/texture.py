@@ -278,10 +278,8 @@ def _facing(view: View, points: np.ndarray, normals: np.ndarray) -> tuple[np.nda
 
 
 def _filled(image: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """An image [H, W, C] whose pixels that are not known [H, W] take the colours around them.
-
-    What lies between charts is looked at by viewers that shrink textures, and beside them by those that interpolate.
-    """
+    """An image [H, W, C] whose pixels that are not known [H, W] take the colours around them. What lies between charts
+    is looked at by viewers that shrink textures, and beside them by those that interpolate."""
     import cv2
 
     if known.all() or max(known.shape) == 1:

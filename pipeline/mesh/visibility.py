@@ -106,9 +106,7 @@ def bilinear(image: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 def spread_colors(points: np.ndarray, known: np.ndarray, colors: np.ndarray) -> np.ndarray:
     """Colours [P, C] at points [P, 3] from known ones [K, 3] with colours [K, C]: inverse-distance mean of the nearest.
-
-    What no photo shows, such as the place where a body stood, gets the colours around it.
-    """
+    What no photo shows, such as the place where a body stood, gets the colours around it."""
     from scipy.spatial import KDTree
 
     nearest = min(8, len(known))

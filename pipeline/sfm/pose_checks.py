@@ -35,10 +35,8 @@ class Findings:
 
 
 def find(result: dict, photos: list[Photo]) -> Findings:
-    """Looks at a worker's counts and pairs.
-
-    Blurred photos match each other, for want of anything finer; a group of nothing else is no group.
-    """
+    """Looks at a worker's counts and pairs. Blurred photos match each other, for want of anything finer; a group of
+    nothing else is no group."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 

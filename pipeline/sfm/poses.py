@@ -43,10 +43,8 @@ WIDEST_PAIR = 60.0  # degrees between the optical axes of known cameras whose ph
 
 
 def hopeful(name: str, first: dict) -> bool:
-    """Whether an attempt is worth its time after the first one's failed checks.
-
-    Photos of one spot, or of a background that stands still, tell no more with more features.
-    """
+    """Whether an attempt is worth its time after the first one's failed checks. Photos of one spot, or of a background
+    that stands still, tell no more with more features."""
     still = first["still_pairs"] > 0.5
     return still if name == "without what stands still" else first["turn_only_pairs"] <= 0.9 and not still
 

@@ -259,10 +259,8 @@ def read_pairs(pycolmap, database: Path) -> tuple[dict[str, int], list[tuple[str
 
 
 def findings(job: dict, features: dict[str, int], pairs: list) -> dict:
-    """What the matches say whatever the poses: `counts` of each photo, `pairs`, and the share of `turn_only` pairs.
-
-    A pair holds the names, the number of matches, and the share of them that did not move between the photos.
-    """
+    """What the matches say whatever the poses: `counts` of each photo, `pairs`, and the share of `turn_only` pairs. A
+    pair holds the names, the number of matches, and the share of them that did not move between the photos."""
     result = {name: {"features": count, "best_matches": 0} for name, count in features.items()}
     sizes = {name: group for group in job["groups"] for name in group["names"]}
     told, moving = [], []
@@ -297,10 +295,8 @@ def turn_only(pairs: list[tuple[dict, np.ndarray, np.ndarray]], least: float = 2
 
 
 def contradictions(pairs: list, views: list[dict]) -> list[dict]:
-    """Pairs of posed photos, with how far their matches are from the lines that the poses put them on.
-
-    Each pair was matched on its own: where poses are right nearly all agree; no poses agree with repeating things.
-    """
+    """Pairs of posed photos, with how far their matches are from the lines that the poses put them on. Each pair was
+    matched on its own: where poses are right nearly all agree; no poses agree with repeating things."""
     posed = {view["name"]: view for view in views}
     found = []
     for a, b, first, second in pairs:

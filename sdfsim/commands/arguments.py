@@ -58,10 +58,8 @@ Cluster = Annotated[
 
 
 def command(work: Callable[..., None]) -> Callable[..., None]:
-    """A command: `work` with a `Session` made for it, and with the options --json, --device and -v.
-
-    Work that does not compute takes no `device`; that it is there is checked all the same.
-    """
+    """A command: `work` with a `Session` made for it, and with the options --json, --device and -v. Work that does not
+    compute takes no `device`; that it is there is checked all the same."""
     given = inspect.signature(work, eval_str=True).parameters
 
     @wraps(work)

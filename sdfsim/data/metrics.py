@@ -44,10 +44,8 @@ def energy(motion: Trajectory) -> np.ndarray:
 
 
 def energy_gain(motion: Trajectory) -> float | None:
-    """Largest increase of the energy over that of the first frame, as a fraction of it (0 when it never rises).
-
-    None where the first frame has no energy above that of rest at the origin's height, so that no fraction exists.
-    """
+    """Largest increase of the energy over that of the first frame, as a fraction of it (0 when it never rises). None
+    where the first frame has no energy above that of rest at the origin's height, so that no fraction exists."""
     course = energy(motion)
     return float((course.max() - course[0]) / course[0]) if course[0] > 0 else None
 

@@ -213,10 +213,8 @@ def decompose(mesh: Mesh, scratch: Path) -> list[Mesh]:
 
 
 def fit_shapes(sources: list[ShapeSource], out: Path, on_progress: Progress) -> None:
-    """Fit a Shape folder `out/NAME` for every shape that has none yet.
-
-    The surface is that of the convex pieces, since that is what the teacher collides.
-    """
+    """Fit a Shape folder `out/NAME` for every shape that has none yet. The surface is that of the convex pieces, since
+    that is what the teacher collides."""
     todo = [source for source in sources if not (out / source.name / "shape.json").exists()]
     for done, (index, _) in enumerate(parallel(_fit_one, [(s, out / s.name) for s in todo]), start=1):
         on_progress(done / len(todo), f"shape {todo[index].name} fitted, {done} of {len(todo)}")

@@ -353,10 +353,8 @@ _known: WeakKeyDictionary[Sdf, tuple[np.ndarray, BakedGrid | None, Surface, np.n
 def _geometry(
     sdf: Sdf, nodes: np.ndarray, pieces: tuple[np.ndarray, ...]
 ) -> tuple[BakedGrid | None, Surface, np.ndarray, Clumps]:
-    """The grid of an SDF that has no closed form, its surface, from where its nodes look out, and these in leaves.
-
-    Made once for all scenes of a process.
-    """
+    """The grid of an SDF that has no closed form, its surface, from where its nodes look out, and these in leaves. Made
+    once for all scenes of a process."""
     kept = _known.get(sdf)
     if kept is None or kept[0].shape != nodes.shape or (kept[0] != nodes).any():
         grid = None if isinstance(sdf, ANALYTIC) else baked(sdf, nodes, pieces)
@@ -410,10 +408,8 @@ _ARRAYS = (
 
 
 def _nodes_of(bodies: Bodies, k: int) -> np.ndarray:
-    """[K, 3] surface nodes of the shape of body k, at scale 1 in the shape's own frame.
-
-    Rounded to 1e-12 m, so that bodies of different scales know them as the same nodes.
-    """
+    """[K, 3] surface nodes of the shape of body k, at scale 1 in the shape's own frame. Rounded to 1e-12 m, so that
+    bodies of different scales know them as the same nodes."""
     first, last = int(bodies.node_start[k]), int(bodies.node_start[k + 1])
     return ((bodies.node[first:last] + bodies.com[k]) / bodies.scale[k]).cpu().numpy().round(12)
 

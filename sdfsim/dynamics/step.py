@@ -152,10 +152,8 @@ def _turned(bodies: Bodies, state: State, rows: Tensor, dt: float) -> tuple[Tens
 
 
 def correct(model: Model, bodies: Bodies, state: State, solved: State, acts: Acts, rules: StepOptions) -> State:
-    """What the network makes of the solve: only bodies that have met somebody are in its graph.
-
-    `inference.corrected` is the same, compiled, for the CPU.
-    """
+    """What the network makes of the solve: only bodies that have met somebody are in its graph. `inference.corrected`
+    is the same, compiled, for the CPU."""
     weight = next(model.network.parameters())
     active, graph = contact_graph(bodies, state, solved, acts, rules, model.dt, weight.dtype)
     predicted = model.network(graph.to(weight.device), friction=rules.friction, trust=rules.trust)

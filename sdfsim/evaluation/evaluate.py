@@ -259,10 +259,8 @@ def report_lines(report: dict[str, Any]) -> list[str]:
 
 
 def error_rows(report: dict[str, Any], *, name: str, at_frame: bool = False) -> Rows:
-    """Errors up to every horizon, or at each of `metrics.FRAMES` alone; the head first.
-
-    Rows are the model, the teacher again, and flight without contact. Intervals go with the horizons.
-    """
+    """Errors up to every horizon, or at each of `metrics.FRAMES` alone; the head first. Rows are the model, the teacher
+    again, and flight without contact. Intervals go with the horizons."""
     again = {f"teacher, {size} m/s off": found for size, found in _perturbed(report).items()}
     rows = {name: report["model"], **again, "ballistic": report["ballistic"]}
     longest = max(map(int, report["model"]))

@@ -47,9 +47,7 @@ def exact_solids(data: Path, shapes: dict[str, Shape]) -> dict[str, Solid]:
 
 def deepest(motion: Trajectory, solids: dict[str, Solid], every: int = EVERY) -> np.ndarray:
     """[F] m, signed distance of the deepest node of any body in any other, or in the floor z = 0, every so many frames.
-
-    Negative inside, infinite where nothing touches. Pairs of static bodies, and these in the floor, do not count.
-    """
+    Negative inside, infinite where nothing touches. Pairs of static bodies, and these in the floor, do not count."""
     kept = slice(every, None, every)
     position = motion.position[kept]
     frames, bodies = position.shape[:2]
@@ -102,9 +100,7 @@ def _near(position: np.ndarray, turn: np.ndarray, bounds: np.ndarray, moving: np
 
 def depths(scene: Scene, motion: Trajectory, every: int = 5) -> np.ndarray:
     """[F] m, depth of the deepest node in those of every so many frames (see `rollout_motion`) in which bodies touch.
-
-    The only plane of the scene, if any, is the floor z = 0.
-    """
+    The only plane of the scene, if any, is the floor z = 0."""
     solids = {}
     for name in set(motion.shape.tolist()):
         shape = scene.shapes[int(name)]

@@ -63,10 +63,8 @@ Fault = tuple[Loc, str]  # where below a table, and what is wrong there
 
 
 class Numeral(str):
-    """A number without quotes, as the file writes it.
-
-    Fields read their numbers themselves, as YAML 1.1 guesses: `1:30` would become 90, and `1e-3` a text.
-    """
+    """A number without quotes, as the file writes it. Fields read their numbers themselves, as YAML 1.1 guesses: `1:30`
+    would become 90, and `1e-3` a text."""
 
 
 NOTHING = object()  # what a key has that is followed by nothing, `~` or `null`
@@ -764,10 +762,8 @@ def load_scene(
 
 
 def _load_shapes(table: SceneTable, document: Document, on_progress: Progress) -> dict[str | None, Shape]:
-    """Every shape in use, in the order of first use; None is the plane that all bodies with a `plane` share.
-
-    What must be fitted or sampled waits until all else is known to be right: a fit takes a minute.
-    """
+    """Every shape in use, in the order of first use; None is the plane that all bodies with a `plane` share. What must
+    be fitted or sampled waits until all else is known to be right: a fit takes a minute."""
     used = dict.fromkeys(body.shape for body in table.bodies)
     shapes: dict[str | None, Shape] = {None: analytic_shape("plane", name="plane")}
     slow = {key: s.kind in _FITTED or s.sdf == "grid" for key, s in table.shapes.items()}

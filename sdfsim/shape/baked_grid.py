@@ -112,10 +112,8 @@ def bake(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = ()) -> Bake
 
 
 def inwards(sdf: Sdf, nodes: np.ndarray) -> np.ndarray:
-    """[K, 3] unit vectors from nodes [K, 3] m on the surface into the solid: against the mean of the normals around.
-
-    On an edge or in a corner a distance has several normals; this is what lies between them.
-    """
+    """[K, 3] unit vectors from nodes [K, 3] m on the surface into the solid: against the mean of the normals around. On
+    an edge or in a corner a distance has several normals; this is what lies between them."""
     if not len(nodes):
         return np.zeros((0, 3))
     reach = 0.008 * float(np.ptp(sdf.bounds, axis=0).max())
@@ -127,10 +125,8 @@ def inwards(sdf: Sdf, nodes: np.ndarray) -> np.ndarray:
 
 
 def wall_thickness(sdf: Sdf, nodes: np.ndarray) -> float:
-    """m: twice the depth to which one can go inwards from a node until the surface opposite is nearer.
-
-    The least that all nodes but a twentieth have: edges that come to a point are thin everywhere.
-    """
+    """m: twice the depth to which one can go inwards from a node until the surface opposite is nearer. The least that
+    all nodes but a twentieth have: edges that come to a point are thin everywhere."""
     extent = float(np.ptp(sdf.bounds, axis=0).max())
     some = nodes[:: max(1, len(nodes) // 512)]
     depth = np.geomspace(1.0 / 512.0, 0.5, 32) * extent

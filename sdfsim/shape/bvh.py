@@ -19,13 +19,13 @@ class ClosestPoint:
     def __init__(self, mesh: Mesh) -> None:
         import open3d as o3d
 
-        self._tensor: Any = o3d.core.Tensor
+        self.tensor: Any = o3d.core.Tensor
         self.centre = 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0))
         threads = int(os.environ.get("OMP_NUM_THREADS", "0") or 0)
         self.scene = o3d.t.geometry.RaycastingScene(nthreads=max(threads, 0))
         self.threads = max(threads, 0)
         local = np.ascontiguousarray(mesh.vertices - self.centre, dtype=np.float32)
-        self.scene.add_triangles(self._tensor(local), self._tensor(np.ascontiguousarray(mesh.faces, dtype=np.uint32)))
+        self.scene.add_triangles(self.tensor(local), self.tensor(np.ascontiguousarray(mesh.faces, dtype=np.uint32)))
 
     def __call__(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Nearest surface point [P, 3] m and the unit normal [P, 3] of its triangle."""
@@ -39,7 +39,7 @@ class ClosestPoint:
         return occupancy.numpy() > 0.5
 
     def _local(self, points: np.ndarray):
-        return self._tensor(np.ascontiguousarray(points - self.centre, dtype=np.float32))
+        return self.tensor(np.ascontiguousarray(points - self.centre, dtype=np.float32))
 
 
 class Winding:
@@ -72,14 +72,14 @@ class Caster:
     def __init__(self, mesh: Mesh) -> None:
         import open3d as o3d
 
-        self._tensor: Any = o3d.core.Tensor
-        self._scene = o3d.t.geometry.RaycastingScene()
+        self.tensor: Any = o3d.core.Tensor
+        self.scene = o3d.t.geometry.RaycastingScene()
         vertices, faces = mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32)
-        self._scene.add_triangles(self._tensor(vertices), self._tensor(faces))
+        self.scene.add_triangles(self.tensor(vertices), self.tensor(faces))
 
     def cast(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Distances [R] in lengths of the directions, inf where nothing is hit; faces [R]; where in the face [R, 2]."""
-        found = self._scene.cast_rays(self._tensor(rays))
+        found = self.scene.cast_rays(self.tensor(rays))
         return found["t_hit"].numpy(), found["primitive_ids"].numpy(), found["primitive_uvs"].numpy()
 
     def hits(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -90,11 +90,11 @@ class Caster:
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
         """Distances [P] of points [P, 3] from the surface, which is closed; negative inside."""
-        return self._scene.compute_signed_distance(self._tensor(points.astype(np.float32))).numpy()
+        return self.scene.compute_signed_distance(self.tensor(points.astype(np.float32))).numpy()
 
     def anything(self, rays: np.ndarray, most: float = np.inf) -> np.ndarray:
         """[R] whether anything is hit, within so many lengths of the directions."""
-        return self._scene.test_occlusions(self._tensor(rays), tnear=0.0, tfar=most).numpy()
+        return self.scene.test_occlusions(self.tensor(rays), tnear=0.0, tfar=most).numpy()
 
     def blocked(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Whether something lies between points [R, 3] and [R, 3] or [3]."""

@@ -26,9 +26,7 @@ def in_metres(
     inner: Inner, frame: Frame, bounds: np.ndarray, points: torch.Tensor, chunk: int
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Distance [P] m and gradient [P, 3] at `points` [P, 3] m; computed in float32, `chunk` at once, and cast back.
-
-    `inner` is what is known in the box of the normalised `frame`; `bounds` [2, 3] m are the solid's.
-    """
+    `inner` is what is known in the box of the normalised `frame`; `bounds` [2, 3] m are the solid's."""
     centre = torch.from_numpy(frame.centre).to(points)
     half = torch.from_numpy(np.abs(bounds - frame.centre).max(0) / frame.scale).to(points.device, torch.float32)
     distance, gradient = [], []

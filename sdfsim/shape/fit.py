@@ -353,11 +353,8 @@ class _Run:
         return near, far
 
     def hurry(self, possible: int) -> None:
-        """Place decay and end so that `possible` updates in all suffice.
-
-        Until the decay has begun the end moves both ways, since the first steps of a busy machine tell little; after
-        that it only comes nearer.
-        """
+        """Place decay and end so that `possible` updates in all suffice. Until the decay has begun the end moves both
+        ways, since the first steps of a busy machine tell little; after that it only comes nearer."""
         begun = self.step >= self.turn
         self.stop = min(self.stop if begun else self.plan.steps, max(possible, self.step))
         if not begun:

@@ -172,9 +172,7 @@ def _vertex_colors(loaded: Any, count: int) -> np.ndarray | None:
 
 def write_ply(mesh: Mesh, attributes: Mapping[str, np.ndarray] = MappingProxyType({})) -> bytes:
     """A mesh as binary PLY, vertices in double precision: what is read back is what was written, to the last bit.
-
-    `attributes` are more properties of the vertices by name, [V] int32 or float32; most programs pass over them.
-    """
+    `attributes` are more properties of the vertices by name, [V] int32 or float32; most programs pass over them."""
     columns = [(axis, "<f8", "double") for axis in "xyz"]
     values = list(mesh.vertices.T)
     if mesh.colors is not None:

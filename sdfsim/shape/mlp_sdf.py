@@ -56,10 +56,8 @@ class MlpSdf:
 
     @accepts_numpy
     def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Distance [P] m and gradient [P, 3] at `points` [P, 3] m; evaluated in float32, cast back.
-
-        Near the solid the gradient is the network's own; see `everywhere` for what is not.
-        """
+        """Distance [P] m and gradient [P, 3] at `points` [P, 3] m; evaluated in float32, cast back. Near the solid the
+        gradient is the network's own; see `everywhere` for what is not."""
         return in_metres(self._inside, self.frame, self.bounds, points, PREPARED)
 
     def _inside(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -139,10 +137,8 @@ class Tape:
         into_weights: Sequence[torch.Tensor],
         into_biases: Sequence[torch.Tensor],
     ) -> None:
-        """Gradients of a loss in the parameters, after `forward` with the same weights at the same points.
-
-        `error` [T] is the derivative of the loss in each value; `into_weights` and `into_biases` are overwritten.
-        """
+        """Gradients of a loss in the parameters, after `forward` with the same weights at the same points. `error` [T]
+        is the derivative of the loss in each value; `into_weights` and `into_biases` are overwritten."""
         last = len(weights) - 1
         torch.mm(error[None], self.hidden[-1], out=into_weights[last])
         into_biases[last].copy_(error.sum())

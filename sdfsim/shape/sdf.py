@@ -166,11 +166,8 @@ class SphereSdf(ClosedForm):
 
 @dataclass(frozen=True, eq=False)
 class BoxSdf(ClosedForm):
-    """An axis-aligned box with half extents `half` (x, y, z) m.
-
-    Inside, the gradient points to the nearest face: the first of equally near ones, and the positive side of an
-    axis at its middle.
-    """
+    """An axis-aligned box with half extents `half` (x, y, z) m. Inside, the gradient points to the nearest face: the
+    first of equally near ones, and the positive side of an axis at its middle."""
 
     KIND, COUNT = "box", 3
     half: tuple[float, float, float]
@@ -214,10 +211,8 @@ class CapsuleSdf(ClosedForm):
 
 @dataclass(frozen=True, eq=False)
 class CylinderSdf(ClosedForm):
-    """A cylinder about z of `radius` m and half height `half` m.
-
-    Inside, the gradient points to the nearer of side and end; of equally near ones to the end.
-    """
+    """A cylinder about z of `radius` m and half height `half` m. Inside, the gradient points to the nearer of side and
+    end; of equally near ones to the end."""
 
     KIND, COUNT = "cylinder", 2
     radius: float
@@ -319,10 +314,8 @@ class GridSdf:
 
     @accepts_numpy
     def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Distance [P] m and gradient [P, 3] at `points` [P, 3] m; interpolated in float32, cast back.
-
-        Near the solid the gradient is the interpolant's own (see `trilinear`); see `everywhere` for what is far.
-        """
+        """Distance [P] m and gradient [P, 3] at `points` [P, 3] m; interpolated in float32, cast back. Near the solid
+        the gradient is the interpolant's own (see `trilinear`); see `everywhere` for what is far."""
         return in_metres(partial(trilinear, self.values), self.frame, self.bounds, points, CHUNK)
 
 

@@ -366,9 +366,7 @@ def mesh_shape(
     resolution: int = DEFAULT_RESOLUTION, on_progress: Progress = silent,
 ) -> Shape:  # fmt: skip
     """The shape of a mesh (metres) without any fit: its exact SDF or a grid of it, nodes and mass as a fit has them.
-
-    Arguments as of `shape_from_mesh`. Raises SdfsimError: the mesh cannot be used.
-    """
+    Arguments as of `shape_from_mesh`. Raises SdfsimError: the mesh cannot be used."""
     solid = solidify(mesh, name=name, cap=cap, thicken=thicken)
     sdf, note = sdf_of_mesh(solid.surface, kind, resolution, on_progress)
     nodes = surface_nodes(sdf, solid.surface, DEFAULT_COUNT)

@@ -173,10 +173,8 @@ def _outwards(vertices: np.ndarray, faces: np.ndarray, patch: np.ndarray) -> np.
 def _close(
     vertices: np.ndarray, faces: np.ndarray, limit: float, area: float, scale: float, notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Close openings by fans around their middle, smallest first, up to `limit` in all (normalised area), and say so.
-
-    A fan is right for any flat loop, though it may lie over itself: what it covers twice cancels in winding numbers.
-    """
+    """Close openings by fans around their middle, smallest first, up to `limit` in all (normalised area), and say so. A
+    fan is right for any flat loop, though it may lie over itself: what it covers twice cancels in winding numbers."""
     fans = []
     for loop in openings(faces):
         ring = vertices[loop]

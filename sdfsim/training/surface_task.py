@@ -119,10 +119,8 @@ class SurfaceTask:
         return int(batch.moves.sum())
 
     def ranges(self) -> dict[str, list[float]]:
-        """[low, high] of what the trajectories hold, SI units, coefficients as products with the floor's.
-
-        Sizes and speeds are those of the bodies that move.
-        """
+        """[low, high] of what the trajectories hold, SI units, coefficients as products with the floor's. Sizes and
+        speeds are those of the bodies that move."""
         extent = {name: float(np.ptp(shape.sdf.bounds, axis=0).max()) for name, shape in self.shapes.items()}
         size = np.concatenate([[extent[str(n)] for n in t.shape] * t.scale for t in self.trajectories])
         size = size[~np.concatenate([t.static for t in self.trajectories])]

@@ -33,9 +33,7 @@ class Rollouts:
 
     def __call__(self, run: Run) -> dict[str, float]:
         """Translation RMSE in m and mean rotation error in degrees of the averaged weights; NaN where they blow up.
-
-        Over all bodies that move and all steps, as `evaluate` has them.
-        """
+        Over all bodies that move and all steps, as `evaluate` has them."""
         from sdfsim.data.metrics import rotation_error, translation_rmse
         from sdfsim.data.replay import batches, roll_out
 

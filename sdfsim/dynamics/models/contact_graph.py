@@ -59,11 +59,8 @@ class ContactGraph:
 
 @dataclass(frozen=True)
 class EdgeFrames:
-    """What the rounds of message passing need of every edge, computed once a step.
-
-    A body's twist is its velocity and angular velocity, stacked. Rows and columns of three are the edge's axes: normal,
-    tangent, binormal.
-    """
+    """What the rounds of message passing need of every edge, computed once a step. A body's twist is its velocity and
+    angular velocity, stacked. Rows and columns of three are the edge's axes: normal, tangent, binormal."""
 
     speed: Tensor  # [E, 1], the scale that makes velocities dimensionless
     mass: Tensor  # [E, 3] effective mass along each axis; 0 along those on which nothing may act

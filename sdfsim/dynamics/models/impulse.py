@@ -204,10 +204,8 @@ def _shortened(vector: Tensor, most: Tensor) -> Tensor:
 
 
 def _energy_share(graph: ContactGraph, frames: EdgeFrames, end: Tensor, seen: Tensor, start: Tensor) -> Tensor:
-    """[E] the share of impulses `end` [E, axis] that adds no more energy to an island than the solve took from it.
-
-    The work of an impulse is its product with the mean of the relative velocities before and after it.
-    """
+    """[E] the share of impulses `end` [E, axis] that adds no more energy to an island than the solve took from it. The
+    work of an impulse is its product with the mean of the relative velocities before and after it."""
     with torch.no_grad():
         free = torch.cat([graph.free_velocity, graph.free_angular], -1)
         taken = kinetic(graph, free) - kinetic(graph, start[..., 0])

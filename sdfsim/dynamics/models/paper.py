@@ -35,10 +35,8 @@ def graph(bodies: Bodies, state: State, contacts: Contacts) -> Graph:
 
 
 def _contact_features(bodies: Bodies, state: State, contacts: Contacts) -> Tensor:
-    """[E, 15]: node to closest point, normal, both seen from the other body's centre, distances.
-
-    An infinite floor has no centre: its body node stands in for the closest point.
-    """
+    """[E, 15]: node to closest point, normal, both seen from the other body's centre, distances. An infinite floor has
+    no centre: its body node stands in for the closest point."""
     c = contacts
     to_closest = -c.distance[:, None] * c.normal
     bounded = bodies.size[c.body].isfinite()[:, None]
