@@ -106,9 +106,7 @@ def do_mesh(run: Run, work: Path) -> dict:
 def do_fit(run: Run, work: Path) -> dict:
     """Fits a compact signed distance to every mesh."""
     from pipeline.export import fit_parts
-    from sdfsim.parallel import choose_threads, network_work
 
-    choose_threads(network_work, repeat=10)
     budget = run.own_budget
     if budget is None and run.options.budget is not None:
         budget = max(10.0, FIT_SHARE * run.options.budget)

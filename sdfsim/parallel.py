@@ -99,13 +99,3 @@ def choose_threads(work: Callable[[], object], threads: int | None = None, *, re
     best = min(took, key=lambda count: took[count])
     torch.set_num_threads(best)
     return took[best]
-
-
-def network_work() -> None:
-    """A training step of a small network, for `choose_threads`."""
-    rng = torch.Generator().manual_seed(0)
-    values = torch.rand(8192, 64, generator=rng)
-    weights = [torch.rand(64, 64, generator=rng, requires_grad=True) for _ in range(4)]
-    for weight in weights:
-        values = torch.sin(values @ weight)
-    torch.autograd.grad(values.sum(), weights)

@@ -70,24 +70,6 @@ def torus_knot() -> Mesh:
     return _tube(_knot_rings(192, 24), "torus_knot")
 
 
-def sponge() -> Mesh:
-    """A cube with 2 x 2 square channels through it along each axis, as wide as the walls between them."""
-    solid = _sponge_cells()
-    cells = len(solid)
-    padded = np.pad(solid, 1)
-    corners = []
-    for axis in range(3):
-        for step in (-1, 1):
-            bare = padded & ~np.roll(padded, -step, axis=axis)
-            base = (np.argwhere(bare) - 1).astype(np.float64)
-            first, second = np.eye(3)[(axis + 1) % 3], np.eye(3)[(axis + 2) % 3]
-            base += np.eye(3)[axis] * (step > 0)
-            quad = [base, base + first, base + first + second, base + second]
-            corners.append(np.stack(quad if step > 0 else quad[::-1], axis=1))
-    vertices = np.concatenate(corners).reshape(-1, 3) / cells - 0.5
-    return clean(Mesh(vertices, _quads(np.arange(len(vertices)).reshape(-1, 4))), name="sponge")
-
-
 def bowl(radius: float = 0.5, wall: float = 0.06) -> Mesh:
     """Half of a spherical shell about the origin, of outer `radius` m and `wall` m thick, open at the top (+z)."""
     outer, inner = _bowl_profiles(radius, wall, 16)
@@ -124,7 +106,6 @@ PRIMITIVES: dict[str, Callable[..., Mesh]] = {
     "torus": torus,
     "gear": gear,
     "torus_knot": torus_knot,
-    "sponge": sponge,
     "bowl": bowl,
     "shoe": shoe,
 }
@@ -145,11 +126,6 @@ def convex_pieces(kind: str) -> list[Mesh]:
             convex_hull(np.concatenate([np.column_stack([sector, np.full(4, z)]) for z in (-0.1, 0.1)]))
             for sector in outline
         ]
-    if kind == "sponge":
-        solid = _sponge_cells()
-        cells = len(solid)
-        cube = box((1.0 / cells, 1.0 / cells, 1.0 / cells))
-        return [Mesh(cube.vertices + (cell + 0.5) / cells - 0.5, cube.faces) for cell in np.argwhere(solid)]
     if kind == "bowl":
         outer, inner = _bowl_profiles(0.5, 0.06, 6)
         turns = 2 * np.pi * np.arange(25) / 24
@@ -226,12 +202,6 @@ def _gear_outline() -> tuple[np.ndarray, np.ndarray]:
     reach = np.tile([radius - tooth, radius - tooth, radius, radius], teeth)
     circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
     return circle * reach[:, None], circle * bore
-
-
-def _sponge_cells() -> np.ndarray:
-    """[5, 5, 5] bool: solid unless two or more of the three indices are odd."""
-    odd = np.arange(5) % 2
-    return odd[:, None, None] + odd[None, :, None] + odd[None, None, :] < 2
 
 
 def _bowl_profiles(radius: float, wall: float, bands: int) -> tuple[np.ndarray, np.ndarray]:
