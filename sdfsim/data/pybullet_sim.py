@@ -1,38 +1,7 @@
 """The teacher: PyBullet with Kubric's settings (an optional extra, `pip install sdfsim[data]`).
 
-Lines are Kubric's: `sim` is kubric/simulator/pybullet.py, `ab` and `c` are challenges/movi/movi_*_worker.py. The engine
-is that of pybullet 3.2.7. "As there" means that ours is the same.
-
-| setting | Kubric | what the engine makes of it | here |
-| --- | --- | --- | --- |
-| maximal coordinates | sim:84, 100, 125, floor too | btRigidBody in place of btMultiBody | as there |
-| contact threshold | sim:85, 101, 133: 0, floor too | contacts act at distance <= 0, else 20 mm early | as there |
-| restitution threshold | sim:38: 0 | e times the approach speed, also of the slowest | as there |
-| warm starting | sim:38: 0 | impulses start at 0 in every inner step | as there |
-| split impulse | sim:39: on | only below -40 mm; else 8 % of a depth a step become speed | as there |
-| contact slop | sim:39: 0 | all of a penetration is pushed out | as there |
-| cone friction | sim:39: off | read for btMultiBody alone: along the slip and across | as there |
-| overlapping pairs | sim:40: deterministic | pairs are sorted: a scene repeats | as there |
-| iterations | not set | 50, or until the residual is below 1e-7 | as there |
-| damping | not set | 0 for btRigidBody (0.04 for btMultiBody) | as there |
-| sleeping | not set | off unless a URDF is loaded with URDF_ENABLE_SLEEPING | as there |
-| rolling, spinning friction | not set | 0 | as there |
-| mass | set_mass, set_static | changes inertia too; 0 is static | as there |
-| inertia | no URDF_USE_INERTIA_FROM_FILE | that of the hulls' bounding box; exact of a sphere | as there |
-| friction, restitution | setters, 0 to 1 | the two bodies' values are multiplied | as there |
-| gravity | core/scene.py:67: (0, 0, -10) | | the recipes': as there |
-| collision margin | not set | 1 mm around hulls; within boxes and spheres | as there |
-| recorded velocities | getBaseVelocity at a frame | those that the next inner step starts from | as there |
-| overlap test | sim:145: getClosestPoints, distance 0 | hulls with their margins | as there |
-| inner step | core/scene.py:66: 1/240 s | | the same at 60 frames/s, else 1/250 s: 50 divides it |
-| frames | sim:170: every 240 // rate-th step | 12 a second (ab:72) | 50 or 60: a rollout's steps |
-| floor | ab:87, c:95: "dome", scale 2, 1 | a hull 159, 79 m wide, its margin on top of z = 0 | box, top at z = 0 |
-
-One thing is done that Kubric does not. An inner step is taken before the first, with the bodies far apart, because the
-engine has the inertias of a mass of 1 kg in it. Bodies that start in the air move the same.
-
-The floor is a box because its upper face is the plane z = 0 exactly, which is what learned models meet; rebounds on the
-dome are as high. Spheres of our own recipes are exact; Kubric's is a hull, as all of its bodies, and rolls as one.
+docs/teacher.md compares the settings one by one. An inner step is taken before the first, with the bodies far apart,
+because the engine has the inertias of a mass of 1 kg in it.
 """
 
 from __future__ import annotations
