@@ -160,8 +160,8 @@ def reconstruct(
     Writes one folder a stage, Shape folders in `assets/`, `scene.yaml`, `config.yaml`, `report.json` and `report.md` to
     `out`, and returns the report. Skips a stage whose inputs, options (see `Options`) and version are those of its last
     run, and goes on with a killed one. Photos, in a folder, a video, a transforms.json or a COLMAP model, are never
-    written to. Raises SdfsimError of bad photos or options (exit code 1), or where poses or surface are not good enough
-    (3).
+    written to. Raises SdfsimError for bad photos or options (exit code 1), or where poses or surface are not good
+    enough (3).
     """
     resolved = Options(str(Path(photos).absolute()), **options)
     resolved.check()

@@ -73,7 +73,7 @@ def fit_lines(report: dict[str, Any]) -> list[str]:
 
 def named_meshes(sources: list[Path]) -> dict[str, Path]:
     """Mesh files, and those of folders, by the names their shapes get: the file's own name without suffix; where
-    several files share it, the name of the folder they lie in. Raises SdfsimError of no meshes, or two of one name."""
+    several files share it, the name of the folder they lie in. Raises SdfsimError for no meshes, or two of one name."""
     files: list[Path] = []
     for source in sources:
         if source.is_dir():

@@ -106,7 +106,7 @@ def load_recording(
 ) -> tuple[Recording, Scene]:
     """A recording of the bodies of a scene that move, and the scene: of a run folder or a `rollout.npz`, whose scene is
     known; or a CSV of poses (`COLUMNS`), whose positions are those of the shapes' own origins, as in a scene file.
-    Raises SdfsimError of no scene, unreadable files, or a recording that is not of this scene."""
+    Raises SdfsimError for no scene, unreadable files, or a recording that is not of this scene."""
     if path.suffix == ".csv":
         if scene_file is None:
             raise SdfsimError(f"{path}: a recording without its scene", "give it: --scene scene.yaml")
@@ -180,8 +180,8 @@ def _from_poses(names: list[str], dt: float, origin: np.ndarray, orientation: np
 
 def identify(recording: Recording, scene: Scene, *, on_progress: Progress = silent) -> Identified:
     """Find the coefficients and masses with which the contact solve repeats a recording; those of bodies that do not
-    move are taken from the scene. Raises SdfsimError of bodies on paths, a recording too short, or one in which nothing
-    touches."""
+    move are taken from the scene. Raises SdfsimError for bodies on paths, a recording too short, or one in which
+    nothing touches."""
     from scipy.optimize import least_squares
 
     if any(b.motion == "kinematic" for b in scene.bodies):

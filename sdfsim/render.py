@@ -41,8 +41,8 @@ def render(
 ) -> None:  # fmt: skip
     """Write a movie (.mp4, H.264, as long as the run) or a picture (.png, `at` s, by default the end) of a run.
 
-    Camera and what it looks at, [3] m each, are as in `eye_of`. Raises SdfsimError of another ending, a time outside of
-    the run, a camera where it looks at, or a file that cannot be written.
+    Camera and what it looks at, [3] m each, are as in `eye_of`. Raises SdfsimError for another ending, a time outside
+    of the run, a camera where it looks at, or a file that cannot be written.
     """
     out, scene = Path(out), scene if isinstance(scene, Scene) else scene.load()
     check_format(out)

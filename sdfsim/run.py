@@ -82,7 +82,7 @@ def simulate(
     finished one is left as it is, and its report is returned. `say` is called with lines for the person; live viewers
     listen on `bind`.
 
-    Raises SdfsimError of bad input, an output that cannot be written, another run that writes to the same folder, or a
+    Raises SdfsimError for bad input, an output that cannot be written, another run that writes to the same folder, or a
     finished run to resume that is another one than this; SimulationError where the state broke, and KeyboardInterrupt:
     what was computed before is in the folder.
     """
@@ -198,7 +198,7 @@ def read_run(
     path: Path, scene_file: Path | None = None, *, allow_outside: bool = False, on_progress: Progress = silent
 ) -> tuple[Scene, Rollout]:
     """A finished or interrupted run, by its folder or `rollout.npz`, and its scene: a scene file, or that the run was
-    made from. Raises SdfsimError of no run, no scene, or another scene than that of the run."""
+    made from. Raises SdfsimError for no run, no scene, or another scene than that of the run."""
     file = path / "rollout.npz" if path.is_dir() else path
     rollout = Rollout.load(file)
     scene = load_scene(scene_file or scene_of(file.parent), on_progress, allow_outside=allow_outside)

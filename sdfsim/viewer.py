@@ -31,7 +31,7 @@ _NO_GRAPHICS = "pictures need a Vulkan driver: apt-get install mesa-vulkan-drive
 
 def stream_to_viewer(playback: Playback, kind: Literal["native", "web"], *, bind: str = LOOPBACK) -> str:
     """Send everything that `playback` logs from now on to a viewer: a window, or a page that is there for as long as
-    this process runs, whose address is returned. Raises SdfsimError of no screen, or where the viewer does not start.
+    this process runs, whose address is returned. Raises SdfsimError for no screen, or where the viewer does not start.
     """
     check_screen(kind)
     serving = _Serving(bind)
@@ -94,7 +94,7 @@ def _has_screen() -> bool:
 
 
 def show(recording: Path, *, web: bool = False, bind: str = LOOPBACK) -> None:
-    """Open a recording, and wait until the viewer is closed. Raises SdfsimError of no such recording, or where it
+    """Open a recording, and wait until the viewer is closed. Raises SdfsimError for no such recording, or where it
     fails."""
     serving = _Serving(bind)
     command = [_executable(), str(_existing(recording)), *serving.options]
@@ -107,7 +107,7 @@ def show(recording: Path, *, web: bool = False, bind: str = LOOPBACK) -> None:
 
 def screenshot(recording: Path, picture: Path, *, at: float | None = None) -> None:
     """Write what the viewer shows of a recording `at` a time in s (default: the end) as a PNG, without a screen. Raises
-    SdfsimError of no such recording or time, no graphics driver, or a file that cannot be written."""
+    SdfsimError for no such recording or time, no graphics driver, or a file that cannot be written."""
     _existing(recording)
     if not picture.parent.is_dir() or not os.access(picture.parent, os.W_OK):
         raise SdfsimError(f"{picture}: the folder is missing or not writable")

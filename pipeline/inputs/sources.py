@@ -90,7 +90,7 @@ def find_source(given: Path) -> Source:
 
 def find_photos(folder: Path) -> tuple[list[Path], list[str]]:
     """The photo files of a folder, or of its subfolder `images` where all are there, in name order, and notes on what
-    was passed over. Raises SdfsimError of fewer than three."""
+    was passed over. Raises SdfsimError for fewer than three."""
     try:
         entries = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
     except OSError as error:

@@ -164,7 +164,7 @@ def place(shown: Mesh, views: list[View], scale: tuple[float, str] | None = None
 
 def measured_scale(distance: Sequence, views: list[View], photos: list[Photo], surface: Caster) -> tuple[float, str]:
     """Metres a normalised unit at which a known distance (see `Options`) is what it should be, and where that comes
-    from, in words. Pixels are those of the user's own photos. Raises SdfsimError of no such posed photo or several, a
+    from, in words. Pixels are those of the user's own photos. Raises SdfsimError for no such posed photo or several, a
     pixel outside it, or one that shows nothing of the surface."""
     first, second, metres = distance
     start, end = (_locate(text, views, photos, surface) for text in (first, second))
@@ -175,7 +175,7 @@ def measured_scale(distance: Sequence, views: list[View], photos: list[Photo], s
 
 
 def check_distance(distance: Sequence, photos: list[Photo]) -> None:
-    """Checks what can be known of a distance's ends before there are poses. Raises SdfsimError of no such photo or
+    """Checks what can be known of a distance's ends before there are poses. Raises SdfsimError for no such photo or
     several, or of a pixel outside it."""
     for text in distance[:2]:
         name, pixel = _parts(text)

@@ -43,8 +43,8 @@ def make_dataset(
 
     Shapes are a folder (see `origins`; movi-b takes NAME/ folders alone) or the name of a public set; so many
     `random_solids` of PyBullet go beside them. `bodies` move instead of the recipe's range (bowl and pile), at `fps` in
-    `RATES`. Raises SdfsimError of an unknown recipe or rate, an option that the recipe has no use for, no usable shapes
-    or none to be fetched, PyBullet absent, another dataset in `out`, or another run writing to it.
+    `RATES`. Raises SdfsimError for an unknown recipe or rate, an option that the recipe has no use for, no usable
+    shapes or none to be fetched, PyBullet absent, another dataset in `out`, or another run writing to it.
     """
     plan = _checked(recipe, shapes, random_solids, bodies, fps)
     engine = import_pybullet()

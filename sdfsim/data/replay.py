@@ -41,7 +41,7 @@ def roll_out(
 
     The recording engine makes `substeps` inner steps in one. `as_teacher` the solver takes over two habits of the
     teacher: bodies are larger by `MARGIN` than their shapes, and what is pushed out adds to the speed of a rebound.
-    "learned" free flight is for networks on surface nodes. Raises SdfsimError (exit code 3) of a state that is not
+    "learned" free flight is for networks on surface nodes. Raises SdfsimError (exit code 3) for a state that is not
     finite.
     """
     units = model_units(model, group[0])

@@ -89,7 +89,7 @@ def origins(shapes: Path | None, random_solids: int = 0, *, as_is: bool = False)
     the first of PyBullet's random solids.
 
     `as_is` takes the NAME/ folders alone, in their own size (Kubric's assets have their centre of mass at 0). Raises
-    SdfsimError of no shapes, more solids than there are, one name twice, or one that no Shape folder can have.
+    SdfsimError for no shapes, more solids than there are, one name twice, or one that no Shape folder can have.
     """
     found = []
     if shapes is not None:

@@ -110,7 +110,7 @@ class Unread(nn.Module):
 
 def load_model(name: str | Path | None = None, *, weights: bool = True) -> Model:
     """A bundled model by name (None: the solver), or any model file by path; without `weights` its network is `Unread`.
-    Raises SdfsimError of an unknown name, or an unreadable or foreign file."""
+    Raises SdfsimError for an unknown name, or an unreadable or foreign file."""
     from safetensors import SafetensorError, safe_open
 
     if name is None or name == SOLVER:

@@ -135,7 +135,7 @@ class Simulator:
         self._good = self._start = self.state
 
     def steps(self, count: int) -> Iterator[State]:
-        """Advance by `count` steps, yielding the state after each (SI units). Raises SimulationError of a state that
+        """Advance by `count` steps, yielding the state after each (SI units). Raises SimulationError for a state that
         cannot be; its `rollout` is one frame here, the last good state."""
         for _ in range(count):
             self._step()
@@ -168,7 +168,7 @@ class Simulator:
 
     def contact_points(self) -> list[ContactPoint]:
         """Where bodies touch in the present state, as the last step of the contact solve has left it. Raises
-        SdfsimError of networks on surface nodes, which know no impulses."""
+        SdfsimError for networks on surface nodes, which know no impulses."""
         if self.model.on_surfaces:
             raise SdfsimError(
                 "networks on surface nodes tell no impulses", "take the solver, or a network on top of it"
@@ -195,7 +195,7 @@ class Simulator:
         a `Simulator` of each changed scene.
 
         Variants map names of bodies to changed fields: position, quat_xyzw, velocity, angular_velocity, mass, friction,
-        restitution (SI units), such as {"ball": {"velocity": (1, 0, 0)}}. Raises SdfsimError of no such body or field,
+        restitution (SI units), such as {"ball": {"velocity": (1, 0, 0)}}. Raises SdfsimError for no such body or field,
         or a value that it cannot have; SimulationError where a state broke.
         """
         return rollouts(self.scene, variants, self.model, seconds=seconds, steps=steps, dt=self._dt)
@@ -203,7 +203,7 @@ class Simulator:
     def run(self, seconds: float | None = None, steps: int | None = None) -> Rollout:
         """Simulate for so many seconds (default: the scene's duration; see `steps_in`) or steps, and keep everything.
 
-        Raises SdfsimError of a length of time that is negative or not finite; SimulationError where the state broke,
+        Raises SdfsimError for a length of time that is negative or not finite; SimulationError where the state broke,
         with what was computed in its `rollout`.
         """
         if steps is None:
@@ -347,7 +347,7 @@ def check_seconds(seconds: float) -> None:
 
 
 def pick_device(name: str) -> torch.device:
-    """A device: "auto", "cpu", "cuda" or "cuda:0". Raises SdfsimError of another name, or where there is no CUDA."""
+    """A device: "auto", "cpu", "cuda" or "cuda:0". Raises SdfsimError for another name, or where there is no CUDA."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if not re.fullmatch(r"cpu|cuda(:\d+)?", name, re.ASCII):

@@ -17,8 +17,8 @@ MOST_WIDER = 1e4
 
 def scene_units(scene: Scene, model: Model, dt: float | None = None) -> Units:
     """Model units for a scene: bodies of the model's size, at the model's gravity (Froude scaling); `dt` s fixes the
-    scale by the wanted step instead. Raises SdfsimError of a step that is not positive, or bodies of sizes that no step
-    serves."""
+    scale by the wanted step instead. Raises SdfsimError for a step that is not positive, or bodies of sizes that no
+    step serves."""
     if dt is not None and not 0.0 < dt < np.inf:
         raise SdfsimError(f"dt: must be > 0 s and finite (got {dt:g})")
     strength = float(np.linalg.norm(scene.gravity)) or EARTH

@@ -22,7 +22,7 @@ CHUNKS = 16  # pieces that the variants are cut into at most, so that cores end 
 
 def varied(scene: Scene, variant: Variant) -> Scene:
     """The scene with some values changed: body -> field -> value, of the fields of `VECTORS` and `NUMBERS` in SI units.
-    An inertia of its own grows with the mass. Raises SdfsimError of no such body or field, or a value that it cannot
+    An inertia of its own grows with the mass. Raises SdfsimError for no such body or field, or a value that it cannot
     have."""
     known = {body.name for body in scene.bodies}
     for name in variant:

@@ -23,7 +23,7 @@ _HERE = "<scene>"  # what messages call a scene that is in no file
 
 class Scene:
     """A scene that is being written. `print` shows it as the file that `save` writes. Settings are keys of the file
-    itself: gravity, duration, seed, model, effects, limits; raises SceneError of no such key."""
+    itself: gravity, duration, seed, model, effects, limits; raises SceneError for no such key."""
 
     def __init__(self, **settings: Any) -> None:
         known = [key for key in SceneTable.model_fields if key not in ("version", "shapes", "bodies")]
@@ -37,7 +37,7 @@ class Scene:
 
         Keys are of the body and of its shape, which has the same name, as docs/scene.md has them, such as
         sphere={"radius": 0.1}, position=(0, 0, 1). Paths of meshes and folders start at the current folder. A body that
-        looks like an earlier one takes shape="name of that one". Raises SceneError of no such key; values are checked
+        looks like an earlier one takes shape="name of that one". Raises SceneError for no such key; values are checked
         by `load`, all at once.
         """
         _check(keys, [*_OF_SHAPE, *(key for key in BodyTable.model_fields if key != "name")], f"body {name!r}")

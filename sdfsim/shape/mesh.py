@@ -395,7 +395,7 @@ def wavefront(pieces: list[Mesh]) -> str:
 
 
 def convex_hull(points: np.ndarray) -> Mesh:
-    """Convex hull of `points` [P, 3] m, outward faces. Raises SdfsimError of fewer than four points, or where they are
+    """Convex hull of `points` [P, 3] m, outward faces. Raises SdfsimError for fewer than four points, or where they are
     not finite or all in one plane."""
     from scipy.spatial import ConvexHull, QhullError
 

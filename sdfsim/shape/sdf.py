@@ -61,7 +61,7 @@ class Sdf(Protocol):
 def accepts_numpy(call: Callable[..., tuple[torch.Tensor, torch.Tensor]]) -> Callable[..., tuple[Any, Any]]:
     """Let an Sdf's `__call__` also take what makes a NumPy array [P, 3], and then answer in NumPy of the same dtype.
 
-    Whole numbers become float64. An object with a `device` attribute is evaluated there. Raises ValueError of other
+    Whole numbers become float64. An object with a `device` attribute is evaluated there. Raises ValueError for other
     shapes.
     """
 
@@ -328,7 +328,7 @@ def sample_grid(
     """Sample a signed distance (a `DistanceOracle` or an Sdf) of a solid within `bounds` [2, 3] m on a voxel grid.
 
     There are `resolution`^3 samples over a cube 1.4 times as wide as the solid, of 4 bytes each, 1.4 / (resolution - 1)
-    of its largest extent apart. Raises SdfsimError of fewer than two samples a side, or bounds without extent or not
+    of its largest extent apart. Raises SdfsimError for fewer than two samples a side, or bounds without extent or not
     finite.
     """
     if resolution < 2:

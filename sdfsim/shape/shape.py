@@ -318,7 +318,7 @@ def with_wall(shape: Shape, wall: float) -> Shape:
 
     Volume, centre of mass and inertia are then those of the wall, taken from the SDF on a grid. Where the SDF is exact
     and the wall at least 1/100 of the shape's longest side, the volume is within 1 % and the inertia within 4 %. A wall
-    that is thicker than the shape makes it solid. Contacts see the same surface. Raises SdfsimError of a plane.
+    that is thicker than the shape makes it solid. Contacts see the same surface. Raises SdfsimError for a plane.
     """
     volume, com, inertia = mass_properties_of_sdf(shape.sdf, wall=wall)
     return replace(shape, volume=volume, com=com, inertia=inertia, source=shape.source | {"wall": wall})
@@ -350,7 +350,7 @@ def shape_from_primitive(
     sdf: SdfKind = "mlp", resolution: int = DEFAULT_RESOLUTION, on_progress: Progress = silent,
 ) -> Shape:  # fmt: skip
     """The shape of a procedural mesh of `primitives.PRIMITIVES`, its largest extent `size` m, made on first use and
-    cached; other arguments as of `shape_from_mesh`. Raises SdfsimError of no such primitive."""
+    cached; other arguments as of `shape_from_mesh`. Raises SdfsimError for no such primitive."""
     if kind not in primitives.PRIMITIVES:
         raise SdfsimError(f"no primitive called {kind!r}", "there are " + ", ".join(primitives.PRIMITIVES))
     mesh = primitives.PRIMITIVES[kind]()
@@ -420,7 +420,7 @@ def analytic_shape(
     Radius and height (along z, of a capsule with its caps) are in m, and so is the box's size, full extents along x, y,
     z. Mass properties are exact (of the plane 0); the plane shows a 20 m square. Nodes: sphere 128 spread as a
     Fibonacci spiral, capsule and cylinder rings, box 8 corners and points along edges and on faces, plane none. Raises
-    SdfsimError of an unknown kind, or a size that is missing or not positive.
+    SdfsimError for an unknown kind, or a size that is missing or not positive.
     """
     source = {"kind": kind}
     if kind == "plane":

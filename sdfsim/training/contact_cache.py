@@ -131,7 +131,7 @@ def contact_frames(
     data: Path, split: str, how: Solved, *, on_progress: Callable[[float, str], None] | None = None
 ) -> ContactFrames:
     """The contact frames of a dataset split: from the cache file beside it, else made now and cached. Raises
-    SdfsimError of no trajectories, unreadable ones, or some that differ in step or gravity."""
+    SdfsimError for no trajectories, unreadable ones, or some that differ in step or gravity."""
     folder = data / "frames"
     name = f"{split}-{how.stride}-{how.inner}-{how.draws}"
     if not (data / split).is_dir():
@@ -177,7 +177,7 @@ def join_frames(sets: list[ContactFrames]) -> ContactFrames:
 
 def inner_steps(dt: float, substep: float) -> int:
     """Inner steps of `substep` s in a recorded step of `dt` s; what is not told (0) counts as in our own recordings.
-    Raises SdfsimError of more than 5."""
+    Raises SdfsimError for more than 5."""
     count = round(dt / substep) if substep > 0 else SUBSTEPS
     if not 1 <= count <= SUBSTEPS:
         raise SdfsimError(f"recorded steps of {dt:g} s hold {count} inner ones of the engine", f"at most {SUBSTEPS}")

@@ -50,7 +50,7 @@ def train(
     Datasets have train/ and validation/; several (impulse only) are drawn from as if they were one. The preset is a
     name in `PRESETS`, or one of your own, with other `steps` if given. `resume` goes on from the checkpoint in `out`,
     with the result of an uninterrupted run; `budget` is seconds of processor time, all cores together, after which it
-    stops early. Returns paths, losses and processor time. Raises SdfsimError of an unknown preset, unusable data, a
+    stops early. Returns paths, losses and processor time. Raises SdfsimError for an unknown preset, unusable data, a
     checkpoint in `out` without `resume`, another run writing to it, or diverged training.
     """
     from sdfsim.dynamics.simulator import pick_device
