@@ -75,8 +75,8 @@ HORIZON = 50  # steps of the errors that are drawn
 ENGINES = [
     *(("PyBullet", k) for k in (5, 4, 3, 2, 1)),
     *(("MuJoCo", k) for k in (10, 5, 2)),
-    *(("MuJoCo mesh SDF", k) for k in (10, 5, 2)),
-    *(("Drake", k) for k in (10, 5, 2)),
+    *(("MuJoCo mesh SDF", k) for k in (5, 2)),
+    *(("Drake", k) for k in (5, 2)),
     ("Newton", 5),
 ]
 ENGINES_QUICK = [("PyBullet", 5), ("PyBullet", 1), ("MuJoCo", 5)]
