@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,16 +21,7 @@ if TYPE_CHECKING:
     from pipeline.field.training import Trainer
 
 FOLDER = "held_out"
-EMPTY = 0.9  # grey of pixels whose ray misses the trained spherefrom pipeline.progress import Progress, quiet
-
-
-@dataclass(frozen=True)
-class Compared:
-    """A held-out photo against its render, over pixels whose ray meets the unit sphere."""
-
-    psnr: float  # dB
-    overlap: float | None  # of the silhouettes, intersection over union; None without masks
-    picture: np.ndarray  # [H, W, 3] uint8, the render
+EMPTY = 0.9  # grey of pixels whose ray misses the trained sphere
 
 
 class HeldOut:
@@ -39,15 +29,16 @@ class HeldOut:
     that show nothing of the unit sphere are passed over; `shown` has the indices of the others."""
 
     def __init__(self, views: list[View], photos_folder: Path, trainer: Trainer, *, masked: bool) -> None:
-        self.views, self.trainer, self.masked = views, trainer, masked
+        self.views, self.trainer = views, trainer
         longest = max(100, trainer.settings.long_side // 3)
-        self.rays = load_rays(views, photos_folder, longest, masks=masked).to(trainer.device)
+        self.rays = load_rays(views, photos_folder, longest, masks=False).to(trainer.device)
         self.shown: list[int] = self.rays.view.unique().tolist()
         self.backdrop = torch.full((3,), BACKDROP, device=trainer.device) if masked else None
 
     @torch.no_grad()
-    def compare(self, number: int) -> Compared:
-        """Renders one of the `shown` views with the field as it is; its cached SDF has to be up to date."""
+    def compare(self, number: int) -> tuple[float, np.ndarray]:
+        """PSNR, dB, and render [H, W, 3] uint8 of one of the `shown` views, over pixels whose ray meets the unit
+        sphere; the field's cached SDF has to be up to date."""
         trainer, rays = self.trainer, self.rays
         assert trainer.cache is not None
         index = torch.nonzero(rays.view == number)[:, 0]
@@ -58,13 +49,9 @@ class HeldOut:
                 render(trainer.field, trainer.cache, origins, directions, trainer.beta,
                        samples=trainer.settings.samples, backdrop=self.backdrop)
             )  # fmt: skip
-        rgb, opacity = (torch.cat([part[key] for part in parts]) for key in ("rgb", "opacity"))
+        rgb = torch.cat([part["rgb"] for part in parts])
         error = float(((rgb - rays.rgb[index].float() / 255) ** 2).mean())
-        overlap = None
-        if rays.mask is not None:
-            inside, solid = rays.mask[index] >= 128, opacity >= 0.5
-            overlap = float((inside & solid).sum() / (inside | solid).sum().clamp_min(1))
-        return Compared(-10 * math.log10(max(error, 1e-10)), overlap, self._picture(number, index, rgb))
+        return -10 * math.log10(max(error, 1e-10)), self._picture(number, index, rgb)
 
     def _picture(self, number: int, index: Tensor, rgb: Tensor) -> np.ndarray:
         width, height = (int(side) for side in self.rays.sizes[number])
@@ -75,22 +62,18 @@ class HeldOut:
 
 
 def score(held: HeldOut, out: Path, on_progress: Progress = quiet) -> dict:
-    """PSNR (and, with masks, overlap of silhouettes) of the held-out views for the report, empty where none shows
-    anything of the unit sphere; writes the renders to `out`/held_out."""
+    """PSNR of the held-out views for the report, empty where none shows anything of the unit sphere; writes the renders
+    to `out`/held_out."""
     if not held.shown:
         return {}
     (out / FOLDER).mkdir(exist_ok=True)
-    found = []
+    psnr = []
     for count, number in enumerate(held.shown, 1):
-        found.append(held.compare(number))
-        Image.fromarray(found[-1].picture).save(out / FOLDER / held.views[number].name, quality=92)
+        decibels, picture = held.compare(number)
+        psnr.append(decibels)
+        Image.fromarray(picture).save(out / FOLDER / held.views[number].name, quality=92)
         on_progress(count / len(held.shown), f"held-out view {count} of {len(held.shown)}")
-    psnr = [one.psnr for one in found]
-    report = {
+    return {
         "held_out_photos": [held.views[number].source for number in held.shown],
         "psnr": round(float(np.mean(psnr)), 2), "psnr_each": [round(value, 2) for value in psnr],
     }  # fmt: skip
-    if held.masked:
-        overlaps = [one.overlap for one in found if one.overlap is not None]
-        report["silhouette_overlap"] = round(float(np.mean(overlaps)), 4)
-    return report

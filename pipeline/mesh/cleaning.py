@@ -29,10 +29,10 @@ def components(mesh: Mesh) -> np.ndarray:
     return connected_components(graph, directed=False)[1][mesh.faces[:, 0]]
 
 
-def belonging(mesh: Mesh, seen: np.ndarray, share: float, speck: float) -> tuple[np.ndarray, list[float], dict]:
+def belonging(mesh: Mesh, seen: np.ndarray, share: float, speck: float) -> tuple[np.ndarray, list[float]]:
     """Which faces [F] bool of a closed mesh belong, by connected components: those that photos show (`seen` [F] bool)
     and that have at least this share of all the area. Also the longest sides of the other components from the largest
-    down, without those shorter than `speck`, and counts of these."""
+    down, without those shorter than `speck`."""
     label = components(mesh)
     _, area = face_normals(mesh)
     total, shown = np.bincount(label, area), np.bincount(label, area * seen)
@@ -47,11 +47,7 @@ def belonging(mesh: Mesh, seen: np.ndarray, share: float, speck: float) -> tuple
     size = (high - low).max(1)
     # A cavity is a flaw of the piece around it and no piece of its own.
     left_out = size[(small | unseen) & ~inward & (size >= speck)]
-    counts = {
-        "components": len(total), "dropped_small": int((small & ~unseen).sum()), "dropped_unseen": int(unseen.sum()),
-        "dropped_area_share": round(float(total[small | unseen].sum() / total.sum()), 4),
-    }  # fmt: skip
-    return ~(small | unseen)[label], sorted(left_out.tolist(), reverse=True), counts
+    return ~(small | unseen)[label], sorted(left_out.tolist(), reverse=True)
 
 
 def islands(mesh: Mesh, faces: np.ndarray, share: float) -> np.ndarray:

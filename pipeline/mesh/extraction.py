@@ -15,7 +15,7 @@ from pipeline.mesh.cleaning import belonging, islands, keep_faces
 from pipeline.mesh.visibility import Visibility, look, to_bytes
 from pipeline.progress import Progress, quiet
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
-from sdfsim.shape.mesh import Mesh, face_normals, vertex_normals
+from sdfsim.shape.mesh import Mesh, vertex_normals
 
 Distance = Callable[[np.ndarray], np.ndarray]
 
@@ -140,7 +140,7 @@ class Surface:
     seen: np.ndarray  # [V] bool, vertices of it that photos show well enough
     kept: np.ndarray  # [F] bool, faces of it that belong
     shown: np.ndarray  # [F] bool, faces of it that belong and that photos show
-    report: dict  # counts of what was left out, and why
+    left_out: list[float]  # longest sides of what does not belong, the largest first
 
     @property
     def visible(self) -> Mesh:
@@ -199,10 +199,9 @@ def surface_of(
     cell = volume.cell
     found = look(Visibility(raw, 0.75 * cell), views, photos_folder, on_progress)
     far = KDTree(points).query(raw.vertices, distance_upper_bound=MAX_FROM_POINTS)[0] > MAX_FROM_POINTS
-    shown_at_all = trusted_vertices(raw, found.count, np.abs(limit(raw.vertices)) < 1.5 * cell)
-    seen = shown_at_all & ~far
+    seen = trusted_vertices(raw, found.count, np.abs(limit(raw.vertices)) < 1.5 * cell) & ~far
     faces_seen = seen[raw.faces].sum(1) >= 2
-    kept, left_out, counts = belonging(raw, faces_seen, FLOATER / 4, SPECK)
+    kept, left_out = belonging(raw, faces_seen, FLOATER / 4, SPECK)
     shown = islands(raw, faces_seen & kept, FLOATER)
     if shown.sum() < 100:
         raise SdfsimError(
@@ -210,14 +209,7 @@ def surface_of(
             exit_code=EXIT_QUALITY,
         )  # fmt: skip
     rgb = np.where(found.weight[:, None] > 0, found.color, 255 * field_colors(field, raw))
-    area = face_normals(raw)[1]
-    report = {
-        "resolution": max(volume.values.shape), "cell": cell, "solid_faces": int(kept.sum()),
-        "left_out": left_out, "shown_faces": int(shown.sum()), "solid": {**counts, "smallest_share_kept": FLOATER / 4},
-        "dropped_far_from_points_share": round(float((shown_at_all & far).sum() / max(shown_at_all.sum(), 1)), 4),
-        "unseen_share": round(float(1 - area[shown].sum() / area[kept].sum()), 4),
-    }  # fmt: skip
-    return Surface(volume, replace(raw, colors=to_bytes(rgb)), seen, kept, shown, report)
+    return Surface(volume, replace(raw, colors=to_bytes(rgb)), seen, kept, shown, left_out)
 
 
 @torch.no_grad()

@@ -101,8 +101,7 @@ def make_meshes(
     deep = {name: hollow(closed[name], 2 * surface.volume.cell * metres) for name in parts.bodies}
     hollows = {name: rounded(found).tolist() for name, found in deep.items() if found is not None}
     return {
-        **surface.report,
-        "left_out_m": [float(rounded(length * metres)) for length in (*surface.report["left_out"], *parts.noise)],
+        "left_out_m": [float(rounded(length * metres)) for length in (*surface.left_out, *parts.noise)],
         "extent_m": rounded(np.ptp(placement.mesh(surface.visible).vertices, axis=0)).tolist(),
         "up_from": placement.up_from, "up_within_degrees": round(placement.up_within, 2),
         "up_confidence": placement.up_confidence, "size": placement.size_from, "objects": list(parts.bodies),
@@ -205,22 +204,13 @@ def draw_names(parts: Parts, views: list[View], photos_folder: Path) -> Image.Im
         number = np.searchsorted(borders, face, side="right")
         return np.where(np.isfinite(away), number, len(meshes)).reshape(size)
 
-    pixels = np.array([np.bincount(seen(v, THUMB).ravel(), minlength=len(meshes) + 1)[:-1] for v in views], float)
-    share = pixels / np.maximum(pixels.max(0), 1)
-    chosen: list[int] = []
-    best = np.zeros(len(meshes))
-    while len(chosen) < min(PICTURES, len(views)):  # Each next photo shows most of what the earlier ones show worst.
-        gain = np.maximum(share - best, 0).sum(1)
-        if chosen and gain.max() < 0.3:
-            break
-        chosen.append(int(gain.argmax()))
-        best = np.maximum(best, share[chosen[-1]])
+    pixels = np.array([np.bincount(seen(v, THUMB).ravel(), minlength=len(meshes) + 1)[:-1] for v in views])
+    # Of each body, the largest first, the photo that shows most of it.
+    chosen = list(dict.fromkeys(pixels.argmax(0).tolist()))[:PICTURES] or [0]
     tiles = [_tile(views[k], seen(views[k], WIDE), list(parts.bodies), photos_folder) for k in chosen]
     sheet = Image.new("RGB", (sum(t.width for t in tiles), max(t.height for t in tiles)), (255, 255, 255))
-    left = 0
-    for tile in tiles:
-        sheet.paste(tile, (left, 0))
-        left += tile.width
+    for tile, right in zip(tiles, np.cumsum([t.width for t in tiles]).tolist(), strict=True):
+        sheet.paste(tile, (right - tile.width, 0))
     return sheet
 
 

@@ -373,7 +373,6 @@ def main(job_path: str) -> None:
         result["contradictions"] = contradictions(pairs, result["views"])
         result["mean_error"] = float(best.compute_mean_reprojection_error())
         result["points"] = int(best.num_points3D())
-        result["track_length"] = float(best.compute_mean_track_length())
     write_json(out / "result.json", result)
     say("phase done")
 

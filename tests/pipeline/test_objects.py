@@ -52,7 +52,7 @@ def surface_of(distance: Callable, seen: Callable | None = None, turn: np.ndarra
     there = raw.vertices @ turn
     shown = (ball(raw.vertices) < -0.03) & (np.ones(len(there), bool) if seen is None else seen(there))
     faces = shown[raw.faces].all(1)
-    return Surface(volume, raw, shown, np.ones(len(raw.faces), bool), faces, {})
+    return Surface(volume, raw, shown, np.ones(len(raw.faces), bool), faces, [])
 
 
 def parts_of(
