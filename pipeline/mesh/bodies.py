@@ -65,31 +65,19 @@ class Level:
 
 @dataclass(frozen=True)
 class Body:
-    """A body that stands on a level plane, or that masks name.
+    """A body that stands on a level plane, or that masks name."""
 
-    Attributes:
-        name: that of its masks, else object1, object2 ... from the largest down.
-        level: what it stands on; `nothing` where that is not known.
-        size: the longest side of its bounding box.
-        own: [X, Y, Z] bool on a part of the samples: those nearest to this body, of all that stands on the plane.
-        low: [3] position of the first of these samples.
-        cell: between them.
-        layer: thickness of the contact layer, in which the field cannot tell body and plane apart.
-        hollow: [A, B] bool on the plane: places that the body goes around at the top of the contact layer.
-        corner: [2] of the first of these, in the axes of `frame_of` the plane.
-        seam: where it ends against what it touches, negative within; None where it ends by itself.
-    """
-
-    name: str
-    level: Level
-    size: float
+    name: str  # that of its masks, else object1, object2 ... from the largest down
+    level: Level  # what it stands on; `nothing` where that is not known
+    size: float  # the longest side of its bounding box
+    # [X, Y, Z] bool on a part of the samples: those nearest to this body, of all that stands on the plane
     own: np.ndarray
-    low: np.ndarray
-    cell: float
-    layer: float
-    hollow: np.ndarray
-    corner: np.ndarray
-    seam: Volume | None = None
+    low: np.ndarray  # [3] position of the first of these samples
+    cell: float  # between them
+    layer: float  # thickness of the contact layer, in which the field cannot tell body and plane apart
+    hollow: np.ndarray  # [A, B] bool on the plane: places that the body goes around at the top of the contact layer
+    corner: np.ndarray  # [2] of the first of these, in the axes of `frame_of` the plane
+    seam: Volume | None = None  # where it ends against what it touches, negative within; None where it ends by itself
 
     def lifted(self, points: np.ndarray) -> np.ndarray:
         """Points [P, 3], those below the top of the contact layer raised to it."""
