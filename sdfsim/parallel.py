@@ -17,6 +17,8 @@ from sdfsim.errors import SdfsimError
 Progress = Callable[[float, str], None]  # called with the fraction of the work that is done, and a message
 StageProgress = Callable[[str, float, str], None]  # the same, behind the name of one stage of several
 
+TIMED = 3  # calls, after one that is not timed
+
 
 def silent(fraction: float, message: str) -> None:
     """Progress that nobody is told."""
@@ -82,9 +84,9 @@ def limit_threads(count: int) -> None:
     torch.set_num_threads(count)
 
 
-def choose_threads(work: Callable[[], object], threads: int | None = None, *, repeat: int = 3) -> float:
-    """Time `work`, typically of tens of milliseconds, with one thread and with all, `repeat` times after one that is
-    not timed; leave torch set to the faster (or to `threads`), and return the seconds that one call takes.
+def choose_threads(work: Callable[[], object], threads: int | None = None) -> float:
+    """Time `work`, typically of tens of milliseconds, with one thread and with all; leave torch set to the faster (or
+    to `threads`), and return the seconds that one call takes.
 
     On a busy machine a second thread slows a computation down by up to ten times.
     """
@@ -93,9 +95,9 @@ def choose_threads(work: Callable[[], object], threads: int | None = None, *, re
         torch.set_num_threads(count)
         work()
         began = time.monotonic()
-        for _ in range(repeat):
+        for _ in range(TIMED):
             work()
-        took[count] = (time.monotonic() - began) / repeat
+        took[count] = (time.monotonic() - began) / TIMED
     best = min(took, key=lambda count: took[count])
     torch.set_num_threads(best)
     return took[best]

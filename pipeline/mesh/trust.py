@@ -13,7 +13,6 @@ import numpy as np
 
 from pipeline.cameras import View
 from pipeline.mesh.visibility import Visibility
-from pipeline.progress import Progress, quiet
 from sdfsim.shape.mesh import Mesh, face_normals
 
 FEW = 3  # photos: what fewer see is weak
@@ -75,15 +74,14 @@ def sigma_along(information: np.ndarray, normals: np.ndarray) -> np.ndarray:
     return np.where(known, np.sqrt(np.maximum(variance, 0)), np.inf)
 
 
-def support_of(sight: Visibility, views: Sequence[View], on_progress: Progress = quiet) -> Support:
+def support_of(sight: Visibility, views: Sequence[View]) -> Support:
     """What views tell of the vertices of a mesh, all in metres."""
     count = len(sight.vertices)
     seen, total = np.zeros(count, np.int64), np.zeros((count, 3, 3))
-    for number, view in enumerate(views):
+    for view in views:
         index = sight.of_view(view)[0]
         seen[index] += 1
         total[index] += information(view, sight.vertices[index])
-        on_progress((number + 1) / len(views), f"what photo {number + 1} of {len(views)} sees")
     return Support(sight.vertices, sight.normals, seen, total)
 
 

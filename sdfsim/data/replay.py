@@ -31,7 +31,6 @@ def roll_out(
     free_flight: FreeFlight = "exact",
     *,
     contact: bool = True,
-    sleep: bool = False,
     substeps: int = SUBSTEPS,
     as_teacher: bool = False,
     floor: tuple[float, float] = FLOOR,
@@ -50,7 +49,7 @@ def roll_out(
     gravity = torch.tensor(group[0].gravity / units.acceleration, dtype=torch.float64, device=device)
     rules = StepOptions(
         gravity, group[0].dt / units.time, model.inner or substeps, contact=contact, free_flight=free_flight,
-        sleep=sleep, margin=MARGIN / units.length if as_teacher else 0.0, adds=as_teacher,
+        margin=MARGIN / units.length if as_teacher else 0.0, adds=as_teacher,
     )  # fmt: skip
     if model.on_surfaces:
         state = with_history(state, bodies, rules)
