@@ -11,7 +11,6 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.run_memory import PHASES
@@ -356,7 +355,9 @@ def framed(scene: Scene, motion: Rollout | None = None) -> tuple[np.ndarray, flo
 
 def _turned(vectors: np.ndarray, quat_xyzw: np.ndarray) -> np.ndarray:
     """Vectors [..., 3] turned by a unit quaternion [4]."""
-    return Rotation.from_quat(quat_xyzw).apply(vectors)
+    axis, real = quat_xyzw[:3], quat_xyzw[3]  # by hand, because scipy's Rotation takes a fifth of a second to load
+    across = 2.0 * np.cross(axis, vectors)
+    return vectors + real * across + np.cross(axis, across)
 
 
 def _shaded(rr: Any, mesh: Mesh, color: tuple[int, ...]) -> rr.Mesh3D:

@@ -13,11 +13,13 @@ from torch import Tensor, nn
 
 from sdfsim.dynamics import kernels
 from sdfsim.dynamics.bodies import State
-from sdfsim.dynamics.kernels import impulse as compiled
 from sdfsim.dynamics.kernels.world import World
 from sdfsim.dynamics.models.contact_graph import REST_SPEED
 from sdfsim.dynamics.models.impulse import CALM, LIVELY, ImpulseNetwork, Round
 from sdfsim.dynamics.solver import Acts
+
+with kernels.kept():
+    from sdfsim.dynamics.kernels import impulse as compiled
 from sdfsim.dynamics.step import StepOptions
 
 _log = logging.getLogger(__name__)

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +29,17 @@ def compiled(what: str = "step.step") -> bool:
     return any(_cache().glob(f"**/{what}-*.nbi"))
 
 
-_settings: Any = config
-_before = _settings.CACHE_DIR
-if not _before:
-    _settings.CACHE_DIR = str(_cache())
-try:
-    from sdfsim.dynamics.kernels import impulse as impulse
+@contextmanager
+def kept() -> Iterator[None]:
+    """What is compiled of functions that are defined in the block is kept: modules that have some are imported in it."""
+    settings: Any = config
+    before = settings.CACHE_DIR
+    settings.CACHE_DIR = before or str(_cache())
+    try:
+        yield
+    finally:
+        settings.CACHE_DIR = before
+
+
+with kept():
     from sdfsim.dynamics.kernels import step as step
-finally:
-    _settings.CACHE_DIR = _before
