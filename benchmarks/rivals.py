@@ -149,13 +149,13 @@ def mugs(folder: Path) -> Scene:
 
 
 def scan(folder: Path) -> Scene:
-    """Ten bodies fall onto `rugged` ground."""
+    """Ten bodies fall onto `rugged` ground, some onto its arch."""
     shapes = [sample_shape(name) for name in ("bowl", "cone", "ring")]
     shapes += [box(0.5), ball(0.5), mesh_shape(rugged(), name="ground", kind="mesh")]
     rng = np.random.default_rng(2)
     bodies = [
         body(
-            f"b{k}", k % 5, (0.9 * (k % 4) - 1.35, 0.9 * (k // 4) - 0.9, 1.5), scale=0.6 if k % 5 < 3 else 1.0,
+            f"b{k}", k % 5, (0.9 * (k % 4) - 1.35, 0.9 * (k // 4) - 0.9, 2.2), scale=0.6 if k % 5 < 3 else 1.0,
             quat_xyzw=Rotation.random(rng=rng).as_quat(),
         )
         for k in range(10)

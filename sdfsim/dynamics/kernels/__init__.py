@@ -31,7 +31,7 @@ def compiled(what: str = "step.step") -> bool:
 
 @contextmanager
 def kept() -> Iterator[None]:
-    """What is compiled of functions that are defined in the block is kept: modules that have some are imported in it."""
+    """What is compiled of functions defined in the block is kept: modules that have some are imported in it."""
     settings: Any = config
     before = settings.CACHE_DIR
     settings.CACHE_DIR = before or str(_cache())
