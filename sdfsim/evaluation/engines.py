@@ -11,7 +11,7 @@ import re
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import chdir, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -399,12 +399,13 @@ def drake(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajector
 
 def _tetrahedra(mesh: Mesh, beside: Path) -> str:
     """A VTK file of tetrahedra that fill a closed mesh, kept beside the shape's URDF."""
-    kept = beside.with_suffix(".vtk")
+    kept = beside.with_suffix(".vtk").resolve()
     if not kept.exists():
         filler = _engine("pytetwild", "fTetWild", "rivals")
-        points, cells = filler.tetrahedralize(
-            mesh.vertices.astype(float), mesh.faces.astype(np.int32), edge_length_fac=TETRAHEDRA
-        )
+        with tempfile.TemporaryDirectory() as scratch, chdir(scratch):  # it leaves a file where it runs
+            points, cells = filler.tetrahedralize(
+                mesh.vertices.astype(float), mesh.faces.astype(np.int32), edge_length_fac=TETRAHEDRA
+            )
         corner = points[cells[:, 0], None]
         volume = np.linalg.det(points[cells[:, 1:]] - corner)
         cells = np.where(volume[:, None] < 0, cells[:, [0, 2, 1, 3]], cells)[np.abs(volume) > 0]

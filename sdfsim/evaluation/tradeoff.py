@@ -32,9 +32,7 @@ from sdfsim.evaluation.engines import (
     bullet,
     centred_mesh,
     dataset_urdf,
-    drake,
     mujoco,
-    newton,
     start_of_scene,
     timed,
 )
@@ -76,8 +74,6 @@ ENGINES = [
     *(("PyBullet", k) for k in (5, 4, 3, 2, 1)),
     *(("MuJoCo", k) for k in (10, 5, 2)),
     *(("MuJoCo mesh SDF", k) for k in (5, 2)),
-    *(("Drake", k) for k in (5, 2)),
-    ("Newton", 5),
 ]
 ENGINES_QUICK = [("PyBullet", 5), ("PyBullet", 1), ("MuJoCo", 5)]
 FLOOR_LABEL = "chaos floor: PyBullet 4 ms, starts 1 mm per s off"
@@ -314,10 +310,9 @@ def measure_engine(name: str, substeps: int, off: float, cases: Cases) -> dict[s
     """Errors and times of an engine with so many of its steps in a recorded one, starts `off` m/s off."""
     if abs(cases.recorded[0].dt - DT) > 1e-9:
         raise SdfsimError(f"recorded with another step than {DT} s")
-    run: Callable[..., tuple[Trajectory, Timing]] = {
-        "PyBullet": bullet, "MuJoCo": mujoco, "MuJoCo mesh SDF": partial(mujoco, pieces=False), "Drake": drake,
-        "Newton": newton,
-    }[name]  # fmt: skip
+    run: Callable[..., tuple[Trajectory, Timing]] = (
+        bullet if name == "PyBullet" else partial(mujoco, pieces=name == "MuJoCo")
+    )
     recorded = cases.recorded if name == "PyBullet" else cases.starts
     starts = [cases.engine_start(perturbed(t, off, [0, k])) for k, t in enumerate(recorded)]
     with peak_memory() as memory:
