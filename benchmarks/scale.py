@@ -184,7 +184,7 @@ def to_the_end(name: str, home: Path) -> dict[str, Any]:
     return {
         "bodies": len(moving),
         "nodes": sum(len(loaded.shapes[loaded.bodies[k].shape].nodes) for k in moving),
-        "steps": len(rollout) - 1,
+        "steps": len(rollout),
         "s": seconds,
         "mib": mib,
         "worst": 1e3 * float(depth.max()),
