@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,7 @@ from sdfsim.dynamics.kernels import distance as kinds
 from sdfsim.dynamics.kernels import record
 from sdfsim.dynamics.kernels import world as compiled
 from sdfsim.dynamics.kernels.step import step as compiled_step
+from sdfsim.files import digest
 from sdfsim.shape.baked_grid import WALL, BakedGrid, baked, inwards
 from sdfsim.shape.sdf import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, Sdf, SphereSdf
 from sdfsim.shape.surface_nodes import Surface, surface_of
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
     from sdfsim.dynamics.step import StepOptions
 
 _log = logging.getLogger(__name__)
+MOST_KEPT = 64  # shapes whose geometry stays at hand after their scenes are gone
 ANALYTIC = PlaneSdf | SphereSdf | BoxSdf | CapsuleSdf | CylinderSdf
 Clumps = list[list[np.ndarray]]
 LEAF, CLUMP = 16, 256  # nodes that a leaf and a clump of leaves hold at most
@@ -347,7 +350,11 @@ def compiled_shapes(bodies: Bodies) -> kinds.Shapes:
     )
 
 
-_known: WeakKeyDictionary[Sdf, tuple[np.ndarray, BakedGrid | None, Surface, np.ndarray, Clumps]] = WeakKeyDictionary()
+Geometry = tuple[np.ndarray, BakedGrid | None, Surface, np.ndarray, Clumps]
+_known: WeakKeyDictionary[Sdf, Geometry] = WeakKeyDictionary()
+_latest: OrderedDict[str, Geometry] = (
+    OrderedDict()
+)  # by content: scenes that reach a worker have copies of their shapes
 
 
 def _geometry(
@@ -357,15 +364,22 @@ def _geometry(
     once for all scenes of a process."""
     kept = _known.get(sdf)
     if kept is None or kept[0].shape != nodes.shape or (kept[0] != nodes).any():
-        grid = None if isinstance(sdf, ANALYTIC) else baked(sdf, nodes, pieces)
-        if grid and grid.thickness <= 1.001 * WALL * grid.cell:
-            told = "a shape of %.2g m has walls of at most %.2g m: things may pass through; --thicken helps"
-            _log.warning(told, _extent(sdf), grid.thickness)
-        surface = surface_of(sdf, nodes, pieces)
-        inward = INWARD * _extent(sdf) * inwards(sdf, surface.nodes)
-        kept = nodes, grid, surface, inward, _clumps(surface.nodes, surface.patch)
-        _known[sdf] = kept
+        content = digest(sdf, nodes, pieces)
+        kept = _latest.pop(content, None) or _looked_at(sdf, nodes, pieces)
+        _known[sdf] = _latest[content] = kept
+        if len(_latest) > MOST_KEPT:
+            _latest.popitem(last=False)
     return kept[1:]
+
+
+def _looked_at(sdf: Sdf, nodes: np.ndarray, pieces: tuple[np.ndarray, ...]) -> Geometry:
+    grid = None if isinstance(sdf, ANALYTIC) else baked(sdf, nodes, pieces)
+    if grid and grid.thickness <= 1.001 * WALL * grid.cell:
+        told = "a shape of %.2g m has walls of at most %.2g m: things may pass through; --thicken helps"
+        _log.warning(told, _extent(sdf), grid.thickness)
+    surface = surface_of(sdf, nodes, pieces)
+    inward = INWARD * _extent(sdf) * inwards(sdf, surface.nodes)
+    return nodes, grid, surface, inward, _clumps(surface.nodes, surface.patch)
 
 
 def compiled_world(bodies: Bodies, state: State) -> compiled.World:

@@ -1,5 +1,6 @@
 """The contact solve as a simulator's model: scaling, places, sleep, going on after a kill, crowds."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -7,9 +8,11 @@ import pytest
 import torch
 
 from sdfsim import Simulator
+from sdfsim.dynamics import solver
 from sdfsim.dynamics.rollout import Rollout
+from sdfsim.evaluation import hard_cases
 from sdfsim.scene.scene import Scene
-from sdfsim.shape.shape import analytic_shape, load_shape
+from sdfsim.shape.shape import analytic_shape, load_shape, with_sdf
 from tests.dynamics.test_laws import ball, body, cube
 from tests.dynamics.test_scale import SHAPES
 from tests.hard_cases import gates
@@ -173,3 +176,13 @@ def test_a_fitted_shape_rests_on_a_large_box_as_on_a_plane(name, wide):
     moved = np.abs(rollout.position[:, 0] - rollout.position[0, 0])
     assert moved.max() < 3e-3 * float(np.ptp(shape.sdf.bounds, axis=0).max())
     assert sim["thing"].asleep
+
+
+def test_a_copy_of_a_scene_is_not_baked_again(monkeypatch):
+    """Workers get copies of scenes: their shapes are known by what they hold."""
+    shape = with_sdf(analytic_shape("box", size=(1.0, 0.7, 0.3)), "grid", resolution=16)
+    scene = hard_cases.on_floor([shape], [hard_cases.body("b", 0, [0, 0, 1.0])])
+    first = Simulator(scene, "solver").run(steps=5)
+    monkeypatch.setattr(solver, "baked", None)
+    again = Simulator(pickle.loads(pickle.dumps(scene)), "solver").run(steps=5)
+    np.testing.assert_array_equal(first.position, again.position)
