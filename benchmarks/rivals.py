@@ -6,7 +6,7 @@ DATA is a MOVi-B dataset. Every engine simulates every case with inner steps of 
 metre; smaller ones in proportion to the root of their size), one thread, processor time. No engine is another's truth:
 an error is the distance from the same engine's motion at 1 ms. Depth is measured on the exact surfaces. Convex pieces
 are CoACD's, with one setting for all, where a shape has none of its own. Making them, tetrahedra and kernels is not
-timed. Restitution is 0, friction the same for all. DIR keeps results; the table in RESULTS.md is written from them.
+timed. Restitution is 0, friction the same for all. DIR keeps results; the table of the cases goes to RESULTS.md.
 """
 
 from __future__ import annotations
@@ -183,6 +183,9 @@ CASES: dict[str, Callable[[Path], Scene]] = {
 }
 
 
+ALL = ["MOVi-B", *CASES]
+
+
 def alike(scene: Scene) -> Scene:
     """The scene with one friction, no restitution and no sleep."""
     bodies = tuple(replace(b, friction=FRICTION, restitution=0.0) for b in scene.bodies)
@@ -321,7 +324,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
     parser.add_argument("-o", "--out", type=Path, required=True)
-    parser.add_argument("--only", nargs="+", default=["MOVi-B", *CASES], help="cases")
+    parser.add_argument("--only", nargs="+", default=ALL, help="cases")
     chosen = parser.parse_args()
     jobs = [
         Job(case, name, [INNER, STEPS, COMPARED, HEAP_STEPS, MOVI_B, FRICTION], measured,
@@ -330,8 +333,8 @@ def main() -> None:
     ]  # fmt: skip
     results = measure(jobs, chosen.out / "results", where="fresh", on_progress=lambda _, m: print(m, flush=True))
     print(table(results, chosen.only))
-    if set(chosen.only) == {"MOVi-B", *CASES}:
-        write_section("rivals", "python benchmarks/rivals.py DATA -o DIR", table(results, chosen.only))
+    some = "" if chosen.only == ALL else " --only " + " ".join(f'"{case}"' for case in chosen.only)
+    write_section("rivals", f"python benchmarks/rivals.py DATA -o DIR{some}", table(results, chosen.only))
 
 
 if __name__ == "__main__":
