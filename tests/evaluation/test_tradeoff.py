@@ -62,7 +62,7 @@ def test_the_whole_study_in_small(cube_data, tmp_path, monkeypatch):
     monkeypatch.setattr(study, "MOST_QUICK", 1)
     monkeypatch.setattr(study, "ENGINES_QUICK", [("PyBullet", 5), ("MuJoCo", 5)])
 
-    def absent(*_):
+    def absent(*_, **__):
         raise SdfsimError("MuJoCo is not installed")
 
     monkeypatch.setattr(study, "mujoco", absent)
