@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from sdfsim.shape.shape import Shape, load_shape
 
 # Threads of torch wait for one another by spinning, and beside other programs they take the processor from those they
-# wait for: a step then takes ten times as long. So they spin for some 10 microseconds only, which costs nothing on a
-# free machine. Has an effect only before torch is imported.
-os.environ.setdefault("GOMP_SPINCOUNT", "10000")
+# wait for: a step then takes ten times as long. So they spin for some microseconds only, which costs little on a free
+# machine. Has an effect only before torch is imported.
+os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 __version__ = "0.1.0"
 __all__ = ["Rollout", "Scene", "SceneError", "SdfsimError", "Shape", "Simulator", "load_scene", "load_shape"]

@@ -34,7 +34,7 @@ ROUNDS = 12  # of refinement
 NEAR = 3.0  # cells: so near to its surface a grid is fine
 OUTWARD = 1e-3  # how much deeper another node must be to be preferred to one that is farther out by a length
 STRIDE, FINEST = 0.02, 5e-4  # of a body's size, the first step of the refinement and the last
-MANY = 48  # pairs from which on threads are worth their while
+MANY = 192  # pairs from which on threads are worth their while, also beside other programs
 SHARES = 16  # of the pairs, each with its own scratch, that threads take in turn
 
 
