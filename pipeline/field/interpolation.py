@@ -1,31 +1,66 @@
 """Trilinear interpolation of grids that are learned.
 
-torch's `grid_sample` does the same for volumes, with one thread a volume and channel by channel: it was half of a
-training step. Here the eight corners of a point are rows of a table, summed by `embedding_bag`.
+On a CPU it is compiled. torch's `grid_sample` does the same for volumes, with one thread a volume and channel by
+channel; elsewhere the eight corners of a point are rows of a table, summed by `embedding_bag`.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
+import numba
 import torch
 from torch import Tensor
 from torch.nn import functional
+
+from sdfsim.dynamics import kernels
+
+with kernels.kept():
+    from pipeline.field.trilinear import gather, scatter
 
 
 def interpolate(grid: Tensor, points: Tensor) -> Tensor:
     """Trilinear values [P, C] of a grid [n, n, n, C] (z, y, x order) over [-1, 1]^3 at points [P, 3] (x, y, z), outside
     those of its border. Differentiable in the grid, not in the points."""
-    side, channels = grid.shape[0], grid.shape[3]
+    if grid.is_cuda:
+        return by_rows(grid, points)
+    return _Compiled.apply(grid, points.detach().contiguous())  # type: ignore[no-any-return]
+
+
+class _Compiled(torch.autograd.Function):
+    """Values of a grid on the CPU, with torch's number of threads."""
+
+    @staticmethod
+    def forward(ctx: Any, grid: Tensor, points: Tensor) -> Tensor:
+        """[P, C] from a grid [n, n, n, C] at points [P, 3]."""
+        ctx.save_for_backward(points)
+        ctx.shape = grid.shape
+        numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))
+        found = grid.new_empty(len(points), grid.shape[3])
+        gather(grid.detach().contiguous().numpy(), points.numpy(), found.numpy())
+        return found
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
+        """Gradient of the grid."""
+        (points,) = ctx.saved_tensors
+        gradient = grads[0].new_zeros(ctx.shape)
+        scatter(gradient.numpy(), points.numpy(), grads[0].contiguous().numpy(), numba.get_num_threads())
+        return gradient, None
+
+
+def by_rows(grid: Tensor, points: Tensor) -> Tensor:
+    """What `interpolate` gives, in torch alone, for any device."""
+    side = grid.shape[0]
     place = ((points.detach().t() + 1) * (0.5 * (side - 1))).clamp(0, side - 1)
     cell = place.long().clamp_max(side - 2)
     x1, y1, z1 = place - cell
     x0, y0, z0 = 1 - x1, 1 - y1, 1 - z1
     first = cell[0] + side * cell[1] + side * side * cell[2]
     steps = [x + side * y + side * side * z for z in (0, 1) for y in (0, 1) for x in (0, 1)]
-    rows = first[:, None] + torch.tensor(steps, device=points.device)
     weights = torch.stack([face * x for face in (z0 * y0, z0 * y1, z1 * y0, z1 * y1) for x in (x0, x1)], 1)
-    return _WeightedRows.apply(grid.reshape(-1, channels), rows, weights)  # type: ignore[no-any-return]
+    rows = first[:, None] + torch.tensor(steps, device=points.device)
+    return _WeightedRows.apply(grid.reshape(-1, grid.shape[3]), rows, weights)  # type: ignore[no-any-return]
 
 
 class _WeightedRows(torch.autograd.Function):

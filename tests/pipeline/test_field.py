@@ -21,7 +21,7 @@ from pipeline.field.grid_field import (
     render_weights,
     stencil,
 )
-from pipeline.field.interpolation import interpolate
+from pipeline.field.interpolation import by_rows, interpolate
 from pipeline.field.rays import Rays, camera_rays, load_rays
 from pipeline.field.rendering import choose_samples, sdf_cache, sphere_interval
 from pipeline.field.training import PRESETS, Trained, Trainer, save_field, train
@@ -269,13 +269,14 @@ def twin(grid: Tensor, points: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize(("side", "channels"), [(2, 1), (5, 4), (33, 2)])
-def test_values_and_gradient_are_those_of_the_general_sampler(side, channels):
+@pytest.mark.parametrize("way", [interpolate, by_rows])
+def test_values_and_gradient_are_those_of_the_general_sampler(side, channels, way):
     rng = torch.Generator().manual_seed(side)
     grid = torch.randn(side, side, side, channels, generator=rng, dtype=torch.float64, requires_grad=True)
     inside = torch.rand(500, 3, generator=rng, dtype=torch.float64) * 2.4 - 1.2  # some of them outside
     knots = torch.linspace(-1, 1, side, dtype=torch.float64)
     points = torch.cat([inside, torch.cartesian_prod(knots, knots, knots)])
-    found, wanted = interpolate(grid, points), twin(grid, points)
+    found, wanted = way(grid, points), twin(grid, points)
     torch.testing.assert_close(found, wanted, rtol=0, atol=1e-12)
     weights = torch.randn(found.shape, generator=rng, dtype=torch.float64)
     (one,) = torch.autograd.grad((found * weights).sum(), grid)

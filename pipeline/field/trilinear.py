@@ -1,0 +1,55 @@
+"""Trilinear interpolation and its gradient, compiled for the CPU: `interpolation.py` has the same in torch."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numba import njit, prange
+
+
+@njit(cache=True, inline="always")
+def _cell(points: Any, p: int, side: int) -> Any:
+    """The lower corner (x, y, z) of the cell of a point, and the point's place in it, 0 to 1."""
+    last, half = side - 1, 0.5 * (side - 1)
+    x = min(max((points[p, 0] + 1.0) * half, 0.0), last)
+    y = min(max((points[p, 1] + 1.0) * half, 0.0), last)
+    z = min(max((points[p, 2] + 1.0) * half, 0.0), last)
+    i, j, k = min(int(x), side - 2), min(int(y), side - 2), min(int(z), side - 2)
+    return i, j, k, x - i, y - j, z - k
+
+
+@njit(cache=True, parallel=True)
+def gather(grid: Any, points: Any, found: Any) -> None:
+    """Writes the values of a grid [n, n, n, C] at points [P, 3] to `found` [P, C]."""
+    side, channels = grid.shape[0], grid.shape[3]
+    for p in prange(len(points)):
+        i, j, k, x, y, z = _cell(points, p, side)
+        for c in range(channels):
+            low = (grid[k, j, i, c] * (1 - x) + grid[k, j, i + 1, c] * x) * (1 - y) + (
+                grid[k, j + 1, i, c] * (1 - x) + grid[k, j + 1, i + 1, c] * x
+            ) * y
+            high = (grid[k + 1, j, i, c] * (1 - x) + grid[k + 1, j, i + 1, c] * x) * (1 - y) + (
+                grid[k + 1, j + 1, i, c] * (1 - x) + grid[k + 1, j + 1, i + 1, c] * x
+            ) * y
+            found[p, c] = low * (1 - z) + high * z
+
+
+@njit(cache=True, parallel=True)
+def scatter(gradient: Any, points: Any, given: Any, threads: int) -> None:
+    """Adds what gradients [P, C] at points [P, 3] are of each value of a grid to `gradient` [n, n, n, C].
+
+    Each thread owns every `threads`-th layer and adds in the order of points, so that the sums do not depend on how
+    many there are.
+    """
+    side, channels = gradient.shape[0], gradient.shape[3]
+    for t in prange(threads):
+        for p in range(len(points)):
+            i, j, k, x, y, z = _cell(points, p, side)
+            for layer, part in ((k, 1 - z), (k + 1, z)):
+                if layer % threads == t:
+                    for c in range(channels):
+                        value = given[p, c] * part
+                        gradient[layer, j, i, c] += value * (1 - y) * (1 - x)
+                        gradient[layer, j, i + 1, c] += value * (1 - y) * x
+                        gradient[layer, j + 1, i, c] += value * y * (1 - x)
+                        gradient[layer, j + 1, i + 1, c] += value * y * x
