@@ -6,6 +6,8 @@ channel; elsewhere the eight corners of a point are rows of a table, summed by `
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numba
@@ -35,9 +37,9 @@ class _Compiled(torch.autograd.Function):
         """[P, C] from a grid [n, n, n, C] at points [P, 3]."""
         ctx.save_for_backward(points)
         ctx.shape = grid.shape
-        numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))
         found = grid.new_empty(len(points), grid.shape[3])
-        gather(grid.detach().contiguous().numpy(), points.numpy(), found.numpy())
+        with _threads():
+            gather(grid.detach().contiguous().numpy(), points.numpy(), found.numpy())
         return found
 
     @staticmethod
@@ -45,8 +47,21 @@ class _Compiled(torch.autograd.Function):
         """Gradient of the grid."""
         (points,) = ctx.saved_tensors
         gradient = grads[0].new_zeros(ctx.shape)
-        scatter(gradient.numpy(), points.numpy(), grads[0].contiguous().numpy(), numba.get_num_threads())
+        with _threads() as count:
+            scatter(gradient.numpy(), points.numpy(), grads[0].contiguous().numpy(), count)
         return gradient, None
+
+
+@contextmanager
+def _threads() -> Iterator[int]:
+    """Compiled code in the block uses as many threads as torch does, if it has so many."""
+    before = numba.get_num_threads()
+    count = min(torch.get_num_threads(), before)
+    numba.set_num_threads(count)
+    try:
+        yield count
+    finally:
+        numba.set_num_threads(before)
 
 
 def by_rows(grid: Tensor, points: Tensor) -> Tensor:
