@@ -18,7 +18,7 @@ from torch.nn import functional
 from sdfsim.dynamics import kernels
 
 with kernels.kept():
-    from pipeline.field.trilinear import gather, scatter
+    from pipeline.field.trilinear import gather, gather_with_threads, scatter, scatter_with_threads
 
 
 def interpolate(grid: Tensor, points: Tensor) -> Tensor:
@@ -38,8 +38,13 @@ class _Compiled(torch.autograd.Function):
         ctx.save_for_backward(points)
         ctx.shape = grid.shape
         found = grid.new_empty(len(points), grid.shape[3])
-        with _threads():
-            gather(grid.detach().contiguous().numpy(), points.numpy(), found.numpy())
+        given = grid.detach().contiguous().numpy(), points.numpy(), found.numpy()
+        # Without threads where one is enough: they do not survive a fork.
+        if torch.get_num_threads() == 1:
+            gather(*given, 0, len(points))
+        else:
+            with _threads() as count:
+                gather_with_threads(*given, count)
         return found
 
     @staticmethod
@@ -47,14 +52,18 @@ class _Compiled(torch.autograd.Function):
         """Gradient of the grid."""
         (points,) = ctx.saved_tensors
         gradient = grads[0].new_zeros(ctx.shape)
-        with _threads() as count:
-            scatter(gradient.numpy(), points.numpy(), grads[0].contiguous().numpy(), count)
+        given = gradient.numpy(), points.numpy(), grads[0].contiguous().numpy()
+        if torch.get_num_threads() == 1:
+            scatter(*given, 1, 0)
+        else:
+            with _threads() as count:
+                scatter_with_threads(*given, count)
         return gradient, None
 
 
 @contextmanager
 def _threads() -> Iterator[int]:
-    """Compiled code in the block uses as many threads as torch does, if it has so many."""
+    """Compiled code in the block uses as many threads as torch does, if it has so many; gives that number."""
     before = numba.get_num_threads()
     count = min(torch.get_num_threads(), before)
     numba.set_num_threads(count)

@@ -18,11 +18,11 @@ def _cell(points: Any, p: int, side: int) -> Any:
     return i, j, k, x - i, y - j, z - k
 
 
-@njit(cache=True, parallel=True)
-def gather(grid: Any, points: Any, found: Any) -> None:
-    """Writes the values of a grid [n, n, n, C] at points [P, 3] to `found` [P, C]."""
+@njit(cache=True)
+def gather(grid: Any, points: Any, found: Any, first: int, last: int) -> None:
+    """Writes the values of a grid [n, n, n, C] at points [first:last, 3] to `found` [first:last, C]."""
     side, channels = grid.shape[0], grid.shape[3]
-    for p in prange(len(points)):
+    for p in range(first, last):
         i, j, k, x, y, z = _cell(points, p, side)
         for c in range(channels):
             low = (grid[k, j, i, c] * (1 - x) + grid[k, j, i + 1, c] * x) * (1 - y) + (
@@ -34,22 +34,35 @@ def gather(grid: Any, points: Any, found: Any) -> None:
             found[p, c] = low * (1 - z) + high * z
 
 
-@njit(cache=True, parallel=True)
-def scatter(gradient: Any, points: Any, given: Any, threads: int) -> None:
+@njit(cache=True)
+def scatter(gradient: Any, points: Any, given: Any, shares: int, share: int) -> None:
     """Adds what gradients [P, C] at points [P, 3] are of each value of a grid to `gradient` [n, n, n, C].
 
-    Each thread owns every `threads`-th layer and adds in the order of points, so that the sums do not depend on how
-    many there are.
+    A share has every so many layers and adds in the order of points, so that sums do not depend on how many there are.
     """
     side, channels = gradient.shape[0], gradient.shape[3]
+    for p in range(len(points)):
+        i, j, k, x, y, z = _cell(points, p, side)
+        for layer, part in ((k, 1 - z), (k + 1, z)):
+            if layer % shares == share:
+                for c in range(channels):
+                    value = given[p, c] * part
+                    gradient[layer, j, i, c] += value * (1 - y) * (1 - x)
+                    gradient[layer, j, i + 1, c] += value * (1 - y) * x
+                    gradient[layer, j + 1, i, c] += value * y * (1 - x)
+                    gradient[layer, j + 1, i + 1, c] += value * y * x
+
+
+@njit(cache=True, parallel=True)
+def gather_with_threads(grid: Any, points: Any, found: Any, threads: int) -> None:
+    """The same as `gather` for all points."""
+    count = len(points)
     for t in prange(threads):
-        for p in range(len(points)):
-            i, j, k, x, y, z = _cell(points, p, side)
-            for layer, part in ((k, 1 - z), (k + 1, z)):
-                if layer % threads == t:
-                    for c in range(channels):
-                        value = given[p, c] * part
-                        gradient[layer, j, i, c] += value * (1 - y) * (1 - x)
-                        gradient[layer, j, i + 1, c] += value * (1 - y) * x
-                        gradient[layer, j + 1, i, c] += value * y * (1 - x)
-                        gradient[layer, j + 1, i + 1, c] += value * y * x
+        gather(grid, points, found, t * count // threads, (t + 1) * count // threads)
+
+
+@njit(cache=True, parallel=True)
+def scatter_with_threads(gradient: Any, points: Any, given: Any, threads: int) -> None:
+    """The same as `scatter`, a share a thread."""
+    for t in prange(threads):
+        scatter(gradient, points, given, threads, t)

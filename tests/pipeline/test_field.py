@@ -284,6 +284,22 @@ def test_values_and_gradient_are_those_of_the_general_sampler(side, channels, wa
     torch.testing.assert_close(one, two, rtol=0, atol=1e-12)
 
 
+def test_threads_change_nothing():
+    rng, found, before = torch.Generator().manual_seed(3), {}, torch.get_num_threads()
+    grid = torch.randn(17, 17, 17, 4, generator=rng, requires_grad=True)
+    points = torch.rand(3000, 3, generator=rng) * 2 - 1
+    try:
+        for count in (1, 2):
+            torch.set_num_threads(count)
+            values = interpolate(grid, points)
+            (slope,) = torch.autograd.grad((values**2).sum(), grid)
+            found[count] = values.detach(), slope
+    finally:
+        torch.set_num_threads(before)
+    for one, two in zip(found[1], found[2], strict=True):
+        assert torch.equal(one, two)
+
+
 def test_a_linear_function_of_x_y_z_is_itself():
     line = torch.linspace(-1, 1, 9, dtype=torch.float64)
     z, y, x = torch.meshgrid(line, line, line, indexing="ij")
