@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.results import write_section
 from sdfsim.console import Session
 from sdfsim.evaluation.hard_cases import GROUPS
-from sdfsim.evaluation.stress import ENGINES, Study, draw_group, figures, losses, stress, table, write_report
+from sdfsim.evaluation.stress import ENGINES, TEACHER, Study, draw_group, figures, losses, stress, table, write_report
 from sdfsim.files import read_json, write_json, write_text
 from sdfsim.recording import save_rollout
 
@@ -39,8 +40,10 @@ def write_document(study: Study) -> None:
     before, rest = DOCUMENT.read_text(encoding="utf-8").split(BEGIN)
     shown = f"{BEGIN}\n\n{form}\n\n{table(study)}\n{pictures}\n\n{END}"
     write_text(DOCUMENT, before + shown + rest.split(END)[1])
+    # Beside engines that know no restitution nothing else could be seen.
+    others = [who for who in study.who if who == TEACHER or who not in ENGINES]
     for group, name in PICTURES.items():
-        draw_group(study, group, ROOT / "docs" / "images" / name)
+        draw_group(replace(study, who=others), group, ROOT / "docs" / "images" / name)
 
 
 def accepted(study: Study) -> dict[str, Any]:
