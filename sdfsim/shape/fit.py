@@ -31,7 +31,7 @@ Recipe = Literal["quick", "default", "paper"]
 Layers = tuple[list[torch.Tensor], list[torch.Tensor]]
 
 # Changes whenever the same mesh would come out differently; part of every cache key.
-FIT_VERSION = 6
+FIT_VERSION = 7
 
 # Points are drawn from a little beyond the box that is used: at the very edge of its data a network's slope is poor.
 MARGIN = 1.15

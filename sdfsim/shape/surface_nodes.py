@@ -20,6 +20,7 @@ REACHED = 0.005
 PROJECTIONS = 3
 DEFAULT_GRID = 24
 DEFAULT_COUNT = 512  # what the bundled model was trained with; docs/tradeoff.md has what fewer cost
+DIRECTIONS = 1000  # in which nodes are to reach as far as the surface
 # Faces that meet at less than this cosine (20 degrees) make an edge worth nodes of its own.
 SHARP = 0.94
 
@@ -166,9 +167,26 @@ def _nearest_piece(pieces: Sequence[np.ndarray], places: np.ndarray) -> np.ndarr
 
 
 def surface_nodes(sdf: Sdf, surface: Mesh, count: int) -> np.ndarray:
-    """Nodes for contact, at most `count` [K, 3] m: first corners of the convex hull, then points all over `sdf`."""
-    corners = thin(surface.vertices[_outer(surface.vertices)], count // 3)
-    return thin(sample_nodes(sdf), count, keep=corners)
+    """Nodes for contact, at most `count` [K, 3] m: a third that reach farthest outwards, then points all over `sdf`."""
+    return thin(sample_nodes(sdf), count, keep=_reaching(surface.vertices, count // 3))
+
+
+def _reaching(points: np.ndarray, count: int) -> np.ndarray:
+    """At most `count` of points [P, 3] whose convex hull comes nearest to that of all: in turn the outermost in the
+    direction in which those before fall short the most. Evenly spread points leave gaps of a tenth of a body along a
+    rim, through which it sinks into a floor."""
+    k = np.arange(DIRECTIONS) + 0.5
+    turn, height = np.pi * (1 + np.sqrt(5)) * k, 1 - 2 * k / DIRECTIONS  # a spiral over the unit sphere
+    flat = np.sqrt(1 - height**2)
+    outer = _outer(points)
+    along = np.stack([flat * np.cos(turn), flat * np.sin(turn), height], 1) @ points[outer].T
+    farthest, reached = along.max(1), np.full(DIRECTIONS, -np.inf)
+    tolerance = 1e-6 * float(np.ptp(points, axis=0).max())
+    chosen: list[int] = []
+    while len(chosen) < count and (farthest - reached).max() > tolerance:
+        chosen.append(int(along[(farthest - reached).argmax()].argmax()))
+        reached = np.maximum(reached, along[:, chosen[-1]])
+    return points[outer[chosen]]
 
 
 def _outer(vertices: np.ndarray) -> np.ndarray:

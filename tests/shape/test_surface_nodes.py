@@ -5,9 +5,9 @@ import pytest
 from scipy.spatial import KDTree
 
 from sdfsim.shape import primitives
-from sdfsim.shape.mesh import sample_surface
-from sdfsim.shape.sdf import BoxSdf, SphereSdf
-from sdfsim.shape.surface_nodes import edge_nodes, hull_nodes, sample_nodes, thin
+from sdfsim.shape.mesh import Mesh, sample_surface
+from sdfsim.shape.sdf import BoxSdf, MeshSdf, SphereSdf
+from sdfsim.shape.surface_nodes import edge_nodes, hull_nodes, sample_nodes, surface_nodes, thin
 
 
 @pytest.mark.parametrize("scale", [0.01, 1.0, 300.0])
@@ -79,3 +79,30 @@ def test_edges_of_a_box_and_none_of_its_flat_diagonals() -> None:
     assert len(points) == 4 * (3 + 7 + 11)
     assert len(edge_nodes(corners, 5.0)) == 0
     assert len(edge_nodes(primitives.sphere().vertices, 0.01)) == 0
+
+
+def test_nodes_reach_as_far_as_a_vase_does_in_every_direction() -> None:
+    import trimesh
+
+    height = np.linspace(0.0, 1.0, 121)
+    radius = 0.2 + 0.13 * np.sin(np.pi * height) ** 2 + 0.05 * height**8  # a belly, a neck and a rim
+    profile = np.stack([radius, height], 1)
+    vase = trimesh.creation.revolve(np.concatenate([[[0.0, 0.0]], profile, [[0.0, 1.0]]]), sections=160)
+    rng = np.random.default_rng(0)
+    mesh = Mesh(vase.vertices + rng.normal(0.0, 0.003, vase.vertices.shape), vase.faces)  # rough, as one from photos
+    nodes = surface_nodes(MeshSdf(mesh), mesh, 512)
+    direction = rng.normal(size=(5000, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    short = (direction @ mesh.vertices.T).max(1) - (direction @ nodes.T).max(1)
+    assert short.max() < 0.006 and short.mean() < 0.0006
+
+
+def test_of_a_box_the_corners_reach_farthest_and_nothing_else() -> None:
+    import trimesh
+
+    box = trimesh.creation.box((1.0, 0.6, 0.4)).subdivide().subdivide()
+    mesh = Mesh(box.vertices, box.faces)
+    nodes = surface_nodes(BoxSdf((0.5, 0.3, 0.2)), mesh, 512)
+    corners = np.abs(nodes[:8]) - [0.5, 0.3, 0.2]
+    np.testing.assert_allclose(corners, 0.0, atol=1e-12)
+    assert len(np.unique(nodes[:8], axis=0)) == 8
