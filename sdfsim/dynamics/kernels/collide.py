@@ -525,6 +525,8 @@ def _moved(shapes, world, motion, matrix, rules, manifolds, p, count):
 @njit(**BARE)
 def _nodes(shapes, world, motion, matrix, look, a, b, side, near, pair, went, scratch, t, count):
     """The deepest node of each near leaf of one body in the other's distances, refined; added to what is found."""
+    if near.count[pair, side] == 0:
+        return count
     table, brick, sample = shapes.table, shapes.brick, shapes.sample
     depth, node, keys, normal = scratch.depth, scratch.node, scratch.key, scratch.normal
     one, other = (a, b) if side == 0 else (b, a)
@@ -532,6 +534,7 @@ def _nodes(shapes, world, motion, matrix, look, a, b, side, near, pair, went, sc
     w, c = map_between(motion.position, matrix, world.scale, world.com, one, other)
     k, own = world.scale[other], world.scale[one]
     stride = STRIDE * shapes.clump_ball[shapes.clump_start[r], 3]
+    flat = table[s, KIND] == PLANE  # whose distance has one normal: no look from within
     kept = 0
     for at in range(near.start[pair, side], near.start[pair, side] + near.count[pair, side]):
         i = near.leaf[at]
@@ -545,8 +548,11 @@ def _nodes(shapes, world, motion, matrix, look, a, b, side, near, pair, went, sc
         facing = (0.0, 0.0, 0.0)
         for u in range(shapes.leaf_node[i], shapes.leaf_node[i + 1]):
             p = get(shapes.node, u)
-            d, n = _gap(table, brick, sample, s, w, c, p, get(shapes.inward, u))
-            d *= k
+            if flat:
+                d, n = k * (dot(w[2], p) + c[2]), (0.0, 0.0, 1.0)
+            else:
+                d, n = _gap(table, brick, sample, s, w, c, p, get(shapes.inward, u))
+                d *= k
             score = d - OUTWARD * own * norm(p)
             if d <= look and score < lowest:
                 deepest, chosen, lowest, facing = d, u, score, n
@@ -607,10 +613,11 @@ def _gap(table, brick, sample, t, w, c, p, inward):
     On an edge of t its own distance has two normals, and the one that parts two stacked boxes is not always the
     nearer. From within, only the face that is met is near.
     """
-    at = mapped(w, c, p)
-    back = sub(mapped(w, c, add(p, inward)), at)
-    if table[t, KIND] == GRID and norm(back) > NEAR * table[t, CELL]:
-        back = scale(back, NEAR * table[t, CELL] / norm(back))  # of a much larger body
+    at, back = mapped(w, c, p), (dot(w[0], inward), dot(w[1], inward), dot(w[2], inward))
+    if table[t, KIND] == GRID:
+        most, long = NEAR * table[t, CELL], dot(back, back)
+        if long > most * most:
+            back = scale(back, most / math.sqrt(long))  # of a much larger body
     d, n = distance(table, brick, sample, t, add(at, back))
     return d - dot(back, n), n
 
@@ -685,10 +692,11 @@ def _round(shapes, world, motion, matrix, reach, a, b, side, found, at):
 
 
 @njit(**BARE)
-def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p):
-    """The least distance of pair p with its two bodies at `place` and `frame`, of the nodes that were near."""
+def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, least, enough):
+    """The least distance of pair p with its two bodies at `place` and `frame`, of the nodes that were near; `least`
+    where all are farther, and any that is `enough`. `went` is how much nearer two points may have come since `near`
+    was made."""
     table, brick, sample = shapes.table, shapes.brick, shapes.sample
-    least = math.inf
     for side in range(2):
         s, t = shape[pairs[p, side]], shape[pairs[p, 1 - side]]
         w, c = map_between(place, frame, scales, coms, side, 1 - side)
@@ -700,12 +708,16 @@ def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p):
                 least = min(least, k * d - scales[side] * table[s, SIZE])
         elif not is_round(table, t):
             for i in range(near.start[p, side], near.start[p, side] + near.count[p, side]):
+                if near.away[i] - went >= least:
+                    continue
                 e = near.leaf[i]
                 d, _ = distance(table, brick, sample, t, mapped(w, c, get(shapes.leaf_ball, e)))
                 if k * d - scales[side] * shapes.leaf_ball[e, 3] < least:
                     for u in range(shapes.leaf_node[e], shapes.leaf_node[e + 1]):
                         d, _ = distance(table, brick, sample, t, mapped(w, c, get(shapes.node, u)))
                         least = min(least, k * d)
+                    if least <= enough:
+                        return least
     return least
 
 

@@ -222,7 +222,7 @@ def _slope(world, orientation, momentum, u, h, b, trial, frame):
 @njit(**FAST)
 def _parts(shapes, world, work, motion, rules, manifolds, near):
     """How much of the inner step each body may move, so that none passes through what is thinner than its way."""
-    free, change, part, matrix = work.free, work.change, work.part, work.matrix
+    free, change, part = work.free, work.change, work.part
     for b in world.going:
         part[b] = 1.0
     for p in range(len(near.start)):
@@ -236,7 +236,7 @@ def _parts(shapes, world, work, motion, rules, manifolds, near):
         depth = _harmless(shapes, world, a, b)
         away = near.away_all[p] - work.gone[a] - work.gone[b]
         if speed * rules.inner > depth and not away > speed * rules.inner:
-            free_part = _clear(shapes, world, motion, matrix, rules, manifolds, near, free, change, p, speed, depth)
+            free_part = _clear(shapes, world, motion, work, rules, manifolds, near, p, speed, depth)
             part[a], part[b] = min(part[a], free_part), min(part[b], free_part)
 
 
@@ -256,15 +256,17 @@ def _harmless(shapes, world, a, b):
 
 
 @njit(**FAST)
-def _clear(shapes, world, motion, matrix, rules, manifolds, near, free, change, p, speed, depth):
+def _clear(shapes, world, motion, work, rules, manifolds, near, p, speed, depth):
     """How much of the inner step a pair may move until it overlaps a little: conservative advancement."""
+    free, change = work.free, work.change
+    gone = work.gone[manifolds.pair[p, 0]] + work.gone[manifolds.pair[p, 1]]
     place, frame, turned = np.empty((2, 3)), np.empty((2, 3, 3)), np.empty((2, 4))
     scales, coms = np.empty(2), np.empty((2, 3))
     for side in range(2):
         body = manifolds.pair[p, side]
         scales[side] = world.scale[body]
         put(coms, side, get(world.com, body))
-    deep = 0.75 * depth
+    deep, way = 0.75 * depth, speed * rules.inner
     t = 0.0
     for _ in range(64):
         for side in range(2):
@@ -275,12 +277,16 @@ def _clear(shapes, world, motion, matrix, rules, manifolds, near, free, change, 
             for x in range(4):
                 turned[side, x] = q[x]
             to_matrix(turned, side, frame)
-        gap = nearest(shapes, world.shape, place, frame, scales, coms, manifolds.pair, near, p)
+        # What is farther than the way that is left is not met.
+        gap = nearest(
+            shapes, world.shape, place, frame, scales, coms, manifolds.pair, near, p, gone + t * way, (1.0 - t) * way,
+            0.0 if t == 0.0 else -0.5 * deep,
+        )  # fmt: skip
         if t == 0.0 and gap <= 0.0:
             return 1.0  # in contact already, and answered
         if gap <= -0.5 * deep:
             return t
-        t += (gap + deep) / (speed * rules.inner)
+        t += (gap + deep) / way
         if t >= 1.0:
             return 1.0
     return t
