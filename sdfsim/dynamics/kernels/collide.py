@@ -8,7 +8,18 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit, prange
 
-from sdfsim.dynamics.kernels.distance import CAPSULE, CELL, GRID, KIND, PLANE, SIZE, SPHERE, distance, patch_of
+from sdfsim.dynamics.kernels.distance import (
+    CAPSULE,
+    CELL,
+    GRID,
+    KIND,
+    PLANE,
+    SIZE,
+    SPHERE,
+    distance,
+    distance_alone,
+    patch_of,
+)
 from sdfsim.dynamics.kernels.vectors import (
     BARE,
     FAST,
@@ -329,7 +340,7 @@ def _near(shapes, world, motion, matrix, pairs, ways, reach, near, p):
         other = b if one == a else a
         w, c = map_between(motion.position, matrix, world.scale, world.com, one, other)
         k = world.scale[other]
-        d, _ = distance(table, brick, sample, world.shape[other], mapped(w, c, (0.0, 0.0, 0.0)))
+        d = distance_alone(table, brick, sample, world.shape[other], mapped(w, c, (0.0, 0.0, 0.0)))
         s = world.shape[one]
         size = (
             shapes.table[s, SIZE] + (shapes.table[s, SIZE + 1] if shapes.table[s, KIND] == CAPSULE else 0.0)
@@ -343,12 +354,11 @@ def _near(shapes, world, motion, matrix, pairs, ways, reach, near, p):
         k, own = world.scale[other], world.scale[one]
         at = near.start[p, side]
         for clump in range(shapes.clump_start[s], shapes.clump_start[s + 1]):
-            d, _ = distance(table, brick, sample, t, mapped(w, c, get(shapes.clump_ball, clump)))
+            d = distance_alone(table, brick, sample, t, mapped(w, c, get(shapes.clump_ball, clump)))
             if k * d - own * shapes.clump_ball[clump, 3] > most:
                 continue
             for i in range(shapes.clump_leaf[clump], shapes.clump_leaf[clump + 1]):
-                d, _ = distance(table, brick, sample, t, mapped(w, c, get(shapes.leaf_ball, i)))
-                away = k * d - own * shapes.leaf_ball[i, 3]
+                away = _beyond(shapes, t, w, c, k, own, i)
                 if away <= most:
                     near.leaf[at], near.away[at] = i, away
                     at += 1
@@ -479,7 +489,7 @@ def _swallowed(shapes, world, motion, matrix, a, b, side, found, t):
         return False
     table, brick, sample = shapes.table, shapes.brick, shapes.sample
     k, centre = world.scale[other], scale(get(world.com, one), 1.0 / world.scale[one])
-    own, _ = distance(table, brick, sample, world.shape[one], centre)
+    own = distance_alone(table, brick, sample, world.shape[one], centre)
     if own >= 0.0:
         return False
     w, c = map_between(motion.position, matrix, world.scale, world.com, one, other)
@@ -539,20 +549,22 @@ def _nodes(shapes, world, motion, matrix, look, a, b, side, near, pair, went, sc
     for at in range(near.start[pair, side], near.start[pair, side] + near.count[pair, side]):
         i = near.leaf[at]
         if near.away[at] - went <= look:
-            d, _ = distance(table, brick, sample, s, mapped(w, c, get(shapes.leaf_ball, i)))
-            near.away[at] = k * d - own * shapes.leaf_ball[i, 3] + went
+            near.away[at] = _beyond(shapes, s, w, c, k, own, i) + went
         near.away_all[pair] = min(near.away_all[pair], near.away[at])
         if near.away[at] - went > look:
             continue
         deepest, chosen, lowest = 0.0, -1, 1e300
-        facing = (0.0, 0.0, 0.0)
+        facing, d, there = (0.0, 0.0, 0.0), -math.inf, get(shapes.node, shapes.leaf_node[i])
+        slack = look + 4.0 * own * norm(get(shapes.inward, shapes.leaf_node[i]))  # a look from within adds two at most
         for u in range(shapes.leaf_node[i], shapes.leaf_node[i + 1]):
             p = get(shapes.node, u)
             if flat:
                 d, n = k * (dot(w[2], p) + c[2]), (0.0, 0.0, 1.0)
+            elif d - own * norm(sub(p, there)) > slack:
+                continue  # too near to one that is far
             else:
                 d, n = _gap(table, brick, sample, s, w, c, p, get(shapes.inward, u))
-                d *= k
+                there, d = p, d * k
             score = d - OUTWARD * own * norm(p)
             if d <= look and score < lowest:
                 deepest, chosen, lowest, facing = d, u, score, n
@@ -692,10 +704,10 @@ def _round(shapes, world, motion, matrix, reach, a, b, side, found, at):
 
 
 @njit(**BARE)
-def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, least, enough):
+def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, least, enough, refresh):
     """The least distance of pair p with its two bodies at `place` and `frame`, of the nodes that were near; `least`
     where all are farther, and any that is `enough`. `went` is how much nearer two points may have come since `near`
-    was made."""
+    was made; whether the poses are those of the bodies, so that `near` may take up how far leaves are (`refresh`)."""
     table, brick, sample = shapes.table, shapes.brick, shapes.sample
     for side in range(2):
         s, t = shape[pairs[p, side]], shape[pairs[p, 1 - side]]
@@ -704,21 +716,39 @@ def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, lea
         if is_round(table, s):
             half = table[s, SIZE + 1] if table[s, KIND] == CAPSULE else 0.0
             for e in range(-2, 3):
-                d, _ = distance(table, brick, sample, t, mapped(w, c, (0.0, 0.0, 0.5 * e * half)))
+                d = distance_alone(table, brick, sample, t, mapped(w, c, (0.0, 0.0, 0.5 * e * half)))
                 least = min(least, k * d - scales[side] * table[s, SIZE])
-        elif not is_round(table, t):
-            for i in range(near.start[p, side], near.start[p, side] + near.count[p, side]):
-                if near.away[i] - went >= least:
+        elif near.count[p, side] > 0 and not is_round(table, t):
+            first, last = near.start[p, side], near.start[p, side] + near.count[p, side]
+            front = first
+            if refresh:
+                for i in range(first, last):
+                    if near.away[i] - went < least:
+                        near.away[i] = went + _beyond(shapes, t, w, c, k, scales[side], near.leaf[i])
+                        front = i if near.away[i] < near.away[front] else front
+            # The nearest leaf first: the others are then seldom near enough to be looked into.
+            for n in range(first - 1, last):
+                i = front if n < first else n
+                if n == front or near.away[i] - went >= least:
                     continue
                 e = near.leaf[i]
-                d, _ = distance(table, brick, sample, t, mapped(w, c, get(shapes.leaf_ball, e)))
-                if k * d - scales[side] * shapes.leaf_ball[e, 3] < least:
+                if refresh or _beyond(shapes, t, w, c, k, scales[side], e) < least:
+                    there, d = get(shapes.node, shapes.leaf_node[e]), -math.inf
                     for u in range(shapes.leaf_node[e], shapes.leaf_node[e + 1]):
-                        d, _ = distance(table, brick, sample, t, mapped(w, c, get(shapes.node, u)))
-                        least = min(least, k * d)
+                        p_u = get(shapes.node, u)
+                        if d - scales[side] * norm(sub(p_u, there)) < least:  # else too near to one that is far
+                            there, d = p_u, k * distance_alone(table, brick, sample, t, mapped(w, c, p_u))
+                            least = min(least, d)
                     if least <= enough:
                         return least
     return least
+
+
+@njit(**BARE)
+def _beyond(shapes, t, w, c, k, own, e):
+    """How far a leaf is from shape t at least."""
+    d = distance_alone(shapes.table, shapes.brick, shapes.sample, t, mapped(w, c, get(shapes.leaf_ball, e)))
+    return k * d - own * shapes.leaf_ball[e, 3]
 
 
 @njit(**BARE)
@@ -726,17 +756,17 @@ def _lowest(table, brick, sample, t, w, c, half):
     """Where between -half and half of its axis a capsule is nearest to shape t: golden section."""
     low, high = -half, half
     one, other = high - 0.6180339887498949 * (high - low), low + 0.6180339887498949 * (high - low)
-    f, _ = distance(table, brick, sample, t, mapped(w, c, (0.0, 0.0, one)))
-    g, _ = distance(table, brick, sample, t, mapped(w, c, (0.0, 0.0, other)))
+    f = distance_alone(table, brick, sample, t, mapped(w, c, (0.0, 0.0, one)))
+    g = distance_alone(table, brick, sample, t, mapped(w, c, (0.0, 0.0, other)))
     for _ in range(30):
         if f <= g:
             high, other, g = other, one, f
             one = high - 0.6180339887498949 * (high - low)
-            f, _ = distance(table, brick, sample, t, mapped(w, c, (0.0, 0.0, one)))
+            f = distance_alone(table, brick, sample, t, mapped(w, c, (0.0, 0.0, one)))
         else:
             low, one, f = one, other, g
             other = low + 0.6180339887498949 * (high - low)
-            g, _ = distance(table, brick, sample, t, mapped(w, c, (0.0, 0.0, other)))
+            g = distance_alone(table, brick, sample, t, mapped(w, c, (0.0, 0.0, other)))
     return 0.5 * (low + high)
 
 

@@ -77,6 +77,15 @@ def distance(table, brick, sample, s, p):
 
 
 @njit(**BARE)
+def distance_alone(table, brick, sample, s, p):
+    """Signed distance alone, of a grid in two thirds of the time."""
+    if table[s, KIND] == GRID:
+        return _grid_alone(table, brick, sample, s, p)
+    d, _ = distance(table, brick, sample, s, p)
+    return d
+
+
+@njit(**BARE)
 def patch_of(table, label, s, p):
     """The patch of shape s that is nearest to p."""
     first = int(table[s, PATCH])
@@ -132,6 +141,32 @@ def _cylinder(p, radius, half):
 @njit(**BARE)
 def _grid(table, brick, sample, s, p):
     """Trilinear in the brick around p, or between the corners of bricks; the distance to the box adds beyond it."""
+    corners, part, beyond = _around(table, brick, sample, s, p)
+    d, slope = _trilinear(corners, part)
+    length = norm(slope)
+    normal = (0.0, 0.0, 1.0) if length < TINY else scale(slope, 1.0 / length)
+    far = dot(beyond, beyond)
+    if far > 0.0:
+        # The solid lies within the box, which is convex: it is no nearer than this.
+        d = max(d, 0.0)
+        normal = along(beyond, normal, d)
+        d = math.sqrt(far + d * d)
+        normal = scale(normal, 1.0 / norm(normal))
+    return d, normal
+
+
+@njit(**BARE)
+def _grid_alone(table, brick, sample, s, p):
+    """The distance of `_grid`."""
+    corners, part, beyond = _around(table, brick, sample, s, p)
+    d, _ = _trilinear(corners, part)
+    far = dot(beyond, beyond)
+    return d if far == 0.0 else math.sqrt(far + max(d, 0.0) ** 2)
+
+
+@njit(forceinline=True, **BARE)
+def _around(table, brick, sample, s, p):
+    """The eight samples around p, or around the nearest place of the grid; where between them; and how far beyond."""
     cell = table[s, CELL]
     nx, ny, nz = int(table[s, BRICKS]), int(table[s, BRICKS + 1]), int(table[s, BRICKS + 2])
     a = 1.0 / cell
@@ -149,27 +184,19 @@ def _grid(table, brick, sample, s, p):
         u, v, w = cx / 8.0, cy / 8.0, cz / 8.0
         o = int(table[s, COARSE]) + (i * (ny + 1) + j) * (nz + 1) + k
         e, f = (ny + 1) * (nz + 1), nz + 1
-    d, slope = _trilinear(
-        sample[o], sample[o + 1], sample[o + f], sample[o + f + 1],
-        sample[o + e], sample[o + e + 1], sample[o + e + f], sample[o + e + f + 1], u - i, v - j, w - k,
+    corners = (
+        np.float64(sample[o]), np.float64(sample[o + 1]), np.float64(sample[o + f]), np.float64(sample[o + f + 1]),
+        np.float64(sample[o + e]), np.float64(sample[o + e + 1]), np.float64(sample[o + e + f]),
+        np.float64(sample[o + e + f + 1]),
     )  # fmt: skip
-    length = norm(slope)
-    normal = (0.0, 0.0, 1.0) if length < TINY else scale(slope, 1.0 / length)
-    far = dot(beyond, beyond)
-    if far > 0.0:
-        # The solid lies within the box, which is convex: it is no nearer than this.
-        d = max(d, 0.0)
-        normal = along(beyond, normal, d)
-        d = math.sqrt(far + d * d)
-        normal = scale(normal, 1.0 / norm(normal))
-    return d, normal
+    return corners, (u - i, v - j, w - k), beyond
 
 
-@njit(**BARE)
-def _trilinear(a000, a001, a010, a011, a100, a101, a110, a111, u, v, w):
+@njit(forceinline=True, **BARE)
+def _trilinear(corners, part):
     """The interpolant between eight corners and its slope a cell."""
-    a000, a001, a010, a011 = np.float64(a000), np.float64(a001), np.float64(a010), np.float64(a011)
-    a100, a101, a110, a111 = np.float64(a100), np.float64(a101), np.float64(a110), np.float64(a111)
+    a000, a001, a010, a011, a100, a101, a110, a111 = corners
+    u, v, w = part
     a = a000 + w * (a001 - a000)
     b = a010 + w * (a011 - a010)
     c = a100 + w * (a101 - a100)

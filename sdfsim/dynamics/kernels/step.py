@@ -277,18 +277,17 @@ def _clear(shapes, world, motion, work, rules, manifolds, near, p, speed, depth)
             for x in range(4):
                 turned[side, x] = q[x]
             to_matrix(turned, side, frame)
-        # What is farther than the way that is left is not met.
+        rest = (1.0 - t) * way - deep  # what is no nearer is not met before the end
         gap = nearest(
-            shapes, world.shape, place, frame, scales, coms, manifolds.pair, near, p, gone + t * way, (1.0 - t) * way,
-            0.0 if t == 0.0 else -0.5 * deep,
+            shapes, world.shape, place, frame, scales, coms, manifolds.pair, near, p, gone + t * way, rest,
+            0.0 if t == 0.0 else -0.5 * deep, t == 0.0,
         )  # fmt: skip
-        if t == 0.0 and gap <= 0.0:
-            return 1.0  # in contact already, and answered
+        # Or they are in contact already, and it is answered.
+        if gap >= rest or (t == 0.0 and gap <= 0.0):
+            return 1.0
         if gap <= -0.5 * deep:
             return t
         t += (gap + deep) / way
-        if t >= 1.0:
-            return 1.0
     return t
 
 
