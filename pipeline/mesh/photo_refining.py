@@ -7,7 +7,7 @@ nothing: there the surface is the smallest one between what is known on both sid
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -27,6 +27,9 @@ STRAIGHT = 0.35  # least cosine between the normal and a photo's line of sight
 HALF = 3  # a patch has this many pixels to each side of its middle
 PLACES = 25  # along the normal
 NOISE = 4.0  # variance of grey levels that is no texture
+# What is not reconstructed may stand before a photo. That one agrees with no others around there: with the best two of
+# ASKED photos by less than CLEAR times as well as any photo does. One vertex of so many is asked.
+ASKED, CLEAR, SELDOM = 8, 0.5, 16
 # How far vertices are moved, in cells of the field's finest grid; the second round looks in half that range.
 REACH, ROUNDS = 1.3, 2
 EVERY = 4  # one vertex of so many is looked at, the others follow
@@ -81,6 +84,7 @@ def refine(mesh: Mesh, pictures: list[Picture], blocking: Caster, lift: float, f
     links = ((links + links.T) > 0).astype(float)
     mean = diags(1 / np.asarray(links.sum(1)).ravel()) @ links
     low = height(mesh.vertices) < layer
+    clear = np.ones((len(pictures), count), bool)
     upright = height(np.eye(3)) - height(np.zeros((1, 3))) if low.any() else np.zeros(3)
     for number in range(ROUNDS):
         normal = vertex_normals(mesh)
@@ -89,7 +93,11 @@ def refine(mesh: Mesh, pictures: list[Picture], blocking: Caster, lift: float, f
             normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         picked = np.random.default_rng(number).permutation(count)[: count // EVERY]
         moves = np.linspace(-1, 1, PLACES) * REACH * finest / 2**number
-        score = agreement(Visibility(mesh, lift, blocking).at(picked), normal[picked], pictures, moves)
+        sight = Visibility(mesh, lift, blocking)
+        if number == 0:
+            some = picked[: count // SELDOM]
+            clear = unblocked(sight.at(some), normal[some], pictures, moves, mean, some)
+        score = agreement(sight.at(picked), normal[picked], pictures, moves, clear[:, picked])
         place, trust = best_places(score, moves)
         trust[low[picked]] = 0
         along = np.where(low[:, None], normal - (normal @ upright)[:, None] * upright, normal)
@@ -121,15 +129,54 @@ def refine(mesh: Mesh, pictures: list[Picture], blocking: Caster, lift: float, f
     return mesh
 
 
-def agreement(sight: Visibility, normal: np.ndarray, pictures: list[Picture], moves: np.ndarray) -> np.ndarray:
-    """How alike photos show the patches [P, M] around vertices [P] that are moved [M] along normals [P, 3]. The mean
-    correlation between any two of the photos, -1 where too few show a vertex."""
-    count = len(normal)
-    cosine = np.zeros((len(pictures), count), np.float32)
+def agreement(
+    sight: Visibility, normal: np.ndarray, pictures: list[Picture], moves: np.ndarray, clear: np.ndarray
+) -> np.ndarray:
+    """How alike photos show the patches [P, M] around vertices [P] that are moved [M] along normals [P, 3]: the mean
+    correlation between any two of those that are `clear` [K, P], -1 where too few show a vertex."""
+    result = np.full((len(normal), len(moves)), -1.0)
+    for part, number, found in patches(sight, normal, pictures, moves, clear, PHOTOS):
+        used = (number >= 0).sum(0)[:, None]
+        result[part] = ((found.sum(2) ** 2).sum(2) - used) / (used * (used - 1))
+    return result
+
+
+def unblocked(sight: Visibility, normal: np.ndarray, pictures: list[Picture], moves: np.ndarray, mean: csr_matrix,
+              picked: np.ndarray) -> np.ndarray:  # fmt: skip
+    """Whether nothing stands before photos [K, V] where they seem to show vertices: asked at those `picked`, as seen
+    by `sight` with normals, and the same around them."""
+    count = mean.shape[0]
+    support, asked = np.zeros((count, len(pictures))), np.zeros((count, len(pictures)))
+    every = np.ones((len(pictures), len(picked)), bool)
+    for part, number, found in patches(sight, normal, pictures, moves, every, ASKED):
+        alike = found @ found.swapaxes(2, 3)  # [S, M, ASKED, ASKED]
+        alike[:, :, range(len(number)), range(len(number))] = -1
+        best = np.sort(alike, 3)[..., -(FEWEST - 1) :].mean(3)
+        best = best[np.arange(len(part)), best.max(2).argmax(1)]
+        vertex, slot = np.nonzero(number.T >= 0)
+        at = picked[part[vertex]], number[slot, vertex]
+        support[at], asked[at] = best[vertex, slot], 1
+    for _ in range(AROUND):
+        support, asked = mean @ support, mean @ asked
+    support = support / asked.clip(1e-9)
+    return (support >= CLEAR * support.max(1, keepdims=True)).T
+
+
+def patches(
+    sight: Visibility, normal: np.ndarray, pictures: list[Picture], moves: np.ndarray, clear: np.ndarray, most: int
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """The patches around vertices [P], moved [M] along normals [P, 3], in the photos that look straightest, at most so
+    many and only those that are `clear` [K, P].
+
+    Yields some of the vertices [S] after the others, the number of each photo [most, S], -1 for none, and grey levels
+    [S, M, most, G] as in `normalised`; only vertices that `FEWEST` photos show.
+    """
+    cosine = np.zeros((len(pictures), len(normal)), np.float32)
     for number, picture in enumerate(pictures):
         index, _, straight = sight.of_view(picture.view)
         cosine[number, index] = np.where(straight > STRAIGHT, straight, 0)
-    chosen = np.argsort(-cosine, 0)[:PHOTOS]
+    cosine *= clear
+    chosen = np.argsort(-cosine, 0)[:most]
     shown = np.take_along_axis(cosine, chosen, 0) > 0
     centers = np.array([picture.view.center for picture in pictures])[chosen[0]]
     pixel = np.array([1 / (picture.view.focal * picture.scale) for picture in pictures])[chosen[0]]
@@ -137,18 +184,16 @@ def agreement(sight: Visibility, normal: np.ndarray, pictures: list[Picture], mo
     frames = np.stack([frame_of(n)[:2] for n in normal])
     grid = np.mgrid[-HALF : HALF + 1, -HALF : HALF + 1].reshape(2, -1)
     patch = pixel[:, None, None] * np.einsum("kg,pkc->pgc", grid, frames)
-    result = np.full((count, len(moves)), -1.0)
-    for part in np.array_split(np.flatnonzero(shown.sum(0) >= FEWEST), count // 400 + 1):
+    for part in np.array_split(np.flatnonzero(shown.sum(0) >= FEWEST), len(normal) // 400 + 1):
         middle = sight.vertices[part][:, None] + moves[:, None] * normal[part][:, None]
         points = middle[:, :, None] + patch[part][:, None]
-        total = np.zeros(points.shape[:3], np.float32)
-        for number, there in zip(chosen[:, part], shown[:, part], strict=True):
-            for which in np.unique(number[there]):
-                mine = np.flatnonzero(there & (number == which))
-                total[mine] += normalised(pictures[which], points[mine])
-        used = shown[:, part].sum(0)[:, None]
-        result[part] = ((total**2).sum(2) - used) / (used * (used - 1))
-    return result
+        number = np.where(shown[:, part], chosen[:, part], -1)
+        found = np.zeros((*points.shape[:2], len(number), points.shape[2]), np.float32)
+        for slot, which in enumerate(number):
+            for one in np.unique(which[which >= 0]):
+                mine = np.flatnonzero(which == one)
+                found[mine, :, slot] = normalised(pictures[one], points[mine])
+        yield part, number, found
 
 
 def normalised(picture: Picture, points: np.ndarray) -> np.ndarray:

@@ -87,7 +87,7 @@ class Plan:
 PLANS = {
     "default": Plan(),
     # A surface from a few minutes of training is not known as exactly as a full fit would follow it.
-    "quick": Plan(steps=2000, settle=600),
+    "quick": Plan(steps=1500, settle=600, pool=200_000),
     # Rubanova et al. 2024, section 3.1 and appendix: 400k updates at 1e-5, noise 0.1 drawn again every 100 updates.
     "paper": Plan(
         activation="relu",
