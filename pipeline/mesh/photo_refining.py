@@ -30,8 +30,8 @@ NOISE = 4.0  # variance of grey levels that is no texture
 # What is not reconstructed may stand before a photo. That one agrees with no others around there: with the best two of
 # ASKED photos by less than CLEAR times as well as any photo does. One vertex of so many is asked.
 ASKED, CLEAR, SELDOM = 8, 0.5, 16
-# How far vertices are moved, in cells of the field's finest grid; the second round looks in half that range.
-REACH, ROUNDS = 1.3, 2
+# How far vertices are moved, in cells of the field's finest grid; the last round looks in half that range.
+REACH, ROUNDS = 1.3, 3
 EVERY = 4  # one vertex of so many is looked at, the others follow
 ALIKE, SURE = 0.35, 0.9  # correlations between which trust in a place rises
 SPREAD = 3.0  # of the usual difference from the surface around it, at which a place is no longer trusted
@@ -92,7 +92,7 @@ def refine(mesh: Mesh, pictures: list[Picture], blocking: Caster, lift: float, f
             normal = normal + mean @ normal
             normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         picked = np.random.default_rng(number).permutation(count)[: count // EVERY]
-        moves = np.linspace(-1, 1, PLACES) * REACH * finest / 2**number
+        moves = np.linspace(-1, 1, PLACES) * REACH * finest / (1 if number + 1 < ROUNDS else 2)
         sight = Visibility(mesh, lift, blocking)
         if number == 0:
             some = picked[: count // SELDOM]
