@@ -40,6 +40,8 @@ LEAST_PART, ALL_ALONG = 0.08, 0.65
 THROUGH = 0.6
 # Two parts are apart if their seam is smaller than this share of the smaller one's surface, or their colours differ.
 NARROW, COLORS = 0.06, 0.12
+# Where colours differ twice as much as that, this share of a groove will do.
+SHALLOW = 0.75
 # How far a line where parts meet may be from a plane, as a share of its width, beyond a sample.
 FLAT = 0.1
 # Parts touch that have so many samples beside one another.
@@ -378,15 +380,15 @@ def _apart(solid: Solid, label: np.ndarray, found: list[Seam], pair: tuple[int, 
     seam, cell, part = between[0], solid.volume.cell, flood(solid, label, found)
     if any(not (part == k).any() or np.ptp(np.argwhere(part == k), axis=0).min() * cell < least for k in pair):
         return False
-    deep = groove[KDTree(solid.points).query(seam.rim)[1]]
-    along = (deep > GROOVE).mean() > ALL_ALONG and deep.mean() > DEEP
+    first, second = (_hue(colors[label == k].mean(0)) for k in pair)
+    differ = float(np.linalg.norm(first - second))
+    deep, enough = groove[KDTree(solid.points).query(seam.rim)[1]], SHALLOW if differ > 2 * COLORS else 1.0
+    along = (deep > GROOVE).mean() > enough * ALL_ALONG and deep.mean() > enough * DEEP
     beyond = _walled(solid, seam)[1]
     area = (np.abs(beyond) < WALL * cell).sum() * cell**2 / (2 * WALL)
     ring = ConvexHull((seam.rim - seam.point) @ frame_of(seam.normal)[:2].T, qhull_options="QJ").volume
     skin = min((solid.border & (part == k)).sum() * cell**2 for k in pair)
-    first, second = (_hue(colors[label == k].mean(0)) for k in pair)
-    differ = np.linalg.norm(first - second) > COLORS
-    return bool(along and area > THROUGH * ring and (area < NARROW * skin or differ))
+    return bool(along and area > THROUGH * ring and (area < NARROW * skin or differ > COLORS))
 
 
 def _hue(color: np.ndarray) -> np.ndarray:
