@@ -84,7 +84,7 @@ def refine(mesh: Mesh, pictures: list[Picture], blocking: Caster, lift: float, f
     links = ((links + links.T) > 0).astype(float)
     mean = diags(1 / np.asarray(links.sum(1)).ravel()) @ links
     low = height(mesh.vertices) < layer
-    clear = np.ones((len(pictures), count), bool)
+    clear = np.ones((len(pictures), count), bool)  # until the first round has asked
     upright = height(np.eye(3)) - height(np.zeros((1, 3))) if low.any() else np.zeros(3)
     for number in range(ROUNDS):
         normal = vertex_normals(mesh)
@@ -95,8 +95,7 @@ def refine(mesh: Mesh, pictures: list[Picture], blocking: Caster, lift: float, f
         moves = np.linspace(-1, 1, PLACES) * REACH * finest / (1 if number + 1 < ROUNDS else 2)
         sight = Visibility(mesh, lift, blocking)
         if number == 0:
-            some = picked[: count // SELDOM]
-            clear = unblocked(sight.at(some), normal[some], pictures, moves, mean, some)
+            clear = unblocked(sight, normal, pictures, moves, mean, picked[: count // SELDOM])
         score = agreement(sight.at(picked), normal[picked], pictures, moves, clear[:, picked])
         place, trust = best_places(score, moves)
         trust[low[picked]] = 0
@@ -143,12 +142,11 @@ def agreement(
 
 def unblocked(sight: Visibility, normal: np.ndarray, pictures: list[Picture], moves: np.ndarray, mean: csr_matrix,
               picked: np.ndarray) -> np.ndarray:  # fmt: skip
-    """Whether nothing stands before photos [K, V] where they seem to show vertices: asked at those `picked`, as seen
-    by `sight` with normals, and the same around them."""
-    count = mean.shape[0]
-    support, asked = np.zeros((count, len(pictures))), np.zeros((count, len(pictures)))
+    """Whether nothing stands before photos [K, V] where they seem to show vertices with normals [V, 3]: asked at those
+    `picked`, and the same around them."""
+    support, asked = np.zeros((len(normal), len(pictures))), np.zeros((len(normal), len(pictures)))
     every = np.ones((len(pictures), len(picked)), bool)
-    for part, number, found in patches(sight, normal, pictures, moves, every, ASKED):
+    for part, number, found in patches(sight.at(picked), normal[picked], pictures, moves, every, ASKED):
         alike = found @ found.swapaxes(2, 3)  # [S, M, ASKED, ASKED]
         alike[:, :, range(len(number)), range(len(number))] = -1
         best = np.sort(alike, 3)[..., -(FEWEST - 1) :].mean(3)
