@@ -555,7 +555,8 @@ def _nodes(shapes, world, motion, matrix, look, a, b, side, near, pair, went, sc
             continue
         deepest, chosen, lowest = 0.0, -1, 1e300
         facing, d, there = (0.0, 0.0, 0.0), -math.inf, get(shapes.node, shapes.leaf_node[i])
-        slack = look + 4.0 * own * norm(get(shapes.inward, shapes.leaf_node[i]))  # a look from within adds two at most
+        # From within a distance is off by two lengths of the way inwards at most, and so is the next one.
+        slack = look + 4.0 * own * norm(get(shapes.inward, shapes.leaf_node[i]))
         for u in range(shapes.leaf_node[i], shapes.leaf_node[i + 1]):
             p = get(shapes.node, u)
             if flat:
