@@ -144,8 +144,8 @@ class Stage:
 STAGES = {
     "photos": Stage(do_photos, "photos", version=3),
     "poses": Stage(do_poses, "poses", ("seed",), 3),
-    "distill": Stage(do_distill, "distill", ("preset", "seed", "budget"), 3),
-    "mesh": Stage(do_mesh, "mesh", ("preset", "size", "distance", "crop"), 7),
+    "distill": Stage(do_distill, "distill", ("preset", "seed", "budget"), 4),
+    "mesh": Stage(do_mesh, "mesh", ("preset", "size", "distance", "crop"), 8),
     "fit": Stage(do_fit, "assets", ("seed", "budget", "recipe")),
     "scene": Stage(do_scene, "scene", ("seed", "drop", "material"), 3),
 }

@@ -76,9 +76,9 @@ def refine(mesh: Mesh, pictures: list[Picture], blocking: Caster, lift: float, f
     Below `layer` of `height`, above the plane that the body stands on, no photo tells the body from its plane; vertices
     there move along the plane only.
     """
-    if len(pictures) < FEWEST:
-        return mesh
     count = len(mesh.vertices)
+    if len(pictures) < FEWEST or count < SELDOM:
+        return mesh
     edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
     links = coo_matrix((np.ones(len(edges)), edges.T), shape=(count, count)).tocsr()
     links = ((links + links.T) > 0).astype(float)
@@ -143,8 +143,9 @@ def agreement(
 def unblocked(sight: Visibility, normal: np.ndarray, pictures: list[Picture], moves: np.ndarray, mean: csr_matrix,
               picked: np.ndarray) -> np.ndarray:  # fmt: skip
     """Whether nothing stands before photos [K, V] where they seem to show vertices with normals [V, 3]: asked at those
-    `picked`, and the same around them."""
-    support, asked = np.zeros((len(normal), len(pictures))), np.zeros((len(normal), len(pictures)))
+    `picked`, and the same around them; yes where they were not asked."""
+    support = np.zeros((len(pictures), len(normal)), np.float32)
+    asked = np.zeros((len(pictures), len(normal)), bool)
     every = np.ones((len(pictures), len(picked)), bool)
     for part, number, found in patches(sight.at(picked), normal[picked], pictures, moves, every, ASKED):
         alike = found @ found.swapaxes(2, 3)  # [S, M, ASKED, ASKED]
@@ -152,12 +153,15 @@ def unblocked(sight: Visibility, normal: np.ndarray, pictures: list[Picture], mo
         best = np.sort(alike, 3)[..., -(FEWEST - 1) :].mean(3)
         best = best[np.arange(len(part)), best.max(2).argmax(1)]
         vertex, slot = np.nonzero(number.T >= 0)
-        at = picked[part[vertex]], number[slot, vertex]
-        support[at], asked[at] = best[vertex, slot], 1
-    for _ in range(AROUND):
-        support, asked = mean @ support, mean @ asked
-    support = support / asked.clip(1e-9)
-    return (support >= CLEAR * support.max(1, keepdims=True)).T
+        at = number[slot, vertex], picked[part[vertex]]
+        support[at], asked[at] = best[vertex, slot], True
+    for photo, there in zip(support, asked, strict=True):  # photo by photo: all at once may not fit into memory
+        total, weight = photo.astype(float), there.astype(float)
+        for _ in range(AROUND if there.any() else 0):
+            total, weight = mean @ total, mean @ weight
+        photo[:] = np.where(weight > 1e-6, total / weight.clip(1e-6), np.inf)
+    told = np.where(np.isfinite(support), support, -1)
+    return (support >= CLEAR * told.max(0)) | (told.max(0) <= 0)
 
 
 def patches(

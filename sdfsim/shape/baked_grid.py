@@ -20,7 +20,7 @@ from sdfsim.shape.mesh import convex_hull
 from sdfsim.shape.mlp_sdf import MlpSdf
 from sdfsim.shape.sdf import Sdf
 
-BAKE_VERSION = 1
+BAKE_VERSION = 2
 SIDE = 8  # cells of a brick along each side
 CELLS = 128  # along the largest extent of a solid
 FINEST = 512  # likewise, where walls are thin

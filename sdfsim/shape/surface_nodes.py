@@ -21,6 +21,7 @@ PROJECTIONS = 3
 DEFAULT_GRID = 24
 DEFAULT_COUNT = 512  # what the bundled model was trained with; docs/tradeoff.md has what fewer cost
 DIRECTIONS = 1000  # in which nodes are to reach as far as the surface
+CHUNK = 10_000  # points looked at together
 # Faces that meet at less than this cosine (20 degrees) make an edge worth nodes of its own.
 SHARP = 0.94
 
@@ -178,15 +179,21 @@ def _reaching(points: np.ndarray, count: int) -> np.ndarray:
     k = np.arange(DIRECTIONS) + 0.5
     turn, height = np.pi * (1 + np.sqrt(5)) * k, 1 - 2 * k / DIRECTIONS  # a spiral over the unit sphere
     flat = np.sqrt(1 - height**2)
-    outer = _outer(points)
-    along = np.stack([flat * np.cos(turn), flat * np.sin(turn), height], 1) @ points[outer].T
+    directions = np.stack([flat * np.cos(turn), flat * np.sin(turn), height], 1)
+    best, most = np.zeros(DIRECTIONS, np.int64), np.full(DIRECTIONS, -np.inf)
+    for start in range(0, len(points), CHUNK):
+        along = directions @ points[start : start + CHUNK].T
+        best = np.where(along.max(1) > most, start + along.argmax(1), best)
+        most = np.maximum(most, along.max(1))
+    outer = points[np.unique(best)]
+    along = directions @ outer.T
     farthest, reached = along.max(1), np.full(DIRECTIONS, -np.inf)
     tolerance = 1e-6 * float(np.ptp(points, axis=0).max())
     chosen: list[int] = []
     while len(chosen) < count and (farthest - reached).max() > tolerance:
         chosen.append(int(along[(farthest - reached).argmax()].argmax()))
         reached = np.maximum(reached, along[:, chosen[-1]])
-    return points[outer[chosen]]
+    return outer[chosen]
 
 
 def _outer(vertices: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from scipy.spatial import KDTree
 from sdfsim.shape import primitives
 from sdfsim.shape.mesh import Mesh, sample_surface
 from sdfsim.shape.sdf import BoxSdf, MeshSdf, SphereSdf
-from sdfsim.shape.surface_nodes import edge_nodes, hull_nodes, sample_nodes, surface_nodes, thin
+from sdfsim.shape.surface_nodes import _reaching, edge_nodes, hull_nodes, sample_nodes, surface_nodes, thin
 
 
 @pytest.mark.parametrize("scale", [0.01, 1.0, 300.0])
@@ -101,8 +101,12 @@ def test_of_a_box_the_corners_reach_farthest_and_nothing_else() -> None:
     import trimesh
 
     box = trimesh.creation.box((1.0, 0.6, 0.4)).subdivide().subdivide()
-    mesh = Mesh(box.vertices, box.faces)
-    nodes = surface_nodes(BoxSdf((0.5, 0.3, 0.2)), mesh, 512)
-    corners = np.abs(nodes[:8]) - [0.5, 0.3, 0.2]
-    np.testing.assert_allclose(corners, 0.0, atol=1e-12)
-    assert len(np.unique(nodes[:8], axis=0)) == 8
+    corners = _reaching(box.vertices, 170)
+    assert len(np.unique(corners, axis=0)) == len(corners) == 8
+    np.testing.assert_allclose(np.abs(corners) - [0.5, 0.3, 0.2], 0.0, atol=1e-12)
+
+
+def test_of_a_flat_sheet_its_rim_reaches_farthest() -> None:
+    x, y = np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-1, 1, 21))
+    corners = _reaching(np.stack([x, y, 0 * x], -1).reshape(-1, 3), 170)
+    assert len(corners) == 4 and (np.abs(corners[:, :2]) == 1.0).all()

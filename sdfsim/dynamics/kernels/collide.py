@@ -43,6 +43,7 @@ KEYS = 1024  # patches of a shape at most
 ALIKE = 0.9  # cosine between normals that are taken for one
 ROUNDS = 12  # of refinement
 NEAR = 3.0  # cells: so near to its surface a grid is fine
+FARTHER = 2.0  # cells: by so much it is too far elsewhere, at a tip
 OUTWARD = 1e-3  # how much deeper another node must be to be preferred to one that is farther out by a length
 STRIDE, FINEST = 0.02, 5e-4  # of a body's size, the first step of the refinement and the last
 MANY = 192  # pairs from which on threads are worth their while, also beside other programs
@@ -545,6 +546,7 @@ def _nodes(shapes, world, motion, matrix, look, a, b, side, near, pair, went, sc
     k, own = world.scale[other], world.scale[one]
     stride = STRIDE * shapes.clump_ball[shapes.clump_start[r], 3]
     flat = table[s, KIND] == PLANE  # whose distance has one normal: no look from within
+    slack = k * _too_far(table, s)
     kept = 0
     for at in range(near.start[pair, side], near.start[pair, side] + near.count[pair, side]):
         i = near.leaf[at]
@@ -554,18 +556,16 @@ def _nodes(shapes, world, motion, matrix, look, a, b, side, near, pair, went, sc
         if near.away[at] - went > look:
             continue
         deepest, chosen, lowest = 0.0, -1, 1e300
-        facing, d, there = (0.0, 0.0, 0.0), -math.inf, get(shapes.node, shapes.leaf_node[i])
-        # From within a distance is off by two lengths of the way inwards at most, and so is the next one.
-        slack = look + 4.0 * own * norm(get(shapes.inward, shapes.leaf_node[i]))
+        facing, d, off, there = (0.0, 0.0, 0.0), -math.inf, 0.0, get(shapes.node, shapes.leaf_node[i])
         for u in range(shapes.leaf_node[i], shapes.leaf_node[i + 1]):
-            p = get(shapes.node, u)
+            p, within = get(shapes.node, u), get(shapes.inward, u)
             if flat:
                 d, n = k * (dot(w[2], p) + c[2]), (0.0, 0.0, 1.0)
-            elif d - own * norm(sub(p, there)) > slack:
-                continue  # too near to one that is far
+            elif d - own * (norm(sub(p, there)) + 2.0 * (norm(within) + off)) > look + slack:
+                continue  # too near to one that is far; a look from within is off by twice the way inwards at most
             else:
-                d, n = _gap(table, brick, sample, s, w, c, p, get(shapes.inward, u))
-                there, d = p, d * k
+                d, n = _gap(table, brick, sample, s, w, c, p, within)
+                there, off, d = p, norm(within), d * k
             score = d - OUTWARD * own * norm(p)
             if d <= look and score < lowest:
                 deepest, chosen, lowest, facing = d, u, score, n
@@ -707,8 +707,9 @@ def _round(shapes, world, motion, matrix, reach, a, b, side, found, at):
 @njit(**BARE)
 def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, least, enough, refresh):
     """The least distance of pair p with its two bodies at `place` and `frame`, of the nodes that were near; `least`
-    where all are farther, and any that is `enough`. `went` is how much nearer two points may have come since `near`
-    was made; whether the poses are those of the bodies, so that `near` may take up how far leaves are (`refresh`)."""
+    where all are farther, and any that is less than `enough`. `went` is how much nearer two points may have come since
+    `near` was made; whether the poses are those of the bodies, so that `near` may take up how far leaves are
+    (`refresh`)."""
     table, brick, sample = shapes.table, shapes.brick, shapes.sample
     for side in range(2):
         s, t = shape[pairs[p, side]], shape[pairs[p, 1 - side]]
@@ -734,15 +735,21 @@ def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, lea
                     continue
                 e = near.leaf[i]
                 if refresh or _beyond(shapes, t, w, c, k, scales[side], e) < least:
-                    there, d = get(shapes.node, shapes.leaf_node[e]), -math.inf
+                    there, d, slack = get(shapes.node, shapes.leaf_node[e]), -math.inf, k * _too_far(table, t)
                     for u in range(shapes.leaf_node[e], shapes.leaf_node[e + 1]):
                         p_u = get(shapes.node, u)
-                        if d - scales[side] * norm(sub(p_u, there)) < least:  # else too near to one that is far
+                        if d - scales[side] * norm(sub(p_u, there)) - slack < least:  # else too near to one that is far
                             there, d = p_u, k * distance_alone(table, brick, sample, t, mapped(w, c, p_u))
                             least = min(least, d)
-                    if least <= enough:
+                    if least < enough:
                         return least
     return least
+
+
+@njit(**BARE)
+def _too_far(table, t):
+    """By how much the distance of shape t may be more than the true one: between the corners of a grid's bricks."""
+    return FARTHER * table[t, CELL] if table[t, KIND] == GRID else 0.0
 
 
 @njit(**BARE)

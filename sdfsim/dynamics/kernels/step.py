@@ -277,7 +277,7 @@ def _clear(shapes, world, motion, work, rules, manifolds, near, p, speed, depth)
             for x in range(4):
                 turned[side, x] = q[x]
             to_matrix(turned, side, frame)
-        rest = (1.0 - t) * way - deep  # what is no nearer is not met before the end
+        rest = max((1.0 - t) * way - deep, -0.5 * deep)  # what is no nearer is not met before the end
         gap = nearest(
             shapes, world.shape, place, frame, scales, coms, manifolds.pair, near, p, gone + t * way, rest,
             0.0 if t == 0.0 else -0.5 * deep, t == 0.0,
