@@ -12,7 +12,7 @@ from sdfsim.shape.shape import Shape
 
 
 def points(shape: Shape, count: int | None) -> Shape:
-    """The shape with the first `count` of its nodes (None: all). They are those that reach farthest, then the most spread."""
+    """The shape with the first `count` of its nodes (None: all): those that reach farthest, then the most spread."""
     return replace(shape, nodes=shape.nodes[:count])
 
 
