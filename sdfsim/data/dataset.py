@@ -182,10 +182,23 @@ def floor_of(info: dict) -> tuple[float, float]:
         raise SdfsimError(f"{INFO}: floor: must have friction and restitution (got {told!r})") from error
 
 
-def product_range(values: np.ndarray, floor: float) -> list[float]:
-    """[low, high] of the products of two bodies' coefficients, or of a body's and the floor's."""
-    low, high = float(values.min()), float(values.max())
-    return [low * min(low, floor), high * max(high, floor)]
+def ranges_of(
+    size: np.ndarray, speed: np.ndarray, mass_ratio: np.ndarray, friction: np.ndarray, restitution: np.ndarray
+) -> dict[str, list[float]]:
+    """[low, high] of what a model has seen, SI units: sizes and speeds of the bodies that move, mass ratios within a
+    scene, and the products of two bodies' coefficients, or of a body's and the floor's."""
+
+    def products(values: np.ndarray, floor: float) -> list[float]:
+        low, high = float(values.min()), float(values.max())
+        return [low * min(low, floor), high * max(high, floor)]
+
+    return {
+        "size": [float(size.min()), float(size.max())],
+        "speed": [0.0, float(np.percentile(speed, 99.9))],
+        "mass_ratio": [1.0, float(mass_ratio.max())],
+        "friction": products(friction, FLOOR[0]),
+        "restitution": products(restitution, FLOOR[1]),
+    }
 
 
 def trajectory_files(folder: Path, split: str) -> list[Path]:

@@ -8,7 +8,6 @@ network meets states that are a little beside what is recorded.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,16 +22,16 @@ from sdfsim.dynamics.free_flight import torque_free
 from sdfsim.dynamics.models.contact_graph import SUBSTEPS
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_arrays, write_arrays
-from sdfsim.parallel import parallel
+from sdfsim.parallel import Progress, parallel, silent
 
 if TYPE_CHECKING:
     from sdfsim.dynamics.bodies import Bodies, State
     from sdfsim.dynamics.solver import Acts
+    from sdfsim.dynamics.step import StepOptions
 
 STEP = 0.02  # s, the step that networks know
 FRAMES_VERSION = 8  # counts up whenever frames of the same recordings come out differently
 TOGETHER = 25  # trajectories that are followed side by side
-_SMALL = {"first": np.int16, "second": np.int16}
 
 
 @dataclass(frozen=True)
@@ -127,32 +126,31 @@ class ContactFrames:
         return digest.hexdigest()[:16]
 
 
-def contact_frames(
-    data: Path, split: str, how: Solved, *, on_progress: Callable[[float, str], None] | None = None
-) -> ContactFrames:
+def contact_frames(data: Path, split: str, how: Solved, *, on_progress: Progress = silent) -> ContactFrames:
     """The contact frames of a dataset split: from the cache file beside it, else made now and cached. Raises
-    SdfsimError for no trajectories, unreadable ones, or some that differ in step or gravity."""
+    SdfsimError for no trajectories, unreadable ones, some that differ in step or gravity, or none with a contact."""
     folder = data / "frames"
     name = f"{split}-{how.stride}-{how.inner}-{how.draws}"
-    if not (data / split).is_dir():
+    made = list(folder.glob(f"{name}-*.npz"))
+    if not (data / split).is_dir() and len(made) == 1:
         # A machine that only trains may have been given nothing but the cache.
-        made = list(folder.glob(f"{name}-*.npz"))
-        if len(made) == 1:
-            return ContactFrames.load(made[0])
+        return ContactFrames.load(made[0])
     files = trajectory_files(data, split)
     cached = folder / f"{name}-{_fingerprint(data, files, how)}.npz"
     if cached.exists():
         return ContactFrames.load(cached)
     check_alike(str(data / split), map(Trajectory.load, files))
     groups = [files[i : i + TOGETHER] for i in range(0, len(files), TOGETHER)]
-    parts: list[list[dict[str, np.ndarray]]] = [[]] * len(groups)
+    parts: list[list[ContactFrames]] = [[]] * len(groups)
     for done, (index, part) in enumerate(parallel(_followed, [(group, how) for group in groups]), start=1):
         parts[index] = part
-        if on_progress:
-            on_progress(done / len(groups), f"contacts of {split}, part {done} of {len(groups)}")
-    frames = _concatenate([p for part in parts for p in part], Trajectory.load(files[0]).gravity, len(files))
+        on_progress(done / len(groups), f"contacts of {split}, part {done} of {len(groups)}")
+    steps = [step for part in parts for step in part]
+    if not steps:
+        raise SdfsimError(f"{data / split}: nothing touches anything in its trajectories")
+    frames = replace(join_frames(steps), trajectories=np.array([len(files)]))
     folder.mkdir(exist_ok=True)
-    for old in folder.glob(f"{name}-*.npz"):
+    for old in made:
         old.unlink()
     frames.save(cached)
     return frames
@@ -193,8 +191,8 @@ def _fingerprint(data: Path, files: list[Path], how: Solved) -> str:
     return digest.hexdigest()[:12]
 
 
-def _followed(files: list[Path], how: Solved) -> list[dict[str, np.ndarray]]:
-    """Parts of the arrays, one for each draw and step: all trajectories of a group at that step."""
+def _followed(files: list[Path], how: Solved) -> list[ContactFrames]:
+    """The frames of each draw and step: of all trajectories of a group at that step."""
     from sdfsim.data.batching import merged  # needs the SDFs, hence more than torch and numpy
     from sdfsim.dynamics.bodies import Units
     from sdfsim.dynamics.run_memory import Memory
@@ -218,7 +216,7 @@ def _followed(files: list[Path], how: Solved) -> list[dict[str, np.ndarray]]:
             state = _disturbed(bodies, state, how, rng) if draw else state
             after, acts = solver_step(bodies, state, rules, memory, note=True)
             touch = after.touch
-            parts += _of_step(bodies, state, after, acts, _recorded(group, now + how.stride, start), rules.dt)
+            parts += _of_step(bodies, state, after, acts, _recorded(group, now + how.stride, start), rules)
     return parts
 
 
@@ -257,9 +255,9 @@ def _disturbed(bodies: Bodies, state: State, how: Solved, rng: np.random.Generat
 
 
 def _of_step(
-    bodies: Bodies, state: State, after: State, acts: Acts, recorded: State, dt: float
-) -> list[dict[str, np.ndarray]]:
-    """The frames of a step of several trajectories as one part of the arrays, in units in which it lasts `STEP`."""
+    bodies: Bodies, state: State, after: State, acts: Acts, recorded: State, rules: StepOptions
+) -> list[ContactFrames]:
+    """The frames of a step of several trajectories, in units in which it lasts `STEP`; none where nothing touches."""
     if not len(acts):
         return []
     floor = len(bodies) - 1
@@ -268,60 +266,55 @@ def _of_step(
     order = np.argsort(of_edge, kind="stable")
     used, count = np.unique(of_edge, return_counts=True)
     rows = np.flatnonzero(np.isin(world, used))
-    sizes = np.bincount(world[rows])[used]
-    begins = np.searchsorted(world[:floor], np.arange(world.max() + 1))
-    time = dt / STEP
+    begins = np.searchsorted(world[:floor], np.arange(world.max() + 1))[of_edge[order]]
+    first, second = acts.first.numpy()[order], acts.second.numpy()[order]
+    time = rules.dt / STEP
     length = time**2
+    speed = length / time
 
     def body(values: torch.Tensor, unit: float = 1.0) -> np.ndarray:
-        return values.numpy()[rows] / unit
+        return (values.numpy()[rows] / unit).astype(np.float32)
 
     def edge(values: torch.Tensor, unit: float = 1.0) -> np.ndarray:
-        return values.numpy()[order] / unit
+        return (values.numpy()[order] / unit).astype(np.float32)
 
-    def turned(end: State) -> torch.Tensor:
-        return pose.to_rotvec(pose.multiply(end.orientation, pose.conjugate(state.orientation))) / dt
+    def motion(end: State, names: tuple[str, str, str, str]) -> dict[str, np.ndarray]:
+        """Velocities at the end of the step, and mean ones over it."""
+        turned = pose.to_rotvec(pose.multiply(end.orientation, pose.conjugate(state.orientation)))
+        parts = (
+            body(end.velocity, speed),
+            body(end.angular_velocity, 1.0 / time),
+            body((end.position - state.position) / rules.dt, speed),
+            body(turned / rules.dt, 1.0 / time),
+        )
+        return dict(zip(names, parts, strict=True))
 
-    free = torque_free(state.orientation, state.angular_velocity, bodies.inertia, dt)[1]
-    second = acts.second.numpy()[order]
-    speed = length / time
-    result = {
-        "bodies": sizes,
-        "edges": count,
-        "orientation": body(state.orientation),
-        "velocity": body(state.velocity, speed),
-        "angular": body(state.angular_velocity, 1.0 / time),
-        "free_angular": body(free, 1.0 / time),
-        "mass": body(bodies.mass),
-        "inertia": body(bodies.inertia.diagonal(dim1=-2, dim2=-1), length**2),
-        "friction": body(bodies.friction),
-        "restitution": body(bodies.restitution),
-        "size": body(bodies.size, length),
-        "first": acts.first.numpy()[order] - begins[of_edge[order]],
-        "second": np.where(second == floor, -1, second - begins[of_edge[order]]),
-        "arm_first": edge(acts.arm_first, length),
-        "arm_second": edge(acts.arm_second, length),
-        "normal": edge(acts.normal),
-        "impulse": edge(acts.impulse, speed),
-        "gap": edge(acts.gap, length),
-        "when": edge(acts.when),
-    }
-    names = (("solved_velocity", "solved_angular", "solved_moved", "solved_turned"),)
-    names += (("end_velocity", "end_angular", "moved", "turned"),)
-    for (velocity, angular, moved, turning), end in zip(names, (after, recorded), strict=True):
-        result[velocity] = body(end.velocity, speed)
-        result[angular] = body(end.angular_velocity, 1.0 / time)
-        result[moved] = body((end.position - state.position) / dt, speed)
-        result[turning] = body(turned(end), 1.0 / time)
-    return [result]
-
-
-def _concatenate(parts: list[dict[str, np.ndarray]], gravity: np.ndarray, trajectories: int) -> ContactFrames:
-    joined = {k: np.concatenate([p[k] for p in parts]) for k in parts[0]}
-    starts = {
-        "body_start": np.concatenate([[0], np.cumsum(joined.pop("bodies"))]),
-        "edge_start": np.concatenate([[0], np.cumsum(joined.pop("edges"))]),
-    }
-    small = {k: v.astype(_SMALL.get(k, np.float32)) for k, v in joined.items()}
-    common = {"dt": STEP, "gravity": np.asarray(gravity), "trajectories": np.array([trajectories])}
-    return ContactFrames(**starts, **small, **common)
+    free = torque_free(state.orientation, state.angular_velocity, bodies.inertia, rules.dt)[1]
+    return [
+        ContactFrames(
+            body_start=np.concatenate([[0], np.cumsum(np.bincount(world[rows])[used])]),
+            edge_start=np.concatenate([[0], np.cumsum(count)]),
+            orientation=body(state.orientation),
+            velocity=body(state.velocity, speed),
+            angular=body(state.angular_velocity, 1.0 / time),
+            free_angular=body(free, 1.0 / time),
+            **motion(after, ("solved_velocity", "solved_angular", "solved_moved", "solved_turned")),
+            **motion(recorded, ("end_velocity", "end_angular", "moved", "turned")),
+            mass=body(bodies.mass),
+            inertia=body(bodies.inertia.diagonal(dim1=-2, dim2=-1), length**2),
+            friction=body(bodies.friction),
+            restitution=body(bodies.restitution),
+            size=body(bodies.size, length),
+            first=(first - begins).astype(np.int16),
+            second=np.where(second == floor, -1, second - begins).astype(np.int16),
+            arm_first=edge(acts.arm_first, length),
+            arm_second=edge(acts.arm_second, length),
+            normal=edge(acts.normal),
+            impulse=edge(acts.impulse, speed),
+            gap=edge(acts.gap, length),
+            when=edge(acts.when),
+            dt=STEP,
+            gravity=rules.gravity.numpy(),
+            trajectories=np.zeros(1, dtype=np.int64),
+        )
+    ]

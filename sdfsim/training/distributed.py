@@ -8,15 +8,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 
 @dataclass(frozen=True)
 class Team:
     """One of `size` processes that share every batch: each works on its part, gradients are added up."""
 
-    rank: int = 0  # 0 ... size - 1; the first writes all files.
-    size: int = 1  # how many there are
+    rank: int = 0  # 0 ... size - 1
+    size: int = 1
 
     @property
     def leads(self) -> bool:
@@ -48,11 +48,10 @@ class Team:
         """Replace everybody's gradients by their sum."""
         if self.size == 1:
             return
-        gradients: list[Tensor] = [p.grad if p.grad is not None else torch.zeros_like(p) for p in parameters]
-        flat = torch.cat([g.flatten() for g in gradients])
+        gradients = [p.grad if p.grad is not None else torch.zeros_like(p) for p in parameters]
+        flat = nn.utils.parameters_to_vector(gradients)
         torch.distributed.all_reduce(flat)
-        for gradient, part in zip(gradients, flat.split([g.numel() for g in gradients]), strict=True):
-            gradient.copy_(part.reshape(gradient.shape))
+        nn.utils.vector_to_parameters(flat, gradients)
 
     def wait(self) -> None:
         """Until everybody has got here."""
@@ -71,7 +70,6 @@ def gather_team(device: str) -> tuple[Team, str]:
     cuda = device != "cpu" and torch.cuda.is_available()
     if not torch.distributed.is_initialized():
         torch.distributed.init_process_group("nccl" if cuda else "gloo")
-    team = Team(torch.distributed.get_rank(), size)
     if cuda:
         torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
-    return team, "cuda" if cuda else "cpu"
+    return Team(torch.distributed.get_rank(), size), "cuda" if cuda else "cpu"

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sdfsim.data.dataset import FLOOR, product_range
+from sdfsim.data.dataset import FLOOR, ranges_of
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.models.contact_graph import ContactGraph, number_pairs
 from sdfsim.dynamics.models.impulse import ImpulseNetwork, Velocities
@@ -36,38 +36,23 @@ class ImpulseTask:
         self.frames = frames
         self.device = device
         self.weight = _importance(frames)
+        self.counts = frames.trajectories.tolist()  # trajectories of each set of frames
+        self.dt = frames.dt
+        self.gravity = float(np.linalg.norm(frames.gravity))
 
     def digest(self) -> str:
         """Changes with the data."""
         return self.frames.digest()
 
-    @property
-    def counts(self) -> list[int]:
-        """Trajectories of each dataset."""
-        return self.frames.trajectories.tolist()
-
-    @property
-    def dt(self) -> float:
-        """s, the recorded step."""
-        return self.frames.dt
-
-    @property
-    def gravity(self) -> float:
-        """m/s^2, magnitude."""
-        return float(np.linalg.norm(self.frames.gravity))
-
     def ranges(self) -> dict[str, list[float]]:
-        """[low, high] of what the frames hold: coefficients as products of two bodies, SI units."""
+        """What the frames hold; see `ranges_of`."""
         f = self.frames
         moving = f.mass > 0
+        heaviest = np.maximum.reduceat(f.mass, f.body_start[:-1])
+        lightest = np.minimum.reduceat(np.where(moving, f.mass, np.inf), f.body_start[:-1])
         speed = np.linalg.norm(f.velocity[moving], axis=-1)
-        return {
-            "size": _span(f.size[moving]),
-            "speed": [0.0, float(np.percentile(speed, 99.9))],
-            "mass_ratio": [1.0, _mass_ratio(f)],
-            "friction": product_range(f.friction, FLOOR[0]),
-            "restitution": product_range(f.restitution, FLOOR[1]),
-        }
+        ratios = (heaviest / lightest)[heaviest > 0]
+        return ranges_of(f.size[moving], speed, ratios, f.friction, f.restitution)
 
     def draw(self, rng: np.random.Generator, count: int, team: Team = ALONE) -> Batch:
         """A batch of `count` frames, or the part of it that falls to one of a team."""
@@ -99,10 +84,6 @@ class ImpulseTask:
             return torch.from_numpy(array[edges]).to(self.device)
 
         pair, pairs = number_pairs(index[0], index[1], len(mass))
-        coefficients = {
-            "friction": _product(body(f.friction, FLOOR[0]), index),
-            "restitution": _product(body(f.restitution, FLOOR[1]), index),
-        }
         graph = ContactGraph(
             inverse_mass=torch.where(moves, 1.0 / mass.clamp_min(1e-9), torch.zeros_like(mass)),
             inverse_inertia=inverse_inertia,
@@ -124,8 +105,9 @@ class ImpulseTask:
             impulse=edge(f.impulse),
             gap=edge(f.gap),
             when=edge(f.when),
+            friction=body(f.friction, FLOOR[0])[index].prod(0),
+            restitution=body(f.restitution, FLOOR[1])[index].prod(0),
             dt=f.dt,
-            **coefficients,
         )
         truth = Velocities(body(f.end_velocity), body(f.end_angular), body(f.moved), body(f.turned))
         counts = torch.zeros_like(moves)
@@ -137,36 +119,21 @@ class ImpulseTask:
         predicted = network(batch.graph, mirrored=mirrored)
         lever = 0.5 * batch.size[:, None]
         terms = [
-            self.size_of(predicted.velocity - batch.truth.velocity),
-            self.size_of(predicted.mean_velocity - batch.truth.mean_velocity),
-            self.size_of((predicted.angular - batch.truth.angular) * lever),
-            self.size_of((predicted.mean_angular - batch.truth.mean_angular) * lever),
+            _size(predicted.velocity - batch.truth.velocity),
+            _size(predicted.mean_velocity - batch.truth.mean_velocity),
+            _size((predicted.angular - batch.truth.angular) * lever),
+            _size((predicted.mean_angular - batch.truth.mean_angular) * lever),
         ]
         return torch.stack(terms).mean(0)[batch.counts].sum() / max(1, int(batch.counts.sum()))
-
-    @staticmethod
-    def size_of(error: Tensor) -> Tensor:
-        """[N] pseudo-Huber size of errors [N, 3] m/s."""
-        return (error.square().sum(-1) + HUBER**2).sqrt() - HUBER
 
     def weight_of(self, batch: Batch) -> int:
         """Over how many bodies a batch's loss is the mean."""
         return int(batch.counts.sum())
 
 
-def _span(values: np.ndarray) -> list[float]:
-    return [float(values.min()), float(values.max())]
-
-
-def _mass_ratio(f: ContactFrames) -> float:
-    """The largest ratio of two masses that move in one frame."""
-    heaviest = np.maximum.reduceat(f.mass, f.body_start[:-1])
-    lightest = np.minimum.reduceat(np.where(f.mass > 0, f.mass, np.inf), f.body_start[:-1])
-    return float((heaviest / lightest)[heaviest > 0].max())
-
-
-def _product(coefficient: Tensor, index: Tensor) -> Tensor:
-    return coefficient[index[0]] * coefficient[index[1]]
+def _size(error: Tensor) -> Tensor:
+    """[N] pseudo-Huber size of errors [N, 3] m/s."""
+    return (error.square().sum(-1) + HUBER**2).sqrt() - HUBER
 
 
 def _ranges(start: np.ndarray, picked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

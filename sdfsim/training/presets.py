@@ -18,39 +18,27 @@ class Preset:
     # surface nodes a body of networks on surface nodes (meshes: about so many vertices); None for all
     nodes: int | None = None
     noise: float | None = None  # m, standard deviation of their pose noise (None: none); *impulse* has its own
-    # the same of Muon, which then trains the hidden matrices; None leaves all to Adam, as published
+    # peak learning rate of Muon, which then trains the hidden matrices; None leaves all to Adam, as published
     matrix_rate: float | None = None
     strides: tuple[int, ...] = (1,)  # recorded steps in a step (impulse); several for a network of several step lengths
     inner: int = 0  # inner steps of the solve in a step; 0 for those of the recording engine
 
 
+LITTLE = {"width": 32, "rounds": 4}
 PUBLISHED = {"width": 128, "steps": 10}  # sizes of SDF-Sim's network
 # The radii of MeshGraphNets and DPI are not in the texts that we have: with these, graphs of MOVi-B have about as many
 # edges between bodies as SDF-Sim's paper counts (docs/paper.md).
+RADII = {"paper": 0.1, "fignet": 0.1, "fignet-star": 0.1, "mgn": 0.02, "mgn-large": 0.38, "dpi": 0.3}
 
 PRESETS = {
-    "small": Preset("impulse", {"width": 32, "rounds": 4}, steps=16_000, batch=32, rate=2e-3, matrix_rate=0.01),
-    "alone": Preset("impulse", {"width": 32, "rounds": 4, "alone": 1}, 16_000, batch=32, rate=2e-3, matrix_rate=0.01),
-    "long": Preset(
-        "impulse",
-        {"width": 32, "rounds": 4},
-        steps=16_000,
-        batch=32,
-        rate=2e-3,
-        matrix_rate=0.01,
-        strides=(1, 2),
-        inner=1,
-    ),
+    "small": Preset("impulse", LITTLE, steps=16_000, batch=32, rate=2e-3, matrix_rate=0.01),
+    "alone": Preset("impulse", LITTLE | {"alone": 1}, steps=16_000, batch=32, rate=2e-3, matrix_rate=0.01),
+    "long": Preset("impulse", LITTLE, steps=16_000, batch=32, rate=2e-3, matrix_rate=0.01, strides=(1, 2), inner=1),
     "base": Preset("impulse", {"width": 128, "rounds": 8}, steps=100_000, batch=64, rate=1e-3, matrix_rate=0.01),
     **{
-        name: Preset(kind, PUBLISHED, steps=1_000_000, batch=8, rate=1e-3, reach=reach, nodes=64, noise=0.003)
-        for name, kind, reach in (
-            ("paper", "paper", 0.1),
-            ("fignet", "fignet", 0.1),
-            ("fignet-star", "fignet-star", 0.1),
-            ("mgn", "mgn", 0.02),
-            ("mgn-large", "mgn", 0.38),
-            ("dpi", "dpi", 0.3),
+        name: Preset(
+            name.removesuffix("-large"), PUBLISHED, 1_000_000, batch=8, rate=1e-3, reach=reach, nodes=64, noise=0.003
         )
+        for name, reach in RADII.items()
     },
 }

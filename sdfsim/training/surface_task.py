@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from sdfsim.data.batching import PLANE, merged
-from sdfsim.data.dataset import FLOOR, Trajectory, check_alike, load_shapes, product_range, trajectory_files
+from sdfsim.data.dataset import Trajectory, check_alike, load_shapes, ranges_of, trajectory_files
 from sdfsim.dynamics import pose
-from sdfsim.dynamics.bodies import Bodies, State, Units
+from sdfsim.dynamics.bodies import Bodies, State, Units, largest_extent
 from sdfsim.dynamics.models.families import FAMILIES
 from sdfsim.dynamics.models.message_passing import Graph, GraphNetwork, flipped
 from sdfsim.dynamics.models.surfaces import TARGET, Near, node_owner, target_acceleration
@@ -45,6 +45,7 @@ class SurfaceTask:
         self.shapes = {k: self.family.surface(s, plan.nodes) for k, s in load_shapes(data, names).items()}
         self.plane = self.family.surface(PLANE, plan.nodes)
         self.reach, self.device, self.noise = plan.reach, device, plan.noise if noisy else None
+        self.counts = [len(self.trajectories)]
         self.dt = self.trajectories[0].dt
         self.gravity = float(np.linalg.norm(self.trajectories[0].gravity))
 
@@ -57,11 +58,6 @@ class SurfaceTask:
         for name, shape in sorted(self.shapes.items()):
             digest.update(name.encode() + np.ascontiguousarray(shape.nodes).tobytes())
         return digest.hexdigest()[:16]
-
-    @property
-    def counts(self) -> list[int]:
-        """Trajectories of each dataset: of the one."""
-        return [len(self.trajectories)]
 
     def prepare(self, network: GraphNetwork, rng: np.random.Generator) -> None:
         """Set the network's feature statistics from a few batches."""
@@ -119,22 +115,16 @@ class SurfaceTask:
         return int(batch.moves.sum())
 
     def ranges(self) -> dict[str, list[float]]:
-        """[low, high] of what the trajectories hold, SI units, coefficients as products with the floor's. Sizes and
-        speeds are those of the bodies that move."""
-        extent = {name: float(np.ptp(shape.sdf.bounds, axis=0).max()) for name, shape in self.shapes.items()}
-        size = np.concatenate([[extent[str(n)] for n in t.shape] * t.scale for t in self.trajectories])
-        size = size[~np.concatenate([t.static for t in self.trajectories])]
-        masses = [t.mass[~t.static] for t in self.trajectories if not t.static.all()]
-        friction = np.concatenate([t.friction for t in self.trajectories])
-        restitution = np.concatenate([t.restitution for t in self.trajectories])
-        speed = np.concatenate([np.linalg.norm(t.velocity[:, ~t.static], axis=-1).ravel() for t in self.trajectories])
-        return {
-            "size": [float(size.min()), float(size.max())],
-            "speed": [0.0, float(np.percentile(speed, 99.9))],
-            "mass_ratio": [1.0, float(max(mass.max() / mass.min() for mass in masses))],
-            "friction": product_range(friction, FLOOR[0]),
-            "restitution": product_range(restitution, FLOOR[1]),
-        }
+        """What the trajectories hold; see `ranges_of`."""
+        extent = {name: largest_extent(shape) for name, shape in self.shapes.items()}
+        moving = [(t, ~t.static) for t in self.trajectories if not t.static.all()]
+        return ranges_of(
+            np.concatenate([(np.array([extent[str(n)] for n in t.shape]) * t.scale)[m] for t, m in moving]),
+            np.concatenate([np.linalg.norm(t.velocity[:, m], axis=-1).ravel() for t, m in moving]),
+            np.array([t.mass[m].max() / t.mass[m].min() for t, m in moving]),
+            np.concatenate([t.friction for t in self.trajectories]),
+            np.concatenate([t.restitution for t in self.trajectories]),
+        )
 
     def _poses(self, picked: list[Trajectory], frames: list[int], offset: int, yaw: Tensor) -> tuple[Tensor, Tensor]:
         """Positions [N, 3] and orientations [N, 4] of all bodies at frame + offset, then the floor's."""

@@ -8,29 +8,23 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
 from sdfsim.data.dataset import SOLID, SPLITS, read_info
 from sdfsim.errors import SdfsimError, run_main
 from sdfsim.files import locked, write_text
+from sdfsim.parallel import Progress, silent
 from sdfsim.training.distributed import gather_team
 from sdfsim.training.presets import PRESETS, Preset
-from sdfsim.training.run import Run, Task, held_out_loss
-from sdfsim.training.validation import Rollouts, held_out_rollouts
-
-if TYPE_CHECKING:
-    from sdfsim.dynamics.model import Model
+from sdfsim.training.run import Run, held_out_loss
 
 CHECKPOINT_SECONDS = 60.0
-LOG_STEPS = 100
-ROLLOUTS = 10  # times in a run that held-out trajectories are rolled out
-
-Progress = Callable[[float, str], None]
+TELL_STEPS = 100
 
 
 def train(
@@ -43,71 +37,61 @@ def train(
     seed: int = 0,
     device: str = "cpu",
     budget: float = math.inf,
-    on_progress: Progress | None = None,
+    on_progress: Progress = silent,
 ) -> dict:
     """Train a preset on one dataset or several; write `model.safetensors`, `log.jsonl` and a checkpoint under `out`.
 
     Datasets have train/ and validation/; several (impulse only) are drawn from as if they were one. The preset is a
     name in `PRESETS`, or one of your own, with other `steps` if given. `resume` goes on from the checkpoint in `out`,
     with the result of an uninterrupted run; `budget` is seconds of processor time, all cores together, after which it
-    stops early. Returns paths, losses and processor time. Raises SdfsimError for an unknown preset, unusable data, a
-    checkpoint in `out` without `resume`, another run writing to it, or diverged training.
+    stops early. Returns paths, losses and processor time. Raises SdfsimError for unusable data, a checkpoint in `out`
+    without `resume`, another run writing to it, or diverged training.
     """
     from sdfsim.dynamics.simulator import pick_device
 
-    if isinstance(preset, str) and preset not in PRESETS:
-        raise SdfsimError(f"unknown preset {preset!r}", f"known: {', '.join(PRESETS)}")
     plan = PRESETS[preset] if isinstance(preset, str) else preset
     folders = [data] if isinstance(data, Path) else list(data)
-    if steps is not None and steps < 1:
-        raise SdfsimError(f"steps: must be at least 1 (got {steps})")
     total = plan.steps if steps is None else steps
+    if total < 1:
+        raise SdfsimError(f"steps: must be at least 1 (got {total})")
     checkpoint = out / "checkpoint.npz"
     if checkpoint.exists() and not resume:
         raise SdfsimError(f"{checkpoint} exists", "continue with --resume, or choose another -o")
-    tell = on_progress or (lambda fraction, message: None)
     infos = [read_info(folder) for folder in folders]
     team, device = gather_team(device)
     place = pick_device(device)
     with locked(out) if team.leads else nullcontext():
         with team.in_turn():  # the first finds contacts and caches them, the others read
-            task, held_out = _tasks(plan, folders, place, lambda f, m: tell(0.0, m))
+            task, held_out = _tasks(plan, folders, place, lambda _, message: on_progress(0.0, message))
         # A folder's trajectories are followed once for each length of step.
         counted = (t.counts[:: len(plan.strides)] for t in (task, held_out))
-        each = zip(folders, infos, *counted, strict=True)
-        made = [_made(folder, info, *counts) for folder, info, *counts in each]
+        made = [_made(*one) for one in zip(folders, infos, *counted, strict=True)]
         run = Run(plan, task, total, seed, place, team)
         if checkpoint.exists():
             run.load(checkpoint)
         team.wait()
         if team.leads:
             _shorten(out / "log.jsonl", run.step)
-        watched = held_out_rollouts(folders[0], place, lambda m: tell(0.0, m)) if team.leads else None
-        _loop(run, held_out, watched, out, budget, tell)
+        _loop(run, held_out, out, budget, on_progress)
         report = {"steps": run.step, "seconds": run.seconds, "loss": run.loss}
         if team.leads:
-            model = run.export(name=preset if isinstance(preset, str) else preset.kind, data=made, ranges=task.ranges())
-            report |= {"model": _saved(model, out), "held_out_loss": held_out_loss(run, held_out)}
+            model = run.export(preset if isinstance(preset, str) else preset.kind, made)
+            report |= {"model": str(out / "model.safetensors"), "held_out_loss": held_out_loss(run, held_out)}
+            try:
+                model.save(out / "model.safetensors")
+            except ImportError:  # without safetensors: --resume writes it from the checkpoint elsewhere
+                report["model"] = None
     return report
-
-
-def _saved(model: Model, out: Path) -> str | None:
-    """Write the model; None where safetensors is missing: --resume writes it from the checkpoint elsewhere."""
-    try:
-        model.save(out / "model.safetensors")
-    except ImportError:
-        return None
-    return str(out / "model.safetensors")
 
 
 def _made(data: Path, info: dict, train: int, validation: int) -> dict[str, Any]:
     """What a model's card tells of a dataset; how many trajectories there were, where they are not here."""
     here = {split: len(list((data / split).glob("*.npz"))) for split in SPLITS if (data / split).is_dir()}
-    counts = {"train": train, "validation": validation} | here
     known = {k: info.get(k) for k in ("recipe", "seed", "engine", "engine_version")}
     known |= {k: info[k] for k in ("bodies", "fps") if info.get(k)}
     shapes = info.get("shapes", [])
     solids = sum(name.startswith(SOLID) for name in shapes)
+    counts = {"train": train, "validation": validation} | here
     return known | {"shapes": len(shapes), "random_solids": solids, "trajectories": counts}
 
 
@@ -131,7 +115,7 @@ def _tasks(plan: Preset, folders: Sequence[Path], device: torch.device, tell: Pr
     return SurfaceTask(data, "train", plan, device, noisy=True), SurfaceTask(data, "validation", plan, device)
 
 
-def _loop(run: Run, held_out: Task, rollouts: Rollouts | None, out: Path, budget: float, tell: Progress) -> None:
+def _loop(run: Run, held_out: Any, out: Path, budget: float, on_progress: Progress) -> None:
     saved = time.monotonic()
     try:
         while run.step < run.total and run.seconds < budget:
@@ -141,11 +125,14 @@ def _loop(run: Run, held_out: Task, rollouts: Rollouts | None, out: Path, budget
                 run.seconds += time.process_time() - started
                 due = run.step % min(1000, max(1, run.total // 10)) == 0 or run.step == run.total
                 if run.team.leads and due:  # a step's line in the log is part of it
-                    _log(run, held_out, rollouts, out / "log.jsonl")
+                    entry = {"step": run.step, "seconds": round(run.seconds, 1), "loss": run.loss}
+                    entry |= {"rate": run.plan.rate * run.share(), "held_out_loss": held_out_loss(run, held_out)}
+                    with open(out / "log.jsonl", "a") as log:
+                        log.write(json.dumps(entry) + "\n")
             if not run.team.leads:
                 continue
-            if run.step % LOG_STEPS == 0:
-                tell(run.step / run.total, f"step {run.step}, loss {run.loss:.4f}")
+            if run.step % TELL_STEPS == 0:
+                on_progress(run.step / run.total, f"step {run.step}, loss {run.loss:.4f}")
             if time.monotonic() - saved > CHECKPOINT_SECONDS:
                 run.save(out / "checkpoint.npz")
                 saved = time.monotonic()
@@ -172,28 +159,13 @@ def _uninterrupted() -> Iterator[None]:
 
 
 def _shorten(log: Path, step: int) -> None:
-    """Leave of a log what was written up to a step, in whole lines: the rest will be done, and logged, again."""
-    if not log.exists():
-        return
+    """Leave of a log what was written up to a step: the rest will be done, and logged, again."""
     kept = []
-    for line in log.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True):
-        try:
-            entry = json.loads(line)
-        except ValueError:
-            break  # a kill has cut it short
-        if entry["step"] > step:
-            break
-        kept.append(line)
+    for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if log.exists() else []:
+        with suppress(ValueError):  # a kill has cut it short
+            if json.loads(line)["step"] <= step:
+                kept.append(line + "\n")
     write_text(log, "".join(kept))
-
-
-def _log(run: Run, held_out: Task, rollouts: Rollouts | None, path: Path) -> None:
-    entry: dict[str, Any] = {"step": run.step, "seconds": round(run.seconds, 1), "loss": run.loss}
-    entry |= {"rate": run.plan.rate * run.share(), "held_out_loss": held_out_loss(run, held_out)}
-    if rollouts and (run.step % max(1, run.total // ROLLOUTS) == 0 or run.step == run.total):
-        entry |= rollouts(run)
-    with open(path, "a") as log:
-        log.write(json.dumps(entry) + "\n")
 
 
 def main() -> None:
@@ -206,10 +178,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device", default="auto", choices=["auto", "cpu", "cuda"])
     parser.add_argument("--resume", action="store_true")
-    args = parser.parse_args()
-    options = {name: getattr(args, name) for name in ("preset", "resume", "steps", "seed", "device")}
-    report = train(args.data, args.out, **options, on_progress=lambda f, m: print(f"{f:6.1%}  {m}", flush=True))
-    print(json.dumps(report))
+    options = vars(parser.parse_args())
+    data, out = options.pop("data"), options.pop("out")
+    print(json.dumps(train(data, out, **options, on_progress=lambda f, m: print(f"{f:6.1%}  {m}", flush=True))))
 
 
 if __name__ == "__main__":

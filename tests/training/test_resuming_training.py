@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from sdfsim.data.dataset import Trajectory
 from sdfsim.dynamics.model import load_model
 from sdfsim.errors import SdfsimError
 from sdfsim.training import contact_cache
@@ -77,18 +76,3 @@ def test_a_run_does_not_go_on_with_other_data(ball_data, presets, preset, tmp_pa
     assert (tmp_path / "run" / "checkpoint.npz").read_bytes() == before
     shutil.copytree(ball_data, tmp_path / "copy")
     assert train(tmp_path / "copy", tmp_path / "run", preset=preset, steps=2, resume=True)["steps"] == 2
-
-
-def test_training_goes_without_rollouts_where_shapes_are_missing_and_says_so(ball_data, presets, tmp_path):
-    data, told = tmp_path / "data", []
-    contact_frames(ball_data, "train", TRAIN)
-    contact_frames(ball_data, "validation", HELD_OUT)
-    shutil.copytree(ball_data, data)
-    (data / "shapes" / "ball" / "sdf.npz").unlink(missing_ok=True)
-    for file in (data / "shapes" / "ball").iterdir():
-        if file.name != "shape.json":
-            file.unlink()
-    train(data, tmp_path / "run", preset="tiny", steps=5, on_progress=lambda f, m: told.append(m))
-    assert sum(m.startswith("no rollouts while training: ") for m in told) == 1
-    assert "rollout_m" not in (tmp_path / "run" / "log.jsonl").read_text()
-    assert Trajectory.load(data / "train" / "0.npz").dt == 0.02

@@ -1,6 +1,5 @@
 """Training on a handful of recorded steps: it learns, it resumes to the bit, it leaves no pickle."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -184,16 +183,6 @@ def test_frames_of_another_gravity_cannot_be_joined(ball_data):
     frames = contact_frames(ball_data, "train", ONCE)
     with pytest.raises(SdfsimError, match="must share gravity"):
         join_frames([frames, replace(frames, gravity=0.5 * frames.gravity)])
-
-
-def test_the_log_tells_rollouts_and_is_drawn(ball_data, presets, tmp_path):
-    pytest.importorskip("matplotlib")
-    train(ball_data, tmp_path / "run", preset="tiny", steps=20)
-    entries = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
-    assert all(0 < e["rollout_m"] < 100 and 0 <= e["rollout_degrees"] <= 180 for e in entries)
-    report = evaluate(ball_data, model=tmp_path / "run" / "model.safetensors", split="validation", errors_only=True)
-    assert entries[-1]["rollout_m"] == pytest.approx(report["model"]["39"]["translation_rmse"], rel=1e-4)
-    assert entries[-1]["rollout_degrees"] == pytest.approx(report["model"]["39"]["rotation_error"], rel=1e-4)
 
 
 @pytest.mark.parametrize("steps", [0, -5])
