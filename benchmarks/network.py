@@ -19,9 +19,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from sdfsim.data.batching import scene_of
+from sdfsim.data.batching import every, scene_of
 from sdfsim.data.dataset import Trajectory, load_shapes, read_info, trajectory_files
-from sdfsim.data.replay import every
 from sdfsim.dynamics.model import SOLVER, load_model
 from sdfsim.dynamics.models.contact_graph import SUBSTEPS, ContactGraph
 from sdfsim.dynamics.models.impulse import Velocities

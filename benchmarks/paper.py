@@ -32,8 +32,8 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from samples.large import write_scene
+from sdfsim.data.batching import batches, first_frames, roll_out
 from sdfsim.data.dataset import Trajectory, engine_substep, load_shapes, read_info, trajectory_files
-from sdfsim.data.replay import batches, first_frames, roll_out
 from sdfsim.dynamics.model import SOLVER, Model, load_model, new_network
 from sdfsim.dynamics.run_memory import Memory
 from sdfsim.dynamics.simulator import Simulator

@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,8 +25,7 @@ SPLITS = ("train", "validation", "test")
 INFO = "dataset.json"
 SOLID = "solid_"  # how the names of PyBullet's random solids begin
 FLOOR = (0.3, 0.5)  # friction and restitution of the recipes' floor, the plane z = 0
-LONGEST_STEP = 10.0  # s, between recorded frames
-LONGEST_SUBSTEP = 1.0  # s, an engine's inner step
+LONGEST_STEP = 10.0  # s, between recorded frames; an engine's inner step is a tenth of that at most
 EXACTLY = 1e-3  # part of what gravity adds in a step, by which a free flight may miss it
 _NAME = re.compile(r"(?!\.)[\w. -]+")  # of a folder beside others, never a path
 _AXES = {  # T frames, N bodies
@@ -63,12 +62,7 @@ class Trajectory:
         """Read and check one file. The `dataset.json` beside it, or in the folder above, tells the engine's inner step;
         `as_recorded` leaves velocities as the engine recorded them, from which it goes on when it is started again.
         Raises SdfsimError with the file and the field that is wrong."""
-        arrays = read_arrays(path, "a trajectory")
-        if missing := [name for name in _AXES if name not in arrays]:
-            raise SdfsimError(f"{path}: missing field(s) {', '.join(missing)}")
-        arrays = {name: _typed(path, name, arrays[name]) for name in _AXES}
-        _check(path, arrays)
-        recorded = cls(**{**arrays, "dt": float(arrays["dt"])})
+        recorded = cls(**_checked(path, read_arrays(path, "a trajectory")))
         return recorded if as_recorded else at_instants(recorded, engine_substep(path.parent))
 
 
@@ -92,54 +86,46 @@ def engine_substep(data: Path) -> float:
     """The recording engine's inner step in s, where the dataset (a folder or one of its splits) tells it; 0 elsewhere.
     Raises SdfsimError where the `dataset.json` holds something else there."""
     home = home_of(data)
-    if home is None:
-        return 0.0
-    settings = read_info(home).get("engine_settings") or {}
+    settings = (read_info(home).get("engine_settings") or {}) if home else {}
     found = settings.get("timeStep", 0.0) if isinstance(settings, dict) else settings
-    if isinstance(found, bool) or not isinstance(found, int | float) or not 0.0 <= found <= LONGEST_SUBSTEP:
-        where = f"{home / INFO}: engine_settings.timeStep"
-        raise SdfsimError(f"{where}: must be 0 (unknown) to {LONGEST_SUBSTEP:g} s (got {found!r})")
+    if type(found) not in (int, float) or not 0.0 <= found <= 0.1 * LONGEST_STEP:
+        raise SdfsimError(f"{data}: {INFO}: engine_settings.timeStep: must be 0 (unknown) to 1 s (got {found!r})")
     return float(found)
 
 
-def _typed(path: Path, name: str, values: np.ndarray) -> np.ndarray:
-    """A field as the type that the rest of the code counts on."""
-    try:
-        if name == "shape":
-            return values.astype(str)
-        numbers = values.astype(np.float64, casting="same_kind", copy=False)
-    except (TypeError, ValueError) as error:
-        wanted = "names" if name == "shape" else "real numbers"
-        raise SdfsimError(f"{path}: {name}: must be {wanted}: {error}") from error
-    if name == "static" and not np.isin(numbers, (0.0, 1.0)).all():
-        raise SdfsimError(f"{path}: static: must be true or false (or 1 or 0)")
-    return numbers.astype(bool) if name == "static" else numbers
-
-
-def _check(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    if arrays["position"].ndim != 3 or len(arrays["position"]) < 2:
-        found = list(arrays["position"].shape)
-        raise SdfsimError(f"{path}: position: must be [T, N, 3] with at least two frames (got {found})")
+def _checked(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+    """The fields of a trajectory in the types that the rest of the code counts on."""
+    if missing := [name for name in _AXES if name not in arrays]:
+        raise SdfsimError(f"{path}: missing field(s) {', '.join(missing)}")
+    found: dict[str, Any] = {}
     sizes = dict(zip("TN", arrays["position"].shape, strict=False))
     for name, axes in _AXES.items():
         if arrays[name].shape != (wanted := tuple(sizes.get(str(axis), axis) for axis in axes)):
             raise SdfsimError(f"{path}: {name}: must be {list(wanted)} (got {list(arrays[name].shape)})")
-        if name != "shape" and not np.isfinite(arrays[name]).all():
+        try:
+            names = name == "shape"
+            found[name] = arrays[name].astype(str) if names else arrays[name].astype(float, casting="same_kind")
+        except (TypeError, ValueError) as error:
+            raise SdfsimError(f"{path}: {name}: must be {'names' if names else 'real numbers'}: {error}") from error
+        if not names and not np.isfinite(found[name]).all():
             raise SdfsimError(f"{path}: {name}: has values that are not finite")
-    check_names(f"{path}: shape", arrays["shape"].tolist())
-    moving = ~arrays["static"]
+    check_names(f"{path}: shape", found["shape"].tolist())
+    moving = found["static"] == 0
     rules = {
-        "mass: must be > 0 for bodies that move": arrays["mass"][moving] > 0,
-        "inertia: must be > 0 for bodies that move": arrays["inertia"][moving] > 0,
-        "quat_xyzw: must be unit quaternions": np.abs(np.linalg.norm(arrays["quat_xyzw"], axis=-1) - 1.0) <= 1e-3,
-        "scale: must be > 0": arrays["scale"] > 0,
-        f"dt: must be > 0 and at most {LONGEST_STEP:g} s": (arrays["dt"] > 0) & (arrays["dt"] <= LONGEST_STEP),
-        "friction: must be >= 0": arrays["friction"] >= 0,
-        "restitution: must be 0 to 1": (arrays["restitution"] >= 0) & (arrays["restitution"] <= 1),
+        "position: must have at least two frames": np.array(len(found["position"]) >= 2),
+        "static: must be true or false (or 1 or 0)": np.isin(found["static"], (0.0, 1.0)),
+        "mass: must be > 0 for bodies that move": found["mass"][moving] > 0,
+        "inertia: must be > 0 for bodies that move": found["inertia"][moving] > 0,
+        "quat_xyzw: must be unit quaternions": np.abs(np.linalg.norm(found["quat_xyzw"], axis=-1) - 1.0) <= 1e-3,
+        "scale: must be > 0": found["scale"] > 0,
+        f"dt: must be > 0 and at most {LONGEST_STEP:g} s": (found["dt"] > 0) & (found["dt"] <= LONGEST_STEP),
+        "friction: must be >= 0": found["friction"] >= 0,
+        "restitution: must be 0 to 1": (found["restitution"] >= 0) & (found["restitution"] <= 1),
     }
     for rule, kept in rules.items():
         if not kept.all():
             raise SdfsimError(f"{path}: {rule}")
+    return found | {"static": ~moving, "dt": float(found["dt"])}
 
 
 def check_names(where: str, names: Iterable[str]) -> None:

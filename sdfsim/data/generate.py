@@ -10,7 +10,7 @@ import numpy as np
 from sdfsim.data.dataset import FLOOR, INFO, SPLITS, Trajectory, read_info
 from sdfsim.data.public_shapes import public_folder
 from sdfsim.data.pybullet_sim import FPS, RATES, TEACHER_VERSION, Teacher, engine_settings, import_pybullet
-from sdfsim.data.scenarios import RECIPES, Cast, Recipe
+from sdfsim.data.scenarios import RECIPES, Cast
 from sdfsim.data.shape_assets import VHACD, Origin, fit_shapes, origins, prepare, split_of
 from sdfsim.errors import SdfsimError
 from sdfsim.files import locked, write_json
@@ -18,7 +18,6 @@ from sdfsim.parallel import Progress, parallel, silent
 
 GRAVITY = (0.0, 0.0, -10.0)  # m/s^2
 STEPS = 100
-MOST_BODIES = 512
 REDRAWS = 1000  # of a scene in which a body found no room
 
 
@@ -43,12 +42,12 @@ def make_dataset(
 
     Shapes are a folder (see `origins`; movi-b takes NAME/ folders alone) or the name of a public set; so many
     `random_solids` of PyBullet go beside them. `bodies` move instead of the recipe's range (bowl and pile), at `fps` in
-    `RATES`. Raises SdfsimError for an unknown recipe or rate, an option that the recipe has no use for, no usable
-    shapes or none to be fetched, PyBullet absent, another dataset in `out`, or another run writing to it.
+    `RATES`. Raises SdfsimError for an option that the recipe has no use for, no usable shapes or none to be fetched,
+    PyBullet absent, another dataset in `out`, or another run writing to it.
     """
-    plan = _checked(recipe, shapes, random_solids, bodies, fps)
+    plan = RECIPES[recipe]
     engine = import_pybullet()
-    given = _origins(plan, shapes and public_folder(shapes, on_progress), random_solids)
+    given = _origins(recipe, shapes, random_solids, bodies, on_progress)
     info = {
         "recipe": recipe,
         "seed": seed,
@@ -81,7 +80,7 @@ def make_dataset(
         folder.mkdir(parents=True, exist_ok=True)
         files = [(k, folder / f"{k:05d}.npz") for k in range(trajectories)]
         todo = [job for job in files if not job[1].exists()]
-        make_one = partial(_make_one, recipe, Cast(mine, scenery, bodies), fps, seed, split)
+        make_one = partial(_make_one, recipe, Cast(mine, scenery, bodies), fps, [seed, SPLITS.index(split)])
         for done, _ in enumerate(parallel(make_one, todo), start=1):
             on_progress(0.5 + 0.5 * done / len(todo), f"trajectory {done} of {len(todo)}")
     return {
@@ -127,41 +126,33 @@ def make_trajectory(recipe: str, rng: np.random.Generator, cast: Cast, fps: int 
             dt=1.0 / fps,
             gravity=np.array(GRAVITY),
         )
-    raise SdfsimError(
-        f"no room for the bodies of {recipe} in any of {REDRAWS:,} draws of a scene", "are the meshes in metres?"
-    )
+    raise SdfsimError(f"{recipe}: no room for the bodies in any of {REDRAWS:,} scenes", "are the meshes in metres?")
 
 
-def _make_one(recipe: str, cast: Cast, fps: int, seed: int, split: str, index: int, path: Path) -> None:
-    make_trajectory(recipe, np.random.default_rng([seed, SPLITS.index(split), index]), cast, fps).save(path)
+def _make_one(recipe: str, cast: Cast, fps: int, seed: list[int], index: int, path: Path) -> None:
+    make_trajectory(recipe, np.random.default_rng([*seed, index]), cast, fps).save(path)
 
 
-def _checked(recipe: str, shapes: Path | None, random_solids: int, bodies: int | None, fps: int) -> Recipe:
-    """The recipe, when everything goes with it."""
-    if recipe not in RECIPES:
-        raise SdfsimError(f"unknown recipe {recipe!r}", f"known: {', '.join(RECIPES)}")
-    if fps not in RATES:
-        raise SdfsimError(f"--fps must be {' or '.join(map(str, RATES))} (got {fps})")
+def _origins(
+    recipe: str, shapes: Path | None, random_solids: int, bodies: int | None, on_progress: Progress
+) -> list[Origin]:
+    """Where the shapes of a recipe come from, its own scenery last, when all options go with it."""
     plan = RECIPES[recipe]
-    if bodies is not None and not (plan.counted and 1 <= bodies <= MOST_BODIES):
-        counted = " and ".join(name for name, r in RECIPES.items() if r.counted)
-        raise SdfsimError(f"--bodies goes with {counted}, and is 1 to {MOST_BODIES} (got {bodies} for {recipe})")
-    if plan.given and shapes is None and (plan.kubasic or not random_solids):
-        which = "kubasic, or a folder of such shapes" if plan.kubasic else "FOLDER or --random-solids N"
-        raise SdfsimError(f"{recipe} needs shapes", f"give --shapes {which}")
-    if random_solids and (plan.kubasic or not plan.given):
-        raise SdfsimError(f"{recipe} has no use for --random-solids")
-    if shapes is not None and not plan.given:
-        raise SdfsimError(f"{recipe} brings its own shapes", "leave out --shapes")
-    return plan
-
-
-def _origins(plan: Recipe, shapes: Path | None, random_solids: int) -> list[Origin]:
-    """Where the shapes of a recipe come from, its own scenery last."""
-    given = origins(shapes, random_solids, as_is=plan.kubasic) if plan.given else []
-    if taken := {o.name for o in given} & set(plan.scenery):
+    unused = {
+        "--bodies": bodies is not None and not plan.counted,
+        "--random-solids": random_solids and (plan.kubasic or not plan.given),
+        "--shapes": shapes is not None and not plan.given,
+    }
+    for option, given in unused.items():
+        if given:
+            raise SdfsimError(f"{recipe} has no use for {option}")
+    if plan.given and shapes is None and not random_solids:
+        raise SdfsimError(f"{recipe} needs shapes", "give --shapes a folder, or kubasic or ycb")
+    folder = shapes and public_folder(shapes, on_progress)
+    found = origins(folder, random_solids, as_is=plan.kubasic) if plan.given else []
+    if taken := {o.name for o in found} & set(plan.scenery):
         raise SdfsimError(f"{shapes}: the recipe has a shape {min(taken)!r} of its own", "rename yours")
-    return given + [Origin(name, primitive=kind) for name, kind in plan.scenery.items()]
+    return found + [Origin(name, primitive=kind) for name, kind in plan.scenery.items()]
 
 
 def _check_same(out: Path, info: dict) -> None:

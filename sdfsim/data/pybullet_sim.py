@@ -62,13 +62,9 @@ def import_pybullet():
     return pybullet
 
 
-def write_urdf(mesh: Path, path: Path) -> None:
-    """Write the URDF of a body that collides `mesh`, an OBJ about its centre of mass; a relative path starts at it."""
-    write_form_urdf(f'<mesh filename="{mesh}"/>', path)
-
-
-def write_form_urdf(geometry: str, path: Path) -> Path:
-    """Write the URDF of a geometry about its centre; `geometry` is its URDF element, such as '<sphere radius="1"/>'."""
+def write_urdf(geometry: str, path: Path) -> Path:
+    """Write the URDF of a body about its centre of mass; `geometry` is its element, such as '<sphere radius="1"/>' or
+    '<mesh filename="NAME.obj"/>', where a relative path starts at the URDF."""
     write_text(path, URDF_TEMPLATE.format(geometry=geometry))
     return path
 
@@ -115,15 +111,16 @@ class Teacher:
 
     def add(self, body: TeacherBody, position: Vector = FAR, quat: Vector = UNTURNED) -> int:
         """Add a body with its centre of mass at `position` [3] m, orientation `quat` [4] xyzw; returns its index."""
-        handle = self._call(
-            "loadURDF", str(body.urdf), basePosition=list(position), baseOrientation=list(quat),
-            globalScaling=body.scale, useFixedBase=int(body.mass == 0), **MAXIMAL,
-        )  # fmt: skip
+        # Far away first and moved then: the engine's order of pairs depends on it.
+        flags = {"basePosition": FAR, "globalScaling": body.scale, "useFixedBase": int(body.mass == 0)}
+        handle = self._call("loadURDF", str(body.urdf), **flags, **MAXIMAL)
         surface = {"lateralFriction": body.friction, "restitution": body.restitution}
         self._call("changeDynamics", handle, -1, mass=body.mass, **surface, **BODY_SETTINGS)
         self.bodies.append(handle)
         self._settled = False
-        return len(self.bodies) - 1
+        index = len(self.bodies) - 1
+        self.place(index, position, quat)
+        return index
 
     def overlaps(self, index: int) -> bool:
         """Whether body `index` touches or penetrates anything; around convex pieces is a margin of 1 mm."""
@@ -188,12 +185,8 @@ class Teacher:
             self.push(i, velocity, angular)
         self._settled = True
 
-    def close(self) -> None:
-        """Leave the engine."""
-        self.pb.disconnect(self.client)
-
     def __enter__(self) -> Teacher:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
+        self.pb.disconnect(self.client)

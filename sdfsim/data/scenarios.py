@@ -80,7 +80,6 @@ APART = 12.0  # m between the heights of pairs
 HALF = 0.5  # of the bodies: along x or y, of a spin that fits, or unturned; the others any way
 
 Bodies = list[tuple[ShapeSource, TeacherBody]]
-Draw = Callable[[ShapeSource], TeacherBody]
 Pose = tuple[np.ndarray, Rotation]  # [3] m of the centre of mass, and the orientation
 
 
@@ -108,12 +107,7 @@ class Recipe:
 
 def movi_b(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies | None:
     """Kubric's `movi_ab_worker`, restated."""
-
-    def draw(source: ShapeSource) -> TeacherBody:
-        scale = rng.uniform(*SIZES)
-        return _body(source, scale, *MATERIALS[str(rng.choice(list(MATERIALS)))])
-
-    return _toss(teacher, rng, cast, draw)
+    return _toss(teacher, rng, cast, lambda source: _of_material(source, rng, SIZES))
 
 
 def movi_c(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies | None:
@@ -127,11 +121,12 @@ def bowl(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies:
     inner = BALL * (ROOM * count / (4 * PACKED)) ** (1 / 3)
     vessel, ball = cast.scenery["bowl"], cast.scenery["ball"]
     bodies = [(vessel, _body(vessel, 2 * inner / (1 - WALL), 0.0, *FLOOR))]
-    position, high = upright(*bodies[0], np.zeros(2), 0.0, Rotation.identity())
-    _put(teacher, bodies[0][1], position, Rotation.identity())
+    position = upright(*bodies[0], np.zeros(2), 0.0, Rotation.identity())
+    teacher.add(bodies[0][1], position)
+    rim = position + _box(*bodies[0], Rotation.identity())[1][2] * UP
     for place in _layers(rng, count, max(0.75 * inner - 0.5 * BALL, 0.0)):
         bodies.append((ball, _body(ball, BALL, *PLAIN)))
-        index = _put(teacher, bodies[-1][1], place + high * UP, Rotation.random(rng=rng))
+        index = teacher.add(bodies[-1][1], place + rim[2] * UP, Rotation.random(rng=rng).as_quat())
         teacher.push(index, rng.uniform((-1.0, -1.0, 0.0), (1.0, 1.0, 0.0)), STILL)
     return bodies
 
@@ -159,7 +154,7 @@ def pile(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies:
     bodies, boxes = [], np.empty((0, 2, 3))
     for _ in range(count):
         source = cast.shapes[rng.integers(len(cast.shapes))]
-        body = _body(source, rng.uniform(*PILE_EXTENTS), *MATERIALS[str(rng.choice(list(MATERIALS)))])
+        body = _of_material(source, rng, PILE_EXTENTS)
         rotation = Rotation.random(rng=rng)
         low, high = _box(source, body, rotation)
         places = np.array([radius * np.sqrt(rng.random()) * _direction(rng)[:2] for _ in range(PILE_TRIES)])
@@ -167,7 +162,7 @@ def pile(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies:
         tops = [boxes[under, 1, 2].max(initial=0.0) for under in below]
         position = np.array([*places[np.argmin(tops)], min(tops) + rng.uniform(*PILE_GAPS) - low[2]])
         boxes = np.concatenate([boxes, [[position + low, position + high]]])
-        _put(teacher, body, position, rotation)
+        teacher.add(body, position, rotation.as_quat())
         bodies.append((source, body))
     return bodies
 
@@ -186,7 +181,7 @@ def varied(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies | N
         extent = rng.uniform(*OBSTACLE_EXTENTS)
         obstacle = _body(source, extent, 0.0, rng.uniform(*FRICTIONS), rng.uniform(*RESTITUTIONS))
         place, rotation = rng.uniform(-1.0, 1.0, 2), Rotation.from_euler("z", rng.uniform(0, 2 * np.pi))
-        _put(teacher, obstacle, upright(source, obstacle, place, 0.0, rotation)[0], rotation)
+        teacher.add(obstacle, upright(source, obstacle, place, 0.0, rotation), rotation.as_quat())
         placed.append((source, obstacle))
     masses: list[float] = []
 
@@ -222,7 +217,9 @@ RECIPES = {
 }
 
 
-def _toss(teacher: Teacher, rng: np.random.Generator, cast: Cast, draw: Draw) -> Bodies | None:
+def _toss(
+    teacher: Teacher, rng: np.random.Generator, cast: Cast, draw: Callable[[ShapeSource], TeacherBody]
+) -> Bodies | None:
     """Kubric's 3 to 10 bodies without overlaps, thrown across; None when one finds no room."""
 
     def propose(source: ShapeSource, body: TeacherBody) -> Pose | None:
@@ -256,7 +253,7 @@ def at_rest(teacher: Teacher, rng: np.random.Generator, bodies: Bodies, start: s
         place = below + rng.uniform(-0.1, 0.1, 2) * body.scale if stacked else rng.uniform(-FIELD, FIELD, 2)
         gap = rng.uniform(GAP, DROP) if start == "dropped" else GAP
         rotation = _standing(source, rng)
-        return upright(source, body, place, (top if stacked else 0.0) + gap, rotation)[0], rotation
+        return upright(source, body, place, (top if stacked else 0.0) + gap, rotation), rotation
 
     for index, (source, body) in enumerate(bodies, start=first):
         if (pose := _find_room(teacher, (source, body), propose)) is None:
@@ -287,7 +284,7 @@ def set_moving(teacher: Teacher, rng: np.random.Generator, bodies: Bodies, motio
         gap = rng.uniform(*HEIGHTS) if motion == "falling" else GAP
         any_way = source.sphere or (motion == "falling" and rng.random() < HALF)
         rotation = Rotation.random(rng=rng) if any_way else _standing(source, rng)
-        return upright(source, body, rng.uniform(-FIELD, FIELD, 2), gap, rotation)[0], rotation
+        return upright(source, body, rng.uniform(-FIELD, FIELD, 2), gap, rotation), rotation
 
     for index, one in enumerate(bodies, start=len(teacher.bodies)):
         if _find_room(teacher, one, propose) is None:
@@ -320,7 +317,8 @@ def _meet(teacher: Teacher, rng: np.random.Generator, pair: Bodies, height: floa
     middle = np.array([*rng.uniform(-FIELD, FIELD, 2), height])
     time = rng.uniform(*MEETING)
     for k, side in enumerate((-1.0, 1.0)):
-        index = _put(teacher, pair[k][1], middle + side * (reach[k] + speeds[k] * time) * line, rotations[k])
+        place = middle + side * (reach[k] + speeds[k] * time) * line
+        index = teacher.add(pair[k][1], place, rotations[k].as_quat())
         teacher.push(index, -side * speeds[k] * line, STILL)
 
 
@@ -338,16 +336,14 @@ def _find_room(
     return None
 
 
-def _put(teacher: Teacher, body: TeacherBody, position: np.ndarray, rotation: Rotation) -> int:
-    """Add a body where it is to be; its index."""
-    index = teacher.add(body)
-    teacher.place(index, position, rotation.as_quat())
-    return index
-
-
 def _body(source: ShapeSource, extent: float, density: float, friction: float, restitution: float) -> TeacherBody:
     """A body of a shape at scale `extent`; density 0 makes it static."""
     return TeacherBody(source.urdf, extent, source.volume * density * extent**3, friction, restitution)
+
+
+def _of_material(source: ShapeSource, rng: np.random.Generator, extents: tuple[float, float]) -> TeacherBody:
+    """A body of a random size and one of MOVi-B's materials."""
+    return _body(source, rng.uniform(*extents), *MATERIALS[str(rng.choice(list(MATERIALS)))])
 
 
 def _box(source: ShapeSource, body: TeacherBody, rotation: Rotation) -> tuple[np.ndarray, np.ndarray]:
@@ -362,13 +358,9 @@ def _direction(rng: np.random.Generator) -> np.ndarray:
     return np.array([np.cos(turn), np.sin(turn), 0.0])
 
 
-def upright(
-    source: ShapeSource, body: TeacherBody, place: np.ndarray, height: float, rotation: Rotation
-) -> tuple[np.ndarray, float]:
-    """Where [3] m the centre of mass is when the lowest point is at `height` m over `place` [2] m; and the top, m."""
-    low, high = _box(source, body, rotation)
-    position = np.array([*place, height - low[2]])
-    return position, float(position[2] + high[2])
+def upright(source: ShapeSource, body: TeacherBody, place: np.ndarray, height: float, rotation: Rotation) -> np.ndarray:
+    """Where [3] m the centre of mass is when the lowest point is at `height` m over `place` [2] m."""
+    return np.array([*place, height - _box(source, body, rotation)[0][2]])
 
 
 def _standing(source: ShapeSource, rng: np.random.Generator) -> Rotation:

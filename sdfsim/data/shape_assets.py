@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from sdfsim.data.dataset import SOLID, check_names
-from sdfsim.data.pybullet_sim import write_form_urdf, write_urdf
+from sdfsim.data.pybullet_sim import write_urdf
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, write_json, write_text
 from sdfsim.parallel import Progress, parallel
@@ -181,11 +181,11 @@ def _source(origin: Origin, record: dict[str, Any], engine: Path) -> ShapeSource
     pieces, urdf = engine / f"{origin.name}.obj", engine / f"{origin.name}.urdf"
     sphere = origin.primitive == "sphere"
     if sphere:  # a ball of facets would lose a third of its speed in 3 s of rolling
-        write_form_urdf('<sphere radius="0.5"/>', urdf)
+        write_urdf('<sphere radius="0.5"/>', urdf)
     else:
         # A path from the URDF on, so that a dataset can be moved. Not the bare name: the engine looks in the working
         # directory first, where a mesh of that name may well lie.
-        write_urdf(Path("..", pieces.resolve().parent.name, pieces.name), urdf)
+        write_urdf(f'<mesh filename="../{pieces.resolve().parent.name}/{pieces.name}"/>', urdf)
     if origin.as_is:
         assert origin.mesh is not None
         vertices = load_mesh(origin.mesh).vertices

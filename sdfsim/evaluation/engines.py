@@ -21,12 +21,12 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from sdfsim.data.dataset import Trajectory, shapes_folder
-from sdfsim.data.pybullet_sim import DT, SUBSTEPS, Teacher, TeacherBody, substeps_of, write_form_urdf, write_urdf
+from sdfsim.data.pybullet_sim import DT, SUBSTEPS, Teacher, TeacherBody, substeps_of, write_urdf
 from sdfsim.data.shape_assets import decompose
 from sdfsim.dynamics.bodies import Units, from_scene
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.errors import SdfsimError
-from sdfsim.files import replacing, write_text
+from sdfsim.files import write_text
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.mesh import Mesh, load_pieces, wavefront
 from sdfsim.shape.sdf import BoxSdf, PlaneSdf, SphereSdf
@@ -496,14 +496,13 @@ def shape_urdf(shape: Shape, folder: Path) -> Path:
         geometry = f'<sphere radius="{sizes}"/>' if sphere else f'<box size="{sizes}"/>'
         urdf = folder / f"{'sphere' if sphere else 'box'}-{sizes.replace(' ', '-')}.urdf"
         folder.mkdir(parents=True, exist_ok=True)
-        return urdf if urdf.exists() else write_form_urdf(geometry, urdf)
+        return urdf if urdf.exists() else write_urdf(geometry, urdf)
     urdf = folder / f"pieces-{shape.mesh.digest()[:16]}.urdf"
     if not urdf.exists():
         folder.mkdir(parents=True, exist_ok=True)
         pieces, mesh = own_pieces(shape) or decompose(shape.mesh, folder / urdf.stem), urdf.with_suffix(".obj")
         write_text(mesh, wavefront([Mesh(piece.vertices - shape.com, piece.faces) for piece in pieces]))
-        with replacing(urdf) as partial:
-            write_urdf(mesh.resolve(), partial)
+        write_urdf(f'<mesh filename="{mesh.resolve()}"/>', urdf)
     return urdf
 
 

@@ -11,10 +11,9 @@ import numpy as np
 
 from sdfsim.console import columns
 from sdfsim.data import metrics
-from sdfsim.data.batching import scene_of
+from sdfsim.data.batching import batches, every, first_frames, model_units, roll_out, scene_of
 from sdfsim.data.dataset import Trajectory, engine_substep, load_shapes, trajectory_files
 from sdfsim.data.metrics import FRAMES, HORIZONS
-from sdfsim.data.replay import batches, every, first_frames, model_units, roll_out
 from sdfsim.dynamics.model import Model, load_model
 from sdfsim.dynamics.simulator import pick_device
 from sdfsim.dynamics.step import FreeFlight

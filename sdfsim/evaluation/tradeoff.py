@@ -16,10 +16,9 @@ import numpy as np
 import torch
 
 import sdfsim
-from sdfsim.data.batching import scene_of
+from sdfsim.data.batching import every, first_frames, roll_out, scene_of
 from sdfsim.data.dataset import FLOOR, Trajectory, check_alike, floor_of, home_of, read_info
 from sdfsim.data.pybullet_sim import DT, SUBSTEP
-from sdfsim.data.replay import every, first_frames, roll_out
 from sdfsim.dynamics.model import SOLVER, Model, load_model, model_names
 from sdfsim.dynamics.models.contact_graph import SUBSTEPS
 from sdfsim.dynamics.simulator import Simulator

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from sdfsim.data.batching import roll_out
 from sdfsim.data.dataset import Trajectory
-from sdfsim.data.replay import roll_out
 from sdfsim.dynamics import inference
 from sdfsim.dynamics import step as step_module
 from sdfsim.dynamics.bodies import State

@@ -76,7 +76,7 @@ def test_a_shape_of_pieces_is_the_engines_pieces_where_they_are_at_hand(tmp_path
     engine = tmp_path / "shapes" / "engine"
     engine.mkdir(parents=True)
     (engine / "cube.obj").write_text("o piece\n" + CUBE)
-    write_urdf(engine / "cube.obj", engine / "cube.urdf")
+    write_urdf(f'<mesh filename="{engine / "cube.obj"}"/>', engine / "cube.urdf")
     solid = exact_solids(tmp_path, shapes)["cube"]
     assert solid.kind == "pieces"
     np.testing.assert_allclose(solid.bounds, [[-0.5] * 3, [0.5] * 3])

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from sdfsim.data.batching import merged, scene_of
+from sdfsim.data.batching import merged, roll_out, scene_of
 from sdfsim.data.dataset import Trajectory, load_shapes
-from sdfsim.data.replay import roll_out
 from sdfsim.dynamics.bodies import Units
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.errors import SdfsimError
