@@ -206,7 +206,7 @@ def shapes_folder(folder: Path) -> Path:
 
 
 def load_shapes(folder: Path, names: set[str]) -> dict[str, Shape]:
-    """The Shape folders `shapes/NAME` of a dataset (its own, or its parent's for a split folder)."""
+    """Shapes of a dataset, or of a split of it, by name."""
     # Here and not above: training from cached contact frames runs where only torch and numpy are installed.
     from sdfsim.shape.shape import load_shape
 

@@ -4,8 +4,8 @@
 scans of the YCB object set (CC BY 4.0), as the repository eleramp/pybullet-object-models has reoriented them: YCB's own
 site offers the same objects in other files.
 
-The sums are those of the files that the published figures were made from. An archive as a whole is not checked:
-packing it anew changes no shape.
+public_shapes.sha256 holds the sums of the files that the published figures were made from. An archive as a whole is not
+checked: packing it anew changes no shape.
 """
 
 from __future__ import annotations
@@ -28,40 +28,10 @@ YCB = (
 )
 ARCHIVE = ".tar.gz"
 # Of every set: its files, as they lie in the set's folder, and their SHA-256.
-SUMS = {
-    "kubasic": {
-        "cone/visual_geometry.obj": "a5bb85a5083e3b0e644acdcb4355bdf17a2fb8b3ec8d006bc8955ea6cf0ef983",
-        "cone/collision_geometry.obj": "de2a2c2bc742bace10e25c78cdddddeb49c9aff5d2f82f3fd5952a09348ad171",
-        "cube/visual_geometry.obj": "5eca831005f71c7994152820ca99af9381a22a5704d1de755ad2718b572dd3b7",
-        "cube/collision_geometry.obj": "3cf6780cff4fe1a8156dd442cc943067e704f9436355655567acbb143a727f4e",
-        "cylinder/visual_geometry.obj": "96122a88977a7919a595e45ec178b8d4bb489da4a6bae827cf558278976aa0e7",
-        "cylinder/collision_geometry.obj": "96ccec6bd37f843acacf690106d66c54b606f7e055f626581e04e0ce1f54965f",
-        "gear/visual_geometry.obj": "5ad916a4472d10f792496fba24fc1800dd4bde89008d09abbbc34d8cd9f3e072",
-        "gear/collision_geometry.obj": "e68f98add410359408885710c9690a4bd59778e149ee282073ae108c6cf2ea7c",
-        "sphere/visual_geometry.obj": "a2a6ef8ca079fb960db9cd8e465f701fee3ff6adbaad1f5ea7253deac23d703e",
-        "sphere/collision_geometry.obj": "96a605690ddc8eda2cce2f5245537d4a8ebc3c7866f415f159fa7cd634c72307",
-        "sponge/visual_geometry.obj": "2a4835aa062ad4f2d249f42d3dfd7e696f2ad8191377a868eefeb5724e263cdc",
-        "sponge/collision_geometry.obj": "a154ee2060f643e522a5f78a1016e7970f24d6e0f58afc040fe8af3927992cb0",
-        "spot/visual_geometry.obj": "80ee429ad8633692248713c60efa57c3eadc8dc020abe326f8f0bd18353e849f",
-        "spot/collision_geometry.obj": "3e761ded81a8c69d5d8462b5eb8a45a4166d64f6bf53ae762a8ddabc8286a5fc",
-        "suzanne/visual_geometry.obj": "fb84550aab93739eb992653931047c59889608f16dbbd0916c71d5fdebda528f",
-        "suzanne/collision_geometry.obj": "eb145c75aab68a71616ec4a9b8c9adfc508795dc65ca736fb699e10f342920f1",
-        "teapot/visual_geometry.obj": "cb97775ab91aa6dbd847e6b4eaa32f6c9c65b4c0c1ecffdb17da62ae4fbd8358",
-        "teapot/collision_geometry.obj": "8c25f84d4eea68cdbc65dbc817480c2ad0553e72fee6a9d193091418a4d9d741",
-        "torus/visual_geometry.obj": "9d5cdce39d6dd13279e4b6984f38a4f4f0329d315e4ce0d44b2bb3147a7bb140",
-        "torus/collision_geometry.obj": "24f171da80765d3c74da06553cec7e928f20874ae8b9d43bc8e7e1db73a4b062",
-        "torus_knot/visual_geometry.obj": "c1c2a2147d077547220dcd89a63f5ceae33acde9bfdd664357e2bad2d7fe8100",
-        "torus_knot/collision_geometry.obj": "e3957dcbb790e293ae490513266f2304b9eb908a6a2af2e5b3a1d0b51c8ecdab",
-    },
-    "ycb": {
-        "ycb_banana.obj": "ee31f11cd1d5b07d84e50761873abe7fbc53de76b5b01fa286935198ad0d49cb",
-        "ycb_cracker_box.obj": "ed49124153fc37d69346c29a36484515b49b2a3c37656a385f19876a416ca368",
-        "ycb_mustard_bottle.obj": "f495746e5638ce392f865058970d99ad8b0bb1842d70d0825e5a9b2e933bebd1",
-        "ycb_potted_meat_can.obj": "b957322daa655f4f70c8d25c758a6ce6a4c0037dd8e2e9fa08c191e553888e47",
-        "ycb_scissors.obj": "c908f454bbc837f101ea06b147e82cb07dd86e27bc2c4cc25ca00505eb181e01",
-        "ycb_tomato_soup_can.obj": "563caec7edab869d95f860f4459b816e362fc61e1b745ea89695ce830733d486",
-    },
-}
+SUMS: dict[str, dict[str, str]] = {}
+for line in Path(__file__).with_suffix(".sha256").read_text(encoding="utf-8").splitlines():
+    told, path = line.split()
+    SUMS.setdefault(path.split("/")[0], {})[path.partition("/")[2]] = told
 
 
 def public_folder(shapes: Path, on_progress: Progress = silent) -> Path:
@@ -71,22 +41,19 @@ def public_folder(shapes: Path, on_progress: Progress = silent) -> Path:
     if name not in SUMS or shapes.is_dir():
         return shapes
     folder = user_cache("public") / name
-    missing: dict[str, list[str]] = {}
-    for file, expected in SUMS[name].items():
-        if (folder / file).is_file():  # people may have put it there, so it is checked each time
-            _check((folder / file).read_bytes(), expected, str(folder / file), "remove it, then it is fetched again")
-        else:
-            missing.setdefault(_url(file), []).append(file)
     hint = f"put these files into {folder} by hand: {', '.join(SUMS[name])}"
-    for url, files in missing.items():
+    missing = [file for file in SUMS[name] if not (folder / file).is_file()]
+    for url in dict.fromkeys(map(_url, missing)):
         on_progress(0.0, f"fetching {url}")
-        found = _fetched(url, hint)
-        content = {file: found.get(Path(file).name) or found.get("", b"") for file in files}
-        for file in files:  # all of them before any is kept
-            _check(content[file], SUMS[name][file], f"{url}: {Path(file).name}", hint)
-        for file in files:
+        content = _fetched(url, hint)
+        found = {file: content.get(Path(file).name) or content.get("", b"") for file in missing if _url(file) == url}
+        for file in found:  # all of them before any is kept
+            _check(found[file], SUMS[name][file], f"{url}: {Path(file).name}", hint)
+        for file in found:
             (folder / file).parent.mkdir(parents=True, exist_ok=True)
-            write_bytes(folder / file, content[file])
+            write_bytes(folder / file, found[file])
+    for file, expected in SUMS[name].items():  # people may have put it there, so it is checked each time
+        _check((folder / file).read_bytes(), expected, str(folder / file), "remove it, then it is fetched again")
     return folder
 
 

@@ -80,6 +80,7 @@ APART = 12.0  # m between the heights of pairs
 HALF = 0.5  # of the bodies: along x or y, of a spin that fits, or unturned; the others any way
 
 Bodies = list[tuple[ShapeSource, TeacherBody]]
+Draw = Callable[[ShapeSource], TeacherBody]
 Pose = tuple[np.ndarray, Rotation]  # [3] m of the centre of mass, and the orientation
 
 
@@ -94,10 +95,9 @@ class Cast:
 
 @dataclass(frozen=True)
 class Recipe:
-    """How scenes start."""
+    """How scenes start: `spawn` puts the bodies of a scene into the teacher's world and returns them in its order,
+    static ones with mass 0; None where one found no room."""
 
-    # puts the bodies of a scene into the teacher's world and returns them in its order, those that are static with mass
-    # 0; None where one found no room
     spawn: Callable[[Teacher, np.random.Generator, Cast], Bodies | None]
     kubasic: bool = False  # takes NAME/ folders as they are, in all splits; otherwise shapes are split by name
     given: bool = True  # draws bodies from shapes that the caller gives
@@ -123,10 +123,10 @@ def bowl(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies:
     bodies = [(vessel, _body(vessel, 2 * inner / (1 - WALL), 0.0, *FLOOR))]
     position = upright(*bodies[0], np.zeros(2), 0.0, Rotation.identity())
     teacher.add(bodies[0][1], position)
-    rim = position + _box(*bodies[0], Rotation.identity())[1][2] * UP
+    rim = position[2] + _box(*bodies[0], Rotation.identity())[1][2]
     for place in _layers(rng, count, max(0.75 * inner - 0.5 * BALL, 0.0)):
         bodies.append((ball, _body(ball, BALL, *PLAIN)))
-        index = teacher.add(bodies[-1][1], place + rim[2] * UP, Rotation.random(rng=rng).as_quat())
+        index = teacher.add(bodies[-1][1], place + rim * UP, Rotation.random(rng=rng).as_quat())
         teacher.push(index, rng.uniform((-1.0, -1.0, 0.0), (1.0, 1.0, 0.0)), STILL)
     return bodies
 
@@ -217,9 +217,7 @@ RECIPES = {
 }
 
 
-def _toss(
-    teacher: Teacher, rng: np.random.Generator, cast: Cast, draw: Callable[[ShapeSource], TeacherBody]
-) -> Bodies | None:
+def _toss(teacher: Teacher, rng: np.random.Generator, cast: Cast, draw: Draw) -> Bodies | None:
     """Kubric's 3 to 10 bodies without overlaps, thrown across; None when one finds no room."""
 
     def propose(source: ShapeSource, body: TeacherBody) -> Pose | None:

@@ -27,7 +27,6 @@ from sdfsim.shape.watertight import solidify
 NODES = 512  # surface nodes a shape: the vertices and edges of the pieces first, since those are what really touches
 THINNEST = 0.02  # thickness over largest extent below which a mesh is left out: no fit resolves it
 VISUAL, COLLISION = "visual_geometry.obj", "collision_geometry.obj"  # the two files of a NAME/ folder
-SOLIDS = 1000  # in pybullet_data
 VHACD = {"resolution": 1_000_000, "concavity": 0.0025, "maxNumVerticesPerCH": 64}
 # In a process of its own: it prints to stdout, and on an odd mesh it aborts, or takes all the memory there is.
 VHACD_CALL = f"""
@@ -40,11 +39,11 @@ VHACD_TIME = 600  # s
 
 @dataclass(frozen=True)
 class Origin:
-    """Where a shape comes from."""
+    """Where a shape comes from: a mesh that V-HACD cuts, convex pieces with a mesh to show, or a primitive."""
 
     name: str  # of the Shape folder
     mesh: Path | None = None  # file of the solid, which is also what is shown
-    pieces: Path | None = None  # OBJ with one convex piece a group; None: `mesh` is cut into pieces by V-HACD
+    pieces: Path | None = None  # OBJ with one convex piece a group
     primitive: str = ""  # name of a primitive, in place of files
     as_is: bool = False  # keep size and origin of the files, as MOVi-B does. Other shapes get a largest extent of 1 m.
 
@@ -89,7 +88,7 @@ def origins(shapes: Path | None, random_solids: int = 0, *, as_is: bool = False)
     the first of PyBullet's random solids.
 
     `as_is` takes the NAME/ folders alone, in their own size (Kubric's assets have their centre of mass at 0). Raises
-    SdfsimError for no shapes, more solids than there are, one name twice, or one that no Shape folder can have.
+    SdfsimError for no shapes, one name twice, or one that no Shape folder can have.
     """
     found = []
     if shapes is not None:
@@ -101,8 +100,6 @@ def origins(shapes: Path | None, random_solids: int = 0, *, as_is: bool = False)
         if not found:
             also = "" if as_is else ", or mesh files"
             raise SdfsimError(f"{shapes}: no shapes found", f"expected NAME/{VISUAL} and NAME/{COLLISION}{also}")
-    if not 0 <= random_solids <= SOLIDS:
-        raise SdfsimError(f"--random-solids must be 0 to {SOLIDS} (got {random_solids})")
     if random_solids:
         import pybullet_data
 
@@ -122,13 +119,12 @@ def prepare(found: list[Origin], engine: Path, on_progress: Progress) -> tuple[l
     that is to be taken as it is cannot be used.
     """
     engine.mkdir(parents=True, exist_ok=True)
-    records: list[dict[str, Any]] = [{}] * len(found)
-    for done, (index, record) in enumerate(parallel(_prepare_one, [(o, engine) for o in found]), start=1):
+    records: dict[int, dict[str, Any]] = {}
+    for index, record in parallel(_prepare_one, [(origin, engine) for origin in found]):
         records[index] = record
-        on_progress(done / len(found), f"pieces of {found[index].name}, {done} of {len(found)}")
-    pairs = list(zip(found, records, strict=True))
-    left_out = {o.name: r["left_out"] for o, r in pairs if "left_out" in r}
-    return [_source(o, r, engine) for o, r in pairs if "left_out" not in r], left_out
+        on_progress(len(records) / len(found), f"pieces of {found[index].name}, {len(records)} of {len(found)}")
+    left_out = {o.name: records[k]["left_out"] for k, o in enumerate(found) if "left_out" in records[k]}
+    return [_source(o, records[k], engine) for k, o in enumerate(found) if o.name not in left_out], left_out
 
 
 def _prepare_one(origin: Origin, engine: Path) -> dict[str, Any]:
@@ -150,10 +146,9 @@ def _write_pieces(origin: Origin, engine: Path) -> dict[str, Any]:
     """Write NAME.obj in the engine's frame; volume at scale 1, and centre of mass and size in the original's."""
     file = engine / f"{origin.name}.obj"
     if origin.as_is:
-        assert origin.mesh is not None and origin.pieces is not None
-        volume = mass_properties(load_mesh(origin.mesh))[0]
+        assert origin.mesh and origin.pieces
         write_text(file, origin.pieces.read_text(encoding="utf-8"))
-        return {"volume": volume, "com": [0.0, 0.0, 0.0], "size": 1.0}
+        return {"volume": mass_properties(load_mesh(origin.mesh))[0], "com": [0.0, 0.0, 0.0], "size": 1.0}
     if origin.primitive == "sphere":
         write_text(file, wavefront([convex_hull(primitives.sphere().vertices)]))
         return {"volume": np.pi / 6.0, "com": [0.0, 0.0, 0.0], "size": 1.0}
@@ -162,7 +157,7 @@ def _write_pieces(origin: Origin, engine: Path) -> dict[str, Any]:
     elif origin.pieces is not None:
         pieces = load_pieces(origin.pieces)
     else:
-        assert origin.mesh is not None
+        assert origin.mesh
         solid = solidify(load_mesh(origin.mesh), name=origin.name)
         extent = np.ptp(solid.surface.vertices, axis=0)
         if extent.min() < THINNEST * extent.max():
@@ -180,17 +175,12 @@ def _write_pieces(origin: Origin, engine: Path) -> dict[str, Any]:
 def _source(origin: Origin, record: dict[str, Any], engine: Path) -> ShapeSource:
     pieces, urdf = engine / f"{origin.name}.obj", engine / f"{origin.name}.urdf"
     sphere = origin.primitive == "sphere"
-    if sphere:  # a ball of facets would lose a third of its speed in 3 s of rolling
-        write_urdf('<sphere radius="0.5"/>', urdf)
-    else:
-        # A path from the URDF on, so that a dataset can be moved. Not the bare name: the engine looks in the working
-        # directory first, where a mesh of that name may well lie.
-        write_urdf(f'<mesh filename="../{pieces.resolve().parent.name}/{pieces.name}"/>', urdf)
-    if origin.as_is:
-        assert origin.mesh is not None
-        vertices = load_mesh(origin.mesh).vertices
-    else:
-        vertices = np.concatenate([piece.vertices for piece in load_pieces(pieces)])
+    # A ball of facets would lose a third of its speed in 3 s of rolling. Pieces have a path from the URDF on, so that a
+    # dataset can be moved; not the bare name, which the engine would look for in the working directory first.
+    mesh = f'<mesh filename="../{pieces.resolve().parent.name}/{pieces.name}"/>'
+    write_urdf('<sphere radius="0.5"/>' if sphere else mesh, urdf)
+    loaded = [load_mesh(origin.mesh)] if origin.as_is and origin.mesh else load_pieces(pieces)
+    vertices = np.concatenate([mesh.vertices for mesh in loaded])
     com = np.array(record["com"])
     return ShapeSource(origin.name, urdf, record["volume"], vertices, pieces, origin.mesh, com, record["size"], sphere)
 
@@ -202,8 +192,7 @@ def decompose(mesh: Mesh, scratch: Path) -> list[Mesh]:
     try:
         write_text(before, wavefront([mesh]))
         command = [sys.executable, "-c", VHACD_CALL, before, after, log]
-        quiet = subprocess.DEVNULL
-        subprocess.run(command, stdout=quiet, stderr=quiet, check=True, timeout=VHACD_TIME)
+        subprocess.run(command, capture_output=True, check=True, timeout=VHACD_TIME)
         return load_pieces(after)
     except subprocess.SubprocessError as error:
         raise SdfsimError("V-HACD found no convex pieces", "give them in a NAME/ folder") from error
@@ -224,8 +213,7 @@ def _fit_one(source: ShapeSource, out: Path) -> None:
     if source.sphere:
         analytic_shape("sphere", radius=0.5, name=source.name).save(out)
         return
-    display = None
-    if source.display is not None:
-        mesh = load_mesh(source.display)
-        display = Mesh((mesh.vertices - source.com) / source.size, mesh.faces, mesh.colors)
+    display = load_mesh(source.display) if source.display else None
+    if display:
+        display = Mesh((display.vertices - source.com) / source.size, display.faces, display.colors)
     fit_pieces(load_pieces(source.pieces), name=source.name, display=display, nodes=NODES).save(out)
