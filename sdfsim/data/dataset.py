@@ -207,7 +207,7 @@ def shapes_folder(folder: Path) -> Path:
 
 def load_shapes(folder: Path, names: set[str]) -> dict[str, Shape]:
     """Shapes of a dataset, or of a split of it, by name."""
-    # Here and not above: training from cached contact frames runs where only torch and numpy are installed.
+    # Imported here: training from cached contact frames runs where only torch and numpy are installed.
     from sdfsim.shape.shape import load_shape
 
     return {name: load_shape(shapes_folder(folder) / name) for name in sorted(names)}

@@ -24,10 +24,9 @@ def rotation_error(quat: np.ndarray, truth: np.ndarray) -> float:
     return float(np.degrees((one * two.inv()).magnitude()).mean())
 
 
-def interval(values: np.ndarray, seed: int = 0, draws: int = 1000) -> list[float]:
+def interval(values: np.ndarray) -> list[float]:
     """[low, high]: 95 % bootstrap interval of the mean of `values` [K]."""
-    rng = np.random.default_rng(seed)
-    means = values[rng.integers(len(values), size=(draws, len(values)))].mean(1)
+    means = values[np.random.default_rng(0).integers(len(values), size=(1000, len(values)))].mean(1)
     return [float(v) for v in np.percentile(means, [2.5, 97.5])]
 
 
@@ -50,10 +49,9 @@ def energy_gain(motion: Trajectory) -> float | None:
     return float((course.max() - course[0]) / course[0]) if course[0] > 0 else None
 
 
-def speeds(motion: Trajectory, steps: int = REST_STEPS) -> np.ndarray:
-    """[steps, N] m/s over the last steps: displacement by time, so that a body which creeps is seen to move."""
-    steps = min(steps, len(motion.position) - 1)
-    return np.linalg.norm(np.diff(motion.position[-steps - 1 :], axis=0), axis=-1) / motion.dt
+def speeds(motion: Trajectory) -> np.ndarray:
+    """[`REST_STEPS`, N] m/s over the last steps: displacement by time, so that a body which creeps is seen to move."""
+    return np.linalg.norm(np.diff(motion.position[-REST_STEPS - 1 :], axis=0), axis=-1) / motion.dt
 
 
 def resting(recorded: Trajectory) -> np.ndarray:

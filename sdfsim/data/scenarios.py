@@ -70,7 +70,6 @@ STACKED = 0.5  # part of the bodies that go on top of the one before
 STEADY = 0.03  # least distance of the centre of mass from the rim of the face it stands on, over the largest extent
 
 # Starts in one kind of motion.
-MOTIONS = ("rolling", "sliding", "spinning", "falling", "head-on")
 SPEEDS = (0.5, 4.0)  # m/s
 SPINS = (1.0, 10.0)  # rad/s, about the vertical
 HEIGHTS = (0.1, 2.0)  # m, under a body that falls
