@@ -25,7 +25,8 @@ SPLITS = ("train", "validation", "test")
 INFO = "dataset.json"
 SOLID = "solid_"  # how the names of PyBullet's random solids begin
 FLOOR = (0.3, 0.5)  # friction and restitution of the recipes' floor, the plane z = 0
-LONGEST_STEP = 10.0  # s, between recorded frames; an engine's inner step is a tenth of that at most
+LONGEST_STEP = 10.0  # s, between recorded frames
+LONGEST_SUBSTEP = 1.0  # s, an engine's inner step
 EXACTLY = 1e-3  # part of what gravity adds in a step, by which a free flight may miss it
 _NAME = re.compile(r"(?!\.)[\w. -]+")  # of a folder beside others, never a path
 _AXES = {  # T frames, N bodies
@@ -88,8 +89,9 @@ def engine_substep(data: Path) -> float:
     home = home_of(data)
     settings = (read_info(home).get("engine_settings") or {}) if home else {}
     found = settings.get("timeStep", 0.0) if isinstance(settings, dict) else settings
-    if type(found) not in (int, float) or not 0.0 <= found <= 0.1 * LONGEST_STEP:
-        raise SdfsimError(f"{data}: {INFO}: engine_settings.timeStep: must be 0 (unknown) to 1 s (got {found!r})")
+    if type(found) not in (int, float) or not 0.0 <= found <= LONGEST_SUBSTEP:
+        where = f"{home}/{INFO}: engine_settings.timeStep"
+        raise SdfsimError(f"{where}: must be 0 (unknown) to {LONGEST_SUBSTEP:g} s (got {found!r})")
     return float(found)
 
 
