@@ -80,6 +80,22 @@ def scene_of(
     return scene, [*world, -1]
 
 
+def state_at(trajectories: list[Trajectory], frames: list[int], like: State) -> State:
+    """The state of all trajectories, each at its frame; the floor, which is last, as in `like`."""
+
+    def of(name: str, floor: torch.Tensor) -> torch.Tensor:
+        rows = np.concatenate([getattr(t, name)[k] for t, k in zip(trajectories, frames, strict=True)])
+        return torch.cat([torch.from_numpy(rows).to(floor.device), floor[-1:]])
+
+    return replace(
+        like,
+        position=of("position", like.position),
+        orientation=of("quat_xyzw", like.orientation),
+        velocity=of("velocity", like.velocity),
+        angular_velocity=of("angular_velocity", like.angular_velocity),
+    )
+
+
 def roll_out(
     model: Model,
     group: list[Trajectory],

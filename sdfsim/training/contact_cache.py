@@ -193,7 +193,7 @@ def _fingerprint(data: Path, files: list[Path], how: Solved) -> str:
 
 def _followed(files: list[Path], how: Solved) -> list[ContactFrames]:
     """The frames of each draw and step: of all trajectories of a group at that step."""
-    from sdfsim.data.batching import merged  # needs the SDFs, hence more than torch and numpy
+    from sdfsim.data.batching import merged, state_at  # needs the SDFs, hence more than torch and numpy
     from sdfsim.dynamics.bodies import Units
     from sdfsim.dynamics.run_memory import Memory
     from sdfsim.dynamics.solver import solver_step
@@ -212,28 +212,13 @@ def _followed(files: list[Path], how: Solved) -> list[ContactFrames]:
         rng = np.random.default_rng([draw, int(hashlib.sha256(files[0].name.encode()).hexdigest()[:8], 16)])
         memory, touch = Memory(), None
         for now in range(0, count - how.stride, how.stride):
-            state = replace(_recorded(group, now, start), touch=touch)
+            state = replace(state_at(group, [now] * len(group), start), touch=touch)
             state = _disturbed(bodies, state, how, rng) if draw else state
             after, acts = solver_step(bodies, state, rules, memory, note=True)
             touch = after.touch
-            parts += _of_step(bodies, state, after, acts, _recorded(group, now + how.stride, start), rules)
+            recorded = state_at(group, [now + how.stride] * len(group), start)
+            parts += _of_step(bodies, state, after, acts, recorded, rules)
     return parts
-
-
-def _recorded(group: list[Trajectory], frame: int, like: State) -> State:
-    """The state of all trajectories of a group at a frame; the floor is last."""
-
-    def of(name: str, floor: torch.Tensor) -> torch.Tensor:
-        rows = np.concatenate([getattr(t, name)[frame] for t in group])
-        return torch.cat([torch.from_numpy(rows), floor[-1:]])
-
-    return replace(
-        like,
-        position=of("position", like.position),
-        orientation=of("quat_xyzw", like.orientation),
-        velocity=of("velocity", like.velocity),
-        angular_velocity=of("angular_velocity", like.angular_velocity),
-    )
 
 
 def _disturbed(bodies: Bodies, state: State, how: Solved, rng: np.random.Generator) -> State:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sdfsim.data.batching import PLANE, merged
+from sdfsim.data.batching import PLANE, merged, state_at
 from sdfsim.data.dataset import Trajectory, check_alike, load_shapes, ranges_of, trajectory_files
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State, Units, largest_extent
@@ -90,7 +90,9 @@ class SurfaceTask:
         picked, frames = picked[team.share(count)], frames[team.share(count)]
         units = Units(1.0, 1.0, 1.0)
         bodies, state = merged(picked, frames, self.shapes, units, self.device, plane=self.plane)
-        poses = [self._poses(picked, frames, offset, yaw) for offset in (-2, -1, 0, 1)]
+        recorded = [state_at(picked, [k + offset for k in frames], state) for offset in (-2, -1, 0, 1)]
+        yaw = yaw.to(self.device).expand_as(state.orientation)
+        poses = [(pose.rotate(yaw, one.position), pose.multiply(yaw, one.orientation)) for one in recorded]
         noisy = poses if noise is None else _disturbed(poses, bodies, noise)
         state = State(
             position=noisy[2][0],
@@ -125,15 +127,6 @@ class SurfaceTask:
             np.concatenate([t.friction for t in self.trajectories]),
             np.concatenate([t.restitution for t in self.trajectories]),
         )
-
-    def _poses(self, picked: list[Trajectory], frames: list[int], offset: int, yaw: Tensor) -> tuple[Tensor, Tensor]:
-        """Positions [N, 3] and orientations [N, 4] of all bodies at frame + offset, then the floor's."""
-        each = [(t.position[f + offset], t.quat_xyzw[f + offset]) for t, f in zip(picked, frames, strict=True)]
-        each.append((np.zeros((1, 3)), np.array([[0.0, 0.0, 0.0, 1.0]])))
-        position, quat = (np.concatenate(part) for part in zip(*each, strict=True))
-        place, turn = torch.from_numpy(position), torch.from_numpy(quat)
-        yaw = yaw.expand_as(turn)
-        return pose.rotate(yaw, place).to(self.device), pose.multiply(yaw, turn).to(self.device)
 
     def _noise(self, picked: list[Trajectory], rng: np.random.Generator, team: Team) -> Tensor | None:
         """Noise [3, 2, N + 1, 3] m of each input pose, shifts and turns at the surface, of its bodies and the floor:
