@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from copy import deepcopy
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -82,9 +83,7 @@ class Run:
 
     def averaged(self) -> nn.Module:
         """The network with its averaged weights."""
-        from sdfsim.dynamics.model import new_network
-
-        network = new_network(self.plan.kind, self.plan.config).to(self.device)
+        network = deepcopy(self.network)
         network.load_state_dict(self.average)
         return network.eval().requires_grad_(False)
 
