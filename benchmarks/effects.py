@@ -21,15 +21,13 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.results import write_section
+from benchmarks.results import ROOT, script, write_section
 from sdfsim.dynamics.bodies import largest_extent
 from sdfsim.dynamics.simulator import Simulator
-from sdfsim.errors import run_main
 from sdfsim.evaluation.harness import markdown, number, one_thread
 from sdfsim.scene.scene import Scene
 from sdfsim.scene.scene_file import load_scene
 
-SAMPLES = Path(__file__).resolve().parents[1] / "samples"
 SCENES = ("pile", "tower", "spheres_in_bowl")
 STEPS, REPEATS = 300, 5
 
@@ -49,7 +47,7 @@ def cost(scene: Scene) -> tuple[float, np.ndarray]:
 def main() -> None:
     rows = [("scene", "off", "ms a step", "of all on", "bodies end")]
     for name in SCENES:
-        scene = load_scene(SAMPLES / f"{name}.yaml")
+        scene = load_scene(ROOT / "samples" / f"{name}.yaml")
         size = min(largest_extent(scene.shapes[b.shape]) * b.scale for b in scene.bodies if b.motion == "dynamic")
         with one_thread():
             usual, there = cost(scene)
@@ -59,9 +57,8 @@ def main() -> None:
                 away = float(np.linalg.norm(end - there, axis=1).max()) / size
                 told = "the same" if away < 0.01 else f"up to {number(away, 2)} sizes away"
                 rows.append((name, effect, number(ms), number(ms / usual, 2), told))
-    print(markdown(rows))
     write_section("effects", "python benchmarks/effects.py", markdown(rows))
 
 
 if __name__ == "__main__":
-    run_main(main)
+    script(__doc__, main)
