@@ -139,8 +139,9 @@ def _tried(case: Case, model: Model | str, device: str, out: Path) -> dict[str, 
         result["broke"] += [run.broke for run in runs if run.broke]
         missed = any(f.limit is not None and measured[f.name] > f.limit for f in case.figures)
         shown = next((run for run in runs if run.broke), runs[0])
-        if shown.rollout and not result["recording"] and (result["broke"] or missed):
-            path = Path("recordings") / str(shown.rollout.meta["model"]) / f"{case.name}.rrd"
+        if isinstance(model, Model) and not result["recording"] and (result["broke"] or missed):
+            assert shown.rollout is not None
+            path = Path("recordings") / model.name / f"{case.name}.rrd"
             (out / path).parent.mkdir(parents=True, exist_ok=True)
             save_rollout(shown.scene, shown.rollout.frames(0, int((shown.rollout.time <= WATCHED).sum())), out / path)
             result["recording"] = str(path)
