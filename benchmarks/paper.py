@@ -39,19 +39,7 @@ from sdfsim.dynamics.model import SOLVER, Model, load_model, new_network
 from sdfsim.dynamics.run_memory import Memory
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.evaluation.evaluate import errors, evaluate, load_recorded
-from sdfsim.evaluation.harness import (
-    Job,
-    Panel,
-    Results,
-    cells,
-    draw,
-    line,
-    markdown,
-    measure,
-    number,
-    one_thread,
-    peak_memory,
-)
+from sdfsim.evaluation.harness import Job, Panel, cells, draw, line, markdown, measure, number, one_thread, peak_memory
 from sdfsim.files import write_text
 from sdfsim.scene.scene_file import load_scene
 from sdfsim.shape.fit import PLANS, fit_pieces
@@ -219,7 +207,7 @@ MINUTES = [5.0, 15.0, 30.0, 60.0]
 
 def accuracy(data: Path, *, out: Path, minutes: list[float] = MINUTES) -> None:
     """Train everything a little, then a little more, and write accuracy.md and accuracy.png."""
-    results: Results = {}
+    results: dict[tuple[str, str], dict[str, Any]] = {}
     minutes = sorted(minutes)
     for spent in minutes:
         for name in COMPARED:
@@ -288,7 +276,7 @@ def sdf(data: Path, *, out: Path) -> None:
     written(out / "sdf.md", markdown(rows))
 
 
-def accuracy_table(results: Results, minutes: list[float]) -> str:
+def accuracy_table(results: dict[tuple[str, str], dict[str, Any]], minutes: list[float]) -> str:
     """Errors by network and minutes; a table for each form of free flight."""
     parts = []
     for way in ("exact", "learned"):

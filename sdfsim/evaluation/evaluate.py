@@ -12,15 +12,7 @@ import numpy as np
 from sdfsim.console import columns
 from sdfsim.data import metrics
 from sdfsim.data.batching import scene_of
-from sdfsim.data.dataset import (
-    Trajectory,
-    engine_substep,
-    floor_of,
-    home_of,
-    load_shapes,
-    read_info,
-    trajectory_files,
-)
+from sdfsim.data.dataset import Trajectory, engine_substep, floor_of, home_of, load_shapes, read_info, trajectory_files
 from sdfsim.data.metrics import FRAMES, HORIZONS
 from sdfsim.data.pybullet_sim import engine_settings, import_pybullet, substeps_of
 from sdfsim.data.replay import batches, every, first_frames, model_units, roll_out
