@@ -190,8 +190,41 @@ def mujoco(start: Start, steps: int, substeps: int = SUBSTEPS, *, pieces: bool =
         SdfsimError: MuJoCo is not installed, or a shape's engine file cannot be read.
     """
     engine = _engine("mujoco", "MuJoCo", "bench")
-    t = start.motion
-    model = _mujoco_model(engine, start, t.dt / substeps, pieces)
+    t, step, spec = start.motion, start.motion.dt / substeps, engine.MjSpec()
+    spec.option.timestep, spec.option.gravity = step, t.gravity
+    spec.memory = 2**31
+    if start.floor:
+        ground = spec.worldbody.add_geom(type=engine.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1.0])
+        ground.contype, ground.conaffinity, ground.friction[0], ground.solmix = 0, 1, 0.0, 1e-6
+    forms = {name: _forms(engine, urdf, None if pieces else start.meshes[name]) for name, urdf in start.urdfs.items()}
+    for i, name in enumerate(t.shape):
+        body = spec.worldbody.add_body(name=f"b{i}")
+        if t.static[i]:
+            body.pos, body.quat = t.position[0, i], np.roll(t.quat_xyzw[0, i], 1)
+        else:
+            body.add_freejoint()
+            body.explicitinertial = True
+            body.mass, body.inertia, body.ipos = float(t.mass[i]), t.inertia[i], np.zeros(3)
+        for k, (kind, form) in enumerate(forms[str(name)]):
+            shape: dict[str, Any] = {"type": kind}
+            if not isinstance(form, dict):
+                shape["size"] = t.scale[i] * form
+            else:
+                shape["meshname"] = f"{name}_{t.scale[i]:.9g}_{k}"
+                if spec.mesh(shape["meshname"]) is None:
+                    scaled = {"uservert": (form["uservert"] * t.scale[i]).ravel()}
+                    spec.add_mesh(name=shape["meshname"], **form | scaled)
+            # One geom that meets the floor, and one that meets bodies.
+            for kinds, other in (((1, 0), start.floor), ((2, 2), (t.friction[i], t.restitution[i]))):
+                if other is None:
+                    continue
+                geom = body.add_geom(**shape)
+                geom.contype, geom.conaffinity = kinds
+                geom.condim, geom.friction[0] = 3, t.friction[i] * other[0]
+                bounce = float(np.clip(t.restitution[i] * other[1], 1e-3, 1.0))
+                damping = -np.log(bounce) / np.hypot(np.pi, np.log(bounce))
+                geom.solref = [SOFTEST * step, max(damping, 1e-3)]
+    model = spec.compile()
     data: Any = engine.MjData(model)
     moving = np.flatnonzero(~t.static)
     place, speed = data.qpos.reshape(-1, 7), data.qvel.reshape(-1, 6)
@@ -199,15 +232,11 @@ def mujoco(start: Start, steps: int, substeps: int = SUBSTEPS, *, pieces: bool =
     turned = Rotation.from_quat(t.quat_xyzw[0, moving])
     speed[:, :3], speed[:, 3:] = t.velocity[0, moving], turned.inv().apply(t.angular_velocity[0, moving])
 
-    def advance() -> None:
-        for _ in range(substeps):
-            engine.mj_step(model, data)
-
     def state() -> tuple[np.ndarray, ...]:
         quat = np.roll(place[:, 3:], -1, axis=-1)
         return place[:, :3].copy(), quat, speed[:, :3].copy(), Rotation.from_quat(quat).apply(speed[:, 3:])
 
-    return _motion(t, steps, advance, state)
+    return _motion(t, steps, lambda: engine.mj_step(model, data, substeps), state)
 
 
 def _engine(module: str, title: str, extra: str) -> Any:
@@ -243,43 +272,6 @@ def _motion(
     for name, found in zip(FRAMES, zip(*frames, strict=True), strict=True):
         motion[name][:, ~start.static] = found
     return replace(start, **motion), timing
-
-
-def _mujoco_model(engine: Any, start: Start, step: float, pieces: bool) -> Any:
-    t, spec = start.motion, engine.MjSpec()
-    spec.option.timestep, spec.option.gravity = step, t.gravity
-    spec.memory = 2**31
-    if start.floor:
-        ground = spec.worldbody.add_geom(type=engine.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1.0])
-        ground.contype, ground.conaffinity, ground.friction[0], ground.solmix = 0, 1, 0.0, 1e-6
-    forms = {name: _forms(engine, urdf, None if pieces else start.meshes[name]) for name, urdf in start.urdfs.items()}
-    for i, name in enumerate(t.shape):
-        body = spec.worldbody.add_body(name=f"b{i}")
-        if t.static[i]:
-            body.pos, body.quat = t.position[0, i], np.roll(t.quat_xyzw[0, i], 1)
-        else:
-            body.add_freejoint()
-            body.explicitinertial = True
-            body.mass, body.inertia, body.ipos = float(t.mass[i]), t.inertia[i], np.zeros(3)
-        for k, (kind, form) in enumerate(forms[str(name)]):
-            shape: dict[str, Any] = {"type": kind}
-            if not isinstance(form, dict):
-                shape["size"] = t.scale[i] * form
-            else:
-                shape["meshname"] = f"{name}_{t.scale[i]:.9g}_{k}"
-                if spec.mesh(shape["meshname"]) is None:
-                    scaled = {"uservert": (form["uservert"] * t.scale[i]).ravel()}
-                    spec.add_mesh(name=shape["meshname"], **form | scaled)
-            for other in (start.floor, (t.friction[i], t.restitution[i])):
-                if other is None:
-                    continue
-                geom = body.add_geom(**shape)
-                geom.contype, geom.conaffinity = (1, 0) if other is start.floor else (2, 2)
-                geom.condim, geom.friction[0] = 3, t.friction[i] * other[0]
-                bounce = float(np.clip(t.restitution[i] * other[1], 1e-3, 1.0))
-                damping = -np.log(bounce) / np.hypot(np.pi, np.log(bounce))
-                geom.solref = [SOFTEST * step, max(damping, 1e-3)]
-    return spec.compile()
 
 
 def _forms(engine: Any, urdf: Path, mesh: Mesh | None) -> list[tuple[Any, np.ndarray | dict[str, Any]]]:
@@ -334,18 +326,15 @@ def drake(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajector
             kind, sizes = form_of(start.urdfs[name])
             place = lib.RigidTransform(lib.Quaternion(np.roll(t.quat_xyzw[0, i], 1)), t.position[0, i])
             scale, moves = float(t.scale[i]), not t.static[i]
-            if kind == "sphere":
-                form: Any = lib.Sphere(scale * sizes[0])
-            elif kind == "box":
-                form = lib.Box(*(scale * sizes))
-            else:
-                file = Path(scratch) / (f"{name}.vtk" if moves else f"{name}.obj")
+            if kind == "mesh":
+                file, mesh = Path(scratch) / (f"{name}.vtk" if moves else f"{name}.obj"), start.meshes[name]
                 if not file.exists():
-                    mesh = start.meshes[name]
                     write_text(file, _tetrahedra(mesh, start.urdfs[name]) if moves else wavefront([mesh]))
-                form = lib.Mesh(str(file), scale)
-            size = scale * float(sizes.min() if len(sizes) else np.ptp(start.meshes[name].vertices, axis=0).min())
-            properties = surface(float(own[i]), moves, size)
+                form, smallest = lib.Mesh(str(file), scale), np.ptp(mesh.vertices, axis=0).min()
+            else:
+                form = lib.Sphere(scale * sizes[0]) if kind == "sphere" else lib.Box(*(scale * sizes))
+                smallest = sizes.min()
+            properties = surface(float(own[i]), moves, scale * float(smallest))
             if not moves:
                 plant.RegisterCollisionGeometry(plant.world_body(), place, form, f"g{i}", properties)
                 continue
@@ -361,12 +350,6 @@ def drake(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajector
         speed = lib.SpatialVelocity(t.angular_velocity[0, i], t.velocity[0, i])
         plant.SetFreeBodySpatialVelocity(context=context, body=body, V_JpJc=speed)
     simulator.Initialize()
-    made = 0
-
-    def advance() -> None:
-        nonlocal made
-        made += 1
-        simulator.AdvanceTo(made * t.dt)
 
     def state() -> tuple[np.ndarray, ...]:
         places = [plant.EvalBodyPoseInWorld(context, body) for _, body, _ in bodies]
@@ -375,7 +358,7 @@ def drake(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajector
         velocities = (np.array([getattr(v, of)() for v in speeds]) for of in ("translational", "rotational"))
         return np.array([place.translation() for place in places]), quat, *velocities
 
-    return _motion(t, steps, advance, state)
+    return _motion(t, steps, lambda: simulator.AdvanceTo(round(context.get_time() / t.dt + 1) * t.dt), state)
 
 
 def _tetrahedra(mesh: Mesh, beside: Path) -> str:
