@@ -127,15 +127,6 @@ UNSIGNED = 64  # samples along each side
 COMPARED = NAMES | {"paper-unsigned": "SDF-Sim, unsigned distances"}
 
 
-def trained(name: str, data: Path, place: Path, minutes: float) -> Path:
-    """The model of a network after so many minutes of one core."""
-    torch.set_num_threads(1)
-    plan = plan_of(name)
-    resume = (place / "checkpoint.npz").exists()
-    report = train(data, place, preset=plan, resume=resume, budget=60 * minutes, on_progress=told)
-    return Path(report["model"])
-
-
 def plan_of(name: str) -> Preset:
     """How a network is trained for the comparison: at equal sizes, with the schedule of the published ones."""
     return replace(PRESETS[name.removesuffix("-unsigned")], config=TRAINED, batch=BATCH, nodes=NODES)
@@ -215,7 +206,11 @@ def accuracy(data: Path, *, out: Path, minutes: list[float] = MINUTES) -> None:
             file = out / "models" / f"{name}-{spent:g}.safetensors"
             if not file.exists():
                 file.parent.mkdir(parents=True, exist_ok=True)
-                trained(name, seen_by, out / "runs" / name, spent).rename(file)
+                torch.set_num_threads(1)
+                place, budget = out / "runs" / name, 60 * spent
+                resume = (place / "checkpoint.npz").exists()
+                train(seen_by, place, preset=plan_of(name), resume=resume, budget=budget, on_progress=told)
+                (place / "model.safetensors").rename(file)
             jobs = []
             for split in ("validation", "test") if spent == minutes[-1] else ("validation",):
                 for way in ("exact", "learned"):

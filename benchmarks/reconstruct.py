@@ -161,25 +161,21 @@ def surface_errors(folder: Path, photos: Path, move: Similarity) -> dict[str, An
     missing = distances(_scene(mesh), np.concatenate(seen))
     objects = {entry["name"]: read(f"objects/{entry['name']}.ply") for entry in read_parts(folder / "mesh")["objects"]}
     vases = {name: body for name, body in objects.items() if np.abs(body.get_center()[:2] - VASE).max() < 0.1}
+    standing = {name: np.asarray(body.vertices) for name, body in vases.items()}
+    standing = {name: at[at[:, 2] > at[:, 2].min() + 0.015] for name, at in standing.items()}
     corners = np.asarray(truth.vertices)[np.asarray(truth.triangles)]
     truth.remove_triangles_by_mask(corners[:, :, 2].max(1) < TABLE + 1e-3)
     return {
         "surface": summary(errors),
         "object": summary(errors[near]),
         "missing": summary(missing),
-        "body": {name: summary(distances(true_scene, _above(body, 0.015))) for name, body in vases.items()},
+        "body": {name: summary(distances(true_scene, points)) for name, points in standing.items()},
         "complete_percent": 100 * float((missing < 1.0).mean()),
         "scale_error_percent": 100 * abs(place.scale * to_unit.scale / move.scale - 1),
         "up_error_degrees": float(np.degrees(np.arccos(min(1.0, float((rotation @ place.rotation[2])[2]))))),
         "bodies": list(objects),
         "vase": {name: vase_size(body) for name, body in vases.items()} | {"truth": vase_size(truth)},
     }
-
-
-def _above(mesh: Any, height: float) -> np.ndarray:
-    """The vertices [V, 3] of an open3d mesh that lie more than `height` above its lowest."""
-    points = np.asarray(mesh.vertices)
-    return points[points[:, 2] > points[:, 2].min() + height]
 
 
 def vase_size(mesh: Any) -> dict[str, float]:

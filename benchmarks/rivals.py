@@ -28,15 +28,15 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.results import script, told, write_section
 from samples.large import sample_shape, write_scene
 from sdfsim.data.batching import scene_of
-from sdfsim.data.dataset import FLOOR, Trajectory, load_shapes, trajectory_files
+from sdfsim.data.dataset import Trajectory
 from sdfsim.dynamics.bodies import largest_extent
 from sdfsim.dynamics.model import load_model
-from sdfsim.dynamics.rollout import Rollout
-from sdfsim.dynamics.simulator import Simulator, join
+from sdfsim.dynamics.simulator import Simulator
 from sdfsim.dynamics.units import scene_units
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation import engines
-from sdfsim.evaluation.engines import Engine, in_metres, rollout_motion, start_of_scene, timed
+from sdfsim.evaluation.engines import Engine, in_metres, ours, rollout_motion, start_of_scene
+from sdfsim.evaluation.evaluate import load_recorded
 from sdfsim.evaluation.hard_cases import ball, body, box, on_floor
 from sdfsim.evaluation.harness import Job, Results, markdown, measure, number, peak_memory
 from sdfsim.evaluation.penetration import depths
@@ -161,12 +161,6 @@ LARGE = ("512 spheres in a bowl", "heaps")
 ALL = ["MOVi-B", *CASES]
 
 
-def alike(scene: Scene) -> Scene:
-    """The scene with one friction, no restitution and no sleep."""
-    bodies = tuple(replace(b, friction=FRICTION, restitution=0.0) for b in scene.bodies)
-    return replace(scene, bodies=bodies, effects=Effects(sleep="off"))
-
-
 def in_pieces(scene: Scene, folder: Path) -> Scene:
     """The scene with convex pieces for every shape but spheres and boxes, kept in a folder."""
     shapes = []
@@ -178,13 +172,6 @@ def in_pieces(scene: Scene, folder: Path) -> Scene:
             shape = replace(shape, pieces=tuple(piece.vertices for piece in load_pieces(file)))
         shapes.append(shape)
     return replace(scene, shapes=tuple(shapes))
-
-
-def movi_b(data: Path) -> list[Scene]:
-    """Recorded starts, as scenes of their own."""
-    recorded = [Trajectory.load(file) for file in trajectory_files(data, "test")[:MOVI_B]]
-    shapes = load_shapes(data, {str(n) for t in recorded for n in t.shape})
-    return [scene_of([t], [0], shapes, FLOOR)[0] for t in recorded]
 
 
 # --- measuring ---
@@ -204,9 +191,8 @@ def moved(name: str, scene: Scene, steps: int, inner: int, folder: Path) -> tupl
     next(simulator.frames(1))
     prepared = time.perf_counter() - began
     simulator.reset()
-    frames: list[Rollout] = []
-    timing = timed(lambda count: frames.extend(simulator.frames(count)), steps)
-    return rollout_motion(scene, join(frames)), timing.cpu_ms / (0.02 * units.time), prepared
+    rollout, timing = ours(simulator, steps)
+    return rollout_motion(scene, rollout), timing.cpu_ms / (0.02 * units.time), prepared
 
 
 def measured(name: str, case: str, data: Path, folder: Path) -> dict[str, Any]:
@@ -219,7 +205,14 @@ def measured(name: str, case: str, data: Path, folder: Path) -> dict[str, Any]:
     """
     torch.set_num_threads(1)
     (folder / "pieces").mkdir(parents=True, exist_ok=True)
-    scenes = [alike(s) for s in (movi_b(data) if case == "MOVi-B" else [CASES[case](folder)])]
+    if case == "MOVi-B":
+        recorded, shapes = load_recorded(data, "test", most=MOVI_B)
+        scenes = [scene_of([t], [0], shapes)[0] for t in recorded]
+    else:
+        scenes = [CASES[case](folder)]
+    for k, scene in enumerate(scenes):
+        bodies = tuple(replace(b, friction=FRICTION, restitution=0.0) for b in scene.bodies)
+        scenes[k] = replace(scene, bodies=bodies, effects=Effects(sleep="off"))
     steps, inners = (HEAP_STEPS, (USUAL,)) if case in LARGE else (STEPS, INNER)
     size = [min(largest_extent(s.shapes[b.shape]) * b.scale for b in s.bodies if b.motion == "dynamic") for s in scenes]
     found: dict[int, dict[str, float]] = {}

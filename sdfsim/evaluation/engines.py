@@ -25,6 +25,7 @@ from sdfsim.data.pybullet_sim import DT, SUBSTEPS, Teacher, TeacherBody, substep
 from sdfsim.data.shape_assets import decompose
 from sdfsim.dynamics.bodies import Units, from_scene
 from sdfsim.dynamics.rollout import Rollout
+from sdfsim.dynamics.simulator import Simulator, join
 from sdfsim.errors import SdfsimError
 from sdfsim.files import replacing, write_text
 from sdfsim.scene.scene import Scene
@@ -77,6 +78,13 @@ def timed(advance: Callable[[int], object], steps: int) -> Timing:
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     count = max(1, steps - 1)
     return Timing(1e3 * first, 1e3 * wall / count, 1e3 * cpu / count)
+
+
+def ours(simulator: Simulator, steps: int) -> tuple[Rollout, Timing]:
+    """Our motion, and its time."""
+    frames: list[Rollout] = []
+    timing = timed(lambda count: frames.extend(simulator.frames(count)), steps)
+    return join(frames), timing
 
 
 def start_of_scene(scene: Scene, folder: Path, units: Units = SI) -> Start:

@@ -22,7 +22,7 @@ from sdfsim.dynamics.step import FreeFlight
 from sdfsim.dynamics.training_ranges import outside_training
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.engines import Start, bullet, dataset_urdf
-from sdfsim.evaluation.penetration import EVERY, Solid, exact_solids, penetration
+from sdfsim.evaluation.penetration import EVERY, exact_solids, penetration
 from sdfsim.parallel import Progress, parallel, silent
 from sdfsim.shape.shape import Shape
 from sdfsim.training.contact_cache import inner_steps
@@ -121,8 +121,17 @@ def evaluate(
     }
     if not errors_only:
         on_progress(0.9, "penetration, energy and rest")
-        solids = exact_solids(data, shapes)
-        report |= _quality(contenders["model"], recorded, solids)
+        solids, rest = exact_solids(data, shapes), [metrics.resting(t) for t in recorded]
+        sides = {"model": contenders["model"], "teacher": recorded}
+        geometry = {name: solid.kind for name, solid in solids.items()}
+        depth = {who: penetration(motions, solids) for who, motions in sides.items()}
+        report["penetration"] = depth | {"geometry": geometry, "every": EVERY}
+        report["energy_gain"] = {who: energy_gain(motions) for who, motions in sides.items()}
+        report["resting_speed"] = {"bodies": int(sum(r.sum() for r in rest))}
+        for who, motions in sides.items():  # the median in the last steps of the bodies that rest in the recording
+            last = [metrics.speeds(motion)[:, r].ravel() for motion, r in zip(motions, rest, strict=True)]
+            speeds = np.concatenate(last)
+            report["resting_speed"][who] = float(np.median(speeds)) if len(speeds) else None
     on_progress(1.0, "done")
     return report
 
@@ -252,29 +261,10 @@ def _distance(motion: Trajectory, truth: Trajectory) -> np.ndarray:
     return np.linalg.norm(motion.position[:, moving] - truth.position[:, moving], axis=-1)
 
 
-def _quality(predicted: Motions, recorded: Motions, solids: dict[str, Solid]) -> dict:
-    """Penetration, energy gain and resting speed of the model and of the teacher."""
-    rest = [metrics.resting(t) for t in recorded]
-    sides = {"model": predicted, "teacher": recorded}
-    return {
-        "penetration": {who: penetration(motions, solids) for who, motions in sides.items()}
-        | {"geometry": {name: solid.kind for name, solid in solids.items()}, "every": EVERY},
-        "energy_gain": {who: energy_gain(motions) for who, motions in sides.items()},
-        "resting_speed": {who: _resting(motions, rest) for who, motions in sides.items()}
-        | {"bodies": int(sum(r.sum() for r in rest))},
-    }
-
-
 def energy_gain(motions: Motions) -> dict[str, float | None]:
     """Mean and worst, over the trajectories, of the largest gain as a fraction of the energy at the start."""
     gains = [gain for motion in motions if (gain := metrics.energy_gain(motion)) is not None]
     return {"mean": float(np.mean(gains)) if gains else None, "worst": max(gains) if gains else None}
-
-
-def _resting(motions: Motions, rest: list[np.ndarray]) -> float | None:
-    """Median speed m/s in the last steps of the bodies [N] that rest in the recording; None without any."""
-    found = [metrics.speeds(motion)[:, r].ravel() for motion, r in zip(motions, rest, strict=True)]
-    return float(np.median(np.concatenate(found))) if any(len(f) for f in found) else None
 
 
 # --- tables ---

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -42,7 +43,17 @@ def exact_solids(data: Path, shapes: dict[str, Shape]) -> dict[str, Solid]:
     A shape that was fitted to an engine's convex pieces is those pieces, where the dataset's engine file leads to
     them: the mesh beside it is what is shown. Other learned or sampled distances give way to those of the mesh.
     """
-    return {name: _solid(data, name, shape) for name, shape in shapes.items()}
+    solids = {}
+    for name, shape in shapes.items():
+        # A dataset's body frames sit at the centre of mass, and so do its shapes' origins.
+        solids[name] = _exact(shape)
+        if shape.source.get("kind") == "pieces" and isinstance(shape.sdf, MlpSdf | GridSdf):
+            solids[name] = replace(solids[name], kind="shown mesh")
+            with suppress(SdfsimError):
+                oracle = PiecesDistance(load_pieces(dataset_urdf(data, name).with_suffix(".obj")))
+                distance = lambda points, oracle=oracle: oracle(points).distance  # noqa: E731
+                solids[name] = Solid(shape.nodes, oracle.bounds, distance, "pieces")
+    return solids
 
 
 def deepest(motion: Trajectory, solids: dict[str, Solid], every: int = EVERY) -> np.ndarray:
@@ -111,17 +122,6 @@ def _near(position: np.ndarray, turn: np.ndarray, bounds: np.ndarray, moving: np
     gap = np.abs(centre[:, :, None] - centre[:, None]) - half[:, :, None] - half[:, None]
     pairs = (moving[:, None] | moving[None]) & ~np.eye(len(bounds), dtype=bool)
     return (gap <= 0).all(-1) & pairs
-
-
-def _solid(data: Path, name: str, shape: Shape) -> Solid:
-    # A dataset's body frames sit at the centre of mass, and so do its shapes' origins.
-    if shape.source.get("kind") != "pieces" or not isinstance(shape.sdf, MlpSdf | GridSdf):
-        return _exact(shape)
-    try:
-        oracle = PiecesDistance(load_pieces(dataset_urdf(data, name).with_suffix(".obj")))
-    except SdfsimError:
-        return replace(_exact(shape), kind="shown mesh")
-    return Solid(shape.nodes, oracle.bounds, lambda points: oracle(points).distance, "pieces")
 
 
 def _exact(shape: Shape, com: np.ndarray | float = 0.0) -> Solid:

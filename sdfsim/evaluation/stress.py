@@ -91,29 +91,30 @@ def stress(
         import_pybullet()
         who += [TEACHER] if TEACHER in engines else []
     who += [name for name in engines if name != TEACHER]
-    jobs: list[tuple[float, Job]] = []
-    cut = {}
-    for case in found:
-        repeats = [case.scenes(repeat) for repeat in range(case.repeats)]
-        # About how long a model takes, in no unit; a step has its price without bodies too.
-        weight = case.seconds * sum(10 + len(scene.bodies) for scenes in repeats for scene in scenes)
-        content = [VERSION, case.seconds, case.cuda, [figure.name for figure in case.figures], repeats]
+    scenes = {case.name: [case.scenes(repeat) for repeat in range(case.repeats)] for case in found}
+
+    def work(case: Case) -> float:
+        """About how long a model takes, in no unit; a step has its price without bodies too."""
+        return case.seconds * sum(10 + len(scene.bodies) for repeat in scenes[case.name] for scene in repeat)
+
+    jobs, cut = [], {}
+    for case in sorted(found, key=work, reverse=True):
+        figures = [figure.name for figure in case.figures]
+        content = [VERSION, case.seconds, case.cuda, figures, scenes[case.name]]
         for model in tested:
             # Another device is for networks: the solver has none.
             if not case.cuda or (model.kind != SOLVER and torch.cuda.is_available()):
-                job = Job(case.name, model.name, [content, model, device], _tried, (case, model, device, out))
-                jobs.append((weight, job))
+                arguments = (case, model, device, out)
+                jobs.append(Job(case.name, model.name, [content, model, device], _tried, arguments))
         for name in who[len(tested) :] if case.engines else []:
             settings = [TEACHER_VERSION, engine_settings(DT, SUBSTEPS)]
-            job = Job(case.name, name, [content, settings], _tried, (case, name, device, out))
-            jobs.append((0.05 * weight, job))
-            cut |= {id(shape): shape for scene in repeats[0] for shape in scene.shapes}
-    jobs.sort(key=lambda one: -one[0])
+            jobs.append(Job(case.name, name, [content, settings], _tried, (case, name, device, out)))
+            cut |= {id(shape): shape for scene in scenes[case.name][0] for shape in scene.shapes}
     with locked(out):
         for shape in cut.values():  # before the work is split up, so that no two processes cut one mesh into pieces
             if not isinstance(shape.sdf, PlaneSdf):
                 shape_urdf(shape, out / "engine")
-        results = measure([job for _, job in jobs], out / "results", where="cores", on_progress=on_progress)
+        results = measure(jobs, out / "results", where="cores", on_progress=on_progress)
     if failed := [f"{case} with {one}: {r['failed']}" for (case, one), r in results.items() if "failed" in r]:
         raise SdfsimError(failed[0])
     return Study(found, who, results, quick)
@@ -122,9 +123,9 @@ def stress(
 def _tried(case: Case, model: Model | str, device: str, out: Path) -> dict[str, Any]:
     """All repetitions of a case with one model, or with an engine by name: see `Study.results`."""
     figures: dict[str, list[float]] = {figure.name: [] for figure in case.figures}
-    result: dict[str, Any] = {"figures": figures, "broke": [], "outside": [], "recording": None}
+    broke, outside, recording = [], [], None
     if isinstance(model, Model) and (about := GROUPS[case.group].about) in constant_in_training(model):
-        result["outside"].append(f"{about} was constant in training, so it was not learned")
+        outside.append(f"{about} was constant in training, so it was not learned")
     for repeat in range(case.repeats):
         scenes = case.scenes(repeat)
         if isinstance(model, str):
@@ -132,21 +133,20 @@ def _tried(case: Case, model: Model | str, device: str, out: Path) -> dict[str, 
         else:
             places = [device, "cuda"] if case.cuda else [device]
             runs = [simulated(scene, model, place, case.seconds) for place in places for scene in scenes]
-            result["outside"] += [line for run in runs if run.rollout for line in run.rollout.meta["outside_training"]]
         measured = case.measure(runs)
         for name, values in figures.items():
             values.append(float(measured[name]))
-        result["broke"] += [run.broke for run in runs if run.broke]
+        broke += [run.broke for run in runs if run.broke]
+        outside += [line for run in runs if run.rollout for line in run.rollout.meta["outside_training"]]
         missed = any(f.limit is not None and measured[f.name] > f.limit for f in case.figures)
         shown = next((run for run in runs if run.broke), runs[0])
-        if isinstance(model, Model) and not result["recording"] and (result["broke"] or missed):
+        if isinstance(model, Model) and not recording and (broke or missed):
             assert shown.rollout is not None
-            path = Path("recordings") / model.name / f"{case.name}.rrd"
-            (out / path).parent.mkdir(parents=True, exist_ok=True)
-            save_rollout(shown.scene, shown.rollout.frames(0, int((shown.rollout.time <= WATCHED).sum())), out / path)
-            result["recording"] = str(path)
-    result["outside"] = list(dict.fromkeys(result["outside"]))
-    return result
+            recording = f"recordings/{model.name}/{case.name}.rrd"
+            (out / recording).parent.mkdir(parents=True, exist_ok=True)
+            watched = shown.rollout.frames(0, int((shown.rollout.time <= WATCHED).sum()))
+            save_rollout(shown.scene, watched, out / recording)
+    return {"figures": figures, "broke": broke, "outside": list(dict.fromkeys(outside)), "recording": recording}
 
 
 def simulated(scene: Scene, model: Model, device: str, seconds: float) -> Run:

@@ -93,13 +93,6 @@ class Cases:
         """Which trajectory is timed: the one in the middle by its number of bodies."""
         return int(np.argsort([len(t.mass) for t in self.recorded], kind="stable")[len(self.recorded) // 2])
 
-    def engine_start(self, motion: Trajectory) -> Start:
-        """One of `recorded` for an engine. Raises SdfsimError where an engine's file is not at hand."""
-        if lacking := sorted({str(n) for n in motion.shape} - set(self.urdfs)):
-            raise SdfsimError(f"no engine file of {', '.join(lacking)} at hand")
-        meshes = {name: centred_mesh(shape) for name, shape in self.shapes.items()}
-        return Start(motion, self.urdfs, self.floor, self.own_inertia, meshes)
-
 
 def load_cases(data: Path, *, quick: bool) -> Cases:
     """The trajectories of a dataset's test split, at most `MOST`; a quick study takes fewer and shorter ones. Raises
@@ -219,23 +212,19 @@ def arranged(setting: Setting, cases: Cases) -> dict[str, Shape]:
     kind, _, count = setting.nodes.partition(" ")
     for name, shape in cases.shapes.items():
         if setting.sdf != "own" and not isinstance(shape.sdf, ClosedForm):
-            shape = _measured_by(shape, setting.sdf)
+            way, _, cells = setting.sdf.partition(" ")
+            if way == "grid":
+                pieces = own_pieces(shape)
+                exact = PiecesDistance(pieces) if pieces else MeshDistance(shape.mesh)
+                shape = replace(shape, pieces=(), sdf=sample_grid(exact, exact.bounds, int(cells)))
+            else:
+                shape = with_sdf(replace(shape, pieces=()), way)  # type: ignore[arg-type]
         if kind == "thin":
             shape = replace(shape, nodes=hull_nodes(shape.nodes, int(count)))
         elif kind == "grid":
             shape = with_nodes(shape, int(count))
         shapes[name] = shape
     return shapes
-
-
-def _measured_by(shape: Shape, sdf: str) -> Shape:
-    """The shape with distances of one kind alone (see `Setting.sdf`)."""
-    kind, _, count = sdf.partition(" ")
-    if kind != "grid":
-        return with_sdf(replace(shape, pieces=()), kind)  # type: ignore[arg-type]
-    pieces = own_pieces(shape)
-    exact = PiecesDistance(pieces) if pieces else MeshDistance(shape.mesh)
-    return replace(shape, pieces=(), sdf=sample_grid(exact, exact.bounds, int(count)))
 
 
 # --- measuring ---
@@ -275,8 +264,14 @@ def measure_engine(name: str, substeps: int, off: float, cases: Cases) -> dict[s
     if abs(cases.recorded[0].dt - DT) > 1e-9:
         raise SdfsimError(f"recorded with another step than {DT} s")
     run = RUNS[name]
+    if lacking := sorted({str(n) for t in cases.recorded for n in t.shape} - set(cases.urdfs)):
+        raise SdfsimError(f"no engine file of {', '.join(lacking)} at hand")
+    meshes = {name: centred_mesh(shape) for name, shape in cases.shapes.items()}
     recorded = cases.recorded if name == "PyBullet" else cases.starts
-    starts = [cases.engine_start(perturbed(t, off, [0, k])) for k, t in enumerate(recorded)]
+    starts = [
+        Start(perturbed(t, off, [0, k]), cases.urdfs, cases.floor, cases.own_inertia, meshes)
+        for k, t in enumerate(recorded)
+    ]
     with peak_memory() as memory:
         motions = [run(start, cases.steps, substeps)[0] for start in starts]
     repeats = [run(starts[cases.timed], min(TIMED, cases.steps), substeps)[1] for _ in range(REPEATS)]
@@ -354,18 +349,18 @@ def tradeoff(
         else:
             scene = load_scene(source, lambda f, m: on_progress("shapes", f, m)) if source else tossed((1,))
             cases = cases_of_scene(scene, names[0], out / "engine", quick=quick)
-        kinds, families, jobs = {}, {}, []
+        kinds, families, jobs = {FLOOR_LABEL: "floor"}, {}, []
         content = [VERSION, machine(), replace(cases, urdfs={}, solids={})]
         for setting in settings(names, quick=quick):
             kinds[setting.label] = "ours" if setting.contact else "baseline"
             families[setting.label] = setting.family
             weights = load_model(setting.model) if setting.contact else None
             jobs.append(Job("cases", setting.label, [content, setting, weights], measure_ours, (setting, cases)))
-        for name, substeps in [(n, k) for n, ks in (ENGINES_QUICK if quick else ENGINES).items() for k in ks]:
-            label = f"{name} {1e3 * DT / substeps:.3g} ms"
-            kinds[label], families[label] = "engine", f"{name}: step"
-            jobs.append(Job("cases", label, [content, label], measure_engine, (name, substeps, 0.0, cases)))
-        kinds[FLOOR_LABEL] = "floor"
+        for name, counts in (ENGINES_QUICK if quick else ENGINES).items():
+            for substeps in counts:
+                label = f"{name} {1e3 * DT / substeps:.3g} ms"
+                kinds[label], families[label] = "engine", f"{name}: step"
+                jobs.append(Job("cases", label, [content, label], measure_engine, (name, substeps, 0.0, cases)))
         jobs.append(Job("cases", FLOOR_LABEL, [content, OFF], measure_engine, ("PyBullet", 5, OFF, cases)))
         results = measure(jobs, out / "results", on_progress=lambda f, m: on_progress("measure", f, m))
         points = [{"label": label, "kind": kinds[label], **result} for (_, label), result in results.items()]
@@ -414,10 +409,10 @@ def table(points: list[dict[str, Any]]) -> str:
     for point in points:
         row: dict[str, Any] = {}
         for name, value in point.items():
-            if isinstance(value, dict):
-                row |= {f"{name}_{steps}": found for steps, found in value.items() if not isinstance(found, list)}
-            else:
-                row[name] = value
+            columns = (
+                {f"{name}_{steps}": one for steps, one in value.items()} if isinstance(value, dict) else {name: value}
+            )
+            row |= {name: one for name, one in columns.items() if not isinstance(one, list)}
         rows.append({name: f"{value:.6g}" if isinstance(value, float) else value for name, value in row.items()})
     text = io.StringIO()
     writer = csv.DictWriter(text, list(dict.fromkeys(name for row in rows for name in row)), lineterminator="\n")
