@@ -127,11 +127,12 @@ def evaluate(
         depth = {who: penetration(motions, solids) for who, motions in sides.items()}
         report["penetration"] = depth | {"geometry": geometry, "every": EVERY}
         report["energy_gain"] = {who: energy_gain(motions) for who, motions in sides.items()}
-        report["resting_speed"] = {"bodies": int(sum(r.sum() for r in rest))}
+        resting: dict[str, float | None] = {"bodies": int(sum(r.sum() for r in rest))}
         for who, motions in sides.items():  # the median in the last steps of the bodies that rest in the recording
             last = [metrics.speeds(motion)[:, r].ravel() for motion, r in zip(motions, rest, strict=True)]
             speeds = np.concatenate(last)
-            report["resting_speed"][who] = float(np.median(speeds)) if len(speeds) else None
+            resting[who] = float(np.median(speeds)) if len(speeds) else None
+        report["resting_speed"] = resting
     on_progress(1.0, "done")
     return report
 

@@ -548,7 +548,7 @@ def cases(*, quick: bool = False, shapes: Path | None = None) -> list[Case]:
         **more: Any,
     ) -> None:
         """A case of `scenes`: a function of the repetition, or scenes that repetitions nudge."""
-        of = scenes if callable(scenes) else lambda repeat: [nudged(scene, repeat) for scene in scenes]
+        of = (lambda repeat: [nudged(one, repeat) for one in scenes]) if isinstance(scenes, list) else scenes
         repeats = min(repeats, 2) if quick else repeats  # there is no spread of one
         found.append(Case(name, group, title, of, measure, figures, repeats=repeats, **more))
 
