@@ -12,13 +12,11 @@ simulator keeps for its recording, is left out.
 
 from __future__ import annotations
 
-import argparse
 import os
 import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 if __name__ == "__main__":
@@ -26,7 +24,7 @@ if __name__ == "__main__":
 
 import numpy as np
 
-from benchmarks.results import write_section
+from benchmarks.results import script, write_section
 from benchmarks.scale import apart, with_nodes_cut
 from samples.large import write_scene
 from sdfsim.data.batching import scene_of
@@ -35,7 +33,7 @@ from sdfsim.dynamics.model import load_model
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.dynamics.solver import Compiled, compiled_rules, taken_up
 from sdfsim.dynamics.units import scene_units
-from sdfsim.errors import SdfsimError, run_main
+from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.engines import Start, bullet, dataset_urdf, start_of_scene
 from sdfsim.evaluation.harness import markdown, number
 from sdfsim.files import read_json, write_json
@@ -50,20 +48,17 @@ GROWN = (256, 512)  # bodies far apart
 FAR, FAR_OFF = (10, 10_000), np.array([30.0, 30.0, 0.0])  # static ones, and where
 
 
-def solved(scene: Scene, steps: int, dt: float | None = None, *, sleep: bool = False) -> tuple[float, tuple[int, ...]]:
-    """Milliseconds a step of the compiled solve, and what its last step counted (pairs, contacts, ...)."""
+def solved(scene: Scene, steps: int, dt: float | None = None) -> float:
+    """Milliseconds a step of the compiled solve."""
     simulator = Simulator(scene, "solver")
-    rules = compiled_rules(
-        simulator.rules.gravity.numpy(), dt / simulator.units.time if dt else simulator.rules.dt,
-        simulator.rules.substeps, sleep=sleep,
-    )  # fmt: skip
+    dt = dt / simulator.units.time if dt else simulator.rules.dt
+    rules = compiled_rules(simulator.rules.gravity.numpy(), dt, simulator.rules.substeps, sleep=False)
     inside = Compiled(simulator.bodies, simulator.state)
     motion, manifolds = taken_up(simulator.bodies, simulator.state, inside, rules)
-    counts: tuple[int, ...] = ()
     began = time.perf_counter()
     for _ in range(steps):
-        manifolds, _, counts = inside.run(motion, manifolds, rules)
-    return 1e3 * (time.perf_counter() - began) / steps, counts
+        manifolds, *_ = inside.run(motion, manifolds, rules)
+    return 1e3 * (time.perf_counter() - began) / steps
 
 
 def movi_b(data: Path) -> tuple[float, float]:
@@ -72,7 +67,7 @@ def movi_b(data: Path) -> tuple[float, float]:
     names = {str(n) for t in recorded for n in t.shape}
     shapes, urdfs = load_shapes(data, names), {n: dataset_urdf(data, n) for n in names}
     engine = [bullet(Start(t, urdfs, FLOOR), STEPS)[1].wall_ms for t in recorded]
-    ours = [solved(scene_of([t], [0], shapes)[0], STEPS, t.dt)[0] for t in recorded]
+    ours = [solved(scene_of([t], [0], shapes)[0], STEPS, t.dt) for t in recorded]
     return float(np.mean(engine)), float(np.mean(ours))
 
 
@@ -80,7 +75,7 @@ def bowl(count: int, folder: Path) -> tuple[float, float]:
     """Milliseconds a step of PyBullet and of the solve."""
     scene = load_scene(write_scene("bowl", folder / str(count), count))
     start = start_of_scene(scene, folder / "engine", scene_units(scene, load_model("solver")))
-    return bullet(start, FALL)[1].wall_ms, solved(scene, FALL)[0]
+    return bullet(start, FALL)[1].wall_ms, solved(scene, FALL)
 
 
 def with_far(count: int) -> Scene:
@@ -91,33 +86,21 @@ def with_far(count: int) -> Scene:
     return replace(scene, bodies=(replace(mover, velocity=np.array([-1.0, 0.0, 0.0])), *still, floor))
 
 
-def pairs(data: Path | None, folder: Path) -> dict[str, tuple[tuple[str, str], Callable[[], tuple[float, float]]]]:
+def pairs(data: Path | None, folder: Path) -> dict[str, tuple[str, str, Callable[[], tuple[float, float]]]]:
     """What is compared, by name: what the two are called, and a call that gives the milliseconds a step of both."""
+    found: dict[str, tuple[str, str, Callable[[], tuple[float, float]]]] = {}
+    if data:
+        found["a MOVi-B step"] = ("PyBullet", "sdfsim", lambda: movi_b(data))
+    for n in BALLS:
+        found[f"{n} spheres in a bowl"] = ("PyBullet", "sdfsim", lambda n=n: bowl(n, folder))
+
+    def both(name: str, one: tuple[str, Scene], other: tuple[str, Scene], steps: int) -> None:
+        found[name] = (one[0], other[0], lambda: (solved(one[1], steps), solved(other[1], steps)))
+
     heap = load_scene(write_scene("knots", folder / "knots", 64))
-    half, scenes = with_nodes_cut(heap, 0.5), {n: apart(n) for n in GROWN}
-    far, engine = {n: with_far(n) for n in FAR}, ("PyBullet", "sdfsim")
-    return {
-        **({"a MOVi-B step": (engine, partial(movi_b, data))} if data else {}),
-        **{f"{n} spheres in a bowl": (engine, partial(bowl, n, folder)) for n in BALLS},
-        "64 knots": (("half of the nodes", "all"), lambda: (solved(half, 60)[0], solved(heap, 60)[0])),
-        "boxes far apart": (
-            (str(GROWN[0]), str(GROWN[1])),
-            lambda: (solved(scenes[GROWN[0]], 50)[0], solved(scenes[GROWN[1]], 50)[0]),
-        ),
-        "static boxes far away": (
-            (str(FAR[0]), str(FAR[1])), lambda: (solved(far[FAR[0]], 500)[0], solved(far[FAR[1]], 500)[0]),
-        ),
-    }  # fmt: skip
-
-
-def measured(data: Path | None, repeats: int) -> dict[str, tuple[str, str, float, float, float]]:
-    """By name: what was compared, the medians of both in ms, and the median of their ratios."""
-    found = {}
-    with tempfile.TemporaryDirectory() as scratch:
-        for name, ((one, other), call) in pairs(data, Path(scratch)).items():
-            times = np.array([call() for _ in range(repeats)])
-            first, second = np.median(times, axis=0)
-            found[name] = (one, other, float(first), float(second), float(np.median(times[:, 1] / times[:, 0])))
+    both("64 knots", ("half of the nodes", with_nodes_cut(heap, 0.5)), ("all", heap), 60)
+    both("boxes far apart", *((str(n), apart(n)) for n in GROWN), 50)
+    both("static boxes far away", *((str(n), with_far(n)) for n in FAR), 500)
     return found
 
 
@@ -130,26 +113,24 @@ def slipped_back(found: dict[str, float], kept: dict[str, float]) -> list[str]:
     ]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path, nargs="?", help="a MOVi-B dataset")
-    parser.add_argument("--check", action="store_true", help="compare with the ratios that are kept")
-    parser.add_argument("--repeats", type=int, default=5)
-    chosen = parser.parse_args()
-    found = measured(chosen.data, chosen.repeats)
-    rows = [("a step", "of", "ms", "of", "ms", "second / first")]
-    for name, (one, other, first, second, ratio) in found.items():
-        rows.append((name, one, number(first), other, number(second), f"{ratio:.2f}"))
-    print(markdown(rows))
-    if chosen.check:
-        if worse := slipped_back({name: values[-1] for name, values in found.items()}, read_json(RATCHET)):
-            raise SdfsimError("slipped back: " + "; ".join(worse))
+def main(data: Path | None = None, *, check: bool = False, repeats: int = 5) -> None:
+    if not data and not check:
+        raise SdfsimError("give a MOVi-B dataset, or --check")
+    rows, ratios = [("a step", "of", "ms", "of", "ms", "second / first")], {}
+    with tempfile.TemporaryDirectory() as scratch:
+        for name, (one, other, call) in pairs(data, Path(scratch)).items():
+            times = np.array([call() for _ in range(repeats)])
+            first, second = np.median(times, axis=0)
+            ratios[name] = round(float(np.median(times[:, 1] / times[:, 0])), 3)
+            rows.append((name, one, number(first), other, number(second), f"{ratios[name]:.2f}"))
+    if not check:
+        write_section("contact step", "python -m benchmarks.contact_step DATA", markdown(rows))
+        write_json(RATCHET, ratios)
         return
-    if not chosen.data:
-        parser.error("DATA is needed")
-    write_section("contact step", "python -m benchmarks.contact_step DATA", markdown(rows))
-    write_json(RATCHET, {name: round(values[-1], 3) for name, values in found.items()})
+    print(markdown(rows))
+    if worse := slipped_back(ratios, read_json(RATCHET)):
+        raise SdfsimError("slipped back: " + "; ".join(worse))
 
 
 if __name__ == "__main__":
-    run_main(main)
+    script(__doc__, main)

@@ -9,9 +9,8 @@ errors are those at a frame alone). Trainings resume, and results that DIR holds
 
 from __future__ import annotations
 
-import argparse
 import statistics
-import time
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,15 +18,18 @@ from typing import Any
 import numpy as np
 import torch
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.results import script, told
 from sdfsim.data.batching import every, scene_of
 from sdfsim.data.dataset import Trajectory, load_shapes, read_info, trajectory_files
 from sdfsim.dynamics.model import SOLVER, load_model
 from sdfsim.dynamics.models.contact_graph import SUBSTEPS, ContactGraph
 from sdfsim.dynamics.models.impulse import Velocities
 from sdfsim.dynamics.simulator import Simulator
-from sdfsim.errors import run_main
+from sdfsim.evaluation.engines import ours
 from sdfsim.evaluation.evaluate import evaluate
-from sdfsim.evaluation.harness import Job, Results, markdown, measure, one_thread
+from sdfsim.evaluation.harness import Job, markdown, measure, one_thread
 from sdfsim.files import write_text
 from sdfsim.training.contact_cache import Solved, contact_frames, join_frames
 from sdfsim.training.impulse_task import ImpulseTask
@@ -80,10 +82,7 @@ def timed(model: str, method: Method, data: Path) -> dict[str, Any]:
             simulator = Simulator(scene, used, dt=start.dt)
             substeps = method.substeps or used.inner or SUBSTEPS * method.stride
             simulator.rules = replace(simulator.rules, substeps=substeps, trust=1.0)
-            simulator.run(steps=2)
-            began = time.process_time()
-            simulator.run(steps=STEPS_TIMED // method.stride)
-            taken.append(1e6 * (time.process_time() - began) / STEPS_TIMED)
+            taken.append(1e3 * ours(simulator, STEPS_TIMED // method.stride)[1].cpu_ms / method.stride)
     return {"us": statistics.median(taken)}
 
 
@@ -113,75 +112,60 @@ def _solve(g: ContactGraph, *, mirrored: bool = False) -> Velocities:
     return Velocities(g.solved_velocity, g.solved_angular, g.mean_velocity, g.mean_angular)
 
 
-def trained(folders: list[Path], out: Path, preset: str, seed: int, steps: int | None) -> Path:
+def trained(folders: list[Path], out: Path, preset: str, seed: int, steps: int | None) -> str:
     """The model of a preset and a seed; trained now, or on from where it was left."""
     place = out / "runs" / f"{preset}-{seed}"
     if not (place / "model.safetensors").exists():
         resume = (place / "checkpoint.npz").exists()
         train(folders, place, preset=preset, seed=seed, steps=steps, resume=resume, on_progress=told)
-    return place / "model.safetensors"
+    return str(place / "model.safetensors")
 
 
-def told(fraction: float, message: str) -> None:
-    print(f"{fraction:6.1%}  {message}", flush=True)
-
-
-def cell(results: Results, name: str, seeds: list[int], key: str, at_frame: bool) -> str:
+def cell(found: list[dict[str, Any]]) -> str:
     """Mean over seeds; in brackets their range, where there are several, and the first one's interval over scenes."""
-    found = [results[key, f"{name}, seed {seed}"] for seed in seeds if (key, f"{name}, seed {seed}") in results]
     if not found or "failed" in found[0]:
         return found[0]["failed"] if found else "-"
-    errors = [one["model"]["at_frame"] if at_frame else one["model"] for one in found]
-    metres, degrees = ([e[what] for e in errors] for what in ("translation_rmse", "rotation_error"))
-    low, high = errors[0]["translation_rmse_95"]
+    metres, degrees = ([one[what] for one in found] for what in ("translation_rmse", "rotation_error"))
+    low, high = found[0]["translation_rmse_95"]
     between = f"seeds {min(metres):.3f} to {max(metres):.3f}; " if len(metres) > 1 else ""
     return f"{np.mean(metres):.3f} m ({between}{low:.3f} to {high:.3f}), {np.mean(degrees):.1f}°"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path, nargs="+")
-    parser.add_argument("--at-frames", type=Path, required=True)
-    parser.add_argument("-o", "--out", type=Path, required=True)
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--steps", type=int, help="of training, in place of the presets'")
-    chosen = parser.parse_args()
-    seeds, first = list(range(chosen.seeds)), chosen.data[0]
-    places = [(data, split) for data in (first, chosen.at_frames) for split in ("validation", "test")]
+def main(data: list[Path], *, at_frames: Path, out: Path, seeds: int = 3, steps: int | None = None) -> None:
+    first, places = data[0], [(home, split) for home in (data[0], at_frames) for split in ("validation", "test")]
     jobs: list[Job] = []
-    models: dict[str, list[str]] = {}
+    presets = dict.fromkeys(method.preset for method in METHODS.values() if method.preset)
+    models = {preset: [trained(data, out, preset, seed, steps) for seed in range(seeds)] for preset in presets}
     for name, method in METHODS.items():
-        for seed in seeds if method.preset else seeds[:1]:
-            model = SOLVER
-            if method.preset:
-                model = str(trained(chosen.data, chosen.out, method.preset, seed, chosen.steps))
-                if model not in models.setdefault(method.preset, []):
-                    models[method.preset].append(model)
+        for seed, model in enumerate(models[method.preset] if method.preset else [SOLVER]):
             content = [method, load_model(model).network if method.preset else None, read_info(first)]
-            for data, split in places:
-                key, floor = f"{data.name}-{split}", name == next(iter(METHODS))
-                more = (model, method, data, split, floor)
-                jobs.append(Job(key, f"{name}, seed {seed}", [content, key], judged, more))
+            for home, split in places:
+                key, floor = f"{home.name}-{split}", name == next(iter(METHODS))
+                arguments = (model, method, home, split, floor)
+                jobs.append(Job(key, f"{name}, seed {seed}", [content, key], judged, arguments))
             if seed == 0:
                 jobs.append(Job("time", name, content, timed, (model, method, first)))
-    results = measure(jobs, chosen.out / "results", on_progress=told)
-    head = ("", *(f"{data.name}, {split}" for data, split in places), "µs for 20 ms")
-    rows: list[tuple[str, ...]] = [head]
+    results = measure(jobs, out / "results", on_progress=told)
+
+    def errors(name: str, who: str) -> list[list[dict[str, Any]]]:
+        """By place and seed, the errors of the model or of the teacher again."""
+        found = []
+        for home, split in places:
+            runs = [results.get((f"{home.name}-{split}", f"{name}, seed {seed}"), {}) for seed in range(seeds)]
+            runs = [run.get(who, run) for run in runs if who in run or "failed" in run]
+            found.append([run.get("at_frame", run) if home == at_frames else run for run in runs])
+        return found
+
+    rows: list[tuple[str, ...]] = [("", *(f"{home.name}, {split}" for home, split in places), "µs for 20 ms")]
     for name in METHODS:
-        cells = [cell(results, name, seeds, f"{d.name}-{s}", d == chosen.at_frames) for d, s in places]
-        rows.append((name, *cells, f"{results['time', name].get('us', float('nan')):.0f}"))
-    solver = f"{next(iter(METHODS))}, seed 0"
+        us = results["time", name].get("us", float("nan"))
+        rows.append((name, *map(cell, errors(name, "model")), f"{us:.0f}"))
     for size in ("1e-6", "1e-3"):
-        cells = []
-        for data, split in places:
-            errors = results[f"{data.name}-{split}", solver].get(size)
-            errors = errors["at_frame"] if errors and data == chosen.at_frames else errors
-            cells.append("-" if not errors else f"{errors['translation_rmse']:.3f} m, {errors['rotation_error']:.1f}°")
-        rows.append((f"the teacher again, {size} m/s off", *cells, ""))
-    table = markdown(rows) + "\n" + one_step(chosen.data, models)
-    write_text(chosen.out / "table.md", table)
+        rows.append((f"the teacher again, {size} m/s off", *map(cell, errors(next(iter(METHODS)), size)), ""))
+    table = markdown(rows) + "\n" + one_step(data, models)
+    write_text(out / "table.md", table)
     print(table)
 
 
 if __name__ == "__main__":
-    run_main(main)
+    script(__doc__, main)

@@ -17,7 +17,6 @@ are kept. Each command writes a table in Markdown into DIR.
 
 from __future__ import annotations
 
-import argparse
 import resource
 import statistics
 import sys
@@ -25,34 +24,23 @@ import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from benchmarks.results import script, told
 from samples.large import write_scene
 from sdfsim.data.batching import batches, first_frames, roll_out
-from sdfsim.data.dataset import Trajectory, engine_substep, load_shapes, read_info, trajectory_files
+from sdfsim.data.dataset import engine_substep, read_info
 from sdfsim.dynamics.model import SOLVER, Model, load_model, new_network
 from sdfsim.dynamics.run_memory import Memory
 from sdfsim.dynamics.simulator import Simulator
-from sdfsim.errors import run_main
-from sdfsim.evaluation.evaluate import errors, evaluate
-from sdfsim.evaluation.harness import (
-    Job,
-    Line,
-    Panel,
-    Results,
-    draw,
-    markdown,
-    measure,
-    number,
-    one_thread,
-    peak_memory,
-)
+from sdfsim.evaluation.evaluate import errors, evaluate, load_recorded
+from sdfsim.evaluation.harness import Job, Panel, cells, draw, line, markdown, measure, number, one_thread, peak_memory
 from sdfsim.files import write_text
-from sdfsim.scene.scene import Body, Scene
 from sdfsim.scene.scene_file import load_scene
 from sdfsim.shape.fit import PLANS, fit_pieces
 from sdfsim.shape.mesh import convex_hull
@@ -87,27 +75,13 @@ def untrained(name: str, nodes: int | None) -> Model:
     return Model(name, plan.kind, network, dt=0.02, gravity=10.0, length=1.0, reach=plan.reach, nodes=nodes)
 
 
-def seen(name: str, scenes: list[Scene], nodes: int | None) -> dict[str, float]:
-    """A step of every scene, all motion predicted, one thread.
+def recorded(name: str, data: Path) -> dict[str, float]:
+    """A step's graph at random recorded steps of test trajectories, with as many nodes as in the paper; one thread.
 
     Returns:
         Means of edges between bodies (each once), of all edges and of the nodes of the graph; medians of the
         milliseconds to find what is near and to pass the graph; peak memory.
     """
-    model, found = untrained(name, nodes), []
-    with one_thread(), peak_memory() as memory:
-        for scene in scenes:
-            sim = Simulator(scene, model, free_flight="learned")
-            sim.step()  # not timed: it loads what is compiled
-            sim.reset()
-            found.append(next(sim.frames(1)).counters)
-    counts = {key: float(np.mean([f[key][0] for f in found])) for key in ("contacts", "edges", "nodes")}
-    times = {key: statistics.median(float(f[key][0]) for f in found) for key in ("contact_ms", "network_ms")}
-    return counts | times | {"mib": memory["mib"] or float("nan")}
-
-
-def recorded(name: str, data: Path) -> dict[str, float]:
-    """The same of random recorded steps of test trajectories, with as many nodes as in the paper."""
     plan = replace(PRESETS[name], nodes=PUBLISHED_NODES)
     task, network = SurfaceTask(data, "test", plan, torch.device("cpu")), untrained(name, PUBLISHED_NODES).network
     shared, found = Memory(), []
@@ -130,31 +104,27 @@ def recorded(name: str, data: Path) -> dict[str, float]:
 
 
 def grown(name: str, scene_file: Path) -> dict[str, float]:
-    """Of spheres that the solver has let settle in a bowl."""
+    """The same of one step of spheres that the solver has let settle in a bowl, all motion predicted."""
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY << 30, MEMORY << 30))
     scene = load_scene(scene_file)
     settled = Simulator(scene).step(SETTLED)  # a sphere's origin is its centre of mass
-
-    def moved(k: int, body: Body) -> Body:
-        if body.motion != "dynamic":
-            return body
-        return replace(body, position=settled.position[k].numpy(), quat_xyzw=settled.orientation[k].numpy())
-
-    bodies = tuple(moved(k, body) for k, body in enumerate(scene.bodies))
-    return seen(name, [replace(scene, bodies=bodies)], 64)
+    poses = zip(settled.position.numpy(), settled.orientation.numpy(), strict=True)
+    bodies = tuple(
+        replace(body, position=position, quat_xyzw=turn) if body.motion == "dynamic" else body
+        for body, (position, turn) in zip(scene.bodies, poses, strict=True)
+    )
+    model = untrained(name, 64)
+    with one_thread(), peak_memory() as memory:
+        simulator = Simulator(replace(scene, bodies=bodies), model, free_flight="learned")
+        simulator.step()  # not timed: it loads what is compiled
+        simulator.reset()
+        found = next(simulator.frames(1)).counters
+    known = ("contacts", "edges", "nodes", "contact_ms", "network_ms")
+    return {key: float(found[key][0]) for key in known} | {"mib": memory["mib"] or float("nan")}
 
 
 UNSIGNED = 64  # samples along each side
 COMPARED = NAMES | {"paper-unsigned": "SDF-Sim, unsigned distances"}
-
-
-def trained(name: str, data: Path, place: Path, minutes: float) -> Path:
-    """The model of a network after so many minutes of one core."""
-    torch.set_num_threads(1)
-    plan = plan_of(name)
-    resume = (place / "checkpoint.npz").exists()
-    report = train(data, place, preset=plan, resume=resume, budget=60 * minutes, on_progress=told)
-    return Path(report["model"])
 
 
 def plan_of(name: str) -> Preset:
@@ -167,10 +137,6 @@ def judged(model: Path, data: Path, split: str, free_flight: str) -> dict[str, A
     torch.set_num_threads(1)
     report = evaluate(data, model=model, split=split, steps=int(FRAME), free_flight=free_flight, errors_only=True)  # type: ignore[arg-type]
     return report["model"][FRAME]
-
-
-def told(fraction: float, message: str) -> None:
-    print(f"{fraction:6.1%}  {message}", flush=True)
 
 
 def unsigned(data: Path, home: Path) -> Path:
@@ -187,33 +153,23 @@ def unsigned(data: Path, home: Path) -> Path:
     return home
 
 
-def graphs(data: Path, out: Path) -> None:
+def graphs(data: Path, *, out: Path) -> None:
     """Write graphs.md."""
-    jobs = [
-        Job(
-            "movi-b",
-            name,
-            [PRESETS[name], STEPS_SEEN, STEPS_TIMED, PUBLISHED_NODES, read_info(data)],
-            recorded,
-            (name, data),
-        )
-        for name in NAMES
-    ]
+    jobs = []
+    for name in NAMES:
+        content = [PRESETS[name], STEPS_SEEN, STEPS_TIMED, PUBLISHED_NODES, read_info(data)]
+        jobs.append(Job("movi-b", name, content, recorded, (name, data)))
     results = measure(jobs, out / "graphs", where="fresh", on_progress=told)
     columns = {
         "contacts": "collision edges", "edges": "graph edges", "nodes": "nodes", "contact_ms": "ms to find them",
         "network_ms": "ms of the network", "mib": "MiB",
     }  # fmt: skip
-    rows: list[tuple[str, ...]] = [("", *columns.values())]
-    for name, title in NAMES.items():
-        found = results["movi-b", name]
-        rows.append(
-            (title, *(number(found.get(k)) for k in columns), *([found["failed"]] if "failed" in found else []))
-        )
+    rows = [("", *columns.values(), "")]
+    rows += [(title, *cells(results["movi-b", name], columns)) for name, title in NAMES.items()]
     written(out / "graphs.md", markdown(rows))
 
 
-def growth(out: Path) -> None:
+def growth(*, out: Path) -> None:
     """Write growth.md and growth.png."""
     jobs = []
     for count in BOWLS:
@@ -223,88 +179,87 @@ def growth(out: Path) -> None:
     results = measure(jobs, out / "growth", where="fresh", on_progress=told)
     rows: list[tuple[str, ...]] = [("ms of the network / MiB", *NAMES.values())]
     for count in BOWLS:
-        cells = (results[f"{count} spheres", name] for name in NAMES)
-        rows.append((
-            f"{count} spheres",
-            *(f["failed"] if "failed" in f else f"{number(f['network_ms'])} / {number(f['mib'])}" for f in cells),
-        ))  # fmt: skip
+        row = (results[f"{count} spheres", name] for name in NAMES)
+        told_of = (f.get("failed") or f"{number(f['network_ms'])} / {number(f['mib'])}" for f in row)
+        rows.append((f"{count} spheres", *told_of))
     panels = []
     for key, label in (("edges", "edges of the graph"), ("network_ms", "ms of the network"), ("mib", "MiB")):
         lines = []
         for name, title in NAMES.items():
-            known = [(n, results[f"{n} spheres", name]) for n in BOWLS if "failed" not in results[f"{n} spheres", name]]
-            lines.append(Line(title, [n for n, _ in known], [f[key] for _, f in known]))
+            found = [{"spheres": n} | results[f"{n} spheres", name] for n in BOWLS]
+            lines.append(line(title, found, "spheres", key))
         panels.append(Panel("spheres in a bowl", "spheres", label, lines, "xy"))
-    draw(panels, out / "growth.png", wide=3, dpi=110)
+    draw(panels, out / "growth.png")
     written(out / "growth.md", markdown(rows))
 
 
-def accuracy(data: Path, out: Path, minutes: list[float]) -> None:
+MINUTES = [5.0, 15.0, 30.0, 60.0]
+
+
+def accuracy(data: Path, *, out: Path, minutes: list[float] = MINUTES) -> None:
     """Train everything a little, then a little more, and write accuracy.md and accuracy.png."""
-    results: Results = {}
-    for spent in sorted(minutes):
+    results: dict[tuple[str, str], dict[str, Any]] = {}
+    minutes = sorted(minutes)
+    for spent in minutes:
         for name in COMPARED:
-            place = out / "runs" / name
             seen_by = unsigned(data, out / "unsigned") if name.endswith("unsigned") else data
-            case = f"{name} after {spent:g} minutes"
-            content = [plan_of(name), spent, read_info(data)]
-            for way in ("exact", "learned"):
-                file = out / "models" / f"{name}-{spent:g}.safetensors"
-                if not file.exists():
-                    file.parent.mkdir(parents=True, exist_ok=True)
-                    trained(name, seen_by, place, spent).rename(file)
-                splits = ("validation", "test") if spent == max(minutes) else ("validation",)
-                jobs = [Job(f"{split}, {way}", case, content, judged, (file, seen_by, split, way)) for split in splits]
-                results |= measure(jobs, out / "accuracy")
-        written(out / "accuracy.md", accuracy_table(results, sorted(minutes)))
+            file = out / "models" / f"{name}-{spent:g}.safetensors"
+            if not file.exists():
+                file.parent.mkdir(parents=True, exist_ok=True)
+                torch.set_num_threads(1)
+                place, budget = out / "runs" / name, 60 * spent
+                resume = (place / "checkpoint.npz").exists()
+                train(seen_by, place, preset=plan_of(name), resume=resume, budget=budget, on_progress=told)
+                (place / "model.safetensors").rename(file)
+            jobs = []
+            for split in ("validation", "test") if spent == minutes[-1] else ("validation",):
+                for way in ("exact", "learned"):
+                    content, arguments = [plan_of(name), spent, read_info(data)], (file, seen_by, split, way)
+                    jobs.append(Job(f"{split}, {way}", _case(name, spent), content, judged, arguments))
+            results |= measure(jobs, out / "accuracy")
+        written(out / "accuracy.md", accuracy_table(results, minutes))
     panels = []
     for way in ("exact", "learned"):
         lines = []
         for name, title in COMPARED.items():
-            found = [
-                results.get((f"validation, {way}", f"{name} after {spent:g} minutes"), {}) for spent in sorted(minutes)
-            ]
-            known = [
-                (m, f["translation_rmse"]) for m, f in zip(sorted(minutes), found, strict=True) if "failed" not in f
-            ]
-            lines.append(Line(title, [m for m, _ in known], [e for _, e in known]))
-        panels.append(
-            Panel(f"free flight {way}", "minutes of one core", f"m at {FRAME} steps, validation", lines, "xy")
-        )
-    draw(panels, out / "accuracy.png", wide=2, dpi=110)
+            found = [{"minutes": m} | results[f"validation, {way}", _case(name, m)] for m in minutes]
+            lines.append(line(title, found, "minutes", "translation_rmse"))
+        label = f"m at {FRAME} steps, validation"
+        panels.append(Panel(f"free flight {way}", "minutes of one core", label, lines, "xy"))
+    draw(panels, out / "accuracy.png")
+
+
+def _case(name: str, minutes: float) -> str:
+    return f"{name} after {minutes:g} minutes"
 
 
 def rolled_out(data: Path, width: int | None, home: Path) -> dict[str, Any]:
     """Errors of the solver on validation data whose shapes are networks of so many hidden units, refitted where they
     are not 64 wide and kept in `home`; on the convex pieces themselves for None."""
     torch.set_num_threads(1)
-    recorded = [Trajectory.load(file) for file in trajectory_files(data, "validation")]
-    recorded = [first_frames(t, int(FRAME) + 1) for t in recorded if not t.static.all()]
-    shapes = load_shapes(data, {str(n) for t in recorded for n in t.shape})
+    recorded, shapes = load_recorded(data, "validation")
+    recorded = [first_frames(t, int(FRAME) + 1) for t in recorded]
     if width is not None:
         shapes = {name: refitted(shape, width, home / name) for name, shape in shapes.items()}
     inner = inner_steps(recorded[0].dt, engine_substep(data))
     solver, motions = load_model(SOLVER), []
     for group in batches(recorded):
         motions += roll_out(solver, group, shapes, int(FRAME), torch.device("cpu"), substeps=inner, as_teacher=True)
-    return errors(motions, [t for group in batches(recorded) for t in group])[FRAME]
+    return errors(motions, recorded)[FRAME]
 
 
 def refitted(shape: Shape, width: int, folder: Path) -> Shape:
     """The shape known by a network of so many hidden units alone, with its own nodes, fitted for a minute."""
-    if width == PLANS["default"].width:
+    usual = PLANS["default"]
+    if width == usual.width:
         return replace(shape, pieces=())
     if not (folder / "shape.json").exists():
-        usual = PLANS["default"]
-        PLANS["default"] = replace(usual, width=width)
-        try:
+        with patch.dict(PLANS, default=replace(usual, width=width)):
             fit_pieces([convex_hull(piece) for piece in shape.pieces], name=shape.name).save(folder)
-        finally:
-            PLANS["default"] = usual
     return replace(shape, pieces=(), sdf=load_shape(folder).sdf)
 
 
-def sdf(data: Path, out: Path) -> None:
+def sdf(data: Path, *, out: Path) -> None:
     """Write sdf.md."""
     ways = {"convex pieces, exactly": None, "64 wide": 64, "32 wide": 32, "128 wide": 128}
     jobs = [
@@ -316,32 +271,34 @@ def sdf(data: Path, out: Path) -> None:
     written(out / "sdf.md", markdown(rows))
 
 
-def accuracy_table(results: Results, minutes: list[float]) -> str:
+def accuracy_table(results: dict[tuple[str, str], dict[str, Any]], minutes: list[float]) -> str:
     """Errors by network and minutes; a table for each form of free flight."""
     parts = []
     for way in ("exact", "learned"):
         told_of = (*(f"{m:g} min" for m in minutes), "by a power law at 10 h", f"test, {minutes[-1]:g} min")
         rows: list[tuple[str, ...]] = [(f"free flight {way}", *told_of)]
         for name, title in COMPARED.items():
-            found = [results.get((f"validation, {way}", f"{name} after {m:g} minutes")) for m in minutes]
-            test = results.get((f"test, {way}", f"{name} after {minutes[-1]:g} minutes"))
+            found = [results.get((f"validation, {way}", _case(name, m)), {}) for m in minutes]
+            test = results.get((f"test, {way}", _case(name, minutes[-1])), {})
             rows.append((title, *map(_cell, found), _power_law(minutes, found), _cell(test)))
         parts.append(markdown(rows))
     return "\n".join(parts)
 
 
-def _cell(found: dict[str, Any] | None) -> str:
-    if found is None or "failed" in found:
-        return "-" if found is None else found["failed"]
+def _cell(found: dict[str, Any]) -> str:
+    if "translation_rmse" not in found:
+        return found.get("failed", "-")
     return f"{number(found['translation_rmse'])} m, {found['rotation_error']:.1f}°"
 
 
-def _power_law(minutes: list[float], found: list[dict[str, Any] | None]) -> str:
+def _power_law(minutes: list[float], found: list[dict[str, Any]]) -> str:
     """What a line through the logarithms of time and error says for ten hours of one core."""
-    known = [(m, f["translation_rmse"]) for m, f in zip(minutes, found, strict=True) if f and "failed" not in f]
-    if len(known) < 3:
+    known = line(
+        "", [{"minutes": m} | f for m, f in zip(minutes, found, strict=True) if f], "minutes", "translation_rmse"
+    )
+    if len(known.x) < 3:
         return "-"
-    slope, start = np.polyfit(np.log([m for m, _ in known]), np.log([e for _, e in known]), 1)
+    slope, start = np.polyfit(np.log(known.x), np.log(known.y), 1)
     return f"{number(float(np.exp(start + slope * np.log(600.0))))} m"
 
 
@@ -350,26 +307,5 @@ def written(path: Path, table: str) -> None:
     print(table, flush=True)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    commands = parser.add_subparsers(dest="command", required=True)
-    for name in ("graphs", "growth", "accuracy", "sdf"):
-        command = commands.add_parser(name)
-        if name != "growth":
-            command.add_argument("data", type=Path)
-        command.add_argument("-o", "--out", type=Path, required=True)
-        if name == "accuracy":
-            command.add_argument("--minutes", type=float, nargs="+", default=[5.0, 15.0, 30.0, 60.0])
-    chosen = parser.parse_args()
-    if chosen.command == "graphs":
-        graphs(chosen.data, chosen.out)
-    elif chosen.command == "growth":
-        growth(chosen.out)
-    elif chosen.command == "sdf":
-        sdf(chosen.data, chosen.out)
-    else:
-        accuracy(chosen.data, chosen.out, chosen.minutes)
-
-
 if __name__ == "__main__":
-    run_main(main)
+    script(__doc__, graphs, growth, accuracy, sdf)

@@ -17,7 +17,6 @@ without, and print the errors of every body.
 
 from __future__ import annotations
 
-import argparse
 import json
 import shutil
 import sys
@@ -29,16 +28,17 @@ from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from benchmarks.results import ROOT, script
 from pipeline.cameras import Similarity, View, load_views
 from pipeline.field.training import load_field
 from pipeline.mesh.meshing import read_parts
 from pipeline.mesh.placement import load_placement
 from pipeline.mesh.trust import vertex_areas
 from sdfsim.console import Session
-from sdfsim.errors import run_main
+from sdfsim.errors import SdfsimError
 from sdfsim.shape.mesh import Mesh, load_mesh, read_attributes, read_mesh, signed_volume
 
-PHOTOS = Path(__file__).resolve().parent.parent / "samples" / "photos" / "table_vase"
+PHOTOS = ROOT / "samples" / "photos" / "table_vase"
 TABLE, VASE = 0.55, np.array([0.12, -0.05])  # m: the table's height, and the vase's axis
 RENDERED = ("touching", "shelf")
 NEAR_FLOOR = 0.03  # m, below which a surface is the floor's
@@ -88,36 +88,32 @@ def trust_errors(folder: Path, photos: Path, move: Similarity) -> list[dict[str,
     which the photos tell something, in quarters from the surest on, and the least sure twentieth; then what is guessed
     there, and what is guessed of all that the scene is made of, also where nothing is displayed.
     """
-    import open3d as o3d
+    truth = _scene(_open3d().io.read_triangle_mesh(photos / "truth.ply"))
+    bodies = [f"objects/{entry['name']}.ply" for entry in read_parts(folder / "mesh")["objects"]]
+    rows: list[dict[str, Any]] = []
 
-    truth = _scene(o3d.io.read_triangle_mesh(photos / "truth.ply"))
-
-    def measured(names: list[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Areas, uncertainties and errors [V] of vertices, m."""
-        meshes = [read_mesh(folder / "mesh" / name) for name in names]
-        given = [read_attributes(folder / "mesh" / name, ["uncertainty"])[0] for name in names]
+    def measured(first: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Areas, uncertainties and errors [V] m of the vertices of a mesh and of the bodies."""
+        files = [folder / "mesh" / name for name in (first, *bodies)]
+        meshes = [read_mesh(file) for file in files]
+        given = [read_attributes(file, ["uncertainty"])[0] for file in files]
         points = to_truth(folder, np.concatenate([mesh.vertices for mesh in meshes]), move)
         error = truth.compute_distance(points.astype(np.float32)).numpy()
         return np.concatenate([vertex_areas(mesh) for mesh in meshes]), np.concatenate(given).astype(float), error
 
-    parts = read_parts(folder / "mesh")
-    bodies = [f"objects/{entry['name']}.ply" for entry in parts["objects"]]
-    area, uncertainty, error = measured(["shown.ply", *bodies])
-    known = np.isfinite(uncertainty)
-    shares = [0, 0.25, 0.5, 0.75, 0.95, 1]
-    limits = np.quantile(uncertainty[known], shares, weights=area[known], method="inverted_cdf").tolist()
-    rows: list[dict[str, Any]] = []
-
-    def add(name: str, chosen: np.ndarray, area: np.ndarray, error: np.ndarray, told: list[float] | None) -> None:
+    def add(name: str, chosen: np.ndarray, ends: list[float] | None) -> None:
         median, p90 = 1000 * np.quantile(error[chosen], [0.5, 0.9], weights=area[chosen], method="inverted_cdf")
-        rows.append({"part": name, "uncertainty_mm": told, "error_median_mm": median, "error_p90_mm": p90})
+        rows.append({"part": name, "uncertainty_mm": ends, "error_median_mm": median, "error_p90_mm": p90})
 
-    ends = [(f"quarter {k}", limits[k - 1], limits[k if k < 4 else 5]) for k in (1, 2, 3, 4)]
-    for name, low, high in [*ends, ("least sure 5 %", limits[4], limits[5])]:
-        add(name, known & (uncertainty >= low) & (uncertainty <= high), area, error, [1000 * low, 1000 * high])
-    add("guessed and displayed", ~known, area, error, None)
-    area, uncertainty, error = measured(["solid.ply", *bodies])
-    add("guessed, of all", ~np.isfinite(uncertainty), area, error, None)
+    area, uncertainty, error = measured("shown.ply")
+    known = np.isfinite(uncertainty)
+    parts = {f"quarter {k}": (0.25 * (k - 1), 0.25 * k) for k in (1, 2, 3, 4)} | {"least sure 5 %": (0.95, 1.0)}
+    for name, shares in parts.items():
+        low, high = np.quantile(uncertainty[known], shares, weights=area[known], method="inverted_cdf").tolist()
+        add(name, known & (uncertainty >= low) & (uncertainty <= high), [1000 * low, 1000 * high])
+    add("guessed and displayed", ~known, None)
+    area, uncertainty, error = measured("solid.ply")
+    add("guessed, of all", ~np.isfinite(uncertainty), None)
     return rows
 
 
@@ -129,8 +125,7 @@ def surface_errors(folder: Path, photos: Path, move: Similarity) -> dict[str, An
     reconstruction; `complete_percent` is the share of it within 1 %. `vase`: see `vase_size`, of the bodies at its
     place and of the truth. `body`: of these bodies, 1.5 cm above what they stand on, to the truth.
     """
-    import open3d as o3d
-
+    o3d = _open3d()
     about = json.loads((photos / "transforms.json").read_text())
     width, place = about["table_width"], load_placement(folder / "mesh").to_metres
     to_unit, rotation = load_field(folder / "distill").to_unit, move.rotation
@@ -166,26 +161,21 @@ def surface_errors(folder: Path, photos: Path, move: Similarity) -> dict[str, An
     missing = distances(_scene(mesh), np.concatenate(seen))
     objects = {entry["name"]: read(f"objects/{entry['name']}.ply") for entry in read_parts(folder / "mesh")["objects"]}
     vases = {name: body for name, body in objects.items() if np.abs(body.get_center()[:2] - VASE).max() < 0.1}
+    standing = {name: np.asarray(body.vertices) for name, body in vases.items()}
+    standing = {name: at[at[:, 2] > at[:, 2].min() + 0.015] for name, at in standing.items()}
     corners = np.asarray(truth.vertices)[np.asarray(truth.triangles)]
     truth.remove_triangles_by_mask(corners[:, :, 2].max(1) < TABLE + 1e-3)
     return {
         "surface": summary(errors),
         "object": summary(errors[near]),
         "missing": summary(missing),
-        "body": {name: summary(distances(true_scene, _above(body, 0.015))) for name, body in vases.items()},
+        "body": {name: summary(distances(true_scene, points)) for name, points in standing.items()},
         "complete_percent": 100 * float((missing < 1.0).mean()),
         "scale_error_percent": 100 * abs(place.scale * to_unit.scale / move.scale - 1),
-        "tilt_degrees": float(np.degrees(np.arccos(min(1.0, float((rotation @ place.rotation[2])[2]))))),
+        "up_error_degrees": float(np.degrees(np.arccos(min(1.0, float((rotation @ place.rotation[2])[2]))))),
         "bodies": list(objects),
         "vase": {name: vase_size(body) for name, body in vases.items()} | {"truth": vase_size(truth)},
-        "up_error_degrees": float(np.degrees(np.arccos(np.clip((rotation @ place.rotation.T @ [0, 0, 1])[2], -1, 1)))),
     }
-
-
-def _above(mesh: Any, height: float) -> np.ndarray:
-    """The vertices [V, 3] of an open3d mesh that lie more than `height` above its lowest."""
-    points = np.asarray(mesh.vertices)
-    return points[points[:, 2] > points[:, 2].min() + height]
 
 
 def vase_size(mesh: Any) -> dict[str, float]:
@@ -198,11 +188,15 @@ def vase_size(mesh: Any) -> dict[str, float]:
     return {"hollow_cm": 100 * float(top - np.median(hit)), "height_cm": 100 * float(top - TABLE)}
 
 
-def _scene(mesh: Any) -> Any:
-    import open3d as o3d
+def _open3d() -> Any:
+    import open3d  # slow to load
 
-    made: Any = o3d.t.geometry.RaycastingScene()
-    made.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(mesh))
+    return open3d
+
+
+def _scene(mesh: Any) -> Any:
+    made, surface = _open3d().t.geometry.RaycastingScene(), _open3d().t.geometry.TriangleMesh.from_legacy(mesh)
+    made.add_triangles(surface)
     return made
 
 
@@ -220,6 +214,8 @@ def captured(layout: str, out: Path) -> Path:
     sys.path.insert(0, str(PHOTOS.parent))
     import phone
 
+    if layout not in phone.LAYOUTS:
+        raise SdfsimError(f"--capture: {layout}: is none of {', '.join(phone.LAYOUTS)}")
     place = out.with_name(f"{out.name}-{layout}" + (".r3d" if layout == "record3d" else ""))
     if not place.exists():
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -263,36 +259,30 @@ def rendered(name: str, out: Path, **options: Any) -> dict[str, Any]:
     return result
 
 
-def main() -> None:
-    """Runs the chain and prints one JSON object."""
+def main(
+    photos: Path = PHOTOS,
+    *,
+    out: Path,
+    capture: str | None = None,
+    preset: str = "quick",
+    size: float | None = None,
+    distance: list[str] | None = None,
+    budget: float | None = None,
+) -> None:
     from pipeline.stages import reconstruct
 
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("photos", type=Path, nargs="?", default=PHOTOS, help="a folder, or: touching, shelf")
-    parser.add_argument("-o", "--out", type=Path, required=True)
-    parser.add_argument("--capture", choices=("record3d", "exr", "polycam", "nerfstudio"), help="with depth, see above")
-    parser.add_argument("--preset", default="quick")
-    parser.add_argument("--size", type=float)
-    parser.add_argument("--distance", nargs=3, metavar=("PLACE", "PLACE", "METRES"))
-    parser.add_argument("--budget", type=float, metavar="MINUTES", help="for everything")
-    chosen = parser.parse_args()
-    distance = [*chosen.distance[:2], float(chosen.distance[2])] if chosen.distance else None
-    budget = None if chosen.budget is None else 60 * chosen.budget
-    if str(chosen.photos) in RENDERED:
-        with Session(as_json=True) as session:
-            told = session.stage_progress
-            session.report(rendered(str(chosen.photos), chosen.out, preset=chosen.preset, budget=budget, progress=told))
-        return
-    given = chosen.photos if chosen.capture is None else captured(chosen.capture, chosen.out)
+    options: dict[str, Any] = {"preset": preset, "budget": None if budget is None else 60 * budget}
     with Session(as_json=True) as session:
-        report = reconstruct(
-            given, chosen.out, preset=chosen.preset, size=chosen.size, distance=distance, budget=budget,
-            progress=session.stage_progress,
-        )  # fmt: skip
-        if (chosen.photos / "truth.ply").exists():
-            report["truth"] = evaluate(chosen.out, chosen.photos)
+        if str(photos) in RENDERED:
+            session.report(rendered(str(photos), out, **options, progress=session.stage_progress))
+            return
+        options |= {"size": size, "distance": distance and [*distance[:2], float(distance[2])]}
+        given = captured(capture, out) if capture else photos
+        report = reconstruct(given, out, **options, progress=session.stage_progress)
+        if (photos / "truth.ply").exists():
+            report["truth"] = evaluate(out, photos)
         session.report(report)
 
 
 if __name__ == "__main__":
-    run_main(main)
+    script(__doc__, main)

@@ -1,21 +1,61 @@
-"""RESULTS.md: one section a benchmark, each written by the benchmark itself."""
+"""What benchmarks share: their command lines, lines of progress, and RESULTS.md, one section a benchmark."""
 
 from __future__ import annotations
 
+import argparse
+import inspect
 import re
+import typing
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+from sdfsim.errors import run_main
 from sdfsim.files import write_text
 
+ROOT = Path(__file__).resolve().parents[1]
 PAGE = Path(__file__).with_name("RESULTS.md")
 
 
+def script(doc: str | None, *functions: Callable[..., None]) -> None:
+    """Run a function with what the command line gives: of several the one that it names first.
+
+    Keyword-only parameters are options, `out` also as -o; lists take several values.
+    """
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True) if len(functions) > 1 else None
+    for function in functions:
+        own = commands.add_parser(function.__name__) if commands else parser
+        own.set_defaults(function=function)
+        hints = typing.get_type_hints(function)
+        for name, parameter in inspect.signature(function).parameters.items():
+            hint, usual, needed = hints[name], parameter.default, parameter.default is parameter.empty
+            given: dict[str, Any] = {"type": (*typing.get_args(hint), hint)[0], "default": None if needed else usual}
+            if typing.get_origin(hint) is list:
+                given["nargs"] = "+"
+            if usual is False:
+                given = {"action": "store_true"}
+            if parameter.kind is parameter.KEYWORD_ONLY:
+                names = [f"--{name.replace('_', '-')}", *(["-o"] if name == "out" else [])]
+                own.add_argument(*names, required=needed, **given)
+            else:
+                own.add_argument(name, **given, **({} if needed else {"nargs": "?"}))
+    chosen = vars(parser.parse_args())
+    run_main(lambda: chosen.pop("function")(**chosen))
+
+
+def told(fraction: float, message: str) -> None:
+    """Progress, a line each."""
+    print(f"{fraction:6.1%}  {message}", flush=True)
+
+
 def write_section(name: str, command: str, content: str, page: Path = PAGE) -> None:
-    """Put `content` between the marks of a section, under the command that repeats it.
+    """Print `content`, and put it between the marks of a section, under the command that repeats it.
 
     Raises:
         ValueError: the page has no such section.
     """
+    print(content)
     marks = f"<!-- {name} -->", f"<!-- end of {name} -->"
     text, shown = page.read_text(encoding="utf-8"), f"{marks[0]}\n\n    {command}\n\n{content.strip()}\n\n{marks[1]}"
     pattern = re.compile(f"{re.escape(marks[0])}.*?{re.escape(marks[1])}", re.DOTALL)

@@ -11,11 +11,11 @@ timed. Restitution is 0, friction the same for all. DIR keeps results; the table
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,25 +25,18 @@ from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.results import write_section
+from benchmarks.results import script, told, write_section
 from samples.large import sample_shape, write_scene
 from sdfsim.data.batching import scene_of
-from sdfsim.data.dataset import FLOOR, Trajectory, load_shapes, trajectory_files
+from sdfsim.data.dataset import Trajectory
 from sdfsim.dynamics.bodies import largest_extent
 from sdfsim.dynamics.model import load_model
-from sdfsim.dynamics.simulator import Simulator, join
+from sdfsim.dynamics.simulator import Simulator
 from sdfsim.dynamics.units import scene_units
-from sdfsim.errors import SdfsimError, run_main
-from sdfsim.evaluation.engines import (
-    LONGEST,
-    bullet,
-    drake,
-    mujoco,
-    newton,
-    rollout_motion,
-    start_of_scene,
-    timed,
-)
+from sdfsim.errors import SdfsimError
+from sdfsim.evaluation import engines
+from sdfsim.evaluation.engines import Engine, in_metres, ours, rollout_motion, start_of_scene
+from sdfsim.evaluation.evaluate import load_recorded
 from sdfsim.evaluation.hard_cases import ball, body, box, on_floor
 from sdfsim.evaluation.harness import Job, Results, markdown, measure, number, peak_memory
 from sdfsim.evaluation.penetration import depths
@@ -53,15 +46,15 @@ from sdfsim.scene.scene import Effects, Scene
 from sdfsim.scene.scene_file import load_scene
 from sdfsim.shape.mesh import Mesh, clean, load_pieces, wavefront
 from sdfsim.shape.sdf import BoxSdf, PlaneSdf, SphereSdf
-from sdfsim.shape.shape import Shape, analytic_shape, mesh_shape, own_pieces, shape_from_mesh
+from sdfsim.shape.shape import analytic_shape, mesh_shape, own_pieces, shape_from_mesh
 
-ENGINES: dict[str, Callable[..., tuple[Trajectory, Any]] | None] = {
+ENGINES: dict[str, Engine | None] = {
     "sdfsim": None,
-    "PyBullet, pieces": bullet,
-    "MuJoCo, pieces": mujoco,
-    "MuJoCo, SDF": lambda *arguments: mujoco(*arguments, pieces=False),
-    "Drake, hydroelastic": drake,
-    "Newton, XPBD": newton,
+    "PyBullet, pieces": engines.bullet,
+    "MuJoCo, pieces": engines.mujoco,
+    "MuJoCo, SDF": partial(engines.mujoco, pieces=False),
+    "Drake, hydroelastic": engines.drake,
+    "Newton, XPBD": engines.newton,
 }
 INNER = (2, 5, 10, 20)  # inner steps in one of 20 ms; the last is an engine's own truth
 USUAL = 5
@@ -71,7 +64,6 @@ HEAP_STEPS = 20  # of the large scenes: enough to time a step
 MOVI_B = 5  # trajectories
 DEEP = 0.01  # of the smallest body's size: "equal penetration"
 FRICTION = 0.7  # of everything: 0.49 where two meet
-BALLS = (16, 512)
 
 
 # --- the cases ---
@@ -118,24 +110,11 @@ def rugged() -> Mesh:
     return implicit("ground", field, (3.0, 3.0, 1.0), 0.028)
 
 
-def fitted(mesh: Mesh, folder: Path) -> Shape:
-    """The learned shape of a mesh, by way of its file."""
-    file = folder / f"{mesh.digest()[:12]}.obj"
-    if not file.exists():
-        write_text(file, wavefront([mesh]))
-    return shape_from_mesh(file)
-
-
 def bowls(folder: Path) -> Scene:
     """Six bowls fall into each other."""
     rng = np.random.default_rng(1)
     places = [(*rng.uniform(-0.05, 0.05, 2), 0.5 + 0.6 * k) for k in range(6)]
     return on_floor([sample_shape("bowl")], [body(f"bowl{k}", 0, place) for k, place in enumerate(places)])
-
-
-def knots(folder: Path) -> Scene:
-    """Twelve torus knots fall into a heap."""
-    return load_scene(write_scene("knots", folder / "knots", 12))
 
 
 def mugs(folder: Path) -> Scene:
@@ -145,7 +124,9 @@ def mugs(folder: Path) -> Scene:
     for k in range(4):
         bodies.append(body(f"peg{k}", 1, (1.5 * k, 0.0, 2.0), motion="static", mass=0.0, quat_xyzw=turned))
         bodies.append(body(f"mug{k}", 0, (1.5 * k - 0.36, 0.0, 1.9), velocity=np.array([0.3 * k, 0.0, 0.0])))
-    return on_floor([fitted(mug(), folder), analytic_shape("capsule", radius=0.05, height=0.9)], bodies)
+    file = folder / "mug.obj"
+    write_text(file, wavefront([mug()]))
+    return on_floor([shape_from_mesh(file), analytic_shape("capsule", radius=0.05, height=0.9)], bodies)
 
 
 def scan(folder: Path) -> Scene:
@@ -163,33 +144,21 @@ def scan(folder: Path) -> Scene:
     return on_floor(shapes, [*bodies, body("ground", 5, (0.0, 0.0, 1.0), motion="static", mass=0.0)])
 
 
-def spheres(count: int) -> Callable[[Path], Scene]:
-    """So many of them in a bowl."""
-    return lambda folder: load_scene(write_scene("bowl", folder / f"bowl{count}", count))
-
-
-def heaps(folder: Path) -> Scene:
-    """380 bodies of eight shapes with 1.1 million nodes fall into heaps."""
-    return load_scene(write_scene("heaps", folder / "heaps"))
+def written(folder: Path, name: str, count: int | None = None) -> Scene:
+    """One of the large scenes."""
+    return load_scene(write_scene(name, folder / f"{name}{count or ''}", count))
 
 
 CASES: dict[str, Callable[[Path], Scene]] = {
     "bowls in bowls": bowls,
-    "torus knots": knots,
+    "torus knots": partial(written, name="knots", count=12),
     "mugs on pegs": mugs,
     "scan of 200,000 triangles": scan,
-    **{f"{count} spheres in a bowl": spheres(count) for count in BALLS},
-    "heaps": heaps,
+    **{f"{count} spheres in a bowl": partial(written, name="bowl", count=count) for count in (16, 512)},
+    "heaps": partial(written, name="heaps"),
 }
-
-
+LARGE = ("512 spheres in a bowl", "heaps")
 ALL = ["MOVi-B", *CASES]
-
-
-def alike(scene: Scene) -> Scene:
-    """The scene with one friction, no restitution and no sleep."""
-    bodies = tuple(replace(b, friction=FRICTION, restitution=0.0) for b in scene.bodies)
-    return replace(scene, bodies=bodies, effects=Effects(sleep="off"))
 
 
 def in_pieces(scene: Scene, folder: Path) -> Scene:
@@ -205,13 +174,6 @@ def in_pieces(scene: Scene, folder: Path) -> Scene:
     return replace(scene, shapes=tuple(shapes))
 
 
-def movi_b(data: Path) -> list[Scene]:
-    """Recorded starts, as scenes of their own."""
-    recorded = [Trajectory.load(file) for file in trajectory_files(data, "test")[:MOVI_B]]
-    shapes = load_shapes(data, {str(n) for t in recorded for n in t.shape})
-    return [scene_of([t], [0], shapes, FLOOR)[0] for t in recorded]
-
-
 # --- measuring ---
 
 
@@ -219,30 +181,18 @@ def moved(name: str, scene: Scene, steps: int, inner: int, folder: Path) -> tupl
     """An engine's motion of a scene in m and s, its ms per simulated second, and the seconds that preparing took."""
     units = scene_units(scene, load_model("solver"))
     began = time.perf_counter()
-    run = ENGINES[name]
-    if run is None:
-        simulator = Simulator(scene, "solver")
-        simulator.rules = replace(simulator.rules, substeps=inner)
-        frames = [next(simulator.frames(1))]
-        prepared = time.perf_counter() - began
-        simulator.reset()
-        frames, spent = [], time.process_time()
-
-        def advance(count: int) -> None:
-            for frame in simulator.frames(count):
-                frames.append(frame)
-                if time.process_time() - spent > LONGEST:
-                    raise SdfsimError(f"{len(frames)} of {steps} steps in {LONGEST:g} s")
-
-        timing = timed(advance, steps)
-        motion = rollout_motion(scene, join(frames))
-    else:
+    if run := ENGINES[name]:
         start = start_of_scene(in_pieces(scene, folder / "pieces"), folder / "engine", units)
         prepared = time.perf_counter() - began
         motion, timing = run(start, steps, inner)
-        lengths = {"position": units.length, "scale": units.length, "velocity": units.length / units.time}
-        motion = replace(motion, **{key: factor * getattr(motion, key) for key, factor in lengths.items()})
-    return motion, timing.cpu_ms / (0.02 * units.time), prepared
+        return in_metres(motion, units), timing.cpu_ms / (0.02 * units.time), prepared
+    simulator = Simulator(scene, "solver")
+    simulator.rules = replace(simulator.rules, substeps=inner)
+    next(simulator.frames(1))
+    prepared = time.perf_counter() - began
+    simulator.reset()
+    rollout, timing = ours(simulator, steps)
+    return rollout_motion(scene, rollout), timing.cpu_ms / (0.02 * units.time), prepared
 
 
 def measured(name: str, case: str, data: Path, folder: Path) -> dict[str, Any]:
@@ -255,15 +205,21 @@ def measured(name: str, case: str, data: Path, folder: Path) -> dict[str, Any]:
     """
     torch.set_num_threads(1)
     (folder / "pieces").mkdir(parents=True, exist_ok=True)
-    large = case == "heaps" or case.startswith("512")
-    scenes = [alike(s) for s in (movi_b(data) if case == "MOVi-B" else [CASES[case](folder)])]
-    steps, inners = (HEAP_STEPS, (USUAL,)) if large else (STEPS, INNER)
+    if case == "MOVi-B":
+        recorded, shapes = load_recorded(data, "test", most=MOVI_B)
+        scenes = [scene_of([t], [0], shapes)[0] for t in recorded]
+    else:
+        scenes = [CASES[case](folder)]
+    for k, scene in enumerate(scenes):
+        bodies = tuple(replace(b, friction=FRICTION, restitution=0.0) for b in scene.bodies)
+        scenes[k] = replace(scene, bodies=bodies, effects=Effects(sleep="off"))
+    steps, inners = (HEAP_STEPS, (USUAL,)) if case in LARGE else (STEPS, INNER)
     size = [min(largest_extent(s.shapes[b.shape]) * b.scale for b in s.bodies if b.motion == "dynamic") for s in scenes]
     found: dict[int, dict[str, float]] = {}
     motions: dict[int, list[Trajectory]] = {}
     prepare, broken = 0.0, {}
     with peak_memory() as memory:
-        for inner in sorted(inners):
+        for inner in inners:
             try:
                 runs = [moved(name, scene, steps, inner, folder) for scene in scenes]
             except SdfsimError as error:
@@ -277,11 +233,11 @@ def measured(name: str, case: str, data: Path, folder: Path) -> dict[str, Any]:
                 "deep": float(np.percentile(deep, 95)) if len(deep) else 0.0,
                 "lost": sum(lost(case, motion, w) for motion, w in zip(motions[inner], size, strict=True)),
             }
-    if (finest := motions.pop(INNER[-1], None)) is not None:
-        for inner, mine in motions.items():
+    for inner, mine in motions.items():
+        if INNER[-1] in motions and inner != INNER[-1]:
             gaps = [
                 np.linalg.norm((one.position - best.position)[: COMPARED + 1, ~one.static], axis=-1).ravel() / w
-                for one, best, w in zip(mine, finest, size, strict=True)
+                for one, best, w in zip(mine, motions[INNER[-1]], size, strict=True)
             ]
             found[inner]["away"] = float(np.sqrt(np.mean(np.concatenate(gaps) ** 2)))
     return {"inner": found, "broken": broken, "prepare_s": prepare, "mib": memory["mib"]}
@@ -303,39 +259,28 @@ def table(results: Results, cases: list[str]) -> str:
     for case in cases:
         for name in ENGINES:
             result = results[case, name]
-            if "failed" in result:
-                rows.append((case, name, result["failed"], *[""] * 6))
-                continue
-            usual = result["inner"].get(str(USUAL))
+            usual = result.get("inner", {}).get(str(USUAL))
             if usual is None:
-                rows.append((case, name, "; ".join(result["broken"].values()), *[""] * 6))
+                why = result.get("failed") or "; ".join(result["broken"].values())
+                rows.append((case, name, why, *[""] * 6))
                 continue
             equal = [one["ms"] for one in result["inner"].values() if one["deep"] <= DEEP and not one["lost"]]
             rows.append((
                 case, name, number(usual["ms"]), number(100 * usual["deep"], 2),
-                number(100 * usual.get("away", np.nan), 2),
-                str(usual["lost"]), number(min(equal)) if equal else "none", number(result["prepare_s"], 2),
-                number(result["mib"]),
+                number(100 * usual.get("away", np.nan), 2), str(usual["lost"]),
+                number(min(equal)) if equal else "none", number(result["prepare_s"], 2), number(result["mib"]),
             ))  # fmt: skip
     return markdown(rows)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("-o", "--out", type=Path, required=True)
-    parser.add_argument("--only", nargs="+", default=ALL, help="cases")
-    chosen = parser.parse_args()
-    jobs = [
-        Job(case, name, [INNER, STEPS, COMPARED, HEAP_STEPS, MOVI_B, FRICTION], measured,
-            (name, case, chosen.data.resolve(), chosen.out / "scenes"))
-        for case in chosen.only for name in ENGINES
-    ]  # fmt: skip
-    results = measure(jobs, chosen.out / "results", where="fresh", on_progress=lambda _, m: print(m, flush=True))
-    print(table(results, chosen.only))
-    some = "" if chosen.only == ALL else " --only " + " ".join(f'"{case}"' for case in chosen.only)
-    write_section("rivals", f"python benchmarks/rivals.py DATA -o DIR{some}", table(results, chosen.only))
+def main(data: Path, *, out: Path, only: list[str] = ALL) -> None:
+    content, jobs = [INNER, STEPS, COMPARED, HEAP_STEPS, MOVI_B, FRICTION], []
+    for case in only:
+        jobs += [Job(case, name, content, measured, (name, case, data.resolve(), out / "scenes")) for name in ENGINES]
+    results = measure(jobs, out / "results", where="fresh", on_progress=told)
+    some = "" if only == ALL else " --only " + " ".join(f'"{case}"' for case in only)
+    write_section("rivals", f"python benchmarks/rivals.py DATA -o DIR{some}", table(results, only))
 
 
 if __name__ == "__main__":
-    run_main(main)
+    script(__doc__, main)

@@ -13,7 +13,6 @@ holds is not measured again. The *paper* network predicts all motion of all bodi
 
 from __future__ import annotations
 
-import argparse
 import os
 import resource
 import subprocess
@@ -29,7 +28,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.results import write_section
+from benchmarks.results import script, told, write_section
 from samples.large import HEAPS, write_scene
 from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import FLOOR, Trajectory, load_shapes, trajectory_files
@@ -37,10 +36,9 @@ from sdfsim.dynamics.model import load_model
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.simulator import SimulationError, Simulator, join
 from sdfsim.dynamics.units import scene_units
-from sdfsim.errors import run_main
-from sdfsim.evaluation.engines import bullet, mujoco, rollout_motion, start_of_scene
+from sdfsim.evaluation.engines import Engine, bullet, in_metres, mujoco, rollout_motion, start_of_scene
 from sdfsim.evaluation.hard_cases import body, box, on_floor
-from sdfsim.evaluation.harness import Job, Line, Panel, Results, draw, markdown, measure, number, peak_memory
+from sdfsim.evaluation.harness import Job, Panel, cells, draw, line, markdown, measure, number, peak_memory
 from sdfsim.evaluation.penetration import depths
 from sdfsim.parallel import cluster, parallel
 from sdfsim.scene.scene import Scene
@@ -50,7 +48,6 @@ BOWLS = (1, 16, 64, 256, 512)
 APART = (125, 500, 2000)
 PARTS = (16, 4, 1)  # of the nodes of a knot
 DISTINCT, CHUNK, STEPS = 100, 10, 96  # scenes that differ, scenes of a job, steps of a scene
-COUNTS = ("pairs", "contacts", "edges")
 COLUMNS = {"ms": "ms a step", "peak_mib": "MiB", "contacts": "contacts", "depth_95": "deepest 95 %, mm", "lost": "lost"}
 
 
@@ -67,7 +64,7 @@ def with_nodes_cut(scene: Scene, keep: float) -> Scene:
     return replace(scene, shapes=shapes)
 
 
-def ours(source: Path | int, steps: int, model: str | None, keep: float = 1.0) -> dict:
+def ours(source: Path | int, steps: int, model: str, keep: float = 1.0) -> dict:
     """What a scene (its file, or so many boxes `apart`) costs with a model, and how deep bodies are in each other."""
     torch.set_num_threads(1)
     scene = apart(source) if isinstance(source, int) else with_nodes_cut(load_scene(source), keep)
@@ -84,35 +81,32 @@ def ours(source: Path | int, steps: int, model: str | None, keep: float = 1.0) -
             broken = error.message
         spent = time.process_time() - began
     rollout = join(frames)
-    depth = depths(scene, rollout_motion(scene, rollout))
     return {
         "bodies": int(simulator.bodies.moves.sum()),
-        "nodes": len(simulator.bodies.node),
         "ms": 1e3 * spent / max(1, len(frames) - 1),
-        "counts": {name: float(rollout.counters[name].mean()) for name in COUNTS},
         "contacts": float(rollout.counters["contacts"].mean()),
-        "depth_95": 1e3 * float(np.percentile(depth, 95)) if len(depth) else 0.0,
-        "lost": int((rollout.position[-1, :, 2] < -0.1).sum()),
         "broken": broken,
         "peak_mib": memory["mib"],
-    }
+    } | _where(scene, rollout_motion(scene, rollout))
 
 
-def engine(name: str, file: Path, steps: int) -> dict:
-    """The same of PyBullet or MuJoCo; spheres are spheres there, everything else its convex pieces."""
+def engine(run: Engine, file: Path, steps: int) -> dict:
+    """The same of an engine; spheres are spheres there, everything else its convex pieces."""
     scene = load_scene(file)
     units = scene_units(scene, load_model("solver"))
     start = start_of_scene(scene, file.parent / "engine", units)
     with peak_memory() as memory:
-        motion, timing = (bullet if name == "PyBullet" else mujoco)(start, steps)
-    lengths = {"position": units.length, "scale": units.length}
-    depth = depths(scene, replace(motion, **{name: f * getattr(motion, name) for name, f in lengths.items()}))
+        motion, timing = run(start, steps)
+    known = {"bodies": int((~motion.static).sum()), "ms": timing.cpu_ms, "peak_mib": memory["mib"]}
+    return known | _where(scene, in_metres(motion, units))
+
+
+def _where(scene: Scene, motion: Trajectory) -> dict[str, float]:
+    """How deep bodies are in each other, mm, and how many are below the floor at the end."""
+    depth = depths(scene, motion)
     return {
-        "bodies": int((~motion.static).sum()),
-        "ms": timing.cpu_ms,
         "depth_95": 1e3 * float(np.percentile(depth, 95)) if len(depth) else 0.0,
-        "lost": int((units.length * motion.position[-1, :, 2] < -0.1).sum()),
-        "peak_mib": memory["mib"],
+        "lost": int((motion.position[-1, :, 2] < -0.1).sum()),
     }
 
 
@@ -125,46 +119,35 @@ def jobs_of(folder: Path, paper: str | None, largest: int) -> list[Job]:
 
     jobs = []
     for count in (n for n in BOWLS if n <= largest):
-        for nodes, model in ((64, "solver"), (512, "solver"), (64, "small"), (64, paper)):
-            if model:
-                steps = 200 if model != paper else 10
-                method = f"{Path(model).stem}, {nodes} nodes"
-                case = f"{count} spheres in a bowl"
-                jobs.append(Job(case, method, [steps], ours, (scene("bowl", count, nodes), steps, model)))
-        for name in ("PyBullet", "MuJoCo"):
-            jobs.append(Job(f"{count} spheres in a bowl", name, [200], engine, (name, scene("bowl", count, 64), 200)))
+        case = f"{count} spheres in a bowl"
+        for nodes, model in ((64, "solver"), (512, "solver"), (64, "small"), *(((64, paper),) if paper else ())):
+            steps, method = 200 if model != paper else 10, f"{Path(model).stem}, {nodes} nodes"
+            jobs.append(Job(case, method, [steps], ours, (scene("bowl", count, nodes), steps, model)))
+        for name, run in (("PyBullet", bullet), ("MuJoCo", mujoco)):
+            jobs.append(Job(case, name, [200], engine, (run, scene("bowl", count, 64), 200)))
     for model in ("solver", "small"):
         jobs += [Job(f"{n} boxes far apart", model, [30], ours, (n, 30, model)) for n in APART if n <= 4 * largest]
         for parts in PARTS:
-            arguments = (scene("knots", 64, 2844), 100, model, 1 / parts)
-            jobs.append(Job(f"64 knots of {2844 // parts} nodes", model, [100], ours, arguments))
+            knots = (scene("knots", 64, 2844), 100, model, 1 / parts)
+            jobs.append(Job(f"64 knots of {2844 // parts} nodes", model, [100], ours, knots))
     return jobs
 
 
-def table(results: Results) -> str:
-    """A row a result, in Markdown."""
-    rows = [("case", "with", *COLUMNS.values(), "")]
-    for (case, method), found in results.items():
-        cells = (number(found.get(name)) for name in COLUMNS)
-        rows.append((case, method, *cells, found.get("broken") or found.get("failed") or ""))
-    return markdown(rows)
-
-
-def growth(out: Path, paper: str | None, largest: int) -> None:
+def growth(*, out: Path, paper: str | None = None, largest: int = 512) -> None:
     """Write the section and scale.png."""
-    jobs = jobs_of(out, paper, largest)
-    results = measure(jobs, out / "results", where="fresh", on_progress=told)
-    bowls = {key: found for key, found in results.items() if "bowl" in key[0] and "failed" not in found}
+    results = measure(jobs_of(out, paper, largest), out / "results", where="fresh", on_progress=told)
+    bowls = {key: found for key, found in results.items() if "bowl" in key[0]}
     panels = []
     for name in ("ms", "peak_mib"):
         lines = []
         for method in dict.fromkeys(method for _, method in bowls):
             mine = [found for (_, one), found in bowls.items() if one == method]
-            lines.append(Line(method, [found["bodies"] for found in mine], [found[name] for found in mine]))
+            lines.append(line(method, mine, "bodies", name))
         panels.append(Panel("spheres in a bowl", "spheres", COLUMNS[name], lines, "xy"))
-    draw(panels, out / "scale.png", dpi=110)
-    print(table(results))
-    write_section("growth", "python benchmarks/scale.py growth -o DIR", table(results))
+    draw(panels, out / "scale.png")
+    rows = [("case", "with", *COLUMNS.values(), "")]
+    rows += [(*key, *cells(found, COLUMNS)) for key, found in results.items()]
+    write_section("growth", "python benchmarks/scale.py growth -o DIR", markdown(rows))
 
 
 def to_the_end(name: str, home: Path) -> dict[str, Any]:
@@ -192,36 +175,31 @@ def to_the_end(name: str, home: Path) -> dict[str, Any]:
     }
 
 
-def large(out: Path) -> None:
+def large(*, out: Path) -> None:
     """Write the section and a movie each."""
     jobs = [Job("to the end", name, [name], to_the_end, (name, out)) for name in HEAPS]
     results = measure(jobs, out / "large", where="fresh", on_progress=told)
     titles = {"bodies": "bodies", "nodes": "nodes", "steps": "steps", "s": "s from command to recording", "mib": "MiB",
               "worst": "deepest, mm", "lost": "below the floor"}  # fmt: skip
-    rows = [
-        ("", *titles.values()),
-        *((name, *(number(results["to the end", name][k]) for k in titles)) for name in HEAPS),
-    ]
-    print(markdown(rows))
+    rows = [("", *titles.values())]
+    rows += [(name, *(number(results["to the end", name][k]) for k in titles)) for name in HEAPS]
     write_section("large scenes", "python benchmarks/scale.py large -o DIR", markdown(rows))
 
 
-def simulated(scenes: list[Scene], steps: int) -> int:
-    """How many bodies moved."""
+def simulated(scenes: list[Scene], steps: int) -> None:
     for scene in scenes:
         Simulator(scene).run(steps=steps)
-    return sum(b.motion == "dynamic" for scene in scenes for b in scene.bodies)
 
 
-def many(data: Path, count: int) -> None:
+def many(data: Path, *, scenes: int = 1000) -> None:
     """Write the section: scenes a second by workers."""
     from distributed import LocalCluster
 
     recorded = [Trajectory.load(file) for file in trajectory_files(data, "train")[:DISTINCT]]
     shapes = load_shapes(data, {str(n) for t in recorded for n in t.shape})
     distinct = [scene_of([t], [0], shapes, FLOOR)[0] for t in recorded]
-    scenes = [distinct[k % len(distinct)] for k in range(count)]
-    jobs = [(scenes[k : k + CHUNK], STEPS) for k in range(0, count, CHUNK)]
+    repeated = [distinct[k % len(distinct)] for k in range(scenes)]
+    jobs = [(repeated[k : k + CHUNK], STEPS) for k in range(0, scenes, CHUNK)]
     rows, first = [("workers", "scenes a second", "times one worker")], 0.0
     for workers in range(1, (os.cpu_count() or 1) + 1):
         local: Any = LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address="")
@@ -230,38 +208,11 @@ def many(data: Path, count: int) -> None:
                 deque(parallel(simulated, jobs[:workers]), maxlen=0)  # not timed: the workers load what is compiled
                 began = time.perf_counter()
                 deque(parallel(simulated, jobs), maxlen=0)
-                rate = count / (time.perf_counter() - began)
+                rate = scenes / (time.perf_counter() - began)
         first = first or rate
         rows.append((str(workers), number(rate), f"{rate / first:.2f}"))
-    print(markdown(rows))
-    write_section("many scenes", f"python benchmarks/scale.py many DATA --scenes {count}", markdown(rows))
-
-
-def told(_: float, message: str) -> None:
-    print(message, flush=True)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    commands = parser.add_subparsers(dest="command", required=True)
-    for name in ("growth", "large", "many"):
-        command = commands.add_parser(name)
-        if name == "many":
-            command.add_argument("data", type=Path)
-            command.add_argument("--scenes", type=int, default=1000)
-        else:
-            command.add_argument("-o", "--out", type=Path, required=True)
-        if name == "growth":
-            command.add_argument("--paper", help="weights of a paper network")
-            command.add_argument("--largest", type=int, default=512, help="bodies in the bowl")
-    chosen = parser.parse_args()
-    if chosen.command == "growth":
-        growth(chosen.out, chosen.paper, chosen.largest)
-    elif chosen.command == "large":
-        large(chosen.out)
-    else:
-        many(chosen.data, chosen.scenes)
+    write_section("many scenes", f"python benchmarks/scale.py many DATA --scenes {scenes}", markdown(rows))
 
 
 if __name__ == "__main__":
-    run_main(main)
+    script(__doc__, growth, large, many)

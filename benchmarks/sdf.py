@@ -9,18 +9,22 @@ timed. Fits that DIR holds are not made again. Writes DIR/table.md and DIR/sdf.p
 
 from __future__ import annotations
 
-import argparse
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import torch
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.results import script, told
 from sdfsim.data.public_shapes import public_folder
-from sdfsim.errors import SdfsimError, run_main
-from sdfsim.evaluation.harness import Job, Line, Panel, Results, draw, machine, markdown, measure, number
+from sdfsim.errors import SdfsimError
+from sdfsim.evaluation.harness import Job, Panel, cells, draw, line, machine, markdown, measure, number
 from sdfsim.files import write_text
 from sdfsim.shape.fit import FIT_VERSION, PLANS, Recipe, fit_mesh
 from sdfsim.shape.fit_metrics import EXACT
@@ -37,17 +41,14 @@ ERRORS = tuple(EXACT)
 
 def fit(file: Path, folder: Path, recipe: Recipe, budget: float, width: int | None = None) -> dict:
     """Fit a mesh, keep the shape, and tell the errors of its certificate, and the seconds that it took."""
-    usual = PLANS[recipe]
-    PLANS[recipe] = replace(usual, width=width or usual.width)
+    plan = replace(PLANS[recipe], width=width or PLANS[recipe].width)
     began = time.monotonic()
-    try:
+    with patch.dict(PLANS, {recipe: plan}):
         shape = fit_mesh(load_mesh(file), name=file.parent.name, recipe=recipe, budget=budget)
-    finally:
-        PLANS[recipe] = usual
     shape.save(folder)
-    told = {name: shape.certificate[name] for name in (*ERRORS, "steps")}
-    reason = shape.certificate["reason"] or shape.certificate["caveat"]
-    return told | {"seconds": time.monotonic() - began, "reason": reason}
+    found = {name: shape.certificate[name] for name in (*ERRORS, "steps")}
+    missed = shape.certificate["reason"] or shape.certificate["caveat"]
+    return found | {"seconds": time.monotonic() - began, "broken": missed}
 
 
 def queries(file: Path, default: Path, paper: Path) -> dict:
@@ -91,59 +92,38 @@ def queries(file: Path, default: Path, paper: Path) -> dict:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("meshes", type=Path, metavar="MESH_FOLDER")
-    parser.add_argument("-o", "--out", type=Path, required=True)
-    parser.add_argument("--shapes", help="names, separated by commas (default: all)")
-    parser.add_argument("--seconds", type=float, default=60.0, help="budget of a fit")
-    chosen = parser.parse_args()
-    files = {file.parent.name: file for file in sorted(public_folder(chosen.meshes).glob("*/visual_geometry.obj"))}
-    names = chosen.shapes.split(",") if chosen.shapes else list(files)
+def main(meshes: Path, *, out: Path, shapes: str = "", seconds: float = 60.0) -> None:
+    files = {file.parent.name: file for file in sorted(public_folder(meshes).glob("*/visual_geometry.obj"))}
+    names = shapes.split(",") if shapes else list(files)
     if not files or set(names) - set(files):
-        raise SdfsimError(f"{chosen.meshes}: no NAME/visual_geometry.obj of {', '.join(names) or 'any shape'}")
-    methods = {"ours": ("default", chosen.seconds), "paper's recipe": ("paper", chosen.seconds)}
-    methods |= {f"ours, {width} wide": ("default", chosen.seconds, width) for width in WIDTHS}
+        raise SdfsimError(f"{meshes}: no NAME/visual_geometry.obj of {', '.join(names) or 'any shape'}")
+    methods = {"ours": ("default", seconds), "paper's recipe": ("paper", seconds)}
+    methods |= {f"ours, {width} wide": ("default", seconds, width) for width in WIDTHS}
     methods |= {f"ours, {budget:g} s": ("default", budget) for budget in BUDGETS}
     jobs = []
     for name in names:
         for method, plan in methods.items():
             content = [FIT_VERSION, load_mesh(files[name]), plan, PLANS[plan[0]], machine()]
-            jobs.append(Job(name, method, content, fit, (files[name], chosen.out / "shapes" / method / name, *plan)))
-    tell = lambda fraction, message: print(f"{fraction:4.0%} {message}", flush=True)  # noqa: E731
-    fits = measure(jobs, chosen.out / "results", on_progress=tell)
-    shapes = [chosen.out / "shapes" / method / names[0] for method in ("ours", "paper's recipe")]
-    asked = Job(names[0], "queries", [jobs[0].content], queries, (files[names[0]], *shapes))
-    timed = measure([asked], chosen.out / "results", on_progress=tell)[names[0], "queries"]
-    draw(panels(fits, names), chosen.out / "sdf.png", dpi=110)
+            jobs.append(Job(name, method, content, fit, (files[name], out / "shapes" / method / name, *plan)))
+    fits = measure(jobs, out / "results", on_progress=told)
+    fitted = [out / "shapes" / method / names[0] for method in ("ours", "paper's recipe")]
+    asked = Job(names[0], "queries", [jobs[0].content], queries, (files[names[0]], *fitted))
+    timed = measure([asked], out / "results", on_progress=told)[names[0], "queries"]
+    panels = []
+    for key in ("error_within_0.01", "error_in_box"):
+        ours = [*(f"ours, {b:g} s" for b in BUDGETS), "ours"]
+        lines = [line(name, [fits[name, method] for method in ours], "seconds", key) for name in names]
+        panels.append(Panel(key.replace("_", " "), "seconds", "of the largest extent", lines, "xy", EXACT[key]))
+    draw(panels, out / "sdf.png")
+    # Errors are relative to the largest extent; the last column says what of its certificate a fit missed.
+    table = [("shape", "fit", *ERRORS, "updates", "s", "missed")]
+    table += [(*key, *cells(found, (*ERRORS, "steps", "seconds"))) for key, found in fits.items()]
     rows = [("", f"s per million points of {names[0]}", "bytes")]
     rows += [(name, number(found["seconds"]), f"{found['bytes']:,}") for name, found in timed.items()]
-    text = f"{table(fits)}\n{markdown(rows)}"
-    write_text(chosen.out / "table.md", text)
+    text = f"{markdown(table)}\n{markdown(rows)}"
+    write_text(out / "table.md", text)
     print(text)
 
 
-def table(fits: Results) -> str:
-    """A row a fit: errors relative to the largest extent, and what of the certificate it missed."""
-    rows: list[tuple[str, ...]] = [("shape", "fit", *ERRORS, "updates", "s", "missed")]
-    for (name, method), found in fits.items():
-        cells = (number(found.get(key)) for key in (*ERRORS, "steps", "seconds"))
-        rows.append((name, method, *cells, found.get("failed") or found["reason"]))
-    return markdown(rows)
-
-
-def panels(fits: Results, names: list[str]) -> list[Panel]:
-    """Errors against seconds of our fits, a line a shape."""
-    shown = []
-    for key in ("error_within_0.01", "error_in_box"):
-        lines = []
-        for name in names:
-            mine = [fits[name, method] for method in (*(f"ours, {b:g} s" for b in BUDGETS), "ours")]
-            mine = [found for found in mine if "failed" not in found]
-            lines.append(Line(name, [found["seconds"] for found in mine], [found[key] for found in mine]))
-        shown.append(Panel(key.replace("_", " "), "seconds", "of the largest extent", lines, "xy", EXACT[key]))
-    return shown
-
-
 if __name__ == "__main__":
-    run_main(main)
+    script(__doc__, main)

@@ -52,13 +52,12 @@ def stress(
     """The hard cases, with every model and the teacher: a table, plots, and recordings of what went wrong."""
     from sdfsim.evaluation import stress as study
     from sdfsim.evaluation.harness import check_matplotlib
-    from sdfsim.recording import save_rollout
 
     check_matplotlib()
     options: Any = {"models": model or [], "quick": quick, "shapes": shapes, "device": device}
-    found = study.stress(out, **options, record=save_rollout, on_progress=session.progress)
+    found = study.stress(out, **options, on_progress=session.progress)
     report = study.write_report(found, out)
     tell_failed(session, report)
-    lost = [f"{who}: {', '.join(f'{n} {what}' for what, n in lost.items())}" for who, lost in report["models"].items()]
     table = columns(study.rows(found, {"missed": "!", "behind": "<"}))
-    session.report(report, [*table, "! beyond what is wanted, < worse than the teacher", *lost, f"wrote {out}"])
+    notes = ["! beyond what is wanted, < worse than the teacher", *study.loss_lines(found), f"wrote {out}"]
+    session.report(report, [*table, *notes])

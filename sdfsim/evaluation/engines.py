@@ -10,8 +10,8 @@ import importlib
 import re
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import chdir, contextmanager
+from collections.abc import Callable
+from contextlib import chdir
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from sdfsim.data.pybullet_sim import DT, SUBSTEPS, Teacher, TeacherBody, substep
 from sdfsim.data.shape_assets import decompose
 from sdfsim.dynamics.bodies import Units, from_scene
 from sdfsim.dynamics.rollout import Rollout
+from sdfsim.dynamics.simulator import Simulator, join
 from sdfsim.errors import SdfsimError
 from sdfsim.files import write_text
 from sdfsim.scene.scene import Scene
@@ -40,23 +41,19 @@ ITERATIONS = 10  # of Newton's XPBD in an inner step
 LONGEST = 60.0  # s of the processor that an engine may take for a motion
 
 
+FRAMES = ("position", "quat_xyzw", "velocity", "angular_velocity")
+SI = Units(1.0, 1.0, 1.0)
+
+
 @dataclass(frozen=True)
 class Start:
-    """What an engine starts from.
+    """What an engine starts from."""
 
-    Attributes:
-        motion: its first frame counts.
-        urdfs: the engine's file of each shape, by name.
-        floor: friction and restitution of the floor z = 0, or None for no floor.
-        own_inertia: the bodies get the inertias of `motion`; else the engine takes its own, which must be the same.
-        meshes: the surface of each shape about its centre of mass, by name: for engines that collide surfaces.
-    """
-
-    motion: Trajectory
-    urdfs: dict[str, Path]
-    floor: tuple[float, float] | None
-    own_inertia: bool = False
-    meshes: dict[str, Mesh] = field(default_factory=dict)
+    motion: Trajectory  # its first frame counts
+    urdfs: dict[str, Path]  # the engine's file of each shape, by name
+    floor: tuple[float, float] | None  # friction and restitution of the floor z = 0, or None for no floor
+    own_inertia: bool = False  # bodies get the inertias of `motion`; else the engine's own must be the same
+    meshes: dict[str, Mesh] = field(default_factory=dict)  # about centres of mass, for engines that collide surfaces
 
 
 @dataclass(frozen=True)
@@ -66,6 +63,9 @@ class Timing:
     first_ms: float
     wall_ms: float
     cpu_ms: float
+
+
+Engine = Callable[..., tuple[Trajectory, Timing]]  # called with a start, steps to record, and inner steps in one
 
 
 def timed(advance: Callable[[int], object], steps: int) -> Timing:
@@ -80,22 +80,25 @@ def timed(advance: Callable[[int], object], steps: int) -> Timing:
     return Timing(1e3 * first, 1e3 * wall / count, 1e3 * cpu / count)
 
 
-def start_of_scene(scene: Scene, folder: Path, units: Units | None = None) -> Start:
+def ours(simulator: Simulator, steps: int) -> tuple[Rollout, Timing]:
+    """Our motion, and its time."""
+    frames: list[Rollout] = []
+    timing = timed(lambda count: frames.extend(simulator.frames(count)), steps)
+    return join(frames), timing
+
+
+def start_of_scene(scene: Scene, folder: Path, units: Units = SI) -> Start:
     """A scene whose only plane, if any, is a level floor; shapes are called by their index in it.
 
-    The engine's files are written to `folder` where they are not there yet. Units are SI unless given.
-
-    Raises:
-        SdfsimError: bodies on a path, or planes other than one level floor.
+    The engine's files are written to `folder` where they are not there yet. Raises SdfsimError for bodies on a path, or
+    planes other than one level floor.
     """
     planes = [b for b in scene.bodies if isinstance(scene.shapes[b.shape].sdf, PlaneSdf)]
     upright = [Rotation.from_quat(b.quat_xyzw).apply([0.0, 0.0, 1.0])[2] > 1 - 1e-9 for b in planes]
-    where = f"{scene.path}: " if scene.path else ""
-    if any(b.motion == "kinematic" for b in scene.bodies):
-        raise SdfsimError(f"{where}has bodies on a path, which the engines do not know")
-    if len(planes) > 1 or not all(upright):
-        raise SdfsimError(f"{where}the engines know one level plane as the floor (has {len(planes)} planes)")
-    units = units or Units(1.0, 1.0, 1.0)
+    if len(planes) > 1 or not all(upright) or any(b.motion == "kinematic" for b in scene.bodies):
+        raise SdfsimError(
+            f"{scene.path or 'scene'}: engines know one level plane as the floor, and no bodies on a path"
+        )
     motion = start_motion(scene, units)
     motion.position[..., 2] -= planes[0].position[2] / units.length if planes else 0.0
     shapes = {name: scene.shapes[int(name)] for name in sorted(set(motion.shape.tolist()))}
@@ -109,10 +112,10 @@ def centred_mesh(shape: Shape) -> Mesh:
     return Mesh(shape.mesh.vertices - shape.com, shape.mesh.faces)
 
 
-def start_motion(scene: Scene, units: Units = Units(1.0, 1.0, 1.0)) -> Trajectory:  # noqa: B008
+def start_motion(scene: Scene, units: Units = SI) -> Trajectory:
     """The start of a scene's bodies but for planes as a recording of one frame, shapes called by their index."""
     bodies, state = from_scene(scene, units, torch.device("cpu"))
-    solid = np.array([not isinstance(scene.shapes[b.shape].sdf, PlaneSdf) for b in scene.bodies])
+    solid = _solid(scene)
 
     def of(values: torch.Tensor) -> np.ndarray:
         return values.numpy()[solid].copy()
@@ -136,11 +139,20 @@ def start_motion(scene: Scene, units: Units = Units(1.0, 1.0, 1.0)) -> Trajector
 
 def rollout_motion(scene: Scene, rollout: Rollout) -> Trajectory:
     """Our motion of a scene as `start_motion` has its start."""
-    solid = [not isinstance(scene.shapes[b.shape].sdf, PlaneSdf) for b in scene.bodies]
-    names = {"quat_xyzw": "orientation"}
-    frames = ("position", "quat_xyzw", "velocity", "angular_velocity")
-    found = {name: getattr(rollout, names.get(name, name))[:, solid] for name in frames}
+    frames = (rollout.position, rollout.orientation, rollout.velocity, rollout.angular_velocity)
+    found = {name: values[:, _solid(scene)] for name, values in zip(FRAMES, frames, strict=True)}
     return replace(start_motion(scene), **found, dt=float(rollout.meta["dt"]))
+
+
+def _solid(scene: Scene) -> np.ndarray:
+    """[N] bool: which bodies are no planes."""
+    return np.array([not isinstance(scene.shapes[b.shape].sdf, PlaneSdf) for b in scene.bodies])
+
+
+def in_metres(motion: Trajectory, units: Units) -> Trajectory:
+    """An engine's motion from a `start_of_scene` in `units`, with positions, scales and velocities in m and m/s."""
+    lengths = {"position": units.length, "scale": units.length, "velocity": units.velocity}
+    return replace(motion, **{name: factor * getattr(motion, name) for name, factor in lengths.items()})
 
 
 # --- PyBullet ---
@@ -152,20 +164,8 @@ def bullet(start: Start, steps: int, substeps: int | None = None) -> tuple[Traje
     Raises:
         SdfsimError: PyBullet is not installed, a step that is none of the teacher's, or another inertia than recorded.
     """
-    parts: list[dict[str, np.ndarray]] = []
-    with bullet_at(start, substeps) as teacher:
-        timing = timed(lambda count: parts.append(teacher.run(count)), steps)
-    first, rest = parts
-    motion = {name: np.concatenate([first[name][:1], rest[name]]) for name in first}
-    return replace(start.motion, **motion), timing
-
-
-@contextmanager
-def bullet_at(start: Start, substeps: int | None = None) -> Iterator[Teacher]:
-    """The teacher at a start. Raises as `bullet` does."""
-    t = start.motion
-    inner = substeps or substeps_of(t.dt)
-    with Teacher(t.gravity, start.floor, step=t.dt, substeps=inner) as teacher:
+    t, parts = start.motion, []
+    with Teacher(t.gravity, start.floor, step=t.dt, substeps=substeps or substeps_of(t.dt)) as teacher:
         for i, name in enumerate(t.shape):
             urdf = start.urdfs[str(name)]
             mass = 0.0 if t.static[i] else float(t.mass[i])
@@ -179,7 +179,9 @@ def bullet_at(start: Start, substeps: int | None = None) -> Iterator[Teacher]:
                 teacher.set_inertia(i, t.inertia[i])
             elif not np.allclose(teacher.inertia(i), t.inertia[i], rtol=SAME_INERTIA):
                 raise SdfsimError(f"{urdf}: the engine's inertia is not the recorded one")
-        yield teacher
+        timing = timed(lambda count: parts.append(teacher.run(count)), steps)
+    first, rest = parts
+    return replace(t, **{name: np.concatenate([first[name][:1], rest[name]]) for name in FRAMES}), timing
 
 
 # --- MuJoCo ---
@@ -196,71 +198,7 @@ def mujoco(start: Start, steps: int, substeps: int = SUBSTEPS, *, pieces: bool =
         SdfsimError: MuJoCo is not installed, or a shape's engine file cannot be read.
     """
     engine = _engine("mujoco", "MuJoCo", "bench")
-    t = start.motion
-    model = _mujoco_model(engine, start, t.dt / substeps, pieces)
-    data: Any = engine.MjData(model)
-    moving = np.flatnonzero(~t.static)
-    place, speed = data.qpos.reshape(-1, 7), data.qvel.reshape(-1, 6)
-    place[:, :3], place[:, 3:] = t.position[0, moving], np.roll(t.quat_xyzw[0, moving], 1, axis=-1)
-    turned = Rotation.from_quat(t.quat_xyzw[0, moving])
-    speed[:, :3], speed[:, 3:] = t.velocity[0, moving], turned.inv().apply(t.angular_velocity[0, moving])
-
-    def advance() -> None:
-        for _ in range(substeps):
-            engine.mj_step(model, data)
-
-    def state() -> tuple[np.ndarray, ...]:
-        quat = np.roll(place[:, 3:], -1, axis=-1)
-        return place[:, :3].copy(), quat, speed[:, :3].copy(), Rotation.from_quat(quat).apply(speed[:, 3:])
-
-    return _motion(t, steps, advance, state)
-
-
-def _engine(module: str, title: str, extra: str) -> Any:
-    """An optional package. Raises SdfsimError when it is not installed."""
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise SdfsimError(f"{title} is not installed", f"pip install 'sdfsim[{extra}]'") from error
-
-
-def _motion(
-    start: Trajectory, steps: int, advance: Callable[[], None], state: Callable[[], tuple[np.ndarray, ...]]
-) -> tuple[Trajectory, Timing]:
-    """The motion of an engine, and its time.
-
-    Args:
-        start: its first frame counts.
-        steps: to record.
-        advance: makes one recorded step.
-        state: positions [M, 3] m, quaternions [M, 4] xyzw, velocities [M, 3] m/s and rad/s of the bodies that move, in
-            the frame of the world.
-
-    Raises:
-        SdfsimError: the motion is not finite, or takes too long.
-    """
-    began = time.process_time()
-    frames = [state()]
-
-    def advanced(count: int) -> None:
-        for _ in range(count):
-            advance()
-            frames.append(state())
-            if not np.isfinite(frames[-1][0]).all():
-                raise SdfsimError(f"a position is not finite after {len(frames) - 1} steps")
-            if time.process_time() - began > LONGEST:
-                raise SdfsimError(f"{len(frames) - 1} of {steps} steps in {LONGEST:g} s")
-
-    timing = timed(advanced, steps)
-    names = ("position", "quat_xyzw", "velocity", "angular_velocity")
-    motion = {name: np.repeat(getattr(start, name)[:1], steps + 1, axis=0) for name in names}
-    for name, found in zip(names, zip(*frames, strict=True), strict=True):
-        motion[name][:, ~start.static] = found
-    return replace(start, **motion), timing
-
-
-def _mujoco_model(engine: Any, start: Start, step: float, pieces: bool) -> Any:
-    t, spec = start.motion, engine.MjSpec()
+    t, step, spec = start.motion, start.motion.dt / substeps, engine.MjSpec()
     spec.option.timestep, spec.option.gravity = step, t.gravity
     spec.memory = 2**31
     if start.floor:
@@ -284,16 +222,64 @@ def _mujoco_model(engine: Any, start: Start, step: float, pieces: bool) -> Any:
                 if spec.mesh(shape["meshname"]) is None:
                     scaled = {"uservert": (form["uservert"] * t.scale[i]).ravel()}
                     spec.add_mesh(name=shape["meshname"], **form | scaled)
-            for other in (start.floor, (t.friction[i], t.restitution[i])):
+            # One geom that meets the floor, and one that meets bodies.
+            for kinds, other in (((1, 0), start.floor), ((2, 2), (t.friction[i], t.restitution[i]))):
                 if other is None:
                     continue
                 geom = body.add_geom(**shape)
-                geom.contype, geom.conaffinity = (1, 0) if other is start.floor else (2, 2)
+                geom.contype, geom.conaffinity = kinds
                 geom.condim, geom.friction[0] = 3, t.friction[i] * other[0]
                 bounce = float(np.clip(t.restitution[i] * other[1], 1e-3, 1.0))
                 damping = -np.log(bounce) / np.hypot(np.pi, np.log(bounce))
                 geom.solref = [SOFTEST * step, max(damping, 1e-3)]
-    return spec.compile()
+    model = spec.compile()
+    data: Any = engine.MjData(model)
+    moving = np.flatnonzero(~t.static)
+    place, speed = data.qpos.reshape(-1, 7), data.qvel.reshape(-1, 6)
+    place[:, :3], place[:, 3:] = t.position[0, moving], np.roll(t.quat_xyzw[0, moving], 1, axis=-1)
+    turned = Rotation.from_quat(t.quat_xyzw[0, moving])
+    speed[:, :3], speed[:, 3:] = t.velocity[0, moving], turned.inv().apply(t.angular_velocity[0, moving])
+
+    def state() -> tuple[np.ndarray, ...]:
+        quat = np.roll(place[:, 3:], -1, axis=-1)
+        return place[:, :3].copy(), quat, speed[:, :3].copy(), Rotation.from_quat(quat).apply(speed[:, 3:])
+
+    return _motion(t, steps, lambda: engine.mj_step(model, data, substeps), state)
+
+
+def _engine(module: str, title: str, extra: str) -> Any:
+    """An optional package. Raises SdfsimError when it is not installed."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise SdfsimError(f"{title} is not installed", f"pip install 'sdfsim[{extra}]'") from error
+
+
+def _motion(
+    start: Trajectory, steps: int, advance: Callable[[], None], state: Callable[[], tuple[np.ndarray, ...]]
+) -> tuple[Trajectory, Timing]:
+    """The motion of an engine of `steps` calls of `advance`, and its time.
+
+    `state` gives positions [M, 3] m, quaternions [M, 4] xyzw and velocities [M, 3] m/s and rad/s of the bodies that
+    move, in the frame of the world. Raises SdfsimError where the motion is not finite, or takes longer than `LONGEST`.
+    """
+    began = time.process_time()
+    frames = [state()]
+
+    def advanced(count: int) -> None:
+        for _ in range(count):
+            advance()
+            frames.append(state())
+            if not np.isfinite(frames[-1][0]).all():
+                raise SdfsimError(f"a position is not finite after {len(frames) - 1} steps")
+            if time.process_time() - began > LONGEST:
+                raise SdfsimError(f"{len(frames) - 1} of {steps} steps in {LONGEST:g} s")
+
+    timing = timed(advanced, steps)
+    motion = {name: np.repeat(getattr(start, name)[:1], steps + 1, axis=0) for name in FRAMES}
+    for name, found in zip(FRAMES, zip(*frames, strict=True), strict=True):
+        motion[name][:, ~start.static] = found
+    return replace(start, **motion), timing
 
 
 def _forms(engine: Any, urdf: Path, mesh: Mesh | None) -> list[tuple[Any, np.ndarray | dict[str, Any]]]:
@@ -348,18 +334,15 @@ def drake(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajector
             kind, sizes = form_of(start.urdfs[name])
             place = lib.RigidTransform(lib.Quaternion(np.roll(t.quat_xyzw[0, i], 1)), t.position[0, i])
             scale, moves = float(t.scale[i]), not t.static[i]
-            if kind == "sphere":
-                form: Any = lib.Sphere(scale * sizes[0])
-            elif kind == "box":
-                form = lib.Box(*(scale * sizes))
-            else:
-                file = Path(scratch) / (f"{name}.vtk" if moves else f"{name}.obj")
+            if kind == "mesh":
+                file, mesh = Path(scratch) / (f"{name}.vtk" if moves else f"{name}.obj"), start.meshes[name]
                 if not file.exists():
-                    mesh = start.meshes[name]
                     write_text(file, _tetrahedra(mesh, start.urdfs[name]) if moves else wavefront([mesh]))
-                form = lib.Mesh(str(file), scale)
-            size = scale * float(sizes.min() if len(sizes) else np.ptp(start.meshes[name].vertices, axis=0).min())
-            properties = surface(float(own[i]), moves, size)
+                form, smallest = lib.Mesh(str(file), scale), np.ptp(mesh.vertices, axis=0).min()
+            else:
+                form = lib.Sphere(scale * sizes[0]) if kind == "sphere" else lib.Box(*(scale * sizes))
+                smallest = sizes.min()
+            properties = surface(float(own[i]), moves, scale * float(smallest))
             if not moves:
                 plant.RegisterCollisionGeometry(plant.world_body(), place, form, f"g{i}", properties)
                 continue
@@ -375,26 +358,15 @@ def drake(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajector
         speed = lib.SpatialVelocity(t.angular_velocity[0, i], t.velocity[0, i])
         plant.SetFreeBodySpatialVelocity(context=context, body=body, V_JpJc=speed)
     simulator.Initialize()
-    made = 0
-
-    def advance() -> None:
-        nonlocal made
-        made += 1
-        simulator.AdvanceTo(made * t.dt)
 
     def state() -> tuple[np.ndarray, ...]:
         places = [plant.EvalBodyPoseInWorld(context, body) for _, body, _ in bodies]
         speeds = [plant.EvalBodySpatialVelocityInWorld(context, body) for _, body, _ in bodies]
         quat = np.roll([place.rotation().ToQuaternion().wxyz() for place in places], -1, axis=-1)
-        velocity = [speed.translational() for speed in speeds]
-        return (
-            np.array([p.translation() for p in places]),
-            quat,
-            np.array(velocity),
-            np.array([speed.rotational() for speed in speeds]),
-        )
+        velocities = (np.array([getattr(v, of)() for v in speeds]) for of in ("translational", "rotational"))
+        return np.array([place.translation() for place in places]), quat, *velocities
 
-    return _motion(t, steps, advance, state)
+    return _motion(t, steps, lambda: simulator.AdvanceTo(round(context.get_time() / t.dt + 1) * t.dt), state)
 
 
 def _tetrahedra(mesh: Mesh, beside: Path) -> str:

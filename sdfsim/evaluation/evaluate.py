@@ -12,22 +12,25 @@ import numpy as np
 from sdfsim.console import columns
 from sdfsim.data import metrics
 from sdfsim.data.batching import batches, every, first_frames, model_units, roll_out, scene_of
-from sdfsim.data.dataset import Trajectory, engine_substep, load_shapes, trajectory_files
+from sdfsim.data.dataset import Trajectory, engine_substep, floor_of, home_of, load_shapes, read_info, trajectory_files
 from sdfsim.data.metrics import FRAMES, HORIZONS
+from sdfsim.data.pybullet_sim import engine_settings, import_pybullet, substeps_of
 from sdfsim.dynamics.model import Model, load_model
 from sdfsim.dynamics.simulator import pick_device
 from sdfsim.dynamics.step import FreeFlight
 from sdfsim.dynamics.training_ranges import outside_training
 from sdfsim.errors import SdfsimError
-from sdfsim.evaluation.baselines import chaos_floor
-from sdfsim.evaluation.penetration import EVERY, Solid, exact_solids, penetration
-from sdfsim.parallel import Progress, silent
+from sdfsim.evaluation.engines import Start, bullet, dataset_urdf
+from sdfsim.evaluation.penetration import EVERY, exact_solids, penetration
+from sdfsim.parallel import Progress, parallel, silent
 from sdfsim.shape.shape import Shape
 from sdfsim.training.contact_cache import inner_steps
 
 LIMITS = (0.1, 0.25, 0.5)  # m, translation errors that a body survives
 SURVIVED = "0.25"  # m, the limit whose median survival time is shown
 NOTHING = "-"
+# m/s; 0 tells what the recording alone does not bring back: an engine's state is more than its recorded frames.
+PERTURBATIONS = {"0": 0.0, "1e-6": 1e-6, "1e-3": 1e-3}
 
 Motions = list[Trajectory]
 Rows = list[tuple[str, ...]]
@@ -52,10 +55,11 @@ def evaluate(
     Args:
         model: bundled name, path or `Model`.
         steps: how far; errors are reported at the horizons of `HORIZONS` and `FRAMES` up to there, and there.
-        free_flight: "exact" or (paper network) "learned".
+        free_flight: "exact" or (networks on surface nodes) "learned".
         stride: recorded steps in a step of the model; errors are then those of every so many-th frame.
         substeps: inner steps of the solve in a step; None for the model's, else for those of the recording engine.
-        chaos_floor: also run the teacher again from starts that differ slightly (see `baselines.PERTURBATIONS`).
+        chaos_floor: also run the teacher again from starts that differ slightly (see `PERTURBATIONS`).
+        errors_only: leave out penetration, energy gain and resting speed.
 
     Returns:
         A report:
@@ -73,9 +77,7 @@ def evaluate(
     place = pick_device(device)
     used = (model if isinstance(model, Model) else load_model(model)).to(place)
     if free_flight == "learned" and not used.on_surfaces:
-        raise SdfsimError(
-            "free_flight 'learned' exists for networks on surface nodes only", "give a model of that kind"
-        )
+        raise SdfsimError("free_flight 'learned' exists for networks on surface nodes only")
     recorded, shapes = load_recorded(data, split)
     longest = min(steps, *(len(t.position) - 1 for t in recorded))
     longest -= longest % stride
@@ -89,12 +91,11 @@ def evaluate(
     used = replace(used, inner=substeps or used.inner)
     for k, group in enumerate(groups):
         on_progress(0.8 * k / len(groups), f"{used.name}: batch {k + 1} of {len(groups)}, {longest} steps")
+        common = (used, group, shapes, longest, place)
         started = time.perf_counter()
-        contenders["model"] += roll_out(
-            used, group, shapes, longest, place, free_flight, substeps=inner, as_teacher=True
-        )
+        contenders["model"] += roll_out(*common, free_flight, substeps=inner, as_teacher=True)
         seconds += time.perf_counter() - started
-        contenders["ballistic"] += roll_out(used, group, shapes, longest, place, contact=False)
+        contenders["ballistic"] += roll_out(*common, contact=False)
     again, floor_report = {}, {}
     if chaos_floor:
         on_progress(0.8, "teacher, from starts that differ slightly")
@@ -119,8 +120,18 @@ def evaluate(
     }
     if not errors_only:
         on_progress(0.9, "penetration, energy and rest")
-        solids = exact_solids(data, shapes)
-        report |= _quality(contenders["model"], recorded, solids)
+        solids, rest = exact_solids(data, shapes), [metrics.resting(t) for t in recorded]
+        sides = {"model": contenders["model"], "teacher": recorded}
+        geometry = {name: solid.kind for name, solid in solids.items()}
+        depth = {who: penetration(motions, solids) for who, motions in sides.items()}
+        report["penetration"] = depth | {"geometry": geometry, "every": EVERY}
+        report["energy_gain"] = {who: energy_gain(motions) for who, motions in sides.items()}
+        resting: dict[str, float | None] = {"bodies": int(sum(r.sum() for r in rest))}
+        for who, motions in sides.items():  # the median in the last steps of the bodies that rest in the recording
+            last = [metrics.speeds(motion)[:, r].ravel() for motion, r in zip(motions, rest, strict=True)]
+            speeds = np.concatenate(last)
+            resting[who] = float(np.median(speeds)) if len(speeds) else None
+        report["resting_speed"] = resting
     on_progress(1.0, "done")
     return report
 
@@ -181,6 +192,42 @@ def load_recorded(
     return recorded, load_shapes(data, {str(n) for t in recorded for n in t.shape})
 
 
+# --- the teacher against itself ---
+
+
+def chaos_floor(data: Path, trajectories: Motions, steps: int, seed: int = 0) -> dict[str, Motions]:
+    """Run the teacher again from recorded starts (velocities as recorded) of a dataset with a URDF for every shape.
+
+    Returns, by the names of `PERTURBATIONS`, the motions (steps + 1 frames) that follow when the velocity of each body
+    that moves is changed by so much in a random direction. Raises SdfsimError where PyBullet or an engine file is
+    absent, or the recording is not this teacher's.
+    """
+    import_pybullet()
+    info = read_info(home_of(data) or data.parent)
+    settings = info.get("engine_settings")
+    if info.get("engine") != "pybullet" or not isinstance(settings, dict):
+        raise SdfsimError(f"recorded by {info.get('engine') or 'an unnamed engine'}, not by PyBullet as it is set here")
+    ours = engine_settings(trajectories[0].dt, substeps_of(trajectories[0].dt))
+    if other := [name for name, value in ours.items() if settings.get(name) != value]:
+        raise SdfsimError(f"recorded with other engine settings ({', '.join(other)})")
+    urdfs = {name: dataset_urdf(data, name) for name in {str(n) for t in trajectories for n in t.shape}}
+    jobs = [
+        (Start(perturbed(t, size, [seed, k]), urdfs, floor_of(info)), steps)
+        for size in PERTURBATIONS.values()
+        for k, t in enumerate(trajectories)
+    ]
+    done = {index: motion for index, (motion, _) in parallel(bullet, jobs)}
+    count = len(trajectories)
+    return {name: [done[i * count + k] for k in range(count)] for i, name in enumerate(PERTURBATIONS)}
+
+
+def perturbed(t: Trajectory, size: float, seed: list[int]) -> Trajectory:
+    """The trajectory with velocities of its moving bodies changed by `size` m/s in random directions."""
+    direction = np.random.default_rng(seed).normal(size=t.velocity[0].shape)
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    return replace(t, velocity=t.velocity + size * direction * ~t.static[:, None])
+
+
 def _teacher_again(data: Path, split: str, steps: int, stride: int) -> tuple[dict[str, Motions], dict]:
     """The teacher's motions from perturbed starts by "teacher NAME", and what the report says of them."""
     recorded = [first_frames(t, stride * steps + 1) for t in load_recorded(data, split, as_recorded=True)[0]]
@@ -199,6 +246,9 @@ def _teacher_again(data: Path, split: str, steps: int, stride: int) -> tuple[dic
     return {f"teacher {name}": motions for name, motions in again.items()}, {"chaos_floor": report}
 
 
+# --- energy, rest and survival ---
+
+
 def _survival(motions: Motions, recorded: Motions) -> dict[str, float | None]:
     """Limit in m -> seconds until half of all bodies have been farther from the recording; None if they never are."""
     error = np.concatenate([_distance(m, t) for m, t in zip(motions, recorded, strict=True)], axis=1)
@@ -211,29 +261,10 @@ def _distance(motion: Trajectory, truth: Trajectory) -> np.ndarray:
     return np.linalg.norm(motion.position[:, moving] - truth.position[:, moving], axis=-1)
 
 
-def _quality(predicted: Motions, recorded: Motions, solids: dict[str, Solid]) -> dict:
-    """Penetration, energy gain and resting speed of the model and of the teacher."""
-    rest = [metrics.resting(t) for t in recorded]
-    sides = {"model": predicted, "teacher": recorded}
-    return {
-        "penetration": {who: penetration(motions, solids) for who, motions in sides.items()}
-        | {"geometry": {name: solid.kind for name, solid in solids.items()}, "every": EVERY},
-        "energy_gain": {who: energy_gain(motions) for who, motions in sides.items()},
-        "resting_speed": {who: _resting(motions, rest) for who, motions in sides.items()}
-        | {"bodies": int(sum(r.sum() for r in rest))},
-    }
-
-
 def energy_gain(motions: Motions) -> dict[str, float | None]:
     """Mean and worst, over the trajectories, of the largest gain as a fraction of the energy at the start."""
     gains = [gain for motion in motions if (gain := metrics.energy_gain(motion)) is not None]
     return {"mean": float(np.mean(gains)) if gains else None, "worst": max(gains) if gains else None}
-
-
-def _resting(motions: Motions, rest: list[np.ndarray]) -> float | None:
-    """Median speed m/s in the last steps of the bodies [N] that rest in the recording; None without any."""
-    found = [metrics.speeds(motion)[:, r].ravel() for motion, r in zip(motions, rest, strict=True)]
-    return float(np.median(np.concatenate(found))) if any(len(f) for f in found) else None
 
 
 # --- tables ---
@@ -261,22 +292,19 @@ def error_rows(report: dict[str, Any], *, name: str, at_frame: bool = False) -> 
     """Errors up to every horizon, or at each of `metrics.FRAMES` alone; the head first. Rows are the model, the teacher
     again, and flight without contact. Intervals go with the horizons."""
     again = {f"teacher, {size} m/s off": found for size, found in _perturbed(report).items()}
-    rows = {name: report["model"], **again, "ballistic": report["ballistic"]}
     longest = max(map(int, report["model"]))
     shown = [h for h in report["model"] if int(h) in (FRAMES if at_frame else (*HORIZONS, longest))]
-    head, table = [""], []
-    for steps in shown:
-        span = f"{f'frame {steps}' if at_frame else f'{steps} steps'} = {report['model'][steps]['seconds']:.3g} s"
-        head += [f"m, {span}", f"degrees, {span}"]
-    for who, horizons in rows.items():
-        cells = [who]
+    spans = [f"{f'frame {h}' if at_frame else f'{h} steps'} = {report['model'][h]['seconds']:.3g} s" for h in shown]
+    rows: Rows = [("", *(f"{unit}, {span}" for span in spans for unit in ("m", "degrees")))]
+    for who, horizons in ({name: report["model"]} | again | {"ballistic": report["ballistic"]}).items():
+        cells = []
         for steps in shown:
             found = horizons[steps]["at_frame"] if at_frame else horizons[steps]
             for what, digits in (("translation_rmse", 3), ("rotation_error", 1)):
                 low, high = (f"{end:.{digits}f}" for end in found[f"{what}_95"])
                 cells.append(f"{found[what]:.{digits}f}" + (f" ({low} to {high})" if not at_frame else ""))
-        table.append(tuple(cells))
-    return [tuple(head), *table]
+        rows.append((who, *cells))
+    return rows
 
 
 def quality_rows(report: dict[str, Any], *, name: str) -> Rows:
@@ -290,12 +318,12 @@ def quality_rows(report: dict[str, Any], *, name: str) -> Rows:
 
     def quality(who: str) -> list[str]:
         depth, gain = report["penetration"][who], report["energy_gain"][who]
-        told = zip(
-            (depth["percentile_95"], depth["worst"], gain["mean"], gain["worst"], report["resting_speed"][who]),
-            ("{:.4f} m", "{:.4f} m", "{:.2%}", "{:.2%}", "{:.4f} m/s"),
-            strict=True,
-        )
-        return [NOTHING if value is None else form.format(value).replace("%", " %") for value, form in told]
+        told = {
+            "{:.4f} m": [depth["percentile_95"], depth["worst"]],
+            "{:.2f} %": [value and 100 * value for value in (gain["mean"], gain["worst"])],
+            "{:.4f} m/s": [report["resting_speed"][who]],
+        }
+        return [NOTHING if value is None else form.format(value) for form, values in told.items() for value in values]
 
     others = {f"teacher, {size} m/s off": f"teacher {size}" for size in _perturbed(report)} | {"ballistic": "ballistic"}
     return [
@@ -309,27 +337,25 @@ def quality_rows(report: dict[str, Any], *, name: str) -> Rows:
 def notes(report: dict[str, Any]) -> list[str]:
     """What has to be known beside the tables, a line each."""
     depth, floor, steps = report["penetration"], report.get("chaos_floor", {}), report["steps"]
-    shown = sorted(name for name, kind in depth["geometry"].items() if kind == "shown mesh")
-    lines = {
-        f"Penetration: the deepest node in every {depth['every']}th frame with contact.": True,
-        "Energy gain: the largest over the energy at the start; mean and worst of the trajectories.": True,
-        f"Resting speed: median of the {report['resting_speed']['bodies']} bodies that rest in the recording.": True,
-        f"Within {SURVIVED} m: until half of the bodies have been farther from the recording.": True,
-        f"Without the engine's files, penetration is into the mesh that is shown of {', '.join(shown)}.": shown,
-        f"The shortest recording ends after {steps} steps; {report['steps_asked']} were asked for.": (
-            steps < report["steps_asked"]
-        ),
-        **{f"Outside the model's training: {line}.": True for line in report["outside_training"]},
-        "No dataset.json tells the engine's inner step: velocities count as at the positions' instants.": (
-            not report["engine_substep"]
-        ),
-        f"The teacher's chaos floor is left out: {floor.get('left_out')}.": "left_out" in floor,
-        "Run again unperturbed, the teacher departs from its recording by up to "
-        f"{floor.get('median_farthest_unperturbed_m', 0.0):.1g} m (median of the trajectories).": (
-            "perturbations" in floor
-        ),
-    }
-    return [line for line, holds in lines.items() if holds]
+    lines = [
+        f"Penetration: the deepest node in every {depth['every']}th frame with contact.",
+        "Energy gain: the largest over the energy at the start; mean and worst of the trajectories.",
+        f"Resting speed: median of the {report['resting_speed']['bodies']} bodies that rest in the recording.",
+        f"Within {SURVIVED} m: until half of the bodies have been farther from the recording.",
+        *(f"Outside the model's training: {line}." for line in report["outside_training"]),
+    ]
+    if shown := sorted(name for name, kind in depth["geometry"].items() if kind == "shown mesh"):
+        lines.append(f"Without the engine's files, penetration is into the mesh that is shown of {', '.join(shown)}.")
+    if steps < report["steps_asked"]:
+        lines.append(f"The shortest recording ends after {steps} steps; {report['steps_asked']} were asked for.")
+    if not report["engine_substep"]:
+        lines.append("No dataset.json tells the engine's inner step: velocities count as at the positions' instants.")
+    if "left_out" in floor:
+        lines.append(f"The teacher's chaos floor is left out: {floor['left_out']}.")
+    elif floor:
+        farthest = f"{floor['median_farthest_unperturbed_m']:.1g} m (median of the trajectories)"
+        lines.append(f"Run again unperturbed, the teacher departs from its recording by up to {farthest}.")
+    return lines
 
 
 def _perturbed(report: dict[str, Any]) -> dict[str, dict]:

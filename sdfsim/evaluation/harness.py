@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import multiprocessing
 import platform
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -29,20 +29,13 @@ FAILURES = (SdfsimError, RuntimeError, MemoryError)
 
 @dataclass(frozen=True)
 class Job:
-    """One case with one method, names fit for a file.
-
-    Attributes:
-        content: all that the result depends on; see `digest`.
-        function: called with `arguments`; makes the result, which JSON can hold.
-        weight: about how long it takes, in no unit.
-    """
+    """One case with one method, names fit for a file."""
 
     case: str
     method: str
-    content: Any
-    function: Callable[..., dict[str, Any]]
+    content: Any  # all that the result depends on; see `digest`
+    function: Callable[..., dict[str, Any]]  # makes the result, which JSON can hold
     arguments: tuple = ()
-    weight: float = 1.0
 
 
 def measure(
@@ -52,36 +45,28 @@ def measure(
     where: Literal["here", "cores", "fresh"] = "here",
     on_progress: Progress = silent,
 ) -> Results:
-    """The results of all jobs by (case, method): kept ones where they still hold, new ones elsewhere.
+    """The results of all jobs by (case, method): those kept in FOLDER/METHOD/CASE.json where their content is still the
+    same, new ones elsewhere.
 
     A job that fails gives {"failed": why}. That is not kept, because an engine or memory may be there the next time.
 
     Args:
-        jobs: what there is to run.
-        folder: holds METHOD/CASE.json.
-        where: "here", one after the other in this process; "cores", on all of them, the longest first; "fresh", each in
-            a process of its own, whose peak memory is then the job's.
+        where: "here", one after the other in this process; "cores", on all of them in the order of `jobs`; "fresh",
+            each in a process of its own, whose peak memory is then the job's.
     """
-    files = [folder / job.method / f"{job.case}.json" for job in jobs]
-    marks = [digest(job.content, sdfsim.__version__) for job in jobs]
-    results = {}
     todo: list[tuple[Job, Path, str]] = []
-    for job, file, mark in zip(jobs, files, marks, strict=True):
-        kept = _kept(file, mark)
-        if kept is None:
+    results: Results = {}
+    for job in jobs:
+        file, mark = folder / job.method / f"{job.case}.json", digest(job.content, sdfsim.__version__)
+        results[job.case, job.method] = kept = _kept(file, mark)
+        if not kept:
             todo.append((job, file, mark))
-        else:
-            results[job.case, job.method] = kept
-    if where == "cores":
-        todo.sort(key=lambda one: -one[0].weight)
-    total, done = sum(job.weight for job, _, _ in todo), 0.0
-    for index, result in _ended(todo, where):
+    for done, (index, result) in enumerate(_ended(todo, where), 1):
         job = todo[index][0]
         results[job.case, job.method] = result
-        done += job.weight
-        on_progress(done / total, f"{job.case} with {job.method}")
+        on_progress(done / len(todo), f"{job.case} with {job.method}")
     on_progress(1.0, f"{len(todo)} results measured, {len(jobs) - len(todo)} kept from before")
-    return {(job.case, job.method): results[job.case, job.method] for job in jobs}
+    return results
 
 
 def _ended(todo: list[tuple[Job, Path, str]], where: str) -> Iterator[tuple[int, dict]]:
@@ -106,14 +91,13 @@ def _run(job: Job, file: Path, mark: str) -> dict[str, Any]:
     return read_json(file)["result"]  # as JSON has it, whether new or kept
 
 
-def _kept(file: Path, mark: str) -> dict[str, Any] | None:
-    if not file.exists():
-        return None
+def _kept(file: Path, mark: str) -> dict[str, Any]:
+    """The result in a file; empty where there is none of this content."""
     try:
         content = read_json(file)
-        return content["result"] if content["digest"] == mark else None
-    except (SdfsimError, KeyError, TypeError):
-        return None
+    except SdfsimError:
+        return {}
+    return content["result"] if content["digest"] == mark else {}
 
 
 def machine() -> str:
@@ -135,6 +119,12 @@ def number(value: float | None, digits: int = 3) -> str:
     return f"{value:,.0f}" if abs(value) >= 10**digits else f"{value:.{digits}g}"
 
 
+def cells(found: dict[str, Any], columns: Iterable[str]) -> tuple[str, ...]:
+    """Cells of a table: these figures of a result, and last what went wrong with it."""
+    why = next((found[key] for key in ("failed", "broken") if found.get(key)), "")
+    return (*(number(found.get(key)) for key in columns), why)
+
+
 def front(time: Sequence[float], error: Sequence[float]) -> list[int]:
     """Indices, by time, of points that no other beats: none is at most as slow and as wrong, and one of both less."""
     kept: list[int] = []
@@ -146,42 +136,39 @@ def front(time: Sequence[float], error: Sequence[float]) -> list[int]:
 
 @dataclass(frozen=True)
 class Line:
-    """One line of a panel: name, x [K], y [K], and where they are known the half-widths [K] of its error bars."""
+    """One line of a panel."""
 
-    name: str
-    x: Sequence[float]
-    y: Sequence[float]
-    noise: Sequence[float] | None = None
+    name: str  # lines of one name have one colour in all panels
+    x: Sequence[float]  # [K]
+    y: Sequence[float]  # [K]
+    noise: Sequence[float] | None = None  # [K], half-widths of error bars
+
+
+def line(name: str, results: Iterable[dict[str, Any]], x: str, y: str) -> Line:
+    """Two figures of the results that did not fail."""
+    known = [found for found in results if "failed" not in found]
+    return Line(name, [found[x] for found in known], [found[y] for found in known])
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One plot of several. Lines of one name have one colour in all panels.
-
-    Attributes:
-        log: of its axes: "", "x", "y" or "xy".
-        limit: y of a dotted line: what is wanted.
-    """
+    """One plot of several."""
 
     title: str
     x: str
     y: str
     lines: Sequence[Line]
-    log: str = ""
-    limit: float | None = None
+    log: str = ""  # of its axes: "", "x", "y" or "xy"
+    limit: float | None = None  # y of a dotted line: what is wanted
 
 
-def draw(
-    panels: Sequence[Panel], path: Path, *, wide: int = 4, dpi: int = 80, size: tuple[float, float] = (3.3, 2.5),
-    key: Literal["inside", "outside"] = "inside",
-) -> None:  # fmt: skip
-    """Write panels of `size` inches, `wide` in a row, as a PNG. Raises SdfsimError when matplotlib is not installed."""
+def draw(panels: Sequence[Panel], path: Path, *, size: tuple[float, float] = (3.3, 2.5)) -> None:
+    """Write panels of `size` inches in a row as a PNG. Raises SdfsimError when matplotlib is not installed."""
     pyplot = check_matplotlib()
-    high, wide = -(-len(panels) // wide), min(wide, len(panels))
     across, up = size
-    figure, axes = pyplot.subplots(high, wide, figsize=(across * wide, up * high), squeeze=False, layout="constrained")
+    figure, axes = pyplot.subplots(1, len(panels), figsize=(across * len(panels), up), layout="constrained")
     names = list(dict.fromkeys(line.name for panel in panels for line in panel.lines))
-    for axis, panel in zip(axes.flat, panels, strict=False):
+    for axis, panel in zip(np.atleast_1d(axes), panels, strict=True):
         for line in panel.lines:
             marker, at = ("o-" if len(line.x) <= 12 else "-"), names.index(line.name)
             style = {"label": line.name, "color": f"C{at}", "markersize": 3 + at // 10, "linewidth": 1.2}
@@ -195,12 +182,10 @@ def draw(
         axis.set_ylabel(panel.y, fontsize=8)
         axis.tick_params(labelsize=7)
         axis.grid(alpha=0.3)
-        axis.legend(fontsize=6, **({"bbox_to_anchor": (1.0, 1.0), "loc": "upper left"} if key == "outside" else {}))
-    for axis in axes.flat[len(panels) :]:
-        axis.set_visible(False)
+        axis.legend(fontsize=6, **({"bbox_to_anchor": (1, 1), "loc": "upper left"} if len(panel.lines) > 8 else {}))
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as partial:
-        figure.savefig(partial, dpi=dpi, format="png")
+        figure.savefig(partial, dpi=100, format="png")
     pyplot.close(figure)
 
 

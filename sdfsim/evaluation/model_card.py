@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
+
+import typer
 
 from sdfsim.dynamics.model import BUNDLED, Model, load_model
 from sdfsim.errors import run_main
@@ -16,18 +18,17 @@ from sdfsim.files import write_text
 MODEL = "this model"  # in the tables of a card
 
 
-def bundle(path: Path, data: Path, name: str, folder: Path = BUNDLED) -> dict:
+def bundle(model: Path, data: Path, name: Annotated[str, typer.Option()], folder: Path = BUNDLED) -> dict:
     """Evaluate what `sdfsim train` wrote on the test split of `data`; write `NAME.safetensors` and its card `NAME.md`;
     return the evaluation's report."""
-    model = load_model(path)
-    report = evaluate(data, model=model, chaos_floor=True)
-    kept = ("model", "ballistic", "chaos_floor", "median_survival_s")
-    kept += ("penetration", "energy_gain", "resting_speed")
+    found = load_model(model)
+    report = evaluate(data, model=found, chaos_floor=True)
+    kept = ("model", "ballistic", "chaos_floor", "median_survival_s", "penetration", "energy_gain", "resting_speed")
     results = {"errors": {what: report[what] for what in kept}, "test_trajectories": report["trajectories"]}
-    model = replace(model, name=name, card=model.card | results)
+    found = replace(found, name=name, card=found.card | results)
     folder.mkdir(parents=True, exist_ok=True)
-    model.save(folder / f"{name}.safetensors")
-    write_text(folder / f"{name}.md", card_text(model, report))
+    found.save(folder / f"{name}.safetensors")
+    write_text(folder / f"{name}.md", card_text(found, report))
     return report
 
 
@@ -59,16 +60,5 @@ def card_text(model: Model, report: dict) -> str:
     return "\n\n".join(part.rstrip("\n") for part in parts) + "\n"
 
 
-def main() -> None:
-    """Command line of this module."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("model", type=Path)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--name", required=True)
-    args = parser.parse_args()
-    report = bundle(args.model, args.data, args.name)
-    print(json.dumps({k: report[k] for k in ("model", "ballistic")}, indent=2))
-
-
 if __name__ == "__main__":
-    run_main(main)
+    run_main(lambda: typer.run(bundle))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -42,7 +43,17 @@ def exact_solids(data: Path, shapes: dict[str, Shape]) -> dict[str, Solid]:
     A shape that was fitted to an engine's convex pieces is those pieces, where the dataset's engine file leads to
     them: the mesh beside it is what is shown. Other learned or sampled distances give way to those of the mesh.
     """
-    return {name: _solid(data, name, shape) for name, shape in shapes.items()}
+    solids = {}
+    for name, shape in shapes.items():
+        # A dataset's body frames sit at the centre of mass, and so do its shapes' origins.
+        solids[name] = _exact(shape)
+        if shape.source.get("kind") == "pieces" and isinstance(shape.sdf, MlpSdf | GridSdf):
+            solids[name] = replace(solids[name], kind="shown mesh")
+            with suppress(SdfsimError):
+                oracle = PiecesDistance(load_pieces(dataset_urdf(data, name).with_suffix(".obj")))
+                distance = lambda points, oracle=oracle: oracle(points).distance  # noqa: E731
+                solids[name] = Solid(shape.nodes, oracle.bounds, distance, "pieces")
+    return solids
 
 
 def deepest(motion: Trajectory, solids: dict[str, Solid], every: int = EVERY) -> np.ndarray:
@@ -78,12 +89,27 @@ def deepest(motion: Trajectory, solids: dict[str, Solid], every: int = EVERY) ->
 def penetration(motions: list[Trajectory], solids: dict[str, Solid]) -> dict:
     """Penetration m over the frames of all `motions` in which something touches: percentile_95 and worst of the depth
     of a frame's deepest node (None where nothing touches), and steps_with_contact."""
-    depth = penetrations(np.concatenate([deepest(motion, solids) for motion in motions]))
+    depth = _touching(np.concatenate([deepest(motion, solids) for motion in motions]))
     return {
         "percentile_95": float(np.percentile(depth, 95)) if len(depth) else None,
         "worst": float(depth.max()) if len(depth) else None,
         "steps_with_contact": len(depth),
     }
+
+
+def depths(scene: Scene, motion: Trajectory, every: int = 5) -> np.ndarray:
+    """[F] m, depth of the deepest node in those of every so many frames (see `rollout_motion`) in which bodies touch.
+    The only plane of the scene, if any, is the floor z = 0."""
+    solids = {}
+    for name in set(motion.shape.tolist()):
+        shape = scene.shapes[int(name)]
+        solids[name] = _exact(replace(shape, nodes=shape.nodes - shape.com), shape.com)
+    return _touching(deepest(motion, solids, every))
+
+
+def _touching(distance: np.ndarray) -> np.ndarray:
+    """[F] m, depths of those frames of `deepest` in which anything touches."""
+    return np.maximum(0.0, -distance[np.isfinite(distance)])
 
 
 def _near(position: np.ndarray, turn: np.ndarray, bounds: np.ndarray, moving: np.ndarray, touch: float) -> np.ndarray:
@@ -96,32 +122,6 @@ def _near(position: np.ndarray, turn: np.ndarray, bounds: np.ndarray, moving: np
     gap = np.abs(centre[:, :, None] - centre[:, None]) - half[:, :, None] - half[:, None]
     pairs = (moving[:, None] | moving[None]) & ~np.eye(len(bounds), dtype=bool)
     return (gap <= 0).all(-1) & pairs
-
-
-def depths(scene: Scene, motion: Trajectory, every: int = 5) -> np.ndarray:
-    """[F] m, depth of the deepest node in those of every so many frames (see `rollout_motion`) in which bodies touch.
-    The only plane of the scene, if any, is the floor z = 0."""
-    solids = {}
-    for name in set(motion.shape.tolist()):
-        shape = scene.shapes[int(name)]
-        solids[name] = _exact(replace(shape, nodes=shape.nodes - shape.com), shape.com)
-    return penetrations(deepest(motion, solids, every))
-
-
-def penetrations(distance: np.ndarray) -> np.ndarray:
-    """[F] m, depths of those frames of `deepest` in which anything touches."""
-    return np.maximum(0.0, -distance[np.isfinite(distance)])
-
-
-def _solid(data: Path, name: str, shape: Shape) -> Solid:
-    # A dataset's body frames sit at the centre of mass, and so do its shapes' origins.
-    if shape.source.get("kind") != "pieces" or not isinstance(shape.sdf, MlpSdf | GridSdf):
-        return _exact(shape)
-    try:
-        oracle = PiecesDistance(load_pieces(dataset_urdf(data, name).with_suffix(".obj")))
-    except SdfsimError:
-        return replace(_exact(shape), kind="shown mesh")
-    return Solid(shape.nodes, oracle.bounds, lambda points: oracle(points).distance, "pieces")
 
 
 def _exact(shape: Shape, com: np.ndarray | float = 0.0) -> Solid:

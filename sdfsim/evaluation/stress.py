@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +16,15 @@ import sdfsim
 from sdfsim.data.public_shapes import public_folder
 from sdfsim.data.pybullet_sim import DT, SUBSTEPS, TEACHER_VERSION, engine_settings, import_pybullet
 from sdfsim.dynamics.model import SOLVER, Model, load_model, model_names
-from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.simulator import SimulationError, Simulator, pick_device
 from sdfsim.dynamics.training_ranges import constant_in_training
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.engines import bullet, drake, mujoco, rollout_motion, shape_urdf, start_motion, start_of_scene
 from sdfsim.evaluation.hard_cases import GROUPS, Case, Figure, Run, cases, ran_away
-from sdfsim.evaluation.harness import Job, Line, Panel, Results, check_matplotlib, draw, markdown, measure
+from sdfsim.evaluation.harness import Job, Line, Panel, Results, draw, markdown, measure
 from sdfsim.files import locked, write_json, write_text
 from sdfsim.parallel import Progress, silent
+from sdfsim.recording import save_rollout
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.sdf import PlaneSdf
 
@@ -37,8 +39,6 @@ LEGEND = (
     f"{OUTSIDE}: outside of what the model has seen in training",
     "±: standard deviation over repetitions, started slightly off or with other random scenes",
 )
-
-Record = Callable[[Scene, Rollout, Path], None]
 
 
 @dataclass(frozen=True)
@@ -66,17 +66,16 @@ def stress(
     shapes: Path | None = None,
     device: str = "cpu",
     engines: Sequence[str] = (TEACHER,),
-    record: Record | None = None,
     on_progress: Progress = silent,
 ) -> Study:
-    """Run every case that `out` does not hold the result of yet; it holds results/, recordings/ and the engine's files.
+    """Run every case that `out` does not hold the result of yet. It holds results/, the engine's files, and in
+    recordings/ a motion of each case that is not as wanted.
 
     Args:
         models: names or paths; none for the solver and all bundled networks.
         quick: fewer and shorter cases.
         shapes: folder of meshes that are to rest on the floor too, or name of a public set (see `public_folder`).
         engines: of `ENGINES`.
-        record: writes a motion of each case that is not as wanted into a file; None for no recordings.
 
     Raises:
         SdfsimError: no such model or device, two models of one name, unusable shapes or none to be fetched, another run
@@ -88,22 +87,29 @@ def stress(
     if twice := {name for name in who if who.count(name) > 1}:
         raise SdfsimError(f"two models are called {min(twice)!r}", "rename a file: results are kept by name")
     found = cases(quick=quick, shapes=shapes and public_folder(shapes, on_progress))
-    engines = [name for name in engines if name != TEACHER or _teacher_is_here()]
+    with suppress(SdfsimError):
+        import_pybullet()
+        who += [TEACHER] if TEACHER in engines else []
+    who += [name for name in engines if name != TEACHER]
+    scenes = {case.name: [case.scenes(repeat) for repeat in range(case.repeats)] for case in found}
+
+    def work(case: Case) -> float:
+        """About how long a model takes, in no unit; a step has its price without bodies too."""
+        return case.seconds * sum(10 + len(scene.bodies) for repeat in scenes[case.name] for scene in repeat)
+
     jobs, cut = [], {}
-    for case in found:
-        repeats = [case.scenes(repeat) for repeat in range(case.repeats)]
-        # About how long a model takes, in no unit; a step has its price without bodies too.
-        weight = case.seconds * sum(10 + len(scene.bodies) for scenes in repeats for scene in scenes)
-        content = [VERSION, case.seconds, case.cuda, [figure.name for figure in case.figures], repeats]
+    for case in sorted(found, key=work, reverse=True):
+        figures = [figure.name for figure in case.figures]
+        content = [VERSION, case.seconds, case.cuda, figures, scenes[case.name]]
         for model in tested:
             # Another device is for networks: the solver has none.
             if not case.cuda or (model.kind != SOLVER and torch.cuda.is_available()):
-                arguments = (case, model, device, out, record)
-                jobs.append(Job(case.name, model.name, [content, model, device], _tried, arguments, weight))
-        for name in engines if case.engines else []:
-            settings, arguments = [TEACHER_VERSION, engine_settings(DT, SUBSTEPS)], (case, name, "", out, None)
-            jobs.append(Job(case.name, name, [content, settings], _tried, arguments, 0.05 * weight))
-            cut |= {id(shape): shape for scene in repeats[0] for shape in scene.shapes}
+                arguments = (case, model, device, out)
+                jobs.append(Job(case.name, model.name, [content, model, device], _tried, arguments))
+        for name in who[len(tested) :] if case.engines else []:
+            settings = [TEACHER_VERSION, engine_settings(DT, SUBSTEPS)]
+            jobs.append(Job(case.name, name, [content, settings], _tried, (case, name, device, out)))
+            cut |= {id(shape): shape for scene in scenes[case.name][0] for shape in scene.shapes}
     with locked(out):
         for shape in cut.values():  # before the work is split up, so that no two processes cut one mesh into pieces
             if not isinstance(shape.sdf, PlaneSdf):
@@ -111,23 +117,15 @@ def stress(
         results = measure(jobs, out / "results", where="cores", on_progress=on_progress)
     if failed := [f"{case} with {one}: {r['failed']}" for (case, one), r in results.items() if "failed" in r]:
         raise SdfsimError(failed[0])
-    return Study(found, [*who, *engines], results, quick)
+    return Study(found, who, results, quick)
 
 
-def _teacher_is_here() -> bool:
-    try:
-        import_pybullet()
-    except SdfsimError:
-        return False
-    return True
-
-
-def _tried(case: Case, model: Model | str, device: str, out: Path, record: Record | None) -> dict[str, Any]:
+def _tried(case: Case, model: Model | str, device: str, out: Path) -> dict[str, Any]:
     """All repetitions of a case with one model, or with an engine by name: see `Study.results`."""
     figures: dict[str, list[float]] = {figure.name: [] for figure in case.figures}
-    result: dict[str, Any] = {"figures": figures, "broke": [], "outside": [], "recording": None}
+    broke, outside, recording = [], [], None
     if isinstance(model, Model) and (about := GROUPS[case.group].about) in constant_in_training(model):
-        result["outside"].append(f"{about} was constant in training, so it was not learned")
+        outside.append(f"{about} was constant in training, so it was not learned")
     for repeat in range(case.repeats):
         scenes = case.scenes(repeat)
         if isinstance(model, str):
@@ -135,21 +133,20 @@ def _tried(case: Case, model: Model | str, device: str, out: Path, record: Recor
         else:
             places = [device, "cuda"] if case.cuda else [device]
             runs = [simulated(scene, model, place, case.seconds) for place in places for scene in scenes]
-            result["outside"] += [line for run in runs if run.rollout for line in run.rollout.meta["outside_training"]]
         measured = case.measure(runs)
         for name, values in figures.items():
             values.append(float(measured[name]))
-        result["broke"] += [run.broke for run in runs if run.broke]
+        broke += [run.broke for run in runs if run.broke]
+        outside += [line for run in runs if run.rollout for line in run.rollout.meta["outside_training"]]
         missed = any(f.limit is not None and measured[f.name] > f.limit for f in case.figures)
-        if record and isinstance(model, Model) and result["recording"] is None and (result["broke"] or missed):
-            shown = next((run for run in runs if run.broke), runs[0])
+        shown = next((run for run in runs if run.broke), runs[0])
+        if isinstance(model, Model) and not recording and (broke or missed):
             assert shown.rollout is not None
-            path = Path("recordings") / model.name / f"{case.name}.rrd"
-            (out / path).parent.mkdir(parents=True, exist_ok=True)
-            record(shown.scene, shown.rollout.frames(0, int((shown.rollout.time <= WATCHED).sum())), out / path)
-            result["recording"] = str(path)
-    result["outside"] = list(dict.fromkeys(result["outside"]))
-    return result
+            recording = f"recordings/{model.name}/{case.name}.rrd"
+            (out / recording).parent.mkdir(parents=True, exist_ok=True)
+            watched = shown.rollout.frames(0, int((shown.rollout.time <= WATCHED).sum()))
+            save_rollout(shown.scene, watched, out / recording)
+    return {"figures": figures, "broke": broke, "outside": list(dict.fromkeys(outside)), "recording": recording}
 
 
 def simulated(scene: Scene, model: Model, device: str, seconds: float) -> Run:
@@ -242,13 +239,14 @@ def losses(study: Study) -> dict[str, dict[str, int]]:
     return found
 
 
+def loss_lines(study: Study) -> list[str]:
+    """`losses`, a line each."""
+    return [f"{who}: {', '.join(f'{n} {what}' for what, n in lost.items())}" for who, lost in losses(study).items()]
+
+
 def table(study: Study) -> str:
     """The whole study in Markdown: what was lost, the legend, and a table for each group."""
-    lines = [
-        f"- {who}: {', '.join(f'{n} {what}' for what, n in found.items())}" for who, found in losses(study).items()
-    ]
-    lines += [f"- {line}" for line in LEGEND]
-    parts = ["\n".join(lines) + "\n"]
+    parts = ["\n".join(f"- {line}" for line in [*loss_lines(study), *LEGEND]) + "\n"]
     for name in dict.fromkeys(case.group for case in study.cases):
         part = replace(study, cases=[case for case in study.cases if case.group == name])
         parts += [f"**{GROUPS[name].title}**\n", markdown(rows(part, {"missed": "**", "behind": "*"}))]
@@ -276,28 +274,29 @@ def write_report(study: Study, out: Path) -> dict[str, Any]:
         The content of report.json: `models` (see `losses`), `figures` by model, `recordings`, and `failed_checks`, a
         line for each case that blew up.
     """
-    check_matplotlib()
     drawn = [name for name in GROUPS if draw_group(study, name, out / "plots" / f"{name}.png")]
-    form = "the short form" if study.quick else "the long form"
-    head = f"# Hard cases\n\nsdfsim {sdfsim.__version__}, {form}. Teacher: PyBullet as it made the training data.\n\n"
     plots = "\n".join(f"![{GROUPS[name].title}](plots/{name}.png)" for name in drawn)
     told = [
         f"- {who}, {case}: {line}"
         for (case, who), result in study.results.items()
         for line in [*result["broke"], *result["outside"]]
     ]
-    write_text(
-        out / "stress.md",
-        f"{head}{table(study)}\n{plots}\n\n## Blew up, or outside of training\n\n" + "\n".join(told) + "\n",
-    )
-    recordings = {str(out / r["recording"]) for r in study.results.values() if r["recording"]}
+    parts = [
+        "# Hard cases",
+        f"sdfsim {sdfsim.__version__}. Teacher: PyBullet as it made the training data.",
+        table(study),
+        plots,
+        "## Blew up, or outside of training",
+        "\n".join(told),
+    ]
+    write_text(out / "stress.md", "\n\n".join(parts) + "\n")
     report = {
         "folder": str(out),
         "table": str(out / "stress.md"),
         "quick": study.quick,
         "models": losses(study),
         "figures": figures(study),
-        "recordings": sorted(recordings),
+        "recordings": sorted(str(out / r["recording"]) for r in study.results.values() if r["recording"]),
         "failed_checks": [
             f"{case} with {who} blew up: {result['broke'][0]}"
             for (case, who), result in study.results.items()
@@ -309,12 +308,10 @@ def write_report(study: Study, out: Path) -> dict[str, Any]:
 
 
 def figures(study: Study) -> dict[str, dict[str, dict[str, float]]]:
-    """By model or teacher, then CASE/FIGURE: value and noise of every judged figure."""
+    """By model or engine, then CASE/FIGURE: value and noise of every judged figure."""
     found: dict[str, dict] = {who: {} for who in study.who}
-    for case in study.cases:
-        for who in study.who:
-            for figure in case.figures:
-                if figure.judged and (result := study.results.get((case.name, who))):
-                    entry = {"value": value(result, figure), "noise": noise(result, figure)}
-                    found[who][f"{case.name}/{figure.name}"] = entry
+    judged = [(case.name, figure) for case in study.cases for figure in case.figures if figure.judged]
+    for (case, figure), who in product(judged, study.who):
+        if result := study.results.get((case, who)):
+            found[who][f"{case}/{figure.name}"] = {"value": value(result, figure), "noise": noise(result, figure)}
     return found

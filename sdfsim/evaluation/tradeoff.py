@@ -6,7 +6,8 @@ import csv
 import io
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -24,31 +25,11 @@ from sdfsim.dynamics.models.contact_graph import SUBSTEPS
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.dynamics.units import scene_units
 from sdfsim.errors import SdfsimError
-from sdfsim.evaluation.baselines import perturbed
-from sdfsim.evaluation.engines import (
-    Start,
-    Timing,
-    bullet,
-    centred_mesh,
-    dataset_urdf,
-    mujoco,
-    start_of_scene,
-    timed,
-)
-from sdfsim.evaluation.evaluate import energy_gain, errors, load_recorded
+from sdfsim.evaluation import engines
+from sdfsim.evaluation.engines import Engine, Start, Timing, centred_mesh, dataset_urdf, start_of_scene, timed
+from sdfsim.evaluation.evaluate import energy_gain, errors, load_recorded, perturbed
 from sdfsim.evaluation.hard_cases import tossed
-from sdfsim.evaluation.harness import (
-    Job,
-    Line,
-    Panel,
-    draw,
-    front,
-    machine,
-    measure,
-    number,
-    one_thread,
-    peak_memory,
-)
+from sdfsim.evaluation.harness import Job, Line, Panel, draw, front, machine, measure, number, one_thread, peak_memory
 from sdfsim.evaluation.penetration import Solid, exact_solids, penetration
 from sdfsim.files import locked, write_json, write_text
 from sdfsim.parallel import StageProgress
@@ -68,13 +49,14 @@ TIMED = 80  # steps, at most
 EXPLODED = 1.0  # an energy gain of so many times the energy at the start is a motion that blew up
 OFF = 1e-3  # m/s, by which the starts of the chaos floor differ from the recorded ones
 HORIZON = 50  # steps of the errors that are drawn
+RUNS: dict[str, Engine] = {
+    "PyBullet": engines.bullet,
+    "MuJoCo": engines.mujoco,
+    "MuJoCo mesh SDF": partial(engines.mujoco, pieces=False),
+}
 # Steps of the engine in a recorded one.
-ENGINES = [
-    *(("PyBullet", k) for k in (5, 4, 3, 2, 1)),
-    *(("MuJoCo", k) for k in (10, 5, 2)),
-    *(("MuJoCo mesh SDF", k) for k in (5, 2)),
-]
-ENGINES_QUICK = [("PyBullet", 5), ("PyBullet", 1), ("MuJoCo", 5)]
+ENGINES = {"PyBullet": (5, 4, 3, 2, 1), "MuJoCo": (10, 5, 2), "MuJoCo mesh SDF": (5, 2)}
+ENGINES_QUICK = {"PyBullet": (5, 1), "MuJoCo": (5,)}
 TRUTH = f"PyBullet {1e3 * SUBSTEP:.3g} ms"  # made the recordings: no error of its own
 FLOOR_LABEL = "chaos floor: PyBullet 4 ms, starts 1 mm per s off"
 GRIDS = (32, 64, 128, 256)
@@ -88,28 +70,17 @@ Rows = list[tuple[str, ...]]
 
 @dataclass(frozen=True)
 class Cases:
-    """What every contender simulates.
+    """What every contender simulates."""
 
-    Attributes:
-        recorded: as the teacher moved the bodies, from their first frames on.
-        starts: the same with velocities at the instants of the positions: what ours start from.
-        shapes: of every name in use, their origins at the centres of mass.
-        urdfs: the engines' files, by name; those that are not at hand are absent.
-        solids: the exact geometry, by name.
-        floor: its friction and restitution.
-        own_inertia: see `Start`.
-        length, time: m and s of the scene in one of these; recordings are 1.
-    """
-
-    recorded: list[Trajectory]
-    starts: list[Trajectory]
-    shapes: dict[str, Shape]
-    urdfs: dict[str, Path]
-    solids: dict[str, Solid]
-    floor: tuple[float, float]
-    own_inertia: bool = False
-    length: float = 1.0
-    time: float = 1.0
+    recorded: list[Trajectory]  # as the teacher moved the bodies, from their first frames on
+    starts: list[Trajectory]  # with velocities at the instants of the positions: what ours start from
+    shapes: dict[str, Shape]  # of every name in use, their origins at the centres of mass
+    urdfs: dict[str, Path]  # the engines' files, by name; those that are not at hand are absent
+    solids: dict[str, Solid]  # the exact geometry, by name
+    floor: tuple[float, float]  # friction and restitution
+    own_inertia: bool = False  # see `Start`
+    length: float = 1.0  # m of the scene in one of these; recordings are 1
+    time: float = 1.0  # s
 
     @property
     def steps(self) -> int:
@@ -121,35 +92,22 @@ class Cases:
         """Which trajectory is timed: the one in the middle by its number of bodies."""
         return int(np.argsort([len(t.mass) for t in self.recorded], kind="stable")[len(self.recorded) // 2])
 
-    def engine_start(self, motion: Trajectory) -> Start:
-        """One of `recorded` for an engine. Raises SdfsimError where an engine's file is not at hand."""
-        if lacking := sorted({str(n) for n in motion.shape} - set(self.urdfs)):
-            raise SdfsimError(f"no engine file of {', '.join(lacking)} at hand")
-        meshes = {name: centred_mesh(shape) for name, shape in self.shapes.items()}
-        return Start(motion, self.urdfs, self.floor, self.own_inertia, meshes)
-
 
 def load_cases(data: Path, *, quick: bool) -> Cases:
-    """The trajectories of a dataset's test split, at most `MOST`; a quick study takes fewer and shorter ones.
-
-    Raises:
-        SdfsimError: no or unreadable trajectories or shapes, or recordings of different steps or gravities.
-    """
+    """The trajectories of a dataset's test split, at most `MOST`; a quick study takes fewer and shorter ones. Raises
+    SdfsimError as `load_recorded` does, or for recordings of different gravities."""
     most = MOST_QUICK if quick else MOST
     # The engine starts again from its own velocities, others from those at the instants of the positions.
     recorded, shapes = load_recorded(data, "test", most=most, as_recorded=True)
     starts, _ = load_recorded(data, "test", most=most)
     check_alike(str(data), recorded)
     longest = min(STEPS_QUICK if quick else STEPS, *(len(t.position) - 1 for t in recorded))
-    recorded = [first_frames(t, longest + 1) for t in recorded]
     urdfs = {}
     for name in shapes:
-        try:
+        with suppress(SdfsimError):  # the engines are points that say so
             urdfs[name] = dataset_urdf(data, name)
-        except SdfsimError:
-            continue  # the engines are points that say so
     return Cases(
-        recorded=recorded,
+        recorded=[first_frames(t, longest + 1) for t in recorded],
         starts=[first_frames(t, longest + 1) for t in starts],
         shapes={name: replace(shape, com=np.zeros(3)) for name, shape in shapes.items()},
         urdfs=urdfs,
@@ -162,28 +120,25 @@ def cases_of_scene(scene: Scene, model: str, folder: Path, *, quick: bool) -> Ca
     """The one case that a scene makes: the teacher simulates it, and that is what contenders are judged by.
 
     Lengths, times and masses are those of `model` (Froude scaling), so that the teacher, whose steps and margins are
-    meant for bodies of about a metre, serves scenes of any size. The engines' files go to `folder`.
-
-    Raises:
-        SdfsimError: a floor other than one level plane, bodies on a path, bodies that may not touch all others, effects
-            that are off, nothing that moves, or PyBullet is not installed.
+    meant for bodies of about a metre, serves scenes of any size. The engines' files go to `folder`. Raises SdfsimError
+    for a scene with more than bodies, that all meet each other, on one level plane, or without PyBullet.
     """
-    if any(b.collides_with is not None for b in scene.bodies):
-        raise SdfsimError(f"{scene.path}: has bodies that may not touch all others, which is not measured")
-    if off := [name for name in PHYSICAL if getattr(scene.effects, name) == "off"]:
-        raise SdfsimError(f"{scene.path}: effects: {off[0]} is off, which is not measured", "leave it at auto")
-    if not any(b.motion == "dynamic" for b in scene.bodies):
-        raise SdfsimError(f"{scene.path}: nothing moves in it")
     units = scene_units(scene, load_model(model, weights=False), None)
     start = start_of_scene(scene, folder, units)
-    if start.floor is None:
-        raise SdfsimError(f"{scene.path}: needs one level plane as its floor")
+    problems = {
+        "bodies that may not touch all others are not measured": any(b.collides_with is not None for b in scene.bodies),
+        "effects that are off are not measured": any(getattr(scene.effects, name) == "off" for name in PHYSICAL),
+        "nothing moves in it": not any(b.motion == "dynamic" for b in scene.bodies),
+        "needs one level plane as its floor": start.floor is None,
+    }
+    if start.floor is None or any(problems.values()):
+        raise SdfsimError(f"{scene.path}: {next(problem for problem, there in problems.items() if there)}")
     shapes = {name: _centred(scene.shapes[int(name)], name) for name in start.urdfs}
     t = start.motion
     # The engine's flights are those of bodies that are half an inner step of gravity faster than it is told.
     lead = 0.5 * SUBSTEP * t.gravity * ~t.static[:, None]
     steps = max(2, min(STEPS_QUICK if quick else STEPS, round(scene.duration / units.time / DT)))
-    recorded, _ = bullet(replace(start, motion=replace(t, velocity=t.velocity - lead)), steps)
+    recorded, _ = engines.bullet(replace(start, motion=replace(t, velocity=t.velocity - lead)), steps)
     solids = exact_solids(folder, shapes)
     return Cases([recorded], [t], shapes, start.urdfs, solids, start.floor, True, units.length, units.time)
 
@@ -204,25 +159,17 @@ def _centred(shape: Shape, name: str) -> Shape:
 
 @dataclass(frozen=True)
 class Setting:
-    """One way to simulate. The defaults are those of `sdfsim evaluate`.
+    """One way to simulate. The defaults are those of `sdfsim evaluate`."""
 
-    Attributes:
-        model: name or path.
-        nodes: "own", the shapes' own nodes; "thin K", K of them, outermost first; "grid N", sampled anew from N^3
-            points.
-        sdf: "own", convex pieces where the shape has some; "mlp", its network alone; "grid N", samples of the exact
-            distance, N along each side; "mesh", the distance to the mesh that is shown.
-        stride: recorded steps in a step.
-        substeps: inner steps of the solve in a step, where the model does not say how many.
-        contact: off is the ballistic baseline.
-    """
-
-    model: str
+    model: str  # name or path
+    # "own", the shapes' own; "thin K", K of them, outermost first; "grid N", sampled anew from N^3 points
     nodes: str = "own"
+    # "own", convex pieces where the shape has some; "mlp", its network alone; "grid N", samples of the exact distance,
+    # N along each side; "mesh", the distance to the mesh that is shown
     sdf: str = "own"
-    stride: int = 1
-    substeps: int = SUBSTEPS
-    contact: bool = True
+    stride: int = 1  # recorded steps in a step
+    substeps: int = SUBSTEPS  # inner steps of the solve in a step, where the model does not say how many
+    contact: bool = True  # off is the ballistic baseline
 
     @property
     def label(self) -> str:
@@ -258,29 +205,25 @@ def settings(models: Sequence[str], *, quick: bool) -> list[Setting]:
     return [*chosen, Setting(models[0], contact=False)]
 
 
-def arranged(setting: Setting, cases: Cases) -> tuple[Model, dict[str, Shape]]:
-    """The model, and the shapes with the nodes and distances that a setting wants."""
-    model, shapes = load_model(setting.model), {}
+def arranged(setting: Setting, cases: Cases) -> dict[str, Shape]:
+    """The shapes with the nodes and distances that a setting wants."""
+    shapes = {}
     kind, _, count = setting.nodes.partition(" ")
     for name, shape in cases.shapes.items():
         if setting.sdf != "own" and not isinstance(shape.sdf, ClosedForm):
-            shape = _measured_by(shape, setting.sdf)
+            way, _, cells = setting.sdf.partition(" ")
+            if way == "grid":
+                pieces = own_pieces(shape)
+                exact = PiecesDistance(pieces) if pieces else MeshDistance(shape.mesh)
+                shape = replace(shape, pieces=(), sdf=sample_grid(exact, exact.bounds, int(cells)))
+            else:
+                shape = with_sdf(replace(shape, pieces=()), way)  # type: ignore[arg-type]
         if kind == "thin":
             shape = replace(shape, nodes=hull_nodes(shape.nodes, int(count)))
         elif kind == "grid":
             shape = with_nodes(shape, int(count))
         shapes[name] = shape
-    return model, shapes
-
-
-def _measured_by(shape: Shape, sdf: str) -> Shape:
-    """The shape with distances of one kind alone (see `Setting.sdf`)."""
-    kind, _, count = sdf.partition(" ")
-    if kind != "grid":
-        return with_sdf(replace(shape, pieces=()), kind)  # type: ignore[arg-type]
-    pieces = own_pieces(shape)
-    exact = PiecesDistance(pieces) if pieces else MeshDistance(shape.mesh)
-    return replace(shape, pieces=(), sdf=sample_grid(exact, exact.bounds, int(count)))
+    return shapes
 
 
 # --- measuring ---
@@ -290,7 +233,7 @@ def measure_ours(setting: Setting, cases: Cases) -> dict[str, Any]:
     """Errors and times of our simulator in one setting: see `_judged` and `_times`."""
     with peak_memory() as memory:
         began = time.perf_counter()
-        model, shapes = arranged(setting, cases)
+        model, shapes = load_model(setting.model), arranged(setting, cases)
         prepared = time.perf_counter() - began
         starts, steps = [every(t, setting.stride) for t in cases.starts], cases.steps // setting.stride
         motions = roll_out(
@@ -319,11 +262,15 @@ def measure_engine(name: str, substeps: int, off: float, cases: Cases) -> dict[s
     """Errors and times of an engine with so many of its steps in a recorded one, starts `off` m/s off."""
     if abs(cases.recorded[0].dt - DT) > 1e-9:
         raise SdfsimError(f"recorded with another step than {DT} s")
-    run: Callable[..., tuple[Trajectory, Timing]] = (
-        bullet if name == "PyBullet" else partial(mujoco, pieces=name == "MuJoCo")
-    )
+    run = RUNS[name]
+    if lacking := sorted({str(n) for t in cases.recorded for n in t.shape} - set(cases.urdfs)):
+        raise SdfsimError(f"no engine file of {', '.join(lacking)} at hand")
+    meshes = {name: centred_mesh(shape) for name, shape in cases.shapes.items()}
     recorded = cases.recorded if name == "PyBullet" else cases.starts
-    starts = [cases.engine_start(perturbed(t, off, [0, k])) for k, t in enumerate(recorded)]
+    starts = [
+        Start(perturbed(t, off, [0, k]), cases.urdfs, cases.floor, cases.own_inertia, meshes)
+        for k, t in enumerate(recorded)
+    ]
     with peak_memory() as memory:
         motions = [run(start, cases.steps, substeps)[0] for start in starts]
     repeats = [run(starts[cases.timed], min(TIMED, cases.steps), substeps)[1] for _ in range(REPEATS)]
@@ -401,18 +348,18 @@ def tradeoff(
         else:
             scene = load_scene(source, lambda f, m: on_progress("shapes", f, m)) if source else tossed((1,))
             cases = cases_of_scene(scene, names[0], out / "engine", quick=quick)
-        kinds, families, jobs = {}, {}, []
+        kinds, families, jobs = {FLOOR_LABEL: "floor"}, {}, []
         content = [VERSION, machine(), replace(cases, urdfs={}, solids={})]
         for setting in settings(names, quick=quick):
             kinds[setting.label] = "ours" if setting.contact else "baseline"
             families[setting.label] = setting.family
             weights = load_model(setting.model) if setting.contact else None
             jobs.append(Job("cases", setting.label, [content, setting, weights], measure_ours, (setting, cases)))
-        for name, substeps in ENGINES_QUICK if quick else ENGINES:
-            label = f"{name} {1e3 * DT / substeps:.3g} ms"
-            kinds[label], families[label] = "engine", f"{name}: step"
-            jobs.append(Job("cases", label, [content, label], measure_engine, (name, substeps, 0.0, cases)))
-        kinds[FLOOR_LABEL] = "floor"
+        for name, counts in (ENGINES_QUICK if quick else ENGINES).items():
+            for substeps in counts:
+                label = f"{name} {1e3 * DT / substeps:.3g} ms"
+                kinds[label], families[label] = "engine", f"{name}: step"
+                jobs.append(Job("cases", label, [content, label], measure_engine, (name, substeps, 0.0, cases)))
         jobs.append(Job("cases", FLOOR_LABEL, [content, OFF], measure_engine, ("PyBullet", 5, OFF, cases)))
         results = measure(jobs, out / "results", on_progress=lambda f, m: on_progress("measure", f, m))
         points = [{"label": label, "kind": kinds[label], **result} for (_, label), result in results.items()]
@@ -438,22 +385,21 @@ def tradeoff(
         }
         write_json(out / "report.json", report)
         write_text(out / "tradeoff.csv", table(points))
+        error = {p["label"]: p["translation_rmse"][steps] for p in fine}
+
+        def along(name: str, points: Sequence[dict[str, Any]]) -> Line:
+            points = sorted(points, key=lambda p: p["ms"])
+            return Line(name, [p["ms"] for p in points], [error[p["label"]] for p in points])
+
         drawn: dict[str, list[dict[str, Any]]] = {}
         for point in fine:
             if point["label"] != TRUTH and point["kind"] != "floor":
                 drawn.setdefault(families[point["label"]], []).append(point)
-        lines = [Line("our front", *_along(best, steps))]
-        lines += [Line(name, *_along(sorted(row, key=lambda p: p["ms"]), steps)) for name, row in drawn.items()]
-        floor = next((p["translation_rmse"][steps] for p in fine if p["kind"] == "floor"), None)
+        lines = [along("our front", best), *(along(name, points) for name, points in drawn.items())]
         axes = ("ms of computing per simulated second", f"translation RMSE over {steps} steps, m")
-        panel = Panel("lower left is better; dotted: the engine from starts 1 mm/s off", *axes, lines, "xy", floor)
-        draw([panel], out / "tradeoff.png", size=(8.0, 5.0), key="outside", dpi=100)
+        title = "lower left is better; dotted: the engine from starts 1 mm/s off"
+        draw([Panel(title, *axes, lines, "xy", error.get(FLOOR_LABEL))], out / "tradeoff.png", size=(8.0, 5.0))
         return report
-
-
-def _along(points: Sequence[dict[str, Any]], steps: str) -> tuple[list[float], list[float]]:
-    """Times and errors of points."""
-    return [p["ms"] for p in points], [p["translation_rmse"][steps] for p in points]
 
 
 def table(points: list[dict[str, Any]]) -> str:
@@ -462,10 +408,10 @@ def table(points: list[dict[str, Any]]) -> str:
     for point in points:
         row: dict[str, Any] = {}
         for name, value in point.items():
-            if isinstance(value, dict):
-                row |= {f"{name}_{steps}": found for steps, found in value.items() if not isinstance(found, list)}
-            else:
-                row[name] = value
+            columns = (
+                {f"{name}_{steps}": one for steps, one in value.items()} if isinstance(value, dict) else {name: value}
+            )
+            row |= {name: one for name, one in columns.items() if not isinstance(one, list)}
         rows.append({name: f"{value:.6g}" if isinstance(value, float) else value for name, value in row.items()})
     text = io.StringIO()
     writer = csv.DictWriter(text, list(dict.fromkeys(name for row in rows for name in row)), lineterminator="\n")

@@ -80,7 +80,7 @@ def test_penetration_is_the_overlap_of_two_cubes_and_of_one_with_the_floor():
     assert depths(scene, rollout.motion, every=20) == pytest.approx([0.1])
     found = hard_cases.squeezed([rollout])
     assert found["worst depth"] == pytest.approx(10.0) and found["fallen"] == 0.0
-    sunk = hard_cases.sunk(hard_cases.box(1.0))
+    sunk = hard_cases.on_floor([hard_cases.box(1.0)], [hard_cases.body("sunk", 0, [0, 0, 0])])
     assert depths(sunk, motion(sunk, 5).motion, every=5) == pytest.approx([0.5])
     apart = hard_cases.overlapping(hard_cases.ball(), hard_cases.ball(), 1.2)
     assert (depths(apart, motion(apart, 5).motion, every=5) == 0).all()

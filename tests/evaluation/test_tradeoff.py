@@ -35,10 +35,10 @@ def test_every_setting_has_a_label_of_its_own():
 def test_networks_and_shapes_are_what_a_setting_says(cases):
     box = with_sdf(analytic_shape("box", size=(1.0, 0.6, 0.4)), "grid", resolution=48)
     cases = replace(cases, shapes={"box": box, "ball": analytic_shape("sphere", radius=0.5)})
-    few = arranged(Setting("solver", nodes="thin 10"), cases)[1]["box"].nodes
+    few = arranged(Setting("solver", nodes="thin 10"), cases)["box"].nodes
     # Outermost first: of a box, the eight corners are among them.
     assert len(few) == 10 and (np.abs(np.abs(few) - [0.5, 0.3, 0.2]).max(1) < 1e-9).sum() == 8
-    grid = arranged(Setting("solver", nodes="grid 6"), cases)[1]["box"].nodes
+    grid = arranged(Setting("solver", nodes="grid 6"), cases)["box"].nodes
     assert 8 <= len(grid) <= 6**3 and np.abs(np.asarray(box.sdf(grid)[0])).max() < 0.01
 
 
@@ -60,12 +60,12 @@ def test_the_whole_study_in_small(cube_data, tmp_path, monkeypatch):
     monkeypatch.setattr(study, "settings", lambda *_, **__: chosen)
     monkeypatch.setattr(study, "REPEATS", 2)
     monkeypatch.setattr(study, "MOST_QUICK", 1)
-    monkeypatch.setattr(study, "ENGINES_QUICK", [("PyBullet", 5), ("MuJoCo", 5)])
+    monkeypatch.setattr(study, "ENGINES_QUICK", {"PyBullet": (5,), "MuJoCo": (5,)})
 
     def absent(*_, **__):
         raise SdfsimError("MuJoCo is not installed")
 
-    monkeypatch.setattr(study, "mujoco", absent)
+    monkeypatch.setitem(study.RUNS, "MuJoCo", absent)
     before = torch.get_num_threads()
 
     def run():

@@ -8,9 +8,8 @@ import pytest
 pytest.importorskip("pybullet")
 
 from sdfsim.data.dataset import Trajectory, trajectory_files
-from sdfsim.evaluation.baselines import chaos_floor
 from sdfsim.evaluation.engines import Start, bullet, dataset_urdf
-from sdfsim.evaluation.evaluate import evaluate
+from sdfsim.evaluation.evaluate import chaos_floor, evaluate
 from tests.dynamics.conftest import random_model
 
 
