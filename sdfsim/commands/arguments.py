@@ -31,20 +31,11 @@ def folder_of(text: str) -> Path:
 
 
 Json = Annotated[bool, typer.Option("--json", help="One JSON object on stdout, everything else on stderr.")]
-Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="More figures, and tracebacks with errors.")]
-Camera = Annotated[
-    tuple[float, float, float] | None,
-    typer.Option(metavar="X Y Z", help="Where the camera is, m (default: all of the motion is in sight)."),
-]
-LookAt = Annotated[
-    tuple[float, float, float] | None,
-    typer.Option("--look-at", metavar="X Y Z", help="What it looks at, m (default: the middle of the scene)."),
-]
+Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Tracebacks with errors.")]
 Device = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Where to compute.")]
 Outside = Annotated[
     bool, typer.Option("--allow-outside", help="Let the scene name files that are not in its own folder.")
 ]
-Bind = Annotated[str, typer.Option(metavar="ADDRESS", help="Where viewers listen; 0.0.0.0 lets the network in.")]
 Out = Annotated[
     Path, typer.Option("-o", "--out", parser=folder_of, metavar="PATH", help="Folder to write.", show_default=False)
 ]
