@@ -35,6 +35,8 @@ WEAK = 1e-3  # how strongly coefficients that nothing shows are held to it
 OUTLIER = 2e-3  # model lengths: errors of windows that count less than squared, beyond
 NUDGE = 0.02  # of a coefficient, for differences: contacts come and go, so that smaller ones tell nothing
 SURE = 1.96  # standard deviations in an interval of 95 %
+HIGH = {"friction": 2.0, "restitution": 1.0}  # the largest products that are looked for
+RATIO = 7.0  # the largest logarithm of a mass ratio
 COLUMNS = ("time", "body", "x", "y", "z", "qx", "qy", "qz", "qw")
 
 
@@ -49,56 +51,6 @@ class Recording:
     velocity: np.ndarray
     angular_velocity: np.ndarray
     known: np.ndarray  # [T] bool, whether the velocities are to be trusted
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A number with its interval of 95 %; no interval, and a number that means nothing, where it is not shown."""
-
-    value: float
-    interval: tuple[float, float] | None
-
-
-@dataclass(frozen=True)
-class Identified:
-    """What a recording tells."""
-
-    # friction, restitution: pair of body names -> product of the two bodies' coefficients
-    friction: dict[tuple[str, str], Estimate]
-    restitution: dict[tuple[str, str], Estimate]
-    # own_friction, own_restitution: body -> its own, where that of what it touched is given by the scene
-    own_friction: dict[str, Estimate]
-    own_restitution: dict[str, Estimate]
-    mass: dict[str, Estimate]  # body -> kg, as the ratio to the first body that is touched by another that moves
-    error_m: float  # root mean square error of the windows that are left, m; windows: how many there were
-    windows: int
-
-    def lines(self) -> list[str]:
-        """As lines for people."""
-        heads = {"friction": "friction, product", "restitution": "restitution, product"}
-        heads |= {"own_friction": "friction of the body's own", "own_restitution": "restitution of the body's own"}
-        lines, report = [], self.report()
-        for kind, head in (heads | {"mass": "mass, kg"}).items():
-            for name, told in report[kind].items():
-                seen = "not shown by this motion"
-                if told["interval"]:
-                    seen = "{:.3f} ({:.3f} to {:.3f})".format(told["value"], *told["interval"])
-                lines.append(f"{head}: {name}: {seen}")
-        return [*lines, f"{self.windows} windows, repeated with an error of {self.error_m:.2g} m"]
-
-    def report(self) -> dict[str, Any]:
-        """As a JSON object."""
-        found: dict[str, Any] = {"error_m": self.error_m, "windows": self.windows}
-        for kind in ("friction", "restitution", "own_friction", "own_restitution", "mass"):
-            # What the motion does not show has no value either: the fit left it where it happened to begin.
-            found[kind] = {
-                " / ".join(name) if isinstance(name, tuple) else name: {
-                    "value": e.value if e.interval else None,
-                    "interval": e.interval,
-                }
-                for name, e in getattr(self, kind).items()
-            }
-        return found
 
 
 def load_recording(
@@ -178,26 +130,28 @@ def _from_poses(names: list[str], dt: float, origin: np.ndarray, orientation: np
     return Recording(dt, position, turn.numpy(), velocity, angular, known)
 
 
-def identify(recording: Recording, scene: Scene, *, on_progress: Progress = silent) -> Identified:
+def identify(recording: Recording, scene: Scene, *, on_progress: Progress = silent) -> dict[str, Any]:
     """Find the coefficients and masses with which the contact solve repeats a recording; those of bodies that do not
-    move are taken from the scene. Raises SdfsimError for bodies on paths, a recording too short, or one in which
-    nothing touches."""
+    move are taken from the scene.
+
+    Returns `value` and `interval` (of 95 %; both None where the motion does not show it) of: `friction` and
+    `restitution`, by "BODY / BODY", the product of both bodies' coefficients; `own_friction` and `own_restitution`, by
+    body, where the scene gives that of what it touched; `mass` in kg, relative to the first body that another one
+    touched. And `error_m`, the root mean square error of the `windows` that are left. Raises SdfsimError for bodies on
+    paths, a recording too short, or one in which nothing touches.
+    """
     from scipy.optimize import least_squares
 
     if any(b.motion == "kinematic" for b in scene.bodies):
         raise SdfsimError("bodies on paths: identify works on bodies that move freely and those that are static")
     windows = Windows(recording, scene)
-    start = windows.start()
-    best = start
     # A sweep over all coefficients alike finds the valley; the fit goes down in it.
-    tried = [(f, e) for f in (0.2, 0.5, 0.9) for e in (0.1, 0.4, 0.7, 0.95)]
+    tried = [windows.start(f, e) for f in (0.2, 0.5, 0.9) for e in (0.1, 0.4, 0.7, 0.95)]
     costs = []
-    for k, (friction, restitution) in enumerate(tried):
-        trial = windows.start(friction, restitution)
+    for k, trial in enumerate(tried):
         costs.append(float(np.minimum(np.abs(windows.errors(trial)), 10.0).sum()))
-        best = trial if costs[-1] == min(costs) else best
         on_progress(0.3 * k / len(tried), "a first sweep over friction and restitution")
-    count = [0]
+    start, count = windows.start(START, START), [0]
 
     def errors(parameters: np.ndarray) -> np.ndarray:
         count[0] += 1
@@ -205,8 +159,23 @@ def identify(recording: Recording, scene: Scene, *, on_progress: Progress = sile
         return np.concatenate([windows.errors(parameters), WEAK * (parameters - start)])
 
     slope: Any = lambda parameters: windows.jacobian(parameters, errors)  # noqa: E731
-    found = least_squares(errors, best, slope, windows.bounds(), x_scale=0.1, loss="soft_l1", max_nfev=25)
-    return windows.told(found.x, windows.jacobian(found.x, errors), errors(found.x))
+    best = tried[int(np.argmin(costs))]
+    found = least_squares(errors, best, slope, windows.bounds, x_scale=0.1, loss="soft_l1", max_nfev=25)
+    return windows.report(found.x, windows.jacobian(found.x, errors), errors(found.x))
+
+
+def report_lines(report: dict[str, Any]) -> list[str]:
+    """`identify`'s report for people."""
+    heads = {"friction": "friction, product", "restitution": "restitution, product"}
+    heads |= {"own_friction": "friction of the body's own", "own_restitution": "restitution of the body's own"}
+    lines = []
+    for kind, head in (heads | {"mass": "mass, kg"}).items():
+        for name, told in report[kind].items():
+            seen = "not shown by this motion"
+            if told["interval"]:
+                seen = "{:.3f} ({:.3f} to {:.3f})".format(told["value"], *told["interval"])
+            lines.append(f"{head}: {name}: {seen}")
+    return [*lines, f"{report['windows']} windows, repeated with an error of {report['error_m']:.2g} m"]
 
 
 class Windows:
@@ -242,6 +211,9 @@ class Windows:
         self.seen = sorted({k for pair in self.pairs for k in pair if k < many})
         beside = [pair for pair in self.pairs if pair[1] < many]
         self.weighed = sorted({k for pair in beside for k in pair})[1:]
+        ratios = np.full(len(self.weighed), RATIO)
+        high = [self._most(name, k) for name in HIGH for k in self.seen]
+        self.bounds = np.concatenate([np.zeros(len(high)), -ratios]), np.concatenate([high, ratios])
 
     def _build(self, begin: np.ndarray) -> None:
         """Bodies and start states of the windows that begin at frames `begin`."""
@@ -291,28 +263,16 @@ class Windows:
                 found.add((a // many, *sorted((a % many, other))))
         return found
 
-    def start(self, friction: float = START, restitution: float = START) -> np.ndarray:
-        """Parameters to begin with."""
+    def _most(self, name: str, body: int) -> float:
+        """What a body's own coefficient may be at most, given those of the static bodies that it touched."""
+        many = len(self.moving)
+        others = [getattr(self.fixed[b - many], name) for a, b in self.pairs if a == body and b >= many]
+        return HIGH[name] / max([v for v in others if v > 0.0], default=1.0)
+
+    def start(self, friction: float, restitution: float) -> np.ndarray:
+        """Parameters with one coefficient for all, and the masses of the scene."""
         count = len(self.seen)
         return np.concatenate([np.full(count, friction), np.full(count, restitution), np.zeros(len(self.weighed))])
-
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Least and largest parameters: a product of friction may be up to 2, one of restitution up to 1."""
-        ratios = np.full(len(self.weighed), 7.0)
-        high = np.concatenate([self._most("friction", 2.0), self._most("restitution", 1.0), ratios])
-        return np.concatenate([np.zeros(2 * len(self.seen)), -ratios]), high
-
-    def _most(self, name: str, product: float) -> np.ndarray:
-        """What a body's own coefficient may be at most, given those of the static bodies that it touched."""
-        most = []
-        for k in self.seen:
-            others = [
-                getattr(self.fixed[b - len(self.moving)], name)
-                for a, b in self.pairs
-                if a == k and b >= len(self.moving)
-            ]
-            most.append(product / max([v for v in others if v > 0.0], default=1.0))
-        return np.array(most)
 
     def errors(self, parameters: np.ndarray) -> np.ndarray:
         """Differences of all windows from the recording, in units of `OUTLIER`; turns at half of a body's size."""
@@ -341,7 +301,7 @@ class Windows:
 
     def jacobian(self, parameters: np.ndarray, errors: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         """[R, P] by central differences of `NUDGE`, one-sided at the bounds."""
-        low, high = self.bounds()
+        low, high = self.bounds
         columns = []
         for k in range(len(parameters)):
             one, other = parameters.copy(), parameters.copy()
@@ -349,9 +309,10 @@ class Windows:
             columns.append((errors(one) - errors(other)) / (one[k] - other[k]))
         return np.stack(columns, 1)
 
-    def told(self, parameters: np.ndarray, jacobian: np.ndarray, errors: np.ndarray) -> Identified:
-        """Estimates with intervals: the curvature of the robust cost, and how windows pull apart (a sandwich)."""
-        data, slope = errors[: len(errors) - len(parameters)], jacobian[: len(errors) - len(parameters)]
+    def report(self, parameters: np.ndarray, jacobian: np.ndarray, errors: np.ndarray) -> dict[str, Any]:
+        """What `identify` returns. Intervals are from the curvature of the robust cost, and how windows pull apart (a
+        sandwich)."""
+        data, slope = errors[: -len(parameters)], jacobian[: -len(parameters)]
         weight = (1.0 + data**2) ** -0.5  # of the soft L1 loss
         curvature = (slope * weight[:, None]).T @ slope + WEAK**2 * np.eye(len(parameters))
         # Errors within a window go together: windows, not single poses, are what is independent.
@@ -362,36 +323,32 @@ class Windows:
         spread = max(1.0, self.count / max(1, self.count - len(parameters)))
         covariance = spread * inverse @ (pull.T @ pull) @ inverse
         shown = np.square(slope).sum(0) > 1.0
-        count, many = len(self.seen), len(self.moving)
-        names = [b.name for b in (*self.moving, *self.fixed)]
 
-        def estimate(value: float, gradient: np.ndarray) -> Estimate:
-            if not shown[gradient != 0.0].all():
-                return Estimate(float(value), None)
-            half = SURE * float(np.sqrt(gradient @ covariance @ gradient))
-            return Estimate(float(value), (max(0.0, float(value) - half), float(value) + half))
+        def estimate(value: float, gradient: dict[int, float]) -> dict[str, Any]:
+            """Of a value with these derivatives by parameters; the fit left one that is not shown where it began."""
+            which, by = list(gradient), np.array(list(gradient.values()))
+            if not shown[which][by != 0.0].all():
+                return {"value": None, "interval": None}
+            half = SURE * float(np.sqrt(by @ covariance[np.ix_(which, which)] @ by))
+            return {"value": float(value), "interval": (max(0.0, float(value) - half), float(value) + half)}
 
-        def coefficients(offset: int, name: str) -> tuple[dict, dict]:
-            products, own = {}, {}
+        many, bodies = len(self.moving), [*self.moving, *self.fixed]
+        rms = float(np.sqrt(np.mean((data * OUTLIER) ** 2))) * self.units.length
+        found: dict[str, Any] = {"error_m": rms, "windows": self.count}
+        for offset, kind in ((0, "friction"), (len(self.seen), "restitution")):
+            found[kind], found[f"own_{kind}"] = {}, {}
             for a, b in self.pairs:
-                gradient = np.zeros(len(parameters))
-                i = offset + self.seen.index(a)
+                i, name = offset + self.seen.index(a), f"{bodies[a].name} / {bodies[b].name}"
                 if b < many:
                     j = offset + self.seen.index(b)
-                    gradient[i], gradient[j] = parameters[j], parameters[i]
-                    products[names[a], names[b]] = estimate(parameters[i] * parameters[j], gradient)
+                    gradient = {i: parameters[j], j: parameters[i]}
+                    found[kind][name] = estimate(parameters[i] * parameters[j], gradient)
                 else:
-                    other = getattr(self.fixed[b - many], name)
-                    gradient[i] = other
-                    products[names[a], names[b]] = estimate(parameters[i] * other, gradient)
-                    own[names[a]] = estimate(parameters[i], np.eye(len(parameters))[i])
-            return products, own
-
-        friction, own_friction = coefficients(0, "friction")
-        restitution, own_restitution = coefficients(count, "restitution")
-        mass = {}
-        for i, k in enumerate(self.weighed):
-            value = self.moving[k].mass * float(np.exp(parameters[2 * count + i]))
-            mass[self.moving[k].name] = estimate(value, value * np.eye(len(parameters))[2 * count + i])
-        rms = float(np.sqrt(np.mean((data * OUTLIER) ** 2))) * self.units.length
-        return Identified(friction, restitution, own_friction, own_restitution, mass, rms, self.count)
+                    other = getattr(bodies[b], kind)
+                    found[kind][name] = estimate(parameters[i] * other, {i: other})
+                    found[f"own_{kind}"][bodies[a].name] = estimate(parameters[i], {i: 1.0})
+        found["mass"] = {}
+        for i, k in enumerate(self.weighed, 2 * len(self.seen)):
+            value = self.moving[k].mass * float(np.exp(parameters[i]))
+            found["mass"][self.moving[k].name] = estimate(value, {i: value})
+        return found
