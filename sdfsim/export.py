@@ -12,9 +12,10 @@ import io
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -24,7 +25,7 @@ from sdfsim.errors import SdfsimError
 from sdfsim.files import check_writable, replacing, write_bytes, write_text
 from sdfsim.identify import COLUMNS
 from sdfsim.parallel import StageProgress
-from sdfsim.recording import body_colors, framed, sheet, with_normals
+from sdfsim.recording import body_colors, framed, shown, with_normals
 from sdfsim.run import read_run
 from sdfsim.scene import written
 from sdfsim.scene.collision_filter import contact_groups
@@ -72,16 +73,8 @@ class Take:
         """m to each side, of the sheet that is shown for a plane."""
         return 6.0 * framed(self.scene)[1]
 
-    def display(self, shape: Shape) -> Mesh:
-        """The mesh that is shown at scale 1."""
-        return sheet(self.plane_size()) if isinstance(shape.sdf, PlaneSdf) else shape.shown
 
-
-class Written(NamedTuple):
-    """The files of an export, and what they do not hold, one line each."""
-
-    files: list[Path]
-    left_out: list[str]
+Written = tuple[list[Path], list[str]]  # the files of an export, and what they do not hold, one line each
 
 
 def export(
@@ -115,14 +108,9 @@ def export(
     check_writable(out.parent)
     take = _read(source, scene_file, allow_outside, on_progress)
     out.parent.mkdir(parents=True, exist_ok=True)
-    written = FORMATS[kind](take, out, on_progress)
-    return {
-        "format": kind[1:],
-        "bodies": len(take.names),
-        "frames": len(take.time),
-        "files": written.files,
-        "left_out": written.left_out,
-    }
+    files, left_out = FORMATS[kind](take, out, on_progress)
+    counts = {"bodies": len(take.names), "frames": len(take.time)}
+    return {"format": kind[1:], **counts, "files": files, "left_out": left_out}
 
 
 def _extra(module: str) -> Any:
@@ -137,34 +125,31 @@ def _extra(module: str) -> Any:
 
 
 def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progress: StageProgress) -> Take:
-    def told(fraction: float, message: str) -> None:
-        on_progress("shapes", fraction, message)
-
+    told = partial(on_progress, "shapes")
+    run = None
     if source.suffix == ".npz" or (source / "rollout.npz").is_file():
         scene, run = read_run(source, scene_file, allow_outside=allow_outside, on_progress=told)
-        turn = run.orientation.copy()
-        turn[1:] *= np.cumprod(np.where((turn[1:] * turn[:-1]).sum(-1) < 0, -1.0, 1.0), axis=0)[..., None]
-        com = np.array([body.scale * scene.shapes[body.shape].com for body in scene.bodies])
-        offset = Rotation.from_quat(turn.reshape(-1, 4)).apply(np.tile(com, (len(turn), 1)))
-        return _take(scene, run.time, run.position - offset.reshape(run.position.shape), turn)
-    if scene_file is not None:
+    elif scene_file is not None:
         raise SdfsimError(f"{source}: only a run has a scene beside it", "leave --scene away")
-    if (source / RECORD_FILE).is_file():
+    elif (source / RECORD_FILE).is_file():
         shape = load_shape(source)
         moves = "dynamic" if shape.volume > 0 else "static"
         scene = written.Scene().add(shape.name, asset=source, motion=moves).load(told)
     elif source.suffix.lower() in (".yaml", ".yml"):
         scene = load_scene(source, told, allow_outside=allow_outside)
     else:
-        told_of = "a run folder, a rollout.npz, a scene.yaml or a Shape folder"
-        raise SdfsimError(f"{source}: {'not' if source.exists() else 'no such file;'} {told_of}")
-    position = np.array([body.position for body in scene.bodies])
-    return _take(scene, np.zeros(1), position[None], np.array([body.quat_xyzw for body in scene.bodies])[None])
-
-
-def _take(scene: Scene, time: np.ndarray, position: np.ndarray, quat: np.ndarray) -> Take:
+        raise SdfsimError(f"{source}: not a run folder, a rollout.npz, a scene.yaml or a Shape folder")
+    if run is not None:
+        time, turn = run.time, run.orientation.copy()
+        turn[1:] *= np.cumprod(np.where((turn[1:] * turn[:-1]).sum(-1) < 0, -1.0, 1.0), axis=0)[..., None]
+        com = np.array([body.scale * scene.shapes[body.shape].com for body in scene.bodies])
+        offset = Rotation.from_quat(turn.reshape(-1, 4)).apply(np.tile(com, (len(turn), 1)))
+        place = run.position - offset.reshape(run.position.shape)
+    else:
+        time, turn = np.zeros(1), np.array([[body.quat_xyzw for body in scene.bodies]])
+        place = np.array([[body.position for body in scene.bodies]])
     names, shapes = (_plain_names([one.name for one in ones]) for ones in (scene.bodies, scene.shapes))
-    return Take(scene, names, shapes, np.array(body_colors(scene), dtype=np.uint8), time, position, quat)
+    return Take(scene, names, shapes, np.array(body_colors(scene), dtype=np.uint8), time, place, turn)
 
 
 def _plain_names(names: list[str]) -> list[str]:
@@ -206,20 +191,14 @@ def convex_pieces(shape: Shape) -> list[Mesh]:
 
 def _cut(take: Take, wanted: Callable[[Body], bool], on_progress: StageProgress) -> dict[int, list[Mesh]]:
     """Convex pieces of every shape without a closed form that a wanted body has, by its index."""
-    used = {body.shape for body in take.scene.bodies if wanted(body)}
-    todo = sorted(k for k in used if not isinstance(take.scene.shapes[k].sdf, ClosedForm))
+    used = sorted({body.shape for body in take.scene.bodies if wanted(body)})
     pieces = {}
-    for done, k in enumerate(todo):
-        on_progress("convex pieces", done / len(todo), f"of {take.scene.shapes[k].name}")
-        pieces[k] = convex_pieces(take.scene.shapes[k])
-    if todo:
-        on_progress("convex pieces", 1.0, f"{sum(map(len, pieces.values()))} of {len(todo)} shapes")
+    for done, k in enumerate(used):
+        shape = take.scene.shapes[k]
+        if not isinstance(shape.sdf, ClosedForm):
+            on_progress("convex pieces", done / len(used), f"of {shape.name}")
+            pieces[k] = convex_pieces(shape)
     return pieces
-
-
-def _write_obj(folder: Path, name: str, mesh: Mesh) -> Path:
-    write_text(folder / f"{name}.obj", wavefront([mesh]))
-    return folder / f"{name}.obj"
 
 
 def _write_assets(
@@ -227,14 +206,17 @@ def _write_assets(
 ) -> tuple[dict[int, Path], dict[int, list[Path]]]:
     """OBJ files in `NAME_assets/`: what is shown of each shape without a closed form, and its convex pieces."""
     folder = out.with_name(f"{out.stem}_assets")
-    shown, cut = {}, {}
-    for k in sorted({body.shape for body in take.scene.bodies}):
-        if isinstance(take.scene.shapes[k].sdf, ClosedForm):
-            continue
+
+    def obj(name: str, mesh: Mesh) -> Path:
         folder.mkdir(exist_ok=True)
-        shown[k] = _write_obj(folder, take.shapes[k], take.scene.shapes[k].mesh)
-        cut[k] = [_write_obj(folder, f"{take.shapes[k]}-{i}", p) for i, p in enumerate(pieces.get(k, []))]
-    return shown, cut
+        write_text(folder / f"{name}.obj", wavefront([mesh]))
+        return folder / f"{name}.obj"
+
+    used = sorted({body.shape for body in take.scene.bodies})
+    drawn = [k for k in used if not isinstance(take.scene.shapes[k].sdf, ClosedForm)]
+    seen = {k: obj(take.shapes[k], take.scene.shapes[k].mesh) for k in drawn}
+    cut = {k: [obj(f"{take.shapes[k]}-{i}", p) for i, p in enumerate(pieces.get(k, []))] for k in drawn}
+    return seen, cut
 
 
 def _numbers(*values: Any) -> str:
@@ -287,10 +269,10 @@ def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
     time = file.array(take.time) if take.moving else 0
     samplers, channels = [], []
     for k, (name, body, shape, color) in enumerate(take.each()):
-        shown = take.display(shape)
-        own = shown.colors is not None or shown.texture is not None
+        seen = shown(shape, take.plane_size())
+        own = seen.colors is not None or seen.texture is not None
         if body.shape not in numbers:
-            mesh, normals = with_normals(shown)
+            mesh, normals = with_normals(seen)
             attributes = {"POSITION": file.array(mesh.vertices), "NORMAL": file.array(normals)}
             if mesh.uv is not None:
                 attributes["TEXCOORD_0"] = file.array(mesh.uv)
@@ -300,7 +282,7 @@ def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
             numbers[body.shape] = attributes, file.array(mesh.faces.reshape(-1), "<u4")
         key = take.shapes[body.shape] + ("" if own else "-{:02x}{:02x}{:02x}".format(*color))
         if key not in drawn:
-            material = file.material(key, np.ones(3) if own else _linear(color), shown.texture, rough=0.8)
+            material = file.material(key, np.ones(3) if own else _linear(color), seen.texture, rough=0.8)
             drawn[key] = file.mesh(key, *numbers[body.shape], material)
         place, turn = take.position[:, k], take.quat_xyzw[:, k]
         node = {"translation": place[0].tolist(), "rotation": turn[0].tolist(), "scale": [body.scale] * 3}
@@ -312,8 +294,7 @@ def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
     if channels:
         file.animations.append({"name": "run", "samplers": samplers, "channels": channels})
     write_bytes(out, file.to_bytes())
-    unseen = ["masses, friction and all else that is not seen"]
-    return Written([out], unseen + _missing(take, motion=True, textures=True))
+    return [out], ["masses, friction and all else that is not seen", *_missing(take, motion=True, textures=True)]
 
 
 # --- USD ---
@@ -350,8 +331,8 @@ def _usd(take: Take, out: Path, on_progress: StageProgress) -> Written:
             code = usd.TimeCode(RATE * float(take.time[t])) if animated else usd.TimeCode.Default()
             place.Set(gf.Vec3d(*take.position[t, k].tolist()), code)
             turn.Set(gf.Quatd(*_wxyz(take.quat_xyzw[t, k]).tolist()), code)
-        shown = geom.PrimvarsAPI(prim).CreatePrimvar("displayColor", sdf.ValueTypeNames.Color3fArray)
-        shown.Set([gf.Vec3f(*_linear(color).tolist())])
+        tint = geom.PrimvarsAPI(prim).CreatePrimvar("displayColor", sdf.ValueTypeNames.Color3fArray)
+        tint.Set([gf.Vec3f(*_linear(color).tolist())])
         if body.motion != "static":
             rigid = physics.RigidBodyAPI.Apply(prim)
             rigid.CreateKinematicEnabledAttr(body.motion == "kinematic")
@@ -406,7 +387,7 @@ def _usd(take: Take, out: Path, on_progress: StageProgress) -> Written:
             named.rename(partial)
         finally:
             named.unlink(missing_ok=True)
-    return Written([out], _missing(take, motion=True))
+    return [out], _missing(take, motion=True)
 
 
 def _usd_geometry(take: Take, shape: Shape, dynamic: bool, stage: Any, path: str) -> None:
@@ -431,7 +412,6 @@ def _usd_geometry(take: Take, shape: Shape, dynamic: bool, stage: Any, path: str
             prim.CreateAxisAttr(geom.Tokens.z)
             prim.CreateWidthAttr(2.0 * take.plane_size())
             prim.CreateLengthAttr(2.0 * take.plane_size())
-        prim.CreateExtentAttr(geom.Boundable.ComputeExtentFromPlugins(prim, 0.0))
         physics.CollisionAPI.Apply(prim.GetPrim())
         return
     seen = _usd_mesh(stage, solid, shape.mesh)
@@ -451,9 +431,7 @@ def _usd_mesh(stage: Any, path: str, mesh: Mesh) -> Any:
     geom, vt = _extra("pxr.UsdGeom"), _extra("pxr.Vt")
     mesh, normals = with_normals(mesh)
     prim = geom.Mesh.Define(stage, path)
-    points = vt.Vec3fArray.FromNumpy(mesh.vertices.astype(np.float32))
-    prim.CreatePointsAttr(points)
-    prim.CreateExtentAttr(geom.PointBased.ComputeExtent(points))
+    prim.CreatePointsAttr(vt.Vec3fArray.FromNumpy(mesh.vertices.astype(np.float32)))
     prim.CreateFaceVertexCountsAttr(vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, dtype=np.int32)))
     prim.CreateFaceVertexIndicesAttr(vt.IntArray.FromNumpy(mesh.faces.reshape(-1).astype(np.int32)))
     prim.CreateSubdivisionSchemeAttr(geom.Tokens.none)
@@ -461,8 +439,8 @@ def _usd_mesh(stage: Any, path: str, mesh: Mesh) -> Any:
     prim.CreateNormalsAttr(vt.Vec3fArray.FromNumpy(normals.astype(np.float32)))
     prim.SetNormalsInterpolation(geom.Tokens.vertex)
     if mesh.colors is not None:
-        shown = prim.CreateDisplayColorPrimvar(geom.Tokens.vertex)
-        shown.Set(vt.Vec3fArray.FromNumpy(_linear(mesh.colors).astype(np.float32)))
+        tint = prim.CreateDisplayColorPrimvar(geom.Tokens.vertex)
+        tint.Set(vt.Vec3fArray.FromNumpy(_linear(mesh.colors).astype(np.float32)))
     return prim.GetPrim()
 
 
@@ -471,7 +449,7 @@ def _usd_mesh(stage: Any, path: str, mesh: Mesh) -> Any:
 
 def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
     scene, left_out = take.scene, _missing(take)
-    shown, cut = _write_assets(take, out, _cut(take, lambda body: True, on_progress))
+    seen, cut = _write_assets(take, out, _cut(take, lambda body: True, on_progress))
     root = XML("mujoco", model=_plain_names([out.stem])[0])
     folder = out.with_name(f"{out.stem}_assets").name
     _add(root, "compiler", angle="radian", meshdir=folder, balanceinertia="true")
@@ -512,8 +490,8 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
             places.append(_numbers(body.position, _wxyz(quat)))
             speeds.append(_numbers(speed, turn.inv().apply(body.angular_velocity)))
         rgba = _rgba(shape, color)
-        if body.shape in shown:
-            mesh = mesh_of(shown[body.shape], body.scale)
+        if body.shape in seen:
+            mesh = mesh_of(seen[body.shape], body.scale)
             _add(node, "geom", type="mesh", mesh=mesh, rgba=rgba, group="2", contype="0", conaffinity="0")
             solids = [{"type": "mesh", "mesh": mesh_of(file, body.scale), "group": "3"} for file in cut[body.shape]]
         else:
@@ -549,7 +527,7 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
     if places:
         _add(_add(root, "keyframe"), "key", name="start", qpos=" ".join(places), qvel=" ".join(speeds))
     _write_xml(out, root)
-    return Written([out, *shown.values(), *(file for files in cut.values() for file in files)], left_out)
+    return [out, *seen.values(), *(file for files in cut.values() for file in files)], left_out
 
 
 def _mjcf_surface(friction: float, restitution: float, *, pair: bool = False) -> dict[str, str]:
@@ -570,7 +548,7 @@ def _mjcf_surface(friction: float, restitution: float, *, pair: bool = False) ->
 
 
 def _urdf(take: Take, out: Path, on_progress: StageProgress) -> Written:
-    shown, cut = _write_assets(take, out, _cut(take, lambda body: body.motion != "static", on_progress))
+    seen, cut = _write_assets(take, out, _cut(take, lambda body: body.motion != "static", on_progress))
     files: list[Path] = []
     single = len(take.names) == 1 and take.scene.path is None
     for name, body, shape, color in take.each():
@@ -592,7 +570,7 @@ def _urdf(take: Take, out: Path, on_progress: StageProgress) -> Written:
             _add(_add(element, "geometry"), "mesh", filename=path, scale=_numbers([scale] * 3))
 
         visual = _add(link, "visual")
-        if body.shape not in shown:
+        if body.shape not in seen:
             if isinstance(shape.sdf, PlaneSdf):  # PyBullet draws none
                 _add(visual, "origin", xyz="0 0 -0.001", rpy="0 0 0")
                 _add(_add(visual, "geometry"), "box", size=_numbers([2.0 * take.plane_size()] * 2, 0.002))
@@ -600,23 +578,23 @@ def _urdf(take: Take, out: Path, on_progress: StageProgress) -> Written:
                 _urdf_form(_add(visual, "geometry"), shape.sdf, body.scale)
             _urdf_form(_add(_add(link, "collision"), "geometry"), shape.sdf, body.scale)
         else:
-            mesh(visual, shown[body.shape])
+            mesh(visual, seen[body.shape])
             if body.motion == "static":  # triangles as they are, which PyBullet knows of what never moves
-                mesh(_add(link, "collision", concave="yes"), shown[body.shape])
+                mesh(_add(link, "collision", concave="yes"), seen[body.shape])
             for file in cut[body.shape] if body.motion != "static" else []:
                 mesh(_add(link, "collision"), file)
         rgba = _rgba(shape, color)
         _add(_add(visual, "material", name=f"{name}_color"), "color", rgba=rgba)
         files.append(out if single else out.with_name(f"{out.stem}.{name}.urdf"))
         _write_xml(files[-1], root)
-    assets = [*shown.values(), *(file for found in cut.values() for file in found)]
+    assets = [*seen.values(), *(file for found in cut.values() for file in found)]
     if single:
-        return Written([*files, *assets], [])
+        return [*files, *assets], []
     poses = out.with_suffix(".csv")
     start = replace(take, time=take.time[:1], position=take.position[:1], quat_xyzw=take.quat_xyzw[:1])
     _csv(start, poses, on_progress)
     left_out = ["where the bodies are: that is in the CSV", "gravity, velocities and collides_with", *_missing(take)]
-    return Written([*files, poses, *assets], left_out)
+    return [*files, poses, *assets], left_out
 
 
 def _urdf_form(geometry: XML, form: Any, scale: float) -> None:
@@ -643,7 +621,7 @@ def _csv(take: Take, out: Path, on_progress: StageProgress) -> Written:
             pose = np.concatenate([take.position[t, k], take.quat_xyzw[t, k]])
             writer.writerow([f"{time:.9g}", body.name, *(f"{value:.12g}" for value in pose)])
     write_text(out, text.getvalue())
-    return Written([out], ["everything but poses"])
+    return [out], ["everything but poses"]
 
 
 FORMATS: dict[str, Callable[[Take, Path, StageProgress], Written]] = {

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,7 @@ from sdfsim.dynamics.rollout import Rollout
 from sdfsim.errors import SdfsimError
 from sdfsim.files import replacing
 from sdfsim.parallel import Progress, silent
-from sdfsim.recording import Eye, Place, body_colors, eye_of, framed, sheet, with_normals
+from sdfsim.recording import Eye, body_colors, eye_around, framed, is_infinite, shown, with_normals
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.bvh import Caster
 from sdfsim.shape.mesh import Mesh
@@ -23,6 +23,8 @@ from sdfsim.shape.mesh import Mesh
 if TYPE_CHECKING:
     from sdfsim.scene import written
 
+Place = Sequence[float] | np.ndarray
+_Model = tuple[Mesh, np.ndarray]  # what is drawn of a body about its centre of mass, with normals [V, 3]
 SIZE = (960, 540)  # px, width and height
 FRAMES = 30  # a second
 FORMATS = (".mp4", ".png")
@@ -66,6 +68,23 @@ def render(
     write_movie(out, pictures())
 
 
+def eye_of(
+    scene: Scene, motion: Rollout | None = None, camera: Place | None = None, look_at: Place | None = None
+) -> Eye:
+    """From where a scene is looked at; of the eye and what it looks at, [3] m each, what is not given is chosen so that
+    all of the scene is in sight. Raises SdfsimError where the eye is where it looks at, or not at a finite place."""
+    centre, radius = framed(scene, motion)
+    given = eye_around(centre if look_at is None else np.array(look_at, dtype=float), radius, -scene.gravity)
+    eye = given if camera is None else replace(given, position=np.array(camera, dtype=float))
+    sight = eye.target - eye.position
+    if not np.isfinite(sight).all() or np.linalg.norm(sight) < 1e-9:
+        raise SdfsimError("--camera and --look-at: must be two different points")
+    if np.linalg.norm(np.cross(sight, eye.up)) < 1e-3 * np.linalg.norm(sight):  # straight down, up has no place there
+        aside = np.cross(eye.up, eye.up[[1, 2, 0]] + [0.1, 0.2, 0.3])
+        eye = replace(eye, position=eye.position + 1e-3 * np.linalg.norm(sight) * aside)
+    return eye
+
+
 def check_format(out: Path) -> None:
     """Raises SdfsimError where the ending of a file says neither movie nor picture."""
     if out.suffix not in FORMATS:
@@ -97,31 +116,19 @@ def poses_at(rollout: Rollout, time: float) -> tuple[np.ndarray, np.ndarray]:
     return place, turned / np.linalg.norm(turned, axis=-1, keepdims=True)
 
 
-@dataclass(frozen=True)
-class _Model:
-    """What is drawn of a body, about its centre of mass: vertices and normals [V, 3], faces [F, 3], colours [V, 3], or
-    places [V, 2] in a texture [H, W, 3]."""
-
-    vertices: np.ndarray
-    normals: np.ndarray
-    faces: np.ndarray
-    colors: np.ndarray
-    uv: np.ndarray | None = None
-    texture: np.ndarray | None = None
-
-
 class _Cast:
     """The triangles of some bodies, numbers [B] in the scene, at places [B, 3] m and turns [B, 3, 3]; `body` [F] is
-    which one a face is of."""
+    which one a face is of. Each is a mesh about its centre of mass, with normals [V, 3]."""
 
     def __init__(self, models: list[_Model], bodies: np.ndarray, places: np.ndarray, turns: np.ndarray) -> None:
-        starts = np.cumsum([0, *(len(m.vertices) for m in models)])
-        vertices = np.concatenate([m.vertices @ r.T + t for m, r, t in zip(models, turns, places, strict=True)])
-        self._normals = np.concatenate([m.normals @ r.T for m, r in zip(models, turns, strict=True)])
-        self._colors = np.concatenate([m.colors for m in models])
-        self._faces = np.concatenate([m.faces + start for m, start in zip(models, starts, strict=False)])
-        self._textured = [(k, m.uv, m.texture, start) for k, m, start in zip(bodies, models, starts, strict=False)]
-        self.body = np.repeat(bodies, [len(m.faces) for m in models])
+        meshes = [mesh for mesh, _ in models]
+        starts = np.cumsum([0, *(len(m.vertices) for m in meshes)])[:-1]
+        vertices = np.concatenate([m.vertices @ r.T + t for m, r, t in zip(meshes, turns, places, strict=True)])
+        self._normals = np.concatenate([normals @ r.T for (_, normals), r in zip(models, turns, strict=True)])
+        self._colors = np.concatenate([m.colors for m in meshes])
+        self._faces = np.concatenate([m.faces + start for m, start in zip(meshes, starts, strict=True)])
+        self._meshes = list(zip(bodies, meshes, starts, strict=True))
+        self.body = np.repeat(bodies, [len(m.faces) for m in meshes])
         self.caster = Caster(Mesh(vertices, self._faces))
 
     def surface(self, face: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -129,12 +136,13 @@ class _Cast:
         share = np.stack([1.0 - uv.sum(-1), uv[:, 0], uv[:, 1]], -1)[..., None]
         corners = self._faces[face]
         normal, color = (self._normals[corners] * share).sum(1), (self._colors[corners] * share).sum(1)
-        for body, places, texture, start in self._textured:
-            if places is not None and texture is not None:
+        for body, mesh, start in self._meshes:
+            if mesh.uv is not None and mesh.texture is not None:
                 on = np.flatnonzero(self.body[face] == body)
-                at = (places[corners[on] - start] * share[on]).sum(1) * texture.shape[1::-1]
-                column, row = np.clip(at, 0, np.array(texture.shape[1::-1]) - 1).astype(int).T
-                color[on] = texture[row, column]
+                size = np.array(mesh.texture.shape[1::-1])
+                at = (mesh.uv[corners[on] - start] * share[on]).sum(1) * size
+                column, row = np.clip(at, 0, size - 1).astype(int).T
+                color[on] = mesh.texture[row, column]
         return normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9), color
 
 
@@ -145,13 +153,13 @@ class Studio:
     def __init__(self, scene: Scene, eye: Eye, radius: float) -> None:
         self._eye, self._radius = eye, radius
         shapes = [scene.shapes[b.shape] for b in scene.bodies]
-        self._floors = np.array([not np.isfinite(shape.sdf.bounds).all() for shape in shapes])
-        self._models = []
-        for body, shape, floor, color in zip(scene.bodies, shapes, self._floors, body_colors(scene), strict=True):
-            mesh, normals = with_normals(sheet(40.0 * radius) if floor else shape.shown)
+        self._floors = np.array([is_infinite(shape) for shape in shapes])
+        self._models: list[_Model] = []
+        for body, shape, color in zip(scene.bodies, shapes, body_colors(scene), strict=True):
+            mesh, normals = with_normals(shown(shape, 40.0 * radius))
             colors = np.broadcast_to(color, mesh.vertices.shape) if mesh.colors is None else mesh.colors
             vertices = body.scale * (mesh.vertices - shape.com)
-            self._models.append(_Model(vertices, normals, mesh.faces, colors.astype(float), mesh.uv, mesh.texture))
+            self._models.append((replace(mesh, vertices=vertices, colors=colors.astype(float)), normals))
         forward = (eye.target - eye.position) / np.linalg.norm(eye.target - eye.position)
         right = np.cross(forward, eye.up)
         right /= np.linalg.norm(right)
@@ -168,10 +176,10 @@ class Studio:
 
     def _cast(self, which: np.ndarray, position: np.ndarray, orientation: np.ndarray) -> _Cast | None:
         bodies = np.flatnonzero(which)
-        turns = Rotation.from_quat(orientation).as_matrix()
-        return (
-            _Cast([self._models[k] for k in bodies], bodies, position[bodies], turns[bodies]) if len(bodies) else None
-        )
+        if not len(bodies):
+            return None
+        turns = Rotation.from_quat(orientation[bodies]).as_matrix()
+        return _Cast([self._models[k] for k in bodies], bodies, position[bodies], turns)
 
     def picture(self, position: np.ndarray, orientation: np.ndarray) -> np.ndarray:
         """[H, W, 3] uint8 of bodies with these centres of mass [N, 3] m and orientations [N, 4]."""
