@@ -30,7 +30,8 @@ FRAMES = 30  # a second
 FORMATS = (".mp4", ".png")
 _TALL = np.tan(np.radians(20.0))  # half of the field of view's height, at distance 1
 _SUN = np.array([0.35, -0.5, 0.8]) / np.linalg.norm([0.35, -0.5, 0.8])  # in a frame whose z is up
-_SKY, _SHADE = np.array([236.0, 240.0, 245.0], np.float32), 0.45  # what nothing is in front of; light where the sun does not shine
+_SKY = np.array([236.0, 240.0, 245.0], np.float32)  # what nothing is in front of
+_SHADE = 0.45  # light where the sun does not shine
 _SUB = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]])  # px, where edges are looked at again
 _GRID = np.stack(np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5), -1).reshape(-1, 2)  # px
 
