@@ -58,7 +58,6 @@ def test_plan_tells_all_there_is_to_know(scene, model):
     assert report["constant_in_training"] == ["restitution"]
     assert any("path" in line for line in report["outside_training"])
     assert any(line.startswith("friction") for line in report["outside_training"]) is False  # 0.25 is in its range
-    assert set(report["not_default"]) == {"effects.restitution", "limits.memory_gib", "model", "duration"}
     lines = "\n".join(plan_lines(report))
     for word in ("off saves nothing", "[effects.sleep]", "kept apart by collides_with", "so not learned: restitution"):
         assert word in lines
