@@ -10,6 +10,7 @@ import csv
 import importlib
 import io
 import re
+import tempfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -22,7 +23,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sdfsim.errors import SdfsimError
-from sdfsim.files import check_writable, replacing, write_bytes, write_text
+from sdfsim.files import check_writable, write_bytes, write_text
 from sdfsim.identify import COLUMNS
 from sdfsim.parallel import StageProgress
 from sdfsim.recording import body_colors, framed, shown, with_normals
@@ -334,31 +335,27 @@ def _usd(take: Take, out: Path, on_progress: StageProgress) -> Written:
         tint = geom.PrimvarsAPI(prim).CreatePrimvar("displayColor", sdf.ValueTypeNames.Color3fArray)
         tint.Set([gf.Vec3f(*_linear(color).tolist())])
         if body.motion != "static":
-            rigid = physics.RigidBodyAPI.Apply(prim)
-            rigid.CreateKinematicEnabledAttr(body.motion == "kinematic")
+            _usd_apply(prim, "PhysicsRigidBodyAPI", kinematicEnabled=body.motion == "kinematic")
         if body.motion == "dynamic":
-            rigid.CreateVelocityAttr(gf.Vec3f(*body.velocity.tolist()))
-            rigid.CreateAngularVelocityAttr(gf.Vec3f(*np.rad2deg(body.angular_velocity).tolist()))
+            spin = np.rad2deg(body.angular_velocity)
+            velocities = {"velocity": gf.Vec3f(*body.velocity.tolist()), "angularVelocity": gf.Vec3f(*spin.tolist())}
+            _usd_apply(prim, "PhysicsRigidBodyAPI", **velocities)
             diagonal, axes = np.linalg.eigh(_inertia(body, shape))
             axes[:, 2] *= np.sign(np.linalg.det(axes))
-            mass = physics.MassAPI.Apply(prim)
-            mass.CreateMassAttr(body.mass)
-            mass.CreateCenterOfMassAttr(gf.Vec3f(*(body.scale * shape.com).tolist()))
-            mass.CreateDiagonalInertiaAttr(gf.Vec3f(*diagonal.tolist()))
-            mass.CreatePrincipalAxesAttr(gf.Quatf(*_wxyz(Rotation.from_matrix(axes).as_quat()).tolist()))
+            com, turned = body.scale * shape.com, _wxyz(Rotation.from_matrix(axes).as_quat())
+            masses = {"mass": body.mass, "centerOfMass": gf.Vec3f(*com.tolist())}
+            masses |= {"diagonalInertia": gf.Vec3f(*diagonal.tolist()), "principalAxes": gf.Quatf(*turned.tolist())}
+            _usd_apply(prim, "PhysicsMassAPI", **masses)
         surface = (body.friction, body.restitution)
         if surface not in materials:
-            path = f"/World/materials/surface_{len(materials)}"
-            materials[surface] = shade.Material.Define(stage, path)
-            told = physics.MaterialAPI.Apply(materials[surface].GetPrim())
-            told.CreateStaticFrictionAttr(body.friction)
-            told.CreateDynamicFrictionAttr(body.friction)
-            told.CreateRestitutionAttr(body.restitution)
+            materials[surface] = shade.Material.Define(stage, f"/World/materials/surface_{len(materials)}")
+            made, (friction, restitution) = materials[surface].GetPrim(), surface
+            told = {"staticFriction": friction, "dynamicFriction": friction, "restitution": restitution}
+            _usd_apply(made, "PhysicsMaterialAPI", **told)
             # PhysX takes the mean of two bodies' coefficients unless told. Its schema is not part of OpenUSD.
-            materials[surface].GetPrim().AddAppliedSchema("PhysxMaterialAPI")
+            made.AddAppliedSchema("PhysxMaterialAPI")
             for what in ("friction", "restitution"):
-                mode = f"physxMaterial:{what}CombineMode"
-                materials[surface].GetPrim().CreateAttribute(mode, sdf.ValueTypeNames.Token).Set("multiply")
+                made.CreateAttribute(f"physxMaterial:{what}CombineMode", sdf.ValueTypeNames.Token).Set("multiply")
         shade.MaterialBindingAPI.Apply(prim).Bind(materials[surface], materialPurpose="physics")
 
         of = (body.shape, body.motion == "dynamic")
@@ -378,53 +375,52 @@ def _usd(take: Take, out: Path, on_progress: StageProgress) -> Written:
         for other in np.flatnonzero(~allowed[g]):
             made.CreateFilteredGroupsRel().AddTarget(f"/World/groups/group_{other}")
 
-    with replacing(out) as partial:
-        # The ending tells OpenUSD what to write.
-        named = partial.with_name(partial.name + out.suffix.lower())
-        try:
-            if not stage.GetRootLayer().Export(str(named)):
-                raise OSError("OpenUSD could not write it")
-            named.rename(partial)
-        finally:
-            named.unlink(missing_ok=True)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / f"stage{out.suffix.lower()}"  # the ending tells OpenUSD what to write
+        if not stage.GetRootLayer().Export(str(file)):
+            raise SdfsimError(f"{file}: OpenUSD cannot write it")
+        write_bytes(out, file.read_bytes())
     return [out], _missing(take, motion=True)
+
+
+def _usd_apply(prim: Any, schema: str, **values: Any) -> None:
+    """Give a prim a schema of UsdPhysics, and values for its attributes."""
+    prim.ApplyAPI(schema)
+    for name, value in values.items():
+        prim.GetAttribute(f"physics:{name}").Set(value)
 
 
 def _usd_geometry(take: Take, shape: Shape, dynamic: bool, stage: Any, path: str) -> None:
     """Prims below `path` that are seen and collide."""
-    gf, geom, physics = (_extra(f"pxr.{name}") for name in ("Gf", "UsdGeom", "UsdPhysics"))
+    gf, geom = _extra("pxr.Gf"), _extra("pxr.UsdGeom")
     form, solid = shape.sdf, f"{path}/solid"
     if isinstance(form, ClosedForm):
         if isinstance(form, SphereSdf):
-            prim = geom.Sphere.Define(stage, solid)
-            prim.CreateRadiusAttr(form.radius)
+            sizes: dict[str, Any] = {"radius": form.radius}
         elif isinstance(form, BoxSdf):
-            prim = geom.Cube.Define(stage, solid)
-            prim.CreateSizeAttr(2.0)
-            prim.AddScaleOp().Set(gf.Vec3f(*form.half))
+            sizes = {"size": 2.0}
         elif isinstance(form, CapsuleSdf | CylinderSdf):
-            prim = (geom.Capsule if isinstance(form, CapsuleSdf) else geom.Cylinder).Define(stage, solid)
-            prim.CreateRadiusAttr(form.radius)
-            prim.CreateHeightAttr(2.0 * form.half)
-            prim.CreateAxisAttr(geom.Tokens.z)
+            sizes = {"axis": "Z", "radius": form.radius, "height": 2.0 * form.half}
         else:
-            prim = geom.Plane.Define(stage, solid)
-            prim.CreateAxisAttr(geom.Tokens.z)
-            prim.CreateWidthAttr(2.0 * take.plane_size())
-            prim.CreateLengthAttr(2.0 * take.plane_size())
-        physics.CollisionAPI.Apply(prim.GetPrim())
+            sizes = {"axis": "Z", "width": 2.0 * take.plane_size(), "length": 2.0 * take.plane_size()}
+        prim = stage.DefinePrim(solid, "Cube" if isinstance(form, BoxSdf) else form.KIND.title())
+        for name, value in sizes.items():
+            prim.GetAttribute(name).Set(value)
+        if isinstance(form, BoxSdf):
+            geom.Xformable(prim).AddScaleOp().Set(gf.Vec3f(*form.half))
+        _usd_apply(prim, "PhysicsCollisionAPI")
         return
     seen = _usd_mesh(stage, solid, shape.mesh)
     pieces = own_pieces(shape) if dynamic else []
-    for k, piece in enumerate(pieces):
-        collider = _usd_mesh(stage, f"{path}/piece_{k}", piece)
-        geom.Imageable(collider).CreatePurposeAttr(geom.Tokens.guide)
-        physics.CollisionAPI.Apply(collider)
-        physics.MeshCollisionAPI.Apply(collider).CreateApproximationAttr("convexHull")
-    if not pieces:  # engines collide moving bodies as convex pieces, and cut them themselves
-        physics.CollisionAPI.Apply(seen)
-        approximation = "convexDecomposition" if dynamic else "none"
-        physics.MeshCollisionAPI.Apply(seen).CreateApproximationAttr(approximation)
+    # Engines collide moving bodies as convex pieces, and cut them themselves where there are none.
+    colliders = [(seen, "convexDecomposition" if dynamic else "none")]
+    if pieces:
+        colliders = [(_usd_mesh(stage, f"{path}/piece_{k}", piece), "convexHull") for k, piece in enumerate(pieces)]
+    for collider, approximation in colliders:
+        if pieces:
+            geom.Imageable(collider).CreatePurposeAttr(geom.Tokens.guide)
+        _usd_apply(collider, "PhysicsCollisionAPI")
+        _usd_apply(collider, "PhysicsMeshCollisionAPI", approximation=approximation)
 
 
 def _usd_mesh(stage: Any, path: str, mesh: Mesh) -> Any:
