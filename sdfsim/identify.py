@@ -63,71 +63,58 @@ def load_recording(
         if scene_file is None:
             raise SdfsimError(f"{path}: a recording without its scene", "give it: --scene scene.yaml")
         scene = load_scene(scene_file, on_progress, allow_outside=allow_outside)
-        moving = [b.name for b in scene.bodies if b.motion == "dynamic"]
-        return _from_poses(moving, *_read_csv(path, moving), scene), scene
+        return _from_poses(path, scene), scene
     scene, rollout = read_run(path, scene_file, allow_outside=allow_outside, on_progress=on_progress)
     rows = [k for k, b in enumerate(scene.bodies) if b.motion == "dynamic"]
-    recording = Recording(
-        dt=float(np.diff(rollout.time).mean()) if len(rollout) else 0.0,
-        position=rollout.position[:, rows],
-        orientation=rollout.orientation[:, rows],
-        velocity=rollout.velocity[:, rows],
-        angular_velocity=rollout.angular_velocity[:, rows],
-        known=np.ones(len(rollout.time), dtype=bool),
-    )
-    return recording, scene
+    motion = (rollout.position, rollout.orientation, rollout.velocity, rollout.angular_velocity)
+    dt = float(np.diff(rollout.time).mean()) if len(rollout) else 0.0
+    return Recording(dt, *(values[:, rows] for values in motion), np.ones(len(rollout.time), dtype=bool)), scene
 
 
-def _read_csv(path: Path, moving: list[str]) -> tuple[float, np.ndarray, np.ndarray]:
-    """Spacing s, positions [T, D, 3] m and orientations [T, D, 4] of the bodies."""
+def _read_csv(path: Path, moving: list[str]) -> tuple[float, np.ndarray]:
+    """Spacing s and poses [T, D, 7] of the bodies, positions [m] before quaternions."""
+    rows: dict[float, dict[str, list[float]]] = {}
     try:
         with path.open(newline="", encoding="utf-8") as file:
             reader = csv.DictReader(file)
             if tuple(reader.fieldnames or ()) != COLUMNS:
                 raise SdfsimError(f"{path}:1: columns must be {','.join(COLUMNS)}")
-            rows: dict[float, dict[str, list[float]]] = {}
             for row in reader:
-                line = reader.line_num
-                if row["body"] not in moving:
-                    continue
-                try:
-                    values = [float(row[c]) for c in ("time", *COLUMNS[2:])]
-                except (TypeError, ValueError):
-                    raise SdfsimError(f"{path}:{line}: not a number in {row}") from None
-                if not np.isfinite(values).all() or not np.linalg.norm(values[4:]) > 0.0:
-                    raise SdfsimError(f"{path}:{line}: must be finite, with a quaternion that is not 0")
-                rows.setdefault(values[0], {})[row["body"]] = values[1:]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+                if row["body"] in moving:
+                    time, *values = (float(row[c] or "") for c in ("time", *COLUMNS[2:]))
+                    if not np.isfinite([time, *values]).all() or not any(values[3:]):
+                        raise ValueError("must be finite, with a quaternion that is not 0")
+                    rows.setdefault(time, {})[row["body"]] = values
+    except ValueError as error:
+        raise SdfsimError(f"{path}:{reader.line_num}: {error}") from error
+    except (OSError, csv.Error) as error:
         raise SdfsimError(f"{path}: not a CSV of poses ({error})") from error
     times = np.array(sorted(rows))
     if len(times) < 4:
         raise SdfsimError(f"{path}: {len(times)} times of {moving} (at least 4)")
     gaps = np.diff(times)
     if np.ptp(gaps) > 0.02 * gaps.mean():
-        raise SdfsimError(
-            f"{path}: times must be evenly spaced (they are {gaps.min():.4g} to {gaps.max():.4g} s apart)"
-        )
+        told = f"they are {gaps.min():.4g} to {gaps.max():.4g} s apart"
+        raise SdfsimError(f"{path}: times must be evenly spaced ({told})")
     for time in times:
         if missing := set(moving) - set(rows[time]):
             raise SdfsimError(f"{path}: no pose of body {min(missing)!r} at time {time:g}")
-    poses = np.array([[rows[time][name] for name in moving] for time in times])
-    return float(gaps.mean()), poses[..., :3], poses[..., 3:]
+    return float(gaps.mean()), np.array([[rows[time][name] for name in moving] for time in times])
 
 
-def _from_poses(names: list[str], dt: float, origin: np.ndarray, orientation: np.ndarray, scene: Scene) -> Recording:
+def _from_poses(path: Path, scene: Scene) -> Recording:
     """Velocities by central differences, which are exact in free flight, where no impact is near."""
-    turn = torch.from_numpy(orientation / np.linalg.norm(orientation, axis=-1, keepdims=True))
-    body = {b.name: b for b in scene.bodies}
-    com = np.array([scene.shapes[body[n].shape].com * body[n].scale for n in names])
-    position = origin + pose.rotate(turn, torch.from_numpy(com).expand(len(origin), -1, -1)).numpy()
+    bodies = [b for b in scene.bodies if b.motion == "dynamic"]
+    dt, poses = _read_csv(path, [b.name for b in bodies])
+    turn = pose.normalise(torch.from_numpy(poses[..., 3:]))
+    com = torch.from_numpy(np.array([scene.shapes[b.shape].com * b.scale for b in bodies]))
+    position = poses[..., :3] + pose.rotate(turn, com.expand(len(poses), -1, -1)).numpy()
     velocity, angular = np.zeros_like(position), np.zeros_like(position)
     velocity[1:-1] = (position[2:] - position[:-2]) / (2.0 * dt)
     angular[1:-1] = pose.to_rotvec(pose.multiply(turn[2:], pose.conjugate(turn[:-2]))).numpy() / (2.0 * dt)
-    bend = np.zeros(position.shape[:2])
-    bend[1:-1] = np.linalg.norm(position[2:] - 2.0 * position[1:-1] + position[:-2], axis=-1) / dt**2
-    known: np.ndarray = np.all(bend < SMOOTH * max(float(np.linalg.norm(scene.gravity)), 1.0), axis=-1)
-    known[[0, -1]] = False
-    return Recording(dt, position, turn.numpy(), velocity, angular, known)
+    bend = np.linalg.norm(position[2:] - 2.0 * position[1:-1] + position[:-2], axis=-1) / dt**2
+    smooth = np.all(bend < SMOOTH * max(float(np.linalg.norm(scene.gravity)), 1.0), axis=-1)
+    return Recording(dt, position, turn.numpy(), velocity, angular, np.pad(smooth, 1))
 
 
 def identify(recording: Recording, scene: Scene, *, on_progress: Progress = silent) -> dict[str, Any]:
@@ -188,25 +175,26 @@ class Windows:
         self.units = scene_units(scene, model)
         self.moving = [b for b in scene.bodies if b.motion == "dynamic"]
         self.fixed = [b for b in scene.bodies if b.motion != "dynamic"]
-        self.length = max(3, round(WINDOW * self.units.time / recording.dt)) if recording.dt > 0 else 0
-        every = max(1, round(EVERY * self.units.time / recording.dt)) if recording.dt > 0 else 1
+        if recording.dt == 0.0:
+            raise SdfsimError("the recording is a single frame")
+        self.length = max(3, round(WINDOW * self.units.time / recording.dt))
+        every = max(1, round(EVERY * self.units.time / recording.dt))
         begin = np.arange(0, len(recording.position) - self.length, every)
         begin = begin[recording.known[begin]]
         if not len(begin):
-            raise SdfsimError(
-                "the recording is too short, or nowhere smooth", f"give at least {self.length + 1} frames"
-            )
-        inner = max(1, int(np.ceil(recording.dt / self.units.time / (model.dt / 5.0) - 0.01)))
+            told = f"give at least {self.length + 1} frames"
+            raise SdfsimError("the recording is too short, or nowhere smooth", told)
+        dt = recording.dt / self.units.time
+        inner = max(1, int(np.ceil(dt / (model.dt / 5.0) - 0.01)))
         gravity = torch.from_numpy(np.asarray(scene.gravity) / self.units.acceleration)
-        self.rules = StepOptions(gravity, recording.dt / self.units.time, inner)
+        self.rules = StepOptions(gravity, dt, inner)
         self.model = model
         self._build(begin)
-        self.touched = self._touched()
-        kept = np.array(sorted({w for w, _, _ in self.touched}), dtype=int)
-        if not len(kept):
+        touched = self._touched()
+        if not touched:
             raise SdfsimError("nothing touches in the recording", "friction and restitution show in contacts only")
-        self._build(begin[kept])
-        self.pairs = sorted({(a, b) for _, a, b in self.touched})
+        self._build(begin[sorted({w for w, _, _ in touched})])
+        self.pairs = sorted({(a, b) for _, a, b in touched})
         many = len(self.moving)
         self.seen = sorted({k for pair in self.pairs for k in pair if k < many})
         beside = [pair for pair in self.pairs if pair[1] < many]
@@ -240,10 +228,7 @@ class Windows:
         self.goal = r.position[frames] / u.length, r.orientation[frames]
         self.memory, self.count = Memory(), len(begin)
         self.world = self.memory.compiled(self.bodies, self.start_state).world
-        self.given = {
-            name: getattr(self.world, name).copy()
-            for name in ("friction", "restitution", "inverse_mass", "inertia", "inverse_inertia")
-        }
+        self.given = {name: getattr(self.world, name).copy() for name in ("inverse_mass", "inertia", "inverse_inertia")}
 
     def _run(self) -> list[State]:
         state, states = self.start_state, []
@@ -277,25 +262,19 @@ class Windows:
     def errors(self, parameters: np.ndarray) -> np.ndarray:
         """Differences of all windows from the recording, in units of `OUTLIER`; turns at half of a body's size."""
         count, many = len(self.seen), len(self.moving)
-        rows = {k: np.arange(self.count) * many + k for k in range(many)}
-        for name, values in self.given.items():
-            getattr(self.world, name)[:] = values
-        for i, k in enumerate(self.seen):
-            self.world.friction[rows[k]] = parameters[i]
-            self.world.restitution[rows[k]] = parameters[count + i]
-        for i, k in enumerate(self.weighed):
-            ratio = np.exp(parameters[2 * count + i])
-            self.world.inverse_mass[rows[k]] /= ratio
-            self.world.inertia[rows[k]] *= ratio
-            self.world.inverse_inertia[rows[k]] /= ratio
         total = self.count * many
+        for k, friction, restitution in zip(self.seen, parameters[:count], parameters[count : 2 * count], strict=True):
+            self.world.friction[k:total:many] = friction
+            self.world.restitution[k:total:many] = restitution
+        for k, ratio in zip(self.weighed, np.exp(parameters[2 * count :]), strict=True):
+            for name, power in (("inverse_mass", -1), ("inertia", 1), ("inverse_inertia", -1)):
+                getattr(self.world, name)[k:total:many] = self.given[name][k:total:many] * ratio**power
         size = self.bodies.size[:total].numpy()[:, None]
         errors = []
         for t, state in enumerate(self._run()):
             place, turn = (values[t].reshape(total, -1) for values in self.goal)
-            away = pose.multiply(
-                state.orientation[:total], pose.conjugate(torch.from_numpy(np.ascontiguousarray(turn)))
-            )
+            back = pose.conjugate(torch.from_numpy(np.ascontiguousarray(turn)))
+            away = pose.multiply(state.orientation[:total], back)
             errors += [state.position[:total].numpy() - place, 0.5 * size * pose.to_rotvec(away).numpy()]
         return np.nan_to_num(np.concatenate(errors).ravel(), nan=1e3) / OUTLIER
 
