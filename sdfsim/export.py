@@ -190,23 +190,12 @@ def convex_pieces(shape: Shape) -> list[Mesh]:
         raise SdfsimError(f"shape {shape.name}: CoACD cannot cut it into convex pieces ({error})") from error
 
 
-def _cut(take: Take, wanted: Callable[[Body], bool], on_progress: StageProgress) -> dict[int, list[Mesh]]:
-    """Convex pieces of every shape without a closed form that a wanted body has, by its index."""
-    used = sorted({body.shape for body in take.scene.bodies if wanted(body)})
-    pieces = {}
-    for done, k in enumerate(used):
-        shape = take.scene.shapes[k]
-        if not isinstance(shape.sdf, ClosedForm):
-            on_progress("convex pieces", done / len(used), f"of {shape.name}")
-            pieces[k] = convex_pieces(shape)
-    return pieces
-
-
 def _write_assets(
-    take: Take, out: Path, pieces: dict[int, list[Mesh]]
+    take: Take, out: Path, cuts: Callable[[Body], bool], on_progress: StageProgress
 ) -> tuple[dict[int, Path], dict[int, list[Path]]]:
-    """OBJ files in `NAME_assets/`: what is shown of each shape without a closed form, and its convex pieces."""
-    folder = out.with_name(f"{out.stem}_assets")
+    """OBJ files in `NAME_assets/`, by the index of each shape without a closed form: what is shown of it, and its
+    convex pieces where a body `cuts` it."""
+    folder, shapes = out.with_name(f"{out.stem}_assets"), take.scene.shapes
 
     def obj(name: str, mesh: Mesh) -> Path:
         folder.mkdir(exist_ok=True)
@@ -214,9 +203,14 @@ def _write_assets(
         return folder / f"{name}.obj"
 
     used = sorted({body.shape for body in take.scene.bodies})
-    drawn = [k for k in used if not isinstance(take.scene.shapes[k].sdf, ClosedForm)]
-    seen = {k: obj(take.shapes[k], take.scene.shapes[k].mesh) for k in drawn}
-    cut = {k: [obj(f"{take.shapes[k]}-{i}", p) for i, p in enumerate(pieces.get(k, []))] for k in drawn}
+    drawn = [k for k in used if not isinstance(shapes[k].sdf, ClosedForm)]
+    wanted = {body.shape for body in take.scene.bodies if cuts(body)}
+    seen, cut = {}, {}
+    for done, k in enumerate(drawn):
+        on_progress("convex pieces", done / len(drawn), f"of {shapes[k].name}")
+        seen[k] = obj(take.shapes[k], shapes[k].mesh)
+        pieces = convex_pieces(shapes[k]) if k in wanted else []
+        cut[k] = [obj(f"{take.shapes[k]}-{i}", piece) for i, piece in enumerate(pieces)]
     return seen, cut
 
 
@@ -445,7 +439,7 @@ def _usd_mesh(stage: Any, path: str, mesh: Mesh) -> Any:
 
 def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
     scene, left_out = take.scene, _missing(take)
-    seen, cut = _write_assets(take, out, _cut(take, lambda body: True, on_progress))
+    seen, cut = _write_assets(take, out, lambda body: True, on_progress)
     root = XML("mujoco", model=_plain_names([out.stem])[0])
     folder = out.with_name(f"{out.stem}_assets").name
     _add(root, "compiler", angle="radian", meshdir=folder, balanceinertia="true")
@@ -494,11 +488,9 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
             form: Any = shape.sdf
             sizes = (take.plane_size(),) * 3 if isinstance(form, PlaneSdf) else form.scaled(body.scale).sizes
             solids = [{"type": form.KIND, "size": _numbers(sizes), "rgba": rgba}]
-        surface = {"condim": "3", **_mjcf_surface(body.friction**2, body.restitution**2)}
-        surface |= {
-            "contype": f"{1 << group[k]}",
-            "conaffinity": f"{sum(1 << g for g in np.flatnonzero(allowed[group[k]]))}",
-        }
+        mates = sum(1 << g for g in np.flatnonzero(allowed[group[k]]))
+        surface = {"condim": "3", "contype": f"{1 << group[k]}", "conaffinity": f"{mates}"}
+        surface |= _mjcf_surface(body.friction**2, body.restitution**2)
         geoms.append([f"{name}-{i}" for i in range(len(solids))])
         for solid, label in zip(solids, geoms[-1], strict=True):
             _add(node, "geom", name=label, **solid, **surface)
@@ -544,7 +536,7 @@ def _mjcf_surface(friction: float, restitution: float, *, pair: bool = False) ->
 
 
 def _urdf(take: Take, out: Path, on_progress: StageProgress) -> Written:
-    seen, cut = _write_assets(take, out, _cut(take, lambda body: body.motion != "static", on_progress))
+    seen, cut = _write_assets(take, out, lambda body: body.motion != "static", on_progress)
     files: list[Path] = []
     single = len(take.names) == 1 and take.scene.path is None
     for name, body, shape, color in take.each():

@@ -9,12 +9,10 @@ import socket
 import subprocess
 import sys
 import sysconfig
-import tempfile
 import time
 import webbrowser
 from pathlib import Path
 from shutil import which
-from typing import Any
 
 from sdfsim.errors import SdfsimError
 from sdfsim.recording import Playback
@@ -24,7 +22,7 @@ LOOPBACK = "127.0.0.1"  # where viewers listen; their own default would let the 
 _GRPC_PORT, _WEB_PORT = 9876, 9090
 _START_SECONDS = 60.0
 _TOAST_SECONDS = 10.0  # the notices of the start cover the plots until they fade
-_NO_GRAPHICS = "pictures need a Vulkan driver: apt-get install mesa-vulkan-drivers"
+_NO_GRAPHICS = "it needs a Vulkan driver: apt-get install mesa-vulkan-drivers"
 
 
 def stream_to_viewer(playback: Playback, kind: str) -> str:
@@ -57,9 +55,10 @@ def _command(port: int, options: list[str]) -> list[str]:
     return [_executable(), *options, "--bind", LOOPBACK, "--port", str(port)]
 
 
-def _launch(port: int, options: list[str], output: Any = subprocess.DEVNULL) -> subprocess.Popen:
+def _launch(port: int, options: list[str]) -> subprocess.Popen:
     """A viewer in a group of its own: `rerun` is a script that starts the real one, and both have to go together."""
-    return subprocess.Popen(_command(port, options), stdout=output, stderr=output, start_new_session=True)
+    quiet = subprocess.DEVNULL
+    return subprocess.Popen(_command(port, options), stdout=quiet, stderr=quiet, start_new_session=True)
 
 
 def check_screen(kind: str) -> None:
@@ -88,18 +87,14 @@ def screenshot(recording: Path, picture: Path, *, at: float | None = None) -> No
     _check_recording(recording)
     if not picture.parent.is_dir() or not os.access(picture.parent, os.W_OK):
         raise SdfsimError(f"{picture}: the folder is missing or not writable")
-    port = _free_port(0)
-    with tempfile.TemporaryFile() as log:
-        viewer = _launch(port, ["--headless", "--window-size", WINDOW, str(recording.resolve())], log)
-        try:
-            _picture(viewer, _address(port), picture, at)
-        except ConnectionError as error:
-            log.seek(0)
-            told = log.read().decode(errors="replace")
-            hint = _NO_GRAPHICS if "adapter" in told.lower() and viewer.poll() is not None else ""
-            raise SdfsimError(f"{recording}: no picture: {str(error).splitlines()[0]}", hint) from error
-        finally:
-            _end(viewer)
+    port = _free_port()
+    viewer = _launch(port, ["--headless", "--window-size", WINDOW, str(recording.resolve())])
+    try:
+        _picture(viewer, _address(port), picture, at)
+    except ConnectionError as error:
+        raise SdfsimError(f"{recording}: no picture: {str(error).splitlines()[0]}", _NO_GRAPHICS) from error
+    finally:
+        _end(viewer)
 
 
 def _picture(viewer: subprocess.Popen, address: str, picture: Path, at: float | None) -> None:
@@ -142,12 +137,8 @@ def _end(process: subprocess.Popen) -> None:
 
 
 def _check_recording(file: Path) -> None:
-    hint = "give a rollout.rrd that simulate has written"
-    if not file.is_file():
-        raise SdfsimError(f"{file}: no such recording", hint)
-    with open(file, "rb") as handle:
-        if handle.read(3) != b"RRF":
-            raise SdfsimError(f"{file}: not a rerun recording", hint)
+    if not file.is_file() or file.open("rb").read(3) != b"RRF":
+        raise SdfsimError(f"{file}: no such recording", "give a rollout.rrd that simulate has written")
 
 
 def _executable() -> str:
@@ -163,13 +154,10 @@ def _answers(port: int) -> bool:
         return probe.connect_ex((LOOPBACK, port)) == 0
 
 
-def _free_port(wanted: int) -> int:
+def _free_port(wanted: int = 0) -> int:
     """`wanted` if nothing listens there, else any free port."""
-    for port in (wanted, 0):
-        with socket.socket() as probe:
-            try:
-                probe.bind((LOOPBACK, port))
-                return probe.getsockname()[1]
-            except OSError:
-                continue
-    raise SdfsimError("no free network port for the viewer")
+    if wanted and not _answers(wanted):
+        return wanted
+    with socket.socket() as probe:
+        probe.bind((LOOPBACK, 0))
+        return probe.getsockname()[1]
