@@ -66,9 +66,10 @@ def load_recording(
         return _from_poses(path, scene), scene
     scene, rollout = read_run(path, scene_file, allow_outside=allow_outside, on_progress=on_progress)
     rows = [k for k, b in enumerate(scene.bodies) if b.motion == "dynamic"]
-    motion = (rollout.position, rollout.orientation, rollout.velocity, rollout.angular_velocity)
+    moving = ("position", "orientation", "velocity", "angular_velocity")
     dt = float(np.diff(rollout.time).mean()) if len(rollout) else 0.0
-    return Recording(dt, *(values[:, rows] for values in motion), np.ones(len(rollout.time), dtype=bool)), scene
+    motion = {name: getattr(rollout, name)[:, rows] for name in moving}
+    return Recording(dt, **motion, known=np.ones(len(rollout.time), dtype=bool)), scene
 
 
 def _read_csv(path: Path, moving: list[str]) -> tuple[float, np.ndarray]:

@@ -125,7 +125,7 @@ class _Cast:
         vertices = np.concatenate([m.vertices @ r.T + t for m, r, t in zip(self._meshes, turns, places, strict=True)])
         normals = [normals @ r.T for (_, normals), r in zip(models, turns, strict=True)]
         self._normals = np.concatenate(normals, dtype=np.float32)
-        self._colors = np.concatenate([m.colors for m in self._meshes], dtype=np.float32)
+        self._colors = np.concatenate([np.asarray(m.colors, dtype=np.float32) for m in self._meshes])
         self._faces = np.concatenate([m.faces + start for m, start in zip(self._meshes, self._starts, strict=False)])
         self.body = np.repeat(np.arange(len(models)), [len(m.faces) for m in self._meshes])
         self.caster = Caster(Mesh(vertices, self._faces))
