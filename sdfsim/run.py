@@ -131,7 +131,7 @@ def simulate(
             live.log_steps(join(frames))
 
         started, broken = time.monotonic(), None
-        still = list(resting(scene, join(frames)).all(1))  # by frame, whether everything rests
+        still = [row.all() for row in resting(scene, join(frames))]  # by frame, whether everything rests
 
         def settled() -> bool:
             return until_settled and len(still) > SETTLED and all(still[-SETTLED - 1 :])
@@ -145,7 +145,7 @@ def simulate(
                 now = float(frame.time[-1])
                 on_progress("simulate", now / length, f"{now:.2f} of {length:g} s simulated")
                 if until_settled:
-                    still += list(resting(scene, frame).all(1))
+                    still += [row.all() for row in resting(scene, frame)]
                 if settled():
                     break
         except (SimulationError, KeyboardInterrupt) as error:
