@@ -8,9 +8,8 @@ from typing import Annotated
 import typer
 
 from pipeline.commands import distill, fit, mesh, poses, reconstruct
-from sdfsim.commands.exporting import export
 from sdfsim.commands.learning import dataset, evaluate, train
-from sdfsim.commands.simulating import identify, info, plan, render, simulate, view
+from sdfsim.commands.simulating import export, identify, info, plan, render, simulate, view
 from sdfsim.commands.studying import stress, tradeoff
 
 YOUNG = 100_000  # new objects that Python waits for before it looks for cycles
@@ -44,25 +43,9 @@ def options(
     gc.set_threshold(YOUNG)
 
 
-for command in (
-    reconstruct,
-    poses,
-    distill,
-    mesh,
-    fit,
-    simulate,
-    plan,
-    view,
-    render,
-    identify,
-    export,
-    dataset,
-    train,
-    evaluate,
-    tradeoff,
-    stress,
-    info,
-):
+COMMANDS = [reconstruct, poses, distill, mesh, fit, simulate, plan, view, render, identify, export]
+COMMANDS += [dataset, train, evaluate, tradeoff, stress, info]
+for command in COMMANDS:
     app.command()(command)
 
 if __name__ == "__main__":

@@ -183,16 +183,14 @@ def fit(
     options = fitting.Options(recipe or "default", budget, cap, thicken, units)
     if len(sources) == 1 and not sources[0].is_dir():
         report = fitting.fit(sources[0], out, options, device=device, on_progress=session.progress)
-        lines = fitting.fit_lines(report)
     else:
         meshes = fitting.named_meshes(sources)
         with working_on(cluster):
             report = fitting.fit_many(meshes, out, options, device=device, on_progress=session.progress)
-        lines = fitting.batch_lines(report)
     tell_failed(session, report)
     if any("error" in shape for shape in report.get("shapes", {}).values()):
         session.exit_code = EXIT_ERROR
-    session.report(report, lines)
+    session.report(report, fitting.fit_lines(report))
 
 
 def _stage(session: Session, name: str, folder: Path, *, then: Stage | None = None, **options: Any) -> None:

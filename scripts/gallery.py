@@ -10,7 +10,7 @@ from PIL import Image
 
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.render import render
-from sdfsim.run import ended, ending_lines, summary
+from sdfsim.run import ending_lines, summary
 from sdfsim.scene.scene_file import load_scene
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -36,7 +36,7 @@ def main(names: list[str]) -> None:
         at, camera, look_at = PICTURES[name]
         scene = load_scene(ROOT / "samples" / f"{name}.yaml")
         rollout = Simulator(scene).run()
-        print(name, *ending_lines(summary(rollout, 0.0) | {"ended": ended(scene, rollout)}), sep="\n  ")
+        print(name, *ending_lines(summary(scene, rollout, 0.0)), sep="\n  ")
         with tempfile.TemporaryDirectory() as folder:
             picture = Path(folder) / "picture.png"
             render(scene, rollout, picture, camera=camera, look_at=look_at, at=min(at, rollout.time[-1]))

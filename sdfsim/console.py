@@ -35,10 +35,11 @@ class Session:
         self._pressed = False
         self._clean_up = contextlib.ExitStack()
         self._bar = _Bar()
+        self.say = self._bar.say  # a line on stderr
 
     def __enter__(self) -> Session:
         default = signal.default_int_handler
-        if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is default:
+        if signal.getsignal(signal.SIGINT) is default:
             signal.signal(signal.SIGINT, self._press)
             self._clean_up.callback(signal.signal, signal.SIGINT, default)
         if self.as_json:
@@ -51,73 +52,61 @@ class Session:
         return self
 
     def _press(self, number: int, frame: FrameType | None) -> None:
-        self._pressed = True  # remembered, whatever becomes of the exception
+        self._pressed = True  # a library that is interrupted while it is imported fails in its own way
         raise KeyboardInterrupt
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._bar.close()
-        code = self._explain(error) if error is not None else self.exit_code
-        try:
-            with self._clean_up:
-                sys.stdout.flush()
-            if self.as_json and self._result is not None:
-                print(json.dumps(_plain(self._result)), flush=True)
-        except OSError as unwritten:
-            lost = self._lost_output(unwritten)
-            code = code or lost
-        if code is not None:
-            raise SystemExit(code) from None
+        if error is not None and not isinstance(error, Exception | KeyboardInterrupt):
+            self._clean_up.close()
+            return
+        if error is not None:
+            self._explain(error)
+        with self._clean_up:
+            sys.stdout.flush()
+        if self.as_json and self._result is not None:
+            self._print(json.dumps(plain(self._result)))
+        raise SystemExit(self.exit_code) from None
 
-    def _explain(self, error: BaseException) -> int | None:
-        """Tell the error; None lets it through (it is not ours to handle)."""
+    def _explain(self, error: BaseException) -> None:
+        """Tell the error; what it is decides the exit code."""
+        hint, self.exit_code, more = "", EXIT_ERROR, {}
         if isinstance(error, SdfsimError):
-            problems = {"problems": error.problems} if isinstance(error, SceneError) else {}
-            return self._fail(error.message, error.hint, error.exit_code, **problems)
-        if isinstance(error, BrokenPipeError):
-            return self._lost_output(error)
-        # A library that was interrupted while it was being imported fails in its own way.
-        if isinstance(error, KeyboardInterrupt) or (self._pressed and not isinstance(error, OSError)):
-            return self._fail("interrupted; what was finished is kept", "", EXIT_INTERRUPTED)
-        if isinstance(error, OSError):
-            where = f"{error.filename}: " if error.filename else ""
-            return self._fail(f"{where}{error.strerror or error}", "", EXIT_ERROR)
-        if isinstance(error, Exception):
+            message, hint, self.exit_code = error.message, error.hint, error.exit_code
+            more = {"problems": error.problems} if isinstance(error, SceneError) else {}
+        elif isinstance(error, KeyboardInterrupt) or (self._pressed and not isinstance(error, OSError)):
+            message, self.exit_code = "interrupted; what was finished is kept", EXIT_INTERRUPTED
+        elif isinstance(error, OSError):
+            message = (f"{error.filename}: " if error.filename else "") + str(error.strerror or error)
+        else:
+            message = f"internal error: {type(error).__name__}: {error}"
             hint = "" if self.verbose else "this is a fault of sdfsim; -v shows where"
-            return self._fail(f"internal error: {type(error).__name__}: {error}", hint, EXIT_ERROR)
-        return None
-
-    def _lost_output(self, error: OSError) -> int:
-        """The report cannot be written. Whoever read it and closed the pipe, such as `head`, has seen enough."""
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # else Python tries again at its end, and fails loudly
-        if not isinstance(error, BrokenPipeError):
-            self.say(f"error: the report cannot be written: {error.strerror or error}")
-        return EXIT_ERROR
-
-    def _fail(self, message: str, hint: str, code: int, **more: Any) -> int:
         if self.verbose:
             traceback.print_exc(file=sys.stderr)
         self.say("\n".join(f"error: {line}" for line in message.splitlines()))
         if hint:
             self.say(f"hint: {hint}")
-        self._result = {**(self._result or {}), "error": message, "hint": hint, "exit_code": code, **more}
-        return code
+        told = {"error": message, "hint": hint, "exit_code": self.exit_code}
+        self._result = (self._result or {}) | told | more
 
-    def say(self, text: str) -> None:
-        """A line on stderr."""
-        self._bar.say(text)
+    def _print(self, text: str) -> None:
+        """Print on stdout. Whoever read it and closed the pipe, such as `head`, has seen enough."""
+        try:
+            print(text, flush=True)
+        except OSError as error:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # else Python tries again at its end, and fails loudly
+            if not isinstance(error, BrokenPipeError):
+                self.say(f"error: the report cannot be written: {error.strerror}")
+            self.exit_code = self.exit_code or EXIT_ERROR
 
     def report(self, result: dict[str, Any], lines: list[str] | None = None) -> None:
         """The outcome: `result` for --json, `lines` (or the entries of `result`) for people."""
         self._result = result
-        if self.as_json:
-            return
-        self._bar.close()
-        try:
-            print("\n".join(_as_lines(_plain(result)) if lines is None else lines), flush=True)
-        except OSError as error:
-            self.exit_code = self._lost_output(error)
+        if not self.as_json:
+            self._bar.close()
+            self._print("\n".join(_as_lines(plain(result)) if lines is None else lines))
 
     def hold(self, why: str) -> None:
         """Wait for Ctrl-C, if a person is there to press it."""
@@ -142,25 +131,20 @@ class _Bar:
         self._progress: Any = None
         self._task: Any = None
         self._stage: str | None = None
-        self._started = self._told = self._from = 0.0
+        self._told = 0.0
         self._ended = False
 
     def update(self, stage: str, fraction: float, message: str) -> None:
         fraction, now = min(max(fraction, 0.0), 1.0), time.monotonic()
         title = f"{stage}: {message}" if stage and message else stage or message
-        fresh = stage != self._stage
-        if fresh:  # work that is gone on with begins in the middle
-            self._stage, self._started, self._from, self._ended = stage, now, fraction, False
+        fresh, self._stage = stage != self._stage, stage
         if sys.stderr.isatty():
             self._draw(fresh, fraction, title)
             return
-        end = fraction >= 1 and not self._ended
-        if fresh or end or (fraction < 1 and now - self._told >= _PLAIN_SECONDS):
+        ended = fraction >= 1 and (fresh or not self._ended)
+        if fresh or ended or (fraction < 1 and now - self._told >= _PLAIN_SECONDS):
             self._told, self._ended = now, fraction >= 1
-            elapsed, done = now - self._started, fraction - self._from
-            known = done > 0.01 and fraction < 1
-            left = f", about {duration(elapsed * (1 - fraction) / done)} left" if known else ""
-            self.say(f"[{fraction:4.0%}] {title} ({duration(elapsed)}{left})")
+            self.say(f"[{fraction:4.0%}] {title}")
 
     def _draw(self, fresh: bool, fraction: float, title: str) -> None:
         from rich.console import Console
@@ -203,14 +187,14 @@ def columns(rows: Sequence[Sequence[str]]) -> list[str]:
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """What JSON can hold: numpy numbers and arrays and paths become plain, numbers that are not finite null."""
     if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if hasattr(value, "tolist"):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value if value is None or isinstance(value, bool | int | str) else str(value)

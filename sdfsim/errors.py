@@ -40,9 +40,6 @@ class SdfsimError(Exception):
         self.hint = hint
         self.exit_code = exit_code
 
-    def __str__(self) -> str:
-        return self.message
-
 
 class SceneError(SdfsimError):
     """A scene file that cannot be used; `problems` lists every fault found in it, one line each: `FILE:LINE: FIELD:

@@ -10,21 +10,23 @@ import csv
 import importlib
 import io
 import re
+import tempfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sdfsim.errors import SdfsimError
-from sdfsim.files import check_writable, replacing, write_bytes, write_text
+from sdfsim.files import check_writable, write_bytes, write_text
 from sdfsim.identify import COLUMNS
 from sdfsim.parallel import StageProgress
-from sdfsim.recording import body_colors, framed, sheet, with_normals
+from sdfsim.recording import body_colors, framed, shown, with_normals
 from sdfsim.run import read_run
 from sdfsim.scene import written
 from sdfsim.scene.collision_filter import contact_groups
@@ -72,16 +74,8 @@ class Take:
         """m to each side, of the sheet that is shown for a plane."""
         return 6.0 * framed(self.scene)[1]
 
-    def display(self, shape: Shape) -> Mesh:
-        """The mesh that is shown at scale 1."""
-        return sheet(self.plane_size()) if isinstance(shape.sdf, PlaneSdf) else shape.shown
 
-
-class Written(NamedTuple):
-    """The files of an export, and what they do not hold, one line each."""
-
-    files: list[Path]
-    left_out: list[str]
+Written = tuple[list[Path], list[str]]  # the files of an export, and what they do not hold, one line each
 
 
 def export(
@@ -115,14 +109,9 @@ def export(
     check_writable(out.parent)
     take = _read(source, scene_file, allow_outside, on_progress)
     out.parent.mkdir(parents=True, exist_ok=True)
-    written = FORMATS[kind](take, out, on_progress)
-    return {
-        "format": kind[1:],
-        "bodies": len(take.names),
-        "frames": len(take.time),
-        "files": written.files,
-        "left_out": written.left_out,
-    }
+    files, left_out = FORMATS[kind](take, out, on_progress)
+    counts = {"bodies": len(take.names), "frames": len(take.time)}
+    return {"format": kind[1:], **counts, "files": files, "left_out": left_out}
 
 
 def _extra(module: str) -> Any:
@@ -137,34 +126,31 @@ def _extra(module: str) -> Any:
 
 
 def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progress: StageProgress) -> Take:
-    def told(fraction: float, message: str) -> None:
-        on_progress("shapes", fraction, message)
-
+    told = partial(on_progress, "shapes")
+    run = None
     if source.suffix == ".npz" or (source / "rollout.npz").is_file():
         scene, run = read_run(source, scene_file, allow_outside=allow_outside, on_progress=told)
-        turn = run.orientation.copy()
-        turn[1:] *= np.cumprod(np.where((turn[1:] * turn[:-1]).sum(-1) < 0, -1.0, 1.0), axis=0)[..., None]
-        com = np.array([body.scale * scene.shapes[body.shape].com for body in scene.bodies])
-        offset = Rotation.from_quat(turn.reshape(-1, 4)).apply(np.tile(com, (len(turn), 1)))
-        return _take(scene, run.time, run.position - offset.reshape(run.position.shape), turn)
-    if scene_file is not None:
+    elif scene_file is not None:
         raise SdfsimError(f"{source}: only a run has a scene beside it", "leave --scene away")
-    if (source / RECORD_FILE).is_file():
+    elif (source / RECORD_FILE).is_file():
         shape = load_shape(source)
         moves = "dynamic" if shape.volume > 0 else "static"
         scene = written.Scene().add(shape.name, asset=source, motion=moves).load(told)
     elif source.suffix.lower() in (".yaml", ".yml"):
         scene = load_scene(source, told, allow_outside=allow_outside)
     else:
-        told_of = "a run folder, a rollout.npz, a scene.yaml or a Shape folder"
-        raise SdfsimError(f"{source}: {'not' if source.exists() else 'no such file;'} {told_of}")
-    position = np.array([body.position for body in scene.bodies])
-    return _take(scene, np.zeros(1), position[None], np.array([body.quat_xyzw for body in scene.bodies])[None])
-
-
-def _take(scene: Scene, time: np.ndarray, position: np.ndarray, quat: np.ndarray) -> Take:
+        raise SdfsimError(f"{source}: not a run folder, a rollout.npz, a scene.yaml or a Shape folder")
+    if run is not None:
+        time, turn = run.time, run.orientation.copy()
+        turn[1:] *= np.cumprod(np.where((turn[1:] * turn[:-1]).sum(-1) < 0, -1.0, 1.0), axis=0)[..., None]
+        com = np.array([body.scale * scene.shapes[body.shape].com for body in scene.bodies])
+        offset = Rotation.from_quat(turn.reshape(-1, 4)).apply(np.tile(com, (len(turn), 1)))
+        place = run.position - offset.reshape(run.position.shape)
+    else:
+        time, turn = np.zeros(1), np.array([[body.quat_xyzw for body in scene.bodies]])
+        place = np.array([[body.position for body in scene.bodies]])
     names, shapes = (_plain_names([one.name for one in ones]) for ones in (scene.bodies, scene.shapes))
-    return Take(scene, names, shapes, np.array(body_colors(scene), dtype=np.uint8), time, position, quat)
+    return Take(scene, names, shapes, np.array(body_colors(scene), dtype=np.uint8), time, place, turn)
 
 
 def _plain_names(names: list[str]) -> list[str]:
@@ -204,37 +190,28 @@ def convex_pieces(shape: Shape) -> list[Mesh]:
         raise SdfsimError(f"shape {shape.name}: CoACD cannot cut it into convex pieces ({error})") from error
 
 
-def _cut(take: Take, wanted: Callable[[Body], bool], on_progress: StageProgress) -> dict[int, list[Mesh]]:
-    """Convex pieces of every shape without a closed form that a wanted body has, by its index."""
-    used = {body.shape for body in take.scene.bodies if wanted(body)}
-    todo = sorted(k for k in used if not isinstance(take.scene.shapes[k].sdf, ClosedForm))
-    pieces = {}
-    for done, k in enumerate(todo):
-        on_progress("convex pieces", done / len(todo), f"of {take.scene.shapes[k].name}")
-        pieces[k] = convex_pieces(take.scene.shapes[k])
-    if todo:
-        on_progress("convex pieces", 1.0, f"{sum(map(len, pieces.values()))} of {len(todo)} shapes")
-    return pieces
-
-
-def _write_obj(folder: Path, name: str, mesh: Mesh) -> Path:
-    write_text(folder / f"{name}.obj", wavefront([mesh]))
-    return folder / f"{name}.obj"
-
-
 def _write_assets(
-    take: Take, out: Path, pieces: dict[int, list[Mesh]]
+    take: Take, out: Path, cuts: Callable[[Body], bool], on_progress: StageProgress
 ) -> tuple[dict[int, Path], dict[int, list[Path]]]:
-    """OBJ files in `NAME_assets/`: what is shown of each shape without a closed form, and its convex pieces."""
-    folder = out.with_name(f"{out.stem}_assets")
-    shown, cut = {}, {}
-    for k in sorted({body.shape for body in take.scene.bodies}):
-        if isinstance(take.scene.shapes[k].sdf, ClosedForm):
-            continue
+    """OBJ files in `NAME_assets/`, by the index of each shape without a closed form: what is shown of it, and its
+    convex pieces where a body `cuts` it."""
+    folder, shapes = out.with_name(f"{out.stem}_assets"), take.scene.shapes
+
+    def obj(name: str, mesh: Mesh) -> Path:
         folder.mkdir(exist_ok=True)
-        shown[k] = _write_obj(folder, take.shapes[k], take.scene.shapes[k].mesh)
-        cut[k] = [_write_obj(folder, f"{take.shapes[k]}-{i}", p) for i, p in enumerate(pieces.get(k, []))]
-    return shown, cut
+        write_text(folder / f"{name}.obj", wavefront([mesh]))
+        return folder / f"{name}.obj"
+
+    used = sorted({body.shape for body in take.scene.bodies})
+    drawn = [k for k in used if not isinstance(shapes[k].sdf, ClosedForm)]
+    wanted = {body.shape for body in take.scene.bodies if cuts(body)}
+    seen, cut = {}, {}
+    for done, k in enumerate(drawn):
+        on_progress("convex pieces", done / len(drawn), f"of {shapes[k].name}")
+        seen[k] = obj(take.shapes[k], shapes[k].mesh)
+        pieces = convex_pieces(shapes[k]) if k in wanted else []
+        cut[k] = [obj(f"{take.shapes[k]}-{i}", piece) for i, piece in enumerate(pieces)]
+    return seen, cut
 
 
 def _numbers(*values: Any) -> str:
@@ -287,10 +264,10 @@ def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
     time = file.array(take.time) if take.moving else 0
     samplers, channels = [], []
     for k, (name, body, shape, color) in enumerate(take.each()):
-        shown = take.display(shape)
-        own = shown.colors is not None or shown.texture is not None
+        seen = shown(shape, take.plane_size())
+        own = seen.colors is not None or seen.texture is not None
         if body.shape not in numbers:
-            mesh, normals = with_normals(shown)
+            mesh, normals = with_normals(seen)
             attributes = {"POSITION": file.array(mesh.vertices), "NORMAL": file.array(normals)}
             if mesh.uv is not None:
                 attributes["TEXCOORD_0"] = file.array(mesh.uv)
@@ -300,7 +277,7 @@ def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
             numbers[body.shape] = attributes, file.array(mesh.faces.reshape(-1), "<u4")
         key = take.shapes[body.shape] + ("" if own else "-{:02x}{:02x}{:02x}".format(*color))
         if key not in drawn:
-            material = file.material(key, np.ones(3) if own else _linear(color), shown.texture, rough=0.8)
+            material = file.material(key, np.ones(3) if own else _linear(color), seen.texture, rough=0.8)
             drawn[key] = file.mesh(key, *numbers[body.shape], material)
         place, turn = take.position[:, k], take.quat_xyzw[:, k]
         node = {"translation": place[0].tolist(), "rotation": turn[0].tolist(), "scale": [body.scale] * 3}
@@ -312,8 +289,7 @@ def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
     if channels:
         file.animations.append({"name": "run", "samplers": samplers, "channels": channels})
     write_bytes(out, file.to_bytes())
-    unseen = ["masses, friction and all else that is not seen"]
-    return Written([out], unseen + _missing(take, motion=True, textures=True))
+    return [out], ["masses, friction and all else that is not seen", *_missing(take, motion=True, textures=True)]
 
 
 # --- USD ---
@@ -350,34 +326,30 @@ def _usd(take: Take, out: Path, on_progress: StageProgress) -> Written:
             code = usd.TimeCode(RATE * float(take.time[t])) if animated else usd.TimeCode.Default()
             place.Set(gf.Vec3d(*take.position[t, k].tolist()), code)
             turn.Set(gf.Quatd(*_wxyz(take.quat_xyzw[t, k]).tolist()), code)
-        shown = geom.PrimvarsAPI(prim).CreatePrimvar("displayColor", sdf.ValueTypeNames.Color3fArray)
-        shown.Set([gf.Vec3f(*_linear(color).tolist())])
+        tint = geom.PrimvarsAPI(prim).CreatePrimvar("displayColor", sdf.ValueTypeNames.Color3fArray)
+        tint.Set([gf.Vec3f(*_linear(color).tolist())])
         if body.motion != "static":
-            rigid = physics.RigidBodyAPI.Apply(prim)
-            rigid.CreateKinematicEnabledAttr(body.motion == "kinematic")
+            _usd_apply(prim, "PhysicsRigidBodyAPI", kinematicEnabled=body.motion == "kinematic")
         if body.motion == "dynamic":
-            rigid.CreateVelocityAttr(gf.Vec3f(*body.velocity.tolist()))
-            rigid.CreateAngularVelocityAttr(gf.Vec3f(*np.rad2deg(body.angular_velocity).tolist()))
+            spin = np.rad2deg(body.angular_velocity)
+            velocities = {"velocity": gf.Vec3f(*body.velocity.tolist()), "angularVelocity": gf.Vec3f(*spin.tolist())}
+            _usd_apply(prim, "PhysicsRigidBodyAPI", **velocities)
             diagonal, axes = np.linalg.eigh(_inertia(body, shape))
             axes[:, 2] *= np.sign(np.linalg.det(axes))
-            mass = physics.MassAPI.Apply(prim)
-            mass.CreateMassAttr(body.mass)
-            mass.CreateCenterOfMassAttr(gf.Vec3f(*(body.scale * shape.com).tolist()))
-            mass.CreateDiagonalInertiaAttr(gf.Vec3f(*diagonal.tolist()))
-            mass.CreatePrincipalAxesAttr(gf.Quatf(*_wxyz(Rotation.from_matrix(axes).as_quat()).tolist()))
+            com, turned = body.scale * shape.com, _wxyz(Rotation.from_matrix(axes).as_quat())
+            masses = {"mass": body.mass, "centerOfMass": gf.Vec3f(*com.tolist())}
+            masses |= {"diagonalInertia": gf.Vec3f(*diagonal.tolist()), "principalAxes": gf.Quatf(*turned.tolist())}
+            _usd_apply(prim, "PhysicsMassAPI", **masses)
         surface = (body.friction, body.restitution)
         if surface not in materials:
-            path = f"/World/materials/surface_{len(materials)}"
-            materials[surface] = shade.Material.Define(stage, path)
-            told = physics.MaterialAPI.Apply(materials[surface].GetPrim())
-            told.CreateStaticFrictionAttr(body.friction)
-            told.CreateDynamicFrictionAttr(body.friction)
-            told.CreateRestitutionAttr(body.restitution)
+            materials[surface] = shade.Material.Define(stage, f"/World/materials/surface_{len(materials)}")
+            made, (friction, restitution) = materials[surface].GetPrim(), surface
+            told = {"staticFriction": friction, "dynamicFriction": friction, "restitution": restitution}
+            _usd_apply(made, "PhysicsMaterialAPI", **told)
             # PhysX takes the mean of two bodies' coefficients unless told. Its schema is not part of OpenUSD.
-            materials[surface].GetPrim().AddAppliedSchema("PhysxMaterialAPI")
+            made.AddAppliedSchema("PhysxMaterialAPI")
             for what in ("friction", "restitution"):
-                mode = f"physxMaterial:{what}CombineMode"
-                materials[surface].GetPrim().CreateAttribute(mode, sdf.ValueTypeNames.Token).Set("multiply")
+                made.CreateAttribute(f"physxMaterial:{what}CombineMode", sdf.ValueTypeNames.Token).Set("multiply")
         shade.MaterialBindingAPI.Apply(prim).Bind(materials[surface], materialPurpose="physics")
 
         of = (body.shape, body.motion == "dynamic")
@@ -397,63 +369,59 @@ def _usd(take: Take, out: Path, on_progress: StageProgress) -> Written:
         for other in np.flatnonzero(~allowed[g]):
             made.CreateFilteredGroupsRel().AddTarget(f"/World/groups/group_{other}")
 
-    with replacing(out) as partial:
-        # The ending tells OpenUSD what to write.
-        named = partial.with_name(partial.name + out.suffix.lower())
-        try:
-            if not stage.GetRootLayer().Export(str(named)):
-                raise OSError("OpenUSD could not write it")
-            named.rename(partial)
-        finally:
-            named.unlink(missing_ok=True)
-    return Written([out], _missing(take, motion=True))
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / f"stage{out.suffix.lower()}"  # the ending tells OpenUSD what to write
+        if not stage.GetRootLayer().Export(str(file)):
+            raise SdfsimError(f"{file}: OpenUSD cannot write it")
+        write_bytes(out, file.read_bytes())
+    return [out], _missing(take, motion=True)
+
+
+def _usd_apply(prim: Any, schema: str, **values: Any) -> None:
+    """Give a prim a schema of UsdPhysics, and values for its attributes."""
+    prim.ApplyAPI(schema)
+    for name, value in values.items():
+        prim.GetAttribute(f"physics:{name}").Set(value)
 
 
 def _usd_geometry(take: Take, shape: Shape, dynamic: bool, stage: Any, path: str) -> None:
     """Prims below `path` that are seen and collide."""
-    gf, geom, physics = (_extra(f"pxr.{name}") for name in ("Gf", "UsdGeom", "UsdPhysics"))
+    gf, geom = _extra("pxr.Gf"), _extra("pxr.UsdGeom")
     form, solid = shape.sdf, f"{path}/solid"
     if isinstance(form, ClosedForm):
         if isinstance(form, SphereSdf):
-            prim = geom.Sphere.Define(stage, solid)
-            prim.CreateRadiusAttr(form.radius)
+            sizes: dict[str, Any] = {"radius": form.radius}
         elif isinstance(form, BoxSdf):
-            prim = geom.Cube.Define(stage, solid)
-            prim.CreateSizeAttr(2.0)
-            prim.AddScaleOp().Set(gf.Vec3f(*form.half))
+            sizes = {"size": 2.0}
         elif isinstance(form, CapsuleSdf | CylinderSdf):
-            prim = (geom.Capsule if isinstance(form, CapsuleSdf) else geom.Cylinder).Define(stage, solid)
-            prim.CreateRadiusAttr(form.radius)
-            prim.CreateHeightAttr(2.0 * form.half)
-            prim.CreateAxisAttr(geom.Tokens.z)
+            sizes = {"axis": "Z", "radius": form.radius, "height": 2.0 * form.half}
         else:
-            prim = geom.Plane.Define(stage, solid)
-            prim.CreateAxisAttr(geom.Tokens.z)
-            prim.CreateWidthAttr(2.0 * take.plane_size())
-            prim.CreateLengthAttr(2.0 * take.plane_size())
-        prim.CreateExtentAttr(geom.Boundable.ComputeExtentFromPlugins(prim, 0.0))
-        physics.CollisionAPI.Apply(prim.GetPrim())
+            sizes = {"axis": "Z", "width": 2.0 * take.plane_size(), "length": 2.0 * take.plane_size()}
+        prim = stage.DefinePrim(solid, "Cube" if isinstance(form, BoxSdf) else form.KIND.title())
+        for name, value in sizes.items():
+            prim.GetAttribute(name).Set(value)
+        if isinstance(form, BoxSdf):
+            geom.Xformable(prim).AddScaleOp().Set(gf.Vec3f(*form.half))
+        _usd_apply(prim, "PhysicsCollisionAPI")
         return
     seen = _usd_mesh(stage, solid, shape.mesh)
     pieces = own_pieces(shape) if dynamic else []
-    for k, piece in enumerate(pieces):
-        collider = _usd_mesh(stage, f"{path}/piece_{k}", piece)
-        geom.Imageable(collider).CreatePurposeAttr(geom.Tokens.guide)
-        physics.CollisionAPI.Apply(collider)
-        physics.MeshCollisionAPI.Apply(collider).CreateApproximationAttr("convexHull")
-    if not pieces:  # engines collide moving bodies as convex pieces, and cut them themselves
-        physics.CollisionAPI.Apply(seen)
-        approximation = "convexDecomposition" if dynamic else "none"
-        physics.MeshCollisionAPI.Apply(seen).CreateApproximationAttr(approximation)
+    # Engines collide moving bodies as convex pieces, and cut them themselves where there are none.
+    colliders = [(seen, "convexDecomposition" if dynamic else "none")]
+    if pieces:
+        colliders = [(_usd_mesh(stage, f"{path}/piece_{k}", piece), "convexHull") for k, piece in enumerate(pieces)]
+    for collider, approximation in colliders:
+        if pieces:
+            geom.Imageable(collider).CreatePurposeAttr(geom.Tokens.guide)
+        _usd_apply(collider, "PhysicsCollisionAPI")
+        _usd_apply(collider, "PhysicsMeshCollisionAPI", approximation=approximation)
 
 
 def _usd_mesh(stage: Any, path: str, mesh: Mesh) -> Any:
     geom, vt = _extra("pxr.UsdGeom"), _extra("pxr.Vt")
     mesh, normals = with_normals(mesh)
     prim = geom.Mesh.Define(stage, path)
-    points = vt.Vec3fArray.FromNumpy(mesh.vertices.astype(np.float32))
-    prim.CreatePointsAttr(points)
-    prim.CreateExtentAttr(geom.PointBased.ComputeExtent(points))
+    prim.CreatePointsAttr(vt.Vec3fArray.FromNumpy(mesh.vertices.astype(np.float32)))
     prim.CreateFaceVertexCountsAttr(vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, dtype=np.int32)))
     prim.CreateFaceVertexIndicesAttr(vt.IntArray.FromNumpy(mesh.faces.reshape(-1).astype(np.int32)))
     prim.CreateSubdivisionSchemeAttr(geom.Tokens.none)
@@ -461,8 +429,8 @@ def _usd_mesh(stage: Any, path: str, mesh: Mesh) -> Any:
     prim.CreateNormalsAttr(vt.Vec3fArray.FromNumpy(normals.astype(np.float32)))
     prim.SetNormalsInterpolation(geom.Tokens.vertex)
     if mesh.colors is not None:
-        shown = prim.CreateDisplayColorPrimvar(geom.Tokens.vertex)
-        shown.Set(vt.Vec3fArray.FromNumpy(_linear(mesh.colors).astype(np.float32)))
+        tint = prim.CreateDisplayColorPrimvar(geom.Tokens.vertex)
+        tint.Set(vt.Vec3fArray.FromNumpy(_linear(mesh.colors).astype(np.float32)))
     return prim.GetPrim()
 
 
@@ -471,7 +439,7 @@ def _usd_mesh(stage: Any, path: str, mesh: Mesh) -> Any:
 
 def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
     scene, left_out = take.scene, _missing(take)
-    shown, cut = _write_assets(take, out, _cut(take, lambda body: True, on_progress))
+    seen, cut = _write_assets(take, out, lambda body: True, on_progress)
     root = XML("mujoco", model=_plain_names([out.stem])[0])
     folder = out.with_name(f"{out.stem}_assets").name
     _add(root, "compiler", angle="radian", meshdir=folder, balanceinertia="true")
@@ -512,19 +480,17 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
             places.append(_numbers(body.position, _wxyz(quat)))
             speeds.append(_numbers(speed, turn.inv().apply(body.angular_velocity)))
         rgba = _rgba(shape, color)
-        if body.shape in shown:
-            mesh = mesh_of(shown[body.shape], body.scale)
+        if body.shape in seen:
+            mesh = mesh_of(seen[body.shape], body.scale)
             _add(node, "geom", type="mesh", mesh=mesh, rgba=rgba, group="2", contype="0", conaffinity="0")
             solids = [{"type": "mesh", "mesh": mesh_of(file, body.scale), "group": "3"} for file in cut[body.shape]]
         else:
             form: Any = shape.sdf
             sizes = (take.plane_size(),) * 3 if isinstance(form, PlaneSdf) else form.scaled(body.scale).sizes
             solids = [{"type": form.KIND, "size": _numbers(sizes), "rgba": rgba}]
-        surface = {"condim": "3", **_mjcf_surface(body.friction**2, body.restitution**2)}
-        surface |= {
-            "contype": f"{1 << group[k]}",
-            "conaffinity": f"{sum(1 << g for g in np.flatnonzero(allowed[group[k]]))}",
-        }
+        mates = sum(1 << g for g in np.flatnonzero(allowed[group[k]]))
+        surface = {"condim": "3", "contype": f"{1 << group[k]}", "conaffinity": f"{mates}"}
+        surface |= _mjcf_surface(body.friction**2, body.restitution**2)
         geoms.append([f"{name}-{i}" for i in range(len(solids))])
         for solid, label in zip(solids, geoms[-1], strict=True):
             _add(node, "geom", name=label, **solid, **surface)
@@ -549,7 +515,7 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
     if places:
         _add(_add(root, "keyframe"), "key", name="start", qpos=" ".join(places), qvel=" ".join(speeds))
     _write_xml(out, root)
-    return Written([out, *shown.values(), *(file for files in cut.values() for file in files)], left_out)
+    return [out, *seen.values(), *(file for files in cut.values() for file in files)], left_out
 
 
 def _mjcf_surface(friction: float, restitution: float, *, pair: bool = False) -> dict[str, str]:
@@ -570,7 +536,7 @@ def _mjcf_surface(friction: float, restitution: float, *, pair: bool = False) ->
 
 
 def _urdf(take: Take, out: Path, on_progress: StageProgress) -> Written:
-    shown, cut = _write_assets(take, out, _cut(take, lambda body: body.motion != "static", on_progress))
+    seen, cut = _write_assets(take, out, lambda body: body.motion != "static", on_progress)
     files: list[Path] = []
     single = len(take.names) == 1 and take.scene.path is None
     for name, body, shape, color in take.each():
@@ -592,7 +558,7 @@ def _urdf(take: Take, out: Path, on_progress: StageProgress) -> Written:
             _add(_add(element, "geometry"), "mesh", filename=path, scale=_numbers([scale] * 3))
 
         visual = _add(link, "visual")
-        if body.shape not in shown:
+        if body.shape not in seen:
             if isinstance(shape.sdf, PlaneSdf):  # PyBullet draws none
                 _add(visual, "origin", xyz="0 0 -0.001", rpy="0 0 0")
                 _add(_add(visual, "geometry"), "box", size=_numbers([2.0 * take.plane_size()] * 2, 0.002))
@@ -600,23 +566,23 @@ def _urdf(take: Take, out: Path, on_progress: StageProgress) -> Written:
                 _urdf_form(_add(visual, "geometry"), shape.sdf, body.scale)
             _urdf_form(_add(_add(link, "collision"), "geometry"), shape.sdf, body.scale)
         else:
-            mesh(visual, shown[body.shape])
+            mesh(visual, seen[body.shape])
             if body.motion == "static":  # triangles as they are, which PyBullet knows of what never moves
-                mesh(_add(link, "collision", concave="yes"), shown[body.shape])
+                mesh(_add(link, "collision", concave="yes"), seen[body.shape])
             for file in cut[body.shape] if body.motion != "static" else []:
                 mesh(_add(link, "collision"), file)
         rgba = _rgba(shape, color)
         _add(_add(visual, "material", name=f"{name}_color"), "color", rgba=rgba)
         files.append(out if single else out.with_name(f"{out.stem}.{name}.urdf"))
         _write_xml(files[-1], root)
-    assets = [*shown.values(), *(file for found in cut.values() for file in found)]
+    assets = [*seen.values(), *(file for found in cut.values() for file in found)]
     if single:
-        return Written([*files, *assets], [])
+        return [*files, *assets], []
     poses = out.with_suffix(".csv")
     start = replace(take, time=take.time[:1], position=take.position[:1], quat_xyzw=take.quat_xyzw[:1])
     _csv(start, poses, on_progress)
     left_out = ["where the bodies are: that is in the CSV", "gravity, velocities and collides_with", *_missing(take)]
-    return Written([*files, poses, *assets], left_out)
+    return [*files, poses, *assets], left_out
 
 
 def _urdf_form(geometry: XML, form: Any, scale: float) -> None:
@@ -643,7 +609,7 @@ def _csv(take: Take, out: Path, on_progress: StageProgress) -> Written:
             pose = np.concatenate([take.position[t, k], take.quat_xyzw[t, k]])
             writer.writerow([f"{time:.9g}", body.name, *(f"{value:.12g}" for value in pose)])
     write_text(out, text.getvalue())
-    return Written([out], ["everything but poses"])
+    return [out], ["everything but poses"]
 
 
 FORMATS: dict[str, Callable[[Take, Path, StageProgress], Written]] = {

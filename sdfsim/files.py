@@ -47,16 +47,15 @@ def replacing(path: Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
-def write_text(path: Path, text: str) -> None:
-    """A UTF-8 text file."""
-    with replacing(path) as partial:
-        partial.write_text(text, encoding="utf-8")
-
-
 def write_bytes(path: Path, content: bytes) -> None:
     """A file of these bytes."""
     with replacing(path) as partial:
         partial.write_bytes(content)
+
+
+def write_text(path: Path, text: str) -> None:
+    """A UTF-8 text file."""
+    write_bytes(path, text.encode("utf-8"))
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -82,19 +81,14 @@ def read_arrays(path: Path, what: str, hint: str = "") -> dict[str, np.ndarray]:
     """All arrays of an `.npz` file; `what` says in the message what it should have been. Raises SdfsimError where it is
     absent, cut short, no such file, or claims an absurd size."""
     try:
-        _check_sizes(path)
+        with zipfile.ZipFile(path) as archive:
+            unpacked = sum(member.file_size for member in archive.infolist())
+        if unpacked > max(FREELY, MOST_GROWTH * path.stat().st_size):
+            raise ValueError(f"it would unpack to {unpacked / 2**30:.1f} GiB")
         with np.load(path, allow_pickle=False) as data:
             return {name: data[name] for name in data.files}
     except Exception as error:  # the readers raise whatever a damaged file made them stumble over
         raise SdfsimError(f"{path}: cannot be read as {what}: {error}", hint) from error
-
-
-def _check_sizes(path: Path) -> None:
-    """Raise ValueError where an `.npz` would take far more memory than what is in it."""
-    with zipfile.ZipFile(path) as archive:
-        unpacked = sum(member.file_size for member in archive.infolist())
-        if unpacked > max(FREELY, MOST_GROWTH * path.stat().st_size):
-            raise ValueError(f"it would unpack to {unpacked / 2**30:.1f} GiB")
 
 
 @contextmanager

@@ -35,6 +35,8 @@ WEAK = 1e-3  # how strongly coefficients that nothing shows are held to it
 OUTLIER = 2e-3  # model lengths: errors of windows that count less than squared, beyond
 NUDGE = 0.02  # of a coefficient, for differences: contacts come and go, so that smaller ones tell nothing
 SURE = 1.96  # standard deviations in an interval of 95 %
+HIGH = {"friction": 2.0, "restitution": 1.0}  # the largest products that are looked for
+RATIO = 7.0  # the largest logarithm of a mass ratio
 COLUMNS = ("time", "body", "x", "y", "z", "qx", "qy", "qz", "qw")
 
 
@@ -51,56 +53,6 @@ class Recording:
     known: np.ndarray  # [T] bool, whether the velocities are to be trusted
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """A number with its interval of 95 %; no interval, and a number that means nothing, where it is not shown."""
-
-    value: float
-    interval: tuple[float, float] | None
-
-
-@dataclass(frozen=True)
-class Identified:
-    """What a recording tells."""
-
-    # friction, restitution: pair of body names -> product of the two bodies' coefficients
-    friction: dict[tuple[str, str], Estimate]
-    restitution: dict[tuple[str, str], Estimate]
-    # own_friction, own_restitution: body -> its own, where that of what it touched is given by the scene
-    own_friction: dict[str, Estimate]
-    own_restitution: dict[str, Estimate]
-    mass: dict[str, Estimate]  # body -> kg, as the ratio to the first body that is touched by another that moves
-    error_m: float  # root mean square error of the windows that are left, m; windows: how many there were
-    windows: int
-
-    def lines(self) -> list[str]:
-        """As lines for people."""
-        heads = {"friction": "friction, product", "restitution": "restitution, product"}
-        heads |= {"own_friction": "friction of the body's own", "own_restitution": "restitution of the body's own"}
-        lines, report = [], self.report()
-        for kind, head in (heads | {"mass": "mass, kg"}).items():
-            for name, told in report[kind].items():
-                seen = "not shown by this motion"
-                if told["interval"]:
-                    seen = "{:.3f} ({:.3f} to {:.3f})".format(told["value"], *told["interval"])
-                lines.append(f"{head}: {name}: {seen}")
-        return [*lines, f"{self.windows} windows, repeated with an error of {self.error_m:.2g} m"]
-
-    def report(self) -> dict[str, Any]:
-        """As a JSON object."""
-        found: dict[str, Any] = {"error_m": self.error_m, "windows": self.windows}
-        for kind in ("friction", "restitution", "own_friction", "own_restitution", "mass"):
-            # What the motion does not show has no value either: the fit left it where it happened to begin.
-            found[kind] = {
-                " / ".join(name) if isinstance(name, tuple) else name: {
-                    "value": e.value if e.interval else None,
-                    "interval": e.interval,
-                }
-                for name, e in getattr(self, kind).items()
-            }
-        return found
-
-
 def load_recording(
     path: Path, scene_file: Path | None = None, *, allow_outside: bool = False, on_progress: Progress = silent
 ) -> tuple[Recording, Scene]:
@@ -111,93 +63,83 @@ def load_recording(
         if scene_file is None:
             raise SdfsimError(f"{path}: a recording without its scene", "give it: --scene scene.yaml")
         scene = load_scene(scene_file, on_progress, allow_outside=allow_outside)
-        moving = [b.name for b in scene.bodies if b.motion == "dynamic"]
-        return _from_poses(moving, *_read_csv(path, moving), scene), scene
+        return _from_poses(path, scene), scene
     scene, rollout = read_run(path, scene_file, allow_outside=allow_outside, on_progress=on_progress)
     rows = [k for k, b in enumerate(scene.bodies) if b.motion == "dynamic"]
-    recording = Recording(
-        dt=float(np.diff(rollout.time).mean()) if len(rollout) else 0.0,
-        position=rollout.position[:, rows],
-        orientation=rollout.orientation[:, rows],
-        velocity=rollout.velocity[:, rows],
-        angular_velocity=rollout.angular_velocity[:, rows],
-        known=np.ones(len(rollout.time), dtype=bool),
-    )
-    return recording, scene
+    moving = ("position", "orientation", "velocity", "angular_velocity")
+    dt = float(np.diff(rollout.time).mean()) if len(rollout) else 0.0
+    motion = {name: getattr(rollout, name)[:, rows] for name in moving}
+    return Recording(dt, **motion, known=np.ones(len(rollout.time), dtype=bool)), scene
 
 
-def _read_csv(path: Path, moving: list[str]) -> tuple[float, np.ndarray, np.ndarray]:
-    """Spacing s, positions [T, D, 3] m and orientations [T, D, 4] of the bodies."""
+def _read_csv(path: Path, moving: list[str]) -> tuple[float, np.ndarray]:
+    """Spacing s and poses [T, D, 7] of the bodies, positions [m] before quaternions."""
+    rows: dict[float, dict[str, list[float]]] = {}
     try:
         with path.open(newline="", encoding="utf-8") as file:
             reader = csv.DictReader(file)
             if tuple(reader.fieldnames or ()) != COLUMNS:
                 raise SdfsimError(f"{path}:1: columns must be {','.join(COLUMNS)}")
-            rows: dict[float, dict[str, list[float]]] = {}
             for row in reader:
-                line = reader.line_num
-                if row["body"] not in moving:
-                    continue
-                try:
-                    values = [float(row[c]) for c in ("time", *COLUMNS[2:])]
-                except (TypeError, ValueError):
-                    raise SdfsimError(f"{path}:{line}: not a number in {row}") from None
-                if not np.isfinite(values).all() or not np.linalg.norm(values[4:]) > 0.0:
-                    raise SdfsimError(f"{path}:{line}: must be finite, with a quaternion that is not 0")
-                rows.setdefault(values[0], {})[row["body"]] = values[1:]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+                if row["body"] in moving:
+                    time, *values = (float(row[c] or "") for c in ("time", *COLUMNS[2:]))
+                    if not np.isfinite([time, *values]).all() or not any(values[3:]):
+                        raise ValueError("must be finite, with a quaternion that is not 0")
+                    rows.setdefault(time, {})[row["body"]] = values
+    except ValueError as error:
+        raise SdfsimError(f"{path}:{reader.line_num}: {error}") from error
+    except (OSError, csv.Error) as error:
         raise SdfsimError(f"{path}: not a CSV of poses ({error})") from error
     times = np.array(sorted(rows))
     if len(times) < 4:
         raise SdfsimError(f"{path}: {len(times)} times of {moving} (at least 4)")
     gaps = np.diff(times)
     if np.ptp(gaps) > 0.02 * gaps.mean():
-        raise SdfsimError(
-            f"{path}: times must be evenly spaced (they are {gaps.min():.4g} to {gaps.max():.4g} s apart)"
-        )
+        told = f"they are {gaps.min():.4g} to {gaps.max():.4g} s apart"
+        raise SdfsimError(f"{path}: times must be evenly spaced ({told})")
     for time in times:
         if missing := set(moving) - set(rows[time]):
             raise SdfsimError(f"{path}: no pose of body {min(missing)!r} at time {time:g}")
-    poses = np.array([[rows[time][name] for name in moving] for time in times])
-    return float(gaps.mean()), poses[..., :3], poses[..., 3:]
+    return float(gaps.mean()), np.array([[rows[time][name] for name in moving] for time in times])
 
 
-def _from_poses(names: list[str], dt: float, origin: np.ndarray, orientation: np.ndarray, scene: Scene) -> Recording:
+def _from_poses(path: Path, scene: Scene) -> Recording:
     """Velocities by central differences, which are exact in free flight, where no impact is near."""
-    turn = torch.from_numpy(orientation / np.linalg.norm(orientation, axis=-1, keepdims=True))
-    body = {b.name: b for b in scene.bodies}
-    com = np.array([scene.shapes[body[n].shape].com * body[n].scale for n in names])
-    position = origin + pose.rotate(turn, torch.from_numpy(com).expand(len(origin), -1, -1)).numpy()
+    bodies = [b for b in scene.bodies if b.motion == "dynamic"]
+    dt, poses = _read_csv(path, [b.name for b in bodies])
+    turn = pose.normalise(torch.from_numpy(poses[..., 3:]))
+    com = torch.from_numpy(np.array([scene.shapes[b.shape].com * b.scale for b in bodies]))
+    position = poses[..., :3] + pose.rotate(turn, com.expand(len(poses), -1, -1)).numpy()
     velocity, angular = np.zeros_like(position), np.zeros_like(position)
     velocity[1:-1] = (position[2:] - position[:-2]) / (2.0 * dt)
     angular[1:-1] = pose.to_rotvec(pose.multiply(turn[2:], pose.conjugate(turn[:-2]))).numpy() / (2.0 * dt)
-    bend = np.zeros(position.shape[:2])
-    bend[1:-1] = np.linalg.norm(position[2:] - 2.0 * position[1:-1] + position[:-2], axis=-1) / dt**2
-    known: np.ndarray = np.all(bend < SMOOTH * max(float(np.linalg.norm(scene.gravity)), 1.0), axis=-1)
-    known[[0, -1]] = False
-    return Recording(dt, position, turn.numpy(), velocity, angular, known)
+    bend = np.linalg.norm(position[2:] - 2.0 * position[1:-1] + position[:-2], axis=-1) / dt**2
+    smooth = np.all(bend < SMOOTH * max(float(np.linalg.norm(scene.gravity)), 1.0), axis=-1)
+    return Recording(dt, position, turn.numpy(), velocity, angular, np.pad(smooth, 1))
 
 
-def identify(recording: Recording, scene: Scene, *, on_progress: Progress = silent) -> Identified:
+def identify(recording: Recording, scene: Scene, *, on_progress: Progress = silent) -> dict[str, Any]:
     """Find the coefficients and masses with which the contact solve repeats a recording; those of bodies that do not
-    move are taken from the scene. Raises SdfsimError for bodies on paths, a recording too short, or one in which
-    nothing touches."""
+    move are taken from the scene.
+
+    Returns `value` and `interval` (of 95 %; both None where the motion does not show it) of: `friction` and
+    `restitution`, by "BODY / BODY", the product of both bodies' coefficients; `own_friction` and `own_restitution`, by
+    body, where the scene gives that of what it touched; `mass` in kg, relative to the first body that another one
+    touched. And `error_m`, the root mean square error of the `windows` that are left. Raises SdfsimError for bodies on
+    paths, a recording too short, or one in which nothing touches.
+    """
     from scipy.optimize import least_squares
 
     if any(b.motion == "kinematic" for b in scene.bodies):
         raise SdfsimError("bodies on paths: identify works on bodies that move freely and those that are static")
     windows = Windows(recording, scene)
-    start = windows.start()
-    best = start
     # A sweep over all coefficients alike finds the valley; the fit goes down in it.
-    tried = [(f, e) for f in (0.2, 0.5, 0.9) for e in (0.1, 0.4, 0.7, 0.95)]
+    tried = [windows.start(f, e) for f in (0.2, 0.5, 0.9) for e in (0.1, 0.4, 0.7, 0.95)]
     costs = []
-    for k, (friction, restitution) in enumerate(tried):
-        trial = windows.start(friction, restitution)
+    for k, trial in enumerate(tried):
         costs.append(float(np.minimum(np.abs(windows.errors(trial)), 10.0).sum()))
-        best = trial if costs[-1] == min(costs) else best
         on_progress(0.3 * k / len(tried), "a first sweep over friction and restitution")
-    count = [0]
+    start, count = windows.start(START, START), [0]
 
     def errors(parameters: np.ndarray) -> np.ndarray:
         count[0] += 1
@@ -205,8 +147,23 @@ def identify(recording: Recording, scene: Scene, *, on_progress: Progress = sile
         return np.concatenate([windows.errors(parameters), WEAK * (parameters - start)])
 
     slope: Any = lambda parameters: windows.jacobian(parameters, errors)  # noqa: E731
-    found = least_squares(errors, best, slope, windows.bounds(), x_scale=0.1, loss="soft_l1", max_nfev=25)
-    return windows.told(found.x, windows.jacobian(found.x, errors), errors(found.x))
+    best = tried[int(np.argmin(costs))]
+    found = least_squares(errors, best, slope, windows.bounds, x_scale=0.1, loss="soft_l1", max_nfev=25)
+    return windows.report(found.x, windows.jacobian(found.x, errors), errors(found.x))
+
+
+def report_lines(report: dict[str, Any]) -> list[str]:
+    """`identify`'s report for people."""
+    heads = {"friction": "friction, product", "restitution": "restitution, product"}
+    heads |= {"own_friction": "friction of the body's own", "own_restitution": "restitution of the body's own"}
+    lines = []
+    for kind, head in (heads | {"mass": "mass, kg"}).items():
+        for name, told in report[kind].items():
+            seen = "not shown by this motion"
+            if told["interval"]:
+                seen = "{:.3f} ({:.3f} to {:.3f})".format(told["value"], *told["interval"])
+            lines.append(f"{head}: {name}: {seen}")
+    return [*lines, f"{report['windows']} windows, repeated with an error of {report['error_m']:.2g} m"]
 
 
 class Windows:
@@ -219,29 +176,33 @@ class Windows:
         self.units = scene_units(scene, model)
         self.moving = [b for b in scene.bodies if b.motion == "dynamic"]
         self.fixed = [b for b in scene.bodies if b.motion != "dynamic"]
-        self.length = max(3, round(WINDOW * self.units.time / recording.dt)) if recording.dt > 0 else 0
-        every = max(1, round(EVERY * self.units.time / recording.dt)) if recording.dt > 0 else 1
+        if recording.dt == 0.0:
+            raise SdfsimError("the recording is a single frame")
+        self.length = max(3, round(WINDOW * self.units.time / recording.dt))
+        every = max(1, round(EVERY * self.units.time / recording.dt))
         begin = np.arange(0, len(recording.position) - self.length, every)
         begin = begin[recording.known[begin]]
         if not len(begin):
-            raise SdfsimError(
-                "the recording is too short, or nowhere smooth", f"give at least {self.length + 1} frames"
-            )
-        inner = max(1, int(np.ceil(recording.dt / self.units.time / (model.dt / 5.0) - 0.01)))
+            told = f"give at least {self.length + 1} frames"
+            raise SdfsimError("the recording is too short, or nowhere smooth", told)
+        dt = recording.dt / self.units.time
+        inner = max(1, int(np.ceil(dt / (model.dt / 5.0) - 0.01)))
         gravity = torch.from_numpy(np.asarray(scene.gravity) / self.units.acceleration)
-        self.rules = StepOptions(gravity, recording.dt / self.units.time, inner)
+        self.rules = StepOptions(gravity, dt, inner)
         self.model = model
         self._build(begin)
-        self.touched = self._touched()
-        kept = np.array(sorted({w for w, _, _ in self.touched}), dtype=int)
-        if not len(kept):
+        touched = self._touched()
+        if not touched:
             raise SdfsimError("nothing touches in the recording", "friction and restitution show in contacts only")
-        self._build(begin[kept])
-        self.pairs = sorted({(a, b) for _, a, b in self.touched})
+        self._build(begin[sorted({w for w, _, _ in touched})])
+        self.pairs = sorted({(a, b) for _, a, b in touched})
         many = len(self.moving)
         self.seen = sorted({k for pair in self.pairs for k in pair if k < many})
         beside = [pair for pair in self.pairs if pair[1] < many]
         self.weighed = sorted({k for pair in beside for k in pair})[1:]
+        ratios = np.full(len(self.weighed), RATIO)
+        high = [self._most(name, k) for name in HIGH for k in self.seen]
+        self.bounds = np.concatenate([np.zeros(len(high)), -ratios]), np.concatenate([high, ratios])
 
     def _build(self, begin: np.ndarray) -> None:
         """Bodies and start states of the windows that begin at frames `begin`."""
@@ -268,10 +229,7 @@ class Windows:
         self.goal = r.position[frames] / u.length, r.orientation[frames]
         self.memory, self.count = Memory(), len(begin)
         self.world = self.memory.compiled(self.bodies, self.start_state).world
-        self.given = {
-            name: getattr(self.world, name).copy()
-            for name in ("friction", "restitution", "inverse_mass", "inertia", "inverse_inertia")
-        }
+        self.given = {name: getattr(self.world, name).copy() for name in ("inverse_mass", "inertia", "inverse_inertia")}
 
     def _run(self) -> list[State]:
         state, states = self.start_state, []
@@ -291,57 +249,39 @@ class Windows:
                 found.add((a // many, *sorted((a % many, other))))
         return found
 
-    def start(self, friction: float = START, restitution: float = START) -> np.ndarray:
-        """Parameters to begin with."""
+    def _most(self, name: str, body: int) -> float:
+        """What a body's own coefficient may be at most, given those of the static bodies that it touched."""
+        many = len(self.moving)
+        others = [getattr(self.fixed[b - many], name) for a, b in self.pairs if a == body and b >= many]
+        return HIGH[name] / max([v for v in others if v > 0.0], default=1.0)
+
+    def start(self, friction: float, restitution: float) -> np.ndarray:
+        """Parameters with one coefficient for all, and the masses of the scene."""
         count = len(self.seen)
         return np.concatenate([np.full(count, friction), np.full(count, restitution), np.zeros(len(self.weighed))])
-
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Least and largest parameters: a product of friction may be up to 2, one of restitution up to 1."""
-        ratios = np.full(len(self.weighed), 7.0)
-        high = np.concatenate([self._most("friction", 2.0), self._most("restitution", 1.0), ratios])
-        return np.concatenate([np.zeros(2 * len(self.seen)), -ratios]), high
-
-    def _most(self, name: str, product: float) -> np.ndarray:
-        """What a body's own coefficient may be at most, given those of the static bodies that it touched."""
-        most = []
-        for k in self.seen:
-            others = [
-                getattr(self.fixed[b - len(self.moving)], name)
-                for a, b in self.pairs
-                if a == k and b >= len(self.moving)
-            ]
-            most.append(product / max([v for v in others if v > 0.0], default=1.0))
-        return np.array(most)
 
     def errors(self, parameters: np.ndarray) -> np.ndarray:
         """Differences of all windows from the recording, in units of `OUTLIER`; turns at half of a body's size."""
         count, many = len(self.seen), len(self.moving)
-        rows = {k: np.arange(self.count) * many + k for k in range(many)}
-        for name, values in self.given.items():
-            getattr(self.world, name)[:] = values
-        for i, k in enumerate(self.seen):
-            self.world.friction[rows[k]] = parameters[i]
-            self.world.restitution[rows[k]] = parameters[count + i]
-        for i, k in enumerate(self.weighed):
-            ratio = np.exp(parameters[2 * count + i])
-            self.world.inverse_mass[rows[k]] /= ratio
-            self.world.inertia[rows[k]] *= ratio
-            self.world.inverse_inertia[rows[k]] /= ratio
         total = self.count * many
+        for k, friction, restitution in zip(self.seen, parameters[:count], parameters[count : 2 * count], strict=True):
+            self.world.friction[k:total:many] = friction
+            self.world.restitution[k:total:many] = restitution
+        for k, ratio in zip(self.weighed, np.exp(parameters[2 * count :]), strict=True):
+            for name, power in (("inverse_mass", -1), ("inertia", 1), ("inverse_inertia", -1)):
+                getattr(self.world, name)[k:total:many] = self.given[name][k:total:many] * ratio**power
         size = self.bodies.size[:total].numpy()[:, None]
         errors = []
         for t, state in enumerate(self._run()):
             place, turn = (values[t].reshape(total, -1) for values in self.goal)
-            away = pose.multiply(
-                state.orientation[:total], pose.conjugate(torch.from_numpy(np.ascontiguousarray(turn)))
-            )
+            back = pose.conjugate(torch.from_numpy(np.ascontiguousarray(turn)))
+            away = pose.multiply(state.orientation[:total], back)
             errors += [state.position[:total].numpy() - place, 0.5 * size * pose.to_rotvec(away).numpy()]
         return np.nan_to_num(np.concatenate(errors).ravel(), nan=1e3) / OUTLIER
 
     def jacobian(self, parameters: np.ndarray, errors: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         """[R, P] by central differences of `NUDGE`, one-sided at the bounds."""
-        low, high = self.bounds()
+        low, high = self.bounds
         columns = []
         for k in range(len(parameters)):
             one, other = parameters.copy(), parameters.copy()
@@ -349,9 +289,10 @@ class Windows:
             columns.append((errors(one) - errors(other)) / (one[k] - other[k]))
         return np.stack(columns, 1)
 
-    def told(self, parameters: np.ndarray, jacobian: np.ndarray, errors: np.ndarray) -> Identified:
-        """Estimates with intervals: the curvature of the robust cost, and how windows pull apart (a sandwich)."""
-        data, slope = errors[: len(errors) - len(parameters)], jacobian[: len(errors) - len(parameters)]
+    def report(self, parameters: np.ndarray, jacobian: np.ndarray, errors: np.ndarray) -> dict[str, Any]:
+        """What `identify` returns. Intervals are from the curvature of the robust cost, and how windows pull apart (a
+        sandwich)."""
+        data, slope = errors[: -len(parameters)], jacobian[: -len(parameters)]
         weight = (1.0 + data**2) ** -0.5  # of the soft L1 loss
         curvature = (slope * weight[:, None]).T @ slope + WEAK**2 * np.eye(len(parameters))
         # Errors within a window go together: windows, not single poses, are what is independent.
@@ -362,36 +303,32 @@ class Windows:
         spread = max(1.0, self.count / max(1, self.count - len(parameters)))
         covariance = spread * inverse @ (pull.T @ pull) @ inverse
         shown = np.square(slope).sum(0) > 1.0
-        count, many = len(self.seen), len(self.moving)
-        names = [b.name for b in (*self.moving, *self.fixed)]
 
-        def estimate(value: float, gradient: np.ndarray) -> Estimate:
-            if not shown[gradient != 0.0].all():
-                return Estimate(float(value), None)
-            half = SURE * float(np.sqrt(gradient @ covariance @ gradient))
-            return Estimate(float(value), (max(0.0, float(value) - half), float(value) + half))
+        def estimate(value: float, gradient: dict[int, float]) -> dict[str, Any]:
+            """Of a value with these derivatives by parameters; the fit left one that is not shown where it began."""
+            which, by = list(gradient), np.array(list(gradient.values()))
+            if not shown[which][by != 0.0].all():
+                return {"value": None, "interval": None}
+            half = SURE * float(np.sqrt(by @ covariance[np.ix_(which, which)] @ by))
+            return {"value": float(value), "interval": (max(0.0, float(value) - half), float(value) + half)}
 
-        def coefficients(offset: int, name: str) -> tuple[dict, dict]:
-            products, own = {}, {}
+        many, bodies = len(self.moving), [*self.moving, *self.fixed]
+        rms = float(np.sqrt(np.mean((data * OUTLIER) ** 2))) * self.units.length
+        found: dict[str, Any] = {"error_m": rms, "windows": self.count}
+        for offset, kind in ((0, "friction"), (len(self.seen), "restitution")):
+            found[kind], found[f"own_{kind}"] = {}, {}
             for a, b in self.pairs:
-                gradient = np.zeros(len(parameters))
-                i = offset + self.seen.index(a)
+                i, name = offset + self.seen.index(a), f"{bodies[a].name} / {bodies[b].name}"
                 if b < many:
                     j = offset + self.seen.index(b)
-                    gradient[i], gradient[j] = parameters[j], parameters[i]
-                    products[names[a], names[b]] = estimate(parameters[i] * parameters[j], gradient)
+                    gradient = {i: parameters[j], j: parameters[i]}
+                    found[kind][name] = estimate(parameters[i] * parameters[j], gradient)
                 else:
-                    other = getattr(self.fixed[b - many], name)
-                    gradient[i] = other
-                    products[names[a], names[b]] = estimate(parameters[i] * other, gradient)
-                    own[names[a]] = estimate(parameters[i], np.eye(len(parameters))[i])
-            return products, own
-
-        friction, own_friction = coefficients(0, "friction")
-        restitution, own_restitution = coefficients(count, "restitution")
-        mass = {}
-        for i, k in enumerate(self.weighed):
-            value = self.moving[k].mass * float(np.exp(parameters[2 * count + i]))
-            mass[self.moving[k].name] = estimate(value, value * np.eye(len(parameters))[2 * count + i])
-        rms = float(np.sqrt(np.mean((data * OUTLIER) ** 2))) * self.units.length
-        return Identified(friction, restitution, own_friction, own_restitution, mass, rms, self.count)
+                    other = getattr(bodies[b], kind)
+                    found[kind][name] = estimate(parameters[i] * other, {i: other})
+                    found[f"own_{kind}"][bodies[a].name] = estimate(parameters[i], {i: 1.0})
+        found["mass"] = {}
+        for i, k in enumerate(self.weighed, 2 * len(self.seen)):
+            value = self.moving[k].mass * float(np.exp(parameters[i]))
+            found["mass"][self.moving[k].name] = estimate(value, {i: value})
+        return found

@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import signal
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from timeit import timeit
 from typing import Any
 
 import torch
@@ -45,10 +45,12 @@ def parallel(function: Callable[..., Any], jobs: Sequence[tuple]) -> Iterator[tu
 
 def _one(function: Callable[..., Any], index: int, job: tuple, caller: int) -> tuple[int, Any]:
     """In a worker: one thread, and Ctrl-C is the caller's business. On a single core the caller works itself."""
+    global _most
     if os.getpid() != caller:
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGINT, signal.SIG_IGN)
-        limit_threads(1)
+        _most = 1
+        torch.set_num_threads(1)
     return index, function(*job)
 
 
@@ -77,13 +79,6 @@ def cluster(address: str | None) -> Iterator[None]:
         yield
 
 
-def limit_threads(count: int) -> None:
-    """Let torch use no more than `count` threads in this process from now on."""
-    global _most
-    _most = count
-    torch.set_num_threads(count)
-
-
 def choose_threads(work: Callable[[], object], threads: int | None = None) -> float:
     """Time `work`, typically of tens of milliseconds, with one thread and with all; leave torch set to the faster (or
     to `threads`), and return the seconds that one call takes.
@@ -91,13 +86,10 @@ def choose_threads(work: Callable[[], object], threads: int | None = None) -> fl
     On a busy machine a second thread slows a computation down by up to ten times.
     """
     took = {}
-    for count in sorted({threads} if threads else {1, _most}):
+    for count in {threads} if threads else {1, _most}:
         torch.set_num_threads(count)
         work()
-        began = time.monotonic()
-        for _ in range(TIMED):
-            work()
-        took[count] = (time.monotonic() - began) / TIMED
+        took[count] = timeit(work, number=TIMED) / TIMED
     best = min(took, key=lambda count: took[count])
     torch.set_num_threads(best)
     return took[best]

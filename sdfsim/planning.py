@@ -15,9 +15,8 @@ from sdfsim.dynamics.model import load_model
 from sdfsim.dynamics.simulator import Simulator, pick_device
 from sdfsim.dynamics.training_ranges import constant_in_training
 from sdfsim.parallel import StageProgress
-from sdfsim.scene.effects import Plan, plan
-from sdfsim.scene.scene import Effects, Scene
-from sdfsim.scene.scene_file import DEFAULT_DURATION, DEFAULT_GRAVITY, load_scene
+from sdfsim.scene.effects import plan
+from sdfsim.scene.scene_file import load_scene
 
 TRIAL_STEPS = 5
 
@@ -30,8 +29,8 @@ def describe(
     on_progress: StageProgress,
     allow_outside: bool = False,
 ) -> dict[str, Any]:
-    """The plan of a scene with its units and the cost of a step, measured over the first few. Raises SdfsimError: bad
-    input."""
+    """The plan of a scene with its units, and what a step costs in the first few: pairs by what filters them; contacts,
+    nodes, edges, time and memory. Raises SdfsimError for bad input."""
     pick_device(device)
     if model:
         load_model(model, weights=False)
@@ -39,6 +38,8 @@ def describe(
     decided = plan(scene)
     simulator = Simulator(scene, model=model, device=device)
     units, steps = simulator.units, simulator.steps_in(scene.duration)
+    counters = simulator.run(steps=TRIAL_STEPS).counters
+    near, step_ms = int(counters["pairs"][1]), float(np.median(counters["step_ms"][1:]))
     return {
         "scene": str(scene_file),
         "effects": {name: asdict(effect) for name, effect in decided.effects().items()},
@@ -47,7 +48,11 @@ def describe(
         "kinematic": list(decided.kinematic_bodies),
         "masses_kg": {b.name: b.mass for b in scene.bodies if b.motion == "dynamic"},
         "nodes": decided.nodes,
-        **_costs(simulator, decided, steps),
+        "pairs": {**asdict(decided.pairs), "apart": decided.pairs.possible - near, "near": near},
+        "step": {k: float(counters[k][1:].max()) for k in ("contacts", "nodes", "edges")},
+        "memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "step_ms": step_ms,
+        "run_s": 1e-3 * step_ms * steps,
         "model": simulator.model.name,
         "device": str(simulator.device),
         "duration_s": scene.duration,
@@ -56,36 +61,8 @@ def describe(
         "units": {"length_m": units.length, "time_s": units.time, "mass_kg": units.mass},
         "outside_training": simulator.outside_training,
         "constant_in_training": constant_in_training(simulator.model),
-        "not_default": _not_default(scene, model),
         "failed_checks": [f"fit of shape {told}" for told in scene.missed],
     }
-
-
-def _costs(simulator: Simulator, decided: Plan, steps: int) -> dict[str, Any]:
-    """Pairs by what filters them; contacts, nodes, edges and time of a step, memory; time of the run at that pace."""
-    counters = simulator.run(steps=TRIAL_STEPS).counters
-    near = int(counters["pairs"][1])
-    step_ms = float(np.median(counters["step_ms"][1:]))
-    return {
-        "pairs": {**asdict(decided.pairs), "apart": decided.pairs.possible - near, "near": near},
-        "step": {k: float(counters[k][1:].max()) for k in ("contacts", "nodes", "edges")},
-        "memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        "step_ms": step_ms,
-        "run_s": 1e-3 * step_ms * steps,
-    }
-
-
-def _not_default(scene: Scene, model: str | None) -> dict[str, Any]:
-    """What the file or the command says that is not the default."""
-    said: dict[str, tuple[Any, Any]] = {
-        **{f"effects.{name}": (value, getattr(Effects(), name)) for name, value in vars(scene.effects).items()},
-        "limits.memory_gib": (scene.limits.memory_gib, None),
-        "model": (model or scene.model, None),
-        "seed": (scene.seed, 0),
-        "gravity": (scene.gravity.tolist(), list(DEFAULT_GRAVITY)),
-        "duration": (scene.duration, DEFAULT_DURATION),
-    }
-    return {name: value for name, (value, default) in said.items() if value != default}
 
 
 def plan_lines(report: dict[str, Any]) -> list[str]:
@@ -110,5 +87,4 @@ def plan_lines(report: dict[str, Any]) -> list[str]:
         f"its kilogram {units['mass_kg']:.4g} kg",
         *(f"outside the model's training: {line}" for line in report["outside_training"]),
         *(f"constant in the model's training, so not learned: {name}" for name in report["constant_in_training"]),
-        *(f"not the default: {name}: {said}" for name, said in report["not_default"].items()),
     ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import cycle
 from pathlib import Path
@@ -11,19 +11,19 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from PIL import Image
 
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.run_memory import PHASES
-from sdfsim.errors import SdfsimError
 from sdfsim.files import write_bytes
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.mesh import Mesh, face_normals, vertex_normals
+from sdfsim.shape.shape import Shape
 
 if TYPE_CHECKING:
     import rerun as rr
     import rerun.blueprint as rrb
 
-Place = Sequence[float] | np.ndarray
 WORLD = "world"
 CONTACTS = "world/contacts"
 # What is plotted: the counters of a view by their legends.
@@ -50,18 +50,15 @@ FARTHEST = 1.0  # what leaves the scene for good must not make it a dot
 
 
 class Playback:
-    """One recording of one scene, to be written to a file, or streamed to a viewer. Its first view is from `eye_of`;
-    where the motion is known already, it shows all of it."""
+    """One recording of one scene, to be written to a file, or streamed to a viewer. Its first view shows all of the
+    scene, and where the motion is known already all of that."""
 
-    def __init__(
-        self, scene: Scene, motion: Rollout | None = None, camera: Place | None = None, look_at: Place | None = None
-    ) -> None:
+    def __init__(self, scene: Scene, motion: Rollout | None = None) -> None:
         import rerun as rr
 
         self._rr = rr
         self._scene = scene
-        self._framed = framed(scene, motion)
-        self._eye = eye_of(scene, motion, camera, look_at)
+        self._centre, self._radius = framed(scene, motion)
         self._step = 0
         self._com = [b.scale * scene.shapes[b.shape].com for b in scene.bodies]
         self._crowds = _crowds(scene)
@@ -79,7 +76,7 @@ class Playback:
             origin=WORLD,
             name="scene",
             overrides={path: rrb.EntityBehavior(visible=False) for path in hidden},
-            eye_controls=self._eye.controls(),
+            eye_controls=_controls(eye_around(self._centre, self._radius, -self._scene.gravity)),
             line_grid=False,
         )
         plots = [
@@ -99,22 +96,19 @@ class Playback:
         rr, scene = self._rr, self._scene
         self.stream.send_blueprint(self.blueprint())
         self.stream.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        size = self._framed[1]
-        hues = distinct_colors(len(self._alone) + len(self._crowds))
+        colors = body_colors(scene)
         for crowd in self._crowds:
             shape = scene.shapes[crowd.shape]
             mesh = replace(shape.shown, vertices=shape.shown.vertices - shape.com)
-            self.stream.log(crowd.path, _shaded(rr, mesh, next(hues)), static=True)
+            self.stream.log(crowd.path, _shaded(rr, mesh, colors[crowd.bodies[0]]), static=True)
             scales = np.repeat([[scene.bodies[k].scale] for k in crowd.bodies], 3, 1)
             self.stream.log(crowd.path, rr.InstancePoses3D.from_fields(scales=scales), static=True)
         for k, path in self._alone:
             body, com = scene.bodies[k], self._com[k]
             shape = scene.shapes[body.shape]
-            infinite = not np.all(np.isfinite(shape.sdf.bounds))
-            color = STATIC_COLOR if body.motion == "static" else next(hues)
-            mesh = sheet(6 * size) if infinite else shape.shown
+            mesh = shown(shape, 6 * self._radius)
             placed = replace(mesh, vertices=mesh.vertices * body.scale - com)
-            self.stream.log(f"{path}/mesh", _shaded(rr, placed, color), static=True)
+            self.stream.log(f"{path}/mesh", _shaded(rr, placed, colors[k]), static=True)
             if len(shape.nodes):
                 nodes = rr.Points3D(shape.nodes * body.scale - com, colors=_NODE_COLOR, radii=rr.Radius.ui_points(2))
                 self.stream.log(f"{path}/nodes", nodes, static=True)
@@ -174,16 +168,13 @@ def _crowds(scene: Scene) -> list[Crowd]:
     return found
 
 
-def save_rollout(
-    scene: Scene, rollout: Rollout, path: Path, camera: Place | None = None, look_at: Place | None = None
-) -> None:
-    """Write `rollout` as a rerun recording: to a temporary name first, then renamed. Camera and what it looks at, [3] m
-    each, are of the first view, see `eye_of`. Raises SdfsimError where the file cannot be written."""
-    playback = Playback(scene, rollout, camera, look_at)
-    encoded = playback.stream.binary_stream()
+def save_rollout(scene: Scene, rollout: Rollout, path: Path) -> None:
+    """Write `rollout` as a rerun recording. Raises SdfsimError where the file cannot be written."""
+    playback = Playback(scene, rollout)
+    encoded = playback.stream.binary_stream()  # since rerun's own sink only logs a full disk
     playback.log_static()
     playback.log_steps(rollout)
-    _write(path, encoded)
+    write_bytes(path, encoded.read() or b"")
 
 
 @dataclass(frozen=True)
@@ -218,15 +209,15 @@ def save_reconstruction(
     rotations = [np.asarray(photo.rotation) for photo in photos]
     centres = [-turn.T @ photo.translation for turn, photo in zip(rotations, photos, strict=True)]
     # Cameras surround what matters; sparse points also lie on whatever is behind it.
-    shown = np.concatenate([np.reshape(centres, (-1, 3)), points[:0] if mesh is None else mesh.vertices])
-    low, high = (shown.min(0), shown.max(0)) if len(shown) else (-np.ones(3), np.ones(3))
+    around = np.concatenate([np.reshape(centres, (-1, 3)), points[:0] if mesh is None else mesh.vertices])
+    low, high = (around.min(0), around.max(0)) if len(around) else (-np.ones(3), np.ones(3))
     centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2 or 1.0
     # Before there is a surface, z need not be up: photographers mostly hold the camera level.
     up = -np.sum([turn[1] for turn in rotations], axis=0) if mesh is None and photos else np.array([0.0, 0.0, 1.0])
     hidden = {"reconstruction": "trust"} | ({"trust": "surface"} if trust else {})
     tabs = [
         rrb.Spatial3DView(
-            origin=WORLD, name=name, eye_controls=_around(centre, radius, up).controls(), line_grid=False,
+            origin=WORLD, name=name, eye_controls=_controls(eye_around(centre, radius, up)), line_grid=False,
             contents=["+ $origin/**", f"- $origin/{other}/**"],
         )
         for name, other in hidden.items()
@@ -242,32 +233,19 @@ def save_reconstruction(
         stream.log(entity, _shaded(rr, surface, (200, 190, 175)), static=True)
     for photo, turn, centre_of in zip(photos, rotations, centres, strict=True):
         entity = f"{WORLD}/cameras/{rr.escape_entity_path_part(photo.name)}"
-        pose = rr.Transform3D(translation=centre_of, mat3x3=turn.T)
-        stream.log(entity, pose, static=True)
+        stream.log(entity, rr.Transform3D(translation=centre_of, mat3x3=turn.T), static=True)
         shrink = min(1.0, _PHOTO_PIXELS / max(photo.size))
-        size = [max(1, round(s * shrink)) for s in photo.size]
         pinhole = rr.Pinhole(
             focal_length=photo.focal * shrink,
             principal_point=np.array(photo.principal) * shrink,
-            resolution=size,
+            resolution=[max(1, round(s * shrink)) for s in photo.size],
             image_plane_distance=0.1 * radius,
             color=photo.color,
         )
         stream.log(entity, pinhole, static=True)
         if photo.image is not None and photo.image.exists():
-            stream.log(entity, rr.Image(_thumbnail(photo.image, size)).compress(jpeg_quality=80), static=True)
-    _write(path, encoded)
-
-
-def _thumbnail(path: Path, size: list[int]) -> np.ndarray:
-    from PIL import Image
-
-    with Image.open(path) as image:
-        return np.asarray(image.convert("RGB").resize((size[0], size[1]), Image.Resampling.BILINEAR))
-
-
-def _write(path: Path, encoded: Any) -> None:
-    """All bytes of a rerun binary stream into `path`. We write them, since rerun's own sink only logs a full disk."""
+            image = rr.Image(_reduced(Image.open(photo.image), _PHOTO_PIXELS))
+            stream.log(entity, image.compress(jpeg_quality=80), static=True)
     write_bytes(path, encoded.read() or b"")
 
 
@@ -279,33 +257,14 @@ class Eye:
     target: np.ndarray  # [3] m, the point in the middle
     up: np.ndarray  # [3] unit vector
 
-    def controls(self) -> rrb.EyeControls3D:
-        """As the viewer takes it."""
-        import rerun.blueprint as rrb
 
-        return rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital, position=self.position, look_target=self.target, eye_up=self.up
-        )
+def _controls(eye: Eye) -> rrb.EyeControls3D:
+    import rerun.blueprint as rrb
+
+    return rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=eye.position, look_target=eye.target, eye_up=eye.up)
 
 
-def eye_of(
-    scene: Scene, motion: Rollout | None = None, camera: Place | None = None, look_at: Place | None = None
-) -> Eye:
-    """From where a scene is looked at; of the eye and what it looks at, [3] m each, what is not given is chosen so that
-    all of the scene is in sight. Raises SdfsimError where the eye is where it looks at, or not at a finite place."""
-    centre, radius = framed(scene, motion)
-    given = _around(centre if look_at is None else np.array(look_at, dtype=float), radius, -scene.gravity)
-    eye = given if camera is None else replace(given, position=np.array(camera, dtype=float))
-    sight = eye.target - eye.position
-    if not np.isfinite(sight).all() or np.linalg.norm(sight) < 1e-9:
-        raise SdfsimError("--camera and --look-at: must be two different points")
-    if np.linalg.norm(np.cross(sight, eye.up)) < 1e-3 * np.linalg.norm(sight):  # straight down, up has no place there
-        aside = np.cross(eye.up, eye.up[[1, 2, 0]] + [0.1, 0.2, 0.3])
-        eye = replace(eye, position=eye.position + 1e-3 * np.linalg.norm(sight) * aside)
-    return eye
-
-
-def _around(centre: np.ndarray, radius: float, up: np.ndarray) -> Eye:
+def eye_around(centre: np.ndarray, radius: float, up: np.ndarray) -> Eye:
     """An eye from which a ball is in sight."""
     length = np.linalg.norm(up)
     up = up / length if length > 0 else np.array([0.0, 0.0, 1.0])
@@ -317,8 +276,14 @@ def _around(centre: np.ndarray, radius: float, up: np.ndarray) -> Eye:
 
 def body_colors(scene: Scene) -> list[tuple[int, ...]]:
     """An RGB colour (0 to 255) for every body: grey where it stays put, else one of `HUES`, in turn."""
-    hues = cycle(distinct_colors(HUES))
+    hues = map(_color, cycle(range(HUES)))
     return [STATIC_COLOR if body.motion == "static" else next(hues) for body in scene.bodies]
+
+
+def _color(number: int) -> tuple[int, ...]:
+    """RGB (0 to 255), the hues of one number and the next a golden angle apart."""
+    rgb = colorsys.hsv_to_rgb((0.58 + number * 0.61803398875) % 1.0, 0.62, 0.9 if number % 2 == 0 else 0.75)
+    return tuple(round(255 * c) for c in rgb)
 
 
 def framed(scene: Scene, motion: Rollout | None = None) -> tuple[np.ndarray, float]:
@@ -332,7 +297,7 @@ def framed(scene: Scene, motion: Rollout | None = None) -> tuple[np.ndarray, flo
     planes = []
     for k, body in enumerate(scene.bodies):
         shape = scene.shapes[body.shape]
-        if not np.all(np.isfinite(shape.sdf.bounds)):
+        if is_infinite(shape):
             planes.append((body.position, _turned(np.array([0.0, 0.0, 1.0]), body.quat_xyzw)))
         elif len(shape.mesh.vertices):
             box = np.stack([shape.mesh.vertices.min(0), shape.mesh.vertices.max(0)]) * body.scale
@@ -369,31 +334,29 @@ def _shaded(rr: Any, mesh: Mesh, color: tuple[int, ...]) -> rr.Mesh3D:
         vertex_normals=normals,
         vertex_colors=mesh.colors,
         vertex_texcoords=mesh.uv,
-        albedo_texture=None if mesh.texture is None else _reduced(mesh.texture),
+        albedo_texture=None if mesh.texture is None else _reduced(Image.fromarray(mesh.texture), _TEXTURE_PIXELS),
         albedo_factor=color if mesh.colors is None and mesh.texture is None else None,
     )
 
 
-def _reduced(texture: np.ndarray) -> np.ndarray:
-    """A texture [H, W, 3] small enough for a recording, which holds every pixel of it."""
-    from PIL import Image
-
-    image = Image.fromarray(texture)
-    image.thumbnail((_TEXTURE_PIXELS, _TEXTURE_PIXELS))
+def _reduced(image: Image.Image, longest: int) -> np.ndarray:
+    """Pixels [H, W, 3] small enough for a recording, which holds every one of them."""
+    image = image.convert("RGB")
+    image.thumbnail((longest, longest))
     return np.asarray(image)
 
 
-def sheet(half: float) -> Mesh:
-    """A square of z = 0, `half` m to each side, shown for an infinite plane."""
-    vertices = np.array([[-half, -half, 0.0], [half, -half, 0.0], [half, half, 0.0], [-half, half, 0.0]])
-    return Mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]]))
+def is_infinite(shape: Shape) -> bool:
+    """Whether it is a plane."""
+    return not np.isfinite(shape.sdf.bounds).all()
 
 
-def distinct_colors(count: int) -> Iterator[tuple[int, ...]]:
-    """`count` RGB colours (0 to 255) whose hues are a golden angle from each other."""
-    for i in range(count):
-        rgb = colorsys.hsv_to_rgb((0.58 + i * 0.61803398875) % 1.0, 0.62, 0.9 if i % 2 == 0 else 0.75)
-        yield tuple(round(255 * c) for c in rgb)
+def shown(shape: Shape, half: float) -> Mesh:
+    """The mesh that is shown at scale 1; of a plane a square, `half` m to each side."""
+    if not is_infinite(shape):
+        return shape.shown
+    corners = np.array([[-half, -half, 0.0], [half, -half, 0.0], [half, half, 0.0], [-half, half, 0.0]])
+    return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
 
 
 def with_normals(mesh: Mesh) -> tuple[Mesh, np.ndarray]:

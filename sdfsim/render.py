@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,7 @@ from sdfsim.dynamics.rollout import Rollout
 from sdfsim.errors import SdfsimError
 from sdfsim.files import replacing
 from sdfsim.parallel import Progress, silent
-from sdfsim.recording import Eye, Place, body_colors, eye_of, framed, sheet, with_normals
+from sdfsim.recording import Eye, body_colors, eye_around, framed, is_infinite, shown, with_normals
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.bvh import Caster
 from sdfsim.shape.mesh import Mesh
@@ -23,15 +23,16 @@ from sdfsim.shape.mesh import Mesh
 if TYPE_CHECKING:
     from sdfsim.scene import written
 
+Place = Sequence[float] | np.ndarray
+_Model = tuple[Mesh, np.ndarray]  # what is drawn of a body about its centre of mass, with normals [V, 3]
 SIZE = (960, 540)  # px, width and height
 FRAMES = 30  # a second
 FORMATS = (".mp4", ".png")
 _TALL = np.tan(np.radians(20.0))  # half of the field of view's height, at distance 1
 _SUN = np.array([0.35, -0.5, 0.8]) / np.linalg.norm([0.35, -0.5, 0.8])  # in a frame whose z is up
-_SKY, _SHADE = np.array([236.0, 240.0, 245.0]), 0.45  # what nothing is in front of; light where the sun does not shine
+_SKY = np.array([236.0, 240.0, 245.0], np.float32)  # what nothing is in front of
+_SHADE = 0.45  # light where the sun does not shine
 _SUB = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]])  # px, where edges are looked at again
-# Columns of a layer: distance m, body, colours in the sun and in the shade, the ray to the sun, whether it is blocked.
-_AWAY, _BODY, _LIT, _SHADOWED, _SHADOW, _DARK = 0, 1, slice(2, 5), slice(5, 8), slice(8, 14), 14
 _GRID = np.stack(np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5), -1).reshape(-1, 2)  # px
 
 
@@ -66,6 +67,23 @@ def render(
     write_movie(out, pictures())
 
 
+def eye_of(
+    scene: Scene, motion: Rollout | None = None, camera: Place | None = None, look_at: Place | None = None
+) -> Eye:
+    """From where a scene is looked at; of the eye and what it looks at, [3] m each, what is not given is chosen so that
+    all of the scene is in sight. Raises SdfsimError where the eye is where it looks at, or not at a finite place."""
+    centre, radius = framed(scene, motion)
+    given = eye_around(centre if look_at is None else np.array(look_at, dtype=float), radius, -scene.gravity)
+    eye = given if camera is None else replace(given, position=np.array(camera, dtype=float))
+    sight = eye.target - eye.position
+    if not np.isfinite(sight).all() or np.linalg.norm(sight) < 1e-9:
+        raise SdfsimError("--camera and --look-at: must be two different points")
+    if np.linalg.norm(np.cross(sight, eye.up)) < 1e-3 * np.linalg.norm(sight):  # straight down, up has no place there
+        aside = np.cross(eye.up, eye.up[[1, 2, 0]] + [0.1, 0.2, 0.3])
+        eye = replace(eye, position=eye.position + 1e-3 * np.linalg.norm(sight) * aside)
+    return eye
+
+
 def check_format(out: Path) -> None:
     """Raises SdfsimError where the ending of a file says neither movie nor picture."""
     if out.suffix not in FORMATS:
@@ -97,45 +115,35 @@ def poses_at(rollout: Rollout, time: float) -> tuple[np.ndarray, np.ndarray]:
     return place, turned / np.linalg.norm(turned, axis=-1, keepdims=True)
 
 
-@dataclass(frozen=True)
-class _Model:
-    """What is drawn of a body, about its centre of mass: vertices and normals [V, 3], faces [F, 3], colours [V, 3], or
-    places [V, 2] in a texture [H, W, 3]."""
-
-    vertices: np.ndarray
-    normals: np.ndarray
-    faces: np.ndarray
-    colors: np.ndarray
-    uv: np.ndarray | None = None
-    texture: np.ndarray | None = None
-
-
 class _Cast:
-    """The triangles of some bodies, numbers [B] in the scene, at places [B, 3] m and turns [B, 3, 3]; `body` [F] is
-    which one a face is of."""
+    """The triangles of all bodies, each a mesh about its centre of mass with normals [V, 3], at places [N, 3] m and
+    turns [N, 3, 3]; `body` [F] is which one a face is of."""
 
-    def __init__(self, models: list[_Model], bodies: np.ndarray, places: np.ndarray, turns: np.ndarray) -> None:
-        starts = np.cumsum([0, *(len(m.vertices) for m in models)])
-        vertices = np.concatenate([m.vertices @ r.T + t for m, r, t in zip(models, turns, places, strict=True)])
-        self._normals = np.concatenate([m.normals @ r.T for m, r in zip(models, turns, strict=True)])
-        self._colors = np.concatenate([m.colors for m in models])
-        self._faces = np.concatenate([m.faces + start for m, start in zip(models, starts, strict=False)])
-        self._textured = [(k, m.uv, m.texture, start) for k, m, start in zip(bodies, models, starts, strict=False)]
-        self.body = np.repeat(bodies, [len(m.faces) for m in models])
+    def __init__(self, models: list[_Model], places: np.ndarray, turns: np.ndarray) -> None:
+        self._meshes = [mesh for mesh, _ in models]
+        self._starts = np.cumsum([0, *(len(m.vertices) for m in self._meshes)])
+        vertices = np.concatenate([m.vertices @ r.T + t for m, r, t in zip(self._meshes, turns, places, strict=True)])
+        normals = [normals @ r.T for (_, normals), r in zip(models, turns, strict=True)]
+        self._normals = np.concatenate(normals, dtype=np.float32)
+        self._colors = np.concatenate([np.asarray(m.colors, dtype=np.float32) for m in self._meshes])
+        self._faces = np.concatenate([m.faces + start for m, start in zip(self._meshes, self._starts, strict=False)])
+        self.body = np.repeat(np.arange(len(models)), [len(m.faces) for m in self._meshes])
         self.caster = Caster(Mesh(vertices, self._faces))
 
     def surface(self, face: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Normals [R, 3] and colours [R, 3] at places of faces."""
-        share = np.stack([1.0 - uv.sum(-1), uv[:, 0], uv[:, 1]], -1)[..., None]
+        share = np.stack([1.0 - uv[:, 0] - uv[:, 1], uv[:, 0], uv[:, 1]], -1)
         corners = self._faces[face]
-        normal, color = (self._normals[corners] * share).sum(1), (self._colors[corners] * share).sum(1)
-        for body, places, texture, start in self._textured:
-            if places is not None and texture is not None:
+        normal, color = (np.einsum("rk,rkc->rc", share, of[corners]) for of in (self._normals, self._colors))
+        for body, mesh in enumerate(self._meshes):
+            if mesh.uv is not None and mesh.texture is not None:
                 on = np.flatnonzero(self.body[face] == body)
-                at = (places[corners[on] - start] * share[on]).sum(1) * texture.shape[1::-1]
-                column, row = np.clip(at, 0, np.array(texture.shape[1::-1]) - 1).astype(int).T
-                color[on] = texture[row, column]
-        return normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9), color
+                size = np.array(mesh.texture.shape[1::-1])
+                at = np.einsum("rk,rkc->rc", share[on], mesh.uv[corners[on] - self._starts[body]]) * size
+                column, row = np.clip(at, 0, size - 1).astype(int).T
+                color[on] = mesh.texture[row, column]
+        length = np.sqrt(np.einsum("rc,rc->r", normal, normal))
+        return normal / np.maximum(length, 1e-9)[:, None], color
 
 
 class Studio:
@@ -145,39 +153,25 @@ class Studio:
     def __init__(self, scene: Scene, eye: Eye, radius: float) -> None:
         self._eye, self._radius = eye, radius
         shapes = [scene.shapes[b.shape] for b in scene.bodies]
-        self._floors = np.array([not np.isfinite(shape.sdf.bounds).all() for shape in shapes])
-        self._models = []
-        for body, shape, floor, color in zip(scene.bodies, shapes, self._floors, body_colors(scene), strict=True):
-            mesh, normals = with_normals(sheet(40.0 * radius) if floor else shape.shown)
+        self._floors = np.array([is_infinite(shape) for shape in shapes])
+        self._models: list[_Model] = []
+        for body, shape, color in zip(scene.bodies, shapes, body_colors(scene), strict=True):
+            mesh, normals = with_normals(shown(shape, 40.0 * radius))
             colors = np.broadcast_to(color, mesh.vertices.shape) if mesh.colors is None else mesh.colors
             vertices = body.scale * (mesh.vertices - shape.com)
-            self._models.append(_Model(vertices, normals, mesh.faces, colors.astype(float), mesh.uv, mesh.texture))
+            self._models.append((replace(mesh, vertices=vertices, colors=colors), normals))
         forward = (eye.target - eye.position) / np.linalg.norm(eye.target - eye.position)
         right = np.cross(forward, eye.up)
         right /= np.linalg.norm(right)
         self.axes = np.stack([right, np.cross(forward, right), forward])
         self.sun = _SUN @ np.stack([right, np.cross(eye.up, right), eye.up])
-        self._moves = np.array([b.motion != "static" for b in scene.bodies])
-        still = [
-            b.position + Rotation.from_quat(b.quat_xyzw).apply(b.scale * s.com)
-            for b, s in zip(scene.bodies, shapes, strict=True)
-        ]
-        self._still = self._cast(~self._moves, np.array(still), np.array([b.quat_xyzw for b in scene.bodies]))
         self._through = self._rays(_GRID)
-        self._stands = self._layer(self._still, self._through)  # the same in every picture
-
-    def _cast(self, which: np.ndarray, position: np.ndarray, orientation: np.ndarray) -> _Cast | None:
-        bodies = np.flatnonzero(which)
-        turns = Rotation.from_quat(orientation).as_matrix()
-        return (
-            _Cast([self._models[k] for k in bodies], bodies, position[bodies], turns[bodies]) if len(bodies) else None
-        )
 
     def picture(self, position: np.ndarray, orientation: np.ndarray) -> np.ndarray:
         """[H, W, 3] uint8 of bodies with these centres of mass [N, 3] m and orientations [N, 4]."""
-        moving = self._cast(self._moves, position, orientation)
+        cast = _Cast(self._models, position, Rotation.from_quat(orientation).as_matrix())
         wide, tall = SIZE
-        pixels, label = self._look(moving, self._through, self._stands)
+        pixels, label = self._look(cast, self._through)
         pixels, label = pixels.reshape(tall, wide, 3), label.reshape(tall, wide)
         edge = np.zeros((tall, wide), bool)
         for axis in (0, 1):
@@ -185,8 +179,7 @@ class Studio:
             edge[: tall - (axis == 0), : wide - (axis == 1)] |= differs
             edge[axis == 0 :, axis == 1 :] |= differs
         if edge.any():
-            rays = self._rays((_GRID[edge.reshape(-1)][:, None] + _SUB).reshape(-1, 2))
-            again, _ = self._look(moving, rays, self._layer(self._still, rays))
+            again, _ = self._look(cast, self._rays((_GRID[edge.reshape(-1)][:, None] + _SUB).reshape(-1, 2)))
             pixels[edge] = again.reshape(-1, len(_SUB), 3).mean(1)
         return np.clip(pixels + 0.5, 0, 255).astype(np.uint8)
 
@@ -197,44 +190,27 @@ class Studio:
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         return np.concatenate([np.broadcast_to(self._eye.position, direction.shape), direction], 1, dtype=np.float32)
 
-    def _look(self, moving: _Cast | None, rays: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Colours [R, 3] along rays [R, 6], and numbers [R] by which bodies, light and shade differ. `seen` is the
-        layer of what stands still."""
-        if moving is not None:
-            layer = self._layer(moving, rays)
-            seen = np.where((layer[:, _AWAY] < seen[:, _AWAY])[:, None], layer, seen)
-        dark = seen[:, _DARK] > 0.0
-        if moving is not None:
-            light = np.flatnonzero(~dark)
-            dark[light] = moving.caster.anything(seen[light, _SHADOW])
-        return np.where(dark[:, None], seen[:, _SHADOWED], seen[:, _LIT]), 2 * seen[:, _BODY] + dark
-
-    def _layer(self, cast: _Cast | None, rays: np.ndarray) -> np.ndarray:
-        """[R, 15] float32: what rays [R, 6] see of some bodies; columns as above."""
-        layer = np.zeros((len(rays), 15), np.float32)
-        layer[:, _AWAY], layer[:, _BODY], layer[:, _DARK] = np.inf, -1, 1.0
-        layer[:, _LIT] = layer[:, _SHADOWED] = _SKY
-        if cast is None:
-            return layer
+    def _look(self, cast: _Cast, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Colours [R, 3] along rays [R, 6], and numbers [R] by which bodies, light and shade differ."""
         away, face, uv = cast.caster.cast(rays)
         there = np.flatnonzero(np.isfinite(away))
-        away, face, body, direction = away[there, None], face[there], cast.body[face[there]], rays[there, 3:]
+        away, face, direction = away[there, None], face[there], rays[there, 3:]
+        body = cast.body[face]
         normal, color = cast.surface(face, uv[there])
-        facing = np.where((normal * direction).sum(-1, keepdims=True) > 0.0, -normal, normal)
-        point, toward = rays[there, :3] + away * direction, facing @ self.sun
+        facing = np.where(np.einsum("rc,rc->r", normal, direction)[:, None] > 0.0, -normal, normal)
+        point, toward = rays[there, :3] + away * direction, facing @ self.sun.astype(np.float32)
         # Infinite planes are checked, so that motion over them is seen.
-        square = np.floor(point / 10.0 ** np.floor(np.log10(self._radius)) + 1e-4).sum(1)
-        color[self._floors[body] & (square % 2 != 0)] *= 0.93
-        # Far away the floor goes over into the sky.
-        clear = 2.0 * (self._radius + np.linalg.norm(self._eye.target - self._eye.position))
-        fog = np.clip((away / clear - 1.0) / 2.0, 0.0, 1.0)
-        shade = _SHADE + 0.1 * (facing @ self._eye.up)
-        for part, light in ((_SHADOWED, shade), (_LIT, shade + (1.0 - _SHADE) * toward)):
-            layer[there, part] = (1.0 - fog) * np.clip(light, 0.0, 1.1)[:, None] * color + fog * _SKY
+        floor = np.flatnonzero(self._floors[body])
+        square = np.floor(point[floor] / 10.0 ** np.floor(np.log10(self._radius)) + 1e-4).sum(1)
+        color[floor[square % 2 != 0]] *= 0.93
         start = point + 1e-3 * self._radius * facing
-        layer[there, _SHADOW] = np.concatenate([start, np.broadcast_to(self.sun, start.shape)], 1)
-        dark = toward <= 0.0
-        if self._still:
-            dark |= self._still.caster.anything(layer[there, _SHADOW])
-        layer[there, _AWAY], layer[there, _BODY], layer[there, _DARK] = away[:, 0], body, dark
-        return layer
+        to_sun = np.concatenate([start, np.broadcast_to(self.sun, start.shape)], 1, dtype=np.float32)
+        dark = (toward <= 0.0) | cast.caster.anything(to_sun)
+        light = _SHADE + 0.1 * (facing @ self._eye.up.astype(np.float32)) + np.where(dark, 0.0, (1.0 - _SHADE) * toward)
+        # Far away the floor goes over into the sky.
+        clear = 2.0 * (self._radius + float(np.linalg.norm(self._eye.target - self._eye.position)))
+        fog = np.clip((away / clear - 1.0) / 2.0, 0.0, 1.0)
+        pixels, label = np.tile(_SKY, (len(rays), 1)), np.full(len(rays), -1)
+        pixels[there] = (1.0 - fog) * np.clip(light, 0.0, 1.1)[:, None] * color + fog * _SKY
+        label[there] = 2 * body + dark
+        return pixels, label

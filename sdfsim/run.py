@@ -14,10 +14,9 @@ import numpy as np
 import torch
 import yaml
 
-from sdfsim.console import columns
+from sdfsim.console import columns, plain
 from sdfsim.dynamics.bodies import State, Touch, largest_extent
-from sdfsim.dynamics.model import Model, load_model
-from sdfsim.dynamics.rest import Rest
+from sdfsim.dynamics.model import load_model
 from sdfsim.dynamics.rollout import Rollout, energy_from_nothing
 from sdfsim.dynamics.run_memory import COUNTS, PHASES
 from sdfsim.dynamics.simulator import SimulationError, Simulator, check_seconds, join, pick_device
@@ -36,15 +35,16 @@ from sdfsim.files import (
     write_text,
 )
 from sdfsim.parallel import Progress, StageProgress, silent
-from sdfsim.recording import Place, Playback, eye_of, framed, save_rollout
+from sdfsim.recording import Playback, framed, save_rollout
 from sdfsim.scene.scene import Scene
 from sdfsim.scene.scene_file import load_scene
+from sdfsim.viewer import check_screen, stream_to_viewer
 
 Viewer = Literal["none", "file", "native", "web"]
-CHECKPOINT = "checkpoint"  # folder in that of the run
 EVERY = 30.0  # s between two checkpoints
-TOLD = 12  # bodies that are told of one by one at the end
-STILL = 0.01  # see `ended`
+SETTLED = 25  # steps for which everything has to rest
+STILL = 0.01  # see `resting`
+TOLD = 12  # bodies, up to which each has a line at the end
 FAR = 10.0  # times the size of the scene: who is farther away in the end has left it
 ODD = 0.01  # energy from nothing in a step, as a part of what is in play, that is told
 _REPORT = "report.json"
@@ -65,22 +65,17 @@ def simulate(
     device: str,
     on_progress: StageProgress,
     say: Callable[[str], None],
-    bind: str = "127.0.0.1",
     allow_outside: bool = False,
     until_settled: bool = False,
     resume: bool = False,
-    camera: Place | None = None,
-    look_at: Place | None = None,
 ) -> dict[str, Any]:
     """Simulate a scene and write config.yaml, report.json, rollout.npz and (unless `viewer` is none) rollout.rrd; an
     earlier run in `out` is replaced. Returns the report; of the shapes that were fitted for this scene, `failed_checks`
     names those that are not usable, and `caveats` those that are not exact.
 
-    What is None is as the scene says: model, `seconds` of simulated time, seed; and the first view of the recording,
-    from `camera` [3] m to `look_at` [3] m, has all of the motion in sight. `until_settled` ends the run as soon as
+    What is None is as the scene says: model, `seconds` of simulated time, seed. `until_settled` ends the run as soon as
     everything rests. `resume` goes on with the run in `out` that was interrupted, from the start where there is none; a
-    finished one is left as it is, and its report is returned. `say` is called with lines for the person; live viewers
-    listen on `bind`.
+    finished one is left as it is, and its report is returned. `say` is called with lines for the person.
 
     Raises SdfsimError for bad input, an output that cannot be written, another run that writes to the same folder, or a
     finished run to resume that is another one than this; SimulationError where the state broke, and KeyboardInterrupt:
@@ -94,18 +89,15 @@ def simulate(
         load_model(model, weights=False)
     check_writable(out)
     check_own(out, "simulate", *_RESULTS)
-    if viewer in ("native", "web"):
-        from sdfsim.viewer import check_screen
-
-        check_screen(viewer)
+    check_screen(viewer)
     scene = load_scene(scene_file, partial(on_progress, "shapes"), allow_outside=allow_outside)
-    eye_of(scene, None, camera, look_at)
     simulator = Simulator(scene, model=model, device=device, seed=seed)
     length = scene.duration if seconds is None else seconds
+    asked = model or scene.model or ""
     config = {
         "command": "simulate",
         "scene": str(scene_file.resolve()),
-        "model": _repeatable(model or scene.model, simulator.model),
+        "model": str(Path(asked).resolve()) if asked.endswith(".safetensors") else simulator.model.name,
         "seconds": float(length),
         "seed": int(simulator.seed),
         "viewer": viewer,
@@ -115,14 +107,14 @@ def simulate(
     }
     out.mkdir(parents=True, exist_ok=True)
     with locked(out):
-        kept = Checkpoint(out, simulator)
+        kept = Checkpoint(out / "checkpoint", simulator)
         steps = simulator.steps_in(length)
         if resume and (done := finished(out / _REPORT, kept.identity, steps, until_settled=until_settled)):
             kept.clear()  # where it was killed between its last file and its end
             say(f"{out}: finished already")
             return done
         frames = kept.restore() if resume else []
-        if not frames and any((out / name).exists() for name in (*_RESULTS, CHECKPOINT)):
+        if not frames and any((out / name).exists() for name in _RESULTS):
             say(f"replaced the earlier run in {out}")
         for name in _RESULTS:
             (out / name).unlink(missing_ok=True)
@@ -131,20 +123,30 @@ def simulate(
             frames = [simulator.initial_rollout()]
             kept.add(frames[0])
         write_text(out / CONFIG, yaml.safe_dump(config, sort_keys=False))
-        live = _live(Playback(scene, None, camera, look_at), viewer, join(frames), say, bind)
+        live = Playback(scene) if viewer in ("native", "web") else None
+        if live:
+            if address := stream_to_viewer(live, viewer):
+                say(f"watch it at {address}")
+            live.log_static()
+            live.log_steps(join(frames))
 
         started, broken = time.monotonic(), None
-        settled = until_settled and kept.rest.settled  # already, where it was killed between its last step and the end
-        left = 0 if settled else steps - simulator.steps_done
+        still = [row.all() for row in resting(scene, join(frames))]  # by frame, whether everything rests
+
+        def settled() -> bool:
+            return until_settled and len(still) > SETTLED and all(still[-SETTLED - 1 :])
+
         try:
-            for frame in simulator.frames(left):
+            for frame in simulator.frames(0 if settled() else steps - simulator.steps_done):
                 frames.append(frame)
                 kept.add(frame)
                 if live:
                     live.log_steps(frame)
                 now = float(frame.time[-1])
                 on_progress("simulate", now / length, f"{now:.2f} of {length:g} s simulated")
-                if settled := until_settled and kept.rest.settled:
+                if until_settled:
+                    still += [row.all() for row in resting(scene, frame)]
+                if settled():
                     break
         except (SimulationError, KeyboardInterrupt) as error:
             broken = error
@@ -152,21 +154,22 @@ def simulate(
         rollout = join(frames)
         on_progress("simulate", 1.0, f"{len(rollout)} steps" + (" (stopped early)" if broken else ""))
 
-        report = summary(rollout, time.monotonic() - started)
-        report["ended"] = ended(scene, rollout)
-        report["status"] = "done" if broken is None else "failed" if isinstance(broken, SdfsimError) else "interrupted"
-        report["folder"] = str(out)
-        report["identity"] = kept.identity
-        report["failed_checks"] = [f"fit of shape {told}" for told in scene.missed]
-        report["caveats"] = [f"fit of shape {told}" for told in scene.caveats]
+        report = summary(scene, rollout, time.monotonic() - started) | {
+            "status": "done" if broken is None else "failed" if isinstance(broken, SdfsimError) else "interrupted",
+            "folder": out,
+            "identity": kept.identity,
+            "failed_checks": [f"fit of shape {told}" for told in scene.missed],
+            "caveats": [f"fit of shape {told}" for told in scene.caveats],
+        }
         if until_settled:
-            report["settled"] = settled
+            report["settled"] = settled()
         if isinstance(broken, SdfsimError):
             report["error"] = broken.message
         rollout.save(out / "rollout.npz")
         if viewer != "none":
-            save_rollout(scene, rollout, out / "rollout.rrd", camera, look_at)
-            report["recording"] = str(out / "rollout.rrd")
+            save_rollout(scene, rollout, out / "rollout.rrd")
+            report["recording"] = out / "rollout.rrd"
+        report = plain(report)
         write_json(out / _REPORT, report)
         if not isinstance(broken, KeyboardInterrupt):
             kept.clear()
@@ -177,23 +180,6 @@ def simulate(
         return report
 
 
-def _repeatable(asked: str | None, model: Model) -> str:
-    """The model as it can be asked for again, from whatever folder."""
-    return str(Path(asked).resolve()) if asked and asked.endswith(".safetensors") else model.name
-
-
-def _live(live: Playback, viewer: Viewer, first: Rollout, say: Callable[[str], None], bind: str) -> Playback | None:
-    if viewer not in ("native", "web"):
-        return None
-    from sdfsim.viewer import stream_to_viewer
-
-    if address := stream_to_viewer(live, viewer, bind=bind):
-        say(f"watch it at {address}")
-    live.log_static()
-    live.log_steps(first)
-    return live
-
-
 def read_run(
     path: Path, scene_file: Path | None = None, *, allow_outside: bool = False, on_progress: Progress = silent
 ) -> tuple[Scene, Rollout]:
@@ -201,163 +187,118 @@ def read_run(
     made from. Raises SdfsimError for no run, no scene, or another scene than that of the run."""
     file = path / "rollout.npz" if path.is_dir() else path
     rollout = Rollout.load(file)
-    scene = load_scene(scene_file or scene_of(file.parent), on_progress, allow_outside=allow_outside)
+    if scene_file is None:
+        try:
+            scene_file = Path(yaml.safe_load((file.parent / CONFIG).read_text(encoding="utf-8"))["scene"])
+        except (OSError, ValueError, yaml.YAMLError, KeyError, TypeError) as error:
+            told = f"{file.parent}: not the folder of a simulation ({error})"
+            raise SdfsimError(told, "give its scene: --scene") from error
+    scene = load_scene(scene_file, on_progress, allow_outside=allow_outside)
     if tuple(body.name for body in scene.bodies) != rollout.names:
         raise SdfsimError(f"{file}: its bodies are not those of {scene.path}", "give its scene: --scene")
     return scene, rollout
 
 
-def scene_of(folder: Path) -> Path:
-    """The scene file of a run folder. Raises SdfsimError where there is none."""
-    try:
-        config = yaml.safe_load((folder / CONFIG).read_text(encoding="utf-8"))
-        return Path(config["scene"])
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError) as error:
-        raise SdfsimError(f"{folder}: not the folder of a simulation ({error})", "give its scene: --scene") from error
-
-
-def summary(rollout: Rollout, wall: float) -> dict[str, Any]:
-    """The numbers of a run that a person looks at first; None for one that is not finite."""
-    counters = rollout.counters
-    energy = counters["kinetic_energy"]
-    taken = counters["step_ms"][1:]
-    return {
-        "model": rollout.meta.get("model"),
-        "steps": len(rollout),
-        "dt_s": _number(rollout.meta["dt"]),
-        "simulated_s": _number(rollout.time[-1]),
-        "wall_s": round(wall, 3),
-        "step_ms_median": _number(np.median(taken)) if len(taken) else None,
-        "contacts_mean": _number(counters["contacts"].mean()),
-        "worst_penetration_m": _number(counters["worst_penetration"].max()),
-        "kinetic_energy_J": [_number(energy[0]), _number(energy[-1])],
-        "energy_from_nothing": energy_from_nothing(rollout),
-        "outside_training": rollout.meta.get("outside_training", []),
-        "cost": cost(rollout),
-        "finite": bool(np.isfinite(rollout.position).all() and np.isfinite(rollout.orientation).all()),
-        "meta": rollout.meta,
-    }
-
-
-def ended(scene: Scene, rollout: Rollout) -> dict[str, Any]:
-    """Where the bodies that move by themselves are in the end.
-
-    `bodies`: of the first `TOLD` the name, the place of the centre of mass in m, the speed in m/s and whether they
-    rest, as `rest` do: they move by less than `STILL` of their size in the time that they take to fall that far.
-    `moving`: names of those that do not, the fastest first; `left`: of those that have left the scene for good.
-    `driven`: whether bodies on paths do work.
-    """
-    rows = [k for k, body in enumerate(scene.bodies) if body.motion == "dynamic"]
-    sizes = [scene.bodies[k].scale * largest_extent(scene.shapes[scene.bodies[k].shape]) for k in rows]
-    place, velocity, spin = (getattr(rollout, name)[-1, rows] for name in ("position", "velocity", "angular_velocity"))
-    size, speed = np.array(sizes), np.linalg.norm(velocity, axis=-1)
+def resting(scene: Scene, rollout: Rollout) -> np.ndarray:
+    """[T+1, D] bool: which of the D dynamic bodies rest. They move by less than `STILL` of their size in the time that
+    they take to fall that far."""
+    rows = _dynamic(scene)
+    extents = [largest_extent(shape) for shape in scene.shapes]
+    size = np.array([scene.bodies[k].scale * extents[scene.bodies[k].shape] for k in rows])
+    speed, spin = (np.linalg.norm(v[:, rows], axis=-1) for v in (rollout.velocity, rollout.angular_velocity))
     strength = float(np.linalg.norm(scene.gravity)) or EARTH
-    rests = speed + 0.5 * size * np.linalg.norm(spin, axis=-1) < STILL * np.sqrt(strength * size)
-    centre, radius = framed(scene)
+    return speed + 0.5 * size * spin < STILL * np.sqrt(strength * size)
+
+
+def _dynamic(scene: Scene) -> list[int]:
+    return [k for k, body in enumerate(scene.bodies) if body.motion == "dynamic"]
+
+
+def summary(scene: Scene, rollout: Rollout, wall: float) -> dict[str, Any]:
+    """The numbers of a run that a person looks at first. `cost` is what every counter and phase of the step took;
+    `ended` says where the bodies that move by themselves are in the end, and which of them `left` the scene for good;
+    `driven` is whether bodies on paths do work."""
+    counters = rollout.counters
+    rows, (centre, radius) = _dynamic(scene), framed(scene)
+    place, speed = rollout.position[-1, rows], np.linalg.norm(rollout.velocity[-1, rows], axis=-1)
     left = np.linalg.norm(place - centre, axis=-1) > FAR * radius
-    names = np.array([scene.bodies[k].name for k in rows], dtype=str)
-    faster = np.argsort(-speed, kind="stable")
+    told = zip(rows, place, speed, resting(scene, rollout)[-1], left, strict=True)
+    costs = {name: counters[name][1:] for name in (*COUNTS, *PHASES, "step_ms")}
     return {
-        "bodies": [
-            {
-                "name": str(names[k]),
-                "centre_m": place[k].tolist(),
-                "speed_m_s": _number(speed[k]),
-                "rests": bool(rests[k]),
-            }
-            for k in range(min(len(rows), TOLD))
+        "model": rollout.meta["model"],
+        "steps": len(rollout),
+        "dt_s": rollout.meta["dt"],
+        "simulated_s": float(rollout.time[-1]),
+        "wall_s": round(wall, 3),
+        "step_ms_median": float(np.median(counters["step_ms"][1:])) if len(rollout) else None,
+        "contacts_mean": float(counters["contacts"].mean()),
+        "worst_penetration_m": float(counters["worst_penetration"].max()),
+        "kinetic_energy_J": counters["kinetic_energy"][[0, -1]].tolist(),
+        "energy_from_nothing": energy_from_nothing(rollout),
+        "outside_training": rollout.meta["outside_training"],
+        "cost": {name: {"sum": v.sum(), "most": v.max()} for name, v in costs.items() if len(v)},
+        "finite": bool(np.isfinite(rollout.position).all() and np.isfinite(rollout.orientation).all()),
+        "ended": [
+            {"name": scene.bodies[k].name, "centre_m": at, "speed_m_s": fast, "rests": rests, "left": gone}
+            for k, at, fast, rests, gone in told
         ],
-        "count": len(rows),
-        "rest": int(rests.sum()),
-        "moving": [str(names[k]) for k in faster if not rests[k] and not left[k]],
-        "left": [str(names[k]) for k in faster if left[k]],
         "driven": any(body.motion == "kinematic" for body in scene.bodies),
+        "meta": rollout.meta,
     }
 
 
 def ending_lines(report: dict[str, Any]) -> list[str]:
     """Where bodies ended, which rest, and what was odd."""
-    end, lines = report["ended"], []
-    if end["count"] == len(end["bodies"]):
-        rows = []
-        for body in end["bodies"]:
-            place = ", ".join(f"{x:.3f}" for x in body["centre_m"])
-            how = "left the scene" if body["name"] in end["left"] else f"{body['speed_m_s'] or 0.0:.2g} m/s"
-            rows.append((f"  {body['name']}", f"({place}) m", "at rest" if body["rests"] else how))
-        lines += columns(rows) if rows else []
-    moving = end["count"] - end["rest"]
-    fastest = f", the fastest {', '.join(end['moving'][:3])}" if moving and end["moving"] else ""
-    lines.append(f"{end['rest']} of {end['count']} bodies rest" + (f"; {moving} move{fastest}" if moving else ""))
-    if end["left"]:
-        many = f" and {len(end['left']) - 3} more" if len(end["left"]) > 3 else ""
-        lines.append(f"left the scene: {', '.join(end['left'][:3])}{many}")
+    bodies, lines = report["ended"], []
+    if 0 < len(bodies) <= TOLD:
+        places = ["({:.3f}, {:.3f}, {:.3f}) m".format(*body["centre_m"]) for body in bodies]
+        moves = ["at rest" if body["rests"] else f"{body['speed_m_s']:.2g} m/s" for body in bodies]
+        lines += columns([(f"  {body['name']}", *rest) for body, *rest in zip(bodies, places, moves, strict=True)])
+    moving = [body["name"] for body in bodies if not body["rests"] and not body["left"]]
+    left = [body["name"] for body in bodies if body["left"]]
+    lines.append(f"{sum(body['rests'] for body in bodies)} of {len(bodies)} bodies rest")
+    for what, names in (("move", moving), ("left the scene", left)):
+        if names:
+            lines.append(f"{what}: {', '.join(names[:3])}" + (f" and {len(names) - 3} more" if len(names) > 3 else ""))
     made = report["energy_from_nothing"]
-    if made["worst"] > ODD and not end["driven"]:  # what is on a path does work
+    if made["worst"] > ODD and not report["driven"]:
         part = f"{100 * made['steps_above_1_percent']:.1f} % of the steps made more than 1 % of what was in play"
         lines.append(f"energy from nothing: {made['sum_J']:.3g} J; {part}, the worst {100 * made['worst']:.2g} %")
     return lines
 
 
-def cost(rollout: Rollout) -> dict[str, dict[str, Any]]:
-    """Sum and largest value over the steps of everything that was counted or timed."""
-    counted = {name: rollout.counters[name][1:] for name in (*COUNTS, *PHASES, "step_ms") if name in rollout.counters}
-    return {
-        name: {"sum": _number(v.sum()), "mean": _number(v.mean()), "most": _number(v.max())}
-        for name, v in counted.items()
-        if len(v)
-    }
-
-
-def cost_lines(report: dict[str, Any]) -> list[str]:
-    """What a run has cost, as one table: a row for each counter and each phase of the step."""
-    told = {**COUNTS, **{name: f"{what}, ms" for name, what in PHASES.items()}, "step_ms": "whole step, ms"}
-    rows = [("", "a step", "most", "together")]
-    for name, values in report["cost"].items():
-        mean, most, total = (f"{values[k]:,.1f}" for k in ("mean", "most", "sum"))
-        rows.append((told[name], mean, most, total))
-    return columns(rows)
-
-
-def _number(value: Any) -> float | None:
-    return float(value) if np.isfinite(value) else None
-
-
 class Checkpoint:
-    """What is kept of one run: its `identity`, its frames in parts, the state that the last part leads to, and for how
-    long everything has rested (`rest`)."""
+    """What is kept of one run in a folder: its `identity`, its frames in parts, and the state that the last part leads
+    to."""
 
     def __init__(self, folder: Path, simulator: Simulator) -> None:
-        self._folder = folder / CHECKPOINT
+        self._folder = folder
         self._simulator = simulator
         self.identity = identity(simulator)
-        self.rest = Rest()
-        self._fresh: list[tuple[Rollout, State, int, Rest]] = []  # one entry a step: an interruption splits none
+        self._fresh: list[tuple[Rollout, State, int]] = []  # one entry a step: an interruption splits none
         self._parts = 0
         self._saved = time.monotonic()
 
     def restore(self) -> list[Rollout]:
         """The frames so far, the simulator's state brought to the last of them; none where nothing was kept. Raises
         SdfsimError where that is of another scene, model or seed, or damaged."""
-        if not (self._folder / _STATE).exists():
+        file = self._folder / _STATE
+        if not file.exists():
             return []
-        kept = read_arrays(self._folder / _STATE, "a checkpoint", _ANEW)
-        simulator = self._simulator
+        kept = read_arrays(file, "a checkpoint", _ANEW)
         try:
             if str(kept["identity"]) != self.identity:
                 raise SdfsimError(f"{self._folder}: {_OTHER}", _ANEW)
             self._parts = int(kept["parts"])
-            simulator.state = _state(kept, simulator.device)
-            simulator.steps_done = int(kept["steps_done"])
-            self.rest = Rest(kept["rest.anchor"], int(kept["rest.quiet"]))
+            self._simulator.state = _state(kept, self._simulator.device)
+            self._simulator.steps_done = int(kept["steps_done"])
         except (KeyError, TypeError, ValueError) as error:
-            raise SdfsimError(f"{self._folder / _STATE}: not a checkpoint of this version ({error})", _ANEW) from error
-        return [Rollout.load(self._folder / _part(k)) for k in range(self._parts)]
+            raise SdfsimError(f"{file}: not a checkpoint of this version ({error})", _ANEW) from error
+        return [Rollout.load(self._part(k)) for k in range(self._parts)]
 
     def add(self, frame: Rollout) -> None:
         """Keep a frame and the state it tells of; on disk when the last time is long enough ago."""
-        simulator = self._simulator
-        self.rest = self.rest.after(simulator.bodies, simulator.state)
-        self._fresh.append((frame, simulator.state, simulator.steps_done, self.rest))
+        self._fresh.append((frame, self._simulator.state, self._simulator.steps_done))
         if time.monotonic() - self._saved > EVERY:
             self.save()
 
@@ -365,10 +306,10 @@ class Checkpoint:
         """Bring what is new to the disk; the state comes last, so that it never tells of a part that is not there."""
         if self._fresh:
             self._folder.mkdir(exist_ok=True)
-            _, state, steps, rest = self._fresh[-1]
-            join([frame for frame, *_ in self._fresh]).save(self._folder / _part(self._parts))
+            _, state, steps = self._fresh[-1]
+            join([frame for frame, *_ in self._fresh]).save(self._part(self._parts))
             done = {"identity": self.identity, "parts": self._parts + 1, "steps_done": steps}
-            write_arrays(self._folder / _STATE, {**done, **_arrays(state, rest)}, compressed=False)
+            write_arrays(self._folder / _STATE, done | _arrays(state), compressed=False)
             self._fresh = []  # not before: Ctrl-C amid this saves once more, and must write the same part again
             self._parts += 1
         self._saved = time.monotonic()
@@ -377,6 +318,9 @@ class Checkpoint:
         """Nothing is to be gone on with. The state goes first: parts that a kill leaves are nothing without it."""
         (self._folder / _STATE).unlink(missing_ok=True)
         shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _part(self, number: int) -> Path:
+        return self._folder / f"part_{number:04}.npz"
 
 
 def finished(report_file: Path, identity: str, steps: int, *, until_settled: bool) -> dict[str, Any] | None:
@@ -405,18 +349,13 @@ def identity(simulator: Simulator) -> str:
     return digest(s.dt, s.seed, replace(s.rules, rows=None), s.units, s.bodies, s.state, model)
 
 
-def _part(number: int) -> str:
-    return f"part_{number:04}.npz"
-
-
-def _arrays(state: State, rest: Rest) -> dict[str, np.ndarray]:
-    """Every array of a state, of who sleeps in it and of how long all has rested, by name."""
-    found = {"time": np.array(state.time), "rest.quiet": np.array(rest.quiet)}
-    for prefix, of in (("", state), ("touch.", state.touch), ("rest.", rest)):
-        for field in fields(of) if of is not None else ():
-            value = getattr(of, field.name)
-            if isinstance(value, torch.Tensor | np.ndarray):
-                found[prefix + field.name] = np.asarray(value.cpu() if isinstance(value, torch.Tensor) else value)
+def _arrays(state: State) -> dict[str, np.ndarray]:
+    """Every array of a state and of what touches in it, by name."""
+    found = {"time": np.array(state.time)}
+    for prefix, part in (("", state), ("touch.", state.touch)):
+        for name, value in vars(part).items() if part is not None else ():
+            if isinstance(value, torch.Tensor):
+                found[prefix + name] = value.cpu().numpy()
     return found
 
 

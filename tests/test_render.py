@@ -8,9 +8,9 @@ import pytest
 
 import sdfsim
 from sdfsim import Simulator
-from sdfsim.recording import eye_of, framed
-from sdfsim.render import FRAMES, SIZE, Studio, poses_at, render
-from sdfsim.run import ended, ending_lines, summary
+from sdfsim.recording import framed
+from sdfsim.render import FRAMES, SIZE, Studio, eye_of, poses_at, render
+from sdfsim.run import ending_lines, summary
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.mesh import Mesh
 from sdfsim.shape.shape import analytic_shape
@@ -114,9 +114,8 @@ def test_the_end_of_a_run_tells_who_rests_who_moves_and_who_is_gone():
     scene.add("ball", sphere={"radius": 0.05}, position=(0, 0.4, 0.06), friction=0.8, restitution=0.0)
     scene.add("lost", shape="ball", position=(0, -0.4, 0.2), collides_with=[], velocity=(0, 0, -5))
     scene = scene.load()
-    rollout = Simulator(scene).run()
-    end = ended(scene, rollout)
-    assert (end["count"], end["rest"], end["moving"], end["left"]) == (3, 1, ["ball"], ["lost"])
-    lines = ending_lines(summary(rollout, 1.0) | {"ended": end})
-    assert "at rest" in lines[0] and "m/s" in lines[1] and "left the scene" in lines[2]
-    assert lines[3] == "1 of 3 bodies rest; 2 move, the fastest ball" and lines[4] == "left the scene: lost"
+    report = summary(scene, Simulator(scene).run(), 1.0)
+    assert [(body["rests"], body["left"]) for body in report["ended"]] == [(True, False), (False, False), (False, True)]
+    lines = ending_lines(report)
+    assert "at rest" in lines[0] and "m/s" in lines[1] and "m/s" in lines[2]
+    assert lines[3:] == ["1 of 3 bodies rest", "move: ball", "left the scene: lost"]

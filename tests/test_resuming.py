@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from sdfsim import SdfsimError, Simulator, load_scene, run
-from sdfsim.dynamics.rest import STEPS
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.scene.scene import Scene, Waypoints
 from sdfsim.shape.sdf import sample_grid
@@ -149,7 +148,7 @@ def test_the_identity_of_a_run_is_all_that_decides_it(change):
     assert equal == (change is same)
 
 
-@pytest.mark.parametrize("after", [2, STEPS])
+@pytest.mark.parametrize("after", [2, run.SETTLED])
 def test_a_run_until_all_rests_ends_where_it_would_have_however_often_it_is_killed(tmp_path, monkeypatch, after):
     """One that is killed after its last step, before its results are written, makes no step more."""
     monkeypatch.setattr(run, "EVERY", 0.0)
@@ -163,7 +162,7 @@ def test_a_run_until_all_rests_ends_where_it_would_have_however_often_it_is_kill
         simulate(scene, tmp_path / "run", stop=(after - 0.5) / 100, kind=Killed, **options)
     whole = simulate(scene, tmp_path / "whole", **options)
     resumed = simulate(scene, tmp_path / "run", resume=True, **options)
-    assert whole["settled"] and resumed["settled"] and whole["steps"] == resumed["steps"] == STEPS
+    assert whole["settled"] and resumed["settled"] and whole["steps"] == resumed["steps"] == run.SETTLED
     assert simulate(scene, tmp_path / "whole", resume=True, **options) == whole
 
 

@@ -23,31 +23,13 @@ def seconds_of(text: str) -> float:
     return float(match[1]) * {"": 1, "s": 1, "m": 60, "h": 3600}[match[2]]
 
 
-def folder_of(text: str) -> Path:
-    """A folder that is named: an empty name, of a variable that is not set, would be the current one."""
-    if not text.strip():
-        raise typer.BadParameter("is empty; the current folder is .")
-    return Path(text)
-
-
 Json = Annotated[bool, typer.Option("--json", help="One JSON object on stdout, everything else on stderr.")]
-Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="More figures, and tracebacks with errors.")]
-Camera = Annotated[
-    tuple[float, float, float] | None,
-    typer.Option(metavar="X Y Z", help="Where the camera is, m (default: all of the motion is in sight)."),
-]
-LookAt = Annotated[
-    tuple[float, float, float] | None,
-    typer.Option("--look-at", metavar="X Y Z", help="What it looks at, m (default: the middle of the scene)."),
-]
+Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Tracebacks with errors.")]
 Device = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Where to compute.")]
 Outside = Annotated[
     bool, typer.Option("--allow-outside", help="Let the scene name files that are not in its own folder.")
 ]
-Bind = Annotated[str, typer.Option(metavar="ADDRESS", help="Where viewers listen; 0.0.0.0 lets the network in.")]
-Out = Annotated[
-    Path, typer.Option("-o", "--out", parser=folder_of, metavar="PATH", help="Folder to write.", show_default=False)
-]
+Out = Annotated[Path, typer.Option("-o", "--out", metavar="PATH", help="Folder to write.", show_default=False)]
 Model = Annotated[str | None, typer.Option(help="Bundled model or path (default: the scene's, else the best one).")]
 Budget = Annotated[
     float | None, typer.Option(parser=seconds_of, metavar="TIME", help="Longest time to take, such as 90s, 10m or 1h.")

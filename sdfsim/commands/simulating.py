@@ -1,4 +1,5 @@
-"""From scenes to motion and back: simulate, plan, view, identify, info."""
+"""From scenes to motion and on to pictures, other programs and coefficients: simulate, plan, view, render, export,
+identify, info."""
 
 from __future__ import annotations
 
@@ -8,7 +9,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from sdfsim.commands.arguments import Bind, Camera, LookAt, Model, Out, Outside, command, tell_failed
+from sdfsim.commands.arguments import Model, Out, Outside, command, tell_failed
 from sdfsim.console import Session, duration
 from sdfsim.errors import EXIT_USAGE, SdfsimError
 
@@ -16,12 +17,14 @@ _PACKAGES = (
     *("torch", "numpy", "scipy", "open3d", "trimesh", "pycolmap", "opencv-python-headless", "rerun-sdk"),
     *("pydantic", "pybullet"),
 )
+SceneFile = Annotated[Path, typer.Argument(help="scene.yaml", show_default=False)]
+OfRun = Annotated[Path | None, typer.Option(help="scene.yaml of a run (default: that of the run folder).")]
 
 
 @command
 def simulate(
     session: Session,
-    scene: Annotated[Path, typer.Argument(help="scene.yaml", show_default=False)],
+    scene: SceneFile,
     out: Out,
     model: Model = None,
     seconds: Annotated[float | None, typer.Option(help="Simulated time (default: the scene's).", min=0)] = None,
@@ -31,9 +34,6 @@ def simulate(
         bool, typer.Option("--until-settled", help="End as soon as everything rests (--seconds at the latest).")
     ] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the interrupted run in the folder.")] = False,
-    camera: Camera = None,
-    look_at: LookAt = None,
-    bind: Bind = "127.0.0.1",
     allow_outside: Outside = False,
     device: str = "auto",
 ) -> None:
@@ -47,12 +47,9 @@ def simulate(
         seconds=seconds,
         seed=seed,
         viewer=viewer,
-        bind=bind,
         allow_outside=allow_outside,
         until_settled=until_settled,
         resume=resume,
-        camera=camera,
-        look_at=look_at,
         device=device,
         on_progress=session.stage_progress,
         say=session.say,
@@ -64,7 +61,6 @@ def simulate(
         f"mean contacts {report['contacts_mean']:.1f}, worst penetration {report['worst_penetration_m']:.2g} m",
         *run.ending_lines(report),
         *([] if report.get("settled", True) else ["not settled: give it more --seconds"]),
-        *(run.cost_lines(report) if session.verbose else []),
         f"wrote {out}",
         *(f"outside the model's training: {line}" for line in report["outside_training"]),
         *(f"usable, not exact: {line}" for line in report["caveats"]),
@@ -79,11 +75,7 @@ def simulate(
 
 @command
 def plan(
-    session: Session,
-    scene: Annotated[Path, typer.Argument(help="scene.yaml", show_default=False)],
-    model: Model = None,
-    allow_outside: Outside = False,
-    device: str = "auto",
+    session: Session, scene: SceneFile, model: Model = None, allow_outside: Outside = False, device: str = "auto"
 ) -> None:
     """Which effects are in play, why, and what a step costs."""
     from sdfsim import planning
@@ -103,7 +95,6 @@ def view(
     web: Annotated[bool, typer.Option("--web", help="In the browser.")] = False,
     picture: Annotated[Path | None, typer.Option("--screenshot", help="Write a PNG instead; needs no screen.")] = None,
     at: Annotated[float | None, typer.Option(help="Time of the screenshot, s (default: the end).")] = None,
-    bind: Bind = "127.0.0.1",
 ) -> None:
     """Watch a recording, or take a picture of it."""
     if at is not None and picture is None:
@@ -112,10 +103,10 @@ def view(
 
     if picture is not None:
         viewer.screenshot(recording, picture, at=at)
-        session.report({"screenshot": str(picture)})
+        session.report({"screenshot": picture})
     else:
-        viewer.show(recording, web=web, bind=bind)
-        session.report({"recording": str(recording)})
+        viewer.show(recording, web=web)
+        session.report({"recording": recording})
 
 
 @command
@@ -123,9 +114,15 @@ def render(
     session: Session,
     source: Annotated[Path, typer.Argument(help="Run folder or rollout.npz.", show_default=False)],
     out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help=".mp4 or .png.", show_default=False)],
-    scene: Annotated[Path | None, typer.Option(help="scene.yaml (default: that of the run folder).")] = None,
-    camera: Camera = None,
-    look_at: LookAt = None,
+    scene: OfRun = None,
+    camera: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(metavar="X Y Z", help="Where the camera is, m (default: all of the motion is in sight)."),
+    ] = None,
+    look_at: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option("--look-at", metavar="X Y Z", help="What it looks at, m (default: the middle of the scene)."),
+    ] = None,
     at: Annotated[float | None, typer.Option(help="Time of a picture, s (default: the end).")] = None,
     allow_outside: Outside = False,
 ) -> None:
@@ -139,7 +136,31 @@ def render(
     shapes, frames = partial(session.stage_progress, "shapes"), partial(session.stage_progress, "render")
     loaded, rollout = read_run(source, scene, allow_outside=allow_outside, on_progress=shapes)
     room.render(loaded, rollout, out, camera=camera, look_at=look_at, at=at, on_progress=frames)
-    session.report({"picture" if out.suffix == ".png" else "movie": str(out)}, [f"wrote {out}"])
+    session.report({"picture" if out.suffix == ".png" else "movie": out}, [f"wrote {out}"])
+
+
+@command
+def export(
+    session: Session,
+    source: Annotated[Path, typer.Argument(help="Run folder, rollout.npz, scene.yaml or Shape folder.")],
+    out: Annotated[
+        Path,
+        typer.Option("-o", "--out", metavar="FILE", help="Ends in .glb .usd .usda .usdc .xml .mjcf .urdf or .csv."),
+    ],
+    scene: OfRun = None,
+    allow_outside: Outside = False,
+) -> None:
+    """Shape, scene or run -> a file of other programs (docs/export.md)."""
+    from sdfsim import export as room
+
+    report = room.export(source, out, scene_file=scene, allow_outside=allow_outside, on_progress=session.stage_progress)
+    files = report["files"]
+    lines = [
+        f"bodies {report['bodies']}, frames {report['frames']}",
+        f"wrote {files[0]}" + (f" and {len(files) - 1} files beside it" if len(files) > 1 else ""),
+        *(f"not in it: {line}" for line in report["left_out"]),
+    ]
+    session.report(report, lines)
 
 
 @command
@@ -148,7 +169,7 @@ def identify(
     recording: Annotated[
         Path, typer.Argument(help="Run folder, rollout.npz or CSV of poses (docs/identify.md).", show_default=False)
     ],
-    scene: Annotated[Path | None, typer.Option(help="scene.yaml (default: that of the run folder).")] = None,
+    scene: OfRun = None,
     allow_outside: Outside = False,
 ) -> None:
     """Motion -> friction, restitution and mass ratios."""
@@ -156,8 +177,8 @@ def identify(
 
     shapes, fit = partial(session.stage_progress, "shapes"), partial(session.stage_progress, "identify")
     motion, known = room.load_recording(recording, scene, allow_outside=allow_outside, on_progress=shapes)
-    found = room.identify(motion, known, on_progress=fit)
-    session.report(found.report(), found.lines())
+    report = room.identify(motion, known, on_progress=fit)
+    session.report(report, room.report_lines(report))
 
 
 @command

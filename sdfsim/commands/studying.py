@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from sdfsim.commands.arguments import Out, command, folder_of, tell_failed
+from sdfsim.commands.arguments import Out, command, tell_failed
 from sdfsim.console import Session, columns
 
 Models = Annotated[
@@ -39,9 +39,7 @@ def tradeoff(
 @command
 def stress(
     session: Session,
-    out: Annotated[Path, typer.Option("-o", "--out", parser=folder_of, metavar="PATH", help="Folder to write.")] = Path(
-        "stress"
-    ),
+    out: Out = Path("stress"),
     model: Models = None,
     quick: Annotated[bool, typer.Option("--quick", help="Fewer and shorter cases, in minutes.")] = False,
     shapes: Annotated[

@@ -78,22 +78,17 @@ def test_json_keeps_native_output_off_stdout(scene, model, tmp_path, monkeypatch
     assert "from C" in told.err and "from Python" in told.err
 
 
-BAD_SCENES = [
-    ("mass: -0.3", "bodies[1].mass: must be > 0 (got -0.3 kg)"),
-]
-
-
-@pytest.mark.parametrize(("field", "fault"), BAD_SCENES)
 @pytest.mark.parametrize("command", ["simulate", "plan"])
-def test_a_bad_scene_is_one_line_and_code_1(tmp_path, command, field, fault):
+def test_a_bad_scene_is_one_line_and_code_1(tmp_path, command):
     file = tmp_path / "scene.yaml"
-    file.write_text(SCENE.rstrip().removesuffix("}") + f", {field}}}\n")
+    file.write_text(SCENE.rstrip().removesuffix("}") + ", mass: -0.3}\n")
+    told = f"{file}:8: bodies[1].mass: must be > 0 (got -0.3 kg)"
     done = run(command, file, *(["-o", tmp_path / "run"] if command == "simulate" else []))
     assert done.exit_code == 1
-    assert done.stderr == f"error: {file}:8: {fault}\n" and done.stdout == ""
+    assert done.stderr == f"error: {told}\n" and done.stdout == ""
     assert not (tmp_path / "run").exists()
     answer = json.loads(run("plan", file, "--json").stdout)
-    assert answer["exit_code"] == 1 and answer["problems"] == [f"{file}:8: {fault}"]
+    assert answer["exit_code"] == 1 and answer["problems"] == [told]
 
 
 @pytest.mark.parametrize(
@@ -135,18 +130,6 @@ def test_bad_input_is_one_line_and_code_1(scene, model, tmp_path, arguments, tol
     errors = [line for line in lines if line.startswith("error: ")]
     assert done.exit_code == 1 and len(errors) == 1, done.stderr
     assert told.format(**names) in errors[0] and "Traceback" not in done.stderr
-
-
-@pytest.mark.skipif(
-    not Path("/dev/full").exists(), reason="/dev/full, a disk that is always full, exists on Linux only"
-)
-def test_a_full_disk_is_one_line(scene, model, tmp_path):
-    out = tmp_path / "run"
-    out.mkdir()
-    (out / f".rollout.npz.{os.getpid()}.part").symlink_to("/dev/full")
-    done = run("simulate", scene, "-o", out, "--model", model)
-    assert done.exit_code == 1 and "No space left" in done.stderr and "Traceback" not in done.stderr
-    assert not (out / "rollout.npz").exists()
 
 
 @pytest.mark.skipif(

@@ -1,6 +1,5 @@
-"""Shapes with many nodes: no edge is missed. And when everything rests."""
+"""Shapes with many nodes: no edge is missed."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim.dynamics.bodies import Units, from_scene
 from sdfsim.dynamics.models.paper_edges import find_contacts
-from sdfsim.dynamics.rest import STEPS, STRAY, Rest
 from sdfsim.scene.scene import Scene
-from sdfsim.shape.shape import analytic_shape, load_shape
+from sdfsim.shape.shape import load_shape
 from tests.dynamics.conftest import make_body
 
 SHAPES = Path(__file__).resolve().parents[2] / "samples" / "shapes"
@@ -21,23 +19,6 @@ REACH, DT = 0.1, 0.02
 
 def bodies_of(scene: Scene):
     return from_scene(scene, Units(1.0, 1.0, 1.0), torch.device("cpu"))
-
-
-def ball(nodes: int):
-    """A sphere of diameter 1 m with so many nodes, evenly along a spiral."""
-    k = np.arange(nodes) + 0.5
-    turn, height = np.pi * (1 + 5**0.5) * k, 1 - 2 * k / nodes
-    wide = np.sqrt(1 - height**2)
-    points = 0.5 * np.stack([wide * np.cos(turn), wide * np.sin(turn), height], 1)
-    return replace(analytic_shape("sphere", radius=0.5), nodes=points)
-
-
-def stacks(count: int, nodes: int = 64, spacing: float = 3.0) -> Scene:
-    """Balls on a floor, each with another on top."""
-    floor = make_body("floor", 1, [0, 0, 0], motion="static", mass=0.0)
-    spots = [(spacing * (k % 30), spacing * (k // 30)) for k in range(count)]
-    balls = [make_body(f"{k}/{h}", 0, [x, y, 0.5 + h]) for k, (x, y) in enumerate(spots) for h in range(2)]
-    return Scene((ball(nodes), analytic_shape("plane")), (floor, *balls), GRAVITY.numpy(), 1.0)
 
 
 def test_fitted_shapes_with_many_nodes_keep_every_edge():
@@ -64,22 +45,3 @@ def test_fitted_shapes_with_many_nodes_keep_every_edge():
             held = found.node[(found.owner == i) & (found.body == j)] - mine.start
             missing += int((~np.isin(np.flatnonzero(near), held.numpy())).sum())
     assert missing == 0 and len(found) > 100
-
-
-def test_rest_is_when_nothing_strays_for_long_enough():
-    bodies, state = bodies_of(stacks(2))
-    rest, told = Rest(), []
-    for k in range(STEPS + 2):
-        rest = rest.after(bodies, replace(state, position=state.position + 0.2 * STRAY * (-1) ** k))
-        told.append(rest.settled)
-    assert told == [False] * STEPS + [True, True]
-    moved = state.position.clone()
-    moved[3, 0] += 2 * STRAY
-    assert not rest.after(bodies, replace(state, position=moved)).settled
-    fallen = state.position.clone()
-    fallen[0, 2] -= 1.0  # the floor is not asked
-    rest, told = Rest(), []
-    for position in (state.position, fallen, *(fallen * 0 + k for k in range(STEPS + 3))):
-        rest = rest.after(bodies, replace(state, position=position))
-        told.append(rest.settled)
-    assert not any(told)

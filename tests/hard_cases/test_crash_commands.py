@@ -35,18 +35,11 @@ def moments(ended: Ended, count: int, seed: int) -> list[Moment]:
     return changes + [Moment(seconds=rng.uniform(0.01, ended.seconds)) for _ in range(count - count // 2)]
 
 
+@pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_killed_command_goes_on(works, undisturbed, tmp_path, name):
+def test_a_killed_command_goes_on(works, undisturbed, tmp_path, name, count):
     ended, expected = undisturbed(name)
-    for number, moment in enumerate(moments(ended, FEW, seed=1)):
-        kill_and_resume(works[name], tmp_path / str(number) / name, [moment], expected)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", COMMANDS)
-def test_a_command_killed_at_many_moments_goes_on(works, undisturbed, tmp_path, name):
-    ended, expected = undisturbed(name)
-    for number, moment in enumerate(moments(ended, MANY, seed=2)):
+    for number, moment in enumerate(moments(ended, count, seed=count)):
         kill_and_resume(works[name], tmp_path / str(number) / name, [moment], expected)
 
 
@@ -68,14 +61,11 @@ def test_ctrl_c_keeps_what_was_finished(works, undisturbed, tmp_path, name):
     kill_and_resume(work, folder, [], expected)
 
 
-def interruptions(ended: Ended, count: int, seed: int) -> list[Moment]:
-    rng = random.Random(seed)
-    return [Moment(seconds=rng.uniform(0.3, 0.9) * ended.seconds, how=signal.SIGINT) for _ in range(count)]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", COMMANDS)
 def test_ctrl_c_at_any_moment_changes_nothing_in_the_end(works, undisturbed, tmp_path, name):
     ended, expected = undisturbed(name)
-    for number, moment in enumerate(interruptions(ended, MANY // 2, seed=4)):
+    rng = random.Random(4)
+    for number in range(MANY // 2):
+        moment = Moment(seconds=rng.uniform(0.3, 0.9) * ended.seconds, how=signal.SIGINT)
         kill_and_resume(works[name], tmp_path / str(number) / name, [moment], expected)

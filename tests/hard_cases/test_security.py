@@ -210,8 +210,5 @@ def test_every_viewer_is_told_where_to_listen(tmp_path, monkeypatch, web):
     fake.write_text(f'#!/bin/sh\necho "$@" > {told}\n')
     fake.chmod(0o755)
     monkeypatch.setattr(viewer, "_executable", lambda: str(fake))
-    for options, address in (([], "127.0.0.1"), (["--bind", "0.0.0.0"], "0.0.0.0")):
-        done = CliRunner().invoke(cli.app, ["view", str(tmp_path / "a.rrd"), *(["--web"] if web else []), *options])
-        assert done.exit_code == 0 and f"--bind {address} " in told.read_text()
-    wrong = CliRunner().invoke(cli.app, ["view", str(tmp_path / "a.rrd"), "--bind", "everywhere"])
-    assert wrong.exit_code == 1 and "--bind everywhere: not an address" in wrong.stderr
+    done = CliRunner().invoke(cli.app, ["view", str(tmp_path / "a.rrd"), *(["--web"] if web else [])])
+    assert done.exit_code == 0 and "--bind 127.0.0.1 " in told.read_text()
