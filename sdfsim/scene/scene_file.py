@@ -31,7 +31,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from sdfsim.errors import SceneError, SdfsimError, nearest
 from sdfsim.parallel import Progress, silent
-from sdfsim.scene.scene import Body, Effects, Limits, Motion, Scene, Waypoints
+from sdfsim.scene.scene import Body, Effects, Limits, Motion, Scene, Switch, Waypoints
 from sdfsim.shape.primitives import PRIMITIVES
 from sdfsim.shape.shape import (
     DEFAULT_RESOLUTION,
@@ -198,7 +198,6 @@ Whole = Annotated[int, BeforeValidator(_numeral), Field(le=10**18)]
 Vector = Annotated[list[Number], _THREE]
 Direction = Annotated[Vector, AfterValidator(_unit)]
 Quaternion = Annotated[list[Number], Field(min_length=4, max_length=4), AfterValidator(_unit)]
-Switch = Literal["auto", "on", "off"]
 
 
 class Table(BaseModel):
