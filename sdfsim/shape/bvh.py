@@ -21,9 +21,8 @@ class ClosestPoint:
 
         self.tensor: Any = o3d.core.Tensor
         self.centre = 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0))
-        threads = int(os.environ.get("OMP_NUM_THREADS", "0") or 0)
-        self.scene = o3d.t.geometry.RaycastingScene(nthreads=max(threads, 0))
-        self.threads = max(threads, 0)
+        self.threads = int(os.environ.get("OMP_NUM_THREADS") or 0)
+        self.scene = o3d.t.geometry.RaycastingScene(nthreads=self.threads)
         local = np.ascontiguousarray(mesh.vertices - self.centre, dtype=np.float32)
         self.scene.add_triangles(self.tensor(local), self.tensor(np.ascontiguousarray(mesh.faces, dtype=np.uint32)))
 

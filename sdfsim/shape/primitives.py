@@ -9,12 +9,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sdfsim.shape.mesh import Mesh, clean, convex_hull
+from sdfsim.shape.mesh import Mesh, clean, convex_hull, lattice
 
 
 def box(size: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Mesh:
     """A box with full extents `size` m: 8 vertices, 12 faces."""
-    corners = np.stack(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5], indexing="ij"), axis=-1).reshape(-1, 3)
+    corners = lattice([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5])
     quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
     return clean(Mesh(corners * np.array(size), _quads(quads)), name="box")
 

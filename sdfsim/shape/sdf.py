@@ -14,12 +14,10 @@ from sdfsim.errors import SdfsimError
 from sdfsim.parallel import Progress, silent
 from sdfsim.shape.distance import MeshDistance
 from sdfsim.shape.far_field import BOX, in_metres
-from sdfsim.shape.mesh import Frame, Mesh, normal_frame
+from sdfsim.shape.mesh import Frame, Mesh, lattice, normal_frame
 
 # Points of a grid evaluated at once: eight indices and corners with what is made of them, about 250 bytes a point.
 CHUNK = 262_144
-# Distances asked for at once while a grid is sampled.
-SAMPLED = 200_000
 # All lengths of `MeshSdf` are relative to the mesh's largest extent. The hierarchy works in float32, so closest points
 # are off by some 1e-7: nearer than this the offset to them says little about the direction, and differences over the
 # step say it better.
@@ -37,9 +35,7 @@ UP = (0.0, 0.0, 1.0)
 class Sdf(Protocol):
     """A signed distance with its gradient: positive outside, negative inside, metres, the shape's own frame.
 
-    Its members: `MlpSdf` (a fitted network), the closed forms `PlaneSdf`, `SphereSdf`, `CapsuleSdf`, `CylinderSdf` and
-    `BoxSdf`, `GridSdf` (samples) and `MeshSdf` (the exact mesh). Those members also have
-    `to(device)` and `scaled(factor)`.
+    Its members, `MlpSdf`, the closed forms, `GridSdf` and `MeshSdf`, also have `to(device)` and `scaled(factor)`.
 
     Attributes:
         bounds: [2, 3] float64 m, the axis-aligned box that holds the solid (infinite for a plane).
@@ -51,19 +47,15 @@ class Sdf(Protocol):
     def __call__(self, points: Any, /) -> tuple[Any, Any]:
         """Distance [P] m and gradient [P, 3] (unit length where the SDF is exact) at `points` [P, 3] m.
 
-        The result has the dtype and device of `points`. Never NaN: where the gradient is undefined
-        (medial axis, an edge) any valid one-sided gradient is returned. The implementations of this
-        package also take a NumPy array, or what makes one, and then return NumPy arrays.
+        The result has the dtype and device of `points`. Never NaN: where the gradient is undefined (medial axis, an
+        edge) any valid one-sided gradient is returned. The members also take a NumPy array, and then return some.
         """
         ...
 
 
 def accepts_numpy(call: Callable[..., tuple[torch.Tensor, torch.Tensor]]) -> Callable[..., tuple[Any, Any]]:
-    """Let an Sdf's `__call__` also take what makes a NumPy array [P, 3], and then answer in NumPy of the same dtype.
-
-    Whole numbers become float64. An object with a `device` attribute is evaluated there. Raises ValueError for other
-    shapes.
-    """
+    """Let an Sdf's `__call__` also take what makes a NumPy array [P, 3] (whole numbers become float64), and then answer
+    in NumPy. Raises ValueError for other shapes."""
 
     @wraps(call)
     def wrapper(self: Any, points: Any) -> tuple[Any, Any]:
@@ -336,13 +328,10 @@ def sample_grid(
     frame = normal_frame(bounds)
     axis = np.linspace(-BOX, BOX, resolution)
     values = np.empty((resolution, resolution, resolution), dtype=np.float32)
-    layers = max(1, SAMPLED // resolution**2)
-    for start in range(0, resolution, layers):
-        on_progress(start / resolution, "sampling the distance")
-        some = axis[start : start + layers]
-        points = np.stack(np.meshgrid(some, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-        found = np.asarray(distance(frame.outward(points))[0])
-        values[start : start + layers] = (found / frame.scale).reshape(len(some), resolution, resolution)
+    for k, x in enumerate(axis):
+        on_progress(k / resolution, "sampling the distance")
+        found = np.asarray(distance(frame.outward(lattice([x], axis, axis)))[0])
+        values[k] = (found / frame.scale).reshape(resolution, resolution)
     on_progress(1.0, "sampled")
     return GridSdf(torch.from_numpy(values), frame, np.asarray(bounds, dtype=np.float64))
 
@@ -361,13 +350,9 @@ class MeshSdf:
         if len(self.mesh.faces) == 0:
             raise SdfsimError("mesh has no faces")
 
-    @property
+    @cached_property
     def bounds(self) -> np.ndarray:
         """[2, 3] float64 m, the box of the faces' corners."""
-        return self._box
-
-    @cached_property
-    def _box(self) -> np.ndarray:
         corners = self.mesh.vertices[np.unique(self.mesh.faces)]
         return np.stack([corners.min(0), corners.max(0)])
 

@@ -19,7 +19,7 @@ from sdfsim.parallel import Progress, silent
 from sdfsim.shape import primitives
 from sdfsim.shape.distance import MeshDistance
 from sdfsim.shape.mass import mass_properties_of_sdf
-from sdfsim.shape.mesh import Frame, Mesh, convex_hull, load_mesh, read_glb, read_mesh, write_glb, write_ply
+from sdfsim.shape.mesh import Frame, Mesh, convex_hull, lattice, load_mesh, read_glb, read_mesh, write_glb, write_ply
 from sdfsim.shape.mlp_sdf import ACTIVATIONS, MlpSdf
 from sdfsim.shape.sdf import (
     CLOSED_FORMS,
@@ -469,7 +469,7 @@ def _sphere_nodes(radius: float, count: int) -> np.ndarray:
 def _box_nodes(half: np.ndarray) -> np.ndarray:
     """Corners, edges and faces of a 5 x 5 x 5 lattice on the box: [98, 3] m, the corners first."""
     axis = np.linspace(-1.0, 1.0, 5)
-    lattice = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    sides = (np.abs(lattice) == 1.0).sum(1)
+    places = lattice(axis, axis, axis)
+    sides = (np.abs(places) == 1.0).sum(1)
     order = np.argsort(-sides, kind="stable")
-    return (lattice * half)[order[sides[order] > 0]]
+    return (places * half)[order[sides[order] > 0]]
