@@ -74,36 +74,32 @@ def accepts_numpy(call: Callable[..., tuple[torch.Tensor, torch.Tensor]]) -> Cal
 
 
 class ClosedForm:
-    """A solid about the origin with an exact distance; its fields are its `COUNT` sizes, m, positive (else
-    SdfsimError)."""
+    """A solid about the origin with an exact distance; its fields are its sizes, m, positive (else SdfsimError)."""
 
     KIND: ClassVar[str]
-    COUNT: ClassVar[int]
 
     def __post_init__(self) -> None:
         sizes = np.array(self.sizes, dtype=np.float64)
-        if sizes.shape != (self.COUNT,) or not (np.isfinite(sizes) & (sizes > 0)).all():
+        if self.bounds.shape != (2, 3) or not (np.isfinite(sizes) & (sizes > 0)).all():
             told = ", ".join(f"{name} {value}" for name, value in vars(self).items())
             raise SdfsimError(f"the sizes of a {self.KIND} must be > 0 (got {told})")
 
     @property
     def sizes(self) -> tuple[float, ...]:
-        """[COUNT] m."""
+        """m, one after the other."""
         return tuple(np.hstack([*vars(self).values()]).tolist()) if vars(self) else ()
 
     @property
     def bounds(self) -> np.ndarray:
         """[2, 3] float64 m, the box that holds the solid."""
-        return np.outer([-1.0, 1.0], self.reach)
+        return np.outer([-1.0, 1.0], self._reach())
 
-    @property
-    def reach(self) -> tuple[float, ...]:
+    def _reach(self) -> tuple[float, ...]:
         """(x, y, z) m, its half extents."""
         raise NotImplementedError
 
-    @staticmethod
-    def measure(points: torch.Tensor, sizes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Distance [P] m and gradient [P, 3] at `points` [P, 3] m of solids with `sizes` [P or 1, COUNT] m."""
+    def _measure(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Distance [P] m and unit gradient [P, 3] at `points` [P, 3] m."""
         raise NotImplementedError
 
     def to(self, device: torch.device | str) -> Self:
@@ -118,22 +114,21 @@ class ClosedForm:
     @accepts_numpy
     def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Distance [P] m and unit gradient [P, 3] at `points` [P, 3] m."""
-        return self.measure(points, torch.tensor([self.sizes], dtype=points.dtype, device=points.device))
+        return self._measure(points)
 
 
 @dataclass(frozen=True, eq=False)
 class PlaneSdf(ClosedForm):
     """The half space below z = 0 is solid; the normal is +z. Infinite."""
 
-    KIND, COUNT = "plane", 0
+    KIND = "plane"
 
     @property
     def bounds(self) -> np.ndarray:
         """[2, 3] m: infinite but for the top."""
         return np.array([[-np.inf] * 3, [np.inf, np.inf, 0.0]])
 
-    @staticmethod
-    def measure(points: torch.Tensor, sizes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _measure(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         return points[:, 2].clone(), _up(points)
 
 
@@ -141,19 +136,17 @@ class PlaneSdf(ClosedForm):
 class SphereSdf(ClosedForm):
     """A ball of `radius` m. The gradient at the centre points up."""
 
-    KIND, COUNT = "sphere", 1
+    KIND = "sphere"
     radius: float
 
-    @property
-    def reach(self) -> tuple[float, ...]:
+    def _reach(self) -> tuple[float, ...]:
         return (self.radius,) * 3
 
-    @staticmethod
-    def measure(points: torch.Tensor, sizes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _measure(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         length = points.norm(dim=1)
         tiny = torch.finfo(points.dtype).tiny
         unit = points / length.clamp_min(tiny)[:, None]
-        return length - sizes[:, 0], torch.where((length > tiny)[:, None], unit, _up(points))
+        return length - self.radius, torch.where((length > tiny)[:, None], unit, _up(points))
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,17 +154,15 @@ class BoxSdf(ClosedForm):
     """An axis-aligned box with half extents `half` (x, y, z) m. Inside, the gradient points to the nearest face: the
     first of equally near ones, and the positive side of an axis at its middle."""
 
-    KIND, COUNT = "box", 3
+    KIND = "box"
     half: tuple[float, float, float]
 
-    @property
-    def reach(self) -> tuple[float, ...]:
+    def _reach(self) -> tuple[float, ...]:
         return self.half
 
-    @staticmethod
-    def measure(points: torch.Tensor, sizes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _measure(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         side = torch.where(points < 0, -1.0, 1.0).to(points.dtype)
-        excess = points.abs() - sizes
+        excess = points.abs() - points.new_tensor(self.half)
         beyond = excess.clamp_min(0)
         length = beyond.norm(dim=1)
         deepest, axis = excess.max(dim=1)
@@ -186,19 +177,17 @@ class BoxSdf(ClosedForm):
 class CapsuleSdf(ClosedForm):
     """All within `radius` m of the segment |z| <= `half` m."""
 
-    KIND, COUNT = "capsule", 2
+    KIND = "capsule"
     radius: float
     half: float
 
-    @property
-    def reach(self) -> tuple[float, ...]:
+    def _reach(self) -> tuple[float, ...]:
         return self.radius, self.radius, self.half + self.radius
 
-    @staticmethod
-    def measure(points: torch.Tensor, sizes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _measure(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         axis = torch.zeros_like(points)
-        axis[:, 2] = torch.minimum(torch.maximum(points[:, 2], -sizes[:, 1]), sizes[:, 1])
-        return SphereSdf.measure(points - axis, sizes)
+        axis[:, 2] = points[:, 2].clamp(-self.half, self.half)
+        return SphereSdf(self.radius)._measure(points - axis)
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,16 +195,14 @@ class CylinderSdf(ClosedForm):
     """A cylinder about z of `radius` m and half height `half` m. Inside, the gradient points to the nearer of side and
     end; of equally near ones to the end."""
 
-    KIND, COUNT = "cylinder", 2
+    KIND = "cylinder"
     radius: float
     half: float
 
-    @property
-    def reach(self) -> tuple[float, ...]:
+    def _reach(self) -> tuple[float, ...]:
         return self.radius, self.radius, self.half
 
-    @staticmethod
-    def measure(points: torch.Tensor, sizes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _measure(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         tiny = torch.finfo(points.dtype).tiny
         away = points[:, :2].norm(dim=1)
         outward = torch.zeros_like(points)
@@ -224,7 +211,7 @@ class CylinderSdf(ClosedForm):
         outward[:, :2] = torch.where((away > tiny)[:, None], unit, outward[:, :2])
         end = torch.zeros_like(points)
         end[:, 2] = torch.where(points[:, 2] < 0, -1.0, 1.0).to(points.dtype)
-        aside, above = away - sizes[:, 0], points[:, 2].abs() - sizes[:, 1]
+        aside, above = away - self.radius, points[:, 2].abs() - self.half
         corner = (aside > 0) & (above > 0)
         length = torch.sqrt(aside.clamp_min(0) ** 2 + above.clamp_min(0) ** 2)
         slanted = (aside[:, None] * outward + above[:, None] * end) / length.clamp_min(tiny)[:, None]
