@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -660,10 +661,7 @@ def load_scene(
     for i, entry in enumerate(table.bodies):
         made = _body(entry, order[entry.shape], table.motion_of(entry), groups)
         if made.motion == "dynamic":
-            mass, fault = _mass(entry, shapes[entry.shape])
-            made = replace(made, mass=mass)
-            if fault:
-                document.wrong(("bodies", i, "name"), fault)
+            made = replace(made, mass=_mass(entry, shapes[entry.shape], partial(document.wrong, ("bodies", i, "name"))))
         for name, offset in zip(entry.names(), entry.offsets(), strict=True):
             way = made.path and replace(made.path, position=made.path.position + offset)
             bodies.append(replace(made, name=name, position=made.position + offset, path=way))
@@ -748,18 +746,17 @@ def _body(entry: BodyTable, shape: int, motion: Motion, groups: dict[str, list[s
     )
 
 
-def _mass(entry: BodyTable, shape: Shape) -> tuple[float, str | None]:
-    """Of a dynamic body, kg; and why it cannot move, if so."""
+def _mass(entry: BodyTable, shape: Shape, wrong: Callable[[str], None]) -> float:
+    """Of a dynamic body, kg; tells `wrong` why it cannot move, if so."""
     volume = shape.volume * entry.scale**3
     mass = entry.density * volume if entry.mass is None else entry.mass
     if not (np.isfinite(volume) and volume > 0):
-        return mass, f"cannot move: its shape has a volume of {volume:g} m^3; close it, or make it static"
-    if not (np.isfinite(mass) and mass > 0):
-        told = f"density {entry.density:g} kg/m^3 times a volume of {volume:g} m^3"
-        return mass, f"has no usable mass: {told}; give mass in kg"
-    if not len(shape.nodes):
-        return mass, "cannot move: its shape has no surface nodes to touch others with; make it static"
-    return mass, None
+        wrong(f"cannot move: its shape has a volume of {volume:g} m^3; close it, or make it static")
+    elif not (np.isfinite(mass) and mass > 0):
+        wrong(f"has no usable mass: density {entry.density:g} kg/m^3 times a volume of {volume:g} m^3; give mass in kg")
+    elif not len(shape.nodes):
+        wrong("cannot move: its shape has no surface nodes to touch others with; make it static")
+    return mass
 
 
 _SECTIONS: dict[str, type[Table]] = {

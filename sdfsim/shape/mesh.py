@@ -115,14 +115,13 @@ def _faces(loaded: Any) -> np.ndarray:
 
 def _check_gltf(path: Path) -> None:
     """Refuse a glTF file whose geometry is not in its buffers: compressed, sparse, or of a length they do not have."""
-    if path.suffix.lower() == ".gltf":
-        header = json.loads(path.read_text(encoding="utf-8"))
-    else:
-        with open(path, "rb") as file:
-            magic, _, _, length, _ = struct.unpack("<4s4I", file.read(20))
-            if magic != b"glTF":
-                raise ValueError("it does not begin with glTF")
-            header = json.loads(file.read(length))
+    content = path.read_bytes()
+    if path.suffix.lower() == ".glb":
+        magic, _, _, length, _ = struct.unpack("<4s4I", content[:20])
+        if magic != b"glTF":
+            raise ValueError("it does not begin with glTF")
+        content = content[20 : 20 + length]
+    header = json.loads(content)
     views = header.get("bufferViews", [])
     for accessor in header.get("accessors", []):
         if "bufferView" not in accessor or "sparse" in accessor:
@@ -155,7 +154,7 @@ def _check_counts(path: Path, mesh: Mesh) -> None:
 
 def _vertex_colors(loaded: Any, count: int) -> np.ndarray | None:
     """[V, 3] uint8 when the file carries colours; a texture is looked up at each vertex."""
-    visual = getattr(loaded, "visual", None)
+    visual: Any = getattr(loaded, "visual", None)
     if getattr(visual, "kind", None) == "texture":
         image = getattr(visual.material, "image", None) or getattr(visual.material, "baseColorTexture", None)
         if image is None or image.format not in TEXTURES or visual.uv is None:
