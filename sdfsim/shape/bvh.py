@@ -42,11 +42,9 @@ class ClosestPoint:
 
 
 class Winding:
-    """Generalized winding number (Jacobson et al. 2013; fast form: Barill et al. 2018), to about 0.01 a layer.
-
-    How often the surface goes around a point: 1 inside, 0 outside, 2 where two bodies overlap, 0 in a cavity; by the
-    solid angle that is seen of the surface where it is open. Some ten times slower than ray parity.
-    """
+    """Generalized winding number (Jacobson et al. 2013; fast form: Barill et al. 2018), to about 0.01 a layer: how
+    often the surface goes around a point, by the solid angle that is seen of it where it is open. Some ten times slower
+    than ray parity."""
 
     def __init__(self, mesh: Mesh) -> None:
         # igl computes in float32 within: far from the origin, or in small units, that would cost the sign.

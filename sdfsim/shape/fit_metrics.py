@@ -119,13 +119,9 @@ def verdict(errors: dict) -> dict:
 
 
 def coverage(nodes: np.ndarray, oracle: DistanceOracle) -> dict:
-    """How evenly nodes [K, 3] m stand for a surface, by straight distances from 20,000 surface samples to their nearest
-    node; ready for JSON, relative to the largest extent.
-
-    The `count` of nodes, `largest_hole` (largest distance to the nearest node), `uncovered` (fraction of the surface
-    farther than 0.1 from every node) and `off_surface` (largest distance of a node from the surface). Without nodes the
-    distances are None.
-    """
+    """How evenly nodes [K, 3] m stand for a surface, ready for JSON, relative to the largest extent: the `count` of
+    nodes, `largest_hole` (largest distance from a surface sample to the nearest node), `uncovered` (fraction of the
+    surface farther than 0.1 from every node) and `off_surface` (largest distance of a node from the surface)."""
     from scipy.spatial import KDTree
 
     frame = normal_frame(oracle.bounds)

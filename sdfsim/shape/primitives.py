@@ -1,7 +1,4 @@
-"""Procedural watertight meshes, metres, centred on their own origin, and the convex pieces of those that have them.
-
-Every function has defaults that give a largest extent near 1 m; faces are counter-clockwise seen from outside.
-"""
+"""Procedural watertight meshes, metres, about 1 m wide unless told, and the convex pieces of those that have them."""
 
 from __future__ import annotations
 

@@ -231,12 +231,9 @@ def _up(points: torch.Tensor) -> torch.Tensor:
 
 
 def trilinear(values: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Value [P] and gradient [P, 3] of a grid [R, R, R] over [-BOX, BOX]^3 at points [P, 3] in it; NaN for NaN.
-
-    The gradient is the exact one of the interpolant, not an interpolation of central differences: the step x - f grad f
-    then leads to the level that the value has, and it takes the eight samples that the value takes anyway, not
-    thirty-two. It jumps from cell to cell, by about the cell over the radius of curvature.
-    """
+    """Value [P] and gradient [P, 3] of a grid [R, R, R] over [-BOX, BOX]^3 at points [P, 3] in it; NaN for NaN. The
+    gradient is the exact one of the interpolant, so that the step x - f grad f leads to the level that the value has;
+    it jumps from cell to cell."""
     side = values.shape[-1]
     per_cell = (side - 1) / (2 * BOX)
     place = (points + BOX) * per_cell
@@ -293,8 +290,8 @@ class GridSdf:
 
     @accepts_numpy
     def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Distance [P] m and gradient [P, 3] at `points` [P, 3] m; interpolated in float32, cast back. Near the solid
-        the gradient is the interpolant's own (see `trilinear`); see `everywhere` for what is far."""
+        """Distance [P] m and gradient [P, 3] at `points` [P, 3] m; interpolated in float32 (see `trilinear`), cast
+        back. See `everywhere` for what is far."""
         return in_metres(partial(trilinear, self.values), self.frame, self.bounds, points, CHUNK)
 
 
@@ -304,12 +301,9 @@ def sample_grid(
     resolution: int,
     on_progress: Progress = silent,
 ) -> GridSdf:
-    """Sample a signed distance (a `DistanceOracle` or an Sdf) of a solid within `bounds` [2, 3] m on a voxel grid.
-
-    There are `resolution`^3 samples over a cube 1.4 times as wide as the solid, of 4 bytes each, 1.4 / (resolution - 1)
-    of its largest extent apart. Raises SdfsimError for fewer than two samples a side, or bounds without extent or not
-    finite.
-    """
+    """Sample a signed distance (a `DistanceOracle` or an Sdf) of a solid within `bounds` [2, 3] m at `resolution`^3
+    places over a cube 1.4 times as wide as the solid. Raises SdfsimError for fewer than two samples a side, or bounds
+    without extent or not finite."""
     if resolution < 2:
         raise SdfsimError(f"a grid needs at least two samples along each side (got {resolution})")
     frame = normal_frame(bounds)
@@ -326,10 +320,7 @@ def sample_grid(
 @dataclass(frozen=True, eq=False)
 class MeshSdf:
     """The signed distance of a triangle mesh, with the sign of `MeshDistance`, good to about 1e-7 of the mesh's size.
-
-    The hierarchy lives on the CPU; points on another device are brought there and the answers back. Raises SdfsimError
-    where the mesh has no faces.
-    """
+    It is asked on the CPU, wherever the points are. Raises SdfsimError where the mesh has no faces."""
 
     mesh: Mesh  # metres
 
@@ -353,7 +344,7 @@ class MeshSdf:
         return MeshDistance(self.mesh)
 
     def to(self, device: torch.device | str) -> MeshSdf:
-        """Itself: it is asked on the CPU wherever the points are."""
+        """Itself."""
         return self
 
     def scaled(self, factor: float) -> MeshSdf:
@@ -362,11 +353,8 @@ class MeshSdf:
 
     @accepts_numpy
     def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Distance [P] m and unit gradient [P, 3] at `points` [P, 3] m.
-
-        The gradient points along the line to the closest point, on the surface along the normal (between the normals
-        of the faces that meet at an edge or corner), and where there is neither, up.
-        """
+        """Distance [P] m and unit gradient [P, 3] at `points` [P, 3] m: along the line to the closest point, on the
+        surface along the normal (at an edge or corner between normals), and where there is neither, up."""
         distance, gradient = self._exact(points.detach().cpu().numpy().astype(np.float64))
         return torch.from_numpy(distance).to(points), torch.from_numpy(gradient).to(points)
 

@@ -399,9 +399,8 @@ def analytic_shape(
     "cylinder" or "box".
 
     Radius and height (along z, of a capsule with its caps) are in m, and so is the box's size, full extents along x, y,
-    z. Mass properties are exact (of the plane 0); the plane shows a 20 m square. Nodes: sphere 128 spread as a
-    Fibonacci spiral, capsule and cylinder rings, box 8 corners and points along edges and on faces, plane none. Raises
-    SdfsimError for a size that is missing or not positive.
+    z. Mass properties are exact (of the plane 0); the plane shows a 20 m square and has no nodes. Raises SdfsimError
+    for a size that is missing or not positive.
     """
     volume, inertia, nodes = 0.0, np.zeros((3, 3)), np.zeros((0, 3))
     if kind == "plane":

@@ -26,6 +26,9 @@ LEAK = 0.01
 STEP = 1e-4
 # Less of the surface than this is not worth cutting: the corners of small faces that cross each other.
 TRIFLE = 1e-3
+# Longer faces may hide something between the points at which they are tested; a centroid speaks for the whole of
+# shorter ones, which is wrong along seams only, by a fraction of their size.
+COARSE, FINE = 0.1, 0.008
 # A sheet thinner than this is below what a fit resolves (mean errors of 0.0015 near the surface are allowed).
 THINNEST = 0.01
 THICKEST = 2.0  # likewise, of what is thickened
@@ -328,24 +331,18 @@ def face_normals(corners: np.ndarray) -> np.ndarray:
     return np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
 
 
-def exposed(
-    corners: np.ndarray, side: Side, *, fine: float = 0.008, coarse: float = 0.1
-) -> tuple[np.ndarray, np.ndarray]:
+def exposed(corners: np.ndarray, side: Side) -> tuple[np.ndarray, np.ndarray]:
     """The parts of triangles [F, 3, 3 + K] that are boundary, [F', 3, 3 + K] wound outwards, and their layers [F'].
-
-    Lengths are relative to the size: faces longer than `coarse` may hide something between the points at which they
-    are tested, and are cut before they are judged; those shorter than `fine` go by their centroid, which is wrong by
-    a fraction of their size, along seams only.
-    """
+    Faces longer than `COARSE` are cut before they are judged; those shorter than `FINE` go by their centroid."""
     weights = np.array([[30, 1, 1], [1, 30, 1], [1, 1, 30], [15, 15, 1], [15, 1, 15], [1, 15, 15]], dtype=np.float64)
     weights /= weights.sum(1, keepdims=True)
     kept, layers = [corners[:0]], [np.zeros(0, dtype=np.int64)]
-    corners = no_longer_than(corners, coarse)
+    corners = no_longer_than(corners, COARSE)
     while len(corners):
         centres, normals = centres_and_normals(corners)
         verdict = side(centres, normals)
         decided = np.ones(len(corners), dtype=bool)
-        large = np.flatnonzero(_longest(corners) > fine)
+        large = np.flatnonzero(_longest(corners) > FINE)
         tests = np.einsum("kc,fci->fki", weights, corners[large, :, :3])
         others = side(tests.reshape(-1, 3), np.repeat(normals[large], len(weights), axis=0))
         decided[large] = (others.reshape(-1, len(weights)) == verdict[large, None]).all(1)
