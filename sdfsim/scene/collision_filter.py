@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations_with_replacement
 
 import numpy as np
 
@@ -39,22 +41,17 @@ def contact_groups(bodies: Sequence[Body]) -> tuple[np.ndarray, np.ndarray]:
 def count_pairs(bodies: Sequence[Body]) -> Pairs:
     """Count the pairs of a scene by what lets them touch."""
     group, allowed = contact_groups(bodies)
-    kinds: dict[tuple[int, bool, bool, bool], int] = {}
-    for body, number in zip(bodies, group.tolist(), strict=True):
-        kind = (number, body.motion == "dynamic", body.friction > 0, body.restitution > 0)
-        kinds[kind] = kinds.get(kind, 0) + 1
+    each = (bodies, group.tolist())
+    kinds = Counter((g, b.motion == "dynamic", b.friction > 0, b.restitution > 0) for b, g in zip(*each, strict=True))
     unmoved = excluded = possible = frictional = bouncy = 0
-    listed = list(kinds.items())
-    for i, ((one, moves, rough, springy), count) in enumerate(listed):
-        for (other, goes, grips, bounces), more in listed[i:]:
-            same = (one, moves, rough, springy) == (other, goes, grips, bounces)
-            pairs = count * (count - 1) // 2 if same else count * more
-            if not (moves or goes):
-                unmoved += pairs
-            elif not allowed[one, other]:
-                excluded += pairs
-            else:
-                possible += pairs
-                frictional += pairs * (rough and grips)
-                bouncy += pairs * (springy and bounces)
+    for (one, count), (other, more) in combinations_with_replacement(kinds.items(), 2):
+        pairs = count * (count - 1) // 2 if one == other else count * more
+        if not (one[1] or other[1]):
+            unmoved += pairs
+        elif not allowed[one[0], other[0]]:
+            excluded += pairs
+        else:
+            possible += pairs
+            frictional += pairs * (one[2] and other[2])
+            bouncy += pairs * (one[3] and other[3])
     return Pairs(len(bodies) * (len(bodies) - 1) // 2, unmoved, excluded, possible, frictional, bouncy)

@@ -11,17 +11,18 @@ import numpy as np
 from sdfsim.shape.shape import Shape
 
 Motion = Literal["static", "dynamic", "kinematic"]
+Switch = Literal["auto", "on", "off"]
 
 
 @dataclass(frozen=True)
 class Effects:
     """Which effects the file asks for; `auto` lets the plan decide."""
 
-    contact: Literal["auto", "on", "off"] = "auto"
-    friction: Literal["auto", "on", "off"] = "auto"
-    restitution: Literal["auto", "on", "off"] = "auto"
-    rotation: Literal["auto", "on", "off"] = "auto"
-    sleep: Literal["auto", "on", "off"] = "auto"
+    contact: Switch = "auto"
+    friction: Switch = "auto"
+    restitution: Switch = "auto"
+    rotation: Switch = "auto"
+    sleep: Switch = "auto"
 
 
 @dataclass(frozen=True)

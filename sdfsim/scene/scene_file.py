@@ -7,22 +7,32 @@ from __future__ import annotations
 
 import errno
 import itertools
+import math
 import re
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, WrapValidator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    WrapValidator,
+)
 from pydantic import model_validator as validator_of_model
-from pydantic_core import InitErrorDetails, PydanticCustomError, core_schema
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from sdfsim.errors import SceneError, SdfsimError, nearest
 from sdfsim.parallel import Progress, silent
-from sdfsim.scene.scene import Body, Effects, Limits, Motion, Scene, Waypoints
+from sdfsim.scene.scene import Body, Effects, Limits, Motion, Scene, Switch, Waypoints
 from sdfsim.shape.primitives import PRIMITIVES
 from sdfsim.shape.shape import (
     DEFAULT_RESOLUTION,
@@ -50,11 +60,8 @@ MOST_BYTES = 16 * 2**20  # of a file
 MOST_VALUES = 500_000  # of a file, each as often as an alias repeats it
 LARGEST = 1e12  # of any number: beyond it powers and products of what is legal are no longer finite
 _SHOWN = 40  # letters of a value in a message
-_NAMED = 20  # names in one message
 _LEVELS = 8  # no key lies deeper
 _NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
-_WHOLE = re.compile(r"[-+]?[0-9]{1,18}")
-_NOT_FINITE = re.compile(r"[-+]?\.?(nan|inf|infinity)", re.IGNORECASE)
 _NULL = ("", "~", "null", "Null", "NULL")
 _PLAIN_TAGS = {f"tag:yaml.org,2002:{t}" for t in ("str int float bool null map seq timestamp merge value".split())}
 
@@ -63,8 +70,7 @@ Fault = tuple[Loc, str]  # where below a table, and what is wrong there
 
 
 class Numeral(str):
-    """A number without quotes, as the file writes it. Fields read their numbers themselves, as YAML 1.1 guesses: `1:30`
-    would become 90, and `1e-3` a text."""
+    """A number without quotes, as the file writes it. YAML 1.1 guesses: `1:30` would become 90, and `1e-3` a text."""
 
 
 NOTHING = object()  # what a key has that is followed by nothing, `~` or `null`
@@ -73,102 +79,57 @@ NOTHING = object()  # what a key has that is followed by nothing, `~` or `null`
 def _shown(value: Any) -> str:
     """What the file says, for a message."""
     if isinstance(value, str):
-        text = repr(str(value))
-        return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "...'"
+        text = str(value) if isinstance(value, Numeral) else repr(value)
+        return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
     return "nothing" if value is NOTHING else "a list" if isinstance(value, list) else "a mapping"
 
 
-def _problem(text: str, kind: Any = "value") -> PydanticCustomError:
-    return PydanticCustomError(kind, "{text}", {"text": text})
+def _problem(text: str) -> PydanticCustomError:
+    return PydanticCustomError("value", "{text}", {"text": text})
 
 
-def _told(error: Any) -> tuple[str, str]:
-    """What pydantic found, in our words, and the kind of it."""
-    kind, got = error["type"], f"(got {_shown(error['input'])})"
-    if kind == "literal_error":
-        allowed = error["ctx"]["expected"].replace("'", "").replace(" or ", ", ")
-        return f"must be one of {allowed} {got}", "value"
+def _told(error: Any, table: type[Table]) -> str:
+    """What pydantic found in a table, in our words."""
+    kind, known = error["type"], table.model_fields
+    if kind == "value":
+        return error["msg"]
+    if kind == "missing":
+        return "is required"
+    key = error["loc"][0]
+    if kind == "extra_forbidden":
+        return f"unknown key{nearest(key, known) or '; known here: ' + (', '.join(known) or 'none')}"
+    extra, limits = known[key].json_schema_extra, error.get("ctx", {})
+    unit = extra.get("unit", "") if isinstance(extra, dict) else ""
+    got, allowed = _shown(error["input"]), limits.get("expected", "").replace("'", "").replace(" or ", ", ")
+    if kind.startswith("int_"):
+        return f"must be a whole number (got {got})"
     texts = {
-        "missing": "is required",
-        "list_type": f"must be a list {got}",
-        "dict_type": f"must be a mapping {got}",
-        "string_type": f"must be a text {got}",
-        "too_short": "must hold at least one entry (got 0)",
+        "number": f"must be a number{unit and ' in '}{unit} (got {got})",
+        "greater_than": f"must be > {limits.get('gt', 0):g} (got {got}{unit and ' '}{unit})",
+        "greater_than_equal": f"must be >= {limits.get('ge', 0):g} (got {got}{unit and ' '}{unit})",
+        "less_than_equal": f"must be <= {limits.get('le', 0):g} (got {got}{unit and ' '}{unit})",
+        "too_short": f"must have a length of at least {limits.get('min_length')} (got {limits.get('actual_length')})",
+        "too_long": f"must have a length of at most {limits.get('max_length')} (got {limits.get('actual_length')})",
+        "literal_error": f"must be one of {allowed} (got {got})",
+        "list_type": f"must be a list (got {got})",
+        "dict_type": f"must be a mapping (got {got})",
     }
-    return texts.get(kind) or error["msg"], "unknown" if kind == "unknown" else "value"
+    return texts.get(kind, f"must be a text (got {got})")
 
 
-@dataclass(frozen=True)
-class Number:
-    """A finite number, read from its text: above < x, least <= x <= most."""
-
-    unit: str = ""  # its SI unit, or an empty string
-    above: float | None = None
-    least: float | None = None
-    most: float | None = None
-    whole: bool = False  # it has no fraction
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> core_schema.CoreSchema:
-        return core_schema.no_info_plain_validator_function(self.read)
-
-    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict:
-        limits = {"exclusiveMinimum": self.above, "minimum": self.least, "maximum": self.most}
-        kind = "integer" if self.whole else "number"
-        return {"type": kind, "unit": self.unit, **{k: v for k, v in limits.items() if v is not None}}
-
-    def read(self, value: Any) -> float:
-        unit, number = f" {self.unit}" if self.unit else "", isinstance(value, Numeral)
-        if number and (_NOT_FINITE.fullmatch(value) or np.isinf(float(value))):
-            raise _problem(f"must be finite (got {value})")
-        if not (number and (_WHOLE if self.whole else _NUMBER).fullmatch(value)):
-            what = "a whole number" if self.whole else f"a number in{unit}" if unit else "a number"
-            raise _problem(f"must be {what} (got {_shown(value)})")
-        found = int(value) if self.whole else float(value)
-        for limit, sign, fine in (
-            (self.above, ">", self.above is None or found > self.above),
-            (self.least, ">=", self.least is None or found >= self.least),
-            (self.most, "<=", self.most is None or found <= self.most),
-            (LARGEST, "at most", self.whole or abs(found) <= LARGEST),
-        ):
-            if not fine:
-                raise _problem(f"must be {sign} {limit:g} (got {value}{unit})")
-        return found
+def _numeral(value: Any) -> Any:
+    if not isinstance(value, Numeral):
+        raise PydanticCustomError("number", "not a number")
+    return value
 
 
-@dataclass(frozen=True)
-class Vector:
-    """A list of numbers -> float64 [length]."""
-
-    of: Number = Number()  # each of them
-    length: int = 3  # how many
-    direction: str = ""  # why it may not be zero, where only its direction counts: it is made one long
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> core_schema.CoreSchema:
-        entries = core_schema.list_schema(core_schema.no_info_plain_validator_function(self.of.read))
-        return core_schema.no_info_wrap_validator_function(self._read, entries)
-
-    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict:
-        return {**self.of.__get_pydantic_json_schema__(schema, handler), "length": self.length}
-
-    def _read(self, value: Any, handler: Callable[[list], list[float]]) -> np.ndarray:
-        if not isinstance(value, list) or len(value) != self.length:
-            got = f"{len(value)} values" if isinstance(value, list) else _shown(value)
-            unit = f" in {self.of.unit}" if self.of.unit else ""
-            raise _problem(f"must be a list of {self.length} numbers{unit} (got {got})")
-        made = np.array(handler(value))
-        if not self.direction:
-            return made
-        largest = np.abs(made).max()
-        if largest < 1e-9:
-            raise _problem(f"must not be zero: {self.direction}")
-        made = made / largest  # first, so that the length of huge numbers does not overflow
-        return made / np.linalg.norm(made)
-
-
-def _text(text: str) -> str:
-    if not text.strip():
-        raise _problem(f"must be a text (got {_shown(text)})")
-    return str(text)
+def _unit(values: list[float]) -> np.ndarray:
+    """A direction, made one long."""
+    largest = np.abs(values).max()
+    if largest < 1e-9:
+        raise _problem("must not be zero")
+    made = np.array(values) / largest  # first, so that the length of huge numbers does not overflow
+    return made / np.linalg.norm(made)
 
 
 def _partners(value: Any, handler: Callable[[Any], list[str]]) -> list[str] | None:
@@ -186,8 +147,6 @@ def _find(text: str, info: ValidationInfo) -> Path:
         # Where it leads when every link is followed; of a folder, also where the files of a shape lead.
         inside = (WEIGHTS_FILE, MESH_FILE, RECORD_FILE, SKIN_FILE) if place.is_dir() else ()
         ends = [place.resolve(), *((place / name).resolve() for name in inside)]
-        with suppress(FileNotFoundError, NotADirectoryError):  # told in the words of whoever wants it
-            place.stat()
         outside = not all(end.is_relative_to(home.resolve()) for end in ends)
     except (OSError, RuntimeError, ValueError) as error:  # a loop of links, too long a name, a zero byte
         raise _problem(f"cannot be looked up: {place} ({getattr(error, 'strerror', None) or error})") from None
@@ -228,17 +187,24 @@ def _version(number: int) -> int:
     return number
 
 
-Text = Annotated[str, AfterValidator(_text)]
-Metres = Annotated[float, Number("m", above=0)]
-Place = Annotated[Any, Vector(Number("m"))]
-Switch = Literal["auto", "on", "off"]
-Quaternion = Annotated[Any, Vector(length=4, direction="a quaternion has length 1")]
+def key(what: str, default: Any = ..., unit: str = "", **limits: float) -> Any:
+    """A key of a table: what it says, its unit, and what is allowed."""
+    return Field(default, description=what, json_schema_extra={"unit": unit}, **limits)  # type: ignore[arg-type]
+
+
+_THREE = Field(min_length=3, max_length=3)
+Text = Annotated[str, Field(pattern=r"\S")]
+Number = Annotated[float, BeforeValidator(_numeral), Field(ge=-LARGEST, le=LARGEST)]
+Whole = Annotated[int, BeforeValidator(_numeral), Field(le=10**18)]
+Vector = Annotated[list[Number], _THREE]
+Direction = Annotated[Vector, AfterValidator(_unit)]
+Quaternion = Annotated[list[Number], Field(min_length=4, max_length=4), AfterValidator(_unit)]
 
 
 class Table(BaseModel):
     """A mapping of the file. All of its faults are found at once."""
 
-    model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True)
+    model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True, extra="forbid")
 
     @validator_of_model(mode="wrap")
     @classmethod
@@ -246,19 +212,14 @@ class Table(BaseModel):
         data = {} if data is NOTHING else data
         if not isinstance(data, dict):
             raise _problem(f"must be a mapping (got {_shown(data)})")
-        known = cls.model_fields
-        listed = f"; known here: {', '.join(known) or 'none'}"
-        faults = [(key, f"unknown key{nearest(key, known) or listed}", "unknown") for key in data if key not in known]
-        found = [((key,), text, kind) for key, text, kind in faults]
-        found += [(loc, text, "value") for loc, text in cls.check_keys(data)]
-        made = None
+        found, made = list(cls.check_keys(data)), None
         try:
             made = handler(data)
-            found += [(loc, text, "value") for loc, text in made.check_values()]
+            found += made.check_values()
         except ValidationError as error:
-            found += [(e["loc"], *_told(e)) for e in error.errors(include_url=False)]
+            found += [(e["loc"], _told(e, cls)) for e in error.errors(include_url=False)]
         if found:
-            details = [InitErrorDetails(type=_problem(text, kind), loc=loc, input=None) for loc, text, kind in found]
+            details = [InitErrorDetails(type=_problem(text), loc=loc, input=None) for loc, text in found]
             raise ValidationError.from_exception_data(cls.__name__, details)
         return made
 
@@ -283,45 +244,45 @@ def _one_of(data: dict, keys: Iterable[str], *, required: bool = False) -> Itera
 class EffectsTable(Table):
     """Which effects to compute; `auto` is on where it can change the motion, as `sdfsim plan` tells."""
 
-    contact: Switch = Field(default="auto", description="bodies touch")
-    friction: Switch = Field(default="auto", description="contacts hold sideways")
-    restitution: Switch = Field(default="auto", description="contacts rebound")
-    rotation: Switch = Field(default="auto", description="bodies turn")
-    sleep: Switch = Field(default="auto", description="what rests is frozen until something disturbs it")
+    contact: Switch = key("bodies touch", "auto")
+    friction: Switch = key("contacts hold sideways", "auto")
+    restitution: Switch = key("contacts rebound", "auto")
+    rotation: Switch = key("bodies turn", "auto")
+    sleep: Switch = key("what rests is frozen until something disturbs it", "auto")
 
 
 class LimitsTable(Table):
     """What a run must keep to."""
 
-    memory_gib: Annotated[float | None, Number("GiB", above=0)] = Field(
-        default=None, description="memory that one step may take for distances and edges; no limit without it"
+    memory_gib: Number | None = key(
+        "memory that one step may take for distances and edges; no limit without it", None, "GiB", gt=0
     )
 
 
 class Primitive(Table):
     """A procedural shape."""
 
-    name: Annotated[Text, AfterValidator(_primitive)] = Field(description=f"one of {', '.join(PRIMITIVES)}")
-    size: Metres = Field(1.0, description="largest extent")
+    name: Annotated[Text, AfterValidator(_primitive)] = key(f"one of {', '.join(PRIMITIVES)}")
+    size: Number = key("largest extent", 1.0, "m", gt=0)
 
 
 class Sphere(Table):
     """An exact sphere about the origin."""
 
-    radius: Metres = Field(description="radius")
+    radius: Number = key("radius", unit="m", gt=0)
 
 
 class Upright(Table):
     """An exact capsule or cylinder along z, about the origin."""
 
-    radius: Metres = Field(description="radius")
-    height: Metres = Field(description="along z; of a capsule with its caps, so above twice the radius")
+    radius: Number = key("radius", unit="m", gt=0)
+    height: Number = key("along z; of a capsule with its caps, so above twice the radius", unit="m", gt=0)
 
 
 class Box(Table):
     """An exact box about the origin."""
 
-    size: Annotated[Any, Vector(Number("m", above=0))] = Field(description="extents along x, y, z")
+    size: Annotated[list[Annotated[Number, Field(gt=0)]], _THREE] = key("extents along x, y, z", unit="m")
 
 
 class PlaneShape(Table):
@@ -336,42 +297,38 @@ _WITH_SDF = ("asset", *_FITTED)  # the others have an exact SDF of their own
 class ShapeTable(Table):
     """One shape: exactly one of `asset` to `plane`, and how its distances and surface nodes are made."""
 
-    asset: Annotated[Text, AfterValidator(_folder)] | None = Field(
-        None, description="folder that `reconstruct` or `fit` has written, from the scene's folder"
+    asset: Annotated[Text, AfterValidator(_folder)] | None = key(
+        "folder that `reconstruct` or `fit` has written, from the scene's folder", None
     )
-    mesh: Annotated[Text, AfterValidator(_file)] | None = Field(
-        None, description="mesh file, from the scene's folder; fitted on first use, then taken from a cache"
+    mesh: Annotated[Text, AfterValidator(_file)] | None = key(
+        "mesh file, from the scene's folder; fitted on first use, then taken from a cache", None
     )
-    primitive: Primitive | None = Field(None, description="a procedural shape, fitted on first use")
-    sphere: Sphere | None = Field(None, description="an exact sphere")
-    capsule: Upright | None = Field(None, description="an exact capsule")
-    cylinder: Upright | None = Field(None, description="an exact cylinder")
-    box: Box | None = Field(None, description="an exact box")
-    plane: PlaneShape | None = Field(None, description="an infinite plane")
-    units: Literal["m", "cm", "mm", "in"] = Field("m", description="of the numbers in a mesh file")
-    cap: Literal["on", "off"] = Field("off", description="close the openings of a mesh")
-    thicken: Annotated[float | None, Number("m", above=0)] = Field(
-        None, description="thickness that an open sheet of a mesh gets"
-    )
-    sdf: SdfKind | None = Field(
-        None,
-        description="where distances come from: a fitted network, samples on a grid, or the mesh itself; without it "
+    primitive: Primitive | None = key("a procedural shape, fitted on first use", None)
+    sphere: Sphere | None = key("an exact sphere", None)
+    capsule: Upright | None = key("an exact capsule", None)
+    cylinder: Upright | None = key("an exact cylinder", None)
+    box: Box | None = key("an exact box", None)
+    plane: PlaneShape | None = key("an infinite plane", None)
+    units: Literal["m", "cm", "mm", "in"] = key("of the numbers in a mesh file", "m")
+    cap: Literal["on", "off"] = key("close the openings of a mesh", "off")
+    thicken: Number | None = key("thickness that an open sheet of a mesh gets", None, "m", gt=0)
+    sdf: SdfKind | None = key(
+        "where distances come from: a fitted network, samples on a grid, or the mesh itself; without it "
         "an asset keeps its own and others are fitted",
+        None,
     )
-    resolution: Annotated[int, Number(least=8, most=512, whole=True)] = Field(
-        DEFAULT_RESOLUTION, description="samples along each side, with `sdf: grid`"
+    resolution: Whole = key("samples along each side, with `sdf: grid`", DEFAULT_RESOLUTION, ge=8, le=512)
+    nodes: Whole | None = key(
+        "N of the N^3 grid whose points become surface nodes; without it a shape keeps its own", None, ge=3, le=128
     )
-    nodes: Annotated[int | None, Number(least=3, most=128, whole=True)] = Field(
-        None, description="N of the N^3 grid whose points become surface nodes; without it a shape keeps its own"
-    )
-    wall: Metres | None = Field(
-        None, description="makes the shape hollow: only what lies within this of its surface has mass"
+    wall: Number | None = key(
+        "makes the shape hollow: only what lies within this of its surface has mass", None, "m", gt=0
     )
 
     @classmethod
     def check_keys(cls, data: dict) -> Iterator[Fault]:
         yield from _one_of(data, _KINDS, required=True)
-        kind = _kind_of(data)
+        kind = next((key for key in data if key in _KINDS), None)
         for key in ("units", "cap", "thicken"):
             if key in data and kind not in ("mesh", None):
                 yield (key,), f"goes with mesh only (this is a {kind})"
@@ -379,9 +336,9 @@ class ShapeTable(Table):
             yield ("sdf",), f"goes with {', '.join(_WITH_SDF)} only (a {kind} has its exact SDF)"
         if "resolution" in data and data.get("sdf") in (None, "mlp", "mesh"):
             yield ("resolution",), "goes with sdf: grid only"
-        for key, why in (("nodes", "has no nodes"), ("wall", "has no mass")):
+        for key in ("nodes", "wall"):
             if key in data and kind == "plane":
-                yield (key,), f"goes with bodies only (a plane {why})"
+                yield (key,), "goes with bodies only (a plane has no nodes and no mass)"
 
     def check_values(self) -> Iterator[Fault]:
         if self.capsule and self.capsule.height <= 2 * self.capsule.radius:
@@ -394,21 +351,15 @@ class ShapeTable(Table):
         return next(kind for kind in _KINDS if getattr(self, kind) is not None)
 
 
-def _kind_of(data: Any) -> str | None:
-    return next((key for key in data if key in _KINDS), None) if isinstance(data, dict) else None
-
-
 _ROTATIONS = ("quat_xyzw", "quat_wxyz", "euler_xyz_deg")
 
 
 class Turned(Table):
     """What has an orientation, given by at most one of three keys."""
 
-    quat_xyzw: Quaternion | None = Field(None, description="orientation as a quaternion, scalar last; of any length")
-    quat_wxyz: Quaternion | None = Field(None, description="the same with its scalar first")
-    euler_xyz_deg: Annotated[Any, Vector(Number("degrees"))] | None = Field(
-        None, description="the same as turns about the fixed x, then y, then z"
-    )
+    quat_xyzw: Quaternion | None = key("orientation as a quaternion, scalar last; of any length", None)
+    quat_wxyz: Quaternion | None = key("the same with its scalar first", None)
+    euler_xyz_deg: Vector | None = key("the same as turns about the fixed x, then y, then z", None, "degrees")
 
     @classmethod
     def check_keys(cls, data: dict) -> Iterator[Fault]:
@@ -422,23 +373,21 @@ class Turned(Table):
             from scipy.spatial.transform import Rotation  # slow to import
 
             return Rotation.from_euler("xyz", self.euler_xyz_deg, degrees=True).as_quat()
-        return np.array([0.0, 0.0, 0.0, 1.0]) if self.quat_xyzw is None else self.quat_xyzw
+        return np.array([0.0, 0.0, 0.0, 1.0] if self.quat_xyzw is None else self.quat_xyzw)
 
 
 class Waypoint(Turned):
     """One pose of a path. In between a body goes straight and turns evenly; before and after it rests."""
 
-    time: Annotated[float, Number("s", least=0)] = Field(description="when; later than the pose before it")
-    position: Place = Field(description="of the shape's own origin")
+    time: Number = key("when; later than the pose before it", unit="s", ge=0)
+    position: Vector = key("of the shape's own origin", unit="m")
 
 
 class Plane(Table):
     """The points x with normal . x = offset, of a body without a shape."""
 
-    normal: Annotated[Any, Vector(direction="it is the direction the plane faces")] = Field(
-        (0.0, 0.0, 1.0), description="the direction it faces; of any length"
-    )
-    offset: Annotated[float, Number("m")] = Field(0.0, description="distance from the origin along the normal")
+    normal: Direction = key("the direction it faces; of any length", (0.0, 0.0, 1.0))
+    offset: Number = key("distance from the origin along the normal", 0.0, "m")
 
     def pose(self) -> tuple[np.ndarray, np.ndarray]:
         """Position [3] m and quaternion [4] xyzw that carry z = 0 onto the plane."""
@@ -452,47 +401,46 @@ class Plane(Table):
 class Arrange(Table):
     """Copies on a grid, centred on the position in x and y, its lowest layer at the position."""
 
-    grid: Annotated[Any, Vector(Number(least=1, whole=True))] = Field(description="copies along x, y, z")
-    spacing: Metres = Field(description="from one to the next")
+    grid: Annotated[list[Annotated[Whole, Field(ge=1)]], _THREE] = key("copies along x, y, z")
+    spacing: Number = key("from one to the next", unit="m", gt=0)
 
 
 _NOT_WITH_PATH = ("position", *_ROTATIONS, "velocity", "angular_velocity", "mass", "density")
 _NOT_WITH_PLANE = ("shape", "scale", *_NOT_WITH_PATH, "count", "arrange")
+_ORIGIN = (0.0, 0.0, 0.0)
 
 
 class BodyTable(Turned):
     """One body, or many copies of it: either a `shape` or a `plane` of its own."""
 
-    name: Text = Field(description="unique; copies are called name[0], name[1], ...")
-    shape: Text | None = Field(None, description="a name under `shapes`")
-    plane: Plane | None = Field(None, description="makes it an infinite static plane")
-    motion: Motion | None = Field(
-        None, description="kinematic bodies follow their `path`, whatever they meet; dynamic without it, planes static"
+    name: Text = key("unique; copies are called name[0], name[1], ...")
+    shape: Text | None = key("a name under `shapes`", None)
+    plane: Plane | None = key("makes it an infinite static plane", None)
+    motion: Motion | None = key(
+        "kinematic bodies follow their `path`, whatever they meet; dynamic without it, planes static", None
     )
-    path: Annotated[list[Waypoint], Field(min_length=1)] | None = Field(None, description="poses of a kinematic body")
-    scale: Annotated[float, Number(above=0)] = Field(1.0, description="factor on the size of the shape")
-    position: Place = Field((0.0, 0.0, 0.0), description="of the shape's own origin")
-    velocity: Annotated[Any, Vector(Number("m/s"))] = Field((0.0, 0.0, 0.0), description="of the centre of mass")
-    angular_velocity: Annotated[Any, Vector(Number("rad/s"))] = Field((0.0, 0.0, 0.0), description="in world axes")
-    mass: Annotated[float | None, Number("kg", above=0)] = Field(None, description="without it the density counts")
-    density: Annotated[float, Number("kg/m^3", above=0)] = Field(1000.0, description="not together with mass")
-    friction: Annotated[float, Number(least=0, most=1000)] = Field(
-        0.5, description="Coulomb coefficient; two bodies' product counts"
+    path: Annotated[list[Waypoint], Field(min_length=1)] | None = key("poses of a kinematic body", None)
+    scale: Number = key("factor on the size of the shape", 1.0, gt=0)
+    position: Vector = key("of the shape's own origin", _ORIGIN, "m")
+    velocity: Vector = key("of the centre of mass", _ORIGIN, "m/s")
+    angular_velocity: Vector = key("in world axes", _ORIGIN, "rad/s")
+    mass: Number | None = key("without it the density counts", None, "kg", gt=0)
+    density: Number = key("not together with mass", 1000.0, "kg/m^3", gt=0)
+    friction: Number = key("Coulomb coefficient; two bodies' product counts", 0.5, ge=0, le=1000)
+    restitution: Number = key("two bodies' product counts", 0.5, ge=0, le=1)
+    collides_with: Annotated[list[Text] | None, WrapValidator(_partners)] = key(
+        "`all`, or a list of names: two bodies touch where each lists the other", None
     )
-    restitution: Annotated[float, Number(least=0, most=1)] = Field(0.5, description="two bodies' product counts")
-    collides_with: Annotated[list[Text] | None, WrapValidator(_partners)] = Field(
-        None, description="`all`, or a list of names: two bodies touch where each lists the other"
-    )
-    count: Annotated[int | None, Number(least=1, whole=True)] = Field(
-        None, description="how many copies; without it, as many as the grid has places"
-    )
-    arrange: Arrange | None = Field(None, description="where the copies are")
+    count: Whole | None = key("how many copies; without it, as many as the grid has places", None, ge=1)
+    arrange: Arrange | None = key("where the copies are", None)
 
     @classmethod
     def check_keys(cls, data: dict) -> Iterator[Fault]:
         for key in _NOT_WITH_PLANE if "plane" in data else ():
             if key in data:
                 yield (key,), "does not go with plane: a plane is static and has its pose from normal and offset"
+        if "plane" in data and data.get("motion", "static") != "static":
+            yield ("motion",), "a plane must be static"
         if "plane" not in data:
             yield from _one_of(data, ("shape", "plane"), required=True)
             yield from super().check_keys(data)
@@ -507,30 +455,20 @@ class BodyTable(Turned):
             yield ("path",), "goes with motion: kinematic only"
 
     def check_values(self) -> Iterator[Fault]:
-        if self.plane and self.motion not in (None, "static"):
-            yield ("motion",), "a plane must be static"
         for i, (before, pose) in enumerate(itertools.pairwise(self.path or []), 1):
             if pose.time <= before.time:
                 got = f"(got {pose.time:g} s after {before.time:g} s)"
                 yield ("path", i), f"must be later than the pose before it {got}"
-        if self.motion == "static":
-            yield from self.check_rest()
         if self.arrange is None and self.copies > 1:
             advice = "needs arrange: {grid: [nx, ny, nz], spacing: metres}"
             yield ("count",), f"{advice} (got {self.copies} at one place)"
         elif self.copies > self.places:
             yield ("count",), f"must be <= {self.places}, the places of the grid (got {self.copies})"
 
-    def check_rest(self) -> Iterator[Fault]:
-        """That it has no velocity, as a static body."""
-        for key in ("velocity", "angular_velocity"):
-            if np.any(getattr(self, key)):
-                yield (key,), "must be zero: a static body does not move"
-
     @property
     def places(self) -> int:
         """Of the grid, or the one of a body alone."""
-        return 1 if self.arrange is None else int(np.prod(self.arrange.grid, dtype=np.float64))
+        return 1 if self.arrange is None else math.prod(self.arrange.grid)
 
     @property
     def copies(self) -> int:
@@ -555,39 +493,31 @@ class BodyTable(Turned):
 class SceneTable(Table):
     """The whole file."""
 
-    version: Annotated[int, Number(whole=True), AfterValidator(_version)] = Field(description=f"always {VERSION}")
-    model: Annotated[Text, AfterValidator(_model)] | None = Field(
-        None, description="bundled model, or a .safetensors file in the scene's folder; it owns its time step"
+    version: Annotated[Whole, AfterValidator(_version)] = key(f"always {VERSION}")
+    model: Annotated[Text, AfterValidator(_model)] | None = key(
+        "bundled model, or a .safetensors file in the scene's folder; it owns its time step", None
     )
-    duration: Annotated[float, Number("s", above=0)] = Field(DEFAULT_DURATION, description="simulated time")
-    seed: Annotated[int, Number(least=0, whole=True)] = Field(0, description="of the run's random numbers")
-    gravity: Annotated[Any, Vector(Number("m/s^2"))] = Field(DEFAULT_GRAVITY, description="pull on every free body")
-    effects: EffectsTable = Field(default=EffectsTable(), description="which effects to compute")
-    limits: LimitsTable = Field(default=LimitsTable(), description="what a run must keep to")
-    shapes: dict[str, ShapeTable] = Field({}, description="shapes by name")
-    bodies: Annotated[list[BodyTable], Field(min_length=1)] = Field(description="all bodies")
+    duration: Number = key("simulated time", DEFAULT_DURATION, "s", gt=0)
+    seed: Whole = key("of the run's random numbers", 0, ge=0)
+    gravity: Vector = key("pull on every free body", DEFAULT_GRAVITY, "m/s^2")
+    effects: EffectsTable = key("which effects to compute", EffectsTable())
+    limits: LimitsTable = key("what a run must keep to", LimitsTable())
+    shapes: dict[str, ShapeTable] = key("shapes by name", {})
+    bodies: Annotated[list[BodyTable], Field(min_length=1)] = key("all bodies")
 
     @classmethod
     def check_keys(cls, data: dict) -> Iterator[Fault]:
         shapes = data["shapes"] if isinstance(data.get("shapes"), dict) else {}
         listed = data["bodies"] if isinstance(data.get("bodies"), list) else []
-        bodies = [(i, entry) for i, entry in enumerate(listed) if isinstance(entry, dict)]
         first: dict[str, int] = {}
-        for i, entry in bodies:
-            name, shape = (_name(entry.get(key)) for key in ("name", "shape"))
-            if name and first.setdefault(name, i) != i:
+        for i, entry in enumerate(listed):
+            said = [entry.get(key) for key in ("name", "shape")] if isinstance(entry, dict) else ["", ""]
+            name, shape = (text if isinstance(text, str) else "" for text in said)  # else a fault of its own
+            if name.strip() and first.setdefault(name, i) != i:
                 yield ("bodies", i, "name"), f"two bodies are called {name!r} (the first is bodies[{first[name]}])"
-            if shape and shape not in shapes:
-                few = [*list(shapes)[:_NAMED], *(["..."] if len(shapes) > _NAMED else [])]
-                there = f"; shapes are {', '.join(few)}" if shapes else "; the file has no shapes"
+            if shape.strip() and shape not in shapes:
+                there = f"; shapes are {', '.join([*shapes][:20])}" if shapes else "; the file has no shapes"
                 yield ("bodies", i, "shape"), f"no shape is called {shape!r}{nearest(shape, shapes) or there}"
-            if _kind_of(shapes.get(shape)) == "plane" and entry.get("motion") in ("dynamic", "kinematic"):
-                yield ("bodies", i, "motion"), "a plane must be static"
-        for i, entry in bodies:
-            partners = entry.get("collides_with")
-            for k, partner in enumerate(map(_name, partners) if isinstance(partners, list) else ()):
-                if partner and partner not in first and "[" not in partner:
-                    yield ("bodies", i, "collides_with", k), _nobody(partner, first)
 
     def check_values(self) -> Iterator[Fault]:
         first = {body.name: i for i, body in enumerate(self.bodies)}
@@ -599,26 +529,23 @@ class SceneTable(Table):
         for name in copies.keys() & first.keys():
             yield ("bodies", first[name], "name"), f"two bodies are called {name!r} (see bodies[{copies[name]}])"
         for i, body in enumerate(self.bodies):
-            if body.motion is None and self.motion_of(body) == "static":
-                yield from ((("bodies", i, *loc), text) for loc, text in body.check_rest())
+            if body.shape and self.flat(body) and body.motion not in (None, "static"):
+                yield ("bodies", i, "motion"), "a plane must be static"
+            for key in ("velocity", "angular_velocity") if self.motion_of(body) == "static" else ():
+                if np.any(getattr(body, key)):
+                    yield ("bodies", i, key), "must be zero: a static body does not move"
             for k, partner in enumerate(body.collides_with or []):
                 if partner not in first and partner not in copies:
-                    yield ("bodies", i, "collides_with", k), _nobody(partner, first)
+                    yield ("bodies", i, "collides_with", k), f"no body is called {partner!r}{nearest(partner, first)}"
+
+    def flat(self, body: BodyTable) -> bool:
+        """Whether it is a plane."""
+        shape = self.shapes.get(body.shape or "")
+        return body.plane is not None or (shape is not None and shape.plane is not None)
 
     def motion_of(self, body: BodyTable) -> Motion:
         """As it says, else static for planes and dynamic for others."""
-        shape = self.shapes.get(body.shape) if body.shape else None
-        flat = body.plane is not None or (shape is not None and shape.plane is not None)
-        return body.motion or ("static" if flat else "dynamic")
-
-
-def _name(value: Any) -> str:
-    """A name that can be looked for; empty where the value is a fault of its own."""
-    return str(value) if isinstance(value, str) and value.strip() else ""
-
-
-def _nobody(name: str, known: Iterable[str]) -> str:
-    return f"no body is called {name!r}{nearest(name, known)}"
+        return body.motion or ("static" if self.flat(body) else "dynamic")
 
 
 class Document:
@@ -630,15 +557,15 @@ class Document:
 
     def __init__(self, path: Path, text: str | None = None) -> None:
         self._path = path
-        self._line: dict[Loc, int] = {}  # of every value
-        self._key_line: dict[Loc, int] = {}
+        self._line: dict[Loc, int] = {}  # of every key, and of every entry of a list
         self._found: dict[tuple[int, str], None] = {}  # in the order of the finding, each once
-        self.data = self._read(_compose(path, _text_of(path) if text is None else text), ())
+        root = _compose(path, _text_of(path) if text is None else text)
+        self.data = self._read(root, (), root.start_mark.line + 1)
 
-    def wrong(self, loc: Loc, text: str, *, key: bool = False, line: int = 0) -> None:
-        """Note a fault at the value under `loc`, at its key, or at a line."""
-        known = next(loc[:depth] for depth in range(len(loc), -1, -1) if loc[:depth] in self._line)
-        line = line or (self._key_line.get(loc, 0) if key else 0) or self._line[known]
+    def wrong(self, loc: Loc, text: str, line: int | None = None) -> None:
+        """Note a fault of the value under `loc`, in its line or another."""
+        if line is None:
+            line = next(self._line[loc[:depth]] for depth in range(len(loc), -1, -1) if loc[:depth] in self._line)
         where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc)[1:200]
         self._found[line, f"{self._path}:{line}: {where}: {text}" if loc else f"{self._path}:{line}: {text}"] = None
 
@@ -647,8 +574,8 @@ class Document:
         if self._found:
             raise SceneError([text for _, text in sorted(self._found, key=lambda entry: entry[0])])
 
-    def _read(self, node: yaml.Node, loc: Loc) -> Any:
-        self._line[loc] = node.start_mark.line + 1
+    def _read(self, node: yaml.Node, loc: Loc, line: int) -> Any:
+        self._line[loc] = line
         if len(self._line) > MOST_VALUES:
             raise SceneError([f"{self._path}:1: with its aliases it has more than {MOST_VALUES} values"])
         if node.tag not in _PLAIN_TAGS:
@@ -656,22 +583,20 @@ class Document:
         if len(loc) > _LEVELS:
             return "..."
         if isinstance(node, yaml.SequenceNode):
-            return [self._read(child, (*loc, i)) for i, child in enumerate(node.value)]
+            return [self._read(child, (*loc, i), child.start_mark.line + 1) for i, child in enumerate(node.value)]
         if isinstance(node, yaml.ScalarNode):
-            plain = node.style is None
-            number = plain and (_NUMBER.fullmatch(node.value) or _NOT_FINITE.fullmatch(node.value))
-            return NOTHING if plain and node.value in _NULL else Numeral(node.value) if number else node.value
+            if node.style is not None:
+                return node.value
+            return NOTHING if node.value in _NULL else (Numeral if _NUMBER.fullmatch(node.value) else str)(node.value)
         found: dict[str, Any] = {}
         for key_node, child in node.value:
             key, line = key_node.value, key_node.start_mark.line + 1
             if not isinstance(key_node, yaml.ScalarNode) or key_node.tag not in _PLAIN_TAGS:
-                self.wrong(loc, "a key must be a text without tags", line=line)
+                self.wrong(loc, "a key must be a text without tags", line)
             elif key in found:
-                first = self._key_line[*loc, key]
-                self.wrong((*loc, key), f"the key appears twice (first on line {first})", line=line)
+                self.wrong((*loc, key), f"the key appears twice (first on line {self._line[*loc, key]})", line)
             else:
-                self._key_line[*loc, key] = line
-                found[key] = self._read(child, (*loc, key))
+                found[key] = self._read(child, (*loc, key), line)
         return found
 
 
@@ -679,9 +604,8 @@ def _text_of(path: Path) -> str:
     try:
         if path.exists() and not path.is_dir() and not path.is_file():
             raise OSError(errno.EINVAL, "not a file")  # a device or a pipe may have no end
-        if path.is_file() and (size := path.stat().st_size) > MOST_BYTES:
-            told = f"{size / 2**20:.0f} MiB, at most {MOST_BYTES // 2**20}"
-            raise SceneError([f"{path}: too large for a scene ({told})"], "arrange makes many bodies of one entry")
+        if path.is_file() and path.stat().st_size > MOST_BYTES:
+            raise SceneError([f"{path}: too large for a scene (at most {MOST_BYTES // 2**20} MiB)"])
         return path.read_bytes().decode("utf-8")
     except OSError as error:
         why = "no such file" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
@@ -712,7 +636,7 @@ def read_scene(path: Path, *, allow_outside: bool = False, text: str | None = No
         table = SceneTable.model_validate(document.data, context=context)
     except ValidationError as error:
         for e in error.errors(include_url=False):
-            document.wrong(e["loc"], e["msg"], key=e["type"] == "unknown")
+            document.wrong(e["loc"], e["msg"])
         document.check()
         raise
     document.check()
@@ -737,10 +661,7 @@ def load_scene(
     for i, entry in enumerate(table.bodies):
         made = _body(entry, order[entry.shape], table.motion_of(entry), groups)
         if made.motion == "dynamic":
-            mass, fault = _mass(entry, shapes[entry.shape])
-            made = replace(made, mass=mass)
-            if fault:
-                document.wrong(("bodies", i, "name"), fault)
+            made = replace(made, mass=_mass(entry, shapes[entry.shape], partial(document.wrong, ("bodies", i, "name"))))
         for name, offset in zip(entry.names(), entry.offsets(), strict=True):
             way = made.path and replace(made.path, position=made.path.position + offset)
             bodies.append(replace(made, name=name, position=made.position + offset, path=way))
@@ -825,18 +746,17 @@ def _body(entry: BodyTable, shape: int, motion: Motion, groups: dict[str, list[s
     )
 
 
-def _mass(entry: BodyTable, shape: Shape) -> tuple[float, str | None]:
-    """Of a dynamic body, kg; and why it cannot move, if so."""
+def _mass(entry: BodyTable, shape: Shape, wrong: Callable[[str], None]) -> float:
+    """Of a dynamic body, kg; tells `wrong` why it cannot move, if so."""
     volume = shape.volume * entry.scale**3
     mass = entry.density * volume if entry.mass is None else entry.mass
     if not (np.isfinite(volume) and volume > 0):
-        return mass, f"cannot move: its shape has a volume of {volume:g} m^3; close it, or make it static"
-    if not (np.isfinite(mass) and mass > 0):
-        told = f"density {entry.density:g} kg/m^3 times a volume of {volume:g} m^3"
-        return mass, f"has no usable mass: {told}; give mass in kg"
-    if not len(shape.nodes):
-        return mass, "cannot move: its shape has no surface nodes to touch others with; make it static"
-    return mass, None
+        wrong(f"cannot move: its shape has a volume of {volume:g} m^3; close it, or make it static")
+    elif not (np.isfinite(mass) and mass > 0):
+        wrong(f"has no usable mass: density {entry.density:g} kg/m^3 times a volume of {volume:g} m^3; give mass in kg")
+    elif not len(shape.nodes):
+        wrong("cannot move: its shape has no surface nodes to touch others with; make it static")
+    return mass
 
 
 _SECTIONS: dict[str, type[Table]] = {
@@ -870,21 +790,22 @@ def reference() -> str:
         lines += ["", "| key | what | unit | allowed | default |", "| --- | --- | --- | --- | --- |"] if schema else []
         for key, field in table.model_fields.items():
             told = {**next(iter(schema[key].get("anyOf", [])), {}), **schema[key]}
-            default = "required" if field.is_required() else _default(told.get("default"))
-            cells = (f"`{key}`", told["description"], told.get("unit", ""), _allowed(told), default)
+            default = "required" if field.is_required() else told.get("default")
+            default = "" if default is None or isinstance(default, dict) else str(default)
+            cells = (f"`{key}`", told["description"], told["unit"], _allowed(told), default)
             lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
 
-def _default(value: Any) -> str:
-    return "" if value is None or isinstance(value, dict) else str(value)
-
-
 def _allowed(schema: dict) -> str:
-    signs = {"exclusiveMinimum": ">", "minimum": ">=", "maximum": "<="}
-    limits = " and ".join(f"{sign} {schema[key]:g}" for key, sign in signs.items() if key in schema)
-    count = f"{schema['length']} numbers" if "length" in schema else ""
-    return ", ".join(schema.get("enum", [])) or ", each ".join(part for part in (count, limits) if part)
+    """The values that a schema allows; bounds that every number has are not told."""
+    limits = []
+    for sign, native, other in ((">", "exclusiveMinimum", "gt"), (">=", "minimum", "ge"), ("<=", "maximum", "le")):
+        limit = schema.get(native, schema.get(other, np.inf))
+        limits += [f"{sign} {limit:g}"] if abs(limit) < LARGEST else []
+    if "maxItems" in schema:
+        return ", each ".join(part for part in (f"{schema['maxItems']} numbers", _allowed(schema["items"])) if part)
+    return ", ".join(schema.get("enum", [])) or " and ".join(limits)
 
 
 if __name__ == "__main__":

@@ -67,18 +67,21 @@ class Scene:
 
     def _text(self, folder: Path | None) -> str:
         """The file; paths start at `folder`, or stay as they are."""
-        shapes = {name: dict(entry) for name, entry in self._shapes.items()}
-        for entry in shapes.values() if folder else ():
-            entry.update(
-                {key: os.path.relpath(entry[key], folder) for key in _PATHS if isinstance(entry.get(key), str)}
-            )
-        settings = dict(self._settings)
-        if folder and str(settings.get("model", "")).endswith(".safetensors"):
-            settings["model"] = os.path.relpath(settings["model"], folder)
-        lines = [f"version: {VERSION}", *(f"{key}: {_flow(value)}" for key, value in settings.items())]
-        lines += ["shapes:", *(f"  {_flow(name)}: {_flow(entry)}" for name, entry in shapes.items())] if shapes else []
-        lines += ["bodies:", *(f"  - {_flow(body)}" for body in self._bodies)] if self._bodies else []
-        return "\n".join(lines) + "\n"
+
+        def moved(path: Any) -> Any:
+            return os.path.relpath(path, folder) if folder and isinstance(path, str) else path
+
+        document = {"version": VERSION, **self._settings}
+        if str(document.get("model", "")).endswith(".safetensors"):
+            document["model"] = moved(document["model"])
+        if self._shapes:
+            document["shapes"] = {
+                name: {key: moved(value) if key in _PATHS else value for key, value in entry.items()}
+                for name, entry in self._shapes.items()
+            }
+        if self._bodies:
+            document["bodies"] = self._bodies
+        return yaml.safe_dump(document, default_flow_style=None, sort_keys=False, width=10**9)
 
 
 def _check(keys: dict[str, Any], known: list[str], what: str) -> None:
@@ -96,8 +99,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(entry) for entry in value]
     return ("on" if value else "off") if isinstance(value, bool) else str(value) if isinstance(value, Path) else value
-
-
-def _flow(value: Any) -> str:
-    """One line of YAML."""
-    return yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10**9).removesuffix("...\n").strip()

@@ -1,7 +1,4 @@
-"""A signed distance baked to a grid of bricks: what the contact solve asks thousands of times a step.
-
-A network is what a shape is stored and shipped as; a look into a grid is a hundred times faster than asking it.
-"""
+"""A signed distance baked to a grid of bricks, a hundred times faster to ask than a network: for the contact solve."""
 
 from __future__ import annotations
 
@@ -16,7 +13,7 @@ import torch
 from sdfsim.errors import SdfsimError
 from sdfsim.files import digest, read_arrays, user_cache, write_arrays
 from sdfsim.shape.distance import PiecesDistance
-from sdfsim.shape.mesh import convex_hull
+from sdfsim.shape.mesh import convex_hull, lattice
 from sdfsim.shape.mlp_sdf import MlpSdf
 from sdfsim.shape.sdf import Sdf
 
@@ -92,16 +89,14 @@ def bake(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = ()) -> Bake
     low, high = sdf.bounds[0] - PADDING * cell, sdf.bounds[1] + PADDING * cell
     count = np.ceil((high - low) / (SIDE * cell)).astype(int)
     low = 0.5 * (low + high) - 0.5 * count * SIDE * cell
-    corners = _places(low, SIDE * cell, [np.arange(n + 1) for n in count])
-    coarse = ask(corners).reshape(count + 1)
-    middles = _places(low, SIDE * cell, [np.arange(n) + 0.5 for n in count])
+    coarse = ask(low + SIDE * cell * lattice(*(np.arange(n + 1) for n in count))).reshape(count + 1)
+    middles = low + SIDE * cell * lattice(*(np.arange(n) + 0.5 for n in count))
     # Distances change by no more than the way gone; two cells are for contacts that have not quite been made.
     near = np.abs(ask(middles)) <= (0.5 * np.sqrt(3.0) * SIDE + 2.0) * cell
     brick = np.full(len(middles), -1, dtype=np.int32)
     brick[near] = np.arange(near.sum())
     steps = (np.arange(SIDE + 1) - 0.5 * SIDE) * cell
-    offsets = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(1, -1, 3)
-    fine = ask((middles[near][:, None] + offsets).reshape(-1, 3)).reshape(-1, *(SIDE + 1,) * 3)
+    fine = ask((middles[near][:, None] + lattice(steps, steps, steps)).reshape(-1, 3)).reshape(-1, *(SIDE + 1,) * 3)
     grid = BakedGrid(low, cell, coarse, brick.reshape(count), fine, thickness, 0.0)
     generator = np.random.default_rng(0)
     some = middles[near][generator.integers(near.sum(), size=20_000)]
@@ -152,10 +147,6 @@ def interpolated(grid: BakedGrid, points: np.ndarray) -> np.ndarray:
         weight = np.prod(np.where(corner, part, 1.0 - part), axis=1)
         total += weight * grid.fine[(number, *(cell + corner).T)]
     return total
-
-
-def _places(low: np.ndarray, spacing: float, axes: list[np.ndarray]) -> np.ndarray:
-    return low + spacing * np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def _ask(sdf: Sdf, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

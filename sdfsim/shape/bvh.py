@@ -21,9 +21,8 @@ class ClosestPoint:
 
         self.tensor: Any = o3d.core.Tensor
         self.centre = 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0))
-        threads = int(os.environ.get("OMP_NUM_THREADS", "0") or 0)
-        self.scene = o3d.t.geometry.RaycastingScene(nthreads=max(threads, 0))
-        self.threads = max(threads, 0)
+        self.threads = int(os.environ.get("OMP_NUM_THREADS") or 0)
+        self.scene = o3d.t.geometry.RaycastingScene(nthreads=self.threads)
         local = np.ascontiguousarray(mesh.vertices - self.centre, dtype=np.float32)
         self.scene.add_triangles(self.tensor(local), self.tensor(np.ascontiguousarray(mesh.faces, dtype=np.uint32)))
 
@@ -43,11 +42,9 @@ class ClosestPoint:
 
 
 class Winding:
-    """Generalized winding number (Jacobson et al. 2013; fast form: Barill et al. 2018), to about 0.01 a layer.
-
-    How often the surface goes around a point: 1 inside, 0 outside, 2 where two bodies overlap, 0 in a cavity; by the
-    solid angle that is seen of the surface where it is open. Some ten times slower than ray parity.
-    """
+    """Generalized winding number (Jacobson et al. 2013; fast form: Barill et al. 2018), to about 0.01 a layer: how
+    often the surface goes around a point, by the solid angle that is seen of it where it is open. Some ten times slower
+    than ray parity."""
 
     def __init__(self, mesh: Mesh) -> None:
         # igl computes in float32 within: far from the origin, or in small units, that would cost the sign.

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.bvh import ClosestPoint, Winding
-from sdfsim.shape.mesh import Mesh, joined
-from sdfsim.shape.watertight import Solid, as_it_is, exposed
+from sdfsim.shape.mesh import Mesh, components, is_closed, joined
+from sdfsim.shape.watertight import Solid, exposed
 
 # The paper trusts a sign only where the offset to the surface is less than 75 degrees from the normal's line.
 TRUSTED_COSINE = float(np.cos(np.radians(75.0)))
@@ -40,20 +41,20 @@ class DistanceOracle(Protocol):
 
 class MeshDistance:
     """Signed distance to a solid that is bounded by triangles (see `solidify`), or to a mesh as it is: a sheet has no
-    inside.
+    inside. Raises SdfsimError where the mesh has no faces.
 
     The sign is that of the solid's winding number: inside where the surface goes around a point more than half a time.
     Where a single clean surface bounds the solid, ray parity says the same and is faster. `trusted` follows the paper
     (appendix on SDF training): the angle between (point - closest) and the face normal is below 75 or above 105
-    degrees; where the surface does not quite close, the winding number must also be clear. Raises SdfsimError where the
-    mesh has no faces.
+    degrees; where the surface does not quite close, the winding number must also be clear.
     """
 
     def __init__(self, body: Solid | Mesh) -> None:
         if isinstance(body, Mesh):
             if len(body.faces) == 0:
                 raise SdfsimError("mesh has no faces")
-            body = as_it_is(body)
+            closed = is_closed(body)
+            body = Solid(body, body, closed=closed, simple=closed and components(body.faces).max() == 0)
         self.solid = body
         self.surface = body.surface
         self.closed = body.closed
@@ -64,8 +65,7 @@ class MeshDistance:
 
     def __call__(self, points: np.ndarray) -> Reference:
         """Reference values at `points` [P, 3] m."""
-        parts = [self._chunk(part) for part in _chunks(points)]
-        return Reference(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        return _in_chunks(self._chunk, points)
 
     def _chunk(self, points: np.ndarray) -> Reference:
         closest, normal = self._nearest(points)
@@ -92,13 +92,16 @@ class MeshDistance:
 
 class PiecesDistance:
     """Signed distance to a union of convex closed pieces, metres: the exact body that a rigid-body engine collides.
+    Raises SdfsimError where there are no pieces.
 
     Whether a point is inside is exact (half-spaces of each piece). Outside, the distance is the minimum over the
     pieces. Inside, it is the distance to the boundary of the *union*: faces that another piece covers are left out, so
-    that the seams between touching pieces do not show up as a surface. Raises SdfsimError where there are no pieces.
+    that the seams between touching pieces do not show up as a surface.
     """
 
     def __init__(self, pieces: list[Mesh]) -> None:
+        from scipy.spatial import ConvexHull
+
         if not pieces:
             raise SdfsimError("a shape of convex pieces needs at least one piece")
         self.pieces = pieces
@@ -109,22 +112,24 @@ class PiecesDistance:
         # Pieces that touch leave seams of no width between them: a hair's breadth outside still counts as inside.
         self._seam = 1e-5 * size
         self._boxes = np.stack([np.stack([piece.vertices.min(0), piece.vertices.max(0)]) for piece in pieces])
-        self._planes = [half_spaces(piece) for piece in pieces]
+        # [H, 4] outward normals and offsets of each hull; inside is normal . x + offset < 0.
+        hulls = [ConvexHull(piece.vertices) for piece in pieces]
+        self._planes = [np.unique(hull.equations.round(9), axis=0) for hull in hulls]
         self._outside = ClosestPoint(everything)
         self.surface = everything if len(pieces) == 1 else self._boundary(everything, size)
         self._inside = self._outside if len(pieces) == 1 else ClosestPoint(self.surface)
 
     def __call__(self, points: np.ndarray) -> Reference:
         """Reference values at `points` [P, 3] m; every sign is trusted."""
-        parts = [self._chunk(np.asarray(part, dtype=np.float64)) for part in _chunks(points)]
-        return Reference(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        return _in_chunks(self._chunk, points)
 
     def inside(self, points: np.ndarray, margin: float = 0.0) -> np.ndarray:
         """[P] bool: deeper than `margin` m in at least one piece."""
         result = np.zeros(len(points), dtype=bool)
         low, high = self._boxes[:, 0] + margin, self._boxes[:, 1] - margin
         # Neighbours are judged together, against the few pieces that reach their block.
-        order = _by_block(points, self.bounds)
+        cell = np.clip((points - self.bounds[0]) / (self.bounds[1] - self.bounds[0]) * 16, 0, 15).astype(np.int64)
+        order = np.argsort(cell @ [256, 16, 1], kind="stable")
         for start in range(0, len(points), BLOCK):
             some = order[start : start + BLOCK]
             block = points[some]
@@ -156,20 +161,7 @@ class PiecesDistance:
         return Mesh(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3))
 
 
-def half_spaces(piece: Mesh) -> np.ndarray:
-    """[H, 4] outward unit normal and offset of the piece's convex hull; inside is normal . x + offset < 0."""
-    from scipy.spatial import ConvexHull
-
-    return np.unique(ConvexHull(piece.vertices).equations.round(9), axis=0)
-
-
-def _by_block(points: np.ndarray, bounds: np.ndarray) -> np.ndarray:
-    """An order in which points of the same cell of a 16^3 grid over `bounds` follow each other."""
-    cell = np.clip((points - bounds[0]) / (bounds[1] - bounds[0]) * 16, 0, 15).astype(np.int64)
-    return np.argsort((cell[:, 0] * 16 + cell[:, 1]) * 16 + cell[:, 2], kind="stable")
-
-
-def _chunks(points: np.ndarray):
+def _in_chunks(ask: Callable[[np.ndarray], Reference], points: np.ndarray) -> Reference:
     points = np.asarray(points, dtype=np.float64)
-    for start in range(0, max(len(points), 1), CHUNK):
-        yield points[start : start + CHUNK]
+    parts = [ask(points[start : start + CHUNK]) for start in range(0, max(len(points), 1), CHUNK)]
+    return Reference(*(np.concatenate(column) for column in zip(*parts, strict=True)))

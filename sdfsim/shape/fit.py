@@ -40,6 +40,8 @@ SAME = 1e-4
 # A fit is checked on the way on this many points of three kinds: with these spreads around the surface, and in the box.
 CHECKED = 4000
 CHECKED_SIGMAS = (0.006, 0.06)
+# Weights of the first periodic layer are uniform in +- this; it sets the finest scale that a fit starts with.
+FIRST = 8.0
 WARMUP = 50  # updates
 CHECK_EVERY = 100  # updates
 # Seconds that the certificate takes of a budget, beside a tenth.
@@ -58,12 +60,11 @@ class Plan:
     some hundredths of the size, without which the far field is off by as much.
     """
 
-    activation: Activation = "wave"  # of the hidden layers ("wave" or "relu")
+    # of the hidden layers; "relu" is trained as the paper does: by Adam, on both sides of every mirror plane, and by
+    # signs only where the paper's rule trusts them
+    activation: Activation = "wave"
     width: int = 64  # of the hidden layers
     layers: int = 6  # linear layers, the last one included
-    # first-layer weights are uniform in +-first (periodic; it sets the finest scale the fit starts with)
-    first: float = 8.0
-    optimiser: Literal["soap", "adam"] = "soap"  # "soap" or "adam"
     lr: float = 1e-2  # step size
     decay: float = 0.5  # the part of the steps over which it falls to zero, at the end (0: constant)
     steps: int = 5000  # updates
@@ -74,14 +75,11 @@ class Plan:
     resample: int = 0  # updates between fresh pools of points (0: one pool)
     pool: int = 400_000  # points in a pool
     soften: float | None = 0.04  # errors count with soften / (|distance| + soften); None counts all alike
-    # use the parity sign everywhere on closed surfaces, not only where the paper's rule trusts it
-    sign_everywhere: bool = True
     # errors of the averaged weights at which the decay begins early, which halves them: of the distance (means within
     # 0.01 and in the box), of the gradient (median cosine distance within 0.1) and of the sign (fraction wrong farther
     # than 0.002). None never stops early.
     goal: tuple[float, float, float, float] | None = (7e-4, 6e-3, 4e-3, 1.3e-3)
     settle: int = 1000  # steps of an early decay
-    fold: bool = True  # fit a solid that is its own mirror image on one side only
 
 
 PLANS = {
@@ -93,8 +91,6 @@ PLANS = {
         activation="relu",
         width=128,
         layers=8,
-        first=0.0,
-        optimiser="adam",
         lr=1e-5,
         decay=0.0,
         steps=400_000,
@@ -103,16 +99,13 @@ PLANS = {
         resample=100,
         pool=65_536,
         soften=None,
-        sign_everywhere=False,
         goal=None,
-        settle=0,
-        fold=False,
     ),
 }
 
 
 def fit_mesh(
-    mesh: Mesh | MeshDistance,
+    mesh: Mesh,
     *,
     name: str,
     recipe: Recipe = "default",
@@ -123,22 +116,19 @@ def fit_mesh(
     on_progress: Progress = silent,
     device: torch.device | str = "cpu",
 ) -> Shape:
-    """Fit the compact SDF network to the solid that a triangle mesh in metres (or its distance oracle) bounds, see
-    `solidify`.
+    """Fit the compact SDF network to the solid that a triangle mesh in metres bounds, see `solidify`.
 
     The result depends on the mesh, the recipe (see `PLANS`) and the seed only (up to rounding, which the number of
     threads and the device change), unless the budget in s cuts the training short. The shape's `certificate` tells the
     errors and whether it is usable (`passed`), `source["notes"]` what was done to the mesh. Raises SdfsimError where
     the mesh cannot be used or bounds no solid.
     """
-    if isinstance(mesh, Mesh):
-        mesh = MeshDistance(solidify(mesh, name=name, cap=cap, thicken=thicken))
-    solid = mesh.solid
+    solid = solidify(mesh, name=name, cap=cap, thicken=thicken)
 
     def pick(sdf: Sdf) -> np.ndarray:
         return surface_nodes(sdf, solid.surface, DEFAULT_COUNT)
 
-    sdf, points, certificate = _fit(mesh, recipe, budget, seed, pick, on_progress, device)
+    sdf, points, certificate = _fit(MeshDistance(solid), recipe, budget, seed, pick, on_progress, device)
     source: dict[str, Any] = {"kind": "mesh", "recipe": recipe, "fit_version": FIT_VERSION}
     source |= {"notes": list(solid.notes)} if solid.notes else {}
     return Shape(name, solid.surface, sdf, points, *solid.mass_properties(), certificate, source)
@@ -231,20 +221,13 @@ class Pool(NamedTuple):
 
 
 class _Run:
-    """A network in training, and samples of the solid that it learns.
-
-    Attributes:
-        frame: of the solid.
-        mirrors: its mirror planes.
-        step: updates made.
-        turn: the update at which the decay begins; an early stop or a short budget moves it forward.
-        stop: the update at which it ends.
-    """
+    """A network in training, and samples of the solid that it learns. The decay of its steps begins at update `turn`
+    and ends at `stop`; an early stop or a short budget moves both forward."""
 
     def __init__(self, oracle: DistanceOracle, plan: Plan, seed: int, device: torch.device) -> None:
         self.oracle, self.plan, self.device, self._seed = oracle, plan, device, seed
         self.frame = normal_frame(oracle.bounds)
-        self.mirrors = self._mirrors() if plan.fold else (False, False, False)
+        self.mirrors = self._mirrors() if plan.activation == "wave" else (False, False, False)
         self.pool, self.check = self._pool(0), self._check()
         # Drawn on the CPU, so that points and first weights do not depend on the device.
         self.generator = torch.Generator().manual_seed(seed)
@@ -252,7 +235,7 @@ class _Run:
         for parameter in self.parameters:
             parameter.grad = torch.zeros_like(parameter)
         self.average = [parameter.clone() for parameter in self.parameters]
-        self.optimiser = (Soap if plan.optimiser == "soap" else torch.optim.Adam)(self.parameters, plan.lr)
+        self.optimiser = (Soap if plan.activation == "wave" else torch.optim.Adam)(self.parameters, plan.lr)
         self.step = 0
         self.turn, self.stop = int(plan.steps * (1.0 - plan.decay)), plan.steps
         self._tape = Tape(plan.activation, plan.width, plan.layers, self.parameters[0])
@@ -279,7 +262,7 @@ class _Run:
         local = np.clip(local, -MARGIN * BOX, MARGIN * BOX)
         truth = self.oracle(self.frame.outward(local))
         distance = truth.distance / self.frame.scale
-        signed = truth.trusted | (self.oracle.closed and self.plan.sign_everywhere)
+        signed = truth.trusted | (self.oracle.closed and self.plan.activation == "wave")
         # So close to the surface the direction from it is rounding.
         clear = np.abs(distance) > 1e-4
         offset = local - self.frame.inward(truth.closest)
@@ -368,11 +351,9 @@ class _Run:
 
 
 def _initial(plan: Plan, generator: torch.Generator) -> list[torch.Tensor]:
-    """First [1, W, 3], hidden [L - 2, W, W] and last [1, 1, W] weights; biases [L - 1, W, 1] and [1, 1, 1].
-
-    Equal layers are stacked for the optimiser. Periodic layers start with phases all
-    around and the spread of inputs that sine layers have (Sitzmann et al. 2020); ReLU layers with He's variance.
-    """
+    """First [1, W, 3], hidden [L - 2, W, W] and last [1, 1, W] weights; biases [L - 1, W, 1] and [1, 1, 1]: equal
+    layers are stacked for the optimiser. Periodic layers start with phases all around and the spread of inputs that
+    sine layers have (Sitzmann et al. 2020); ReLU layers with He's variance."""
     width, hidden = plan.width, plan.layers - 2
 
     def uniform(bound: float, layers: int, *shape: int) -> torch.Tensor:
@@ -380,7 +361,7 @@ def _initial(plan: Plan, generator: torch.Generator) -> list[torch.Tensor]:
 
     periodic = plan.activation == "wave"
     return [
-        uniform(plan.first if periodic else math.sqrt(2.0), 1, width, 3),
+        uniform(FIRST if periodic else math.sqrt(2.0), 1, width, 3),
         uniform(math.sqrt(6.0 / width), hidden, width, width),
         uniform(math.sqrt(6.0 / width) / (10.0 if periodic else 1.0), 1, 1, width),
         uniform(math.pi if periodic else 0.05, plan.layers - 1, width, 1),

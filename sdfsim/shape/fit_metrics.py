@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from sdfsim.shape.distance import DistanceOracle, MeshDistance
+from sdfsim.shape.distance import DistanceOracle
 from sdfsim.shape.far_field import BOX
-from sdfsim.shape.mesh import Mesh, normal_frame, sample_surface, signed_volume
+from sdfsim.shape.mesh import normal_frame, sample_surface
 from sdfsim.shape.sdf import Sdf
 
 # Lengths are fractions of the shape's largest extent. EXACT is what good fits of clean meshes reach.
@@ -35,15 +35,11 @@ USABLE = {
 SIGN_FROM = 0.002
 FAR_FROM = 0.1
 FAR_HALF = 2.0  # half extent of the cube in which the far field is tested
-# A wall counts as thin below this, and thin walls explain a miss when this much of the surface has them.
-THIN, THIN_SHARE = 0.02, 0.02
 FAR_FROM_A_NODE = 0.1
 EXPOSED_STEP = 5e-4  # a surface sample is hidden where this far along its normal is inside
 
 
-def certify(
-    sdf: Sdf, oracle: DistanceOracle, *, nodes: np.ndarray | None = None, points: int = 10_000, seed: int = 1
-) -> dict:
+def certify(sdf: Sdf, oracle: DistanceOracle, *, nodes: np.ndarray | None = None, points: int = 10_000) -> dict:
     """Errors of `sdf` on held-out points near the surface, in the fitted box and beyond it, ready for JSON (None: could
     not be measured, as where an open mesh leaves the sign in doubt); lengths relative to the largest extent.
 
@@ -58,7 +54,7 @@ def certify(
     m, if there are any; and what `verdict` says.
     """
     # A stream of its own, so that no seed of the fit draws these points.
-    rng = np.random.default_rng([seed, 0xCE47])
+    rng = np.random.default_rng([1, 0xCE47])
     frame = normal_frame(oracle.bounds)
 
     def asked(local: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -103,11 +99,8 @@ def certify(
     ratio = (value / np.where(true == 0, np.nan, true))[np.abs(true) > FAR_FROM]
     result["far_field_ratio"] = float(ratio.max()) if len(ratio) else math.nan
     if nodes is not None:
-        result["coverage"] = coverage(nodes, oracle, seed=seed)
+        result["coverage"] = coverage(nodes, oracle)
     result.update(verdict(result))
-    for told in ("reason", "caveat"):
-        if result[told]:
-            result[told] += f": {cause(oracle, seed=seed)}"
     # None for what could not be measured: JSON has no NaN.
     return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in result.items()}
 
@@ -125,45 +118,16 @@ def verdict(errors: dict) -> dict:
     return {"passed": not reason, "reason": reason, "caveat": "" if reason else missed(EXACT, "exact fits have")}
 
 
-def cause(oracle: DistanceOracle, *, seed: int = 1) -> str:
-    """What about a geometry makes it hard to fit, as far as it can be measured: holes, thin walls, else its detail."""
-    if not oracle.closed:
-        return "open mesh, so its inside is not clear"
-    share = thin_share(oracle, seed=seed)
-    if share >= THIN_SHARE:
-        return f"thin walls ({100 * share:.0f} % of the surface is thinner than {THIN:g})"
-    return "fine detail, or too short a fit"
-
-
-def thin_share(oracle: DistanceOracle, thin: float = THIN, *, points: int = 2000, seed: int = 1) -> float:
-    """Fraction of a closed surface behind which the solid ends within `thin` of its largest extent.
-
-    Measured along the inward normal of `points` samples; what is outside again after a step has been left through
-    the opposite side. Gaps narrower than a quarter of `thin` may be stepped over.
-    """
-    scale = normal_frame(oracle.bounds).scale
-    surface, normal = outward_samples(oracle.surface, points, np.random.default_rng([seed, 0x7417]))
-    left = np.zeros(points, dtype=bool)
-    for depth in np.linspace(thin, 0.0, 4, endpoint=False):
-        left |= oracle(surface - depth * scale * normal).distance > 0
-    return float(left.mean())
-
-
-def coverage(nodes: np.ndarray, surface: DistanceOracle | Mesh, *, points: int = 20_000, seed: int = 1) -> dict:
-    """How evenly nodes [K, 3] m stand for a surface (its oracle, which knows what is hidden inside, or a mesh), by
-    straight distances from surface samples to their nearest node; raises SdfsimError where it has no faces or extent.
-
-    Returns, ready for JSON and relative to the largest extent, the `count` of nodes, `largest_hole` (largest distance
-    to the nearest node), `uncovered` (fraction of the surface farther than 0.1 from every node) and `off_surface`
-    (largest distance of a node from the surface). Without nodes the distances are None.
-    """
+def coverage(nodes: np.ndarray, oracle: DistanceOracle) -> dict:
+    """How evenly nodes [K, 3] m stand for a surface, ready for JSON, relative to the largest extent: the `count` of
+    nodes, `largest_hole` (largest distance from a surface sample to the nearest node), `uncovered` (fraction of the
+    surface farther than 0.1 from every node) and `off_surface` (largest distance of a node from the surface)."""
     from scipy.spatial import KDTree
 
-    oracle = MeshDistance(surface) if isinstance(surface, Mesh) else surface
     frame = normal_frame(oracle.bounds)
     if len(nodes) == 0:
         return {"count": 0, "largest_hole": None, "uncovered": 1.0, "off_surface": None}
-    samples, normal = outward_samples(oracle.surface, points, np.random.default_rng([seed, 0xC0E4]))
+    samples, normal = sample_surface(oracle.surface, 20_000, np.random.default_rng([1, 0xC0E4]))
     if oracle.closed:  # overlapping parts hide faces, and so do the seams between convex pieces
         outside = oracle(samples + EXPOSED_STEP * frame.scale * normal).distance > 0
         samples = samples[outside] if outside.any() else samples
@@ -174,9 +138,3 @@ def coverage(nodes: np.ndarray, surface: DistanceOracle | Mesh, *, points: int =
         "uncovered": float((gap > FAR_FROM_A_NODE).mean()),
         "off_surface": float(np.abs(oracle(nodes).distance).max() / frame.scale),
     }
-
-
-def outward_samples(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """`sample_surface`, with the normals of a closed mesh pointing out also when its faces are inside out."""
-    points, normal = sample_surface(mesh, count, rng)
-    return points, -normal if signed_volume(mesh) < 0 else normal

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sdfsim.errors import SdfsimError
-from sdfsim.shape.mesh import Mesh, is_closed
+from sdfsim.shape.mesh import Mesh, is_closed, lattice
 
 if TYPE_CHECKING:  # sdf.py measures meshes, and so imports this file
     from sdfsim.shape.distance import DistanceOracle
@@ -60,7 +60,7 @@ def mass_properties_of_sdf(
     axes = [start[axis] + cell * np.arange(counts[axis]) for axis in range(3)]
     volume, first, second = 0.0, np.zeros(3), np.zeros((3, 3))
     for x in axes[0]:
-        points = np.stack(np.meshgrid([x], axes[1], axes[2], indexing="ij"), axis=-1).reshape(-1, 3)
+        points = lattice([x], axes[1], axes[2])
         distance = np.asarray(sdf(points)[0])
         solid, hollow = (np.clip(0.5 - depth / cell, 0.0, 1.0) for depth in (distance, distance + wall))
         weight = (solid - hollow) * cell**3

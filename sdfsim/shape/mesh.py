@@ -10,7 +10,6 @@ import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -116,14 +115,13 @@ def _faces(loaded: Any) -> np.ndarray:
 
 def _check_gltf(path: Path) -> None:
     """Refuse a glTF file whose geometry is not in its buffers: compressed, sparse, or of a length they do not have."""
-    if path.suffix.lower() == ".gltf":
-        header = json.loads(path.read_text(encoding="utf-8"))
-    else:
-        with open(path, "rb") as file:
-            magic, _, _, length, _ = struct.unpack("<4s4I", file.read(20))
-            if magic != b"glTF":
-                raise ValueError("it does not begin with glTF")
-            header = json.loads(file.read(length))
+    content = path.read_bytes()
+    if path.suffix.lower() == ".glb":
+        magic, _, _, length, _ = struct.unpack("<4s4I", content[:20])
+        if magic != b"glTF":
+            raise ValueError("it does not begin with glTF")
+        content = content[20 : 20 + length]
+    header = json.loads(content)
     views = header.get("bufferViews", [])
     for accessor in header.get("accessors", []):
         if "bufferView" not in accessor or "sparse" in accessor:
@@ -157,20 +155,18 @@ def _check_counts(path: Path, mesh: Mesh) -> None:
 def _vertex_colors(loaded: Any, count: int) -> np.ndarray | None:
     """[V, 3] uint8 when the file carries colours; a texture is looked up at each vertex."""
     visual: Any = getattr(loaded, "visual", None)
-    kind = getattr(visual, "kind", None)
-    if kind == "texture":
-        material = getattr(visual, "material", None)
-        image = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
-        if image is None or image.format not in TEXTURES or getattr(visual, "uv", None) is None:
+    if getattr(visual, "kind", None) == "texture":
+        image = getattr(visual.material, "image", None) or getattr(visual.material, "baseColorTexture", None)
+        if image is None or image.format not in TEXTURES or visual.uv is None:
             return None
         visual = visual.to_color()
-    elif kind not in ("vertex", "face"):
+    elif getattr(visual, "kind", None) not in ("vertex", "face"):
         return None
     colors = np.asarray(visual.vertex_colors)
     return colors[:, :3].astype(np.uint8) if colors.shape[:1] == (count,) else None
 
 
-def write_ply(mesh: Mesh, attributes: Mapping[str, np.ndarray] = MappingProxyType({})) -> bytes:
+def write_ply(mesh: Mesh, attributes: Mapping[str, np.ndarray] | None = None) -> bytes:
     """A mesh as binary PLY, vertices in double precision: what is read back is what was written, to the last bit.
     `attributes` are more properties of the vertices by name, [V] int32 or float32; most programs pass over them."""
     columns = [(axis, "<f8", "double") for axis in "xyz"]
@@ -178,7 +174,7 @@ def write_ply(mesh: Mesh, attributes: Mapping[str, np.ndarray] = MappingProxyTyp
     if mesh.colors is not None:
         columns += [(channel, "u1", "uchar") for channel in ("red", "green", "blue")]
         values += list(mesh.colors.T)
-    for name, column in attributes.items():
+    for name, column in (attributes or {}).items():
         columns.append((name, column.dtype.newbyteorder("<").str, {"i": "int", "f": "float"}[column.dtype.kind]))
         values.append(column)
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(mesh.vertices)}"]
@@ -196,11 +192,12 @@ def read_mesh(path: Path) -> Mesh:
     """The mesh of a shape folder as `write_ply` wrote it: not cleaned, not reordered. Raises SdfsimError: damaged."""
     try:
         loaded = _read(path)
-        mesh = Mesh(np.array(loaded.vertices, dtype=np.float64), _faces(loaded), None)
-        _check_read(mesh)
-        if loaded.visual.kind != "vertex":
-            return mesh
-        return Mesh(mesh.vertices, mesh.faces, np.array(loaded.visual.vertex_colors)[:, :3].astype(np.uint8))
+        visual, colors = loaded.visual, None
+        if visual.kind == "vertex":
+            colors = np.array(visual.vertex_colors)[:, :3].astype(np.uint8)
+        mesh = Mesh(np.array(loaded.vertices, dtype=np.float64), _faces(loaded), colors)
+        _require_whole(mesh)
+        return mesh
     except Exception as error:  # the readers raise whatever their format made them stumble over
         raise SdfsimError(f"{path}: damaged or cut short ({error})") from error
 
@@ -244,19 +241,19 @@ def read_glb(path: Path) -> dict[str, Mesh]:
             # trimesh counts up from the lower edge of a texture.
             uv = np.asarray(drawn.visual.uv) * [1.0, -1.0] + [0.0, 1.0]
             mesh = Mesh(np.array(drawn.vertices), _faces(drawn), None, uv, np.asarray(image.convert("RGB")))
-            _check_read(mesh)
+            _require_whole(mesh)
             found[str(name)] = mesh
     except Exception as error:  # the readers raise whatever their format made them stumble over
         raise SdfsimError(f"{path}: damaged or cut short ({error})") from error
     return found
 
 
-def _check_read(mesh: Mesh) -> None:
-    """Raise ValueError where a mesh of our own making is not whole."""
-    if len(mesh.faces) and (mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices)):
-        raise ValueError("face indices out of range")
+def _require_whole(mesh: Mesh) -> None:
+    """Raise ValueError where numbers are missing or faces have corners that are not there."""
     if not np.isfinite(mesh.vertices).all() or (mesh.uv is not None and not np.isfinite(mesh.uv).all()):
         raise ValueError("vertices that are not finite")
+    if len(mesh.faces) and (mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices)):
+        raise ValueError(f"face indices out of range (0 to {len(mesh.vertices) - 1} allowed)")
 
 
 def clean(mesh: Mesh, *, name: str = "mesh") -> Mesh:
@@ -268,15 +265,12 @@ def clean(mesh: Mesh, *, name: str = "mesh") -> Mesh:
     vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
     if len(faces) == 0:
         raise SdfsimError(f"{name}: mesh has no faces", "a point cloud is not enough: export triangles")
-    if not np.isfinite(vertices).all():
-        bad = int((~np.isfinite(vertices)).any(1).sum())
-        raise SdfsimError(f"{name}: {bad} of {len(vertices)} vertices are not finite")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise SdfsimError(f"{name}: face indices out of range (0 to {len(vertices) - 1} allowed)")
-
+    try:
+        _require_whole(mesh)
+    except ValueError as error:
+        raise SdfsimError(f"{name}: {error}") from error
     if (farthest := float(np.abs(vertices).max())) > FARTHEST:
         raise SdfsimError(f"{name}: a coordinate of {farthest:.3g} is too large (at most {FARTHEST:g})")
-
     extent = float(np.ptp(vertices[np.unique(faces)], axis=0).max())
     # Files round to about seven digits: what agrees to a millionth of the size is one vertex.
     keys = np.round((vertices - vertices.min(0)) / max(1e-6 * extent, 1e-300)).astype(np.int64)
@@ -372,15 +366,12 @@ def load_pieces(path: str | Path) -> list[Mesh]:
                 groups[-1].append([float(number) for number in rest.split()[:3]])
     except (UnicodeDecodeError, ValueError) as error:
         raise SdfsimError(f"{path}: not a readable OBJ file ({error})") from error
-    pieces = []
-    for number, group in enumerate(group for group in groups if group):
-        try:
-            pieces.append(convex_hull(np.array(group)))
-        except (SdfsimError, ValueError) as error:
-            raise SdfsimError(f"{path}: piece {number}: {error}") from error
-    if not pieces:
+    if not any(groups):
         raise SdfsimError(f"{path}: no vertices, so no convex pieces")
-    return pieces
+    try:
+        return [convex_hull(np.array(group)) for group in groups if group]
+    except (SdfsimError, ValueError) as error:
+        raise SdfsimError(f"{path}: {error}") from error
 
 
 def wavefront(pieces: list[Mesh]) -> str:
@@ -434,6 +425,11 @@ def joined(meshes: Sequence[Mesh]) -> Mesh:
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
     return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))
+
+
+def lattice(*axes: Sequence[float] | np.ndarray) -> np.ndarray:
+    """All places [P, 3] with a coordinate of each of three axes, z running fastest."""
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -56,8 +56,8 @@ class MlpSdf:
 
     @accepts_numpy
     def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Distance [P] m and gradient [P, 3] at `points` [P, 3] m; evaluated in float32, cast back. Near the solid the
-        gradient is the network's own; see `everywhere` for what is not."""
+        """Distance [P] m and gradient [P, 3] at `points` [P, 3] m; evaluated in float32, cast back. See `everywhere`
+        for what is far."""
         return in_metres(self._inside, self.frame, self.bounds, points, PREPARED)
 
     def _inside(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -69,12 +69,8 @@ class MlpSdf:
 
 
 def wave(before: torch.Tensor, slope: torch.Tensor, spare: torch.Tensor) -> None:
-    """The periodic activation: parabolic arcs r (1 - 2 |r|) with r = x - round(x), of period 1 and height 1/8.
-
-    Like a sine it is odd, smooth to first order and bounded, and keeps fine detail that ReLU networks smear; value and
-    slope cost a quarter of a sine and a cosine. `before`, x, becomes the value, `slope` the derivative 1 - 4 |r|;
-    `spare` is overwritten.
-    """
+    """The periodic activation: parabolic arcs r (1 - 2 |r|) with r = x - round(x), close to a sine at a quarter of its
+    cost. `before`, x, becomes the value, `slope` the derivative 1 - 4 |r|; `spare` is overwritten."""
     torch.round(before, out=spare)
     before.sub_(spare)
     torch.abs(before, out=spare)
@@ -92,11 +88,8 @@ ACTIVATIONS = {"wave": wave, "relu": relu}
 
 
 class Tape:
-    """Working memory of the sweeps, for up to a number of points.
-
-    A layer is `act(W x + b)`; the last one, which `layers` counts too, is linear with one output. Weights are [out, in]
-    and biases [out], one a layer. Computes on the device and in the dtype of `like`.
-    """
+    """Working memory of the sweeps. A layer is `act(W x + b)`; the last one, which `layers` counts too, is linear with
+    one output. Weights are [out, in] and biases [out], one a layer, of the device and dtype of `like`."""
 
     def __init__(self, activation: Activation, width: int, layers: int, like: torch.Tensor) -> None:
         self._act = ACTIVATIONS[activation]
@@ -163,10 +156,7 @@ def value_and_gradient(
     weights: Sequence[torch.Tensor], biases: Sequence[torch.Tensor], activation: Activation, points: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Value [T] and gradient [T, 3] of a network (see `Tape`) at normalised points [T, 3]; no autograd graph is built.
-
-    The forward sweep keeps each activation's derivative; one reverse sweep multiplies them back to the input, which
-    costs as much as the forward one. Memory is bounded by `SWEPT`, whatever the number of points.
-    """
+    The forward sweep keeps each activation's derivative; one reverse sweep multiplies them back to the input."""
     tapes = _kept.__dict__.setdefault("tapes", {})
     like, width = weights[0], len(weights[0])
     key = (activation, width, len(weights), like.device, like.dtype)

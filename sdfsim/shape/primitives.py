@@ -1,7 +1,4 @@
-"""Procedural watertight meshes, metres, centred on their own origin, and the convex pieces of those that have them.
-
-Every function has defaults that give a largest extent near 1 m; faces are counter-clockwise seen from outside.
-"""
+"""Procedural watertight meshes, metres, about 1 m wide unless told, and the convex pieces of those that have them."""
 
 from __future__ import annotations
 
@@ -9,12 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sdfsim.shape.mesh import Mesh, clean, convex_hull
+from sdfsim.shape.mesh import Mesh, clean, convex_hull, lattice
 
 
 def box(size: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Mesh:
     """A box with full extents `size` m: 8 vertices, 12 faces."""
-    corners = np.stack(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5], indexing="ij"), axis=-1).reshape(-1, 3)
+    corners = lattice([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5])
     quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
     return clean(Mesh(corners * np.array(size), _quads(quads)), name="box")
 

@@ -14,12 +14,10 @@ from sdfsim.errors import SdfsimError
 from sdfsim.parallel import Progress, silent
 from sdfsim.shape.distance import MeshDistance
 from sdfsim.shape.far_field import BOX, in_metres
-from sdfsim.shape.mesh import Frame, Mesh, normal_frame
+from sdfsim.shape.mesh import Frame, Mesh, lattice, normal_frame
 
 # Points of a grid evaluated at once: eight indices and corners with what is made of them, about 250 bytes a point.
 CHUNK = 262_144
-# Distances asked for at once while a grid is sampled.
-SAMPLED = 200_000
 # All lengths of `MeshSdf` are relative to the mesh's largest extent. The hierarchy works in float32, so closest points
 # are off by some 1e-7: nearer than this the offset to them says little about the direction, and differences over the
 # step say it better.
@@ -37,9 +35,7 @@ UP = (0.0, 0.0, 1.0)
 class Sdf(Protocol):
     """A signed distance with its gradient: positive outside, negative inside, metres, the shape's own frame.
 
-    Its members: `MlpSdf` (a fitted network), the closed forms `PlaneSdf`, `SphereSdf`, `CapsuleSdf`, `CylinderSdf` and
-    `BoxSdf`, `GridSdf` (samples) and `MeshSdf` (the exact mesh). Those members also have
-    `to(device)` and `scaled(factor)`.
+    Its members, `MlpSdf`, the closed forms, `GridSdf` and `MeshSdf`, also have `to(device)` and `scaled(factor)`.
 
     Attributes:
         bounds: [2, 3] float64 m, the axis-aligned box that holds the solid (infinite for a plane).
@@ -51,19 +47,15 @@ class Sdf(Protocol):
     def __call__(self, points: Any, /) -> tuple[Any, Any]:
         """Distance [P] m and gradient [P, 3] (unit length where the SDF is exact) at `points` [P, 3] m.
 
-        The result has the dtype and device of `points`. Never NaN: where the gradient is undefined
-        (medial axis, an edge) any valid one-sided gradient is returned. The implementations of this
-        package also take a NumPy array, or what makes one, and then return NumPy arrays.
+        The result has the dtype and device of `points`. Never NaN: where the gradient is undefined (medial axis, an
+        edge) any valid one-sided gradient is returned. The members also take a NumPy array, and then return some.
         """
         ...
 
 
 def accepts_numpy(call: Callable[..., tuple[torch.Tensor, torch.Tensor]]) -> Callable[..., tuple[Any, Any]]:
-    """Let an Sdf's `__call__` also take what makes a NumPy array [P, 3], and then answer in NumPy of the same dtype.
-
-    Whole numbers become float64. An object with a `device` attribute is evaluated there. Raises ValueError for other
-    shapes.
-    """
+    """Let an Sdf's `__call__` also take what makes a NumPy array [P, 3] (whole numbers become float64), and then answer
+    in NumPy. Raises ValueError for other shapes."""
 
     @wraps(call)
     def wrapper(self: Any, points: Any) -> tuple[Any, Any]:
@@ -82,36 +74,32 @@ def accepts_numpy(call: Callable[..., tuple[torch.Tensor, torch.Tensor]]) -> Cal
 
 
 class ClosedForm:
-    """A solid about the origin with an exact distance; its fields are its `COUNT` sizes, m, positive (else
-    SdfsimError)."""
+    """A solid about the origin with an exact distance; its fields are its sizes, m, positive (else SdfsimError)."""
 
     KIND: ClassVar[str]
-    COUNT: ClassVar[int]
 
     def __post_init__(self) -> None:
         sizes = np.array(self.sizes, dtype=np.float64)
-        if sizes.shape != (self.COUNT,) or not (np.isfinite(sizes) & (sizes > 0)).all():
+        if self.bounds.shape != (2, 3) or not (np.isfinite(sizes) & (sizes > 0)).all():
             told = ", ".join(f"{name} {value}" for name, value in vars(self).items())
             raise SdfsimError(f"the sizes of a {self.KIND} must be > 0 (got {told})")
 
     @property
     def sizes(self) -> tuple[float, ...]:
-        """[COUNT] m."""
+        """m, one after the other."""
         return tuple(np.hstack([*vars(self).values()]).tolist()) if vars(self) else ()
 
     @property
     def bounds(self) -> np.ndarray:
         """[2, 3] float64 m, the box that holds the solid."""
-        return np.outer([-1.0, 1.0], self.reach)
+        return np.outer([-1.0, 1.0], self._reach())
 
-    @property
-    def reach(self) -> tuple[float, ...]:
+    def _reach(self) -> tuple[float, ...]:
         """(x, y, z) m, its half extents."""
         raise NotImplementedError
 
-    @staticmethod
-    def measure(points: torch.Tensor, sizes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Distance [P] m and gradient [P, 3] at `points` [P, 3] m of solids with `sizes` [P or 1, COUNT] m."""
+    def _measure(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Distance [P] m and unit gradient [P, 3] at `points` [P, 3] m."""
         raise NotImplementedError
 
     def to(self, device: torch.device | str) -> Self:
@@ -126,22 +114,21 @@ class ClosedForm:
     @accepts_numpy
     def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Distance [P] m and unit gradient [P, 3] at `points` [P, 3] m."""
-        return self.measure(points, torch.tensor([self.sizes], dtype=points.dtype, device=points.device))
+        return self._measure(points)
 
 
 @dataclass(frozen=True, eq=False)
 class PlaneSdf(ClosedForm):
     """The half space below z = 0 is solid; the normal is +z. Infinite."""
 
-    KIND, COUNT = "plane", 0
+    KIND = "plane"
 
     @property
     def bounds(self) -> np.ndarray:
         """[2, 3] m: infinite but for the top."""
         return np.array([[-np.inf] * 3, [np.inf, np.inf, 0.0]])
 
-    @staticmethod
-    def measure(points: torch.Tensor, sizes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _measure(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         return points[:, 2].clone(), _up(points)
 
 
@@ -149,19 +136,17 @@ class PlaneSdf(ClosedForm):
 class SphereSdf(ClosedForm):
     """A ball of `radius` m. The gradient at the centre points up."""
 
-    KIND, COUNT = "sphere", 1
+    KIND = "sphere"
     radius: float
 
-    @property
-    def reach(self) -> tuple[float, ...]:
+    def _reach(self) -> tuple[float, ...]:
         return (self.radius,) * 3
 
-    @staticmethod
-    def measure(points: torch.Tensor, sizes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _measure(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         length = points.norm(dim=1)
         tiny = torch.finfo(points.dtype).tiny
         unit = points / length.clamp_min(tiny)[:, None]
-        return length - sizes[:, 0], torch.where((length > tiny)[:, None], unit, _up(points))
+        return length - self.radius, torch.where((length > tiny)[:, None], unit, _up(points))
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,17 +154,15 @@ class BoxSdf(ClosedForm):
     """An axis-aligned box with half extents `half` (x, y, z) m. Inside, the gradient points to the nearest face: the
     first of equally near ones, and the positive side of an axis at its middle."""
 
-    KIND, COUNT = "box", 3
+    KIND = "box"
     half: tuple[float, float, float]
 
-    @property
-    def reach(self) -> tuple[float, ...]:
+    def _reach(self) -> tuple[float, ...]:
         return self.half
 
-    @staticmethod
-    def measure(points: torch.Tensor, sizes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _measure(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         side = torch.where(points < 0, -1.0, 1.0).to(points.dtype)
-        excess = points.abs() - sizes
+        excess = points.abs() - points.new_tensor(self.half)
         beyond = excess.clamp_min(0)
         length = beyond.norm(dim=1)
         deepest, axis = excess.max(dim=1)
@@ -194,19 +177,17 @@ class BoxSdf(ClosedForm):
 class CapsuleSdf(ClosedForm):
     """All within `radius` m of the segment |z| <= `half` m."""
 
-    KIND, COUNT = "capsule", 2
+    KIND = "capsule"
     radius: float
     half: float
 
-    @property
-    def reach(self) -> tuple[float, ...]:
+    def _reach(self) -> tuple[float, ...]:
         return self.radius, self.radius, self.half + self.radius
 
-    @staticmethod
-    def measure(points: torch.Tensor, sizes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _measure(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         axis = torch.zeros_like(points)
-        axis[:, 2] = torch.minimum(torch.maximum(points[:, 2], -sizes[:, 1]), sizes[:, 1])
-        return SphereSdf.measure(points - axis, sizes)
+        axis[:, 2] = points[:, 2].clamp(-self.half, self.half)
+        return SphereSdf(self.radius)._measure(points - axis)
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,16 +195,14 @@ class CylinderSdf(ClosedForm):
     """A cylinder about z of `radius` m and half height `half` m. Inside, the gradient points to the nearer of side and
     end; of equally near ones to the end."""
 
-    KIND, COUNT = "cylinder", 2
+    KIND = "cylinder"
     radius: float
     half: float
 
-    @property
-    def reach(self) -> tuple[float, ...]:
+    def _reach(self) -> tuple[float, ...]:
         return self.radius, self.radius, self.half
 
-    @staticmethod
-    def measure(points: torch.Tensor, sizes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _measure(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         tiny = torch.finfo(points.dtype).tiny
         away = points[:, :2].norm(dim=1)
         outward = torch.zeros_like(points)
@@ -232,7 +211,7 @@ class CylinderSdf(ClosedForm):
         outward[:, :2] = torch.where((away > tiny)[:, None], unit, outward[:, :2])
         end = torch.zeros_like(points)
         end[:, 2] = torch.where(points[:, 2] < 0, -1.0, 1.0).to(points.dtype)
-        aside, above = away - sizes[:, 0], points[:, 2].abs() - sizes[:, 1]
+        aside, above = away - self.radius, points[:, 2].abs() - self.half
         corner = (aside > 0) & (above > 0)
         length = torch.sqrt(aside.clamp_min(0) ** 2 + above.clamp_min(0) ** 2)
         slanted = (aside[:, None] * outward + above[:, None] * end) / length.clamp_min(tiny)[:, None]
@@ -252,12 +231,9 @@ def _up(points: torch.Tensor) -> torch.Tensor:
 
 
 def trilinear(values: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Value [P] and gradient [P, 3] of a grid [R, R, R] over [-BOX, BOX]^3 at points [P, 3] in it; NaN for NaN.
-
-    The gradient is the exact one of the interpolant, not an interpolation of central differences: the step x - f grad f
-    then leads to the level that the value has, and it takes the eight samples that the value takes anyway, not
-    thirty-two. It jumps from cell to cell, by about the cell over the radius of curvature.
-    """
+    """Value [P] and gradient [P, 3] of a grid [R, R, R] over [-BOX, BOX]^3 at points [P, 3] in it; NaN for NaN. The
+    gradient is the exact one of the interpolant, so that the step x - f grad f leads to the level that the value has;
+    it jumps from cell to cell."""
     side = values.shape[-1]
     per_cell = (side - 1) / (2 * BOX)
     place = (points + BOX) * per_cell
@@ -314,8 +290,8 @@ class GridSdf:
 
     @accepts_numpy
     def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Distance [P] m and gradient [P, 3] at `points` [P, 3] m; interpolated in float32, cast back. Near the solid
-        the gradient is the interpolant's own (see `trilinear`); see `everywhere` for what is far."""
+        """Distance [P] m and gradient [P, 3] at `points` [P, 3] m; interpolated in float32 (see `trilinear`), cast
+        back. See `everywhere` for what is far."""
         return in_metres(partial(trilinear, self.values), self.frame, self.bounds, points, CHUNK)
 
 
@@ -325,24 +301,18 @@ def sample_grid(
     resolution: int,
     on_progress: Progress = silent,
 ) -> GridSdf:
-    """Sample a signed distance (a `DistanceOracle` or an Sdf) of a solid within `bounds` [2, 3] m on a voxel grid.
-
-    There are `resolution`^3 samples over a cube 1.4 times as wide as the solid, of 4 bytes each, 1.4 / (resolution - 1)
-    of its largest extent apart. Raises SdfsimError for fewer than two samples a side, or bounds without extent or not
-    finite.
-    """
+    """Sample a signed distance (a `DistanceOracle` or an Sdf) of a solid within `bounds` [2, 3] m at `resolution`^3
+    places over a cube 1.4 times as wide as the solid. Raises SdfsimError for fewer than two samples a side, or bounds
+    without extent or not finite."""
     if resolution < 2:
         raise SdfsimError(f"a grid needs at least two samples along each side (got {resolution})")
     frame = normal_frame(bounds)
     axis = np.linspace(-BOX, BOX, resolution)
     values = np.empty((resolution, resolution, resolution), dtype=np.float32)
-    layers = max(1, SAMPLED // resolution**2)
-    for start in range(0, resolution, layers):
-        on_progress(start / resolution, "sampling the distance")
-        some = axis[start : start + layers]
-        points = np.stack(np.meshgrid(some, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-        found = np.asarray(distance(frame.outward(points))[0])
-        values[start : start + layers] = (found / frame.scale).reshape(len(some), resolution, resolution)
+    for k, x in enumerate(axis):
+        on_progress(k / resolution, "sampling the distance")
+        found = np.asarray(distance(frame.outward(lattice([x], axis, axis)))[0])
+        values[k] = (found / frame.scale).reshape(resolution, resolution)
     on_progress(1.0, "sampled")
     return GridSdf(torch.from_numpy(values), frame, np.asarray(bounds, dtype=np.float64))
 
@@ -350,10 +320,7 @@ def sample_grid(
 @dataclass(frozen=True, eq=False)
 class MeshSdf:
     """The signed distance of a triangle mesh, with the sign of `MeshDistance`, good to about 1e-7 of the mesh's size.
-
-    The hierarchy lives on the CPU; points on another device are brought there and the answers back. Raises SdfsimError
-    where the mesh has no faces.
-    """
+    It is asked on the CPU, wherever the points are. Raises SdfsimError where the mesh has no faces."""
 
     mesh: Mesh  # metres
 
@@ -377,7 +344,7 @@ class MeshSdf:
         return MeshDistance(self.mesh)
 
     def to(self, device: torch.device | str) -> MeshSdf:
-        """Itself: it is asked on the CPU wherever the points are."""
+        """Itself."""
         return self
 
     def scaled(self, factor: float) -> MeshSdf:
@@ -386,11 +353,8 @@ class MeshSdf:
 
     @accepts_numpy
     def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Distance [P] m and unit gradient [P, 3] at `points` [P, 3] m.
-
-        The gradient points along the line to the closest point, on the surface along the normal (between the normals
-        of the faces that meet at an edge or corner), and where there is neither, up.
-        """
+        """Distance [P] m and unit gradient [P, 3] at `points` [P, 3] m: along the line to the closest point, on the
+        surface along the normal (at an edge or corner between normals), and where there is neither, up."""
         distance, gradient = self._exact(points.detach().cpu().numpy().astype(np.float64))
         return torch.from_numpy(distance).to(points), torch.from_numpy(gradient).to(points)
 

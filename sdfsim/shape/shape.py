@@ -19,7 +19,7 @@ from sdfsim.parallel import Progress, silent
 from sdfsim.shape import primitives
 from sdfsim.shape.distance import MeshDistance
 from sdfsim.shape.mass import mass_properties_of_sdf
-from sdfsim.shape.mesh import Frame, Mesh, convex_hull, load_mesh, read_glb, read_mesh, write_glb, write_ply
+from sdfsim.shape.mesh import Frame, Mesh, convex_hull, lattice, load_mesh, read_glb, read_mesh, write_glb, write_ply
 from sdfsim.shape.mlp_sdf import ACTIVATIONS, MlpSdf
 from sdfsim.shape.sdf import (
     CLOSED_FORMS,
@@ -86,13 +86,9 @@ class Shape:
         return self.mesh if self.skin is None else self.skin
 
     def save(self, folder: str | Path) -> Path:
-        """Write the shape folder and return it: shape.safetensors, mesh.ply, perhaps textured.glb and, last,
-        shape.json.
-
-        Each file appears complete or not at all, and shape.json only beside the files it describes. Raises SdfsimError
-        where the folder cannot be written, or the SDF has no file format: its kind has none, or it is exact and of
-        another mesh.
-        """
+        """Write the shape folder and return it. Each file appears complete or not at all, and shape.json last, beside
+        the files it describes. Raises SdfsimError where the folder cannot be written, or the SDF is of a kind without a
+        file format, or exact and of another mesh."""
         from safetensors.torch import save as to_bytes
 
         folder = Path(folder)
@@ -149,12 +145,12 @@ def load_shape(folder: str | Path) -> Shape:
         tensors = from_bytes((folder / WEIGHTS_FILE).read_bytes())
     except (SafetensorError, OSError) as error:
         raise SdfsimError(f"{folder / WEIGHTS_FILE}: damaged or cut short ({error})") from error
-    for name, tensor in tensors.items():
-        if name != "bounds" and not torch.isfinite(tensor).all():
-            raise SdfsimError(f"{folder / WEIGHTS_FILE}: {name} is not finite")
     mesh = read_mesh(folder / MESH_FILE)
     skins = read_glb(folder / SKIN_FILE) if (folder / SKIN_FILE).is_file() else {}
     try:
+        for name, tensor in tensors.items():
+            if name != "bounds":  # a plane's are infinite
+                _finite(tensor.numpy(), name, *tensor.shape)
         sizes = record.get("pieces", [])
         return Shape(
             name=str(record["name"]),
@@ -201,32 +197,22 @@ def _sdf_from_file(description: dict[str, Any], tensors: dict[str, torch.Tensor]
     if kind == "mesh":
         return MeshSdf(mesh)
     if kind in CLOSED_FORMS:
-        sizes = {
-            key: _finite(value, key, *np.shape(value)).tolist() for key, value in description.items() if key != "kind"
-        }
         made: Any = CLOSED_FORMS[kind]
-        return made(**{key: tuple(v) if isinstance(v, list) else v for key, v in sizes.items()})
-    if kind not in ("mlp", "grid"):
-        raise ValueError(f"unknown SDF kind {kind!r}")
-    if not all(tensor.is_floating_point() for tensor in tensors.values()):
-        raise ValueError("weights that are not floating-point numbers")
+        return made(**{k: tuple(v) if isinstance(v, list) else v for k, v in description.items() if k != "kind"})
     frame = Frame(_finite(description["centre"], "centre", 3), float(_finite(description["scale"], "scale")))
     if frame.scale <= 0:
         raise ValueError(f"scale must be > 0 (got {frame.scale:g})")
     bounds = _finite(tensors["bounds"].numpy(), "bounds", 2, 3)
     if kind == "grid":
         return GridSdf(tensors["grid"].float(), frame, bounds)
-    if description["activation"] not in ACTIVATIONS:
-        raise ValueError(f"unknown activation {description['activation']!r}")
+    if kind != "mlp" or description["activation"] not in ACTIVATIONS:
+        raise ValueError(f"unknown SDF kind {kind!r} or activation {description.get('activation')!r}")
     weights, biases = (
         tuple(tensors[f"layer{layer}.{part}"].float() for layer in range(int(description["layers"])))
         for part in ("weight", "bias")
     )
-    sizes = [3, *(len(weight) for weight in weights)]
-    if sizes[-1] != 1 or any(
-        tuple(weight.shape) != (rows, columns) or tuple(bias.shape) != (rows,)
-        for weight, bias, columns, rows in zip(weights, biases, sizes[:-1], sizes[1:], strict=True)
-    ):
+    rows = [len(bias) for bias in biases]
+    if rows[-1] != 1 or [tuple(weight.shape) for weight in weights] != list(zip(rows, [3, *rows[:-1]], strict=True)):
         raise ValueError("the layers do not fit together")
     x, y, z = (bool(mirror) for mirror in description.get("mirrors", (False, False, False)))
     return MlpSdf(weights, biases, description["activation"], frame, bounds, (x, y, z))
@@ -242,13 +228,12 @@ def _finite(value: Any, what: str, *shape: int) -> np.ndarray:
 
 def scaled(shape: Shape, factor: float) -> Shape:
     """The same shape `factor` times as large, about its own origin. Raises SdfsimError where the factor is not positive
-    and finite, or the SDF of a kind that cannot be scaled."""
+    and finite."""
     if not (np.isfinite(factor) and factor > 0):
         raise SdfsimError(f"{shape.name}: scale must be > 0 (got {factor})")
     if factor == 1.0:
         return shape
-    if not isinstance(shape.sdf, MlpSdf | GridSdf | MeshSdf | ClosedForm):
-        raise SdfsimError(f"{shape.name}: an SDF of type {type(shape.sdf).__name__} cannot be scaled")
+    assert isinstance(shape.sdf, MlpSdf | GridSdf | MeshSdf | ClosedForm)
     return replace(
         shape,
         mesh=replace(shape.mesh, vertices=shape.mesh.vertices * factor),
@@ -267,8 +252,7 @@ def own_pieces(shape: Shape) -> list[Mesh]:
     if shape.pieces:
         return [convex_hull(points) for points in shape.pieces]
     kind = str(shape.source.get("primitive", ""))
-    pieces = primitives.convex_pieces(kind)
-    if not pieces:
+    if not (pieces := primitives.convex_pieces(kind)):
         return []
     usual = primitives.PRIMITIVES[kind]().vertices
     factor = float(np.ptp(shape.mesh.vertices, axis=0).max() / np.ptp(usual, axis=0).max())
@@ -295,7 +279,7 @@ def with_sdf(shape: Shape, kind: SdfKind, *, resolution: int = DEFAULT_RESOLUTIO
 def sdf_of_mesh(
     mesh: Mesh, kind: Literal["grid", "mesh"], resolution: int, on_progress: Progress = silent
 ) -> tuple[Sdf, dict]:
-    """A mesh's exact SDF or a grid of it, and what a shape's `source` says about it. Raises as `with_sdf` does."""
+    """A mesh's exact SDF or a grid of it, and what a shape's `source` says about it."""
     if kind == "mesh":
         return MeshSdf(mesh), {"sdf": "mesh"}
     oracle = MeshDistance(mesh)
@@ -303,11 +287,8 @@ def sdf_of_mesh(
 
 
 def with_nodes(shape: Shape, grid: int) -> Shape:
-    """The same shape with other surface nodes: those of a grid of `grid`^3 points, sampled from its SDF alone.
-
-    The paper resamples a trained simulator's bodies like this (7^3 instead of the meshes' vertices). Nearer than a
-    40th of the shape's size no two nodes are kept. Raises as `sample_nodes` does.
-    """
+    """The same shape with the surface nodes of a grid of `grid`^3 points, sampled from its SDF alone, as the paper
+    resamples a trained simulator's bodies. Raises as `sample_nodes` does."""
     # What was measured of the former nodes does not hold for these.
     certificate = {key: value for key, value in shape.certificate.items() if key != "coverage"}
     return replace(shape, nodes=sample_nodes(shape.sdf, grid=grid), certificate=certificate)
@@ -316,9 +297,9 @@ def with_nodes(shape: Shape, grid: int) -> Shape:
 def with_wall(shape: Shape, wall: float) -> Shape:
     """The same shape as a hollow one: only what lies within `wall` m of its surface has mass.
 
-    Volume, centre of mass and inertia are then those of the wall, taken from the SDF on a grid. Where the SDF is exact
-    and the wall at least 1/100 of the shape's longest side, the volume is within 1 % and the inertia within 4 %. A wall
-    that is thicker than the shape makes it solid. Contacts see the same surface. Raises SdfsimError for a plane.
+    Volume, centre of mass and inertia are taken from the SDF on a grid. Where the SDF is exact and the wall at least
+    1/100 of the shape's longest side, the volume is within 1 % and the inertia within 4 %. Raises SdfsimError for a
+    plane.
     """
     volume, com, inertia = mass_properties_of_sdf(shape.sdf, wall=wall)
     return replace(shape, volume=volume, com=com, inertia=inertia, source=shape.source | {"wall": wall})
@@ -340,7 +321,7 @@ def shape_from_mesh(
     # Not of the file's bytes: a glTF keeps its vertices, and an OBJ its colours, in files beside it.
     key = mesh.digest()
     how = {"cap": cap, "thicken": None if thicken is None else thicken / units, "on_progress": on_progress}
-    shape = _cached(mesh, key, path.stem, sdf, resolution, cache_dir, how)
+    shape = _cached(mesh, key, path.stem, sdf, resolution, cache_dir, **how)
     source = {**shape.source, "file": path.name, "sha256": key}
     return scaled(replace(shape, name=name or path.stem, source=source), units)
 
@@ -357,7 +338,7 @@ def shape_from_primitive(
     unit = Mesh(mesh.vertices / float(np.ptp(mesh.vertices, axis=0).max()), mesh.faces)
     # Rounded, since sines and cosines differ in their last digit from machine to machine.
     key = Mesh(unit.vertices.round(9), unit.faces).digest()
-    shape = _cached(unit, key, kind, sdf, resolution, cache_dir, {"on_progress": on_progress})
+    shape = _cached(unit, key, kind, sdf, resolution, cache_dir, on_progress=on_progress)
     return scaled(replace(shape, name=name or kind, source={**shape.source, "primitive": kind}), size)
 
 
@@ -366,7 +347,7 @@ def mesh_shape(
     resolution: int = DEFAULT_RESOLUTION, on_progress: Progress = silent,
 ) -> Shape:  # fmt: skip
     """The shape of a mesh (metres) without any fit: its exact SDF or a grid of it, nodes and mass as a fit has them.
-    Arguments as of `shape_from_mesh`. Raises SdfsimError: the mesh cannot be used."""
+    Raises SdfsimError where the mesh cannot be used."""
     solid = solidify(mesh, name=name, cap=cap, thicken=thicken)
     sdf, note = sdf_of_mesh(solid.surface, kind, resolution, on_progress)
     nodes = surface_nodes(sdf, solid.surface, DEFAULT_COUNT)
@@ -374,7 +355,7 @@ def mesh_shape(
 
 
 def _cached(
-    mesh: Mesh, key: str, name: str, kind: SdfKind, resolution: int, cache_dir: str | Path | None, how: dict[str, Any]
+    mesh: Mesh, key: str, name: str, kind: SdfKind, resolution: int, cache_dir: str | Path | None, **how: Any
 ) -> Shape:
     if kind == "mesh":  # made as fast as it is read
         return mesh_shape(mesh, name=name, kind=kind, **how)
@@ -409,55 +390,41 @@ def _cached(
 def analytic_shape(
     kind: Literal["plane", "sphere", "capsule", "cylinder", "box"],
     *,
-    radius: float | None = None,
-    height: float | None = None,
-    size: Sequence[float] | np.ndarray | None = None,
+    radius: float = 0.0,
+    height: float = 0.0,
+    size: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
     name: str | None = None,
 ) -> Shape:
     """A shape with an exact SDF, about the origin: "plane" (z = 0, +z outside, infinite), "sphere", "capsule",
     "cylinder" or "box".
 
     Radius and height (along z, of a capsule with its caps) are in m, and so is the box's size, full extents along x, y,
-    z. Mass properties are exact (of the plane 0); the plane shows a 20 m square. Nodes: sphere 128 spread as a
-    Fibonacci spiral, capsule and cylinder rings, box 8 corners and points along edges and on faces, plane none. Raises
-    SdfsimError for an unknown kind, or a size that is missing or not positive.
+    z. Mass properties are exact (of the plane 0); the plane shows a 20 m square and has no nodes. Raises SdfsimError
+    for a size that is missing or not positive.
     """
-    source = {"kind": kind}
+    volume, inertia, nodes = 0.0, np.zeros((3, 3)), np.zeros((0, 3))
     if kind == "plane":
         square = np.array([[-10, -10, 0], [10, -10, 0], [10, 10, 0], [-10, 10, 0]], dtype=np.float64)
-        mesh = Mesh(square, np.array([[0, 1, 2], [0, 2, 3]]))
-        return Shape(
-            name or kind, mesh, PlaneSdf(), np.zeros((0, 3)), 0.0, np.zeros(3), np.zeros((3, 3)), source=source
-        )
-    if kind == "sphere":
-        if radius is None:
-            raise SdfsimError("a sphere needs a radius")
+        sdf, mesh = PlaneSdf(), Mesh(square, np.array([[0, 1, 2], [0, 2, 3]]))
+    elif kind == "sphere":
         sdf = SphereSdf(float(radius))
         volume = 4.0 / 3.0 * np.pi * sdf.radius**3
         inertia = 0.4 * volume * sdf.radius**2 * np.eye(3)
         mesh, nodes = primitives.sphere(sdf.radius), _sphere_nodes(sdf.radius, 128)
     elif kind == "box":
-        if size is None or len(size) != 3:
-            raise SdfsimError("a box needs its size along x, y and z")
         x, y, z = (0.5 * float(value) for value in size)
         sdf = BoxSdf((x, y, z))
         volume = 8.0 * x * y * z
         inertia = volume / 3.0 * np.diag([y * y + z * z, z * z + x * x, x * x + y * y])
         mesh, nodes = primitives.box((2 * x, 2 * y, 2 * z)), _box_nodes(np.array([x, y, z]))
-    elif kind in ("capsule", "cylinder"):
-        if radius is None or height is None:
-            raise SdfsimError(f"a {kind} needs a radius and a height")
-        caps = 2.0 * radius if kind == "capsule" else 0.0
-        if not height > caps:
-            raise SdfsimError(f"a capsule's height must be above twice its radius (got {height:g} and {radius:g})")
-        half = 0.5 * (float(height) - caps)
-        sdf = (CapsuleSdf if kind == "capsule" else CylinderSdf)(float(radius), half)
-        volume, inertia = _round_mass(sdf.radius, half, caps=caps > 0)
-        nodes = _round_nodes(sdf.radius, half, caps=caps > 0)
-        mesh = convex_hull(_round_nodes(sdf.radius, half, caps=caps > 0, around=48))
     else:
-        raise SdfsimError(f"unknown analytic shape {kind!r}", "use plane, sphere, capsule, cylinder or box")
-    return Shape(name or kind, mesh, sdf, nodes, float(volume), np.zeros(3), inertia, source=source)
+        caps = kind == "capsule"
+        half = 0.5 * (float(height) - 2.0 * radius * caps)
+        sdf = (CapsuleSdf if caps else CylinderSdf)(float(radius), half)
+        volume, inertia = _round_mass(sdf.radius, half, caps=caps)
+        nodes = _round_nodes(sdf.radius, half, caps=caps)
+        mesh = convex_hull(_round_nodes(sdf.radius, half, caps=caps, around=48))
+    return Shape(name or kind, mesh, sdf, nodes, float(volume), np.zeros(3), inertia, source={"kind": kind})
 
 
 def _round_mass(radius: float, half: float, *, caps: bool) -> tuple[float, np.ndarray]:
@@ -501,7 +468,7 @@ def _sphere_nodes(radius: float, count: int) -> np.ndarray:
 def _box_nodes(half: np.ndarray) -> np.ndarray:
     """Corners, edges and faces of a 5 x 5 x 5 lattice on the box: [98, 3] m, the corners first."""
     axis = np.linspace(-1.0, 1.0, 5)
-    lattice = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    sides = (np.abs(lattice) == 1.0).sum(1)
+    places = lattice(axis, axis, axis)
+    sides = (np.abs(places) == 1.0).sum(1)
     order = np.argsort(-sides, kind="stable")
-    return (lattice * half)[order[sides[order] > 0]]
+    return (places * half)[order[sides[order] > 0]]

@@ -10,8 +10,7 @@ class Soap:
 
     For each matrix gradient G of `parameters`, each [L, rows, columns] of L equal layers, it tracks averages of G G^T
     and G^T G, and runs Adam in the basis of their eigenvectors, which one step of orthogonal iteration follows every
-    few updates. On these 64-wide networks that costs a tenth of the gradient itself, and reaches in a thousand steps
-    what Adam does not in ten thousand. The first step only sets up the bases. A dimension of size 1 is not rotated.
+    few updates. The first step only sets up the bases. A dimension of size 1 is not rotated.
     """
 
     MOMENTUM, SECOND, LEAST = 0.95, 0.95, 1e-10

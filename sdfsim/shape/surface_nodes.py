@@ -9,7 +9,7 @@ import numpy as np
 
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.distance import PiecesDistance
-from sdfsim.shape.mesh import Mesh, convex_hull, normal_frame
+from sdfsim.shape.mesh import Mesh, convex_hull, lattice, normal_frame
 from sdfsim.shape.sdf import Sdf
 
 # The paper's sampling (section 3 and appendix): a grid over this half extent of the normalised frame, projected onto
@@ -24,6 +24,8 @@ DIRECTIONS = 1000  # in which nodes are to reach as far as the surface
 CHUNK = 10_000  # points looked at together
 # Faces that meet at less than this cosine (20 degrees) make an edge worth nodes of its own.
 SHARP = 0.94
+LATTICE = 40  # of the lattice that tells the nearest patch, along the largest extent
+OUTSIDE = 1e-3  # of the extent: vertices that lie deeper in the union are not on its surface
 
 
 def sample_nodes(sdf: Sdf, *, grid: int = DEFAULT_GRID, voxel: float = VOXEL) -> np.ndarray:
@@ -35,8 +37,7 @@ def sample_nodes(sdf: Sdf, *, grid: int = DEFAULT_GRID, voxel: float = VOXEL) ->
     """
     frame = normal_frame(sdf.bounds)
     axis = np.linspace(-GRID_HALF, GRID_HALF, grid)
-    points = frame.outward(np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3))
-    points = project(sdf, points)
+    points = project(sdf, frame.outward(lattice(axis, axis, axis)))
     distance = np.asarray(sdf(points)[0])
     reached = np.abs(distance) <= REACHED * frame.scale
     # A network may have a stray zero level in the corners of its box: nothing outside the solid's bounds is surface.
@@ -48,9 +49,9 @@ def sample_nodes(sdf: Sdf, *, grid: int = DEFAULT_GRID, voxel: float = VOXEL) ->
     return frame.outward(_one_per_voxel(frame.inward(points), voxel))
 
 
-def project(sdf: Sdf, points: np.ndarray, *, steps: int = PROJECTIONS) -> np.ndarray:
+def project(sdf: Sdf, points: np.ndarray) -> np.ndarray:
     """Move points [P, 3] m to the zero level by a few steps x - f grad f / |grad f|^2."""
-    for _ in range(steps):
+    for _ in range(PROJECTIONS):
         distance, gradient = sdf(points)
         # A step never gets longer than twice the distance: slopes below 0.7 are errors of a fit, not geometry.
         squared = np.maximum(np.square(gradient).sum(1), 0.5)
@@ -88,9 +89,13 @@ def thin(points: np.ndarray, count: int, *, keep: np.ndarray | None = None) -> n
 def hull_nodes(vertices: np.ndarray, count: int) -> np.ndarray:
     """At most `count` of a polyhedral body's own vertices [V, 3] m: first those of the convex hull, for only they can
     touch a flat floor; the others farthest first."""
-    outer = _outer(vertices)
-    rest = np.delete(vertices, outer, axis=0)
-    return thin(rest, count, keep=vertices[outer])
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        outer = np.sort(ConvexHull(vertices).vertices)
+    except QhullError:  # all in a plane
+        return thin(vertices, count)
+    return thin(np.delete(vertices, outer, axis=0), count, keep=vertices[outer])
 
 
 def edge_nodes(piece: np.ndarray, spacing: float) -> np.ndarray:
@@ -110,10 +115,6 @@ def edge_nodes(piece: np.ndarray, spacing: float) -> np.ndarray:
         parts = int(np.ceil(np.linalg.norm(end - start) / spacing))
         points.append(start + np.arange(1, parts)[:, None] / parts * (end - start))
     return np.concatenate(points)
-
-
-LATTICE = 40  # of the lattice that tells the nearest patch, along the largest extent
-OUTSIDE = 1e-3  # of the extent: vertices that lie deeper in the union are not on its surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,8 +142,7 @@ def surface_of(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray]) -> Sur
     cell = extent / LATTICE
     low = sdf.bounds[0] - cell
     count = np.ceil((sdf.bounds[1] + cell - low) / cell).astype(int) + 1
-    axes = [low[a] + cell * np.arange(count[a]) for a in range(3)]
-    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    places = lattice(*(low[axis] + cell * np.arange(count[axis]) for axis in range(3)))
     nearest = _nearest_piece(pieces, np.concatenate([places, nodes]))
     return Surface(
         nodes=np.concatenate([vertices[bare], nodes]),
@@ -194,13 +194,3 @@ def _reaching(points: np.ndarray, count: int) -> np.ndarray:
         chosen.append(int(along[(farthest - reached).argmax()].argmax()))
         reached = np.maximum(reached, along[:, chosen[-1]])
     return outer[chosen]
-
-
-def _outer(vertices: np.ndarray) -> np.ndarray:
-    """Indices of the convex hull's vertices; all of them when the vertices lie in a plane."""
-    from scipy.spatial import ConvexHull, QhullError
-
-    try:
-        return np.sort(ConvexHull(vertices).vertices)
-    except QhullError:
-        return np.arange(len(vertices))

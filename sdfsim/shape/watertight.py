@@ -15,7 +15,7 @@ import numpy as np
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.bvh import ClosestPoint, Winding
 from sdfsim.shape.mass import integrals
-from sdfsim.shape.mesh import Frame, Mesh, clean, components, directed_edges, is_closed, normal_frame
+from sdfsim.shape.mesh import Frame, Mesh, clean, components, directed_edges, is_closed, lattice, normal_frame
 
 # Openings are closed unasked up to this fraction of the surface, smallest first.
 SMALL = 0.02
@@ -26,6 +26,9 @@ LEAK = 0.01
 STEP = 1e-4
 # Less of the surface than this is not worth cutting: the corners of small faces that cross each other.
 TRIFLE = 1e-3
+# Longer faces may hide something between the points at which they are tested; a centroid speaks for the whole of
+# shorter ones, which is wrong along seams only, by a fraction of their size.
+COARSE, FINE = 0.1, 0.008
 # A sheet thinner than this is below what a fit resolves (mean errors of 0.0015 near the surface are allowed).
 THINNEST = 0.01
 THICKEST = 2.0  # likewise, of what is thickened
@@ -54,12 +57,6 @@ class Solid:
         """Volume m^3, centre of mass [3] m, and inertia [3, 3] m^5 (per unit density) about it: exact to rounding for a
         surface that was not cut, to about 0.1 % otherwise. Raises SdfsimError where it encloses nothing."""
         return integrals(self.surface, 1.0 if self.layers is None else 1.0 / self.layers)
-
-
-def as_it_is(mesh: Mesh) -> Solid:
-    """`mesh` (metres, with faces) without any repair or refusal; a sheet has no inside then."""
-    closed = is_closed(mesh)
-    return Solid(mesh, mesh, closed=closed, simple=closed and components(mesh.faces).max() == 0)
 
 
 def solidify(mesh: Mesh, *, name: str = "mesh", cap: bool = False, thicken: float | None = None) -> Solid:
@@ -226,15 +223,11 @@ def _thickened(mesh: Mesh, frame: Frame, name: str, thickness: float) -> Solid:
     from skimage.measure import marching_cubes
 
     size = frame.scale + thickness
-    if not thickness <= THICKEST * frame.scale:
+    least, most = THINNEST * frame.scale / (1 - THINNEST), THICKEST * frame.scale
+    if not least <= thickness <= most:
         raise SdfsimError(
-            f"{name}: a thickness of {thickness:g} m is too large for a mesh of {frame.scale:.3g} m",
-            f"use at most {THICKEST * frame.scale:.2g} m",
-        )
-    if not thickness >= THINNEST * size:
-        raise SdfsimError(
-            f"{name}: a thickness of {thickness:g} m is too small for a mesh of {frame.scale:.3g} m",
-            f"use at least {THINNEST * frame.scale / (1 - THINNEST):.2g} m",
+            f"{name}: a thickness of {thickness:g} m is too small or too large for a mesh of {frame.scale:.3g} m",
+            f"use {least:.2g} to {most:.2g} m",
         )
     cell = min(size / 100, thickness / 2.5)
     low = mesh.vertices.min(0) - 0.5 * thickness - 2 * cell
@@ -246,10 +239,9 @@ def _thickened(mesh: Mesh, frame: Frame, name: str, thickness: float) -> Solid:
         return np.linalg.norm(points - nearest(points)[0], axis=1) - 0.5 * thickness
 
     def nodes(starts: np.ndarray, axis: np.ndarray) -> np.ndarray:
-        grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(1, -1, 3)
-        return (low + cell * (starts[:, None] * block + grid)).reshape(-1, 3)
+        return (low + cell * (starts[:, None] * block + lattice(axis, axis, axis))).reshape(-1, 3)
 
-    blocks = np.stack(np.meshgrid(*(np.arange(count) for count in counts), indexing="ij"), axis=-1).reshape(-1, 3)
+    blocks = lattice(*(np.arange(count) for count in counts))
     # Distances change by no more than the way gone: a block that is far from the surface has its middle's sign.
     middle = distance(nodes(blocks, np.array([0.5 * (block - 1)])))
     values = np.repeat(middle[:, None], block**3, axis=1).astype(np.float32)
@@ -276,9 +268,7 @@ def consistent(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.
 
     oriented: tuple[Any, Any] = igl.bfs_orient(np.ascontiguousarray(faces, dtype=np.int64))
     turned, patch = oriented
-    same = np.zeros(len(faces), dtype=bool)
-    for k in range(3):
-        same |= (faces[:, k] == turned[:, 0]) & (faces[:, (k + 1) % 3] == turned[:, 1])
+    same = ~_differ(faces, turned)
     area = face_areas(vertices[faces])
     minority = np.bincount(patch, weights=area * same) < 0.5 * np.bincount(patch, weights=area)
     wrong = same == minority[patch]
@@ -341,24 +331,18 @@ def face_normals(corners: np.ndarray) -> np.ndarray:
     return np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
 
 
-def exposed(
-    corners: np.ndarray, side: Side, *, fine: float = 0.008, coarse: float = 0.1
-) -> tuple[np.ndarray, np.ndarray]:
+def exposed(corners: np.ndarray, side: Side) -> tuple[np.ndarray, np.ndarray]:
     """The parts of triangles [F, 3, 3 + K] that are boundary, [F', 3, 3 + K] wound outwards, and their layers [F'].
-
-    Lengths are relative to the size: faces longer than `coarse` may hide something between the points at which they
-    are tested, and are cut before they are judged; those shorter than `fine` go by their centroid, which is wrong by
-    a fraction of their size, along seams only.
-    """
+    Faces longer than `COARSE` are cut before they are judged; those shorter than `FINE` go by their centroid."""
     weights = np.array([[30, 1, 1], [1, 30, 1], [1, 1, 30], [15, 15, 1], [15, 1, 15], [1, 15, 15]], dtype=np.float64)
     weights /= weights.sum(1, keepdims=True)
     kept, layers = [corners[:0]], [np.zeros(0, dtype=np.int64)]
-    corners = no_longer_than(corners, coarse)
+    corners = no_longer_than(corners, COARSE)
     while len(corners):
         centres, normals = centres_and_normals(corners)
         verdict = side(centres, normals)
         decided = np.ones(len(corners), dtype=bool)
-        large = np.flatnonzero(_longest(corners) > fine)
+        large = np.flatnonzero(_longest(corners) > FINE)
         tests = np.einsum("kc,fci->fki", weights, corners[large, :, :3])
         others = side(tests.reshape(-1, 3), np.repeat(normals[large], len(weights), axis=0))
         decided[large] = (others.reshape(-1, len(weights)) == verdict[large, None]).all(1)

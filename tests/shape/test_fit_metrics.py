@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 
 from sdfsim.shape import primitives
 from sdfsim.shape.distance import MeshDistance, PiecesDistance
-from sdfsim.shape.fit_metrics import EXACT, USABLE, certify, coverage, thin_share, verdict
+from sdfsim.shape.fit_metrics import EXACT, USABLE, certify, coverage, verdict
 from sdfsim.shape.mesh import Mesh, sample_surface
 from sdfsim.shape.sdf import BoxSdf, Sdf, SphereSdf
 from sdfsim.shape.surface_nodes import sample_nodes, thin
@@ -75,7 +75,7 @@ def test_what_is_usable_but_not_exact_passes_with_a_caveat(cube: MeshDistance) -
     assert all(EXACT[key] < limit for key, limit in USABLE.items())
     got = certify(shifted(CUBE, 0.0012), cube, points=500)
     assert got["passed"] and got["reason"] == ""
-    assert got["caveat"] == "error_within_0.01 is 0.0012, exact fits have 0.001: fine detail, or too short a fit"
+    assert got["caveat"] == "error_within_0.01 is 0.0012, exact fits have 0.001"
     assert verdict(EXACT) == {"passed": True, "reason": "", "caveat": ""}
     at_limit = verdict(EXACT | USABLE)
     assert at_limit["passed"] and at_limit["caveat"]
@@ -126,22 +126,9 @@ def test_a_flipped_region_is_a_sign_error_of_its_size(cube: MeshDistance) -> Non
     assert not got["passed"]
 
 
-def test_a_miss_says_what_can_be_measured_about_its_cause(cube: MeshDistance) -> None:
-    assert thin_share(cube) == 0.0
-    plate = MeshDistance(primitives.box((1.0, 1.0, 0.015)))
-    assert thin_share(plate) == pytest.approx(2.0 / 2.06, abs=0.02)
-    assert thin_share(plate, 0.01) < 0.02
-    inside_out = MeshDistance(Mesh(plate.surface.vertices, plate.surface.faces[:, ::-1]))
-    assert thin_share(inside_out) == pytest.approx(thin_share(plate), abs=0.02)
-    bad = shifted(CUBE, 0.01)
-    reason = certify(bad, plate, points=500)["reason"]
-    assert "thin walls (9" in reason
-    assert "% of the surface is thinner than 0.02)" in reason
-    assert certify(bad, cube, points=500)["reason"].endswith("fine detail, or too short a fit")
+def test_what_an_open_mesh_leaves_in_doubt_is_ready_for_json(cube: MeshDistance) -> None:
     holed = MeshDistance(Mesh(cube.surface.vertices, cube.surface.faces[1:]))
-    got = certify(bad, holed, points=500)
-    assert "open mesh" in got["reason"]
-    assert json.dumps(got, allow_nan=False)
+    assert json.dumps(certify(shifted(CUBE, 0.01), holed, points=500), allow_nan=False)
 
 
 def test_the_coverage_of_known_nodes_on_a_cube(cube: MeshDistance) -> None:
@@ -153,8 +140,7 @@ def test_the_coverage_of_known_nodes_on_a_cube(cube: MeshDistance) -> None:
     # Eight corners with three quarter discs of radius 0.1 each.
     assert got["uncovered"] == pytest.approx(1 - np.pi * 0.1**2 * 6 / 6, abs=0.005)
     assert got["off_surface"] < 1e-6
-    assert coverage(corners, cube.surface) == got
-    large = coverage(30.0 * corners, primitives.box((30.0, 30.0, 30.0)))
+    large = coverage(30.0 * corners, MeshDistance(primitives.box((30.0, 30.0, 30.0))))
     assert large == pytest.approx(got, rel=1e-3, abs=1e-6)
     assert coverage(np.concatenate([corners, np.zeros((1, 3))]), cube)["off_surface"] == pytest.approx(0.5)
     none = coverage(np.zeros((0, 3)), cube)
