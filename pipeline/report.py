@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.cameras import Similarity, camera_up, frame_of, load_sparse, load_views
+from pipeline.inputs.photos import load_photos
 from pipeline.options import Options
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, write_json, write_text
@@ -22,8 +24,8 @@ RESULTS = {
     "report": ("report.md", "photos"),
 }  # fmt: skip
 RECORDING = "reconstruction.rrd"
+NAMED = 10  # photos left out that the notes name; the page has them all
 PROPOSED = (255, 40, 200)  # RGB of the cameras that are proposed
-NAMED = 10  # photos that a note names one by one
 FEW_PHOTOS, LOW_PSNR, HIGH_ERROR = 20, 20.0, 1.0
 GUESSED_SHARE = 0.01  # of a body's surface, from which on a note says so
 
@@ -38,10 +40,8 @@ def write_report(
     fit = stages.get("fit", {})
     poses = stages.get("poses", {})
     if failed and not poses:
-        try:
+        with suppress(SdfsimError):
             poses = read_json(folder / ".poses.part" / "checks.json")
-        except SdfsimError:
-            poses = {}
     report: dict[str, Any] = {
         "version": 1, "options": asdict(options), "seconds": seconds, "seconds_total": round(sum(seconds.values()), 1),
         "psnr": stages.get("distill", {}).get("psnr"), "stages": stages, "poses": poses, "notes": notes(stages),
@@ -53,8 +53,7 @@ def write_report(
         report["error"] = {"stage": stage, "message": error.message, "hint": error.hint}
     if options.budget is not None and report["seconds_total"] > 1.1 * options.budget:
         report["notes"].append(
-            f"it took {report['seconds_total']:.0f} s, more than the budget of {options.budget:.0f} s: poses, mesh and "
-            "the shortest of fits take their time"
+            f"it took {report['seconds_total']:.0f} s, more than the budget of {options.budget:.0f} s"
         )
     report["improve"] = improvements(report)
     write_text(folder / "report.md", page(report, folder))
@@ -68,22 +67,19 @@ def write_report(
 
 def photo_rows(folder: Path, stages: dict[str, dict], poses: dict) -> list[dict]:
     """Each photo with what became of it: posed, held out (with its PSNR), left out (and why), or not posed yet."""
-    try:
-        photos = read_json(folder / "photos" / "photos.json")["photos"] if "photos" in stages else []
-    except (SdfsimError, KeyError):
-        photos = []
+    photos = []
+    if "photos" in stages:
+        with suppress(SdfsimError):
+            photos = load_photos(folder / "photos")
     why = {entry["photo"]: entry["why"] for entry in poses.get("left_out", [])}
     distill = stages.get("distill", {})
     held = dict(zip(distill.get("held_out_photos", []), distill.get("psnr_each", []), strict=False))
     rows = []
     for photo in photos:
-        name = photo["source"]
+        name = photo.source
         state = "left out" if name in why else "held out" if name in held else "posed" if poses else "prepared"
-        rows.append({
-            "photo": name, "file": photo["name"], "state": state, "why": why.get(name, ""), "fault": photo["fault"],
-            "sharpness": photo["sharpness"], "mask": photo["mask"], "size": [photo["width"], photo["height"]],
-            "focal_exif": photo["focal"], "psnr": held.get(name),
-        })  # fmt: skip
+        rows.append({"photo": name, "file": photo.name, "state": state, "why": why.get(name, photo.fault),
+                     "psnr": held.get(name)})  # fmt: skip
     return rows
 
 
@@ -128,26 +124,19 @@ def trust_lines(mesh: dict) -> list[str]:
 
 
 def touching_lines(mesh: dict) -> list[str]:
-    """Which bodies touch, which masks have no body, and how deep hollows are, from the report of the mesh stage."""
-    from pipeline.mesh.hollows import hollow_line
-
-    lines = []
-    for first, second, by in mesh.get("touching", []):
-        how = "split where their masks end" if by == "masks" else (
-            "split along a seam by concavity and colour; give masks to be sure")  # fmt: skip
-        lines.append(f"{first} and {second} touch; {how}")
-    lines += [f"masks of {name}: no surface corresponds to them" for name in mesh.get("masks_without_surface", [])]
-    return lines + [hollow_line(name, *found) for name, found in mesh.get("hollows_m", {}).items()]
+    """Which bodies touch, and which masks have no body, from the report of the mesh stage."""
+    how = {"masks": "split where their masks end", "shape": "split along a seam by shape; give masks to be sure"}
+    lines = [f"{first} and {second} touch; {how[by]}" for first, second, by in mesh.get("touching", [])]
+    return lines + [
+        f"masks of {name}: no surface corresponds to them" for name in mesh.get("masks_without_surface", [])
+    ]
 
 
 def notes(stages: dict[str, dict]) -> list[str]:
     """What a person should know about a run: what was passed over, assumed or is uncertain; one line each."""
     poses, mesh = stages.get("poses", {}), stages.get("mesh", {})
-    left = poses.get("left_out", [])
     lines = [*stages.get("photos", {}).get("notes", []), *poses.get("warnings", [])]
-    lines += [f"left out: {entry['photo']}: {entry['why']}" for entry in left[:NAMED]]
-    if len(left) > NAMED:
-        lines.append(f"left out: {len(left) - NAMED} more")
+    lines += [f"left out: {entry['photo']}: {entry['why']}" for entry in poses.get("left_out", [])[:NAMED]]
     if mesh.get("up_from") == "cameras":
         lines.append("no level plane found: up is taken from the cameras and may be off by some degrees")
     if mesh.get("up_confidence") == "low":
@@ -194,13 +183,9 @@ def page(report: dict, folder: Path) -> str:
             lines += [f"## {title}", "", *(f"- {entry}" for entry in entries), ""]
     rows: list[tuple[str, object]] = []
     if poses:
-        fov = ", ".join(f"{angle:.1f}°" for angle in poses["field_of_view"])
         rows += [
             ("photos with a pose", f"{poses['posed']} of {poses['photos']}"),
             ("mean reprojection error", f"{poses['mean_error']:.2f} px, {poses['points']} points"),
-            ("field of view of the longer side", fov),
-            ("viewing directions", f"{poses.get('span_degrees', 0):.0f}° around"),
-            ("pairs of photos that contradict the poses", f"{poses.get('contradictions', 0):.1%}"),
         ]
         rows += [(f"attempt: {one['name']}", "; ".join(one["failures"]) or f"good, {one['posed']} posed")
                  for one in poses.get("attempts", [])]  # fmt: skip
@@ -229,22 +214,21 @@ def page(report: dict, folder: Path) -> str:
     lines += ["## Numbers", "", "| | |", "| --- | --- |", *(f"| {name} | {value} |" for name, value in rows), ""]
     if (folder / "mesh" / "objects.png").exists() and mesh:
         lines += ["## What was found", "", "![bodies by name](mesh/objects.png)", ""]
-    files = {photo["photo"]: photo["file"] for photo in report["photos"]}
-    held = [name for name in distill.get("held_out_photos", []) if name in files]
+    held = [photo for photo in report["photos"] if photo["state"] == "held out"]
     if held:
         lines += ["## Photos that were not trained on: photo and render", ""]
-        lines += [f"![{name}](photos/images/{files[name]}) ![render](distill/held_out/{files[name]})" for name in held]
-    lines += ["", "## Photos", "", "| photo | | | |", "| --- | --- | --- | --- |"]
-    lines += [f"| {row['photo']} | {row['state']} | {row['why']} | {row['fault']} |" for row in report["photos"]]
+        lines += [f"![{photo['photo']}](photos/images/{photo['file']}) ![render](distill/held_out/{photo['file']})"
+                  for photo in held]  # fmt: skip
+    lines += ["", "## Photos", "", "| photo | | |", "| --- | --- | --- |"]
+    lines += [f"| {row['photo']} | {row['state']} | {row['why']} |" for row in report["photos"]]
     return "\n".join(lines) + "\n"
 
 
 def write_recording(folder: Path, done: Collection[str]) -> Path | None:
     """Writes `reconstruction.rrd`: cameras with their photos, sparse points, the surface, how far it can be trusted.
 
-    Before the mesh stage it is in the units of the camera poses, with z up as far as the cameras tell; from then on in
-    metres with z up. Returns its path, or None before the poses stage. Raises SdfsimError where a stage's folder is
-    damaged, or the file cannot be written.
+    Before the mesh stage it is in the units of the camera poses, z up as far as the cameras tell; then in metres.
+    Returns its path, or None before the poses stage.
     """
     from pipeline.field.training import load_field
     from pipeline.mesh.meshing import NEXT, TEXTURED, trust_meshes

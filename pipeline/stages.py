@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import hashlib
 import json
 import os
@@ -289,11 +288,8 @@ def hash_of_photos(given: Path) -> str:
     digest = hashlib.sha256()
     for path in find_source(given).files():
         digest.update(path.name.encode("utf-8", "surrogateescape") + b"\0")
-        try:
-            with open(path, "rb") as file:
-                digest.update(hashlib.file_digest(file, "sha256").digest())
-        except OSError as error:
-            raise SdfsimError(f"{path}: cannot be read ({error.strerror})") from error
+        with open(path, "rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
     return digest.hexdigest()
 
 
@@ -372,11 +368,9 @@ def _old(place: Path) -> Path:
 
 @contextlib.contextmanager
 def readable_errors(folder: Path) -> Iterator[None]:
-    """Turns a full disk or a folder that cannot be written into an SdfsimError of one clear line."""
+    """Turns a full disk, or what cannot be read or written, into an SdfsimError of one clear line."""
     try:
         yield
     except OSError as error:
-        reasons = {errno.ENOSPC: "the disk is full", errno.EDQUOT: "the disk quota is used up"}
-        hint = "free some space and run again: finished stages are kept" if error.errno in reasons else ""
-        reason = reasons.get(error.errno or 0, error.strerror or str(error))
-        raise SdfsimError(f"{error.filename or folder}: cannot be written ({reason})", hint) from error
+        message = f"{error.filename or folder}: {error.strerror or error}"
+        raise SdfsimError(message, "run again when this is put right: finished stages are kept") from error

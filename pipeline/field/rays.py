@@ -12,6 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from pipeline.cameras import View
+from pipeline.inputs.images import reduced
 from sdfsim.errors import SdfsimError
 
 
@@ -68,8 +69,7 @@ def load_rays(views: list[View], photos_folder: Path, long_side: int, *, masks: 
         try:
             with Image.open(Path(photos_folder) / "images" / view.name) as image:
                 image.load()
-                scale = min(1.0, long_side / max(image.size))
-                size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
+                size = reduced(image.size, long_side)
                 pixels = np.asarray(image.convert("RGB").resize(size, Image.Resampling.BOX))
             shade = None
             file = Path(photos_folder) / "masks" / (view.name + ".png")

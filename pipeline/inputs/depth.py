@@ -34,7 +34,7 @@ def read_depth(file: DepthFile) -> np.ndarray:
     """Depth [H, W] m along the optical axis; 0 where the sensor had none, was not sure, or saw an edge. Raises
     SdfsimError where the file is absent, damaged, or needs a package that is not installed."""
     counts = _read(file.path, file.shape, np.float32)
-    unit = file.unit if file.unit is not None else (1e-3 if counts.dtype.kind in "ui" else 1.0)
+    unit = file.unit or (1e-3 if counts.dtype.kind in "ui" else 1.0)
     depth = counts.astype(np.float32) * np.float32(unit)
     good = np.isfinite(depth) & (depth > 0) & (depth < FARTHEST)
     if file.confidence is not None:
@@ -59,39 +59,28 @@ def _edges(depth: np.ndarray) -> np.ndarray:
 def _read(path: Path, shape: tuple[int, int] | None, raw: type) -> np.ndarray:
     """The numbers [H, W] of a file, `raw` ones where it does not say what they are."""
     try:
-        if path.suffix in (".depth", ".conf"):
-            values = _compressed(path, raw, shape or (256, 192))
+        if path.suffix in (".depth", ".conf"):  # of Record3D
+            import imagecodecs
+
+            rows, columns = shape or (256, 192)
+            size = rows * columns * np.dtype(raw).itemsize
+            values = np.frombuffer(imagecodecs.lzfse_decode(path.read_bytes(), out=size), raw).reshape(rows, columns)
         elif path.suffix.lower() == ".exr":
-            values = _exr(path)
+            import OpenEXR
+
+            with OpenEXR.File(str(path)) as file:
+                pixels = next(iter(file.channels().values())).pixels
+            values = pixels if pixels.ndim == 2 else pixels[..., 0]
         elif path.suffix.lower() == ".npy":
             values = np.load(path, allow_pickle=False)
         else:
             import cv2
 
             values = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    except ImportError as error:
+        raise SdfsimError(f"{path}: needs the package {error.name}", EXTRA) from error
     except (OSError, ValueError, RuntimeError) as error:
         raise SdfsimError(f"{path}: cannot be read as depth: {error}", "export the capture again") from error
     if values is None or np.squeeze(values).ndim != 2:
         raise SdfsimError(f"{path}: no picture with one channel", "depth is a PNG of 16 bits, an EXR or an NPY")
     return np.squeeze(values)
-
-
-def _compressed(path: Path, raw: type, shape: tuple[int, int]) -> np.ndarray:
-    """Numbers [H, W] that Record3D packed by LZFSE."""
-    try:
-        import imagecodecs
-    except ImportError as error:
-        raise SdfsimError(f"{path}: compressed by LZFSE, which needs the package imagecodecs", EXTRA) from error
-    size = shape[0] * shape[1] * np.dtype(raw).itemsize
-    return np.frombuffer(imagecodecs.lzfse_decode(path.read_bytes(), out=size), raw).reshape(shape)
-
-
-def _exr(path: Path) -> np.ndarray:
-    """The first channel of an EXR."""
-    try:
-        import OpenEXR
-    except ImportError as error:
-        raise SdfsimError(f"{path}: an EXR needs the package OpenEXR", EXTRA) from error
-    with OpenEXR.File(str(path)) as file:
-        pixels = next(iter(file.channels().values())).pixels
-    return pixels if pixels.ndim == 2 else pixels[..., 0]

@@ -18,12 +18,13 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.cameras import View, view_of
 from sdfsim.files import write_arrays, write_json
 
-# Px that a point may be off while known cameras are refined, points that a camera needs to be moved, points that most
-# need for any to be moved (with fewer, a dozen photos came out worse than given), and the m within which a phone tracks
-# its place.
-REFINE_PIXELS, REFINE_POINTS, SUPPORTED, TRACKED = (16.0, 6.0), 30, 70, 0.02
+REFINE_PIXELS = (16.0, 6.0)  # that a point may be off while known cameras are refined, at first and then
+REFINE_POINTS = 30  # points that a camera needs to be moved
+SUPPORTED = 70  # that most cameras need for any to be moved: with fewer, a dozen photos came out worse than given
+TRACKED = 0.02  # m within which a phone tracks its place
 
 
 def say(message: str) -> None:
@@ -59,18 +60,14 @@ def features(pycolmap, job: dict, database: Path) -> None:
         if group["focal"]:
             reader.camera_params = f"{group['focal']},{group['width'] / 2},{group['height'] / 2},0"
         common = {"image_names": group["names"], "camera_mode": pycolmap.CameraMode.SINGLE}
-        if not all(_known(pycolmap, database, name) for name in group["names"]):
-            # Before extraction, whose threads would number photos in the order in which they happen to end.
+        with pycolmap.Database.open(database) as opened:
+            known = all(opened.read_image_with_name(name) is not None for name in group["names"])
+        if not known:  # Before extraction, whose threads would number photos in the order in which they happen to end.
             pycolmap.import_images(database, job["images"], options=reader, **common)
         pycolmap.extract_features(
             database, job["images"], reader_options=reader, extraction_options=extraction,
             device=pycolmap.Device.cpu, **common,
         )  # fmt: skip
-
-
-def _known(pycolmap, database: Path, name: str) -> bool:
-    with pycolmap.Database.open(database) as opened:
-        return opened.read_image_with_name(name) is not None
 
 
 def matches(pycolmap, job: dict, database: Path) -> None:
@@ -174,13 +171,7 @@ def refine(pycolmap, model, database: Path, job: dict, out: Path) -> None:
     cameras stay where they were, at the scale they had.
     """
     given = {key: image.projection_center() for key, image in model.images.items()}
-    priors = [
-        pycolmap.PosePrior(
-            position=center, position_covariance=np.eye(3) * TRACKED**2, corr_data_id=model.images[key].data_id,
-            coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
-        )
-        for key, center in given.items()
-    ]  # fmt: skip
+    cartesian = pycolmap.PosePriorCoordinateSystem.CARTESIAN
     for pixels in REFINE_PIXELS:
         options = incremental_options(pycolmap, job)
         options.mapper.filter_max_reproj_error = pixels
@@ -197,14 +188,12 @@ def refine(pycolmap, model, database: Path, job: dict, out: Path) -> None:
             config.add_image(key)
         with_priors = pycolmap.PosePriorBundleAdjustmentOptions()
         with_priors.alignment_ransac.random_seed = job["seed"]
-        adjuster = pycolmap.create_pose_prior_bundle_adjuster(
-            adjustment,
-            with_priors,
-            config,
-            [prior for key, prior in zip(given, priors, strict=True) if key in seen],
-            found,
-        )
-        adjuster.solve()
+        priors = [
+            pycolmap.PosePrior(position=given[key], position_covariance=np.eye(3) * TRACKED**2,
+                               corr_data_id=model.images[key].data_id, coordinate_system=cartesian)
+            for key in given if key in seen
+        ]  # fmt: skip
+        pycolmap.create_pose_prior_bundle_adjuster(adjustment, with_priors, config, priors, found).solve()
         after = np.array([found.images[key].projection_center() for key in seen])
         found.transform(pycolmap.estimate_sim3d(after, np.array([given[key] for key in seen])))
         for key in seen:
@@ -214,8 +203,7 @@ def refine(pycolmap, model, database: Path, job: dict, out: Path) -> None:
 def collect(reconstruction, out: Path) -> list[dict]:
     """Writes `sparse.npz` and returns the posed views as plain values."""
     views, index_of = [], {}
-    registered = sorted((i for i in reconstruction.images.values() if i.has_pose), key=lambda i: i.name)
-    for image in registered:
+    for image in sorted((i for i in reconstruction.images.values() if i.has_pose), key=lambda i: i.name):
         camera = reconstruction.cameras[image.camera_id]
         focal, cx, cy, k = (float(value) for value in camera.params)
         pose = image.cam_from_world()
@@ -223,7 +211,7 @@ def collect(reconstruction, out: Path) -> list[dict]:
         views.append(
             {
                 "name": image.name, "width": camera.width, "height": camera.height,
-                "focal": focal, "cx": cx, "cy": cy, "k": k, "camera": int(image.camera_id),
+                "focal": focal, "cx": cx, "cy": cy, "k": k,
                 "rotation": pose.rotation.matrix().tolist(), "translation": list(map(float, pose.translation)),
             }
         )  # fmt: skip
@@ -259,8 +247,8 @@ def read_pairs(pycolmap, database: Path) -> tuple[dict[str, int], list[tuple[str
 
 
 def findings(job: dict, features: dict[str, int], pairs: list) -> dict:
-    """What the matches say whatever the poses: `counts` of each photo, `pairs`, and the share of `turn_only` pairs. A
-    pair holds the names, the number of matches, and the share of them that did not move between the photos."""
+    """What the matches say whatever the poses: `counts` of each photo, `pairs` (with the share of matches that did not
+    move between the photos), and the share of `turn_only` pairs."""
     result = {name: {"features": count, "best_matches": 0} for name, count in features.items()}
     sizes = {name: group for group in job["groups"] for name in group["names"]}
     told, moving = [], []
@@ -297,7 +285,7 @@ def turn_only(pairs: list[tuple[dict, np.ndarray, np.ndarray]], least: float = 2
 def contradictions(pairs: list, views: list[dict]) -> list[dict]:
     """Pairs of posed photos, with how far their matches are from the lines that the poses put them on. Each pair was
     matched on its own: where poses are right nearly all agree; no poses agree with repeating things."""
-    posed = {view["name"]: view for view in views}
+    posed = {view["name"]: view_of({**view, "source": ""}) for view in views}
     found = []
     for a, b, first, second in pairs:
         if len(first) >= 30 and a in posed and b in posed:
@@ -306,24 +294,15 @@ def contradictions(pairs: list, views: list[dict]) -> list[dict]:
     return found
 
 
-def epipolar_errors(a: dict, b: dict, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def epipolar_errors(a: View, b: View, first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Sampson distances [M], px of photo `a`, of matched pixels [M, 2] of two posed photos."""
-
-    def rays(view: dict, pixels: np.ndarray) -> np.ndarray:
-        bent = (pixels - [view["cx"], view["cy"]]) / view["focal"]
-        flat = bent
-        for _ in range(8):
-            flat = bent / (1 + view["k"] * np.clip((flat**2).sum(1, keepdims=True), 0, 4))
-        return np.hstack([flat, np.ones((len(flat), 1))])
-
-    turn_a, turn_b = np.array(a["rotation"]), np.array(b["rotation"])
-    turn = turn_b @ turn_a.T
-    x, y, z = np.array(b["translation"]) - turn @ np.array(a["translation"])
+    turn = b.rotation @ a.rotation.T
+    x, y, z = b.translation - turn @ a.translation
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ turn
-    p, q = rays(a, first), rays(b, second)
+    p, q = a.straight(*first.T), b.straight(*second.T)
     forth, back = p @ essential.T, q @ essential
     slope = (forth[:, :2] ** 2).sum(1) + (back[:, :2] ** 2).sum(1)
-    return np.abs((q * forth).sum(1)) / np.sqrt(np.maximum(slope, 1e-30)) * a["focal"]
+    return np.abs((q * forth).sum(1)) / np.sqrt(np.maximum(slope, 1e-30)) * a.focal
 
 
 def focal_of_pairs(pycolmap, job: dict, database: Path, out: Path) -> dict[str, float]:
@@ -362,19 +341,16 @@ def main(job_path: str) -> None:
     matches(pycolmap, job, database)
     say("phase mapping")
     counts, pairs = read_pairs(pycolmap, database)
-    result: dict[str, Any] = {"views": [], "models": [], **findings(job, counts, pairs)}
+    result: dict[str, Any] = {"views": [], **findings(job, counts, pairs)}
     result["focal_of_pairs"] = {} if job["known_cameras"] else focal_of_pairs(pycolmap, job, database, out)
-    models = sorted(mapping(pycolmap, job, database, out), key=lambda r: (-r.num_reg_images(), -r.num_points3D()))
-    for model in models:
-        result["models"].append(sorted(image.name for image in model.images.values() if image.has_pose))
+    models = mapping(pycolmap, job, database, out)
     if models:
-        best = models[0]
+        best = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
         result["views"] = collect(best, out)
         result["contradictions"] = contradictions(pairs, result["views"])
         result["mean_error"] = float(best.compute_mean_reprojection_error())
         result["points"] = int(best.num_points3D())
     write_json(out / "result.json", result)
-    say("phase done")
 
 
 if __name__ == "__main__":
