@@ -81,8 +81,8 @@ def meshes_of(mesh_folder: Path, name: str) -> tuple[Mesh, Mesh]:
 
 
 def skins_of(mesh_folder: Path) -> dict[str, Mesh]:
-    """The textured mesh of each part in its own frame."""
-    skins = read_glb(mesh_folder / TEXTURED)
+    """The textured mesh of each part in its own frame; none where there are no textures."""
+    skins = read_glb(mesh_folder / TEXTURED) if (mesh_folder / TEXTURED).exists() else {}
     origins = {name: origin_of(load_mesh(mesh_folder / "objects" / f"{name}.ply")) for name in skins if name != SCENERY}
     return {name: replace(skin, vertices=skin.vertices - origins.get(name, 0)) for name, skin in skins.items()}
 

@@ -52,9 +52,7 @@ def write_report(
         stage, error = failed
         report["error"] = {"stage": stage, "message": error.message, "hint": error.hint}
     if options.budget is not None and report["seconds_total"] > 1.1 * options.budget:
-        report["notes"].append(
-            f"it took {report['seconds_total']:.0f} s, more than the budget of {options.budget:.0f} s"
-        )
+        report["notes"].append(f"it took {report['seconds_total']:.0f} s, the budget was {options.budget:.0f} s")
     report["improve"] = improvements(report)
     write_text(folder / "report.md", page(report, folder))
     report["paths"] = {
@@ -95,48 +93,29 @@ def improvements(report: dict) -> list[str]:
     if report["psnr"] is not None and report["psnr"] < LOW_PSNR:
         lines.append(f"photos that were not trained on come out at {report['psnr']:.1f} dB only: train for longer "
                      "(--preset standard), and keep light and exposure the same in all photos")  # fmt: skip
-    lines += [f"{k}. of the photos that would help most: {photo_line(photo)}"
-              for k, photo in enumerate(stages.get("mesh", {}).get("next_photos", []), start=1)]  # fmt: skip
+    for number, photo in enumerate(stages.get("mesh", {}).get("next_photos", []), start=1):
+        place, target = (", ".join(f"{x:.2f}" for x in photo[key]) for key in ("position", "looking_at"))
+        lines.append(f"{number}. of the photos that would help most: {photo['words']} (camera at {place} m, aimed at "
+                     f"{target} m); it makes up for {photo['gain']:.0%} of what is weak")  # fmt: skip
     if report["failed_checks"]:
         lines.append("fit for longer (a larger --budget), or mend the mesh: a shape is not usable")
     return lines
 
 
-def photo_line(photo: dict) -> str:
-    """Where to take a photo, from an entry of `next_photos`: in words and as numbers."""
-    place, target = (", ".join(f"{round(x, 2) + 0.0:.2f}" for x in photo[key]) for key in ("position", "looking_at"))
-    return (f"{photo['words']} (camera at {place} m, aimed at {target} m); it makes up for {photo['gain']:.0%} of what "
-            "is weak")  # fmt: skip
-
-
-def trust_lines(mesh: dict) -> list[str]:
-    """What of each body is guessed, and how much more photos could do, from the report of the mesh stage."""
-    lines = []
-    for name, part in mesh.get("trust", {}).items():
-        if part["guessed"] > GUESSED_SHARE and name != "scene":
-            lines.append(f"{name}: {part['guessed']:.0%} of its surface is guessed, fewer than two photos see it")
-    if "weak" in mesh:
-        made_up = sum(photo["gain"] for photo in mesh["next_photos"])
-        more = f"the photos proposed make up for {made_up:.0%} of that" if made_up else "no one photo would help much"
-        lines.append(f"{mesh['weak']:.1%} of what could be photographed is weak: fewer than three photos see it, or "
-                     f"all from nearly one direction; {more}")  # fmt: skip
-    return lines
-
-
-def touching_lines(mesh: dict) -> list[str]:
-    """Which bodies touch, and which masks have no body, from the report of the mesh stage."""
-    how = {"masks": "split where their masks end", "shape": "split along a seam by shape; give masks to be sure"}
-    lines = [f"{first} and {second} touch; {how[by]}" for first, second, by in mesh.get("touching", [])]
-    return lines + [
-        f"masks of {name}: no surface corresponds to them" for name in mesh.get("masks_without_surface", [])
-    ]
-
-
 def notes(stages: dict[str, dict]) -> list[str]:
     """What a person should know about a run: what was passed over, assumed or is uncertain; one line each."""
-    poses, mesh = stages.get("poses", {}), stages.get("mesh", {})
+    poses, scene = stages.get("poses", {}), stages.get("scene", {})
     lines = [*stages.get("photos", {}).get("notes", []), *poses.get("warnings", [])]
     lines += [f"left out: {entry['photo']}: {entry['why']}" for entry in poses.get("left_out", [])[:NAMED]]
+    lines += mesh_notes(stages.get("mesh", {}))
+    lines += [f"usable, not exact: {caveat}" for caveat in stages.get("fit", {}).get("caveats", [])]
+    lines += [f"{name}: {material_line(body)}" for name, body in scene.get("bodies", {}).items()]
+    return lines + scene.get("notes", [])
+
+
+def mesh_notes(mesh: dict) -> list[str]:
+    """Those of the mesh stage, from its report."""
+    lines = []
     if mesh.get("up_from") == "cameras":
         lines.append("no level plane found: up is taken from the cameras and may be off by some degrees")
     if mesh.get("up_confidence") == "low":
@@ -145,16 +124,22 @@ def notes(stages: dict[str, dict]) -> list[str]:
         lines.append(f"size {mesh['size']} (give --size or --distance)")
     if mesh.get("objects"):
         lines.append(f"bodies of their own: {', '.join(mesh['objects'])} (mesh/objects.png shows which is which)")
-    lines += touching_lines(mesh)
+    how = {"masks": "split where their masks end", "shape": "split along a seam by shape; give masks to be sure"}
+    lines += [f"{first} and {second} touch; {how[by]}" for first, second, by in mesh.get("touching", [])]
+    lines += [f"masks of {name}: they have no surface" for name in mesh.get("masks_without_surface", [])]
     if "smallest_object_m" in mesh:
         lines.append(f"what rises less than {mesh['smallest_object_m']:.2g} m stays part of what it stands on")
     if mesh.get("left_out_m"):
         largest = max(mesh["left_out_m"])
         lines.append(f"{len(mesh['left_out_m'])} loose pieces were left out, the largest {largest:.2g} m long")
-    lines += trust_lines(mesh)
-    lines += [f"usable, not exact: {caveat}" for caveat in stages.get("fit", {}).get("caveats", [])]
-    lines += [f"{name}: {material_line(body)}" for name, body in stages.get("scene", {}).get("bodies", {}).items()]
-    return lines + stages.get("scene", {}).get("notes", [])
+    for name, part in mesh.get("trust", {}).items():
+        if part["guessed"] > GUESSED_SHARE and name != "scene":
+            lines.append(f"{name}: {part['guessed']:.0%} of its surface is guessed, fewer than two photos see it")
+    if "weak" in mesh:
+        more = "" if mesh["next_photos"] else "; no one photo would help much"
+        lines.append(f"{mesh['weak']:.1%} of what could be photographed is weak: fewer than three photos see it, or "
+                     f"all from nearly one direction{more}")  # fmt: skip
+    return lines
 
 
 def material_line(body: dict) -> str:
@@ -169,7 +154,7 @@ def material_line(body: dict) -> str:
 def page(report: dict, folder: Path) -> str:
     """The report as Markdown; its pictures are files of the run."""
     poses, stages = report["poses"], report["stages"]
-    mesh, distill = stages.get("mesh", {}), stages.get("distill", {})
+    mesh = stages.get("mesh", {})
     lines = [f"# Reconstruction of {Path(report['options']['photos']).name}", ""]
     if "error" in report:
         error = report["error"]
@@ -192,9 +177,6 @@ def page(report: dict, folder: Path) -> str:
     if moved := poses.get("moved"):
         rows.append(("cameras moved from where the capture saw them, median",
                      f"{1000 * moved['metres']:.1f} mm, {moved['degrees']:.2f}°"))  # fmt: skip
-    if depth := distill.get("depth"):
-        rows.append(("depth beside the points that photos give", f"{depth['scale'] - 1:+.2%} in scale, then "
-                     f"{depth['spread']:.2%} in the median, {depth['points']} pixels"))  # fmt: skip
     if report["psnr"] is not None:
         rows.append(("photos that were not trained on", f"PSNR {report['psnr']:.1f} dB"))
     if mesh:
@@ -249,12 +231,12 @@ def write_recording(folder: Path, done: Collection[str]) -> Path | None:
     for move in moves:
         views, points = [move.view(view) for view in views], move.points(points)
     photos = []
-    for number, view in enumerate([*views, *proposed]):
+    for view in [*views, *proposed]:
         image = folder / "photos" / "images" / view.name
+        known = image.is_file()
         photos.append(
-            PosedPhoto(view.source, image if image.is_file() else None, view.focal, (view.cx, view.cy),
-                       (view.width, view.height), view.rotation, view.translation,
-                       PROPOSED if number >= len(views) else None)
+            PosedPhoto(view.source, image if known else None, view.focal, (view.cx, view.cy),
+                       (view.width, view.height), view.rotation, view.translation, None if known else PROPOSED)
         )  # fmt: skip
     save_reconstruction(folder / RECORDING, photos, points, sparse.rgb, mesh, skins, trust)
     return folder / RECORDING

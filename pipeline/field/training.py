@@ -5,17 +5,18 @@ from __future__ import annotations
 import json
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import numpy as np
 import safetensors.torch
 import torch
+from PIL import Image
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from pipeline.cameras import Similarity, Sparse, View
 from pipeline.field.grid_field import Field, FieldSize, GridField, differences, level_step, stencil
-from pipeline.field.held_out import HeldOut, score
 from pipeline.field.mlp_field import MlpField, MlpSize
 from pipeline.field.rays import Rays, held_out, load_rays
 from pipeline.field.rendering import (
@@ -24,6 +25,7 @@ from pipeline.field.rendering import (
     bounded_samples,
     choose_samples,
     composite,
+    render,
     samples_at,
     sdf_cache,
     sphere_interval,
@@ -31,10 +33,16 @@ from pipeline.field.rendering import (
 from pipeline.inputs.images import BACKDROP
 from pipeline.inputs.photos import load_photos
 from pipeline.progress import Progress, quiet, share_of
-from pipeline.sfm.depth import depth_points, depth_scale
-from pipeline.sfm.supervision import FreeSpace, Supervision, supervision_of, unit_sphere_of
+from pipeline.sfm.supervision import (
+    FreeSpace,
+    Supervision,
+    depth_points,
+    depth_scale,
+    supervision_of,
+    unit_sphere_of,
+)
 from sdfsim.errors import SdfsimError
-from sdfsim.files import replacing, write_json
+from sdfsim.files import write_bytes, write_json
 from sdfsim.parallel import choose_threads
 
 # Steps between updates of the cached SDF, fewer at first; a multiple, so that both fall on the same steps.
@@ -44,6 +52,8 @@ HOLLOWS = 0.25  # of the training is done before filled free space is looked for
 BACKGROUND_RATE = 0.02  # of the background's grid beside the MLP
 FEWEST_STEPS = 100  # with however small a budget
 PACE = 25  # steps between looks at the clock
+HELD_OUT = "held_out"  # folder of the renders of photos that were not trained on
+EMPTY = 0.9  # grey of their pixels whose ray misses the trained sphere
 
 
 @dataclass(frozen=True)
@@ -255,18 +265,17 @@ class Trainer:
         about = {
             "iteration": self.iteration, "iterations": self.iterations, "seconds": self.seconds,
             "active": self.field.active, "view_dependence": self.field.view_dependence,
-            "size": self.settings.size.to_dict(),
+            "size": str(self.settings.size),
         }  # fmt: skip
         # As bytes: safetensors' own writer does not raise OSError where the disk is full.
-        with replacing(path) as partial:
-            partial.write_bytes(safetensors.torch.save(tensors, metadata={"about": json.dumps(about)}))
+        write_bytes(path, safetensors.torch.save(tensors, metadata={"about": json.dumps(about)}))
 
     def load(self, path: Path) -> bool:
         """Goes on from a checkpoint; False where there is none that fits."""
         try:
             with safe_open(str(path), "pt") as file:
                 about = json.loads(file.metadata()["about"])
-                if about["size"] != json.loads(json.dumps(self.settings.size.to_dict())):
+                if about["size"] != str(self.settings.size):
                     return False
                 tensors = {key: file.get_tensor(key).to(self.device) for key in file.keys()}
         except (OSError, SafetensorError, KeyError, TypeError, ValueError):
@@ -295,7 +304,6 @@ class MlpTrainer(Trainer):
     converged = 0.0  # share of the last step's rays whose opacity is bounded
 
     def fresh(self) -> tuple[Field, torch.optim.Adam]:
-        """A field that is a sphere, and its optimiser."""
         settings = self.settings
         assert isinstance(settings.size, MlpSize)
         field = MlpField(settings.size, self.seed, settings.start_radius).to(self.device)
@@ -305,20 +313,16 @@ class MlpTrainer(Trainer):
 
     @property
     def beta(self) -> float:
-        """Learned scale of the density, normalised units."""
         return float(self.field.beta.detach())
 
     def density_scale(self) -> Tensor:
-        """The same, with its gradient."""
         return self.field.beta
 
     def rate_factor(self) -> float:
-        """Factor of the learning rates: down to a tenth."""
         return 0.1**self.fraction
 
     def refresh(self) -> None:
-        """Brings the cached SDF up to date, from which only pictures are made."""
-        self.cache = sdf_cache(self.field, CACHE)
+        self.cache = sdf_cache(self.field, CACHE)  # only for pictures
 
     def sample(self, origins: Tensor, directions: Tensor, uniforms: Tensor) -> Samples:
         """Samples [R, S] that bound the error of the opacity, for as many uniforms [R, S]."""
@@ -334,11 +338,9 @@ class MlpTrainer(Trainer):
         return samples_at(distance, enter, leave, origins, directions, near)
 
     def slope_queries(self, points: Tensor) -> Tensor:
-        """The points themselves: the network hands on its own gradient."""
-        return points
+        return points  # The network hands on its own gradient.
 
     def slope_losses(self, sdf: Tensor, more: Tensor) -> dict[str, Tensor]:
-        """The loss of the gradient."""
         return {"eikonal": ((more[:, 3:].norm(dim=1) - 1) ** 2).mean() * self.settings.eikonal}
 
 
@@ -365,10 +367,9 @@ def train(
     """Trains a field and writes `field.safetensors` and `field.json` to `out`; resumes from `checkpoint.safetensors`.
 
     Views and sparse points are in the world of the poses. The budget, s, includes training before a kill: the number of
-    steps is cut to what fits. Without `threads` the CPU takes what is fastest now (a second thread only slows things
-    down where another program uses the core). Raises SdfsimError where the loss is no longer finite.
+    steps is cut to what fits. Without `threads` the CPU takes what is fastest now. Raises SdfsimError where the loss is
+    no longer finite.
     """
-    out = Path(out)
     photos = load_photos(photos_folder)
     masked = all(photo.mask for photo in photos)
     to_unit = unit_sphere_of(views, sparse, masked=masked)
@@ -396,10 +397,7 @@ def train(
         losses = trainer.step()
         smooth = {k: 0.95 * smooth.get(k, v) + 0.05 * v for k, v in losses.items()}
         if not all(math.isfinite(v) for v in losses.values()):
-            raise SdfsimError(
-                "distill: the loss is no longer finite",
-                "the poses may be wrong: look at them with `sdfsim poses`, or take more photos",
-            )
+            raise SdfsimError("distill: the loss is no longer finite", "look at the poses: `sdfsim poses`")
         now = time.monotonic()
         trainer.seconds = before + now - started
         if left is not None and trainer.iteration % PACE == 0:
@@ -414,8 +412,8 @@ def train(
     trainer.refresh()
     scores = {}
     if test:
-        held = HeldOut([local[i] for i in test], photos_folder, trainer, masked=masked)
-        scores = score(held, out, share_of(on_progress, 0.92, 0.08))
+        held, tell = [local[i] for i in test], share_of(on_progress, 0.92, 0.08)
+        scores = score(held, photos_folder, trainer, out, masked=masked, on_progress=tell)
     report = {
         "iterations": trainer.iterations, "rays": len(rays), "train_seconds": round(trainer.seconds, 1),
         "seconds_before": round(before, 1), "resumed": resumed, "masked": masked, "beta": trainer.beta,
@@ -426,6 +424,50 @@ def train(
     save_field(trained, out)
     checkpoint.unlink(missing_ok=True)
     return trained
+
+
+def score(views: list[View], photos_folder: Path, trainer: Trainer, out: Path, *, masked: bool,
+          on_progress: Progress = quiet) -> dict:  # fmt: skip
+    """PSNR of held-out views, in normalised space, for the report, at a third of the training resolution; empty where
+    none shows anything of the unit sphere. Writes the renders to `out`/held_out. The cached SDF has to be up to date.
+    """
+    rays = load_rays(views, photos_folder, max(100, trainer.settings.long_side // 3), masks=False).to(trainer.device)
+    shown: list[int] = rays.view.unique().tolist()
+    if not shown:
+        return {}
+    backdrop = torch.full((3,), BACKDROP, device=trainer.device) if masked else None
+    (out / HELD_OUT).mkdir(exist_ok=True)
+    psnr = []
+    for count, number in enumerate(shown, 1):
+        decibels, picture = compare(rays, number, trainer, backdrop)
+        psnr.append(decibels)
+        Image.fromarray(picture).save(out / HELD_OUT / views[number].name, quality=92)
+        on_progress(count / len(shown), f"held-out view {count} of {len(shown)}")
+    return {
+        "held_out_photos": [views[number].source for number in shown],
+        "psnr": round(float(np.mean(psnr)), 2), "psnr_each": [round(value, 2) for value in psnr],
+    }  # fmt: skip
+
+
+@torch.no_grad()
+def compare(rays: Rays, number: int, trainer: Trainer, backdrop: Tensor | None) -> tuple[float, np.ndarray]:
+    """PSNR, dB, and render [H, W, 3] uint8 of one view, over pixels whose ray meets the unit sphere."""
+    assert trainer.cache is not None
+    index = torch.nonzero(rays.view == number)[:, 0]
+    parts = []
+    for part in index.split(4096):
+        origins, directions = rays.at(part)
+        parts.append(
+            render(trainer.field, trainer.cache, origins, directions, trainer.beta,
+                   samples=trainer.settings.samples, backdrop=backdrop)["rgb"]
+        )  # fmt: skip
+    rgb = torch.cat(parts)
+    error = float(((rgb - rays.rgb[index].float() / 255) ** 2).mean())
+    width, height = (int(side) for side in rays.sizes[number])
+    picture = np.full((height, width, 3), EMPTY)
+    column, row = rays.pixel[index].cpu().numpy().T
+    picture[row, column] = rgb.cpu().numpy()
+    return -10 * math.log10(max(error, 1e-10)), (255 * picture.clip(0, 1) + 0.5).astype(np.uint8)
 
 
 def calibrate(probe: Trainer, threads: int | None) -> float:
@@ -452,10 +494,9 @@ def save_field(trained: Trained, folder: Path) -> None:
     """Writes `field.safetensors`, then `field.json`."""
     field = trained.field
     tensors = {k: v.detach().cpu().contiguous() for k, v in field.state_dict().items()}
-    with replacing(folder / "field.safetensors") as partial:
-        partial.write_bytes(safetensors.torch.save(tensors))
+    write_bytes(folder / "field.safetensors", safetensors.torch.save(tensors))
     about = {
-        "version": 1, "size": field.size.to_dict(), "start_radius": field.start_radius, "beta": trained.beta,
+        "version": 1, "size": asdict(field.size), "start_radius": field.start_radius, "beta": trained.beta,
         "to_unit": trained.to_unit.to_dict(), "report": trained.report,
     }  # fmt: skip
     write_json(folder / "field.json", about)
@@ -464,14 +505,14 @@ def save_field(trained: Trained, folder: Path) -> None:
 def load_field(folder: Path) -> Trained:
     """Reads what `train` wrote. Raises SdfsimError: no readable field in `folder`."""
     try:
-        about = json.loads((Path(folder) / "field.json").read_text(encoding="utf-8"))
+        about = json.loads((folder / "field.json").read_text(encoding="utf-8"))
         size, radius = about["size"], float(about["start_radius"])
         if "levels" in size:
-            size = replace(FieldSize(**size), levels=tuple(size["levels"]), channels=tuple(size["channels"]))
-            field: Field = GridField(size, start_radius=radius)
+            lists = {key: tuple(size[key]) for key in ("levels", "channels")}
+            field: Field = GridField(FieldSize(**{**size, **lists}), start_radius=radius)
         else:
             field = MlpField(MlpSize(**size), start_radius=radius)
-        with safe_open(str(Path(folder) / "field.safetensors"), "pt") as file:
+        with safe_open(str(folder / "field.safetensors"), "pt") as file:
             field.load_state_dict({key: file.get_tensor(key) for key in file.keys()})
         return Trained(field, float(about["beta"]), Similarity.from_dict(about["to_unit"]), about["report"])
     except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:

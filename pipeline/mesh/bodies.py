@@ -16,8 +16,18 @@ from scipy.spatial import KDTree
 
 from pipeline.cameras import View, frame_of
 from pipeline.inputs.labels import load_names
-from pipeline.mesh.cleaning import components, islands, keep_faces
-from pipeline.mesh.extraction import FLOATER, RIM, Distance, Surface, Volume, sample, sample_box
+from pipeline.mesh.extraction import (
+    FLOATER,
+    RIM,
+    Distance,
+    Surface,
+    Volume,
+    components,
+    islands,
+    keep_faces,
+    sample,
+    sample_box,
+)
 from pipeline.mesh.photo_refining import load_pictures, refine
 from pipeline.mesh.seams import Part, Solid, Votes, count_votes, part_of_name, parts_by_shape, parts_by_votes, solid_of
 from pipeline.mesh.visibility import Visibility, look, spread_colors, to_bytes
@@ -459,15 +469,13 @@ def _chosen(pieces: list[Body], pairs: list[tuple[int, int, str]], kept: np.ndar
 
 def _names(bodies: list[Body]) -> list[str]:
     """A name of its own for each body: that of its masks, or else a number from the largest down."""
-    order = sorted(range(len(bodies)), key=lambda index: -bodies[index].size)
     names, taken = [""] * len(bodies), {body.name for body in bodies}
-    for index in order:
+    for index in sorted(range(len(bodies)), key=lambda index: -bodies[index].size):
         wanted = bodies[index].name
-        choices = itertools.chain([wanted] if wanted else [], (f"{wanted}_{n}" for n in itertools.count(2)))
-        free = (name for name in choices if name not in names)
-        if not wanted:
-            free = (name for n in itertools.count(1) if (name := f"object{n}") not in taken | set(names))
-        names[index] = next(free)
+        if not wanted or wanted in names:
+            stem, first = (f"{wanted}_", 2) if wanted else ("object", 1)
+            wanted = next(name for n in itertools.count(first) if (name := f"{stem}{n}") not in {*names, *taken})
+        names[index] = wanted
     return names
 
 

@@ -15,7 +15,7 @@ from PIL import Image
 
 from pipeline.cameras import View
 from pipeline.inputs.photos import Photo
-from pipeline.mesh.cleaning import keep_faces
+from pipeline.mesh.extraction import keep_faces
 from pipeline.mesh.visibility import FLATTEST, bilinear, framed, to_bytes
 from pipeline.progress import Progress, quiet, share_of
 from sdfsim.shape.bvh import Caster

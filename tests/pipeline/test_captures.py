@@ -18,8 +18,8 @@ from pipeline.inputs.known_cameras import lens_of, posed
 from pipeline.inputs.photos import KNOWN_CAMERAS, Photo, load_photos, prepare_photos
 from pipeline.inputs.sources import find_source
 from pipeline.mesh.placement import Up, place
-from pipeline.sfm.depth import DepthPoints, depth_points, depth_scale
 from pipeline.sfm.poses import solve
+from pipeline.sfm.supervision import DepthPoints, depth_points, depth_scale
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.mesh import Mesh
 from tests.pipeline.photo_sets import SAMPLES, TABLE_VASE

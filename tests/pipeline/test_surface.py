@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.cameras import CAREFUL, UNKNOWN, Similarity, Sparse, View, camera_up, nearest_to_axes
-from pipeline.mesh.cleaning import belonging, components, islands
-from pipeline.mesh.extraction import Volume, sample_box, sample_volume, trusted_vertices
+from pipeline.mesh.extraction import Volume, belonging, components, islands, sample_box, sample_volume, trusted_vertices
 from pipeline.mesh.placement import find_up, load_placement, place, plane_up, resting_height
 from pipeline.mesh.visibility import Visibility, bilinear, spread_colors
 from pipeline.sfm.supervision import unit_sphere_of

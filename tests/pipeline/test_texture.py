@@ -14,7 +14,7 @@ from pipeline.cameras import View
 from pipeline.export import skins_of
 from pipeline.inputs.photos import Photo
 from pipeline.mesh import texture
-from pipeline.mesh.cleaning import components
+from pipeline.mesh.extraction import components
 from pipeline.mesh.texture import BLOCK, Shots, fewer, rasterise, shots_of, textured, unfold
 from pipeline.mesh.visibility import Visibility, bilinear, look, to_bytes
 from sdfsim.errors import SdfsimError

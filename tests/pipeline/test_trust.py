@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.cameras import View
-from pipeline.mesh.next_photos import Advice, next_photos
-from pipeline.mesh.trust import Support, information, sigma_along, summary, support_of
+from pipeline.mesh.trust import Advice, Support, information, next_photos, sigma_along, summary, support_of
 from pipeline.mesh.visibility import Visibility
 from pipeline.report import improvements, notes
 from sdfsim.errors import SdfsimError
