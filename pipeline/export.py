@@ -123,7 +123,8 @@ def write_scene(
             raise SdfsimError(
                 f"material: no body is called {name!r}{nearest(name, names)}", "the bodies are " + ", ".join(names)
             )
-    if scene_file.exists() and content_hash(scene_file.read_bytes()) not in (written, content_hash(text.encode())):
+    made = hashlib.sha256(text.encode()).hexdigest()
+    if scene_file.exists() and hashlib.sha256(scene_file.read_bytes()).hexdigest() not in (written, made):
         endings = itertools.chain([""], itertools.count(2))
         kept = next(p for n in endings if not (p := scene_file.with_name(f"{scene_file.name}.bak{n}")).exists())
         scene_file.rename(kept)
@@ -132,7 +133,7 @@ def write_scene(
     return {
         "objects": list(solids), "bodies": bodies_of(scene, materials), "size": placement.size_from,
         "drop": {"shape": drop, **(asdict(slab) if slab else {})}, "notes": notes,
-        "scene_sha256": content_hash(text.encode()),
+        "scene_sha256": made,
     }  # fmt: skip
 
 
@@ -153,11 +154,6 @@ def bodies_of(scene: Scene, materials: dict[str, Choice]) -> dict[str, dict]:
 
 def _names(parts: dict) -> list[str]:
     return [entry["name"] for entry in parts["objects"]]
-
-
-def content_hash(content: bytes) -> str:
-    """SHA-256 in hex."""
-    return hashlib.sha256(content).hexdigest()
 
 
 def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab | None, *, scenery: bool = True,

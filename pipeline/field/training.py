@@ -62,9 +62,7 @@ class Settings:
 
     # resolutions of the grids, or of the MLP of the VolSDF paper
     size: FieldSize | MlpSize = FieldSize()  # noqa: RUF009  frozen
-    # radius of the ball that training starts from. Small, because what is solid at first has to be carved away, and
-    # shadowed parts hardly are.
-    start_radius: float = 0.25
+    start_radius: float = 0.25  # of the ball that training starts from; small, as shadowed parts are hardly carved away
     iterations: int = 2800  # steps of Adam; 4000 are no better on the bundled set
     rays: int = 512  # a step
     samples: int = 32  # along a ray inside the sphere
@@ -120,9 +118,7 @@ class Trainer:
         self.depth = torch.tensor(supervision.depth, dtype=torch.float32, device=device)
         self.free = FreeSpace(supervision.sight if settings.free else supervision.sight[:0], device)
         self.field, self.optimizer = self.fresh()
-        self.iteration = 0
-        self.iterations = settings.iterations
-        self.seconds = 0.0
+        self.iteration, self.iterations, self.seconds = 0, settings.iterations, 0.0
         self.cache: Tensor | None = None
 
     def fresh(self) -> tuple[Field, torch.optim.Adam]:
@@ -390,8 +386,8 @@ def train(
     if budget is not None and not resumed:
         trainer.iterations = min(settings.iterations, max(FEWEST_STEPS, int(budget / per_step)))
     left = None if budget is None else budget - trainer.seconds
-    saved, started, first = time.monotonic(), time.monotonic(), trainer.iteration
-    before = trainer.seconds
+    saved = started = time.monotonic()
+    first, before = trainer.iteration, trainer.seconds
     smooth: dict[str, float] = {}
     while trainer.iteration < trainer.iterations:
         losses = trainer.step()
@@ -429,8 +425,7 @@ def train(
 def score(views: list[View], photos_folder: Path, trainer: Trainer, out: Path, *, masked: bool,
           on_progress: Progress = quiet) -> dict:  # fmt: skip
     """PSNR of held-out views, in normalised space, for the report, at a third of the training resolution; empty where
-    none shows anything of the unit sphere. Writes the renders to `out`/held_out. The cached SDF has to be up to date.
-    """
+    none shows anything of the unit sphere. Writes the renders to `out`/held_out."""
     rays = load_rays(views, photos_folder, max(100, trainer.settings.long_side // 3), masks=False).to(trainer.device)
     shown: list[int] = rays.view.unique().tolist()
     if not shown:
@@ -478,16 +473,12 @@ def calibrate(probe: Trainer, threads: int | None) -> float:
 
 
 def paced(trainer: Trainer, settings: Settings, budget: float, elapsed: float, done: int) -> int:
-    """Steps that fit into the budget (s) after `elapsed` s: the measured pace may be another than before training, when
-    other work goes on."""
+    """Steps that fit into the budget (s) after `done` steps in `elapsed` s, as the pace changes with other work."""
     left = int((budget - elapsed) / (elapsed / done))
-    least = max(trainer.iteration, min(FEWEST_STEPS, settings.iterations))
-    if left <= 0:
-        return least
-    # Schedules follow the share that is done: they must not jump.
-    wanted = min(settings.iterations, trainer.iteration + left)
-    low, high = int(0.9 * trainer.iterations), int(1.1 * trainer.iterations)
-    return max(least, min(max(wanted, low), high))
+    wanted = trainer.iteration + left
+    if left > 0:  # Schedules follow the share that is done: they must not jump.
+        wanted = min(max(wanted, int(0.9 * trainer.iterations)), int(1.1 * trainer.iterations))
+    return max(trainer.iteration, min(FEWEST_STEPS, settings.iterations), min(wanted, settings.iterations))
 
 
 def save_field(trained: Trained, folder: Path) -> None:

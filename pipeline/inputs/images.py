@@ -74,7 +74,9 @@ def read_photo(path: Path, long_side: int, mask: Path | None = None, shape: floa
         turned = image
     if turned.size != image.size:
         original = original[1], original[0]
-    upright = _eight_bits(turned)
+    upright = turned
+    if turned.mode.startswith("I"):  # 16 bits a pixel, which PIL would clip to 8
+        upright = Image.fromarray((np.asarray(turned).astype(np.uint32) >> 8).astype(np.uint8))
     has_alpha = upright.mode in ("RGBA", "LA", "PA") or "transparency" in upright.info
     upright = upright.convert("RGBA" if has_alpha else "RGB")
     upright = upright.resize(reduced(upright.size, long_side), Image.Resampling.LANCZOS)
@@ -107,8 +109,7 @@ def turned_like(stored: Image.Image, size: tuple[int, int], path: Path) -> Image
         if off(image, size[0] / size[1]) < 0.02:
             return image
     raise SdfsimError(
-        f"{path}: a mask of {stored.width} x {stored.height} does not fit its photo, shaped {size[0]} x {size[1]}",
-        "masks and label images have to be as large as their photos, and upright",
+        f"{path}: a mask of {stored.width} x {stored.height} does not fit its photo, shaped {size[0]} x {size[1]}"
     )
 
 
@@ -121,8 +122,7 @@ def decoded(path: Path, long_side: int) -> tuple[Image.Image, tuple[int, int], f
             width, height = size = image.size
             if width * height > MAX_PIXELS:
                 raise SdfsimError(
-                    f"{path}: too large ({width} x {height}, at most {MAX_PIXELS // 1_000_000} megapixels)",
-                    "scale it down first",
+                    f"{path}: too large ({width} x {height}, at most {MAX_PIXELS // 1_000_000} megapixels)"
                 )
             if min(size) < MIN_SIDE:
                 raise SdfsimError(f"{path}: too small ({width} x {height}, at least {MIN_SIDE} px a side)")
@@ -150,13 +150,6 @@ def reduced(size: tuple[int, int], long_side: int) -> tuple[int, int]:
 def off(image: Image.Image, shape: float) -> float:
     """By what share an image is wider or narrower than a shape, width over height."""
     return abs(image.width / image.height / shape - 1)
-
-
-def _eight_bits(image: Image.Image) -> Image.Image:
-    """16 bits a pixel scaled to 8; PIL would clip instead."""
-    if image.mode.startswith("I"):
-        return Image.fromarray((np.asarray(image).astype(np.uint32) >> 8).astype(np.uint8))
-    return image
 
 
 def block_means(values: np.ndarray, blocks: int) -> np.ndarray:

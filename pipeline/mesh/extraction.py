@@ -19,19 +19,15 @@ from sdfsim.shape.mesh import Mesh, face_normals, vertex_normals
 Distance = Callable[[np.ndarray], np.ndarray]
 
 BATCH = 1 << 17  # points a query
-# The solid ends at this radius of normalised space: beyond it the field was never trained.
-RIM = 0.99
+RIM = 0.99  # radius in normalised space at which the solid ends: beyond it the field was never trained
 EXTENT = 1.02  # half the side of the sampled cube
-MIN_SEEN = 2
+MIN_SEEN = 2  # photos that have to show a vertex
 # Farther than this from every point of structure-from-motion (normalised units) a surface is a guess: on the rendered
 # set the median error there is ten times that within.
 MAX_FROM_POINTS = 0.1
-# A patch of the visible surface smaller than this share of it says nothing; of the closed solid a quarter of that.
-FLOATER = 0.01
-# What is left out is reported from this size on, normalised units.
-SPECK = 0.02
-# A component of whose area photos show less than this share is matter behind the scenery.
-UNSEEN = 0.05
+FLOATER = 0.01  # of the visible surface: a smaller patch says nothing; of the closed solid a quarter of that
+SPECK = 0.02  # normalised units, from which on what is left out is reported
+UNSEEN = 0.05  # a component of whose area photos show less than this share is matter behind the scenery
 
 
 @dataclass(frozen=True)
@@ -190,8 +186,7 @@ def surface_of(
     hardly any of it is in the photos."""
     from scipy.spatial import KDTree
 
-    raw = volume.mesh()
-    cell = volume.cell
+    raw, cell = volume.mesh(), volume.cell
     found = look(Visibility(raw, 0.75 * cell), views, photos_folder, on_progress)
     far = KDTree(points).query(raw.vertices, distance_upper_bound=MAX_FROM_POINTS)[0] > MAX_FROM_POINTS
     seen = trusted_vertices(raw, found.count, np.abs(limit(raw.vertices)) < 1.5 * cell) & ~far

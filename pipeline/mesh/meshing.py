@@ -108,12 +108,12 @@ def trust(
     sight = Visibility(whole, shots.lift, shots.blocking)
     support = support_of(sight, shots.views)
     shown = {name: support.nearest(mesh.vertices) for name, mesh in displayed.items()}
-    advice = next_photos(closed, support, sight, shots.blocking, shots.views, counted)
-    save_views([photo.view for photo in advice.photos], out / NEXT)
+    photos, weak = next_photos(closed, support, sight, shots.blocking, shots.views, counted)
+    save_views([photo.view for photo in photos], out / NEXT)
     return support, {
         "trust": {name: summary(mesh, shown[name]) for name, mesh in displayed.items()},
-        "trust_colors_m": color_range(whole, support.uncertainty), "weak": round(advice.weak, 4),
-        "next_photos": [photo.told() for photo in advice.photos],
+        "trust_colors_m": color_range(whole, support.uncertainty), "weak": round(weak, 4),
+        "next_photos": [photo.told() for photo in photos],
     }  # fmt: skip
 
 

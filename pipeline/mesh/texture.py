@@ -22,8 +22,7 @@ from sdfsim.shape.bvh import Caster
 from sdfsim.shape.mesh import Mesh, face_normals, joined, sample_surface, vertex_normals
 
 FACES = 40_000  # of a textured mesh: finer detail is in its texture
-# The time of xatlas grows with the square of the faces of a chart: it gets the mesh in pieces of so many.
-PIECE = 300
+PIECE = 300  # faces that xatlas gets at a time: its time grows with the square of the faces of a chart
 LARGEST = 4096  # px, longest side of a texture
 SMALLEST = 16  # texels that a mesh is long at least, also where no photo shows it
 FULL = 0.5  # share of a texture that charts can be counted on to fill
@@ -61,7 +60,7 @@ class Shots:
 
 
 def shots_of(views: list[View], photos: list[Photo], folder: Path, meshes: Sequence[Mesh], cell: float) -> Shots:
-    """The photos of some views, all in metres, of a scene that consists of `meshes`, exact to about a `cell`."""
+    """The photos of some views of a scene of `meshes`, all in metres, exact to about a `cell`."""
     sharpness = {photo.name: photo.sharpness for photo in photos}
     return Shots(views, np.array([sharpness[view.name] for view in views]), folder, Caster(joined(meshes)), cell)
 

@@ -158,30 +158,23 @@ class NextPhoto:
         }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Advice:
-    """What more photos could do."""
-
-    photos: list[NextPhoto]  # the best first; none where no photo helps `LEAST` of the surface
-    weak: float  # share that is weak, of the surface that the photos or a camera around could show
-
-
 def next_photos(
     meshes: Mapping[str, Mesh], support: Support, sight: Visibility, solid: Caster, views: Sequence[View],
     counted: np.ndarray,
-) -> Advice:  # fmt: skip
-    """The photos that help most, chosen greedily, each given those before it.
+) -> tuple[list[NextPhoto], float]:  # fmt: skip
+    """The photos that help most, the best first, chosen greedily; none where none helps `LEAST` of the surface. Also
+    the share that is weak, of the surface that the photos or a camera around could show.
 
     Weak is what fewer than `FEW` photos see, or what is `UNSURE`. A photo helps a place that it sees freely and at a
     fair angle: by the share of `FEW` photos that it lacks, else by how much less uncertain it becomes. Cameras are
     tried on a shell around the scene, at the median distance of the given ones, in free space, in sight of a given
     camera, and with something in the picture that is known well.
 
-    Meshes are closed, by name; all is in metres with the floor at z = 0. Vertices that are not `counted` [V] bool,
-    where the solid was cut off, do not matter.
+    Meshes are closed, by name; all is in metres with the floor at z = 0. Only vertices that are `counted` [V] bool
+    matter.
     """
     if not counted.any():
-        return Advice([], 0.0)
+        return [], 0.0
     area = np.where(counted, vertex_areas(joined(list(meshes.values()))), 0)
     index = np.random.default_rng(0).choice(len(area), SAMPLES, p=area / area.sum())
     part = np.repeat(np.arange(len(meshes)), [len(mesh.vertices) for mesh in meshes.values()])[index]
@@ -219,7 +212,7 @@ def next_photos(
         turned = (places - middle) @ (view.center - middle)
         turned /= np.linalg.norm(places - middle, axis=1) * np.linalg.norm(view.center - middle)
         free &= turned < np.cos(np.radians(APART))
-    return Advice(chosen, float(weak.sum() / total))
+    return chosen, float(weak.sum() / total)
 
 
 def worth(now: Support, view: View, seen: np.ndarray) -> np.ndarray:

@@ -134,21 +134,16 @@ def moved(before: list[View], after: list[View]) -> dict[str, float]:
     }
 
 
-def read_if_there(path: Path) -> Any:
-    """The content of a JSON file, or None where it is absent or was cut short."""
-    try:
-        return read_json(path)
-    except SdfsimError:
-        return None
-
-
 def run_worker(job: dict, folder: Path, timeout: float, on_progress: Progress) -> dict:
     """Runs the COLMAP child process on one job, unless the folder holds its result already; returns `result.json`.
     Raises SdfsimError, which names its log, where it crashed or ran out of time."""
-    if read_if_there(folder / "job.json") != job:
+    before: Any = None
+    with suppress(SdfsimError):  # absent, or cut short
+        before = read_json(folder / "job.json")
+        if before == job:
+            return read_json(folder / "result.json")
+    if before != job:
         shutil.rmtree(folder, ignore_errors=True)  # Of other photos or settings.
-    elif (done := read_if_there(folder / "result.json")) is not None:
-        return done
     folder.mkdir(parents=True, exist_ok=True)
     log = folder / "colmap.log"
     write_json(folder / "job.json", job)

@@ -259,8 +259,8 @@ def test_cameras_beside_the_photos_are_not_used(tmp_path):
     ("content", "words"),
     [("{", "cannot be read as cameras"), ('{"frames": []}', "cameras with a photo: 0, at least 3"),
      ('{"frames": [{"file_path": "a.jpg", "camera_model": "PANO"}]}', r"a\.jpg: camera_model: 'PANO' is not read"),
-     ('{"fl_x": 9, "w": 5, "frames": [{"file_path": "a.jpg"}]}', r"a\.jpg: fl_x without w and h"),
-     ('{"camera_angle_x": 2, "is_fisheye": true, "frames": [{"file_path": "a.jpg"}]}', r"a fisheye without fl_x")],
+     ('{"fl_x": 9, "w": 5, "frames": [{"file_path": "a.jpg"}]}', r"a\.jpg: a fisheye, or a lens with fl_x, needs"),
+     ('{"camera_angle_x": 2, "is_fisheye": true, "frames": [{"file_path": "a.jpg"}]}', r"a fisheye, or a lens with fl_x, needs")],
 )  # fmt: skip
 def test_bad_transforms_are_one_line(tmp_path, content, words):
     (tmp_path / "transforms.json").write_text(content)
