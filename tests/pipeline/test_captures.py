@@ -19,7 +19,7 @@ from pipeline.inputs.photos import KNOWN_CAMERAS, Photo, load_photos, prepare_ph
 from pipeline.inputs.sources import find_source
 from pipeline.mesh.placement import Up, place
 from pipeline.sfm.poses import solve
-from pipeline.sfm.supervision import DepthPoints, depth_points, depth_scale
+from pipeline.sfm.supervision import depth_points, depth_scale
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.mesh import Mesh
 from tests.pipeline.photo_sets import SAMPLES, TABLE_VASE
@@ -113,16 +113,6 @@ def test_depth_is_read_in_its_unit_where_it_can_be_believed(tmp_path):
         DepthFile(tmp_path / "m.npy", None, tmp_path / "sure.png"),
     ):
         np.testing.assert_allclose(read_depth(file), wanted, atol=1e-6)
-
-
-@pytest.mark.parametrize("name", ["no.png", "text.png", "color.png", "text.exr", "text.depth"])
-def test_depth_that_cannot_be_read_is_told_by_its_file(name, tmp_path):
-    if name == "color.png":
-        Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(tmp_path / name)
-    elif name != "no.png":
-        (tmp_path / name).write_text("not a picture")
-    with pytest.raises(SdfsimError, match=name):
-        read_depth(DepthFile(tmp_path / name))
 
 
 def camera(name: str, x: float, width: int = 64, height: int = 48) -> View:
@@ -227,11 +217,6 @@ def test_what_is_no_capture_is_told(tmp_path):
     file.write_text("{}")
     with pytest.raises(SdfsimError, match="cannot be read as a capture"):
         find_source(given)
-
-
-def test_points_of_depth_are_an_empty_set_without_depth(tmp_path):
-    found = depth_points([camera("a", 0.0)], [replace(photo("a"), depth=False)], tmp_path)
-    assert isinstance(found, DepthPoints) and found.xyz.shape == (0, 3)
 
 
 def test_a_zip_does_not_write_outside_of_its_folder(tmp_path):

@@ -101,14 +101,3 @@ def test_masks_of_no_use_are_refused(tmp_path, name, file, why):
     mask(folder / "masks" / name / file, slice(0, 9))
     with pytest.raises(SdfsimError, match=why):
         find_source(folder)
-
-
-def test_label_images_in_colour_or_of_nothing_are_refused(tmp_path):
-    folder = noise(tmp_path / "in", NAMES)
-    (folder / "labels").mkdir()
-    Image.new("RGB", (120, 90)).save(folder / "labels" / "0.png")
-    with pytest.raises(SdfsimError, match="one number a pixel"):
-        find_source(folder)
-    Image.new("L", (120, 90)).save(folder / "labels" / "0.png")
-    with pytest.raises(SdfsimError, match="all labels are 0"):
-        find_source(folder)

@@ -8,7 +8,6 @@ import pytest
 
 from pipeline.materials import MATERIALS, choose
 from pipeline.options import Options, read_config
-from pipeline.report import material_line
 from sdfsim.errors import SdfsimError
 from tests.cli.conftest import run as command
 
@@ -68,14 +67,6 @@ def test_what_is_no_material_is_refused_before_any_work(body, text, message):
     with pytest.raises(SdfsimError) as caught:
         Options(material={body: text}).check()
     assert caught.value.message == f"material: {message}" and caught.value.exit_code == 1
-
-
-def test_the_report_says_what_a_body_is_made_of_and_weighs():
-    surface = {"friction": 0.65, "restitution": 0.8}
-    vase = {"material": "ceramic", **surface, "density": 2400.0, "wall": 0.004, "volume": 1.04e-3, "mass": 2.496}
-    expected = "ceramic, friction 0.65, restitution 0.8, 2.5 kg (0.00104 m^3 in a wall of 4 mm, 2400 kg/m^3)"
-    assert material_line(vase) == expected
-    assert material_line({"material": "wood", **surface}) == "wood, friction 0.65, restitution 0.8"
 
 
 def test_the_command_takes_a_material_for_every_body(photos, tmp_path, calls, monkeypatch):

@@ -77,20 +77,6 @@ def test_a_photo_without_a_pixel_is_its_camera(views, photos):
 
 
 @pytest.mark.parametrize(
-    ("start", "end", "says"),
-    [
-        ("photo9.jpg:1,1", "photo1.jpg:3,3", "no photo is called 'photo9.jpg'"),
-        ("photo0.jpg:2000,1", "photo1.jpg:3,3", r"photo0.jpg:2000,1 lies outside the photo \(1280 x 960 px\)"),
-        ("photo0.jpg:1,1", "photo1.jpg:640,480", "photo0.jpg:1,1 shows nothing of the surface"),
-        ("photo1.jpg:640,480", "photo1.jpg:640.0,480", "are in the same place"),
-    ],
-)
-def test_places_that_are_none_are_named(views, photos, start, end, says):
-    with pytest.raises(SdfsimError, match=says):
-        measured_scale([start, end, 1.0], views, photos, Caster(cube(1.0)))
-
-
-@pytest.mark.parametrize(
     ("end", "says"),
     [
         ("photo9.jpg:1,1", "no photo is called 'photo9.jpg'"),
