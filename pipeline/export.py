@@ -34,12 +34,9 @@ GAP = 0.3  # of the fall, as a share of the side
 
 def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str = "default", seed: int = 0,
               device: str = "cpu", on_progress: Progress = quiet) -> dict:  # fmt: skip
-    """Fits a compact SDF to the scenery and to every body, each a Shape folder in `out` that goes by its name; folders
-    that are there already are kept. A body's origin is the middle of its base.
-
-    Returns a certificate for each of `shapes`, and `passed`, `reason` and `caveats` for all of them; raises SdfsimError
-    where the mesh stage has not run or a mesh cannot be used. The budget is in s, for all.
-    """
+    """Fits a compact SDF to the scenery and to every body within the budget, s; each is a Shape folder in `out` that
+    goes by its name, and those that are there already are kept. Returns a certificate for each of `shapes`, and
+    `passed`, `reason` and `caveats` for all of them."""
     from sdfsim.shape.baked_grid import grid_certificate
     from sdfsim.shape.fit import fit_mesh
     from sdfsim.shape.shape import load_shape
@@ -100,8 +97,7 @@ def write_scene(
     """Writes scene.yaml for the meshes of a mesh folder and the shapes beside it; returns the stage's report.
 
     A file that the user has changed (it has another hash than `written`, that of what this function last wrote) is kept
-    as `scene.yaml.bak`. Bodies without an entry in `materials` get an assumed one. Raises SdfsimError where the mesh or
-    fit stage has not run, or a material is for a body that there is not.
+    as `scene.yaml.bak`. Raises SdfsimError where a material is for a body that there is not.
     """
     parts, placement = read_parts(mesh_folder), load_placement(mesh_folder)
     solids = {name: load_mesh(mesh_folder / "objects" / f"{name}.ply") for name in _names(parts)}

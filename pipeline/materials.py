@@ -72,8 +72,7 @@ class Choice:
 
 def choose(given: dict[str, str]) -> dict[str, Choice]:
     """Looks up what bodies are made of: by the body's name, a name in `MATERIALS`, perhaps with the thickness of a
-    hollow body's wall, such as `ceramic:4mm` (mm, cm or m). Raises SdfsimError where there is no such material or
-    thickness, or of a thickness of what does not move."""
+    hollow body's wall (mm, cm or m), such as `ceramic:4mm`. Raises SdfsimError where this makes no sense."""
     found = {}
     for body, text in given.items():
         name, colon, thickness = text.partition(":")

@@ -35,11 +35,8 @@ class Picture:
 
 
 def exif_focal(image: Image.Image) -> tuple[float | None, str]:
-    """Focal length in units of the image's longer side, and the camera's name, from EXIF.
-
-    Uses the 35 mm equivalent (a 36 mm wide frame) or the focal length with the focal plane resolution. A photo whose
-    shape is not the one that the camera wrote down was cropped, and its focal length is not known.
-    """
+    """Focal length in units of the image's longer side, and the camera's name, from EXIF. A photo whose shape is not
+    the one that the camera wrote down was cropped, and its focal length is not known."""
     try:
         exif, tags = image.getexif(), ExifTags.Base
         detail = exif.get_ifd(ExifTags.IFD.Exif)
@@ -52,7 +49,7 @@ def exif_focal(image: Image.Image) -> tuple[float | None, str]:
         longer, shorter = max(width, height), min(width, height)
         if shorter > 0 and abs(longer / shorter * min(image.size) / max(image.size) - 1) > 0.02:
             return None, camera
-        if number(tags.FocalLengthIn35mmFilm) > 0:
+        if number(tags.FocalLengthIn35mmFilm) > 0:  # of a frame that is 36 mm wide
             return number(tags.FocalLengthIn35mmFilm) / 36.0, camera
         unit = {2: 25.4, 3: 10.0, 4: 1.0}.get(int(number(tags.FocalPlaneResolutionUnit)), 25.4)
         # The density is that of the photo as written: a copy at half the size has half of it.

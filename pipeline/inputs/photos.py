@@ -57,7 +57,7 @@ def prepare_photos(
 
     Writes `images/NNNN.jpg` and `photos.json`; where they were given, `masks/NNNN.jpg.png`, `depth/NNNN.jpg.npy`,
     `labels/NNNN.jpg.png` with their names, `known_cameras.json` and `capture.json`. Returns the photos in order, and
-    notes for the report. Raises SdfsimError as `find_source`, `read_photo` and `chosen_frames` do.
+    notes for the report.
     """
     source, out = find_source(given), Path(out)
     unpacked = out / ".capture"

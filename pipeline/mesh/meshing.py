@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from pipeline.field.training import load_field
 from pipeline.inputs.captures import load_capture
 from pipeline.inputs.photos import load_photos
 from pipeline.mesh.bodies import Parts, split
-from pipeline.mesh.extraction import ball, field_distance, sample_volume, surface_of
+from pipeline.mesh.extraction import Distance, ball, field_distance, sample_volume, surface_of
 from pipeline.mesh.placement import GRAVITY, Placement, Up, measured_scale, place
 from pipeline.mesh.texture import Shots, shots_of, texture_parts
 from pipeline.mesh.trust import Support, color_range, colors_of, next_photos, summary, support_of
@@ -39,15 +39,9 @@ def make_meshes(
     distance: Sequence | None = None, crop: Sequence[float] | None = None, device: str = "cpu",
     on_progress: Progress = quiet,
 ) -> dict:  # fmt: skip
-    """Extracts surfaces, writes them to `out` and returns the stage's report; `size`, `distance` and `crop` as in
-    `Options`.
-
-    Writes `mesh.ply` (all that photos show), of the scenery `solid.ply` (closed) and `shown.ply` (what is displayed),
-    `objects/NAME.ply` (closed) of each body, `parts.json`, `placement.json`, `objects.png`, and `textured.glb`: the
-    scenery and each body with a texture. Vertices in the PLY files have `views` and `uncertainty`, see `Support`;
-    `next_photos.json` has the cameras of the photos that would help most. Raises SdfsimError (exit code 3) where there
-    is no surface worth the name, or (1) of a distance or box that makes no sense.
-    """
+    """Writes the files that docs/objects.md lists and returns the stage's report; `size`, `distance` and `crop` as in
+    `Options`. Vertices in the PLY files have `views` and `uncertainty`, see `Support`. Raises SdfsimError (exit code 3)
+    where there is no surface worth the name, or (1) of a distance or box that makes no sense."""
     trained = load_field(distill)
     field, to_unit = trained.field.to(device), trained.to_unit
     views = [to_unit.view(view) for view in load_views(poses)]
@@ -112,12 +106,12 @@ def trust(
     save_views([photo.view for photo in photos], out / NEXT)
     return support, {
         "trust": {name: summary(mesh, shown[name]) for name, mesh in displayed.items()},
-        "trust_colors_m": color_range(whole, support.uncertainty), "weak": round(weak, 4),
+        "weak": round(weak, 4),
         "next_photos": [photo.told() for photo in photos],
     }  # fmt: skip
 
 
-def box_of(placement: Placement, corners: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+def box_of(placement: Placement, corners: np.ndarray) -> Distance:
     """Distance from what is left after cropping: the trained ball within a box with corners [2, 3] m."""
     middle, half = corners.mean(0), np.ptp(corners, axis=0) / 2
 

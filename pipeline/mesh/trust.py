@@ -105,9 +105,8 @@ def vertex_areas(mesh: Mesh) -> np.ndarray:
 
 
 def summary(mesh: Mesh, support: Support) -> dict:
-    """Of a mesh's area: `area_m2`; `seen_by`, the shares of 0, 1, 2, and 3 or more photos; `guessed`, that of fewer
-    than two or of lines of sight that are parallel; `uncertainty_m`, the median of the rest, None where all is guessed.
-    """
+    """Of a mesh's area: `seen_by`, the shares of 0, 1, 2, and 3 or more photos; `guessed`, that of fewer than two or of
+    lines of sight that are parallel; `uncertainty_m`, the median of the rest, None where all is guessed."""
     area, uncertainty = vertex_areas(mesh), support.uncertainty
     known = np.isfinite(uncertainty)
     median = None
@@ -115,7 +114,7 @@ def summary(mesh: Mesh, support: Support) -> dict:
         median = float(np.quantile(uncertainty[known], 0.5, weights=area[known], method="inverted_cdf"))
     seen_by = np.bincount(np.minimum(support.views, FEW), area, minlength=FEW + 1) / area.sum()
     return {
-        "area_m2": float(area.sum()), "seen_by": [round(float(share), 4) for share in seen_by],
+        "seen_by": [round(float(share), 4) for share in seen_by],
         "guessed": round(float(area[~known].sum() / area.sum()), 4),
         "uncertainty_m": median,
     }  # fmt: skip
@@ -166,12 +165,8 @@ def next_photos(
     the share that is weak, of the surface that the photos or a camera around could show.
 
     Weak is what fewer than `FEW` photos see, or what is `UNSURE`. A photo helps a place that it sees freely and at a
-    fair angle: by the share of `FEW` photos that it lacks, else by how much less uncertain it becomes. Cameras are
-    tried on a shell around the scene, at the median distance of the given ones, in free space, in sight of a given
-    camera, and with something in the picture that is known well.
-
-    Meshes are closed, by name; all is in metres with the floor at z = 0. Only vertices that are `counted` [V] bool
-    matter.
+    fair angle: by the share of `FEW` photos that it lacks, else by how much less uncertain it becomes. Meshes are
+    closed, by name, in metres with the floor at z = 0; only vertices that are `counted` [V] bool matter.
     """
     if not counted.any():
         return [], 0.0
@@ -261,7 +256,8 @@ def camera_at(place: np.ndarray, target: np.ndarray, like: View) -> View:
 
 
 def _places(views: Sequence[View], middle: np.ndarray, towards: np.ndarray, solid: Caster) -> np.ndarray:
-    """Places [C, 3] where a camera could be, see `next_photos`."""
+    """Places [C, 3] where a camera could be: around the scene, at the median distance of the given ones, in free space
+    and in sight of a given one."""
     given = np.array([view.center for view in views])
     far = float(np.median(np.linalg.norm(given - middle, axis=1)))
     height = np.degrees(np.arcsin(np.clip(-towards[:, 2], -1, 1)))

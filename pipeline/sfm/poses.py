@@ -65,8 +65,8 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
     """Finds the poses of `photos` and writes `cameras.json`, `sparse.npz`, `checks.json` to `out`; returns the checks.
 
     Makes `ATTEMPTS` until poses can be trusted, for at most `timeout` s each; each has a folder of its own, in which a
-    killed run goes on. Where the photos came with cameras these are kept, checked against the photos, and given sparse
-    points. Raises SdfsimError (exit code 3) where too few photos could be posed, or the result is not plausible.
+    killed run goes on. Cameras that came with the photos are kept and checked. Raises SdfsimError (exit code 3) where
+    too few photos could be posed, or the result is not plausible.
     """
     known = photos_folder / KNOWN_CAMERAS
     job = {

@@ -144,12 +144,9 @@ def supervision_of(
 
 
 class FreeSpace:
-    """Points between cameras and what they see, on lines [L, 6] from start to end, which must be empty whatever colours
-    say.
-
-    Half of those handed out are where the field is solid all the same: a vase's mouth is crossed by one line of sight
-    in hundreds, and would stay filled if lines were drawn evenly.
-    """
+    """Points on lines [L, 6] from cameras to what they see, which must be empty whatever colours say. Half of those
+    handed out are where the field is solid all the same: a vase's mouth is crossed by one line of sight in hundreds,
+    and would stay filled if lines were drawn evenly."""
 
     def __init__(self, sight: np.ndarray, device: str) -> None:
         self.start, self.end = (
