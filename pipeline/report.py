@@ -64,20 +64,18 @@ def write_report(
 
 
 def photo_rows(folder: Path, stages: dict[str, dict], poses: dict) -> list[dict]:
-    """Each photo with what became of it: posed, held out (with its PSNR), left out (and why), or not posed yet."""
+    """Each photo with what became of it: posed, held out, left out (and why), or not posed yet."""
     photos = []
     if "photos" in stages:
         with suppress(SdfsimError):
             photos = load_photos(folder / "photos")
     why = {entry["photo"]: entry["why"] for entry in poses.get("left_out", [])}
-    distill = stages.get("distill", {})
-    held = dict(zip(distill.get("held_out_photos", []), distill.get("psnr_each", []), strict=False))
+    held = stages.get("distill", {}).get("held_out_photos", [])
     rows = []
     for photo in photos:
         name = photo.source
         state = "left out" if name in why else "held out" if name in held else "posed" if poses else "prepared"
-        rows.append({"photo": name, "file": photo.name, "state": state, "why": why.get(name, photo.fault),
-                     "psnr": held.get(name)})  # fmt: skip
+        rows.append({"photo": name, "file": photo.name, "state": state, "why": why.get(name, photo.fault)})
     return rows
 
 
@@ -174,9 +172,6 @@ def page(report: dict, folder: Path) -> str:
         ]
         rows += [(f"attempt: {one['name']}", "; ".join(one["failures"]) or f"good, {one['posed']} posed")
                  for one in poses.get("attempts", [])]  # fmt: skip
-    if moved := poses.get("moved"):
-        rows.append(("cameras moved from where the capture saw them, median",
-                     f"{1000 * moved['metres']:.1f} mm, {moved['degrees']:.2f}°"))  # fmt: skip
     if report["psnr"] is not None:
         rows.append(("photos that were not trained on", f"PSNR {report['psnr']:.1f} dB"))
     if mesh:

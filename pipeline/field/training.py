@@ -94,18 +94,6 @@ PRESETS = {
 }  # fmt: skip
 
 
-def beta_at(settings: Settings, fraction: float) -> float:
-    """Density scale: falls geometrically over the first 85 % of training, then stays."""
-    start, end = settings.beta
-    return start * (end / start) ** min(1.0, fraction / 0.85)
-
-
-def active_levels(size: FieldSize, fraction: float) -> int:
-    """Grid levels in use: two at first, the others one after the other until 45 % of training."""
-    extra = len(size.levels) - 2
-    return 2 + min(extra, int(extra * fraction / 0.45 + 0.4)) if extra > 0 else len(size.levels)
-
-
 class Trainer:
     """One training run of the grids; rays, sparse points and lines of sight are in the space of the unit sphere."""
 
@@ -136,13 +124,11 @@ class Trainer:
         return self.iteration / self.iterations
 
     @property
-    def beta(self) -> float:
-        """Scale of the density now, normalised units."""
-        return beta_at(self.settings, self.fraction)
-
-    def density_scale(self) -> float | Tensor:
-        """The same, with a gradient where it is learned."""
-        return self.beta
+    def beta(self) -> float | Tensor:
+        """Scale of the density, normalised units: falls geometrically over the first 85 % of training, then stays. With
+        a gradient where it is learned."""
+        start, end = self.settings.beta
+        return start * (end / start) ** min(1.0, self.fraction / 0.85)
 
     def rate_factor(self) -> float:
         """Factor of the learning rates: short warm-up, then cosine down to 3 %."""
@@ -157,7 +143,9 @@ class Trainer:
     def refresh(self) -> None:
         """Brings the cached SDF and the active levels up to date."""
         assert isinstance(self.settings.size, FieldSize)
-        self.field.active = active_levels(self.settings.size, self.fraction)
+        # Two levels at first, the others one after the other until 45 % of training.
+        levels = len(self.settings.size.levels)
+        self.field.active = min(levels, 2 + int((levels - 2) * self.fraction / 0.45 + 0.4))
         # Colour does not change with direction at first, or a wrong surface is painted right.
         self.field.view_dependence = min(1.0, max(0.0, (self.fraction - 0.4) / 0.3))
         self.cache = sdf_cache(self.field, CACHE)
@@ -175,7 +163,7 @@ class Trainer:
         if self.cache is None or self.iteration % self.period == 0:
             self.refresh()
         assert self.cache is not None
-        return choose_samples(self.cache, origins, directions, self.beta, uniforms)
+        return choose_samples(self.cache, origins, directions, float(self.beta), uniforms)
 
     def slope_queries(self, points: Tensor) -> Tensor:
         """Where the field has to be asked [Q, 3] for its slopes at points [P, 3]."""
@@ -216,7 +204,7 @@ class Trainer:
         sdf, geometry, more = (
             values.split([len(part) for part in parts]) for values in field.geometry_at(torch.cat(parts))
         )
-        out = composite(field, samples, (sdf[0], geometry[0], more[0]), self.density_scale(), behind)
+        out = composite(field, samples, (sdf[0], geometry[0], more[0]), self.beta, behind)
         losses = {"color": (out["rgb"] - truth).abs().mean()}
         if self.rays.mask is not None:
             wanted = self.rays.mask[index].float() / 255
@@ -308,10 +296,7 @@ class MlpTrainer(Trainer):
         return field, torch.optim.Adam(groups)
 
     @property
-    def beta(self) -> float:
-        return float(self.field.beta.detach())
-
-    def density_scale(self) -> Tensor:
+    def beta(self) -> Tensor:
         return self.field.beta
 
     def rate_factor(self) -> float:
@@ -412,11 +397,11 @@ def train(
         scores = score(held, photos_folder, trainer, out, masked=masked, on_progress=tell)
     report = {
         "iterations": trainer.iterations, "rays": len(rays), "train_seconds": round(trainer.seconds, 1),
-        "seconds_before": round(before, 1), "resumed": resumed, "masked": masked, "beta": trainer.beta,
+        "seconds_before": round(before, 1), "resumed": resumed, "masked": masked, "beta": float(trainer.beta),
         "threads": torch.get_num_threads(), "losses": {k: round(v, 5) for k, v in smooth.items()}, **scores,
         "depth": agreed,
     }  # fmt: skip
-    trained = Trained(trainer.field.cpu(), trainer.beta, to_unit, report)
+    trained = Trained(trainer.field.cpu(), float(trainer.beta), to_unit, report)
     save_field(trained, out)
     checkpoint.unlink(missing_ok=True)
     return trained
@@ -453,7 +438,7 @@ def compare(rays: Rays, number: int, trainer: Trainer, backdrop: Tensor | None) 
     for part in index.split(4096):
         origins, directions = rays.at(part)
         parts.append(
-            render(trainer.field, trainer.cache, origins, directions, trainer.beta,
+            render(trainer.field, trainer.cache, origins, directions, float(trainer.beta),
                    samples=trainer.settings.samples, backdrop=backdrop)["rgb"]
         )  # fmt: skip
     rgb = torch.cat(parts)

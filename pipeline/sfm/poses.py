@@ -99,8 +99,6 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
     checks, folder, result = max(tries, key=lambda t: (not t[0]["failures"], t[0]["posed"], t[0]["points"]))
     checks["attempts"], checks["known_cameras"] = told, bool(job["known_cameras"])
     views = views_of(result, photos) if job["refine"] or not job["known_cameras"] else load_views(known)
-    if job["refine"] and views:
-        checks["moved"] = moved(load_views(known), views)
     if checks["known_cameras"] and checks["failures"]:
         checks["failures"] = [f"the known cameras do not fit the photos: {'; '.join(checks['failures'])}"]
         checks["causes"] = []
@@ -121,17 +119,6 @@ def seen_together(views: list[View]) -> list[list[str]]:
     ahead = np.array([view.rotation[2] for view in views])
     close = ahead @ ahead.T > np.cos(np.radians(WIDEST_PAIR))
     return [[views[a].name, views[b].name] for a, b in np.argwhere(np.triu(close, 1)).tolist()]
-
-
-def moved(before: list[View], after: list[View]) -> dict[str, float]:
-    """How far bundle adjustment moved the cameras of a capture: medians, m and degrees."""
-    given = {view.name: view for view in before}
-    pairs = [(given[view.name], view) for view in after]
-    turns = [np.clip((np.trace(a.rotation @ b.rotation.T) - 1) / 2, -1, 1) for a, b in pairs]
-    return {
-        "metres": round(float(np.median([np.linalg.norm(a.center - b.center) for a, b in pairs])), 5),
-        "degrees": round(float(np.degrees(np.median(np.arccos(turns)))), 4),
-    }
 
 
 def run_worker(job: dict, folder: Path, timeout: float, on_progress: Progress) -> dict:

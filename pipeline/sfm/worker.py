@@ -46,15 +46,11 @@ def watch_parent() -> None:
 
 def features(pycolmap, job: dict, database: Path) -> None:
     """Extracts features, one camera per group of photos of the same size and lens."""
-    extraction = pycolmap.FeatureExtractionOptions()
-    extraction.use_gpu = False
-    extraction.max_image_size = job["pixels"]
-    extraction.sift.max_num_features = job["max_features"]
-    extraction.sift.peak_threshold = job["peak_threshold"]
+    sift = {"max_num_features": job["max_features"], "peak_threshold": job["peak_threshold"]}
+    extraction = pycolmap.FeatureExtractionOptions(use_gpu=False, max_image_size=job["pixels"], sift=sift)
     pycolmap.Database.open(database).close()  # makes it
     for group in job["groups"]:
-        reader = pycolmap.ImageReaderOptions()
-        reader.camera_model = "SIMPLE_RADIAL"
+        reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
         if job["masks"]:
             reader.mask_path = job["masks"]
         if group["focal"]:
@@ -72,30 +68,26 @@ def features(pycolmap, job: dict, database: Path) -> None:
 
 def matches(pycolmap, job: dict, database: Path) -> None:
     """Matches the pairs of the job, else every pair, or neighbours in name order where there are too many."""
-    matching = pycolmap.FeatureMatchingOptions()
-    matching.use_gpu = False
-    matching.guided_matching = job["guided"]
-    matching.sift.max_ratio = job["max_ratio"]
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.min_num_inliers = job["min_inliers"]
-    verification.filter_stationary_matches = job["moving_only"]
-    verification.ransac.random_seed = job["seed"]
-    # Pairs that do not overlap would otherwise use up all 10,000 trials each, most of the time of this stage.
-    verification.ransac.min_inlier_ratio = job["min_inlier_ratio"]
+    matching = pycolmap.FeatureMatchingOptions(
+        use_gpu=False, guided_matching=job["guided"], sift={"max_ratio": job["max_ratio"]}
+    )
+    verification = pycolmap.TwoViewGeometryOptions(
+        min_num_inliers=job["min_inliers"], filter_stationary_matches=job["moving_only"],
+        # Pairs that do not overlap would otherwise use up all 10,000 trials each, most of the time of this stage.
+        ransac={"random_seed": job["seed"], "min_inlier_ratio": job["min_inlier_ratio"]},
+    )  # fmt: skip
     common = {"matching_options": matching, "verification_options": verification, "device": pycolmap.Device.cpu}
+    # Small blocks only so that progress shows in the database.
     if job["pairs"] is not None:
-        pairing = pycolmap.ImportedPairingOptions(block_size=100)
-        pairing.match_list_path = database.with_name("pairs.txt")
-        pairing.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in job["pairs"]))
+        listed = database.with_name("pairs.txt")
+        listed.write_text("".join(f"{a} {b}\n" for a, b in job["pairs"]))
+        pairing = pycolmap.ImportedPairingOptions(block_size=100, match_list_path=listed)
         pycolmap.match_image_pairs(database, pairing_options=pairing, **common)
     elif job["count"] <= job["exhaustive_up_to"]:
-        pairing = pycolmap.ExhaustivePairingOptions()
-        pairing.block_size = 10  # Small blocks, here and above, only so that progress shows in the database.
+        pairing = pycolmap.ExhaustivePairingOptions(block_size=10)
         pycolmap.match_exhaustive(database, pairing_options=pairing, **common)
     else:
-        pairing = pycolmap.SequentialPairingOptions()
-        pairing.overlap = 20
-        pairing.quadratic_overlap = True
+        pairing = pycolmap.SequentialPairingOptions(overlap=20, quadratic_overlap=True)
         pycolmap.match_sequential(database, pairing_options=pairing, **common)
 
 
@@ -124,18 +116,14 @@ def mapping(pycolmap, job: dict, database: Path, out: Path):
 
 def incremental_options(pycolmap, job: dict):
     """Settings of incremental mapping: on one thread, as several add up in an order that differs from run to run."""
-    options = pycolmap.IncrementalPipelineOptions()
-    options.min_model_size = 3
-    options.max_num_models = 4
-    options.num_threads = options.mapper.num_threads = 1
-    options.random_seed = job["seed"]
-    options.min_num_matches = job["min_inliers"]
-    options.mapper.random_seed = job["seed"]
-    options.triangulation.random_seed = job["seed"]
-    options.mapper.init_min_num_inliers = min(100, job["init_inliers"])
-    options.mapper.init_min_tri_angle = job["init_angle"]
-    options.mapper.abs_pose_min_num_inliers = job["pose_inliers"]
-    return options
+    mapper = {
+        "num_threads": 1, "random_seed": job["seed"], "init_min_num_inliers": job["init_inliers"],
+        "init_min_tri_angle": job["init_angle"], "abs_pose_min_num_inliers": job["pose_inliers"],
+    }  # fmt: skip
+    return pycolmap.IncrementalPipelineOptions(
+        min_model_size=3, max_num_models=4, num_threads=1, random_seed=job["seed"], min_num_matches=job["min_inliers"],
+        mapper=mapper, triangulation={"random_seed": job["seed"]},
+    )  # fmt: skip
 
 
 def known_cameras(pycolmap, job: dict, database: Path):
@@ -177,8 +165,10 @@ def refine(pycolmap, model, database: Path, job: dict, out: Path) -> None:
         options.mapper.filter_max_reproj_error = pixels
         options.triangulation.complete_max_reproj_error = options.triangulation.merge_max_reproj_error = pixels
         found = pycolmap.triangulate_points(model, database, job["images"], out / "colmap", options=options)
-        config, adjustment = pycolmap.BundleAdjustmentConfig(), pycolmap.BundleAdjustmentOptions()
-        adjustment.refine_focal_length = adjustment.refine_extra_params = adjustment.print_summary = False
+        config = pycolmap.BundleAdjustmentConfig()
+        adjustment = pycolmap.BundleAdjustmentOptions(
+            refine_focal_length=False, refine_extra_params=False, print_summary=False
+        )
         adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
         adjustment.ceres.solver_options.num_threads = 1  # several add up in an order that differs from run to run
         seen = [key for key, image in found.images.items() if image.has_pose and image.num_points3D >= REFINE_POINTS]
@@ -186,8 +176,7 @@ def refine(pycolmap, model, database: Path, job: dict, out: Path) -> None:
             return
         for key in seen:
             config.add_image(key)
-        with_priors = pycolmap.PosePriorBundleAdjustmentOptions()
-        with_priors.alignment_ransac.random_seed = job["seed"]
+        with_priors = pycolmap.PosePriorBundleAdjustmentOptions(alignment_ransac={"random_seed": job["seed"]})
         priors = [
             pycolmap.PosePrior(position=given[key], position_covariance=np.eye(3) * TRACKED**2,
                                corr_data_id=model.images[key].data_id, coordinate_system=cartesian)

@@ -92,7 +92,6 @@ def test_the_poses_of_a_phone_are_refined(tmp_path):
     centers = [np.array([view.center for view in views]) for views in (given, found)]
     np.testing.assert_allclose(centers[0].mean(0), centers[1].mean(0), atol=0.003)
     assert np.std(centers[0]) == pytest.approx(np.std(centers[1]), rel=2e-3)
-    assert 0.0005 < checks["moved"]["metres"] < 0.03
 
 
 def test_depth_is_read_in_its_unit_where_it_can_be_believed(tmp_path):
