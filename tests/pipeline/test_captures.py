@@ -73,7 +73,7 @@ def test_the_poses_of_a_phone_are_refined(tmp_path):
     folder.mkdir()
     out.mkdir()
     photos, _ = prepare_photos(tmp_path / "capture", folder)
-    checks = solve(photos, folder, out)
+    solve(photos, folder, out)
     frames = json.loads((TABLE_VASE / "transforms.json").read_text())["frames"][::3]
     true = np.array([(phone.TO_ARKIT @ np.array(frame["transform_matrix"]))[:3, 3] for frame in frames])
 

@@ -13,9 +13,8 @@ from PIL import Image
 
 from pipeline.cameras import Sparse, View
 from pipeline.field import training
-from pipeline.field.rays import load_rays
 from pipeline.field.rendering import sdf_cache
-from pipeline.field.training import FEWEST_STEPS, HELD_OUT, PRESETS, Trainer, compare, paced, score, train
+from pipeline.field.training import FEWEST_STEPS, HELD_OUT, PRESETS, Trainer, compare, load_rays, paced, score, train
 from pipeline.inputs.photos import save_photos
 from tests.pipeline.test_field import SMALL, posed_noise
 from tests.pipeline.test_poses import photo
