@@ -12,7 +12,6 @@ from types import MappingProxyType
 import numpy as np
 
 from pipeline.cameras import View
-from pipeline.inputs.depth import DepthFile
 from pipeline.inputs.images import Picture
 from sdfsim.errors import SdfsimError
 
@@ -56,6 +55,20 @@ def lens_of(
     names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
     distortion = tuple(float(bends.get(name, 0.0)) for name in names)
     return Lens(((fx, 0, cx), (0, fy, cy), (0, 0, 1)), distortion, fisheye)
+
+
+@dataclass(frozen=True)
+class DepthFile:
+    """Where the depth of a photo is kept."""
+
+    path: Path  # PNG or TIFF of integers, EXR, NPY, or Record3D's compressed floats (`.depth`)
+    unit: float | None = None  # m that a count stands for; None: integers are millimetres, floats metres
+    confidence: Path | None = None  # file of the same shape, higher is better; None: there is none
+    shape: tuple[int, int] | None = None  # rows and columns, of a `.depth` file, which does not say so itself
+
+    def files(self) -> list[Path]:
+        """The files that this depth is read from."""
+        return [self.path] + ([self.confidence] if self.confidence else [])
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ import numpy as np
 from PIL import Image
 
 from pipeline.cameras import View, save_views
-from pipeline.inputs.captures import CAPTURE, spread, unpack
-from pipeline.inputs.depth import read_depth
+from pipeline.inputs.captures import CAPTURE, read_depth, spread, unpack
 from pipeline.inputs.images import BLURRED, Picture, read_photo, sharpness
 from pipeline.inputs.known_cameras import KnownCamera, Lens, rectified
 from pipeline.inputs.labels import FOLDER, NAMES

@@ -79,12 +79,12 @@ class Texels:
 def texture_parts(meshes: dict[str, Mesh], shots: Shots, on_progress: Progress = quiet) -> dict[str, Mesh]:
     """Each mesh with a texture, fewer faces where it has many, and vertices doubled where its charts meet; its vertex
     colours stay wherever no photo shows the surface."""
-    sizes = np.array([len(mesh.faces) for mesh in meshes.values()], float)
-    ends = np.cumsum(sizes) / max(sizes.sum(), 1)
-    return {
-        name: textured(mesh, shots, share_of(on_progress, float(end - size / sizes.sum()), float(size / sizes.sum())))
-        for (name, mesh), size, end in zip(meshes.items(), sizes, ends, strict=True)
-    }
+    made, done, total = {}, 0.0, sum(len(mesh.faces) for mesh in meshes.values())
+    for name, mesh in meshes.items():
+        share = len(mesh.faces) / total
+        made[name] = textured(mesh, shots, share_of(on_progress, done, share))
+        done += share
+    return made
 
 
 def textured(mesh: Mesh, shots: Shots, on_progress: Progress = quiet) -> Mesh:

@@ -12,8 +12,7 @@ import pytest
 from PIL import Image
 
 from pipeline.cameras import Similarity, Sparse, View, load_views
-from pipeline.inputs.captures import UP, load_capture, spread
-from pipeline.inputs.depth import DepthFile, read_depth
+from pipeline.inputs.captures import UP, DepthFile, load_capture, read_depth, spread
 from pipeline.inputs.known_cameras import lens_of, posed
 from pipeline.inputs.photos import KNOWN_CAMERAS, Photo, load_photos, prepare_photos
 from pipeline.inputs.sources import find_source
