@@ -107,10 +107,10 @@ def _polycam(folder: Path) -> list[KnownCamera]:
         about = json.loads(path.read_text(encoding="utf-8"))
         photo = next((p for p in sorted(images.glob(path.stem + ".*"))), images / f"{path.stem}.jpg")
         pose = np.array([[about[f"t_{row}{column}"] for column in range(4)] for row in range(3)], float)
-        depth = depth_file(*(folder / name / f"{path.stem}.png" for name in ("depth", "confidence")))
-        lens = lens_of(*(float(about[key]) for key in ("fx", "fy", "cx", "cy")))
+        depth = depth_file(folder / "depth" / f"{path.stem}.png", folder / "confidence" / f"{path.stem}.png")
+        fx, fy, cx, cy = (float(about[key]) for key in ("fx", "fy", "cx", "cy"))
         size = int(about["width"]), int(about["height"])
-        found.append(posed(photo.relative_to(folder).as_posix(), size, lens, pose, depth=depth))
+        found.append(posed(photo.relative_to(folder).as_posix(), size, lens_of(fx, fy, cx, cy), pose, depth=depth))
     return found
 
 
