@@ -44,14 +44,18 @@ class View:
         """Field of view of the longer side, degrees."""
         return float(2 * np.degrees(np.arctan(0.5 * max(self.width, self.height) / self.focal)))
 
-    def rays(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Unit directions [P, 3] in world axes through pixels u, v [P]."""
+    def straight(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Directions (x, y, 1) [P, 3] in camera axes through pixels u, v [P]."""
         xd, yd = (u - self.cx) / self.focal, (v - self.cy) / self.focal
-        x, y = xd.copy(), yd.copy()
+        x, y = xd, yd
         for _ in range(8):  # Fixed point; k r^2 is a few percent, so this is far below a hundredth of a pixel.
             scale = 1 + self.k * np.clip(x * x + y * y, 0, 4)
             x, y = xd / scale, yd / scale
-        direction = np.stack([x, y, np.ones_like(x)], -1) @ self.rotation
+        return np.stack([x, y, np.ones_like(x)], -1)
+
+    def rays(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Unit directions [P, 3] in world axes through pixels u, v [P]."""
+        direction = self.straight(u, v) @ self.rotation
         return direction / np.linalg.norm(direction, axis=-1, keepdims=True)
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -112,33 +116,34 @@ def save_views(views: list[View], path: Path) -> None:
         {**asdict(v), "rotation": np.asarray(v.rotation).tolist(), "translation": np.asarray(v.translation).tolist()}
         for v in views
     ]
-    data = {"version": 1, "convention": "world to camera; x right, y down, z forward", "views": entries}
-    write_json(path, data)
+    convention = "world to camera; x right, y down, z forward"
+    write_json(path, {"version": 1, "convention": convention, "views": entries})
 
 
 def load_views(path: Path) -> list[View]:
     """The views of a poses folder, or of a file that `save_views` wrote. Raises SdfsimError where it is absent or
     damaged."""
-    path = Path(path)
     path = path / "cameras.json" if path.is_dir() else path
     data = read_json(path, "run the poses stage first")
     try:
-        return [
-            View(**{**v, "rotation": np.array(v["rotation"], float), "translation": np.array(v["translation"], float)})
-            for v in data["views"]
-        ]
+        return [view_of(entry) for entry in data["views"]]
     except (ValueError, KeyError, TypeError) as error:
         raise SdfsimError(f"{path}: damaged", "run the poses stage again") from error
 
 
+def view_of(entry: dict) -> View:
+    """A view from plain values."""
+    arrays = {key: np.array(entry[key], float) for key in ("rotation", "translation")}
+    return View(**{**entry, **arrays})
+
+
 def load_sparse(folder: Path) -> Sparse:
     """Reads the sparse points of a poses folder. Raises SdfsimError: no readable `sparse.npz`."""
-    path = Path(folder) / "sparse.npz"
-    data = read_arrays(path, "sparse points", "run the poses stage again")
+    path = folder / "sparse.npz"
     try:
-        return Sparse(**{key: data[key] for key in ("xyz", "rgb", "error", "point_of", "view_of")})
-    except KeyError as error:
-        raise SdfsimError(f"{path}: damaged: no {error}", "run the poses stage again") from error
+        return Sparse(**read_arrays(path, "sparse points", "run the poses stage again"))
+    except TypeError as error:
+        raise SdfsimError(f"{path}: damaged: {error}", "run the poses stage again") from error
 
 
 def frame_of(normal: np.ndarray) -> np.ndarray:
@@ -168,8 +173,8 @@ class Up(NamedTuple):
 
 
 def camera_up(views: list[View]) -> Up:
-    """Up from the cameras alone: people hold cameras level, so their right axes are horizontal. It is the direction
-    with the least spread of the right axes; where these span no plane, the mean image up."""
+    """Up from the cameras alone: people hold cameras level, so it is the direction with the least spread of their right
+    axes; where these span no plane, the mean image up."""
     right = np.array([v.rotation[0] for v in views])
     mean = -np.mean([v.rotation[1] for v in views], axis=0)
     mean /= np.linalg.norm(mean) + 1e-12

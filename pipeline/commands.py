@@ -11,9 +11,9 @@ from sdfsim.commands.arguments import Budget, Cluster, Out, command, tell_failed
 from sdfsim.console import Session, duration
 from sdfsim.errors import EXIT_ERROR, EXIT_USAGE, SdfsimError
 
+Presets = Literal["quick", "standard", "fine", "paper"]
 Preset = Annotated[
-    Literal["quick", "standard", "fine", "paper"],
-    typer.Option(help="How much time to spend; paper is the network of the VolSDF paper, for a GPU."),
+    Presets, typer.Option(help="How much time to spend; paper is the network of the VolSDF paper, for a GPU.")
 ]
 Photos = Annotated[
     Path,
@@ -21,7 +21,7 @@ Photos = Annotated[
         help="Folder of photos, a video, a transforms.json, a COLMAP model, or a phone's capture.", show_default=False
     ),
 ]
-KeptPreset = Annotated[Literal["quick", "standard", "fine", "paper"] | None, typer.Option(help="Default: as before.")]
+KeptPreset = Annotated[Presets | None, typer.Option(help="Default: as before.")]
 Stage = Literal["photos", "poses", "distill", "mesh", "fit", "scene"]
 Size = Annotated[float | None, typer.Option(help="Widest side of the scene, metres.", min=0.0)]
 Distance = Annotated[
@@ -129,15 +129,14 @@ def _corners(crop: tuple[str, str] | None) -> list[float] | None:
 
 def _by_body(materials: list[str]) -> dict[str, str]:
     """Materials by the body's name, from texts BODY=MATERIAL."""
-    pairs = [text.partition("=") for text in materials]
-    for text, (body, _, material) in zip(materials, pairs, strict=True):
-        if not body or not material:
-            raise SdfsimError(
-                f"--material takes BODY=MATERIAL, such as object1=wood (got {text})", exit_code=EXIT_USAGE
-            )
-    if len({body for body, _, _ in pairs}) < len(pairs):
-        raise SdfsimError(f"--material names a body twice (got {' '.join(materials)})", exit_code=EXIT_USAGE)
-    return {body: material for body, _, material in pairs}
+    found: dict[str, str] = {}
+    for text in materials:
+        body, _, material = text.partition("=")
+        if not body or not material or body in found:
+            told = f"--material takes BODY=MATERIAL once for a body, such as object1=wood (got {text})"
+            raise SdfsimError(told, exit_code=EXIT_USAGE)
+        found[body] = material
+    return found
 
 
 @command

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-import os
 import shutil
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -35,14 +34,9 @@ GAP = 0.3  # of the fall, as a share of the side
 
 def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str = "default", seed: int = 0,
               device: str = "cpu", on_progress: Progress = quiet) -> dict:  # fmt: skip
-    """Fits a compact SDF to the scenery and to every body, each a Shape folder in `out` that goes by its name.
-
-    The scenery's solid is closed, so the sign of its distance is right everywhere; what is shown of it is its visible
-    surface. A body's origin is the middle of its base. Folders that are there already are kept.
-
-    Returns a certificate for each of `shapes`, and `passed`, `reason` and `caveats` for all of them; raises SdfsimError
-    where the mesh stage has not run or a mesh cannot be used. The budget is in s, for all.
-    """
+    """Fits a compact SDF to the scenery and to every body within the budget, s; each is a Shape folder in `out` that
+    goes by its name, and those that are there already are kept. Returns a certificate for each of `shapes`, and
+    `passed`, `reason` and `caveats` for all of them."""
     from sdfsim.shape.baked_grid import grid_certificate
     from sdfsim.shape.fit import fit_mesh
     from sdfsim.shape.shape import load_shape
@@ -84,10 +78,8 @@ def meshes_of(mesh_folder: Path, name: str) -> tuple[Mesh, Mesh]:
 
 
 def skins_of(mesh_folder: Path) -> dict[str, Mesh]:
-    """The textured mesh of each part in its own frame; none where the mesh stage is one that made no textures."""
-    if not (mesh_folder / TEXTURED).exists():
-        return {}
-    skins = read_glb(mesh_folder / TEXTURED)
+    """The textured mesh of each part in its own frame; none where there are no textures."""
+    skins = read_glb(mesh_folder / TEXTURED) if (mesh_folder / TEXTURED).exists() else {}
     origins = {name: origin_of(load_mesh(mesh_folder / "objects" / f"{name}.ply")) for name in skins if name != SCENERY}
     return {name: replace(skin, vertices=skin.vertices - origins.get(name, 0)) for name, skin in skins.items()}
 
@@ -105,10 +97,8 @@ def write_scene(
     """Writes scene.yaml for the meshes of a mesh folder and the shapes beside it; returns the stage's report.
 
     A file that the user has changed (it has another hash than `written`, that of what this function last wrote) is kept
-    as `scene.yaml.bak`. Bodies without an entry in `materials` get an assumed one. Raises SdfsimError where the mesh or
-    fit stage has not run, or a material is for a body that there is not.
+    as `scene.yaml.bak`. Raises SdfsimError where a material is for a body that there is not.
     """
-    mesh_folder = Path(mesh_folder)
     parts, placement = read_parts(mesh_folder), load_placement(mesh_folder)
     solids = {name: load_mesh(mesh_folder / "objects" / f"{name}.ply") for name in _names(parts)}
     notes: list[str] = []
@@ -129,17 +119,17 @@ def write_scene(
             raise SdfsimError(
                 f"material: no body is called {name!r}{nearest(name, names)}", "the bodies are " + ", ".join(names)
             )
-    if scene_file.exists() and content_hash(scene_file.read_bytes()) not in (written, content_hash(text.encode())):
-        numbers = itertools.chain([""], itertools.count(2))
-        names = (scene_file.with_name(f"{scene_file.name}.bak{n}") for n in numbers)
-        kept = next(path for path in names if not path.exists())
-        os.replace(scene_file, kept)
+    made = hashlib.sha256(text.encode()).hexdigest()
+    if scene_file.exists() and hashlib.sha256(scene_file.read_bytes()).hexdigest() not in (written, made):
+        endings = itertools.chain([""], itertools.count(2))
+        kept = next(p for n in endings if not (p := scene_file.with_name(f"{scene_file.name}.bak{n}")).exists())
+        scene_file.rename(kept)
         notes.append(f"{scene_file.name} had been changed by hand: kept as {kept.name}")
     write_text(scene_file, text)
     return {
         "objects": list(solids), "bodies": bodies_of(scene, materials), "size": placement.size_from,
         "drop": {"shape": drop, **(asdict(slab) if slab else {})}, "notes": notes,
-        "scene_sha256": content_hash(text.encode()),
+        "scene_sha256": made,
     }  # fmt: skip
 
 
@@ -162,16 +152,10 @@ def _names(parts: dict) -> list[str]:
     return [entry["name"] for entry in parts["objects"]]
 
 
-def content_hash(content: bytes) -> str:
-    """SHA-256 in hex."""
-    return hashlib.sha256(content).hexdigest()
-
-
 def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab | None, *, scenery: bool = True,
                drop: str = "box", materials: dict[str, Choice] | None = None, seed: int = 0) -> str:  # fmt: skip
     """The text of scene.yaml: a floor, the scenery, the bodies that were found at their origins [3] m, and one dropped
     from above where there is a slab."""
-    source = {"plane": "the dominant plane", "cameras": "the cameras"}.get(placement.up_from, placement.up_from)
     assumed = " (give --size or --distance for true metres)" if placement.size_from.startswith("assumed") else ""
     made = materials or {}
     shapes: list[str] = []
@@ -203,7 +187,7 @@ def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab 
         ball = {"sphere": {"radius": float(rounded(slab.thickness / 2))}}
         add(drop, f"position: {_flow(rounded(slab.position).tolist())}", box if drop == "box" else ball)
     return "\n".join([
-        f"# Reconstructed from photos. Up from {source}, within {placement.up_within:.1f} degrees "
+        f"# Reconstructed from photos. Up from the {placement.up_from}, within {placement.up_within:.1f} degrees "
         f"(confidence: {placement.up_confidence}).",
         f"# Size {placement.size_from}{assumed}. Lengths in m, density in kg/m^3.",
         "version: 1",

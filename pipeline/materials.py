@@ -1,7 +1,4 @@
-"""Named materials: how heavy, how rough and how bouncy a body is, and where each number comes from.
-
-`python -m pipeline.materials` prints the table of docs/objects.md.
-"""
+"""Named materials: how heavy, how rough and how bouncy a body is, and where each number comes from."""
 
 from __future__ import annotations
 
@@ -75,8 +72,7 @@ class Choice:
 
 def choose(given: dict[str, str]) -> dict[str, Choice]:
     """Looks up what bodies are made of: by the body's name, a name in `MATERIALS`, perhaps with the thickness of a
-    hollow body's wall, such as `ceramic:4mm` (mm, cm or m). Raises SdfsimError where there is no such material or
-    thickness, or of a thickness of what does not move."""
+    hollow body's wall (mm, cm or m), such as `ceramic:4mm`. Raises SdfsimError where this makes no sense."""
     found = {}
     for body, text in given.items():
         name, colon, thickness = text.partition(":")
@@ -85,37 +81,13 @@ def choose(given: dict[str, str]) -> dict[str, Choice]:
                 f"material: {body}: no such material: {name!r}{nearest(name, MATERIALS)}",
                 "there are " + ", ".join(MATERIALS),
             )
-        wall = _wall(body, thickness) if colon else None
         if colon and body in UNMOVED:
             raise SdfsimError(f"material: {body}: takes no thickness: it does not move, so its mass never counts")
+        match = _WALL.fullmatch(thickness)
+        wall = float(match[1]) * UNITS[match[2]] if match else None
+        if colon and not wall:
+            raise SdfsimError(
+                f"material: {body}: {thickness!r} is not the thickness of a wall", "give one such as 4mm or 0.4cm"
+            )
         found[body] = Choice(name, MATERIALS[name], wall)
     return found
-
-
-def _wall(body: str, text: str) -> float:
-    match = _WALL.fullmatch(text)
-    metres = float(match[1]) * UNITS[match[2]] if match else 0.0
-    if not metres > 0:
-        raise SdfsimError(
-            f"material: {body}: {text!r} is not the thickness of a wall", "give one such as 4mm, 0.4cm or 0.004m"
-        )
-    return metres
-
-
-def table() -> str:
-    """The table of docs/objects.md."""
-    lines = ["| material | density, kg/m^3 | friction | restitution |", "| --- | --- | --- | --- |"]
-    for name, made in MATERIALS.items():
-        cells = (
-            f"{number:g} ({source})"
-            for number, source in (
-                (made.density, made.density_from), (made.friction, made.friction_from),
-                (made.restitution, made.restitution_from),
-            )
-        )  # fmt: skip
-        lines.append("| " + " | ".join((f"`{name}`", *cells)) + " |")
-    return "\n".join(lines) + "\n"
-
-
-if __name__ == "__main__":
-    print(table(), end="")

@@ -55,12 +55,9 @@ class Options:
         if self.size is not None and self.distance is not None:
             raise SdfsimError("size and distance: both set the scale", "give one of them")
         if self.distance is not None and self.distance[0] == self.distance[1]:
-            raise SdfsimError(f"distance: both ends are {self.distance[0]}", "give two places that are some way apart")
+            raise SdfsimError(f"distance: both ends are {self.distance[0]}")
         if self.crop is not None and not np.less(self.crop[:3], self.crop[3:]).all():
-            raise SdfsimError(
-                f"crop: the second corner must lie beyond the first in x, y and z (got {self.crop})",
-                "corners are x,y,z in metres, the lower one first",
-            )
+            raise SdfsimError(f"crop: the second corner must lie beyond the first in x, y and z (got {self.crop})")
         choose(self.material)
 
     def changed(self, changes: dict[str, Any]) -> Options:

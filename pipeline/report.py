@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.cameras import Similarity, camera_up, frame_of, load_sparse, load_views
+from pipeline.inputs.photos import load_photos
 from pipeline.options import Options
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, write_json, write_text
@@ -22,8 +24,8 @@ RESULTS = {
     "report": ("report.md", "photos"),
 }  # fmt: skip
 RECORDING = "reconstruction.rrd"
+NAMED = 10  # photos left out that the notes name; the page has them all
 PROPOSED = (255, 40, 200)  # RGB of the cameras that are proposed
-NAMED = 10  # photos that a note names one by one
 FEW_PHOTOS, LOW_PSNR, HIGH_ERROR = 20, 20.0, 1.0
 GUESSED_SHARE = 0.01  # of a body's surface, from which on a note says so
 
@@ -38,10 +40,8 @@ def write_report(
     fit = stages.get("fit", {})
     poses = stages.get("poses", {})
     if failed and not poses:
-        try:
+        with suppress(SdfsimError):
             poses = read_json(folder / ".poses.part" / "checks.json")
-        except SdfsimError:
-            poses = {}
     report: dict[str, Any] = {
         "version": 1, "options": asdict(options), "seconds": seconds, "seconds_total": round(sum(seconds.values()), 1),
         "psnr": stages.get("distill", {}).get("psnr"), "stages": stages, "poses": poses, "notes": notes(stages),
@@ -52,10 +52,7 @@ def write_report(
         stage, error = failed
         report["error"] = {"stage": stage, "message": error.message, "hint": error.hint}
     if options.budget is not None and report["seconds_total"] > 1.1 * options.budget:
-        report["notes"].append(
-            f"it took {report['seconds_total']:.0f} s, more than the budget of {options.budget:.0f} s: poses, mesh and "
-            "the shortest of fits take their time"
-        )
+        report["notes"].append(f"it took {report['seconds_total']:.0f} s, the budget was {options.budget:.0f} s")
     report["improve"] = improvements(report)
     write_text(folder / "report.md", page(report, folder))
     report["paths"] = {
@@ -67,23 +64,18 @@ def write_report(
 
 
 def photo_rows(folder: Path, stages: dict[str, dict], poses: dict) -> list[dict]:
-    """Each photo with what became of it: posed, held out (with its PSNR), left out (and why), or not posed yet."""
-    try:
-        photos = read_json(folder / "photos" / "photos.json")["photos"] if "photos" in stages else []
-    except (SdfsimError, KeyError):
-        photos = []
+    """Each photo with what became of it: posed, held out, left out (and why), or not posed yet."""
+    photos = []
+    if "photos" in stages:
+        with suppress(SdfsimError):
+            photos = load_photos(folder / "photos")
     why = {entry["photo"]: entry["why"] for entry in poses.get("left_out", [])}
-    distill = stages.get("distill", {})
-    held = dict(zip(distill.get("held_out_photos", []), distill.get("psnr_each", []), strict=False))
+    held = stages.get("distill", {}).get("held_out_photos", [])
     rows = []
     for photo in photos:
-        name = photo["source"]
+        name = photo.source
         state = "left out" if name in why else "held out" if name in held else "posed" if poses else "prepared"
-        rows.append({
-            "photo": name, "file": photo["name"], "state": state, "why": why.get(name, ""), "fault": photo["fault"],
-            "sharpness": photo["sharpness"], "mask": photo["mask"], "size": [photo["width"], photo["height"]],
-            "focal_exif": photo["focal"], "psnr": held.get(name),
-        })  # fmt: skip
+        rows.append({"photo": name, "file": photo.name, "state": state, "why": why.get(name, photo.fault)})
     return rows
 
 
@@ -99,55 +91,29 @@ def improvements(report: dict) -> list[str]:
     if report["psnr"] is not None and report["psnr"] < LOW_PSNR:
         lines.append(f"photos that were not trained on come out at {report['psnr']:.1f} dB only: train for longer "
                      "(--preset standard), and keep light and exposure the same in all photos")  # fmt: skip
-    lines += [f"{k}. of the photos that would help most: {photo_line(photo)}"
-              for k, photo in enumerate(stages.get("mesh", {}).get("next_photos", []), start=1)]  # fmt: skip
+    for number, photo in enumerate(stages.get("mesh", {}).get("next_photos", []), start=1):
+        place, target = (", ".join(f"{x:.2f}" for x in photo[key]) for key in ("position", "looking_at"))
+        lines.append(f"{number}. of the photos that would help most: {photo['words']} (camera at {place} m, aimed at "
+                     f"{target} m); it makes up for {photo['gain']:.0%} of what is weak")  # fmt: skip
     if report["failed_checks"]:
         lines.append("fit for longer (a larger --budget), or mend the mesh: a shape is not usable")
     return lines
 
 
-def photo_line(photo: dict) -> str:
-    """Where to take a photo, from an entry of `next_photos`: in words and as numbers."""
-    place, target = (", ".join(f"{round(x, 2) + 0.0:.2f}" for x in photo[key]) for key in ("position", "looking_at"))
-    return (f"{photo['words']} (camera at {place} m, aimed at {target} m); it makes up for {photo['gain']:.0%} of what "
-            "is weak")  # fmt: skip
-
-
-def trust_lines(mesh: dict) -> list[str]:
-    """What of each body is guessed, and how much more photos could do, from the report of the mesh stage."""
-    lines = []
-    for name, part in mesh.get("trust", {}).items():
-        if part["guessed"] > GUESSED_SHARE and name != "scene":
-            lines.append(f"{name}: {part['guessed']:.0%} of its surface is guessed, fewer than two photos see it")
-    if "weak" in mesh:
-        made_up = sum(photo["gain"] for photo in mesh["next_photos"])
-        more = f"the photos proposed make up for {made_up:.0%} of that" if made_up else "no one photo would help much"
-        lines.append(f"{mesh['weak']:.1%} of what could be photographed is weak: fewer than three photos see it, or "
-                     f"all from nearly one direction; {more}")  # fmt: skip
-    return lines
-
-
-def touching_lines(mesh: dict) -> list[str]:
-    """Which bodies touch, which masks have no body, and how deep hollows are, from the report of the mesh stage."""
-    from pipeline.mesh.hollows import hollow_line
-
-    lines = []
-    for first, second, by in mesh.get("touching", []):
-        how = "split where their masks end" if by == "masks" else (
-            "split along a seam by concavity and colour; give masks to be sure")  # fmt: skip
-        lines.append(f"{first} and {second} touch; {how}")
-    lines += [f"masks of {name}: no surface corresponds to them" for name in mesh.get("masks_without_surface", [])]
-    return lines + [hollow_line(name, *found) for name, found in mesh.get("hollows_m", {}).items()]
-
-
 def notes(stages: dict[str, dict]) -> list[str]:
     """What a person should know about a run: what was passed over, assumed or is uncertain; one line each."""
-    poses, mesh = stages.get("poses", {}), stages.get("mesh", {})
-    left = poses.get("left_out", [])
+    poses, scene = stages.get("poses", {}), stages.get("scene", {})
     lines = [*stages.get("photos", {}).get("notes", []), *poses.get("warnings", [])]
-    lines += [f"left out: {entry['photo']}: {entry['why']}" for entry in left[:NAMED]]
-    if len(left) > NAMED:
-        lines.append(f"left out: {len(left) - NAMED} more")
+    lines += [f"left out: {entry['photo']}: {entry['why']}" for entry in poses.get("left_out", [])[:NAMED]]
+    lines += mesh_notes(stages.get("mesh", {}))
+    lines += [f"usable, not exact: {caveat}" for caveat in stages.get("fit", {}).get("caveats", [])]
+    lines += [f"{name}: {material_line(body)}" for name, body in scene.get("bodies", {}).items()]
+    return lines + scene.get("notes", [])
+
+
+def mesh_notes(mesh: dict) -> list[str]:
+    """Those of the mesh stage, from its report."""
+    lines = []
     if mesh.get("up_from") == "cameras":
         lines.append("no level plane found: up is taken from the cameras and may be off by some degrees")
     if mesh.get("up_confidence") == "low":
@@ -156,16 +122,22 @@ def notes(stages: dict[str, dict]) -> list[str]:
         lines.append(f"size {mesh['size']} (give --size or --distance)")
     if mesh.get("objects"):
         lines.append(f"bodies of their own: {', '.join(mesh['objects'])} (mesh/objects.png shows which is which)")
-    lines += touching_lines(mesh)
+    how = {"masks": "split where their masks end", "shape": "split along a seam by shape; give masks to be sure"}
+    lines += [f"{first} and {second} touch; {how[by]}" for first, second, by in mesh.get("touching", [])]
+    lines += [f"masks of {name}: they have no surface" for name in mesh.get("masks_without_surface", [])]
     if "smallest_object_m" in mesh:
         lines.append(f"what rises less than {mesh['smallest_object_m']:.2g} m stays part of what it stands on")
     if mesh.get("left_out_m"):
         largest = max(mesh["left_out_m"])
         lines.append(f"{len(mesh['left_out_m'])} loose pieces were left out, the largest {largest:.2g} m long")
-    lines += trust_lines(mesh)
-    lines += [f"usable, not exact: {caveat}" for caveat in stages.get("fit", {}).get("caveats", [])]
-    lines += [f"{name}: {material_line(body)}" for name, body in stages.get("scene", {}).get("bodies", {}).items()]
-    return lines + stages.get("scene", {}).get("notes", [])
+    for name, part in mesh.get("trust", {}).items():
+        if part["guessed"] > GUESSED_SHARE and name != "scene":
+            lines.append(f"{name}: {part['guessed']:.0%} of its surface is guessed, fewer than two photos see it")
+    if "weak" in mesh:
+        more = "" if mesh["next_photos"] else "; no one photo would help much"
+        lines.append(f"{mesh['weak']:.1%} of what could be photographed is weak: fewer than three photos see it, or "
+                     f"all from nearly one direction{more}")  # fmt: skip
+    return lines
 
 
 def material_line(body: dict) -> str:
@@ -180,7 +152,7 @@ def material_line(body: dict) -> str:
 def page(report: dict, folder: Path) -> str:
     """The report as Markdown; its pictures are files of the run."""
     poses, stages = report["poses"], report["stages"]
-    mesh, distill = stages.get("mesh", {}), stages.get("distill", {})
+    mesh = stages.get("mesh", {})
     lines = [f"# Reconstruction of {Path(report['options']['photos']).name}", ""]
     if "error" in report:
         error = report["error"]
@@ -194,22 +166,12 @@ def page(report: dict, folder: Path) -> str:
             lines += [f"## {title}", "", *(f"- {entry}" for entry in entries), ""]
     rows: list[tuple[str, object]] = []
     if poses:
-        fov = ", ".join(f"{angle:.1f}°" for angle in poses["field_of_view"])
         rows += [
             ("photos with a pose", f"{poses['posed']} of {poses['photos']}"),
             ("mean reprojection error", f"{poses['mean_error']:.2f} px, {poses['points']} points"),
-            ("field of view of the longer side", fov),
-            ("viewing directions", f"{poses.get('span_degrees', 0):.0f}° around"),
-            ("pairs of photos that contradict the poses", f"{poses.get('contradictions', 0):.1%}"),
         ]
         rows += [(f"attempt: {one['name']}", "; ".join(one["failures"]) or f"good, {one['posed']} posed")
                  for one in poses.get("attempts", [])]  # fmt: skip
-    if moved := poses.get("moved"):
-        rows.append(("cameras moved from where the capture saw them, median",
-                     f"{1000 * moved['metres']:.1f} mm, {moved['degrees']:.2f}°"))  # fmt: skip
-    if depth := distill.get("depth"):
-        rows.append(("depth beside the points that photos give", f"{depth['scale'] - 1:+.2%} in scale, then "
-                     f"{depth['spread']:.2%} in the median, {depth['points']} pixels"))  # fmt: skip
     if report["psnr"] is not None:
         rows.append(("photos that were not trained on", f"PSNR {report['psnr']:.1f} dB"))
     if mesh:
@@ -229,22 +191,21 @@ def page(report: dict, folder: Path) -> str:
     lines += ["## Numbers", "", "| | |", "| --- | --- |", *(f"| {name} | {value} |" for name, value in rows), ""]
     if (folder / "mesh" / "objects.png").exists() and mesh:
         lines += ["## What was found", "", "![bodies by name](mesh/objects.png)", ""]
-    files = {photo["photo"]: photo["file"] for photo in report["photos"]}
-    held = [name for name in distill.get("held_out_photos", []) if name in files]
+    held = [photo for photo in report["photos"] if photo["state"] == "held out"]
     if held:
         lines += ["## Photos that were not trained on: photo and render", ""]
-        lines += [f"![{name}](photos/images/{files[name]}) ![render](distill/held_out/{files[name]})" for name in held]
-    lines += ["", "## Photos", "", "| photo | | | |", "| --- | --- | --- | --- |"]
-    lines += [f"| {row['photo']} | {row['state']} | {row['why']} | {row['fault']} |" for row in report["photos"]]
+        lines += [f"![{photo['photo']}](photos/images/{photo['file']}) ![render](distill/held_out/{photo['file']})"
+                  for photo in held]  # fmt: skip
+    lines += ["", "## Photos", "", "| photo | | |", "| --- | --- | --- |"]
+    lines += [f"| {row['photo']} | {row['state']} | {row['why']} |" for row in report["photos"]]
     return "\n".join(lines) + "\n"
 
 
 def write_recording(folder: Path, done: Collection[str]) -> Path | None:
     """Writes `reconstruction.rrd`: cameras with their photos, sparse points, the surface, how far it can be trusted.
 
-    Before the mesh stage it is in the units of the camera poses, with z up as far as the cameras tell; from then on in
-    metres with z up. Returns its path, or None before the poses stage. Raises SdfsimError where a stage's folder is
-    damaged, or the file cannot be written.
+    Before the mesh stage it is in the units of the camera poses, z up as far as the cameras tell; then in metres.
+    Returns its path, or None before the poses stage.
     """
     from pipeline.field.training import load_field
     from pipeline.mesh.meshing import NEXT, TEXTURED, trust_meshes
@@ -265,12 +226,12 @@ def write_recording(folder: Path, done: Collection[str]) -> Path | None:
     for move in moves:
         views, points = [move.view(view) for view in views], move.points(points)
     photos = []
-    for number, view in enumerate([*views, *proposed]):
+    for view in [*views, *proposed]:
         image = folder / "photos" / "images" / view.name
+        known = image.is_file()
         photos.append(
-            PosedPhoto(view.source, image if image.is_file() else None, view.focal, (view.cx, view.cy),
-                       (view.width, view.height), view.rotation, view.translation,
-                       PROPOSED if number >= len(views) else None)
+            PosedPhoto(view.source, image if known else None, view.focal, (view.cx, view.cy),
+                       (view.width, view.height), view.rotation, view.translation, None if known else PROPOSED)
         )  # fmt: skip
     save_reconstruction(folder / RECORDING, photos, points, sparse.rgb, mesh, skins, trust)
     return folder / RECORDING

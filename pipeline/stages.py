@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import hashlib
 import json
 import os
@@ -37,7 +36,7 @@ class Run:
     progress: Callable[[str, float, str], None] | None = None  # called with (stage, fraction, message)
     # s for the one stage that is run; None: it has its share of the budget for everything
     own_budget: float | None = None
-    started: float = field(default_factory=time.monotonic)  # when, on the monotonic clock
+    started: float = field(default_factory=time.monotonic)
 
     def tell(self, stage: str) -> Progress:
         """What one stage tells its progress to."""
@@ -54,8 +53,10 @@ class Run:
         return str(pick_device(self.options.device))
 
 
+# What each stage does: it makes its result in a folder that is there already and returns its report.
+
+
 def do_photos(run: Run, work: Path) -> dict:
-    """Prepares the photos."""
     from pipeline.inputs.photos import prepare_photos
 
     photos, notes = prepare_photos(Path(run.options.photos), work, on_progress=run.tell("photos"))
@@ -63,7 +64,6 @@ def do_photos(run: Run, work: Path) -> dict:
 
 
 def do_poses(run: Run, work: Path) -> dict:
-    """Finds the camera poses."""
     from pipeline.inputs.photos import load_photos
     from pipeline.mesh.placement import check_distance
     from pipeline.sfm.poses import solve
@@ -76,7 +76,6 @@ def do_poses(run: Run, work: Path) -> dict:
 
 
 def do_distill(run: Run, work: Path) -> dict:
-    """Trains the field."""
     from pipeline.cameras import load_sparse, load_views
     from pipeline.field.training import PRESETS, train
 
@@ -85,15 +84,13 @@ def do_distill(run: Run, work: Path) -> dict:
         spent = time.monotonic() - run.started
         budget = max(20.0, run.options.budget * (1 - FIT_SHARE) - spent - AFTER_TRAINING)
     poses = run.place("poses")
-    trained = train(
+    return train(
         load_views(poses), load_sparse(poses), run.place("photos"), work, settings=PRESETS[run.options.preset],
         budget=budget, seed=run.options.seed, device=run.device(), on_progress=run.tell("distill"),
-    )  # fmt: skip
-    return trained.report
+    ).report  # fmt: skip
 
 
 def do_mesh(run: Run, work: Path) -> dict:
-    """Makes meshes of the field."""
     from pipeline.mesh.meshing import make_meshes
 
     return make_meshes(
@@ -104,7 +101,6 @@ def do_mesh(run: Run, work: Path) -> dict:
 
 
 def do_fit(run: Run, work: Path) -> dict:
-    """Fits a compact signed distance to every mesh."""
     from pipeline.export import fit_parts
 
     budget = run.own_budget
@@ -117,7 +113,6 @@ def do_fit(run: Run, work: Path) -> dict:
 
 
 def do_scene(run: Run, work: Path) -> dict:
-    """Writes the scene file."""
     from pipeline.export import write_scene
     from pipeline.materials import choose
 
@@ -133,11 +128,10 @@ def do_scene(run: Run, work: Path) -> dict:
 class Stage:
     """One stage of the way."""
 
-    run: Callable[[Run, Path], dict]  # makes the result in a folder that is there already; returns the stage's report
+    run: Callable[[Run, Path], dict]
     folder: str  # where the result lies in that of the run
     options: tuple[str, ...] = ()  # that the result depends on
-    # of the code. Raise it with every change after which the stage makes something else of the same inputs and options.
-    # The stages after it follow by themselves.
+    # Raise it with every change after which the stage makes something else of the same; those after it follow.
     version: int = 1
 
 
@@ -159,17 +153,14 @@ def reconstruct(
 
     Writes one folder a stage, Shape folders in `assets/`, `scene.yaml`, `config.yaml`, `report.json` and `report.md` to
     `out`, and returns the report. Skips a stage whose inputs, options (see `Options`) and version are those of its last
-    run, and goes on with a killed one. Photos, in a folder, a video, a transforms.json or a COLMAP model, are never
-    written to. Raises SdfsimError for bad photos or options (exit code 1), or where poses or surface are not good
-    enough (3).
+    run, and goes on with a killed one. Photos (see `find_source`) are never written to. Raises SdfsimError for bad
+    photos or options (exit code 1), or where poses or surface are not good enough (3).
     """
     resolved = Options(str(Path(photos).absolute()), **options)
     resolved.check()
     names = list(STAGES)
-    for name in (from_stage, until_stage):
-        _check_name(name or names[0])
-    first = names.index(from_stage) if from_stage else len(names)
-    last = names.index(until_stage) if until_stage else len(names) - 1
+    first = _number(from_stage) if from_stage else len(names)
+    last = _number(until_stage) if until_stage else len(names) - 1
     if from_stage and first > last:
         raise SdfsimError(f"from {from_stage} until {until_stage}: {until_stage} comes before {from_stage}")
     run = Run(Path(out), resolved, progress)
@@ -191,14 +182,13 @@ def run_stage(
 ) -> dict:  # fmt: skip
     """Runs one stage in a folder that the stages before it have written; returns and raises as `reconstruct` does.
     Options that are given (not None) are kept in the folder's config.yaml; a budget is that of this call alone."""
-    _check_name(name)
-    kept = read_config(Path(folder))
+    number, kept = _number(name), read_config(Path(folder))
     known = {key: value for key, value in changes.items() if value is not None}
     options = kept.changed(known)
     options.check()
     run = Run(Path(folder), replace(options, budget=kept.budget), progress, known.get("budget"))
-    done, names = current(run.folder), list(STAGES)
-    for before in names[: names.index(name)]:
+    done = current(run.folder)
+    for before in list(STAGES)[:number]:
         if before not in done:
             why = "is older than what it reads" if read_record(run.place(before)) else "has not run"
             command = "poses" if before == "photos" else before  # No command does the photos alone.
@@ -206,9 +196,10 @@ def run_stage(
     return run_all(run, {name: False})
 
 
-def _check_name(name: str) -> None:
-    if name not in STAGES:
-        raise SdfsimError(f"no such stage: {name!r}", "stages: " + ", ".join(STAGES))
+def _number(stage: str) -> int:
+    if stage not in STAGES:
+        raise SdfsimError(f"no such stage: {stage!r}", "stages: " + ", ".join(STAGES))
+    return list(STAGES).index(stage)
 
 
 def run_all(run: Run, stages: dict[str, bool]) -> dict:
@@ -254,9 +245,8 @@ def run_reported(run: Run, stage: str, *, again: bool) -> None:
 
 def run_one(run: Run, stage: str, *, again: bool) -> None:
     """Runs one stage, or skips it where its fingerprint is that of its last run."""
-    names = list(STAGES)
-    number, place, work = names.index(stage), run.place(stage), run.folder / f".{stage}.part"
-    before = read_record(run.place(names[number - 1])) if number else None
+    place, work = run.place(stage), run.folder / f".{stage}.part"
+    before = read_record(run.place(list(STAGES)[_number(stage) - 1])) if stage != "photos" else None
     inputs = before["made"] if before else hash_of_photos(Path(run.options.photos))
     values = {**asdict(run.options), "recipe": run.options.fit_recipe()}
     depends: dict[str, Any] = {key: values[key] for key in STAGES[stage].options} | {"own_budget": run.own_budget}
@@ -289,11 +279,8 @@ def hash_of_photos(given: Path) -> str:
     digest = hashlib.sha256()
     for path in find_source(given).files():
         digest.update(path.name.encode("utf-8", "surrogateescape") + b"\0")
-        try:
-            with open(path, "rb") as file:
-                digest.update(hashlib.file_digest(file, "sha256").digest())
-        except OSError as error:
-            raise SdfsimError(f"{path}: cannot be read ({error.strerror})") from error
+        with open(path, "rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
     return digest.hexdigest()
 
 
@@ -372,11 +359,9 @@ def _old(place: Path) -> Path:
 
 @contextlib.contextmanager
 def readable_errors(folder: Path) -> Iterator[None]:
-    """Turns a full disk or a folder that cannot be written into an SdfsimError of one clear line."""
+    """Turns a full disk, or what cannot be read or written, into an SdfsimError of one clear line."""
     try:
         yield
     except OSError as error:
-        reasons = {errno.ENOSPC: "the disk is full", errno.EDQUOT: "the disk quota is used up"}
-        hint = "free some space and run again: finished stages are kept" if error.errno in reasons else ""
-        reason = reasons.get(error.errno or 0, error.strerror or str(error))
-        raise SdfsimError(f"{error.filename or folder}: cannot be written ({reason})", hint) from error
+        message = f"{error.filename or folder}: {error.strerror or error}"
+        raise SdfsimError(message, "run again when this is put right: finished stages are kept") from error

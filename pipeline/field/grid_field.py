@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -26,10 +26,6 @@ class FieldSize:
     channels: tuple[int, ...] = (4, 4, 4, 2)  # features a level
     width: int = 64  # hidden width of both small networks
     background: int = 64  # grid points a side of the background
-
-    def to_dict(self) -> dict:
-        """Plain values for JSON."""
-        return asdict(self)
 
 
 BACKGROUND_SAMPLES = 12
@@ -67,7 +63,7 @@ class Field(nn.Module, ABC):
     """SDF and colour in the unit sphere, and a background outside; what both encodings have in common."""
 
     background: nn.Parameter  # [n, n, n, 4], channel 0 density before softplus, channels 1 to 3 colour before sigmoid
-    size: Any  # of the encoding, with `to_dict`
+    size: Any  # of the encoding, a dataclass
     start_radius: float  # radius of the sphere that the SDF starts from
     active: int = 0  # how many levels of detail are in use
     view_dependence: float = 1.0  # how much colour changes with direction, 0 to 1
@@ -114,7 +110,6 @@ class GridField(Field):
         super().__init__()
         self.size, self.start_radius = size, start_radius
         self.active = len(size.levels)
-        self.view_dependence = 1.0
         rng = torch.Generator().manual_seed(seed)
 
         def uniform(*shape: int, bound: float) -> nn.Parameter:
@@ -136,15 +131,13 @@ class GridField(Field):
         self.head = layer(width, 1 + GEOMETRY, gain=0.2)
         with torch.no_grad():
             self.head.weight[0] *= 0.1
-        self.color = nn.Sequential(
-            layer(GEOMETRY + 8 + sum(size.channels), width), nn.ReLU(), layer(width, 3, gain=0.3)
-        )
+        seen = GEOMETRY + 8 + sum(size.channels)
+        self.color = nn.Sequential(layer(seen, width), nn.ReLU(), layer(width, 3, gain=0.3))
         n = size.background
         self.background = uniform(n, n, n, 4, bound=1e-2)
 
     @property
     def finest(self) -> float:
-        """Width of a cell of the finest level, normalised units."""
         return level_step(self.size.levels, len(self.size.levels))
 
     def features(self, points: Tensor) -> Tensor:
@@ -163,7 +156,6 @@ class GridField(Field):
         return base + hidden[:, 0], hidden[:, 1:], features
 
     def color_of(self, geometry: Tensor, features: Tensor, directions: Tensor) -> Tensor:
-        """RGB [P, 3] in 0..1 seen along unit directions [P, 3]."""
         seen_along = self.view_dependence * direction_features(directions)
         return torch.sigmoid(self.color(torch.cat([geometry, features, seen_along], 1)))
 

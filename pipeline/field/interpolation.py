@@ -6,8 +6,6 @@ channel; elsewhere the eight corners of a point are rows of a table, summed by `
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import numba
@@ -39,12 +37,10 @@ class _Compiled(torch.autograd.Function):
         ctx.shape = grid.shape
         found = grid.new_empty(len(points), grid.shape[3])
         given = grid.detach().contiguous().numpy(), points.numpy(), found.numpy()
-        # Without threads where one is enough: they do not survive a fork.
         if torch.get_num_threads() == 1:
             gather(*given, 0, len(points))
         else:
-            with _threads() as count:
-                gather_with_threads(*given, count)
+            _with_threads(gather_with_threads, *given)
         return found
 
     @staticmethod
@@ -56,21 +52,18 @@ class _Compiled(torch.autograd.Function):
         if torch.get_num_threads() == 1:
             scatter(*given, 1, 0)
         else:
-            with _threads() as count:
-                scatter_with_threads(*given, count)
+            _with_threads(scatter_with_threads, *given)
         return gradient, None
 
 
-@contextmanager
-def _threads() -> Iterator[int]:
-    """Compiled code in the block uses as many threads as torch does, if it has so many; gives that number."""
+def _with_threads(work: Any, *given: Any) -> None:
+    """Compiled work on as many threads as torch uses, if there are so many. Not for one: threads do not survive a
+    fork."""
     before = numba.get_num_threads()
     count = min(torch.get_num_threads(), before)
     numba.set_num_threads(count)
-    try:
-        yield count
-    finally:
-        numba.set_num_threads(before)
+    work(*given, count)
+    numba.set_num_threads(before)
 
 
 def by_rows(grid: Tensor, points: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -25,10 +25,6 @@ class MlpSize:
     color_depth: int = 4  # hidden layers of the colour network
     view_frequencies: int = 4  # octaves of the encoding of directions
     background: int = 64  # grid points a side of the background
-
-    def to_dict(self) -> dict:
-        """Plain values for JSON."""
-        return asdict(self)
 
 
 def encoded(values: Tensor, frequencies: int) -> Tensor:
@@ -128,7 +124,6 @@ class MlpField(Field):
         return torch.cat([hidden[:, :1] / SPAN, hidden[:, 1:]], 1)
 
     def sdf(self, points: Tensor) -> Tensor:
-        """Signed distance [P] in normalised units at points [P, 3]."""
         return self._network(points)[:, 0]
 
     def geometry_at(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -143,7 +138,6 @@ class MlpField(Field):
         return found[:, 0], found[:, 1:], torch.cat([points.detach(), gradient], 1)
 
     def color_of(self, geometry: Tensor, features: Tensor, directions: Tensor) -> Tensor:
-        """RGB [P, 3] in 0..1 seen along unit directions [P, 3], from what `geometry_at` gave."""
         hidden = torch.cat(
             [features[:, :3], encoded(directions, self.size.view_frequencies), features[:, 3:], geometry], 1
         )

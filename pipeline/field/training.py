@@ -1,40 +1,48 @@
-"""Trains a field on posed photos: presets and schedules, the losses of a step, checkpoints, and the trained field."""
+"""Trains a field on posed photos: presets, rays, the losses of a step, checkpoints, and the trained field."""
 
 from __future__ import annotations
 
 import json
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import safetensors.torch
 import torch
+from PIL import Image
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from pipeline.cameras import Similarity, Sparse, View
 from pipeline.field.grid_field import Field, FieldSize, GridField, differences, level_step, stencil
-from pipeline.field.held_out import HeldOut, score
 from pipeline.field.mlp_field import MlpField, MlpSize
-from pipeline.field.rays import Rays, held_out, load_rays
 from pipeline.field.rendering import (
     BACKGROUND_SAMPLES,
     Samples,
     bounded_samples,
     choose_samples,
     composite,
+    render,
     samples_at,
     sdf_cache,
     sphere_interval,
 )
-from pipeline.inputs.images import BACKDROP
+from pipeline.inputs.images import BACKDROP, reduced
 from pipeline.inputs.photos import load_photos
 from pipeline.progress import Progress, quiet, share_of
-from pipeline.sfm.depth import depth_points, depth_scale
-from pipeline.sfm.supervision import FreeSpace, Supervision, supervision_of, unit_sphere_of
+from pipeline.sfm.supervision import (
+    FreeSpace,
+    Supervision,
+    depth_points,
+    depth_scale,
+    supervision_of,
+    unit_sphere_of,
+)
 from sdfsim.errors import SdfsimError
-from sdfsim.files import replacing, write_json
+from sdfsim.files import write_bytes, write_json
 from sdfsim.parallel import choose_threads
 
 # Steps between updates of the cached SDF, fewer at first; a multiple, so that both fall on the same steps.
@@ -44,6 +52,8 @@ HOLLOWS = 0.25  # of the training is done before filled free space is looked for
 BACKGROUND_RATE = 0.02  # of the background's grid beside the MLP
 FEWEST_STEPS = 100  # with however small a budget
 PACE = 25  # steps between looks at the clock
+HELD_OUT = "held_out"  # folder of the renders of photos that were not trained on
+EMPTY = 0.9  # grey of their pixels whose ray misses the trained sphere
 
 
 @dataclass(frozen=True)
@@ -52,9 +62,7 @@ class Settings:
 
     # resolutions of the grids, or of the MLP of the VolSDF paper
     size: FieldSize | MlpSize = FieldSize()  # noqa: RUF009  frozen
-    # radius of the ball that training starts from. Small, because what is solid at first has to be carved away, and
-    # shadowed parts hardly are.
-    start_radius: float = 0.25
+    start_radius: float = 0.25  # of the ball that training starts from; small, as shadowed parts are hardly carved away
     iterations: int = 2800  # steps of Adam; 4000 are no better on the bundled set
     rays: int = 512  # a step
     samples: int = 32  # along a ray inside the sphere
@@ -86,16 +94,96 @@ PRESETS = {
 }  # fmt: skip
 
 
-def beta_at(settings: Settings, fraction: float) -> float:
-    """Density scale: falls geometrically over the first 85 % of training, then stays."""
-    start, end = settings.beta
-    return start * (end / start) ** min(1.0, fraction / 0.85)
+@dataclass(frozen=True)
+class Rays:
+    """All pixels of some views whose ray meets the unit sphere."""
+
+    rgb: Tensor  # [N, 3] uint8
+    mask: Tensor | None  # [N] uint8 (255 = object), or None
+    view: Tensor  # [N] int16 index into the camera tables
+    pixel: Tensor  # [N, 2] int16 column and row
+    intrinsics: Tensor  # [V, 4] focal, cx, cy, k of the downscaled photos
+    rotation: Tensor  # [V, 3, 3] world to camera
+    center: Tensor  # [V, 3] camera centres
+    sizes: Tensor  # [V, 2] width and height of the downscaled photos
+
+    def __len__(self) -> int:
+        return len(self.rgb)
+
+    def to(self, device: str) -> Rays:
+        """The same rays on another device."""
+        moved: dict[str, Any] = {name: None if part is None else part.to(device) for name, part in vars(self).items()}
+        return Rays(**moved)
+
+    def at(self, index: Tensor) -> tuple[Tensor, Tensor]:
+        """Origins and unit directions [R, 3] of the rays with these indices [R]."""
+        view = self.view[index].long()
+        return camera_rays(
+            self.intrinsics[view], self.rotation[view], self.center[view], self.pixel[index].float() + 0.5
+        )
+
+    def batch(self, count: int, seed: int, iteration: int) -> Tensor:
+        """Indices [count] of a random batch; depends on nothing but its arguments, so a resumed run draws the same."""
+        rng = torch.Generator().manual_seed(seed * 1_000_003 + iteration)
+        return torch.randint(len(self), (count,), generator=rng).to(self.rgb.device)
 
 
-def active_levels(size: FieldSize, fraction: float) -> int:
-    """Grid levels in use: two at first, the others one after the other until 45 % of training."""
-    extra = len(size.levels) - 2
-    return 2 + min(extra, int(extra * fraction / 0.45 + 0.4)) if extra > 0 else len(size.levels)
+def camera_rays(intrinsics: Tensor, rotation: Tensor, center: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
+    """Rays through pixels (see `View.rays`, the slow twin): intrinsics [R, 4], rotation [R, 3, 3], uv [R, 2]."""
+    distorted = (uv - intrinsics[:, 1:3]) / intrinsics[:, :1]
+    xy = distorted
+    for _ in range(8):
+        xy = distorted / (1 + intrinsics[:, 3:] * (xy * xy).sum(1, keepdim=True).clamp_max(4))
+    local = torch.cat([xy, torch.ones_like(xy[:, :1])], 1)
+    direction = (local[:, None] @ rotation)[:, 0]
+    return center, direction / direction.norm(dim=1, keepdim=True)
+
+
+def load_rays(views: list[View], photos_folder: Path, long_side: int, *, masks: bool) -> Rays:
+    """Reads the photos of `views` (in normalised space), downscaled to `long_side` px. With masks, a view without one
+    counts as all object. Raises SdfsimError where a photo is missing."""
+    rgb, mask, view_of, pixel, intrinsics, sizes = [], [], [], [], [], []
+    for index, view in enumerate(views):
+        try:
+            with Image.open(Path(photos_folder) / "images" / view.name) as image:
+                image.load()
+                size = reduced(image.size, long_side)
+                pixels = np.asarray(image.convert("RGB").resize(size, Image.Resampling.BOX))
+            shade = None
+            file = Path(photos_folder) / "masks" / (view.name + ".png")
+            if masks and file.exists():
+                with Image.open(file) as image:
+                    shade = np.asarray(image.convert("L").resize(size, Image.Resampling.BOX))
+        except OSError as error:
+            raise SdfsimError(f"{photos_folder}: cannot read {view.name}", "run the photos stage again") from error
+        sx, sy = size[0] / view.width, size[1] / view.height
+        intrinsics.append([view.focal * (sx + sy) / 2, view.cx * sx, view.cy * sy, view.k])
+        sizes.append(size)
+        column, row = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
+        column, row = column.ravel(), row.ravel()
+        direction = view.rays((column + 0.5) / sx, (row + 0.5) / sy)
+        along = -(direction @ view.center)
+        # Rays that miss the sphere say nothing about what is in it.
+        meets = ((view.center**2).sum() - along**2 < 0.998) & (along > 0)
+        rgb.append(pixels.reshape(-1, 3)[meets])
+        mask.append(shade.reshape(-1)[meets] if shade is not None else np.full(meets.sum(), 255, np.uint8))
+        view_of.append(np.full(meets.sum(), index, np.int16))
+        pixel.append(np.stack([column[meets], row[meets]], 1).astype(np.int16))
+    return Rays(
+        rgb=torch.from_numpy(np.concatenate(rgb)),
+        mask=torch.from_numpy(np.concatenate(mask)) if masks else None,
+        view=torch.from_numpy(np.concatenate(view_of)),
+        pixel=torch.from_numpy(np.concatenate(pixel)),
+        intrinsics=torch.tensor(intrinsics, dtype=torch.float32),
+        rotation=torch.tensor(np.array([v.rotation for v in views]), dtype=torch.float32),
+        center=torch.tensor(np.array([v.center for v in views]), dtype=torch.float32),
+        sizes=torch.tensor(sizes),
+    )
+
+
+def held_out(count: int) -> list[int]:
+    """Indices of the views kept for measuring: every 8th, none where there are too few to spare."""
+    return list(range(4, count, 8)) if count >= 16 else []
 
 
 class Trainer:
@@ -110,9 +198,7 @@ class Trainer:
         self.depth = torch.tensor(supervision.depth, dtype=torch.float32, device=device)
         self.free = FreeSpace(supervision.sight if settings.free else supervision.sight[:0], device)
         self.field, self.optimizer = self.fresh()
-        self.iteration = 0
-        self.iterations = settings.iterations
-        self.seconds = 0.0
+        self.iteration, self.iterations, self.seconds = 0, settings.iterations, 0.0
         self.cache: Tensor | None = None
 
     def fresh(self) -> tuple[Field, torch.optim.Adam]:
@@ -130,13 +216,11 @@ class Trainer:
         return self.iteration / self.iterations
 
     @property
-    def beta(self) -> float:
-        """Scale of the density now, normalised units."""
-        return beta_at(self.settings, self.fraction)
-
-    def density_scale(self) -> float | Tensor:
-        """The same, with a gradient where it is learned."""
-        return self.beta
+    def beta(self) -> float | Tensor:
+        """Scale of the density, normalised units: falls geometrically over the first 85 % of training, then stays. With
+        a gradient where it is learned."""
+        start, end = self.settings.beta
+        return start * (end / start) ** min(1.0, self.fraction / 0.85)
 
     def rate_factor(self) -> float:
         """Factor of the learning rates: short warm-up, then cosine down to 3 %."""
@@ -151,7 +235,9 @@ class Trainer:
     def refresh(self) -> None:
         """Brings the cached SDF and the active levels up to date."""
         assert isinstance(self.settings.size, FieldSize)
-        self.field.active = active_levels(self.settings.size, self.fraction)
+        # Two levels at first, the others one after the other until 45 % of training.
+        levels = len(self.settings.size.levels)
+        self.field.active = min(levels, 2 + int((levels - 2) * self.fraction / 0.45 + 0.4))
         # Colour does not change with direction at first, or a wrong surface is painted right.
         self.field.view_dependence = min(1.0, max(0.0, (self.fraction - 0.4) / 0.3))
         self.cache = sdf_cache(self.field, CACHE)
@@ -169,7 +255,7 @@ class Trainer:
         if self.cache is None or self.iteration % self.period == 0:
             self.refresh()
         assert self.cache is not None
-        return choose_samples(self.cache, origins, directions, self.beta, uniforms)
+        return choose_samples(self.cache, origins, directions, float(self.beta), uniforms)
 
     def slope_queries(self, points: Tensor) -> Tensor:
         """Where the field has to be asked [Q, 3] for its slopes at points [P, 3]."""
@@ -210,7 +296,7 @@ class Trainer:
         sdf, geometry, more = (
             values.split([len(part) for part in parts]) for values in field.geometry_at(torch.cat(parts))
         )
-        out = composite(field, samples, (sdf[0], geometry[0], more[0]), self.density_scale(), behind)
+        out = composite(field, samples, (sdf[0], geometry[0], more[0]), self.beta, behind)
         losses = {"color": (out["rgb"] - truth).abs().mean()}
         if self.rays.mask is not None:
             wanted = self.rays.mask[index].float() / 255
@@ -255,18 +341,17 @@ class Trainer:
         about = {
             "iteration": self.iteration, "iterations": self.iterations, "seconds": self.seconds,
             "active": self.field.active, "view_dependence": self.field.view_dependence,
-            "size": self.settings.size.to_dict(),
+            "size": str(self.settings.size),
         }  # fmt: skip
         # As bytes: safetensors' own writer does not raise OSError where the disk is full.
-        with replacing(path) as partial:
-            partial.write_bytes(safetensors.torch.save(tensors, metadata={"about": json.dumps(about)}))
+        write_bytes(path, safetensors.torch.save(tensors, metadata={"about": json.dumps(about)}))
 
     def load(self, path: Path) -> bool:
         """Goes on from a checkpoint; False where there is none that fits."""
         try:
             with safe_open(str(path), "pt") as file:
                 about = json.loads(file.metadata()["about"])
-                if about["size"] != json.loads(json.dumps(self.settings.size.to_dict())):
+                if about["size"] != str(self.settings.size):
                     return False
                 tensors = {key: file.get_tensor(key).to(self.device) for key in file.keys()}
         except (OSError, SafetensorError, KeyError, TypeError, ValueError):
@@ -295,7 +380,6 @@ class MlpTrainer(Trainer):
     converged = 0.0  # share of the last step's rays whose opacity is bounded
 
     def fresh(self) -> tuple[Field, torch.optim.Adam]:
-        """A field that is a sphere, and its optimiser."""
         settings = self.settings
         assert isinstance(settings.size, MlpSize)
         field = MlpField(settings.size, self.seed, settings.start_radius).to(self.device)
@@ -304,21 +388,14 @@ class MlpTrainer(Trainer):
         return field, torch.optim.Adam(groups)
 
     @property
-    def beta(self) -> float:
-        """Learned scale of the density, normalised units."""
-        return float(self.field.beta.detach())
-
-    def density_scale(self) -> Tensor:
-        """The same, with its gradient."""
+    def beta(self) -> Tensor:
         return self.field.beta
 
     def rate_factor(self) -> float:
-        """Factor of the learning rates: down to a tenth."""
         return 0.1**self.fraction
 
     def refresh(self) -> None:
-        """Brings the cached SDF up to date, from which only pictures are made."""
-        self.cache = sdf_cache(self.field, CACHE)
+        self.cache = sdf_cache(self.field, CACHE)  # only for pictures
 
     def sample(self, origins: Tensor, directions: Tensor, uniforms: Tensor) -> Samples:
         """Samples [R, S] that bound the error of the opacity, for as many uniforms [R, S]."""
@@ -334,11 +411,9 @@ class MlpTrainer(Trainer):
         return samples_at(distance, enter, leave, origins, directions, near)
 
     def slope_queries(self, points: Tensor) -> Tensor:
-        """The points themselves: the network hands on its own gradient."""
-        return points
+        return points  # The network hands on its own gradient.
 
     def slope_losses(self, sdf: Tensor, more: Tensor) -> dict[str, Tensor]:
-        """The loss of the gradient."""
         return {"eikonal": ((more[:, 3:].norm(dim=1) - 1) ** 2).mean() * self.settings.eikonal}
 
 
@@ -365,10 +440,9 @@ def train(
     """Trains a field and writes `field.safetensors` and `field.json` to `out`; resumes from `checkpoint.safetensors`.
 
     Views and sparse points are in the world of the poses. The budget, s, includes training before a kill: the number of
-    steps is cut to what fits. Without `threads` the CPU takes what is fastest now (a second thread only slows things
-    down where another program uses the core). Raises SdfsimError where the loss is no longer finite.
+    steps is cut to what fits. Without `threads` the CPU takes what is fastest now. Raises SdfsimError where the loss is
+    no longer finite.
     """
-    out = Path(out)
     photos = load_photos(photos_folder)
     masked = all(photo.mask for photo in photos)
     to_unit = unit_sphere_of(views, sparse, masked=masked)
@@ -389,17 +463,14 @@ def train(
     if budget is not None and not resumed:
         trainer.iterations = min(settings.iterations, max(FEWEST_STEPS, int(budget / per_step)))
     left = None if budget is None else budget - trainer.seconds
-    saved, started, first = time.monotonic(), time.monotonic(), trainer.iteration
-    before = trainer.seconds
+    saved = started = time.monotonic()
+    first, before = trainer.iteration, trainer.seconds
     smooth: dict[str, float] = {}
     while trainer.iteration < trainer.iterations:
         losses = trainer.step()
         smooth = {k: 0.95 * smooth.get(k, v) + 0.05 * v for k, v in losses.items()}
         if not all(math.isfinite(v) for v in losses.values()):
-            raise SdfsimError(
-                "distill: the loss is no longer finite",
-                "the poses may be wrong: look at them with `sdfsim poses`, or take more photos",
-            )
+            raise SdfsimError("distill: the loss is no longer finite", "look at the poses: `sdfsim poses`")
         now = time.monotonic()
         trainer.seconds = before + now - started
         if left is not None and trainer.iteration % PACE == 0:
@@ -414,18 +485,61 @@ def train(
     trainer.refresh()
     scores = {}
     if test:
-        held = HeldOut([local[i] for i in test], photos_folder, trainer, masked=masked)
-        scores = score(held, out, share_of(on_progress, 0.92, 0.08))
+        held, tell = [local[i] for i in test], share_of(on_progress, 0.92, 0.08)
+        scores = score(held, photos_folder, trainer, out, masked=masked, on_progress=tell)
     report = {
         "iterations": trainer.iterations, "rays": len(rays), "train_seconds": round(trainer.seconds, 1),
-        "seconds_before": round(before, 1), "resumed": resumed, "masked": masked, "beta": trainer.beta,
+        "seconds_before": round(before, 1), "resumed": resumed, "masked": masked, "beta": float(trainer.beta),
         "threads": torch.get_num_threads(), "losses": {k: round(v, 5) for k, v in smooth.items()}, **scores,
         "depth": agreed,
     }  # fmt: skip
-    trained = Trained(trainer.field.cpu(), trainer.beta, to_unit, report)
+    trained = Trained(trainer.field.cpu(), float(trainer.beta), to_unit, report)
     save_field(trained, out)
     checkpoint.unlink(missing_ok=True)
     return trained
+
+
+def score(views: list[View], photos_folder: Path, trainer: Trainer, out: Path, *, masked: bool,
+          on_progress: Progress = quiet) -> dict:  # fmt: skip
+    """PSNR of held-out views, in normalised space, for the report, at a third of the training resolution; empty where
+    none shows anything of the unit sphere. Writes the renders to `out`/held_out."""
+    rays = load_rays(views, photos_folder, max(100, trainer.settings.long_side // 3), masks=False).to(trainer.device)
+    shown: list[int] = rays.view.unique().tolist()
+    if not shown:
+        return {}
+    backdrop = torch.full((3,), BACKDROP, device=trainer.device) if masked else None
+    (out / HELD_OUT).mkdir(exist_ok=True)
+    psnr = []
+    for count, number in enumerate(shown, 1):
+        decibels, picture = compare(rays, number, trainer, backdrop)
+        psnr.append(decibels)
+        Image.fromarray(picture).save(out / HELD_OUT / views[number].name, quality=92)
+        on_progress(count / len(shown), f"held-out view {count} of {len(shown)}")
+    return {
+        "held_out_photos": [views[number].source for number in shown],
+        "psnr": round(float(np.mean(psnr)), 2), "psnr_each": [round(value, 2) for value in psnr],
+    }  # fmt: skip
+
+
+@torch.no_grad()
+def compare(rays: Rays, number: int, trainer: Trainer, backdrop: Tensor | None) -> tuple[float, np.ndarray]:
+    """PSNR, dB, and render [H, W, 3] uint8 of one view, over pixels whose ray meets the unit sphere."""
+    assert trainer.cache is not None
+    index = torch.nonzero(rays.view == number)[:, 0]
+    parts = []
+    for part in index.split(4096):
+        origins, directions = rays.at(part)
+        parts.append(
+            render(trainer.field, trainer.cache, origins, directions, float(trainer.beta),
+                   samples=trainer.settings.samples, backdrop=backdrop)["rgb"]
+        )  # fmt: skip
+    rgb = torch.cat(parts)
+    error = float(((rgb - rays.rgb[index].float() / 255) ** 2).mean())
+    width, height = (int(side) for side in rays.sizes[number])
+    picture = np.full((height, width, 3), EMPTY)
+    column, row = rays.pixel[index].cpu().numpy().T
+    picture[row, column] = rgb.cpu().numpy()
+    return -10 * math.log10(max(error, 1e-10)), (255 * picture.clip(0, 1) + 0.5).astype(np.uint8)
 
 
 def calibrate(probe: Trainer, threads: int | None) -> float:
@@ -436,26 +550,21 @@ def calibrate(probe: Trainer, threads: int | None) -> float:
 
 
 def paced(trainer: Trainer, settings: Settings, budget: float, elapsed: float, done: int) -> int:
-    """Steps that fit into the budget (s) after `elapsed` s: the measured pace may be another than before training, when
-    other work goes on."""
+    """Steps that fit into the budget (s) after `done` steps in `elapsed` s, as the pace changes with other work."""
     left = int((budget - elapsed) / (elapsed / done))
-    least = max(trainer.iteration, min(FEWEST_STEPS, settings.iterations))
-    if left <= 0:
-        return least
-    # Schedules follow the share that is done: they must not jump.
-    wanted = min(settings.iterations, trainer.iteration + left)
-    low, high = int(0.9 * trainer.iterations), int(1.1 * trainer.iterations)
-    return max(least, min(max(wanted, low), high))
+    wanted = trainer.iteration + left
+    if left > 0:  # Schedules follow the share that is done: they must not jump.
+        wanted = min(max(wanted, int(0.9 * trainer.iterations)), int(1.1 * trainer.iterations))
+    return max(trainer.iteration, min(FEWEST_STEPS, settings.iterations), min(wanted, settings.iterations))
 
 
 def save_field(trained: Trained, folder: Path) -> None:
     """Writes `field.safetensors`, then `field.json`."""
     field = trained.field
     tensors = {k: v.detach().cpu().contiguous() for k, v in field.state_dict().items()}
-    with replacing(folder / "field.safetensors") as partial:
-        partial.write_bytes(safetensors.torch.save(tensors))
+    write_bytes(folder / "field.safetensors", safetensors.torch.save(tensors))
     about = {
-        "version": 1, "size": field.size.to_dict(), "start_radius": field.start_radius, "beta": trained.beta,
+        "version": 1, "size": asdict(field.size), "start_radius": field.start_radius, "beta": trained.beta,
         "to_unit": trained.to_unit.to_dict(), "report": trained.report,
     }  # fmt: skip
     write_json(folder / "field.json", about)
@@ -464,14 +573,14 @@ def save_field(trained: Trained, folder: Path) -> None:
 def load_field(folder: Path) -> Trained:
     """Reads what `train` wrote. Raises SdfsimError: no readable field in `folder`."""
     try:
-        about = json.loads((Path(folder) / "field.json").read_text(encoding="utf-8"))
+        about = json.loads((folder / "field.json").read_text(encoding="utf-8"))
         size, radius = about["size"], float(about["start_radius"])
         if "levels" in size:
-            size = replace(FieldSize(**size), levels=tuple(size["levels"]), channels=tuple(size["channels"]))
-            field: Field = GridField(size, start_radius=radius)
+            lists = {key: tuple(size[key]) for key in ("levels", "channels")}
+            field: Field = GridField(FieldSize(**{**size, **lists}), start_radius=radius)
         else:
             field = MlpField(MlpSize(**size), start_radius=radius)
-        with safe_open(str(Path(folder) / "field.safetensors"), "pt") as file:
+        with safe_open(str(folder / "field.safetensors"), "pt") as file:
             field.load_state_dict({key: file.get_tensor(key) for key in file.keys()})
         return Trained(field, float(about["beta"]), Similarity.from_dict(about["to_unit"]), about["report"])
     except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:

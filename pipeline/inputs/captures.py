@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import json
-import shutil
 import zipfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pipeline.inputs.depth import DepthFile
 from pipeline.inputs.images import read_photo, sharpness
-from pipeline.inputs.known_cameras import KnownCamera, lens_of, posed
+from pipeline.inputs.known_cameras import DepthFile, KnownCamera, lens_of, posed
 from sdfsim.errors import SdfsimError
-from sdfsim.files import read_json, write_json
+from sdfsim.files import read_json
 
 CAPTURE = "capture.json"  # what `Capture` says, in the folder of the photos stage
 LARGEST = 32 << 30  # bytes of a capture
@@ -24,7 +22,13 @@ ARCHIVES = {".r3d", ".zip"}
 MOST = 100  # frames that are used of a recording
 TRIED = 5  # frames of a stretch that are looked at for the sharpest
 TURN = 1.0  # m of way that a turn by one radian counts as, when frames are spread along it
+POLYCAM = ("corrected_cameras", "cameras")  # folders of its cameras, the better ones first
 UP = (0.0, 1.0, 0.0)  # ARKit measures gravity, and its worlds have y up
+FARTHEST = 8.0  # m; a phone's sensor guesses beyond
+# Neighbours whose depths differ by more than this share lie on both sides of an edge, which sensors smear.
+EDGE = 0.04
+BELIEVED = 0.5  # of the highest confidence
+EXTRA = "install what reads it: bash scripts/setup.sh record3d (or pip install 'sdfsim[record3d]')"
 
 
 @dataclass(frozen=True)
@@ -38,18 +42,14 @@ class Capture:
 def find_capture(folder: Path) -> Path | None:
     """The folder of a Record3D or Polycam export in `folder`, or None where it is none."""
     for place in (folder, folder / "EXR_RGBD", folder / "keyframes"):
-        polycam = any(
-            any((place / f"{kind}cameras").glob("*.json")) and (place / f"{kind}images").is_dir()
-            for kind in ("", "corrected_")
-        )
         record3d = _metadata(place).is_file() and any((place / name).is_dir() for name in ("rgb", "rgbd"))
-        if polycam or record3d:
+        if record3d or any(any((place / kind).glob("*.json")) for kind in POLYCAM):
             return place
     return None
 
 
 def read_capture(folder: Path) -> tuple[Capture, list[KnownCamera]]:
-    """What a Record3D or Polycam export says of its world, and its cameras; their names are paths in `folder`. Raises
+    """What a Record3D or Polycam export says of its world, and its cameras, whose names are paths in `folder`. Raises
     SdfsimError where it is damaged."""
     try:
         if _metadata(folder).is_file():
@@ -72,10 +72,9 @@ def _record3d(folder: Path) -> list[KnownCamera]:
     from scipy.spatial.transform import Rotation
 
     about: dict[str, Any] = json.loads(_metadata(folder).read_text(encoding="utf-8"))
-    width, height = int(about["w"]), int(about["h"])
     same = np.reshape(about["K"], (3, 3)).T
     each = about.get("perFrameIntrinsicCoeffs")
-    shape = (int(about["dh"]), int(about["dw"])) if "dh" in about else (256, 192)
+    shape = (int(about.get("dh", 256)), int(about.get("dw", 192)))
     rgb = folder / "rgb" if (folder / "rgb").is_dir() else folder / "rgbd"
     photos = sorted((p for p in rgb.iterdir() if p.suffix in (".jpg", ".png") and p.stem.isdigit()),
                     key=lambda p: int(p.stem))  # fmt: skip
@@ -87,55 +86,42 @@ def _record3d(folder: Path) -> list[KnownCamera]:
         fx, fy, cx, cy = map(float, each[number] if each else (same[0, 0], same[1, 1], same[0, 2], same[1, 2]))
         x, y, z, w, *position = about["poses"][number]
         pose = np.column_stack([Rotation.from_quat([x, y, z, w]).as_matrix(), position])
-        exr, raw, sure = folder / "depth" / f"{number}.exr", photo.with_suffix(".depth"), photo.with_suffix(".conf")
-        depth = None
-        if exr.is_file():
-            depth = DepthFile(exr)
-        elif raw.is_file():
-            depth = DepthFile(raw, None, sure if sure.is_file() else None, shape)
-        name = photo.relative_to(folder).as_posix()
-        found.append(posed(name, (width, height), lens_of(fx, fy, cx, cy), pose, depth=depth))
+        exr, raw = folder / "depth" / f"{number}.exr", photo.with_suffix(".depth")
+        depth = depth_file(exr if exr.is_file() else raw, photo.with_suffix(".conf"), shape)
+        size = int(about["w"]), int(about["h"])
+        found.append(posed(photo.relative_to(folder).as_posix(), size, lens_of(fx, fy, cx, cy), pose, depth=depth))
     return found
+
+
+def depth_file(path: Path, confidence: Path, shape: tuple[int, int] | None = None) -> DepthFile | None:
+    """Depth that may be there, with a confidence that may be."""
+    return DepthFile(path, None, confidence if confidence.is_file() else None, shape) if path.is_file() else None
 
 
 def _polycam(folder: Path) -> list[KnownCamera]:
     """Polycam's raw data: a JSON a camera with its matrix as t_00 to t_23 (OpenGL axes, y up), depth in millimetres."""
-    corrected = (folder / "corrected_cameras").is_dir() and (folder / "corrected_images").is_dir()
-    cameras, images = (folder / (("corrected_" if corrected else "") + name) for name in ("cameras", "images"))
+    cameras = next(folder / name for name in POLYCAM if (folder / name).is_dir())
+    images = folder / cameras.name.replace("cameras", "images")
     found = []
     for path in sorted(cameras.glob("*.json")):
         about = json.loads(path.read_text(encoding="utf-8"))
-        photo = next((p for p in sorted(images.glob(path.stem + ".*"))), None)
-        if photo is None:
-            continue
+        photo = next((p for p in sorted(images.glob(path.stem + ".*"))), images / f"{path.stem}.jpg")
         pose = np.array([[about[f"t_{row}{column}"] for column in range(4)] for row in range(3)], float)
-        depth, sure = (folder / name / f"{path.stem}.png" for name in ("depth", "confidence"))
+        depth = depth_file(folder / "depth" / f"{path.stem}.png", folder / "confidence" / f"{path.stem}.png")
         fx, fy, cx, cy = (float(about[key]) for key in ("fx", "fy", "cx", "cy"))
-        found.append(posed(
-            photo.relative_to(folder).as_posix(), (int(about["width"]), int(about["height"])),
-            lens_of(fx, fy, cx, cy), pose,
-            depth=DepthFile(depth, None, sure if sure.is_file() else None) if depth.is_file() else None,
-        ))  # fmt: skip
+        size = int(about["width"]), int(about["height"])
+        found.append(posed(photo.relative_to(folder).as_posix(), size, lens_of(fx, fy, cx, cy), pose, depth=depth))
     return found
 
 
 def unpack(archive: Path, folder: Path) -> None:
-    """Unpacks the files of a zipped capture. Raises SdfsimError where it is damaged or no zip, too large once unpacked,
-    or has names that lead out of the folder."""
+    """Unpacks the files of a zipped capture, none outside of the folder. Raises SdfsimError where it is damaged or no
+    zip, or too large once unpacked."""
     try:
         with zipfile.ZipFile(archive) as file:
-            entries = [entry for entry in file.infolist() if not entry.is_dir()]
-            if sum(entry.file_size for entry in entries) > LARGEST:
+            if sum(entry.file_size for entry in file.infolist()) > LARGEST:
                 raise SdfsimError(f"{archive}: more than {LARGEST >> 30} GiB unpacked", "export fewer frames")
-            for entry in entries:
-                place = folder / entry.filename
-                if not place.resolve().is_relative_to(folder.resolve()):
-                    raise SdfsimError(
-                        f"{archive}: {entry.filename} would lie outside of the capture", "export it again"
-                    )
-                place.parent.mkdir(parents=True, exist_ok=True)
-                with file.open(entry) as packed, open(place, "wb") as out:
-                    shutil.copyfileobj(packed, out)
+            file.extractall(folder)  # which leaves out the parts of a name that lead outside
     except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
         raise SdfsimError(f"{archive}: cannot be unpacked: {error}", "export the capture again") from error
 
@@ -157,11 +143,6 @@ def spread(photos: Sequence[Path], cameras: dict[Path, KnownCamera], most: int =
     return [photos[k] for k in chosen]
 
 
-def save_capture(capture: Capture, folder: Path) -> None:
-    """Writes `capture.json`."""
-    write_json(folder / CAPTURE, {"version": 1, **asdict(capture)})
-
-
 def load_capture(folder: Path) -> Capture | None:
     """What the capture behind a folder of prepared photos says; None: these were just photos."""
     path = Path(folder) / CAPTURE
@@ -169,3 +150,59 @@ def load_capture(folder: Path) -> Capture | None:
         return None
     content = read_json(path, "run the photos stage again")
     return Capture(content["app"], content["up"] and tuple(content["up"]))
+
+
+def read_depth(file: DepthFile) -> np.ndarray:
+    """Depth [H, W] m along the optical axis; 0 where the sensor had none, was not sure, or saw an edge. Raises
+    SdfsimError where the file is absent, damaged, or needs a package that is not installed."""
+    counts = _read(file.path, file.shape, np.float32)
+    unit = file.unit or (1e-3 if counts.dtype.kind in "ui" else 1.0)
+    depth = counts.astype(np.float32) * np.float32(unit)
+    good = np.isfinite(depth) & (depth > 0) & (depth < FARTHEST)
+    if file.confidence is not None:
+        confidence = _read(file.confidence, file.shape, np.uint8)
+        if confidence.shape != depth.shape:
+            raise SdfsimError(f"{file.confidence}: shaped {confidence.shape}, its depth {depth.shape}")
+        good &= confidence >= BELIEVED * confidence.max()
+    depth = np.where(good, depth, 0)
+    return np.where(good & ~_edges(depth), depth, 0).astype(np.float32)
+
+
+def _edges(depth: np.ndarray) -> np.ndarray:
+    """Pixels [H, W] one of whose four neighbours is much nearer or farther."""
+    from scipy import ndimage
+
+    cross = ndimage.generate_binary_structure(2, 1)
+    far = ndimage.maximum_filter(depth, footprint=cross)
+    near = ndimage.minimum_filter(np.where(depth > 0, depth, np.inf), footprint=cross)
+    return (far - depth > EDGE * depth) | (depth - near > EDGE * near)
+
+
+def _read(path: Path, shape: tuple[int, int] | None, raw: type) -> np.ndarray:
+    """The numbers [H, W] of a file, `raw` ones where it does not say what they are."""
+    try:
+        if path.suffix in (".depth", ".conf"):  # of Record3D
+            import imagecodecs
+
+            rows, columns = shape or (256, 192)
+            size = rows * columns * np.dtype(raw).itemsize
+            values = np.frombuffer(imagecodecs.lzfse_decode(path.read_bytes(), out=size), raw).reshape(rows, columns)
+        elif path.suffix.lower() == ".exr":
+            import OpenEXR
+
+            with OpenEXR.File(str(path)) as file:
+                pixels = next(iter(file.channels().values())).pixels
+            values = pixels if pixels.ndim == 2 else pixels[..., 0]
+        elif path.suffix.lower() == ".npy":
+            values = np.load(path, allow_pickle=False)
+        else:
+            import cv2
+
+            values = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    except ImportError as error:
+        raise SdfsimError(f"{path}: needs the package {error.name}", EXTRA) from error
+    except (OSError, ValueError, RuntimeError) as error:
+        raise SdfsimError(f"{path}: cannot be read as depth: {error}", "export the capture again") from error
+    if values is None or np.squeeze(values).ndim != 2:
+        raise SdfsimError(f"{path}: no picture with one channel", "depth is a PNG of 16 bits, an EXR or an NPY")
+    return np.squeeze(values)

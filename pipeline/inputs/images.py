@@ -18,8 +18,6 @@ FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP")
 BACKDROP = 0.5
 # Measured on three real and four rendered sets: photos in focus have 0.19 to 0.6, blurred by 1.5 px less than 0.08.
 BLURRED = 0.1
-DARK, BURNT = 0.04, 0.98
-MOSTLY = 0.6  # share of the photo that is black or white
 BLOCKS = 12  # a side, fewer of small photos
 
 
@@ -37,42 +35,35 @@ class Picture:
 
 
 def exif_focal(image: Image.Image) -> tuple[float | None, str]:
-    """Focal length in units of the image's longer side, and the camera's name, from EXIF.
-
-    Uses the 35 mm equivalent (a 36 mm wide frame) or the focal length with the focal plane resolution. A photo whose
-    shape is not the one that the camera wrote down was cropped, and its focal length is not known.
-    """
+    """Focal length in units of the image's longer side, and the camera's name, from EXIF. A photo whose shape is not
+    the one that the camera wrote down was cropped, and its focal length is not known."""
     try:
-        exif = image.getexif()
+        exif, tags = image.getexif(), ExifTags.Base
         detail = exif.get_ifd(ExifTags.IFD.Exif)
-        camera = " ".join(str(exif.get(tag, "")).strip("\0 ") for tag in (ExifTags.Base.Make, ExifTags.Base.Model))
-        written = [float(detail.get(tag) or 0) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
-        if min(written) > 0:
-            shape, now = max(written) / min(written), max(image.size) / min(image.size)
-            if abs(shape / now - 1) > 0.02:
-                return None, camera.strip()
-        equivalent = float(detail.get(ExifTags.Base.FocalLengthIn35mmFilm) or 0)
-        if equivalent > 0:
-            return equivalent / 36.0, camera.strip()
-        focal = float(detail.get(ExifTags.Base.FocalLength) or 0)
-        density = float(detail.get(ExifTags.Base.FocalPlaneXResolution) or 0)
-        unit = {2: 25.4, 3: 10.0, 4: 1.0}.get(int(detail.get(ExifTags.Base.FocalPlaneResolutionUnit) or 2), 25.4)
-        if focal > 0 and density > 0:
-            # The density is that of the photo as written: a copy at half the size has half of it.
-            ratio = focal / unit * density / (max(written) or max(image.size))
-            if 0.3 < ratio < 20:
-                return ratio, camera.strip()
-        return None, camera.strip()
+        camera = " ".join(str(exif.get(tag, "")).strip("\0 ") for tag in (tags.Make, tags.Model)).strip()
+
+        def number(tag: int) -> float:
+            return float(detail.get(tag) or 0)
+
+        width, height = number(tags.ExifImageWidth), number(tags.ExifImageHeight)
+        longer, shorter = max(width, height), min(width, height)
+        if shorter > 0 and abs(longer / shorter * min(image.size) / max(image.size) - 1) > 0.02:
+            return None, camera
+        if number(tags.FocalLengthIn35mmFilm) > 0:  # of a frame that is 36 mm wide
+            return number(tags.FocalLengthIn35mmFilm) / 36.0, camera
+        unit = {2: 25.4, 3: 10.0, 4: 1.0}.get(int(number(tags.FocalPlaneResolutionUnit)), 25.4)
+        # The density is that of the photo as written: a copy at half the size has half of it.
+        ratio = number(tags.FocalLength) / unit * number(tags.FocalPlaneXResolution) / (longer or max(image.size))
+        return (ratio if 0.3 < ratio < 20 else None), camera
     except (ValueError, TypeError, ZeroDivisionError, OSError, SyntaxError):
         return None, ""  # Broken EXIF is common and never worth failing for.
 
 
 def read_photo(path: Path, long_side: int, mask: Path | None = None, shape: float | None = None) -> Picture:
-    """Reads one photo upright and no larger than `long_side` px.
+    """Reads one photo upright and no larger than `long_side` px; a mask file goes before an alpha channel.
 
-    A mask file goes before an alpha channel; white is the object. Where a known camera has another `shape`, width over
-    height, than the upright photo, the photo stays as stored. Raises SdfsimError, with the file's name, where it is no
-    image, truncated, too small or too large.
+    Where a known camera has another `shape`, width over height, than the upright photo, the photo stays as stored.
+    Raises SdfsimError, with the file's name, where it is no image, truncated, too small or too large.
     """
     image, original, focal, camera = decoded(path, long_side)
     turned = ImageOps.exif_transpose(image)
@@ -80,13 +71,12 @@ def read_photo(path: Path, long_side: int, mask: Path | None = None, shape: floa
         turned = image
     if turned.size != image.size:
         original = original[1], original[0]
-    upright = _eight_bits(turned)
+    upright = turned
+    if turned.mode.startswith("I"):  # 16 bits a pixel, which PIL would clip to 8
+        upright = Image.fromarray((np.asarray(turned).astype(np.uint32) >> 8).astype(np.uint8))
     has_alpha = upright.mode in ("RGBA", "LA", "PA") or "transparency" in upright.info
     upright = upright.convert("RGBA" if has_alpha else "RGB")
-    scale = min(1.0, long_side / max(upright.size))
-    if scale < 1.0:
-        size = (max(1, round(upright.width * scale)), max(1, round(upright.height * scale)))
-        upright = upright.resize(size, Image.Resampling.LANCZOS)
+    upright = upright.resize(reduced(upright.size, long_side), Image.Resampling.LANCZOS)
     pixels, inside = np.asarray(upright), None
     if mask is not None:
         inside = read_mask(mask, upright.size)
@@ -116,8 +106,7 @@ def turned_like(stored: Image.Image, size: tuple[int, int], path: Path) -> Image
         if off(image, size[0] / size[1]) < 0.02:
             return image
     raise SdfsimError(
-        f"{path}: a mask of {stored.width} x {stored.height} does not fit its photo, shaped {size[0]} x {size[1]}",
-        "masks and label images have to be as large as their photos, and upright",
+        f"{path}: a mask of {stored.width} x {stored.height} does not fit its photo, shaped {size[0]} x {size[1]}"
     )
 
 
@@ -130,8 +119,7 @@ def decoded(path: Path, long_side: int) -> tuple[Image.Image, tuple[int, int], f
             width, height = size = image.size
             if width * height > MAX_PIXELS:
                 raise SdfsimError(
-                    f"{path}: too large ({width} x {height}, at most {MAX_PIXELS // 1_000_000} megapixels)",
-                    "scale it down first",
+                    f"{path}: too large ({width} x {height}, at most {MAX_PIXELS // 1_000_000} megapixels)"
                 )
             if min(size) < MIN_SIDE:
                 raise SdfsimError(f"{path}: too small ({width} x {height}, at least {MIN_SIDE} px a side)")
@@ -150,16 +138,15 @@ def decoded(path: Path, long_side: int) -> tuple[Image.Image, tuple[int, int], f
         Image.MAX_IMAGE_PIXELS = limit
 
 
+def reduced(size: tuple[int, int], long_side: int) -> tuple[int, int]:
+    """Width and height, px, of a picture that is made no larger than `long_side`."""
+    scale = min(1.0, long_side / max(size))
+    return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
+
+
 def off(image: Image.Image, shape: float) -> float:
     """By what share an image is wider or narrower than a shape, width over height."""
     return abs(image.width / image.height / shape - 1)
-
-
-def _eight_bits(image: Image.Image) -> Image.Image:
-    """16 bits a pixel scaled to 8; PIL would clip instead."""
-    if image.mode.startswith("I"):
-        return Image.fromarray((np.asarray(image).astype(np.uint32) >> 8).astype(np.uint8))
-    return image
 
 
 def block_means(values: np.ndarray, blocks: int) -> np.ndarray:
@@ -185,20 +172,3 @@ def sharpness(pixels: np.ndarray) -> float:
     chosen = np.argsort(coarse)[-max(1, len(fine) // 10) :]
     strong = float(coarse[chosen].mean())
     return float(np.sqrt(fine[chosen].mean() / strong)) if strong > 1e-6 else 0.0
-
-
-def exposure(pixels: np.ndarray) -> tuple[float, float]:
-    """Shares of a photo, RGB [H, W, 3] uint8, that are nearly black and nearly white."""
-    grey = pixels.astype(np.float32).mean(-1) / 255
-    return float((grey < DARK).mean()), float((grey > BURNT).mean())
-
-
-def fault(sharp: float, dark: float, burnt: float, *, typical: float, masked: bool) -> str:
-    """What is wrong with a photo in a word or two, or nothing, from its shares of nearly black and nearly white.
-    Sharpness is relative to that `typical` of the set: a blur that all have in common may be the scene's. What lies
-    outside a mask says nothing about the exposure."""
-    if not masked and dark > MOSTLY:
-        return "too dark"
-    if not masked and burnt > MOSTLY:
-        return "burnt out"
-    return "blurred" if sharp < max(BLURRED, 0.35 * typical) else ""

@@ -12,13 +12,11 @@ from types import MappingProxyType
 import numpy as np
 
 from pipeline.cameras import View
-from pipeline.inputs.depth import DepthFile
 from pipeline.inputs.images import Picture
 from sdfsim.errors import SdfsimError
 
 LENSES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE")  # camera models of a transforms.json
-# COLMAP's camera models, by number: name, and the names of their parameters. Models whose lens is not one that a
-# pinhole photo can be made of by OpenCV's two formulas are refused by name.
+# COLMAP's camera models, by number: name, and the names of their parameters; none of those that OpenCV does not know.
 MODELS = {
     0: ("SIMPLE_PINHOLE", "f cx cy"), 1: ("PINHOLE", "fx fy cx cy"), 2: ("SIMPLE_RADIAL", "f cx cy k1"),
     3: ("RADIAL", "f cx cy k1 k2"), 4: ("OPENCV", "fx fy cx cy k1 k2 p1 p2"),
@@ -57,6 +55,20 @@ def lens_of(
     names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
     distortion = tuple(float(bends.get(name, 0.0)) for name in names)
     return Lens(((fx, 0, cx), (0, fy, cy), (0, 0, 1)), distortion, fisheye)
+
+
+@dataclass(frozen=True)
+class DepthFile:
+    """Where the depth of a photo is kept."""
+
+    path: Path  # PNG or TIFF of integers, EXR, NPY, or Record3D's compressed floats (`.depth`)
+    unit: float | None = None  # m that a count stands for; None: integers are millimetres, floats metres
+    confidence: Path | None = None  # file of the same shape, higher is better; None: there is none
+    shape: tuple[int, int] | None = None  # rows and columns, of a `.depth` file, which does not say so itself
+
+    def files(self) -> list[Path]:
+        """The files that this depth is read from."""
+        return [self.path] + ([self.confidence] if self.confidence else [])
 
 
 @dataclass(frozen=True)
@@ -111,34 +123,25 @@ def read_transforms(path: Path) -> list[KnownCamera]:
             raise SdfsimError(f"{where}: camera_model: {model!r} is not read", f"allowed: {', '.join(LENSES)}")
         fisheye = model == "OPENCV_FISHEYE" or bool(values.get("is_fisheye"))
         width, height = int(values.get("w", 0)), int(values.get("h", 0))
-        if "fl_x" in values:
-            if width <= 0 or height <= 0:
-                raise SdfsimError(f"{where}: fl_x without w and h", "give the size in px that fl_x is for")
-            fx = float(values["fl_x"])
-        elif fisheye:
-            raise SdfsimError(f"{where}: a fisheye without fl_x", "give fl_x, w and h in px")
-        elif width > 0 and height > 0:
-            fx = 0.5 * width / np.tan(0.5 * float(values["camera_angle_x"]))
-        else:  # For a photo of any width: `scaled` knows it.
-            width, height, fx = 1, 0, 0.5 / np.tan(0.5 * float(values["camera_angle_x"]))
+        sized = width > 0 and height > 0
+        known = "fl_x" in values
+        if (known or fisheye) and not (known and sized):
+            raise SdfsimError(f"{where}: a fisheye, or a lens with fl_x, needs fl_x, w and h in px")
+        if not sized:  # For a photo of any width: `scaled` knows it.
+            width, height = 1, 0
+        fx = float(values["fl_x"]) if known else 0.5 * width / np.tan(0.5 * float(values["camera_angle_x"]))
         fy = float(values.get("fl_y", fx))
         cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
         pose = np.array(frame["transform_matrix"], float).reshape(4, 4)[:3]
         # Where not of a fisheye, what others call k4 is not OpenCV's.
         bends = values if fisheye else {**values, "k4": 0, "k5": 0, "k6": 0}
         lens = lens_of(fx, fy, cx, cy, bends, fisheye)
-        depth = _depth_of(values, path.parent)
+        # As nerfstudio, or as instant-ngp says it.
+        name = values.get("depth_file_path") or values.get("depth_path")
+        unit = values.get("depth_unit_scale_factor", values.get("integer_depth_scale"))
+        depth = DepthFile(path.parent / name, unit and float(unit)) if name else None
         found.append(posed(str(frame["file_path"]), (width, height), lens, pose, frame.get("mask_path"), depth))
     return found
-
-
-def _depth_of(values: dict, folder: Path) -> DepthFile | None:
-    """The depth of a frame, as nerfstudio (`depth_file_path`) or instant-ngp (`depth_path`) say it."""
-    name = values.get("depth_file_path") or values.get("depth_path")
-    if name is None:
-        return None
-    unit = values.get("depth_unit_scale_factor", values.get("integer_depth_scale"))
-    return DepthFile(folder / str(name), None if unit is None else float(unit))
 
 
 def read_model(folder: Path) -> list[KnownCamera]:

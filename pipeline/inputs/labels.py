@@ -12,7 +12,7 @@ from PIL import Image
 
 from pipeline.inputs.images import decoded, read_mask, turned_like
 from sdfsim.errors import SdfsimError
-from sdfsim.files import read_json, write_json
+from sdfsim.files import read_json
 
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
 FOLDER, NAMES = "labels", "names.json"  # what the photos stage writes
@@ -61,13 +61,9 @@ class Labels:
         return result
 
 
-def names_for(photo: Path) -> list[str]:
-    """What a mask file of a photo may be called: like the photo with `.png` behind it, or with another suffix."""
-    return [photo.name + ".png", *(photo.stem + suffix for suffix in MASK_SUFFIXES)]
-
-
 def find_masks(photos: list[Path]) -> dict[Path, Path]:
-    """The mask file of each photo that has one in a folder `masks` in or beside the photo's folder."""
+    """The mask file of each photo that has one in a folder `masks` in or beside the photo's folder; white is the
+    object."""
     masks: dict[Path, Path] = {}
     for root in _roots(photos):
         masks = {**_of_photos(root, root / "masks", photos)[0], **masks}
@@ -75,36 +71,36 @@ def find_masks(photos: list[Path]) -> dict[Path, Path]:
 
 
 def find_labels(photos: list[Path]) -> Labels:
-    """Looks for `masks/NAME/` and `labels/` in and beside the photos' folders. Raises SdfsimError where both are given,
-    for a name that no body can have, or where no file belongs to a photo."""
-    roots = _roots(photos)
-    folders = [(root, path) for root in roots for path in _folders(root / "masks")]
-    folders = [(root, path) for root, path in folders if path not in [photo.parent for photo in photos]]
-    images, notes = {}, []
-    for root in roots:
-        if root / FOLDER not in [photo.parent for photo in photos]:
-            found, more = _of_photos(root, root / FOLDER, photos)
-            images, notes = {**found, **images}, [*notes, *more]
-    if images and folders:
-        raise SdfsimError(f"{folders[0][1]}: there are label images as well", "keep only one of masks/NAME and labels")
+    """Looks for `masks/NAME/` (white is the object of that name) and `labels/` (label images) in and beside the photos'
+    folders. Raises SdfsimError where both are given, for a name that no body can have, or where no file is of use."""
     masks: dict[Path, dict[str, Path]] = {}
-    for root, folder in folders:
-        found, more = _of_photos(root, folder, photos)
-        notes += more
-        known = NAME.fullmatch(folder.name) and yaml.safe_load(folder.name) == folder.name  # "no" would be False
-        if found and (not known or folder.name in TAKEN):
-            raise SdfsimError(f"{folder}: no body can have this name",
-                              f"use letters, digits, - and _, a letter first; not {', '.join(TAKEN)}")  # fmt: skip
-        for photo, path in found.items():
-            masks.setdefault(photo, {}).setdefault(folder.name, path)
+    images: dict[Path, Path] = {}
+    notes: list[str] = []
+    for root in _roots(photos):
+        for folder in sorted(path for path in (root / FOLDER, *(root / "masks").glob("*")) if path.is_dir()):
+            if folder in [photo.parent for photo in photos] or folder.name.startswith("."):
+                continue
+            found, more = _of_photos(root, folder, photos)
+            notes += more
+            if folder == root / FOLDER:
+                images = {**found, **images}
+                continue
+            known = NAME.fullmatch(folder.name) and yaml.safe_load(folder.name) == folder.name  # "no" would be False
+            if found and (not known or folder.name in TAKEN):
+                raise SdfsimError(f"{folder}: no body can have this name",
+                                  f"use letters, digits, - and _, a letter first; not {', '.join(TAKEN)}")  # fmt: skip
+            for photo, path in found.items():
+                masks.setdefault(photo, {}).setdefault(folder.name, path)
+    if images and masks:
+        raise SdfsimError("there are label images and masks by object", "keep only one of masks/NAME and labels")
     if notes and not masks and not images:
         raise SdfsimError(f"{'; '.join(notes)}: nothing of it can be used",
                           "name a mask like its photo: a.png or a.jpg.png for a.jpg")  # fmt: skip
     names = tuple(sorted({name for each in masks.values() for name in each}))
     values: tuple[int, ...] = ()
     if images:
-        found = np.unique(np.concatenate([np.unique(read_label_image(path)) for path in images.values()]))
-        values = tuple(int(value) for value in found if value)
+        there = np.unique(np.concatenate([np.unique(read_label_image(path)) for path in images.values()]))
+        values = tuple(int(value) for value in there if value)
         names = tuple(f"object{value}" for value in values)
         if not names:
             raise SdfsimError(f"{next(iter(images.values())).parent}: all labels are 0", "0 is no object")
@@ -113,30 +109,25 @@ def find_labels(photos: list[Path]) -> Labels:
     return Labels(masks, images, names, values, tuple(notes))
 
 
-def _folders(root: Path) -> list[Path]:
-    return sorted(p for p in root.iterdir() if p.is_dir() and not p.name.startswith(".")) if root.is_dir() else []
-
-
 def _roots(photos: list[Path]) -> list[Path]:
     """The folders in which `masks` and `labels` may lie: those of the photos, and those above them."""
     return list(dict.fromkeys(root for photo in photos for root in (photo.parent, photo.parent.parent)))
 
 
 def _of_photos(root: Path, folder: Path, photos: list[Path]) -> tuple[dict[Path, Path], list[str]]:
-    """The file of each photo in or beside `root` in a folder below it, and a note on what belongs to none."""
+    """The file of each photo in or beside `root` in a folder below it, and a note on what belongs to none. A file is
+    named like its photo, with `.png` behind it or with another suffix."""
     if not folder.is_dir():
         return {}, []
     there = {path.name for path in folder.iterdir() if path.is_file() and path.suffix.lower() in MASK_SUFFIXES}
     found = {}
     for photo in photos:
-        name = next((name for name in names_for(photo) if name in there), None)
+        names = [photo.name + ".png", *(photo.stem + suffix for suffix in MASK_SUFFIXES)]
+        name = next((name for name in names if name in there), None)
         if name and root in (photo.parent, photo.parent.parent):
             found[photo] = folder / name
     rest = sorted(there - {path.name for path in found.values()})
-    called = f"{folder.parent.name}/{folder.name}" if folder.name != FOLDER else FOLDER
-    if not found and not rest:
-        return found, [f"{called} holds no masks"] if folder.name != FOLDER else []
-    return found, [f"{len(rest)} files in {called} belong to no photo (first: {rest[0]})"] if rest else []
+    return found, [f"{len(rest)} files in {folder} belong to no photo (first: {rest[0]})"] if rest else []
 
 
 def read_label_image(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
@@ -153,19 +144,8 @@ def read_label_image(path: Path, size: tuple[int, int] | None = None) -> np.ndar
     return found[np.ix_((rows * found.shape[0]).astype(int), (columns * found.shape[1]).astype(int))]
 
 
-def save_labels(labels: np.ndarray, folder: Path, name: str) -> None:
-    """Writes the labels [H, W] uint8 of a prepared photo into the photos stage's folder."""
-    (folder / FOLDER).mkdir(exist_ok=True)
-    Image.fromarray(labels).save(folder / FOLDER / (name + ".png"))
-
-
-def save_names(names: tuple[str, ...], folder: Path) -> None:
-    """Writes the names of the objects beside their labels."""
-    write_json(folder / FOLDER / NAMES, {"version": 1, "names": list(names)})
-
-
 def load_names(folder: Path) -> list[str]:
-    """Names of the objects whose labels `save_labels` wrote to a photos folder; none where there are none."""
+    """Names of the objects whose labels the photos stage wrote; none where there are none."""
     path = Path(folder) / FOLDER / NAMES
     return read_json(path)["names"] if path.exists() else []
 

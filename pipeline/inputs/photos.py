@@ -1,4 +1,4 @@
-"""Whatever the user gave -> upright, sized photos with masks, focal priors and a word on their quality."""
+"""Whatever the user gave -> upright, sized photos with masks and focal priors."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ import numpy as np
 from PIL import Image
 
 from pipeline.cameras import View, save_views
-from pipeline.inputs.captures import save_capture, spread, unpack
-from pipeline.inputs.depth import read_depth
-from pipeline.inputs.images import Picture, exposure, fault, read_photo, sharpness
+from pipeline.inputs.captures import CAPTURE, read_depth, spread, unpack
+from pipeline.inputs.images import BLURRED, Picture, read_photo, sharpness
 from pipeline.inputs.known_cameras import KnownCamera, Lens, rectified
-from pipeline.inputs.labels import save_labels, save_names
+from pipeline.inputs.labels import FOLDER, NAMES
 from pipeline.inputs.sources import Source, find_source
 from pipeline.progress import Progress, quiet
 from sdfsim.errors import SdfsimError
@@ -34,15 +33,14 @@ class Photo:
     source: str  # the user's name of it, see `Source.name_of`, or the video's with a time; no two photos have the same
     width: int  # prepared width, px
     height: int  # prepared height, px
-    # width and height of the user's photo, px, turned as the prepared one is; of a frame of a video, which nobody has
-    # as a file, those of the prepared photo
+    # width and height of the user's photo, px, turned as the prepared one is; of a frame of a video those prepared
     original: tuple[int, int]
     lens: Lens | None  # what the photo was freed from; None where nothing was straightened
-    focal: float | None  # focal length read from EXIF, px of the prepared photo; None where EXIF has none
+    focal: float | None  # from EXIF, px of the prepared photo; None where EXIF has none
     camera: str  # make and model from EXIF, empty where unknown
     mask: bool  # whether a mask came with it, as alpha or as a file
-    sharpness: float  # see `quality.sharpness`; 0.2 to 0.6 for photos in focus
-    fault: str = ""  # "blurred", "too dark", "burnt out", or nothing
+    sharpness: float  # see `sharpness`; 0.2 to 0.6 for photos in focus
+    fault: str = ""  # "blurred" or nothing
     depth: bool = False  # whether depth came with it
 
     def prepared(self, pixels: np.ndarray, view: View) -> np.ndarray:
@@ -56,10 +54,9 @@ def prepare_photos(
 ) -> tuple[list[Photo], list[str]]:
     """Reads every photo (see `find_source`) and writes upright copies of at most `long_side` px to `out`.
 
-    Writes `images/NNNN.jpg`, for photos with a mask `masks/NNNN.jpg.png`, with depth `depth/NNNN.jpg.npy`, where
-    objects have masks `labels/NNNN.jpg.png` with their names, `photos.json`, where the cameras are known
-    `known_cameras.json`, and of a capture `capture.json`. Returns the photos in order, and notes for the report. Raises
-    SdfsimError as `find_source`, `read_photo` and `chosen_frames` do.
+    Writes `images/NNNN.jpg` and `photos.json`; where they were given, `masks/NNNN.jpg.png`, `depth/NNNN.jpg.npy`,
+    `labels/NNNN.jpg.png` with their names, `known_cameras.json` and `capture.json`. Returns the photos in order, and
+    notes for the report.
     """
     source, out = find_source(given), Path(out)
     unpacked = out / ".capture"
@@ -70,7 +67,6 @@ def prepare_photos(
         source = replace(source, photos=tuple(spread(source.photos, source.frames)))
     (out / "images").mkdir(parents=True, exist_ok=True)
     photos: list[Photo] = []
-    shares: list[tuple[float, float]] = []
     views: list[View] = []
     for origin, picture, known, fraction in _pictures(source, long_side):
         name, lens = f"{len(photos):04d}.jpg", None
@@ -78,36 +74,32 @@ def prepare_photos(
             picture, view, lens = rectified(picture, known, name, origin)
             views.append(view)
         Image.fromarray(picture.pixels).save(out / "images" / name, quality=95, subsampling=0)
-        if picture.mask is not None:
-            (out / "masks").mkdir(exist_ok=True)
-            Image.fromarray(picture.mask).save(out / "masks" / (name + ".png"))
+        for folder, shown in (("masks", picture.mask), (FOLDER, picture.labels)):
+            if shown is not None:
+                (out / folder).mkdir(exist_ok=True)
+                Image.fromarray(shown).save(out / folder / f"{name}.png")
         if known and known.depth:
             depth = read_depth(known.depth)
             _check_shape(known.depth.path, depth.shape[::-1], known)
             (out / "depth").mkdir(exist_ok=True)
-            np.save(out / "depth" / (name + ".npy"), depth)
-        if picture.labels is not None:
-            save_labels(picture.labels, out, name)
+            np.save(out / "depth" / f"{name}.npy", depth)
         height, width = picture.pixels.shape[:2]
         sharp = round(sharpness(picture.pixels), 4)
-        shares.append(exposure(picture.pixels))
         focal = None if known else picture.focal  # A known camera is no prior.
         photos.append(
             Photo(name, origin, width, height, picture.original, lens, focal, picture.camera,
                   picture.mask is not None, sharp, depth=bool(known and known.depth))
         )  # fmt: skip
         on_progress(fraction, f"{len(photos)} photos")
-    typical = float(np.quantile([p.sharpness for p in photos], 0.75))
-    photos = [
-        replace(p, fault=fault(p.sharpness, *share, typical=typical, masked=p.mask))
-        for p, share in zip(photos, shares, strict=True)
-    ]
+    # Relative to what is typical of the set: a blur that all have in common may be the scene's.
+    least = max(BLURRED, 0.35 * float(np.quantile([p.sharpness for p in photos], 0.75)))
+    photos = [replace(p, fault="blurred" if p.sharpness < least else "") for p in photos]
     if views:
         save_views(views, out / KNOWN_CAMERAS)
     if source.capture:
-        save_capture(source.capture, out)
+        write_json(out / CAPTURE, {"version": 1, **asdict(source.capture)})
     if source.labels.names:
-        save_names(source.labels.names, out)
+        write_json(out / FOLDER / NAMES, {"version": 1, "names": list(source.labels.names)})
     save_photos(photos, out)
     shutil.rmtree(unpacked, ignore_errors=True)
     return photos, [*source.notes, *notes_on(photos, len(source.masks))]
@@ -155,28 +147,19 @@ def notes_on(photos: list[Photo], mask_files: int) -> list[str]:
     """What a person should know about a set of photos, of which some came with mask files; one line each."""
     notes = []
     masked = sum(p.mask for p in photos)
-    if masked < len(photos):
-        why = "as masks count only where every photo has one"
-        if mask_files:
-            notes.append(f"{mask_files} of {len(photos)} photos have a mask file: ignored, {why}")
-        if masked:
-            notes.append(
-                f"{masked} of {len(photos)} photos are transparent in part: grey there, but not taken as masks, {why}"
-            )
-    sizes = sorted({(p.width, p.height) for p in photos})
-    if len(sizes) > 1:
-        notes.append("photos of several sizes: " + ", ".join(f"{w} x {h}" for w, h in sizes) + "; one camera for each")
-    for word in ("blurred", "too dark", "burnt out"):
-        names = [p.source for p in photos if p.fault == word]
-        if names:
-            named = ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
-            notes.append(f"{len(names)} of {len(photos)} photos are {word}, take them again: {named}")
+    if masked < len(photos) and (masked or mask_files):
+        notes.append(f"masks count only where every photo has one: {mask_files} mask files are ignored, and what is "
+                     f"transparent in {masked} photos is grey")  # fmt: skip
+    names = [p.source for p in photos if p.fault]
+    if names:
+        named = ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
+        notes.append(f"{len(names)} of {len(photos)} photos are blurred, take them again: {named}")
     return notes
 
 
 def save_photos(photos: list[Photo], folder: Path) -> None:
     """Writes `photos.json`."""
-    write_json(Path(folder) / "photos.json", {"version": 1, "photos": [asdict(p) for p in photos]})
+    write_json(folder / "photos.json", {"version": 1, "photos": [asdict(p) for p in photos]})
 
 
 def load_photos(folder: Path) -> list[Photo]:
@@ -184,15 +167,11 @@ def load_photos(folder: Path) -> list[Photo]:
     path = Path(folder) / "photos.json"
     data = read_json(path, "run the photos stage first")
     try:
-        return [
-            Photo(**{**entry, "original": tuple(entry["original"]), "lens": _lens(entry["lens"])})
-            for entry in data["photos"]
-        ]
+        photos = []
+        for entry in data["photos"]:
+            bent = entry["lens"]
+            lens = bent and Lens(tuple(map(tuple, bent["matrix"])), tuple(bent["distortion"]), bent["fisheye"])
+            photos.append(Photo(**{**entry, "original": tuple(entry["original"]), "lens": lens}))
+        return photos
     except (KeyError, TypeError) as error:
         raise SdfsimError(f"{path}: damaged", "run the photos stage again") from error
-
-
-def _lens(entry: dict | None) -> Lens | None:
-    if entry is None:
-        return None
-    return Lens(tuple(map(tuple, entry["matrix"])), tuple(entry["distortion"]), entry["fisheye"])

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.inputs.images import sharpness
+from pipeline.inputs.images import reduced, sharpness
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 
 SMALL, MIDDLE = 256, 960  # px, longer side of the frames that motion and sharpness are measured on
@@ -48,26 +48,20 @@ def frames_of(path: Path) -> tuple[Iterator[np.ndarray], float]:
     return read(), rate
 
 
-def reduced(frame: np.ndarray, longest: int) -> np.ndarray:
-    """A frame no larger than `longest` px."""
-    import cv2
-
-    scale = min(1.0, longest / max(frame.shape[:2]))
-    size = (round(frame.shape[1] * scale), round(frame.shape[0] * scale))
-    return cv2.resize(frame, size, interpolation=cv2.INTER_AREA)
-
-
 def follow(path: Path) -> Track:
     """First pass: motion and sharpness of every frame. Motion is the median displacement of corners that are found
     again by Lucas-Kanade tracking; where most are lost (a cut, or a blur) it counts as a step of its own."""
     import cv2
 
+    def shrunk(frame: np.ndarray, longest: int) -> np.ndarray:
+        return cv2.resize(frame, reduced(frame.shape[1::-1], longest), interpolation=cv2.INTER_AREA)
+
     frames, rate = frames_of(path)
     before, moved, sharp = None, [], []
     for frame in frames:
-        frame = reduced(frame, MIDDLE)
+        frame = shrunk(frame, MIDDLE)
         sharp.append(sharpness(frame))
-        grey = cv2.cvtColor(reduced(frame, SMALL), cv2.COLOR_RGB2GRAY)
+        grey = cv2.cvtColor(shrunk(frame, SMALL), cv2.COLOR_RGB2GRAY)
         step = 0.0
         if before is not None:
             corners = cv2.goodFeaturesToTrack(before, 200, 0.01, 6)

@@ -1,7 +1,6 @@
-"""What stands on a level plane becomes a body of its own; the scenery is closed where the body stood.
+"""What stands on a level plane, or is named by masks, becomes a body; the scenery is closed where the body stood.
 
-What masks name becomes one wherever it is, and bodies that touch are told apart (`seams.py`). Everything here is in
-normalised space; heights are measured along a plane's normal.
+Everything here is in normalised space; heights are measured along a plane's normal.
 """
 
 from __future__ import annotations
@@ -16,38 +15,39 @@ from scipy.spatial import KDTree
 
 from pipeline.cameras import View, frame_of
 from pipeline.inputs.labels import load_names
-from pipeline.mesh.cleaning import components, islands, keep_faces
-from pipeline.mesh.extraction import FLOATER, RIM, Distance, Surface, Volume, sample, sample_box
+from pipeline.mesh.extraction import (
+    FLOATER,
+    RIM,
+    Distance,
+    Surface,
+    Volume,
+    components,
+    islands,
+    keep_faces,
+    sample,
+    sample_box,
+)
 from pipeline.mesh.photo_refining import load_pictures, refine
 from pipeline.mesh.seams import Part, Solid, Votes, count_votes, part_of_name, parts_by_shape, parts_by_votes, solid_of
 from pipeline.mesh.visibility import Visibility, look, spread_colors, to_bytes
 from sdfsim.shape.bvh import Caster
 from sdfsim.shape.mesh import Mesh, face_normals
 
-# A level plane smaller than this share of the largest one carries nothing: the lid of a box is no table.
-LEVEL_SHARE = 0.1
+LEVEL_SHARE = 0.1  # of the largest level plane: what is smaller carries nothing, as the lid of a box is no table
 LEVEL_NORMAL = 0.95  # least cosine between up and the normal of a face of a level plane
-# A body covers less of what it stands on than this; what covers more is relief.
-LARGEST_FOOT = 0.5
-# A body needs photos of this share of its surface.
-SEEN_SHARE = 0.2
-# Least share of a body's lowest layer that has the solid of the plane right below it.
-STANDS = 0.3
-# What hangs beside a body and is smaller than this share of it was torn off it by noise, and goes where it goes.
-CRUMB = 0.05
-# A second piece of what masks name as one is left out if it is shorter than this share of the first.
-SCRAP = 0.4
+LARGEST_FOOT = 0.5  # share of its plane that a body covers at most; what covers more is relief
+SEEN_SHARE = 0.2  # of a body's surface, that photos have to show
+STANDS = 0.3  # least share of a body's lowest layer that has the solid of the plane right below it
+CRUMB = 0.05  # of a body: what is smaller and hangs beside it was torn off it by noise, and goes where it goes
+SCRAP = 0.4  # of the first piece of what masks name as one: a second one that is shorter is left out
 # Noise has less than the first of the largest body's surface, and less than the second of the most sparse points that a
 # body has on so much surface. Bodies of the rendered shelf had 0.34 to 0.45 on a cell, noise below it 0 and 0.008.
 SMALL_NOISE, BARE = 0.15, 0.05
-# How far sideways, in contact layers, what is around a body's foot is taken away together with it.
-FILLET = 3.0
-# Thickness of the layer in which a field cannot tell a body from what it stands on, in cells of its finest grid.
-LAYER = 1.5
+FILLET = 3.0  # contact layers sideways: what is so near a body's foot is taken away together with it
+LAYER = 1.5  # cells of the finest grid: in a layer so thick a field cannot tell a body from what it stands on
 # What rises less than this (normalised units, or this many cells of the finest grid) stays part of what it stands on.
 SMALLEST, SMALLEST_CELLS = 0.04, 4.0
-# Samples of a body are so much closer than the cells of the field's finest grid.
-FINER = 3.0
+FINER = 3.0  # samples of a body to a cell of the field's finest grid
 
 
 @dataclass(frozen=True)
@@ -63,12 +63,12 @@ class Level:
         return points @ self.normal - self.height
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Body:
     """A body that stands on a level plane, or that masks name."""
 
     name: str  # that of its masks, else object1, object2 ... from the largest down
-    level: Level  # what it stands on; `nothing` where that is not known
+    level: Level  # what it stands on, infinitely far below where that is not known
     size: float  # the longest side of its bounding box
     # [X, Y, Z] bool on a part of the samples: those nearest to this body, of all that stands on the plane
     own: np.ndarray
@@ -110,11 +110,6 @@ class Body:
             return np.maximum(np.where(self.owns(lifted) | holds, found, self.cell), -self.level.above(points))
 
         return value
-
-
-def nothing(up: np.ndarray) -> Level:
-    """A plane that lies below everything, for what stands on none."""
-    return Level(up, -np.inf, 0.0)
 
 
 def find_levels(shown: Mesh, up: np.ndarray, width: float) -> list[Level]:
@@ -244,14 +239,13 @@ def _body(volume: Volume, standing: np.ndarray, box: tuple[slice, ...], mine: np
 def body_mesh(body: Body, field: Distance, cell: float) -> Mesh:
     """The closed mesh of a body, sampled `cell` apart along its plane; crumbs are left out."""
     frame = frame_of(body.level.normal)
-    points = body.low + body.cell * np.argwhere(body.own)
-    turned = points @ frame.T
+    turned = (body.low + body.cell * np.argwhere(body.own)) @ frame.T
     low, high = turned.min(0), turned.max(0)
     low[2] = max(low[2], body.level.height - 2 * cell)
     distance = body.distance(field)
     volume = sample_box(lambda p: distance(p @ frame), low - 2 * cell, high + 2 * cell, cell)
-    mesh = volume.mesh()
-    mesh = Mesh(mesh.vertices @ frame, mesh.faces)
+    sampled = volume.mesh()
+    mesh = Mesh(sampled.vertices @ frame, sampled.faces)
     label = components(mesh)
     area = np.bincount(label, face_normals(mesh)[1])
     return keep_faces(mesh, (area > 0.02 * area.max())[label])
@@ -286,14 +280,13 @@ class Parts:
     """What a scene is made of, in normalised space."""
 
     solid: Mesh | None  # closed mesh of the scenery; None where there are bodies alone
-    # what is displayed of it: its visible surface, and the places where bodies stood; None like `solid`
-    shown: Mesh | None
+    shown: Mesh | None  # what is displayed of it: its visible surface, and the places where bodies stood
     bodies: dict[str, Mesh]  # closed mesh of each body by name, with colours; the largest first
     smallest: float  # what rises less than this above its plane stayed part of the scenery
     # names of two bodies that touch, and "masks" or "shape", which told them apart
     touching: list[tuple[str, str, str]] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)  # names of masks whose object has no surface of its own
-    noise: list[float] = field(default_factory=list)  # longest sides of what was no body, see `_is_noise`
+    noise: list[float] = field(default_factory=list)  # longest sides of what was no body, see `_are_noise`
 
 
 def split(surface: Surface, distance: Distance, finest: float, views: list[View], points: np.ndarray,
@@ -321,39 +314,37 @@ def split(surface: Surface, distance: Distance, finest: float, views: list[View]
         levels = find_levels(keep_faces(surface.raw, plain), up, finest)
         whole = find_bodies(surface, levels, layer, smallest, named)
     pieces: list[Body] = []
-    pairs: list[tuple[int, int, str]] = []
+    touching: list[tuple[Body, Body, str]] = []
     for body in whole:
         found, by = _told_apart(surface, body, votes, smallest)
-        first = len(pieces)
-        for part in found:
-            pieces.append(_piece(body, part, names[part.number - 1] if part.number else ""))
-            index = len(pieces) - 1
-            pairs += [(index, first + other, by) for other in part.neighbours if first + other > index]
-        if not found:
-            pieces.append(replace(body, name=by))
+        parts = [_piece(body, part, names[part.number - 1] if part.number else "") for part in found]
+        touching += [(parts[k], parts[n], by) for k, part in enumerate(found) for n in part.neighbours if n > k]
+        pieces += parts or [replace(body, name=by)]
     if votes is not None and not alone:
         for number, name in enumerate(names, start=1):
             if name not in [body.name for body in pieces]:
                 loose = _loose(surface, votes, number, whole, up, layer, smallest)
                 whole, pieces = [*whole, *loose], [*pieces, *(replace(body, name=name) for body in loose)]
-    pieces, pairs = _chosen(pieces, pairs, ~_are_scraps(pieces))
+    largest = {body.name: body.size for body in sorted(pieces, key=lambda body: body.size)}
+    pieces = [body for body in pieces if not body.name or body.size > SCRAP * largest[body.name]]
     if not pieces:
         return Parts(surface.solid, surface.visible, {}, smallest, missing=names)
-    sampled = [body_mesh(body, distance, min(finest / FINER, surface.volume.cell)) for body in pieces]
-    noise = _are_noise(pieces, sampled, points, finest)
-    gone = [body.size for body, bare in zip(pieces, noise, strict=True) if bare]
-    sampled = [mesh for mesh, bare in zip(sampled, noise, strict=True) if not bare]
-    pieces, pairs = _chosen(pieces, pairs, ~noise)
-    called = _names(pieces)
+    sampled = {body: body_mesh(body, distance, min(finest / FINER, surface.volume.cell)) for body in pieces}
+    noise = _noise(sampled, points, finest)
+    called = _names([body for body in pieces if body not in noise])
     meshes, pictures = {}, load_pictures(views, photos_folder)
-    for name, body, mesh in sorted(zip(called, pieces, sampled, strict=True), key=lambda item: -item[1].size):
+    for body, name in called.items():
         # Lifted clear of the surface in the way, which is sampled more coarsely.
-        mesh = refine(mesh, pictures, blocking, lift, finest, body.level.above, body.layer)
+        mesh = refine(sampled[body], pictures, blocking, lift, finest, body.level.above, body.layer)
         seen = look(Visibility(mesh, lift, blocking), views, photos_folder)
-        meshes[name] = colored(mesh, seen.color, seen.weight > 0)
+        known, color = seen.weight > 0, seen.color
+        if known.any() and not known.all():
+            color[~known] = spread_colors(mesh.vertices[~known], mesh.vertices[known], color[known])
+        meshes[name] = replace(mesh, colors=to_bytes(color))
     solid, shown = (None, None) if alone else scenery(surface, whole, distance)
-    return Parts(solid, shown, meshes, smallest, [(called[a], called[b], by) for a, b, by in pairs],
-                 [name for name in names if name not in called], gone)  # fmt: skip
+    pairs = [(called[a], called[b], by) for a, b, by in touching if a in called and b in called]
+    missing = [name for name in names if name not in meshes]
+    return Parts(solid, shown, meshes, smallest, pairs, missing, [body.size for body in noise])
 
 
 def _told_apart(surface: Surface, body: Body, votes: Votes | None, smallest: float) -> tuple[list[Part], str]:
@@ -403,7 +394,7 @@ def _at_nothing(volume: Volume, mine: np.ndarray, solid: np.ndarray, up: np.ndar
     """The body of some samples `mine` [X, Y, Z] of a solid that stands on nothing known."""
     box = ndimage.find_objects(mine.astype(np.int8))[0]
     size = max(part.stop - part.start for part in box) * volume.cell
-    return _body(volume, solid, box, mine[box], nothing(up), layer, size)
+    return _body(volume, solid, box, mine[box], Level(up, -np.inf, 0.0), layer, size)
 
 
 def _loose(surface: Surface, votes: Votes, number: int, bodies: list[Body], up: np.ndarray, layer: float,
@@ -430,44 +421,30 @@ def _loose(surface: Surface, votes: Votes, number: int, bodies: list[Body], up: 
     return [replace(body, seam=found.seam)]
 
 
-def _are_scraps(pieces: list[Body]) -> np.ndarray:
-    """[N] bool, which bodies are scraps beside a larger one of the same masks."""
-    largest: dict[str, float] = {}
-    for body in pieces:
-        largest[body.name] = max(largest.get(body.name, 0.0), body.size)
-    return np.array([bool(body.name) and body.size <= SCRAP * largest[body.name] for body in pieces], bool)
-
-
-def _are_noise(pieces: list[Body], meshes: list[Mesh], points: np.ndarray, width: float) -> np.ndarray:
-    """[N] bool, which bodies are dark or blurred places that the training filled with something.
+def _noise(meshes: dict[Body, Mesh], points: np.ndarray, width: float) -> list[Body]:
+    """The bodies that are dark or blurred places which the training filled with something.
 
     They are small, no masks name them, and hardly any of the sparse points [P, 3] lies within `width` of them, where
     others are covered with points.
     """
-    area = np.array([face_normals(mesh)[1].sum() for mesh in meshes])
-    near = [np.isfinite(KDTree(m.vertices).query(points, distance_upper_bound=width)[0]).sum() for m in meshes]
-    density, small = np.array(near) / area, area < SMALL_NOISE * area.max(initial=0.0)
-    unnamed = np.array([not body.name for body in pieces], bool)
-    return unnamed & small & (density < BARE * density.max(initial=0.0))
+    area = np.array([face_normals(mesh)[1].sum() for mesh in meshes.values()])
+    trees = [KDTree(mesh.vertices) for mesh in meshes.values()]
+    near = [np.isfinite(tree.query(points, distance_upper_bound=width)[0]).sum() for tree in trees]
+    density = np.array(near) / area
+    bare = (area < SMALL_NOISE * area.max()) & (density < BARE * density.max())
+    return [body for body, without in zip(meshes, bare, strict=True) if without and not body.name]
 
 
-def _chosen(pieces: list[Body], pairs: list[tuple[int, int, str]], kept: np.ndarray) -> tuple[list[Body], list]:
-    """The bodies that are `kept` [N], and the pairs of those that touch."""
-    place = {int(k): index for index, k in enumerate(np.flatnonzero(kept))}
-    return [pieces[k] for k in place], [(place[a], place[b], by) for a, b, by in pairs if a in place and b in place]
-
-
-def _names(bodies: list[Body]) -> list[str]:
-    """A name of its own for each body: that of its masks, or else a number from the largest down."""
-    order = sorted(range(len(bodies)), key=lambda index: -bodies[index].size)
-    names, taken = [""] * len(bodies), {body.name for body in bodies}
-    for index in order:
-        wanted = bodies[index].name
-        choices = itertools.chain([wanted] if wanted else [], (f"{wanted}_{n}" for n in itertools.count(2)))
-        free = (name for name in choices if name not in names)
-        if not wanted:
-            free = (name for n in itertools.count(1) if (name := f"object{n}") not in taken | set(names))
-        names[index] = next(free)
+def _names(bodies: list[Body]) -> dict[Body, str]:
+    """A name of its own for each body, the largest first: that of its masks, or else a number."""
+    names: dict[Body, str] = {}
+    taken = {body.name for body in bodies}
+    for body in sorted(bodies, key=lambda body: -body.size):
+        name = body.name
+        if not name or name in names.values():
+            stem, first = (f"{name}_", 2) if name else ("object", 1)
+            name = next(f"{stem}{n}" for n in itertools.count(first) if f"{stem}{n}" not in {*names.values(), *taken})
+        names[body] = name
     return names
 
 
@@ -477,14 +454,6 @@ def whole_bodies(surface: Surface) -> dict[str, Mesh]:
     label = components(solid)
     order = np.argsort(-np.bincount(label, face_normals(solid)[1]))
     return {f"object{n}": keep_faces(solid, label == k) for n, k in enumerate(order, start=1)}
-
-
-def colored(mesh: Mesh, color: np.ndarray, known: np.ndarray) -> Mesh:
-    """The mesh with its colours [V, 3] in 0..255, those that are not known [V] bool taken from around them."""
-    color = color.copy()
-    if known.any() and not known.all():
-        color[~known] = spread_colors(mesh.vertices[~known], mesh.vertices[known], color[known])
-    return replace(mesh, colors=to_bytes(color))
 
 
 def scenery(surface: Surface, bodies: list[Body], distance: Distance) -> tuple[Mesh, Mesh]:

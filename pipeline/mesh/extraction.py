@@ -11,26 +11,23 @@ import torch
 
 from pipeline.cameras import View
 from pipeline.field.grid_field import Field
-from pipeline.mesh.cleaning import belonging, islands, keep_faces
 from pipeline.mesh.visibility import Visibility, look, to_bytes
 from pipeline.progress import Progress, quiet
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
-from sdfsim.shape.mesh import Mesh, vertex_normals
+from sdfsim.shape.mesh import Mesh, face_normals, vertex_normals
 
 Distance = Callable[[np.ndarray], np.ndarray]
 
 BATCH = 1 << 17  # points a query
-# The solid ends at this radius of normalised space: beyond it the field was never trained.
-RIM = 0.99
+RIM = 0.99  # radius in normalised space at which the solid ends: beyond it the field was never trained
 EXTENT = 1.02  # half the side of the sampled cube
-MIN_SEEN = 2
+MIN_SEEN = 2  # photos that have to show a vertex
 # Farther than this from every point of structure-from-motion (normalised units) a surface is a guess: on the rendered
 # set the median error there is ten times that within.
 MAX_FROM_POINTS = 0.1
-# A patch of the visible surface smaller than this share of it says nothing; of the closed solid a quarter of that.
-FLOATER = 0.01
-# What is left out is reported from this size on, normalised units.
-SPECK = 0.02
+FLOATER = 0.01  # of the visible surface: a smaller patch says nothing; of the closed solid a quarter of that
+SPECK = 0.02  # normalised units, from which on what is left out is reported
+UNSEEN = 0.05  # a component of whose area photos show less than this share is matter behind the scenery
 
 
 @dataclass(frozen=True)
@@ -89,14 +86,13 @@ def sample(distance: Distance, points: np.ndarray) -> np.ndarray:
 
 
 def sample_volume(
-    distance: Distance, resolution: int, *, extent: float = 1.02, coarse: int = 4, on_progress: Progress = quiet
+    distance: Distance, resolution: int, *, extent: float = EXTENT, coarse: int = 4, on_progress: Progress = quiet
 ) -> Volume:
     """Samples over [-extent, extent]^3, `resolution` a side (rounded up to a multiple of `coarse` plus 1), fine only
     near the surface of a distance [P] at points [P, 3].
 
     Evaluates every `coarse`-th point first and all points only in blocks that can hold the surface, since an SDF
-    changes by no more than the distance moved (a factor of 2 is left for fields that are not quite SDFs). Elsewhere
-    values are interpolated.
+    changes by no more than the distance moved (a factor of 2 is left for fields that are not quite SDFs).
     """
     from scipy.ndimage import zoom
 
@@ -152,11 +148,6 @@ class Surface:
         """The closed surface of what belongs."""
         return keep_faces(self.raw, self.kept)
 
-    @property
-    def reaches_rim(self) -> bool:
-        """Whether what belongs goes on beyond the trained space."""
-        return bool((ball(self.solid.vertices) > -2 * self.volume.cell).any())
-
 
 def ball(points: np.ndarray) -> np.ndarray:
     """Distance [P] from the ball that the field was trained in, at points [P, 3]."""
@@ -195,8 +186,7 @@ def surface_of(
     hardly any of it is in the photos."""
     from scipy.spatial import KDTree
 
-    raw = volume.mesh()
-    cell = volume.cell
+    raw, cell = volume.mesh(), volume.cell
     found = look(Visibility(raw, 0.75 * cell), views, photos_folder, on_progress)
     far = KDTree(points).query(raw.vertices, distance_upper_bound=MAX_FROM_POINTS)[0] > MAX_FROM_POINTS
     seen = trusted_vertices(raw, found.count, np.abs(limit(raw.vertices)) < 1.5 * cell) & ~far
@@ -223,3 +213,58 @@ def field_colors(field: Field, mesh: Mesh) -> np.ndarray:
         _, geometry, features = field.geometry_at(p)
         parts.append(field.color_of(geometry, features, d))
     return torch.cat(parts).cpu().numpy()
+
+
+def keep_faces(mesh: Mesh, keep: np.ndarray) -> Mesh:
+    """The mesh of the faces `keep` [F] bool, without the vertices that nothing uses."""
+    faces = mesh.faces[keep]
+    used, inverse = np.unique(faces, return_inverse=True)
+    colors = None if mesh.colors is None else mesh.colors[used]
+    return Mesh(mesh.vertices[used], inverse.reshape(-1, 3).astype(np.int64), colors)
+
+
+def components(mesh: Mesh) -> np.ndarray:
+    """Component number [F] of each face; faces that share a vertex are connected."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]]])
+    count = len(mesh.vertices)
+    graph = coo_matrix((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    return connected_components(graph, directed=False)[1][mesh.faces[:, 0]]
+
+
+def belonging(mesh: Mesh, seen: np.ndarray, share: float, speck: float) -> tuple[np.ndarray, list[float]]:
+    """Which faces [F] bool of a closed mesh belong, by connected components: those that photos show (`seen` [F] bool)
+    and that have at least this share of all the area. Also the longest sides of the other components from the largest
+    down, without those shorter than `speck`."""
+    label = components(mesh)
+    _, area = face_normals(mesh)
+    total, shown = np.bincount(label, area), np.bincount(label, area * seen)
+    unseen, small = shown < UNSEEN * total, total < share * total.sum()
+    largest = int(np.argmax(shown))
+    small[largest] = unseen[largest] = False
+    corner = mesh.vertices[mesh.faces]
+    inward = np.bincount(label, np.einsum("fi,fi->f", corner[:, 0], np.cross(corner[:, 1], corner[:, 2]))) < 0
+    low, high = (np.full((len(total), 3), sign * np.inf) for sign in (1, -1))
+    np.minimum.at(low, label, corner.min(1))
+    np.maximum.at(high, label, corner.max(1))
+    size = (high - low).max(1)
+    # A cavity is a flaw of the piece around it and no piece of its own.
+    left_out = size[(small | unseen) & ~inward & (size >= speck)]
+    return ~(small | unseen)[label], sorted(left_out.tolist(), reverse=True)
+
+
+def islands(mesh: Mesh, faces: np.ndarray, share: float) -> np.ndarray:
+    """Of some faces [F] bool those that lie together: a patch needs this share of the area of all the faces, or of
+    those of its own component of the mesh."""
+    _, area = face_normals(mesh)
+    area = np.where(faces, area, 0)
+    index = np.flatnonzero(faces)
+    patch = components(Mesh(mesh.vertices, mesh.faces[index]))
+    _, whole = np.unique(components(mesh)[index], return_inverse=True)
+    size = np.bincount(patch, area[index])[patch]
+    own = np.bincount(whole, area[index])[whole]
+    result = np.zeros(len(faces), bool)
+    result[index] = size >= share * np.minimum(area.sum(), 5 * own)
+    return result

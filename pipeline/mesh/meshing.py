@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,16 +16,14 @@ from pipeline.field.training import load_field
 from pipeline.inputs.captures import load_capture
 from pipeline.inputs.photos import load_photos
 from pipeline.mesh.bodies import Parts, split
-from pipeline.mesh.extraction import EXTENT, ball, field_distance, sample_volume, surface_of
-from pipeline.mesh.hollows import hollow
-from pipeline.mesh.next_photos import next_photos
+from pipeline.mesh.extraction import Distance, ball, field_distance, sample_volume, surface_of
 from pipeline.mesh.placement import GRAVITY, Placement, Up, measured_scale, place
 from pipeline.mesh.texture import Shots, shots_of, texture_parts
-from pipeline.mesh.trust import Support, color_range, colors_of, summary, support_of
+from pipeline.mesh.trust import Support, color_range, colors_of, next_photos, summary, support_of
 from pipeline.mesh.visibility import Visibility, to_bytes
 from pipeline.progress import Progress, quiet, share_of
 from sdfsim.errors import SdfsimError
-from sdfsim.files import read_json, replacing, write_json
+from sdfsim.files import read_json, write_bytes, write_json
 from sdfsim.shape.bvh import Caster
 from sdfsim.shape.mesh import Mesh, joined, read_attributes, read_mesh, write_glb, write_ply
 
@@ -41,35 +39,24 @@ def make_meshes(
     distance: Sequence | None = None, crop: Sequence[float] | None = None, device: str = "cpu",
     on_progress: Progress = quiet,
 ) -> dict:  # fmt: skip
-    """Extracts surfaces, writes them to `out` and returns the stage's report; `size`, `distance` and `crop` as in
-    `Options`.
-
-    Writes `mesh.ply` (all that photos show), of the scenery `solid.ply` (closed) and `shown.ply` (what is displayed),
-    `objects/NAME.ply` (closed) of each body, `parts.json`, `placement.json`, `objects.png`, and `textured.glb`: the
-    scenery and each body with a texture. Vertices in the PLY files have `views` and `uncertainty`, see `Support`;
-    `next_photos.json` has the cameras of the photos that would help most. Raises SdfsimError (exit code 3) where there
-    is no surface worth the name, or (1) of a distance or box that makes no sense.
-    """
-
+    """Writes the files that docs/objects.md lists and returns the stage's report; `size`, `distance` and `crop` as in
+    `Options`. Vertices in the PLY files have `views` and `uncertainty`, see `Support`. Raises SdfsimError (exit code 3)
+    where there is no surface worth the name, or (1) of a distance or box that makes no sense."""
     trained = load_field(distill)
     field, to_unit = trained.field.to(device), trained.to_unit
     views = [to_unit.view(view) for view in load_views(poses)]
     points = to_unit.points(load_sparse(poses).xyz)
     alone = bool(trained.report["masked"])
     inner, limit = field_distance(field), ball
-    volume = sample_volume(
-        lambda p: np.maximum(inner(p), ball(p)),
-        RESOLUTION[preset],
-        extent=EXTENT,
-        on_progress=share_of(on_progress, 0.0, 0.25),
-    )
+    inside = lambda p: np.maximum(inner(p), limit(p))  # noqa: E731
+    volume = sample_volume(inside, RESOLUTION[preset], on_progress=share_of(on_progress, 0.0, 0.25))
     surface = surface_of(volume, field, views, points, photos, limit, on_progress=share_of(on_progress, 0.25, 0.25))
     scale = measured_scale(distance, views, load_photos(photos), Caster(surface.raw)) if distance else None
     capture, up = load_capture(photos), None
-    if capture is not None:
-        up = None if capture.up is None else Up(to_unit.rotation @ capture.up, f"gravity of {capture.app}", GRAVITY)
-        if scale is None and size is None:
-            scale = 1 / to_unit.scale, f"metres of {capture.app}"
+    if capture is not None and capture.up is not None:
+        up = Up(to_unit.rotation @ capture.up, f"gravity of {capture.app}", GRAVITY)
+    if capture is not None and scale is None and size is None:
+        scale = 1 / to_unit.scale, f"metres of {capture.app}"
     placement = place(surface.visible, views, scale, size=size, alone=alone, up=up)
     if crop is not None:
         limit = box_of(placement, np.reshape(crop, (2, 3)))
@@ -78,10 +65,9 @@ def make_meshes(
             raise SdfsimError("crop: the box holds nothing", "corners are in metres, as in a mesh/mesh.ply without it")
         surface = surface_of(volume, field, views, points, photos, limit, on_progress=share_of(on_progress, 0.5, 0.2))
         # Where a person has cut the surroundings away, what is left is what they want to move.
-        alone = alone or not surface.reaches_rim
+        alone = alone or bool((ball(surface.solid.vertices) < -2 * volume.cell).all())
     on_progress(0.7, "looking for bodies")
-    cut = lambda p: np.maximum(inner(p), limit(p))  # noqa: E731
-    parts = split(surface, cut, field.finest, views, points, photos, placement.to_metres.rotation[2], alone=alone)
+    parts = split(surface, inside, field.finest, views, points, photos, placement.to_metres.rotation[2], alone=alone)
     on_progress(0.8, "drawing objects.png")
     draw_names(parts, views, photos).save(out / "objects.png")
     metres = placement.to_metres.scale
@@ -96,42 +82,36 @@ def make_meshes(
     support, told = trust(closed, displayed, shots, np.abs(limit(ends)) > 1.5 * surface.volume.cell, out)
     write_parts(parts, surface.visible, placement, support, out)
     textures = texture_parts(displayed, shots, share_of(on_progress, 0.87, 0.13))
-    with replacing(out / TEXTURED) as partial:
-        partial.write_bytes(write_glb(textures))
-    deep = {name: hollow(closed[name], 2 * surface.volume.cell * metres) for name in parts.bodies}
-    hollows = {name: rounded(found).tolist() for name, found in deep.items() if found is not None}
+    write_bytes(out / TEXTURED, write_glb(textures))
     return {
         "left_out_m": [float(rounded(length * metres)) for length in (*surface.left_out, *parts.noise)],
         "extent_m": rounded(np.ptp(placement.mesh(surface.visible).vertices, axis=0)).tolist(),
         "up_from": placement.up_from, "up_within_degrees": round(placement.up_within, 2),
         "up_confidence": placement.up_confidence, "size": placement.size_from, "objects": list(parts.bodies),
         "smallest_object_m": float(rounded(parts.smallest * metres)), "touching": parts.touching,
-        "masks_without_surface": parts.missing, "hollows_m": hollows, **told,
+        "masks_without_surface": parts.missing, **told,
     }  # fmt: skip
 
 
 def trust(
     closed: dict[str, Mesh], displayed: dict[str, Mesh], shots: Shots, counted: np.ndarray, out: Path
 ) -> tuple[Support, dict]:
-    """How far the surface can be trusted, and which photos would help; writes `next_photos.json`.
-
-    What is `displayed` has vertices of the `closed` meshes (by name, metres); those are `counted` [V] bool where they
-    were not cut off. Returns what the photos tell of them, one mesh after the other, and what the report says of it.
-    """
+    """What the photos tell of the vertices of the `closed` meshes, one after the other, and what the report says of it;
+    writes `next_photos.json`. Vertices are `counted` [V] bool where they were not cut off; all is in metres."""
     whole = joined(list(closed.values()))
     sight = Visibility(whole, shots.lift, shots.blocking)
     support = support_of(sight, shots.views)
     shown = {name: support.nearest(mesh.vertices) for name, mesh in displayed.items()}
-    advice = next_photos(closed, support, sight, shots.blocking, shots.views, counted)
-    save_views([photo.view for photo in advice.photos], out / NEXT)
+    photos, weak = next_photos(closed, support, sight, shots.blocking, shots.views, counted)
+    save_views([photo.view for photo in photos], out / NEXT)
     return support, {
         "trust": {name: summary(mesh, shown[name]) for name, mesh in displayed.items()},
-        "trust_colors_m": color_range(whole, support.uncertainty), "weak": round(advice.weak, 4),
-        "next_photos": [photo.told() for photo in advice.photos],
+        "weak": round(weak, 4),
+        "next_photos": [photo.told() for photo in photos],
     }  # fmt: skip
 
 
-def box_of(placement: Placement, corners: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+def box_of(placement: Placement, corners: np.ndarray) -> Distance:
     """Distance from what is left after cropping: the trained ball within a box with corners [2, 3] m."""
     middle, half = corners.mean(0), np.ptp(corners, axis=0) / 2
 
@@ -154,8 +134,7 @@ def write_parts(parts: Parts, visible: Mesh, placement: Placement, support: Supp
 
     def write(name: str, mesh: Mesh) -> Mesh:
         moved = placement.mesh(mesh)
-        with replacing(out / name) as partial:
-            partial.write_bytes(write_ply(moved, support.nearest(moved.vertices).attributes()))
+        write_bytes(out / name, write_ply(moved, support.nearest(moved.vertices).attributes()))
         return moved
 
     write("mesh.ply", visible)
@@ -174,12 +153,11 @@ def write_parts(parts: Parts, visible: Mesh, placement: Placement, support: Supp
 
 def read_parts(mesh_folder: Path) -> dict:
     """What `write_parts` wrote to `parts.json`. Raises SdfsimError: the mesh stage has not run."""
-    return read_json(Path(mesh_folder) / "parts.json", "run the mesh stage first")
+    return read_json(mesh_folder / "parts.json", "run the mesh stage first")
 
 
 def trust_meshes(mesh_folder: Path) -> dict[str, Mesh]:
-    """The meshes that the scene is made of, by name, in the colours of `colors_of` their uncertainty. Raises
-    SdfsimError where the mesh stage has not run or its files are damaged."""
+    """The meshes that the scene is made of, by name, in the colours of `colors_of` their uncertainty."""
     known = read_parts(mesh_folder)
     files = {SCENERY: "solid.ply"} if known["scenery"] else {}
     files |= {entry["name"]: f"objects/{entry['name']}.ply" for entry in known["objects"]}
@@ -190,7 +168,7 @@ def trust_meshes(mesh_folder: Path) -> dict[str, Mesh]:
 
 
 def draw_names(parts: Parts, views: list[View], photos_folder: Path) -> Image.Image:
-    """A picture that tells which body has which name: the photos that show them best, each body tinted and labelled."""
+    """A picture of the photos that show bodies best, each body tinted and with its name."""
     meshes = list(parts.bodies.values())
     caster = Caster(joined(meshes if parts.solid is None else [*meshes, parts.solid]))
     borders = np.cumsum([len(mesh.faces) for mesh in meshes])
@@ -215,7 +193,7 @@ def draw_names(parts: Parts, views: list[View], photos_folder: Path) -> Image.Im
 
 
 def _tile(view: View, seen: np.ndarray, names: list[str], photos_folder: Path) -> Image.Image:
-    with Image.open(Path(photos_folder) / "images" / view.name) as photo:
+    with Image.open(photos_folder / "images" / view.name) as photo:
         pixels = np.asarray(photo.convert("RGB").resize(seen.shape[::-1]), float)
     for number in range(len(names)):  # Hues a golden section apart, so that neighbours differ.
         color = 255 * np.array(colorsys.hsv_to_rgb(number * 0.618 % 1, 0.85, 1.0))

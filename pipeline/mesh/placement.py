@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
@@ -27,8 +25,6 @@ MAX_ANGLE, MIN_SHARE = 25.0, 0.08
 LEVEL_NORMAL, MIN_FLOOR = 0.95, 0.05  # least z of a level face's normal, and share of the area that a floor has
 # A pixel may miss what it is meant to show by these shares of the width; farther off by the factor is behind it.
 NEARBY, BEHIND = (0.0, 0.008, 0.016, 0.024), 1.1
-
-Named = TypeVar("Named", View, Photo)
 
 
 @dataclass(frozen=True)
@@ -56,7 +52,7 @@ class Placement:
 
 def load_placement(mesh_folder: Path) -> Placement:
     """Reads `placement.json`. Raises SdfsimError: the mesh stage has not run."""
-    path = Path(mesh_folder) / "placement.json"
+    path = mesh_folder / "placement.json"
     content = read_json(path, "run the mesh stage first")
     try:
         return Placement(**{**content, "to_metres": Similarity.from_dict(content["to_metres"])})
@@ -145,8 +141,7 @@ def place(shown: Mesh, views: list[View], scale: tuple[float, str] | None = None
     """Chooses up, scale and origin: the floor is z = 0 and the middle of the visible surface is over the origin.
 
     Surface and views are in normalised space. `scale`, where known, is metres a normalised unit and where that comes
-    from; else `size` m is the widest side, 1 m where it is None. `alone`: without scenery the floor is where the lowest
-    point is. `up` is looked for where it was not measured.
+    from; else `size` m is the widest side, 1 m where it is None. `alone`: the floor is where the lowest point is.
     """
     up = up or find_up(shown, views)
     rotation = level(shown, views, up.direction)
@@ -164,8 +159,8 @@ def place(shown: Mesh, views: list[View], scale: tuple[float, str] | None = None
 
 def measured_scale(distance: Sequence, views: list[View], photos: list[Photo], surface: Caster) -> tuple[float, str]:
     """Metres a normalised unit at which a known distance (see `Options`) is what it should be, and where that comes
-    from, in words. Pixels are those of the user's own photos. Raises SdfsimError for no such posed photo or several, a
-    pixel outside it, or one that shows nothing of the surface."""
+    from, in words. Pixels are those of the user's own photos. Raises SdfsimError as `_end` does, for a photo without a
+    pose, or a pixel that shows nothing of the surface."""
     first, second, metres = distance
     start, end = (_locate(text, views, photos, surface) for text in (first, second))
     found = float(np.linalg.norm(end - start))
@@ -175,21 +170,19 @@ def measured_scale(distance: Sequence, views: list[View], photos: list[Photo], s
 
 
 def check_distance(distance: Sequence, photos: list[Photo]) -> None:
-    """Checks what can be known of a distance's ends before there are poses. Raises SdfsimError for no such photo or
-    several, or of a pixel outside it."""
+    """Checks what can be known of a distance's ends before there are poses. Raises SdfsimError as `_end` does."""
     for text in distance[:2]:
-        name, pixel = _parts(text)
-        _check_pixel(text, pixel, _called(name, photos, "photo"))
+        _end(text, photos)
 
 
 def _locate(text: str, views: list[View], photos: list[Photo], surface: Caster) -> np.ndarray:
     """Position [3] of one end of a known distance."""
-    name, pixel = _parts(text)
-    view = _called(name, views, "posed photo")
+    photo, pixel = _end(text, photos)
+    view = next((view for view in views if view.name == photo.name), None)
+    if view is None:
+        raise SdfsimError(f"distance: {photo.source} has no pose", "choose a place in another photo")
     if pixel is None:
         return view.center
-    photo = next(photo for photo in photos if photo.name == view.name)
-    _check_pixel(text, pixel, photo)
     turn = np.arange(8) * np.pi / 4
     around = np.concatenate([r * np.stack([np.cos(turn), np.sin(turn)], 1) for r in NEARBY]) * view.width
     spots = photo.prepared(np.array([pixel]), view) + around
@@ -203,30 +196,17 @@ def _locate(text: str, views: list[View], photos: list[Photo], surface: Caster) 
     return view.center + away[best] * rays[0]
 
 
-def _parts(text: str) -> tuple[str, tuple[float, float] | None]:
-    """The photo's name, and the pixel if one is given."""
-    pixel = re.fullmatch(r"(.+):(\d+(?:\.\d+)?),(\d+(?:\.\d+)?)", text)
-    return (pixel[1], (float(pixel[2]), float(pixel[3]))) if pixel else (text, None)
-
-
-def _check_pixel(text: str, pixel: tuple[float, float] | None, photo: Photo) -> None:
-    width, height = photo.original
+def _end(text: str, photos: list[Photo]) -> tuple[Photo, tuple[float, float] | None]:
+    """The photo that one end of a distance names, with or without its subfolder, and the pixel if one is given. Raises
+    SdfsimError for no such photo or several, or a pixel outside it."""
+    match = re.fullmatch(r"(.+):(\d+(?:\.\d+)?),(\d+(?:\.\d+)?)", text)
+    name, pixel = (match[1], (float(match[2]), float(match[3]))) if match else (text, None)
+    found = [p for p in photos if p.source == name] or [p for p in photos if Path(p.source).name == name]
+    if len(found) != 1:
+        told = f"{len(found)} photos are" if found else "no photo is"
+        such = ", ".join(photo.source for photo in (found or photos)[:3])
+        raise SdfsimError(f"distance: {told} called {name!r}", f"write PHOTO:X,Y or PHOTO; photos: {such}, ...")
+    width, height = found[0].original
     if pixel is not None and not (pixel[0] <= width and pixel[1] <= height):
         raise SdfsimError(f"distance: {text} lies outside the photo ({width} x {height} px)")
-
-
-def _called(name: str, views: Sequence[Named], what: str) -> Named:
-    """The one of `views` whose photo has this name, with or without its subfolder."""
-    found = [v for v in views if v.source == name] or [v for v in views if Path(v.source).name == name]
-    if len(found) == 1:
-        return found[0]
-    if found:
-        raise SdfsimError(
-            f"distance: {len(found)} {what}s are called {name!r}",
-            f"write its folder as well: {', '.join(v.source for v in found[:3])}",
-        )
-    near = difflib.get_close_matches(name, [v.source for v in views], 3, 0.3) or [v.source for v in views[:3]]
-    raise SdfsimError(
-        f"distance: no {what} is called {name!r}",
-        f"write PHOTO:X,Y for a pixel or PHOTO for the camera; photos: {', '.join(near)}, ...",
-    )
+    return found[0], pixel

@@ -15,15 +15,14 @@ from PIL import Image
 
 from pipeline.cameras import View
 from pipeline.inputs.photos import Photo
-from pipeline.mesh.cleaning import keep_faces
+from pipeline.mesh.extraction import keep_faces
 from pipeline.mesh.visibility import FLATTEST, bilinear, framed, to_bytes
 from pipeline.progress import Progress, quiet, share_of
 from sdfsim.shape.bvh import Caster
 from sdfsim.shape.mesh import Mesh, face_normals, joined, sample_surface, vertex_normals
 
 FACES = 40_000  # of a textured mesh: finer detail is in its texture
-# The time of xatlas grows with the square of the faces of a chart: it gets the mesh in pieces of so many.
-PIECE = 300
+PIECE = 300  # faces that xatlas gets at a time: its time grows with the square of the faces of a chart
 LARGEST = 4096  # px, longest side of a texture
 SMALLEST = 16  # texels that a mesh is long at least, also where no photo shows it
 FULL = 0.5  # share of a texture that charts can be counted on to fill
@@ -61,7 +60,7 @@ class Shots:
 
 
 def shots_of(views: list[View], photos: list[Photo], folder: Path, meshes: Sequence[Mesh], cell: float) -> Shots:
-    """The photos of some views, all in metres, of a scene that consists of `meshes`, exact to about a `cell`."""
+    """The photos of some views of a scene of `meshes`, all in metres, exact to about a `cell`."""
     sharpness = {photo.name: photo.sharpness for photo in photos}
     return Shots(views, np.array([sharpness[view.name] for view in views]), folder, Caster(joined(meshes)), cell)
 
@@ -80,12 +79,12 @@ class Texels:
 def texture_parts(meshes: dict[str, Mesh], shots: Shots, on_progress: Progress = quiet) -> dict[str, Mesh]:
     """Each mesh with a texture, fewer faces where it has many, and vertices doubled where its charts meet; its vertex
     colours stay wherever no photo shows the surface."""
-    sizes = np.array([len(mesh.faces) for mesh in meshes.values()], float)
-    ends = np.cumsum(sizes) / max(sizes.sum(), 1)
-    return {
-        name: textured(mesh, shots, share_of(on_progress, float(end - size / sizes.sum()), float(size / sizes.sum())))
-        for (name, mesh), size, end in zip(meshes.items(), sizes, ends, strict=True)
-    }
+    made, done, total = {}, 0.0, sum(len(mesh.faces) for mesh in meshes.values())
+    for name, mesh in meshes.items():
+        share = len(mesh.faces) / total
+        made[name] = textured(mesh, shots, share_of(on_progress, done, share))
+        done += share
+    return made
 
 
 def textured(mesh: Mesh, shots: Shots, on_progress: Progress = quiet) -> Mesh:

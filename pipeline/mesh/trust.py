@@ -1,4 +1,4 @@
-"""How far each place of a surface can be trusted: how many photos see it, and how exactly they tell where it is.
+"""How far each place of a surface can be trusted, and which photos would help most.
 
 A photo tells where a point is across its line of sight, to about a pixel, and nothing along it. Lines of sight from
 several directions together tell the rest. What fewer than two photos see is a guess of the field.
@@ -6,20 +6,33 @@ several directions together tell the rest. What fewer than two photos see is a g
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.cameras import View
-from pipeline.mesh.visibility import Visibility
-from sdfsim.shape.mesh import Mesh, face_normals
+from pipeline.cameras import View, focus
+from pipeline.mesh.visibility import Visibility, framed
+from sdfsim.shape.bvh import Caster
+from sdfsim.shape.mesh import Mesh, face_normals, joined
 
 FEW = 3  # photos: what fewer see is weak
 PARALLEL = 1e-12  # of lines of sight: least determinant of their information, with its trace as unit
 # Colours from the surest to the least sure place (anchors of viridis), and of what is guessed.
 SCALE = np.array([[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], float)
 GUESSED = np.array([255.0, 45, 45])
+WANTED = 3  # photos that are proposed
+SAMPLES = 6000  # of the surface
+PLACES = 600  # directions around the scene in which cameras are tried
+HIGHER = 30.0  # degrees by which these may be above or below the cameras given; and the lowest and highest
+LOWEST, HIGHEST = -60.0, 80.0
+FAIR = 0.35  # least cosine between normal and line of sight at which a photo helps
+UNSURE = 3.0  # times the median uncertainty: from there on a place is weak however many photos see it
+CLEAR = 0.1  # times the cameras' distance: least distance of a camera from anything solid and from the floor
+SHARED = 0.2  # share of what a photo shows that is known well already: else it cannot be joined to the others
+APART = 15.0  # degrees between the photos proposed
+LEAST = 0.01  # share of the surface that a photo has to help, else it is not worth the way
+NEARBY, SLIGHT = 35.0, 0.04  # degrees up to which a way is told in metres; share of the distance that is not worth it
 
 
 @dataclass(frozen=True)
@@ -92,9 +105,8 @@ def vertex_areas(mesh: Mesh) -> np.ndarray:
 
 
 def summary(mesh: Mesh, support: Support) -> dict:
-    """Of a mesh's area: `area_m2`; `seen_by`, the shares of 0, 1, 2, and 3 or more photos; `guessed`, that of fewer
-    than two or of lines of sight that are parallel; `uncertainty_m`, the median of the rest, None where all is guessed.
-    """
+    """Of a mesh's area: `seen_by`, the shares of 0, 1, 2, and 3 or more photos; `guessed`, that of fewer than two or of
+    lines of sight that are parallel; `uncertainty_m`, the median of the rest, None where all is guessed."""
     area, uncertainty = vertex_areas(mesh), support.uncertainty
     known = np.isfinite(uncertainty)
     median = None
@@ -102,7 +114,7 @@ def summary(mesh: Mesh, support: Support) -> dict:
         median = float(np.quantile(uncertainty[known], 0.5, weights=area[known], method="inverted_cdf"))
     seen_by = np.bincount(np.minimum(support.views, FEW), area, minlength=FEW + 1) / area.sum()
     return {
-        "area_m2": float(area.sum()), "seen_by": [round(float(share), 4) for share in seen_by],
+        "seen_by": [round(float(share), 4) for share in seen_by],
         "guessed": round(float(area[~known].sum() / area.sum()), 4),
         "uncertainty_m": median,
     }  # fmt: skip
@@ -125,3 +137,159 @@ def colors_of(uncertainty: np.ndarray, limits: tuple[float, float]) -> np.ndarra
     place = np.clip(position, 0, 1) * (len(SCALE) - 1)
     color = np.stack([np.interp(place, np.arange(len(SCALE)), channel) for channel in SCALE.T], -1)
     return np.where(known[:, None], color, GUESSED)
+
+
+@dataclass(frozen=True)
+class NextPhoto:
+    """A photo that would help."""
+
+    view: View  # its camera, metres, z up
+    target: np.ndarray  # [3] m that it looks at
+    gain: float  # what it adds, as a share of all that photos from around could add
+    words: str  # where to stand and where to look
+
+    def told(self) -> dict:
+        """Plain values for the report."""
+        return {
+            "position": [round(float(x), 3) for x in self.view.center],
+            "looking_at": [round(float(x), 3) for x in self.target],
+            "gain": round(self.gain, 3), "words": self.words,
+        }  # fmt: skip
+
+
+def next_photos(
+    meshes: Mapping[str, Mesh], support: Support, sight: Visibility, solid: Caster, views: Sequence[View],
+    counted: np.ndarray,
+) -> tuple[list[NextPhoto], float]:  # fmt: skip
+    """The photos that help most, the best first, chosen greedily; none where none helps `LEAST` of the surface. Also
+    the share that is weak, of the surface that the photos or a camera around could show.
+
+    Weak is what fewer than `FEW` photos see, or what is `UNSURE`. A photo helps a place that it sees freely and at a
+    fair angle: by the share of `FEW` photos that it lacks, else by how much less uncertain it becomes. Meshes are
+    closed, by name, in metres with the floor at z = 0; only vertices that are `counted` [V] bool matter.
+    """
+    if not counted.any():
+        return [], 0.0
+    area = np.where(counted, vertex_areas(joined(list(meshes.values()))), 0)
+    index = np.random.default_rng(0).choice(len(area), SAMPLES, p=area / area.sum())
+    part = np.repeat(np.arange(len(meshes)), [len(mesh.vertices) for mesh in meshes.values()])[index]
+    now, sight = support.at(index), sight.at(index)
+    sure = now.uncertainty[np.isfinite(now.uncertainty)]
+    limit = UNSURE * float(np.median(sure)) if len(sure) else 0.0
+    middle, towards = focus(list(views))
+    places = _places(views, middle, towards, solid)
+    around = [sight.of_place(place, np.ones(SAMPLES, bool)) for place in places]
+    around = [seen[cosine > FAIR] for seen, cosine in around]
+    reachable = now.views > 0
+    for seen in around:
+        reachable[seen] = True
+    total = max(int(reachable.sum()), 1)
+    poor = (now.views < FEW) | (now.uncertainty > limit)
+    weak = poor & reachable
+    short = FEW - now.views[weak]
+    lacking = float(np.where(short > 0, short * (short + 1) / (2 * FEW), 1.0).sum())  # what `worth` may add up to
+    chosen: list[NextPhoto] = []
+    free = np.ones(len(places), bool)
+    while len(chosen) < WANTED:
+        found = _best(now, poor, [(places[k], around[k]) for k in np.flatnonzero(free)], middle, views[0])
+        if found is None or found[0] < LEAST * total:
+            break
+        gain, view, target, seen = found
+        view = replace(view, name=f"next{len(chosen) + 1}", source=f"next{len(chosen) + 1}")
+        counts, matrices = now.views.copy(), now.information.copy()
+        counts[seen] += 1
+        matrices[seen] += information(view, now.vertices[seen])
+        now = replace(now, views=counts, information=matrices)
+        poor = (counts < FEW) | (now.uncertainty > limit)
+        most = int(np.bincount(part[seen]).argmax())
+        words = f"{way_to(view.center, views, middle)}, looking at {list(meshes)[most]}"
+        chosen.append(NextPhoto(view, target, gain / lacking, words))
+        turned = (places - middle) @ (view.center - middle)
+        turned /= np.linalg.norm(places - middle, axis=1) * np.linalg.norm(view.center - middle)
+        free &= turned < np.cos(np.radians(APART))
+    return chosen, float(weak.sum() / total)
+
+
+def worth(now: Support, view: View, seen: np.ndarray) -> np.ndarray:
+    """How much a photo helps each of the places [S] that it sees, 0 to 1."""
+    here = now.at(seen)
+    after = sigma_along(here.information + information(view, here.vertices), here.normals)
+    rest = np.divide(after, here.uncertainty, out=np.ones(len(seen)), where=np.isfinite(after))
+    return np.where(here.views < FEW, (FEW - here.views) / FEW, 1 - np.minimum(rest, 1))
+
+
+def _best(
+    now: Support, poor: np.ndarray, tried: Sequence[tuple[np.ndarray, np.ndarray]], middle: np.ndarray, lens: View
+) -> tuple[float, View, np.ndarray, np.ndarray] | None:
+    """The photo that helps most: how much, its camera, what it looks at [3] m, and the places [S] that it helps.
+
+    Samples are weak where `poor` [V] bool. `tried` are places [3] m with the samples [S] in sight, all around; a camera
+    looks at the `middle` [3] m, or at the middle of the weak places in sight.
+    """
+    best = None
+    for place, around in tried:
+        helped = around[poor[around]]
+        if not len(helped) or (best is not None and len(helped) <= best[0]):
+            continue
+        for target in (middle, now.vertices[helped].mean(0)):
+            view = camera_at(place, target, lens)
+            seen = around[framed(view, now.vertices[around])[1]]
+            if not len(seen) or poor[seen].mean() > 1 - SHARED:
+                continue
+            seen = seen[poor[seen]]
+            gains = worth(now, view, seen)
+            if best is None or gains.sum() > best[0]:
+                best = float(gains.sum()), view, target, seen[gains > 0]
+    return best
+
+
+def camera_at(place: np.ndarray, target: np.ndarray, like: View) -> View:
+    """A camera at a place [3] that looks at another [3], held level (z up), with the lens of another."""
+    forward = target - place
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    if np.linalg.norm(right) < 1e-6:
+        right = np.array([1.0, 0.0, 0.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return replace(like, rotation=rotation, translation=-rotation @ place)
+
+
+def _places(views: Sequence[View], middle: np.ndarray, towards: np.ndarray, solid: Caster) -> np.ndarray:
+    """Places [C, 3] where a camera could be: around the scene, at the median distance of the given ones, in free space
+    and in sight of a given one."""
+    given = np.array([view.center for view in views])
+    far = float(np.median(np.linalg.norm(given - middle, axis=1)))
+    height = np.degrees(np.arcsin(np.clip(-towards[:, 2], -1, 1)))
+    low, high = np.sin(np.radians(np.clip([height.min() - HIGHER, height.max() + HIGHER], LOWEST, HIGHEST)))
+    z = low + (high - low) * (np.arange(PLACES) + 0.5) / PLACES
+    angle = np.pi * (1 + np.sqrt(5)) * np.arange(PLACES)  # the golden angle spreads them evenly
+    flat = np.sqrt(1 - z**2)
+    places = middle + far * np.stack([flat * np.cos(angle), flat * np.sin(angle), z], 1)
+    places = places[(places[:, 2] > CLEAR * far) & (solid.clearance(places) > CLEAR * far)]
+    if not len(places):
+        return places
+    starts, ends = np.repeat(places, len(given), axis=0), np.tile(given, (len(places), 1))
+    in_sight = ~solid.blocked(starts, ends).reshape(len(places), len(given))
+    return places[in_sight.any(1)]
+
+
+def way_to(place: np.ndarray, views: Sequence[View], middle: np.ndarray) -> str:
+    """How to get to a place [3] from where the nearest photo was taken, in words."""
+    nearest = min(views, key=lambda view: float(np.linalg.norm(view.center - place)))
+    right = nearest.rotation[0] * [1, 1, 0]
+    right /= max(np.linalg.norm(right), 1e-12)
+    forward = np.cross([0.0, 0.0, 1.0], right)
+    step = place - nearest.center
+    turns = [np.arctan2(*(at - middle)[1::-1]) for at in (nearest.center, place)]
+    turn = (np.degrees(turns[1] - turns[0]) + 180) % 360 - 180
+    ways = [(step[2], "higher", "lower")]
+    around = ""
+    if abs(turn) > NEARBY:
+        around = f"walk {abs(turn):.0f}° around the scene to your {'right' if turn > 0 else 'left'} from there, "
+    else:
+        ways = [(step @ right, "to the right", "to the left"), (step @ forward, "forward", "back"), *ways]
+    slight = SLIGHT * float(np.linalg.norm(place - middle))
+    told = [f"{abs(size):.2g} m {one if size > 0 else other}" for size, one, other in ways if abs(size) > slight]
+    moved = around + (", ".join(told) or ("at the same height" if around else "from the same place"))
+    return f"stand where {nearest.source} was taken, {moved}"

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.cameras import View, spread_angle, view_span
+from pipeline.cameras import View, spread_angle, view_of, view_span
 from pipeline.inputs.photos import Photo
 
 # Field of view of the longer side, degrees: from a short telephoto to a wide angle lens.
@@ -31,7 +31,7 @@ class Findings:
     components: list[list[str]]  # names of photos linked by verified matches, largest group first
     textureless: float  # share of photos with too few features
     still: float  # share of linked pairs whose matches mostly did not move
-    rotation_only: float  # share of linked pairs that a turn of the camera, without a step, explains
+    turn_only: float  # share of linked pairs that a turn of the camera, without a step, explains
 
 
 def find(result: dict, photos: list[Photo]) -> Findings:
@@ -59,30 +59,24 @@ def find(result: dict, photos: list[Photo]) -> Findings:
 
 def views_of(result: dict, photos: list[Photo]) -> list[View]:
     """The posed views of a worker's result, in photo order."""
-    source = {p.name: p.source for p in photos}
-    return [
-        View(**{**{k: x for k, x in v.items() if k != "camera"}, "source": source[v["name"]],
-                "rotation": np.array(v["rotation"]), "translation": np.array(v["translation"])})
-        for v in result["views"]
-    ]  # fmt: skip
+    source = {photo.name: photo.source for photo in photos}
+    return [view_of({**view, "source": source[view["name"]]}) for view in result["views"]]
 
 
 def check(result: dict, photos: list[Photo], ordinary: dict | None = None) -> dict:
-    """Decides whether a reconstruction can be trusted, for the report: `failures` is empty when the poses may be used,
-    `warnings` are for the reader.
+    """Decides whether a reconstruction can be trusted, for the report: `failures` is empty when the poses may be used.
 
     "All registered" is not "right": repeating textures give complete but wrong reconstructions, which show in the focal
-    length, the reprojection error, the spread of points, or in pairs that contradict the poses. `ordinary` is the
-    result at ordinary thresholds, if `result` is not: its matches tell best how the camera moved.
+    length, the reprojection error, or in pairs that contradict the poses. `ordinary` is the result at ordinary
+    thresholds, if `result` is not: its matches tell best how the camera moved.
     """
     views = views_of(result, photos)
     posed = {view.name for view in views}
     found = find(result, photos)
     if ordinary is not None:
         first = find(ordinary, photos)
-        found = replace(
-            found, still=max(found.still, first.still), rotation_only=max(found.rotation_only, first.rotation_only)
-        )
+        still, turn_only = max(found.still, first.still), max(found.turn_only, first.turn_only)
+        found = replace(found, still=still, turn_only=turn_only)
     together = len(found.components[0]) if found.components else len(photos)
     needed = max(3, -(-together // 2), -(-len(photos) // 3))
     left_out = [{"photo": p.source, "why": left_out_reason(p, result, found)} for p in photos if p.name not in posed]
@@ -105,14 +99,14 @@ def check(result: dict, photos: list[Photo], ordinary: dict | None = None) -> di
         "mean_error": round(result.get("mean_error", 0.0), 4), "points": result.get("points", 0),
         "field_of_view": sorted({round(view.fov, 2) for view in views}), "span_degrees": round(around, 1),
         "contradictions": round(contradicting(result), 4), "components": [len(c) for c in found.components],
-        "still_pairs": round(found.still, 3), "turn_only_pairs": round(found.rotation_only, 3),
+        "still_pairs": round(found.still, 3), "turn_only_pairs": round(found.turn_only, 3),
         "causes": diagnose(result, found, failures), "failures": failures, "warnings": warnings,
     }  # fmt: skip
 
 
 def check_focal(result: dict, views: list[View], photos: list[Photo], failures: list[str], warnings: list[str]) -> None:
     """Checks the field of view, and the focal length against EXIF and against what the pairs say on their own."""
-    off = sorted(view.fov for view in views if not FOV_RANGE[0] <= view.fov <= FOV_RANGE[1])
+    off = [view.fov for view in views if not FOV_RANGE[0] <= view.fov <= FOV_RANGE[1]]
     if off:
         failures.append(f"implausible field of view of {off[0]:.0f} degrees: the poses are probably wrong")
 
@@ -124,11 +118,9 @@ def check_focal(result: dict, views: list[View], photos: list[Photo], failures: 
     agree = to_pairs is not None and 1 / PAIRS_OFF < to_pairs < PAIRS_OFF
     if to_exif is not None and not 1 / FOCAL_OFF < to_exif < FOCAL_OFF:
         # Photos that were cropped carry the focal length of the whole photo.
-        text = f"focal length is {to_exif:.2f} times what EXIF says"
-        if agree:
-            warnings.append(f"{text}, but the pairs of photos agree with it (cropped photos, or wrong EXIF?)")
-        else:
-            failures.append(f"{text} (cropped photos, or wrong poses)")
+        wrong = "EXIF" if agree else "poses"
+        told = f"focal length is {to_exif:.2f} times what EXIF says (cropped photos, or wrong {wrong})"
+        (warnings if agree else failures).append(told)
     elif to_exif is None and to_pairs is not None and not agree:
         failures.append(
             f"focal length is {to_pairs:.2f} times what the pairs of photos say: the poses are probably wrong"
@@ -189,7 +181,7 @@ def diagnose(result: dict, found: Findings, failures: list[str]) -> list[str]:
         causes.append("there is too little to see: blurred, dark, or without texture, like a blank wall")
     elif len(result["counts"]) < FEW_PHOTOS:
         causes.append(f"{len(result['counts'])} photos are too few to be certain of anything")
-    elif found.rotation_only > 0.5 and found.still <= 0.5:
+    elif found.turn_only > 0.5 and found.still <= 0.5:
         causes.append("the photos seem to be taken from one spot: step sideways between photos, do not just turn")
     elif contradicting(result) > MANY_CONTRADICTIONS / 3 or unposed:
         causes.append("a texture that repeats makes different places look the same: cover it, or lay something unlike "
@@ -204,15 +196,16 @@ def failure_message(checks: dict) -> str:
     message = "camera poses: " + "; ".join(checks["failures"])
     if checks["causes"]:
         message += ". Probably " + "; and ".join(checks["causes"])
-    left = checks["left_out"]
-    if left:
-        named = [f"{entry['photo']}: {entry['why']}" for entry in left[:4]]
-        message += ". Left out: " + "; ".join(named) + (f"; and {len(left) - 4} more" if len(left) > 4 else "")
+    named = [f"{entry['photo']}: {entry['why']}" for entry in checks["left_out"]]
+    if named:
+        message += ". Left out: " + "; ".join(named[:4]) + (f"; and {len(named) - 4} more" if len(named) > 4 else "")
     return message
 
 
 def failure_hint(checks: dict) -> str:
     """What to try, from the commonest reason."""
+    if checks.get("known_cameras"):
+        return "check which photo belongs to which camera, and its axes; or give the folder of photos alone"
     reasons = " ".join(entry["why"] for entry in checks["left_out"])
     if reasons.count("features") > reasons.count("overlap"):
         return "take sharper photos in better light, or put something textured under the object"

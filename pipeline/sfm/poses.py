@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import signal
 import sqlite3
 import subprocess
 import sys
 import time
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -65,10 +65,9 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
     """Finds the poses of `photos` and writes `cameras.json`, `sparse.npz`, `checks.json` to `out`; returns the checks.
 
     Makes `ATTEMPTS` until poses can be trusted, for at most `timeout` s each; each has a folder of its own, in which a
-    killed run goes on. Where the photos came with cameras these are kept, checked against the photos, and given sparse
-    points. Raises SdfsimError (exit code 3) where too few photos could be posed, or the result is not plausible.
+    killed run goes on. Cameras that came with the photos are kept and checked. Raises SdfsimError (exit code 3) where
+    too few photos could be posed, or the result is not plausible.
     """
-    out, photos_folder = Path(out), Path(photos_folder)
     known = photos_folder / KNOWN_CAMERAS
     job = {
         "images": str(photos_folder / "images"), "count": len(photos), "groups": size_groups(photos), "seed": seed,
@@ -82,12 +81,9 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
         if tries and (job["known_cameras"] or not hopeful(name, tries[0][0])):
             continue
 
-        def report(fraction: float, message: str, name: str = name, again: bool = bool(tries)) -> None:
-            on_progress(fraction, (f"again, {name}: " if again else "") + message)
-
         folder = out / f"try_{name.replace(' ', '_')}"
         try:
-            result = run_worker({**job, **settings}, folder, timeout, report)
+            result = run_worker({**job, **settings}, folder, timeout, on_progress)
         except SdfsimError as error:
             if not tries:
                 raise
@@ -103,18 +99,12 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
     checks, folder, result = max(tries, key=lambda t: (not t[0]["failures"], t[0]["posed"], t[0]["points"]))
     checks["attempts"], checks["known_cameras"] = told, bool(job["known_cameras"])
     views = views_of(result, photos) if job["refine"] or not job["known_cameras"] else load_views(known)
-    if job["refine"] and views:
-        checks["moved"] = moved(load_views(known), views)
-    hint = failure_hint(checks)
     if checks["known_cameras"] and checks["failures"]:
         checks["failures"] = [f"the known cameras do not fit the photos: {'; '.join(checks['failures'])}"]
         checks["causes"] = []
-        hint = (
-            "check which photo belongs to which camera, and its axes; or give the folder of photos to find poses anew"
-        )
     write_json(out / "checks.json", checks)
     if checks["failures"]:
-        raise SdfsimError(failure_message(checks), hint, exit_code=EXIT_QUALITY)
+        raise SdfsimError(failure_message(checks), failure_hint(checks), exit_code=EXIT_QUALITY)
     save_views(views, out / "cameras.json")
     with replacing(out / "sparse.npz") as partial:  # A copy: the attempt's result stays whole for a run that goes on.
         shutil.copyfile(folder / "sparse.npz", partial)
@@ -131,38 +121,21 @@ def seen_together(views: list[View]) -> list[list[str]]:
     return [[views[a].name, views[b].name] for a, b in np.argwhere(np.triu(close, 1)).tolist()]
 
 
-def moved(before: list[View], after: list[View]) -> dict[str, float]:
-    """How far bundle adjustment moved the cameras of a capture: medians, m and degrees."""
-    given = {view.name: view for view in before}
-    pairs = [(given[view.name], view) for view in after]
-    turns = [np.clip((np.trace(a.rotation @ b.rotation.T) - 1) / 2, -1, 1) for a, b in pairs]
-    return {
-        "metres": round(float(np.median([np.linalg.norm(a.center - b.center) for a, b in pairs])), 5),
-        "degrees": round(float(np.degrees(np.median(np.arccos(turns)))), 4),
-    }
-
-
-def read_if_there(path: Path) -> Any:
-    """The content of a JSON file, or None where it is absent or was cut short."""
-    try:
-        return read_json(path)
-    except SdfsimError:
-        return None
-
-
 def run_worker(job: dict, folder: Path, timeout: float, on_progress: Progress) -> dict:
     """Runs the COLMAP child process on one job, unless the folder holds its result already; returns `result.json`.
     Raises SdfsimError, which names its log, where it crashed or ran out of time."""
-    if read_if_there(folder / "job.json") != job:
+    before: Any = None
+    with suppress(SdfsimError):  # absent, or cut short
+        before = read_json(folder / "job.json")
+        if before == job:
+            return read_json(folder / "result.json")
+    if before != job:
         shutil.rmtree(folder, ignore_errors=True)  # Of other photos or settings.
-    elif (done := read_if_there(folder / "result.json")) is not None:
-        return done
     folder.mkdir(parents=True, exist_ok=True)
     log = folder / "colmap.log"
     write_json(folder / "job.json", job)
-    environment = dict(os.environ)
     root = str(Path(__file__).resolve().parents[2])
-    environment["PYTHONPATH"] = os.pathsep.join(filter(None, [root, environment.get("PYTHONPATH", "")]))
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])}
     lines = folder / "progress.log"
     with open(log, "wb") as errors, open(lines, "wb") as output:
         child = subprocess.Popen(
@@ -177,26 +150,17 @@ def run_worker(job: dict, folder: Path, timeout: float, on_progress: Progress) -
                         f"camera poses: stopped after {timeout:.0f} s (log: {log})", "use fewer or smaller photos"
                     )
                 on_progress(*estimate(folder, lines, job))
-                try:
+                with suppress(subprocess.TimeoutExpired):
                     child.wait(0.5)
-                except subprocess.TimeoutExpired:
-                    continue
         finally:
-            if child.poll() is None:
-                child.kill()
-                child.wait()
-    if child.returncode != 0 or not (folder / "result.json").exists():
-        reason = crash_reason(child.returncode, log)
-        raise SdfsimError(f"camera poses: COLMAP {reason} (log: {log})", "run again; if it stays, try fewer photos")
+            child.kill()
+            child.wait()
+    if child.returncode != 0:
+        raise SdfsimError(
+            f"camera poses: COLMAP failed with status {child.returncode} (log: {log})",
+            "run again; if it stays, try fewer photos",
+        )
     return read_json(folder / "result.json")
-
-
-def crash_reason(code: int, log: Path) -> str:
-    """How the child ended, in words: a signal's name or the last line of its log."""
-    if code < 0:
-        return f"was ended by {signal.Signals(-code).name}"
-    tail = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
-    return f"failed: {tail[-1].strip()[:200]}" if tail else f"failed with status {code}"
 
 
 def estimate(folder: Path, lines: Path, job: dict) -> tuple[float, str]:
@@ -206,21 +170,15 @@ def estimate(folder: Path, lines: Path, job: dict) -> tuple[float, str]:
     phase, placed = said.get("phase", "features"), int(said.get("placed", 0))
     if phase == "mapping":
         return 0.75 + 0.25 * min(1.0, placed / count), f"placing cameras, {placed} of {count}"
-    if phase == "done":
-        return 1.0, "done"
-    table, total = ("keypoints", count) if phase == "features" else ("two_view_geometries", count * (count - 1) / 2)
-    if phase == "matches" and job["pairs"] is not None:
-        total = len(job["pairs"])
-    elif phase == "matches" and count > job["exhaustive_up_to"]:
-        total = count * 20
+    table, total = "keypoints", count
+    if phase == "matches":
+        pairs = count * 20 if count > job["exhaustive_up_to"] else count * (count - 1) // 2
+        table, total = "two_view_geometries", pairs if job["pairs"] is None else len(job["pairs"])
     rows = 0
-    try:
-        with sqlite3.connect(f"file:{folder / 'database.db'}?mode=ro", uri=True, timeout=0.2) as database:
-            rows = database.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
-        database.close()
-    except sqlite3.Error:
-        pass  # Not there yet, or busy: only a progress bar.
+    address = f"file:{folder / 'database.db'}?mode=ro"  # It may not be there yet, or be busy.
+    with suppress(sqlite3.Error), closing(sqlite3.connect(address, uri=True, timeout=0.2)) as found:
+        rows = found.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
     part = min(1.0, rows / max(total, 1))
-    if phase == "features":
-        return 0.2 * part, f"finding features, {rows} of {count} photos"
-    return 0.2 + 0.55 * part, f"matching, {rows} of {int(total)} pairs"
+    if phase == "matches":
+        return 0.2 + 0.55 * part, f"matching, {rows} of {total} pairs"
+    return 0.2 * part, f"finding features, {rows} of {total} photos"

@@ -18,12 +18,13 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.cameras import View, view_of
 from sdfsim.files import write_arrays, write_json
 
-# Px that a point may be off while known cameras are refined, points that a camera needs to be moved, points that most
-# need for any to be moved (with fewer, a dozen photos came out worse than given), and the m within which a phone tracks
-# its place.
-REFINE_PIXELS, REFINE_POINTS, SUPPORTED, TRACKED = (16.0, 6.0), 30, 70, 0.02
+REFINE_PIXELS = (16.0, 6.0)  # that a point may be off while known cameras are refined, at first and then
+REFINE_POINTS = 30  # points that a camera needs to be moved
+SUPPORTED = 70  # that most cameras need for any to be moved: with fewer, a dozen photos came out worse than given
+TRACKED = 0.02  # m within which a phone tracks its place
 
 
 def say(message: str) -> None:
@@ -45,22 +46,19 @@ def watch_parent() -> None:
 
 def features(pycolmap, job: dict, database: Path) -> None:
     """Extracts features, one camera per group of photos of the same size and lens."""
-    extraction = pycolmap.FeatureExtractionOptions()
-    extraction.use_gpu = False
-    extraction.max_image_size = job["pixels"]
-    extraction.sift.max_num_features = job["max_features"]
-    extraction.sift.peak_threshold = job["peak_threshold"]
+    sift = {"max_num_features": job["max_features"], "peak_threshold": job["peak_threshold"]}
+    extraction = pycolmap.FeatureExtractionOptions(use_gpu=False, max_image_size=job["pixels"], sift=sift)
     pycolmap.Database.open(database).close()  # makes it
     for group in job["groups"]:
-        reader = pycolmap.ImageReaderOptions()
-        reader.camera_model = "SIMPLE_RADIAL"
+        reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
         if job["masks"]:
             reader.mask_path = job["masks"]
         if group["focal"]:
             reader.camera_params = f"{group['focal']},{group['width'] / 2},{group['height'] / 2},0"
         common = {"image_names": group["names"], "camera_mode": pycolmap.CameraMode.SINGLE}
-        if not all(_known(pycolmap, database, name) for name in group["names"]):
-            # Before extraction, whose threads would number photos in the order in which they happen to end.
+        with pycolmap.Database.open(database) as opened:
+            known = all(opened.read_image_with_name(name) is not None for name in group["names"])
+        if not known:  # Before extraction, whose threads would number photos in the order in which they happen to end.
             pycolmap.import_images(database, job["images"], options=reader, **common)
         pycolmap.extract_features(
             database, job["images"], reader_options=reader, extraction_options=extraction,
@@ -68,37 +66,28 @@ def features(pycolmap, job: dict, database: Path) -> None:
         )  # fmt: skip
 
 
-def _known(pycolmap, database: Path, name: str) -> bool:
-    with pycolmap.Database.open(database) as opened:
-        return opened.read_image_with_name(name) is not None
-
-
 def matches(pycolmap, job: dict, database: Path) -> None:
     """Matches the pairs of the job, else every pair, or neighbours in name order where there are too many."""
-    matching = pycolmap.FeatureMatchingOptions()
-    matching.use_gpu = False
-    matching.guided_matching = job["guided"]
-    matching.sift.max_ratio = job["max_ratio"]
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.min_num_inliers = job["min_inliers"]
-    verification.filter_stationary_matches = job["moving_only"]
-    verification.ransac.random_seed = job["seed"]
-    # Pairs that do not overlap would otherwise use up all 10,000 trials each, most of the time of this stage.
-    verification.ransac.min_inlier_ratio = job["min_inlier_ratio"]
+    matching = pycolmap.FeatureMatchingOptions(
+        use_gpu=False, guided_matching=job["guided"], sift={"max_ratio": job["max_ratio"]}
+    )
+    verification = pycolmap.TwoViewGeometryOptions(
+        min_num_inliers=job["min_inliers"], filter_stationary_matches=job["moving_only"],
+        # Pairs that do not overlap would otherwise use up all 10,000 trials each, most of the time of this stage.
+        ransac={"random_seed": job["seed"], "min_inlier_ratio": job["min_inlier_ratio"]},
+    )  # fmt: skip
     common = {"matching_options": matching, "verification_options": verification, "device": pycolmap.Device.cpu}
+    # Small blocks only so that progress shows in the database.
     if job["pairs"] is not None:
-        pairing = pycolmap.ImportedPairingOptions(block_size=100)
-        pairing.match_list_path = database.with_name("pairs.txt")
-        pairing.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in job["pairs"]))
+        listed = database.with_name("pairs.txt")
+        listed.write_text("".join(f"{a} {b}\n" for a, b in job["pairs"]))
+        pairing = pycolmap.ImportedPairingOptions(block_size=100, match_list_path=listed)
         pycolmap.match_image_pairs(database, pairing_options=pairing, **common)
     elif job["count"] <= job["exhaustive_up_to"]:
-        pairing = pycolmap.ExhaustivePairingOptions()
-        pairing.block_size = 10  # Small blocks, here and above, only so that progress shows in the database.
+        pairing = pycolmap.ExhaustivePairingOptions(block_size=10)
         pycolmap.match_exhaustive(database, pairing_options=pairing, **common)
     else:
-        pairing = pycolmap.SequentialPairingOptions()
-        pairing.overlap = 20
-        pairing.quadratic_overlap = True
+        pairing = pycolmap.SequentialPairingOptions(overlap=20, quadratic_overlap=True)
         pycolmap.match_sequential(database, pairing_options=pairing, **common)
 
 
@@ -127,18 +116,14 @@ def mapping(pycolmap, job: dict, database: Path, out: Path):
 
 def incremental_options(pycolmap, job: dict):
     """Settings of incremental mapping: on one thread, as several add up in an order that differs from run to run."""
-    options = pycolmap.IncrementalPipelineOptions()
-    options.min_model_size = 3
-    options.max_num_models = 4
-    options.num_threads = options.mapper.num_threads = 1
-    options.random_seed = job["seed"]
-    options.min_num_matches = job["min_inliers"]
-    options.mapper.random_seed = job["seed"]
-    options.triangulation.random_seed = job["seed"]
-    options.mapper.init_min_num_inliers = min(100, job["init_inliers"])
-    options.mapper.init_min_tri_angle = job["init_angle"]
-    options.mapper.abs_pose_min_num_inliers = job["pose_inliers"]
-    return options
+    mapper = {
+        "num_threads": 1, "random_seed": job["seed"], "init_min_num_inliers": job["init_inliers"],
+        "init_min_tri_angle": job["init_angle"], "abs_pose_min_num_inliers": job["pose_inliers"],
+    }  # fmt: skip
+    return pycolmap.IncrementalPipelineOptions(
+        min_model_size=3, max_num_models=4, num_threads=1, random_seed=job["seed"], min_num_matches=job["min_inliers"],
+        mapper=mapper, triangulation={"random_seed": job["seed"]},
+    )  # fmt: skip
 
 
 def known_cameras(pycolmap, job: dict, database: Path):
@@ -174,20 +159,16 @@ def refine(pycolmap, model, database: Path, job: dict, out: Path) -> None:
     cameras stay where they were, at the scale they had.
     """
     given = {key: image.projection_center() for key, image in model.images.items()}
-    priors = [
-        pycolmap.PosePrior(
-            position=center, position_covariance=np.eye(3) * TRACKED**2, corr_data_id=model.images[key].data_id,
-            coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
-        )
-        for key, center in given.items()
-    ]  # fmt: skip
+    cartesian = pycolmap.PosePriorCoordinateSystem.CARTESIAN
     for pixels in REFINE_PIXELS:
         options = incremental_options(pycolmap, job)
         options.mapper.filter_max_reproj_error = pixels
         options.triangulation.complete_max_reproj_error = options.triangulation.merge_max_reproj_error = pixels
         found = pycolmap.triangulate_points(model, database, job["images"], out / "colmap", options=options)
-        config, adjustment = pycolmap.BundleAdjustmentConfig(), pycolmap.BundleAdjustmentOptions()
-        adjustment.refine_focal_length = adjustment.refine_extra_params = adjustment.print_summary = False
+        config = pycolmap.BundleAdjustmentConfig()
+        adjustment = pycolmap.BundleAdjustmentOptions(
+            refine_focal_length=False, refine_extra_params=False, print_summary=False
+        )
         adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
         adjustment.ceres.solver_options.num_threads = 1  # several add up in an order that differs from run to run
         seen = [key for key, image in found.images.items() if image.has_pose and image.num_points3D >= REFINE_POINTS]
@@ -195,16 +176,13 @@ def refine(pycolmap, model, database: Path, job: dict, out: Path) -> None:
             return
         for key in seen:
             config.add_image(key)
-        with_priors = pycolmap.PosePriorBundleAdjustmentOptions()
-        with_priors.alignment_ransac.random_seed = job["seed"]
-        adjuster = pycolmap.create_pose_prior_bundle_adjuster(
-            adjustment,
-            with_priors,
-            config,
-            [prior for key, prior in zip(given, priors, strict=True) if key in seen],
-            found,
-        )
-        adjuster.solve()
+        with_priors = pycolmap.PosePriorBundleAdjustmentOptions(alignment_ransac={"random_seed": job["seed"]})
+        priors = [
+            pycolmap.PosePrior(position=given[key], position_covariance=np.eye(3) * TRACKED**2,
+                               corr_data_id=model.images[key].data_id, coordinate_system=cartesian)
+            for key in given if key in seen
+        ]  # fmt: skip
+        pycolmap.create_pose_prior_bundle_adjuster(adjustment, with_priors, config, priors, found).solve()
         after = np.array([found.images[key].projection_center() for key in seen])
         found.transform(pycolmap.estimate_sim3d(after, np.array([given[key] for key in seen])))
         for key in seen:
@@ -214,8 +192,7 @@ def refine(pycolmap, model, database: Path, job: dict, out: Path) -> None:
 def collect(reconstruction, out: Path) -> list[dict]:
     """Writes `sparse.npz` and returns the posed views as plain values."""
     views, index_of = [], {}
-    registered = sorted((i for i in reconstruction.images.values() if i.has_pose), key=lambda i: i.name)
-    for image in registered:
+    for image in sorted((i for i in reconstruction.images.values() if i.has_pose), key=lambda i: i.name):
         camera = reconstruction.cameras[image.camera_id]
         focal, cx, cy, k = (float(value) for value in camera.params)
         pose = image.cam_from_world()
@@ -223,7 +200,7 @@ def collect(reconstruction, out: Path) -> list[dict]:
         views.append(
             {
                 "name": image.name, "width": camera.width, "height": camera.height,
-                "focal": focal, "cx": cx, "cy": cy, "k": k, "camera": int(image.camera_id),
+                "focal": focal, "cx": cx, "cy": cy, "k": k,
                 "rotation": pose.rotation.matrix().tolist(), "translation": list(map(float, pose.translation)),
             }
         )  # fmt: skip
@@ -259,8 +236,8 @@ def read_pairs(pycolmap, database: Path) -> tuple[dict[str, int], list[tuple[str
 
 
 def findings(job: dict, features: dict[str, int], pairs: list) -> dict:
-    """What the matches say whatever the poses: `counts` of each photo, `pairs`, and the share of `turn_only` pairs. A
-    pair holds the names, the number of matches, and the share of them that did not move between the photos."""
+    """What the matches say whatever the poses: `counts` of each photo, `pairs` (with the share of matches that did not
+    move between the photos), and the share of `turn_only` pairs."""
     result = {name: {"features": count, "best_matches": 0} for name, count in features.items()}
     sizes = {name: group for group in job["groups"] for name in group["names"]}
     told, moving = [], []
@@ -297,7 +274,7 @@ def turn_only(pairs: list[tuple[dict, np.ndarray, np.ndarray]], least: float = 2
 def contradictions(pairs: list, views: list[dict]) -> list[dict]:
     """Pairs of posed photos, with how far their matches are from the lines that the poses put them on. Each pair was
     matched on its own: where poses are right nearly all agree; no poses agree with repeating things."""
-    posed = {view["name"]: view for view in views}
+    posed = {view["name"]: view_of({**view, "source": ""}) for view in views}
     found = []
     for a, b, first, second in pairs:
         if len(first) >= 30 and a in posed and b in posed:
@@ -306,24 +283,15 @@ def contradictions(pairs: list, views: list[dict]) -> list[dict]:
     return found
 
 
-def epipolar_errors(a: dict, b: dict, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def epipolar_errors(a: View, b: View, first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Sampson distances [M], px of photo `a`, of matched pixels [M, 2] of two posed photos."""
-
-    def rays(view: dict, pixels: np.ndarray) -> np.ndarray:
-        bent = (pixels - [view["cx"], view["cy"]]) / view["focal"]
-        flat = bent
-        for _ in range(8):
-            flat = bent / (1 + view["k"] * np.clip((flat**2).sum(1, keepdims=True), 0, 4))
-        return np.hstack([flat, np.ones((len(flat), 1))])
-
-    turn_a, turn_b = np.array(a["rotation"]), np.array(b["rotation"])
-    turn = turn_b @ turn_a.T
-    x, y, z = np.array(b["translation"]) - turn @ np.array(a["translation"])
+    turn = b.rotation @ a.rotation.T
+    x, y, z = b.translation - turn @ a.translation
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ turn
-    p, q = rays(a, first), rays(b, second)
+    p, q = a.straight(*first.T), b.straight(*second.T)
     forth, back = p @ essential.T, q @ essential
     slope = (forth[:, :2] ** 2).sum(1) + (back[:, :2] ** 2).sum(1)
-    return np.abs((q * forth).sum(1)) / np.sqrt(np.maximum(slope, 1e-30)) * a["focal"]
+    return np.abs((q * forth).sum(1)) / np.sqrt(np.maximum(slope, 1e-30)) * a.focal
 
 
 def focal_of_pairs(pycolmap, job: dict, database: Path, out: Path) -> dict[str, float]:
@@ -362,19 +330,16 @@ def main(job_path: str) -> None:
     matches(pycolmap, job, database)
     say("phase mapping")
     counts, pairs = read_pairs(pycolmap, database)
-    result: dict[str, Any] = {"views": [], "models": [], **findings(job, counts, pairs)}
+    result: dict[str, Any] = {"views": [], **findings(job, counts, pairs)}
     result["focal_of_pairs"] = {} if job["known_cameras"] else focal_of_pairs(pycolmap, job, database, out)
-    models = sorted(mapping(pycolmap, job, database, out), key=lambda r: (-r.num_reg_images(), -r.num_points3D()))
-    for model in models:
-        result["models"].append(sorted(image.name for image in model.images.values() if image.has_pose))
+    models = mapping(pycolmap, job, database, out)
     if models:
-        best = models[0]
+        best = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
         result["views"] = collect(best, out)
         result["contradictions"] = contradictions(pairs, result["views"])
         result["mean_error"] = float(best.compute_mean_reprojection_error())
         result["points"] = int(best.num_points3D())
     write_json(out / "result.json", result)
-    say("phase done")
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ from pipeline.export import LEVEL, choose_slab, fit_parts, scene_text, write_sce
 from pipeline.materials import ASSUMED, MATERIALS, choose
 from pipeline.mesh.placement import Placement
 from pipeline.mesh.visibility import Above
-from sdfsim.errors import SdfsimError
 from sdfsim.files import write_json
 from sdfsim.scene.scene_file import load_scene
 from sdfsim.shape.mesh import Mesh, write_ply
@@ -198,12 +197,3 @@ def test_the_scene_file_names_the_source_of_every_number_and_what_is_assumed(fit
     assert above["- {name: object1"].startswith("# ceramic, a wall of 4 mm. From: density: CRC Handbook")
     assert above["- {name: floor"].startswith("# wood. From: density: CRC Handbook")
     assert all(above[f"- {{name: {name}"].startswith("# assumed") for name in ("scene", "box"))
-
-
-def test_a_material_of_no_body_is_refused_and_nothing_is_written(fitted):
-    with pytest.raises(
-        SdfsimError, match=r"^material: no body is called 'objct1' \(did you mean 'object1'\?\)$"
-    ) as caught:
-        write_scene(fitted, fitted / "scene.yaml", materials=choose({"objct1": "wood"}))
-    assert caught.value.hint == "the bodies are floor, scene, object1, box" and caught.value.exit_code == 1
-    assert not (fitted / "scene.yaml").exists()

@@ -22,9 +22,8 @@ from pipeline.field.grid_field import (
     stencil,
 )
 from pipeline.field.interpolation import by_rows, interpolate
-from pipeline.field.rays import Rays, camera_rays, load_rays
 from pipeline.field.rendering import choose_samples, sdf_cache, sphere_interval
-from pipeline.field.training import PRESETS, Trained, Trainer, save_field, train
+from pipeline.field.training import PRESETS, Rays, Trained, Trainer, camera_rays, load_rays, save_field, train
 from pipeline.inputs.photos import save_photos
 from pipeline.sfm.supervision import supervision_of
 from sdfsim.errors import SdfsimError

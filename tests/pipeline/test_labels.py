@@ -31,7 +31,6 @@ def test_masks_by_object_become_labels_and_say_nothing_where_there_are_none(tmp_
     mask(tmp_path / "in" / "masks" / "vase" / "0.jpg.png", slice(50, 100))
     mask(tmp_path / "in" / "masks" / "vase" / "1.png", slice(50, 100))
     mask(tmp_path / "in" / "masks" / "vase" / "z.png", slice(50, 100))
-    (tmp_path / "in" / "masks" / "jug").mkdir()
     out = tmp_path / "out"
     out.mkdir()
     prepared, notes = prepare_photos(folder, out)
@@ -40,7 +39,7 @@ def test_masks_by_object_become_labels_and_say_nothing_where_there_are_none(tmp_
     assert both is not None and one is not None and load_labels(out, "0002.jpg") is None
     assert [both[5, x] for x in (10, 55, 80, 110)] == [1, UNKNOWN, 2, 0]
     assert [one[5, x] for x in (10, 80)] == [UNKNOWN, 2]  # the photo may show a cup that nobody marked
-    assert "masks/jug holds no masks" in notes and "1 files in masks/vase belong to no photo (first: z.png)" in notes
+    assert [note.endswith("masks/vase belong to no photo (first: z.png)") for note in notes] == [True]
     assert not any(photo.mask for photo in prepared)
     assert tmp_path / "in" / "masks" / "cup" / "0.png" in find_source(folder).files()
 
@@ -101,15 +100,4 @@ def test_masks_of_no_use_are_refused(tmp_path, name, file, why):
     folder = noise(tmp_path / "in", NAMES)
     mask(folder / "masks" / name / file, slice(0, 9))
     with pytest.raises(SdfsimError, match=why):
-        find_source(folder)
-
-
-def test_label_images_in_colour_or_of_nothing_are_refused(tmp_path):
-    folder = noise(tmp_path / "in", NAMES)
-    (folder / "labels").mkdir()
-    Image.new("RGB", (120, 90)).save(folder / "labels" / "0.png")
-    with pytest.raises(SdfsimError, match="one number a pixel"):
-        find_source(folder)
-    Image.new("L", (120, 90)).save(folder / "labels" / "0.png")
-    with pytest.raises(SdfsimError, match="all labels are 0"):
         find_source(folder)

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.cameras import load_sparse, view_span
+from pipeline.cameras import view_span
 from pipeline.inputs.photos import Photo, prepare_photos
 from pipeline.sfm import poses
-from pipeline.sfm.pose_checks import check, failure_hint, failure_message, find, views_of
+from pipeline.sfm.pose_checks import check, failure_message, find, views_of
 from pipeline.sfm.poses import ORDINARY, run_worker, size_groups, solve
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.files import write_arrays, write_json
@@ -33,13 +33,13 @@ def result(count: int, posed: int, *, focal: float = 600.0, error: float = 0.5, 
         a = np.radians(span) * k / max(posed, 1)
         turn = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
         views.append({"name": f"{k:04d}.jpg", "width": 640, "height": 480, "focal": focal, "cx": 320, "cy": 240,
-                      "k": 0, "camera": 1, "rotation": turn.tolist(), "translation": [0, 0, 3]})  # fmt: skip
+                      "k": 0, "rotation": turn.tolist(), "translation": [0, 0, 3]})  # fmt: skip
     names = [f"{k:04d}.jpg" for k in range(count)]
     counts = {name: {"features": features, "best_matches": 10, "partners": 1} for name in names}
     pairs = [{"a": a, "b": b, "matches": matches, "still": still} for a, b in pairwise(names)]
     against = [{"a": pair["a"], "b": pair["b"], "matches": matches, "error": 0.3} for pair in pairs]
     return {"views": views, "counts": counts, "pairs": pairs, "contradictions": against, "mean_error": error,
-            "points": 900, "track_length": 4.0, "models": [names[:posed]], "turn_only": 0.0,
+            "points": 900, "turn_only": 0.0,
             "focal_of_pairs": {}}  # fmt: skip
 
 
@@ -51,13 +51,6 @@ def test_good_poses_pass():
     assert verdict["failures"] == [] and verdict["posed"] == 9 and verdict["causes"] == []
     assert verdict["left_out"][0]["photo"] == "IMG_9.JPG"
     assert "too few matches" in verdict["left_out"][0]["why"]
-
-
-def test_too_few_posed_names_photos_reasons_and_what_to_try():
-    verdict = check(result(10, 4, features=20), PHOTOS)
-    message = failure_message(verdict)
-    assert "only 4 of 10 photos" in message and "IMG_4.JPG: too few features (20)" in message and "\n" not in message
-    assert "textured" in failure_hint(verdict)
 
 
 @pytest.mark.parametrize(
@@ -304,9 +297,9 @@ def test_epipolar_errors_are_those_of_projected_points():
     a, b = poses.views_of({"views": views[:2]}, [photo(0), photo(1)])
     points = np.random.default_rng(0).normal(size=(200, 3)) * 0.5
     first, second = a.project(points)[0], b.project(points)[0]
-    assert epipolar_errors(views[0], views[1], first, second).max() < 1e-3
+    assert epipolar_errors(a, b, first, second).max() < 1e-3
     moved = second + np.array([0, 3.0])  # The cameras turn about y, so all lines are nearly level.
-    assert np.median(epipolar_errors(views[0], views[1], first, moved)) == pytest.approx(3 / 2**0.5, rel=0.2)
+    assert np.median(epipolar_errors(a, b, first, moved)) == pytest.approx(3 / 2**0.5, rel=0.2)
 
 
 def test_turning_on_the_spot_is_told_from_walking():
@@ -325,13 +318,6 @@ def test_turning_on_the_spot_is_told_from_walking():
     walked = (size, seen(deep), seen(deep + np.array([0.4, 0, 0])))
     assert turn_only([turned, turned, walked]) == pytest.approx(2 / 3)
     assert turn_only([walked]) == 0.0
-
-
-def test_a_cut_file_of_points_is_one_clear_line(tmp_path):
-    write_arrays(tmp_path / "sparse.npz", {"xyz": np.zeros((500, 3))})
-    (tmp_path / "sparse.npz").write_bytes((tmp_path / "sparse.npz").read_bytes()[:60])
-    with pytest.raises(SdfsimError, match=r"sparse\.npz: cannot be read"):
-        load_sparse(tmp_path)
 
 
 @pytest.mark.slow

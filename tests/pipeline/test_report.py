@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.cameras import save_views
-from pipeline.report import improvements, notes, write_recording
+from pipeline.report import write_recording
 from pipeline.sfm.pose_checks import check, views_of
 from pipeline.stages import reconstruct
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
@@ -52,22 +52,3 @@ def test_a_run_that_stopped_says_where_and_why(photos, tmp_path, act):
     }  # fmt: skip
     assert report["poses"]["posed"] == 1 and any("too little to see" in line for line in report["improve"])
     assert "It stopped in the poses stage" in (tmp_path / "out" / "report.md").read_text()
-
-
-def test_improvements_fit_what_is_wrong():
-    rows = [{"photo": f"{k}.jpg"} for k in range(8)]
-    report = {
-        "photos": rows, "poses": check(result(8, 8, error=1.5), [photo(k) for k in range(8)]),
-        "stages": {}, "psnr": 15.0, "failed_checks": [],
-    }  # fmt: skip
-    lines = " / ".join(improvements(report))
-    for words in ("8 are few", "only within 1.5 px", "15.0 dB"):
-        assert words in lines
-    good = {**report, "photos": rows * 3, "psnr": 28.0,
-            "poses": check(result(8, 8), [photo(k) for k in range(8)])}  # fmt: skip
-    assert improvements(good) == []
-
-
-def test_an_assumed_size_is_never_silent():
-    found = notes({"mesh": {"up_from": "plane", "size": "assumed: widest side = 1 m"}})
-    assert found == ["size assumed: widest side = 1 m (give --size or --distance)"]

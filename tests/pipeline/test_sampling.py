@@ -9,8 +9,17 @@ import torch
 from pipeline.cameras import Sparse
 from pipeline.field.grid_field import FieldSize, GridField, laplace_density
 from pipeline.field.rendering import EPSILON, bounded_samples, draw, nearest, opacity_bound, sdf_cache, worst
-from pipeline.sfm.depth import DepthPoints
-from pipeline.sfm.supervision import CLEARANCE, FILLED, GAP, JUST_EMPTY, NOISES, SLOPE, FreeSpace, supervision_of
+from pipeline.sfm.supervision import (
+    CLEARANCE,
+    FILLED,
+    GAP,
+    JUST_EMPTY,
+    NOISES,
+    SLOPE,
+    DepthPoints,
+    FreeSpace,
+    supervision_of,
+)
 from tests.pipeline.test_field import UNIT
 from tests.pipeline.test_surface import ring
 

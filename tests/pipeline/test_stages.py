@@ -145,7 +145,7 @@ def test_a_full_disk_and_an_unwritable_folder_are_one_clear_line(photos, tmp_pat
         raise OSError(28, "No space left on device", str(work))
 
     act("mesh", full)
-    with pytest.raises(SdfsimError, match="the disk is full"):
+    with pytest.raises(SdfsimError, match="No space left on device"):
         reconstruct(photos, tmp_path / "out")
     (tmp_path / "file").write_text("")
     with pytest.raises(SdfsimError, match="cannot be written"):

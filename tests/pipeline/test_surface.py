@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 from pipeline.cameras import CAREFUL, UNKNOWN, Similarity, Sparse, View, camera_up, nearest_to_axes
-from pipeline.mesh.cleaning import belonging, components, islands
-from pipeline.mesh.extraction import Volume, sample_box, sample_volume, trusted_vertices
+from pipeline.mesh.extraction import belonging, components, islands, sample_box, sample_volume, trusted_vertices
 from pipeline.mesh.placement import find_up, load_placement, place, plane_up, resting_height
 from pipeline.mesh.visibility import Visibility, bilinear, spread_colors
 from pipeline.sfm.supervision import unit_sphere_of
-from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.shape.bvh import Caster
 from sdfsim.shape.mesh import Mesh, is_closed, joined, signed_volume, vertex_normals
 
@@ -72,12 +70,6 @@ def test_a_volume_knows_its_places():
     np.testing.assert_allclose(volume.at(at), at @ direction - 0.2, atol=1e-6)
     cut = volume.limited(lambda p: p[:, 2] - 2.4)
     np.testing.assert_allclose(cut.values, np.maximum(volume.values, volume.points()[..., 2] - 2.4), atol=1e-6)
-
-
-def test_no_surface_is_a_quality_error():
-    with pytest.raises(SdfsimError) as caught:
-        Volume(np.ones((5, 5, 5), np.float32), np.zeros(3), 0.1).mesh()
-    assert caught.value.exit_code == EXIT_QUALITY
 
 
 def crowd() -> tuple[Mesh, np.ndarray]:

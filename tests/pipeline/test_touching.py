@@ -11,11 +11,10 @@ import pytest
 from PIL import Image
 
 from pipeline.cameras import Similarity, View
-from pipeline.inputs.labels import save_labels, save_names
+from pipeline.inputs.labels import FOLDER, NAMES
 from pipeline.mesh.bodies import Parts, split
 from pipeline.mesh.extraction import EXTENT, Surface, ball, sample_volume
-from pipeline.mesh.hollows import hollow, hollow_line
-from pipeline.report import touching_lines
+from sdfsim.files import write_json
 from sdfsim.shape.mesh import Mesh, is_closed, signed_volume
 from tests.pipeline import photo_sets
 
@@ -101,9 +100,10 @@ class Scene:
         for view in self.views:
             Image.new("RGB", (480, 360)).save(folder / "images" / view.name)
         for view, label in zip(self.views, labels, strict=False):
-            save_labels(number[label], folder, view.name)
+            (folder / FOLDER).mkdir(exist_ok=True)
+            Image.fromarray(number[label]).save(folder / FOLDER / f"{view.name}.png")
         if masks:
-            save_names(tuple(masks), folder)
+            write_json(folder / FOLDER / NAMES, {"names": list(masks)})
         nothing, up = np.zeros((0, 3)), np.array([0, 0, 1.0])
         found = split(self.surface, self.distance, FINEST, self.views, nothing, folder, up, alone=alone)
         back = self.to_unit.inverse()
@@ -190,28 +190,6 @@ def test_what_stands_apart_on_a_board_is_three_whole_bodies(tmp_path):
     for name, true in zip(found.bodies, ("torus", "jug", "carton"), strict=True):
         sides = np.ptp(shelf.parts[["torus", "carton", "jug"].index(true)].vertices, axis=0)
         np.testing.assert_allclose(np.ptp(found.bodies[name].vertices, axis=0), sides, rtol=0.01)
-
-
-def test_a_hollow_has_a_depth_and_what_is_below_it_is_floor_or_filling():
-    make = photo_sets.studio()
-    cup = Mesh(*make.lathe(np.array([(0, 0), (0.08, 0), (0.08, 0.16), (0.062, 0.16), (0.062, 0.03), (0, 0.03)])))
-    depth, below = hollow(cup, 0.01) or (0, 0)
-    assert (depth, below) == (pytest.approx(0.13, abs=1e-3), pytest.approx(0.03, abs=1e-3))
-    assert hollow_line("cup", depth, below) == "cup: hollow, 0.13 m deep below its rim, on a floor 0.03 m thick"
-    filled = Mesh(*make.lathe(np.array([(0, 0), (0.08, 0), (0.08, 0.16), (0.062, 0.16), (0.062, 0.12), (0, 0.12)])))
-    line = hollow_line("cup", *(hollow(filled, 0.01) or (0, 0)))
-    assert line == "cup: hollow to 0.04 m below its rim as far as photos see; the 0.12 m below that are solid"
-    assert hollow(filled, 0.05) is None and hollow(Mesh(*photo_sets.ring((0, 0, 0.05), 0.1, 0.04)), 0.01) is None
-
-
-def test_the_report_tells_what_touches_and_which_masks_have_no_body():
-    told = touching_lines({
-        "touching": [("object2", "object3", "shape"), ("cup", "vase", "masks")], "masks_without_surface": ["spoon"]
-    })  # fmt: skip
-    assert told == [
-        "object2 and object3 touch; split along a seam by concavity and colour; give masks to be sure",
-        "cup and vase touch; split where their masks end", "masks of spoon: no surface corresponds to them",
-    ]  # fmt: skip
 
 
 def test_without_scenery_a_connected_pair_comes_apart_by_masks(tmp_path):

@@ -13,11 +13,9 @@ from PIL import Image
 
 from pipeline.cameras import Sparse, View
 from pipeline.field import training
-from pipeline.field.held_out import FOLDER, HeldOut, score
 from pipeline.field.rendering import sdf_cache
-from pipeline.field.training import FEWEST_STEPS, PRESETS, Trainer, paced, train
+from pipeline.field.training import FEWEST_STEPS, HELD_OUT, PRESETS, Trainer, compare, load_rays, paced, score, train
 from pipeline.inputs.photos import save_photos
-from sdfsim.errors import SdfsimError
 from tests.pipeline.test_field import SMALL, posed_noise
 from tests.pipeline.test_poses import photo
 
@@ -89,8 +87,7 @@ class Ball:
 def test_a_field_that_is_right_scores_as_such(tmp_path):
     """Pixels of the ball are those of the photo."""
     photos(tmp_path, 2, masks=True)
-    held = HeldOut(views(2), tmp_path, Ball(), masked=True)  # type: ignore[arg-type]
-    psnr, picture = held.compare(0)
+    psnr, picture = compare(load_rays(views(2), tmp_path, 100, masks=False), 0, Ball(), torch.full((3,), 0.5))  # type: ignore[arg-type]
     assert np.abs(picture[SIDE // 2, SIDE // 2].astype(int) - RED).max() <= 2
     # Outside the ball the photo is red and the render is the backdrop: the error of that share of pixels.
     inside = np.hypot(*(np.mgrid[0:SIDE, 0:SIDE] + 0.5 - SIDE / 2)) < 50 / np.sqrt(8)  # of the unit sphere
@@ -106,9 +103,8 @@ def test_held_out_photos_that_show_nothing_of_the_sphere_are_passed_over(tmp_pat
     ring[4] = away(ring[4])
     report = train(ring, cloud(), tmp_path, tmp_path, settings=settings, threads=1).report
     assert report["held_out_photos"] == ["IMG_12.JPG"] and len(report["psnr_each"]) == 1
-    assert np.isfinite(report["psnr"]) and [p.name for p in (tmp_path / FOLDER).iterdir()] == ["12.jpg"]
-    none = HeldOut([away(view) for view in views(2)], tmp_path, Ball(), masked=False)  # type: ignore[arg-type]
-    assert none.shown == [] and score(none, tmp_path) == {}
+    assert np.isfinite(report["psnr"]) and [p.name for p in (tmp_path / HELD_OUT).iterdir()] == ["12.jpg"]
+    assert score([away(view) for view in views(2)], tmp_path, Ball(), tmp_path, masked=False) == {}  # type: ignore[arg-type]
 
 
 def test_masks_count_only_where_every_photo_has_one_posed_or_not(tmp_path):
@@ -185,12 +181,3 @@ def test_a_run_that_goes_on_has_what_is_left_of_its_budget(tmp_path, clock):
     assert report["resumed"] and report["seconds_before"] == 100.0
     assert report["train_seconds"] == pytest.approx(150.0, abs=training.PACE)
     assert report["train_seconds"] <= 150.0 and report["iterations"] == report["train_seconds"]
-
-
-def test_a_loss_that_is_not_finite_points_to_what_is_there_by_then(tmp_path, monkeypatch):
-    views, sparse = posed_noise(tmp_path)
-    monkeypatch.setattr(Trainer, "step", lambda trainer: {"color": float("nan")})
-    monkeypatch.setattr(training, "calibrate", lambda probe, threads: 1.0)
-    with pytest.raises(SdfsimError, match="no longer finite") as caught:
-        train(views, sparse, tmp_path, tmp_path, settings=SETTINGS)
-    assert "sdfsim poses" in caught.value.hint

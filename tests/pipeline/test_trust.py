@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.cameras import View
-from pipeline.mesh.next_photos import Advice, next_photos
-from pipeline.mesh.trust import Support, information, sigma_along, summary, support_of
+from pipeline.mesh.trust import NextPhoto, Support, information, next_photos, sigma_along, summary, support_of
 from pipeline.mesh.visibility import Visibility
 from pipeline.report import improvements, notes
 from sdfsim.errors import SdfsimError
@@ -129,7 +128,7 @@ class Photographed:
     def support(self, more: list[View] | None = None) -> Support:
         return support_of(self.sight, [*self.views, *(more or [])])
 
-    def advice(self) -> Advice:
+    def advice(self) -> tuple[list[NextPhoto], float]:
         counted = self.vertices[:, 2] > -1e-3
         return next_photos(self.meshes, self.support(), self.sight, self.caster, self.views, counted)
 
@@ -159,15 +158,15 @@ def view_of(make, pose: np.ndarray, number: int) -> View:
 def test_photos_of_one_half_ask_for_the_other_half():
     """Photos from the side of +y alone: the proposals stand at -y, and with them little of the box is left unseen."""
     set_up = Photographed(orbit(studio(), 12, span=180.0))
-    found = set_up.advice()
-    assert len(found.photos) == 3 and found.weak > 0.05
-    places = np.array([photo.view.center for photo in found.photos])
+    photos, weak = set_up.advice()
+    assert len(photos) == 3 and weak > 0.05
+    places = np.array([photo.view.center for photo in photos])
     assert (places[:, 1] < -0.3).all() and (places[:, 2] > 0.05).all()
-    gains = [photo.gain for photo in found.photos]
+    gains = [photo.gain for photo in photos]
     assert gains == sorted(gains, reverse=True) and 0.5 < sum(gains) <= 1
-    before, after = set_up.unseen(), set_up.unseen([photo.view for photo in found.photos])
+    before, after = set_up.unseen(), set_up.unseen([photo.view for photo in photos])
     assert before > 0.2 and after < 0.5 * before
-    for photo in found.photos:
+    for photo in photos:
         assert "stand where 0" in photo.words and "around the scene to your" in photo.words
         assert "looking at " in photo.words
         # The camera does look there.
@@ -176,14 +175,14 @@ def test_photos_of_one_half_ask_for_the_other_half():
         assert depth[0] > 0
     text = " / ".join(improvements({
         "poses": {}, "photos": [], "psnr": None, "failed_checks": [],
-        "stages": {"mesh": {"next_photos": [photo.told() for photo in found.photos]}},
+        "stages": {"mesh": {"next_photos": [photo.told() for photo in photos]}},
     }))  # fmt: skip
-    assert found.photos[0].words in text and f"{places[0][0]:.2f}" in text
+    assert photos[0].words in text and f"{places[0][0]:.2f}" in text
 
 
 def test_where_all_is_photographed_nothing_is_asked_for():
     set_up = Photographed(orbit(studio(), 36))
-    found = set_up.advice()
-    assert found.photos == []
-    told = notes({"mesh": {"trust": {}, "weak": found.weak, "next_photos": []}})
+    photos, weak = set_up.advice()
+    assert photos == []
+    told = notes({"mesh": {"trust": {}, "weak": weak, "next_photos": []}})
     assert any("no one photo would help much" in line for line in told)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from pipeline.inputs.photos import prepare_photos
-from pipeline.inputs.sources import find_source
 from pipeline.inputs.video import FEWEST, Track, choose, follow
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from tests.pipeline.photo_sets import TABLE_VASE
@@ -62,19 +61,8 @@ def test_a_film_without_motion_is_refused_with_the_reason(tmp_path):
     assert caught.value.exit_code == EXIT_QUALITY
 
 
-def test_a_film_that_is_too_short_is_refused(tmp_path):
-    film(tmp_path / "a.mp4", np.arange(10) * 20)
-    with pytest.raises(SdfsimError, match="only 10 frames"):
-        prepare_photos(tmp_path / "a.mp4", tmp_path)
-
-
 def test_what_is_no_video_is_named(tmp_path, capfd):
     (tmp_path / "a.mp4").write_bytes(b"nothing of the kind" * 100)
     with pytest.raises(SdfsimError, match=r"a\.mp4: cannot be decoded as a video"):
         prepare_photos(tmp_path / "a.mp4", tmp_path)
     assert capfd.readouterr().err == ""
-
-
-def test_the_content_of_a_video_counts(tmp_path):
-    (tmp_path / "a.MOV").write_bytes(b"x")
-    assert find_source(tmp_path / "a.MOV").files() == [tmp_path / "a.MOV"]
