@@ -113,6 +113,8 @@ def notes(stages: dict[str, dict]) -> list[str]:
 
 def mesh_notes(mesh: dict) -> list[str]:
     """Those of the mesh stage, from its report."""
+    from pipeline.mesh.hollows import hollow_line
+
     lines = []
     if mesh.get("up_from") == "cameras":
         lines.append("no level plane found: up is taken from the cameras and may be off by some degrees")
@@ -125,6 +127,7 @@ def mesh_notes(mesh: dict) -> list[str]:
     how = {"masks": "split where their masks end", "shape": "split along a seam by shape; give masks to be sure"}
     lines += [f"{first} and {second} touch; {how[by]}" for first, second, by in mesh.get("touching", [])]
     lines += [f"masks of {name}: they have no surface" for name in mesh.get("masks_without_surface", [])]
+    lines += [hollow_line(name, *found) for name, found in mesh.get("hollows_m", {}).items()]
     if "smallest_object_m" in mesh:
         lines.append(f"what rises less than {mesh['smallest_object_m']:.2g} m stays part of what it stands on")
     if mesh.get("left_out_m"):

@@ -139,7 +139,7 @@ STAGES = {
     "photos": Stage(do_photos, "photos", version=3),
     "poses": Stage(do_poses, "poses", ("seed",), 3),
     "distill": Stage(do_distill, "distill", ("preset", "seed", "budget"), 4),
-    "mesh": Stage(do_mesh, "mesh", ("preset", "size", "distance", "crop"), 8),
+    "mesh": Stage(do_mesh, "mesh", ("preset", "size", "distance", "crop"), 9),
     "fit": Stage(do_fit, "assets", ("seed", "budget", "recipe")),
     "scene": Stage(do_scene, "scene", ("seed", "drop", "material"), 3),
 }

@@ -17,6 +17,7 @@ from pipeline.inputs.captures import load_capture
 from pipeline.inputs.photos import load_photos
 from pipeline.mesh.bodies import Parts, split
 from pipeline.mesh.extraction import Distance, ball, field_distance, sample_volume, surface_of
+from pipeline.mesh.hollows import hollow
 from pipeline.mesh.placement import GRAVITY, Placement, Up, measured_scale, place
 from pipeline.mesh.texture import Shots, shots_of, texture_parts
 from pipeline.mesh.trust import Support, color_range, colors_of, next_photos, summary, support_of
@@ -83,12 +84,14 @@ def make_meshes(
     write_parts(parts, surface.visible, placement, support, out)
     textures = texture_parts(displayed, shots, share_of(on_progress, 0.87, 0.13))
     write_bytes(out / TEXTURED, write_glb(textures))
+    deep = {name: hollow(closed[name], 2 * surface.volume.cell * metres) for name in parts.bodies}
     return {
         "left_out_m": [float(rounded(length * metres)) for length in (*surface.left_out, *parts.noise)],
         "extent_m": rounded(np.ptp(placement.mesh(surface.visible).vertices, axis=0)).tolist(),
         "up_from": placement.up_from, "up_within_degrees": round(placement.up_within, 2),
         "up_confidence": placement.up_confidence, "size": placement.size_from, "objects": list(parts.bodies),
         "smallest_object_m": float(rounded(parts.smallest * metres)), "touching": parts.touching,
+        "hollows_m": {name: rounded(found).tolist() for name, found in deep.items() if found is not None},
         "masks_without_surface": parts.missing, **told,
     }  # fmt: skip
 

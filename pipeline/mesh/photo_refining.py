@@ -34,7 +34,9 @@ ASKED, CLEAR, SELDOM = 8, 0.5, 16
 REACH, ROUNDS = 1.3, 3
 EVERY = 4  # one vertex of so many is looked at, the others follow
 ALIKE, SURE = 0.35, 0.9  # correlations between which trust in a place rises
-SPREAD = 3.0  # of the usual difference from the surface around it, at which a place is no longer trusted
+# A place is no longer trusted so many times the usual difference from the surface around it. What is usual is told by
+# the places around, since many of them are far off where the field is; but at most so many times the body's median.
+SPREAD, FAR = 3.0, 2.0
 # A place counts in full where the mean trust within so many edges is this: a lone match at an edge is a mistake.
 NEAR, EVEN = 8, 0.3
 # Weights beside trust: of the surface's area, of its bending, and of where a vertex was.
@@ -113,9 +115,13 @@ def refine(mesh: Mesh, pictures: list[Picture], blocking: Caster, lift: float, f
         stay = STAY + PINNED * (1 - told)
         moved = settled(mesh, along, mean, wanted, weight, stay)
         # What the surface around it contradicts was a mistake.
-        off = np.abs(moved - wanted)[picked]
-        usual = np.median(off[trust > 0]) if (trust > 0).any() else 1.0
-        weight[picked] *= np.exp(-((off / (SPREAD * usual + 1e-9)) ** 2))
+        off = np.abs(moved - wanted)
+        around = np.stack([weight * off, weight], 1)
+        for _ in range(NEAR):
+            around = mean @ around
+        most = FAR * np.median(off[weight > 0]) if (weight > 0).any() else 1.0
+        usual = (around[:, 0] / around[:, 1].clip(1e-9)).clip(None, most)
+        weight = weight * np.exp(-((off / (SPREAD * usual + 1e-9)) ** 2))
         moved = settled(mesh, along, mean, wanted, weight, stay).clip(moves[0], moves[-1])
         # The two sides of a thin wall must not pass through each other.
         caster, skin = Caster(mesh), 1e-3 * finest * normal
