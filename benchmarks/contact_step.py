@@ -53,10 +53,8 @@ FAR, FAR_OFF = (10, 10_000), np.array([30.0, 30.0, 0.0])  # static ones, and whe
 def solved(scene: Scene, steps: int, dt: float | None = None, *, sleep: bool = False) -> tuple[float, tuple[int, ...]]:
     """Milliseconds a step of the compiled solve, and what its last step counted (pairs, contacts, ...)."""
     simulator = Simulator(scene, "solver")
-    rules = compiled_rules(
-        simulator.rules.gravity.numpy(), dt / simulator.units.time if dt else simulator.rules.dt,
-        simulator.rules.substeps, sleep=sleep,
-    )  # fmt: skip
+    options = replace(simulator.rules, sleep=sleep)
+    rules = compiled_rules(replace(options, dt=dt / simulator.units.time) if dt else options)
     inside = Compiled(simulator.bodies, simulator.state)
     motion, manifolds = taken_up(simulator.bodies, simulator.state, inside, rules)
     counts: tuple[int, ...] = ()

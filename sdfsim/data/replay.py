@@ -11,9 +11,9 @@ from sdfsim.data.batching import PLANE, merged
 from sdfsim.data.dataset import FLOOR, Trajectory
 from sdfsim.data.pybullet_sim import MARGIN
 from sdfsim.dynamics.bodies import Units
-from sdfsim.dynamics.earlier_poses import with_history
 from sdfsim.dynamics.model import Model
 from sdfsim.dynamics.models.contact_graph import SUBSTEPS
+from sdfsim.dynamics.models.surfaces import with_history
 from sdfsim.dynamics.run_memory import Memory
 from sdfsim.dynamics.step import FreeFlight, StepOptions, step
 from sdfsim.errors import EXIT_QUALITY, SdfsimError

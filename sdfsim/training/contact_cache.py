@@ -27,7 +27,7 @@ from sdfsim.parallel import parallel
 
 if TYPE_CHECKING:
     from sdfsim.dynamics.bodies import Bodies, State
-    from sdfsim.dynamics.solver import Acts
+    from sdfsim.dynamics.kernels.record import Edges
 
 STEP = 0.02  # s, the step that networks know
 FRAMES_VERSION = 8  # counts up whenever frames of the same recordings come out differently
@@ -216,9 +216,9 @@ def _followed(files: list[Path], how: Solved) -> list[dict[str, np.ndarray]]:
         for now in range(0, count - how.stride, how.stride):
             state = replace(_recorded(group, now, start), touch=touch)
             state = _disturbed(bodies, state, how, rng) if draw else state
-            after, acts = solver_step(bodies, state, rules, memory, note=True)
+            after, edges = solver_step(bodies, state, rules, memory, note=True)
             touch = after.touch
-            parts += _of_step(bodies, state, after, acts, _recorded(group, now + how.stride, start), rules.dt)
+            parts += _of_step(bodies, state, after, edges, _recorded(group, now + how.stride, start), rules.dt)
     return parts
 
 
@@ -257,14 +257,16 @@ def _disturbed(bodies: Bodies, state: State, how: Solved, rng: np.random.Generat
 
 
 def _of_step(
-    bodies: Bodies, state: State, after: State, acts: Acts, recorded: State, dt: float
+    bodies: Bodies, state: State, after: State, edges: Edges, recorded: State, dt: float
 ) -> list[dict[str, np.ndarray]]:
     """The frames of a step of several trajectories as one part of the arrays, in units in which it lasts `STEP`."""
-    if not len(acts):
+    from sdfsim.dynamics.kernels.record import APART, ARM, AXIS, GIVEN, OTHER, WHEN
+
+    if not len(edges.pair):
         return []
     floor = len(bodies) - 1
     world = bodies.world.numpy()
-    of_edge = world[acts.first.numpy()]
+    of_edge = world[edges.pair[:, 0]]
     order = np.argsort(of_edge, kind="stable")
     used, count = np.unique(of_edge, return_counts=True)
     rows = np.flatnonzero(np.isin(world, used))
@@ -276,14 +278,17 @@ def _of_step(
     def body(values: torch.Tensor, unit: float = 1.0) -> np.ndarray:
         return values.numpy()[rows] / unit
 
-    def edge(values: torch.Tensor, unit: float = 1.0) -> np.ndarray:
-        return values.numpy()[order] / unit
+    def edge(column: int, unit: float = 1.0) -> np.ndarray:
+        return edges.value[order, column] / unit
+
+    def vector(column: int, unit: float = 1.0) -> np.ndarray:
+        return edges.value[order, column : column + 3] / unit
 
     def turned(end: State) -> torch.Tensor:
         return pose.to_rotvec(pose.multiply(end.orientation, pose.conjugate(state.orientation))) / dt
 
     free = torque_free(state.orientation, state.angular_velocity, bodies.inertia, dt)[1]
-    second = acts.second.numpy()[order]
+    first, second = edges.pair[order].T
     speed = length / time
     result = {
         "bodies": sizes,
@@ -297,14 +302,14 @@ def _of_step(
         "friction": body(bodies.friction),
         "restitution": body(bodies.restitution),
         "size": body(bodies.size, length),
-        "first": acts.first.numpy()[order] - begins[of_edge[order]],
+        "first": first - begins[of_edge[order]],
         "second": np.where(second == floor, -1, second - begins[of_edge[order]]),
-        "arm_first": edge(acts.arm_first, length),
-        "arm_second": edge(acts.arm_second, length),
-        "normal": edge(acts.normal),
-        "impulse": edge(acts.impulse, speed),
-        "gap": edge(acts.gap, length),
-        "when": edge(acts.when),
+        "arm_first": vector(ARM, length),
+        "arm_second": vector(OTHER, length),
+        "normal": vector(AXIS),
+        "impulse": vector(GIVEN, speed),
+        "gap": edge(APART, length),
+        "when": edge(WHEN),
     }
     names = (("solved_velocity", "solved_angular", "solved_moved", "solved_turned"),)
     names += (("end_velocity", "end_angular", "moved", "turned"),)
