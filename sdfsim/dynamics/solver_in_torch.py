@@ -23,7 +23,7 @@ from sdfsim.dynamics.free_flight import torque_free
 from sdfsim.dynamics.kernels import collide as ways
 from sdfsim.dynamics.kernels import distance as kinds
 from sdfsim.dynamics.kernels import solve as solving
-from sdfsim.dynamics.kernels.world import DRAG, GAP, KEY, NORMAL, POINTS, PUSH, SECOND, Manifolds, Rules
+from sdfsim.dynamics.kernels.world import POINTS, Rules
 
 ROUND = (kinds.SPHERE, kinds.CAPSULE)
 NEARBY = 1e-6  # of a shape's metres, for the differences that are a distance's derivatives
@@ -59,17 +59,6 @@ class Known:
 
     touching: Tensor
     points: Points
-
-
-def known_of(touching: Tensor, manifolds: Manifolds) -> Known:
-    """What the compiled step has left."""
-    points: Points = {}
-    for (a, b), count, rows in zip(manifolds.pair.tolist(), manifolds.count, manifolds.point, strict=True):
-        points[a, b] = [
-            Point(r[:SECOND], r[SECOND:NORMAL], r[NORMAL:GAP], r[GAP], int(r[KEY]), r[PUSH], r[DRAG : DRAG + 3])
-            for r in torch.from_numpy(rows[:count].copy())
-        ]
-    return Known(touching, points)
 
 
 @dataclass

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from sdfsim.dynamics import pose
+from sdfsim.dynamics import inference, pose
 from sdfsim.dynamics.bodies import State
-from sdfsim.dynamics.kernels import impulse as kernel
 from sdfsim.dynamics.kernels.record import APART, ARM, AXIS, GIVEN, OTHER, WHEN, Edges
 from sdfsim.dynamics.kernels.world import World
 from sdfsim.dynamics.model import Model, new_network
@@ -18,6 +17,7 @@ from sdfsim.dynamics.models.contact_graph import ContactGraph
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.shape import analytic_shape
 
+kernel = inference.compiled
 POSE = ("position", "orientation", "velocity", "angular_velocity")
 
 

@@ -8,6 +8,7 @@ import torch
 
 from sdfsim.dynamics import solver_in_torch as twin
 from sdfsim.dynamics.bodies import State, Units, from_scene
+from sdfsim.dynamics.kernels.world import DRAG, GAP, KEY, NORMAL, PUSH, SECOND, Manifolds
 from sdfsim.dynamics.solver import Compiled, compiled_rules, taken_up
 from sdfsim.dynamics.step import StepOptions
 from sdfsim.scene.scene import Scene
@@ -34,6 +35,17 @@ def state_of(motion) -> State:
 
 def poses(state: State) -> tuple[torch.Tensor, ...]:
     return state.position, state.orientation, state.velocity, state.angular_velocity
+
+
+def known_of(touching: torch.Tensor, manifolds: Manifolds) -> twin.Known:
+    """What the compiled step has left."""
+    points: twin.Points = {}
+    for (a, b), count, rows in zip(manifolds.pair.tolist(), manifolds.count, manifolds.point, strict=True):
+        points[a, b] = [
+            twin.Point(r[:SECOND], r[SECOND:NORMAL], r[NORMAL:GAP], r[GAP], int(r[KEY]), r[PUSH], r[DRAG : DRAG + 3])
+            for r in torch.from_numpy(rows[:count].copy())
+        ]
+    return twin.Known(touching, points)
 
 
 def tops(seed: int) -> Scene:
@@ -89,7 +101,7 @@ def test_the_compiled_step_is_its_twin(scene, steps, rules, pull):
             manifolds, *_ = inside.run(motion, manifolds, rules)
             continue
         state = replace(state_of(motion), load=torch.from_numpy(inside.work.load.copy()))
-        known = twin.known_of(torch.from_numpy(motion.touching.copy()), manifolds)
+        known = known_of(torch.from_numpy(motion.touching.copy()), manifolds)
         after, known = twin.Solve(inside.shapes, inside.bodies, rules).step(state, known)
         manifolds, _, counts = inside.run(motion, manifolds, rules)
         assert sum(map(len, known.points.values())) == manifolds.count.sum()
@@ -142,7 +154,7 @@ def test_gradients_are_differences_of_the_compiled_step(name):
         )  # fmt: skip
     else:
         bodies = replace(bodies, **{name: torch.cat([value[None], getattr(bodies, name)[1:]])})
-    solve, known = twin.Solve(inside.shapes, bodies, rules), twin.known_of(torch.zeros(3, dtype=bool), manifolds)
+    solve, known = twin.Solve(inside.shapes, bodies, rules), known_of(torch.zeros(3, dtype=bool), manifolds)
     for _ in range(12):
         state, known = solve.step(state, known)
     np.testing.assert_allclose(state.position[:2].detach().numpy(), end(THROW[name]), atol=1e-9)
