@@ -6,6 +6,7 @@ import logging
 from collections import OrderedDict
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from sdfsim.dynamics.step import StepOptions
 
 _log = logging.getLogger(__name__)
-MOST_KEPT = 256  # shapes whose geometry stays at hand after their scenes are gone
+MOST_KEPT = 64  # shapes whose geometry stays at hand after their scenes are gone
 FORMS = {
     "plane": kinds.PLANE, "sphere": kinds.SPHERE, "capsule": kinds.CAPSULE, "box": kinds.BOX,
     "cylinder": kinds.CYLINDER,
@@ -239,25 +240,31 @@ class Geometry(NamedTuple):
     clumps: Clumps
 
 
-_known: OrderedDict[str, Geometry] = OrderedDict()  # by content: workers get copies of shapes
+_of_sdf: WeakKeyDictionary[Sdf, tuple[np.ndarray, Geometry]] = WeakKeyDictionary()  # with the nodes that it is for
+_of_content: OrderedDict[str, Geometry] = OrderedDict()  # of the latest: workers get copies of shapes
 
 
 def _geometry(sdf: Sdf, nodes: np.ndarray, pieces: tuple[np.ndarray, ...]) -> Geometry:
     """Made once for all scenes of a process."""
-    content = digest(sdf, nodes, pieces)
-    if content not in _known:
-        grid = None if isinstance(sdf, ClosedForm) else baked(sdf, nodes, pieces)
-        extent = 0.0 if isinstance(sdf, PlaneSdf) else float(np.ptp(sdf.bounds, axis=0).max())
-        if grid and grid.thickness <= 1.001 * WALL * grid.cell:
-            told = "a shape of %.2g m has walls of at most %.2g m: things may pass through; --thicken helps"
-            _log.warning(told, extent, grid.thickness)
-        surface = surface_of(sdf, nodes, pieces)
-        inward = INWARD * extent * inwards(sdf, surface.nodes)
-        _known[content] = Geometry(grid, surface, inward, _clumps(surface.nodes, surface.patch))
-        if len(_known) > MOST_KEPT:
-            _known.popitem(last=False)
-    _known.move_to_end(content)
-    return _known[content]
+    known, kept = _of_sdf.get(sdf, (None, None))
+    if kept is None or not np.array_equal(known, nodes):
+        content = digest(sdf, nodes, pieces)
+        kept = _of_content.pop(content, None) or _looked_at(sdf, nodes, pieces)
+        _of_sdf[sdf], _of_content[content] = (nodes, kept), kept
+        if len(_of_content) > MOST_KEPT:
+            _of_content.popitem(last=False)
+    return kept
+
+
+def _looked_at(sdf: Sdf, nodes: np.ndarray, pieces: tuple[np.ndarray, ...]) -> Geometry:
+    grid = None if isinstance(sdf, ClosedForm) else baked(sdf, nodes, pieces)
+    extent = 0.0 if isinstance(sdf, PlaneSdf) else float(np.ptp(sdf.bounds, axis=0).max())
+    if grid and grid.thickness <= 1.001 * WALL * grid.cell:
+        told = "a shape of %.2g m has walls of at most %.2g m: things may pass through; --thicken helps"
+        _log.warning(told, extent, grid.thickness)
+    surface = surface_of(sdf, nodes, pieces)
+    inward = INWARD * extent * inwards(sdf, surface.nodes)
+    return Geometry(grid, surface, inward, _clumps(surface.nodes, surface.patch))
 
 
 def compiled_world(bodies: Bodies, state: State) -> compiled.World:

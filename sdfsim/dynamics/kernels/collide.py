@@ -667,9 +667,9 @@ def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, lea
         w, c = map_between(place, frame, scales, coms, side, 1 - side)
         k = scales[1 - side]
         if is_round(table, s):
+            half = table[s, SIZE + 1] if table[s, KIND] == CAPSULE else 0.0  # of a ball the compiler asks once
             for e in range(-2, 3):
-                place_e = (0.0, 0.0, 0.5 * e * table[s, SIZE + 1])
-                d = distance_alone(table, brick, sample, t, mapped(w, c, place_e))
+                d = distance_alone(table, brick, sample, t, mapped(w, c, (0.0, 0.0, 0.5 * e * half)))
                 least = min(least, k * d - scales[side] * table[s, SIZE])
         elif near.count[p, side] > 0 and not is_round(table, t):
             first, last = near.start[p, side], near.start[p, side] + near.count[p, side]
