@@ -325,13 +325,17 @@ class Scratch(NamedTuple):
     """Room for what is found of one pair, once for each of S shares: compiled code allocates slowly.
 
     Attributes:
-        found: [S, FOUND, COLUMNS] new points.
-        every: [S, FOUND + POINTS, COLUMNS] with those that were known; before that nodes that are to become points.
+        found: [S, FOUND, COLUMNS] new points; every: [S, FOUND + POINTS, COLUMNS] with those that were known.
+        depth, node, key, normal: [S, SIDE] and [S, SIDE, 3] of the nodes that are to become points.
         away, alike: [S, FOUND + POINTS] how far from those chosen a point is, and how many of these are of its kind.
     """
 
     found: np.ndarray
     every: np.ndarray
+    depth: np.ndarray
+    node: np.ndarray
+    key: np.ndarray
+    normal: np.ndarray
     away: np.ndarray
     alike: np.ndarray
 
@@ -340,8 +344,9 @@ class Scratch(NamedTuple):
 def scratch_room():
     most = FOUND + POINTS
     return Scratch(
-        np.empty((SHARES, FOUND, COLUMNS)), np.empty((SHARES, most, COLUMNS)), np.empty((SHARES, most)),
-        np.empty((SHARES, most), np.int64),
+        np.empty((SHARES, FOUND, COLUMNS)), np.empty((SHARES, most, COLUMNS)), np.empty((SHARES, SIDE)),
+        np.empty((SHARES, SIDE), np.int64), np.empty((SHARES, SIDE), np.int64), np.empty((SHARES, SIDE, 3)),
+        np.empty((SHARES, most)), np.empty((SHARES, most), np.int64),
     )  # fmt: skip
 
 
@@ -489,7 +494,7 @@ def _nodes(shapes, world, motion, matrix, look, a, b, side, near, pair, went, sc
     if near.count[pair, side] == 0:
         return count
     table, brick, sample = shapes.table, shapes.brick, shapes.sample
-    some = scratch.every  # a node's number stands in NOTE
+    depth, node, keys, normal = scratch.depth, scratch.node, scratch.key, scratch.normal
     one, other = (a, b) if side == 0 else (b, a)
     r, s = world.shape[one], world.shape[other]
     w, c = map_between(motion.position, matrix, world.scale, world.com, one, other)
@@ -526,32 +531,31 @@ def _nodes(shapes, world, motion, matrix, look, a, b, side, near, pair, went, sc
         # Of those that are of the same two patches and face the same way the deepest, and of all.
         alike, place, worst = 0, -1, -1
         for e in range(kept):
-            normal = (some[t, e, NORMAL], some[t, e, NORMAL + 1], some[t, e, NORMAL + 2])
-            if some[t, e, KEY] == key and dot(facing, normal) > ALIKE:
+            if keys[t, e] == key and dot(facing, (normal[t, e, 0], normal[t, e, 1], normal[t, e, 2])) > ALIKE:
                 alike += 1
-                if place < 0 or some[t, e, GAP] > some[t, place, GAP]:
+                if place < 0 or depth[t, e] > depth[t, place]:
                     place = e
-            if worst < 0 or some[t, e, GAP] > some[t, worst, GAP]:
+            if worst < 0 or depth[t, e] > depth[t, worst]:
                 worst = e
         if alike < EACH:
             place = kept if kept < SIDE else worst
-        if place < kept and some[t, place, GAP] <= deepest:
+        if place < kept and depth[t, place] <= deepest:
             continue
         kept = max(kept, place + 1)
-        some[t, place, GAP], some[t, place, NOTE], some[t, place, KEY] = deepest, chosen, key
+        depth[t, place], node[t, place], keys[t, place] = deepest, chosen, key
         for x in range(3):
-            some[t, place, NORMAL + x] = facing[x]
+            normal[t, place, x] = facing[x]
     for e in range(kept):
         if count == FOUND:
             break
-        u = int(some[t, e, NOTE])
+        u = node[t, e]
         p, d, n = _refined(table, brick, sample, stride, r, s, w, c, k, own, get(shapes.node, u), get(shapes.inward, u))
         if d > look:
             continue
         # p of shape `one` -> about its centre of mass; its foot on the other, likewise.
         mine = sub(scale(p, own), get(world.com, one))
         theirs = sub(along(scale(mapped(w, c, p), k), n, -d), get(world.com, other))
-        _write(scratch.found, t, count, side, mine, theirs, turn(matrix, other, n), d, some[t, e, KEY])
+        _write(scratch.found, t, count, side, mine, theirs, turn(matrix, other, n), d, keys[t, e])
         count += 1
     return count
 
@@ -667,7 +671,7 @@ def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, lea
         w, c = map_between(place, frame, scales, coms, side, 1 - side)
         k = scales[1 - side]
         if is_round(table, s):
-            half = table[s, SIZE + 1] if table[s, KIND] == CAPSULE else 0.0  # of a ball the compiler asks once
+            half = table[s, SIZE + 1] if table[s, KIND] == CAPSULE else 0.0
             for e in range(-2, 3):
                 d = distance_alone(table, brick, sample, t, mapped(w, c, (0.0, 0.0, 0.5 * e * half)))
                 least = min(least, k * d - scales[side] * table[s, SIZE])
