@@ -246,7 +246,7 @@ _of_content: OrderedDict[str, Geometry] = OrderedDict()  # of the latest: worker
 
 def _geometry(sdf: Sdf, nodes: np.ndarray, pieces: tuple[np.ndarray, ...]) -> Geometry:
     """Made once for all scenes of a process."""
-    known, kept = _of_sdf.get(sdf, (None, None))
+    known, kept = _of_sdf.get(sdf, (nodes, None))
     if kept is None or not np.array_equal(known, nodes):
         content = digest(sdf, nodes, pieces)
         kept = _of_content.pop(content, None) or _looked_at(sdf, nodes, pieces)
