@@ -51,8 +51,8 @@ FAR, FAR_OFF = (10, 10_000), np.array([30.0, 30.0, 0.0])  # static ones, and whe
 def solved(scene: Scene, steps: int, dt: float | None = None) -> float:
     """Milliseconds a step of the compiled solve."""
     simulator = Simulator(scene, "solver")
-    dt = dt / simulator.units.time if dt else simulator.rules.dt
-    rules = compiled_rules(simulator.rules.gravity.numpy(), dt, simulator.rules.substeps, sleep=False)
+    options = replace(simulator.rules, sleep=False)
+    rules = compiled_rules(replace(options, dt=dt / simulator.units.time) if dt else options)
     inside = Compiled(simulator.bodies, simulator.state)
     motion, manifolds = taken_up(simulator.bodies, simulator.state, inside, rules)
     began = time.perf_counter()

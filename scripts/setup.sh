@@ -107,6 +107,6 @@ fi
 say "installing Python packages (a few minutes the first time)"
 rm -f .venv/.set-up
 .venv/bin/python -m pip install -qq --disable-pip-version-check "${index[@]}" --editable ".${extras:+[$extras]}"
-.venv/bin/python -c 'from sdfsim.dynamics.solver import warm; warm()'
+.venv/bin/python -c 'import sdfsim; sdfsim.Simulator(sdfsim.load_scene("samples/tower.yaml"), "small").step(2)'
 printf '%s\n%s\n' "$made_from" "${extras//,/ }" >.venv/.set-up
 say "done: $(.venv/bin/python --version), $PWD/.venv"

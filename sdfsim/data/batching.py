@@ -10,9 +10,9 @@ import torch
 from sdfsim.data.dataset import FLOOR, Trajectory
 from sdfsim.data.pybullet_sim import MARGIN
 from sdfsim.dynamics.bodies import Bodies, State, Units, from_scene
-from sdfsim.dynamics.earlier_poses import with_history
 from sdfsim.dynamics.model import Model
 from sdfsim.dynamics.models.contact_graph import SUBSTEPS
+from sdfsim.dynamics.models.surfaces import with_history
 from sdfsim.dynamics.run_memory import Memory
 from sdfsim.dynamics.step import FreeFlight, StepOptions, step
 from sdfsim.errors import EXIT_QUALITY, SdfsimError

@@ -13,10 +13,10 @@ from torch import Tensor, nn
 
 from sdfsim.dynamics import kernels
 from sdfsim.dynamics.bodies import State
+from sdfsim.dynamics.kernels.record import Edges
 from sdfsim.dynamics.kernels.world import World
 from sdfsim.dynamics.models.contact_graph import REST_SPEED
 from sdfsim.dynamics.models.impulse import CALM, LIVELY, ImpulseNetwork, Round
-from sdfsim.dynamics.solver import Acts
 
 with kernels.kept():
     from sdfsim.dynamics.kernels import impulse as compiled
@@ -66,24 +66,25 @@ def _array(values: list[Tensor]) -> np.ndarray:
 
 
 def corrected(
-    weights: compiled.Weights, world: World, before: State, solved: State, acts: Acts, rules: StepOptions, *,
+    weights: compiled.Weights, world: World, before: State, solved: State, edges: Edges, rules: StepOptions, *,
     known: float,
 ) -> State:  # fmt: skip
-    """What the network makes of a step of the solve, whose `acts`, at least one, are its edges; those of a pair of
-    bodies stand together."""
-    pair = torch.stack([acts.first, acts.second], 1).numpy()
-    vectors = [acts.arm_first, acts.arm_second, acts.normal, acts.impulse]
-    value = torch.cat([*vectors, acts.gap[:, None], acts.when[:, None]], 1).numpy()
-    terms = compiled.Terms(
+    """What the network, which knows steps of `known`, makes of a step of the solve, whose `edges`, at least one, are
+    its own; those of a pair of bodies stand together."""
+    after = [tensor.clone() for tensor in _poses(solved)]
+    start, end = (compiled.Poses(*(t.contiguous().numpy() for t in some)) for some in (_poses(before), after))
+    compiled.correct(weights, world, start, end, edges.pair, edges.value, terms_of(rules, known))
+    position, orientation, velocity, angular = after
+    return replace(solved, position=position, orientation=orientation, velocity=velocity, angular_velocity=angular)
+
+
+def terms_of(rules: StepOptions, known: float) -> compiled.Terms:
+    """What is in play, for a network that knows steps of `known`."""
+    return compiled.Terms(
         gravity=rules.gravity.cpu().numpy(), dt=rules.dt, known=known, friction=rules.friction,
         restitution=rules.restitution, rotation=rules.rotation, trust=rules.trust, rest=REST_SPEED, calm=CALM,
         lively=LIVELY,
     )  # fmt: skip
-    after = [tensor.clone() for tensor in _poses(solved)]
-    start, end = (compiled.Poses(*(t.contiguous().numpy() for t in some)) for some in (_poses(before), after))
-    compiled.correct(weights, world, start, end, pair, value, terms)
-    position, orientation, velocity, angular = after
-    return replace(solved, position=position, orientation=orientation, velocity=velocity, angular_velocity=angular)
 
 
 def _poses(state: State) -> tuple[Tensor, ...]:

@@ -100,21 +100,13 @@ def model_names() -> list[str]:
     return [SOLVER, *bundled_models()]
 
 
-class Unread(nn.Module):
-    """Stands for weights that nothing will ask, or that there are none of."""
-
-    def forward(self, *_: Any, **__: Any) -> None:
-        """Never to be called."""
-        raise RuntimeError("the weights of this model were not read")
-
-
 def load_model(name: str | Path | None = None, *, weights: bool = True) -> Model:
-    """A bundled model by name (None: the solver), or any model file by path; without `weights` its network is `Unread`.
+    """A bundled model by name (None: the solver), or any model file by path; without `weights` its network is empty.
     Raises SdfsimError for an unknown name, or an unreadable or foreign file."""
     from safetensors import SafetensorError, safe_open
 
     if name is None or name == SOLVER:
-        return Model(SOLVER, SOLVER, Unread().eval(), dt=0.02, gravity=10.0, length=1.4, reach=0.02)
+        return Model(SOLVER, SOLVER, nn.Module().eval(), dt=0.02, gravity=10.0, length=1.4, reach=0.02)
     path = Path(name) if str(name).endswith(".safetensors") else BUNDLED / f"{name}.safetensors"
     if not path.exists():
         raise SdfsimError(
@@ -128,7 +120,7 @@ def load_model(name: str | Path | None = None, *, weights: bool = True) -> Model
             config = info.pop("config")
             if weights:
                 _check_size(info["kind"], config, {k: file.get_slice(k).get_shape() for k in file.keys()})
-            network = Unread() if not weights else new_network(info["kind"], config)
+            network = nn.Module() if not weights else new_network(info["kind"], config)
             network.load_state_dict({k: file.get_tensor(k) for k in file.keys()} if weights else {})
         model = Model(name=path.stem, network=network, **info)
         for key in ("dt", "gravity", "length", "reach"):

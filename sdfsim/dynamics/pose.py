@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import torch
 from torch import Tensor
 
@@ -39,30 +37,8 @@ def apply(m: Tensor, v: Tensor) -> Tensor:
 
 def to_matrix(q: Tensor) -> Tensor:
     """Rotation matrices [..., 3, 3] of unit quaternions [..., 4]."""
-    products = (q[..., :, None] * q[..., None, :]).flatten(-2)
-    return (products @ _matrix_of_products(q.dtype, q.device)).unflatten(-1, (3, 3))
-
-
-@cache
-def _matrix_of_products(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """[16, 9]: how the entries of the matrix come from the products of two components (x, y, z, w)."""
-    x, y, z, w = range(4)
-    entries = [
-        {(x, x): 1, (y, y): -1, (z, z): -1, (w, w): 1},
-        {(x, y): 2, (w, z): -2},
-        {(x, z): 2, (w, y): 2},
-        {(x, y): 2, (w, z): 2},
-        {(x, x): -1, (y, y): 1, (z, z): -1, (w, w): 1},
-        {(y, z): 2, (w, x): -2},
-        {(x, z): 2, (w, y): -2},
-        {(y, z): 2, (w, x): 2},
-        {(x, x): -1, (y, y): -1, (z, z): 1, (w, w): 1},
-    ]
-    matrix = torch.zeros(16, 9, dtype=dtype)
-    for column, entry in enumerate(entries):
-        for (one, other), factor in entry.items():
-            matrix[4 * one + other, column] = factor
-    return matrix.to(device)
+    axes = torch.eye(3, dtype=q.dtype, device=q.device).expand(*q.shape[:-1], 3, 3)
+    return rotate(q[..., None, :], axes).mT
 
 
 def from_rotvec(r: Tensor) -> Tensor:

@@ -103,10 +103,8 @@ def energy_from_nothing(rollout: Rollout) -> dict[str, float]:
 
 def join(frames: list[Rollout]) -> Rollout:
     """One rollout out of consecutive pieces."""
-    arrays = ("time", "position", "orientation", "velocity", "angular_velocity")
-    arrays += ("contact_count", "contact_point", "contact_body")
     return replace(
         frames[0],
-        **{name: np.concatenate([getattr(f, name) for f in frames]) for name in arrays},
+        **{k: np.concatenate([getattr(f, k) for f in frames]) for k in (*_PER_FRAME, "contact_point", "contact_body")},
         counters={k: np.concatenate([f.counters[k] for f in frames]) for k in frames[0].counters},
     )

@@ -42,7 +42,6 @@ class Memory:
         self.counts = dict.fromkeys((*COUNTS, *PHASES), 0.0)
         self._compiled: Compiled | None = None
         self._packed: tuple[nn.Module, bool, Weights] | None = None
-        self._cuda = False
 
     def compiled(self, bodies: Bodies, state: State) -> Compiled:
         """The bodies as compiled code wants them, made once."""
@@ -61,10 +60,9 @@ class Memory:
             self._packed = network, rules.friction, weights
         return self._packed[2]
 
-    def begin(self, bodies: Bodies) -> None:
+    def begin(self) -> None:
         """Start counting a step."""
         self.counts = dict.fromkeys(self.counts, 0.0)
-        self._cuda = bodies.device.type == "cuda"
 
     def end(self, bodies: Bodies, state: State) -> None:
         """The step led to `state`."""
@@ -81,6 +79,6 @@ class Memory:
         """Add the time that a block takes to a phase."""
         started = time.perf_counter()
         yield
-        if self._cuda:
+        if torch.cuda.is_initialized():
             torch.cuda.synchronize()
         self.counts[phase] += 1e3 * (time.perf_counter() - started)

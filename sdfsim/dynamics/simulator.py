@@ -5,19 +5,18 @@ from __future__ import annotations
 import platform
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 import sdfsim
 from sdfsim.dynamics import pose
-from sdfsim.dynamics.bodies import Bodies, State, awake, from_scene
+from sdfsim.dynamics.bodies import State, awake, from_scene
 from sdfsim.dynamics.body_handle import BodyHandle, ContactPoint
-from sdfsim.dynamics.earlier_poses import history_told, with_history
 from sdfsim.dynamics.model import Model, load_model
 from sdfsim.dynamics.models.contact_graph import SUBSTEPS
 from sdfsim.dynamics.rollout import Rollout, join
@@ -26,16 +25,23 @@ from sdfsim.dynamics.step import FreeFlight, StepOptions, step
 from sdfsim.dynamics.training_ranges import deep_starts, outside_training
 from sdfsim.dynamics.units import scene_units
 from sdfsim.dynamics.validity import check_nodes, check_sizes, fault
-from sdfsim.dynamics.variants import Variant, rollouts
 from sdfsim.errors import EXIT_QUALITY, SdfsimError, nearest
+from sdfsim.parallel import parallel
 from sdfsim.scene.effects import plan
-from sdfsim.scene.scene import Limits, Scene
+from sdfsim.scene.scene import Body, Scene
 
 if TYPE_CHECKING:
-    from sdfsim.dynamics.models.families import Near
+    from sdfsim.dynamics.models.near import Contacts, Pairs
     from sdfsim.scene import written
 
 BYTES_AN_EDGE = 4096  # of the network, while it is worked on
+Variant = Mapping[str, Mapping[str, Any]]  # body -> field -> value
+# what a variant may change: how many numbers a vector has (0: a number), and the most that a number may be
+VARIED = {
+    "position": (3, np.inf), "quat_xyzw": (4, np.inf), "velocity": (3, np.inf), "angular_velocity": (3, np.inf),
+    "mass": (0, np.inf), "friction": (0, np.inf), "restitution": (0, 1.0),
+}  # fmt: skip
+CHUNKS = 16  # pieces that variants are cut into at most, so that cores end together
 
 
 class SimulationError(SdfsimError):
@@ -88,9 +94,9 @@ class Simulator:
         model = model if model is not None else scene.model
         asked = effects.contact.on or free_flight == "learned"
         self.model = model if isinstance(model, Model) else load_model(model, weights=asked)
-        self.model = self.model.to(self.device)
         if not self.model.on_surfaces:
-            self.device = torch.device("cpu")  # the compiled step has no other; a network on top may
+            self.device = torch.device("cpu")  # the compiled step and network have no other
+        self.model = self.model.to(self.device)
         if free_flight == "learned" and not self.model.on_surfaces:
             raise SdfsimError(
                 "free_flight 'learned' exists for networks on surface nodes only", "give a model of that kind"
@@ -100,17 +106,17 @@ class Simulator:
         self.dt = self.model.dt * self.units.time
         self.outside_training = outside_training([scene], self.model, self.units)
         gravity = torch.tensor(scene.gravity / self.units.acceleration, dtype=torch.float64, device=self.device)
+        memory = scene.limits.memory_gib
         self.rules = StepOptions(
             gravity=gravity,
             dt=self.model.dt,
-            falls=effects.gravity.on,
             contact=effects.contact.on,
             friction=effects.friction.on,
             restitution=effects.restitution.on,
             rotation=effects.rotation.on,
             free_flight=free_flight,
             substeps=self.model.inner or SUBSTEPS,
-            rows=_rows(scene.limits),
+            rows=None if memory is None else max(1, int(memory * 2**30 / BYTES_AN_EDGE)),
             sleep=effects.sleep.on and not self.model.on_surfaces,
         )
         worked_on = replace(scene, shapes=tuple(self.model.surface(shape) for shape in scene.shapes))
@@ -123,14 +129,16 @@ class Simulator:
         if self.outside_training:
             self.rules = replace(self.rules, trust=0.0)
         if self.model.on_surfaces:
+            from sdfsim.dynamics.models.surfaces import with_history
+
             self.state = with_history(self.state, self.bodies, self.rules)
         self.memory = Memory()
         dynamic = self.bodies.moves
         weight = self.bodies.mass[dynamic] * self.rules.gravity.norm()
         self._lift = float((weight * self.bodies.size[dynamic]).sum()) * self.units.energy
-        self.contacts: Near | None = None
+        self.contacts: Contacts | Pairs | None = None
         self.steps_done = 0
-        if broken := self._fault(self.state, everybody(self.bodies)):
+        if broken := self._fault(self.state):
             raise SdfsimError(broken)
         self._good = self._start = self.state
 
@@ -198,7 +206,11 @@ class Simulator:
         restitution (SI units), such as {"ball": {"velocity": (1, 0, 0)}}. Raises SdfsimError for no such body or field,
         or a value that it cannot have; SimulationError where a state broke.
         """
-        return rollouts(self.scene, variants, self.model, seconds=seconds, steps=steps, dt=self._dt)
+        scenes = [varied(self.scene, variant) for variant in variants]
+        pieces = np.array_split(np.arange(len(scenes)), min(CHUNKS, max(1, len(scenes))))
+        jobs = [([scenes[k] for k in piece], self.model, self._dt, seconds, steps) for piece in pieces]
+        found = dict(parallel(_run_each, jobs))
+        return [rollout for k in range(len(jobs)) for rollout in found[k]]
 
     def run(self, seconds: float | None = None, steps: int | None = None) -> Rollout:
         """Simulate for so many seconds (default: the scene's duration; see `steps_in`) or steps, and keep everything.
@@ -251,18 +263,20 @@ class Simulator:
         """A state that came from outside is looked at before anything is computed from it."""
         if self.state is self._good:
             return
-        broken = self._fault(self.state, everybody(self.bodies))
+        broken = self._fault(self.state)
         if broken is None and not np.isfinite(self.state.time):
             broken = "time is not finite"
         if broken:
             self.state = self._good
             raise self._broke(broken)
         if self.model.on_surfaces:
+            from sdfsim.dynamics.models.surfaces import history_told
+
             self.state = history_told(self.state, self._good, self.bodies, self.rules)
         self._good = self.state
 
-    def _fault(self, state: State, rows: torch.Tensor, before: State | None = None) -> str | None:
-        found = fault(state, rows, self.rules.dt, self.units, before)
+    def _fault(self, state: State, rows: torch.Tensor | None = None, before: State | None = None) -> str | None:
+        found = fault(state, self.rules.dt, self.units, rows, before)
         return None if found is None else f"body {self._names[found[0]]!r}: {found[1]}"
 
     def _broke(self, what: str) -> SimulationError:
@@ -270,26 +284,12 @@ class Simulator:
         return SimulationError(f"step {self.steps_done + 1}: {what}; {last}", self.initial_rollout())
 
     def _frame(self, milliseconds: float) -> Rollout:
-        state, c, u = self.si_state(), self.contacts, self.units
-        count = 0 if c is None else len(c)
-        points, pairs, depth = np.zeros((0, 3)), np.zeros((0, 2), dtype=np.int64), 0.0
-        if self.state.touch is not None:
-            from sdfsim.dynamics.solver import contact_points
-
-            found = contact_points(self.state)
-            points, pairs, count = found.point * u.length, found.pair, len(found.pair)
-            depth = float((-found.gap).max(initial=0.0)) * u.length
-        if c is not None and count:
-            from sdfsim.dynamics.models.paper_edges import where
-
-            # The edges were found at the start of the step; their points are told where this frame has the bodies.
-            points = (where(self.state, self.bodies, c) * u.length).cpu().numpy()
-            pairs = torch.stack([c.owner, c.body], -1).cpu().numpy()
-            depth = float((-c.distance).clamp_min(0.0).max()) * u.length
+        state, u = self.si_state(), self.units
+        points, pairs, depth = self._touching()
         counters = {
             **self._energies(),
-            "contacts": float(count),
-            "worst_penetration": depth,
+            "contacts": float(len(pairs)),
+            "worst_penetration": depth * u.length,
             **self.memory.counts,
             "step_ms": milliseconds,
         }
@@ -299,8 +299,8 @@ class Simulator:
             orientation=state.orientation.numpy()[None],
             velocity=state.velocity.numpy()[None],
             angular_velocity=state.angular_velocity.numpy()[None],
-            contact_count=np.array([count]),
-            contact_point=points,
+            contact_count=np.array([len(pairs)]),
+            contact_point=points * u.length,
             contact_body=pairs,
             counters={k: np.array([v]) for k, v in counters.items()},
             names=self._names,
@@ -318,26 +318,73 @@ class Simulator:
             },
         )
 
+    def _touching(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """Points [C, 3] where bodies touch, pairs of bodies [C, 2], and the deepest penetration; model units."""
+        near = self.contacts
+        if near is not None and len(near):
+            from sdfsim.dynamics.models.near import where
+
+            # The edges were found at the start of the step; their points are told where this frame has the bodies.
+            points = where(self.state, self.bodies, near).cpu().numpy()
+            pairs = torch.stack([near.owner, near.body], -1).cpu().numpy()
+            return points, pairs, float((-near.distance).clamp_min(0.0).max())
+        if self.state.touch is None:
+            return np.zeros((0, 3)), np.zeros((0, 2), dtype=np.int64), 0.0
+        from sdfsim.dynamics.solver import contact_points
+
+        found = contact_points(self.state)
+        return found.point, found.pair, float((-found.gap).max(initial=0.0))
+
     def _energies(self) -> dict[str, float]:
         """Kinetic and potential energy in joules of all dynamic bodies."""
         s, b, joule = self.state, self.bodies, self.units.energy
         velocity, mass, inertia = (t.cpu().numpy() for t in (s.velocity, b.mass, b.inertia))
         # Bodies that are not dynamic have no mass, and an inertia that means nothing.
-        spin = s.angular_velocity.cpu().numpy()[:, None] @ pose.to_matrix(s.orientation).cpu().numpy()
-        turning = ((spin @ inertia)[:, 0] * spin[:, 0]).sum(-1)[b.moves.cpu().numpy()]
-        moving = 0.5 * (mass @ np.square(velocity).sum(-1) + turning.sum())
+        spin = pose.rotate(pose.conjugate(s.orientation), s.angular_velocity).cpu().numpy()[b.moves.cpu().numpy()]
+        turning = (spin[:, None] @ inertia[b.moves.cpu().numpy()] @ spin[..., None]).sum()
+        moving = 0.5 * (mass @ np.square(velocity).sum(-1) + turning)
         potential = -mass @ (s.position.cpu().numpy() @ self.rules.gravity.cpu().numpy())
         return {"kinetic_energy": float(moving) * joule, "potential_energy": float(potential) * joule}
 
 
-def _rows(limits: Limits) -> int | None:
-    """How many edges a network may work on at once, so that a step keeps to its memory; None for all."""
-    return None if limits.memory_gib is None else max(1, int(limits.memory_gib * 2**30 / BYTES_AN_EDGE))
+def varied(scene: Scene, variant: Variant) -> Scene:
+    """The scene with some values changed, of the fields of `VARIED` in SI units. An inertia of its own grows with the
+    mass. Raises SdfsimError for no such body or field, or a value that it cannot have."""
+    known = {body.name for body in scene.bodies}
+    for name in variant:
+        if name not in known:
+            raise SdfsimError(f"variant: there is no body {name!r}{nearest(name, known)}")
+    return replace(scene, bodies=tuple(_changed(body, variant.get(body.name, {})) for body in scene.bodies))
 
 
-def everybody(bodies: Bodies) -> torch.Tensor:
-    """[N] int64, all of them."""
-    return torch.arange(len(bodies), device=bodies.device)
+def _changed(body: Body, fields: Mapping[str, Any]) -> Body:
+    new: dict[str, Any] = {}
+    for name, given in fields.items():
+        where = f"variant: body {body.name!r}: {name}"
+        if name not in VARIED:
+            raise SdfsimError(f"{where}: no such field{nearest(name, VARIED)}; there are {', '.join(VARIED)}")
+        value, (count, most) = np.asarray(given, dtype=np.float64), VARIED[name]
+        if value.shape != ((count,) if count else ()) or not np.isfinite(value).all():
+            raise SdfsimError(f"{where}: must be {count or 1} finite numbers (got {given!r})")
+        if not count and not 0.0 <= value <= most:
+            raise SdfsimError(f"{where}: must be 0 to {most:g} (got {given!r})")
+        if body.motion != "dynamic" and name in ("velocity", "angular_velocity", "mass"):
+            raise SdfsimError(f"variant: body {body.name!r}: is {body.motion}, so it has no {name}")
+        new[name] = value if count else float(value)
+    if "quat_xyzw" in new:
+        new["quat_xyzw"] = new["quat_xyzw"] / max(np.linalg.norm(new["quat_xyzw"]), 1e-300)
+    if "mass" in new:
+        if not new["mass"] > 0:
+            raise SdfsimError(f"variant: body {body.name!r}: mass: must be > 0")
+        if body.inertia is not None:
+            new["inertia"] = body.inertia * (new["mass"] / body.mass)
+    return replace(body, **new)
+
+
+def _run_each(
+    scenes: list[Scene], model: Model, dt: float | None, seconds: float | None, steps: int | None
+) -> list[Rollout]:
+    return [Simulator(scene, model, dt=dt).run(seconds, steps) for scene in scenes]
 
 
 def check_seconds(seconds: float) -> None:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections import OrderedDict
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -15,12 +14,12 @@ import torch
 from sdfsim.dynamics import kernels, pose
 from sdfsim.dynamics.bodies import Bodies, State, Touch
 from sdfsim.dynamics.kernels import distance as kinds
-from sdfsim.dynamics.kernels import record
 from sdfsim.dynamics.kernels import world as compiled
+from sdfsim.dynamics.kernels.record import Edges
 from sdfsim.dynamics.kernels.step import step as compiled_step
 from sdfsim.files import digest
 from sdfsim.shape.baked_grid import WALL, BakedGrid, baked, inwards
-from sdfsim.shape.sdf import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, Sdf, SphereSdf
+from sdfsim.shape.sdf import ClosedForm, PlaneSdf, Sdf
 from sdfsim.shape.surface_nodes import Surface, surface_of
 
 if TYPE_CHECKING:
@@ -29,36 +28,16 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 MOST_KEPT = 64  # shapes whose geometry stays at hand after their scenes are gone
-ANALYTIC = PlaneSdf | SphereSdf | BoxSdf | CapsuleSdf | CylinderSdf
+FORMS = {
+    "plane": kinds.PLANE, "sphere": kinds.SPHERE, "capsule": kinds.CAPSULE, "box": kinds.BOX,
+    "cylinder": kinds.CYLINDER,
+}  # fmt: skip
 Clumps = list[list[np.ndarray]]
 LEAF, CLUMP = 16, 256  # nodes that a leaf and a clump of leaves hold at most
 TOUCHING = 1e-3  # model lengths, within which a point is told as a contact
 COARSE = 0.01  # model times: in longer inner steps what is hit in their course is told to a network as well
+SLOW = 2.0  # an approach that gravity makes in so many inner steps ends at the surface without a rebound
 INWARD = 0.004  # of a solid's largest extent, from where its nodes look out
-
-
-@dataclass(frozen=True)
-class SolverRules:
-    """What the solve is made of; lengths and speeds in model units, in which the smallest bodies are about 1.4 wide."""
-
-    # contacts are kept up to this distance, and while they have slid by no more; look: new ones are looked for up to
-    # this one
-    reach: float = 0.02
-    look: float = 0.004
-    still: float = 1e-4  # pairs that have moved by less within a step are not looked at again
-    together: float = 1e-4  # points that are deeper than the deepest less this meet in one impact
-    erp: float = 0.08  # the share of a penetration that an inner step resolves, through velocity
-    slop: float = 5e-4  # penetration that is left as it is, so that what rests has contacts that do not come and go
-    split: float = 0.04  # deeper penetration than this is resolved without a lasting velocity
-    # g times the inner step times this is the approach that ends at the surface without a rebound (in
-    # `kernels.world.Rules` it is that speed)
-    slow: float = 2.0
-    rounds: int = 50  # of sequential impulses at most
-    exact: float = 1e-4  # they end when no impulse changes a velocity by more
-    apart: float = 0.03  # points of a manifold are at least so far from each other
-    # stray, rest: who stays within `stray` for so many steps falls asleep
-    stray: float = 0.005
-    rest: int = 25
 
 
 class Compiled:
@@ -85,96 +64,26 @@ class Compiled:
 
     def run(
         self, motion: compiled.Motion, manifolds: compiled.Manifolds, rules: compiled.Rules
-    ) -> tuple[compiled.Manifolds, record.Edges, tuple[int, ...]]:
+    ) -> tuple[compiled.Manifolds, Edges, tuple[int, ...]]:
         """One step: `motion` is written to; the contacts at its end, what they did, and what was counted."""
         return compiled_step(self.shapes, self.world, self.work, motion, rules, manifolds)
 
 
-def warm() -> None:
-    """Have the step and the network on top of it compiled now, so that nobody waits for them later."""
-    from sdfsim.dynamics.bodies import Units, from_scene
-    from sdfsim.dynamics.model import Model
-    from sdfsim.dynamics.models.impulse import ImpulseConfig, ImpulseNetwork
-    from sdfsim.dynamics.step import StepOptions, step
-    from sdfsim.scene.scene import Body, Scene
-    from sdfsim.shape.shape import analytic_shape
-
-    still = np.zeros(3)
-    one = Body("one", 0, "dynamic", 1.0, still, np.array([0.0, 0.0, 0.0, 1.0]), still, still, 1.0, 0.5, 0.5)
-    other = replace(one, name="other", position=np.array([0.9, 0.0, 0.0]))
-    pair = Scene((analytic_shape("sphere", radius=0.5),), (one, other), still, 0.0)
-    network = ImpulseNetwork(ImpulseConfig(width=1, rounds=1))
-    model = Model("untrained", "impulse", network, dt=0.02, gravity=10.0, length=1.0, reach=0.0)
-    step(
-        model, *from_scene(pair, Units(1.0, 1.0, 1.0), torch.device("cpu")), StepOptions(torch.zeros(3).double(), 0.02)
-    )
-
-
-@dataclass(frozen=True)
-class Acts:
-    """What contacts did in a step, at E places where bodies met or nearly met; model units, world axes."""
-
-    # first, second: [E] int64, the two bodies; the first one moves
-    first: torch.Tensor
-    second: torch.Tensor
-    # arm_first, arm_second: [E, 3] from their centres of mass to the contact
-    arm_first: torch.Tensor
-    arm_second: torch.Tensor
-    normal: torch.Tensor  # [E, 3] from the second to the first
-    impulse: torch.Tensor  # [E, 3] on the first, opposite on the second; 0 where they only were near
-    gap: torch.Tensor  # [E] the distance when it was first looked at
-    when: torch.Tensor  # [E] the part of the step that was over by then
-
-    def __len__(self) -> int:
-        return len(self.first)
-
-
-_nobody, _nothing, _nowhere = torch.zeros(0, dtype=torch.int64), torch.zeros(0), torch.zeros(0, 3)
-NO_ACTS = Acts(_nobody, _nobody, _nowhere, _nowhere, _nowhere, _nowhere, _nothing, _nothing)
-
-
-def acts_of(edges: record.Edges, steps: int) -> Acts:
-    """What the compiled step noted, `steps` inner steps long."""
-    count = int(edges.count[0])
-    if not count:
-        return NO_ACTS
-    pair, value = torch.from_numpy(edges.pair[:count]), torch.from_numpy(edges.value[:count])
-
-    def vector(column: int) -> torch.Tensor:
-        return value[:, column : column + 3]
-
-    return Acts(
-        first=pair[:, 0],
-        second=pair[:, 1],
-        arm_first=vector(record.ARM),
-        arm_second=vector(record.OTHER),
-        normal=vector(record.AXIS),
-        impulse=vector(record.GIVEN),
-        gap=value[:, record.APART],
-        when=value[:, record.WHEN] / steps,
-    )
-
-
 def solver_step(
     bodies: Bodies, state: State, rules: StepOptions, memory: Memory, *, note: bool = False
-) -> tuple[State, Acts]:
+) -> tuple[State, Edges]:
     """Advance `state` by one step of the contact solve; scripted bodies have the velocities of the coming step. What
     contacts did is told where it is wanted (`note`)."""
     scene = memory.compiled(bodies, state)
-    inside = compiled_rules(
-        rules.gravity.cpu().numpy(), rules.dt, rules.substeps, friction=rules.friction,
-        restitution=rules.restitution, rotation=rules.rotation, sleep=rules.sleep, margin=rules.margin, adds=rules.adds,
-        note=note,
-    )  # fmt: skip
     with memory.timed("contact_ms"):
-        after, edges, counts = _solve(bodies, state, scene, inside)
-    memory.count(pairs=counts[0], contacts=counts[1], active=counts[3])
-    return after, acts_of(edges, rules.substeps)
+        after, edges, (pairs, contacts, active) = _solve(bodies, state, scene, compiled_rules(rules, note=note))
+    memory.count(pairs=pairs, contacts=contacts, active=active)
+    return after, edges
 
 
 def _solve(
     bodies: Bodies, state: State, scene: Compiled, rules: compiled.Rules
-) -> tuple[State, record.Edges, tuple[int, ...]]:
+) -> tuple[State, Edges, tuple[int, ...]]:
     motion, manifolds = taken_up(bodies, state, scene, rules)
     scene.work.load[:] = 0.0 if state.load is None else state.load.numpy()
     manifolds, edges, counts = scene.run(motion, manifolds, rules)
@@ -222,7 +131,7 @@ def taken_up(
         anchor = np.concatenate([position, orientation], 1)
         still, nobody = np.zeros(n, np.int64), np.full(n, -1, np.int64)
         motion = compiled.Motion(position, orientation, velocity, angular, still > 0, still, anchor, nobody)
-        return motion, no_manifolds()
+        return motion, _manifolds(None)
     island, quiet = np.array(touch.island.numpy()), np.array(touch.quiet.numpy())
     touching = np.array(touch.touching.numpy())
     if (touch.gravity.numpy() != rules.gravity).any():
@@ -243,7 +152,7 @@ def taken_up(
     motion = compiled.Motion(
         position, orientation, velocity, angular, touching, quiet, np.array(touch.anchor.numpy()), island
     )
-    return motion, compiled.Manifolds(touch.pair.numpy(), touch.count.numpy(), touch.point.numpy())
+    return motion, _manifolds(touch)
 
 
 def held(state: State) -> torch.Tensor:
@@ -264,127 +173,103 @@ class Touching:
 
 def contact_points(state: State) -> Touching:
     """Where bodies touch in a state."""
-    touch = state.touch
-    if touch is None or not len(touch.pair):
-        nothing = np.zeros((0, 3))
-        return Touching(np.zeros((0, 2), np.int64), nothing, nothing, nothing, nothing[:, 0])
-    point = touch.point.numpy()
-    there = np.arange(compiled.POINTS) < touch.count.numpy()[:, None]
+    pair, count, point = _manifolds(state.touch)
+    there = np.arange(compiled.POINTS) < count[:, None]
     m, k = (there & (point[..., compiled.GAP] <= TOUCHING)).nonzero()
-    pair, point = touch.pair.numpy()[m], point[m, k]
-    first = pair[:, 0]
-    turn = pose.to_matrix(state.orientation).numpy()[first]
-    place = state.position.numpy()[first] + (turn @ point[:, :3, None])[..., 0]
+    pair, point = pair[m], point[m, k]
+    first = torch.from_numpy(pair[:, 0])
+    place = state.position[first] + pose.rotate(state.orientation[first], torch.from_numpy(point[:, :3]))
     normal = point[:, compiled.NORMAL : compiled.NORMAL + 3]
     impulse = normal * point[:, compiled.PUSH, None] + point[:, compiled.DRAG : compiled.DRAG + 3]
-    return Touching(pair, place, normal, impulse, point[:, compiled.GAP])
+    return Touching(pair, place.numpy(), normal, impulse, point[:, compiled.GAP])
 
 
-def compiled_rules(
-    gravity: np.ndarray, dt: float, substeps: int, *, friction: bool = True, restitution: bool = True,
-    rotation: bool = True, sleep: bool = False, margin: float = 0.0, adds: bool = False, note: bool = False,
-    own: SolverRules | None = None,
-) -> compiled.Rules:  # fmt: skip
-    """The rules of a run, model units."""
-    own = own or SolverRules()
-    inner = dt / substeps
-    slow = own.slow * float(np.linalg.norm(gravity)) * inner
-    made: dict[str, Any] = vars(own) | {"look": own.look + 2.0 * margin, "slow": slow}
+def compiled_rules(rules: StepOptions, *, note: bool = False) -> compiled.Rules:
+    """The rules of a run as the compiled step wants them."""
+    gravity, inner = rules.gravity.cpu().numpy(), rules.dt / rules.substeps
     return compiled.Rules(
-        gravity=np.asarray(gravity, dtype=np.float64), inner=inner, steps=substeps, friction=friction,
-        restitution=restitution, rotation=rotation, sleep=sleep, margin=margin, adds=adds, note=note,
-        ahead=inner if note and inner > COARSE else 0.0, **made,
+        gravity, inner, rules.substeps, SLOW * float(np.linalg.norm(gravity)) * inner, rules.friction,
+        rules.restitution, rules.rotation, rules.sleep, rules.margin, rules.adds, note,
+        ahead=inner if note and inner > COARSE else 0.0,
     )  # fmt: skip
 
 
-def no_manifolds() -> compiled.Manifolds:
-    """Nothing is known of any contact."""
-    return compiled.Manifolds(
-        np.zeros((0, 2), np.int64), np.zeros(0, np.int64), np.zeros((0, compiled.POINTS, compiled.COLUMNS))
-    )
+def _manifolds(touch: Touch | None) -> compiled.Manifolds:
+    """The contacts that are known."""
+    if touch is None:
+        return compiled.Manifolds(
+            np.zeros((0, 2), np.int64), np.zeros(0, np.int64), np.zeros((0, compiled.POINTS, compiled.COLUMNS))
+        )
+    return compiled.Manifolds(touch.pair.numpy(), touch.count.numpy(), touch.point.numpy())
 
 
 def compiled_shapes(bodies: Bodies) -> kinds.Shapes:
     """The shapes of a scene, baked where they have no closed form."""
-    sdfs: Sequence[Sdf] = bodies.sdfs
-    count = len(sdfs)
-    table = np.zeros((count, kinds.FIELDS))
+    table = np.zeros((len(bodies.sdfs), kinds.FIELDS))
     table[:, kinds.THICKNESS], table[:, kinds.CELL], table[:, kinds.PATCH] = np.inf, 1.0, -1.0
-    brick, sample, trees = [np.zeros(0, np.int32)], [np.zeros(0, np.float32)], []
-    label = [np.zeros(0, np.int16)]
+    brick, sample, label = [np.zeros(0, np.int64)], [np.zeros(0, np.float32)], [np.zeros(0, np.int16)]
     owner = {int(s): k for k, s in reversed(list(enumerate(bodies.shape.tolist()))) if s >= 0}
-    for s, sdf in enumerate(sdfs):
-        grid, surface, inward, clumps = _geometry(sdf, _nodes_of(bodies, owner[s]), bodies.pieces[s])
-        trees.append((surface, inward, clumps))
-        row = table[s]
+    known = [_geometry(sdf, _nodes_of(bodies, owner[s]), bodies.pieces[s]) for s, sdf in enumerate(bodies.sdfs)]
+    for row, sdf, (grid, surface, *_) in zip(table, bodies.sdfs, known, strict=True):
         if surface.nearest is not None:
             row[kinds.PATCH_LOW : kinds.PATCH_LOW + 3], row[kinds.PATCH_CELL] = surface.low, surface.cell
             row[kinds.PATCHES : kinds.PATCHES + 3], row[kinds.PATCH] = surface.nearest.shape, sum(map(len, label))
             label.append(surface.nearest.reshape(-1))
-        sizes, walls = row[kinds.SIZE : kinds.SIZE + 3], slice(kinds.THICKNESS, kinds.THICKNESS + 1)
-        if isinstance(sdf, PlaneSdf):
-            row[kinds.KIND] = kinds.PLANE
-        elif isinstance(sdf, SphereSdf):
-            row[kinds.KIND], sizes[0], row[walls] = kinds.SPHERE, sdf.radius, 2.0 * sdf.radius
-        elif isinstance(sdf, BoxSdf):
-            row[kinds.KIND], sizes[:], row[walls] = kinds.BOX, sdf.half, 2.0 * min(sdf.half)
-        elif isinstance(sdf, CapsuleSdf):
-            row[kinds.KIND], sizes[:2], row[walls] = kinds.CAPSULE, (sdf.radius, sdf.half), 2.0 * sdf.radius
-        elif isinstance(sdf, CylinderSdf):
-            row[kinds.KIND], sizes[:2] = kinds.CYLINDER, (sdf.radius, sdf.half)
-            row[walls] = 2.0 * min(sdf.radius, sdf.half)
+        if isinstance(sdf, ClosedForm):
+            row[kinds.KIND], row[kinds.SIZE : kinds.SIZE + len(sdf.sizes)] = FORMS[sdf.KIND], sdf.sizes
+            if sdf.sizes:
+                row[kinds.THICKNESS] = np.ptp(sdf.bounds, axis=0).min()
         elif grid is not None:
-            row[kinds.KIND], row[walls], row[kinds.CELL] = kinds.GRID, grid.thickness, grid.cell
+            row[kinds.KIND], row[kinds.THICKNESS], row[kinds.CELL] = kinds.GRID, grid.thickness, grid.cell
             row[kinds.LOW : kinds.LOW + 3], row[kinds.BRICKS : kinds.BRICKS + 3] = grid.low, grid.brick.shape
             row[kinds.COARSE], row[kinds.BRICK] = sum(map(len, sample)), sum(map(len, brick))
             sample.append(grid.coarse.reshape(-1))
             first, size = sum(map(len, sample)), grid.fine[:1].size
             brick.append(np.where(grid.brick >= 0, grid.brick.astype(np.int64) * size + first, -1).reshape(-1))
             sample.append(grid.fine.reshape(-1))
-    return kinds.Shapes(
-        table,
-        np.concatenate(brick).astype(np.int64),
-        np.concatenate(sample),
-        *_joined(trees),
-        label=np.concatenate(label),
-    )
+    arrays = (np.concatenate(parts) for parts in (brick, sample))
+    return kinds.Shapes(table, *arrays, *_joined(known), label=np.concatenate(label))
 
 
-Geometry = tuple[np.ndarray, BakedGrid | None, Surface, np.ndarray, Clumps]
-_known: WeakKeyDictionary[Sdf, Geometry] = WeakKeyDictionary()
-_latest: OrderedDict[str, Geometry] = (
-    OrderedDict()
-)  # by content: scenes that reach a worker have copies of their shapes
+class Geometry(NamedTuple):
+    """What the solve knows of a shape."""
+
+    grid: BakedGrid | None  # where it has no closed form
+    surface: Surface
+    inward: np.ndarray  # [K, 3] m, from its nodes to where they look out
+    clumps: Clumps
 
 
-def _geometry(
-    sdf: Sdf, nodes: np.ndarray, pieces: tuple[np.ndarray, ...]
-) -> tuple[BakedGrid | None, Surface, np.ndarray, Clumps]:
-    """The grid of an SDF that has no closed form, its surface, from where its nodes look out, and these in leaves. Made
-    once for all scenes of a process."""
-    kept = _known.get(sdf)
-    if kept is None or kept[0].shape != nodes.shape or (kept[0] != nodes).any():
+_of_sdf: WeakKeyDictionary[Sdf, tuple[np.ndarray, Geometry]] = WeakKeyDictionary()  # with the nodes that it is for
+_of_content: OrderedDict[str, Geometry] = OrderedDict()  # of the latest: workers get copies of shapes
+
+
+def _geometry(sdf: Sdf, nodes: np.ndarray, pieces: tuple[np.ndarray, ...]) -> Geometry:
+    """Made once for all scenes of a process."""
+    known, kept = _of_sdf.get(sdf, (nodes, None))
+    if kept is None or not np.array_equal(known, nodes):
         content = digest(sdf, nodes, pieces)
-        kept = _latest.pop(content, None) or _looked_at(sdf, nodes, pieces)
-        _known[sdf] = _latest[content] = kept
-        if len(_latest) > MOST_KEPT:
-            _latest.popitem(last=False)
-    return kept[1:]
+        kept = _of_content.pop(content, None) or _looked_at(sdf, nodes, pieces)
+        _of_sdf[sdf], _of_content[content] = (nodes, kept), kept
+        if len(_of_content) > MOST_KEPT:
+            _of_content.popitem(last=False)
+    return kept
 
 
 def _looked_at(sdf: Sdf, nodes: np.ndarray, pieces: tuple[np.ndarray, ...]) -> Geometry:
-    grid = None if isinstance(sdf, ANALYTIC) else baked(sdf, nodes, pieces)
+    grid = None if isinstance(sdf, ClosedForm) else baked(sdf, nodes, pieces)
+    extent = 0.0 if isinstance(sdf, PlaneSdf) else float(np.ptp(sdf.bounds, axis=0).max())
     if grid and grid.thickness <= 1.001 * WALL * grid.cell:
         told = "a shape of %.2g m has walls of at most %.2g m: things may pass through; --thicken helps"
-        _log.warning(told, _extent(sdf), grid.thickness)
+        _log.warning(told, extent, grid.thickness)
     surface = surface_of(sdf, nodes, pieces)
-    inward = INWARD * _extent(sdf) * inwards(sdf, surface.nodes)
-    return nodes, grid, surface, inward, _clumps(surface.nodes, surface.patch)
+    inward = INWARD * extent * inwards(sdf, surface.nodes)
+    return Geometry(grid, surface, inward, _clumps(surface.nodes, surface.patch))
 
 
 def compiled_world(bodies: Bodies, state: State) -> compiled.World:
     """The bodies of a scene."""
-    array = {name: getattr(bodies, name).cpu().numpy() for name in _ARRAYS}
+    array = {name: value.cpu().numpy() for name, value in vars(bodies).items() if isinstance(value, torch.Tensor)}
     bounds = np.where(np.isfinite(array["bounds"]), array["bounds"], 0.0)
     inertia = array["inertia"]
     moves = array["moves"]
@@ -415,22 +300,11 @@ def compiled_world(bodies: Bodies, state: State) -> compiled.World:
     )  # fmt: skip
 
 
-_ARRAYS = (
-    *("shape", "scale", "com", "bounds", "radius", "inverse_mass", "inertia", "friction", "restitution", "moves"),
-    *("group", "allowed", "world"),
-)
-
-
 def _nodes_of(bodies: Bodies, k: int) -> np.ndarray:
     """[K, 3] surface nodes of the shape of body k, at scale 1 in the shape's own frame. Rounded to 1e-12 m, so that
     bodies of different scales know them as the same nodes."""
     first, last = int(bodies.node_start[k]), int(bodies.node_start[k + 1])
     return ((bodies.node[first:last] + bodies.com[k]) / bodies.scale[k]).cpu().numpy().round(12)
-
-
-def _extent(sdf: Sdf) -> float:
-    low, high = sdf.bounds
-    return float((high - low).max()) if np.isfinite(high).all() else 0.0
 
 
 def _clumps(nodes: np.ndarray, patch: np.ndarray) -> Clumps:
@@ -455,28 +329,28 @@ def _split(nodes: np.ndarray, chosen: np.ndarray, most: int) -> list[np.ndarray]
     return _split(nodes, order[:middle], most) + _split(nodes, order[middle:], most)
 
 
-def _joined(trees: list[tuple[Surface, np.ndarray, Clumps]]) -> tuple[np.ndarray, ...]:
+def _joined(known: list[Geometry]) -> tuple[np.ndarray, ...]:
     """The node arrays of `kinds.Shapes`."""
-    node, inward = [np.zeros((0, 3))], [np.zeros((0, 3))]
-    leaf_node, leaf_ball = [0], [np.zeros((0, 4))]
-    clump_start, clump_leaf, clump_ball = [0], [0], [np.zeros((0, 4))]
-    leaf_patch = []
-    for surface, within, clumps in trees:
-        nodes = surface.nodes
+    node, inward, leaf_ball, clump_ball = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros((0, 4))], [np.zeros((0, 4))]
+    leaf_node, clump_start, clump_leaf, leaf_patch = [0], [0], [0], []
+    for _, surface, within, clumps in known:
         for leaves in clumps:
             for leaf in leaves:
-                node.append(nodes[leaf])
+                node.append(surface.nodes[leaf])
                 inward.append(within[leaf])
                 leaf_node.append(leaf_node[-1] + len(leaf))
-                leaf_ball.append(_ball(nodes[leaf]))
+                leaf_ball.append(_ball(surface.nodes[leaf]))
                 leaf_patch.append(surface.patch[leaf[0]])
             clump_leaf.append(clump_leaf[-1] + len(leaves))
-            clump_ball.append(_ball(nodes[np.concatenate(leaves)]))
+            clump_ball.append(_ball(surface.nodes[np.concatenate(leaves)]))
         clump_start.append(len(clump_leaf) - 1)
-    whole = [np.array(x, dtype=np.int64) for x in (leaf_node, clump_start, clump_leaf)]
+
+    def whole(numbers: list[int]) -> np.ndarray:
+        return np.array(numbers, dtype=np.int64)
+
     return (
-        np.concatenate(node), np.concatenate(inward), whole[0], np.concatenate(leaf_ball), whole[1], whole[2],
-        np.concatenate(clump_ball), np.array(leaf_patch, dtype=np.int64),
+        np.concatenate(node), np.concatenate(inward), whole(leaf_node), np.concatenate(leaf_ball), whole(clump_start),
+        whole(clump_leaf), np.concatenate(clump_ball), whole(leaf_patch),
     )  # fmt: skip
 
 

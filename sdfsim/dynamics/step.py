@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,12 +17,11 @@ from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State, awake
 from sdfsim.dynamics.free_flight import ballistic, torque_free
 from sdfsim.dynamics.model import Model
-from sdfsim.dynamics.models.contact_graph import SUBSTEPS, ContactGraph, number_pairs
+from sdfsim.dynamics.models.contact_graph import SUBSTEPS
 from sdfsim.dynamics.run_memory import Memory
 
 if TYPE_CHECKING:
-    from sdfsim.dynamics.models.families import Near
-    from sdfsim.dynamics.solver import Acts
+    from sdfsim.dynamics.models.near import Contacts, Pairs
 
 FreeFlight = Literal["exact", "learned"]
 _POSE = ("position", "orientation", "velocity", "angular_velocity")
@@ -34,7 +34,6 @@ class StepOptions:
     gravity: Tensor  # [3] float64
     dt: float  # the step
     substeps: int = SUBSTEPS  # inner steps of the solve in it
-    falls: bool = True  # False where gravity is zero: free flight without acceleration
     contact: bool = True  # False leaves every body in free flight
     friction: bool = True  # False computes no tangential impulse
     restitution: bool = True  # False makes every contact one of restitution 0
@@ -53,11 +52,11 @@ class StepOptions:
 @torch.no_grad()
 def step(
     model: Model, bodies: Bodies, state: State, rules: StepOptions, memory: Memory | None = None
-) -> tuple[State, Near | None]:
+) -> tuple[State, Contacts | Pairs | None]:
     """Advance `state` by one step: the next state, and where a network on surface nodes saw bodies near each other,
     None for other models. Without the run's `memory` every step starts from nothing, with the same result."""
     memory = memory or Memory()
-    memory.begin(bodies)
+    memory.begin()
     state, contacts = drive(bodies, state, rules), None
     if model.on_surfaces:
         after, contacts = _surface_step(model, bodies, state, rules, memory)
@@ -89,18 +88,15 @@ def _solved_step(model: Model, bodies: Bodies, state: State, rules: StepOptions,
 
     # No network has seen forces in its training.
     on_top = model.kind == "impulse" and rules.trust > 0.0 and state.load is None
-    solved, acts = solver_step(bodies, state, rules, memory, note=on_top)
-    if not (on_top and len(acts)):
+    solved, edges = solver_step(bodies, state, rules, memory, note=on_top)
+    if not (on_top and len(edges.pair)):
         return solved
-    with memory.timed("network_ms"):
-        if next(model.network.parameters()).device.type == "cpu":
-            from sdfsim.dynamics.inference import corrected
+    from sdfsim.dynamics.inference import corrected
 
-            weights, world = memory.weights(model.network, rules), memory.compiled(bodies, state).world
-            after = corrected(weights, world, state, solved, acts, rules, known=model.dt)
-        else:
-            after = correct(model, bodies, state, solved, acts, rules)
-    memory.count(nodes=len(torch.unique(torch.cat([acts.first, acts.second]))), edges=len(acts))
+    with memory.timed("network_ms"):
+        weights, world = memory.weights(model.network, rules), memory.compiled(bodies, state).world
+        after = corrected(weights, world, state, solved, edges, rules, known=model.dt)
+    memory.count(nodes=len(np.unique(edges.pair)), edges=len(edges.pair))
     # The solve takes poses and velocities that it did not leave behind for changes from outside.
     assert after.touch is not None
     return replace(after, touch=replace(after.touch, held=held(after)))
@@ -111,13 +107,10 @@ def fly(bodies: Bodies, state: State, rules: StepOptions) -> State:
     rows = awake(bodies, state)
     now = {name: getattr(state, name) for name in _POSE}
     if len(rows):
-        place, velocity = state.position[rows], state.velocity[rows]
-        load = None if state.load is None else state.load[rows]
-        if rules.falls or load is not None:
-            pull = rules.gravity if load is None else rules.gravity + bodies.inverse_mass[rows, None] * load[:, :3]
-            place, velocity = ballistic(place, velocity, pull, rules.dt)
-        else:
-            place = place + velocity * rules.dt
+        pull = rules.gravity
+        if state.load is not None:
+            pull = pull + bodies.inverse_mass[rows, None] * state.load[rows, :3]
+        place, velocity = ballistic(state.position[rows], state.velocity[rows], pull, rules.dt)
         if rules.rotation:
             turned = _turned(bodies, state, rows, rules.dt)
         else:
@@ -151,94 +144,9 @@ def _turned(bodies: Bodies, state: State, rows: Tensor, dt: float) -> tuple[Tens
     return orientation, angular + twisted(orientation)
 
 
-def correct(model: Model, bodies: Bodies, state: State, solved: State, acts: Acts, rules: StepOptions) -> State:
-    """What the network makes of the solve: only bodies that have met somebody are in its graph. `inference.corrected`
-    is the same, compiled, for the CPU."""
-    weight = next(model.network.parameters())
-    active, graph = contact_graph(bodies, state, solved, acts, rules, model.dt, weight.dtype)
-    predicted = model.network(graph.to(weight.device), friction=rules.friction, trust=rules.trust)
-    # From the network's units of time and length back to those of the bodies.
-    time = rules.dt / model.dt
-    chosen = (graph.inverse_mass > 0).cpu()
-    rows = active.cpu()[chosen]
-
-    def added(now: Tensor, before: Tensor) -> Tensor:
-        # What the network adds, so that single precision rounds that and not the motion that goes on.
-        return (now.cpu() - before)[chosen].double()
-
-    turn = pose.from_rotvec(added(predicted.mean_angular, graph.mean_angular) * model.dt)
-    place = solved.position[rows] + added(predicted.mean_velocity, graph.mean_velocity) * time * rules.dt
-    velocity = solved.velocity[rows] + added(predicted.velocity, graph.solved_velocity) * time
-    orientation, angular = solved.orientation[rows], solved.angular_velocity[rows]
-    if rules.rotation:
-        orientation = pose.normalise(pose.multiply(turn, orientation))
-        angular = angular + added(predicted.angular, graph.solved_angular) / time
-    now = {name: getattr(solved, name) for name in _POSE}
-    return replace(solved, **_put(now, rows, (place, orientation, velocity, angular)))
-
-
-def contact_graph(
-    bodies: Bodies,
-    state: State,
-    solved: State,
-    acts: Acts,
-    rules: StepOptions,
-    dt: float,
-    dtype: torch.dtype = torch.float32,
-) -> tuple[Tensor, ContactGraph]:
-    """The bodies [A] that met somebody, and the graph among them in `dtype`.
-
-    It is told in units in which the step lasts `dt` and gravity is what it is (Froude scaling): a network knows no
-    other step, and takes a longer one for the same step of smaller bodies.
-    """
-    time = rules.dt / dt
-    length = time**2
-    active, index = torch.unique(torch.cat([acts.first, acts.second]), return_inverse=True)
-    first, second = index.chunk(2)
-    pair, pairs = number_pairs(first, second, len(active))
-    rotation = pose.to_matrix(state.orientation[active])
-    moves = bodies.moves[active]
-    turns = (moves if rules.rotation else torch.zeros_like(moves))[:, None, None]
-    inverse_inertia = rotation @ torch.linalg.inv(bodies.inertia[active]) @ rotation.mT * turns
-    spin = state.angular_velocity[active]
-    if rules.rotation:
-        free = torque_free(state.orientation[active], spin, bodies.inertia[active], rules.dt)[1]
-        spin = torch.where(moves[:, None], free, spin)
-    turned = pose.multiply(solved.orientation[active], pose.conjugate(state.orientation[active]))
-    nothing = torch.zeros_like(acts.gap)
-    # Masses enter as ratios only; relative to the heaviest they stay within single precision.
-    heaviest = bodies.mass[active].max()
-
-    def product(coefficient: Tensor) -> Tensor:
-        return coefficient[acts.first] * coefficient[acts.second]
-
-    values = {
-        "inverse_mass": bodies.inverse_mass[active] * heaviest,
-        "inverse_inertia": inverse_inertia * heaviest * length**2,
-        "velocity": state.velocity[active] / time,
-        "angular": state.angular_velocity[active] * time,
-        "free_velocity": (state.velocity[active] + rules.gravity * rules.dt * moves[:, None]) / time,
-        "free_angular": spin * time,
-        "solved_velocity": solved.velocity[active] / time,
-        "solved_angular": solved.angular_velocity[active] * time,
-        "mean_velocity": (solved.position - state.position)[active] / rules.dt / time,
-        "mean_angular": pose.to_rotvec(turned) / dt,
-        "normal": acts.normal,
-        "arm_first": acts.arm_first / length,
-        "arm_second": acts.arm_second / length,
-        "impulse": acts.impulse / heaviest / time,
-        "gap": acts.gap / length,
-        "when": acts.when,
-        "friction": product(bodies.friction) if rules.friction else nothing,
-        "restitution": product(bodies.restitution) if rules.restitution else nothing,
-    }
-    given = {name: value.to(dtype) for name, value in values.items()}
-    return active, ContactGraph(**given, first=first, second=second, pair=pair, pairs=pairs, dt=dt)
-
-
 def _surface_step(
     model: Model, bodies: Bodies, state: State, rules: StepOptions, memory: Memory
-) -> tuple[State, Near | None]:
+) -> tuple[State, Contacts | Pairs | None]:
     """A published step of the bodies that are near another; free flight, or its learned form, for the others."""
     from sdfsim.dynamics.models.families import FAMILIES
     from sdfsim.dynamics.models.surfaces import compact, predict

@@ -38,15 +38,13 @@ def outside_training(scenes: Sequence[Scene], model: Model, units: Units) -> lis
         return [f"inner step: {1e3 * inner:.3g} ms here, checked up to {1e3 * LONGEST:g} ms (small bodies shorten it)"]
     if not model.ranges:
         return []
-    seen: dict[str, list[float]] = {name: [] for name in LABELS}
-    for scene in scenes:
-        for name, values in _values(scene, units).items():
-            seen[name] += values
+    found = [_values(scene, units) for scene in scenes]
     si = {"size": units.length, "speed": units.velocity}
     lines = []
     if any(b.motion == "kinematic" for scene in scenes for b in scene.bodies):
         lines.append(f"bodies on a path: {model.name} has seen none in training")
-    for name, values in seen.items():
+    for name, label in LABELS.items():
+        values = [value for some in found for value in some.get(name, [])]
         if not values or name not in model.ranges:
             continue
         low, high = model.ranges[name]
@@ -54,7 +52,7 @@ def outside_training(scenes: Sequence[Scene], model: Model, units: Units) -> lis
         if min(values) < low - slack or max(values) > high + slack:
             unit = si.get(name, 1.0)
             lines.append(
-                f"{LABELS[name]}: {min(values) * unit:.3g} to {max(values) * unit:.3g} here, "
+                f"{label}: {min(values) * unit:.3g} to {max(values) * unit:.3g} here, "
                 f"{model.name} was trained on {low * unit:.3g} to {high * unit:.3g}"
             )
     return lines
@@ -92,7 +90,7 @@ def _products(scene: Scene, name: str) -> list[float]:
 def deep_starts(bodies: Bodies, state: State, names: Sequence[str], metres: float) -> list[str]:
     """A line where pairs are deeper inside one another than any that models were trained on; empty where none is.
     Bodies have `names` [N]; a model unit is so many `metres`."""
-    from sdfsim.dynamics.models.paper_edges import find_contacts  # numba takes its time to load
+    from sdfsim.dynamics.models.near import find_contacts  # numba takes its time to load
 
     nothing = torch.zeros(3, dtype=torch.float64, device=bodies.device)
     inside = find_contacts(bodies, state, nothing, reach=0.0, dt=0.0)

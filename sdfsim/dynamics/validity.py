@@ -12,7 +12,6 @@ from sdfsim.dynamics.free_flight import MOST_TURN
 from sdfsim.errors import SdfsimError
 from sdfsim.scene.scene import Scene
 
-QUANTITIES = ("position", "orientation", "velocity", "angular_velocity")
 # Of |q|^2 - 1. The matrix R of a quaternion that keeps to it has |R'R - I| below 1e-5, and a positive determinant.
 UNIT = 2e-6
 # Model lengths from the origin. Double precision places a body to a ten millionth of its size up to here.
@@ -24,37 +23,36 @@ LINE = 1e-5
 
 
 def fault(
-    state: State, rows: torch.Tensor, dt: float, units: Units, before: State | None = None
+    state: State, dt: float, units: Units, rows: torch.Tensor | None = None, before: State | None = None
 ) -> tuple[int, str] | None:
-    """The first of bodies `rows` [R] int64 whose state cannot be, and what is wrong with it; None when all are sound.
-    State and `dt` are in model units."""
-    at = rows.cpu().numpy()
-    found = {name: getattr(state, name).cpu().numpy()[at] for name in QUANTITIES}  # numpy: half of the time
-    with np.errstate(over="ignore"):
-        off = np.abs(np.square(found["orientation"]).sum(-1) - 1.0)
+    """The first of bodies `rows` [R] int64 (None: all) whose state cannot be, and what is wrong with it; None when all
+    are sound. State and `dt` are in model units."""
+    at = np.arange(len(state.position)) if rows is None else rows.cpu().numpy()
+
+    def of(name: str, state: State = state) -> np.ndarray:
+        return getattr(state, name).cpu().numpy()[at]
+
+    turn, spin = of("orientation"), of("angular_velocity")
     limits = [
-        (found["position"], FARTHEST, units.length, "m from the origin, too far to be placed exactly"),
-        (found["velocity"], FASTEST, units.velocity, "m/s, too fast for any contact"),
-        (found["angular_velocity"], MOST_TURN / dt, 1.0 / units.time, "rad/s, too fast to be followed"),
+        ("position", of("position"), FARTHEST, units.length, "m from the origin, too far to be placed exactly"),
+        ("velocity", of("velocity"), FASTEST, units.velocity, "m/s, too fast for any contact"),
+        ("angular_velocity", spin, MOST_TURN / dt, 1.0 / units.time, "rad/s, too fast to be followed"),
     ]
     if before is not None:
-        way = (found["position"] - before.position.cpu().numpy()[at]) / dt
-        limits.append((way, FASTEST, units.velocity, "m/s on its way through the step, too fast for any contact"))
+        way = (of("position") - of("position", before)) / dt
+        limits.append(("way", way, FASTEST, units.velocity, "m/s through the step, too fast for any contact"))
     with np.errstate(over="ignore"):  # no comparison holds for what is not a number
-        if (off <= UNIT).all() and all((np.square(v).sum(-1) <= most * most).all() for v, most, *_ in limits):
-            return None
-    for name in QUANTITIES:
-        bad = ~np.isfinite(found[name]).all(-1)
-        if bad.any():
-            return int(at[bad][0]), f"{name} is not finite"
-    if (bad := off > UNIT).any():
-        return int(at[bad][0]), "orientation is no rotation"
-    for values, most, unit, what in limits:
-        with np.errstate(over="ignore"):
-            size = np.linalg.norm(values, axis=-1)
-        bad = ~(size <= most)
-        if bad.any():
-            return int(at[bad][0]), f"{float(size[bad][0]) * unit:.3g} {what} (at most {most * unit:.3g})"
+        bad = np.flatnonzero(~(np.abs(np.square(turn).sum(-1) - 1.0) <= UNIT))
+        if len(bad):
+            known = np.isfinite(turn[bad[0]]).all()
+            return int(at[bad[0]]), "orientation is no rotation" if known else "orientation is not finite"
+        for name, values, most, unit, what in limits:
+            bad = np.flatnonzero(~(np.square(values).sum(-1) <= most * most))
+            if len(bad) and not np.isfinite(values[bad[0]]).all():
+                return int(at[bad[0]]), f"{name} is not finite"
+            if len(bad):
+                size = float(np.linalg.norm(values[bad[0]])) * unit
+                return int(at[bad[0]]), f"{size:.3g} {what} (at most {most * unit:.3g})"
     return None
 
 

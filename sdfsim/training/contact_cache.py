@@ -26,7 +26,7 @@ from sdfsim.parallel import Progress, parallel, silent
 
 if TYPE_CHECKING:
     from sdfsim.dynamics.bodies import Bodies, State
-    from sdfsim.dynamics.solver import Acts
+    from sdfsim.dynamics.kernels.record import Edges
     from sdfsim.dynamics.step import StepOptions
 
 STEP = 0.02  # s, the step that networks know
@@ -214,10 +214,10 @@ def _followed(files: list[Path], how: Solved) -> list[ContactFrames]:
         for now in range(0, count - how.stride, how.stride):
             state = replace(state_at(group, [now] * len(group), start), touch=touch)
             state = _disturbed(bodies, state, how, rng) if draw else state
-            after, acts = solver_step(bodies, state, rules, memory, note=True)
+            after, edges = solver_step(bodies, state, rules, memory, note=True)
             touch = after.touch
             recorded = state_at(group, [now + how.stride] * len(group), start)
-            parts += _of_step(bodies, state, after, acts, recorded, rules)
+            parts += _of_step(bodies, state, after, edges, recorded, rules)
     return parts
 
 
@@ -240,19 +240,21 @@ def _disturbed(bodies: Bodies, state: State, how: Solved, rng: np.random.Generat
 
 
 def _of_step(
-    bodies: Bodies, state: State, after: State, acts: Acts, recorded: State, rules: StepOptions
+    bodies: Bodies, state: State, after: State, edges: Edges, recorded: State, rules: StepOptions
 ) -> list[ContactFrames]:
     """The frames of a step of several trajectories, in units in which it lasts `STEP`; none where nothing touches."""
-    if not len(acts):
+    from sdfsim.dynamics.kernels.record import APART, ARM, AXIS, GIVEN, OTHER, WHEN
+
+    if not len(edges.pair):
         return []
     floor = len(bodies) - 1
     world = bodies.world.numpy()
-    of_edge = world[acts.first.numpy()]
+    of_edge = world[edges.pair[:, 0]]
     order = np.argsort(of_edge, kind="stable")
     used, count = np.unique(of_edge, return_counts=True)
     rows = np.flatnonzero(np.isin(world, used))
     begins = np.searchsorted(world[:floor], np.arange(world.max() + 1))[of_edge[order]]
-    first, second = acts.first.numpy()[order], acts.second.numpy()[order]
+    first, second = edges.pair[order].T
     time = rules.dt / STEP
     length = time**2
     speed = length / time
@@ -260,8 +262,11 @@ def _of_step(
     def body(values: torch.Tensor, unit: float = 1.0) -> np.ndarray:
         return (values.numpy()[rows] / unit).astype(np.float32)
 
-    def edge(values: torch.Tensor, unit: float = 1.0) -> np.ndarray:
-        return (values.numpy()[order] / unit).astype(np.float32)
+    def edge(column: int, unit: float = 1.0) -> np.ndarray:
+        return (edges.value[order, column] / unit).astype(np.float32)
+
+    def vector(column: int, unit: float = 1.0) -> np.ndarray:
+        return (edges.value[order, column : column + 3] / unit).astype(np.float32)
 
     def motion(end: State, names: tuple[str, str, str, str]) -> dict[str, np.ndarray]:
         """Velocities at the end of the step, and mean ones over it."""
@@ -292,12 +297,12 @@ def _of_step(
             size=body(bodies.size, length),
             first=(first - begins).astype(np.int16),
             second=np.where(second == floor, -1, second - begins).astype(np.int16),
-            arm_first=edge(acts.arm_first, length),
-            arm_second=edge(acts.arm_second, length),
-            normal=edge(acts.normal),
-            impulse=edge(acts.impulse, speed),
-            gap=edge(acts.gap, length),
-            when=edge(acts.when),
+            arm_first=vector(ARM, length),
+            arm_second=vector(OTHER, length),
+            normal=vector(AXIS),
+            impulse=vector(GIVEN, speed),
+            gap=edge(APART, length),
+            when=edge(WHEN),
             dt=STEP,
             gravity=rules.gravity.numpy(),
             trajectories=np.zeros(1, dtype=np.int64),

@@ -16,7 +16,8 @@ from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State, Units, largest_extent
 from sdfsim.dynamics.models.families import FAMILIES
 from sdfsim.dynamics.models.message_passing import Graph, GraphNetwork, flipped
-from sdfsim.dynamics.models.surfaces import TARGET, Near, node_owner, target_acceleration
+from sdfsim.dynamics.models.near import Contacts, Pairs
+from sdfsim.dynamics.models.surfaces import TARGET, node_owner, target_acceleration
 from sdfsim.dynamics.run_memory import Memory
 from sdfsim.training.distributed import ALONE, Team
 from sdfsim.training.presets import Preset
@@ -74,7 +75,7 @@ class SurfaceTask:
         graph = self.family.graph(bodies, state, self.near(bodies, state, Memory()))
         return Batch(graph, target.float(), bodies.moves[node_owner(bodies)])
 
-    def near(self, bodies: Bodies, state: State, memory: Memory) -> Near:
+    def near(self, bodies: Bodies, state: State, memory: Memory) -> Contacts | Pairs:
         """What is near what; see `Family.near`."""
         gravity = torch.tensor(self.trajectories[0].gravity, dtype=torch.float64, device=self.device)
         return self.family.near(bodies, state, gravity, self.reach, self.dt, memory)

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
-from sdfsim.dynamics import pose
+from sdfsim.dynamics import inference, pose
+from sdfsim.dynamics.bodies import State
+from sdfsim.dynamics.kernels.record import APART, ARM, AXIS, GIVEN, OTHER, WHEN, Edges
+from sdfsim.dynamics.kernels.world import World
 from sdfsim.dynamics.model import Model, new_network
+from sdfsim.dynamics.models.contact_graph import ContactGraph
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.shape import analytic_shape
+
+kernel = inference.compiled
+POSE = ("position", "orientation", "velocity", "angular_velocity")
 
 
 def make_body(name: str, shape: int, position, **fields) -> Body:
@@ -70,3 +79,37 @@ def dropped(box_shape) -> Scene:
         make_body("high", 0, [0.0, 0.0, 50.0]),
     )
     return Scene((box_shape, analytic_shape("plane")), bodies, gravity=np.array([0.0, 0.0, -9.81]), duration=1.0)
+
+
+def contact_graph(
+    world: World, before: State, solved: State, edges: Edges, terms: kernel.Terms
+) -> tuple[torch.Tensor, ContactGraph]:
+    """The bodies [A] of a step's graph, and the graph, as the compiled network has it but in torch."""
+    start, end = (kernel.Poses(*(getattr(state, name).numpy() for name in POSE)) for state in (before, solved))
+    given = kernel._graph(world, start, end, edges.pair, edges.value, terms)
+    columns = {"normal": AXIS, "arm_first": ARM, "arm_second": OTHER, "impulse": GIVEN}
+    twists = {"": kernel.START, "free_": kernel.FREE, "solved_": kernel.END, "mean_": kernel.MEAN}
+    value, twist, pair = (torch.from_numpy(array) for array in (given.value, given.twist, given.pair))
+    pairs = len(given.first) - 1
+    return torch.from_numpy(given.body), ContactGraph(
+        inverse_mass=torch.from_numpy(given.inverse_mass),
+        inverse_inertia=torch.from_numpy(given.inverse_inertia),
+        **{f"{name}velocity": twist[:, k : k + 3] for name, k in twists.items()},
+        **{f"{name}angular": twist[:, k + 3 : k + 6] for name, k in twists.items()},
+        **{name: value[:, k : k + 3] for name, k in columns.items()},
+        first=pair[:, 0],
+        second=pair[:, 1],
+        pair=torch.repeat_interleave(torch.arange(pairs), torch.from_numpy(np.diff(given.first))),
+        pairs=pairs,
+        gap=value[:, APART],
+        when=value[:, WHEN],
+        friction=torch.from_numpy(given.product[:, 0]),
+        restitution=torch.from_numpy(given.product[:, 1]),
+        dt=terms.known,
+    )
+
+
+def in_single(graph: ContactGraph) -> ContactGraph:
+    """The graph in single precision, as a network has it."""
+    values = {name: value for name, value in vars(graph).items() if isinstance(value, torch.Tensor)}
+    return replace(graph, **{name: v.float() for name, v in values.items() if v.is_floating_point()})

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sdfsim import SdfsimError, Simulator
-from sdfsim.dynamics import variants
+from sdfsim.dynamics.simulator import varied
 from sdfsim.scene.scene import Effects, Scene
 from sdfsim.shape.shape import analytic_shape
 from tests.dynamics.conftest import make_body
@@ -179,4 +179,4 @@ def test_variants_are_what_they_would_be_alone_in_their_order():
 )
 def test_variants_that_cannot_be_are_refused(variant, message):
     with pytest.raises(SdfsimError, match=message):
-        variants.varied(small(), variant)
+        varied(small(), variant)

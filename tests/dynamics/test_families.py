@@ -7,10 +7,9 @@ import pytest
 import torch
 
 from sdfsim.dynamics.bodies import Bodies, State, Units, from_scene
-from sdfsim.dynamics.earlier_poses import with_history
-from sdfsim.dynamics.models.families import FAMILIES
-from sdfsim.dynamics.models.near_pairs import closest_points, face_pairs, node_pairs
-from sdfsim.dynamics.models.nodes import vertices
+from sdfsim.dynamics.models.families import FAMILIES, vertices
+from sdfsim.dynamics.models.near import closest_points, face_pairs, node_pairs
+from sdfsim.dynamics.models.surfaces import with_history
 from sdfsim.dynamics.pose import rotate
 from sdfsim.dynamics.run_memory import Memory
 from sdfsim.dynamics.step import StepOptions

@@ -9,19 +9,19 @@ import torch
 
 from sdfsim.data.batching import roll_out
 from sdfsim.data.dataset import Trajectory
-from sdfsim.dynamics import inference
+from sdfsim.dynamics import inference, pose
 from sdfsim.dynamics import step as step_module
 from sdfsim.dynamics.bodies import State
 from sdfsim.dynamics.kernels import impulse as kernel
 from sdfsim.dynamics.model import Model, load_model, new_network
+from sdfsim.dynamics.models.contact_graph import ContactGraph
 from sdfsim.dynamics.simulator import Simulator
-from sdfsim.dynamics.step import correct
+from sdfsim.dynamics.step import StepOptions
 from sdfsim.scene.scene import Effects, Scene
 from sdfsim.shape.shape import analytic_shape
-from tests.dynamics.conftest import make_body, random_model
+from tests.dynamics.conftest import POSE, contact_graph, make_body, random_model
 from tests.dynamics.test_laws import cube
 
-POSE = ("position", "orientation", "velocity", "angular_velocity")
 ROUNDING = 1e-5  # by the largest speed around
 
 
@@ -61,26 +61,44 @@ class Compared:
     error: float
 
 
+def in_torch(network, solved: State, rules: StepOptions, active: torch.Tensor, graph: ContactGraph) -> State:
+    """What the network in torch makes of a solved step."""
+    predicted = network(graph, friction=rules.friction, trust=rules.trust)
+    chosen, time = graph.inverse_mass > 0, rules.dt / graph.dt
+    rows = active[chosen]
+    place, velocity, turned, angular = (
+        getattr(solved, name).clone() for name in ("position", "velocity", "orientation", "angular_velocity")
+    )
+    place[rows] += (predicted.mean_velocity - graph.mean_velocity)[chosen] * time * rules.dt
+    velocity[rows] += (predicted.velocity - graph.solved_velocity)[chosen] * time
+    if rules.rotation:
+        turn = pose.from_rotvec((predicted.mean_angular - graph.mean_angular)[chosen] * graph.dt)
+        turned[rows] = pose.normalise(pose.multiply(turn, turned[rows]))
+        angular[rows] += (predicted.angular - graph.solved_angular)[chosen] / time
+    return replace(solved, position=place, orientation=turned, velocity=velocity, angular_velocity=angular)
+
+
 @pytest.fixture
 def steps(monkeypatch) -> list[Compared]:
     """Every step that the compiled network makes, made by torch in double precision as well."""
     found, given = [], []
     compiled, solved_step = inference.corrected, step_module._solved_step
 
-    def stepped(model, bodies, *rest):
-        given[:] = [replace(model, network=deepcopy(model.network).double()), bodies]
-        return solved_step(model, bodies, *rest)
+    def stepped(model, *rest):
+        given[:] = [deepcopy(model.network).double()]
+        return solved_step(model, *rest)
 
-    def both(weights, world, before, solved, acts, rules, *, known):
-        mine = compiled(weights, world, before, solved, acts, rules, known=known)
-        theirs = correct(given[0], given[1], before, solved, acts, rules)
-        rows = torch.cat([acts.first, acts.second])
+    def both(weights, world, before, solved, edges, rules, *, known):
+        mine = compiled(weights, world, before, solved, edges, rules, known=known)
+        graph = contact_graph(world, before, solved, edges, inference.terms_of(rules, known))
+        theirs = in_torch(given[0], solved, rules, *graph)
+        rows = torch.from_numpy(edges.pair.ravel())
         speed = max(float(getattr(s, n)[rows].abs().max()) for s in (before, solved, theirs) for n in POSE[2:])
 
         def apart(other: State, names: tuple[str, ...]) -> float:
             return max(float((getattr(mine, n) - getattr(other, n)).abs().max()) for n in names) / speed
 
-        found.append(Compared(len(acts), apart(solved, POSE[2:]), apart(theirs, POSE)))
+        found.append(Compared(len(edges.pair), apart(solved, POSE[2:]), apart(theirs, POSE)))
         return mine
 
     monkeypatch.setattr(step_module, "_solved_step", stepped)

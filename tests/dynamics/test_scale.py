@@ -7,7 +7,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from sdfsim.dynamics.bodies import Units, from_scene
-from sdfsim.dynamics.models.paper_edges import find_contacts
+from sdfsim.dynamics.models.near import find_contacts
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.shape import load_shape
 from tests.dynamics.conftest import make_body

@@ -7,10 +7,12 @@ import pytest
 import torch
 
 from sdfsim.dynamics import solver_in_torch as twin
-from sdfsim.dynamics.bodies import Units, from_scene
-from sdfsim.dynamics.kernels.distance import distance as kernel_distance
-from sdfsim.dynamics.solver import Compiled, compiled_rules, no_manifolds, taken_up
+from sdfsim.dynamics.bodies import State, Units, from_scene
+from sdfsim.dynamics.kernels.world import DRAG, GAP, KEY, NORMAL, PUSH, SECOND, Manifolds
+from sdfsim.dynamics.solver import Compiled, compiled_rules, taken_up
+from sdfsim.dynamics.step import StepOptions
 from sdfsim.scene.scene import Scene
+from sdfsim.shape.baked_grid import baked, interpolated
 from sdfsim.shape.primitives import convex_pieces
 from sdfsim.shape.shape import analytic_shape, load_shape
 from tests.dynamics.test_laws import ball, body, cube
@@ -23,9 +25,27 @@ ONE = Units(1.0, 1.0, 1.0)
 def compiled(scene: Scene, **rules):
     bodies, state = from_scene(scene, ONE, torch.device("cpu"))
     inside = Compiled(bodies, state)
-    rules = compiled_rules(scene.gravity, 0.02, 5, **rules)
-    motion, _ = taken_up(bodies, state, inside, rules)
-    return inside, motion, rules
+    rules = compiled_rules(StepOptions(torch.from_numpy(scene.gravity), 0.02, **rules))
+    return inside, *taken_up(bodies, state, inside, rules), rules
+
+
+def state_of(motion) -> State:
+    return State(*(torch.from_numpy(array.copy()) for array in motion[:4]))
+
+
+def poses(state: State) -> tuple[torch.Tensor, ...]:
+    return state.position, state.orientation, state.velocity, state.angular_velocity
+
+
+def known_of(touching: torch.Tensor, manifolds: Manifolds) -> twin.Known:
+    """What the compiled step has left."""
+    points: twin.Points = {}
+    for (a, b), count, rows in zip(manifolds.pair.tolist(), manifolds.count, manifolds.point, strict=True):
+        points[a, b] = [
+            twin.Point(r[:SECOND], r[SECOND:NORMAL], r[NORMAL:GAP], r[GAP], int(r[KEY]), r[PUSH], r[DRAG : DRAG + 3])
+            for r in torch.from_numpy(rows[:count].copy())
+        ]
+    return twin.Known(touching, points)
 
 
 def tops(seed: int) -> Scene:
@@ -72,41 +92,34 @@ def floor(shape: int):
 )  # fmt: skip
 def test_the_compiled_step_is_its_twin(scene, steps, rules, pull):
     """Step by step from the compiled states: chaos would soon make more of a rounding."""
-    inside, motion, rules = compiled(scene, **rules)
+    inside, motion, manifolds, rules = compiled(scene, **rules)
     moves = inside.world.moves[:, None]
     inside.work.load[:] = pull * moves * np.random.default_rng(3).normal(size=inside.work.load.shape)
-    manifolds, points = no_manifolds(), 0
+    points = 0
     for k in range(steps):
         if k % 6:
             manifolds, *_ = inside.run(motion, manifolds, rules)
             continue
-        bodies, moving = twin.of_compiled(inside, motion)
-        after, contacts = twin.step(inside.shapes, bodies, moving, rules, twin.contacts_of(manifolds))
+        state = replace(state_of(motion), load=torch.from_numpy(inside.work.load.copy()))
+        known = known_of(torch.from_numpy(motion.touching.copy()), manifolds)
+        after, known = twin.Solve(inside.shapes, inside.bodies, rules).step(state, known)
         manifolds, _, counts = inside.run(motion, manifolds, rules)
-        assert sum(map(len, contacts.values())) == manifolds.count.sum()
-        for name, bound in (("position", 1e-9), ("orientation", 1e-9), ("velocity", 1e-7), ("angular", 1e-7)):
-            np.testing.assert_allclose(getattr(after, name).numpy(), getattr(motion, name), atol=bound, rtol=0)
+        assert sum(map(len, known.points.values())) == manifolds.count.sum()
+        for ours, theirs, bound in zip(poses(after), motion, (1e-9, 1e-9, 1e-7, 1e-7), strict=False):
+            np.testing.assert_allclose(ours.numpy(), theirs, atol=bound, rtol=0)
         points += counts[1]
     assert points > 5
 
 
-@pytest.mark.parametrize(
-    "shape",
-    [
-        analytic_shape("sphere", radius=0.3), analytic_shape("capsule", radius=0.2, height=1.0),
-        analytic_shape("box", size=(1.0, 0.6, 0.3)), analytic_shape("cylinder", radius=0.3, height=0.5),
-        load_shape(SHAPES / "bowl"),
-    ],
-    ids=["sphere", "capsule", "box", "cylinder", "grid"],
-)  # fmt: skip
-def test_distances_are_those_of_the_twin(shape):
-    inside, _, _ = compiled(Scene((shape,), (body("it", 0, [0, 0, 0], 1.0),), np.zeros(3), 1.0))
-    shapes = inside.shapes
-    places = np.random.default_rng(0).uniform(-1.0, 1.0, (2000, 3))
-    d, n = twin.distance(shapes, 0, torch.from_numpy(places))
-    found = [kernel_distance(shapes.table, shapes.brick, shapes.sample, 0, tuple(p)) for p in places]
-    np.testing.assert_allclose(d.numpy(), [x[0] for x in found], atol=1e-12)
-    np.testing.assert_allclose(n.numpy(), [x[1] for x in found], atol=1e-9)
+def test_distances_of_a_grid_and_their_derivatives_are_those_of_what_lies_between_its_samples():
+    bowl = load_shape(SHAPES / "bowl")
+    inside, *_ = compiled(Scene((bowl,), (body("it", 0, [0, 0, 0], 1.0),), np.zeros(3), 1.0))
+    grid = baked(bowl.sdf, bowl.nodes, bowl.pieces)
+    places = torch.from_numpy(bowl.nodes[:200] + 0.3 * grid.cell).requires_grad_()
+    d, n = twin.Distance.apply(places, inside.shapes, 0)
+    np.testing.assert_allclose(d.detach(), interpolated(grid, places.detach().numpy()), atol=1e-12)
+    slope = torch.autograd.grad(d.sum(), places)[0]
+    np.testing.assert_allclose(slope / slope.norm(dim=1, keepdim=True), n.detach(), atol=1e-6)
 
 
 THROW = {"velocity": np.array([1.5, 0.2, -0.5]), "friction": 0.1, "restitution": 0.7, "mass": 1.3}
@@ -124,31 +137,29 @@ def test_gradients_are_differences_of_the_compiled_step(name):
     """Where a ball is after 0.24 s, with two impacts on the way, told by the first body's values."""
 
     def end(value) -> np.ndarray:
-        inside, motion, rules = compiled(thrown(**(THROW | {name: value})))
-        manifolds = no_manifolds()
+        inside, motion, manifolds, rules = compiled(thrown(**(THROW | {name: value})))
         for _ in range(12):
             manifolds, *_ = inside.run(motion, manifolds, rules)
         return motion.position[:2].copy()
 
-    inside, motion, rules = compiled(thrown(**THROW))
-    bodies, moving = twin.of_compiled(inside, motion)
+    inside, motion, manifolds, rules = compiled(thrown(**THROW))
+    bodies, state = inside.bodies, state_of(motion)
     value = torch.tensor(THROW[name], dtype=torch.float64, requires_grad=True)
     if name == "velocity":
-        moving = replace(moving, velocity=torch.cat([value[None], moving.velocity[1:]]))
+        state = replace(state, velocity=torch.cat([value[None], state.velocity[1:]]))
     elif name == "mass":
         share = torch.stack([value / THROW["mass"], *torch.ones(2, dtype=torch.float64)])
         bodies = replace(
-            bodies, inverse_mass=bodies.inverse_mass / share, inertia=bodies.inertia * share[:, None, None],
-            inverse_inertia=bodies.inverse_inertia / share[:, None, None],
+            bodies, inverse_mass=bodies.inverse_mass / share, inertia=bodies.inertia * share[:, None, None]
         )  # fmt: skip
     else:
         bodies = replace(bodies, **{name: torch.cat([value[None], getattr(bodies, name)[1:]])})
-    contacts: twin.Contacts = {}
+    solve, known = twin.Solve(inside.shapes, bodies, rules), known_of(torch.zeros(3, dtype=bool), manifolds)
     for _ in range(12):
-        moving, contacts = twin.step(inside.shapes, bodies, moving, rules, contacts)
-    np.testing.assert_allclose(moving.position[:2].detach().numpy(), end(THROW[name]), atol=1e-9)
+        state, known = solve.step(state, known)
+    np.testing.assert_allclose(state.position[:2].detach().numpy(), end(THROW[name]), atol=1e-9)
     weights = torch.tensor([[1.0, 2.0, 3.0], [-2.0, 1.0, 0.5]], dtype=torch.float64)
-    (gradient,) = torch.autograd.grad((moving.position[:2] * weights).sum(), value)
+    (gradient,) = torch.autograd.grad((state.position[:2] * weights).sum(), value)
     steps = 1e-6 * np.eye(3) if name == "velocity" else [np.array(1e-6)]
     wanted = [((end(THROW[name] + h) - end(THROW[name] - h)) * weights.numpy()).sum() / 2e-6 for h in steps]
     assert np.abs(wanted).max() > 1e-3

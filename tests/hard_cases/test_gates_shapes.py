@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from sdfsim.dynamics.models.paper_edges import find_contacts
+from sdfsim.dynamics.models.near import find_contacts
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.sdf import BoxSdf, SphereSdf

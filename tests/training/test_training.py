@@ -9,12 +9,13 @@ import torch
 from sdfsim.data.batching import merged
 from sdfsim.data.pybullet_sim import MARGIN
 from sdfsim.dynamics.bodies import Units
+from sdfsim.dynamics.inference import terms_of
 from sdfsim.dynamics.model import SURFACE, load_model
 from sdfsim.dynamics.models.contact_graph import REST_SPEED
 from sdfsim.dynamics.models.impulse import Velocities
 from sdfsim.dynamics.run_memory import Memory
 from sdfsim.dynamics.solver import solver_step
-from sdfsim.dynamics.step import StepOptions, contact_graph
+from sdfsim.dynamics.step import StepOptions
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.evaluate import evaluate
 from sdfsim.training import contact_cache
@@ -25,6 +26,7 @@ from sdfsim.training.presets import PRESETS, Preset
 from sdfsim.training.run import Run, held_out_loss
 from sdfsim.training.surface_task import SurfaceTask
 from sdfsim.training.train import train
+from tests.dynamics.conftest import contact_graph, in_single
 
 CPU = torch.device("cpu")
 PAPER = PRESETS["paper"]
@@ -46,10 +48,11 @@ def test_cached_frames_equal_the_simulators_own_graph(ball_data, tmp_path):
     for frame in range(len(first.position) - 1):
         _, state = merged([first], [frame], load_shapes(ball_data, {"ball"}), Units(1.0, 1.0, 1.0), CPU)
         state = replace(state, touch=touch)
-        solved, acts = solver_step(bodies, state, rules, memory, note=True)
+        solved, edges = solver_step(bodies, state, rules, memory, note=True)
         touch = solved.touch
-        if len(acts):
-            found.append(contact_graph(bodies, state, solved, acts, rules, first.dt)[1])
+        if len(edges.pair):
+            world = memory.compiled(bodies, state).world
+            found.append(in_single(contact_graph(world, state, solved, edges, terms_of(rules, first.dt))[1]))
     assert len(found) == len(task.frames) > 5
     for k, graph in enumerate(found):
         batch = task.batch(np.array([k])).graph

@@ -25,11 +25,13 @@ from sdfsim.dynamics.kernels.vectors import (
     FAST,
     add,
     along,
+    cross,
     dot,
     get,
     norm,
     scale,
     sub,
+    to_matrix,
     turn,
     turn_back,
     vector,
@@ -136,14 +138,8 @@ def _overlap(low, high, a, other_low, other_high, b):
 @njit(**FAST)
 def near_pairs(world, motion, low, high):
     """[P, 2] bodies whose boxes overlap, in a fixed order: sweep and prune along the axis on which they spread most."""
-    n = len(world.shape)
-    going = np.empty(len(world.going), np.int64)
-    count = 0
-    for b in world.going:
-        if world.shape[b] >= 0 and math.isfinite(world.radius[b]):
-            going[count] = b
-            count += 1
-    going = going[:count]
+    going = world.going[(world.shape[world.going] >= 0) & np.isfinite(world.radius[world.going])]
+    count = len(going)
     found = np.empty((max(64, 4 * count), 2), np.int64)
     pairs = 0
     axis, widest = 0, -1.0
@@ -153,13 +149,7 @@ def near_pairs(world, motion, low, high):
             least, most = min(least, low[going[i], k]), max(most, low[going[i], k])
         if most - least > widest:
             axis, widest = k, most - least
-    along_axis = np.empty(count)
-    for i in range(count):
-        along_axis[i] = low[going[i], axis]
-    rank = sorted_order(along_axis)
-    order = np.empty(count, np.int64)
-    for i in range(count):
-        order[i] = going[rank[i]]
+    order = going[np.argsort(low[:, axis][going], kind="mergesort")]
     for i in range(count):
         a = order[i]
         awake = _stirs(world, motion, a)
@@ -179,47 +169,14 @@ def near_pairs(world, motion, low, high):
                 found, pairs = _append(found, pairs, a, world.plane[k])
         if not awake:
             continue
-        last, beyond = 0, len(world.still)
-        while last < beyond:
-            k = (last + beyond) // 2
-            if world.low[k, world.axis] <= high[a, world.axis]:
-                last = k + 1
-            else:
-                beyond = k
+        last = np.searchsorted(world.low[:, world.axis], high[a, world.axis], side="right")
         for k in range(last - 1, -1, -1):
             if world.reach[k] < low[a, world.axis]:
                 break
             if _overlap(low, high, a, world.low, world.high, k) and _may_meet(world, a, world.still[k]):
                 found, pairs = _append(found, pairs, a, world.still[k])
-    key = np.empty(pairs)
-    for p in range(pairs):
-        key[p] = found[p, 0] * n + found[p, 1]
-    rank = sorted_order(key)
-    ordered = np.empty((pairs, 2), np.int64)
-    for p in range(pairs):
-        ordered[p, 0], ordered[p, 1] = found[rank[p], 0], found[rank[p], 1]
-    return ordered
-
-
-@njit(**FAST)
-def sorted_order(values):
-    """The order that sorts `values`, equal ones as they come: a merge sort; numpy's takes seconds to compile."""
-    n = len(values)
-    order, other = np.arange(n), np.empty(n, np.int64)
-    width = 1
-    while width < n:
-        for first in range(0, n, 2 * width):
-            i, middle, j, last = first, min(first + width, n), min(first + width, n), min(first + 2 * width, n)
-            for k in range(first, last):
-                if j >= last or (i < middle and values[order[i]] <= values[order[j]]):
-                    other[k] = order[i]
-                    i += 1
-                else:
-                    other[k] = order[j]
-                    j += 1
-        order, other = other, order
-        width *= 2
-    return order
+    found = found[:pairs]
+    return found[np.argsort(found[:, 0] * len(world.shape) + found[:, 1], kind="mergesort")]
 
 
 @njit(**FAST)
@@ -241,7 +198,7 @@ def _carried(world, motion, pairs, old):
         a, b = old.pair[k, 0], old.pair[k, 1]
         key[k] = a * n + b
         asleep[k] = motion.island[a] >= 0 and (motion.island[b] >= 0 or not world.moves[b])
-    order = sorted_order(key)
+    order = np.argsort(key, kind="mergesort")
     here = len(pairs)
     total = here + asleep.sum()
     pair = np.empty((total, 2), np.int64)
@@ -343,9 +300,7 @@ def _near(shapes, world, motion, matrix, pairs, ways, reach, near, p):
         k = world.scale[other]
         d = distance_alone(table, brick, sample, world.shape[other], mapped(w, c, (0.0, 0.0, 0.0)))
         s = world.shape[one]
-        size = (
-            shapes.table[s, SIZE] + (shapes.table[s, SIZE + 1] if shapes.table[s, KIND] == CAPSULE else 0.0)
-        ) * world.scale[one]
+        size = (shapes.table[s, SIZE] + shapes.table[s, SIZE + 1]) * world.scale[one]
         near.count[p, 0] = 1 if d * k - size <= most else 0
         return
     for side in range(2):
@@ -430,7 +385,7 @@ def _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, s
     if went - near.looked[p] < rules.still:
         return
     near.looked[p], near.away_all[p] = went, math.inf
-    count, look = 0, rules.look + _nearer(world, motion, rules, a, b)
+    count, look = 0, rules.look + 2.0 * rules.margin + _nearer(world, motion, rules, a, b)
     for side in range(2):
         if _swallowed(shapes, world, motion, matrix, a, b, side, scratch.found, t):
             manifolds.count[p] = _merged(rules, manifolds.point, p, 0, scratch, t, 1, False)
@@ -459,7 +414,7 @@ def _collide_round(shapes, world, motion, matrix, rules, manifolds, scratch, t, 
     """The manifold of a pair with a sphere or a capsule."""
     a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
     first, second = shapes.table[world.shape[a], KIND], shapes.table[world.shape[b], KIND]
-    one, other = first == SPHERE or first == CAPSULE, second == SPHERE or second == CAPSULE
+    one, other = is_round(shapes.table, world.shape[a]), is_round(shapes.table, world.shape[b])
     known, found, point = manifolds.count[p], scratch.found, manifolds.point
     reach = rules.reach + _nearer(world, motion, rules, a, b)
     count = _round(shapes, world, motion, matrix, reach, a, b, 0 if one else 1, found, t)
@@ -858,3 +813,67 @@ def _merged(rules, point, p, known, scratch, t, count, rounded):
                 farthest, following = away[t, e], e
         chosen = following
     return kept
+
+
+@njit(**FAST)
+def nodes_within(shapes, world, work, motion, rules, node, start):
+    """Nodes that are within `rules.reach` of another body's surface, or will be by the end of the step as they go: the
+    contact edges of the paper (section 3).
+
+    Args:
+        node: [M, 3] surface nodes about the centres of mass, in the bodies' axes.
+        start: [N + 1] int64, body b owns nodes start[b] : start[b + 1].
+
+    Returns:
+        [E, 3] int64 the owner, its node and the other body; [E, 7] the distance, the other's outward normal there and
+        the node seen from the other's centre of mass (world axes).
+    """
+    span = rules.inner * rules.steps
+    for b in world.going:
+        to_matrix(motion.orientation, b, work.matrix)
+    swept(world, work, motion, rules, span)
+    pairs = near_pairs(world, motion, work.low, work.high)
+    index, value = np.empty((256, 3), np.int64), np.empty((256, 7))
+    count = 0
+    for p in range(len(pairs)):
+        for side in range(2):
+            one, other = pairs[p, side], pairs[p, 1 - side]
+            fall = (1.0 if world.moves[one] else 0.0) - (1.0 if world.moves[other] else 0.0)
+            w, c = map_between(motion.position, work.matrix, world.scale, world.com, one, other)
+            own, k = 1.0 / world.scale[one], world.scale[other]
+            apart = sub(get(motion.position, one), get(motion.position, other))
+            speed = norm(sub(get(motion.velocity, one), get(motion.velocity, other)))
+            speed += norm(vector(rules.gravity)) * span * abs(fall) + norm(get(motion.angular, one)) * world.radius[one]
+            if norm(get(motion.angular, other)) > 0.0:
+                speed += norm(get(motion.angular, other)) * world.radius[other]
+            most = rules.reach + speed * span
+            for u in range(start[one], start[one + 1]):
+                place = mapped(w, c, scale(add(get(node, u), get(world.com, one)), own))
+                seen = sub(scale(place, k), get(world.com, other))
+                outside = False
+                for x in range(3):
+                    outside = outside or abs(seen[x] - world.centre[other, x]) > world.half[other, x] + most
+                if outside and world.radius[other] < np.inf:
+                    continue
+                d, n = distance(shapes.table, shapes.brick, shapes.sample, world.shape[other], place)
+                d *= k
+                if d > most:
+                    continue
+                normal, arm = turn(work.matrix, other, n), turn(work.matrix, one, get(node, u))
+                offset = add(apart, arm)
+                velocity = add(get(motion.velocity, one), cross(get(motion.angular, one), arm))
+                back = cross(get(motion.angular, other), along(offset, normal, -d))
+                velocity = sub(velocity, add(get(motion.velocity, other), back))
+                velocity = along(velocity, vector(rules.gravity), fall * span)
+                if d + min(0.0, dot(velocity, normal)) * span > rules.reach:
+                    continue
+                if count == len(index):
+                    more, room = np.empty((2 * count, 3), np.int64), np.empty((2 * count, 7))
+                    more[:count], room[:count] = index, value
+                    index, value = more, room
+                index[count, 0], index[count, 1], index[count, 2] = one, u, other
+                value[count, 0] = d
+                for x in range(3):
+                    value[count, 1 + x], value[count, 4 + x] = normal[x], offset[x]
+                count += 1
+    return index[:count], value[:count]

@@ -11,15 +11,15 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from sdfsim.dynamics.kernels.vectors import BARE, along, dot, norm, scale
+from sdfsim.dynamics.kernels.vectors import BARE, FAST, along, dot, get, norm, put, scale
 
 PLANE, SPHERE, CAPSULE, BOX, CYLINDER, GRID = range(6)
 TINY = 1e-12
 
 
 # Columns of the table of shapes: kind; sizes (sphere: radius; capsule and cylinder: radius, half height, of a capsule
-# without its caps; box: half extents); thickness of the thinnest walls; of a grid the first sample, the cell, bricks
-# along each side, and where its samples and brick numbers begin.
+# without its caps; box: half extents; then 0); thickness of the thinnest walls; of a grid the first sample, the cell,
+# bricks along each side, and where its samples and brick numbers begin.
 KIND, SIZE, THICKNESS, LOW, CELL, BRICKS, COARSE, BRICK = 0, 1, 4, 5, 8, 9, 12, 13
 # And of a shape of several patches: the first place with a label, the distance between two, how many there are along
 # each side, and where they begin; -1 where there is one patch only.
@@ -83,6 +83,16 @@ def distance_alone(table, brick, sample, s, p):
         return _grid_alone(table, brick, sample, s, p)
     d, _ = distance(table, brick, sample, s, p)
     return d
+
+
+@njit(**FAST)
+def distances(table, brick, sample, s, p):
+    """Signed distances [P] and unit gradients [P, 3] of shape s at places [P, 3]."""
+    d, n = np.empty(len(p)), np.empty((len(p), 3))
+    for i in range(len(p)):
+        d[i], normal = distance(table, brick, sample, s, get(p, i))
+        put(n, i, normal)
+    return d, n
 
 
 @njit(**BARE)

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from sdfsim.dynamics.kernels.record import APART, ARM, AXIS, GIVEN, OTHER, WHEN
-from sdfsim.dynamics.kernels.solve import _root
+from sdfsim.dynamics.kernels.solve import join, root
 from sdfsim.dynamics.kernels.step import _torque_free
 from sdfsim.dynamics.kernels.vectors import (
     BARE,
@@ -112,7 +112,7 @@ class Graph(NamedTuple):
         taken: [A] kinetic energy that the solve took from free flight.
         pair: [E, 2] int64, rows of `body`.
         first: [P + 1] int64, the first edge of each pair of bodies; edges of a pair stand together.
-        value: [E, 14] columns of `record`, the last one as the part of the step.
+        value: [E, WIDTH] columns of `record`.
         product: [E, 2] of the two bodies' coefficients of friction and of restitution.
     """
 
@@ -148,17 +148,8 @@ class Frames(NamedTuple):
 
 @njit(**FAST)
 def correct(weights, world, before, after, pair, value, terms):
-    """Add to `after`, in place, what the network adds to the solve.
-
-    Args:
-        weights: of the network.
-        world: the scene.
-        before: poses at the start of the step.
-        after: those at its end as the solve has them.
-        pair: [E, 2] int64, the bodies of the solve's edges.
-        value: [E, 14] their columns.
-        terms: what is in play.
-    """
+    """Add to `after`, the poses at the end of a step as the solve has them, what the network adds, in place; `pair` and
+    `value` are the edges of the solve, see `record.Edges`."""
     graph = _graph(world, before, after, pair, value, terms)
     solved = graph.twist[:, END:].copy()
     if weights.alone:
@@ -531,14 +522,13 @@ def _share_energy(graph, frames, added):
     parent = np.arange(bodies)
     for e in range(len(pair)):
         if moves[pair[e, 0]] and moves[pair[e, 1]]:
-            one, other = _root(parent, pair[e, 0]), _root(parent, pair[e, 1])
-            parent[max(one, other)] = min(one, other)
+            join(parent, pair[e, 0], pair[e, 1])
     least, linear, square = np.zeros(bodies), np.zeros(bodies), np.zeros(bodies)
     for a in range(bodies):
-        least[_root(parent, a)] += graph.taken[a]
+        least[root(parent, a)] += graph.taken[a]
     pushed = _pushed(graph, frames, added)
     for e in range(len(added)):
-        i = _root(parent, pair[e, 0] if moves[pair[e, 0]] else pair[e, 1])
+        i = root(parent, pair[e, 0] if moves[pair[e, 0]] else pair[e, 1])
         for k in range(added.shape[1]):
             before = _seen(graph, frames, graph.twist, END, e, k)
             linear[i] += added[e, k, 0] * before
@@ -547,7 +537,7 @@ def _share_energy(graph, frames, added):
     for i in range(bodies):
         most = max(0.0, least[i])
         if linear[i] + square[i] > most:
-            root = math.sqrt(max(0.0, linear[i] ** 2 + 4.0 * square[i] * most))
-            part[i] = min(1.0, max(0.0, (root - linear[i]) / max(2.0 * square[i], 1e-30)))
+            most = math.sqrt(max(0.0, linear[i] ** 2 + 4.0 * square[i] * most))
+            part[i] = min(1.0, max(0.0, (most - linear[i]) / max(2.0 * square[i], 1e-30)))
     for e in range(len(added)):
-        added[e, :, 0] *= part[_root(parent, pair[e, 0] if moves[pair[e, 0]] else pair[e, 1])]
+        added[e, :, 0] *= part[root(parent, pair[e, 0] if moves[pair[e, 0]] else pair[e, 1])]

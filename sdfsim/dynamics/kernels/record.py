@@ -7,96 +7,83 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from sdfsim.dynamics.kernels.collide import sorted_order
 from sdfsim.dynamics.kernels.solve import IMPULSE, met_half_way
 from sdfsim.dynamics.kernels.vectors import BARE, FAST, get, sub, turn
 from sdfsim.dynamics.kernels.world import DRAG, GAP, NORMAL, PUSH
 
 # Columns of an edge: from the centres of mass of both bodies to the contact, the normal from the second body to the
-# first, the impulse on the first body (all along world axes), the distance when it was first met, the inner step in
-# which it was, and the weight of its place.
+# first, the impulse on the first body (all along world axes), the distance when it was first met, the part of the step
+# that was over by then, and the weight of its place.
 ARM, OTHER, AXIS, GIVEN, APART, WHEN, WEIGHT, WIDTH = 0, 3, 6, 9, 12, 13, 14, 15
 ALIKE = 0.9  # cosine between normals, and
 CLOSE = 0.1  # model lengths between contacts of two bodies, that are taken for one
 
 
 class Edges(NamedTuple):
-    """E places where bodies met or nearly met in a step.
-
-    Attributes:
-        pair: [E, 2] int64, the bodies.
-        value: [E, WIDTH], the columns above.
-        count: [1] int64, how many there are; there may be room for more.
-    """
+    """E places where bodies met or nearly met in a step: pair [E, 2] int64, the bodies; value [E, WIDTH], see above."""
 
     pair: np.ndarray
     value: np.ndarray
-    count: np.ndarray
 
 
 @njit(**FAST)
-def no_edges(room):
-    return Edges(np.empty((room, 2), np.int64), np.empty((room, WIDTH)), np.zeros(1, np.int64))
+def no_edges():
+    return Edges(np.empty((0, 2), np.int64), np.empty((0, WIDTH)))
 
 
 @njit(**FAST)
 def noted(motion, matrix, manifolds, system, when, edges):
-    """The edges with those contacts of an inner step that acted."""
-    for c in range(len(system.where)):
-        if system.row[c, 0, IMPULSE] > 0.0:
-            edges = _with_room(edges)
-            _put(motion, matrix, manifolds, system.where[c, 0], system.where[c, 1], when, edges)
+    """The edges with those contacts of an inner step that acted; `when` is the part of the step that was over."""
+    acted = np.flatnonzero(system.row[:, 0, IMPULSE] > 0.0)
+    edges, e = _longer(edges, len(acted))
+    for c in acted:
+        _put(motion, matrix, manifolds, system.where[c, 0], system.where[c, 1], when, edges, e)
+        e += 1
     return edges
 
 
 @njit(**FAST)
-def gathered(world, motion, matrix, manifolds, pairs, steps, edges):
+def gathered(world, motion, matrix, manifolds, pairs, when, edges):
     """One edge a place: what acted there in the inner steps of a step, and what is near at its end but did not act.
 
     Args:
         pairs: of how many manifolds, the first ones, bodies are near.
     """
+    edges, e = _longer(edges, manifolds.count[:pairs].sum())
     for m in range(pairs):
         for k in range(manifolds.count[m]):
             if manifolds.point[m, k, PUSH] == 0.0:
-                edges = _with_room(edges)
-                _put(motion, matrix, manifolds, m, k, steps - 1, edges)
-    n, total = len(world.shape), edges.count[0]
-    key = np.empty(total)
-    for e in range(total):
-        key[e] = edges.pair[e, 0] * n + edges.pair[e, 1]
-    order = sorted_order(key)
-    whole = no_edges(max(1, total))
-    kept = first = 0
-    for i in range(total):
-        e = order[i]
-        if i == 0 or key[e] != key[order[i - 1]]:
+                _put(motion, matrix, manifolds, m, k, when, edges, e)
+                e += 1
+    key = edges.pair[:e, 0] * len(world.shape) + edges.pair[:e, 1]
+    whole = Edges(np.empty((e, 2), np.int64), np.empty((e, WIDTH)))
+    kept = first = last = 0
+    for e in np.argsort(key, kind="mergesort"):
+        if key[e] != key[last]:
             first = kept
+        last = e
         twin = _twin(whole.value, first, kept, edges.value, e)
         if twin < 0:
-            whole.pair[kept] = edges.pair[e]
-            whole.value[kept] = edges.value[e]
+            whole.pair[kept], whole.value[kept] = edges.pair[e], edges.value[e]
             kept += 1
         elif edges.value[e, WEIGHT] > 0.0:
             _merge(whole.value, twin, edges.value, e)
-    whole.count[0] = kept
-    return whole
+    return Edges(whole.pair[:kept], whole.value[:kept])
 
 
 @njit(**FAST)
-def _with_room(edges):
-    count = edges.count[0]
-    if count < len(edges.pair):
-        return edges
-    more = no_edges(max(64, 2 * count))
-    more.pair[:count], more.value[:count], more.count[0] = edges.pair, edges.value, count
-    return more
+def _longer(edges, more):
+    """The edges with room for `more` behind them, and how many there were."""
+    count = len(edges.pair)
+    longer = Edges(np.empty((count + more, 2), np.int64), np.empty((count + more, WIDTH)))
+    longer.pair[:count], longer.value[:count] = edges.pair, edges.value
+    return longer, count
 
 
 @njit(**BARE)
-def _put(motion, matrix, manifolds, m, k, when, edges):
+def _put(motion, matrix, manifolds, m, k, when, edges, e):
     a, b = manifolds.pair[m, 0], manifolds.pair[m, 1]
-    point, e = manifolds.point, edges.count[0]
+    point = manifolds.point
     arm = turn(matrix, a, (point[m, k, 0], point[m, k, 1], point[m, k, 2]))
     other = turn(matrix, b, (point[m, k, 3], point[m, k, 4], point[m, k, 5]))
     arm, other = met_half_way(sub(get(motion.position, a), get(motion.position, b)), arm, other)
@@ -107,7 +94,6 @@ def _put(motion, matrix, manifolds, m, k, when, edges):
         edges.value[e, AXIS + x] = point[m, k, NORMAL + x]
         edges.value[e, GIVEN + x] = push * point[m, k, NORMAL + x] + point[m, k, DRAG + x]
     edges.value[e, APART], edges.value[e, WHEN], edges.value[e, WEIGHT] = point[m, k, GAP], when, push
-    edges.count[0] = e + 1
 
 
 @njit(**BARE)

@@ -78,7 +78,7 @@ def _equations(world, work, motion, rules, manifolds):
     matrix, inverse, free = work.matrix, work.inverse, work.free
     most = manifolds.count.sum()
     where = np.empty((most, 4), np.int64)
-    row = np.empty((most, 3, WIDTH))
+    row = np.zeros((most, 3, WIDTH))
     grip, wanted, pushed, calm = np.empty(most), np.empty(most), np.zeros(most), np.empty((most, 3))
     count = 0
     for m in range(len(manifolds.count)):
@@ -139,10 +139,6 @@ def _equations(world, work, motion, rules, manifolds):
                 most_drag = friction * point[PUSH]
                 row[count, 1, IMPULSE] = min(max(dot(drag, one), -most_drag), most_drag)
                 row[count, 2, IMPULSE] = min(max(dot(drag, two), -most_drag), most_drag)
-            else:
-                for e in range(1, 3):
-                    for x in range(WIDTH):
-                        row[count, e, x] = 0.0
             where[count, 0], where[count, 1], where[count, 2], where[count, 3] = m, k, a, b
             count += 1
     start, order = _islands(world, work.parent, work.number, where[:count])
@@ -215,11 +211,18 @@ def _row(inverse_mass, inverse, a, b, arm, other, axis, row, c, e):
 
 
 @njit(**BARE)
-def _root(parent, b):
+def root(parent, b):
     while parent[b] != b:
         parent[b] = parent[parent[b]]
         b = parent[b]
     return b
+
+
+@njit(**BARE)
+def join(parent, a, b):
+    """Bodies a and b belong together."""
+    one, other = root(parent, a), root(parent, b)
+    parent[max(one, other)] = min(one, other)
 
 
 @njit(**FAST)
@@ -231,13 +234,11 @@ def _islands(world, parent, number, where):
     for c in range(len(where)):
         a, b = where[c, 2], where[c, 3]
         if world.moves[a] and world.moves[b]:
-            one, other = _root(parent, a), _root(parent, b)
-            if one != other:
-                parent[max(one, other)] = min(one, other)
+            join(parent, a, b)
     islands = 0
     label = np.empty(len(where), np.int64)
     for c in range(len(where)):
-        a = _root(parent, where[c, 2])
+        a = root(parent, where[c, 2])
         if number[a] < 0:
             number[a] = islands
             islands += 1

@@ -10,7 +10,7 @@ from numba import njit
 from sdfsim.dynamics.kernels.collide import collide, is_round, look_around, nearest, scratch_room
 from sdfsim.dynamics.kernels.distance import SIZE, THICKNESS
 from sdfsim.dynamics.kernels.record import gathered, no_edges, noted
-from sdfsim.dynamics.kernels.solve import _root, respond
+from sdfsim.dynamics.kernels.solve import join, respond, root
 from sdfsim.dynamics.kernels.vectors import (
     BARE,
     FAST,
@@ -39,7 +39,7 @@ def step(shapes, world, work, motion, rules, manifolds):
 
     Returns:
         The manifolds at its end; what contacts did, where it is to be noted; and counts: pairs looked at, contacts of
-        the last inner step, islands, bodies that contacts moved, whether anybody had to be looked for again.
+        the last inner step, bodies that contacts moved.
     """
     matrix, inverse, free, change, shift = work.matrix, work.inverse, work.free, work.change, work.shift
     span = rules.inner * rules.steps
@@ -51,15 +51,13 @@ def step(shapes, world, work, motion, rules, manifolds):
         manifolds, near = look_around(shapes, world, work, motion, rules, span, manifolds)
     trial, frame = np.empty((1, 4)), np.empty((1, 3, 3))
     scratch = scratch_room()
-    contacts = islands = looked = 0
-    edges = no_edges(64 if rules.note else 0)
+    contacts, edges = 0, no_edges()
     _shifted(world, work, motion, rules, -0.5)
     for k in range(rules.steps):
         for b in world.going:
             if work.gone[b] > work.ways[b] and world.moves[b]:
                 left = rules.inner * (rules.steps - k)
                 manifolds, near = look_around(shapes, world, work, motion, rules, left, manifolds)
-                looked += 1
                 break
         for b in world.going:
             for x in range(6):
@@ -69,9 +67,9 @@ def step(shapes, world, work, motion, rules, manifolds):
                 _prepare(world, motion, matrix, inverse, work.load, rules, free, b)
         collide(shapes, world, motion, matrix, rules, manifolds, near, work.gone, scratch)
         system = respond(world, work, motion, rules, manifolds)
-        contacts, islands = len(system.where), len(system.start) - 1
+        contacts = len(system.where)
         if rules.note:
-            edges = noted(motion, matrix, manifolds, system, k, edges)
+            edges = noted(motion, matrix, manifolds, system, k / rules.steps, edges)
         _parts(shapes, world, work, motion, rules, manifolds, near)
         for b in world.going:
             if motion.island[b] < 0 and (world.moves[b] or world.scripted[b]):
@@ -79,14 +77,14 @@ def step(shapes, world, work, motion, rules, manifolds):
                 work.gone[b] += moved
                 work.met[b] = work.met[b] or motion.touching[b]
     if rules.note:
-        edges = gathered(world, motion, matrix, manifolds, len(near.start), rules.steps, edges)
+        edges = gathered(world, motion, matrix, manifolds, len(near.start), (rules.steps - 1) / rules.steps, edges)
     _shifted(world, work, motion, rules, 0.5)
     if rules.sleep:
         _settle(world, motion, rules, manifolds)
     met = 0  # of those that are awake still
     for b in world.going:
         met += work.met[b] and motion.island[b] < 0
-    return manifolds, edges, (len(near.start), contacts, islands, met, looked)
+    return manifolds, edges, (len(near.start), contacts, met)
 
 
 @njit(**BARE)
@@ -142,35 +140,34 @@ def _prepare(world, motion, matrix, inverse, load, rules, free, b):
 @njit(**BARE)
 def _advance(world, motion, matrix, rules, load, change, shift, part, trial, frame, b):
     """Move a body by one inner step; returns how far at most any of its points has gone."""
-    if world.scripted[b]:
-        v, w = get(motion.velocity, b), get(motion.angular, b)
-        if w[0] == w[1] == w[2] == 0.0:  # a plane reaches to infinity, and may be led along
-            put(motion.position, b, along(get(motion.position, b), v, rules.inner * part))
-            return norm(v) * rules.inner
-    else:
+    span = rules.inner * part
+    v, w, turned = get(motion.velocity, b), get(motion.angular, b), (0.0, 0.0, 0.0)
+    if world.moves[b]:
         for x in range(6):
             if change[b, x] != 0.0 or shift[b, x] != 0.0:
                 motion.touching[b] = True
-        v, spun = _pulled(world, matrix, load, rules, 1.0, b)
-        v = add(add(get(motion.velocity, b), v), (change[b, 0], change[b, 1], change[b, 2]))
+        pulled, spun = _pulled(world, matrix, load, rules, 1.0, b)
+        v = add(add(v, pulled), (change[b, 0], change[b, 1], change[b, 2]))
         put(motion.velocity, b, v)
         v = add(v, (shift[b, 0], shift[b, 1], shift[b, 2]))
-        w = (0.0, 0.0, 0.0)
         if rules.rotation:
             # What the gyroscopic torque adds comes with the exact motion below, which keeps angular momentum.
-            w = add(add(get(motion.angular, b), spun), (change[b, 3], change[b, 4], change[b, 5]))
-        put(motion.angular, b, w)
-        if rules.rotation and not world.isotropic[b]:
-            put(motion.position, b, along(get(motion.position, b), v, rules.inner * part))
-            _torque_free(world, motion, matrix, rules.inner * part, trial, frame, b)
+            w = add(add(w, spun), (change[b, 3], change[b, 4], change[b, 5]))
             turned = (shift[b, 3], shift[b, 4], shift[b, 5])
-            _turn_on(motion, matrix, scale(turned, rules.inner * part), b)
-            return (norm(v) + (norm(w) + norm(turned)) * world.radius[b]) * rules.inner
-        if rules.rotation:
-            w = add(w, (shift[b, 3], shift[b, 4], shift[b, 5]))
-    put(motion.position, b, along(get(motion.position, b), v, rules.inner * part))
-    _turn_on(motion, matrix, scale(w, rules.inner * part), b)
-    return (norm(v) + norm(w) * world.radius[b]) * rules.inner
+        else:
+            w = (0.0, 0.0, 0.0)
+        put(motion.angular, b, w)
+    put(motion.position, b, along(get(motion.position, b), v, span))
+    if world.moves[b] and rules.rotation and not world.isotropic[b]:
+        _torque_free(world, motion, matrix, span, trial, frame, b)
+        way = norm(w) + norm(turned)
+    else:
+        turned = add(w, turned)
+        way = norm(turned)
+    _turn_on(motion, matrix, scale(turned, span), b)
+    if way == 0.0:  # a plane reaches to infinity, and may be led along
+        return norm(v) * rules.inner
+    return (norm(v) + way * world.radius[b]) * rules.inner
 
 
 @njit(**BARE)
@@ -351,22 +348,20 @@ def _settle(world, motion, rules, manifolds):
     for m in range(len(manifolds.count)):
         a, b = manifolds.pair[m, 0], manifolds.pair[m, 1]
         if manifolds.count[m] and world.moves[a] and world.moves[b]:
-            one, other = _root(parent, a), _root(parent, b)
-            if one != other:
-                parent[max(one, other)] = min(one, other)
+            join(parent, a, b)
     restless = np.zeros(n, np.bool_)
     for b in range(n):
         if world.moves[b] and motion.island[b] < 0 and motion.quiet[b] < rules.rest:
-            restless[_root(parent, b)] = True
+            restless[root(parent, b)] = True
     for m in range(len(manifolds.count)):
         a, b = manifolds.pair[m, 0], manifolds.pair[m, 1]
         if manifolds.count[m] and world.scripted[b]:
             if norm(get(motion.velocity, b)) + norm(get(motion.angular, b)) > 0.0:
-                restless[_root(parent, a)] = True
+                restless[root(parent, a)] = True
     number = motion.island.max() + 1
     for b in range(n):
-        if world.moves[b] and motion.island[b] < 0 and not restless[_root(parent, b)]:
-            motion.island[b] = number + _root(parent, b)
+        if world.moves[b] and motion.island[b] < 0 and not restless[root(parent, b)]:
+            motion.island[b] = number + root(parent, b)
             put(motion.velocity, b, (0.0, 0.0, 0.0))
             put(motion.angular, b, (0.0, 0.0, 0.0))
             motion.touching[b] = True

@@ -132,41 +132,52 @@ class Manifolds(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """What is in play.
+    """What is in play. Lengths and speeds are those of model units, in which the smallest bodies are about 1.4 wide.
 
     Attributes:
         gravity: [3].
         inner: the inner step.
         steps: inner steps in a step.
+        slow: an approach up to this speed ends at the surface without a rebound.
         friction, restitution, rotation, sleep: whether they are.
-        reach to rest: as `solver.SolverRules` has them, for this run.
         margin: all bodies but planes are larger by this than their distances say.
         adds: whether what is pushed out adds to the speed of a rebound.
         note: whether what contacts did in the step is wanted, see `record`.
         ahead: new points are looked for so much time farther, as fast as two bodies move against each other.
+        reach: contacts are kept up to this distance, and while they have slid by no more.
+        look: new ones are looked for up to this one and twice the margin.
+        still: pairs that have moved by less within a step are not looked at again.
+        together: points that are deeper than the deepest less this meet in one impact.
+        erp: the share of a penetration that an inner step resolves, through velocity.
+        slop: penetration that is left as it is, so that what rests has contacts that do not come and go.
+        split: deeper penetration than this is resolved without a lasting velocity.
+        rounds: of sequential impulses at most.
+        exact: they end when no impulse changes a velocity by more.
+        apart: points of a manifold are at least so far from each other.
+        stray, rest: who stays within `stray` for `rest` steps falls asleep.
     """
 
     gravity: np.ndarray
     inner: float
     steps: int
-    friction: bool
-    restitution: bool
-    rotation: bool
-    sleep: bool
-    reach: float
-    look: float
-    still: float
-    together: float
-    erp: float
-    slop: float
-    split: float
     slow: float
-    rounds: int
-    exact: float
-    apart: float
-    stray: float
-    rest: int
-    margin: float
-    adds: bool
-    note: bool
-    ahead: float
+    friction: bool = True
+    restitution: bool = True
+    rotation: bool = True
+    sleep: bool = False
+    margin: float = 0.0
+    adds: bool = False
+    note: bool = False
+    ahead: float = 0.0
+    reach: float = 0.02
+    look: float = 0.004
+    still: float = 1e-4
+    together: float = 1e-4
+    erp: float = 0.08
+    slop: float = 5e-4
+    split: float = 0.04
+    rounds: int = 50
+    exact: float = 1e-4
+    apart: float = 0.03
+    stray: float = 0.005
+    rest: int = 25

@@ -6,7 +6,7 @@ the prediction turns with the scene and does not depend on the choice of units.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -50,11 +50,6 @@ class ContactGraph:
     friction: Tensor
     restitution: Tensor
     dt: float  # the step
-
-    def to(self, device: torch.device) -> ContactGraph:
-        """The same on another device."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        return replace(self, **{k: v.to(device) for k, v in values.items() if isinstance(v, Tensor)})
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ act, and the step turns with the scene, whatever the weights are.
 
 The rounds start from what the solve makes of the step, and what they add is held to a trust region (`bounded`).
 
-This form is for training, for a GPU, and to be read. On the CPU `kernels.impulse` does the same, compiled.
+This form is for training and to be read. `kernels.impulse` is the same, compiled.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ A network gives every surface node an acceleration; shape matching turns those o
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import Protocol, Self, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,42 +15,12 @@ from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State
 from sdfsim.dynamics.models.matching import match_shapes
 from sdfsim.dynamics.models.message_passing import Edges, Features, Graph, GraphNetwork
+from sdfsim.dynamics.step import StepOptions, fly
 
 NODE = Features(13, (0, 3, 6))  # of surface nodes and of body nodes
 INTRA = Features(8, (0, 4))  # of edges within a body
 TARGET = Features(3, (0,))  # of accelerations
 _NOT_PER_BODY = ("pieces", "node", "node_start", "face", "allowed", "sdfs", "tracks")
-
-
-class Near(Protocol):
-    """E places where surfaces of two bodies are near each other.
-
-    Attributes:
-        owner, body: [E] int64, the two bodies.
-        node: [E] int64, a node of the first, index into `Bodies.node`.
-        distance: [E] float64, model length.
-    """
-
-    @property
-    def owner(self) -> Tensor: ...
-
-    @property
-    def body(self) -> Tensor: ...
-
-    @property
-    def node(self) -> Tensor: ...
-
-    @property
-    def distance(self) -> Tensor: ...
-
-    def __len__(self) -> int: ...
-
-    def renumbered(self, body: Tensor, node: Tensor) -> Self:
-        """The same among other bodies: `body` [N] and `node` [M] give their new numbers."""
-        ...
-
-
-Met = TypeVar("Met", bound=Near)
 
 
 def node_owner(bodies: Bodies) -> Tensor:
@@ -59,8 +29,9 @@ def node_owner(bodies: Bodies) -> Tensor:
     return torch.repeat_interleave(torch.arange(len(bodies), device=bodies.device), count)
 
 
-def compact(bodies: Bodies, state: State, contacts: Met, rows: Tensor) -> tuple[Bodies, State, Met]:
-    """The bodies `rows` [A] alone, in ascending order, with their states and all the contacts, which are among them."""
+def compact(bodies: Bodies, state: State, contacts: Any, rows: Tensor) -> tuple[Bodies, State, Any]:
+    """The bodies `rows` [A] alone, in ascending order, with their states and all the contacts
+    (`Contacts` or `Pairs`), which are among them."""
     if len(rows) == len(bodies):
         return bodies, state, contacts
     owner, node = expanded(bodies.node_start[rows], bodies.node_start[rows + 1])
@@ -192,3 +163,38 @@ def _history(state: State) -> tuple[Tensor, Tensor]:
     if state.earlier_position is None or state.earlier_orientation is None:
         raise ValueError("a network on surface nodes needs the two earlier poses")
     return state.earlier_position, state.earlier_orientation
+
+
+def with_history(state: State, bodies: Bodies, rules: StepOptions) -> State:
+    """The same state with the two poses that it would have come from in free flight."""
+    position, orientation = _flown_back(state, bodies, rules)
+    return replace(state, earlier_position=position, earlier_orientation=orientation)
+
+
+def history_told(state: State, before: State, bodies: Bodies, rules: StepOptions) -> State:
+    """A state from outside, with earlier poses that go with it.
+
+    Those that it shares with the state `before` are of that one's motion: bodies that were changed since get the poses
+    that their velocities lead from. A state with earlier poses of its own, such as a restored one, keeps them.
+    """
+    if state.earlier_position is None or state.earlier_orientation is None:
+        return with_history(state, bodies, rules)
+    if state.earlier_position is not before.earlier_position:
+        return state
+    changed = torch.zeros_like(bodies.moves)
+    for name in ("position", "orientation", "velocity", "angular_velocity"):
+        changed |= (getattr(state, name) != getattr(before, name)).any(-1)
+    position, orientation = _flown_back(state, bodies, rules)
+    return replace(
+        state,
+        earlier_position=torch.where(changed[:, None], position, state.earlier_position),
+        earlier_orientation=torch.where(changed[:, None], orientation, state.earlier_orientation),
+    )
+
+
+def _flown_back(state: State, bodies: Bodies, rules: StepOptions) -> tuple[Tensor, Tensor]:
+    """Positions [2, N, 3] and orientations [2, N, 4] two steps and one step before, in free flight."""
+    back = replace(rules, dt=-rules.dt)
+    one = fly(bodies, state, back)
+    two = fly(bodies, one, back)
+    return torch.stack([two.position, one.position]), torch.stack([two.orientation, one.orientation])

@@ -1,8 +1,9 @@
-"""Where meshes and particles of different bodies are near each other: pairs of nodes, and pairs of faces.
+"""Where surfaces of two bodies are near each other: SDF-Sim's edges, and pairs of nodes and of faces for the baselines.
 
-Boxes around the bodies are swept along x, then boxes around the nodes or faces of bodies whose boxes overlap are
-compared, then true distances are taken. A pair counts where d - (closing speed) dt <= reach, as for SDF-Sim's edges.
-An infinite plane has one node and one face, which lie wherever they are closest to the other's.
+What counts is d - (closing speed) dt <= reach. A fixed threshold would let a fast body bounce inside one step without
+ever having had an edge. SDF-Sim asks the distances of other bodies at its nodes (`find_contacts`). For the baselines
+boxes around bodies and then around their nodes or faces are compared, then true distances are taken. An infinite plane
+has one node and one face, which lie wherever they are closest to the other's.
 """
 
 from __future__ import annotations
@@ -14,10 +15,60 @@ from torch import Tensor
 
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State
+from sdfsim.dynamics.kernels.collide import nodes_within
 from sdfsim.dynamics.models.surfaces import expanded, node_owner
 from sdfsim.dynamics.run_memory import Memory
+from sdfsim.dynamics.solver import compiled_rules, taken_up
+from sdfsim.dynamics.step import StepOptions
 
 PIERCING = 1e-9  # relative: areas and denominators below count as none
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """E contact edges, each from a surface node to the closest point on another body; model units, world frame."""
+
+    owner: Tensor  # [E] int64, the body whose node it is
+    node: Tensor  # [E] int64, index into `Bodies.node`
+    body: Tensor  # [E] int64, the body it meets
+    seen: Tensor  # [E, 3] float64, the node from the centre of mass of `body`
+    distance: Tensor  # [E] float64, signed distance of the node from `body`
+    normal: Tensor  # [E, 3] float64, unit outward normal of `body` at the closest point
+
+    def __len__(self) -> int:
+        return len(self.owner)
+
+    def renumbered(self, body: Tensor, node: Tensor) -> Contacts:
+        """The same among other bodies: `body` [N] and `node` [M] give their new numbers."""
+        return replace(self, owner=body[self.owner], body=body[self.body], node=node[self.node])
+
+
+def no_contacts(device: torch.device) -> Contacts:
+    """None at all."""
+    nobody = torch.zeros(0, dtype=torch.int64, device=device)
+    nothing = torch.zeros(0, 3, dtype=torch.float64, device=device)
+    return Contacts(nobody, nobody, nobody, nothing, nothing[:, 0], nothing)
+
+
+def find_contacts(
+    bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, memory: Memory | None = None
+) -> Contacts:
+    """All contact edges of a state within `reach`, the contact radius D, under gravity [3]; all in model units."""
+    scene = (memory or Memory()).compiled(bodies, state)
+    rules = compiled_rules(StepOptions(gravity, dt, 1))._replace(reach=reach)
+    motion, _ = taken_up(bodies, state, scene, rules)
+    found = nodes_within(
+        scene.shapes, scene.world, scene.work, motion, rules, bodies.node.cpu().numpy(), bodies.node_start.cpu().numpy()
+    )
+    index, value = (torch.from_numpy(array).to(bodies.device) for array in found)
+    owner, node, body = index.unbind(1)
+    return Contacts(owner, node, body, seen=value[:, 4:], distance=value[:, 0], normal=value[:, 1:4])
+
+
+def where(state: State, bodies: Bodies, contacts: Contacts | Pairs) -> Tensor:
+    """[E, 3] where the nodes of contact edges are in a state, world."""
+    turned = pose.rotate(state.orientation[contacts.owner], bodies.node[contacts.node])
+    return state.position[contacts.owner] + turned
 
 
 @dataclass(frozen=True)
@@ -146,43 +197,24 @@ def _near(bodies: Bodies, part: Tensor, owner: Tensor, place: Tensor, margin: Te
     of_part = owner[part[:, 0]]
     wide = margin[part].amax(1)[:, None]
     low, high = place[part].amin(1) - wide, place[part].amax(1) + wide
-    count = torch.bincount(of_part, minlength=len(bodies))
-    start = torch.cat([count.new_zeros(1), count.cumsum(0)])
+    start = torch.searchsorted(of_part, torch.arange(len(bodies) + 1, device=of_part.device))
+    endless = ~bodies.size.isfinite()
+    low[endless[of_part]], high[endless[of_part]] = -torch.inf, torch.inf  # each is compared by its height alone
     index = of_part[:, None].expand_as(low)
     empty = torch.full((len(bodies), 3), torch.inf, dtype=low.dtype, device=low.device)
     lowest, highest = empty.scatter_reduce(0, index, low, "amin"), (-empty).scatter_reduce(0, index, high, "amax")
-    plane = (~bodies.size.isfinite() & (count > 0)).nonzero()[:, 0]
-    lowest[plane], highest[plane] = -torch.inf, -torch.inf  # the sweep passes them by
-    one, other = _sweep(lowest, highest)
-    # Every part of every body beside every plane: each is compared by its height alone.
-    bounded = (bodies.size.isfinite() & (count > 0)).nonzero()[:, 0]
-    one, other = (torch.cat(x) for x in zip((one, other), torch.cartesian_prod(bounded, plane).unbind(-1), strict=True))
-    meet = bodies.may_meet(one, other)
+    one, other = torch.triu_indices(len(bodies), len(bodies), 1, device=low.device)
+    one, other = torch.where(endless[one], other, one), torch.where(endless[one], one, other)
+    meet = ((lowest[one] <= highest[other]) & (highest[one] >= lowest[other])).all(-1) & bodies.may_meet(one, other)
     one, other = one[meet], other[meet]
     # Of each body only what is in the box of the other; then all of these against all of those.
-    low[start[plane]], high[start[plane]] = -torch.inf, torch.inf
-    lowest[plane], highest[plane] = -torch.inf, torch.inf
-    firsts, seconds = (
-        _inside(start, body, low, high, lowest[box], highest[box]) for body, box in ((one, other), (other, one))
-    )
-    (pair, first), (number, second) = firsts, seconds
+    pair, first = _inside(start, one, low, high, lowest[other], highest[other])
+    number, second = _inside(start, other, low, high, lowest[one], highest[one])
     begins = torch.searchsorted(number, torch.arange(len(one) + 1, device=number.device))
     row, column = expanded(begins[pair], begins[pair + 1])
     first, second = first[row], second[column]
     near = ((low[first] <= high[second]) & (high[first] >= low[second])).all(-1)
     return first[near], second[near]
-
-
-def _sweep(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """Pairs of overlapping boxes [N, 3], each once."""
-    order = low[:, 0].argsort(stable=True)
-    low, high = low[order], high[order]
-    end = torch.searchsorted(low[:, 0].contiguous(), high[:, 0].contiguous(), right=True)
-    begin = torch.arange(1, len(low) + 1, device=low.device)
-    one, other = expanded(begin, torch.maximum(begin, end))
-    meet = ((low[one] <= high[other]) & (high[one] >= low[other])).all(-1)
-    first, second = order[one[meet]], order[other[meet]]
-    return torch.minimum(first, second), torch.maximum(first, second)
 
 
 def _inside(
