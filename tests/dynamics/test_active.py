@@ -10,8 +10,8 @@ from sdfsim.dynamics import inference, solver
 from sdfsim.dynamics import step as step_module
 from sdfsim.dynamics.kernels import impulse
 from sdfsim.dynamics.models import near
-from sdfsim.dynamics.models.families import paper_graph
 from sdfsim.dynamics.models.near import find_contacts
+from sdfsim.dynamics.models.paper import paper_graph
 from sdfsim.dynamics.models.surfaces import compact, node_owner, predict
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.scene.scene import Effects, Scene, Waypoints

@@ -18,6 +18,21 @@ from sdfsim.shape.shape import analytic_shape
 from tests.dynamics.conftest import angle_between, contact_graph, in_single, make_body, random_model
 
 
+def linear_momentum(sim: Simulator) -> torch.Tensor:
+    return (sim.bodies.mass[:, None] * sim.state.velocity).sum(0)
+
+
+def test_colliding_bodies_in_free_space_keep_linear_momentum(free_pair):
+    sim = Simulator(free_pair, random_model("impulse"))
+    before = linear_momentum(sim)
+    touched = 0
+    for _ in range(20):
+        sim.run(steps=1)
+        touched += sim.memory.counts["edges"] > 0
+        torch.testing.assert_close(linear_momentum(sim), before, rtol=0, atol=1e-5)
+    assert touched > 2
+
+
 def first_graph(scene: Scene, steps: int = 30) -> tuple[Simulator, torch.Tensor, ContactGraph]:
     """The first step in which contacts act: the simulator before it, the bodies in contact, and their graph."""
     sim = Simulator(scene, random_model("impulse"))
@@ -166,6 +181,12 @@ def test_froude_scaled_scenes_move_alike(dropped, size, strength):
     one, other = Simulator(dropped, model).run(steps=8), Simulator(scaled, model).run(steps=8)
     np.testing.assert_allclose(other.time, one.time * time, rtol=1e-9)
     np.testing.assert_allclose(other.position / size, one.position, atol=1e-4)
+
+
+def test_same_scene_same_bits(dropped):
+    model = random_model("impulse")
+    one, other = Simulator(dropped, model).run(steps=8), Simulator(dropped, model).run(steps=8)
+    assert (one.position == other.position).all() and (one.orientation == other.orientation).all()
 
 
 def test_without_friction_nothing_tangential_is_computed(dropped):

@@ -13,120 +13,19 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor, device
 
 from sdfsim.dynamics.bodies import Bodies, State
-from sdfsim.dynamics.models.message_passing import EdgeKind, Edges, Features, Graph, Layout, both_ways
+from sdfsim.dynamics.models.dpi import DPI, dpi_graph
+from sdfsim.dynamics.models.fignet import FIGNET, FIGNET_STAR, fignet_graph, fignet_star_graph
+from sdfsim.dynamics.models.message_passing import Graph, Layout
+from sdfsim.dynamics.models.mgn import MGN, mgn_graph
 from sdfsim.dynamics.models.near import Contacts, Pairs, face_pairs, find_contacts, no_contacts, no_pairs, node_pairs
-from sdfsim.dynamics.models.surfaces import INTRA, NODE, mesh_edges, motion_features, star
+from sdfsim.dynamics.models.paper import PAPER, paper_graph
 from sdfsim.dynamics.run_memory import Memory
 from sdfsim.shape.mesh import Mesh, convex_hull, joined
 from sdfsim.shape.sdf import PlaneSdf
 from sdfsim.shape.shape import Shape
-
-NODES = {"body": NODE, "node": NODE}
-STAR = {"intra_up": EdgeKind("node", "body", INTRA), "intra_down": EdgeKind("body", "node", INTRA)}
-MESH = EdgeKind("node", "node", INTRA)
-
-# SDF-Sim as published (section 3 and appendix). Every body has one body node and its surface nodes, joined both ways
-# (up: to the body node). A surface node within the contact radius of another body joins that body's node both ways. No
-# surface node is ever joined to another.
-
-CONTACT = Features(15, (0, 3, 6, 9))
-PAPER = Layout(
-    NODES,
-    STAR | {"contact_up": EdgeKind("node", "body", CONTACT), "contact_down": EdgeKind("body", "node", CONTACT)},
-)
-
-
-def paper_graph(bodies: Bodies, state: State, contacts: Contacts) -> Graph:
-    """The published graph."""
-    features = _contact_features(bodies, state, contacts).float()
-    node, body = contacts.node[:, None], contacts.body[:, None]
-    edges = {"contact_up": Edges(features, node, body), "contact_down": Edges(features, body, node)}
-    return Graph(motion_features(bodies, state), star(bodies, state) | edges)
-
-
-def _contact_features(bodies: Bodies, state: State, contacts: Contacts) -> Tensor:
-    """[E, 15]: node to closest point, normal, both seen from the other body's centre, distances. An infinite floor has
-    no centre: its body node stands in for the closest point."""
-    c = contacts
-    to_closest = -c.distance[:, None] * c.normal
-    bounded = bodies.size[c.body].isfinite()[:, None]
-    seen = torch.where(bounded, c.seen, -to_closest)
-    closest = seen + to_closest
-    lengths = [c.distance, seen.norm(dim=-1), closest.norm(dim=-1)]
-    return torch.cat([to_closest, c.normal, seen, closest, torch.stack(lengths, -1)], -1)
-
-
-# MeshGraphNets (Pfaff et al., 2021, arXiv 2010.03409). Nodes are the vertices of meshes. Mesh edges join neighbours,
-# world edges join vertices of different bodies within a radius: a small one in *mgn*, a large one in *mgn-large*. There
-# are no body nodes; shape matching makes motions rigid.
-
-WORLD = Features(4, (0,))
-MGN = Layout({"node": NODE}, {"mesh": MESH, "world": EdgeKind("node", "node", WORLD)})
-
-
-def mgn_graph(bodies: Bodies, state: State, pairs: Pairs) -> Graph:
-    """Of MeshGraphNets."""
-    nodes = {"node": motion_features(bodies, state)["node"]}
-    return Graph(nodes, {"mesh": mesh_edges(bodies, state), "world": world_edges(pairs)})
-
-
-def world_edges(pairs: Pairs) -> Edges:
-    """Edges both ways between nodes of different bodies: from sender to receiver, and how far."""
-    length = pairs.way.norm(dim=-1, keepdim=True)
-    forth, back = torch.cat([pairs.way, length], -1), torch.cat([-pairs.way, length], -1)
-    return both_ways(forth, back, pairs.first, pairs.second)
-
-
-# DPI (Li et al., 2019, arXiv 1810.01566): particles, and one root for each body, joined both ways; particles of
-# different bodies within a radius of each other too. Here particles lie on the surface (the paper's fill the body), and
-# all kinds of edges pass messages at once in every step, with weights of that step (there one after the other, in every
-# round with the same).
-
-DPI = Layout(NODES, STAR | {"contact": EdgeKind("node", "node", WORLD)})
-
-
-def dpi_graph(bodies: Bodies, state: State, pairs: Pairs) -> Graph:
-    """Of DPI."""
-    return Graph(motion_features(bodies, state), star(bodies, state) | {"contact": world_edges(pairs)})
-
-
-# FIGNet (Allen et al., 2023, arXiv 2212.03574) and FIGNet* (Lopez-Guevara et al., 2024, arXiv 2401.11985). Nodes are
-# the vertices of meshes and one node a body. Edges join neighbours on a mesh, vertices and their body's node, and the
-# faces of two bodies that are near each other. A face edge knows the closest points of the two faces; its message has a
-# part for each of the receiving face's three vertices, in the order of their distance to its closest point. FIGNet* is
-# FIGNet without mesh edges.
-
-FACE = Features(34, (0, 4, 7, 10, 16, 19, 22, 28, 31))
-FIGNET_STAR = Layout(NODES, STAR | {"face": EdgeKind("node", "node", FACE, corners=3)})
-FIGNET = Layout(NODES, FIGNET_STAR.edges | {"mesh": MESH})
-
-
-def fignet_star_graph(bodies: Bodies, state: State, pairs: Pairs) -> Graph:
-    """Of FIGNet*."""
-    p = pairs
-    forth = _features(p.way, p.from_first, p.from_second, p.normal_first, p.normal_second)
-    back = _features(-p.way, p.from_second, p.from_first, p.normal_second, p.normal_first)
-    face = {"face": both_ways(forth, back, p.first, p.second)}
-    return Graph(motion_features(bodies, state), star(bodies, state) | face)
-
-
-def fignet_graph(bodies: Bodies, state: State, pairs: Pairs) -> Graph:
-    """Of FIGNet."""
-    made = fignet_star_graph(bodies, state, pairs)
-    return Graph(made.nodes, made.edges | {"mesh": mesh_edges(bodies, state)})
-
-
-def _features(way: Tensor, sending: Tensor, receiving: Tensor, normal: Tensor, other: Tensor) -> Tensor:
-    """[E, 34]: between the closest points, from these to the corners of both faces, with lengths; both normals."""
-    corners = [part for face in (sending, receiving) for part in (face.flatten(1), face.norm(dim=-1))]
-    return torch.cat([way, way.norm(dim=-1, keepdim=True), *corners, normal, other], -1)
-
-
-# Which surface nodes a network works on: points of a shape, or the vertices of a mesh with faces between them.
 
 
 def points(shape: Shape, count: int | None) -> Shape:

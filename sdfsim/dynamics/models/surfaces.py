@@ -14,11 +14,14 @@ from torch import Tensor
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State
 from sdfsim.dynamics.models.matching import match_shapes
-from sdfsim.dynamics.models.message_passing import Edges, Features, Graph, GraphNetwork
+from sdfsim.dynamics.models.message_passing import EdgeKind, Edges, Features, Graph, GraphNetwork
 from sdfsim.dynamics.step import StepOptions, fly
 
 NODE = Features(13, (0, 3, 6))  # of surface nodes and of body nodes
 INTRA = Features(8, (0, 4))  # of edges within a body
+NODES = {"body": NODE, "node": NODE}
+STAR = {"intra_up": EdgeKind("node", "body", INTRA), "intra_down": EdgeKind("body", "node", INTRA)}
+MESH = EdgeKind("node", "node", INTRA)
 TARGET = Features(3, (0,))  # of accelerations
 _NOT_PER_BODY = ("pieces", "node", "node_start", "face", "allowed", "sdfs", "tracks")
 
