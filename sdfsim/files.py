@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from sdfsim.errors import SdfsimError
 
@@ -139,6 +138,8 @@ def check_writable(folder: Path) -> None:
 def check_own(folder: Path, command: str, *names: str) -> None:
     """Raises SdfsimError where what a run replaces in a folder, config.yaml and the files `names`, does not come from
     an earlier run of the same command."""
+    import yaml  # here, for training needs torch and numpy only
+
     there = [name for name in (CONFIG, *names) if os.path.lexists(folder / name)]
     if not there:
         return

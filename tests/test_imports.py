@@ -115,6 +115,17 @@ def test_the_library_itself_is_light():
     assert done.stdout.strip() == "[]"
 
 
+def test_training_needs_torch_and_numpy_only():
+    code = (
+        "import importlib.metadata as m, re, sys\n"
+        "ours = [re.match(r'[\\w.-]+', r)[0] for r in m.requires('sdfsim')]\n"
+        "names = {'PyYAML': 'yaml', 'scikit-image': 'skimage', 'libigl': 'igl', 'rerun-sdk': 'rerun'}\n"
+        "for name in {names.get(n, n) for n in ours} - {'torch', 'numpy'}:\n    sys.modules[name] = None\n"
+        "import sdfsim.training.train"
+    )
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
+
+
 @pytest.mark.parametrize("folder", ["benchmarks", "samples", "scripts"])
 def test_what_scripts_import_is_there(folder):
     """Nothing else runs all of them, and a module that moves would break them unseen."""

@@ -26,18 +26,18 @@ NAMES = ("position", "orientation", "velocity", "angular_velocity")
 
 
 @pytest.mark.parametrize("case", gates.CASES)
-def test_every_case_stays_sound(every_model, device, case):
+def test_every_case_stays_sound(every_model, case):
     scene = gates.CASES[case]()
-    rollout = Simulator(scene, every_model, device).run(steps=40)
+    rollout = Simulator(scene, every_model).run(steps=40)
     gates.assert_sound(rollout)
     assert rollout.counters["active"].sum() > 0  # what is shot has left again when a step ends
     assert np.abs(rollout.position).max() < 40.0 and np.abs(rollout.velocity).max() < 60.0
 
 
-def test_ten_seconds_of_projectile(model, device):
+def test_ten_seconds_of_projectile(model):
     velocity, spin = np.array([3.0, -2.0, 8.0]), np.array([0.3, 0.2, 0.1])
     scene = gates.placed(gates.CUBE, [(1.0, 2.0, 3.0)], gravity=gates.EARTH, velocity=velocity, angular_velocity=spin)
-    rollout = Simulator(scene, model, device).run(seconds=10.0)
+    rollout = Simulator(scene, model).run(seconds=10.0)
     t = rollout.time[:, None]
     expected = scene.bodies[0].position + velocity * t + 0.5 * gates.EARTH * t**2
     far = np.linalg.norm(expected, axis=-1).max()
@@ -48,10 +48,10 @@ def test_ten_seconds_of_projectile(model, device):
     assert (Rotation.from_quat(rollout.orientation[:, 0]) * turned.inv()).magnitude().max() < 1e-5
 
 
-def test_twenty_seconds_about_the_middle_axis_flip_and_conserve(model, device):
+def test_twenty_seconds_about_the_middle_axis_flip_and_conserve(model):
     box = analytic_shape("box", size=(1.0, 0.8, 0.6))
     spin = np.array([0.02, 5.0, 0.02])
-    rollout = Simulator(gates.placed(box, [(0, 0, 0)], angular_velocity=spin), model, device).run(seconds=20.0)
+    rollout = Simulator(gates.placed(box, [(0, 0, 0)], angular_velocity=spin), model).run(seconds=20.0)
     turn = Rotation.from_quat(rollout.orientation[:, 0])
     local = turn.inv().apply(rollout.angular_velocity[:, 0])
     inertia = np.diag(box.inertia) / box.volume  # of 1 kg
@@ -62,7 +62,7 @@ def test_twenty_seconds_about_the_middle_axis_flip_and_conserve(model, device):
     assert (np.diff(np.sign(about[np.abs(about) > 1.0])) != 0).sum() >= 2
 
 
-def apart(model, one, other, steps: int, there=lambda p: p, back=lambda p: p, device: str = "cpu") -> float:
+def apart(model, one, other, steps: int, there=lambda p: p, back=lambda p: p) -> float:
     """Largest distance of two scenes' bodies after any single step from the same state.
 
     Contact is sharp: what rounding makes of one step grows in those that follow, so each step starts anew.
@@ -73,9 +73,8 @@ def apart(model, one, other, steps: int, there=lambda p: p, back=lambda p: p, de
         steps: how many.
         there: a state [N, ...] of the first scene as the second one has it.
         back: positions [N, 3] of the second scene as the first one has them.
-        device: where to compute.
     """
-    near, far = (Simulator(s, model, device) for s in (one, other))
+    near, far = (Simulator(s, model) for s in (one, other))
     rows, contacts, worst = gates.moving(one), 0, 0.0
     for _ in range(steps):
         start = replace(near.state, touch=None)
@@ -94,16 +93,16 @@ def in_order(state: State, order: list[int]) -> State:
 
 
 @pytest.mark.parametrize("distance", [1e3, 1e6])
-def test_where_it_happens_does_not_matter(model, device, distance):
+def test_where_it_happens_does_not_matter(model, distance):
     shift = distance * np.array([1.0, -1.0, 0.5])
     scene = gates.mixed()
     far = replace(scene, bodies=tuple(replace(b, position=b.position + shift) for b in scene.bodies))
-    unit = Simulator(scene, model, device).units.length
+    unit = Simulator(scene, model).units.length
 
     def there(state: State) -> State:
-        return replace(state, position=state.position + torch.as_tensor(shift / unit, device=state.position.device))
+        return replace(state, position=state.position + torch.as_tensor(shift / unit))
 
-    assert apart(model, scene, far, 25, there, lambda p: p - shift, device) <= 1e-4
+    assert apart(model, scene, far, 25, there, lambda p: p - shift) <= 1e-4
 
 
 def test_the_order_of_bodies_does_not_matter(model):

@@ -14,9 +14,9 @@ EXIT = 3.0  # m/s, for bodies of about a metre
 
 @pytest.mark.parametrize("offset", [0.0, 0.5], ids=["coincident", "50 %"])
 @pytest.mark.parametrize("shape", SHAPES)
-def test_two_bodies_part(every_model, device, shape, offset):
+def test_two_bodies_part(every_model, shape, offset):
     scene = gates.placed(SHAPES[shape], [(0, 0, 0), (0.8 * offset, 0.6 * offset, 0)])
-    rollout = Simulator(scene, every_model, device).run(seconds=1.3)
+    rollout = Simulator(scene, every_model).run(seconds=1.3)
     gates.assert_sound(rollout)
     away = np.linalg.norm(rollout.position[:, 1] - rollout.position[:, 0], axis=-1)
     assert away[-1] > offset + 0.1  # how far is a quality of the model: cubes half in each other end at 0.64 m
