@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -115,13 +116,22 @@ def _polycam(folder: Path) -> list[KnownCamera]:
 
 
 def unpack(archive: Path, folder: Path) -> None:
-    """Unpacks the files of a zipped capture, none outside of the folder. Raises SdfsimError where it is damaged or no
-    zip, or too large once unpacked."""
+    """Unpacks the files of a zipped capture. Raises SdfsimError where it is damaged or no zip, too large once unpacked,
+    or has names that lead out of the folder."""
     try:
         with zipfile.ZipFile(archive) as file:
-            if sum(entry.file_size for entry in file.infolist()) > LARGEST:
+            entries = [entry for entry in file.infolist() if not entry.is_dir()]
+            if sum(entry.file_size for entry in entries) > LARGEST:
                 raise SdfsimError(f"{archive}: more than {LARGEST >> 30} GiB unpacked", "export fewer frames")
-            file.extractall(folder)  # which leaves out the parts of a name that lead outside
+            for entry in entries:
+                place = folder / entry.filename
+                if not place.resolve().is_relative_to(folder.resolve()):
+                    raise SdfsimError(
+                        f"{archive}: {entry.filename} would lie outside of the capture", "export it again"
+                    )
+                place.parent.mkdir(parents=True, exist_ok=True)
+                with file.open(entry) as packed, open(place, "wb") as out:
+                    shutil.copyfileobj(packed, out)
     except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
         raise SdfsimError(f"{archive}: cannot be unpacked: {error}", "export the capture again") from error
 
