@@ -101,7 +101,7 @@ def do_mesh(run: Run, work: Path) -> dict:
 
 
 def do_fit(run: Run, work: Path) -> dict:
-    from pipeline.export import fit_parts
+    from pipeline.scene_writer import fit_parts
 
     budget = run.own_budget
     if budget is None and run.options.budget is not None:
@@ -113,8 +113,8 @@ def do_fit(run: Run, work: Path) -> dict:
 
 
 def do_scene(run: Run, work: Path) -> dict:
-    from pipeline.export import write_scene
     from pipeline.materials import choose
+    from pipeline.scene_writer import write_scene
 
     before = read_record(run.place("scene"))
     written = before["report"].get("scene_sha256") if before else None

@@ -266,7 +266,7 @@ def asked(calls, monkeypatch) -> dict[str, dict]:
 
     note("pipeline.field.training.train", "distill", SimpleNamespace(report={}))
     note("pipeline.mesh.meshing.make_meshes", "mesh", RESULTS["mesh"])
-    note("pipeline.export.fit_parts", "fit", {})
+    note("pipeline.scene_writer.fit_parts", "fit", {})
     monkeypatch.setattr("sdfsim.parallel.choose_threads", lambda work, repeat: 0.0)
     monkeypatch.setattr("pipeline.cameras.load_views", lambda folder: [])
     monkeypatch.setattr("pipeline.cameras.load_sparse", lambda folder: None)

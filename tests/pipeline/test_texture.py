@@ -11,12 +11,12 @@ import pytest
 from PIL import Image
 
 from pipeline.cameras import View
-from pipeline.export import skins_of
 from pipeline.inputs.photos import Photo
 from pipeline.mesh import texture
 from pipeline.mesh.extraction import components
 from pipeline.mesh.texture import BLOCK, Shots, fewer, rasterise, shots_of, textured, unfold
 from pipeline.mesh.visibility import Visibility, bilinear, look, to_bytes
+from pipeline.scene_writer import skins_of
 from sdfsim.recording import Playback, save_reconstruction, with_normals
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.bvh import Caster

@@ -10,10 +10,10 @@ import pytest
 import yaml
 
 from pipeline.cameras import Similarity
-from pipeline.export import LEVEL, choose_slab, fit_parts, scene_text, write_scene
 from pipeline.materials import ASSUMED, MATERIALS, choose
 from pipeline.mesh.placement import Placement
 from pipeline.mesh.visibility import Above
+from pipeline.scene_writer import LEVEL, choose_slab, fit_parts, scene_text, write_scene
 from sdfsim.files import write_json
 from sdfsim.scene.scene_file import load_scene
 from sdfsim.shape.mesh import Mesh, write_ply
