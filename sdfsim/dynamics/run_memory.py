@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, cast
 
+import numpy as np
 import torch
 from torch import nn
 
@@ -66,8 +67,9 @@ class Memory:
 
     def end(self, bodies: Bodies, state: State) -> None:
         """The step led to `state`."""
-        asleep = 0 if state.touch is None else int((state.touch.island >= 0).sum())
-        self.count(asleep=asleep, free=int(bodies.moves.sum()) - asleep - self.counts["active"])
+        asleep = 0 if state.touch is None else np.count_nonzero(state.touch.island.numpy() >= 0)
+        moving = np.count_nonzero(bodies.moves.cpu().numpy())
+        self.count(asleep=asleep, free=moving - asleep - self.counts["active"])
 
     def count(self, **more: float) -> None:
         """Add to counters."""

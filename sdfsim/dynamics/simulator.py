@@ -14,8 +14,7 @@ import numpy as np
 import torch
 
 import sdfsim
-from sdfsim.dynamics import pose
-from sdfsim.dynamics.bodies import State, awake, from_scene
+from sdfsim.dynamics.bodies import State, from_scene
 from sdfsim.dynamics.body_handle import BodyHandle, ContactPoint
 from sdfsim.dynamics.model import Model, load_model
 from sdfsim.dynamics.models.contact_graph import SUBSTEPS
@@ -135,7 +134,19 @@ class Simulator:
         self.memory = Memory()
         dynamic = self.bodies.moves
         weight = self.bodies.mass[dynamic] * self.rules.gravity.norm()
-        self._lift = float((weight * self.bodies.size[dynamic]).sum()) * self.units.energy
+        lift = float((weight * self.bodies.size[dynamic]).sum()) * self.units.energy
+        self._meta = {
+            "model": self.model.name,
+            "seed": self.seed,
+            "dt": self.dt,
+            "device": str(self.device),
+            "outside_training": self.outside_training,
+            "free_flight": free_flight,
+            "lift_energy": lift,
+            "sdfsim": sdfsim.__version__,
+            "torch": torch.__version__,
+            "python": platform.python_version(),
+        }
         self.contacts: Contacts | Pairs | None = None
         self.steps_done = 0
         if broken := self._fault(self.state):
@@ -253,7 +264,10 @@ class Simulator:
     def _step(self) -> None:
         self._accept()
         after, contacts = step(self.model, self.bodies, self.state, self.rules, self.memory)
-        if broken := self._fault(after, awake(self.bodies, after), self.state):
+        awake = self.bodies.moves.cpu().numpy()
+        if after.touch is not None:
+            awake = awake & (after.touch.island.numpy() < 0)
+        if broken := self._fault(after, awake, self.state):
             raise self._broke(broken)
         self.state, self.contacts = after, contacts
         self._good = after
@@ -275,7 +289,7 @@ class Simulator:
             self.state = history_told(self.state, self._good, self.bodies, self.rules)
         self._good = self.state
 
-    def _fault(self, state: State, rows: torch.Tensor | None = None, before: State | None = None) -> str | None:
+    def _fault(self, state: State, rows: np.ndarray | None = None, before: State | None = None) -> str | None:
         found = fault(state, self.rules.dt, self.units, rows, before)
         return None if found is None else f"body {self._names[found[0]]!r}: {found[1]}"
 
@@ -304,18 +318,7 @@ class Simulator:
             contact_body=pairs,
             counters={k: np.array([v]) for k, v in counters.items()},
             names=self._names,
-            meta={
-                "model": self.model.name,
-                "seed": self.seed,
-                "dt": self.dt,
-                "device": str(self.device),
-                "outside_training": self.outside_training,
-                "free_flight": self.rules.free_flight,
-                "lift_energy": self._lift,
-                "sdfsim": sdfsim.__version__,
-                "torch": torch.__version__,
-                "python": platform.python_version(),
-            },
+            meta=self._meta,
         )
 
     def _touching(self) -> tuple[np.ndarray, np.ndarray, float]:
@@ -337,14 +340,12 @@ class Simulator:
 
     def _energies(self) -> dict[str, float]:
         """Kinetic and potential energy in joules of all dynamic bodies."""
-        s, b, joule = self.state, self.bodies, self.units.energy
-        velocity, mass, inertia = (t.cpu().numpy() for t in (s.velocity, b.mass, b.inertia))
-        # Bodies that are not dynamic have no mass, and an inertia that means nothing.
-        spin = pose.rotate(pose.conjugate(s.orientation), s.angular_velocity).cpu().numpy()[b.moves.cpu().numpy()]
-        turning = (spin[:, None] @ inertia[b.moves.cpu().numpy()] @ spin[..., None]).sum()
-        moving = 0.5 * (mass @ np.square(velocity).sum(-1) + turning)
-        potential = -mass @ (s.position.cpu().numpy() @ self.rules.gravity.cpu().numpy())
-        return {"kinetic_energy": float(moving) * joule, "potential_energy": float(potential) * joule}
+        from sdfsim.dynamics.kernels.survey import energies
+
+        s, b = self.state, self.bodies
+        known = (b.mass, b.inertia, self.rules.gravity, s.position, s.orientation, s.velocity, s.angular_velocity)
+        kinetic, potential = energies(*(t.cpu().numpy() for t in known))
+        return {"kinetic_energy": kinetic * self.units.energy, "potential_energy": potential * self.units.energy}
 
 
 def varied(scene: Scene, variant: Variant) -> Scene:

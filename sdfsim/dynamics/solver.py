@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections import OrderedDict
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
@@ -17,6 +18,7 @@ from sdfsim.dynamics.kernels import distance as kinds
 from sdfsim.dynamics.kernels import world as compiled
 from sdfsim.dynamics.kernels.record import Edges
 from sdfsim.dynamics.kernels.step import step as compiled_step
+from sdfsim.dynamics.kernels.survey import touching
 from sdfsim.files import digest
 from sdfsim.shape.baked_grid import WALL, BakedGrid, baked, inwards
 from sdfsim.shape.sdf import ClosedForm, PlaneSdf, Sdf
@@ -173,22 +175,14 @@ class Touching:
 
 def contact_points(state: State) -> Touching:
     """Where bodies touch in a state."""
-    pair, count, point = _manifolds(state.touch)
-    there = np.arange(compiled.POINTS) < count[:, None]
-    m, k = (there & (point[..., compiled.GAP] <= TOUCHING)).nonzero()
-    pair, point = pair[m], point[m, k]
-    first = torch.from_numpy(pair[:, 0])
-    place = state.position[first] + pose.rotate(state.orientation[first], torch.from_numpy(point[:, :3]))
-    normal = point[:, compiled.NORMAL : compiled.NORMAL + 3]
-    impulse = normal * point[:, compiled.PUSH, None] + point[:, compiled.DRAG : compiled.DRAG + 3]
-    return Touching(pair, place.numpy(), normal, impulse, point[:, compiled.GAP])
+    return Touching(*touching(_manifolds(state.touch), state.position.numpy(), state.orientation.numpy(), TOUCHING))
 
 
 def compiled_rules(rules: StepOptions, *, note: bool = False) -> compiled.Rules:
     """The rules of a run as the compiled step wants them."""
     gravity, inner = rules.gravity.cpu().numpy(), rules.dt / rules.substeps
     return compiled.Rules(
-        gravity, inner, rules.substeps, SLOW * float(np.linalg.norm(gravity)) * inner, rules.friction,
+        gravity, inner, rules.substeps, SLOW * math.hypot(*gravity) * inner, rules.friction,
         rules.restitution, rules.rotation, rules.sleep, rules.margin, rules.adds, note,
         ahead=inner if note and inner > COARSE else 0.0,
     )  # fmt: skip

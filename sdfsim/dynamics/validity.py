@@ -23,37 +23,39 @@ LINE = 1e-5
 
 
 def fault(
-    state: State, dt: float, units: Units, rows: torch.Tensor | None = None, before: State | None = None
+    state: State, dt: float, units: Units, rows: np.ndarray | None = None, before: State | None = None
 ) -> tuple[int, str] | None:
-    """The first of bodies `rows` [R] int64 (None: all) whose state cannot be, and what is wrong with it; None when all
-    are sound. State and `dt` are in model units."""
-    at = np.arange(len(state.position)) if rows is None else rows.cpu().numpy()
+    """The first of the bodies in `rows` [N] bool (None: all) whose state cannot be, and what is wrong with it; None
+    when all are sound. State and `dt` are in model units."""
+    from sdfsim.dynamics.kernels.survey import first_fault  # numba takes its time to load
 
-    def of(name: str, state: State = state) -> np.ndarray:
-        return getattr(state, name).cpu().numpy()[at]
-
-    turn, spin = of("orientation"), of("angular_velocity")
-    limits = [
-        ("position", of("position"), FARTHEST, units.length, "m from the origin, too far to be placed exactly"),
-        ("velocity", of("velocity"), FASTEST, units.velocity, "m/s, too fast for any contact"),
-        ("angular_velocity", spin, MOST_TURN / dt, 1.0 / units.time, "rad/s, too fast to be followed"),
-    ]
-    if before is not None:
-        way = (of("position") - of("position", before)) / dt
-        limits.append(("way", way, FASTEST, units.velocity, "m/s through the step, too fast for any contact"))
-    with np.errstate(over="ignore"):  # no comparison holds for what is not a number
-        bad = np.flatnonzero(~(np.abs(np.square(turn).sum(-1) - 1.0) <= UNIT))
-        if len(bad):
-            known = np.isfinite(turn[bad[0]]).all()
-            return int(at[bad[0]]), "orientation is no rotation" if known else "orientation is not finite"
-        for name, values, most, unit, what in limits:
-            bad = np.flatnonzero(~(np.square(values).sum(-1) <= most * most))
-            if len(bad) and not np.isfinite(values[bad[0]]).all():
-                return int(at[bad[0]]), f"{name} is not finite"
-            if len(bad):
-                size = float(np.linalg.norm(values[bad[0]])) * unit
-                return int(at[bad[0]]), f"{size:.3g} {what} (at most {most * unit:.3g})"
-    return None
+    rows = np.ones(len(state.position), bool) if rows is None else rows
+    place, orientation, velocity, spin = (
+        t.cpu().numpy() for t in (state.position, state.orientation, state.velocity, state.angular_velocity)
+    )
+    earlier = place if before is None else before.position.cpu().numpy()
+    most = np.array([1.0, FARTHEST, FASTEST, MOST_TURN / dt, FASTEST])
+    body, wrong = first_fault(rows, place, orientation, velocity, spin, earlier, dt, UNIT, most)
+    if body < 0:
+        return None
+    with np.errstate(over="ignore", invalid="ignore"):
+        name, value, unit, what = (
+            ("orientation", orientation[body], 1.0, ""),
+            ("position", place[body], units.length, "m from the origin, too far to be placed exactly"),
+            ("velocity", velocity[body], units.velocity, "m/s, too fast for any contact"),
+            ("angular_velocity", spin[body], 1.0 / units.time, "rad/s, too fast to be followed"),
+            (
+                "way",
+                (place[body] - earlier[body]) / dt,
+                units.velocity,
+                "m/s through the step, too fast for any contact",
+            ),
+        )[wrong]
+    if not np.isfinite(value).all():
+        return body, f"{name} is not finite"
+    if not what:
+        return body, "orientation is no rotation"
+    return body, f"{float(np.linalg.norm(value)) * unit:.3g} {what} (at most {most[wrong] * unit:.3g})"
 
 
 def check_sizes(bodies: Bodies, names: Sequence[str], metres: float) -> None:

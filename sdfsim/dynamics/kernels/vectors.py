@@ -110,6 +110,14 @@ def to_matrix(q, i, out):
 
 
 @njit(**BARE)
+def rotated(q, i, v, way):
+    """v turned by quaternion q[i] (xyzw); back for `way` -1."""
+    u, w = scale(get(q, i), way), q[i, 3]
+    t = scale(cross(u, v), 2.0)
+    return add(along(v, t, w), cross(u, t))
+
+
+@njit(**BARE)
 def turned_by(r, q, i):
     """Quaternion (4 numbers, unit length) of q[i] turned by the rotation vector r."""
     angle = norm(r)
