@@ -67,7 +67,7 @@ class Memory:
 
     def end(self, bodies: Bodies, state: State) -> None:
         """The step led to `state`."""
-        asleep = 0 if state.touch is None else np.count_nonzero(state.touch.island.numpy() >= 0)
+        asleep = 0 if state.touch is None else int(np.count_nonzero(state.touch.island.numpy() >= 0))
         moving = np.count_nonzero(bodies.moves.cpu().numpy())
         self.count(asleep=asleep, free=moving - asleep - self.counts["active"])
 

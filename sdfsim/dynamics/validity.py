@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 
 from sdfsim.dynamics.bodies import Bodies, State, Units
 from sdfsim.dynamics.free_flight import MOST_TURN
