@@ -1,12 +1,14 @@
 """Our solver and what people would take instead, on shapes that are hard for them: RESULTS.md.
 
-    python benchmarks/rivals.py DATA -o DIR [--only CASE ...]
+    python benchmarks/rivals.py shapes DATA -o DIR [--only CASE ...]
+    python benchmarks/rivals.py large -o DIR [--only CASE ...]
+        the first 20 steps of large scenes with inner steps of 4 ms: as they fall, and at rest
 
 DATA is a MOVi-B dataset. Every engine simulates every case with inner steps of 10, 4, 2 and 1 ms (of bodies of a
 metre; smaller ones in proportion to the root of their size), one thread, processor time. No engine is another's truth:
 an error is the distance from the same engine's motion at 1 ms. Depth is measured on the exact surfaces. Convex pieces
 are CoACD's, with one setting for all, where a shape has none of its own. Making them, tetrahedra and kernels is not
-timed. Restitution is 0, friction the same for all. DIR keeps results; the table of the cases goes to RESULTS.md.
+timed. Restitution is 0, friction the same for all. DIR keeps results; the tables of all cases go to RESULTS.md.
 """
 
 from __future__ import annotations
@@ -41,7 +43,7 @@ from sdfsim.evaluation.hard_cases import ball, body, box, on_floor
 from sdfsim.evaluation.harness import Job, Results, markdown, measure, number, peak_memory
 from sdfsim.evaluation.penetration import depths
 from sdfsim.export import convex_pieces
-from sdfsim.files import write_text
+from sdfsim.files import read_arrays, write_arrays, write_text
 from sdfsim.scene.scene import Effects, Scene
 from sdfsim.scene.scene_file import load_scene
 from sdfsim.shape.mesh import Mesh, clean, load_pieces, wavefront
@@ -61,6 +63,7 @@ USUAL = 5
 STEPS = 100
 COMPARED = 25  # steps over which an engine is compared with itself: later, chaos says more than the step
 HEAP_STEPS = 20  # of the large scenes: enough to time a step
+SETTLED = 400  # steps in which our solver lets bodies come to rest
 MOVI_B = 5  # trajectories
 DEEP = 0.01  # of the smallest body's size: "equal penetration"
 FRICTION = 0.7  # of everything: 0.49 where two meet
@@ -149,16 +152,39 @@ def written(folder: Path, name: str, count: int | None = None) -> Scene:
     return load_scene(write_scene(name, folder / f"{name}{count or ''}", count))
 
 
+def settled(folder: Path, name: str, count: int | None = None) -> Scene:
+    """The same after our solver has let it come to rest; poses are kept in the folder."""
+    scene, file = written(folder, name, count), folder / f"{name}{count or ''}-settled.npz"
+    if not file.exists():
+        simulator = Simulator(scene, "solver")
+        simulator.step(SETTLED)
+        handles = [simulator[body.name] for body in scene.bodies]
+        poses = {
+            "position": np.array([h.position for h in handles]),
+            "quat_xyzw": np.array([h.quat_xyzw for h in handles]),
+        }
+        write_arrays(file, poses)
+    found, rest = read_arrays(file, "settled bodies"), np.zeros(3)
+    bodies = tuple(
+        replace(b, position=place, quat_xyzw=turn, velocity=rest, angular_velocity=rest) if b.motion == "dynamic" else b
+        for b, place, turn in zip(scene.bodies, found["position"], found["quat_xyzw"], strict=True)
+    )
+    return replace(scene, bodies=bodies)
+
+
 CASES: dict[str, Callable[[Path], Scene]] = {
     "bowls in bowls": bowls,
     "torus knots": partial(written, name="knots", count=12),
     "mugs on pegs": mugs,
     "scan of 200,000 triangles": scan,
-    **{f"{count} spheres in a bowl": partial(written, name="bowl", count=count) for count in (16, 512)},
-    "heaps": partial(written, name="heaps"),
+    "16 spheres in a bowl": partial(written, name="bowl", count=16),
+    "512 spheres in a bowl": partial(written, name="bowl", count=512),
+    "512 spheres at rest in a bowl": partial(settled, name="bowl", count=512),
+    "heaps, 1.1 M nodes": partial(written, name="heaps"),
+    "heaps at rest": partial(settled, name="heaps"),
 }
-LARGE = ("512 spheres in a bowl", "heaps")
-ALL = ["MOVi-B", *CASES]
+LARGE = ["512 spheres in a bowl", "512 spheres at rest in a bowl", "heaps, 1.1 M nodes", "heaps at rest"]
+SHAPES = ["MOVi-B", *(case for case in CASES if case not in LARGE)]
 
 
 def in_pieces(scene: Scene, folder: Path) -> Scene:
@@ -195,7 +221,7 @@ def moved(name: str, scene: Scene, steps: int, inner: int, folder: Path) -> tupl
     return rollout_motion(scene, rollout), timing.cpu_ms / (0.02 * units.time), prepared
 
 
-def measured(name: str, case: str, data: Path, folder: Path) -> dict[str, Any]:
+def measured(name: str, case: str, data: Path | None, folder: Path) -> dict[str, Any]:
     """What every inner step costs an engine in a case.
 
     Returns:
@@ -205,7 +231,7 @@ def measured(name: str, case: str, data: Path, folder: Path) -> dict[str, Any]:
     """
     torch.set_num_threads(1)
     (folder / "pieces").mkdir(parents=True, exist_ok=True)
-    if case == "MOVi-B":
+    if data is not None and case == "MOVi-B":
         recorded, shapes = load_recorded(data, "test", most=MOVI_B)
         scenes = [scene_of([t], [0], shapes)[0] for t in recorded]
     else:
@@ -273,14 +299,50 @@ def table(results: Results, cases: list[str]) -> str:
     return markdown(rows)
 
 
-def main(data: Path, *, out: Path, only: list[str] = ALL) -> None:
-    content, jobs = [INNER, STEPS, COMPARED, HEAP_STEPS, MOVI_B, FRICTION], []
-    for case in only:
-        jobs += [Job(case, name, content, measured, (name, case, data.resolve(), out / "scenes")) for name in ENGINES]
-    results = measure(jobs, out / "results", where="fresh", on_progress=told)
-    some = "" if only == ALL else " --only " + " ".join(f'"{case}"' for case in only)
-    write_section("rivals", f"python benchmarks/rivals.py DATA -o DIR{some}", table(results, only))
+def large_table(results: Results, cases: list[str]) -> str:
+    """A row a case: time, memory and depth by engine."""
+    rows: list[tuple[str, ...]] = [("ms a simulated second / MiB / depth, %", *ENGINES)]
+    for case in cases:
+        row = [case]
+        for name in ENGINES:
+            result = results[case, name]
+            if usual := result.get("inner", {}).get(str(USUAL)):
+                gone = f", {usual['lost']} lost" if usual["lost"] else ""
+                row.append(f"{number(usual['ms'])} / {number(result['mib'])} / {number(100 * usual['deep'], 2)}{gone}")
+            else:
+                row.append(result.get("failed") or "; ".join(result["broken"].values()))
+        rows.append(tuple(row))
+    return markdown(rows)
+
+
+def compared(cases: list[str], data: Path | None, out: Path) -> Results:
+    """Every engine's results of some cases."""
+    content = [INNER, STEPS, COMPARED, HEAP_STEPS, MOVI_B, FRICTION]
+    jobs = [
+        Job(case, name, content, measured, (name, case, data and data.resolve(), out / "scenes"))
+        for case in cases
+        for name in ENGINES
+    ]
+    return measure(jobs, out / "results", where="fresh", on_progress=told)
+
+
+def shapes(data: Path, *, out: Path, only: list[str] = SHAPES) -> None:
+    """Hard shapes; the table of all of them goes to RESULTS.md."""
+    found = table(compared(only, data, out), only)
+    if only == SHAPES:
+        write_section("rivals", "python benchmarks/rivals.py shapes DATA -o DIR", found)
+    else:
+        print(found)
+
+
+def large(*, out: Path, only: list[str] = LARGE) -> None:
+    """Large scenes; the table of all of them goes to RESULTS.md."""
+    found = large_table(compared(only, None, out), only)
+    if only == LARGE:
+        write_section("large rivals", "python benchmarks/rivals.py large -o DIR", found)
+    else:
+        print(found)
 
 
 if __name__ == "__main__":
-    script(__doc__, main)
+    script(__doc__, shapes, large)
