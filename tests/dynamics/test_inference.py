@@ -106,10 +106,10 @@ def steps(monkeypatch) -> list[Compared]:
     return found
 
 
-def agree(steps: list[Compared], count: int, change: float = 1e-3) -> bool:
+def agree(steps: list[Compared], count: int, change: float = 1e-3, rounding: float = ROUNDING) -> bool:
     """Whether compiled and torch do to rounding, in at least `count` steps one of which changes velocities so much."""
     assert len(steps) >= count and max(s.change for s in steps) > change
-    return max(s.error for s in steps) < ROUNDING
+    return max(s.error for s in steps) < rounding
 
 
 @pytest.mark.parametrize("effects", [{}, {"friction": "off"}, {"rotation": "off"}, {"restitution": "off"}], ids=str)
@@ -125,7 +125,7 @@ def test_they_agree_where_every_bound_of_the_trust_region_acts(steps, push):
     for seed in range(3):
         weightless = replace(pile(seed, 4), gravity=np.zeros(3))
         Simulator(weightless, random_model("impulse", seed, push=push)).run(steps=15)
-    assert agree(steps, 10)
+    assert agree(steps, 10, rounding=ROUNDING * push / 5.0)  # single precision, times what the network pushes
 
 
 def test_they_agree_on_one_edge(steps, free_pair):
