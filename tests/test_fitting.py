@@ -111,7 +111,7 @@ def test_work_is_spread_over_processes_of_one_thread() -> None:
         list(parallel(where, [(n,) for n in range(10, 20)]))
 
 
-def test_the_same_call_works_on_a_cluster() -> None:
+def test_the_same_call_works_on_a_cluster(monkeypatch) -> None:
     from distributed import LocalCluster
 
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as engine:
@@ -119,5 +119,6 @@ def test_the_same_call_works_on_a_cluster() -> None:
             found = dict(parallel(where, [(n,) for n in range(8)]))
         workers = {worker.pid for worker in engine.workers.values()}
     assert len(found) == 8 and {pid for _, pid, _ in found.values()} <= workers
+    monkeypatch.setattr("sdfsim.parallel.ANSWERS", 0.5)
     with pytest.raises(SdfsimError, match="no scheduler"), cluster("tcp://127.0.0.1:1"):
         pass

@@ -108,8 +108,11 @@ def mesh_edges(bodies: Bodies, state: State) -> Edges:
     """Edges along the sides of the mesh's faces, each once a direction: sender from receiver, now and at rest."""
     sides = torch.cat([bodies.face[:, [0, 1]], bodies.face[:, [1, 2]], bodies.face[:, [2, 0]]])
     sides = sides[sides[:, 0] != sides[:, 1]]  # those of the plane's one node
-    sides = torch.unique(torch.cat([sides, sides.flip(1)]), dim=0)
-    sender, receiver = sides.unbind(1)
+    count = len(bodies.node)
+    key = torch.unique(
+        torch.cat([sides, sides.flip(1)]) @ sides.new_tensor([count, 1])
+    )  # of rows it takes 50 times as long
+    sender, receiver = key // count, key % count
     arm = _arms(bodies, state)
     features = _now_and_at_rest(arm[sender] - arm[receiver], bodies.node[sender] - bodies.node[receiver])
     return Edges(features, sender[:, None], receiver[:, None])
