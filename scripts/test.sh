@@ -6,4 +6,4 @@ bash scripts/setup.sh test
 .venv/bin/ruff check .
 .venv/bin/pyright
 # Two processes of one thread each are faster than one of two: most tests are too small for threads to help.
-OMP_NUM_THREADS=1 .venv/bin/pytest -n 2 "$@"
+OMP_NUM_THREADS=1 .venv/bin/pytest -n 2 --dist worksteal "$@"

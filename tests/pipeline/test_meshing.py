@@ -184,7 +184,7 @@ def ball_and_photos(blocked: int = 0) -> tuple[Mesh, list[Picture]]:
     def small(points: np.ndarray) -> np.ndarray:
         return np.linalg.norm(points, axis=1) - 0.294 + 0.006 * np.sin(60 * points).prod(1)
 
-    return sample_box(small, np.full(3, -0.32), np.full(3, 0.32), 0.01).mesh(), pictures
+    return sample_box(small, np.full(3, -0.32), np.full(3, 0.32), 0.014).mesh(), pictures
 
 
 def off_the_ball(mesh: Mesh, where: np.ndarray) -> float:

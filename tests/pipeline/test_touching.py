@@ -15,7 +15,7 @@ from pipeline.cameras import Similarity, View
 from pipeline.inputs.labels import FOLDER, NAMES
 from pipeline.mesh import bodies
 from pipeline.mesh.bodies import Parts, split
-from pipeline.mesh.extraction import EXTENT, Surface, ball, sample_volume
+from pipeline.mesh.extraction import EXTENT, Surface, Volume, ball, sample_volume
 from pipeline.mesh.hollows import hollow, hollow_line
 from sdfsim.files import write_json
 from sdfsim.shape.mesh import Mesh, is_closed, signed_volume
@@ -49,6 +49,21 @@ def union(first: np.ndarray, second: np.ndarray, fill: float) -> np.ndarray:
     return np.minimum(first, second) - bulge
 
 
+def plain(seed: int, rows: int, columns: int, palette: list, *rest) -> np.ndarray:
+    """Only mean colours are looked at here, and drawing a pattern takes seconds."""
+    return np.mean(palette, axis=0)[None, None]
+
+
+_samples: dict[tuple, Volume] = {}
+
+
+def sampled(*key, of: Callable[[np.ndarray], np.ndarray]) -> Volume:
+    """Samples of a part's distance, m, in the unit sphere; taken once for scenes that differ in other things."""
+    if key not in _samples:
+        _samples[key] = sample_volume(lambda p: of(p).astype(np.float32), key[-2], extent=EXTENT)
+    return _samples[key]
+
+
 class Scene:
     """A rendered scene as a field would have it, in the space of the unit sphere.
 
@@ -65,6 +80,7 @@ class Scene:
     def __init__(self, build: Callable, chosen: Sequence[str], radius: float, side: int = 97,
                  *, floor: bool = True, fill: float = 0.0, painted: bool = True) -> None:  # fmt: skip
         self.make = photo_sets.studio()
+        self.make.texture = plain
         parts, names = build(self.make)
         self.parts = [part for name, part in zip(names, parts, strict=False) if name in chosen] + parts[len(names) :]
         self.names = [name for name in names if name in chosen]
@@ -82,13 +98,17 @@ class Scene:
             for turn in [np.diag([1.0, -1, -1]) @ pose[:3, :3].T]
         ]
         each = [signed(part) for part in self.parts[:-2]]
-
-        def distance(points: np.ndarray) -> np.ndarray:
-            there = self.to_unit.inverse().points(points)
-            values = [there[:, 2] if floor else np.full(len(there), np.inf), *(one(there) for one in each)]
-            return (reduce(lambda a, b: union(a, b, fill), values) / radius).astype(np.float32)
-
-        volume = sample_volume(lambda p: np.maximum(distance(p), ball(p)).astype(np.float32), side, extent=EXTENT)
+        back = self.to_unit.inverse()
+        volumes = [
+            sampled(build, tuple(self.names), radius, side, k, of=lambda points, one=one: one(back.points(points)))
+            for k, one in enumerate([lambda there: there[:, 2], *each])
+        ]
+        values = [volume.values for volume in volumes[0 if floor else 1 :]]
+        limit = sample_volume(ball, side, extent=EXTENT).values
+        volume = replace(
+            volumes[0],
+            values=np.maximum(reduce(lambda a, b: union(a, b, fill), values) / radius, limit).astype(np.float32),
+        )
         raw = volume.mesh()
         there = self.to_unit.inverse().points(raw.vertices)
         nearest = np.argmin([np.abs(there[:, 2]), *(np.abs(one(there)) for one in each)], axis=0)
