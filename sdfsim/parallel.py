@@ -18,7 +18,7 @@ Progress = Callable[[float, str], None]  # called with the fraction of the work 
 StageProgress = Callable[[str, float, str], None]  # the same, behind the name of one stage of several
 
 TIMED = 3  # calls, after one that is not timed
-ANSWERS = 10.0  # s that a scheduler has
+SCHEDULER_ANSWERS = 10.0  # s, within which
 
 
 def silent(fraction: float, message: str) -> None:
@@ -73,7 +73,7 @@ def cluster(address: str | None) -> Iterator[None]:
     except ImportError as error:
         raise SdfsimError("a cluster needs Dask", "pip install -e '.[cluster]'") from error
     try:
-        client = Client(address, timeout=ANSWERS)
+        client = Client(address, timeout=SCHEDULER_ANSWERS)
     except (OSError, TimeoutError, ValueError) as error:
         raise SdfsimError(f"{address}: no scheduler of a Dask cluster answers there") from error
     with client, parallel_config(backend="dask"):

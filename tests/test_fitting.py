@@ -119,6 +119,6 @@ def test_the_same_call_works_on_a_cluster(monkeypatch) -> None:
             found = dict(parallel(where, [(n,) for n in range(8)]))
         workers = {worker.pid for worker in engine.workers.values()}
     assert len(found) == 8 and {pid for _, pid, _ in found.values()} <= workers
-    monkeypatch.setattr("sdfsim.parallel.ANSWERS", 0.5)
+    monkeypatch.setattr("sdfsim.parallel.SCHEDULER_ANSWERS", 0.5)
     with pytest.raises(SdfsimError, match="no scheduler"), cluster("tcp://127.0.0.1:1"):
         pass

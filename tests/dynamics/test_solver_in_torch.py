@@ -86,7 +86,7 @@ def floor(shape: int):
     ("scene", "steps", "rules", "pull"),
     [
         (heap(0, 4), 60, {}, 0.0), (heap(1, 4), 60, {"margin": 1e-3, "adds": True}, 0.0),
-        (tops(0), 45, {}, 0.0), (tops(1), 19, {}, 0.5), (swallowed(), 30, {}, 0.0),
+        (tops(0), 45, {}, 0.0), (tops(1), 25, {}, 0.5), (swallowed(), 30, {}, 0.0),
     ],
     ids=["closed forms", "as the teacher", "fitted", "fitted, pulled at", "swallowed"],
 )  # fmt: skip

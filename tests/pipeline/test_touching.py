@@ -57,10 +57,11 @@ def plain(seed: int, rows: int, columns: int, palette: list, *rest) -> np.ndarra
 _samples: dict[tuple, Volume] = {}
 
 
-def sampled(*key, of: Callable[[np.ndarray], np.ndarray]) -> Volume:
-    """Samples of a part's distance, m, in the unit sphere; taken once for scenes that differ in other things."""
+def sampled(distance: Callable[[np.ndarray], np.ndarray], side: int, *part) -> Volume:
+    """Samples of the distance, m, of a part of some scene; taken once for scenes that differ in other things."""
+    key = (side, *part)
     if key not in _samples:
-        _samples[key] = sample_volume(lambda p: of(p).astype(np.float32), key[-2], extent=EXTENT)
+        _samples[key] = sample_volume(lambda p: distance(p).astype(np.float32), side, extent=EXTENT)
     return _samples[key]
 
 
@@ -100,7 +101,7 @@ class Scene:
         each = [signed(part) for part in self.parts[:-2]]
         back = self.to_unit.inverse()
         volumes = [
-            sampled(build, tuple(self.names), radius, side, k, of=lambda points, one=one: one(back.points(points)))
+            sampled(lambda points, one=one: one(back.points(points)), side, build, tuple(self.names), radius, k)
             for k, one in enumerate([lambda there: there[:, 2], *each])
         ]
         values = [volume.values for volume in volumes[0 if floor else 1 :]]
