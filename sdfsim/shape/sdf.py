@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial, wraps
@@ -74,7 +73,7 @@ def accepts_numpy(call: Callable[..., tuple[torch.Tensor, torch.Tensor]]) -> Cal
     return wrapper
 
 
-class ClosedForm(ABC):
+class ClosedForm:
     """A solid about the origin with an exact distance; its fields are its sizes, m, positive (else SdfsimError)."""
 
     KIND: ClassVar[str]
@@ -95,13 +94,13 @@ class ClosedForm(ABC):
         """[2, 3] float64 m, the box that holds the solid."""
         return np.outer([-1.0, 1.0], self._reach())
 
-    @abstractmethod
     def _reach(self) -> tuple[float, ...]:
         """(x, y, z) m, its half extents."""
+        raise NotImplementedError
 
-    @abstractmethod
     def _measure(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Distance [P] m and unit gradient [P, 3] at `points` [P, 3] m."""
+        raise NotImplementedError
 
     def to(self, device: torch.device | str) -> Self:
         """Itself: it holds no tensors."""
