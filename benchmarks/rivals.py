@@ -1,6 +1,8 @@
 """Our solver and what people would take instead, on shapes that are hard for them: RESULTS.md.
 
     python benchmarks/rivals.py shapes DATA -o DIR [--only CASE ...]
+    python benchmarks/rivals.py turns DATA -o DIR
+        ours and the engines on convex pieces in turn: medians and ranges of 7 rounds at 4 ms
     python benchmarks/rivals.py large -o DIR [--only CASE ...]
         the first 20 steps of large scenes with inner steps of 4 ms: as they fall, and at rest
 
@@ -58,6 +60,7 @@ ENGINES: dict[str, Engine | None] = {
     "Drake, hydroelastic": engines.drake,
     "Newton, XPBD": engines.newton,
 }
+FAST = list(ENGINES)[:3]
 INNER = (2, 5, 10, 20)  # inner steps in one of 20 ms; the last is an engine's own truth
 USUAL = 5
 STEPS = 100
@@ -221,15 +224,8 @@ def moved(name: str, scene: Scene, steps: int, inner: int, folder: Path) -> tupl
     return rollout_motion(scene, rollout), timing.cpu_ms / (0.02 * units.time), prepared
 
 
-def measured(name: str, case: str, data: Path | None, folder: Path) -> dict[str, Any]:
-    """What every inner step costs an engine in a case.
-
-    Returns:
-        by inner steps: ms per simulated second; deep, the 95th percentile of the depth, and away, the distance from
-        the engine's own finest motion, both over the smallest body's size; lost, bodies that are where they cannot be.
-        prepare_s and mib once.
-    """
-    torch.set_num_threads(1)
+def scenes_of(case: str, data: Path | None, folder: Path) -> list[Scene]:
+    """The scenes of a case, of equal friction and without restitution and sleep."""
     (folder / "pieces").mkdir(parents=True, exist_ok=True)
     if data is not None and case == "MOVi-B":
         recorded, shapes = load_recorded(data, "test", most=MOVI_B)
@@ -239,6 +235,19 @@ def measured(name: str, case: str, data: Path | None, folder: Path) -> dict[str,
     for k, scene in enumerate(scenes):
         bodies = tuple(replace(b, friction=FRICTION, restitution=0.0) for b in scene.bodies)
         scenes[k] = replace(scene, bodies=bodies, effects=Effects(sleep="off"))
+    return scenes
+
+
+def measured(name: str, case: str, data: Path | None, folder: Path) -> dict[str, Any]:
+    """What every inner step costs an engine in a case.
+
+    Returns:
+        by inner steps: ms per simulated second; deep, the 95th percentile of the depth, and away, the distance from
+        the engine's own finest motion, both over the smallest body's size; lost, bodies that are where they cannot be.
+        prepare_s and mib once.
+    """
+    torch.set_num_threads(1)
+    scenes = scenes_of(case, data, folder)
     steps, inners = (HEAP_STEPS, (USUAL,)) if case in LARGE else (STEPS, INNER)
     size = [min(largest_extent(s.shapes[b.shape]) * b.scale for b in s.bodies if b.motion == "dynamic") for s in scenes]
     found: dict[int, dict[str, float]] = {}
@@ -337,6 +346,24 @@ def shapes(data: Path, *, out: Path, only: list[str] = SHAPES) -> None:
         print(found)
 
 
+def turns(data: Path, *, out: Path, rounds: int = 7) -> None:
+    """The fast engines in turn, again and again: what a shared machine does to one of them it does to all."""
+    torch.set_num_threads(1)
+    rows: list[tuple[str, ...]] = [("case, ms per s at 4 ms", *FAST, *(f"sdfsim / {name}" for name in FAST[1:]))]
+    for k, case in enumerate(SHAPES):
+        scenes = scenes_of(case, data, out / "scenes")
+        taken = np.array([
+            [np.mean([moved(name, scene, STEPS, USUAL, out / "scenes")[1] for scene in scenes]) for name in FAST]
+            for _ in range(rounds + 1)
+        ])[1:]  # the first loads and compiles  # fmt: skip
+        told((k + 1) / len(SHAPES), case)
+        figures = [*taken.T, *(taken[:, :1] / taken[:, 1:]).T]
+        rows.append(
+            (case, *("{} ({} to {})".format(*(number(q(f)) for q in (np.median, np.min, np.max))) for f in figures))
+        )
+    write_section("rivals in turn", "python benchmarks/rivals.py turns DATA -o DIR", markdown(rows))
+
+
 def large(*, out: Path, only: list[str] = LARGE) -> None:
     """Large scenes; the table of all of them goes to RESULTS.md."""
     found = large_table(compared(only, None, out), only)
@@ -347,4 +374,4 @@ def large(*, out: Path, only: list[str] = LARGE) -> None:
 
 
 if __name__ == "__main__":
-    script(__doc__, shapes, large)
+    script(__doc__, shapes, turns, large)

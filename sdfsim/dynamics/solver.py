@@ -234,23 +234,25 @@ class Geometry(NamedTuple):
     clumps: Clumps
 
 
-_of_sdf: WeakKeyDictionary[Sdf, tuple[np.ndarray, Geometry]] = WeakKeyDictionary()  # with the nodes that it is for
+Pieces = tuple[np.ndarray, ...]
+# With the nodes and the convex pieces that it is for.
+_of_sdf: WeakKeyDictionary[Sdf, tuple[np.ndarray, Pieces, Geometry]] = WeakKeyDictionary()
 _of_content: OrderedDict[str, Geometry] = OrderedDict()  # of the latest: workers get copies of shapes
 
 
-def _geometry(sdf: Sdf, nodes: np.ndarray, pieces: tuple[np.ndarray, ...]) -> Geometry:
+def _geometry(sdf: Sdf, nodes: np.ndarray, pieces: Pieces) -> Geometry:
     """Made once for all scenes of a process."""
-    known, kept = _of_sdf.get(sdf, (nodes, None))
-    if kept is None or not np.array_equal(known, nodes):
+    known, split, kept = _of_sdf.get(sdf, (nodes, pieces, None))
+    if kept is None or split is not pieces or not np.array_equal(known, nodes):
         content = digest(sdf, nodes, pieces)
         kept = _of_content.pop(content, None) or _looked_at(sdf, nodes, pieces)
-        _of_sdf[sdf], _of_content[content] = (nodes, kept), kept
+        _of_sdf[sdf], _of_content[content] = (nodes, pieces, kept), kept
         if len(_of_content) > MOST_KEPT:
             _of_content.popitem(last=False)
     return kept
 
 
-def _looked_at(sdf: Sdf, nodes: np.ndarray, pieces: tuple[np.ndarray, ...]) -> Geometry:
+def _looked_at(sdf: Sdf, nodes: np.ndarray, pieces: Pieces) -> Geometry:
     grid = None if isinstance(sdf, ClosedForm) else baked(sdf, nodes, pieces)
     extent = 0.0 if isinstance(sdf, PlaneSdf) else float(np.ptp(sdf.bounds, axis=0).max())
     if grid and grid.thickness <= 1.001 * WALL * grid.cell:

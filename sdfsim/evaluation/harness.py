@@ -175,12 +175,13 @@ def draw(panels: Sequence[Panel], path: Path, *, size: tuple[float, float] = (3.
             axis.errorbar(line.x, line.y, yerr=line.noise, fmt=marker, capsize=2, **style)
         for letter in panel.log:
             getattr(axis, f"set_{letter}scale")("log")
+            getattr(axis, f"{letter}axis").set_minor_formatter(pyplot.matplotlib.ticker.LogFormatter())
         if panel.limit:
             axis.axhline(panel.limit, color="tab:red", linewidth=0.8, linestyle=":")
         axis.set_title(panel.title, fontsize=8)
         axis.set_xlabel(panel.x, fontsize=8)
         axis.set_ylabel(panel.y, fontsize=8)
-        axis.tick_params(labelsize=7)
+        axis.tick_params(which="both", labelsize=7)
         axis.grid(alpha=0.3)
         axis.legend(fontsize=6, **({"bbox_to_anchor": (1, 1), "loc": "upper left"} if len(panel.lines) > 8 else {}))
     path.parent.mkdir(parents=True, exist_ok=True)

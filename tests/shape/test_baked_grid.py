@@ -56,6 +56,14 @@ def test_where_pieces_are_known_the_grid_is_of_these():
     np.testing.assert_allclose(module.interpolated(grid, above), [0.01, 0.01, 0.05], atol=2 * grid.error)
 
 
+def test_what_is_known_of_a_shape_with_pieces_is_not_taken_for_one_without():
+    bar, pieces = with_sdf(analytic_shape("box", size=(2.0, 0.4, 0.4)), "mesh"), tuple(two_halves())
+    above = np.array([[0.5, 0.0, 0.15]])
+    for known, want in ((pieces, 0.05), ((), -0.05), (pieces, 0.05)):
+        grid = _geometry(bar.sdf, bar.nodes, known).grid
+        np.testing.assert_allclose(module.interpolated(grid, above), [want], atol=2 * grid.error)
+
+
 def test_the_surface_of_pieces_has_a_patch_for_each():
     pieces = two_halves()
     bar = with_sdf(analytic_shape("box", size=(2.0, 0.4, 0.4)), "mesh")
