@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -42,7 +41,7 @@ from sdfsim.evaluation import engines
 from sdfsim.evaluation.engines import Engine, in_metres, ours, rollout_motion, start_of_scene
 from sdfsim.evaluation.evaluate import load_recorded
 from sdfsim.evaluation.hard_cases import ball, body, box, on_floor
-from sdfsim.evaluation.harness import Job, Results, markdown, measure, number, peak_memory
+from sdfsim.evaluation.harness import Job, Results, markdown, measure, number, one_thread, peak_memory
 from sdfsim.evaluation.penetration import depths
 from sdfsim.export import convex_pieces
 from sdfsim.files import read_arrays, write_arrays, write_text
@@ -238,6 +237,7 @@ def scenes_of(case: str, data: Path | None, folder: Path) -> list[Scene]:
     return scenes
 
 
+@one_thread()
 def measured(name: str, case: str, data: Path | None, folder: Path) -> dict[str, Any]:
     """What every inner step costs an engine in a case.
 
@@ -246,7 +246,6 @@ def measured(name: str, case: str, data: Path | None, folder: Path) -> dict[str,
         the engine's own finest motion, both over the smallest body's size; lost, bodies that are where they cannot be.
         prepare_s and mib once.
     """
-    torch.set_num_threads(1)
     scenes = scenes_of(case, data, folder)
     steps, inners = (HEAP_STEPS, (USUAL,)) if case in LARGE else (STEPS, INNER)
     size = [min(largest_extent(s.shapes[b.shape]) * b.scale for b in s.bodies if b.motion == "dynamic") for s in scenes]
@@ -346,9 +345,9 @@ def shapes(data: Path, *, out: Path, only: list[str] = SHAPES) -> None:
         print(found)
 
 
+@one_thread()
 def turns(data: Path, *, out: Path, rounds: int = 7) -> None:
     """The fast engines in turn, again and again: what a shared machine does to one of them it does to all."""
-    torch.set_num_threads(1)
     rows: list[tuple[str, ...]] = [("case, ms per s at 4 ms", *FAST, *(f"sdfsim / {name}" for name in FAST[1:]))]
     for k, case in enumerate(SHAPES):
         scenes = scenes_of(case, data, out / "scenes")

@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -38,7 +37,7 @@ from sdfsim.dynamics.simulator import SimulationError, Simulator, join
 from sdfsim.dynamics.units import scene_units
 from sdfsim.evaluation.engines import Engine, bullet, in_metres, mujoco, rollout_motion, start_of_scene
 from sdfsim.evaluation.hard_cases import body, box, on_floor
-from sdfsim.evaluation.harness import Job, Panel, cells, draw, line, markdown, measure, number, peak_memory
+from sdfsim.evaluation.harness import Job, Panel, cells, draw, line, markdown, measure, number, one_thread, peak_memory
 from sdfsim.evaluation.penetration import depths
 from sdfsim.parallel import cluster, parallel
 from sdfsim.scene.scene import Scene
@@ -64,9 +63,9 @@ def with_nodes_cut(scene: Scene, keep: float) -> Scene:
     return replace(scene, shapes=shapes)
 
 
+@one_thread()
 def ours(source: Path | int, steps: int, model: str, keep: float = 1.0) -> dict:
     """What a scene (its file, or so many boxes `apart`) costs with a model, and how deep bodies are in each other."""
-    torch.set_num_threads(1)
     scene = apart(source) if isinstance(source, int) else with_nodes_cut(load_scene(source), keep)
     frames, broken = [], None
     with peak_memory() as memory:

@@ -204,13 +204,17 @@ def check_matplotlib() -> Any:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """torch computes in one thread inside the block, whose time is then the processor's."""
-    before = torch.get_num_threads()
+    """torch and the compiled step compute in one thread inside the block, whose time is then the processor's."""
+    import numba
+
+    before = torch.get_num_threads(), numba.get_num_threads()
     torch.set_num_threads(1)
+    numba.set_num_threads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        torch.set_num_threads(before[0])
+        numba.set_num_threads(before[1])
 
 
 @contextmanager
