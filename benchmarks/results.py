@@ -30,6 +30,8 @@ def script(doc: str | None, *functions: Callable[..., None]) -> None:
         hints = typing.get_type_hints(function)
         for name, parameter in inspect.signature(function).parameters.items():
             hint, usual, needed = hints[name], parameter.default, parameter.default is parameter.empty
+            if type(None) in typing.get_args(hint):
+                hint = typing.get_args(hint)[0]
             given: dict[str, Any] = {"type": (*typing.get_args(hint), hint)[0], "default": None if needed else usual}
             if typing.get_origin(hint) is list:
                 given["nargs"] = "+"

@@ -21,6 +21,10 @@ def many(data: list[Path], *, out: Path, minutes: list[float] = [5.0], seeds: in
     SEEN.append((data, out, minutes, seeds))
 
 
+def cut(*, at: list[str] | None = None, share: float | None = None) -> None:
+    SEEN.append((at, share))
+
+
 @pytest.mark.parametrize(
     ("line", "functions", "seen"),
     [
@@ -28,6 +32,8 @@ def many(data: list[Path], *, out: Path, minutes: list[float] = [5.0], seeds: in
         ("here --quick", [few], (Path("here"), True)),
         ("few here", [few, many], (Path("here"), False)),
         ("many a b -o c --minutes 2 5 --seeds 3", [few, many], ([Path("a"), Path("b")], Path("c"), [2.0, 5.0], 3)),
+        ("", [cut], (None, None)),
+        ("--at left 3,4 --share 0.5", [cut], (["left", "3,4"], 0.5)),
         ("many a --out c", [few, many], ([Path("a")], Path("c"), [5.0], None)),
     ],
 )
