@@ -29,9 +29,9 @@ def script(doc: str | None, *functions: Callable[..., None]) -> None:
         own.set_defaults(function=function)
         hints = typing.get_type_hints(function)
         for name, parameter in inspect.signature(function).parameters.items():
-            hint, usual, needed = hints[name], parameter.default, parameter.default is parameter.empty
-            if type(None) in typing.get_args(hint):
-                hint = typing.get_args(hint)[0]
+            usual, needed = parameter.default, parameter.default is parameter.empty
+            hint, *other = typing.get_args(hints[name]) or [hints[name]]
+            hint = hint if type(None) in other else hints[name]
             given: dict[str, Any] = {"type": (*typing.get_args(hint), hint)[0], "default": None if needed else usual}
             if typing.get_origin(hint) is list:
                 given["nargs"] = "+"
