@@ -41,7 +41,7 @@ def script(doc: str | None, *functions: Callable[..., None]) -> None:
                 names = [f"--{name.replace('_', '-')}", *(["-o"] if name == "out" else [])]
                 own.add_argument(*names, required=needed, **given)
             else:
-                own.add_argument(name, **given, **({} if needed else {"nargs": "?"}))
+                own.add_argument(name, **(given if needed else given | {"nargs": "?"}))
     chosen = vars(parser.parse_args())
     run_main(lambda: chosen.pop("function")(**chosen))
 
