@@ -357,9 +357,7 @@ def turns(data: Path, *, out: Path, rounds: int = 7) -> None:
         ])[1:]  # the first loads and compiles  # fmt: skip
         told((k + 1) / len(SHAPES), case)
         figures = [*taken.T, *(taken[:, :1] / taken[:, 1:]).T]
-        rows.append(
-            (case, *("{} ({} to {})".format(*(number(q(f)) for q in (np.median, np.min, np.max))) for f in figures))
-        )
+        rows.append((case, *(f"{number(np.median(f))} ({number(f.min())} to {number(f.max())})" for f in figures)))
     write_section("rivals in turn", "python benchmarks/rivals.py turns DATA -o DIR", markdown(rows))
 
 

@@ -95,7 +95,7 @@ class ClosedForm:
         return np.outer([-1.0, 1.0], self._reach())
 
     def _reach(self) -> tuple[float, ...]:
-        """(x, y, z) m, its half extents."""
+        """(x, y, z) m, its half extents. A plane has none and gives its `bounds` itself, so this is not abstract."""
         raise NotImplementedError
 
     def _measure(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
