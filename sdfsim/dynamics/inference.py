@@ -5,10 +5,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from functools import cache
 from typing import cast
 
 import numpy as np
 import torch
+from threadpoolctl import ThreadpoolController
 from torch import Tensor, nn
 
 from sdfsim.dynamics import kernels
@@ -73,9 +75,17 @@ def corrected(
     its own; those of a pair of bodies stand together."""
     after = [tensor.clone() for tensor in _poses(solved)]
     start, end = (compiled.Poses(*(t.contiguous().numpy() for t in some)) for some in (_poses(before), after))
-    compiled.correct(weights, world, start, end, edges.pair, edges.value, terms_of(rules, known))
+    with _blas().limit(limits=1):
+        compiled.correct(weights, world, start, end, edges.pair, edges.value, terms_of(rules, known))
     position, orientation, velocity, angular = after
     return replace(solved, position=position, orientation=orientation, velocity=velocity, angular_velocity=angular)
+
+
+@cache
+def _blas() -> ThreadpoolController:
+    """The matrix libraries that the compiled network calls. With layers as small as its own, a second thread of theirs
+    doubles the processor time and ends no sooner."""
+    return ThreadpoolController().select(user_api="blas")
 
 
 def terms_of(rules: StepOptions, known: float) -> compiled.Terms:

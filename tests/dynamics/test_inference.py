@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import torch
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from sdfsim.data.batching import roll_out
 from sdfsim.data.dataset import Trajectory
@@ -204,6 +205,25 @@ def test_the_same_steps_give_the_same_bits():
     one, other = (Simulator(pile(2), model_of("random")).run(steps=20) for _ in range(2))
     for name in POSE:
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+def test_matrices_of_the_network_take_one_thread(monkeypatch):
+    """Inside a step. Afterwards their library has its threads again."""
+
+    def threads() -> set[int]:
+        return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+    seen, correct = [], inference.compiled.correct
+
+    def watched(*given):
+        seen.append(threads())
+        correct(*given)
+
+    monkeypatch.setattr(inference.compiled, "correct", watched)
+    with threadpool_limits(3, "blas"):
+        Simulator(pile(2), model_of("random")).run(steps=10)
+        assert threads() == {3}
+    assert seen and all(counts == {1} for counts in seen)
 
 
 @pytest.mark.parametrize("sizes", [{"width": 0}, {"rounds": 0}])
