@@ -85,6 +85,8 @@ def corrected(
 def _blas() -> ThreadpoolController:
     """The matrix libraries that the compiled network calls. With layers as small as its own, a second thread of theirs
     doubles the processor time and ends no sooner."""
+    import scipy.linalg.cython_blas  # noqa: F401  # numba's np.dot loads it when it first runs, too late to be listed
+
     return ThreadpoolController().select(user_api="blas")
 
 

@@ -1,7 +1,9 @@
 """The compiled network against its form in torch, in double precision, step by step; and what it must never do."""
 
+import sys
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from subprocess import run
 
 import numpy as np
 import pytest
@@ -224,6 +226,15 @@ def test_matrices_of_the_network_take_one_thread(monkeypatch):
         Simulator(pile(2), model_of("random")).run(steps=10)
         assert threads() == {3}
     assert seen and all(counts == {1} for counts in seen)
+
+
+def test_the_library_of_its_matrices_is_known_before_they_are_multiplied():
+    code = (
+        "from sdfsim.dynamics.inference import _blas; known = len(_blas().info())\n"
+        "import scipy.linalg.cython_blas; from threadpoolctl import threadpool_info\n"
+        "assert known == sum(library['user_api'] == 'blas' for library in threadpool_info()) > 0"
+    )
+    assert run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 @pytest.mark.parametrize("sizes", [{"width": 0}, {"rounds": 0}])
