@@ -8,9 +8,7 @@ from typing import Annotated
 import typer
 
 from pipeline.commands import distill, fit, mesh, poses, reconstruct
-from sdfsim.commands.learning import dataset, evaluate, train
-from sdfsim.commands.simulating import export, identify, info, plan, render, simulate, view
-from sdfsim.commands.studying import stress, tradeoff
+from sdfsim.commands import motion
 
 YOUNG = 100_000  # new objects that Python waits for before it looks for cycles
 
@@ -43,8 +41,9 @@ def options(
     gc.set_threshold(YOUNG)
 
 
-COMMANDS = [reconstruct, poses, distill, mesh, fit, simulate, plan, view, render, identify, export]
-COMMANDS += [dataset, train, evaluate, tradeoff, stress, info]
+COMMANDS = [reconstruct, poses, distill, mesh, fit]
+COMMANDS += [motion.simulate, motion.plan, motion.view, motion.render, motion.identify, motion.export]
+COMMANDS += [motion.dataset, motion.train, motion.evaluate, motion.tradeoff, motion.stress, motion.info]
 for command in COMMANDS:
     app.command()(command)
 
