@@ -22,7 +22,6 @@ from sdfsim.shape.mesh import Mesh, clean, is_closed, normal_frame, sample_surfa
 from sdfsim.shape.mlp_sdf import Activation, MlpSdf, Tape, value_and_gradient
 from sdfsim.shape.sdf import Sdf
 from sdfsim.shape.shape import Shape
-from sdfsim.shape.soap import Soap
 from sdfsim.shape.surface_nodes import DEFAULT_COUNT, edge_nodes, hull_nodes, sample_nodes, surface_nodes, thin
 from sdfsim.shape.watertight import solidify
 
@@ -228,7 +227,10 @@ class _Run:
         self.oracle, self.plan, self.device, self._seed = oracle, plan, device, seed
         self.frame = normal_frame(oracle.bounds)
         self.mirrors = self._mirrors() if plan.activation == "wave" else (False, False, False)
-        self.pool, self.check = self._pool(0), self._check()
+        self.pool = self._pool(0)
+        # Points to judge by on the way: `CHECKED` of each of three kinds.
+        sigma = np.repeat(CHECKED_SIGMAS, CHECKED)[:, None]
+        self.check = self._sample(sigma, CHECKED, np.random.default_rng([seed, 1]))
         # Drawn on the CPU, so that points and first weights do not depend on the device.
         self.generator = torch.Generator().manual_seed(seed)
         self.parameters = [p.to(device) for p in _initial(plan, self.generator)]
@@ -248,11 +250,6 @@ class _Run:
         low, high = np.log(plan.sigmas)
         sigma = np.exp(rng.uniform(low, high, (near, 1)))
         return self._sample(sigma, plan.pool - near, rng)
-
-    def _check(self) -> Pool:
-        """Points to judge by on the way: `CHECKED` of each of three kinds."""
-        sigma = np.repeat(CHECKED_SIGMAS, CHECKED)[:, None]
-        return self._sample(sigma, CHECKED, np.random.default_rng([self._seed, 1]))
 
     def _sample(self, sigma: np.ndarray, elsewhere: int, rng: np.random.Generator) -> Pool:
         """Points with normal noise of `sigma` [N, 1] around the surface, then `elsewhere` points all over the box."""
@@ -382,3 +379,77 @@ def _layers(parameters: list[torch.Tensor], activation: Activation) -> Layers:
 def _split(parts: list[torch.Tensor]) -> Layers:
     first, hidden, last, biases, end = parts
     return [first[0], *hidden.unbind(), last[0]], [*biases[..., 0].unbind(), end[0, ..., 0]]
+
+
+class Soap:
+    """SOAP (Vyas et al., "SOAP: Improving and Stabilizing Shampoo using Adam", 2024) on a small network.
+
+    For each matrix gradient G of `parameters`, each [L, rows, columns] of L equal layers, it tracks averages of G G^T
+    and G^T G, and runs Adam in the basis of their eigenvectors, which one step of orthogonal iteration follows every
+    few updates. The first step only sets up the bases. A dimension of size 1 is not rotated.
+    """
+
+    MOMENTUM, SECOND, LEAST = 0.95, 0.95, 1e-10
+    PRECONDITIONER = 0.95
+    REFRESH = 10
+
+    def __init__(self, parameters: list[torch.Tensor], lr: float) -> None:
+        self.parameters = parameters
+        self.lr = lr
+        self.count = 0
+        self.state = [self._begin(parameter) for parameter in parameters]
+
+    def _begin(self, parameter: torch.Tensor) -> dict[str, torch.Tensor]:
+        state = {"mean": torch.zeros_like(parameter), "square": torch.zeros_like(parameter)}
+        for side, size in (("left", parameter.shape[-2]), ("right", parameter.shape[-1])):
+            if size > 1:
+                eye = torch.eye(size, dtype=parameter.dtype, device=parameter.device)
+                state[f"{side}_average"] = torch.zeros_like(eye).repeat(len(parameter), 1, 1)
+                state[f"{side}_basis"] = eye.repeat(len(parameter), 1, 1)
+        return state
+
+    @torch.no_grad()
+    def step(self, factor: float) -> None:
+        """Apply the gradients; `factor` is of the learning-rate schedule."""
+        self.count += 1
+        for parameter, state in zip(self.parameters, self.state, strict=True):
+            gradient = parameter.grad
+            assert gradient is not None
+            if self.count > 1:
+                parameter -= self.lr * factor * self._direction(gradient, state)
+            self._follow(gradient, state)
+
+    def _direction(self, gradient: torch.Tensor, state: dict[str, torch.Tensor]) -> torch.Tensor:
+        """Adam's update in the rotated basis, turned back."""
+        state["mean"].lerp_(gradient, 1 - self.MOMENTUM)
+        mean, rotated = _rotate(state["mean"], state), _rotate(gradient, state)
+        state["square"].mul_(self.SECOND).addcmul_(rotated, rotated, value=1 - self.SECOND)
+        updates = self.count - 1
+        mean = mean / (1 - self.MOMENTUM**updates)
+        root = (state["square"] / (1 - self.SECOND**updates)).sqrt_().add_(self.LEAST)
+        direction = mean.div_(root)
+        if "left_basis" in state:
+            direction = state["left_basis"] @ direction
+        return direction @ state["right_basis"].mT if "right_basis" in state else direction
+
+    def _follow(self, gradient: torch.Tensor, state: dict[str, torch.Tensor]) -> None:
+        """Update the averages of G G^T and G^T G, and now and then their eigenvectors."""
+        for side, product in (("left", gradient @ gradient.mT), ("right", gradient.mT @ gradient)):
+            average = state.get(f"{side}_average")
+            if average is None:
+                continue
+            if self.count == 1:
+                average.copy_(product)
+                scale = product.diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(1e-30)[..., None, None]
+                ridge = 1e-6 * torch.eye(product.shape[-1], dtype=product.dtype, device=product.device)
+                state[f"{side}_basis"] = torch.linalg.eigh(product / scale + ridge)[1].flip(-1)
+            else:
+                average.lerp_(product, 1 - self.PRECONDITIONER)
+                if self.count % self.REFRESH == 0:
+                    state[f"{side}_basis"] = torch.linalg.qr(average @ state[f"{side}_basis"])[0]
+
+
+def _rotate(matrix: torch.Tensor, state: dict[str, torch.Tensor]) -> torch.Tensor:
+    if "left_basis" in state:
+        matrix = state["left_basis"].mT @ matrix
+    return matrix @ state["right_basis"] if "right_basis" in state else matrix

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import torch
 
-from sdfsim.shape.soap import Soap
+from sdfsim.shape.fit import Soap
 
 
 def stack(shape: tuple[int, ...], seed: int) -> torch.Tensor:
