@@ -18,6 +18,7 @@ from sdfsim.dynamics.run_memory import PHASES
 from sdfsim.files import write_bytes
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.mesh import Mesh, face_normals, vertex_normals
+from sdfsim.shape.primitives import plane
 from sdfsim.shape.shape import Shape
 
 if TYPE_CHECKING:
@@ -353,10 +354,7 @@ def is_infinite(shape: Shape) -> bool:
 
 def shown(shape: Shape, half: float) -> Mesh:
     """The mesh that is shown at scale 1; of a plane a square, `half` m to each side."""
-    if not is_infinite(shape):
-        return shape.shown
-    corners = np.array([[-half, -half, 0.0], [half, -half, 0.0], [half, half, 0.0], [-half, half, 0.0]])
-    return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    return plane(half) if is_infinite(shape) else shape.shown
 
 
 def with_normals(mesh: Mesh) -> tuple[Mesh, np.ndarray]:

@@ -13,7 +13,7 @@ def box(size: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Mesh:
     """A box with full extents `size` m: 8 vertices, 12 faces."""
     corners = lattice([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5])
     quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
-    return clean(Mesh(corners * np.array(size), _quads(quads)), name="box")
+    return clean(Mesh(corners * np.array(size), _quads(quads)))
 
 
 def sphere(radius: float = 0.5, subdivisions: int = 3) -> Mesh:
@@ -29,23 +29,23 @@ def sphere(radius: float = 0.5, subdivisions: int = 3) -> Mesh:
         corners = np.concatenate([np.stack(part, axis=1) for part in parts])
         corners /= np.linalg.norm(corners, axis=2, keepdims=True)
     corners *= radius / np.linalg.norm(corners, axis=2, keepdims=True)
-    return clean(Mesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3)), name="sphere")
+    return clean(Mesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3)))
 
 
 def cylinder(radius: float = 0.5, height: float = 1.0, segments: int = 64) -> Mesh:
     """A cylinder along z, its middle at the origin."""
     profile = np.array([[0, -height / 2], [radius, -height / 2], [radius, height / 2], [0, height / 2]])
-    return _revolve(profile, segments, "cylinder")
+    return _revolve(profile, segments)
 
 
 def cone(radius: float = 0.5, height: float = 1.0, segments: int = 64) -> Mesh:
     """A cone along z, apex up, the middle of its height at the origin."""
-    return _revolve(np.array([[0, -height / 2], [radius, -height / 2], [0, height / 2]]), segments, "cone")
+    return _revolve(np.array([[0, -height / 2], [radius, -height / 2], [0, height / 2]]), segments)
 
 
 def torus(major: float = 0.35, minor: float = 0.15, segments: int = 64, sides: int = 32) -> Mesh:
     """A ring about z: circles of radius `minor` m around a circle of radius `major` m."""
-    return _tube(_torus_rings(major, minor, segments, sides), "torus")
+    return _tube(_torus_rings(major, minor, segments, sides))
 
 
 def gear() -> Mesh:
@@ -59,18 +59,18 @@ def gear() -> Mesh:
         np.stack([a + this, a + following, b + following, b + this], axis=1)
         for a, b in ((low_out, high_out), (high_out, high_in), (high_in, low_in), (low_in, low_out))
     ]
-    return clean(Mesh(np.concatenate(layers), _quads(np.concatenate(quads))), name="gear")
+    return clean(Mesh(np.concatenate(layers), _quads(np.concatenate(quads))))
 
 
 def torus_knot() -> Mesh:
     """A tube of radius 0.06 m along a (2, 3) torus knot."""
-    return _tube(_knot_rings(192, 24), "torus_knot")
+    return _tube(_knot_rings(192, 24))
 
 
 def bowl(radius: float = 0.5, wall: float = 0.06) -> Mesh:
     """Half of a spherical shell about the origin, of outer `radius` m and `wall` m thick, open at the top (+z)."""
     outer, inner = _bowl_profiles(radius, wall, 16)
-    return _revolve(np.concatenate([outer, inner[::-1]]), 64, "bowl")
+    return _revolve(np.concatenate([outer, inner[::-1]]), 64)
 
 
 def shoe() -> Mesh:
@@ -92,20 +92,26 @@ def shoe() -> Mesh:
     field = np.maximum(body, -np.minimum(cavity, opening))
     vertices, faces, _, _ = marching_cubes(field, 0.0, spacing=(axis[1] - axis[0],) * 3)
     vertices = vertices.astype(np.float64) + axis[0]
-    return clean(Mesh(vertices * (1.0 / np.ptp(vertices[:, 0])), faces.astype(np.int64)), name="shoe")
+    return clean(Mesh(vertices * (1.0 / np.ptp(vertices[:, 0])), faces.astype(np.int64)))
 
 
 PRIMITIVES: dict[str, Callable[..., Mesh]] = {
-    "box": box,
-    "sphere": sphere,
-    "cylinder": cylinder,
-    "cone": cone,
-    "torus": torus,
-    "gear": gear,
-    "torus_knot": torus_knot,
-    "bowl": bowl,
-    "shoe": shoe,
+    make.__name__: make for make in (box, sphere, cylinder, cone, torus, gear, torus_knot, bowl, shoe)
 }
+
+
+def spiral(count: int) -> np.ndarray:
+    """Points [count, 3] spread evenly over the unit sphere: a Fibonacci spiral."""
+    k = np.arange(count) + 0.5
+    height, turn = 1.0 - 2.0 * k / count, np.pi * (1.0 + 5.0**0.5) * k
+    ring = np.sqrt(1.0 - height**2)
+    return np.stack([ring * np.cos(turn), ring * np.sin(turn), height], axis=1)
+
+
+def plane(half: float) -> Mesh:
+    """A square at z = 0 that faces up, `half` m to each side."""
+    corners = np.array([[-half, -half, 0.0], [half, -half, 0.0], [half, half, 0.0], [-half, half, 0.0]])
+    return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
 
 
 def convex_pieces(kind: str) -> list[Mesh]:
@@ -145,21 +151,21 @@ def _spin(profile: np.ndarray, turn: float) -> np.ndarray:
     return np.stack([profile[:, 0] * np.cos(turn), profile[:, 0] * np.sin(turn), profile[:, 1]], axis=1)
 
 
-def _revolve(profile: np.ndarray, segments: int, name: str) -> Mesh:
+def _revolve(profile: np.ndarray, segments: int) -> Mesh:
     """The solid of a profile [K, 2] of (radius, z), both ends on the axis, turned about z."""
     rings = np.stack([_spin(profile, turn) for turn in 2 * np.pi * np.arange(segments) / segments])
     # On the axis all turns of a point are one vertex and half of each quad vanishes: `clean` sees to both.
-    return _tube(rings, name, len(profile) - 1)
+    return _tube(rings, len(profile) - 1)
 
 
-def _tube(rings: np.ndarray, name: str, strips: int | None = None) -> Mesh:
+def _tube(rings: np.ndarray, strips: int | None = None) -> Mesh:
     """The tube through rings [R, K, 3], the last joined to the first, of K strips around, or the first of these."""
     turns, sides = rings.shape[:2]
     this, following = np.arange(turns)[:, None], ((np.arange(turns) + 1) % turns)[:, None]
     left = np.arange(strips or sides)[None]
     right = (left + 1) % sides
     corners = (this * sides + left, following * sides + left, following * sides + right, this * sides + right)
-    return clean(Mesh(rings.reshape(-1, 3), _quads(np.stack(corners, axis=-1).reshape(-1, 4))), name=name)
+    return clean(Mesh(rings.reshape(-1, 3), _quads(np.stack(corners, axis=-1).reshape(-1, 4))))
 
 
 def _ring_hulls(rings: np.ndarray) -> list[Mesh]:

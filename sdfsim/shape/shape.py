@@ -404,13 +404,12 @@ def analytic_shape(
     """
     volume, inertia, nodes = 0.0, np.zeros((3, 3)), np.zeros((0, 3))
     if kind == "plane":
-        square = np.array([[-10, -10, 0], [10, -10, 0], [10, 10, 0], [-10, 10, 0]], dtype=np.float64)
-        sdf, mesh = PlaneSdf(), Mesh(square, np.array([[0, 1, 2], [0, 2, 3]]))
+        sdf, mesh = PlaneSdf(), primitives.plane(10.0)
     elif kind == "sphere":
         sdf = SphereSdf(float(radius))
         volume = 4.0 / 3.0 * np.pi * sdf.radius**3
         inertia = 0.4 * volume * sdf.radius**2 * np.eye(3)
-        mesh, nodes = primitives.sphere(sdf.radius), _sphere_nodes(sdf.radius, 128)
+        mesh, nodes = primitives.sphere(sdf.radius), sdf.radius * primitives.spiral(128)
     elif kind == "box":
         x, y, z = (0.5 * float(value) for value in size)
         sdf = BoxSdf((x, y, z))
@@ -454,15 +453,6 @@ def _round_nodes(radius: float, half: float, *, caps: bool, around: int = 16) ->
     tips = np.array([[0.0, 0.0, z * (half + (radius if caps else 0.0))] for z in (-1.0, 1.0)])
     placed = [np.column_stack([r * circle, np.full(around, z)]) for r, z in rings]
     return np.concatenate([*placed, tips])
-
-
-def _sphere_nodes(radius: float, count: int) -> np.ndarray:
-    """Fibonacci spiral on the sphere: [count, 3] m."""
-    number = np.arange(count) + 0.5
-    height = 1.0 - 2.0 * number / count
-    turn = np.pi * (1.0 + 5.0**0.5) * number
-    ring = np.sqrt(1.0 - height**2)
-    return radius * np.stack([ring * np.cos(turn), ring * np.sin(turn), height], axis=1)
 
 
 def _box_nodes(half: np.ndarray) -> np.ndarray:

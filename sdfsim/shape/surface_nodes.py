@@ -10,6 +10,7 @@ import numpy as np
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.distance import PiecesDistance
 from sdfsim.shape.mesh import Mesh, convex_hull, lattice, normal_frame
+from sdfsim.shape.primitives import spiral
 from sdfsim.shape.sdf import Sdf
 
 # The paper's sampling (section 3 and appendix): a grid over this half extent of the normalised frame, projected onto
@@ -125,8 +126,8 @@ class Surface:
     patch: np.ndarray  # [K] int64, the patch of each
     # [X, Y, Z] int16, the patch that is nearest to the places of a lattice; None for a single patch
     nearest: np.ndarray | None
-    low: np.ndarray  # [3] m, the first of these places; cell: m between two
-    cell: float
+    low: np.ndarray  # [3] m, the first of these places
+    cell: float  # m between two
 
 
 def surface_of(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray]) -> Surface:
@@ -176,10 +177,7 @@ def _reaching(points: np.ndarray, count: int) -> np.ndarray:
     """At most `count` of points [P, 3] whose convex hull comes nearest to that of all: in turn the outermost in the
     direction in which those before fall short the most. Evenly spread points leave gaps of a tenth of a body along a
     rim, through which it sinks into a floor."""
-    k = np.arange(DIRECTIONS) + 0.5
-    turn, height = np.pi * (1 + np.sqrt(5)) * k, 1 - 2 * k / DIRECTIONS  # a spiral over the unit sphere
-    flat = np.sqrt(1 - height**2)
-    directions = np.stack([flat * np.cos(turn), flat * np.sin(turn), height], 1)
+    directions = spiral(DIRECTIONS)
     best, most = np.zeros(DIRECTIONS, np.int64), np.full(DIRECTIONS, -np.inf)
     for start in range(0, len(points), CHUNK):
         along = directions @ points[start : start + CHUNK].T
