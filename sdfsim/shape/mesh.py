@@ -7,7 +7,8 @@ import json
 import logging
 import re
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -190,26 +191,22 @@ def write_ply(mesh: Mesh, attributes: Mapping[str, np.ndarray] | None = None) ->
 
 def read_mesh(path: Path) -> Mesh:
     """The mesh of a shape folder as `write_ply` wrote it: not cleaned, not reordered. Raises SdfsimError: damaged."""
-    try:
+    with _reading(path):
         loaded = _read(path)
         visual, colors = loaded.visual, None
         if visual.kind == "vertex":
             colors = np.array(visual.vertex_colors)[:, :3].astype(np.uint8)
         mesh = Mesh(np.array(loaded.vertices, dtype=np.float64), _faces(loaded), colors)
         _require_whole(mesh)
-        return mesh
-    except Exception as error:  # the readers raise whatever their format made them stumble over
-        raise SdfsimError(f"{path}: damaged or cut short ({error})") from error
+    return mesh
 
 
 def read_attributes(path: Path, names: Sequence[str]) -> list[np.ndarray]:
     """Properties of the vertices [V] of a PLY file that `write_ply` wrote, by their names. Raises SdfsimError where it
     is not readable or has no such property."""
-    try:
+    with _reading(path, f"damaged, or without {', '.join(names)}"):
         vertices = _read(path).metadata["_ply_raw"]["vertex"]["data"]
         return [np.array(vertices[name]) for name in names]
-    except Exception as error:  # the readers raise whatever their format made them stumble over
-        raise SdfsimError(f"{path}: damaged, or without {', '.join(names)} ({error})") from error
 
 
 def write_glb(meshes: dict[str, Mesh]) -> bytes:
@@ -231,9 +228,9 @@ def read_glb(path: Path) -> dict[str, Mesh]:
     """The meshes that `write_glb` wrote, z up, by their names. Raises SdfsimError: not readable."""
     import trimesh
 
-    try:
+    found = {}
+    with _reading(path):
         loaded: Any = trimesh.load_scene(path, process=False)
-        found = {}
         for name, drawn in loaded.geometry.items():
             image = drawn.visual.material.baseColorTexture
             if image.format != "JPEG":
@@ -243,9 +240,16 @@ def read_glb(path: Path) -> dict[str, Mesh]:
             mesh = Mesh(np.array(drawn.vertices), _faces(drawn), None, uv, np.asarray(image.convert("RGB")))
             _require_whole(mesh)
             found[str(name)] = mesh
-    except Exception as error:  # the readers raise whatever their format made them stumble over
-        raise SdfsimError(f"{path}: damaged or cut short ({error})") from error
     return found
+
+
+@contextmanager
+def _reading(path: Path, told: str = "damaged or cut short") -> Iterator[None]:
+    """Turn whatever a reader stumbles over into an SdfsimError."""
+    try:
+        yield
+    except Exception as error:
+        raise SdfsimError(f"{path}: {told} ({error})") from error
 
 
 def _require_whole(mesh: Mesh) -> None:
@@ -357,15 +361,13 @@ def load_pieces(path: str | Path) -> list[Mesh]:
     if not path.is_file():
         raise SdfsimError(f"{path}: no such mesh file")
     groups: list[list[list[float]]] = [[]]
-    try:
+    with _reading(path, "not a readable OBJ file"):
         for line in path.read_text(encoding="utf-8").splitlines():
             key, _, rest = line.strip().partition(" ")
             if key == "o":
                 groups.append([])
             elif key == "v":
                 groups[-1].append([float(number) for number in rest.split()[:3]])
-    except (UnicodeDecodeError, ValueError) as error:
-        raise SdfsimError(f"{path}: not a readable OBJ file ({error})") from error
     if not any(groups):
         raise SdfsimError(f"{path}: no vertices, so no convex pieces")
     try:
