@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from sdfsim.errors import SdfsimError
 from sdfsim.files import digest, read_arrays, user_cache, write_arrays
@@ -77,7 +76,7 @@ def bake(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = ()) -> Bake
 
     def ask(points: np.ndarray) -> np.ndarray:
         parts = np.array_split(points, -(-len(points) // CHUNK))
-        found = [union(part).distance if union else _ask(sdf, part)[0] for part in parts]
+        found = [union(part).distance if union else sdf(part)[0] for part in parts]
         return np.concatenate(found).astype(np.float32)
 
     extent = float(np.ptp(sdf.bounds, axis=0).max())
@@ -115,7 +114,7 @@ def inwards(sdf: Sdf, nodes: np.ndarray) -> np.ndarray:
     around = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1.0
     around /= np.linalg.norm(around, axis=1, keepdims=True)
     places = nodes[:, None] + reach * around
-    normal = -_ask(sdf, places.reshape(-1, 3))[1].reshape(places.shape).sum(1)
+    normal = -sdf(places.reshape(-1, 3))[1].reshape(places.shape).sum(1)
     return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
 
 
@@ -127,7 +126,7 @@ def wall_thickness(sdf: Sdf, nodes: np.ndarray) -> float:
     depth = np.geomspace(1.0 / 512.0, 0.5, 32) * extent
     inside = some[:, None] + depth[:, None] * inwards(sdf, some)[:, None]
     # From what the distance is at the node itself: a fit is a little off.
-    found = _ask(sdf, some)[0][:, None] - _ask(sdf, inside.reshape(-1, 3))[0].reshape(len(some), len(depth))
+    found = sdf(some)[0][:, None] - sdf(inside.reshape(-1, 3))[0].reshape(len(some), len(depth))
     # In a corner the distance grows half as fast as one goes; in the middle of a wall it stops growing.
     stops = np.argmax(np.concatenate([found < 0.4 * depth, np.ones((len(some), 1), bool)], 1), axis=1)
     reached = np.concatenate([depth[:1], depth])[stops]
@@ -147,9 +146,3 @@ def interpolated(grid: BakedGrid, points: np.ndarray) -> np.ndarray:
         weight = np.prod(np.where(corner, part, 1.0 - part), axis=1)
         total += weight * grid.fine[(number, *(cell + corner).T)]
     return total
-
-
-def _ask(sdf: Sdf, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    with torch.no_grad():
-        distance, gradient = sdf(torch.from_numpy(np.ascontiguousarray(points)))
-    return distance.cpu().numpy(), gradient.cpu().numpy()
