@@ -12,6 +12,7 @@ import threading
 import time
 import traceback
 from collections.abc import Sequence
+from functools import partial
 from types import FrameType, TracebackType
 from typing import Any
 
@@ -36,6 +37,10 @@ class Session:
         self._clean_up = contextlib.ExitStack()
         self._bar = _Bar()
         self.say = self._bar.say  # a line on stderr
+        # Called with the name of one stage of several (each has its own bar and ETA), the fraction (0 to 1) of the work
+        # that is done, and a message; `progress` without the name.
+        self.stage_progress = self._bar.update
+        self.progress = partial(self._bar.update, "")
 
     def __enter__(self) -> Session:
         default = signal.default_int_handler
@@ -114,14 +119,6 @@ class Session:
             self.say(why)
             with contextlib.suppress(KeyboardInterrupt):
                 threading.Event().wait()
-
-    def progress(self, fraction: float, message: str) -> None:
-        """`fraction` (0 to 1) of the work is done."""
-        self._bar.update("", fraction, message)
-
-    def stage_progress(self, stage: str, fraction: float, message: str) -> None:
-        """The same for one stage of several; each has its own bar and ETA."""
-        self._bar.update(stage, fraction, message)
 
 
 class _Bar:

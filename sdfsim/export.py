@@ -86,19 +86,11 @@ def export(
     allow_outside: bool = False,
     on_progress: StageProgress = lambda stage, fraction, message: None,
 ) -> dict[str, Any]:
-    """Write a shape, a scene or a run in the format that the ending of `out` names.
+    """Write a run (folder or rollout.npz), a scene.yaml or a Shape folder in the format that the ending of `out` names
+    (see `FORMATS`); `scene_file` is of a run, None for the one that it was made from.
 
-    Args:
-        source: a run folder or its rollout.npz, a scene.yaml, or a Shape folder.
-        out: file to write, with one of the endings of `FORMATS`; its folder is made if missing.
-        scene_file: of a run, None for the one that it was made from.
-
-    Returns:
-        A report: format, bodies, frames, files and left_out.
-
-    Raises:
-        SdfsimError: unknown ending, damaged source, an extra that is not installed, a shape without convex pieces, or
-            a file that cannot be written.
+    Returns a report: format, bodies, frames, files and left_out. Raises SdfsimError for an unknown ending, a damaged
+    source, an extra that is not installed, a shape without convex pieces, or a file that cannot be written.
     """
     source, out, scene_file = Path(source), Path(out), Path(scene_file) if scene_file else None
     kind = out.suffix.lower()

@@ -48,16 +48,8 @@ def fit(mesh_file: Path, out: Path, options: Options, *, device: str, on_progres
     shape = _kept(out, request)
     if shape is None:
         with locked(out):
-            shape = fit_mesh(
-                mesh,
-                name=out.resolve().name,
-                recipe=options.recipe,
-                budget=options.budget,
-                cap=options.cap,
-                thicken=options.thicken,
-                on_progress=on_progress,
-                device=where,
-            )
+            how = {key: value for key, value in vars(options).items() if key != "units"}
+            shape = fit_mesh(mesh, name=out.resolve().name, **how, on_progress=on_progress, device=where)
             certificate = shape.certificate | grid_certificate(shape.sdf, shape.nodes)
             shape = replace(shape, source=shape.source | {"request": request}, certificate=certificate)
             shape.save(out)
@@ -120,8 +112,8 @@ def fit_many(
 ) -> dict[str, Any]:
     """Fit many mesh files into the shape folders `out`/NAME: in processes on CPUs, one after the other on a GPU.
 
-    Returns `shapes`, by name the report of `fit` or the
-    `error` that kept a mesh from being fitted; and in `failed_checks` what missed its certificate.
+    Returns `shapes`, by name the report of `fit` or the `error` that kept a mesh from being fitted; and in
+    `failed_checks` what missed its certificate.
     """
     where, names = pick_device(device), list(meshes)
     check_writable(out)

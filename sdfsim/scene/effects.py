@@ -23,7 +23,6 @@ class Effect:
 class Plan:
     """What the simulator has to do for one scene."""
 
-    # gravity, free_flight, contact, scenery, kinematic, rotation, friction, restitution, sleep: the decisions
     gravity: Effect
     free_flight: Effect
     contact: Effect
@@ -33,8 +32,7 @@ class Plan:
     friction: Effect
     restitution: Effect
     sleep: Effect
-    # static, dynamic, kinematic_bodies: names of the bodies by how they move
-    static: tuple[str, ...]
+    static: tuple[str, ...]  # names of the bodies by how they move, as the next two
     dynamic: tuple[str, ...]
     kinematic_bodies: tuple[str, ...]
     pairs: Pairs  # which pairs of bodies may touch

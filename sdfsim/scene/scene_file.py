@@ -156,17 +156,11 @@ def _find(text: str, info: ValidationInfo) -> Path:
     return place
 
 
-def _folder(text: str, info: ValidationInfo) -> str:
-    place = _find(text, info)
-    if not place.is_dir():
-        raise _problem(f"no such folder: {place}")
-    return str(place)
-
-
-def _file(text: str, info: ValidationInfo) -> str:
-    place = _find(text, info)
-    if not place.is_file():
-        raise _problem(f"no such file: {place}")
+def _there(text: str, info: ValidationInfo) -> str:
+    """An `asset` is a folder, a `mesh` a file."""
+    place, what = _find(text, info), "folder" if info.field_name == "asset" else "file"
+    if not (place.is_dir() if what == "folder" else place.is_file()):
+        raise _problem(f"no such {what}: {place}")
     return str(place)
 
 
@@ -297,10 +291,10 @@ _WITH_SDF = ("asset", *_FITTED)  # the others have an exact SDF of their own
 class ShapeTable(Table):
     """One shape: exactly one of `asset` to `plane`, and how its distances and surface nodes are made."""
 
-    asset: Annotated[Text, AfterValidator(_folder)] | None = key(
+    asset: Annotated[Text, AfterValidator(_there)] | None = key(
         "folder that `reconstruct` or `fit` has written, from the scene's folder", None
     )
-    mesh: Annotated[Text, AfterValidator(_file)] | None = key(
+    mesh: Annotated[Text, AfterValidator(_there)] | None = key(
         "mesh file, from the scene's folder; fitted on first use, then taken from a cache", None
     )
     primitive: Primitive | None = key("a procedural shape, fitted on first use", None)
