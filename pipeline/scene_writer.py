@@ -116,9 +116,8 @@ def write_scene(
     names = [body.name for body in scene.bodies]
     for name in materials:
         if name not in names:
-            raise SdfsimError(
-                f"material: no body is called {name!r}{nearest(name, names)}", "the bodies are " + ", ".join(names)
-            )
+            told = f"material: no body is called {name!r}{nearest(name, names)}"
+            raise SdfsimError(told, "the bodies are " + ", ".join(names))
     made = hashlib.sha256(text.encode()).hexdigest()
     if scene_file.exists() and hashlib.sha256(scene_file.read_bytes()).hexdigest() not in (written, made):
         endings = itertools.chain([""], itertools.count(2))

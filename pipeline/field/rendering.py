@@ -102,7 +102,7 @@ def composite(
     field: Field, samples: Samples, geometry: tuple[Tensor, Tensor, Tensor], beta: float | Tensor, behind: Tensor
 ) -> dict[str, Tensor]:
     """Renders rays from what `field.geometry_at` gave at their samples, before a colour `behind` [R, 3] or [3]: `rgb`
-    [R, 3], `opacity` [R] inside the sphere, `depth` [R]."""
+    [R, 3] and `opacity` [R] inside the sphere."""
     sdf, features, grid = geometry
     shape = samples.distance.shape
     weights, left = render_weights(laplace_density(sdf, beta).view(shape), samples.delta)
@@ -113,11 +113,7 @@ def composite(
         (chosen,), field.color_of(features[chosen], grid[chosen], seen_along)
     )
     rgb = (weights[..., None] * color.view(*shape, 3)).sum(1)
-    return {
-        "rgb": rgb + left[:, None] * behind,
-        "opacity": 1 - left,
-        "depth": (weights * samples.distance).sum(1),
-    }
+    return {"rgb": rgb + left[:, None] * behind, "opacity": 1 - left}
 
 
 @torch.no_grad()

@@ -137,10 +137,8 @@ def _masks_that_count(source: Source, long_side: int) -> dict[Path, Path]:
 def _check_shape(path: Path, size: tuple[int, int], camera: KnownCamera | None) -> None:
     """Checks that a photo, or its depth, of this width and height is shaped like the photo of its camera."""
     if camera and camera.height and abs(size[0] / size[1] / (camera.width / camera.height) - 1) > 0.02:
-        raise SdfsimError(
-            f"{path}: shaped {size[0]} x {size[1]}, but its camera's photo {camera.width} x {camera.height}",
-            "photos and depth have to be those that the cameras were found for, uncropped, and turned the same way",
-        )
+        told = f"{path}: shaped {size[0]} x {size[1]}, but its camera's photo {camera.width} x {camera.height}"
+        raise SdfsimError(told, "give the photos and depth that the cameras were found for, uncropped and as turned")
 
 
 def notes_on(photos: list[Photo], mask_files: int) -> list[str]:

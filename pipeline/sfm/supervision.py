@@ -87,10 +87,8 @@ def depth_scale(views: list[View], sparse: Sparse, points: DepthPoints) -> dict[
         return {"scale": 1.0, "spread": USUAL, "points": len(ratio)}
     scale = float(np.median(ratio))
     if not 1 / (1 + APART) < scale < 1 + APART:
-        raise SdfsimError(
-            f"depth: the cameras say {scale:.3g} times as far as the depth does",
-            "give the unit of the depth (depth_unit_scale_factor, metres a count), or leave the depth out",
-        )
+        told = f"depth: the cameras say {scale:.3g} times as far as the depth does"
+        raise SdfsimError(told, "give its unit (depth_unit_scale_factor, metres a count), or leave it out")
     return {"scale": scale, "spread": float(np.median(np.abs(ratio / scale - 1))), "points": len(ratio)}
 
 
