@@ -104,7 +104,7 @@ def is_model(folder: Path) -> bool:
 
 def _with_cameras(cameras: Path, frames: list[KnownCamera], capture: Capture | None = None) -> Source:
     """The photos that known cameras belong to, in the order of the cameras."""
-    photos, masks, missing = [], {}, []
+    masks, missing = {}, []
     known: dict[Path, KnownCamera] = {}
     for frame in frames:
         photo = _photo_of(frame.name, cameras)
@@ -114,11 +114,11 @@ def _with_cameras(cameras: Path, frames: list[KnownCamera], capture: Capture | N
         if photo in known:
             both = f"{known[photo].name} and {frame.name}"
             raise SdfsimError(f"{cameras}: {both} are the same photo: {photo}", "remove one")
-        photos.append(photo)
         known[photo] = frame
         if frame.mask is not None and (cameras.parent / frame.mask).is_file():
             masks[photo] = cameras.parent / frame.mask
     notes = [f"{len(missing)} of {len(frames)} cameras have no photo (first: {missing[0]})"] if missing else []
+    photos = list(known)
     if len(photos) < MIN_PHOTOS:
         told = f"{cameras}: cameras with a photo: {len(photos)}, at least {MIN_PHOTOS} are needed {' '.join(notes)}"
         raise SdfsimError(told, "put the photos beside the cameras, or in a folder `images` there or just above")

@@ -41,8 +41,7 @@ def frames_of(path: Path) -> tuple[Iterator[np.ndarray], float]:
 def follow(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """First pass: how far the picture has moved up to each frame [F], in picture widths, and how sharp each is [F].
 
-    Motion is the median displacement of corners that are found again by Lucas-Kanade tracking; where most are lost (a
-    cut, or a blur) it counts as a step of its own.
+    Motion is the median displacement of corners that Lucas-Kanade tracking finds again; a step where most are lost.
     """
     import cv2
 
@@ -69,8 +68,7 @@ def follow(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def choose(moved: np.ndarray, sharp: np.ndarray) -> list[int]:
-    """Frames to use, in order: the motion is cut into equal stretches, and the sharpest frame of each is taken; at
-    least `FEWEST` where there are as many, at most `MOST`."""
+    """Frames to use, in order: the sharpest of each of `FEWEST` to `MOST` stretches of equal motion."""
     total = float(moved[-1])
     count = int(np.clip(round(total / STEP) + 1, FEWEST, MOST))
     stretch = np.minimum((moved / max(total, 1e-9) * count).astype(int), count - 1)
