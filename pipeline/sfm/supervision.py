@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from pipeline.cameras import Similarity, Sparse, View, nearest_to_axes
@@ -69,8 +70,6 @@ def depth_scale(views: list[View], sparse: Sparse, points: DepthPoints) -> dict[
     after that; `points`, how many were compared: with fewer than `FEWEST` the depth is taken as it is. Raises
     SdfsimError where they differ by more than `APART`, so that the depth cannot be that of these photos in metres.
     """
-    from scipy.spatial import KDTree
-
     ratios = []
     for number, view in enumerate(views):
         mine = points.view == number
