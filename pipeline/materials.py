@@ -77,17 +77,14 @@ def choose(given: dict[str, str]) -> dict[str, Choice]:
     for body, text in given.items():
         name, colon, thickness = text.partition(":")
         if name not in MATERIALS:
-            raise SdfsimError(
-                f"material: {body}: no such material: {name!r}{nearest(name, MATERIALS)}",
-                "there are " + ", ".join(MATERIALS),
-            )
+            told = f"material: {body}: no such material: {name!r}{nearest(name, MATERIALS)}"
+            raise SdfsimError(told, "there are " + ", ".join(MATERIALS))
         if colon and body in UNMOVED:
             raise SdfsimError(f"material: {body}: takes no thickness: it does not move, so its mass never counts")
         match = _WALL.fullmatch(thickness)
         wall = float(match[1]) * UNITS[match[2]] if match else None
         if colon and not wall:
-            raise SdfsimError(
-                f"material: {body}: {thickness!r} is not the thickness of a wall", "give one such as 4mm or 0.4cm"
-            )
+            told = f"material: {body}: {thickness!r} is not the thickness of a wall"
+            raise SdfsimError(told, "give one such as 4mm or 0.4cm")
         found[body] = Choice(name, MATERIALS[name], wall)
     return found

@@ -27,14 +27,15 @@ RECORDING = "reconstruction.rrd"
 NAMED = 10  # photos left out that the notes name; the page has them all
 PROPOSED = (255, 40, 200)  # RGB of the cameras that are proposed
 FEW_PHOTOS, LOW_PSNR, HIGH_ERROR = 20, 20.0, 1.0
+# What is below a hollow is its floor if it is thinner than this share of the hollow's depth.
+FLOOR = 0.3
 GUESSED_SHARE = 0.01  # of a body's surface, from which on a note says so
 
 
 def write_report(
     folder: Path, options: Options, records: dict[str, dict], failed: tuple[str, SdfsimError] | None = None
 ) -> dict:
-    """Writes report.json and report.md; returns the former. `failed` is the stage that ended in an error, and the
-    error."""
+    """Writes report.json and report.md; returns the former. `failed`: the stage that ended in an error, and that."""
     stages = {stage: known["report"] for stage, known in records.items()}
     seconds = {stage: round(known["seconds"], 1) for stage, known in records.items()}
     fit = stages.get("fit", {})
@@ -113,8 +114,6 @@ def notes(stages: dict[str, dict]) -> list[str]:
 
 def mesh_notes(mesh: dict) -> list[str]:
     """Those of the mesh stage, from its report."""
-    from pipeline.mesh.hollows import hollow_line
-
     lines = []
     if mesh.get("up_from") == "cameras":
         lines.append("no level plane found: up is taken from the cameras and may be off by some degrees")
@@ -141,6 +140,13 @@ def mesh_notes(mesh: dict) -> list[str]:
         lines.append(f"{mesh['weak']:.1%} of what could be photographed is weak: fewer than three photos see it, or "
                      f"all from nearly one direction{more}")  # fmt: skip
     return lines
+
+
+def hollow_line(name: str, depth: float, below: float) -> str:
+    """What the report says about a hollow body, from what `hollow` gives."""
+    if below < FLOOR * depth:
+        return f"{name}: hollow, {depth:.2g} m deep below its rim, on a floor {below:.2g} m thick"
+    return f"{name}: hollow to {depth:.2g} m below its rim as far as photos see; the {below:.2g} m below that are solid"
 
 
 def material_line(body: dict) -> str:

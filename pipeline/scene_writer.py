@@ -34,15 +34,15 @@ GAP = 0.3  # of the fall, as a share of the side
 
 def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str = "default", seed: int = 0,
               device: str = "cpu", on_progress: Progress = quiet) -> dict:  # fmt: skip
-    """Fits a compact SDF to the scenery and to every body within the budget, s; each is a Shape folder in `out` that
-    goes by its name, and those that are there already are kept. Returns a certificate for each of `shapes`, and
-    `passed`, `reason` and `caveats` for all of them."""
+    """Fits a compact SDF to scenery and bodies within the budget, s: a Shape folder each in `out`; those that are there
+    are kept. Returns a certificate for each of `shapes`, and `passed`, `reason` and `caveats` for all of them."""
     from sdfsim.shape.baked_grid import grid_certificate
     from sdfsim.shape.fit import fit_mesh
     from sdfsim.shape.shape import load_shape
 
     parts, skins = read_parts(mesh_folder), skins_of(mesh_folder)
-    weights = ({SCENERY: SCENERY_SHARE} if parts["scenery"] else {}) | dict.fromkeys(_names(parts), 1)
+    weights = {SCENERY: SCENERY_SHARE} if parts["scenery"] else {}
+    weights |= {entry["name"]: 1 for entry in parts["objects"]}
     certificates, done = {}, 0.0
     for name, weight in weights.items():
         share = weight / sum(weights.values())
@@ -100,7 +100,8 @@ def write_scene(
     as `scene.yaml.bak`. Raises SdfsimError where a material is for a body that there is not.
     """
     parts, placement = read_parts(mesh_folder), load_placement(mesh_folder)
-    solids = {name: load_mesh(mesh_folder / "objects" / f"{name}.ply") for name in _names(parts)}
+    names = [entry["name"] for entry in parts["objects"]]
+    solids = {name: load_mesh(mesh_folder / "objects" / f"{name}.ply") for name in names}
     notes: list[str] = []
     slab = None
     if drop != "none":
@@ -116,9 +117,8 @@ def write_scene(
     names = [body.name for body in scene.bodies]
     for name in materials:
         if name not in names:
-            raise SdfsimError(
-                f"material: no body is called {name!r}{nearest(name, names)}", "the bodies are " + ", ".join(names)
-            )
+            told = f"material: no body is called {name!r}{nearest(name, names)}"
+            raise SdfsimError(told, "the bodies are " + ", ".join(names))
     made = hashlib.sha256(text.encode()).hexdigest()
     if scene_file.exists() and hashlib.sha256(scene_file.read_bytes()).hexdigest() not in (written, made):
         endings = itertools.chain([""], itertools.count(2))
@@ -148,14 +148,9 @@ def bodies_of(scene: Scene, materials: dict[str, Choice]) -> dict[str, dict]:
     return found
 
 
-def _names(parts: dict) -> list[str]:
-    return [entry["name"] for entry in parts["objects"]]
-
-
 def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab | None, *, scenery: bool = True,
                drop: str = "box", materials: dict[str, Choice] | None = None, seed: int = 0) -> str:  # fmt: skip
-    """The text of scene.yaml: a floor, the scenery, the bodies that were found at their origins [3] m, and one dropped
-    from above where there is a slab."""
+    """The text of scene.yaml: a floor, the scenery, the bodies at their origins [3] m, and what a slab drops."""
     assumed = " (give --size or --distance for true metres)" if placement.size_from.startswith("assumed") else ""
     made = materials or {}
     shapes: list[str] = []

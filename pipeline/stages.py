@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import os
 import shutil
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -210,11 +209,15 @@ def run_all(run: Run, stages: dict[str, bool]) -> dict:
     check_own(run.folder, COMMAND, "report.json", "report.md")
     for stage in stages:
         check_replaceable(run.place(stage))
-    with readable_errors(run.folder), locked(run.folder):
-        write_config(run.options, run.folder)
-        for stage, again in stages.items():
-            run_reported(run, stage, again=again)
-        return write_report(run.folder, run.options, current(run.folder))
+    try:
+        with locked(run.folder):
+            write_config(run.options, run.folder)
+            for stage, again in stages.items():
+                run_reported(run, stage, again=again)
+            return write_report(run.folder, run.options, current(run.folder))
+    except OSError as error:  # a full disk, or what cannot be read or written
+        message = f"{error.filename or run.folder}: {error.strerror or error}"
+        raise SdfsimError(message, "run again when this is put right: finished stages are kept") from error
 
 
 def check_apart(run: Run) -> None:
@@ -226,10 +229,8 @@ def check_apart(run: Run) -> None:
     for stage in STAGES:
         place = run.place(stage)
         if any(path.is_relative_to(place.resolve()) for path in files):
-            raise SdfsimError(
-                f"{given}: lies in {place}, where the result of the {stage} stage belongs",
-                "choose another -o; photos are never written to",
-            )
+            told = f"{given}: lies in {place}, where the result of the {stage} stage belongs"
+            raise SdfsimError(told, "choose another -o; photos are never written to")
 
 
 def run_reported(run: Run, stage: str, *, again: bool) -> None:
@@ -308,10 +309,8 @@ def read_record(place: Path) -> dict | None:
 def check_replaceable(place: Path) -> None:
     """Raises SdfsimError where anything but an earlier result lies at a stage's place: that is never replaced."""
     if os.path.lexists(place) and read_record(place) is None:
-        raise SdfsimError(
-            f"{place}: in the way, and not replaced: sdfsim did not write it (it holds no {RECORD})",
-            "choose another folder to write to, or move it away",
-        )
+        told = f"{place}: in the way, and not replaced: sdfsim did not write it (it holds no {RECORD})"
+        raise SdfsimError(told, "choose another folder to write to, or move it away")
 
 
 def begin(work: Path, wanted: str, *, fresh: bool) -> Path:
@@ -355,13 +354,3 @@ def finish(work: Path, place: Path, wanted: str, inputs: str, report: dict, seco
 
 def _old(place: Path) -> Path:
     return place.with_name(f".{place.name}.old")
-
-
-@contextlib.contextmanager
-def readable_errors(folder: Path) -> Iterator[None]:
-    """Turns a full disk, or what cannot be read or written, into an SdfsimError of one clear line."""
-    try:
-        yield
-    except OSError as error:
-        message = f"{error.filename or folder}: {error.strerror or error}"
-        raise SdfsimError(message, "run again when this is put right: finished stages are kept") from error

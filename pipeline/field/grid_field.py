@@ -140,17 +140,12 @@ class GridField(Field):
     def finest(self) -> float:
         return level_step(self.size.levels, len(self.size.levels))
 
-    def features(self, points: Tensor) -> Tensor:
-        """Grid features [P, F] at points [P, 3]; zeros for levels that are not active yet."""
-        found = [interpolate(grid, points) for grid in list(self.grids)[: self.active]]
-        missing = sum(self.size.channels[self.active :])
-        if missing:
-            found.append(points.new_zeros(len(points), missing))
-        return torch.cat(found, 1)
-
     def geometry_at(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """SDF [P], geometry features [P, 13] and grid features [P, F] at points [P, 3] of normalised space."""
-        features = self.features(points)
+        found = [interpolate(grid, points) for grid in list(self.grids)[: self.active]]
+        if missing := sum(self.size.channels[self.active :]):  # levels that are not active yet
+            found.append(points.new_zeros(len(points), missing))
+        features = torch.cat(found, 1)
         hidden = self.head(self.geometry(torch.cat([points, features], 1)))
         base = points.norm(dim=1) - self.start_radius
         return base + hidden[:, 0], hidden[:, 1:], features
@@ -168,8 +163,7 @@ def stencil(points: Tensor, step: float) -> Tensor:
 
 def differences(values: Tensor, step: float) -> tuple[Tensor, Tensor]:
     """Gradient [P, 3] and Laplacian [P] by central differences from values [P, 7] on a `stencil`: over one grid cell
-    they reach all the cell's corners, where an analytic gradient touches its own (Li et al., Neuralangelo, 2023, eq.
-    3)."""
+    they reach the corners around, an analytic gradient only its own (Li et al., Neuralangelo, 2023, eq. 3)."""
     gradient = (values[:, :3] - values[:, 3:6]) / (2 * step)
     return gradient, (values[:, :6].sum(1) - 6 * values[:, 6]) / (step * step)
 

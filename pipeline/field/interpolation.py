@@ -45,7 +45,6 @@ class _Compiled(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
-        """Gradient of the grid."""
         (points,) = ctx.saved_tensors
         gradient = grads[0].new_zeros(ctx.shape)
         given = gradient.numpy(), points.numpy(), grads[0].contiguous().numpy()
@@ -57,8 +56,7 @@ class _Compiled(torch.autograd.Function):
 
 
 def _with_threads(work: Any, *given: Any) -> None:
-    """Compiled work on as many threads as torch uses, if there are so many. Not for one: threads do not survive a
-    fork."""
+    """Compiled work on torch's number of threads, if there are so many. Not for one: threads do not survive a fork."""
     before = numba.get_num_threads()
     count = min(torch.get_num_threads(), before)
     numba.set_num_threads(count)
@@ -92,7 +90,6 @@ class _WeightedRows(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
-        """Gradient of the table."""
         rows, weights = ctx.saved_tensors
         parts = (weights[..., None] * grads[0][:, None]).view(-1, ctx.shape[1])
         return grads[0].new_zeros(ctx.shape).index_add_(0, rows.view(-1), parts), None, None

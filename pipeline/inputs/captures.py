@@ -11,6 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
 from pipeline.inputs.images import read_photo, sharpness
 from pipeline.inputs.known_cameras import DepthFile, KnownCamera, lens_of, posed
@@ -50,8 +53,7 @@ def find_capture(folder: Path) -> Path | None:
 
 
 def read_capture(folder: Path) -> tuple[Capture, list[KnownCamera]]:
-    """What a Record3D or Polycam export says of its world, and its cameras, whose names are paths in `folder`. Raises
-    SdfsimError where it is damaged."""
+    """What an export says of its world, and its cameras, by their paths in `folder`. Raises SdfsimError: damaged."""
     try:
         if _metadata(folder).is_file():
             return Capture("Record3D", UP), _record3d(folder)
@@ -67,11 +69,8 @@ def _metadata(folder: Path) -> Path:
 def _record3d(folder: Path) -> list[KnownCamera]:
     """Record3D: a `.r3d` unpacked (`rgbd/N.jpg`, `N.depth`, `N.conf`), or its EXR export (`rgb/N.jpg`, `depth/N.exr`).
 
-    `metadata` holds the matrix K by columns, and a pose a frame: the quaternion x, y, z, w of the camera in the world,
-    OpenGL axes, and its position in metres.
+    `metadata` holds K by columns, and each pose: quaternion x, y, z, w (camera to world, OpenGL axes), position in m.
     """
-    from scipy.spatial.transform import Rotation
-
     about: dict[str, Any] = json.loads(_metadata(folder).read_text(encoding="utf-8"))
     same = np.reshape(about["K"], (3, 3)).T
     each = about.get("perFrameIntrinsicCoeffs")
@@ -116,8 +115,7 @@ def _polycam(folder: Path) -> list[KnownCamera]:
 
 
 def unpack(archive: Path, folder: Path) -> None:
-    """Unpacks the files of a zipped capture. Raises SdfsimError where it is damaged or no zip, too large once unpacked,
-    or has names that lead out of the folder."""
+    """Unpacks a zipped capture. Raises SdfsimError: damaged, too large unpacked, or names lead out of the folder."""
     try:
         with zipfile.ZipFile(archive) as file:
             entries = [entry for entry in file.infolist() if not entry.is_dir()]
@@ -126,9 +124,8 @@ def unpack(archive: Path, folder: Path) -> None:
             for entry in entries:
                 place = folder / entry.filename
                 if not place.resolve().is_relative_to(folder.resolve()):
-                    raise SdfsimError(
-                        f"{archive}: {entry.filename} would lie outside of the capture", "export it again"
-                    )
+                    told = f"{archive}: {entry.filename} would lie outside of the capture"
+                    raise SdfsimError(told, "export it again")
                 place.parent.mkdir(parents=True, exist_ok=True)
                 with file.open(entry) as packed, open(place, "wb") as out:
                     shutil.copyfileobj(packed, out)
@@ -158,8 +155,7 @@ def load_capture(folder: Path) -> Capture | None:
     path = Path(folder) / CAPTURE
     if not path.exists():
         return None
-    content = read_json(path, "run the photos stage again")
-    return Capture(content["app"], content["up"] and tuple(content["up"]))
+    return TypeAdapter(Capture).validate_python(read_json(path, "run the photos stage again"))
 
 
 def read_depth(file: DepthFile) -> np.ndarray:
@@ -175,17 +171,12 @@ def read_depth(file: DepthFile) -> np.ndarray:
             raise SdfsimError(f"{file.confidence}: shaped {confidence.shape}, its depth {depth.shape}")
         good &= confidence >= BELIEVED * confidence.max()
     depth = np.where(good, depth, 0)
-    return np.where(good & ~_edges(depth), depth, 0).astype(np.float32)
-
-
-def _edges(depth: np.ndarray) -> np.ndarray:
-    """Pixels [H, W] one of whose four neighbours is much nearer or farther."""
-    from scipy import ndimage
-
+    # At an edge one of the four neighbours is much nearer or farther.
     cross = ndimage.generate_binary_structure(2, 1)
     far = ndimage.maximum_filter(depth, footprint=cross)
     near = ndimage.minimum_filter(np.where(depth > 0, depth, np.inf), footprint=cross)
-    return (far - depth > EDGE * depth) | (depth - near > EDGE * near)
+    edge = (far - depth > EDGE * depth) | (depth - near > EDGE * near)
+    return np.where(good & ~edge, depth, 0).astype(np.float32)
 
 
 def _read(path: Path, shape: tuple[int, int] | None, raw: type) -> np.ndarray:

@@ -100,14 +100,12 @@ def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
 
 
 def turned_like(stored: Image.Image, size: tuple[int, int], path: Path) -> Image.Image:
-    """A mask as its photo of this size (width, height) is turned: upright, or as stored. Raises SdfsimError where
-    neither is shaped like the photo."""
+    """A mask turned as its photo of this size (width, height), upright or as stored. Raises SdfsimError: neither."""
     for image in (ImageOps.exif_transpose(stored), stored):
         if off(image, size[0] / size[1]) < 0.02:
             return image
-    raise SdfsimError(
-        f"{path}: a mask of {stored.width} x {stored.height} does not fit its photo, shaped {size[0]} x {size[1]}"
-    )
+    given = f"{stored.width} x {stored.height}"
+    raise SdfsimError(f"{path}: a mask of {given} does not fit its photo, shaped {size[0]} x {size[1]}")
 
 
 def decoded(path: Path, long_side: int) -> tuple[Image.Image, tuple[int, int], float | None, str]:
@@ -118,9 +116,8 @@ def decoded(path: Path, long_side: int) -> tuple[Image.Image, tuple[int, int], f
         with Image.open(path, formats=FORMATS) as image:
             width, height = size = image.size
             if width * height > MAX_PIXELS:
-                raise SdfsimError(
-                    f"{path}: too large ({width} x {height}, at most {MAX_PIXELS // 1_000_000} megapixels)"
-                )
+                most = f"{MAX_PIXELS // 1_000_000} megapixels"
+                raise SdfsimError(f"{path}: too large ({width} x {height}, at most {most})")
             if min(size) < MIN_SIDE:
                 raise SdfsimError(f"{path}: too small ({width} x {height}, at least {MIN_SIDE} px a side)")
             focal, camera = exif_focal(image)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from pipeline.cameras import View
 from pipeline.inputs.images import Picture
@@ -92,8 +93,7 @@ class KnownCamera:
 
 def posed(name: str, size: tuple[int, int], lens: Lens, pose: np.ndarray, mask: str | None = None,
           depth: DepthFile | None = None) -> KnownCamera:  # fmt: skip
-    """A camera by its pose [3, 4], camera to world, OpenGL axes (x right, y up, z backwards). Raises SdfsimError: no
-    pose."""
+    """A camera by its pose [3, 4], camera to world, OpenGL axes (x right, y up). Raises SdfsimError: no pose."""
     turn, place = pose[:, :3], pose[:, 3]
     if not np.isfinite(pose).all() or abs(np.linalg.det(turn)) < 1e-6:
         raise SdfsimError(f"{name}: its matrix is not a pose")
@@ -146,12 +146,10 @@ def read_transforms(path: Path) -> list[KnownCamera]:
 
 def read_model(folder: Path) -> list[KnownCamera]:
     """Cameras of a COLMAP model (its documentation, "Output Format")."""
-    from scipy.spatial.transform import Rotation
-
     binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
-    cameras = dict((_cameras_binary if binary else _cameras_text)(folder))
+    cameras, images = (_model_binary if binary else _model_text)(folder)
     found = []
-    for name, camera, quaternion, translation in (_images_binary if binary else _images_text)(folder):
+    for name, camera, quaternion, translation in images:
         model, width, height, values = cameras[camera]
         known = dict(zip(_parameters(folder, model), values, strict=True))
         fx = known.get("fx", known.get("f", 0.0))
@@ -169,48 +167,45 @@ def _parameters(folder: Path, model: str) -> list[str]:
     return names.split()
 
 
-def _lines(path: Path) -> list[str]:
-    return [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+# Of each camera by its number: model, width, height, parameters. Of each image: name, camera, quaternion, translation.
+Model = tuple[dict[int, tuple[str, int, int, list[float]]], list[tuple[str, int, Sequence[float], Sequence[float]]]]
 
 
-def _cameras_text(folder: Path) -> Iterator[tuple[int, tuple[str, int, int, list[float]]]]:
-    for line in _lines(folder / "cameras.txt"):
-        if line.strip():
-            number, model, width, height, *values = line.split()
-            yield int(number), (model, int(width), int(height), [float(v) for v in values])
-
-
-def _images_text(folder: Path) -> Iterator[tuple[str, int, tuple[float, ...], tuple[float, ...]]]:
+def _model_text(folder: Path) -> Model:
+    rows = {}
+    for name in ("cameras.txt", "images.txt"):
+        lines = (folder / name).read_text(encoding="utf-8").splitlines()
+        rows[name] = [line for line in lines if not line.startswith("#")]
+    cameras, images = {}, []
+    for number, model, width, height, *values in (line.split() for line in rows["cameras.txt"] if line.strip()):
+        cameras[int(number)] = model, int(width), int(height), [float(v) for v in values]
     # Two lines an image; the second, its points, may be empty.
-    for line in _lines(folder / "images.txt")[::2]:
-        if line.strip():
-            _, *values, camera, name = line.split(maxsplit=9)
-            numbers = tuple(float(v) for v in values)
-            yield name.strip(), int(camera), numbers[:4], numbers[4:7]
+    for line in filter(str.strip, rows["images.txt"][::2]):
+        _, *values, camera, name = line.split(maxsplit=9)
+        numbers = [float(v) for v in values]
+        images.append((name.strip(), int(camera), numbers[:4], numbers[4:7]))
+    return cameras, images
 
 
-def _cameras_binary(folder: Path) -> Iterator[tuple[int, tuple[str, int, int, list[float]]]]:
-    data = (folder / "cameras.bin").read_bytes()
-    (count,), at = struct.unpack_from("<Q", data), 8
+def _model_binary(folder: Path) -> Model:
+    data, at = (folder / "cameras.bin").read_bytes(), 8
+    cameras, images = {}, []
+    (count,) = struct.unpack_from("<Q", data)
     for _ in range(count):
         number, model, width, height = struct.unpack_from("<IiQQ", data, at)
         name = MODELS[model][0]
-        length = len(_parameters(folder, name))
-        values = struct.unpack_from(f"<{length}d", data, at + 24)
-        at += 24 + 8 * length
-        yield number, (name, width, height, list(values))
-
-
-def _images_binary(folder: Path) -> Iterator[tuple[str, int, tuple[float, ...], tuple[float, ...]]]:
-    data = (folder / "images.bin").read_bytes()
-    (count,), at = struct.unpack_from("<Q", data), 8
+        values = struct.unpack_from(f"<{len(_parameters(folder, name))}d", data, at + 24)
+        at += 24 + 8 * len(values)
+        cameras[number] = name, width, height, list(values)
+    data, at = (folder / "images.bin").read_bytes(), 8
+    (count,) = struct.unpack_from("<Q", data)
     for _ in range(count):
         values = struct.unpack_from("<I7dI", data, at)
         end = data.index(b"\0", at + 64)
-        name = data[at + 64 : end].decode("utf-8")
         (points,) = struct.unpack_from("<Q", data, end + 1)
+        images.append((data[at + 64 : end].decode("utf-8"), values[8], values[1:5], values[5:8]))
         at = end + 9 + 24 * points
-        yield name, values[8], values[1:5], values[5:8]
+    return cameras, images
 
 
 def scaled(known: KnownCamera, width: int, height: int) -> np.ndarray:
@@ -224,8 +219,7 @@ def scaled(known: KnownCamera, width: int, height: int) -> np.ndarray:
 def rectified(picture: Picture, known: KnownCamera, name: str, source: str) -> tuple[Picture, View, Lens | None]:
     """A photo as a pinhole camera in the same place would have taken it, that camera, and the lens it was freed from.
 
-    Nothing is resampled where the lens has no distortion: then there is no lens. Elsewhere the photo is cut to what the
-    lens shows of the pinhole's picture all over.
+    Where nothing is distorted there is no lens and nothing is resampled; else the photo is cut to what is shown.
     """
     height, width = picture.pixels.shape[:2]
     matrix, bent, lens = scaled(known, width, height), known.lens, None

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from pydantic import TypeAdapter
 
 from pipeline.cameras import View, save_views
 from pipeline.inputs.captures import CAPTURE, read_depth, spread, unpack
@@ -55,8 +56,7 @@ def prepare_photos(
     """Reads every photo (see `find_source`) and writes upright copies of at most `long_side` px to `out`.
 
     Writes `images/NNNN.jpg` and `photos.json`; where they were given, `masks/NNNN.jpg.png`, `depth/NNNN.jpg.npy`,
-    `labels/NNNN.jpg.png` with their names, `known_cameras.json` and `capture.json`. Returns the photos in order, and
-    notes for the report.
+    `labels/NNNN.jpg.png` with their names, `known_cameras.json`, `capture.json`. Returns photos, and notes to report.
     """
     source, out = find_source(given), Path(out)
     unpacked = out / ".capture"
@@ -115,7 +115,11 @@ def _pictures(source: Source, long_side: int) -> Iterator[tuple[str, Picture, Kn
             image.thumbnail((long_side, long_side), Image.Resampling.LANCZOS)
             yield name, Picture(np.asarray(image), image.size), None, fraction
         return
-    masks = _masks_that_count(source, long_side)
+    masks = source.masks
+    # They count where every photo has one, or is cut out by transparency.
+    lacking = [path for path in source.photos if path not in masks] if masks else []
+    if any(read_photo(path, long_side).mask is None for path in lacking):
+        masks = {}
     for index, path in enumerate(source.photos):
         camera = source.frames.get(path)
         shape = camera.width / camera.height if camera and camera.height else None
@@ -126,21 +130,11 @@ def _pictures(source: Source, long_side: int) -> Iterator[tuple[str, Picture, Kn
         yield source.name_of(path), picture, camera, (index + 1) / len(source.photos)
 
 
-def _masks_that_count(source: Source, long_side: int) -> dict[Path, Path]:
-    """The mask files, where every photo has one or is cut out by transparency; else none."""
-    lacking = [path for path in source.photos if path not in source.masks]
-    if source.masks and all(read_photo(path, long_side).mask is not None for path in lacking):
-        return source.masks
-    return {}
-
-
 def _check_shape(path: Path, size: tuple[int, int], camera: KnownCamera | None) -> None:
     """Checks that a photo, or its depth, of this width and height is shaped like the photo of its camera."""
     if camera and camera.height and abs(size[0] / size[1] / (camera.width / camera.height) - 1) > 0.02:
-        raise SdfsimError(
-            f"{path}: shaped {size[0]} x {size[1]}, but its camera's photo {camera.width} x {camera.height}",
-            "photos and depth have to be those that the cameras were found for, uncropped, and turned the same way",
-        )
+        told = f"{path}: shaped {size[0]} x {size[1]}, but its camera's photo {camera.width} x {camera.height}"
+        raise SdfsimError(told, "give the photos and depth that the cameras were found for, uncropped and as turned")
 
 
 def notes_on(photos: list[Photo], mask_files: int) -> list[str]:
@@ -167,11 +161,6 @@ def load_photos(folder: Path) -> list[Photo]:
     path = Path(folder) / "photos.json"
     data = read_json(path, "run the photos stage first")
     try:
-        photos = []
-        for entry in data["photos"]:
-            bent = entry["lens"]
-            lens = bent and Lens(tuple(map(tuple, bent["matrix"])), tuple(bent["distortion"]), bent["fisheye"])
-            photos.append(Photo(**{**entry, "original": tuple(entry["original"]), "lens": lens}))
-        return photos
-    except (KeyError, TypeError) as error:
+        return TypeAdapter(list[Photo]).validate_python(data["photos"])
+    except (ValueError, KeyError, TypeError) as error:
         raise SdfsimError(f"{path}: damaged", "run the photos stage again") from error

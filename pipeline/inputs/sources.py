@@ -69,10 +69,8 @@ def find_source(given: Path) -> Source:
     if given.suffix.lower() == ".json" or is_model(given):
         return _with_cameras(given, read_cameras(given))
     if given.is_file():
-        raise SdfsimError(
-            f"{given}: not a folder, a video, a transforms.json or a zipped capture",
-            "give the folder that holds the photos, not a single file",
-        )
+        told = f"{given}: not a folder, a video, a transforms.json or a zipped capture"
+        raise SdfsimError(told, "give the folder that holds the photos, not a single file")
     if (place := find_capture(given)) is not None:
         capture, frames = read_capture(place)
         return _with_cameras(place, frames, capture)
@@ -94,10 +92,8 @@ def find_photos(folder: Path) -> tuple[list[Path], list[str]]:
     other = [p.name for p in entries if p not in found and p.suffix != ".json"]
     notes = [f"{len(other)} files are not used (first: {other[0]}): {READABLE}"] if other else []
     if len(found) < MIN_PHOTOS:
-        raise SdfsimError(
-            f"{folder}: photos found: {len(found)}, at least {MIN_PHOTOS} are needed (20 to 60 are good)",
-            notes[0] if notes else "take photos around the object, each overlapping the one before by two thirds",
-        )
+        told = f"{folder}: photos found: {len(found)}, at least {MIN_PHOTOS} are needed (20 to 60 are good)"
+        raise SdfsimError(told, notes[0] if notes else "take photos all around, each overlapping the one before")
     return found, notes
 
 
@@ -108,7 +104,7 @@ def is_model(folder: Path) -> bool:
 
 def _with_cameras(cameras: Path, frames: list[KnownCamera], capture: Capture | None = None) -> Source:
     """The photos that known cameras belong to, in the order of the cameras."""
-    photos, masks, missing = [], {}, []
+    masks, missing = {}, []
     known: dict[Path, KnownCamera] = {}
     for frame in frames:
         photo = _photo_of(frame.name, cameras)
@@ -116,19 +112,16 @@ def _with_cameras(cameras: Path, frames: list[KnownCamera], capture: Capture | N
             missing.append(frame.name)
             continue
         if photo in known:
-            raise SdfsimError(
-                f"{cameras}: {known[photo].name} and {frame.name} are the same photo: {photo}", "remove one"
-            )
-        photos.append(photo)
+            both = f"{known[photo].name} and {frame.name}"
+            raise SdfsimError(f"{cameras}: {both} are the same photo: {photo}", "remove one")
         known[photo] = frame
         if frame.mask is not None and (cameras.parent / frame.mask).is_file():
             masks[photo] = cameras.parent / frame.mask
     notes = [f"{len(missing)} of {len(frames)} cameras have no photo (first: {missing[0]})"] if missing else []
+    photos = list(known)
     if len(photos) < MIN_PHOTOS:
-        raise SdfsimError(
-            f"{cameras}: cameras with a photo: {len(photos)}, at least {MIN_PHOTOS} are needed {' '.join(notes)}",
-            "the photos have to lie beside the cameras, or in a folder `images` there or up to two folders above",
-        )
+        told = f"{cameras}: cameras with a photo: {len(photos)}, at least {MIN_PHOTOS} are needed {' '.join(notes)}"
+        raise SdfsimError(told, "put the photos beside the cameras, or in a folder `images` there or just above")
     if capture is None and any(frame.depth for frame in known.values()):
         capture = Capture("transforms.json with depth", None)
     labels = find_labels(photos)

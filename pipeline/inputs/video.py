@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,15 +17,6 @@ FEWEST, MOST = 24, 100
 LEAST_MOTION = 0.5  # picture widths in all: less is no walk around anything
 # Else the decoder prints what it thinks of damaged files, past Python.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-
-
-@dataclass(frozen=True)
-class Track:
-    """What a first pass over a video finds."""
-
-    moved: np.ndarray  # [F] how far the picture has moved up to each frame, in picture widths
-    sharp: np.ndarray  # [F] sharpness of each frame
-    rate: float  # frames a second
 
 
 def frames_of(path: Path) -> tuple[Iterator[np.ndarray], float]:
@@ -48,15 +38,17 @@ def frames_of(path: Path) -> tuple[Iterator[np.ndarray], float]:
     return read(), rate
 
 
-def follow(path: Path) -> Track:
-    """First pass: motion and sharpness of every frame. Motion is the median displacement of corners that are found
-    again by Lucas-Kanade tracking; where most are lost (a cut, or a blur) it counts as a step of its own."""
+def follow(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """First pass: how far the picture has moved up to each frame [F], in picture widths, and how sharp each is [F].
+
+    Motion is the median displacement of corners that Lucas-Kanade tracking finds again; a step where most are lost.
+    """
     import cv2
 
     def shrunk(frame: np.ndarray, longest: int) -> np.ndarray:
         return cv2.resize(frame, reduced(frame.shape[1::-1], longest), interpolation=cv2.INTER_AREA)
 
-    frames, rate = frames_of(path)
+    frames, _ = frames_of(path)
     before, moved, sharp = None, [], []
     for frame in frames:
         frame = shrunk(frame, MIDDLE)
@@ -72,39 +64,33 @@ def follow(path: Path) -> Track:
                 step = float(np.median(shift)) / grey.shape[1] if kept.mean() > 0.4 else STEP
         moved.append((moved[-1] if moved else 0.0) + step)
         before = grey
-    return Track(np.array(moved), np.array(sharp), rate)
+    return np.array(moved), np.array(sharp)
 
 
-def choose(track: Track) -> list[int]:
-    """Frames to use, in order: the motion is cut into equal stretches, and the sharpest frame of each is taken; at
-    least `FEWEST` where there are as many, at most `MOST`."""
-    total = float(track.moved[-1])
+def choose(moved: np.ndarray, sharp: np.ndarray) -> list[int]:
+    """Frames to use, in order: the sharpest of each of `FEWEST` to `MOST` stretches of equal motion."""
+    total = float(moved[-1])
     count = int(np.clip(round(total / STEP) + 1, FEWEST, MOST))
-    stretch = np.minimum((track.moved / max(total, 1e-9) * count).astype(int), count - 1)
-    return [int(max(np.flatnonzero(stretch == k), key=lambda i: track.sharp[i])) for k in np.unique(stretch)]
+    stretch = np.minimum((moved / max(total, 1e-9) * count).astype(int), count - 1)
+    return [int(max(np.flatnonzero(stretch == k), key=lambda i: sharp[i])) for k in np.unique(stretch)]
 
 
 def chosen_frames(path: Path) -> Iterator[tuple[str, np.ndarray, float]]:
     """Name, pixels RGB [H, W, 3] uint8 and share done of each frame worth using. Raises SdfsimError where the video
     cannot be decoded, has hardly any frames, or (exit code 3) hardly moves."""
-    track = follow(path)
-    if len(track.sharp) < FEWEST:
-        raise SdfsimError(
-            f"{path}: only {len(track.sharp)} frames can be decoded (at least {FEWEST} are needed)",
-            "is the video whole? Convert it to MP4 (H.264), or film for longer",
-        )
-    if track.moved[-1] < LEAST_MOTION:
-        raise SdfsimError(
-            f"{path}: the picture hardly moves (by {track.moved[-1]:.2f} picture widths in all)",
-            "walk around the object while filming",
-            exit_code=EXIT_QUALITY,
-        )
-    wanted = choose(track)
+    moved, sharp = follow(path)
+    if len(sharp) < FEWEST:
+        told = f"{path}: only {len(sharp)} frames can be decoded (at least {FEWEST} are needed)"
+        raise SdfsimError(told, "is the video whole? Convert it to MP4 (H.264), or film for longer")
+    if moved[-1] < LEAST_MOTION:
+        told = f"{path}: the picture hardly moves (by {moved[-1]:.2f} picture widths in all)"
+        raise SdfsimError(told, "walk around the object while filming", exit_code=EXIT_QUALITY)
+    wanted = choose(moved, sharp)
     left = set(wanted)
-    frames, _ = frames_of(path)
+    frames, rate = frames_of(path)
     for index, frame in enumerate(frames):
         if index in left:
             left.remove(index)
-            yield f"{path.name} at {index / track.rate:.2f} s", frame, 1 - len(left) / len(wanted)
+            yield f"{path.name} at {index / rate:.2f} s", frame, 1 - len(left) / len(wanted)
         if not left:
             return

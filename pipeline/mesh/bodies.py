@@ -79,6 +79,11 @@ class Body:
     corner: np.ndarray  # [2] of the first of these, in the axes of `frame_of` the plane
     seam: Volume | None = None  # where it ends against what it touches, negative within; None where it ends by itself
 
+    def part_of(self, volume: Volume) -> tuple[slice, ...]:
+        """The samples of `own` among those of the whole volume."""
+        start = np.round((self.low - volume.low) / volume.cell).astype(int)
+        return tuple(slice(low, low + count) for low, count in zip(start, self.own.shape, strict=True))
+
     def lifted(self, points: np.ndarray) -> np.ndarray:
         """Points [P, 3], those below the top of the contact layer raised to it."""
         return points + np.maximum(self.layer - self.level.above(points), 0)[:, None] * self.level.normal
@@ -252,14 +257,11 @@ def body_mesh(body: Body, field: Distance, cell: float) -> Mesh:
 
 
 def without_bodies(volume: Volume, bodies: list[Body], field: Distance) -> Volume:
-    """The scenery alone: what bodies leave behind is empty, and their plane goes on below them. `volume` holds samples
-    of `field`, the signed distance."""
+    """Samples of `field` for the scenery alone: bodies leave emptiness behind, and their plane goes on below them."""
     values = volume.values.copy()
     for body in bodies:
-        start = np.round((body.low - volume.low) / volume.cell).astype(int)
-        part = tuple(slice(low, low + count) for low, count in zip(start, body.own.shape, strict=True))
-        shape = values[part].shape
-        points = (body.low + volume.cell * np.indices(shape).reshape(3, -1).T).astype(np.float64)
+        part = body.part_of(volume)
+        points = (body.low + volume.cell * np.indices(body.own.shape).reshape(3, -1).T).astype(np.float64)
         height, lifted, holds = body.level.above(points), body.lifted(points), body.holds(points)
         own = body.owns(lifted) | holds
         inside = values[part].reshape(-1).copy()
@@ -271,7 +273,7 @@ def without_bodies(volume: Volume, bodies: list[Body], field: Distance) -> Volum
         under = np.flatnonzero(own & (height <= 0) & (height > -2 * body.layer))
         foot = under[holds[under] | (sample(field, lifted[under]) < 0.5 * body.layer)] if len(under) else under
         inside[foot] = np.minimum(inside[foot], height[foot])
-        values[part] = inside.reshape(shape)
+        values[part] = inside.reshape(body.own.shape)
     return replace(volume, values=values)
 
 
@@ -363,10 +365,7 @@ def _told_apart(surface: Surface, body: Body, votes: Votes | None, smallest: flo
 
 def _solid(surface: Surface, body: Body) -> Solid:
     """What is solid of a body above its contact layer."""
-    volume = surface.volume
-    start = np.round((body.low - volume.low) / volume.cell).astype(int)
-    part = tuple(slice(low, low + count) for low, count in zip(start, body.own.shape, strict=True))
-    around = Volume(volume.values[part], body.low, body.cell)
+    around = Volume(surface.volume.values[body.part_of(surface.volume)], body.low, body.cell)
     inside = body.own & (around.values < 0) & (body.level.above(around.points()) > body.layer)
     return solid_of(around, inside, surface.raw)
 
@@ -424,8 +423,7 @@ def _loose(surface: Surface, votes: Votes, number: int, bodies: list[Body], up: 
 def _noise(meshes: dict[Body, Mesh], points: np.ndarray, width: float) -> list[Body]:
     """The bodies that are dark or blurred places which the training filled with something.
 
-    They are small, no masks name them, and hardly any of the sparse points [P, 3] lies within `width` of them, where
-    others are covered with points.
+    They are small, have no name, and hardly any sparse point [P, 3] within `width`, where others are covered with them.
     """
     area = np.array([face_normals(mesh)[1].sum() for mesh in meshes.values()])
     trees = [KDTree(mesh.vertices) for mesh in meshes.values()]

@@ -8,6 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.ndimage import map_coordinates, zoom
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 
 from pipeline.cameras import View
 from pipeline.field.grid_field import Field
@@ -53,8 +57,6 @@ class Volume:
 
     def at(self, points: np.ndarray) -> np.ndarray:
         """Trilinear values [P] at points [P, 3]; outside the grid those of its border."""
-        from scipy.ndimage import map_coordinates
-
         return map_coordinates(self.values, ((points - self.low) / self.cell).T, order=1, mode="nearest")
 
     def limited(self, limit: Distance) -> Volume:
@@ -66,8 +68,7 @@ class Volume:
         return replace(self, values=values)
 
     def mesh(self) -> Mesh:
-        """The zero surface by marching cubes, faces counter-clockwise from outside. Raises SdfsimError (exit code 3)
-        where the values have one sign everywhere."""
+        """The zero surface by marching cubes. Raises SdfsimError (exit code 3): the values have one sign everywhere."""
         if not self.values.min() < 0 < self.values.max():
             raise SdfsimError("mesh: the field holds no surface", "try --preset standard", exit_code=EXIT_QUALITY)
         from skimage.measure import marching_cubes
@@ -94,8 +95,6 @@ def sample_volume(
     Evaluates every `coarse`-th point first and all points only in blocks that can hold the surface, since an SDF
     changes by no more than the distance moved (a factor of 2 is left for fields that are not quite SDFs).
     """
-    from scipy.ndimage import zoom
-
     blocks = -(-(resolution - 1) // coarse)
     n = blocks * coarse + 1
     line = np.linspace(-extent, extent, n, dtype=np.float32)
@@ -166,8 +165,7 @@ def field_distance(field: Field) -> Distance:
 
 
 def trusted_vertices(mesh: Mesh, count: np.ndarray, at_limit: np.ndarray) -> np.ndarray:
-    """Vertices [V] bool of a closed mesh that enough views see (`count` [V]) and where the solid was not cut off
-    (`at_limit` [V] bool); small gaps are closed."""
+    """Vertices [V] bool that enough views see (`count` [V]) and that were not cut off (`at_limit` [V]); gaps close."""
     trusted = (count >= MIN_SEEN) & ~at_limit
     edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
     degree = np.maximum(np.bincount(edges[:, 0], minlength=len(trusted)), 1)
@@ -184,8 +182,6 @@ def surface_of(
     """The solid of a sampled field within a `limit`, given by its distance [P], and its visible surface; views and
     sparse points [P, 3] are in normalised space. Raises SdfsimError (exit code 3) where the field has no surface, or
     hardly any of it is in the photos."""
-    from scipy.spatial import KDTree
-
     raw, cell = volume.mesh(), volume.cell
     found = look(Visibility(raw, 0.75 * cell), views, photos_folder, on_progress)
     far = KDTree(points).query(raw.vertices, distance_upper_bound=MAX_FROM_POINTS)[0] > MAX_FROM_POINTS
@@ -194,10 +190,8 @@ def surface_of(
     kept, left_out = belonging(raw, faces_seen, FLOATER / 4, SPECK)
     shown = islands(raw, faces_seen & kept, FLOATER)
     if shown.sum() < 100:
-        raise SdfsimError(
-            "mesh: hardly any of the surface is visible in the photos", "check the poses; try --preset standard",
-            exit_code=EXIT_QUALITY,
-        )  # fmt: skip
+        told = "mesh: hardly any of the surface is visible in the photos"
+        raise SdfsimError(told, "check the poses; try --preset standard", exit_code=EXIT_QUALITY)
     rgb = np.where(found.weight[:, None] > 0, found.color, 255 * field_colors(field, raw))
     return Surface(volume, replace(raw, colors=to_bytes(rgb)), seen, kept, shown, left_out)
 
@@ -225,9 +219,6 @@ def keep_faces(mesh: Mesh, keep: np.ndarray) -> Mesh:
 
 def components(mesh: Mesh) -> np.ndarray:
     """Component number [F] of each face; faces that share a vertex are connected."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]]])
     count = len(mesh.vertices)
     graph = coo_matrix((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(count, count))
@@ -256,8 +247,7 @@ def belonging(mesh: Mesh, seen: np.ndarray, share: float, speck: float) -> tuple
 
 
 def islands(mesh: Mesh, faces: np.ndarray, share: float) -> np.ndarray:
-    """Of some faces [F] bool those that lie together: a patch needs this share of the area of all the faces, or of
-    those of its own component of the mesh."""
+    """Of some faces [F] bool those in patches that have this share of their area, or of that in their component."""
     _, area = face_normals(mesh)
     area = np.where(faces, area, 0)
     index = np.flatnonzero(faces)

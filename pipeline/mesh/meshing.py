@@ -17,11 +17,10 @@ from pipeline.inputs.captures import load_capture
 from pipeline.inputs.photos import load_photos
 from pipeline.mesh.bodies import Parts, split
 from pipeline.mesh.extraction import Distance, ball, field_distance, sample_volume, surface_of
-from pipeline.mesh.hollows import hollow
 from pipeline.mesh.placement import GRAVITY, Placement, Up, measured_scale, place
 from pipeline.mesh.texture import Shots, shots_of, texture_parts
 from pipeline.mesh.trust import Support, color_range, colors_of, next_photos, summary, support_of
-from pipeline.mesh.visibility import Visibility, to_bytes
+from pipeline.mesh.visibility import Visibility, hollow, to_bytes
 from pipeline.progress import Progress, quiet, share_of
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, write_bytes, write_json

@@ -61,14 +61,9 @@ class Votes:
     share: np.ndarray
 
     @property
-    def known(self) -> np.ndarray:
-        """[V] bool, vertices with votes."""
-        return self.share.sum(1) > 0
-
-    @property
     def winner(self) -> np.ndarray:
         """[V] number of the object with most votes, counted from 1; 0 for none of them, -1 where none votes."""
-        return np.where(self.known, self.share.argmax(1), -1)
+        return np.where(self.share.any(1), self.share.argmax(1), -1)
 
 
 def count_votes(sight: Visibility, faces: np.ndarray, views: list[View], photos_folder: Path,
@@ -88,20 +83,15 @@ def count_votes(sight: Visibility, faces: np.ndarray, views: list[View], photos_
     total = votes.sum(1, keepdims=True)
     share = votes / np.where(total > 0, total, 1)
     winner = np.where(total[:, 0] > 0, share.argmax(1), -1)
-    patch = _patches(faces, winner)
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    ends = ends[winner[ends[:, 0]] == winner[ends[:, 1]]]
+    graph = coo_matrix((np.ones(len(ends), np.int8), tuple(ends.T)), shape=(len(winner),) * 2)
+    patch = connected_components(graph, directed=False)[1]
     size = np.bincount(patch)
     largest = np.zeros(len(names) + 2)
     np.maximum.at(largest, winner, size[patch])
     share[size[patch] < STRAY * largest[winner]] = 0
     return Votes(names, share)
-
-
-def _patches(faces: np.ndarray, label: np.ndarray) -> np.ndarray:
-    """Number [V] of the connected patch of vertices of one label [V] that each vertex is in."""
-    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    ends = ends[label[ends[:, 0]] == label[ends[:, 1]]]
-    graph = coo_matrix((np.ones(len(ends), np.int8), tuple(ends.T)), shape=(len(label),) * 2)
-    return connected_components(graph, directed=False)[1]
 
 
 @dataclass(frozen=True)
@@ -165,8 +155,7 @@ def solid_of(volume: Volume, inside: np.ndarray, mesh: Mesh) -> Solid:
 
 
 def parts_by_votes(solid: Solid, votes: Votes) -> tuple[list[Part], int]:
-    """The parts of a solid that masks tell apart, none where there are no two; and the name's number of the whole solid
-    where it has one, else 0."""
+    """The parts of a solid that masks tell apart, none where there are no two; and the number of its one name, or 0."""
     winner = votes.winner[solid.index]
     count = np.bincount(winner[winner >= 0], minlength=len(votes.names) + 1)
     least = np.full(len(count), NAMED)
@@ -359,12 +348,8 @@ def cut(solid: Solid, label: np.ndarray, found: list[Seam], numbers: list[int]) 
                 close[close] = seam.outside(points[close]) < 0.3 * cell
                 value.reshape(-1)[close] = beyond[close]
         # What meets at an edge only does not touch.
-        beside = (
-            np.bincount(
-                part[np.asarray(ndimage.binary_dilation(part == k), bool) & (part >= 0)], minlength=len(numbers)
-            )
-            >= MEET
-        )
+        around = np.asarray(ndimage.binary_dilation(part == k), bool) & (part >= 0)
+        beside = np.bincount(part[around], minlength=len(numbers)) >= MEET
         beside[k] = False
         parts.append(Part(numbers[k], Volume(value.astype(np.float32), solid.volume.low, cell),
                           [there.index(int(other)) for other in np.flatnonzero(beside)]))  # fmt: skip

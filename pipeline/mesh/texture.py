@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from scipy.spatial import KDTree
 
 from pipeline.cameras import View
 from pipeline.inputs.photos import Photo
@@ -102,7 +103,6 @@ def fewer(mesh: Mesh, most: int) -> Mesh:
     if len(mesh.faces) <= most:
         return mesh
     import open3d as o3d
-    from scipy.spatial import KDTree
 
     given = o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.faces.astype(np.int32))

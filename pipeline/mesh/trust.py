@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from pipeline.cameras import View, focus
 from pipeline.mesh.visibility import Visibility, framed
@@ -55,8 +56,6 @@ class Support:
 
     def nearest(self, points: np.ndarray) -> Support:
         """That of the nearest vertex to each of other points [P, 3] m."""
-        from scipy.spatial import KDTree
-
         return self.at(np.asarray(KDTree(self.vertices).query(points)[1]))
 
     def attributes(self) -> dict[str, np.ndarray]:
@@ -256,8 +255,7 @@ def camera_at(place: np.ndarray, target: np.ndarray, like: View) -> View:
 
 
 def _places(views: Sequence[View], middle: np.ndarray, towards: np.ndarray, solid: Caster) -> np.ndarray:
-    """Places [C, 3] where a camera could be: around the scene, at the median distance of the given ones, in free space
-    and in sight of a given one."""
+    """Places [C, 3] for a camera: around, at the given ones' median distance, in free space and in sight of one."""
     given = np.array([view.center for view in views])
     far = float(np.median(np.linalg.norm(given - middle, axis=1)))
     height = np.degrees(np.arcsin(np.clip(-towards[:, 2], -1, 1)))

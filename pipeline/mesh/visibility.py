@@ -1,4 +1,4 @@
-"""Which points of a surface the photos show, and in which colours."""
+"""Which points of a surface photos, or a look from straight above, show; and in which colours."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from scipy.ndimage import map_coordinates
+from scipy.spatial import KDTree
 
 from pipeline.cameras import View
 from pipeline.progress import Progress, quiet
@@ -16,6 +18,7 @@ from sdfsim.shape.mesh import Mesh, vertex_normals
 
 # A point seen at a flatter angle than this (cosine) does not count as seen.
 FLATTEST = 0.08
+PLACES, FEWEST = 64, 9  # looked at along a body's longest side for hollows; that a hollow has
 
 
 @dataclass(frozen=True)
@@ -42,9 +45,28 @@ class Above:
         return np.where(np.isfinite(distance), self.top - distance, np.nan).reshape(at.shape[:-1])
 
 
+def hollow(mesh: Mesh, least: float) -> tuple[float, float] | None:
+    """How deep a body, a closed mesh in metres with z up, is hollow below its rim, and how thick what is below the
+    hollow is, m; None where it holds no water, or none deeper than `least` m."""
+    from skimage.morphology import reconstruction
+
+    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    step = float((high - low)[:2].max()) / PLACES
+    axes = [np.arange(low[k] - step, high[k] + 2 * step, step) for k in range(2)]
+    height = Above(mesh).heights(np.stack(np.meshgrid(*axes, indexing="ij"), -1))
+    through = np.isnan(height)
+    height = np.where(through, low[2], height)
+    water = reconstruction(np.where(through, height, height.max()), height, method="erosion")
+    depth = water - height
+    deep = depth > 0.5 * depth.max()
+    found = float(np.median(depth[deep])) if depth.max() > 0 else 0.0
+    if found < least or deep.sum() < FEWEST:
+        return None
+    return found, float(np.median(height[deep]) - low[2])
+
+
 class Visibility:
-    """Which vertices of a mesh which views see, lifted by `offset` along their normals, with `blocking` (or the mesh
-    itself) in the way."""
+    """Which vertices of a mesh, lifted by `offset` along normals, views see past `blocking` (or the mesh itself)."""
 
     def __init__(self, mesh: Mesh, offset: float, blocking: Caster | None = None) -> None:
         self.vertices, self.normals = mesh.vertices, vertex_normals(mesh)
@@ -98,8 +120,6 @@ def look(sight: Visibility, views: list[View], photos_folder: Path, on_progress:
 
 def bilinear(image: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Values [P, C] of an image [H, W, C] at pixel positions [P, 2] (column, row; centres at whole numbers)."""
-    from scipy.ndimage import map_coordinates
-
     channels = [map_coordinates(image[..., c], at.T[::-1], order=1, mode="nearest") for c in range(image.shape[2])]
     return np.stack(channels, -1)
 
@@ -107,8 +127,6 @@ def bilinear(image: np.ndarray, at: np.ndarray) -> np.ndarray:
 def spread_colors(points: np.ndarray, known: np.ndarray, colors: np.ndarray) -> np.ndarray:
     """Colours [P, C] at points [P, 3] from known ones [K, 3] with colours [K, C]: inverse-distance mean of the nearest.
     What no photo shows, such as the place where a body stood, gets the colours around it."""
-    from scipy.spatial import KDTree
-
     nearest = min(8, len(known))
     away, index = KDTree(known).query(points, k=nearest)
     away, index = away.reshape(len(points), nearest), index.reshape(len(points), nearest)

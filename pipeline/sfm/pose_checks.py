@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from pipeline.cameras import View, spread_angle, view_of, view_span
 from pipeline.inputs.photos import Photo
@@ -35,11 +37,7 @@ class Findings:
 
 
 def find(result: dict, photos: list[Photo]) -> Findings:
-    """Looks at a worker's counts and pairs. Blurred photos match each other, for want of anything finer; a group of
-    nothing else is no group."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
+    """Looks at a worker's counts and pairs. Blurred photos match each other: a group of nothing else is no group."""
     sound = {photo.name for photo in photos if not photo.fault}
     counts, names = result["counts"], sorted(result["counts"])
     linked = [pair for pair in result["pairs"] if pair["matches"] >= FEW_MATCHES]

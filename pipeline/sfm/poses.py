@@ -147,9 +147,8 @@ def run_worker(job: dict, folder: Path, timeout: float, on_progress: Progress) -
         try:
             while child.poll() is None:
                 if time.monotonic() - started > timeout:
-                    raise SdfsimError(
-                        f"camera poses: stopped after {timeout:.0f} s (log: {log})", "use fewer or smaller photos"
-                    )
+                    told = f"camera poses: stopped after {timeout:.0f} s (log: {log})"
+                    raise SdfsimError(told, "use fewer or smaller photos")
                 on_progress(*estimate(folder, lines, job))
                 with suppress(subprocess.TimeoutExpired):
                     child.wait(0.5)
@@ -157,10 +156,8 @@ def run_worker(job: dict, folder: Path, timeout: float, on_progress: Progress) -
             child.kill()
             child.wait()
     if child.returncode != 0:
-        raise SdfsimError(
-            f"camera poses: COLMAP failed with status {child.returncode} (log: {log})",
-            "run again; if it stays, try fewer photos",
-        )
+        told = f"camera poses: COLMAP failed with status {child.returncode} (log: {log})"
+        raise SdfsimError(told, "run again; if it stays, try fewer photos")
     return read_json(folder / "result.json")
 
 

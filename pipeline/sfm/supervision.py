@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from pipeline.cameras import Similarity, Sparse, View, nearest_to_axes
@@ -69,8 +70,6 @@ def depth_scale(views: list[View], sparse: Sparse, points: DepthPoints) -> dict[
     after that; `points`, how many were compared: with fewer than `FEWEST` the depth is taken as it is. Raises
     SdfsimError where they differ by more than `APART`, so that the depth cannot be that of these photos in metres.
     """
-    from scipy.spatial import KDTree
-
     ratios = []
     for number, view in enumerate(views):
         mine = points.view == number
@@ -87,10 +86,8 @@ def depth_scale(views: list[View], sparse: Sparse, points: DepthPoints) -> dict[
         return {"scale": 1.0, "spread": USUAL, "points": len(ratio)}
     scale = float(np.median(ratio))
     if not 1 / (1 + APART) < scale < 1 + APART:
-        raise SdfsimError(
-            f"depth: the cameras say {scale:.3g} times as far as the depth does",
-            "give the unit of the depth (depth_unit_scale_factor, metres a count), or leave the depth out",
-        )
+        told = f"depth: the cameras say {scale:.3g} times as far as the depth does"
+        raise SdfsimError(told, "give its unit (depth_unit_scale_factor, metres a count), or leave it out")
     return {"scale": scale, "spread": float(np.median(np.abs(ratio / scale - 1))), "points": len(ratio)}
 
 

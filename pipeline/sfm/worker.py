@@ -27,11 +27,6 @@ SUPPORTED = 70  # that most cameras need for any to be moved: with fewer, a doze
 TRACKED = 0.02  # m within which a phone tracks its place
 
 
-def say(message: str) -> None:
-    """One line for the parent, at once."""
-    print(message, flush=True)
-
-
 def watch_parent() -> None:
     """Ends this process when its parent is gone (killed), so that no orphan keeps computing."""
     parent = os.getppid()
@@ -106,7 +101,7 @@ def mapping(pycolmap, job: dict, database: Path, out: Path):
     def count() -> None:
         nonlocal done
         done += 1
-        say(f"placed {done}")
+        print(f"placed {done}", flush=True)  # for the parent, at once
 
     found = pycolmap.incremental_mapping(
         database, job["images"], out / "colmap", options=options, next_image_callback=count
@@ -324,11 +319,11 @@ def main(job_path: str) -> None:
     out = Path(job_path).parent
     database = out / "database.db"
     pycolmap.set_random_seed(job["seed"])
-    say("phase features")
+    print("phase features", flush=True)
     features(pycolmap, job, database)
-    say("phase matches")
+    print("phase matches", flush=True)
     matches(pycolmap, job, database)
-    say("phase mapping")
+    print("phase mapping", flush=True)
     counts, pairs = read_pairs(pycolmap, database)
     result: dict[str, Any] = {"views": [], **findings(job, counts, pairs)}
     result["focal_of_pairs"] = {} if job["known_cameras"] else focal_of_pairs(pycolmap, job, database, out)

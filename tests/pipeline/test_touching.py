@@ -16,7 +16,8 @@ from pipeline.inputs.labels import FOLDER, NAMES
 from pipeline.mesh import bodies
 from pipeline.mesh.bodies import Parts, split
 from pipeline.mesh.extraction import EXTENT, Surface, Volume, ball, sample_volume
-from pipeline.mesh.hollows import hollow, hollow_line
+from pipeline.mesh.visibility import hollow
+from pipeline.report import hollow_line
 from sdfsim.files import write_json
 from sdfsim.shape.mesh import Mesh, is_closed, signed_volume
 from tests.pipeline import photo_sets

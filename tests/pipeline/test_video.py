@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.inputs.photos import prepare_photos
-from pipeline.inputs.video import FEWEST, Track, choose, follow
+from pipeline.inputs.video import FEWEST, choose, follow, frames_of
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from tests.pipeline.photo_sets import TABLE_VASE
 
@@ -31,15 +31,15 @@ def film(path: Path, places: np.ndarray, blurred: np.ndarray | None = None) -> N
 
 def test_motion_is_measured_in_picture_widths(tmp_path):
     film(tmp_path / "a.mp4", np.arange(60) * 8)
-    track = follow(tmp_path / "a.mp4")
-    assert len(track.moved) == 60 and track.rate == 25
-    assert track.moved[-1] == pytest.approx(59 * 8 / WIDTH, rel=0.1)
+    moved, _ = follow(tmp_path / "a.mp4")
+    assert len(moved) == 60 and frames_of(tmp_path / "a.mp4")[1] == 25
+    assert moved[-1] == pytest.approx(59 * 8 / WIDTH, rel=0.1)
 
 
 def test_frames_follow_the_motion_not_the_time():
     """The camera rests for two thirds of the film: hardly a frame of these is wanted."""
     moved = np.concatenate([np.zeros(200), np.linspace(0, 6, 100)])
-    chosen = choose(Track(moved, np.ones(300), 25.0))
+    chosen = choose(moved, np.ones(300))
     assert sum(index < 200 for index in chosen) <= 2
     assert np.diff(moved[chosen]).max() < 0.15 and len(chosen) == round(6 / 0.07) + 1
 
