@@ -52,7 +52,7 @@ def moved_onto(views: list[View], about: dict[str, Any]) -> tuple[Similarity, np
     truth = {Path(f["file_path"]).stem.lstrip("0"): np.array(f["transform_matrix"]) for f in about["frames"]}
     true = np.array([truth[Path(v.source).stem.lstrip("0")] for v in views])
     move: Any = pycolmap.estimate_sim3d(np.array([v.center for v in views]), true[:, :3, 3])
-    return Similarity(move.scale, move.rotation.matrix(), move.translation), true
+    return Similarity(float(move.scale), move.rotation.matrix(), move.translation), true
 
 
 def pose_errors(views: list[View], photos: Path) -> tuple[dict[str, float], Similarity]:
