@@ -28,13 +28,14 @@ from benchmarks.results import script, write_section
 from benchmarks.scale import apart, with_nodes_cut
 from samples.large import write_scene
 from sdfsim.data.batching import scene_of
-from sdfsim.data.dataset import FLOOR, Trajectory, load_shapes, trajectory_files
+from sdfsim.data.dataset import FLOOR
 from sdfsim.dynamics.model import load_model
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.dynamics.solver import Compiled, compiled_rules, taken_up
 from sdfsim.dynamics.units import scene_units
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.engines import Start, bullet, dataset_urdf, start_of_scene
+from sdfsim.evaluation.evaluate import load_recorded
 from sdfsim.evaluation.harness import markdown, number
 from sdfsim.files import read_json, write_json
 from sdfsim.scene.scene import Scene
@@ -63,9 +64,8 @@ def solved(scene: Scene, steps: int, dt: float | None = None) -> float:
 
 def movi_b(data: Path) -> tuple[float, float]:
     """Milliseconds a step of PyBullet and of the solve, mean over trajectories."""
-    recorded = [Trajectory.load(f, as_recorded=True) for f in trajectory_files(data, "test")[:TRAJECTORIES]]
-    names = {str(n) for t in recorded for n in t.shape}
-    shapes, urdfs = load_shapes(data, names), {n: dataset_urdf(data, n) for n in names}
+    recorded, shapes = load_recorded(data, "test", most=TRAJECTORIES, as_recorded=True)
+    urdfs = {name: dataset_urdf(data, name) for name in shapes}
     engine = [bullet(Start(t, urdfs, FLOOR), STEPS)[1].wall_ms for t in recorded]
     ours = [solved(scene_of([t], [0], shapes)[0], STEPS, t.dt) for t in recorded]
     return float(np.mean(engine)), float(np.mean(ours))

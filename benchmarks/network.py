@@ -22,13 +22,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.results import script, told
 from sdfsim.data.batching import every, scene_of
-from sdfsim.data.dataset import Trajectory, load_shapes, read_info, trajectory_files
+from sdfsim.data.dataset import read_info
 from sdfsim.dynamics.model import SOLVER, load_model
 from sdfsim.dynamics.models.contact_graph import SUBSTEPS, ContactGraph
 from sdfsim.dynamics.models.impulse import Velocities
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.evaluation.engines import ours
-from sdfsim.evaluation.evaluate import evaluate
+from sdfsim.evaluation.evaluate import evaluate, load_recorded
 from sdfsim.evaluation.harness import Job, markdown, measure, one_thread
 from sdfsim.files import write_text
 from sdfsim.training.contact_cache import Solved, contact_frames, join_frames
@@ -76,9 +76,9 @@ def timed(model: str, method: Method, data: Path) -> dict[str, Any]:
     """Microseconds of a step of 20 ms, the median of scenes of the validation split, each alone in one thread."""
     used, taken = load_model(model), []
     with one_thread():
-        for file in trajectory_files(data, "validation")[:TIMED]:
-            start = every(Trajectory.load(file), method.stride)
-            scene = scene_of([start], [0], load_shapes(data, {str(n) for n in start.shape}))[0]
+        recorded, shapes = load_recorded(data, "validation", most=TIMED)
+        for start in (every(t, method.stride) for t in recorded):
+            scene = scene_of([start], [0], shapes)[0]
             simulator = Simulator(scene, used, dt=start.dt)
             substeps = method.substeps or used.inner or SUBSTEPS * method.stride
             simulator.rules = replace(simulator.rules, substeps=substeps, trust=1.0)

@@ -38,8 +38,9 @@ from sdfsim.data.dataset import engine_substep, read_info
 from sdfsim.dynamics.model import SOLVER, Model, load_model, new_network
 from sdfsim.dynamics.run_memory import Memory
 from sdfsim.dynamics.simulator import Simulator
-from sdfsim.evaluation.evaluate import errors, evaluate, load_recorded
+from sdfsim.evaluation.evaluate import evaluate, load_recorded
 from sdfsim.evaluation.harness import Job, Panel, cells, draw, line, markdown, measure, number, one_thread, peak_memory
+from sdfsim.evaluation.metrics import errors
 from sdfsim.files import write_text
 from sdfsim.scene.scene_file import load_scene
 from sdfsim.shape.fit import PLANS, fit_pieces

@@ -44,33 +44,33 @@ RENDERED = ("touching", "shelf")
 NEAR_FLOOR = 0.03  # m, below which a surface is the floor's
 
 
-def similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
-    """Least-squares similarity target = s R source + t of points [N, 3] (Umeyama, 1991)."""
-    a, b = source - source.mean(0), target - target.mean(0)
-    rotation = Rotation.align_vectors(b, a)[0].as_matrix()
-    scale = float((b * (a @ rotation.T)).sum() / (a**2).sum())
-    return Similarity(scale, rotation, target.mean(0) - scale * rotation @ source.mean(0))
+def moved_onto(views: list[View], about: dict[str, Any]) -> tuple[Similarity, np.ndarray]:
+    """The similarity that moves cameras onto the true ones of a transforms.json, and the poses [V, 4, 4] of these."""
+    import pycolmap
+
+    # Record3D numbers its photos without zeros in front.
+    truth = {Path(f["file_path"]).stem.lstrip("0"): np.array(f["transform_matrix"]) for f in about["frames"]}
+    true = np.array([truth[Path(v.source).stem.lstrip("0")] for v in views])
+    move: Any = pycolmap.estimate_sim3d(np.array([v.center for v in views]), true[:, :3, 3])
+    return Similarity(float(move.scale), move.rotation.matrix(), move.translation), true
 
 
 def pose_errors(views: list[View], photos: Path) -> tuple[dict[str, float], Similarity]:
     """Errors of the camera centres (% of the distance to the table), of rotations and focal lengths; and the move."""
     about = json.loads((photos / "transforms.json").read_text())
-    # Record3D numbers its photos without zeros in front.
-    truth = {Path(f["file_path"]).stem.lstrip("0"): np.array(f["transform_matrix"]) for f in about["frames"]}
-    true = np.array([truth[Path(v.source).stem.lstrip("0")] for v in views])
+    move, true = moved_onto(views, about)
     centers = np.array([v.center for v in views])
-    move = similarity(centers, true[:, :3, 3])
     distance = np.linalg.norm(true[:, :3, 3] - [0, 0, about["table_height"]], axis=1)
     error = 100 * np.linalg.norm(move.points(centers) - true[:, :3, 3], axis=1) / distance
     flip = np.diag([1.0, -1, -1])
     turns = [v.rotation @ move.rotation.T @ pose[:3, :3] @ flip for v, pose in zip(views, true, strict=True)]
-    angles = [np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))) for turn in turns]
+    angles = np.degrees(Rotation.from_matrix(turns).magnitude())
     return {
         "posed": len(views),
-        "of": len(truth),
+        "of": len(about["frames"]),
         "center_error_median_percent": float(np.median(error)),
         "center_error_worst_percent": float(error.max()),
-        "rotation_error_worst_degrees": float(max(angles)),
+        "rotation_error_worst_degrees": float(angles.max()),
         "focal_error_percent": 100 * abs(float(np.median([v.focal for v in views])) / about["fl_x"] - 1),
     }, move
 
@@ -88,7 +88,7 @@ def trust_errors(folder: Path, photos: Path, move: Similarity) -> list[dict[str,
     which the photos tell something, in quarters from the surest on, and the least sure twentieth; then what is guessed
     there, and what is guessed of all that the scene is made of, also where nothing is displayed.
     """
-    truth = _scene(_open3d().io.read_triangle_mesh(photos / "truth.ply"))
+    truth = _scene(_read(photos / "truth.ply"))
     bodies = [f"objects/{entry['name']}.ply" for entry in read_parts(folder / "mesh")["objects"]]
     rows: list[dict[str, Any]] = []
 
@@ -125,14 +125,15 @@ def surface_errors(folder: Path, photos: Path, move: Similarity) -> dict[str, An
     reconstruction; `complete_percent` is the share of it within 1 %. `vase`: see `vase_size`, of the bodies at its
     place and of the truth. `body`: of these bodies, 1.5 cm above what they stand on, to the truth.
     """
-    o3d = _open3d()
+    import open3d as o3d
+
     about = json.loads((photos / "transforms.json").read_text())
     width, place = about["table_width"], load_placement(folder / "mesh").to_metres
     to_unit, rotation = load_field(folder / "distill").to_unit, move.rotation
 
     def read(name: str) -> Any:
         """A mesh of the mesh stage on the true cameras."""
-        mesh: Any = o3d.io.read_triangle_mesh(folder / "mesh" / name)
+        mesh = _read(folder / "mesh" / name)
         mesh.vertices = o3d.utility.Vector3dVector(to_truth(folder, np.asarray(mesh.vertices), move))
         return mesh
 
@@ -143,7 +144,7 @@ def surface_errors(folder: Path, photos: Path, move: Similarity) -> dict[str, An
         median, p90 = np.quantile(values, [0.5, 0.9])
         return {"median": float(median), "p90": float(p90), "mean": float(values.mean())}
 
-    mesh, truth = read("mesh.ply"), o3d.io.read_triangle_mesh(photos / "truth.ply")
+    mesh, truth = read("mesh.ply"), _read(photos / "truth.ply")
     true_scene = _scene(truth)
     o3d.utility.random.seed(0)
     sampled = np.asarray(mesh.sample_points_uniformly(100_000).points)
@@ -188,15 +189,17 @@ def vase_size(mesh: Any) -> dict[str, float]:
     return {"hollow_cm": 100 * float(top - np.median(hit)), "height_cm": 100 * float(top - TABLE)}
 
 
-def _open3d() -> Any:
-    import open3d  # slow to load
+def _read(file: Path) -> Any:
+    import open3d as o3d
 
-    return open3d
+    return o3d.io.read_triangle_mesh(file)
 
 
 def _scene(mesh: Any) -> Any:
-    made, surface = _open3d().t.geometry.RaycastingScene(), _open3d().t.geometry.TriangleMesh.from_legacy(mesh)
-    made.add_triangles(surface)
+    import open3d as o3d
+
+    made = o3d.t.geometry.RaycastingScene()
+    made.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(mesh))
     return made
 
 
@@ -226,12 +229,8 @@ def captured(layout: str, out: Path) -> Path:
 def body_errors(folder: Path, photos: Path) -> dict[str, dict]:
     """Errors of every body of a run: of its sides x, y, z and its volume against the true body in the same place, %;
     and the mean distance of its vertices from that, mm, 1.5 cm above what it stands on."""
-    import open3d as o3d
-
     about = json.loads((photos / "images" / "transforms.json").read_text())
-    truth = {f["file_path"]: np.array(f["transform_matrix"])[:3, 3] for f in about["frames"]}
-    views, found = load_views(folder / "poses"), {}
-    move = similarity(np.array([v.center for v in views]), np.array([truth[v.source] for v in views]))
+    move, found = moved_onto(load_views(folder / "poses"), about)[0], {}
     true = {path.stem: load_mesh(path) for path in sorted((photos / "truth").glob("*.ply"))}
     middles = {name: (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2 for name, mesh in true.items()}
     for entry in read_parts(folder / "mesh")["objects"]:
@@ -241,7 +240,7 @@ def body_errors(folder: Path, photos: Path) -> dict[str, dict]:
         name = min(true, key=lambda name: float(np.linalg.norm(middles[name] - middle)))
         sides = np.ptp(at, axis=0) / np.ptp(true[name].vertices, axis=0) - 1
         volume = signed_volume(Mesh(at, mesh.faces)) / signed_volume(true[name]) - 1
-        surface = _scene(o3d.io.read_triangle_mesh(photos / "truth" / f"{name}.ply"))
+        surface = _scene(_read(photos / "truth" / f"{name}.ply"))
         away = surface.compute_distance(at[at[:, 2] > at[:, 2].min() + 0.015].astype(np.float32)).numpy()
         found[entry["name"]] = {
             "truth": name, "sides_percent": (100 * sides).round(1).tolist(), "volume_percent": round(100 * volume, 1),

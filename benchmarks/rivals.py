@@ -1,16 +1,16 @@
 """Our solver and what people would take instead, on shapes that are hard for them: RESULTS.md.
 
-    python benchmarks/rivals.py shapes DATA -o DIR [--only CASE ...]
+    python benchmarks/rivals.py shapes DATA -o DIR
     python benchmarks/rivals.py turns DATA -o DIR
         ours and the engines on convex pieces in turn: medians and ranges of 7 rounds at 4 ms
-    python benchmarks/rivals.py large -o DIR [--only CASE ...]
+    python benchmarks/rivals.py large -o DIR
         the first 20 steps of large scenes with inner steps of 4 ms: as they fall, and at rest
 
 DATA is a MOVi-B dataset. Every engine simulates every case with inner steps of 10, 4, 2 and 1 ms (of bodies of a
 metre; smaller ones in proportion to the root of their size), one thread, processor time. No engine is another's truth:
 an error is the distance from the same engine's motion at 1 ms. Depth is measured on the exact surfaces. Convex pieces
 are CoACD's, with one setting for all, where a shape has none of its own. Making them, tetrahedra and kernels is not
-timed. Restitution is 0, friction the same for all. DIR keeps results; the tables of all cases go to RESULTS.md.
+timed. Restitution is 0, friction the same for all. DIR keeps results.
 """
 
 from __future__ import annotations
@@ -284,45 +284,6 @@ def lost(case: str, motion: Trajectory, size: float) -> int:
     return int((gone | (height < 1.2)).sum() if case == "mugs on pegs" else gone.sum())
 
 
-def table(results: Results, cases: list[str]) -> str:
-    """A row a case and engine, by the usual inner step, and what equal depth costs."""
-    rows: list[tuple[str, ...]] = [(
-        "case", "engine", "ms per s at 4 ms", "depth, %", "away from itself at 1 ms, %", "lost",
-        f"ms per s where depth is at most {100 * DEEP:g} %", "prepared in, s", "MiB",
-    )]  # fmt: skip
-    for case in cases:
-        for name in ENGINES:
-            result = results[case, name]
-            usual = result.get("inner", {}).get(str(USUAL))
-            if usual is None:
-                why = result.get("failed") or "; ".join(result["broken"].values())
-                rows.append((case, name, why, *[""] * 6))
-                continue
-            equal = [one["ms"] for one in result["inner"].values() if one["deep"] <= DEEP and not one["lost"]]
-            rows.append((
-                case, name, number(usual["ms"]), number(100 * usual["deep"], 2),
-                number(100 * usual.get("away", np.nan), 2), str(usual["lost"]),
-                number(min(equal)) if equal else "none", number(result["prepare_s"], 2), number(result["mib"]),
-            ))  # fmt: skip
-    return markdown(rows)
-
-
-def large_table(results: Results, cases: list[str]) -> str:
-    """A row a case: time, memory and depth by engine."""
-    rows: list[tuple[str, ...]] = [("ms a simulated second / MiB / depth, %", *ENGINES)]
-    for case in cases:
-        row = [case]
-        for name in ENGINES:
-            result = results[case, name]
-            if usual := result.get("inner", {}).get(str(USUAL)):
-                gone = f", {usual['lost']} lost" if usual["lost"] else ""
-                row.append(f"{number(usual['ms'])} / {number(result['mib'])} / {number(100 * usual['deep'], 2)}{gone}")
-            else:
-                row.append(result.get("failed") or "; ".join(result["broken"].values()))
-        rows.append(tuple(row))
-    return markdown(rows)
-
-
 def compared(cases: list[str], data: Path | None, out: Path) -> Results:
     """Every engine's results of some cases."""
     for case in set(cases) & set(LARGE):
@@ -336,13 +297,29 @@ def compared(cases: list[str], data: Path | None, out: Path) -> Results:
     return measure(jobs, out / "results", where="fresh", on_progress=told)
 
 
-def shapes(data: Path, *, out: Path, only: list[str] = SHAPES) -> None:
-    """Hard shapes; the table of all of them goes to RESULTS.md."""
-    found = table(compared(only, data, out), only)
-    if only == SHAPES:
-        write_section("rivals", "python benchmarks/rivals.py shapes DATA -o DIR", found)
-    else:
-        print(found)
+def why_not(result: dict[str, Any]) -> str:
+    """Why a result has no figures at the usual inner step."""
+    return result.get("failed") or "; ".join(result["broken"].values())
+
+
+def shapes(data: Path, *, out: Path) -> None:
+    """Hard shapes: a row a case and engine, by the usual inner step, and what equal depth costs."""
+    rows: list[tuple[str, ...]] = [(
+        "case", "engine", "ms per s at 4 ms", "depth, %", "away from itself at 1 ms, %", "lost",
+        f"ms per s where depth is at most {100 * DEEP:g} %", "prepared in, s", "MiB",
+    )]  # fmt: skip
+    for (case, name), result in compared(SHAPES, data, out).items():
+        usual = result.get("inner", {}).get(str(USUAL))
+        if usual is None:
+            rows.append((case, name, why_not(result), *[""] * 6))
+            continue
+        equal = [one["ms"] for one in result["inner"].values() if one["deep"] <= DEEP and not one["lost"]]
+        rows.append((
+            case, name, number(usual["ms"]), number(100 * usual["deep"], 2),
+            number(100 * usual.get("away", np.nan), 2), str(usual["lost"]),
+            number(min(equal)) if equal else "none", number(result["prepare_s"], 2), number(result["mib"]),
+        ))  # fmt: skip
+    write_section("rivals", "python benchmarks/rivals.py shapes DATA -o DIR", markdown(rows))
 
 
 @one_thread()
@@ -361,13 +338,18 @@ def turns(data: Path, *, out: Path, rounds: int = 7) -> None:
     write_section("rivals in turn", "python benchmarks/rivals.py turns DATA -o DIR", markdown(rows))
 
 
-def large(*, out: Path, only: list[str] = LARGE) -> None:
-    """Large scenes; the table of all of them goes to RESULTS.md."""
-    found = large_table(compared(only, None, out), only)
-    if only == LARGE:
-        write_section("large rivals", "python benchmarks/rivals.py large -o DIR", found)
-    else:
-        print(found)
+def large(*, out: Path) -> None:
+    """Large scenes: a row a case, with time, memory and depth by engine."""
+    rows: dict[str, list[str]] = {case: [case] for case in LARGE}
+    for (case, _), result in compared(LARGE, None, out).items():
+        if usual := result.get("inner", {}).get(str(USUAL)):
+            figures = number(usual["ms"]), number(result["mib"]), number(100 * usual["deep"], 2)
+            gone = f", {usual['lost']} lost" if usual["lost"] else ""
+            rows[case].append(f"{' / '.join(figures)}{gone}")
+        else:
+            rows[case].append(why_not(result))
+    table = markdown([("ms a simulated second / MiB / depth, %", *ENGINES), *rows.values()])
+    write_section("large rivals", "python benchmarks/rivals.py large -o DIR", table)
 
 
 if __name__ == "__main__":

@@ -30,12 +30,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.results import script, told, write_section
 from samples.large import HEAPS, write_scene
 from sdfsim.data.batching import scene_of
-from sdfsim.data.dataset import FLOOR, Trajectory, load_shapes, trajectory_files
+from sdfsim.data.dataset import Trajectory
 from sdfsim.dynamics.model import load_model
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.simulator import SimulationError, Simulator, join
 from sdfsim.dynamics.units import scene_units
 from sdfsim.evaluation.engines import Engine, bullet, in_metres, mujoco, rollout_motion, start_of_scene
+from sdfsim.evaluation.evaluate import load_recorded
 from sdfsim.evaluation.hard_cases import body, box, on_floor
 from sdfsim.evaluation.harness import Job, Panel, cells, draw, line, markdown, measure, number, one_thread, peak_memory
 from sdfsim.evaluation.penetration import depths
@@ -194,9 +195,8 @@ def many(data: Path, *, scenes: int = 1000) -> None:
     """Write the section: scenes a second by workers."""
     from distributed import LocalCluster
 
-    recorded = [Trajectory.load(file) for file in trajectory_files(data, "train")[:DISTINCT]]
-    shapes = load_shapes(data, {str(n) for t in recorded for n in t.shape})
-    distinct = [scene_of([t], [0], shapes, FLOOR)[0] for t in recorded]
+    recorded, shapes = load_recorded(data, "train", most=DISTINCT)
+    distinct = [scene_of([t], [0], shapes)[0] for t in recorded]
     repeated = [distinct[k % len(distinct)] for k in range(scenes)]
     jobs = [(repeated[k : k + CHUNK], STEPS) for k in range(0, scenes, CHUNK)]
     rows, first = [("workers", "scenes a second", "times one worker")], 0.0

@@ -1,6 +1,6 @@
 """How good, how fast and how large our SDF networks are, beside the paper's recipe and other representations.
 
-    python benchmarks/sdf.py MESH_FOLDER -o DIR [--shapes cube,torus] [--seconds 60]
+    python benchmarks/sdf.py MESH_FOLDER -o DIR [--seconds 60]
 
 MESH_FOLDER holds NAME/visual_geometry.obj for each shape; `kubasic` downloads Kubric's. Each is fitted with our recipe
 and the paper's at equal time, with other widths of the network, and with smaller budgets; then queries of one shape are
@@ -92,33 +92,33 @@ def queries(file: Path, default: Path, paper: Path) -> dict:
     }
 
 
-def main(meshes: Path, *, out: Path, shapes: str = "", seconds: float = 60.0) -> None:
+def main(meshes: Path, *, out: Path, seconds: float = 60.0) -> None:
     files = {file.parent.name: file for file in sorted(public_folder(meshes).glob("*/visual_geometry.obj"))}
-    names = shapes.split(",") if shapes else list(files)
-    if not files or set(names) - set(files):
-        raise SdfsimError(f"{meshes}: no NAME/visual_geometry.obj of {', '.join(names) or 'any shape'}")
+    if not files:
+        raise SdfsimError(f"{meshes}: no NAME/visual_geometry.obj")
+    first = next(iter(files))
     methods = {"ours": ("default", seconds), "paper's recipe": ("paper", seconds)}
     methods |= {f"ours, {width} wide": ("default", seconds, width) for width in WIDTHS}
     methods |= {f"ours, {budget:g} s": ("default", budget) for budget in BUDGETS}
     jobs = []
-    for name in names:
+    for name, file in files.items():
         for method, plan in methods.items():
-            content = [FIT_VERSION, load_mesh(files[name]), plan, PLANS[plan[0]], machine()]
-            jobs.append(Job(name, method, content, fit, (files[name], out / "shapes" / method / name, *plan)))
+            content = [FIT_VERSION, load_mesh(file), plan, PLANS[plan[0]], machine()]
+            jobs.append(Job(name, method, content, fit, (file, out / "shapes" / method / name, *plan)))
     fits = measure(jobs, out / "results", on_progress=told)
-    fitted = [out / "shapes" / method / names[0] for method in ("ours", "paper's recipe")]
-    asked = Job(names[0], "queries", [jobs[0].content], queries, (files[names[0]], *fitted))
-    timed = measure([asked], out / "results", on_progress=told)[names[0], "queries"]
+    fitted = [out / "shapes" / method / first for method in ("ours", "paper's recipe")]
+    asked = Job(first, "queries", [jobs[0].content], queries, (files[first], *fitted))
+    timed = measure([asked], out / "results", on_progress=told)[first, "queries"]
     panels = []
     for key in ("error_within_0.01", "error_in_box"):
         ours = [*(f"ours, {b:g} s" for b in BUDGETS), "ours"]
-        lines = [line(name, [fits[name, method] for method in ours], "seconds", key) for name in names]
+        lines = [line(name, [fits[name, method] for method in ours], "seconds", key) for name in files]
         panels.append(Panel(key.replace("_", " "), "seconds", "of the largest extent", lines, "xy", EXACT[key]))
     draw(panels, out / "sdf.png")
     # Errors are relative to the largest extent; the last column says what of its certificate a fit missed.
     table = [("shape", "fit", *ERRORS, "updates", "s", "missed")]
     table += [(*key, *cells(found, (*ERRORS, "steps", "seconds"))) for key, found in fits.items()]
-    rows = [("", f"s per million points of {names[0]}", "bytes")]
+    rows = [("", f"s per million points of {first}", "bytes")]
     rows += [(name, number(found["seconds"]), f"{found['bytes']:,}") for name, found in timed.items()]
     text = f"{markdown(table)}\n{markdown(rows)}"
     write_text(out / "table.md", text)

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from sdfsim.data.batching import MOTION
 from sdfsim.data.dataset import Trajectory, shapes_folder
 from sdfsim.data.pybullet_sim import DT, SUBSTEPS, Teacher, TeacherBody, substeps_of, write_urdf
 from sdfsim.data.shape_assets import decompose
@@ -40,8 +41,6 @@ TETRAHEDRA = 0.05  # their edges over the diagonal of a shape's box
 ITERATIONS = 10  # of Newton's XPBD in an inner step
 LONGEST = 60.0  # s of the processor that an engine may take for a motion
 
-
-FRAMES = ("position", "quat_xyzw", "velocity", "angular_velocity")
 SI = Units(1.0, 1.0, 1.0)
 
 
@@ -140,7 +139,7 @@ def start_motion(scene: Scene, units: Units = SI) -> Trajectory:
 def rollout_motion(scene: Scene, rollout: Rollout) -> Trajectory:
     """Our motion of a scene as `start_motion` has its start."""
     frames = (rollout.position, rollout.orientation, rollout.velocity, rollout.angular_velocity)
-    found = {name: values[:, _solid(scene)] for name, values in zip(FRAMES, frames, strict=True)}
+    found = {name: values[:, _solid(scene)] for name, values in zip(MOTION, frames, strict=True)}
     return replace(start_motion(scene), **found, dt=float(rollout.meta["dt"]))
 
 
@@ -181,7 +180,7 @@ def bullet(start: Start, steps: int, substeps: int | None = None) -> tuple[Traje
                 raise SdfsimError(f"{urdf}: the engine's inertia is not the recorded one")
         timing = timed(lambda count: parts.append(teacher.run(count)), steps)
     first, rest = parts
-    return replace(t, **{name: np.concatenate([first[name][:1], rest[name]]) for name in FRAMES}), timing
+    return replace(t, **{name: np.concatenate([first[name][:1], rest[name]]) for name in MOTION}), timing
 
 
 # --- MuJoCo ---
@@ -276,8 +275,8 @@ def _motion(
                 raise SdfsimError(f"{len(frames) - 1} of {steps} steps in {LONGEST:g} s")
 
     timing = timed(advanced, steps)
-    motion = {name: np.repeat(getattr(start, name)[:1], steps + 1, axis=0) for name in FRAMES}
-    for name, found in zip(FRAMES, zip(*frames, strict=True), strict=True):
+    motion = {name: np.repeat(getattr(start, name)[:1], steps + 1, axis=0) for name in MOTION}
+    for name, found in zip(MOTION, zip(*frames, strict=True), strict=True):
         motion[name][:, ~start.static] = found
     return replace(start, **motion), timing
 

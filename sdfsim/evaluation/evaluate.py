@@ -10,29 +10,27 @@ from typing import Any
 import numpy as np
 
 from sdfsim.console import columns
-from sdfsim.data import metrics
 from sdfsim.data.batching import batches, every, first_frames, model_units, roll_out, scene_of
 from sdfsim.data.dataset import Trajectory, engine_substep, floor_of, home_of, load_shapes, read_info, trajectory_files
-from sdfsim.data.metrics import FRAMES, HORIZONS
 from sdfsim.data.pybullet_sim import engine_settings, import_pybullet, substeps_of
 from sdfsim.dynamics.model import Model, load_model
 from sdfsim.dynamics.simulator import pick_device
 from sdfsim.dynamics.step import FreeFlight
 from sdfsim.dynamics.training_ranges import outside_training
 from sdfsim.errors import SdfsimError
+from sdfsim.evaluation import metrics
 from sdfsim.evaluation.engines import Start, bullet, dataset_urdf
+from sdfsim.evaluation.metrics import FRAMES, HORIZONS, Motions, energy_gain, errors
 from sdfsim.evaluation.penetration import EVERY, exact_solids, penetration
 from sdfsim.parallel import Progress, parallel, silent
 from sdfsim.shape.shape import Shape
 from sdfsim.training.contact_cache import inner_steps
 
-LIMITS = (0.1, 0.25, 0.5)  # m, translation errors that a body survives
 SURVIVED = "0.25"  # m, the limit whose median survival time is shown
 NOTHING = "-"
 # m/s; 0 tells what the recording alone does not bring back: an engine's state is more than its recorded frames.
 PERTURBATIONS = {"0": 0.0, "1e-6": 1e-6, "1e-3": 1e-3}
 
-Motions = list[Trajectory]
 Rows = list[tuple[str, ...]]
 
 
@@ -64,7 +62,7 @@ def evaluate(
     Returns:
         A report:
         "model", "ballistic": errors as `errors` gives them.
-        "chaos_floor": "perturbations" -> name -> errors; or "left_out", why.
+        "chaos_floor": "perturbations" -> name -> errors; "median_farthest_unperturbed_m".
         "outside_training": what of the scenes the model has not seen, one line each.
         "median_survival_s": of all of them, by limit in m: until half of the bodies are farther from the recording.
         "penetration" m, "energy_gain" (a fraction), "resting_speed" m/s: of the model and of the teacher's recording.
@@ -72,7 +70,8 @@ def evaluate(
         Further counts, and "ms_per_step_per_trajectory".
 
     Raises:
-        SdfsimError: no or unreadable trajectories or shapes; exit code 3 when a rollout is not finite.
+        SdfsimError: no or unreadable trajectories or shapes, or no `chaos_floor` where it is asked for; exit code 3
+            when a rollout is not finite.
     """
     place = pick_device(device)
     used = (model if isinstance(model, Model) else load_model(model)).to(place)
@@ -84,6 +83,12 @@ def evaluate(
     as_recorded = [first_frames(t, longest + 1) for t in recorded]
     recorded = [every(t, stride) for t in as_recorded]
     longest //= stride
+    again: dict[str, Motions] = {}
+    if chaos_floor:
+        on_progress(0.0, "teacher, from starts that differ slightly")
+        starts = load_recorded(data, split, as_recorded=True)[0]
+        again = teacher_again(data, starts, longest * stride)
+        again = {name: [every(motion, stride) for motion in motions] for name, motions in again.items()}
     substep = engine_substep(data)
     contenders: dict[str, Motions] = {"model": [], "ballistic": []}
     groups = batches(recorded)
@@ -96,10 +101,6 @@ def evaluate(
         contenders["model"] += roll_out(*common, free_flight, substeps=inner, as_teacher=True)
         seconds += time.perf_counter() - started
         contenders["ballistic"] += roll_out(*common, contact=False)
-    again, floor_report = {}, {}
-    if chaos_floor:
-        on_progress(0.8, "teacher, from starts that differ slightly")
-        again, floor_report = _teacher_again(data, split, longest, stride)
     scenes = [scene_of([t], [0], shapes)[0] for t in recorded]
     report = {
         "data": str(data),
@@ -115,9 +116,16 @@ def evaluate(
         "outside_training": outside_training(scenes, used, model_units(used, recorded[0])),
         "ms_per_step_per_trajectory": 1e3 * seconds / longest / len(recorded),
         **{who: errors(motions, recorded) for who, motions in contenders.items()},
-        **floor_report,
-        "median_survival_s": {who: _survival(motions, recorded) for who, motions in (contenders | again).items()},
+        "median_survival_s": {who: metrics.survival(motions, recorded) for who, motions in contenders.items()},
     }
+    for name, motions in again.items():
+        report["median_survival_s"][f"teacher {name}"] = metrics.survival(motions, recorded)
+    if again:
+        farthest = [metrics.distance(one, truth).max() for one, truth in zip(again["0"], recorded, strict=True)]
+        report["chaos_floor"] = {
+            "perturbations": {name: errors(motions, recorded) for name, motions in again.items()},
+            "median_farthest_unperturbed_m": float(np.median(farthest)),
+        }
     if not errors_only:
         on_progress(0.9, "penetration, energy and rest")
         solids, rest = exact_solids(data, shapes), [metrics.resting(t) for t in recorded]
@@ -136,49 +144,6 @@ def evaluate(
     return report
 
 
-def errors(motions: Motions, recorded: Motions) -> dict[str, dict]:
-    """Errors of motions, over the bodies that move.
-
-    Returns:
-        Horizon in steps -> seconds, translation_rmse m and rotation_error degrees over all bodies and steps up to
-        there, with 95 % intervals over trajectories, and `at_frame`: the same in the last of these steps alone, where
-        translation is the mean over trajectories of the root mean square over bodies.
-    """
-    longest = len(recorded[0].position) - 1
-    bodies = np.array([(~t.static).sum() for t in recorded])
-    share = bodies / bodies.mean()
-    report = {}
-    for h in sorted({h for h in (*HORIZONS, *FRAMES) if h <= longest} | {longest}):
-        upto, there = (
-            np.array([_compared(motion, truth, frames) for motion, truth in zip(motions, recorded, strict=True)])
-            for frames in (slice(1, h + 1), slice(h, h + 1))
-        )
-        squared, angle = upto[:, 0] ** 2 * share, upto[:, 1] * share
-        report[str(h)] = {
-            "seconds": h * recorded[0].dt,
-            "translation_rmse": float(np.sqrt(squared.mean())),
-            "translation_rmse_95": [float(np.sqrt(v)) for v in metrics.interval(squared)],
-            "rotation_error": float(angle.mean()),
-            "rotation_error_95": metrics.interval(angle),
-            "at_frame": {
-                "translation_rmse": float(there[:, 0].mean()),
-                "translation_rmse_95": metrics.interval(there[:, 0]),
-                "rotation_error": float((there[:, 1] * share).mean()),
-                "rotation_error_95": metrics.interval(there[:, 1] * share),
-            },
-        }
-    return report
-
-
-def _compared(motion: Trajectory, truth: Trajectory, frames: slice) -> tuple[float, float]:
-    """RMSE m and mean angle in degrees of one trajectory in some frames."""
-    moving = ~truth.static
-    return (
-        metrics.translation_rmse(motion.position[frames, moving], truth.position[frames, moving]),
-        metrics.rotation_error(motion.quat_xyzw[frames, moving], truth.quat_xyzw[frames, moving]),
-    )
-
-
 def load_recorded(
     data: Path, split: str, *, most: int | None = None, as_recorded: bool = False
 ) -> tuple[Motions, dict[str, Shape]]:
@@ -195,7 +160,7 @@ def load_recorded(
 # --- the teacher against itself ---
 
 
-def chaos_floor(data: Path, trajectories: Motions, steps: int, seed: int = 0) -> dict[str, Motions]:
+def teacher_again(data: Path, trajectories: Motions, steps: int, seed: int = 0) -> dict[str, Motions]:
     """Run the teacher again from recorded starts (velocities as recorded) of a dataset with a URDF for every shape.
 
     Returns, by the names of `PERTURBATIONS`, the motions (steps + 1 frames) that follow when the velocity of each body
@@ -226,45 +191,6 @@ def perturbed(t: Trajectory, size: float, seed: list[int]) -> Trajectory:
     direction = np.random.default_rng(seed).normal(size=t.velocity[0].shape)
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
     return replace(t, velocity=t.velocity + size * direction * ~t.static[:, None])
-
-
-def _teacher_again(data: Path, split: str, steps: int, stride: int) -> tuple[dict[str, Motions], dict]:
-    """The teacher's motions from perturbed starts by "teacher NAME", and what the report says of them."""
-    recorded = [first_frames(t, stride * steps + 1) for t in load_recorded(data, split, as_recorded=True)[0]]
-    try:
-        again = chaos_floor(data, recorded, stride * steps)
-    except SdfsimError as error:
-        why = f"{error.message} ({error.hint})" if error.hint else error.message
-        return {}, {"chaos_floor": {"left_out": why}}
-    again = {name: [every(motion, stride) for motion in motions] for name, motions in again.items()}
-    recorded = [every(t, stride) for t in recorded]
-    farthest = [float(_distance(one, truth).max()) for one, truth in zip(again["0"], recorded, strict=True)]
-    report = {
-        "perturbations": {name: errors(motions, recorded) for name, motions in again.items()},
-        "median_farthest_unperturbed_m": float(np.median(farthest)),
-    }
-    return {f"teacher {name}": motions for name, motions in again.items()}, {"chaos_floor": report}
-
-
-# --- energy, rest and survival ---
-
-
-def _survival(motions: Motions, recorded: Motions) -> dict[str, float | None]:
-    """Limit in m -> seconds until half of all bodies have been farther from the recording; None if they never are."""
-    error = np.concatenate([_distance(m, t) for m, t in zip(motions, recorded, strict=True)], axis=1)
-    return {str(limit): metrics.median_survival(metrics.survival(error, limit), recorded[0].dt) for limit in LIMITS}
-
-
-def _distance(motion: Trajectory, truth: Trajectory) -> np.ndarray:
-    """[T, N] m: translation errors of the bodies that move, the first frame included."""
-    moving = ~truth.static
-    return np.linalg.norm(motion.position[:, moving] - truth.position[:, moving], axis=-1)
-
-
-def energy_gain(motions: Motions) -> dict[str, float | None]:
-    """Mean and worst, over the trajectories, of the largest gain as a fraction of the energy at the start."""
-    gains = [gain for motion in motions if (gain := metrics.energy_gain(motion)) is not None]
-    return {"mean": float(np.mean(gains)) if gains else None, "worst": max(gains) if gains else None}
 
 
 # --- tables ---
@@ -350,9 +276,7 @@ def notes(report: dict[str, Any]) -> list[str]:
         lines.append(f"The shortest recording ends after {steps} steps; {report['steps_asked']} were asked for.")
     if not report["engine_substep"]:
         lines.append("No dataset.json tells the engine's inner step: velocities count as at the positions' instants.")
-    if "left_out" in floor:
-        lines.append(f"The teacher's chaos floor is left out: {floor['left_out']}.")
-    elif floor:
+    if floor:
         farthest = f"{floor['median_farthest_unperturbed_m']:.1g} m (median of the trajectories)"
         lines.append(f"Run again unperturbed, the teacher departs from its recording by up to {farthest}.")
     return lines

@@ -18,11 +18,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sdfsim.data.dataset import Trajectory
-from sdfsim.data.metrics import energy
 from sdfsim.data.scenarios import steady_faces
 from sdfsim.dynamics.bodies import largest_extent
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.errors import SdfsimError
+from sdfsim.evaluation.metrics import energy
 from sdfsim.evaluation.penetration import depths
 from sdfsim.scene.scene import Body, Effects, Scene
 from sdfsim.shape.mesh import MESH_SUFFIXES

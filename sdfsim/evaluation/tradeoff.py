@@ -27,9 +27,10 @@ from sdfsim.dynamics.units import scene_units
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation import engines
 from sdfsim.evaluation.engines import Engine, Start, Timing, centred_mesh, dataset_urdf, start_of_scene, timed
-from sdfsim.evaluation.evaluate import energy_gain, errors, load_recorded, perturbed
+from sdfsim.evaluation.evaluate import load_recorded, perturbed
 from sdfsim.evaluation.hard_cases import tossed
 from sdfsim.evaluation.harness import Job, Line, Panel, draw, front, machine, measure, number, one_thread, peak_memory
+from sdfsim.evaluation.metrics import energy_gain, errors
 from sdfsim.evaluation.penetration import Solid, exact_solids, penetration
 from sdfsim.files import locked, write_json, write_text
 from sdfsim.parallel import StageProgress

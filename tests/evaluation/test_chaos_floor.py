@@ -9,7 +9,7 @@ pytest.importorskip("pybullet")
 
 from sdfsim.data.dataset import Trajectory, trajectory_files
 from sdfsim.evaluation.engines import Start, bullet, dataset_urdf
-from sdfsim.evaluation.evaluate import chaos_floor, evaluate
+from sdfsim.evaluation.evaluate import evaluate, teacher_again
 from tests.dynamics.conftest import random_model
 
 
@@ -54,13 +54,13 @@ def test_free_fall_keeps_a_perturbation_as_it_is(falling):
 
 def test_perturbations_repeat_and_have_the_size_they_are_named_by(cube_data):
     trajectories = [Trajectory.load(f, as_recorded=True) for f in trajectory_files(cube_data, "test")]
-    one, two = (chaos_floor(cube_data, trajectories, 20) for _ in range(2))
+    one, two = (teacher_again(cube_data, trajectories, 20) for _ in range(2))
     for a, b, t in zip(one["1e-3"], two["1e-3"], trajectories, strict=True):
         np.testing.assert_array_equal(a.position, b.position)
         np.testing.assert_allclose(np.linalg.norm(a.velocity[0] - t.velocity[0], axis=-1), 1e-3, rtol=1e-9)
         assert len(a.position) == 21
     np.testing.assert_array_equal(one["0"][0].position[0], trajectories[0].position[0])
-    other = chaos_floor(cube_data, trajectories, 1, seed=1)
+    other = teacher_again(cube_data, trajectories, 1, seed=1)
     assert not np.array_equal(other["1e-3"][0].velocity[0], one["1e-3"][0].velocity[0])
 
 

@@ -94,7 +94,7 @@ def test_the_engines_inner_steps_are_counted():
 
 
 def test_errors_at_a_frame_are_those_of_that_frame_alone():
-    from sdfsim.evaluation.evaluate import errors
+    from sdfsim.evaluation.metrics import errors
 
     truth = balls(np.zeros((31, 2, 3)))
     other = np.zeros((31, 2, 3))

@@ -6,30 +6,24 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sdfsim.data.metrics import (
-    energy,
-    energy_gain,
-    interval,
-    median_survival,
-    resting,
-    rotation_error,
-    speeds,
-    survival,
-    translation_rmse,
-)
+from sdfsim.evaluation.metrics import compared, energy, energy_gain, interval, resting, speeds, survival
 from tests.recordings import balls
 
 
 def test_translation_rmse_of_a_constant_offset_is_its_length():
-    truth = np.random.default_rng(0).normal(size=(7, 3, 3))
-    assert translation_rmse(truth + np.array([3.0, 4.0, 0.0]), truth) == pytest.approx(5.0)
+    truth = balls(np.random.default_rng(0).normal(size=(7, 3, 3)))
+    moved = replace(truth, position=truth.position + np.array([3.0, 4.0, 0.0]))
+    assert compared(moved, truth, slice(None))[0] == pytest.approx(5.0)
 
 
 def test_rotation_error_is_the_mean_angle_and_ignores_the_quaternions_sign():
     truth = Rotation.random(12, rng=np.random.default_rng(0))
     turn = Rotation.from_rotvec(np.repeat([[0.0, 0.0, np.radians(10)], [np.radians(30), 0.0, 0.0]], 6, axis=0))
-    quat = (truth * turn).as_quat().reshape(6, 2, 4)
-    assert rotation_error(-quat, truth.as_quat().reshape(6, 2, 4)) == pytest.approx(20.0)
+    recorded, turned = (
+        balls(np.zeros((6, 2, 3)), quat_xyzw=sign * turns.as_quat().reshape(6, 2, 4))
+        for sign, turns in ((1.0, truth), (-1.0, truth * turn))
+    )
+    assert compared(turned, recorded, slice(None))[1] == pytest.approx(20.0)
 
 
 def test_interval_covers_the_mean_and_shrinks_with_more_data():
@@ -52,7 +46,7 @@ def flight(seconds: float = 1.0, **fields):
 def test_the_energy_of_a_flying_body_is_constant_and_is_what_it_should_be():
     course = energy(flight(mass=np.array([2.0])))
     np.testing.assert_allclose(course, 0.5 * 2.0 * 14.0 + 0.5 * 0.1 * 14.0 + 2.0 * 10.0 * 20.0, rtol=1e-12)
-    assert energy_gain(flight()) == pytest.approx(0.0, abs=1e-12)
+    assert energy_gain([flight()])["worst"] == pytest.approx(0.0, abs=1e-12)
 
 
 def test_spin_is_taken_about_the_bodys_own_axes():
@@ -69,9 +63,9 @@ def test_a_springs_push_is_the_gain_and_scenery_has_no_part_in_it():
     velocity = still.velocity.copy()
     velocity[3:, 0] = [3.0, 0.0, 0.0]
     velocity[5, 0] = 0.0
-    assert energy_gain(replace(still, velocity=velocity)) == pytest.approx(4.5 / 20.0)
-    assert energy_gain(still) == 0.0
-    assert energy_gain(replace(still, position=0.0 * still.position)) is None
+    found = energy_gain([replace(still, velocity=velocity), still, replace(still, position=0.0 * still.position)])
+    assert found == {"mean": pytest.approx(4.5 / 40.0), "worst": pytest.approx(4.5 / 20.0)}
+    assert energy_gain([replace(still, position=0.0 * still.position)]) == {"mean": None, "worst": None}
 
 
 def test_what_rests_is_told_by_displacement_in_the_last_steps():
@@ -86,9 +80,7 @@ def test_what_rests_is_told_by_displacement_in_the_last_steps():
 
 def test_survivors_are_those_that_have_never_left():
     """Three of four leave 0.25 m, at frames 2, 4 and 6; one of them comes back, and stays lost."""
-    error = np.zeros((8, 4))
-    error[2, 0], error[4:, 1], error[6:, 2] = 0.3, 0.25, 9.0
-    share = survival(error, 0.25)
-    np.testing.assert_array_equal(share, [1, 1, 0.75, 0.75, 0.5, 0.5, 0.25, 0.25])
-    assert median_survival(share, 0.02) == pytest.approx(0.12)
-    assert median_survival(survival(error, 10.0), 0.02) is None
+    truth, error = balls(np.zeros((8, 4, 3))), np.zeros((8, 4, 3))
+    error[2, 0, 0], error[4:, 1, 1], error[6:, 2, 2] = 0.3, 0.25, 0.4
+    found = survival([balls(error)], [truth])
+    assert found == {"0.1": pytest.approx(0.12), "0.25": pytest.approx(0.12), "0.5": None}
