@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -115,6 +115,14 @@ class Bodies:
         together = (one == other) | (one < 0) | (other < 0)
         return together & (self.moves[a] | self.moves[b]) & self.allowed[self.group[a], self.group[b]]
 
+    def led(self, state: State) -> State:
+        """The state with scripted bodies where their paths have them at its time."""
+        if self.tracks is None:
+            return state
+        (place, turn), at = self.tracks.at(state.time), self.tracks.body
+        position, orientation = state.position.index_copy(0, at, place), state.orientation.index_copy(0, at, turn)
+        return replace(state, position=position, orientation=orientation)
+
 
 @dataclass(frozen=True)
 class Touch:
@@ -136,29 +144,19 @@ class Touch:
 
 @dataclass(frozen=True)
 class State:
-    """Where N bodies are and how they move.
+    """Where N bodies are and how they move."""
 
-    Attributes:
-        position: [N, 3] float64, centres of mass.
-        orientation: [N, 4] float64 xyzw, shape axes -> world.
-        velocity: [N, 3] float64, of the centres of mass.
-        angular_velocity: [N, 3] float64, world frame.
-        earlier_position, earlier_orientation: [2, N, 3] and [2, N, 4], the two poses before (oldest first),
-            for networks on surface nodes; None where nobody needs them.
-        touch: contacts and sleep of the solve; None before its first step.
-        load: [N, 6] force at the centre of mass and torque that pull at a body, world axes; None where nothing does.
-        time: since the start.
-    """
-
-    position: Tensor
-    orientation: Tensor
-    velocity: Tensor
-    angular_velocity: Tensor
+    position: Tensor  # [N, 3] float64, centres of mass
+    orientation: Tensor  # [N, 4] float64 xyzw, shape axes -> world
+    velocity: Tensor  # [N, 3] float64, of the centres of mass
+    angular_velocity: Tensor  # [N, 3] float64, world frame
+    # [2, N, 3] and [2, N, 4], the two poses before (oldest first), for networks on surface nodes; None for others
     earlier_position: Tensor | None = None
     earlier_orientation: Tensor | None = None
-    touch: Touch | None = None
+    touch: Touch | None = None  # contacts and sleep of the solve; None before its first step
+    # [N, 6] force at the centre of mass and torque that pull at a body, world axes; None where nothing does
     load: Tensor | None = None
-    time: float = 0.0
+    time: float = 0.0  # since the start
 
 
 def awake(bodies: Bodies, state: State) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections import OrderedDict
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -18,7 +18,7 @@ from sdfsim.dynamics.kernels import distance as kinds
 from sdfsim.dynamics.kernels import world as compiled
 from sdfsim.dynamics.kernels.record import Edges
 from sdfsim.dynamics.kernels.step import step as compiled_step
-from sdfsim.dynamics.kernels.survey import touching
+from sdfsim.dynamics.kernels.survey import Touching, touching
 from sdfsim.files import digest
 from sdfsim.shape.baked_grid import WALL, BakedGrid, baked, inwards
 from sdfsim.shape.sdf import ClosedForm, PlaneSdf, Sdf
@@ -97,25 +97,9 @@ def _solve(
         angular_velocity=torch.from_numpy(motion.angular),
         time=state.time + rules.inner * rules.steps,
     )
-    if bodies.tracks is not None:
-        place, orientation = bodies.tracks.at(after.time)
-        at = bodies.tracks.body
-        after = replace(
-            after,
-            position=after.position.index_copy(0, at, place),
-            orientation=after.orientation.index_copy(0, at, orientation),
-        )
-    touch = Touch(
-        touching=torch.from_numpy(motion.touching),
-        quiet=torch.from_numpy(motion.quiet),
-        anchor=torch.from_numpy(motion.anchor),
-        island=torch.from_numpy(motion.island),
-        pair=torch.from_numpy(manifolds.pair),
-        count=torch.from_numpy(manifolds.count),
-        point=torch.from_numpy(manifolds.point),
-        held=held(after),
-        gravity=torch.from_numpy(rules.gravity),
-    )
+    after = bodies.led(after)
+    known = (motion.touching, motion.quiet, motion.anchor, motion.island, *manifolds)
+    touch = Touch(*map(torch.from_numpy, known), held=held(after), gravity=torch.from_numpy(rules.gravity))
     return replace(after, touch=touch), edges, counts
 
 
@@ -162,20 +146,9 @@ def held(state: State) -> torch.Tensor:
     return torch.cat([state.position, state.orientation, state.velocity, state.angular_velocity], -1)
 
 
-@dataclass(frozen=True)
-class Touching:
-    """E places where bodies touch, model units."""
-
-    pair: np.ndarray  # [E, 2] int64, the two bodies
-    point: np.ndarray  # [E, 3] on the first, world; normal: [E, 3] from the second to the first
-    normal: np.ndarray
-    impulse: np.ndarray  # [E, 3] on the first in the last inner step
-    gap: np.ndarray  # [E] below 0 where they are in each other
-
-
 def contact_points(state: State) -> Touching:
     """Where bodies touch in a state."""
-    return Touching(*touching(_manifolds(state.touch), state.position.numpy(), state.orientation.numpy(), TOUCHING))
+    return touching(_manifolds(state.touch), state.position.numpy(), state.orientation.numpy(), TOUCHING)
 
 
 def compiled_rules(rules: StepOptions, *, note: bool = False) -> compiled.Rules:

@@ -38,17 +38,13 @@ def fault(
     if body < 0:
         return None
     with np.errstate(over="ignore", invalid="ignore"):
+        way = (place[body] - earlier[body]) / dt
         name, value, unit, what = (
             ("orientation", orientation[body], 1.0, ""),
             ("position", place[body], units.length, "m from the origin, too far to be placed exactly"),
             ("velocity", velocity[body], units.velocity, "m/s, too fast for any contact"),
             ("angular_velocity", spin[body], 1.0 / units.time, "rad/s, too fast to be followed"),
-            (
-                "way",
-                (place[body] - earlier[body]) / dt,
-                units.velocity,
-                "m/s through the step, too fast for any contact",
-            ),
+            ("way", way, units.velocity, "m/s through the step, too fast for any contact"),
         )[wrong]
     if not np.isfinite(value).all():
         return body, f"{name} is not finite"

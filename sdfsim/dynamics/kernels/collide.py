@@ -53,22 +53,15 @@ SHARES = 16  # of the pairs, each with its own scratch, that threads take in tur
 
 
 class Near(NamedTuple):
-    """The leaves of nodes of either body that the other of P pairs may touch, until bodies are looked for again.
+    """The leaves of nodes of either body that the other of P pairs may touch, until bodies are looked for again."""
 
-    Attributes:
-        start, count: [P, 2] for either side the place of its first leaf and how many are near.
-        leaf: [L] which.
-        away: [L] how far each is at least, once the ways of both bodies since then are taken off.
-        looked: [P] the ways of both bodies when new points were last looked for; -inf for never.
-        away_all: [P] the least of `away`; -inf where it is not known.
-    """
-
+    # start, count: [P, 2] for either side the place of its first leaf and how many are near
     start: np.ndarray
     count: np.ndarray
-    leaf: np.ndarray
-    away: np.ndarray
-    looked: np.ndarray
-    away_all: np.ndarray
+    leaf: np.ndarray  # [L] which
+    away: np.ndarray  # [L] how far each is at least, once the ways of both bodies since then are taken off
+    looked: np.ndarray  # [P] the ways of both bodies when new points were last looked for; -inf for never
+    away_all: np.ndarray  # [P] the least of `away`; -inf where it is not known
 
 
 @njit(**FAST)
@@ -322,20 +315,16 @@ def _near(shapes, world, motion, matrix, pairs, ways, reach, near, p):
 
 
 class Scratch(NamedTuple):
-    """Room for what is found of one pair, once for each of S shares: compiled code allocates slowly.
+    """Room for what is found of one pair, once for each of S shares: compiled code allocates slowly."""
 
-    Attributes:
-        found: [S, FOUND, COLUMNS] new points; every: [S, FOUND + POINTS, COLUMNS] with those that were known.
-        depth, node, key, normal: [S, SIDE] and [S, SIDE, 3] of the nodes that are to become points.
-        away, alike: [S, FOUND + POINTS] how far from those chosen a point is, and how many of these are of its kind.
-    """
-
-    found: np.ndarray
-    every: np.ndarray
+    found: np.ndarray  # [S, FOUND, COLUMNS] new points
+    every: np.ndarray  # [S, FOUND + POINTS, COLUMNS] with those that were known
+    # depth, node, key, normal: [S, SIDE] and [S, SIDE, 3] of the nodes that are to become points
     depth: np.ndarray
     node: np.ndarray
     key: np.ndarray
     normal: np.ndarray
+    # away, alike: [S, FOUND + POINTS] how far from those chosen a point is, and how many of these are of its kind
     away: np.ndarray
     alike: np.ndarray
 

@@ -27,35 +27,20 @@ PATCH_LOW, PATCH_CELL, PATCHES, PATCH, FIELDS = 14, 17, 18, 21, 22
 
 
 class Shapes(NamedTuple):
-    """S shapes; arrays end to end where their number differs from shape to shape.
+    """S shapes; arrays end to end where their number differs from shape to shape."""
 
-    Attributes:
-        table: [S, FIELDS] float64.
-        brick: int64, where in `sample` the 9^3 distances of a brick begin; -1 for bricks far from the surface.
-        sample: float32 distances, at the corners of bricks and in bricks.
-        node: [K, 3] surface nodes, leaf by leaf.
-        inward: [K, 3] from each a little into the solid, away from all faces that meet there.
-        leaf_node: [L + 1] int64, leaf l holds nodes leaf_node[l] : leaf_node[l + 1].
-        leaf_ball: [L, 4] centre and radius of a ball around these.
-        clump_start: [S + 1] int64, shape s has clumps clump_start[s] : clump_start[s + 1].
-        clump_leaf: [C + 1] int64 likewise of the leaves that they hold.
-        clump_ball: [C, 4].
-        leaf_patch: [L] int64, the patch of the surface that a leaf's nodes are of.
-        label: int16, the patches that are nearest to places all over.
-    """
-
-    table: np.ndarray
-    brick: np.ndarray
-    sample: np.ndarray
-    node: np.ndarray
-    inward: np.ndarray
-    leaf_node: np.ndarray
-    leaf_ball: np.ndarray
-    clump_start: np.ndarray
-    clump_leaf: np.ndarray
-    clump_ball: np.ndarray
-    leaf_patch: np.ndarray
-    label: np.ndarray
+    table: np.ndarray  # [S, FIELDS] float64
+    brick: np.ndarray  # int64, where in `sample` the 9^3 distances of a brick begin; -1 for bricks far from the surface
+    sample: np.ndarray  # float32 distances, at the corners of bricks and in bricks
+    node: np.ndarray  # [K, 3] surface nodes, leaf by leaf
+    inward: np.ndarray  # [K, 3] from each a little into the solid, away from all faces that meet there
+    leaf_node: np.ndarray  # [L + 1] int64, leaf l holds nodes leaf_node[l] : leaf_node[l + 1]
+    leaf_ball: np.ndarray  # [L, 4] centre and radius of a ball around these
+    clump_start: np.ndarray  # [S + 1] int64, shape s has clumps clump_start[s] : clump_start[s + 1]
+    clump_leaf: np.ndarray  # [C + 1] int64 likewise of the leaves that they hold
+    clump_ball: np.ndarray  # [C, 4]
+    leaf_patch: np.ndarray  # [L] int64, the patch of the surface that a leaf's nodes are of
+    label: np.ndarray  # int16, the patches that are nearest to places all over
 
 
 @njit(**BARE)

@@ -47,47 +47,32 @@ class Layer(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """Of a network.
+    """Of a network."""
 
-    Attributes:
-        encode, edge, body: of several layers each.
-        normalise: scale and shift, [R, width] both.
-        attention: one number an edge.
-        impulse: (end, mean) for each axis: the normal, and with friction two more.
-        tell: what joins the edge's latents, and what both bodies are told.
-        alone: whether the network starts from free flight, and nothing bounds it.
-    """
-
+    # encode, edge, body: of several layers each
     encode: tuple[Layer, Layer, Layer]
-    normalise: Layer
+    normalise: Layer  # scale and shift, [R, width] both
     edge: tuple[Layer, Layer]
-    attention: Layer
-    impulse: Layer
-    tell: Layer
+    attention: Layer  # one number an edge
+    impulse: Layer  # (end, mean) for each axis: the normal, and with friction two more
+    tell: Layer  # what joins the edge's latents, and what both bodies are told
     body: tuple[Layer, Layer, Layer]
-    alone: bool
+    alone: bool  # whether the network starts from free flight, and nothing bounds it
 
 
 class Terms(NamedTuple):
-    """What is in play.
+    """What is in play."""
 
-    Attributes:
-        gravity: [3].
-        dt: the step; known: the one that the network knows.
-        friction, restitution, rotation: whether they are.
-        trust: of the trust region.
-        rest: the least speed that others are measured by.
-        calm, lively: relative speeds from which on the network has a say, and its full say.
-    """
-
-    gravity: np.ndarray
-    dt: float
-    known: float
+    gravity: np.ndarray  # [3]
+    dt: float  # the step
+    known: float  # the one that the network knows
+    # friction, restitution, rotation: whether they are
     friction: bool
     restitution: bool
     rotation: bool
-    trust: float
-    rest: float
+    trust: float  # of the trust region
+    rest: float  # the least speed that others are measured by
+    # calm, lively: relative speeds from which on the network has a say, and its full say
     calm: float
     lively: float
 
@@ -102,48 +87,33 @@ class Poses(NamedTuple):
 
 
 class Graph(NamedTuple):
-    """A bodies that met somebody and E edges, in the units of the network; masses relative to the heaviest.
+    """A bodies that met somebody and E edges, in the units of the network; masses relative to the heaviest."""
 
-    Attributes:
-        body: [A] int64, their numbers in the scene.
-        inverse_mass: [A]; inverse_inertia: [A, 3, 3], world axes.
-        twist: [A, 24] velocity and angular velocity at the start of the step, at its end in free flight, at its end
-            as the solve has it, and the mean over the step as the solve has it.
-        taken: [A] kinetic energy that the solve took from free flight.
-        pair: [E, 2] int64, rows of `body`.
-        first: [P + 1] int64, the first edge of each pair of bodies; edges of a pair stand together.
-        value: [E, WIDTH] columns of `record`.
-        product: [E, 2] of the two bodies' coefficients of friction and of restitution.
-    """
-
-    body: np.ndarray
-    inverse_mass: np.ndarray
-    inverse_inertia: np.ndarray
+    body: np.ndarray  # [A] int64, their numbers in the scene
+    inverse_mass: np.ndarray  # [A]
+    inverse_inertia: np.ndarray  # [A, 3, 3], world axes
+    # [A, 24] velocity and angular velocity at the start of the step, at its end in free flight, at its end as the
+    # solve has it, and the mean over the step as the solve has it
     twist: np.ndarray
-    taken: np.ndarray
-    pair: np.ndarray
-    first: np.ndarray
-    value: np.ndarray
-    product: np.ndarray
+    taken: np.ndarray  # [A] kinetic energy that the solve took from free flight
+    pair: np.ndarray  # [E, 2] int64, rows of `body`
+    first: np.ndarray  # [P + 1] int64, the first edge of each pair of bodies; edges of a pair stand together
+    value: np.ndarray  # [E, WIDTH] columns of `record`
+    product: np.ndarray  # [E, 2] of the two bodies' coefficients of friction and of restitution
 
 
 class Frames(NamedTuple):
-    """Of E edges, see `models.contact_graph.EdgeFrames`.
+    """Of E edges, see `models.contact_graph.EdgeFrames`."""
 
-    Attributes:
-        read, give: [E, 2, 3, 6] for both bodies and each axis.
-        mass, solved, slip: [E, 3].
-        speed: [E].
-        feature: [E, EDGE_FEATURES] float32.
-    """
-
+    # read, give: [E, 2, 3, 6] for both bodies and each axis
     read: np.ndarray
     give: np.ndarray
+    # mass, solved, slip: [E, 3]
     mass: np.ndarray
     solved: np.ndarray
     slip: np.ndarray
-    speed: np.ndarray
-    feature: np.ndarray
+    speed: np.ndarray  # [E]
+    feature: np.ndarray  # [E, EDGE_FEATURES] float32
 
 
 @njit(**FAST)

@@ -26,27 +26,18 @@ MANY = 64  # islands of contacts from which on threads are worth their while
 
 
 class System(NamedTuple):
-    """The equations of C contact points.
+    """The equations of C contact points."""
 
-    Attributes:
-        where: [C, 4] int64: manifold, point, first and second body.
-        row: [C, 3, WIDTH]: along the normal and two tangents.
-        grip: [C] product of friction; wanted: [C] speed that resolves penetration and is then forgotten; pushed: [C]
-            impulse that has given it so far.
-        calm: [C, 3]: the change that is wanted along the normal if nothing rebounds and no penetration is resolved; the
-            speed along it without contact; and the speed that resolves penetration and stays.
-        start: [I + 1] int64, island i has the contacts order[start[i] : start[i + 1]].
-        order: [C] int64.
-    """
-
-    where: np.ndarray
-    row: np.ndarray
-    grip: np.ndarray
-    wanted: np.ndarray
-    pushed: np.ndarray
+    where: np.ndarray  # [C, 4] int64: manifold, point, first and second body
+    row: np.ndarray  # [C, 3, WIDTH]: along the normal and two tangents
+    grip: np.ndarray  # [C] product of friction
+    wanted: np.ndarray  # [C] speed that resolves penetration and is then forgotten
+    pushed: np.ndarray  # [C] impulse that has given it so far
+    # [C, 3]: the change that is wanted along the normal if nothing rebounds and no penetration is resolved; the
+    # speed along it without contact; and the speed that resolves penetration and stays
     calm: np.ndarray
-    start: np.ndarray
-    order: np.ndarray
+    start: np.ndarray  # [I + 1] int64, island i has the contacts order[start[i] : start[i + 1]]
+    order: np.ndarray  # [C] int64
 
 
 @njit(**FAST)

@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
 from sdfsim.dynamics.kernels.vectors import BARE, FAST, add, dot, get, put, rotated, scale, sub, turn, vector
 from sdfsim.dynamics.kernels.world import DRAG, GAP, NORMAL, PUSH
+
+
+class Touching(NamedTuple):
+    """E places where bodies touch, model units."""
+
+    pair: np.ndarray  # [E, 2] int64, the two bodies
+    point: np.ndarray  # [E, 3] on the first, world
+    normal: np.ndarray  # [E, 3] from the second to the first
+    impulse: np.ndarray  # [E, 3] on the first in the last inner step
+    gap: np.ndarray  # [E] below 0 where they are in each other
 
 
 @njit(**BARE)
@@ -43,8 +55,7 @@ def energies(mass, inertia, gravity, position, orientation, velocity, angular):
 
 @njit(**FAST)
 def touching(manifolds, position, orientation, within):
-    """The E contacts of bodies that are no farther apart than `within`: pairs [E, 2]; points on the first body, normals
-    and impulses [E, 3], world; distances [E]."""
+    """The contacts of bodies that are no farther apart than `within`."""
     most = manifolds.count.sum()
     pair, gap = np.empty((most, 2), np.int64), np.empty(most)
     place, normal, impulse = np.empty((most, 3)), np.empty((most, 3)), np.empty((most, 3))
@@ -61,4 +72,4 @@ def touching(manifolds, position, orientation, within):
                 put(normal, e, n)
                 put(impulse, e, add(scale(n, point[PUSH]), drag))
                 e += 1
-    return pair[:e], place[:e], normal[:e], impulse[:e], gap[:e]
+    return Touching(pair[:e], place[:e], normal[:e], impulse[:e], gap[:e])
