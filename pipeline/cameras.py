@@ -121,7 +121,8 @@ def save_views(views: list[View], path: Path) -> None:
 
 
 def load_views(path: Path) -> list[View]:
-    """The views of a poses folder, or of a file of `save_views`. Raises SdfsimError: absent or damaged."""
+    """The views of a poses folder, or of a file that `save_views` wrote. Raises SdfsimError where it is absent or
+    damaged."""
     path = path / "cameras.json" if path.is_dir() else path
     data = read_json(path, "run the poses stage first")
     try:

@@ -35,7 +35,8 @@ GUESSED_SHARE = 0.01  # of a body's surface, from which on a note says so
 def write_report(
     folder: Path, options: Options, records: dict[str, dict], failed: tuple[str, SdfsimError] | None = None
 ) -> dict:
-    """Writes report.json and report.md; returns the former. `failed`: the stage that ended in an error, and that."""
+    """Writes report.json and report.md; returns the former. `failed` is the stage that ended in an error, and the
+    error."""
     stages = {stage: known["report"] for stage, known in records.items()}
     seconds = {stage: round(known["seconds"], 1) for stage, known in records.items()}
     fit = stages.get("fit", {})

@@ -34,8 +34,9 @@ GAP = 0.3  # of the fall, as a share of the side
 
 def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str = "default", seed: int = 0,
               device: str = "cpu", on_progress: Progress = quiet) -> dict:  # fmt: skip
-    """Fits a compact SDF to scenery and bodies within the budget, s: a Shape folder each in `out`; those that are there
-    are kept. Returns a certificate for each of `shapes`, and `passed`, `reason` and `caveats` for all of them."""
+    """Fits a compact SDF to the scenery and to every body within the budget, s; each is a Shape folder in `out` that
+    goes by its name, and those that are there already are kept. Returns a certificate for each of `shapes`, and
+    `passed`, `reason` and `caveats` for all of them."""
     from sdfsim.shape.baked_grid import grid_certificate
     from sdfsim.shape.fit import fit_mesh
     from sdfsim.shape.shape import load_shape
@@ -150,7 +151,8 @@ def bodies_of(scene: Scene, materials: dict[str, Choice]) -> dict[str, dict]:
 
 def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab | None, *, scenery: bool = True,
                drop: str = "box", materials: dict[str, Choice] | None = None, seed: int = 0) -> str:  # fmt: skip
-    """The text of scene.yaml: a floor, the scenery, the bodies at their origins [3] m, and what a slab drops."""
+    """The text of scene.yaml: a floor, the scenery, the bodies that were found at their origins [3] m, and one dropped
+    from above where there is a slab."""
     assumed = " (give --size or --distance for true metres)" if placement.size_from.startswith("assumed") else ""
     made = materials or {}
     shapes: list[str] = []

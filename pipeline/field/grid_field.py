@@ -163,7 +163,8 @@ def stencil(points: Tensor, step: float) -> Tensor:
 
 def differences(values: Tensor, step: float) -> tuple[Tensor, Tensor]:
     """Gradient [P, 3] and Laplacian [P] by central differences from values [P, 7] on a `stencil`: over one grid cell
-    they reach the corners around, an analytic gradient only its own (Li et al., Neuralangelo, 2023, eq. 3)."""
+    they reach all the cell's corners, where an analytic gradient touches its own (Li et al., Neuralangelo, 2023, eq.
+    3)."""
     gradient = (values[:, :3] - values[:, 3:6]) / (2 * step)
     return gradient, (values[:, :6].sum(1) - 6 * values[:, 6]) / (step * step)
 

@@ -56,7 +56,8 @@ class _Compiled(torch.autograd.Function):
 
 
 def _with_threads(work: Any, *given: Any) -> None:
-    """Compiled work on torch's number of threads, if there are so many. Not for one: threads do not survive a fork."""
+    """Compiled work on as many threads as torch uses, if there are so many. Not for one: threads do not survive a
+    fork."""
     before = numba.get_num_threads()
     count = min(torch.get_num_threads(), before)
     numba.set_num_threads(count)

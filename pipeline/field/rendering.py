@@ -101,7 +101,8 @@ def samples_at(distance: Tensor, enter: Tensor, leave: Tensor, origins: Tensor, 
 def composite(
     field: Field, samples: Samples, geometry: tuple[Tensor, Tensor, Tensor], beta: float | Tensor, behind: Tensor
 ) -> dict[str, Tensor]:
-    """`rgb` [R, 3] and `opacity` [R] of rays before a colour `behind`, from `field.geometry_at` their samples."""
+    """Renders rays from what `field.geometry_at` gave at their samples, before a colour `behind` [R, 3] or [3]: `rgb`
+    [R, 3] and `opacity` [R] inside the sphere."""
     sdf, features, grid = geometry
     shape = samples.distance.shape
     weights, left = render_weights(laplace_density(sdf, beta).view(shape), samples.delta)
@@ -120,7 +121,8 @@ def render(
     field: Field, cache: Tensor, origins: Tensor, directions: Tensor, beta: float, *,
     samples: int = 32, backdrop: Tensor | None = None,
 ) -> dict[str, Tensor]:  # fmt: skip
-    """Renders rays [R, 3] as `composite` does, without gradients; a `backdrop` [3] is the colour behind."""
+    """Renders rays [R, 3] as `composite` does, without gradients and the same every time; a `backdrop` [3] is a
+    constant colour in place of the background model."""
     middle = torch.full((len(origins), samples), 0.5, device=origins.device)
     chosen = choose_samples(cache, origins, directions, beta, middle)
     behind = backdrop
@@ -172,7 +174,8 @@ def _smallest_beta(distance: Tensor, sdf: Tensor, beta: Tensor, safe: Tensor) ->
 
 
 def draw(distance: Tensor, weights: Tensor, uniforms: Tensor) -> Tensor:
-    """Distances [R, M], in order, drawn by uniforms [R, M] in 0..1, by weights [R, S - 1] between samples [R, S]."""
+    """Distances [R, M], in order, drawn by uniforms [R, M] in 0..1 from a density that is constant between samples [R,
+    S], where it has weights [R, S - 1]."""
     weights = weights + 1e-5
     cumulative = torch.cumsum(weights / weights.sum(1, keepdim=True), 1)
     count = uniforms.shape[1]

@@ -217,7 +217,8 @@ class Trainer:
 
     @property
     def beta(self) -> float | Tensor:
-        """Scale of the density, normalised units: falls geometrically over the first 85 % of training, then stays."""
+        """Scale of the density, normalised units: falls geometrically over the first 85 % of training, then stays. With
+        a gradient where it is learned."""
         start, end = self.settings.beta
         return start * (end / start) ** min(1.0, self.fraction / 0.85)
 
@@ -438,8 +439,9 @@ def train(
 ) -> Trained:  # fmt: skip
     """Trains a field and writes `field.safetensors` and `field.json` to `out`; resumes from `checkpoint.safetensors`.
 
-    Views and sparse points are in the world of the poses. As many steps are made as fit into the budget, s, training
-    before a kill included. Without `threads` the CPU takes what is fastest. Raises SdfsimError: the loss is not finite.
+    Views and sparse points are in the world of the poses. The budget, s, includes training before a kill: the number of
+    steps is cut to what fits. Without `threads` the CPU takes what is fastest now. Raises SdfsimError where the loss is
+    no longer finite.
     """
     photos = load_photos(photos_folder)
     masked = all(photo.mask for photo in photos)

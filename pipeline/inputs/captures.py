@@ -53,7 +53,8 @@ def find_capture(folder: Path) -> Path | None:
 
 
 def read_capture(folder: Path) -> tuple[Capture, list[KnownCamera]]:
-    """What an export says of its world, and its cameras, by their paths in `folder`. Raises SdfsimError: damaged."""
+    """What a Record3D or Polycam export says of its world, and its cameras, whose names are paths in `folder`. Raises
+    SdfsimError where it is damaged."""
     try:
         if _metadata(folder).is_file():
             return Capture("Record3D", UP), _record3d(folder)
@@ -69,7 +70,8 @@ def _metadata(folder: Path) -> Path:
 def _record3d(folder: Path) -> list[KnownCamera]:
     """Record3D: a `.r3d` unpacked (`rgbd/N.jpg`, `N.depth`, `N.conf`), or its EXR export (`rgb/N.jpg`, `depth/N.exr`).
 
-    `metadata` holds K by columns, and each pose: quaternion x, y, z, w (camera to world, OpenGL axes), position in m.
+    `metadata` holds the matrix K by columns, and a pose a frame: the quaternion x, y, z, w of the camera in the world,
+    OpenGL axes, and its position in metres.
     """
     about: dict[str, Any] = json.loads(_metadata(folder).read_text(encoding="utf-8"))
     same = np.reshape(about["K"], (3, 3)).T
@@ -115,7 +117,8 @@ def _polycam(folder: Path) -> list[KnownCamera]:
 
 
 def unpack(archive: Path, folder: Path) -> None:
-    """Unpacks a zipped capture. Raises SdfsimError: damaged, too large unpacked, or names lead out of the folder."""
+    """Unpacks the files of a zipped capture. Raises SdfsimError where it is damaged or no zip, too large once unpacked,
+    or has names that lead out of the folder."""
     try:
         with zipfile.ZipFile(archive) as file:
             entries = [entry for entry in file.infolist() if not entry.is_dir()]

@@ -100,7 +100,8 @@ def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
 
 
 def turned_like(stored: Image.Image, size: tuple[int, int], path: Path) -> Image.Image:
-    """A mask turned as its photo of this size (width, height), upright or as stored. Raises SdfsimError: neither."""
+    """A mask as its photo of this size (width, height) is turned: upright, or as stored. Raises SdfsimError where
+    neither is shaped like the photo."""
     for image in (ImageOps.exif_transpose(stored), stored):
         if off(image, size[0] / size[1]) < 0.02:
             return image

@@ -93,7 +93,8 @@ class KnownCamera:
 
 def posed(name: str, size: tuple[int, int], lens: Lens, pose: np.ndarray, mask: str | None = None,
           depth: DepthFile | None = None) -> KnownCamera:  # fmt: skip
-    """A camera by its pose [3, 4], camera to world, OpenGL axes (x right, y up). Raises SdfsimError: no pose."""
+    """A camera by its pose [3, 4], camera to world, OpenGL axes (x right, y up, z backwards). Raises SdfsimError: no
+    pose."""
     turn, place = pose[:, :3], pose[:, 3]
     if not np.isfinite(pose).all() or abs(np.linalg.det(turn)) < 1e-6:
         raise SdfsimError(f"{name}: its matrix is not a pose")
@@ -219,7 +220,8 @@ def scaled(known: KnownCamera, width: int, height: int) -> np.ndarray:
 def rectified(picture: Picture, known: KnownCamera, name: str, source: str) -> tuple[Picture, View, Lens | None]:
     """A photo as a pinhole camera in the same place would have taken it, that camera, and the lens it was freed from.
 
-    Where nothing is distorted there is no lens and nothing is resampled; else the photo is cut to what is shown.
+    Nothing is resampled where the lens has no distortion: then there is no lens. Elsewhere the photo is cut to what the
+    lens shows of the pinhole's picture all over.
     """
     height, width = picture.pixels.shape[:2]
     matrix, bent, lens = scaled(known, width, height), known.lens, None

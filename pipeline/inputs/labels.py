@@ -62,7 +62,8 @@ class Labels:
 
 
 def find_masks(photos: list[Path]) -> dict[Path, Path]:
-    """The mask file of each photo that has one in a folder `masks` in or beside its own; white is the object."""
+    """The mask file of each photo that has one in a folder `masks` in or beside the photo's folder; white is the
+    object."""
     masks: dict[Path, Path] = {}
     for root in _roots(photos):
         masks = {**_of_photos(root, root / "masks", photos)[0], **masks}

@@ -56,7 +56,8 @@ def prepare_photos(
     """Reads every photo (see `find_source`) and writes upright copies of at most `long_side` px to `out`.
 
     Writes `images/NNNN.jpg` and `photos.json`; where they were given, `masks/NNNN.jpg.png`, `depth/NNNN.jpg.npy`,
-    `labels/NNNN.jpg.png` with their names, `known_cameras.json`, `capture.json`. Returns photos, and notes to report.
+    `labels/NNNN.jpg.png` with their names, `known_cameras.json` and `capture.json`. Returns the photos in order, and
+    notes for the report.
     """
     source, out = find_source(given), Path(out)
     unpacked = out / ".capture"

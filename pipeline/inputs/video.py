@@ -68,7 +68,8 @@ def follow(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def choose(moved: np.ndarray, sharp: np.ndarray) -> list[int]:
-    """Frames to use, in order: the sharpest of each of `FEWEST` to `MOST` stretches of equal motion."""
+    """Frames to use, in order: the motion is cut into equal stretches, and the sharpest frame of each is taken; at
+    least `FEWEST` where there are as many, at most `MOST`."""
     total = float(moved[-1])
     count = int(np.clip(round(total / STEP) + 1, FEWEST, MOST))
     stretch = np.minimum((moved / max(total, 1e-9) * count).astype(int), count - 1)

@@ -257,7 +257,8 @@ def body_mesh(body: Body, field: Distance, cell: float) -> Mesh:
 
 
 def without_bodies(volume: Volume, bodies: list[Body], field: Distance) -> Volume:
-    """Samples of `field` for the scenery alone: bodies leave emptiness behind, and their plane goes on below them."""
+    """The scenery alone: what bodies leave behind is empty, and their plane goes on below them. `volume` holds samples
+    of `field`, the signed distance."""
     values = volume.values.copy()
     for body in bodies:
         part = body.part_of(volume)
@@ -423,7 +424,8 @@ def _loose(surface: Surface, votes: Votes, number: int, bodies: list[Body], up: 
 def _noise(meshes: dict[Body, Mesh], points: np.ndarray, width: float) -> list[Body]:
     """The bodies that are dark or blurred places which the training filled with something.
 
-    They are small, have no name, and hardly any sparse point [P, 3] within `width`, where others are covered with them.
+    They are small, no masks name them, and hardly any of the sparse points [P, 3] lies within `width` of them, where
+    others are covered with points.
     """
     area = np.array([face_normals(mesh)[1].sum() for mesh in meshes.values()])
     trees = [KDTree(mesh.vertices) for mesh in meshes.values()]

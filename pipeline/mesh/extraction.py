@@ -68,7 +68,8 @@ class Volume:
         return replace(self, values=values)
 
     def mesh(self) -> Mesh:
-        """The zero surface by marching cubes. Raises SdfsimError (exit code 3): the values have one sign everywhere."""
+        """The zero surface by marching cubes, faces counter-clockwise from outside. Raises SdfsimError (exit code 3)
+        where the values have one sign everywhere."""
         if not self.values.min() < 0 < self.values.max():
             raise SdfsimError("mesh: the field holds no surface", "try --preset standard", exit_code=EXIT_QUALITY)
         from skimage.measure import marching_cubes
@@ -165,7 +166,8 @@ def field_distance(field: Field) -> Distance:
 
 
 def trusted_vertices(mesh: Mesh, count: np.ndarray, at_limit: np.ndarray) -> np.ndarray:
-    """Vertices [V] bool that enough views see (`count` [V]) and that were not cut off (`at_limit` [V]); gaps close."""
+    """Vertices [V] bool of a closed mesh that enough views see (`count` [V]) and where the solid was not cut off
+    (`at_limit` [V] bool); small gaps are closed."""
     trusted = (count >= MIN_SEEN) & ~at_limit
     edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
     degree = np.maximum(np.bincount(edges[:, 0], minlength=len(trusted)), 1)
@@ -247,7 +249,8 @@ def belonging(mesh: Mesh, seen: np.ndarray, share: float, speck: float) -> tuple
 
 
 def islands(mesh: Mesh, faces: np.ndarray, share: float) -> np.ndarray:
-    """Of some faces [F] bool those in patches that have this share of their area, or of that in their component."""
+    """Of some faces [F] bool those that lie together: a patch needs this share of the area of all the faces, or of
+    those of its own component of the mesh."""
     _, area = face_normals(mesh)
     area = np.where(faces, area, 0)
     index = np.flatnonzero(faces)

@@ -217,7 +217,8 @@ def normalised(picture: Picture, points: np.ndarray) -> np.ndarray:
 
 
 def best_places(score: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where photos agree most [P], between even `moves` [M] with scores [P, M], and how far to trust that [P]."""
+    """Where the photos agree most [P], between the evenly spaced `moves` [M] with scores [P, M] from `agreement`, and
+    how far that is to be trusted [P]."""
     best = score.argmax(1)
     middle = best.clip(1, len(moves) - 2)
     before, here, after = (score[np.arange(len(score)), middle + k] for k in (-1, 0, 1))
@@ -230,7 +231,8 @@ def settled(mesh: Mesh, normal: np.ndarray, mean: csr_matrix, wanted: np.ndarray
             stay: np.ndarray) -> np.ndarray:  # fmt: skip
     """How far each vertex moves [V] along its normal [V, 3]: where it is wanted [V], by trust [V], or smooth between.
 
-    Normals are shorter where vertices shall move less; `mean` [V, V] averages neighbours; `stay` [V] trusts the start.
+    Normals are shorter where vertices shall move less; `mean` [V, V] takes the mean of the neighbours, `stay` [V] is
+    the trust in where the vertices are.
     """
     bend = mean - diags(np.ones(len(trust)))
     inwards = ((bend @ mesh.vertices) * normal).sum(1)

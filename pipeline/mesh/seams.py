@@ -155,7 +155,8 @@ def solid_of(volume: Volume, inside: np.ndarray, mesh: Mesh) -> Solid:
 
 
 def parts_by_votes(solid: Solid, votes: Votes) -> tuple[list[Part], int]:
-    """The parts of a solid that masks tell apart, none where there are no two; and the number of its one name, or 0."""
+    """The parts of a solid that masks tell apart, none where there are no two; and the name's number of the whole solid
+    where it has one, else 0."""
     winner = votes.winner[solid.index]
     count = np.bincount(winner[winner >= 0], minlength=len(votes.names) + 1)
     least = np.full(len(count), NAMED)

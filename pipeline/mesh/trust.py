@@ -255,7 +255,8 @@ def camera_at(place: np.ndarray, target: np.ndarray, like: View) -> View:
 
 
 def _places(views: Sequence[View], middle: np.ndarray, towards: np.ndarray, solid: Caster) -> np.ndarray:
-    """Places [C, 3] for a camera: around, at the given ones' median distance, in free space and in sight of one."""
+    """Places [C, 3] where a camera could be: around the scene, at the median distance of the given ones, in free space
+    and in sight of a given one."""
     given = np.array([view.center for view in views])
     far = float(np.median(np.linalg.norm(given - middle, axis=1)))
     height = np.degrees(np.arcsin(np.clip(-towards[:, 2], -1, 1)))

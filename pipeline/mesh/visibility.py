@@ -66,7 +66,8 @@ def hollow(mesh: Mesh, least: float) -> tuple[float, float] | None:
 
 
 class Visibility:
-    """Which vertices of a mesh, lifted by `offset` along normals, views see past `blocking` (or the mesh itself)."""
+    """Which vertices of a mesh which views see, lifted by `offset` along their normals, with `blocking` (or the mesh
+    itself) in the way."""
 
     def __init__(self, mesh: Mesh, offset: float, blocking: Caster | None = None) -> None:
         self.vertices, self.normals = mesh.vertices, vertex_normals(mesh)

@@ -37,7 +37,8 @@ class Findings:
 
 
 def find(result: dict, photos: list[Photo]) -> Findings:
-    """Looks at a worker's counts and pairs. Blurred photos match each other: a group of nothing else is no group."""
+    """Looks at a worker's counts and pairs. Blurred photos match each other, for want of anything finer; a group of
+    nothing else is no group."""
     sound = {photo.name for photo in photos if not photo.fault}
     counts, names = result["counts"], sorted(result["counts"])
     linked = [pair for pair in result["pairs"] if pair["matches"] >= FEW_MATCHES]
