@@ -123,7 +123,7 @@ def roll_out(
     gravity = torch.tensor(group[0].gravity / units.acceleration, dtype=torch.float64, device=device)
     rules = StepOptions(
         gravity, group[0].dt / units.time, model.inner or substeps, contact=contact, free_flight=free_flight,
-        margin=MARGIN / units.length if as_teacher else 0.0, adds=as_teacher,
+        margin=MARGIN / units.length if as_teacher else 0.0, adds=as_teacher, cone=not as_teacher,
     )  # fmt: skip
     if model.on_surfaces:
         state = with_history(state, bodies, rules)

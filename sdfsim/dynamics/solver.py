@@ -16,11 +16,13 @@ from sdfsim.dynamics import kernels, pose
 from sdfsim.dynamics.bodies import Bodies, State, Touch
 from sdfsim.dynamics.kernels import distance as kinds
 from sdfsim.dynamics.kernels import world as compiled
+from sdfsim.dynamics.kernels.convex import BALL, BLOCK, DRUM, HULL, POINT, SEGMENT, THICKNESS, WIDTH, Convex
 from sdfsim.dynamics.kernels.record import Edges
 from sdfsim.dynamics.kernels.step import step as compiled_step
 from sdfsim.dynamics.kernels.survey import Touching, touching
 from sdfsim.files import digest
 from sdfsim.shape.baked_grid import WALL, BakedGrid, baked, inwards
+from sdfsim.shape.convex_pieces import ConvexPiece, pieces_of
 from sdfsim.shape.sdf import ClosedForm, PlaneSdf, Sdf
 from sdfsim.shape.surface_nodes import Surface, surface_of
 
@@ -34,6 +36,7 @@ FORMS = {
     "plane": kinds.PLANE, "sphere": kinds.SPHERE, "capsule": kinds.CAPSULE, "box": kinds.BOX,
     "cylinder": kinds.CYLINDER,
 }  # fmt: skip
+SOLIDS = {"sphere": POINT, "capsule": SEGMENT, "box": BLOCK, "cylinder": DRUM, "hull": HULL}
 Clumps = list[list[np.ndarray]]
 LEAF, CLUMP = 16, 256  # nodes that a leaf and a clump of leaves hold at most
 TOUCHING = 1e-3  # model lengths, within which a point is told as a contact
@@ -114,7 +117,7 @@ def taken_up(
     )
     n, touch = len(position), state.touch
     if touch is None:
-        anchor = np.concatenate([position, orientation], 1)
+        anchor = np.concatenate([position, orientation, position, orientation], 1)
         still, nobody = np.zeros(n, np.int64), np.full(n, -1, np.int64)
         motion = compiled.Motion(position, orientation, velocity, angular, still > 0, still, anchor, nobody)
         return motion, _manifolds(None)
@@ -156,7 +159,7 @@ def compiled_rules(rules: StepOptions, *, note: bool = False) -> compiled.Rules:
     gravity, inner = rules.gravity.cpu().numpy(), rules.dt / rules.substeps
     return compiled.Rules(
         gravity, inner, rules.substeps, SLOW * math.hypot(*gravity) * inner, rules.friction,
-        rules.restitution, rules.rotation, rules.sleep, rules.margin, rules.adds, note,
+        rules.restitution, rules.rotation, rules.sleep, rules.margin, rules.adds, rules.cone, note,
         ahead=inner if note and inner > COARSE else 0.0,
     )  # fmt: skip
 
@@ -195,7 +198,34 @@ def compiled_shapes(bodies: Bodies) -> kinds.Shapes:
             brick.append(np.where(grid.brick >= 0, grid.brick.astype(np.int64) * size + first, -1).reshape(-1))
             sample.append(grid.fine.reshape(-1))
     arrays = (np.concatenate(parts) for parts in (brick, sample))
-    return kinds.Shapes(table, *arrays, *_joined(known), label=np.concatenate(label))
+    solids = [g.solids for g in known]
+    for row, pieces in zip(table, solids, strict=True):
+        if pieces and row[kinds.KIND] == kinds.GRID:
+            row[kinds.THICKNESS] = min(piece.thickness for piece in pieces)
+    return kinds.Shapes(table, *arrays, *_joined(known), np.concatenate(label), *_packed(solids))
+
+
+def _packed(solids: list[tuple[ConvexPiece, ...]]) -> Convex:
+    """The convex pieces of shapes, end to end."""
+    pieces = [piece for some in solids for piece in some]
+    table = np.zeros((len(pieces), WIDTH))
+    for row, piece in zip(table, pieces, strict=True):
+        row[0], row[BALL : BALL + 4], row[THICKNESS] = SOLIDS[piece.kind], piece.ball, piece.thickness
+        row[1 : 1 + len(piece.sizes)] = piece.sizes
+
+    def ends(lengths: list[int]) -> np.ndarray:
+        return np.cumsum([0, *lengths], dtype=np.int64)
+
+    vertex_start, loops = ends([len(piece.vertices) for piece in pieces]), [piece.loops for piece in pieces]
+    loop = [one + first for some, first in zip(loops, vertex_start, strict=False) for one in some]
+    return Convex(
+        start=ends([len(some) for some in solids]), table=table, vertex_start=vertex_start,
+        vertex=np.concatenate([np.zeros((0, 3)), *(piece.vertices for piece in pieces)]),
+        face_start=ends([len(piece.normals) for piece in pieces]),
+        face=np.concatenate([np.zeros((0, 3)), *(piece.normals for piece in pieces)]),
+        loop_start=ends([len(one) for one in loop]),
+        loop=np.concatenate([np.zeros(0, np.int64), *loop]).astype(np.int64),
+    )  # fmt: skip
 
 
 class Geometry(NamedTuple):
@@ -205,6 +235,7 @@ class Geometry(NamedTuple):
     surface: Surface
     inward: np.ndarray  # [K, 3] m, from its nodes to where they look out
     clumps: Clumps
+    solids: tuple[ConvexPiece, ...]  # what it collides as, where it is convex or made of convex pieces
 
 
 Pieces = tuple[np.ndarray, ...]
@@ -233,7 +264,7 @@ def _looked_at(sdf: Sdf, nodes: np.ndarray, pieces: Pieces) -> Geometry:
         _log.warning(told, extent, grid.thickness)
     surface = surface_of(sdf, nodes, pieces)
     inward = INWARD * extent * inwards(sdf, surface.nodes)
-    return Geometry(grid, surface, inward, _clumps(surface.nodes, surface.patch))
+    return Geometry(grid, surface, inward, _clumps(surface.nodes, surface.patch), pieces_of(sdf, pieces))
 
 
 def compiled_world(bodies: Bodies, state: State) -> compiled.World:
@@ -302,7 +333,7 @@ def _joined(known: list[Geometry]) -> tuple[np.ndarray, ...]:
     """The node arrays of `kinds.Shapes`."""
     node, inward, leaf_ball, clump_ball = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros((0, 4))], [np.zeros((0, 4))]
     leaf_node, clump_start, clump_leaf, leaf_patch = [0], [0], [0], []
-    for _, surface, within, clumps in known:
+    for _, surface, within, clumps, _ in known:
         for leaves in clumps:
             for leaf in leaves:
                 node.append(surface.nodes[leaf])

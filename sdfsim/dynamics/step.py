@@ -46,6 +46,7 @@ class StepOptions:
     # adds to the speed of a rebound. Both are habits of the teacher, for comparisons with it.
     margin: float = 0.0
     adds: bool = False
+    cone: bool = True  # whether friction is bounded by a cone; the teacher bounds it along two axes, each by itself
     trust: float = 1.0  # in what the network adds to the solve; 0 where a scene is beyond its training
 
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from sdfsim.dynamics.kernels.convex import Convex
 from sdfsim.dynamics.kernels.vectors import BARE, FAST, along, dot, get, norm, put, scale
 
 PLANE, SPHERE, CAPSULE, BOX, CYLINDER, GRID = range(6)
@@ -41,6 +42,24 @@ class Shapes(NamedTuple):
     clump_ball: np.ndarray  # [C, 4]
     leaf_patch: np.ndarray  # [L] int64, the patch of the surface that a leaf's nodes are of
     label: np.ndarray  # int16, the patches that are nearest to places all over
+    # the fields of `Convex`: compiled loops on all cores take no tuples in tuples
+    piece_start: np.ndarray
+    piece: np.ndarray
+    vertex_start: np.ndarray
+    vertex: np.ndarray
+    face_start: np.ndarray
+    face: np.ndarray
+    loop_start: np.ndarray
+    loop: np.ndarray
+
+
+@njit(**BARE)
+def solids(shapes):
+    """The convex pieces of the shapes."""
+    return Convex(
+        shapes.piece_start, shapes.piece, shapes.vertex_start, shapes.vertex, shapes.face_start, shapes.face,
+        shapes.loop_start, shapes.loop,
+    )  # fmt: skip
 
 
 @njit(**BARE)

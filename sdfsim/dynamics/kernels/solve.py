@@ -9,14 +9,11 @@ import numpy as np
 from numba import njit, prange
 
 from sdfsim.dynamics.kernels.vectors import BARE, FAST, add, along, cross, dot, get, norm, scale, sub, turn, vector
-from sdfsim.dynamics.kernels.world import DRAG, GAP, NORMAL, PUSH
+from sdfsim.dynamics.kernels.world import DRAG, FIRST, GAP, KEY, NORMAL, PUSH, SECOND, TORSION
 
 # Columns of a row: its direction, how it turns the first and the second body, what a unit of impulse makes of their
 # angular velocities, the inverse of what it makes of the relative velocity, the wanted change, the impulse so far.
 AXIS, ARM, OTHER, SPIN, COUNTER, MASS, WANTED, IMPULSE, WIDTH = 0, 3, 6, 9, 12, 15, 16, 17, 18
-# A face presses all over, and resists being turned less than its corners would: by the mean distance from its middle,
-# which is 0.54 of that of the corners for a square, 0.67 of the rim's for a disc, 0.5 of that of the ends for a line.
-SPREAD = 0.58
 TOUCH = 1e-6  # model lengths: nearer is touching, so that rounding does not decide when what starts in contact is met
 AT_REST = 1e-9  # squared: slower tangential motion has no direction
 # No island may gain more energy than so many times what its pushes out of penetration would give each contact alone,
@@ -80,8 +77,6 @@ def _equations(world, work, motion, rules, manifolds):
         bounce = world.restitution[a] * world.restitution[b] if rules.restitution else 0.0
         margin = rules.margin * ((world.radius[a] < math.inf) + (world.radius[b] < math.inf))
         between = sub(get(motion.position, a), get(motion.position, b))
-        flat, middle, opposite = _patch(matrix, manifolds.point, m, manifolds.count[m], a, b)
-        middle, opposite = met_half_way(between, middle, opposite)
         for k in range(manifolds.count[m]):
             point = manifolds.point[m, k]
             n = (point[NORMAL], point[NORMAL + 1], point[NORMAL + 2])
@@ -96,7 +91,8 @@ def _equations(world, work, motion, rules, manifolds):
                 point[PUSH] = point[DRAG] = point[DRAG + 1] = point[DRAG + 2] = 0.0
                 continue
             _row(world.inverse_mass, inverse, a, b, arm, other, n, row, count, 0)
-            target = -approach * bounce if -approach > rules.slow else 0.0
+            # Newton's rule for all that meets in one impact: without friction, and with e = 1, energy is kept.
+            target = -approach * bounce if abs(approach) > rules.slow else 0.0
             deep = push = rest = 0.0
             if gap > TOUCH:
                 target = rest = -gap / rules.inner
@@ -112,14 +108,12 @@ def _equations(world, work, motion, rules, manifolds):
             calm[count, 0], calm[count, 1], calm[count, 2] = rest - dot(then, n), dot(then, n), push
             grip[count] = friction
             if friction > 0.0:
-                slip = along(then, n, -dot(then, n))
-                if flat:
-                    arm = along(scale(middle, 1.0 - SPREAD), arm, SPREAD)
-                    other = along(scale(opposite, 1.0 - SPREAD), other, SPREAD)
+                if point[TORSION] < 1.0:
+                    arm, other = _drawn_in(matrix, manifolds.point, m, manifolds.count[m], k, a, b, between)
                     then = add(
                         _relative(motion.velocity, motion.angular, a, b, arm, other), _coming(free, a, b, arm, other)
                     )
-                    slip = along(then, n, -dot(then, n))
+                slip = along(then, n, -dot(then, n))
                 one = _tangent(n, slip, vector(rules.gravity))
                 two = cross(n, one)
                 _row(world.inverse_mass, inverse, a, b, arm, other, one, row, count, 1)
@@ -128,8 +122,13 @@ def _equations(world, work, motion, rules, manifolds):
                 row[count, 2, WANTED] = -dot(then, two)
                 drag = (point[DRAG], point[DRAG + 1], point[DRAG + 2])
                 most_drag = friction * point[PUSH]
-                row[count, 1, IMPULSE] = min(max(dot(drag, one), -most_drag), most_drag)
-                row[count, 2, IMPULSE] = min(max(dot(drag, two), -most_drag), most_drag)
+                first, second = dot(drag, one), dot(drag, two)
+                if rules.cone:
+                    share = _within(first, second, most_drag)
+                    row[count, 1, IMPULSE], row[count, 2, IMPULSE] = share * first, share * second
+                else:
+                    row[count, 1, IMPULSE] = min(max(first, -most_drag), most_drag)
+                    row[count, 2, IMPULSE] = min(max(second, -most_drag), most_drag)
             where[count, 0], where[count, 1], where[count, 2], where[count, 3] = m, k, a, b
             count += 1
     start, order = _islands(world, work.parent, work.number, where[:count])
@@ -144,20 +143,25 @@ def met_half_way(between, arm, other):
 
 
 @njit(**BARE)
-def _patch(matrix, point, m, count, a, b):
-    """Whether the points of a manifold bound a face, and its middle from either centre of mass (world axes)."""
-    middle, opposite = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    if count < 3:
-        return False, middle, opposite
-    for k in range(count):
-        alike = 0.0
-        for x in range(3):
-            alike += point[m, k, NORMAL + x] * point[m, 0, NORMAL + x]
-        if alike < 0.95:
-            return False, middle, opposite
-        middle = add(middle, (point[m, k, 0], point[m, k, 1], point[m, k, 2]))
-        opposite = add(opposite, (point[m, k, 3], point[m, k, 4], point[m, k, 5]))
-    return True, turn(matrix, a, scale(middle, 1.0 / count)), turn(matrix, b, scale(opposite, 1.0 / count))
+def _drawn_in(matrix, point, m, count, k, a, b, between):
+    """Where friction acts of a point that bounds a face: nearer to the middle of those of the same two patches."""
+    middle, opposite, alike = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0
+    for e in range(count):
+        if point[m, e, KEY] == point[m, k, KEY]:
+            middle = add(middle, (point[m, e, FIRST], point[m, e, FIRST + 1], point[m, e, FIRST + 2]))
+            opposite = add(opposite, (point[m, e, SECOND], point[m, e, SECOND + 1], point[m, e, SECOND + 2]))
+            alike += 1
+    own, share = point[m, k], point[m, k, TORSION]
+    arm = along(scale(middle, (1.0 - share) / alike), (own[FIRST], own[FIRST + 1], own[FIRST + 2]), share)
+    other = along(scale(opposite, (1.0 - share) / alike), (own[SECOND], own[SECOND + 1], own[SECOND + 2]), share)
+    return met_half_way(between, turn(matrix, a, arm), turn(matrix, b, other))
+
+
+@njit(**BARE)
+def _within(one, other, most):
+    """By which factor a tangential impulse is to be shortened to lie within the cone of friction."""
+    length = math.sqrt(one * one + other * other)
+    return 1.0 if length <= most else most / length
 
 
 @njit(**BARE)
@@ -337,7 +341,10 @@ def _balance(mass, rules, system, change, island):
             c = order[o]
             if grip[c] > 0.0:
                 most = grip[c] * row[c, 0, IMPULSE]
-                worst = max(worst, _relax(where, row, mass, change, c, 1, 3, -most, most))
+                if rules.cone:
+                    worst = max(worst, _rub(where, row, mass, change, c, most))
+                else:
+                    worst = max(worst, _relax(where, row, mass, change, c, 1, 3, -most, most))
         if worst <= rules.exact:
             break
 
@@ -367,6 +374,21 @@ def _relax(where, row, mass, change, c, first, last, least, most):
         for x in range(3):
             change[a, x], change[a, 3 + x], change[b, x], change[b, 3 + x] = v[x], w[x], u[x], z[x]
     return worst
+
+
+@njit(**BARE)
+def _rub(where, row, mass, change, c, most):
+    """Bring both tangential rows of a contact to rest, as far as the cone of friction allows; returns by how much that
+    changed."""
+    first, second = row[c, 1, IMPULSE], row[c, 2, IMPULSE]
+    wish = first + (row[c, 1, WANTED] - _speed(where, row, change, c, 1)) * row[c, 1, MASS]
+    _apply(where, row, mass, change, c, 1, wish - first)
+    other = second + (row[c, 2, WANTED] - _speed(where, row, change, c, 2)) * row[c, 2, MASS]
+    share = _within(wish, other, most)
+    _apply(where, row, mass, change, c, 1, (share - 1.0) * wish)
+    _apply(where, row, mass, change, c, 2, share * other - second)
+    row[c, 1, IMPULSE], row[c, 2, IMPULSE] = share * wish, share * other
+    return max(abs(share * wish - first) / row[c, 1, MASS], abs(share * other - second) / row[c, 2, MASS])
 
 
 @njit(**BARE)

@@ -7,10 +7,12 @@ import math
 import numpy as np
 from numba import njit
 
-from sdfsim.dynamics.kernels.collide import collide, is_round, look_around, nearest, scratch_room
 from sdfsim.dynamics.kernels.distance import SIZE, THICKNESS
+from sdfsim.dynamics.kernels.manifold import scratch_room
+from sdfsim.dynamics.kernels.narrow_phase import SOLIDS, collide, look_around, nearest, way_of
 from sdfsim.dynamics.kernels.record import gathered, no_edges, noted
 from sdfsim.dynamics.kernels.solve import join, respond, root
+from sdfsim.dynamics.kernels.surface_distance import is_round
 from sdfsim.dynamics.kernels.vectors import (
     BARE,
     FAST,
@@ -70,7 +72,7 @@ def step(shapes, world, work, motion, rules, manifolds):
         contacts = len(system.where)
         if rules.note:
             edges = noted(motion, matrix, manifolds, system, k / rules.steps, edges)
-        _parts(shapes, world, work, motion, rules, manifolds, near)
+        _parts(shapes, world, work, motion, rules, manifolds, near, scratch)
         for b in world.going:
             if motion.island[b] < 0 and (world.moves[b] or world.scripted[b]):
                 moved = _advance(world, motion, matrix, rules, work.load, change, shift, work.part[b], trial, frame, b)
@@ -217,7 +219,7 @@ def _slope(world, orientation, momentum, u, h, b, trial, frame):
 
 
 @njit(**FAST)
-def _parts(shapes, world, work, motion, rules, manifolds, near):
+def _parts(shapes, world, work, motion, rules, manifolds, near, scratch):
     """How much of the inner step each body may move, so that none passes through what is thinner than its way."""
     free, change, part = work.free, work.change, work.part
     for b in world.going:
@@ -233,7 +235,7 @@ def _parts(shapes, world, work, motion, rules, manifolds, near):
         depth = _harmless(shapes, world, a, b)
         away = near.away_all[p] - work.gone[a] - work.gone[b]
         if speed * rules.inner > depth and not away > speed * rules.inner:
-            free_part = _clear(shapes, world, motion, work, rules, manifolds, near, p, speed, depth)
+            free_part = _clear(shapes, world, motion, work, rules, manifolds, near, scratch, p, speed, depth)
             part[a], part[b] = min(part[a], free_part), min(part[b], free_part)
 
 
@@ -241,6 +243,10 @@ def _parts(shapes, world, work, motion, rules, manifolds, near):
 def _harmless(shapes, world, a, b):
     """How deep two bodies may overlap before a distance points out of the wrong side of a wall."""
     depth = math.inf
+    if way_of(shapes, world.shape[a], world.shape[b]) == SOLIDS:
+        for body in (a, b):
+            depth = min(depth, THIN * shapes.table[world.shape[body], THICKNESS] * world.scale[body])
+        return depth if world.radius[b] < math.inf else math.inf
     for side in range(2):
         one, other = (a, b) if side == 0 else (b, a)
         s, t = world.shape[one], world.shape[other]
@@ -253,7 +259,7 @@ def _harmless(shapes, world, a, b):
 
 
 @njit(**FAST)
-def _clear(shapes, world, motion, work, rules, manifolds, near, p, speed, depth):
+def _clear(shapes, world, motion, work, rules, manifolds, near, scratch, p, speed, depth):
     """How much of the inner step a pair may move until it overlaps a little: conservative advancement."""
     free, change = work.free, work.change
     gone = work.gone[manifolds.pair[p, 0]] + work.gone[manifolds.pair[p, 1]]
@@ -277,7 +283,7 @@ def _clear(shapes, world, motion, work, rules, manifolds, near, p, speed, depth)
         rest = max((1.0 - t) * way - deep, -0.5 * deep)  # what is no nearer is not met before the end
         gap = nearest(
             shapes, world.shape, place, frame, scales, coms, manifolds.pair, near, p, gone + t * way, rest,
-            0.0 if t == 0.0 else -0.5 * deep, t == 0.0,
+            0.0 if t == 0.0 else -0.5 * deep, t == 0.0, scratch.simplex,
         )  # fmt: skip
         # Or they are in contact already, and it is answered.
         if gap >= rest or (t == 0.0 and gap <= 0.0):
@@ -328,20 +334,15 @@ def _settle(world, motion, rules, manifolds):
     for b in world.going:
         if not world.moves[b] or motion.island[b] >= 0:
             continue
-        anchor = motion.anchor[b]
-        cosine = 0.0
-        for x in range(4):
-            cosine += anchor[3 + x] * motion.orientation[b, x]
-        away = sub(get(motion.position, b), (anchor[0], anchor[1], anchor[2]))
-        strayed = norm(away) + 2.0 * math.sqrt(max(0.0, 1.0 - cosine * cosine)) * world.radius[b]
-        if motion.touching[b] and strayed < rules.stray:
+        if motion.touching[b] and _strayed(world, motion, b, 0) < rules.stray:
             motion.quiet[b] += 1
         else:
             motion.quiet[b] = 0
-            for x in range(3):
-                anchor[x] = motion.position[b, x]
-            for x in range(4):
-                anchor[3 + x] = motion.orientation[b, x]
+        if motion.quiet[b] == rules.rest // 2:
+            _drop_anchor(motion, b, 7)
+        if motion.quiet[b] == 0 or (motion.quiet[b] >= rules.rest and not _balanced(world, motion, rules, b)):
+            motion.quiet[b] = 0
+            _drop_anchor(motion, b, 0)
     if motion.quiet.max() < rules.rest:
         return
     parent = np.arange(n)
@@ -365,3 +366,52 @@ def _settle(world, motion, rules, manifolds):
             put(motion.velocity, b, (0.0, 0.0, 0.0))
             put(motion.angular, b, (0.0, 0.0, 0.0))
             motion.touching[b] = True
+
+
+@njit(**BARE)
+def _drop_anchor(motion, b, column):
+    for x in range(3):
+        motion.anchor[b, column + x] = motion.position[b, x]
+    for x in range(4):
+        motion.anchor[b, column + 3 + x] = motion.orientation[b, x]
+
+
+@njit(**BARE)
+def _strayed(world, motion, b, column):
+    """How far at most any point of a body is from where an anchor has it."""
+    anchor, cosine = motion.anchor[b], 0.0
+    for x in range(4):
+        cosine += anchor[column + 3 + x] * motion.orientation[b, x]
+    away = sub(get(motion.position, b), (anchor[column], anchor[column + 1], anchor[column + 2]))
+    return norm(away) + 2.0 * math.sqrt(max(0.0, 1.0 - cosine * cosine)) * world.radius[b]
+
+
+@njit(**BARE)
+def _balanced(world, motion, rules, b):
+    """Whether the forces at a body are in balance: as it went on in the second half of its quiet time, against the
+    first, it would stay near in the time that follows.
+
+    Of the poses q0, q1, q2 at the start, the middle and the end the change of the way is q2 - 2 q1 + q0, which a
+    constant force makes a quarter of what it moves a body in as long a time from rest.
+    """
+    half, whole = rules.rest - rules.rest // 2, rules.rest
+    anchor = motion.anchor[b]
+    most = 0.0
+    for x in range(3):
+        later = (motion.position[b, x] - anchor[7 + x]) / half
+        before = (anchor[7 + x] - anchor[x]) / (whole - half)
+        most += (later - before) ** 2
+    turned, sign, halfway = 0.0, 1.0, 1.0
+    dots = 0.0
+    mids = 0.0
+    for x in range(4):
+        dots += anchor[3 + x] * anchor[10 + x]
+        mids += anchor[10 + x] * motion.orientation[b, x]
+    sign, halfway = (1.0 if dots >= 0.0 else -1.0), (1.0 if mids >= 0.0 else -1.0)
+    for x in range(4):
+        later = (halfway * motion.orientation[b, x] - anchor[10 + x]) / half
+        before = (anchor[10 + x] - sign * anchor[3 + x]) / (whole - half)
+        turned += (later - before) ** 2
+    # Steps a half apart: the acceleration a step, and what it makes of a body at rest in `whole` steps more.
+    gain = (math.sqrt(most) + 2.0 * math.sqrt(turned) * world.radius[b]) / half
+    return 0.5 * gain * whole * whole < rules.drift

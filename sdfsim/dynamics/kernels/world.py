@@ -9,8 +9,9 @@ import numpy as np
 POINTS = 24  # of a manifold at most
 # Columns of a contact point: where it is on either body (about its centre of mass, in its axes), the unit normal from
 # the second body to the first (world), the distance, the impulses of the last inner step: along the normal, and the
-# tangential one (world); the two patches that meet there, and a place for notes.
-FIRST, SECOND, NORMAL, GAP, PUSH, DRAG, KEY, NOTE, COLUMNS = 0, 3, 6, 9, 10, 11, 14, 15, 16
+# tangential one (world); the two patches that meet there; by which factor friction acts nearer to the middle of the
+# patch than the point is; and a place for notes.
+FIRST, SECOND, NORMAL, GAP, PUSH, DRAG, KEY, TORSION, NOTE, COLUMNS = 0, 3, 6, 9, 10, 11, 14, 15, 16, 17
 
 
 class World(NamedTuple):
@@ -84,7 +85,7 @@ class Motion(NamedTuple):
     # and not that at its end (what rests has none)
     touching: np.ndarray
     quiet: np.ndarray  # [N] int64, for how many steps a body has stayed near its anchor
-    anchor: np.ndarray  # [N, 7] the pose that it has stayed near
+    anchor: np.ndarray  # [N, 14] the pose that it has stayed near, and that half of that time later
     island: np.ndarray  # [N] int64, a number shared by the bodies that fell asleep together, -1 for all that are awake
 
 
@@ -110,6 +111,7 @@ class Rules(NamedTuple):
     sleep: bool = False
     margin: float = 0.0  # all bodies but planes are larger by this than their distances say
     adds: bool = False  # whether what is pushed out adds to the speed of a rebound
+    cone: bool = True  # whether friction is bounded by a cone; else along two axes, each by itself
     note: bool = False  # whether what contacts did in the step is wanted, see `record`
     ahead: float = 0.0  # new points are looked for so much time farther, as fast as two bodies move against each other
     reach: float = 0.02  # contacts are kept up to this distance, and while they have slid by no more
@@ -122,6 +124,8 @@ class Rules(NamedTuple):
     rounds: int = 50  # of sequential impulses at most
     exact: float = 1e-4  # they end when no impulse changes a velocity by more
     apart: float = 0.03  # points of a manifold are at least so far from each other
-    # stray, rest: who stays within `stray` for `rest` steps falls asleep
+    # stray, rest: who stays within `stray` for `rest` steps falls asleep, if its forces are so nearly in balance that
+    # they move it by less than `drift` in as long a time
     stray: float = 0.005
     rest: int = 25
+    drift: float = 2e-4

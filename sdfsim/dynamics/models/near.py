@@ -15,7 +15,7 @@ from torch import Tensor
 
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State
-from sdfsim.dynamics.kernels.collide import nodes_within
+from sdfsim.dynamics.kernels.edges import nodes_within
 from sdfsim.dynamics.models.surfaces import expanded, node_owner
 from sdfsim.dynamics.run_memory import Memory
 from sdfsim.dynamics.solver import compiled_rules, taken_up
