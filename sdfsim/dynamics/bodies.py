@@ -13,6 +13,7 @@ from sdfsim.dynamics import pose
 from sdfsim.errors import SdfsimError
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Scene, Waypoints
+from sdfsim.shape.convex_pieces import convex_vertices
 from sdfsim.shape.sdf import Sdf
 from sdfsim.shape.shape import Shape
 
@@ -100,6 +101,8 @@ class Bodies:
     sdfs: tuple[Sdf, ...]  # signed distances of the shapes that may be touched
     # of each of these the vertices of its convex pieces, shape frame in m; none of most
     pieces: tuple[tuple[np.ndarray, ...], ...] = ()
+    # likewise the vertices [V, 3] of the whole, where a shape is convex; none of most
+    hulls: tuple[np.ndarray, ...] = ()
     tracks: Tracks | None = None  # the paths of kinematic bodies, None where there are none
 
     def __len__(self) -> int:
@@ -211,6 +214,7 @@ def from_scene(scene: Scene, units: Units, device: torch.device) -> tuple[Bodies
         world=torch.zeros(len(scene.bodies), dtype=torch.int64, device=device),
         sdfs=tuple(scene.shapes[k].sdf for k in touched),
         pieces=tuple(scene.shapes[k].pieces for k in touched),
+        hulls=tuple(convex_vertices(scene.shapes[k].mesh) for k in touched),
         tracks=_tracks(paths, com, length=units.length, time=units.time, device=device),
     )
     orientation = tensor([b.quat_xyzw for b in scene.bodies])

@@ -61,10 +61,10 @@ class Compiled:
         n = len(self.bodies)
         self.work = compiled.Work(
             matrix=pose.to_matrix(state.orientation.cpu()).numpy(), inverse=np.zeros((n, 3, 3)),
-            free=np.zeros((n, 6)), change=np.zeros((n, 6)), shift=np.zeros((n, 6)), load=np.zeros((n, 6)),
+            free=np.zeros((n, 9)), change=np.zeros((n, 6)), shift=np.zeros((n, 6)), load=np.zeros((n, 6)),
             part=np.ones(n), ways=np.zeros(n), gone=np.zeros(n), low=np.zeros((n, 3)), high=np.zeros((n, 3)),
             beside=np.zeros(n, np.bool_), met=np.zeros(n, np.bool_),
-            parent=np.zeros(n, np.int64), number=np.zeros(n, np.int64),
+            parent=np.zeros(n, np.int64), number=np.zeros(n, np.int64), latest=np.zeros(n, np.int64),
         )  # fmt: skip
 
     def run(
@@ -179,7 +179,10 @@ def compiled_shapes(bodies: Bodies) -> kinds.Shapes:
     table[:, kinds.THICKNESS], table[:, kinds.CELL], table[:, kinds.PATCH] = np.inf, 1.0, -1.0
     brick, sample, label = [np.zeros(0, np.int64)], [np.zeros(0, np.float32)], [np.zeros(0, np.int16)]
     owner = {int(s): k for k, s in reversed(list(enumerate(bodies.shape.tolist()))) if s >= 0}
-    known = [_geometry(sdf, _nodes_of(bodies, owner[s]), bodies.pieces[s]) for s, sdf in enumerate(bodies.sdfs)]
+    known = [
+        _geometry(sdf, _nodes_of(bodies, owner[s]), bodies.pieces[s], bodies.hulls[s])
+        for s, sdf in enumerate(bodies.sdfs)
+    ]
     for row, sdf, (grid, surface, *_) in zip(table, bodies.sdfs, known, strict=True):
         if surface.nearest is not None:
             row[kinds.PATCH_LOW : kinds.PATCH_LOW + 3], row[kinds.PATCH_CELL] = surface.low, surface.cell
@@ -202,7 +205,8 @@ def compiled_shapes(bodies: Bodies) -> kinds.Shapes:
     for row, pieces in zip(table, solids, strict=True):
         if pieces and row[kinds.KIND] == kinds.GRID:
             row[kinds.THICKNESS] = min(piece.thickness for piece in pieces)
-    return kinds.Shapes(table, *arrays, *_joined(known), np.concatenate(label), *_packed(solids))
+    parts = (table, *arrays, *_joined(known), np.concatenate(label), *_packed(solids))
+    return kinds.Shapes(*parts)
 
 
 def _packed(solids: list[tuple[ConvexPiece, ...]]) -> Convex:
@@ -216,15 +220,22 @@ def _packed(solids: list[tuple[ConvexPiece, ...]]) -> Convex:
     def ends(lengths: list[int]) -> np.ndarray:
         return np.cumsum([0, *lengths], dtype=np.int64)
 
-    vertex_start, loops = ends([len(piece.vertices) for piece in pieces]), [piece.loops for piece in pieces]
-    loop = [one + first for some, first in zip(loops, vertex_start, strict=False) for one in some]
+    def joined(parts: list[np.ndarray], like: np.ndarray) -> np.ndarray:
+        return np.concatenate([like[:0], *parts])
+
+    whole, places = np.zeros(0, np.int64), np.zeros((0, 3))
+    vertex_start, face_start = (ends([len(getattr(p, what)) for p in pieces]) for what in ("vertices", "normals"))
+    ahead = list(zip(pieces, vertex_start, face_start, strict=False))
+    loop = [one + first for piece, first, _ in ahead for one in piece.loops]
+    beside = [one + first for piece, first, _ in ahead for one in piece.beside]
+    around = [one + first for piece, _, first in ahead for one in piece.around]
     return Convex(
-        start=ends([len(some) for some in solids]), table=table, vertex_start=vertex_start,
-        vertex=np.concatenate([np.zeros((0, 3)), *(piece.vertices for piece in pieces)]),
-        face_start=ends([len(piece.normals) for piece in pieces]),
-        face=np.concatenate([np.zeros((0, 3)), *(piece.normals for piece in pieces)]),
-        loop_start=ends([len(one) for one in loop]),
-        loop=np.concatenate([np.zeros(0, np.int64), *loop]).astype(np.int64),
+        start=ends([len(some) for some in solids]), table=table,
+        vertex_start=vertex_start, vertex=joined([piece.vertices for piece in pieces], places),
+        face_start=face_start, face=joined([piece.normals for piece in pieces], places),
+        loop_start=ends([len(one) for one in loop]), loop=joined(loop, whole),
+        beside_start=ends([len(one) for one in beside]), beside=joined(beside, whole),
+        around_start=ends([len(one) for one in around]), around=joined(around, whole),
     )  # fmt: skip
 
 
@@ -239,32 +250,33 @@ class Geometry(NamedTuple):
 
 
 Pieces = tuple[np.ndarray, ...]
-# With the nodes and the convex pieces that it is for.
-_of_sdf: WeakKeyDictionary[Sdf, tuple[np.ndarray, Pieces, Geometry]] = WeakKeyDictionary()
+# With the nodes, the convex pieces and the hull that it is for.
+_of_sdf: WeakKeyDictionary[Sdf, tuple[np.ndarray, Pieces, np.ndarray, Geometry]] = WeakKeyDictionary()
 _of_content: OrderedDict[str, Geometry] = OrderedDict()  # of the latest: workers get copies of shapes
 
 
-def _geometry(sdf: Sdf, nodes: np.ndarray, pieces: Pieces) -> Geometry:
+def _geometry(sdf: Sdf, nodes: np.ndarray, pieces: Pieces, hull: np.ndarray) -> Geometry:
     """Made once for all scenes of a process."""
-    known, split, kept = _of_sdf.get(sdf, (nodes, pieces, None))
-    if kept is None or split is not pieces or not np.array_equal(known, nodes):
-        content = digest(sdf, nodes, pieces)
-        kept = _of_content.pop(content, None) or _looked_at(sdf, nodes, pieces)
-        _of_sdf[sdf], _of_content[content] = (nodes, pieces, kept), kept
+    known, split, solid, kept = _of_sdf.get(sdf, (nodes, pieces, hull, None))
+    if kept is None or split is not pieces or solid is not hull or not np.array_equal(known, nodes):
+        content = digest(sdf, nodes, pieces, hull)
+        kept = _of_content.pop(content, None) or _looked_at(sdf, nodes, pieces, hull)
+        _of_sdf[sdf], _of_content[content] = (nodes, pieces, hull, kept), kept
         if len(_of_content) > MOST_KEPT:
             _of_content.popitem(last=False)
     return kept
 
 
-def _looked_at(sdf: Sdf, nodes: np.ndarray, pieces: Pieces) -> Geometry:
+def _looked_at(sdf: Sdf, nodes: np.ndarray, pieces: Pieces, hull: np.ndarray) -> Geometry:
     grid = None if isinstance(sdf, ClosedForm) else baked(sdf, nodes, pieces)
     extent = 0.0 if isinstance(sdf, PlaneSdf) else float(np.ptp(sdf.bounds, axis=0).max())
     if grid and grid.thickness <= 1.001 * WALL * grid.cell:
         told = "a shape of %.2g m has walls of at most %.2g m: things may pass through; --thicken helps"
         _log.warning(told, extent, grid.thickness)
     surface = surface_of(sdf, nodes, pieces)
+    solids = pieces_of(sdf, pieces, hull)
     inward = INWARD * extent * inwards(sdf, surface.nodes)
-    return Geometry(grid, surface, inward, _clumps(surface.nodes, surface.patch), pieces_of(sdf, pieces))
+    return Geometry(grid, surface, inward, _clumps(surface.nodes, surface.patch), solids)
 
 
 def compiled_world(bodies: Bodies, state: State) -> compiled.World:

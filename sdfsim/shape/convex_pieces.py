@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -11,6 +12,8 @@ from sdfsim.shape.mesh import Mesh
 from sdfsim.shape.sdf import BoxSdf, CapsuleSdf, CylinderSdf, Sdf, SphereSdf
 
 FLAT = 1e-6  # faces whose unit normals differ by less are one
+DENT = 5e-4  # of the largest extent: a mesh whose dents are no deeper is convex
+HOLLOW = 1e-3  # of its volume, that a convex mesh may have less than its hull
 CORNERS = 64  # of a face at most: of one with more, so many evenly chosen ones bound the contact
 
 
@@ -25,6 +28,8 @@ class ConvexPiece:
     vertices: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # [V, 3] m, of a hull
     normals: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # [F, 3] outward, one a flat face
     loops: tuple[np.ndarray, ...] = ()  # [F] the vertices of each face, counter-clockwise as seen from outside
+    beside: tuple[np.ndarray, ...] = ()  # [V] the vertices at the other ends of each one's edges
+    around: tuple[np.ndarray, ...] = ()  # [V] the faces that meet there
 
 
 def closed_form(sdf: Sdf) -> ConvexPiece | None:
@@ -50,19 +55,30 @@ def hull(vertices: np.ndarray) -> ConvexPiece:
     number = np.full(len(vertices), -1)
     number[found.vertices] = np.arange(len(corners))
     normals, loops = [], []
-    left = np.ones(len(found.simplices), bool)
+    left, owner = np.ones(len(found.simplices), bool), np.zeros(len(found.simplices), np.int64)
     for k in range(len(found.simplices)):
         if not left[k]:
             continue
         normal = found.equations[k, :3]
         alike = left & (np.linalg.norm(found.equations[:, :3] - normal, axis=1) < FLAT)
         left &= ~alike
+        owner[alike] = len(normals)
         normals.append(normal)
         loops.append(_around(corners, np.unique(number[found.simplices[alike]]), normal))
     widths = [np.ptp(corners @ normal) for normal in normals]
     middle = 0.5 * (corners.min(0) + corners.max(0))
     ball = np.array([*middle, np.linalg.norm(corners - middle, axis=1).max()])
-    return ConvexPiece("hull", (), ball, float(min(widths)), corners, np.array(normals), tuple(loops))
+    triangles = number[found.simplices]
+    sides = np.concatenate([triangles[:, [i, j]] for i, j in ((0, 1), (1, 2), (2, 0), (1, 0), (2, 1), (0, 2))])
+    beside = _grouped(sides[:, 0], sides[:, 1], len(corners))
+    around = _grouped(triangles.reshape(-1), np.repeat(owner, 3), len(corners))
+    return ConvexPiece("hull", (), ball, float(min(widths)), corners, np.array(normals), tuple(loops), beside, around)
+
+
+def _grouped(owner: np.ndarray, value: np.ndarray, count: int) -> tuple[np.ndarray, ...]:
+    """The different values of each of `count` owners."""
+    pairs = np.unique(np.stack([owner, value], axis=1), axis=0)
+    return tuple(np.split(pairs[:, 1], np.searchsorted(pairs[:, 0], np.arange(1, count))))
 
 
 def _around(corners: np.ndarray, chosen: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -75,30 +91,43 @@ def _around(corners: np.ndarray, chosen: np.ndarray, normal: np.ndarray) -> np.n
     return loop[np.linspace(0, len(loop), min(len(loop), CORNERS), endpoint=False).astype(int)]
 
 
-def is_convex(mesh: Mesh, within: float) -> bool:
-    """Whether a closed mesh is its own convex hull to `within` m: no face lies deeper below the hull."""
+_convex: WeakKeyDictionary[Mesh, np.ndarray] = WeakKeyDictionary()
+
+
+def convex_vertices(mesh: Mesh) -> np.ndarray:
+    """[V, 3] m, the vertices of a mesh that is its own convex hull, but for dents and rounding; none of any other."""
+    if mesh not in _convex:
+        _convex[mesh] = mesh.vertices if _is_convex(mesh) else np.zeros((0, 3))
+    return _convex[mesh]
+
+
+def _is_convex(mesh: Mesh) -> bool:
     from scipy.spatial import ConvexHull, QhullError
 
+    if len(mesh.faces) < 4:
+        return False
     try:
         found = ConvexHull(mesh.vertices)
     except QhullError:
         return False  # flat
-    # The corners and the middles of faces and edges of a dent lie below all planes of the hull.
     corners = mesh.vertices[mesh.faces]
-    places = np.concatenate(
-        [mesh.vertices, corners.mean(1), 0.5 * (corners + np.roll(corners, 1, axis=1)).reshape(-1, 3)]
-    )
-    planes = np.unique(found.equations.round(9), axis=0)
-    for part in np.array_split(places, -(-len(places) * len(planes) // 2**22) or 1):
-        if ((part @ planes[:, :3].T + planes[:, 3]).max(1) < -within).any():
-            return False
-    return True
+    volume = abs(np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))) / 6.0
+    if not abs(volume - found.volume) <= HOLLOW * found.volume:
+        return False
+    # What lies deepest in a dent is a corner, or the middle of an edge or a face, well enough.
+    middles = 0.5 * (corners + np.roll(corners, 1, axis=1))
+    places = np.concatenate([mesh.vertices, corners.mean(1), middles.reshape(-1, 3)])
+    planes, deep = np.unique(found.equations.round(9), axis=0), DENT * np.ptp(mesh.vertices, axis=0).max()
+    parts = np.array_split(places, max(1, len(places) * len(planes) // 2**22))
+    return all((part @ planes[:, :3].T + planes[:, 3]).max(1).min() >= -deep for part in parts)
 
 
-def pieces_of(sdf: Sdf, pieces: Sequence[np.ndarray]) -> tuple[ConvexPiece, ...]:
-    """What a shape collides as: its closed form, or its convex pieces (the vertices [V, 3] m of each); none for a
-    plane, and for a surface that has no pieces."""
+def pieces_of(sdf: Sdf, pieces: Sequence[np.ndarray], whole: np.ndarray) -> tuple[ConvexPiece, ...]:
+    """What a shape collides as: its convex pieces (the vertices [V, 3] m of each), its closed form, or its own hull
+    (`whole`, vertices [V, 3] m; none of what is not convex); nothing for a plane, and for what is none of these."""
     if len(pieces):
         return tuple(hull(piece) for piece in pieces)
     found = closed_form(sdf)
-    return () if found is None else (found,)
+    if found is not None:
+        return (found,)
+    return (hull(whole),) if len(whole) else ()

@@ -26,7 +26,7 @@ FARTHEST = 1e12  # from the origin: beyond, not even double precision tells the 
 TEXTURES = ("JPEG", "PNG", "WEBP", "BMP", "TIFF")  # Pillow starts other programs to draw some of the other formats
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Mesh:
     """A triangle mesh.
 

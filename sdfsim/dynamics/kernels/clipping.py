@@ -15,6 +15,7 @@ from sdfsim.dynamics.kernels.convex import (
     POINT,
     SEGMENT,
     SIZE,
+    outermost,
     rounding,
 )
 from sdfsim.dynamics.kernels.vectors import BARE, FAST, add, along, cross, dot, get, put, scale, turn, turn_back
@@ -55,8 +56,10 @@ def feature(convex, p, size, matrix, body, d, out):
     kind, local = convex.table[p, KIND], turn_back(matrix, body, d)
     a, b, c = convex.table[p, SIZE], convex.table[p, SIZE + 1], convex.table[p, SIZE + 2]
     if kind == HULL:
+        top = outermost(convex, p, local)
         best, most = convex.face_start[p], -math.inf
-        for f in range(convex.face_start[p], convex.face_start[p + 1]):
+        for e in range(convex.around_start[top], convex.around_start[top + 1]):
+            f = convex.around[e]
             facing = dot(get(convex.face, f), local)
             if facing > most:
                 best, most = f, facing
@@ -119,13 +122,14 @@ def across(n):
 
 
 @njit(**BARE)
-def touching_points(convex, matrix, pair, plane, gap, n, own, his, reach, room):
+def touching_points(convex, matrix, pair, plane, held, gap, n, own, his, reach, room):
     """The points at which two pieces touch or may soon, of which up to CHOSEN bound the contact; to room.clipped (its
     places are on the first, world axes from the second's origin) and room.gap.
 
     Args:
         plane: whether the second is the half space below its origin, whose normal is n.
-        gap, n, own, his: what `closest` found; of a plane only the gap counts.
+        held: whether n is not that of least distance, so that there may be no point.
+        gap, n, own, his: what `closest` found; of a plane, or where it is held, only the gap counts.
 
     Returns:
         How many were picked, and by which factor friction acts nearer to their middle than the points are: a face that
@@ -171,7 +175,7 @@ def touching_points(convex, matrix, pair, plane, gap, n, own, his, reach, room):
             kept += 1
     count = kept
     extent = _extent(room, count)
-    if least > gap + 1e-6 * extent + 1e-9 * abs(gap):
+    if not held and least > gap + 1e-6 * extent + 1e-9 * abs(gap):
         # Corners or edges meet between the corners of what was clipped.
         at = along(own, n, mine)
         put(room.clipped, count, (dot(at, u), dot(at, w), dot(at, n)))

@@ -37,6 +37,7 @@ KIND, SIZE, BALL, THICKNESS, WIDTH = 0, 1, 4, 8, 9
 TOUCHING = 1e-7  # of the thickness: solids that are farther apart are asked as they lie
 APART = 1e-3  # of the thickness: so far apart overlapping solids are moved
 EXACT = 1e-11  # squared distances are found to this part
+FEW = 48  # vertices that are looked at in turn; of more, neighbours of neighbours
 STEPS, ROUNDS = 48, 10  # of GJK, and of normals
 
 
@@ -51,6 +52,10 @@ class Convex(NamedTuple):
     face: np.ndarray  # [F, 3] float64, outward unit normals
     loop_start: np.ndarray  # [F + 1] int64
     loop: np.ndarray  # [L] int64, the vertices of a face in turn
+    beside_start: np.ndarray  # [V + 1] int64
+    beside: np.ndarray  # int64, the vertices at the other ends of a vertex's edges
+    around_start: np.ndarray  # [V + 1] int64
+    around: np.ndarray  # int64, the faces that meet in a vertex
 
 
 class Simplex(NamedTuple):
@@ -74,16 +79,32 @@ def rounding(convex, p):
 
 
 @njit(**BARE)
+def outermost(convex, p, d):
+    """The vertex of a hull that is farthest along d: of the best of a few, always the neighbour that is farther."""
+    first, last = convex.vertex_start[p], convex.vertex_start[p + 1]
+    best, most = first, -math.inf
+    for v in range(first, last, 1 + (last - first) // FEW):
+        reach = convex.vertex[v, 0] * d[0] + convex.vertex[v, 1] * d[1] + convex.vertex[v, 2] * d[2]
+        if reach > most:
+            best, most = v, reach
+    while last - first > FEW:
+        start = best
+        for e in range(convex.beside_start[start], convex.beside_start[start + 1]):
+            v = convex.beside[e]
+            reach = convex.vertex[v, 0] * d[0] + convex.vertex[v, 1] * d[1] + convex.vertex[v, 2] * d[2]
+            if reach > most:
+                best, most = v, reach
+        if best == start:
+            break
+    return best
+
+
+@njit(**BARE)
 def core(convex, p, d):
     """The point of the core of piece p, in its own frame, that is farthest along d."""
     kind = convex.table[p, KIND]
     if kind == HULL:
-        best, most = convex.vertex_start[p], -math.inf
-        for v in range(convex.vertex_start[p], convex.vertex_start[p + 1]):
-            reach = convex.vertex[v, 0] * d[0] + convex.vertex[v, 1] * d[1] + convex.vertex[v, 2] * d[2]
-            if reach > most:
-                best, most = v, reach
-        return get(convex.vertex, best)
+        return get(convex.vertex, outermost(convex, p, d))
     if kind == POINT:
         return 0.0, 0.0, 0.0
     a, b, c = convex.table[p, SIZE], convex.table[p, SIZE + 1], convex.table[p, SIZE + 2]

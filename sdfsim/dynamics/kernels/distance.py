@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from sdfsim.dynamics.kernels.convex import Convex
-from sdfsim.dynamics.kernels.vectors import BARE, FAST, along, dot, get, norm, put, scale
+from sdfsim.dynamics.kernels.vectors import BARE, ENTRY, along, dot, get, norm, put, scale
 
 PLANE, SPHERE, CAPSULE, BOX, CYLINDER, GRID = range(6)
 TINY = 1e-12
@@ -51,6 +51,10 @@ class Shapes(NamedTuple):
     face: np.ndarray
     loop_start: np.ndarray
     loop: np.ndarray
+    beside_start: np.ndarray
+    beside: np.ndarray
+    around_start: np.ndarray
+    around: np.ndarray
 
 
 @njit(**BARE)
@@ -58,11 +62,11 @@ def solids(shapes):
     """The convex pieces of the shapes."""
     return Convex(
         shapes.piece_start, shapes.piece, shapes.vertex_start, shapes.vertex, shapes.face_start, shapes.face,
-        shapes.loop_start, shapes.loop,
+        shapes.loop_start, shapes.loop, shapes.beside_start, shapes.beside, shapes.around_start, shapes.around,
     )  # fmt: skip
 
 
-@njit(**BARE)
+@njit(**ENTRY)
 def distance(table, brick, sample, s, p):
     """Signed distance and unit gradient of shape s at p."""
     kind = table[s, KIND]
@@ -89,7 +93,7 @@ def distance_alone(table, brick, sample, s, p):
     return d
 
 
-@njit(**FAST)
+@njit(**ENTRY)
 def distances(table, brick, sample, s, p):
     """Signed distances [P] and unit gradients [P, 3] of shape s at places [P, 3]."""
     d, n = np.empty(len(p)), np.empty((len(p), 3))

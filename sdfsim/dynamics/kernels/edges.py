@@ -8,10 +8,23 @@ from numba import njit
 from sdfsim.dynamics.kernels.broad_phase import near_pairs, swept
 from sdfsim.dynamics.kernels.distance import distance
 from sdfsim.dynamics.kernels.surface_distance import map_between, mapped
-from sdfsim.dynamics.kernels.vectors import FAST, add, along, cross, dot, get, norm, scale, sub, to_matrix, turn, vector
+from sdfsim.dynamics.kernels.vectors import (
+    ENTRY,
+    add,
+    along,
+    cross,
+    dot,
+    get,
+    norm,
+    scale,
+    sub,
+    to_matrix,
+    turn,
+    vector,
+)
 
 
-@njit(**FAST)
+@njit(**ENTRY)
 def nodes_within(shapes, world, work, motion, rules, node, start):
     """Nodes that are within `rules.reach` of another body's surface, or will be by the end of the step as they go: the
     contact edges of the paper (section 3).

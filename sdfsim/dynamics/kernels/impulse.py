@@ -16,8 +16,7 @@ from sdfsim.dynamics.kernels.record import APART, ARM, AXIS, GIVEN, OTHER, WHEN
 from sdfsim.dynamics.kernels.solve import join, root
 from sdfsim.dynamics.kernels.step import _torque_free
 from sdfsim.dynamics.kernels.vectors import (
-    BARE,
-    FAST,
+    ENTRY,
     add,
     along,
     cross,
@@ -116,7 +115,7 @@ class Frames(NamedTuple):
     feature: np.ndarray  # [E, EDGE_FEATURES] float32
 
 
-@njit(**FAST)
+@njit(**ENTRY)
 def correct(weights, world, before, after, pair, value, terms):
     """Add to `after`, the poses at the end of a step as the solve has them, what the network adds, in place; `pair` and
     `value` are the edges of the solve, see `record.Edges`."""
@@ -144,7 +143,7 @@ def correct(weights, world, before, after, pair, value, terms):
                 after.orientation[b, x] = q[x]
 
 
-@njit(**FAST)
+@njit(**ENTRY)
 def _graph(world, before, after, pair, value, terms):
     """The bodies that met somebody, their motion, and the edges, in units in which the step lasts `known`."""
     time, total = terms.dt / terms.known, len(pair)
@@ -209,14 +208,14 @@ def _graph(world, before, after, pair, value, terms):
     return Graph(body, inverse_mass, inverse, twist, taken, inside, first[: pairs + 1], scaled, product)
 
 
-@njit(**BARE)
+@njit(**ENTRY)
 def _turning(world, matrix, b, w):
     """Twice the kinetic energy of a rotation."""
     inside = turn_back(matrix, b, w)
     return dot(inside, turn(world.inertia, b, inside))
 
 
-@njit(**BARE)
+@njit(**ENTRY)
 def _rotation(before, after, b):
     """The rotation vector, of at most half a turn, from one orientation to another."""
     v, u = _at(before, b, 0), _at(after, b, 0)
@@ -225,13 +224,13 @@ def _rotation(before, after, b):
     return scale(r, math.copysign(2.0 if s < 1e-12 else 2.0 * math.atan2(s, abs(w)) / s, w))
 
 
-@njit(**BARE)
+@njit(**ENTRY)
 def _at(array, row, column):
     """Three columns as a vector."""
     return array[row, column], array[row, column + 1], array[row, column + 2]
 
 
-@njit(**FAST)
+@njit(**ENTRY)
 def _frames(graph, terms):
     """Frames, effective masses and input features of all edges."""
     total, bodies = len(graph.pair), len(graph.body)
@@ -258,7 +257,7 @@ def _frames(graph, terms):
     return frames
 
 
-@njit(**BARE)
+@njit(**ENTRY)
 def _relative(graph, column, e):
     """Velocity of the first body's surface against the second's."""
     a, b, twist = graph.pair[e, 0], graph.pair[e, 1], graph.twist
@@ -266,7 +265,7 @@ def _relative(graph, column, e):
     return sub(one, add(_at(twist, b, column), cross(_at(twist, b, column + TURN), _at(graph.value, e, OTHER))))
 
 
-@njit(**BARE)
+@njit(**ENTRY)
 def _tangent(graph, slip, lift, around, e):
     """Along the first of these that there is, and whether there is one, see `models.contact_graph._axes`."""
     a, b, n = graph.pair[e, 0], graph.pair[e, 1], _at(graph.value, e, AXIS)
@@ -284,7 +283,7 @@ def _tangent(graph, slip, lift, around, e):
     return scale(flat, 1.0 / norm(flat)), 0.0
 
 
-@njit(**BARE)
+@njit(**ENTRY)
 def _frame(graph, frames, slip, lift, around, crowd, terms, e):
     """One edge; `crowd` is half the logarithm of how many its pair has."""
     a, b, value, twist = graph.pair[e, 0], graph.pair[e, 1], graph.value, graph.twist
@@ -325,14 +324,14 @@ def _frame(graph, frames, slip, lift, around, crowd, terms, e):
     mass[e, 2] *= known
 
 
-@njit(**BARE)
+@njit(**ENTRY)
 def _turned(frames, e, s, k, other):
     """What the turning that a unit impulse along axis k gives a body does to the contact point along another axis."""
     turned, moment = frames.give[e, s, k], frames.read[e, s, other]
     return turned[3] * moment[3] + turned[4] * moment[4] + turned[5] * moment[5]
 
 
-@njit(**BARE)
+@njit(**ENTRY)
 def _seen(graph, frames, twist, column, e, k):
     """Relative velocity of an edge along axis k."""
     a, b, read, total = graph.pair[e, 0], graph.pair[e, 1], frames.read, 0.0
@@ -341,7 +340,7 @@ def _seen(graph, frames, twist, column, e, k):
     return total
 
 
-@njit(**FAST)
+@njit(**ENTRY)
 def _pushed(graph, frames, impulse):
     """[A, 12] twists (end, mean) of the solve after impulses [E, axis, 2] on first bodies, opposite on second ones."""
     twist = graph.twist[:, END:].copy()
@@ -355,7 +354,7 @@ def _pushed(graph, frames, impulse):
     return twist
 
 
-@njit(**FAST)
+@njit(**ENTRY)
 def _layer(x, layer, k, out, bend):
     """x W + b, and its SiLU where it is to bend."""
     np.dot(x, layer.weight[k], out)
@@ -365,14 +364,14 @@ def _layer(x, layer, k, out, bend):
             out[i, j] = v / (np.float32(1.0) + math.exp(-v)) if bend else v
 
 
-@njit(**FAST)
+@njit(**ENTRY)
 def _mlp(x, layers, k, one, two, out):
     _layer(x, layers[0], k, one, True)
     _layer(one, layers[1], k, two, True)
     _layer(two, layers[2], k, out, False)
 
 
-@njit(**FAST)
+@njit(**ENTRY)
 def _impulses(weights, graph, frames):
     """[E, axis, end | mean] what the network adds: the rounds of message passing."""
     total, bodies, pair = len(graph.pair), len(graph.body), graph.pair
@@ -424,7 +423,7 @@ def _impulses(weights, graph, frames):
     return added
 
 
-@njit(**BARE)
+@njit(**ENTRY)
 def _read(normalise, k, graph, frames, twist, edge, body, e, out, row):
     """What an edge reads: its own latents, normalised, those of its bodies, and what is seen of their motion."""
     width = edge.shape[1]
@@ -443,7 +442,7 @@ def _read(normalise, k, graph, frames, twist, edge, body, e, out, row):
         out[row, 3 * width + 3 + x] = _seen(graph, frames, twist, 6, e, x) / frames.speed[e]
 
 
-@njit(**BARE)
+@njit(**ENTRY)
 def _to_shares(first, logit):
     """Softmax over the edges of each pair, in place, so that more of them do not mean more push."""
     for p in range(len(first) - 1):
@@ -456,7 +455,7 @@ def _to_shares(first, logit):
             logit[e, 0] = math.exp(logit[e, 0] - top) / total
 
 
-@njit(**FAST)
+@njit(**ENTRY)
 def _bound(graph, frames, added, terms):
     """Hold impulses [E, axis, end | mean] to the trust region, in place, see `models.impulse.bounded`."""
     axes, solved, start = added.shape[1], frames.solved, graph.twist
@@ -482,7 +481,7 @@ def _bound(graph, frames, added, terms):
     _share_energy(graph, frames, added)
 
 
-@njit(**FAST)
+@njit(**ENTRY)
 def _share_energy(graph, frames, added):
     """Scale the impulses at the end of the step, so that an island gets no more energy than the solve took from it.
 

@@ -18,11 +18,11 @@ from sdfsim.dynamics.kernels.world import (
     GAP,
     KEY,
     NORMAL,
-    NOTE,
     POINTS,
     PUSH,
     SECOND,
     TORSION,
+    VOID,
 )
 
 FOUND = 128  # contact points that a pair may find in one look
@@ -101,7 +101,7 @@ def write(found, count, side, mine, theirs, normal, gap, key):
     found[count, GAP] = gap
     found[count, KEY] = key
     found[count, TORSION] = 1.0
-    found[count, NOTE] = 0.0
+    found[count, VOID] = 0.0
 
 
 @njit(**BARE)
@@ -111,17 +111,17 @@ def first_to_touch(rules, found, count):
     The others follow in the next inner steps, when the impact has been answered.
     """
     for e in range(count):
-        found[e, NOTE] = 0.0
+        found[e, VOID] = 0.0
         for f in range(count):
             alike = 0.0
             for x in range(3):
                 alike += found[e, NORMAL + x] * found[f, NORMAL + x]
             deeper = found[f, GAP] < found[e, GAP] - rules.together
             if alike > ALIKE and deeper and found[e, KEY] == found[f, KEY]:
-                found[e, NOTE] = 1.0
+                found[e, VOID] = 1.0
     kept = 0
     for e in range(count):
-        if found[e, NOTE] == 0.0:
+        if found[e, VOID] == 0.0:
             for x in range(COLUMNS):
                 found[kept, x] = found[e, x]
             kept += 1

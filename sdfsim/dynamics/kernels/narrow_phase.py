@@ -14,7 +14,7 @@ from numba import njit, prange
 
 from sdfsim.dynamics.kernels.broad_phase import carried, near_pairs, swept
 from sdfsim.dynamics.kernels.clipping import CHOSEN, touching_points
-from sdfsim.dynamics.kernels.convex import BALL, Pair, closest, core, first_normal, rounding
+from sdfsim.dynamics.kernels.convex import BALL, Pair, closest, core, first_normal, rounding, separation
 from sdfsim.dynamics.kernels.distance import CAPSULE, GRID, KIND, PLANE, SIZE, SPHERE, distance_alone, solids
 from sdfsim.dynamics.kernels.manifold import (
     FOUND,
@@ -71,6 +71,8 @@ class Near(NamedTuple):
     axis: np.ndarray  # [L, 3] the normal of a pair of pieces, from the second to the first; 0 where it is not known
     looked: np.ndarray  # [P] the ways of both bodies when new points were last looked for; -inf for never
     away_all: np.ndarray  # [P] the least of `away`; -inf where it is not known
+    held: np.ndarray  # [L] bool, whether a pair of pieces has the normal of what supports, see `internal_edges`
+    following: np.ndarray  # [2 P] int64 for finding the contacts of a body
 
 
 @njit(**FAST)
@@ -122,7 +124,7 @@ def near_parts(shapes, world, motion, matrix, pairs, ways, reach):
                 total += pieces * max(1, shapes.piece_start[t + 1] - shapes.piece_start[t])
     near = Near(
         start, np.zeros((count, 2), np.int64), np.empty(total, np.int32), np.empty(total), np.zeros((total, 3)),
-        np.full(count, -math.inf), np.full(count, -math.inf),
+        np.full(count, -math.inf), np.full(count, -math.inf), np.zeros(total, np.bool_), np.zeros(2 * count, np.int64),
     )  # fmt: skip
     if count >= MANY:
         _near_many(shapes, world, motion, matrix, pairs, ways, reach, near)
@@ -134,7 +136,8 @@ def near_parts(shapes, world, motion, matrix, pairs, ways, reach):
 
 @njit(parallel=True, **FAST)
 def _near_many(shapes, world, motion, matrix, pairs, ways, reach, near):
-    for p in prange(len(pairs)):
+    for i in prange(len(pairs)):
+        p = np.int64(i)  # that of a parallel loop is unsigned, for which all would be compiled once more
         _near(shapes, world, motion, matrix, pairs, ways, reach, near, p)
 
 
@@ -177,7 +180,7 @@ def _near(shapes, world, motion, matrix, pairs, ways, reach, near, p):
 
 
 @njit(**BARE)
-def _origin(position, matrix, coms, body):
+def origin(position, matrix, coms, body):
     """The origin of a body's shape."""
     return sub(get(position, body), turn(matrix, body, get(coms, body)))
 
@@ -187,11 +190,11 @@ def _near_pieces(shapes, world, motion, matrix, a, b, most, near, p):
     """The pairs of convex pieces whose balls are near each other."""
     convex = solids(shapes)
     s, t = world.shape[a], world.shape[b]
-    offset = sub(_origin(motion.position, matrix, world.com, a), _origin(motion.position, matrix, world.com, b))
+    offset = sub(origin(motion.position, matrix, world.com, a), origin(motion.position, matrix, world.com, b))
     plane, up = shapes.table[t, KIND] == PLANE, turn(matrix, b, (0.0, 0.0, 1.0))
     at, pieces = near.start[p, 0], convex.start[t + 1] - convex.start[t]
     whole = add(get(motion.position, b), turn(matrix, b, get(world.centre, b)))
-    whole = sub(whole, _origin(motion.position, matrix, world.com, b))
+    whole = sub(whole, origin(motion.position, matrix, world.com, b))
     for i in range(convex.start[s], convex.start[s + 1]):
         ball = (convex.table[i, BALL], convex.table[i, BALL + 1], convex.table[i, BALL + 2])
         middle = add(offset, turn(matrix, a, scale(ball, world.scale[a])))
@@ -230,8 +233,8 @@ def collide(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch
 
 @njit(parallel=True, **FAST)
 def _collide_many(shapes, world, motion, matrix, rules, manifolds, near, gone):
-    for t in prange(SHARES):
-        scratch = scratch_room()
+    for i in prange(SHARES):
+        t, scratch = np.int64(i), scratch_room()
         for p in range(t, len(near.start), SHARES):
             _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, p)
 
@@ -253,7 +256,9 @@ def _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, s
     near.looked[p], near.away_all[p] = went, math.inf
     if way == SOLIDS:
         known = manifolds.count[p]
-        count = _collide_solids(shapes, world, motion, matrix, rules, manifolds, near, went, scratch, p)
+        for at in range(near.start[p, 0], near.start[p, 0] + near.count[p, 0]):
+            near.held[at] = False
+        count = collide_solids(shapes, world, motion, matrix, rules, manifolds, near, went, scratch, p)
         if known == 0:
             count = first_to_touch(rules, scratch.found, count)
         manifolds.count[p] = renewed(rules, manifolds.point, p, known, scratch, count)
@@ -285,12 +290,12 @@ def _nearer(world, motion, rules, a, b):
 
 
 @njit(**BARE)
-def _collide_solids(shapes, world, motion, matrix, rules, manifolds, near, went, scratch, p):
+def collide_solids(shapes, world, motion, matrix, rules, manifolds, near, went, scratch, p):
     """The points at which the convex pieces of two bodies touch or may soon; how many."""
     convex, found, polygons = solids(shapes), scratch.found, scratch.polygons
     a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
     s, t = world.shape[a], world.shape[b]
-    offset = sub(_origin(motion.position, matrix, world.com, a), _origin(motion.position, matrix, world.com, b))
+    offset = sub(origin(motion.position, matrix, world.com, a), origin(motion.position, matrix, world.com, b))
     look = rules.reach + 2.0 * rules.margin + _nearer(world, motion, rules, a, b)
     plane, pieces = shapes.table[t, KIND] == PLANE, max(1, convex.start[t + 1] - convex.start[t])
     up, count = turn(matrix, b, (0.0, 0.0, 1.0)), 0
@@ -299,9 +304,13 @@ def _collide_solids(shapes, world, motion, matrix, rules, manifolds, near, went,
             i, j = near.leaf[at] // pieces, near.leaf[at] % pieces
             key = i * KEYS + j
             pair = Pair(convex.start[s] + i, convex.start[t] + j, a, b, world.scale[a], world.scale[b], offset)
+            own = his = (0.0, 0.0, 0.0)
             if plane:
                 gap, n = _above(convex, matrix, pair, up), up
-                own = his = (0.0, 0.0, 0.0)
+            elif near.held[at]:
+                n = get(near.axis, at)
+                gap = separation(convex, matrix, pair, n)
+                gap -= pair.size * rounding(convex, pair.first) + pair.other * rounding(convex, pair.second)
             else:
                 n = _known_normal(convex, matrix, pair, near, at, manifolds, p, key)
                 gap, n, own, his = closest(convex, matrix, pair, n, scratch.simplex)
@@ -310,7 +319,9 @@ def _collide_solids(shapes, world, motion, matrix, rules, manifolds, near, went,
             if gap <= look:
                 if count + CHOSEN > FOUND:
                     count = thinned(scratch, count)
-                picked, arm = touching_points(convex, matrix, pair, plane, gap, n, own, his, look, polygons)
+                picked, arm = touching_points(
+                    convex, matrix, pair, plane, near.held[at], gap, n, own, his, look, polygons
+                )
                 count = _write_points(world, matrix, pair, n, picked, arm, key, polygons, found, count)
         near.away_all[p] = min(near.away_all[p], near.away[at])
     return count
@@ -384,10 +395,10 @@ def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, lea
     table, brick, sample, convex = shapes.table, shapes.brick, shapes.sample, solids(shapes)
     s, t = shape[pairs[p, 0]], shape[pairs[p, 1]]
     if way_of(shapes, s, t) == SOLIDS:
-        offset = sub(_origin(place, frame, coms, 0), _origin(place, frame, coms, 1))
+        offset = sub(origin(place, frame, coms, 0), origin(place, frame, coms, 1))
         plane, pieces = table[t, KIND] == PLANE, max(1, convex.start[t + 1] - convex.start[t])
         for at in range(near.start[p, 0], near.start[p, 0] + near.count[p, 0]):
-            if near.away[at] - went >= least:
+            if near.away[at] - went >= least or near.held[at]:
                 continue
             i, j = near.leaf[at] // pieces, near.leaf[at] % pieces
             pair = Pair(convex.start[s] + i, convex.start[t] + j, 0, 1, scales[0], scales[1], offset)

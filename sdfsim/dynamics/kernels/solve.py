@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit, prange
 
 from sdfsim.dynamics.kernels.vectors import BARE, FAST, add, along, cross, dot, get, norm, scale, sub, turn, vector
-from sdfsim.dynamics.kernels.world import DRAG, FIRST, GAP, KEY, NORMAL, PUSH, SECOND, TORSION
+from sdfsim.dynamics.kernels.world import DRAG, FIRST, GAP, KEY, NORMAL, PUSH, SECOND, TORSION, VOID
 
 # Columns of a row: its direction, how it turns the first and the second body, what a unit of impulse makes of their
 # angular velocities, the inverse of what it makes of the relative velocity, the wanted change, the impulse so far.
@@ -84,15 +84,21 @@ def _equations(world, work, motion, rules, manifolds):
             other = turn(matrix, b, (point[3], point[4], point[5]))
             arm, other = met_half_way(between, arm, other)
             now = _relative(motion.velocity, motion.angular, a, b, arm, other)
-            then = add(now, _coming(free, a, b, arm, other))
+            free_fall = add(now, _coming(free, a, b, arm, other))
+            then = add(free_fall, _turning(free, a, b, arm, other))
             approach = dot(now, n)
             gap = point[GAP] - margin
-            if gap > TOUCH and (-approach > rules.slow or gap + dot(then, n) * rules.inner > 0.0):
+            if point[VOID] > 0.0 or (
+                gap > TOUCH and (-approach > rules.slow or gap + dot(then, n) * rules.inner > 0.0)
+            ):
                 point[PUSH] = point[DRAG] = point[DRAG + 1] = point[DRAG + 2] = 0.0
                 continue
             _row(world.inverse_mass, inverse, a, b, arm, other, n, row, count, 0)
             # Newton's rule for all that meets in one impact: without friction, and with e = 1, energy is kept.
-            target = -approach * bounce if abs(approach) > rules.slow else 0.0
+            rebounds = bounce > 0.0 and abs(approach) > rules.slow and gap <= TOUCH
+            target = -approach * bounce if rebounds else 0.0
+            # An impact is over before a body has turned: what the gyroscopic torque makes of it comes after.
+            before = dot(free_fall, n) if rebounds else dot(then, n)
             deep = push = rest = 0.0
             if gap > TOUCH:
                 target = rest = -gap / rules.inner
@@ -102,10 +108,10 @@ def _equations(world, work, motion, rules, manifolds):
                     target = max(push, min(target + push, -approach) if rules.adds else target)
             else:
                 deep = -gap * rules.erp / rules.inner
-            row[count, 0, WANTED] = target - dot(then, n)
+            row[count, 0, WANTED] = target - before
             row[count, 0, IMPULSE] = point[PUSH]
             wanted[count] = deep
-            calm[count, 0], calm[count, 1], calm[count, 2] = rest - dot(then, n), dot(then, n), push
+            calm[count, 0], calm[count, 1], calm[count, 2] = rest - before, before, push
             grip[count] = friction
             if friction > 0.0:
                 if point[TORSION] < 1.0:
@@ -113,6 +119,7 @@ def _equations(world, work, motion, rules, manifolds):
                     then = add(
                         _relative(motion.velocity, motion.angular, a, b, arm, other), _coming(free, a, b, arm, other)
                     )
+                    then = add(then, _turning(free, a, b, arm, other))
                 slip = along(then, n, -dot(then, n))
                 one = _tangent(n, slip, vector(rules.gravity))
                 two = cross(n, one)
@@ -177,6 +184,12 @@ def _coming(free, a, b, arm, other):
     one = add((free[a, 0], free[a, 1], free[a, 2]), cross((free[a, 3], free[a, 4], free[a, 5]), arm))
     two = add((free[b, 0], free[b, 1], free[b, 2]), cross((free[b, 3], free[b, 4], free[b, 5]), other))
     return sub(one, two)
+
+
+@njit(**BARE)
+def _turning(free, a, b, arm, other):
+    """What the gyroscopic torque adds to the relative velocity."""
+    return sub(cross((free[a, 6], free[a, 7], free[a, 8]), arm), cross((free[b, 6], free[b, 7], free[b, 8]), other))
 
 
 @njit(**BARE)
@@ -254,7 +267,7 @@ def _islands(world, parent, number, where):
 @njit(parallel=True, **FAST)
 def _solve_many(world, rules, system, change, shift):
     for i in prange(len(system.start) - 1):
-        _solve(world, rules, system, change, shift, i)
+        _solve(world, rules, system, change, shift, np.int64(i))
 
 
 @njit(**BARE)

@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 from sdfsim.dynamics.kernels.distance import SIZE, THICKNESS
+from sdfsim.dynamics.kernels.internal_edges import heed_supports
 from sdfsim.dynamics.kernels.manifold import scratch_room
 from sdfsim.dynamics.kernels.narrow_phase import SOLIDS, collide, look_around, nearest, way_of
 from sdfsim.dynamics.kernels.record import gathered, no_edges, noted
@@ -15,6 +16,7 @@ from sdfsim.dynamics.kernels.solve import join, respond, root
 from sdfsim.dynamics.kernels.surface_distance import is_round
 from sdfsim.dynamics.kernels.vectors import (
     BARE,
+    ENTRY,
     FAST,
     add,
     along,
@@ -35,7 +37,7 @@ THIN = 0.4  # of a wall: who goes farther in an inner step is watched on its way
 MOST_TURN = 0.1  # rad in one stage of torque-free rotation
 
 
-@njit(**FAST)
+@njit(**ENTRY)
 def step(shapes, world, work, motion, rules, manifolds):
     """Advance `motion` by one step, in place; time is that of the bodies that go, however many others there are.
 
@@ -63,11 +65,14 @@ def step(shapes, world, work, motion, rules, manifolds):
                 break
         for b in world.going:
             for x in range(6):
-                free[b, x] = change[b, x] = shift[b, x] = 0.0
+                change[b, x] = shift[b, x] = 0.0
+            for x in range(9):
+                free[b, x] = 0.0
             motion.touching[b] = False
             if world.moves[b] and motion.island[b] < 0 and work.beside[b]:
                 _prepare(world, motion, matrix, inverse, work.load, rules, free, b)
         collide(shapes, world, motion, matrix, rules, manifolds, near, work.gone, scratch)
+        heed_supports(shapes, world, work, motion, rules, manifolds, near, scratch)
         system = respond(world, work, motion, rules, manifolds)
         contacts = len(system.where)
         if rules.note:
@@ -136,7 +141,7 @@ def _prepare(world, motion, matrix, inverse, load, rules, free, b):
     later = turn(matrix, b, turn(world.inertia, b, turn_back(matrix, b, middle)))
     change = scale(turn(inverse, b, cross(later, middle)), rules.inner)
     for x in range(3):
-        free[b, 3 + x] += change[x]
+        free[b, 6 + x] = change[x]
 
 
 @njit(**BARE)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from sdfsim.dynamics.kernels.vectors import BARE, FAST, add, dot, get, put, rotated, scale, sub, turn, vector
+from sdfsim.dynamics.kernels.vectors import ENTRY, add, dot, get, put, rotated, scale, sub, turn, vector
 from sdfsim.dynamics.kernels.world import DRAG, GAP, NORMAL, PUSH
 
 
@@ -21,7 +21,7 @@ class Touching(NamedTuple):
     gap: np.ndarray  # [E] below 0 where they are in each other
 
 
-@njit(**BARE)
+@njit(**ENTRY)
 def first_fault(looked_at, position, orientation, velocity, angular, before, dt, unit, most):
     """The first of the bodies `looked_at` [N] bool whose state cannot be, -1 where all are sound; and what is wrong.
 
@@ -41,7 +41,7 @@ def first_fault(looked_at, position, orientation, velocity, angular, before, dt,
     return -1, 0
 
 
-@njit(**BARE)
+@njit(**ENTRY)
 def energies(mass, inertia, gravity, position, orientation, velocity, angular):
     """Kinetic and potential energy of all bodies with a mass."""
     kinetic = potential = 0.0
@@ -53,7 +53,7 @@ def energies(mass, inertia, gravity, position, orientation, velocity, angular):
     return kinetic, potential
 
 
-@njit(**FAST)
+@njit(**ENTRY)
 def touching(manifolds, position, orientation, within):
     """The contacts of bodies that are no farther apart than `within`."""
     most = manifolds.count.sum()

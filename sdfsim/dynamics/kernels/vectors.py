@@ -6,9 +6,12 @@ import math
 
 from numba import njit
 
-FAST = {"cache": True, "fastmath": {"contract", "arcp", "nsz"}, "error_model": "numpy"}
-# Of functions that make no arrays: without this each counts the references of all arrays that it is given, which takes
-# longer than what most of them do.
+# Of functions that Python calls.
+ENTRY = {"cache": True, "fastmath": {"contract", "arcp", "nsz"}, "error_model": "numpy"}
+# Of functions that only compiled code calls: a way in from Python takes as long to compile as most of them.
+FAST = {**ENTRY, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+# Likewise, of functions that make no arrays: without this each counts the references of all arrays that it is given,
+# which takes longer than what most of them do.
 BARE = {**FAST, "_nrt": False}
 
 

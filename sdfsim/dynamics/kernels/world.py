@@ -10,8 +10,8 @@ POINTS = 24  # of a manifold at most
 # Columns of a contact point: where it is on either body (about its centre of mass, in its axes), the unit normal from
 # the second body to the first (world), the distance, the impulses of the last inner step: along the normal, and the
 # tangential one (world); the two patches that meet there; by which factor friction acts nearer to the middle of the
-# patch than the point is; and a place for notes.
-FIRST, SECOND, NORMAL, GAP, PUSH, DRAG, KEY, TORSION, NOTE, COLUMNS = 0, 3, 6, 9, 10, 11, 14, 15, 16, 17
+# patch than the point is; and whether it is void, see `internal_edges`.
+FIRST, SECOND, NORMAL, GAP, PUSH, DRAG, KEY, TORSION, VOID, COLUMNS = 0, 3, 6, 9, 10, 11, 14, 15, 16, 17
 
 
 class World(NamedTuple):
@@ -53,8 +53,8 @@ class Work(NamedTuple):
     # matrix, inverse: [N, 3, 3] rotation and inverse inertia, world axes
     matrix: np.ndarray
     inverse: np.ndarray
-    # free, change, shift: [N, 6] what an inner step makes of velocities without contact, what contact adds, and
-    # velocities that only move and are forgotten
+    # free [N, 9]: what an inner step makes of velocities without contact; by the gyroscopic torque of the angular one
+    # change, shift [N, 6]: what contact adds, and velocities that only move and are forgotten
     free: np.ndarray
     change: np.ndarray
     shift: np.ndarray
@@ -71,6 +71,7 @@ class Work(NamedTuple):
     # parent, number: [N] int64 for finding islands
     parent: np.ndarray
     number: np.ndarray
+    latest: np.ndarray  # [N] int64 for finding the contacts of a body
 
 
 class Motion(NamedTuple):
