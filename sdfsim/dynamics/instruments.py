@@ -25,6 +25,7 @@ DEEP = 0.01  # of the smaller thickness of two bodies: who is deeper in another 
 FREE = 0.005  # likewise, of free space around a body that something pushes or holds up
 MADE = 0.01  # of the energy in play, beyond which what came from nothing is told
 SHARE = 0.1  # of what lifts a body by its own size, that is in play at least
+FADE = 0.9  # of what was in play before is so much, whenever energy is lost
 PART, LEAST = 0.05, 0.1  # of a run's time that the surfaces may take, and s that they may take anyway
 FEW = 4000  # pairs that are measured together
 FEW_BODIES = 64  # that move: of more, energy is accounted for together only
@@ -146,13 +147,13 @@ def energies(scene: Scene, rollout: Rollout) -> tuple[np.ndarray, np.ndarray, np
 
 
 def energy_account(scene: Scene, rollout: Rollout) -> Energy:
-    """By how much mechanical energy has grown, step by step and in all. What pulls do (the counter `pull_work`) is
-    taken off; steps in which a body on a path touches something may gain what they like."""
+    """By how much mechanical energy has grown, step by step and in all. What pulls and pushes give (the
+    counter `energy_given`) is taken off; steps in which a body on a path touches something may gain what they like."""
     kinetic, potential, lift = energies(scene, rollout)
     steps, count = len(rollout), len(scene.bodies)
     dynamic = np.array([b.motion == "dynamic" for b in scene.bodies])
     driven = np.array([b.motion == "kinematic" for b in scene.bodies])
-    work = rollout.counters.get("pull_work", np.zeros(steps + 1))
+    work = rollout.counters.get("energy_given", np.zeros(steps + 1))
     alone = 1 < dynamic.sum() and (dynamic | driven).sum() <= FEW_BODIES
     beside = _beside(scene, rollout) if alone or driven.any() else np.zeros((steps + 1, count, count), bool)
     led = beside[:, driven].any((1, 2))
@@ -175,9 +176,7 @@ def energy_account(scene: Scene, rollout: Rollout) -> Energy:
     gain = change.clip(min=0.0)
     in_play = np.maximum.accumulate(kinetic.sum(1))[:-1] + float(lift.sum())
     part = np.divide(gain, in_play, out=np.zeros_like(gain), where=in_play > 0)
-    return Energy(
-        float(gain.sum()), float(part.max(initial=0.0)), float((part > MADE).mean()) if steps else 0.0, *best
-    )
+    return Energy(float(gain.sum()), float(part.max(initial=0.0)), float((part > MADE).mean()) if steps else 0.0, *best)
 
 
 def _beside(scene: Scene, rollout: Rollout) -> np.ndarray:
@@ -213,8 +212,8 @@ def _climb(
             fresh = fresh | anew[t]
         low = np.where(fresh, now, low)
         rise = now - low
-        # What was there already of the motion that there is now.
-        play = np.where(fresh, kinetic[t], np.maximum(play, kinetic[t] - rise))
+        # What was there already of the motion that there is now. An impact stays in play for a while.
+        play = np.maximum(np.where(fresh, FADE * play, play), kinetic[t] - rise)
         whole = play + floor
         share = np.divide(rise, whole, out=np.zeros_like(rise), where=whole > 0)
         higher = share > part
@@ -315,8 +314,8 @@ def _pushed(scene: Scene, rollout: Rollout, dynamic: np.ndarray) -> np.ndarray:
     least = 0.02 * np.linalg.norm(scene.gravity) * dt[..., 0] + 1e-6 * np.maximum(fast[1:], fast[:-1]) + 1e-9
     pushed = np.zeros(fast.shape, bool)
     pushed[1:] = (np.linalg.norm(change, axis=2) > least) & dynamic
-    if "pull_work" in rollout.counters:
-        pushed &= (rollout.counters["pull_work"] == 0)[:, None]
+    if "energy_given" in rollout.counters:
+        pushed &= (rollout.counters["energy_given"] == 0)[:, None]
     if rollout.meta.get("free_flight") == "learned":
         pushed[:] = False
     return pushed

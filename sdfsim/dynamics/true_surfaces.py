@@ -371,16 +371,26 @@ def _lowest(
         kept = rank < MOST
         pair, corner, bend, lower = pair[kept], corner[kept], bend[kept], lower[kept]
         for _ in range(2):
-            pair, corner, bend, lower = _halved(solids, mine, pair, corner, bend, lower)
+            side = np.abs(corner[..., 2]).max(1) <= straight[mine.solid[pair]] * (1 + 1e-9)
+            pair, corner, bend, lower = _halved(solids, mine, pair, corner, bend, lower, side & smooth[pair])
     np.minimum.at(missed, pair, lower)
     return best, np.minimum(best, missed), where, slope
 
 
 def _halved(
-    solids: Sequence[Solid], mine: Placed, pair: np.ndarray, corner: np.ndarray, bend: np.ndarray, lower: np.ndarray
+    solids: Sequence[Solid],
+    mine: Placed,
+    pair: np.ndarray,
+    corner: np.ndarray,
+    bend: np.ndarray,
+    lower: np.ndarray,
+    side: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Every triangle cut across its longest edge; new corners of round surfaces and rims lie on them."""
-    edge = np.linalg.norm(np.roll(corner, -1, 1) - corner, axis=2)
+    """Every triangle cut across its longest edge; new corners of round surfaces and rims lie on them. On the straight
+    `side` of a round body that meets a convex one, only the way around it makes the bound worse."""
+    edge = np.roll(corner, -1, 1) - corner
+    edge[side, :, 2] *= 0.05
+    edge = np.linalg.norm(edge, axis=2)
     longest, row = edge.argmax(1), np.arange(len(pair))
     a, b, c = (corner[row, (longest + k) % 3] for k in range(3))
     middle = 0.5 * (a + b)

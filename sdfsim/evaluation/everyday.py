@@ -2,8 +2,8 @@
 
     python -m sdfsim.evaluation.everyday [ROW ...] [--size 0.1] [--yaw 0] [--kind analytic] [--full]
 
-prints a line a check: what was measured, what is wanted, and whether it holds. A row is a kind of scene; `--size` is its
-unit of length (that of the smallest bodies), `--yaw` turns the whole scene about the vertical, and `--kind` is what
+prints a line a check: what was measured, what is wanted, and whether it holds. A row is a kind of scene; `--size` is
+its unit of length (that of the smallest bodies), `--yaw` turns the whole scene about the vertical, and `--kind` is what
 solids are made of: closed forms, the exact distance of a mesh, or samples of it on a grid. Lengths below are in units
 of the size, times and speeds as at 10 cm (they scale by Froude's law). Everything is judged by closed forms and by the
 instruments of `sdfsim.dynamics.instruments`, never by what the contact solve says of itself.
@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from math import cos, hypot, inf, pi, radians, sin, sqrt
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from sdfsim.dynamics.instruments import DEEP, MADE, Verdict, energies, judged
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.simulator import SimulationError, Simulator
 from sdfsim.evaluation.hard_cases import yawed
+from sdfsim.files import write_text
 from sdfsim.scene.scene import Body, Effects, Scene
 from sdfsim.shape import primitives
 from sdfsim.shape.mesh import Mesh, convex_hull, joined
@@ -36,7 +38,7 @@ SIZES = (0.02, 0.1, 1.0)  # m
 YAWS = (0.0, 37.0, 121.0)  # degrees
 KINDS = ("analytic", "mesh", "grid")
 DENSITY = 500.0  # kg/m^3
-JUDGED = 3.0  # s that the surfaces of a run may take
+JUDGED = 60  # frames of a run, evenly spaced, in which surfaces are measured
 FACETS = 48  # of round meshes, unless told
 STILL = Rotation.identity()
 
@@ -72,6 +74,13 @@ class Check:
     @property
     def holds(self) -> bool:
         return bool(self.low <= self.measured <= self.high)
+
+    @property
+    def close(self) -> bool:
+        """Whether another machine's rounding may decide: within a tenth of a limit, or of the range between two."""
+        finite = [limit for limit in (self.low, self.high) if np.isfinite(limit)]
+        width = self.high - self.low if len(finite) == 2 else abs(finite[0])
+        return any(abs(self.measured - limit) < 0.1 * width for limit in finite)
 
     def __str__(self) -> str:
         wanted = f"{self.low:.6g} to {self.high:.6g}"
@@ -251,7 +260,7 @@ class Ran:
 
     @cached_property
     def verdict(self) -> Verdict:
-        return judged(self.scene, self.rollout, seconds=JUDGED)
+        return judged(self.scene, self.rollout, every=-(-len(self.rollout) // JUDGED) or 1)
 
     def energy(self) -> np.ndarray:
         """[T+1] J."""
@@ -289,13 +298,12 @@ def run(
     return Ran(at, scene, rollout, broke)
 
 
-def laws(ran: Ran, name: str, *, energy: bool = True) -> Iterator[Check]:
-    """What holds of every scene."""
+def laws(ran: Ran, name: str, *, deep: float = DEEP) -> Iterator[Check]:
+    """What holds of every scene; bodies may be in each other by a `deep` of the smaller thickness."""
     verdict = ran.verdict
-    yield most(f"{name}: overlap", 100 * verdict.overlap.part if verdict.overlap else 0.0, 100 * DEEP, "% of thickness")
+    yield most(f"{name}: overlap", 100 * verdict.overlap.part if verdict.overlap else 0.0, 100 * deep, "% of thickness")
     yield most(f"{name}: floating", 100 * verdict.floating.part if verdict.floating else 0.0, 0.0, "% of thickness")
-    if energy:
-        yield most(f"{name}: energy from nothing", 100 * verdict.energy.climb, 100 * MADE, "% of what is in play")
+    yield most(f"{name}: energy from nothing", 100 * verdict.energy.climb, 100 * MADE, "% of what is in play")
     if ran.broke:
         yield most(f"{name}: {ran.broke}", 1.0, 0.0)
 
@@ -431,15 +439,16 @@ def thin_floors(at: Setting) -> Iterator[Check]:
         # Half a millimetre of wood at 10 m is no mesh that a grid could hold.
         sheet = solid("analytic" if at.kind == "grid" else at.kind, "box", *size)
         ground = fixed("ground", sheet, [0, 0, -size[2] / 2])
+        deep = DEEP / size[2]  # a hundredth of the cube
         for place in ((0.0, 0.0), (0.3, 0.2)):
             ran = run(at, [ground, Put("cube", cube, [*place, 0.5])], 2.0)
             label = f"at rest on {name} at {place}"
             yield near(f"{label}: height", ran.place("cube")[-1, 2], 0.5, 0.01, "sizes")
             yield most(f"{label}: speed", np.abs(ran.v("cube")).max(), 0.01, "m/s")
-            yield from laws(ran, label)
+            yield from laws(ran, label, deep=deep)
         ran = run(at, [ground, Put("cube", cube, [0.3, 0.2, 1.5], e=0.0)], 1.5)
         yield near(f"dropped on {name}: height", ran.place("cube")[-1, 2], 0.5, 0.01, "sizes")
-        yield from laws(ran, f"dropped on {name}")
+        yield from laws(ran, f"dropped on {name}", deep=deep)
         ran = run(at, [ground, Put("cube", cube, [-2.0, 0.2, 0.5], v=[1.5, 0, 0], mu=0.5)], 1.0)
         way, dt = 1.5**2 / G / UNIT, float(np.diff(ran.seconds).mean())
         yield near(f"sliding on {name}: way", ran.place("cube")[-1, 0] + 2, way, 0.01, "sizes", 1.5 * dt / 2 / UNIT)
@@ -449,8 +458,6 @@ def rolling(at: Setting) -> Iterator[Check]:
     """What is round rolls on, and down a slope with g sin a / (1 + k^2): a cylinder has k^2 = 1/2, a tube
     (1 + (inner / outer)^2) / 2."""
     lie = about("x", 90)
-    # Half of the mesh's facet as a tolerance: a polygon of N sides with dead impacts loses (2/3)(1 - cos 2 pi / N) of
-    # its energy a facet, and never gains.
     tube_k = (1 + (0.45 / 0.5) ** 2) / 2
     forms = {
         "can": (solid(at.kind, "cylinder", 0.5, 1.0), 0.5, 0.5),
@@ -499,8 +506,9 @@ def facets(at: Setting) -> Iterator[Check]:
         kinetic = ran.energy() - ran.energy()[0]
         first = energies(ran.scene, ran.rollout)[0].sum(1)[0]
         turned = abs(ran.place("can")[-1, 0]) / (2 * pi * 0.5) * count
-        # A facet costs the polygon (2/3)(1 - cos(2 pi / N)) of its energy when it hits dead.
-        dead = 1 - (1 - 2 / 3 * (1 - cos(2 * pi / count))) ** (turned + 2)
+        # A polygon of k^2 = 1/2 whose facets hit dead keeps (1/2 + cos(2 pi / N)) / (3/2) of its speed at each: about
+        # the corner that hits next its angular momentum is what it was.
+        dead = 1 - (1 - 2 / 3 * (1 - cos(2 * pi / count))) ** (2 * turned + 4)
         rise = 9.81 * (0.5 - low) * UNIT / (0.75 * speed**2)
         yield Check(
             f"{count} facets at 1 m/s: energy lost", -100 * kinetic[-1] / first, -0.1, 100 * (dead + rise), "% of start"
@@ -704,12 +712,12 @@ def elastic(at: Setting) -> Iterator[Check]:
         ]
         ran = run(at, bodies, 0.5, gravity=0.0)
         energy = ran.energy()
-        p, l = _momenta(ran)  # noqa: E741
+        momentum, angular = _momenta(ran)
         if np.abs(ran.v("a")[-1] - ran.v("a")[0]).max() < 1e-6:
             continue  # they missed
         change.append(energy[-1] / energy[0] - 1)
-        push.append(np.abs(p[-1] - p[0]).max() / np.abs(p).max())
-        turn.append(np.abs(l[-1] - l[0]).max() / np.abs(l).max())
+        push.append(np.abs(momentum[-1] - momentum[0]).max())
+        turn.append(np.abs(angular[-1] - angular[0]).max())
     label = f"{count} throws"
     yield Check(f"{label}: hits", len(change), count / 4, count)
     yield Check(f"{label}: energy on average", 100 * float(np.mean(change)), -0.1, 0.1, "%")
@@ -738,20 +746,21 @@ def elastic(at: Setting) -> Iterator[Check]:
 
 
 def _momenta(ran: Ran) -> tuple[np.ndarray, np.ndarray]:
-    """[T+1, 3] momentum and angular momentum about the origin, of the scales m v and m v size."""
-    push = turn = np.zeros(3)
+    """[T+1, 3] momentum and angular momentum about the origin, as parts of what the two bodies had at the start
+    without regard to directions."""
+    push, turn = np.zeros((len(ran.time), 3)), np.zeros((len(ran.time), 3))
+    had, had_turn = 0.0, 0.0
     for k, body in enumerate(ran.scene.bodies):
-        if body.motion != "dynamic":
-            continue
         shape, r = ran.scene.shapes[body.shape], ran.rollout
         inertia = shape.inertia * (body.mass / shape.volume * body.scale**2)
         axes = Rotation.from_quat(r.orientation[:, k])
         spin = axes.apply(axes.inv().apply(r.angular_velocity[:, k]) @ inertia)
         p = body.mass * r.velocity[:, k]
-        push, turn = push + p, turn + spin + np.cross(r.position[:, k], p)
-    # Both are measured against what one of the two bodies has, since their sum may vanish.
-    one = ran.scene.bodies[0].mass * ran.at.time
-    return push / one + 1.0, turn / (one * ran.at.size) + 1.0
+        arm = np.cross(r.position[:, k], p)
+        push, turn = push + p, turn + spin + arm
+        had += float(np.linalg.norm(p[0]))
+        had_turn += float(np.linalg.norm(spin[0]) + np.linalg.norm(arm[0]))
+    return push / had, turn / had_turn
 
 
 def bullets(at: Setting) -> Iterator[Check]:
@@ -803,6 +812,29 @@ def checks(row: str, at: Setting) -> Iterator[tuple[str, Check]]:
         yield f"{row}: {check.name} [{at}]", check
 
 
+def changed(found: Sequence[tuple[str, Check]], listed: Sequence[str]) -> list[str]:
+    """What differs between checks that were run and the names of those that hold, as far as it is clear: a line each."""
+    lines = []
+    for name, check in found:
+        if check.close or check.holds == (name in listed):
+            continue
+        lines.append(
+            f"{'holds, and is not listed' if check.holds else 'is listed, and does not hold'}: {name}: {check}"
+        )
+    settings = {name.split(":")[0] + name[name.rindex(" [") :] for name, _ in found}
+    ran = {name for name, _ in found}
+    mine = (name for name in listed if name.split(":")[0] + name[name.rindex(" [") :] in settings)
+    return lines + [f"is listed, and there is no such check: {name}" for name in mine if name not in ran]
+
+
+def update(file: Path, found: Sequence[tuple[str, Check]]) -> None:
+    """Bring the list of what holds up to date with checks that were run; others stay as they are."""
+    listed = set(file.read_text(encoding="utf-8").splitlines()) if file.exists() else set()
+    settings = {name.split(":")[0] + name[name.rindex(" [") :] for name, _ in found}
+    listed = {name for name in listed if name.split(":")[0] + name[name.rindex(" [") :] not in settings}
+    write_text(file, "\n".join(sorted(listed | {name for name, check in found if check.holds})) + "\n")
+
+
 def main(arguments: Iterable[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m sdfsim.evaluation.everyday", description=__doc__)
     parser.add_argument("row", nargs="*", help=f"of {', '.join(ROWS)}; none for all")
@@ -811,6 +843,7 @@ def main(arguments: Iterable[str] | None = None) -> int:
     parser.add_argument("--kind", nargs="*", choices=KINDS, default=["analytic"])
     parser.add_argument("--full", action="store_true", help="all random scenes and long runs")
     parser.add_argument("--failed", action="store_true", help="print what does not hold only")
+    parser.add_argument("--update", type=Path, metavar="FILE", help="the list of what holds, to be brought up to date")
     given = parser.parse_args(None if arguments is None else list(arguments))
     held = total = 0
     for row in given.row or ROWS:
@@ -819,10 +852,14 @@ def main(arguments: Iterable[str] | None = None) -> int:
                 for kind in given.kind:
                     at = replace(Setting(), size=size, yaw=yaw, kind=kind, full=given.full)
                     print(f"--- {row} [{at}]", flush=True)
-                    for check in ROWS[row](at):
+                    found = []
+                    for name, check in checks(row, at):
+                        found.append((name, check))
                         held, total = held + check.holds, total + 1
                         if not (given.failed and check.holds):
                             print(check, flush=True)
+                    if given.update:
+                        update(given.update, found)
     print(f"{held} of {total} hold")
     return 0 if held == total else 1
 
