@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from sdfsim.dynamics.rollout import Rollout
@@ -156,7 +156,7 @@ def energy_account(scene: Scene, rollout: Rollout) -> Energy:
     work = rollout.counters.get("energy_given", np.zeros(steps + 1))
     alone = 1 < dynamic.sum() and (dynamic | driven).sum() <= FEW_BODIES
     beside = _beside(scene, rollout) if alone or driven.any() else np.zeros((steps + 1, count, count), bool)
-    led = beside[:, driven].any((1, 2))
+    led = np.asarray(beside[:, driven].any((1, 2)))
     total = (kinetic + potential).sum(1)
     change = np.diff(total) - work[1:]
     change[led[1:]] = np.minimum(change[led[1:]], 0.0)
@@ -167,7 +167,7 @@ def energy_account(scene: Scene, rollout: Rollout) -> Energy:
     best = (float(climb_J[0]), float(climb[0]), "", float(rollout.time[when[0]]))
     if alone:
         rows = np.flatnonzero(dynamic)
-        shared = beside.any(2) | (work != 0)[:, None]
+        shared = beside.any(2) | np.asarray(work != 0)[:, None]
         climbs = _climb((kinetic + potential)[:, rows], kinetic[:, rows], SHARE * lift[rows], shared[:, rows])
         k = int(climbs[1].argmax())
         if climbs[1][k] > best[1]:
@@ -257,12 +257,7 @@ class _Course:
 
 def _surfaces(scene: Scene, rollout: Rollout, seconds: float, every: int) -> tuple[Near | None, Near | None, int]:
     started = time.perf_counter()
-    kinds: dict[int, int] = {}
-    solids = []
-    for shape in scene.shapes:
-        if id(shape) not in kinds:
-            kinds[id(shape)] = len(solids)
-        solids.append(solid_of(shape))
+    solids = [solid_of(shape) for shape in scene.shapes]
     dynamic = np.array([b.motion == "dynamic" for b in scene.bodies])
     group, allowed = contact_groups(scene.bodies)
     course = _Course(scene, rollout, solids, dynamic, group, allowed, _pushed(scene, rollout, dynamic))
@@ -315,7 +310,7 @@ def _pushed(scene: Scene, rollout: Rollout, dynamic: np.ndarray) -> np.ndarray:
     pushed = np.zeros(fast.shape, bool)
     pushed[1:] = (np.linalg.norm(change, axis=2) > least) & dynamic
     if "energy_given" in rollout.counters:
-        pushed &= (rollout.counters["energy_given"] == 0)[:, None]
+        pushed &= np.asarray(rollout.counters["energy_given"] == 0)[:, None]
     if rollout.meta.get("free_flight") == "learned":
         pushed[:] = False
     return pushed
@@ -338,16 +333,16 @@ def near_pairs(course: _Course, frame: int, margin: np.ndarray) -> np.ndarray:
     every = np.arange(count)
     at = placed(scene, rollout, np.full(count, frame), every)
     bounds = np.stack([s.bounds for s in course.solids])[at.solid] * at.scale[:, None, None]
-    endless = ~np.isfinite(bounds).all((1, 2))
+    endless = np.asarray(~np.isfinite(bounds).all((1, 2)))
     bounds = np.where(endless[:, None, None], 0.0, bounds)
     middle = at.origin + np.einsum("kij,kj->ki", at.turn, bounds.mean(1))
     half = 0.5 * np.ptp(bounds, axis=1)
     radius = np.linalg.norm(half, axis=1) + margin
-    wide = endless | (radius > 4 * np.median(radius[~endless], overwrite_input=False) if (~endless).any() else True)
+    wide = endless | (radius > 4 * np.median(radius[~endless]) if (~endless).any() else True)
     found = []
     small = every[~wide]
     if len(small) > 1:
-        close = cKDTree(middle[small]).query_pairs(2 * float(radius[small].max()), output_type="ndarray")
+        close = KDTree(middle[small]).query_pairs(2 * float(radius[small].max()), output_type="ndarray")
         found.append(small[close])
     for k in every[wide]:
         others = every[(every != k) & ~(wide & (every < k))]

@@ -27,8 +27,8 @@ class Rollout:
             the edges acted, with the bodies as they are in this entry.
         contact_body: [sum(contact_count), 2] int64, (owner of the node, body it meets).
         counters: name -> [T+1] array: `kinetic_energy` J, `potential_energy` J, `energy_given` J (by pulls, pushes and
-            whoever set a state, since the frame before), `contacts`, `worst_penetration` m, `step_ms`, and what else the
-            simulator counts. The penetration is how deep the deepest of an entry's
+            whoever set a state, since the frame before), `contacts`, `worst_penetration` m, `step_ms`, and what else
+            the simulator counts. The penetration is how deep the deepest of an entry's
             contact points lies within the body it meets, by that body's distances; 0 where none does.
         names: N body names.
         meta: model, seed, versions, dt s.

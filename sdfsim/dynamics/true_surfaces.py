@@ -1,15 +1,16 @@
 """How far bodies are from each other, or how deep in each other, by their true surfaces alone.
 
-Nothing here knows of the contact search, of baked grids or of surface nodes. A surface is cut into triangles that lie on
-it, and those that may hold the nearest (or deepest) point are cut further: of a distance function that is 1-Lipschitz,
-and convex where the solid is, a triangle's lowest value has a bound, so that crossing sticks, which have no vertex in
-each other, are measured like everything else.
+Nothing here knows of the contact search, of baked grids or of surface nodes. A surface is cut into triangles that lie
+on it, and those that may hold the nearest (or deepest) point are cut further: of a distance function that is
+1-Lipschitz, and convex where the solid is, a triangle's lowest value has a bound, so that crossing sticks, which have
+no vertex in each other, are measured like everything else.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -93,7 +94,7 @@ def _closed_form(sdf: ClosedForm) -> Solid:
         rings += [(radius * np.cos(t), half + radius * np.sin(t)) for t in upper]
     corner, bend = [], []
     level = [np.column_stack([r * circle, np.full(AROUND, z)]) for r, z in rings]
-    for below, above in zip(level, level[1:], strict=False):
+    for below, above in pairwise(level):
         b, a, nb, na = below, above, np.roll(below, -1, 0), np.roll(above, -1, 0)
         corner += [np.stack([b, nb, na], 1), np.stack([b, na, a], 1)]
     bend = [np.full(len(part), radius) for part in corner]
@@ -191,7 +192,7 @@ def _clustered(
     start = np.concatenate([[0], np.cumsum([len(p) for p in parts])])
     corner, bend = corner[order], bend[order]
     balls = []
-    for first, last in zip(start[:-1], start[1:], strict=True):
+    for first, last in pairwise(start):
         points = corner[first:last].reshape(-1, 3)
         centre = 0.5 * (points.min(0) + points.max(0))
         radius = np.linalg.norm(points - centre, axis=1).max()
