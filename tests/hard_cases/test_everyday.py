@@ -12,7 +12,7 @@ import pytest
 from sdfsim.evaluation.everyday import ROWS, Check, Setting, changed, checks, most, near, update
 
 HOLDS = Path(__file__).with_name("everyday_holds.txt")
-FAST = ("slender", "edges", "gentle", "bullets", "flat_drops")
+FAST = ("slender", "edges", "gentle", "bullets", "elastic", "before_touch", "thin_floors", "flat_drops")
 
 
 @pytest.fixture(scope="module")
