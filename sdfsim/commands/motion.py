@@ -71,6 +71,7 @@ def simulate(
     tell_failed(session, report)
     if "recording" in report:
         lines.append(f"watch it: sdfsim view {report['recording']}   (or: rerun {report['recording']})")
+    lines += [f"breaks a law: {line}" for line in report["broken_laws"]]
     session.report(report, lines)
     if viewer == "web":
         session.hold("the page stays up until Ctrl-C")

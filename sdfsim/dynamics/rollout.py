@@ -26,8 +26,9 @@ class Rollout:
         contact_point: [sum(contact_count), 3] float64 m, world, in step order: the points of their owners on which
             the edges acted, with the bodies as they are in this entry.
         contact_body: [sum(contact_count), 2] int64, (owner of the node, body it meets).
-        counters: name -> [T+1] array: `kinetic_energy` J, `potential_energy` J, `contacts`, `worst_penetration` m,
-            `step_ms`, and what else the simulator counts. The penetration is how deep the deepest of an entry's
+        counters: name -> [T+1] array: `kinetic_energy` J, `potential_energy` J, `energy_given` J (by pulls, pushes and
+            whoever set a state, since the frame before), `contacts`, `worst_penetration` m, `step_ms`, and what else
+            the simulator counts. The penetration is how deep the deepest of an entry's
             contact points lies within the body it meets, by that body's distances; 0 where none does.
         names: N body names.
         meta: model, seed, versions, dt s.
@@ -83,22 +84,6 @@ class Rollout:
 
 
 _PER_FRAME = ("time", "position", "orientation", "velocity", "angular_velocity", "contact_count")
-
-
-def energy_from_nothing(rollout: Rollout) -> dict[str, float]:
-    """By how much mechanical energy has grown, which only bodies on paths may make it do: `sum_J` over all steps in
-    which it did; `worst` of a step, as a part of the energy in play (the largest kinetic energy so far, and what would
-    lift every dynamic body by its own size); `steps_above_1_percent`, the part of the steps with more than 0.01 of
-    that."""
-    kinetic, potential = rollout.counters["kinetic_energy"], rollout.counters["potential_energy"]
-    gain = np.diff(kinetic + potential).clip(min=0.0)
-    in_play = np.maximum.accumulate(kinetic)[1:] + rollout.meta["lift_energy"]
-    part = np.divide(gain, in_play, out=np.zeros_like(gain), where=in_play > 0)
-    return {
-        "sum_J": float(gain.sum()),
-        "worst": float(part.max(initial=0.0)),
-        "steps_above_1_percent": float((part > 0.01).mean()) if len(part) else 0.0,
-    }
 
 
 def join(frames: list[Rollout]) -> Rollout:

@@ -149,6 +149,7 @@ class Simulator:
         }
         self.contacts: Contacts | Pairs | None = None
         self.steps_done = 0
+        self._given = 0.0  # model energy that came from outside since the last frame
         if broken := self._fault(self.state):
             raise SdfsimError(broken)
         self._good = self._start = self.state
@@ -176,7 +177,7 @@ class Simulator:
     def reset(self) -> None:
         """Go back to the start of the scene."""
         self.state = self._good = self._start
-        self.memory, self.contacts, self.steps_done = Memory(), None, 0
+        self.memory, self.contacts, self.steps_done, self._given = Memory(), None, 0, 0.0
 
     def __getitem__(self, name: str) -> BodyHandle:
         """A body by its name. Raises SdfsimError where there is none of that name."""
@@ -269,6 +270,10 @@ class Simulator:
             awake = awake & (after.touch.island.numpy() < 0)
         if broken := self._fault(after, awake, self.state):
             raise self._broke(broken)
+        if (load := self.state.load) is not None:
+            force, torque = load.split(3, 1)
+            turning = 0.5 * self.rules.dt * (self.state.angular_velocity + after.angular_velocity)
+            self._given += float((force * (after.position - self.state.position)).sum() + (torque * turning).sum())
         self.state, self.contacts = after, contacts
         self._good = after
         self.steps_done += 1
@@ -287,6 +292,7 @@ class Simulator:
             from sdfsim.dynamics.models.surfaces import history_told
 
             self.state = history_told(self.state, self._good, self.bodies, self.rules)
+        self._given += sum(self._energies(self.state)) - sum(self._energies(self._good))
         self._good = self.state
 
     def _fault(self, state: State, rows: np.ndarray | None = None, before: State | None = None) -> str | None:
@@ -300,8 +306,12 @@ class Simulator:
     def _frame(self, milliseconds: float) -> Rollout:
         state, u = self.si_state(), self.units
         points, pairs, depth = self._touching()
+        kinetic, potential = self._energies(self.state)
+        given, self._given = self._given, 0.0
         counters = {
-            **self._energies(),
+            "kinetic_energy": kinetic * u.energy,
+            "potential_energy": potential * u.energy,
+            "energy_given": given * u.energy,
             "contacts": float(len(pairs)),
             "worst_penetration": depth * u.length,
             **self.memory.counts,
@@ -338,14 +348,13 @@ class Simulator:
         found = contact_points(self.state)
         return found.point, found.pair, float((-found.gap).max(initial=0.0))
 
-    def _energies(self) -> dict[str, float]:
-        """Kinetic and potential energy in joules of all dynamic bodies."""
+    def _energies(self, s: State) -> tuple[float, float]:
+        """Kinetic and potential energy of all dynamic bodies in a state, model units."""
         from sdfsim.dynamics.kernels.survey import energies
 
-        s, b = self.state, self.bodies
+        b = self.bodies
         known = (b.mass, b.inertia, self.rules.gravity, s.position, s.orientation, s.velocity, s.angular_velocity)
-        kinetic, potential = energies(*(t.cpu().numpy() for t in known))
-        return {"kinetic_energy": kinetic * self.units.energy, "potential_energy": potential * self.units.energy}
+        return energies(*(t.cpu().numpy() for t in known))
 
 
 def varied(scene: Scene, variant: Variant) -> Scene:

@@ -20,8 +20,10 @@ from scipy.spatial.transform import Rotation
 from sdfsim.data.dataset import Trajectory
 from sdfsim.data.scenarios import steady_faces
 from sdfsim.dynamics.bodies import largest_extent
+from sdfsim.dynamics.model import Model
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.errors import SdfsimError
+from sdfsim.evaluation.everyday import KINDS, ROWS, SIZES, Setting, failures
 from sdfsim.evaluation.metrics import energy
 from sdfsim.evaluation.penetration import depths
 from sdfsim.scene.scene import Body, Effects, Scene
@@ -101,6 +103,8 @@ class Case:
     cuda: bool = False  # the scenes are simulated a second time there, behind the first
     engines: bool = True  # whether engines can take part
     x: float | None = None  # where it stands in its group's plot of the first figure; None where it is not in a row
+    # figures of a model by scenes of its own, of which `scenes` then gives none
+    own: Callable[[Model], dict[str, float]] | None = None
 
 
 @dataclass(frozen=True)
@@ -123,6 +127,7 @@ GROUPS = {
     "slope": Group("a box at rest on a slope", "friction mu", "friction"),
     "pile": Group("a pile in a bowl", "bodies"),
     "energy": Group("random scenes: energy from nothing"),
+    "everyday": Group("everyday scenes: checks that do not hold"),
     "precision": Group("other arithmetic: time until motions are 10 % of a body's size apart"),
 }
 
@@ -629,6 +634,12 @@ def cases(*, quick: bool = False, shapes: Path | None = None) -> list[Case]:
         lambda repeat: [tossed((20, repeat, k)) for k in range(each)], created, share, worst,
         seconds=2.0, repeats=repeats)  # fmt: skip
 
+    fail, of = Figure("fail", "checks", 0, limit=0.0), Figure("checks", "in all", 0, judged=False)
+    usual = [Setting()] if quick else [*(Setting(size) for size in SIZES), Setting(yaw=37.0), *map(_of_kind, KINDS[1:])]
+    for row in ROWS:
+        add("everyday", f"everyday-{row}", row.replace("_", " "), lambda repeat: [], created, fail, of, repeats=1,
+            engines=False, own=partial(_everyday, row, usual))  # fmt: skip
+
     def plain(repeat: int) -> list[Scene]:
         return [tossed((22, repeat, k)) for k in range(2 if quick else 4)]
 
@@ -641,6 +652,14 @@ def cases(*, quick: bool = False, shapes: Path | None = None) -> list[Case]:
     add("precision", "start-off", "start 1e-6 m/s off", off, diverged, diverges, repeats=2)
     add("precision", "cuda", "on CUDA", plain, diverged, diverges, repeats=2, engines=False, cuda=True)
     return found
+
+
+def _of_kind(kind: str) -> Setting:
+    return Setting(kind=kind)
+
+
+def _everyday(row: str, settings: Sequence[Setting], model: Model) -> dict[str, float]:
+    return failures(row, [replace(at, model=model) for at in settings])
 
 
 def _meshes(folder: Path) -> dict[str, Shape]:

@@ -15,6 +15,7 @@ import torch
 import sdfsim
 from sdfsim.data.public_shapes import public_folder
 from sdfsim.data.pybullet_sim import DT, SUBSTEPS, TEACHER_VERSION, engine_settings, import_pybullet
+from sdfsim.dynamics.instruments import judged
 from sdfsim.dynamics.model import SOLVER, Model, load_model, model_names
 from sdfsim.dynamics.simulator import SimulationError, Simulator, pick_device
 from sdfsim.dynamics.training_ranges import constant_in_training
@@ -28,11 +29,13 @@ from sdfsim.recording import save_rollout
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.sdf import PlaneSdf
 
-VERSION = 3  # counts up when what is measured changes, so that kept results are measured again
+VERSION = 4  # counts up when what is measured changes, so that kept results are measured again
 TEACHER = "teacher"
 ENGINES = {TEACHER: bullet, "MuJoCo": mujoco, "Drake": drake}
 OUTSIDE = "†"
 WATCHED = 10.0  # s of a recording
+OWN = 1e4  # about how long a case with scenes of its own takes, as `work` counts
+LOOKED_AT = 20  # frames of a motion, evenly spaced, in which surfaces are measured
 LEGEND = (
     "bold: beyond what is wanted, or the motion blew up",
     "italic: worse than the teacher by more than both spreads, where nothing else is wanted",
@@ -47,8 +50,9 @@ class Study:
 
     Attributes:
         who: models, then engines; the teacher where PyBullet is installed.
-        results: (case, who) -> figures (name -> a value a repetition), broke and outside (lines) and recording (a
-            path in the folder, or None); nothing for a case that one cannot take part in.
+        results: (case, who) -> figures (name -> a value a repetition), broke, outside and laws (lines; the last are
+            those that a motion of ours breaks, by instruments that know no contacts) and recording (a path in the
+            folder, or None); nothing for a case that one cannot take part in.
         quick: whether it is the short form.
     """
 
@@ -95,6 +99,8 @@ def stress(
 
     def work(case: Case) -> float:
         """About how long a model takes, in no unit; a step has its price without bodies too."""
+        if case.own:
+            return OWN
         return case.seconds * sum(10 + len(scene.bodies) for repeat in scenes[case.name] for scene in repeat)
 
     jobs, cut = [], {}
@@ -123,11 +129,15 @@ def stress(
 def _tried(case: Case, model: Model | str, device: str, out: Path) -> dict[str, Any]:
     """All repetitions of a case with one model, or with an engine by name: see `Study.results`."""
     figures: dict[str, list[float]] = {figure.name: [] for figure in case.figures}
-    broke, outside, recording = [], [], None
+    broke, outside, laws, recording = [], [], [], None
     if isinstance(model, Model) and (about := GROUPS[case.group].about) in constant_in_training(model):
         outside.append(f"{about} was constant in training, so it was not learned")
     for repeat in range(case.repeats):
         scenes = case.scenes(repeat)
+        if case.own and isinstance(model, Model):
+            for name, value in case.own(model).items():
+                figures[name].append(value)
+            continue
         if isinstance(model, str):
             runs = [by_engine(model, scene, out / "engine", case.seconds) for scene in scenes]
         else:
@@ -138,6 +148,10 @@ def _tried(case: Case, model: Model | str, device: str, out: Path) -> dict[str, 
             values.append(float(measured[name]))
         broke += [run.broke for run in runs if run.broke]
         outside += [line for run in runs if run.rollout for line in run.rollout.meta["outside_training"]]
+        for run in runs:
+            if run.rollout:
+                verdict = judged(run.scene, run.rollout, every=max(1, len(run.rollout) // LOOKED_AT))
+                laws += verdict.broken
         missed = any(f.limit is not None and measured[f.name] > f.limit for f in case.figures)
         shown = next((run for run in runs if run.broke), runs[0])
         if isinstance(model, Model) and not recording and (broke or missed):
@@ -146,7 +160,8 @@ def _tried(case: Case, model: Model | str, device: str, out: Path) -> dict[str, 
             (out / recording).parent.mkdir(parents=True, exist_ok=True)
             watched = shown.rollout.frames(0, int((shown.rollout.time <= WATCHED).sum()))
             save_rollout(shown.scene, watched, out / recording)
-    return {"figures": figures, "broke": broke, "outside": list(dict.fromkeys(outside)), "recording": recording}
+    told = {"outside": list(dict.fromkeys(outside)), "laws": laws}
+    return {"figures": figures, "broke": broke, "recording": recording, **told}
 
 
 def simulated(scene: Scene, model: Model, device: str, seconds: float) -> Run:
@@ -271,8 +286,8 @@ def write_report(study: Study, out: Path) -> dict[str, Any]:
     """Write stress.md, its plots and report.json into the folder of a study.
 
     Returns:
-        The content of report.json: `models` (see `losses`), `figures` by model, `recordings`, and `failed_checks`, a
-        line for each case that blew up.
+        The content of report.json: `models` (see `losses`), `figures` by model, `broken_laws`, `recordings`, and
+        `failed_checks`, a line for each case that blew up.
     """
     drawn = [name for name in GROUPS if draw_group(study, name, out / "plots" / f"{name}.png")]
     plots = "\n".join(f"![{GROUPS[name].title}](plots/{name}.png)" for name in drawn)
@@ -281,6 +296,7 @@ def write_report(study: Study, out: Path) -> dict[str, Any]:
         for (case, who), result in study.results.items()
         for line in [*result["broke"], *result["outside"]]
     ]
+    broken = [(case, who, result["laws"]) for (case, who), result in study.results.items() if result["laws"]]
     parts = [
         "# Hard cases",
         f"sdfsim {sdfsim.__version__}. Teacher: PyBullet as it made the training data.",
@@ -288,6 +304,8 @@ def write_report(study: Study, out: Path) -> dict[str, Any]:
         plots,
         "## Blew up, or outside of training",
         "\n".join(told),
+        "## Laws broken, by instruments that do not know the contacts",
+        "\n".join(f"- {who}, {case}: {lines[0]} ({len(lines)} in all)" for case, who, lines in broken),
     ]
     write_text(out / "stress.md", "\n\n".join(parts) + "\n")
     report = {
@@ -296,6 +314,7 @@ def write_report(study: Study, out: Path) -> dict[str, Any]:
         "quick": study.quick,
         "models": losses(study),
         "figures": figures(study),
+        "broken_laws": [f"{case} with {who}: {line}" for case, who, lines in broken for line in lines],
         "recordings": sorted(str(out / r["recording"]) for r in study.results.values() if r["recording"]),
         "failed_checks": [
             f"{case} with {who} blew up: {result['broke'][0]}"

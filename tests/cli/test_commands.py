@@ -39,6 +39,19 @@ def test_simulate_leaves_a_run_folder_and_says_how_to_watch_it(scene, model, tmp
     np.testing.assert_allclose(rollout.position[:, 1, 2], fallen, atol=1e-9)
 
 
+def test_a_run_that_breaks_a_law_says_so_in_its_last_line(tmp_path, scene):
+    """Two boxes that start in each other, which no solver can have kept apart; and nothing of the kind for the ball."""
+    done = run("simulate", scene, "-o", tmp_path / "fall", "--seconds", 0.1)
+    assert "breaks a law" not in done.stdout
+    boxes = SCENE.replace("sphere: {radius: 0.5}", "box: {size: [1, 1, 1]}")
+    boxes += "  - {name: other, shape: ball, position: [0.5, 0, 5.02]}\n"
+    (tmp_path / "boxes.yaml").write_text(boxes)
+    done = run("simulate", tmp_path / "boxes.yaml", "-o", tmp_path / "run", "--seconds", 0.05)
+    laws = json.loads((tmp_path / "run" / "report.json").read_text())["broken_laws"]
+    assert done.stdout.splitlines()[-1] == f"breaks a law: {laws[-1]}"
+    assert laws[0].startswith("overlap: 'ball' and 'other' are 0.5 m in each other")
+
+
 def test_a_second_run_replaces_the_first(scene, model, tmp_path):
     assert run("simulate", scene, "-o", tmp_path / "run", "--model", model, "--seconds", 0.1).exit_code == 0
     done = run("simulate", scene, "-o", tmp_path / "run", "--model", model, "--seconds", 0.1, "--viewer", "none")
