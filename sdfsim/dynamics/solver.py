@@ -24,7 +24,7 @@ from sdfsim.files import digest
 from sdfsim.shape.baked_grid import WALL, BakedGrid, baked, inwards
 from sdfsim.shape.convex_pieces import ConvexPiece, pieces_of
 from sdfsim.shape.sdf import ClosedForm, PlaneSdf, Sdf
-from sdfsim.shape.surface_nodes import Surface, surface_of
+from sdfsim.shape.surface_nodes import Surface, contact_surface
 
 if TYPE_CHECKING:
     from sdfsim.dynamics.run_memory import Memory
@@ -42,7 +42,8 @@ LEAF, CLUMP = 16, 256  # nodes that a leaf and a clump of leaves hold at most
 TOUCHING = 1e-3  # model lengths, within which a point is told as a contact
 COARSE = 0.01  # model times: in longer inner steps what is hit in their course is told to a network as well
 SLOW = 2.0  # an approach that gravity makes in so many inner steps ends at the surface without a rebound
-INWARD = 0.004  # of a solid's largest extent, from where its nodes look out
+# Of a solid's largest extent, from where its nodes look out, and of its thickness: not out of the other side of a wall.
+INWARD, SHALLOW = 0.004, 0.4
 
 
 class Compiled:
@@ -57,7 +58,7 @@ class Compiled:
 
     def place(self, state: State) -> None:
         """Scenery lies where `state` has it."""
-        self.world = compiled_world(self.bodies, state)
+        self.world = compiled_world(self.bodies, state, self.shapes)
         n = len(self.bodies)
         self.work = compiled.Work(
             matrix=pose.to_matrix(state.orientation.cpu()).numpy(), inverse=np.zeros((n, 3, 3)),
@@ -179,10 +180,10 @@ def compiled_shapes(bodies: Bodies) -> kinds.Shapes:
     table[:, kinds.THICKNESS], table[:, kinds.CELL], table[:, kinds.PATCH] = np.inf, 1.0, -1.0
     brick, sample, label = [np.zeros(0, np.int64)], [np.zeros(0, np.float32)], [np.zeros(0, np.int16)]
     owner = {int(s): k for k, s in reversed(list(enumerate(bodies.shape.tolist()))) if s >= 0}
-    known = [
-        _geometry(sdf, _nodes_of(bodies, owner[s]), bodies.pieces[s], bodies.hulls[s])
-        for s, sdf in enumerate(bodies.sdfs)
-    ]
+    every = list(zip(bodies.sdfs, bodies.pieces, bodies.hulls, strict=True))
+    # Where all shapes are convex, or made of convex pieces, none is met as a surface.
+    surfaces = any(not (isinstance(sdf, ClosedForm) or len(pieces) or len(hull)) for sdf, pieces, hull in every)
+    known = [_geometry(_nodes_of(bodies, owner[s]), *some, surfaces=surfaces) for s, some in enumerate(every)]
     for row, sdf, (grid, surface, *_) in zip(table, bodies.sdfs, known, strict=True):
         if surface.nearest is not None:
             row[kinds.PATCH_LOW : kinds.PATCH_LOW + 3], row[kinds.PATCH_CELL] = surface.low, surface.cell
@@ -244,6 +245,7 @@ class Geometry(NamedTuple):
 
     grid: BakedGrid | None  # where it has no closed form
     surface: Surface
+    cover: np.ndarray  # [K] m, how far the surface around a node goes that is nearer to it than to others
     inward: np.ndarray  # [K, 3] m, from its nodes to where they look out
     clumps: Clumps
     solids: tuple[ConvexPiece, ...]  # what it collides as, where it is convex or made of convex pieces
@@ -251,35 +253,37 @@ class Geometry(NamedTuple):
 
 Pieces = tuple[np.ndarray, ...]
 # With the nodes, the convex pieces and the hull that it is for.
-_of_sdf: WeakKeyDictionary[Sdf, tuple[np.ndarray, Pieces, np.ndarray, Geometry]] = WeakKeyDictionary()
+_of_sdf: WeakKeyDictionary[Sdf, tuple[np.ndarray, Pieces, np.ndarray, bool, Geometry]] = WeakKeyDictionary()
 _of_content: OrderedDict[str, Geometry] = OrderedDict()  # of the latest: workers get copies of shapes
 
 
-def _geometry(sdf: Sdf, nodes: np.ndarray, pieces: Pieces, hull: np.ndarray) -> Geometry:
-    """Made once for all scenes of a process."""
-    known, split, solid, kept = _of_sdf.get(sdf, (nodes, pieces, hull, None))
-    if kept is None or split is not pieces or solid is not hull or not np.array_equal(known, nodes):
-        content = digest(sdf, nodes, pieces, hull)
-        kept = _of_content.pop(content, None) or _looked_at(sdf, nodes, pieces, hull)
-        _of_sdf[sdf], _of_content[content] = (nodes, pieces, hull, kept), kept
+def _geometry(nodes: np.ndarray, sdf: Sdf, pieces: Pieces, hull: np.ndarray, *, surfaces: bool) -> Geometry:
+    """Made once for all scenes of a process; with a surface where a scene has some."""
+    known, split, solid, met, kept = _of_sdf.get(sdf, (nodes, pieces, hull, surfaces, None))
+    same = split is pieces and solid is hull and met >= surfaces and np.array_equal(known, nodes)
+    if kept is None or not same:
+        content = digest(sdf, nodes, pieces, hull, surfaces)
+        kept = _of_content.pop(content, None) or _looked_at(sdf, nodes, pieces, hull, surfaces=surfaces)
+        _of_sdf[sdf], _of_content[content] = (nodes, pieces, hull, surfaces, kept), kept
         if len(_of_content) > MOST_KEPT:
             _of_content.popitem(last=False)
     return kept
 
 
-def _looked_at(sdf: Sdf, nodes: np.ndarray, pieces: Pieces, hull: np.ndarray) -> Geometry:
+def _looked_at(sdf: Sdf, nodes: np.ndarray, pieces: Pieces, hull: np.ndarray, *, surfaces: bool) -> Geometry:
     grid = None if isinstance(sdf, ClosedForm) else baked(sdf, nodes, pieces)
     extent = 0.0 if isinstance(sdf, PlaneSdf) else float(np.ptp(sdf.bounds, axis=0).max())
     if grid and grid.thickness <= 1.001 * WALL * grid.cell:
         told = "a shape of %.2g m has walls of at most %.2g m: things may pass through; --thicken helps"
         _log.warning(told, extent, grid.thickness)
-    surface = surface_of(sdf, nodes, pieces)
+    surface, cover = contact_surface(sdf, nodes if surfaces else nodes[:0], pieces, grid)
     solids = pieces_of(sdf, pieces, hull)
-    inward = INWARD * extent * inwards(sdf, surface.nodes)
-    return Geometry(grid, surface, inward, _clumps(surface.nodes, surface.patch), solids)
+    thickness = grid.thickness if grid else 0.0 if extent == 0.0 else float(np.ptp(sdf.bounds, axis=0).min())
+    inward = min(INWARD * extent, SHALLOW * thickness) * inwards(sdf, surface.nodes)
+    return Geometry(grid, surface, cover, inward, _clumps(surface.nodes, surface.patch), solids)
 
 
-def compiled_world(bodies: Bodies, state: State) -> compiled.World:
+def compiled_world(bodies: Bodies, state: State, shapes: kinds.Shapes) -> compiled.World:
     """The bodies of a scene."""
     array = {name: value.cpu().numpy() for name, value in vars(bodies).items() if isinstance(value, torch.Tensor)}
     bounds = np.where(np.isfinite(array["bounds"]), array["bounds"], 0.0)
@@ -303,6 +307,7 @@ def compiled_world(bodies: Bodies, state: State) -> compiled.World:
     low, high = low[order], high[order]
     return compiled.World(
         shape=array["shape"], scale=array["scale"], com=array["com"], centre=centre, half=half, radius=array["radius"],
+        thickness=np.where(array["shape"] >= 0, shapes.table[array["shape"], kinds.THICKNESS] * array["scale"], np.inf),
         inverse_mass=array["inverse_mass"], inertia=inertia,
         inverse_inertia=np.linalg.inv(inertia) * moves[:, None, None], isotropic=isotropic,
         friction=array["friction"], restitution=array["restitution"], moves=moves, scripted=scripted,
@@ -344,28 +349,33 @@ def _split(nodes: np.ndarray, chosen: np.ndarray, most: int) -> list[np.ndarray]
 def _joined(known: list[Geometry]) -> tuple[np.ndarray, ...]:
     """The node arrays of `kinds.Shapes`."""
     node, inward, leaf_ball, clump_ball = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros((0, 4))], [np.zeros((0, 4))]
+    cover = [np.zeros(0)]
     leaf_node, clump_start, clump_leaf, leaf_patch = [0], [0], [0], []
-    for _, surface, within, clumps, _ in known:
+    for _, surface, around, within, clumps, _ in known:
         for leaves in clumps:
             for leaf in leaves:
                 node.append(surface.nodes[leaf])
+                cover.append(around[leaf])
                 inward.append(within[leaf])
                 leaf_node.append(leaf_node[-1] + len(leaf))
-                leaf_ball.append(_ball(surface.nodes[leaf]))
+                leaf_ball.append(_ball(surface.nodes[leaf], around[leaf]))
                 leaf_patch.append(surface.patch[leaf[0]])
             clump_leaf.append(clump_leaf[-1] + len(leaves))
-            clump_ball.append(_ball(surface.nodes[np.concatenate(leaves)]))
+            every = np.concatenate(leaves)
+            clump_ball.append(_ball(surface.nodes[every], around[every]))
         clump_start.append(len(clump_leaf) - 1)
 
     def whole(numbers: list[int]) -> np.ndarray:
         return np.array(numbers, dtype=np.int64)
 
     return (
-        np.concatenate(node), np.concatenate(inward), whole(leaf_node), np.concatenate(leaf_ball), whole(clump_start),
-        whole(clump_leaf), np.concatenate(clump_ball), whole(leaf_patch),
+        np.concatenate(node), np.concatenate(cover), np.concatenate(inward), whole(leaf_node),
+        np.concatenate(leaf_ball), whole(clump_start), whole(clump_leaf), np.concatenate(clump_ball),
+        whole(leaf_patch),
     )  # fmt: skip
 
 
-def _ball(places: np.ndarray) -> np.ndarray:
+def _ball(places: np.ndarray, around: np.ndarray) -> np.ndarray:
+    """[1, 4] middle and radius of a ball around the surface that nodes stand for."""
     middle = 0.5 * (places.min(0) + places.max(0))
-    return np.array([[*middle, np.linalg.norm(places - middle, axis=1).max()]])
+    return np.array([[*middle, (np.linalg.norm(places - middle, axis=1) + around).max()]])

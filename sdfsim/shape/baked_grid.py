@@ -105,6 +105,19 @@ def bake(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = ()) -> Bake
     return replace(grid, error=float(np.abs(interpolated(grid, points) - exact)[close].max(initial=0.0)))
 
 
+def surface_samples(grid: BakedGrid) -> np.ndarray:
+    """[P, 3] m, points all over the surface of a grid, about a cell apart."""
+    corners = [grid.fine[:, i : i + SIDE, j : j + SIDE, k : k + SIDE] for i, j, k in np.ndindex(2, 2, 2)]
+    middle = np.mean(corners, axis=0)
+    chosen = np.nonzero(np.abs(middle) < grid.cell)
+    around = np.stack([corner[chosen] for corner in corners], axis=1).reshape(-1, 2, 2, 2)
+    slope = np.stack([(np.diff(around, axis=axis + 1)).mean((1, 2, 3)) / grid.cell for axis in range(3)], axis=1)
+    brick = np.argwhere(grid.brick >= 0)[np.argsort(grid.brick[grid.brick >= 0])]
+    place = grid.low + grid.cell * (SIDE * brick[chosen[0]] + np.stack(chosen[1:], axis=1) + 0.5)
+    square = np.maximum(np.square(slope).sum(1), 0.25)
+    return place - (middle[chosen] / square)[:, None] * slope
+
+
 def inwards(sdf: Sdf, nodes: np.ndarray) -> np.ndarray:
     """[K, 3] unit vectors from nodes [K, 3] m on the surface into the solid: against the mean of the normals around. On
     an edge or in a corner a distance has several normals; this is what lies between them."""

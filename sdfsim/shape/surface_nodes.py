@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from sdfsim.errors import SdfsimError
+from sdfsim.shape.baked_grid import BakedGrid, surface_samples
 from sdfsim.shape.distance import PiecesDistance
 from sdfsim.shape.mesh import Mesh, convex_hull, lattice, normal_frame
 from sdfsim.shape.primitives import spiral
-from sdfsim.shape.sdf import Sdf
+from sdfsim.shape.sdf import BoxSdf, CylinderSdf, Sdf
 
 # The paper's sampling (section 3 and appendix): a grid over this half extent of the normalised frame, projected onto
 # the surface, points that did not reach it dropped, one point kept per voxel.
@@ -25,6 +26,7 @@ DIRECTIONS = 1000  # in which nodes are to reach as far as the surface
 CHUNK = 10_000  # points looked at together
 # Faces that meet at less than this cosine (20 degrees) make an edge worth nodes of its own.
 SHARP = 0.94
+DENSEST = 4000  # nodes that a closed form has about at most
 LATTICE = 40  # of the lattice that tells the nearest patch, along the largest extent
 OUTSIDE = 1e-3  # of the extent: vertices that lie deeper in the union are not on its surface
 
@@ -128,6 +130,56 @@ class Surface:
     nearest: np.ndarray | None
     low: np.ndarray  # [3] m, the first of these places
     cell: float  # m between two
+
+
+def contact_surface(
+    sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray], grid: BakedGrid | None
+) -> tuple[Surface, np.ndarray]:
+    """The nodes that carry contact where a shape is met as a surface, and how far the surface around each goes that is
+    nearer to it than to others: [K] m. Closed forms have nodes that are as dense as the solid is thin."""
+    if len(nodes) == 0:
+        return Surface(nodes, np.zeros(0, np.int64), None, np.zeros(3), 1.0), np.zeros(0)
+    if isinstance(sdf, BoxSdf | CylinderSdf):
+        area = _area(sdf)
+        spacing = max(0.5 * min(sdf.sizes), np.sqrt(area / DENSEST))
+        nodes = _on_box(np.array(sdf.half), spacing) if isinstance(sdf, BoxSdf) else _on_cylinder(sdf, spacing)
+        return surface_of(sdf, nodes, ()), np.full(len(nodes), 0.75 * spacing)
+    surface = surface_of(sdf, nodes, pieces)
+    if grid is None or len(surface.nodes) == 0:
+        return surface, np.zeros(len(surface.nodes))
+    from scipy.spatial import KDTree
+
+    away, nearest = KDTree(surface.nodes).query(surface_samples(grid))
+    cover = np.zeros(len(surface.nodes))
+    np.maximum.at(cover, nearest, away)
+    return surface, cover + grid.cell
+
+
+def _area(sdf: BoxSdf | CylinderSdf) -> float:
+    if isinstance(sdf, BoxSdf):
+        a, b, c = sdf.half
+        return 8.0 * (a * b + b * c + c * a)
+    return 2.0 * np.pi * sdf.radius * (sdf.radius + 2.0 * sdf.half)
+
+
+def _on_box(half: np.ndarray, spacing: float) -> np.ndarray:
+    """Points all over a box at most `spacing` m apart along its sides, corners and edges among them."""
+    axes = [np.linspace(-h, h, 1 + max(1, int(np.ceil(2.0 * h / spacing)))) for h in half]
+    points = [axes[0][[0, -1]], axes[1][[0, -1]], axes[2][[0, -1]]]
+    sides = [lattice(*(points[k] if k == axis else axes[k] for k in range(3))) for axis in range(3)]
+    return np.unique(np.concatenate(sides), axis=0)
+
+
+def _on_cylinder(sdf: CylinderSdf, spacing: float) -> np.ndarray:
+    """Points all over a cylinder at most `spacing` m apart, its rims among them."""
+    around = 2.0 * np.pi * np.arange(count := max(8, int(np.ceil(2.0 * np.pi * sdf.radius / spacing)))) / count
+    circle = np.stack([np.cos(around), np.sin(around)], axis=1)
+    heights = np.linspace(-sdf.half, sdf.half, 1 + max(1, int(np.ceil(2.0 * sdf.half / spacing))))
+    radii = np.linspace(0.0, sdf.radius, 1 + max(1, int(np.ceil(sdf.radius / spacing))))[:-1]
+    side = [np.column_stack([sdf.radius * circle, np.full(count, z)]) for z in heights]
+    ends = [np.column_stack([r * circle, np.full(count, z)]) for z in (-sdf.half, sdf.half) for r in radii[1:]]
+    tips = [np.array([[0.0, 0.0, -sdf.half], [0.0, 0.0, sdf.half]])]
+    return np.concatenate([*side, *ends, *tips])
 
 
 def surface_of(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray]) -> Surface:

@@ -34,6 +34,7 @@ class Shapes(NamedTuple):
     brick: np.ndarray  # int64, where in `sample` the 9^3 distances of a brick begin; -1 for bricks far from the surface
     sample: np.ndarray  # float32 distances, at the corners of bricks and in bricks
     node: np.ndarray  # [K, 3] surface nodes, leaf by leaf
+    cover: np.ndarray  # [K] how far the surface around a node goes that is nearer to it than to others
     inward: np.ndarray  # [K, 3] from each a little into the solid, away from all faces that meet there
     leaf_node: np.ndarray  # [L + 1] int64, leaf l holds nodes leaf_node[l] : leaf_node[l + 1]
     leaf_ball: np.ndarray  # [L, 4] centre and radius of a ball around these

@@ -26,7 +26,8 @@ from sdfsim.dynamics.kernels.world import (
 )
 
 FOUND = 128  # contact points that a pair may find in one look
-SIDE = 24  # of these from the nodes of either body
+CANDIDATES = 256  # leaves of nodes that may touch, of which
+SIDE = 40  # at most become points
 EACH = 4  # points of a manifold that are of the same two patches
 ALIKE = 0.9  # cosine between normals that are taken for one
 OUTWARD = 1e-3  # how much deeper another point must be to be preferred to one that is farther out by a length
@@ -37,11 +38,14 @@ class Scratch(NamedTuple):
 
     found: np.ndarray  # [FOUND, COLUMNS] new points
     every: np.ndarray  # [FOUND + POINTS, COLUMNS] with those that were known
-    # depth, node, key, normal: [SIDE] and [SIDE, 3] of the nodes that are to become points
+    # depth, node, key, normal, place, used: [CANDIDATES] and [CANDIDATES, 3] of nodes that may become points
     depth: np.ndarray
     node: np.ndarray
     key: np.ndarray
     normal: np.ndarray
+    place: np.ndarray
+    used: np.ndarray
+    pick: np.ndarray  # [SIDE] int64, which of them do
     # away, alike: [FOUND + POINTS] how far from those chosen a point is, and how many of these are of its kind
     away: np.ndarray
     alike: np.ndarray
@@ -53,8 +57,9 @@ class Scratch(NamedTuple):
 def scratch_room():
     most = FOUND + POINTS
     return Scratch(
-        np.empty((FOUND, COLUMNS)), np.empty((most, COLUMNS)), np.empty(SIDE), np.empty(SIDE, np.int64),
-        np.empty(SIDE, np.int64), np.empty((SIDE, 3)), np.empty(most), np.empty(most, np.int64),
+        np.empty((FOUND, COLUMNS)), np.empty((most, COLUMNS)), np.empty(CANDIDATES), np.empty(CANDIDATES, np.int64),
+        np.empty(CANDIDATES, np.int64), np.empty((CANDIDATES, 3)), np.empty((CANDIDATES, 3)),
+        np.empty(CANDIDATES, np.int64), np.empty(SIDE, np.int64), np.empty(most), np.empty(most, np.int64),
         simplex_room(), polygons_room(),
     )  # fmt: skip
 

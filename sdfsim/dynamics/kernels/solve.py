@@ -19,6 +19,9 @@ AT_REST = 1e-9  # squared: slower tangential motion has no direction
 # No island may gain more energy than so many times what its pushes out of penetration would give each contact alone,
 # this share of what its contacts bring with them, and what lifts it by so many slops: a stack lifts all that is above.
 SPARE, ROUNDING, LIFT = 4.0, 0.01, 10.0
+# What comes nearer than this part of a thickness in an inner step bounces before it has touched, else after: thin
+# things would be deep in each other.
+THIN = 0.005
 MANY = 64  # islands of contacts from which on threads are worth their while
 
 
@@ -77,6 +80,7 @@ def _equations(world, work, motion, rules, manifolds):
         bounce = world.restitution[a] * world.restitution[b] if rules.restitution else 0.0
         margin = rules.margin * ((world.radius[a] < math.inf) + (world.radius[b] < math.inf))
         between = sub(get(motion.position, a), get(motion.position, b))
+        thin = THIN * min(world.thickness[a], world.thickness[b])
         for k in range(manifolds.count[m]):
             point = manifolds.point[m, k]
             n = (point[NORMAL], point[NORMAL + 1], point[NORMAL + 2])
@@ -88,20 +92,25 @@ def _equations(world, work, motion, rules, manifolds):
             then = add(free_fall, _turning(free, a, b, arm, other))
             approach = dot(now, n)
             gap = point[GAP] - margin
-            if point[VOID] > 0.0 or (
-                gap > TOUCH and (-approach > rules.slow or gap + dot(then, n) * rules.inner > 0.0)
-            ):
+            way = -dot(then, n) * rules.inner
+            early = not rules.adds and way > thin
+            if point[VOID] > 0.0 or (gap > TOUCH and ((-approach > rules.slow and not early) or gap > way)):
                 point[PUSH] = point[DRAG] = point[DRAG + 1] = point[DRAG + 2] = 0.0
                 continue
             _row(world.inverse_mass, inverse, a, b, arm, other, n, row, count, 0)
             # Newton's rule for all that meets in one impact: without friction, and with e = 1, energy is kept.
-            rebounds = bounce > 0.0 and abs(approach) > rules.slow and gap <= TOUCH
-            target = -approach * bounce if rebounds else 0.0
+            target, rebounds = 0.0, bounce > 0.0 and abs(approach) > rules.slow
+            if rebounds:
+                # What bounces before it has touched has the speed that it will have here on its way back.
+                fall = 2.0 * dot(vector(rules.gravity), n) * max(gap, 0.0) * (1.0 - bounce * bounce)
+                square = bounce * bounce * approach * approach + (fall if early else 0.0)
+                target, rebounds = -math.copysign(math.sqrt(max(square, 0.0)), approach), square > 0.0
             # An impact is over before a body has turned: what the gyroscopic torque makes of it comes after.
             before = dot(free_fall, n) if rebounds else dot(then, n)
             deep = push = rest = 0.0
             if gap > TOUCH:
-                target = rest = -gap / rules.inner
+                rest = -gap / rules.inner
+                target = target if rebounds else rest
             elif gap > -rules.split:
                 if gap < -rules.slop:
                     push = (-gap - rules.slop) * rules.erp / rules.inner
@@ -394,14 +403,18 @@ def _rub(where, row, mass, change, c, most):
     """Bring both tangential rows of a contact to rest, as far as the cone of friction allows; returns by how much that
     changed."""
     first, second = row[c, 1, IMPULSE], row[c, 2, IMPULSE]
-    wish = first + (row[c, 1, WANTED] - _speed(where, row, change, c, 1)) * row[c, 1, MASS]
-    _apply(where, row, mass, change, c, 1, wish - first)
-    other = second + (row[c, 2, WANTED] - _speed(where, row, change, c, 2)) * row[c, 2, MASS]
-    share = _within(wish, other, most)
-    _apply(where, row, mass, change, c, 1, (share - 1.0) * wish)
-    _apply(where, row, mass, change, c, 2, share * other - second)
-    row[c, 1, IMPULSE], row[c, 2, IMPULSE] = share * wish, share * other
-    return max(abs(share * wish - first) / row[c, 1, MASS], abs(share * other - second) / row[c, 2, MASS])
+    # One mass for both, so that friction ends up against the slip and not aside.
+    lesser = min(row[c, 1, MASS], row[c, 2, MASS])
+    one = first + (row[c, 1, WANTED] - _speed(where, row, change, c, 1)) * lesser
+    other = second + (row[c, 2, WANTED] - _speed(where, row, change, c, 2)) * lesser
+    share = _within(one, other, most)
+    one, other = share * one, share * other
+    if one == first and other == second:
+        return 0.0
+    _apply(where, row, mass, change, c, 1, one - first)
+    _apply(where, row, mass, change, c, 2, other - second)
+    row[c, 1, IMPULSE], row[c, 2, IMPULSE] = one, other
+    return max(abs(one - first), abs(other - second)) / lesser
 
 
 @njit(**BARE)

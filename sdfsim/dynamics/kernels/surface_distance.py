@@ -6,6 +6,7 @@ import math
 
 from numba import njit
 
+from sdfsim.dynamics.kernels.clipping import across
 from sdfsim.dynamics.kernels.distance import (
     CAPSULE,
     CELL,
@@ -18,13 +19,14 @@ from sdfsim.dynamics.kernels.distance import (
     distance_alone,
     patch_of,
 )
-from sdfsim.dynamics.kernels.manifold import ALIKE, EACH, FOUND, OUTWARD, SIDE, write
-from sdfsim.dynamics.kernels.vectors import BARE, add, along, dot, get, norm, scale, sub, turn, turn_back
+from sdfsim.dynamics.kernels.manifold import ALIKE, CANDIDATES, FOUND, OUTWARD, SIDE, write
+from sdfsim.dynamics.kernels.vectors import BARE, add, along, dot, get, norm, put, scale, sub, turn, turn_back
 
 KEYS = 1024  # patches of a shape at most
 ROUNDS = 12  # of refinement
 NEAR = 3.0  # cells: so near to its surface a grid is fine
 FARTHER = 2.0  # cells: by so much it is too far elsewhere, at a tip
+WAYS = 8  # in which the outermost nodes of a face are looked for
 STRIDE, FINEST = 0.02, 5e-4  # of a body's size, the first step of the refinement and the last
 
 
@@ -63,19 +65,41 @@ def is_round(table, s):
 
 @njit(**BARE)
 def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went, scratch, count):
-    """The deepest node of each near leaf of one body in the other's distances, refined; added to what is found."""
+    """Where the surface of one body is near another: from the deepest nodes of its near leaves down the other's
+    distance; added to what is found."""
     if near.count[pair, side] == 0:
         return count
-    table, brick, sample = shapes.table, shapes.brick, shapes.sample
-    depth, node, keys, normal = scratch.depth, scratch.node, scratch.key, scratch.normal
     one, other = (a, b) if side == 0 else (b, a)
     r, s = world.shape[one], world.shape[other]
     w, c = map_between(motion.position, matrix, world.scale, world.com, one, other)
     k, own = world.scale[other], world.scale[one]
     stride = STRIDE * shapes.clump_ball[shapes.clump_start[r], 3]
+    kept = _candidates(shapes, r, s, w, c, k, own, look, side, near, pair, went, scratch)
+    chosen = _chosen(scratch, kept, look)
+    for e in range(chosen):
+        if count == FOUND:
+            break
+        u, key = scratch.node[scratch.pick[e]], scratch.key[scratch.pick[e]]
+        p, d, n = _refined(
+            shapes.table, shapes.brick, shapes.sample, stride, r, s, w, c, k, own, get(shapes.node, u),
+            get(shapes.inward, u),
+        )  # fmt: skip
+        if d > look:
+            continue
+        # p of shape `one` -> about its centre of mass; its foot on the other, likewise.
+        mine = sub(scale(p, own), get(world.com, one))
+        theirs = sub(along(scale(mapped(w, c, p), k), n, -d), get(world.com, other))
+        write(scratch.found, count, side, mine, theirs, turn(matrix, other, n), d, key)
+        count += 1
+    return count
+
+
+@njit(**BARE)
+def _candidates(shapes, r, s, w, c, k, own, look, side, near, pair, went, scratch):
+    """The deepest node of each near leaf around which the surface may touch; how many."""
+    table, brick, sample = shapes.table, shapes.brick, shapes.sample
     flat = table[s, KIND] == PLANE  # whose distance has one normal: no look from within
-    slack = k * too_far(table, s)
-    kept = 0
+    slack, kept = k * too_far(table, s), 0
     for at in range(near.start[pair, side], near.start[pair, side] + near.count[pair, side]):
         i = near.leaf[at]
         if near.away[at] - went <= look:
@@ -86,51 +110,78 @@ def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went
         deepest, chosen, lowest = 0.0, -1, 1e300
         facing, d, off, there = (0.0, 0.0, 0.0), -math.inf, 0.0, get(shapes.node, shapes.leaf_node[i])
         for u in range(shapes.leaf_node[i], shapes.leaf_node[i + 1]):
-            p, within = get(shapes.node, u), get(shapes.inward, u)
+            p, within, around = get(shapes.node, u), get(shapes.inward, u), own * shapes.cover[u]
             if flat:
                 d, n = k * (dot(w[2], p) + c[2]), (0.0, 0.0, 1.0)
-            elif d - own * (norm(sub(p, there)) + 2.0 * (norm(within) + off)) > look + slack:
+            elif d - own * (norm(sub(p, there)) + 2.0 * (norm(within) + off)) > look + around + slack:
                 continue  # too near to one that is far; a look from within is off by twice the way inwards at most
             else:
                 d, n = _gap(table, brick, sample, s, w, c, p, within)
                 there, off, d = p, norm(within), d * k
             score = d - OUTWARD * own * norm(p)
-            if d <= look and score < lowest:
+            if d - around <= look and score < lowest:
                 deepest, chosen, lowest, facing = d, u, score, n
         if chosen < 0:
             continue
-        patch, there = shapes.leaf_patch[i], patch_of(table, shapes.label, s, mapped(w, c, get(shapes.node, chosen)))
-        key = patch * KEYS + there if side == 0 else there * KEYS + patch
-        # Of those that are of the same two patches and face the same way the deepest, and of all.
-        alike, place, worst = 0, -1, -1
-        for e in range(kept):
-            if keys[e] == key and dot(facing, (normal[e, 0], normal[e, 1], normal[e, 2])) > ALIKE:
-                alike += 1
-                if place < 0 or depth[e] > depth[place]:
-                    place = e
-            if worst < 0 or depth[e] > depth[worst]:
-                worst = e
-        if alike < EACH:
-            place = kept if kept < SIDE else worst
-        if place < kept and depth[place] <= deepest:
-            continue
-        kept = max(kept, place + 1)
-        depth[place], node[place], keys[place] = deepest, chosen, key
-        for x in range(3):
-            normal[place, x] = facing[x]
+        if kept == CANDIDATES:
+            worst = 0
+            for e in range(kept):
+                worst = e if scratch.depth[e] > scratch.depth[worst] else worst
+            if scratch.depth[worst] <= deepest:
+                continue
+        else:
+            worst = kept
+            kept += 1
+        place = mapped(w, c, get(shapes.node, chosen))
+        patch, there = shapes.leaf_patch[i], patch_of(table, shapes.label, s, place)
+        scratch.depth[worst], scratch.node[worst] = deepest, chosen
+        scratch.key[worst] = patch * KEYS + there if side == 0 else there * KEYS + patch
+        put(scratch.normal, worst, facing)
+        put(scratch.place, worst, scale(place, k))
+    return kept
+
+
+@njit(**BARE)
+def _chosen(scratch, kept, level):
+    """Of candidates that face the same way the deepest, and of those that are about as deep the outermost to all sides:
+    the corners of a face, in whatever order its leaves are. How many, to scratch.pick."""
+    depth, key, normal, place, pick, used = (
+        scratch.depth, scratch.key, scratch.normal, scratch.place, scratch.pick, scratch.used,
+    )  # fmt: skip
     for e in range(kept):
-        if count == FOUND:
+        used[e] = 0
+    chosen = 0
+    while chosen < SIDE:
+        first = -1
+        for e in range(kept):
+            if used[e] == 0 and (first < 0 or depth[e] < depth[first]):
+                first = e
+        if first < 0:
             break
-        u = node[e]
-        p, d, n = _refined(table, brick, sample, stride, r, s, w, c, k, own, get(shapes.node, u), get(shapes.inward, u))
-        if d > look:
-            continue
-        # p of shape `one` -> about its centre of mass; its foot on the other, likewise.
-        mine = sub(scale(p, own), get(world.com, one))
-        theirs = sub(along(scale(mapped(w, c, p), k), n, -d), get(world.com, other))
-        write(scratch.found, count, side, mine, theirs, turn(matrix, other, n), d, keys[e])
-        count += 1
-    return count
+        n = get(normal, first)
+        u, v = across(n)
+        start = chosen
+        pick[chosen] = first
+        chosen += 1
+        for way in range(WAYS):
+            angle = 2.0 * math.pi * way / WAYS
+            d = add(scale(u, math.cos(angle)), scale(v, math.sin(angle)))
+            outer, most = -1, -math.inf
+            for e in range(kept):
+                if used[e] != 1 and key[e] == key[first] and dot(n, get(normal, e)) > ALIKE:
+                    used[e] = 2
+                    if depth[e] <= depth[first] + level and dot(d, get(place, e)) > most:
+                        outer, most = e, dot(d, get(place, e))
+            known = outer < 0
+            for e in range(start, chosen):
+                known = known or pick[e] == outer
+            if not known and chosen < SIDE:
+                pick[chosen] = outer
+                chosen += 1
+        for e in range(kept):
+            used[e] = 1 if used[e] == 2 else used[e]
+        used[first] = 1
+    return chosen
 
 
 @njit(**BARE)

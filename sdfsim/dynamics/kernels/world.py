@@ -24,6 +24,7 @@ class World(NamedTuple):
     centre: np.ndarray
     half: np.ndarray
     radius: np.ndarray  # [N] how far the solid reaches from the centre of mass
+    thickness: np.ndarray  # [N] of its thinnest walls
     inverse_mass: np.ndarray  # [N], 0 unless dynamic
     # inertia, inverse_inertia: [N, 3, 3] in the body's axes; the inverse is 0 where nothing turns
     inertia: np.ndarray
@@ -123,7 +124,7 @@ class Rules(NamedTuple):
     slop: float = 5e-4  # penetration that is left as it is, so that what rests has contacts that do not come and go
     split: float = 0.04  # deeper penetration than this is resolved without a lasting velocity
     rounds: int = 50  # of sequential impulses at most
-    exact: float = 1e-4  # they end when no impulse changes a velocity by more
+    exact: float = 2e-5  # they end when no impulse changes a velocity by more
     apart: float = 0.03  # points of a manifold are at least so far from each other
     # stray, rest: who stays within `stray` for `rest` steps falls asleep, if its forces are so nearly in balance that
     # they move it by less than `drift` in as long a time
