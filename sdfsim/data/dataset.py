@@ -191,12 +191,12 @@ def floor_of(info: dict, folder: Path = Path()) -> tuple[float, float]:
     told = info.get("floor")
     if told is None:
         return FLOOR
-    values = [told.get(name) for name in ("friction", "restitution")] if isinstance(told, dict) else [None]
-    friction, restitution = values if all(type(value) in (int, float) for value in values) else (np.nan, np.nan)
+    values: list[Any] = [told.get(name) if isinstance(told, dict) else None for name in ("friction", "restitution")]
+    friction, restitution = (float(v) if type(v) in (int, float) else np.nan for v in values)
     if not (0.0 <= friction < np.inf and 0.0 <= restitution <= 1.0):
         where = f"{folder / INFO}: floor: must have friction and restitution, >= 0 and 0 to 1 (got {told!r})"
         raise SdfsimError(where, "leave it out for the floor of the recipes, {:g} and {:g}".format(*FLOOR))
-    return float(friction), float(restitution)
+    return friction, restitution
 
 
 def ranges_of(

@@ -55,6 +55,8 @@ class Compiled:
     def place(self, state: State) -> None:
         """Scenery lies where `state` has it."""
         self.world = compiled_world(self.bodies, state)
+        self._scenery = np.flatnonzero(~(self.world.moves | self.world.scripted))
+        self._lies = self._scenery_in(state)
         n = len(self.bodies)
         self.work = compiled.Work(
             matrix=pose.to_matrix(state.orientation.cpu()).numpy(), inverse=np.zeros((n, 3, 3)),
@@ -63,6 +65,15 @@ class Compiled:
             beside=np.zeros(n, np.bool_), met=np.zeros(n, np.bool_),
             parent=np.zeros(n, np.int64), number=np.zeros(n, np.int64),
         )  # fmt: skip
+
+    def follow(self, state: State) -> None:
+        """As `place`, where scenery lies elsewhere than it did: somebody has moved it."""
+        if not np.array_equal(self._scenery_in(state), self._lies):
+            self.place(state)
+
+    def _scenery_in(self, state: State) -> np.ndarray:
+        parts = (part.cpu().numpy()[self._scenery] for part in (state.position, state.orientation))
+        return np.concatenate([*parts], 1)
 
     def run(
         self, motion: compiled.Motion, manifolds: compiled.Manifolds, rules: compiled.Rules
@@ -107,12 +118,13 @@ def taken_up(
     bodies: Bodies, state: State, scene: Compiled, rules: compiled.Rules
 ) -> tuple[compiled.Motion, compiled.Manifolds]:
     """Copies of a state as the compiled step writes to them; whoever was changed from outside is awake, and so are
-    those that slept with it or on it."""
+    those that slept with it or on it. Scenery lies where the state has it."""
     position, orientation, velocity, angular = (
         np.array(t.cpu().numpy(), dtype=np.float64, order="C")
         for t in (state.position, state.orientation, state.velocity, state.angular_velocity)
     )
     n, touch = len(position), state.touch
+    scene.follow(state)
     if touch is None:
         anchor = np.concatenate([position, orientation], 1)
         still, nobody = np.zeros(n, np.int64), np.full(n, -1, np.int64)
@@ -126,8 +138,6 @@ def taken_up(
     if scene.world.scripted.any():
         changed &= ~scene.world.scripted
     if changed.any():
-        if (changed & ~scene.world.moves).any():
-            scene.place(state)
         beside = touch.pair.numpy()[touch.count.numpy() > 0]
         restless = changed.copy()
         restless[beside[changed[beside[:, 1]], 0]] = True
@@ -238,7 +248,12 @@ def _looked_at(sdf: Sdf, nodes: np.ndarray, pieces: Pieces) -> Geometry:
 
 def compiled_world(bodies: Bodies, state: State) -> compiled.World:
     """The bodies of a scene."""
-    array = {name: value.cpu().numpy() for name, value in vars(bodies).items() if isinstance(value, torch.Tensor)}
+    names = (
+        "shape", "scale", "com", "radius", "inverse_mass", "inertia", "friction", "restitution", "moves", "group",
+        "allowed", "world", "bounds",
+    )  # fmt: skip
+    # Copies: who changes a world, as a fit of coefficients does, must not change the bodies that it was made of.
+    array = {name: getattr(bodies, name).cpu().numpy().copy() for name in names}
     bounds = np.where(np.isfinite(array["bounds"]), array["bounds"], 0.0)
     inertia = array["inertia"]
     moves = array["moves"]

@@ -27,15 +27,20 @@ class Pairs:
 def contact_groups(bodies: Sequence[Body]) -> tuple[np.ndarray, np.ndarray]:
     """Bodies that list the same names and are listed by the same bodies are one group: the group [N] int64 of every
     body, and [G, G] bool, whether `collides_with` of both lets two groups touch."""
-    lists = {id(b.collides_with): set(b.collides_with) for b in bodies if b.collides_with is not None}
-    found: dict[tuple, int] = {}
-    group = np.empty(len(bodies), dtype=np.int64)
+    lists: dict[frozenset, int] = {}
+    of_object: dict[int, int] = {}  # many bodies may share one tuple, which is then looked at once
+    own = np.full(len(bodies), -1, dtype=np.int64)
     for k, body in enumerate(bodies):
-        own = None if body.collides_with is None else id(body.collides_with)
-        listed = frozenset(key for key, names in lists.items() if body.name in names)
-        group[k] = found.setdefault((own, listed), len(found))
-    allowed = np.array([[own is None or own in listed for _, listed in found] for own, _ in found], dtype=bool)
-    return group, (allowed & allowed.T).reshape(len(found), len(found))
+        if body.collides_with is not None:
+            if id(body.collides_with) not in of_object:
+                of_object[id(body.collides_with)] = lists.setdefault(frozenset(body.collides_with), len(lists))
+            own[k] = of_object[id(body.collides_with)]
+    listed_by: dict[str, list[int]] = {}
+    for names, number in lists.items():
+        for name in names:
+            listed_by.setdefault(name, []).append(number)
+    found: dict[tuple, int] = {}
+    group = np.array([found.setdefault((o, *listed_by.get(b.name, ())), len(found)) for o, b in zip(own, bodies)])
 
 
 def count_pairs(bodies: Sequence[Body]) -> Pairs:

@@ -310,7 +310,7 @@ def _of_step(
             friction=body(bodies.friction),
             restitution=body(bodies.restitution),
             size=body(bodies.size, length),
-            floor=np.tile(np.float32(of_floor), (len(used), 1)),
+            floor=np.tile(np.array(of_floor, np.float32), (len(used), 1)),
             first=(first - begins).astype(np.int16),
             second=np.where(second == floor, -1, second - begins).astype(np.int16),
             arm_first=vector(ARM, length),
