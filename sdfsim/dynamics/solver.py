@@ -250,10 +250,11 @@ def compiled_world(bodies: Bodies, state: State) -> compiled.World:
     """The bodies of a scene."""
     names = (
         "shape", "scale", "com", "radius", "inverse_mass", "inertia", "friction", "restitution", "moves", "group",
-        "allowed", "world", "bounds",
+        "world", "bounds",
     )  # fmt: skip
     # Copies: who changes a world, as a fit of coefficients does, must not change the bodies that it was made of.
     array = {name: getattr(bodies, name).cpu().numpy().copy() for name in names}
+    array["allowed"] = bodies.allowed.cpu().numpy()  # as large as pairs of groups are many, and never changed
     bounds = np.where(np.isfinite(array["bounds"]), array["bounds"], 0.0)
     inertia = array["inertia"]
     moves = array["moves"]
