@@ -286,10 +286,15 @@ def compiled_world(bodies: Bodies, state: State) -> compiled.World:
 
 
 def _nodes_of(bodies: Bodies, k: int) -> np.ndarray:
-    """[K, 3] surface nodes of the shape of body k, at scale 1 in the shape's own frame. Rounded to 1e-12 m, so that
+    """[K, 3] surface nodes of the shape of body k, at scale 1 in the shape's own frame. Rounded to 12 digits, so that
     bodies of different scales know them as the same nodes."""
     first, last = int(bodies.node_start[k]), int(bodies.node_start[k + 1])
-    return ((bodies.node[first:last] + bodies.com[k]) / bodies.scale[k]).cpu().numpy().round(12)
+    nodes = ((bodies.node[first:last] + bodies.com[k]) / bodies.scale[k]).cpu().numpy()
+    extent = np.ptp(nodes, axis=0).max() if len(nodes) else 0.0
+    if not extent > 0.0:
+        return nodes
+    # Up to the power of ten that holds it, and no further where rounding has made it a little more than that power.
+    return nodes.round(12 - math.ceil(math.log10(extent) - 1e-9))
 
 
 def _clumps(nodes: np.ndarray, patch: np.ndarray) -> Clumps:

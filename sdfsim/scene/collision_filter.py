@@ -82,8 +82,8 @@ def _lists(bodies: Sequence[Body]) -> tuple[list[int], list[list[int]]]:
 
 
 def _partners(kinds: Sequence[tuple[int, frozenset[int]]]) -> list[frozenset[int]]:
-    """The kinds that each kind of bodies may touch; of a kind are told the list that it has (-1: none) and those that it
-    is in. Kinds without a list may all touch each other, and are not among those."""
+    """The kinds that each kind of bodies may touch. Of a kind is told the list that it has (-1: none) and those that
+    name it. Kinds without a list may all touch each other, and are not among those."""
     named: dict[int, list[int]] = {}
     for k, (_, listed) in enumerate(kinds):
         for number in listed:

@@ -44,7 +44,10 @@ def baked(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = (), cache_
     """The grid of an SDF (or of the union of the convex pieces, vertices [V, 3] m each, that it was fitted to), baked
     on first use and then taken from the cache. The thickness of walls is measured at `nodes` [K, 3] m."""
     cache_dir = cache_dir or user_cache("baked")
-    path = cache_dir / f"{digest(sdf, [*pieces], CELLS, FINEST)}-{BAKE_VERSION}.npz"
+    # Walls at the nodes decide how fine the grid is. Nodes come from bodies of any scale: nine digits count.
+    extent = float(np.ptp(sdf.bounds, axis=0).max())
+    known = digest(sdf, np.round(np.asarray(nodes) / extent, 9) + 0.0, [*pieces], CELLS, FINEST)
+    path = cache_dir / f"{known}-{BAKE_VERSION}.npz"
     if path.is_file():
         try:
             kept = read_arrays(path, "a baked grid", "delete it")
@@ -56,7 +59,7 @@ def baked(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = (), cache_
     try:
         cache_dir.mkdir(parents=True, exist_ok=True)
         write_arrays(path, {name: np.asarray(value) for name, value in vars(grid).items()}, compressed=False)
-    except OSError as error:
+    except (SdfsimError, OSError) as error:  # a full disk; a folder that cannot be made
         _log.warning("a baked grid is not kept for the next time: %s", error)
     return grid
 
