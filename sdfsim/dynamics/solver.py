@@ -12,15 +12,16 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import torch
 
-from sdfsim.dynamics import kernels, pose
+from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State, Touch
+from sdfsim.dynamics.compiling import tell_compiling
 from sdfsim.dynamics.kernels import distance as kinds
 from sdfsim.dynamics.kernels import world as compiled
 from sdfsim.dynamics.kernels.record import Edges
 from sdfsim.dynamics.kernels.step import step as compiled_step
 from sdfsim.dynamics.kernels.survey import Touching, touching
 from sdfsim.files import digest
-from sdfsim.shape.baked_grid import WALL, BakedGrid, baked, inwards
+from sdfsim.shape.baked_grid import BakedGrid, baked, inwards, unseen_wall
 from sdfsim.shape.sdf import ClosedForm, PlaneSdf, Sdf
 from sdfsim.shape.surface_nodes import Surface, surface_of
 
@@ -46,8 +47,7 @@ class Compiled:
     """One scene, its bodies in model units, as the compiled step wants it."""
 
     def __init__(self, bodies: Bodies, state: State) -> None:
-        if not kernels.compiled():
-            _log.warning("compiling the contact step, once for this version: about two minutes")
+        tell_compiling(compiled_step, "the contact step", "two minutes")
         self.bodies = bodies
         self.shapes = compiled_shapes(bodies)
         self.place(state)
@@ -238,9 +238,8 @@ def _geometry(sdf: Sdf, nodes: np.ndarray, pieces: Pieces) -> Geometry:
 def _looked_at(sdf: Sdf, nodes: np.ndarray, pieces: Pieces) -> Geometry:
     grid = None if isinstance(sdf, ClosedForm) else baked(sdf, nodes, pieces)
     extent = 0.0 if isinstance(sdf, PlaneSdf) else float(np.ptp(sdf.bounds, axis=0).max())
-    if grid and grid.thickness <= 1.001 * WALL * grid.cell:
-        told = "a shape of %.2g m has walls of at most %.2g m: things may pass through; --thicken helps"
-        _log.warning(told, extent, grid.thickness)
+    if grid and (wall := unseen_wall(sdf, grid)) is not None:
+        _log.warning("a shape of %.2g m has walls of at most %.2g m: things may pass through", extent, wall)
     surface = surface_of(sdf, nodes, pieces)
     inward = INWARD * extent * inwards(sdf, surface.nodes)
     return Geometry(grid, surface, inward, _clumps(surface.nodes, surface.patch))

@@ -23,6 +23,9 @@ FINEST = 512  # likewise, where walls are thin
 PADDING = 4.0  # cells around the solid
 WALL = 2.0  # cells that a wall needs for either of its sides to be seen
 CHUNK = 2**18  # points asked at once
+SPREAD = 512  # places all over a surface
+# Of the largest extent: how near they are before, how near after so many steps towards it.
+CLOSE, REACHED, PROJECTIONS = 0.01, 1e-4, 4
 
 _log = logging.getLogger(__name__)
 
@@ -134,6 +137,25 @@ def wall_thickness(sdf: Sdf, nodes: np.ndarray) -> float:
     stops = np.argmax(np.concatenate([found < 0.4 * depth, np.ones((len(some), 1), bool)], 1), axis=1)
     reached = np.concatenate([depth[:1], depth])[stops]
     return float(2.0 * np.quantile(reached, 0.05))
+
+
+def unseen_wall(sdf: Sdf, grid: BakedGrid) -> float | None:
+    """m, the thickness of walls that are too thin for a grid to tell one side from the other; None where it has no such
+    walls. Nodes lie close along edges and at corners, where every solid is thin: what counts are places all over the
+    surface."""
+    limit = 1.001 * WALL * grid.cell
+    if grid.thickness > limit:
+        return None
+    extent = float(np.ptp(sdf.bounds, axis=0).max())
+    places = np.random.default_rng(0).uniform(*sdf.bounds, (64 * SPREAD, 3))
+    # From close by: edges are what is nearest to much of the space farther away.
+    places = places[np.abs(np.asarray(sdf(places)[0])) <= CLOSE * extent][: 2 * SPREAD]
+    for _ in range(PROJECTIONS):
+        distance, gradient = sdf(places)
+        places = places - np.asarray(distance)[:, None] * np.asarray(gradient)
+    places = places[np.abs(np.asarray(sdf(places)[0])) <= REACHED * extent][:SPREAD]
+    thickness = wall_thickness(sdf, places) if len(places) else grid.thickness
+    return thickness if thickness <= limit else None
 
 
 def interpolated(grid: BakedGrid, points: np.ndarray) -> np.ndarray:

@@ -373,6 +373,8 @@ def _cached(
             return load_shape(folder)
         except SdfsimError:
             shutil.rmtree(folder, ignore_errors=True)  # a damaged entry is only a cache miss
+    if how["on_progress"] is silent:  # nobody sees how it goes on: say at least what takes so long
+        _log.warning("making the shape %s, once for this mesh: about half a minute", name)
     if kind == "grid":
         shape = mesh_shape(mesh, name=name, kind=kind, resolution=resolution, **how)
     else:

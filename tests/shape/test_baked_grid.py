@@ -16,12 +16,13 @@ from sdfsim.dynamics.solver import _geometry, _nodes_of, compiled_shapes
 from sdfsim.errors import SdfsimError
 from sdfsim.scene.scene import Scene
 from sdfsim.shape import baked_grid as module
-from sdfsim.shape.baked_grid import bake, baked, wall_thickness
+from sdfsim.shape.baked_grid import BakedGrid, bake, baked, unseen_wall, wall_thickness
 from sdfsim.shape.distance import PiecesDistance
 from sdfsim.shape.mesh import Mesh, convex_hull
+from sdfsim.shape.primitives import spiral
 from sdfsim.shape.sdf import MeshSdf
 from sdfsim.shape.shape import analytic_shape, scaled, with_sdf
-from sdfsim.shape.surface_nodes import MOST_PATCHES, Surface, surface_of
+from sdfsim.shape.surface_nodes import MOST_PATCHES, Surface, edge_nodes, surface_of
 from tests.dynamics.test_laws import body
 
 
@@ -59,7 +60,48 @@ def two_halves() -> list[np.ndarray]:
 def test_walls_that_no_grid_sees_are_told(wall, told, caplog):
     rod = with_sdf(analytic_shape("box", size=(1.0, 0.03, wall)), "mesh")
     _geometry(rod.sdf, rod.nodes, ())
-    assert ("things may pass through" in caplog.text) is told
+    assert ("things may pass through" in caplog.text) is told and "--thicken" not in caplog.text
+
+
+CONVEX = {
+    "tetrahedron": [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)],
+    "octahedron": [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)],
+    "wedge": [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0), (0, 0, 0.3), (0, 1, 0.3)],
+    "pyramid": [(-1, -1, 0), (1, -1, 0), (-1, 1, 0), (1, 1, 0), (0, 0, 0.5)],
+    "double cone": [(np.cos(a), np.sin(a), 0) for a in np.linspace(0, 6, 20)] + [(0, 0, 0.4), (0, 0, -0.4)],
+    "spike": [(np.cos(a), np.sin(a), 0) for a in np.linspace(0, 6, 20)] + [(0, 0, 5.0)],
+    "ball": spiral(300),
+}
+
+
+def finest(sdf: MeshSdf, nodes: np.ndarray) -> BakedGrid:
+    """As fine a grid as there is, without its samples."""
+    cell = float(np.ptp(sdf.bounds, axis=0).max()) / module.FINEST
+    return BakedGrid(sdf.bounds[0], cell, *(np.zeros(0),) * 3, wall_thickness(sdf, nodes), 0.0)
+
+
+@pytest.mark.parametrize("name", CONVEX)
+def test_a_solid_that_comes_to_edges_has_no_thin_walls(name):
+    """Also where its nodes are on its edges alone, where every solid is thin."""
+    mesh = convex_hull(np.array(CONVEX[name], float))
+    sdf, nodes = MeshSdf(mesh), np.concatenate([mesh.vertices, edge_nodes(mesh.vertices, 0.05)])
+    assert unseen_wall(sdf, finest(sdf, nodes)) is None
+
+
+def test_edges_are_thin():
+    mesh = convex_hull(np.array(CONVEX["wedge"], float))
+    grid = finest(MeshSdf(mesh), np.concatenate([mesh.vertices, edge_nodes(mesh.vertices, 0.05)]))
+    assert grid.thickness <= 2.001 * grid.cell  # what made walls of them
+
+
+@pytest.mark.parametrize("wall", [0.001, 0.003])
+def test_a_hollow_solid_with_thin_walls_is_told_of(wall):
+    outer = analytic_shape("box", size=(1.0, 0.8, 0.6)).mesh
+    inner = analytic_shape("box", size=(1.0 - 2 * wall, 0.8 - 2 * wall, 0.6 - 2 * wall)).mesh
+    faces = np.concatenate([outer.faces, inner.faces[:, ::-1] + len(outer.vertices)])
+    sdf = MeshSdf(Mesh(np.concatenate([outer.vertices, inner.vertices]), faces))
+    found = unseen_wall(sdf, finest(sdf, analytic_shape("box", size=(1.0, 0.8, 0.6)).nodes))
+    assert found is not None and found <= 0.004
 
 
 def test_where_pieces_are_known_the_grid_is_of_these():
