@@ -28,7 +28,7 @@ from benchmarks.results import script, write_section
 from benchmarks.scale import apart, with_nodes_cut
 from samples.large import write_scene
 from sdfsim.data.batching import scene_of
-from sdfsim.data.dataset import FLOOR
+from sdfsim.data.dataset import conditions_of
 from sdfsim.dynamics.model import load_model
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.dynamics.solver import Compiled, compiled_rules, taken_up
@@ -66,8 +66,9 @@ def movi_b(data: Path) -> tuple[float, float]:
     """Milliseconds a step of PyBullet and of the solve, mean over trajectories."""
     recorded, shapes = load_recorded(data, "test", most=TRAJECTORIES, as_recorded=True)
     urdfs = {name: dataset_urdf(data, name) for name in shapes}
-    engine = [bullet(Start(t, urdfs, FLOOR), STEPS)[1].wall_ms for t in recorded]
-    ours = [solved(scene_of([t], [0], shapes)[0], STEPS, t.dt) for t in recorded]
+    floor = conditions_of(data).floor
+    engine = [bullet(Start(t, urdfs, floor), STEPS)[1].wall_ms for t in recorded]
+    ours = [solved(scene_of([t], [0], shapes, floor)[0], STEPS, t.dt) for t in recorded]
     return float(np.mean(engine)), float(np.mean(ours))
 
 

@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.results import script, told
 from sdfsim.data.batching import every, scene_of
-from sdfsim.data.dataset import read_info
+from sdfsim.data.dataset import conditions_of, read_info
 from sdfsim.dynamics.model import SOLVER, load_model
 from sdfsim.dynamics.models.contact_graph import SUBSTEPS, ContactGraph
 from sdfsim.dynamics.models.impulse import Velocities
@@ -78,7 +78,7 @@ def timed(model: str, method: Method, data: Path) -> dict[str, Any]:
     with one_thread():
         recorded, shapes = load_recorded(data, "validation", most=TIMED)
         for start in (every(t, method.stride) for t in recorded):
-            scene = scene_of([start], [0], shapes)[0]
+            scene = scene_of([start], [0], shapes, conditions_of(data).floor)[0]
             simulator = Simulator(scene, used, dt=start.dt)
             substeps = method.substeps or used.inner or SUBSTEPS * method.stride
             simulator.rules = replace(simulator.rules, substeps=substeps, trust=1.0)

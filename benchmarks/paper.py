@@ -34,7 +34,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.results import script, told
 from samples.large import write_scene
 from sdfsim.data.batching import batches, first_frames, roll_out
-from sdfsim.data.dataset import engine_substep, read_info
+from sdfsim.data.dataset import conditions_of, engine_substep, read_info
 from sdfsim.dynamics.model import SOLVER, Model, load_model, new_network
 from sdfsim.dynamics.run_memory import Memory
 from sdfsim.dynamics.simulator import Simulator
@@ -243,9 +243,12 @@ def rolled_out(data: Path, width: int | None, home: Path) -> dict[str, Any]:
     if width is not None:
         shapes = {name: refitted(shape, width, home / name) for name, shape in shapes.items()}
     inner = inner_steps(recorded[0].dt, engine_substep(data))
-    solver, motions = load_model(SOLVER), []
+    solver, motions, conditions = load_model(SOLVER), [], conditions_of(data)
     for group in batches(recorded):
-        motions += roll_out(solver, group, shapes, int(FRAME), torch.device("cpu"), substeps=inner, as_teacher=True)
+        motions += roll_out(
+            solver, group, shapes, int(FRAME), torch.device("cpu"), substeps=inner, floor=conditions.floor,
+            as_teacher=conditions.by_teacher,
+        )  # fmt: skip
     return errors(motions, recorded)[FRAME]
 
 

@@ -31,7 +31,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.results import script, told, write_section
 from samples.large import sample_shape, write_scene
 from sdfsim.data.batching import scene_of
-from sdfsim.data.dataset import Trajectory
+from sdfsim.data.dataset import Trajectory, conditions_of
 from sdfsim.dynamics.bodies import largest_extent
 from sdfsim.dynamics.model import load_model
 from sdfsim.dynamics.simulator import Simulator
@@ -228,7 +228,7 @@ def scenes_of(case: str, data: Path | None, folder: Path) -> list[Scene]:
     (folder / "pieces").mkdir(parents=True, exist_ok=True)
     if data is not None and case == "MOVi-B":
         recorded, shapes = load_recorded(data, "test", most=MOVI_B)
-        scenes = [scene_of([t], [0], shapes)[0] for t in recorded]
+        scenes = [scene_of([t], [0], shapes, conditions_of(data).floor)[0] for t in recorded]
     else:
         scenes = [CASES[case](folder)]
     for k, scene in enumerate(scenes):

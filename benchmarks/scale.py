@@ -30,7 +30,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.results import script, told, write_section
 from samples.large import HEAPS, write_scene
 from sdfsim.data.batching import scene_of
-from sdfsim.data.dataset import Trajectory
+from sdfsim.data.dataset import Trajectory, conditions_of
 from sdfsim.dynamics.model import load_model
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.dynamics.simulator import SimulationError, Simulator, join
@@ -196,7 +196,7 @@ def many(data: Path, *, scenes: int = 1000) -> None:
     from distributed import LocalCluster
 
     recorded, shapes = load_recorded(data, "train", most=DISTINCT)
-    distinct = [scene_of([t], [0], shapes)[0] for t in recorded]
+    distinct = [scene_of([t], [0], shapes, conditions_of(data).floor)[0] for t in recorded]
     repeated = [distinct[k % len(distinct)] for k in range(scenes)]
     jobs = [(repeated[k : k + CHUNK], STEPS) for k in range(0, scenes, CHUNK)]
     rows, first = [("workers", "scenes a second", "times one worker")], 0.0

@@ -6,6 +6,7 @@ The names below load their modules on first use, so that `import sdfsim` stays l
 from __future__ import annotations
 
 import os
+import warnings
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
 # wait for: a step then takes ten times as long. So they spin for some microseconds only, which costs little on a free
 # machine. Has an effect only before torch is imported.
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+
+# Numba tells of an old TBB as it takes the next best of its threading layers, which is as good here.
+warnings.filterwarnings("ignore", message="The TBB threading layer requires TBB version")
 
 __version__ = "0.1.0"
 __all__ = ["Rollout", "Scene", "SceneError", "SdfsimError", "Shape", "Simulator", "load_scene", "load_shape"]

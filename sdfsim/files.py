@@ -6,6 +6,7 @@ import fcntl
 import hashlib
 import json
 import os
+import secrets
 import tempfile
 import zipfile
 from collections.abc import Iterator
@@ -34,7 +35,8 @@ def user_cache(name: str) -> Path:
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary path beside `path` to write to; it takes the final name when the block ends without an error. Raises
     SdfsimError where the disk is full or the folder not writable."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+    # Unique also among the threads of a worker, and the hosts that share a folder.
+    partial = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.part")
     try:
         yield partial
         os.replace(partial, path)

@@ -14,7 +14,7 @@ from sdfsim.errors import SdfsimError
 from sdfsim.files import check_writable, locked, read_json
 from sdfsim.parallel import Progress, parallel, silent
 from sdfsim.scene.scene_file import UNITS
-from sdfsim.shape.baked_grid import grid_certificate
+from sdfsim.shape.baked_grid import baked, grid_certificate, unseen_wall
 from sdfsim.shape.fit import FIT_VERSION, Recipe, fit_mesh
 from sdfsim.shape.mesh import MESH_SUFFIXES, load_mesh
 from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape
@@ -51,7 +51,12 @@ def fit(mesh_file: Path, out: Path, options: Options, *, device: str, on_progres
             how = {key: value for key, value in vars(options).items() if key != "units"}
             shape = fit_mesh(mesh, name=out.resolve().name, **how, on_progress=on_progress, device=where)
             certificate = shape.certificate | grid_certificate(shape.sdf, shape.nodes)
-            shape = replace(shape, source=shape.source | {"request": request}, certificate=certificate)
+            wall = unseen_wall(shape.sdf, baked(shape.sdf, shape.nodes))
+            source = shape.source | {"request": request}
+            if wall is not None:
+                told = f"walls of at most {wall:.2g} m: things may pass through; --thicken helps"
+                source["notes"] = [*source.get("notes", []), told]
+            shape = replace(shape, source=source, certificate=certificate)
             shape.save(out)
     missed = [] if shape.certificate["passed"] else [f"fit: {shape.certificate['reason']}"]
     notes, size = list(shape.source.get("notes", [])), largest_extent(shape)

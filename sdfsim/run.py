@@ -37,7 +37,7 @@ from sdfsim.files import (
 )
 from sdfsim.parallel import Progress, StageProgress, silent
 from sdfsim.recording import Playback, framed, save_rollout
-from sdfsim.scene.scene import Scene
+from sdfsim.scene.scene import Scene, fingerprints
 from sdfsim.scene.scene_file import load_scene
 from sdfsim.viewer import check_screen, stream_to_viewer
 
@@ -152,6 +152,7 @@ def simulate(
             broken = error
             kept.save()
         rollout = join(frames)
+        rollout = replace(rollout, meta=rollout.meta | {"scene": fingerprints(scene)})
         on_progress("simulate", 1.0, f"{len(rollout)} steps" + (" (stopped early)" if broken else ""))
 
         report = summary(scene, rollout, time.monotonic() - started) | {
@@ -184,9 +185,11 @@ def read_run(
     path: Path, scene_file: Path | None = None, *, allow_outside: bool = False, on_progress: Progress = silent
 ) -> tuple[Scene, Rollout]:
     """A finished or interrupted run, by its folder or `rollout.npz`, and its scene: a scene file, or that the run was
-    made from. Raises SdfsimError for no run, no scene, or another scene than that of the run."""
+    made from. Raises SdfsimError for no run, no scene, or one that is not that of the run: of a scene that is given,
+    bodies and shapes count; where none is given, that its file was edited since."""
     file = path / "rollout.npz" if path.is_dir() else path
     rollout = Rollout.load(file)
+    compared = ("shapes",) if scene_file is not None else ("shapes", "bodies", "gravity")
     if scene_file is None:
         try:
             scene_file = Path(yaml.safe_load((file.parent / CONFIG).read_text(encoding="utf-8"))["scene"])
@@ -196,6 +199,10 @@ def read_run(
     scene = load_scene(scene_file, on_progress, allow_outside=allow_outside)
     if tuple(body.name for body in scene.bodies) != rollout.names:
         raise SdfsimError(f"{file}: its bodies are not those of {scene.path}", "give its scene: --scene")
+    known, now = rollout.meta.get("scene", {}), fingerprints(scene)
+    if other := [what for what in compared if known.get(what, now[what]) != now[what]]:
+        told = f"{file}: {scene.path} is not the scene that it was made of: other {' and '.join(other)}"
+        raise SdfsimError(told, "simulate it anew, or give the scene as it was: --scene")
     return scene, rollout
 
 

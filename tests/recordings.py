@@ -1,6 +1,8 @@
 """Small recordings and datasets that tests share: cubes by the teacher, and balls whose bounces are made by hand."""
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -83,6 +85,26 @@ def bouncing(seed: int):
         scale=np.ones(2),
         inertia=np.full((2, 3), 0.1),
     )
+
+
+def sliding(friction: float, **fields) -> Trajectory:
+    """A flat box of 1 x 1 x 0.2 m whose own friction and restitution are 1, slowed down by a floor of this friction."""
+    time = 0.02 * np.arange(40)[:, None, None]
+    slower, along = friction * 10.0, np.array([1.0, 0.0, 0.0])
+    one = balls(np.array([0.0, 0.0, 0.1]) + (3.0 * time - 0.5 * slower * time**2) * along)
+    own = {"friction": np.ones(1), "restitution": np.ones(1), "inertia": np.array([[1.04, 1.04, 2.0]]) / 12.0}
+    own |= {"velocity": (3.0 - slower * time) * along, "shape": np.array(["slab"])}
+    return replace(one, **(own | fields))
+
+
+def slab_data(folder: Path, split: str, trajectory: Trajectory, info: dict | None) -> Path:
+    """A dataset of one trajectory of slabs; `info` is its dataset.json, None for none."""
+    analytic_shape("box", size=(1.0, 1.0, 0.2), name="slab").save(folder / "shapes" / "slab")
+    (folder / split).mkdir()
+    trajectory.save(folder / split / "0.npz")
+    if info is not None:
+        (folder / "dataset.json").write_text(json.dumps(info))
+    return folder
 
 
 @pytest.fixture(scope="module")

@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import yaml
 
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.errors import SdfsimError
-from sdfsim.identify import COLUMNS, identify, load_recording
+from sdfsim.identify import COLUMNS, Windows, identify, load_recording
 from sdfsim.scene.scene_file import load_scene
 
 FLOOR = {"friction": 0.6, "restitution": 0.9}
@@ -91,3 +92,16 @@ def test_a_body_that_only_falls_tells_nothing(recorded, tmp_path):
     )
     with pytest.raises(SdfsimError, match="nothing touches"):
         identify(*load_recording(tmp_path / "rollout.npz", recorded / "scene.yaml"))
+
+
+def test_a_fit_leaves_the_bodies_as_they_are(recorded):
+    recording, scene = load_recording(recorded / "rollout.npz", recorded / "scene.yaml")
+    windows = Windows(recording, scene)
+    names = ("mass", "inverse_mass", "inertia", "friction", "restitution")
+    before = {name: getattr(windows.bodies, name).clone() for name in names}
+    usual = windows.errors(windows.start(0.5, 0.5))
+    other = windows.start(0.1, 0.9)
+    other[-1] = 0.7
+    assert np.abs(windows.errors(other) - usual).max() > 0.1
+    for name, values in before.items():
+        assert torch.equal(getattr(windows.bodies, name), values), name

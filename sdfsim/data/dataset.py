@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sdfsim.data.pybullet_sim import TEACHER_VERSION
+from sdfsim.data.pybullet_sim import TEACHER_VERSION, set_as_teacher
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_arrays, read_json, write_arrays
 
@@ -161,31 +161,61 @@ def home_of(data: Path) -> Path | None:
     return next((folder for folder in (data, data.parent) if (folder / INFO).exists()), None)
 
 
-def floor_of(info: dict) -> tuple[float, float]:
-    """Friction and restitution of the floor in `dataset.json`, or the recipes' own. Raises SdfsimError for neither."""
-    told = info.get("floor") or {"friction": FLOOR[0], "restitution": FLOOR[1]}
-    try:
-        return float(told["friction"]), float(told["restitution"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise SdfsimError(f"{INFO}: floor: must have friction and restitution (got {told!r})") from error
+@dataclass(frozen=True)
+class Conditions:
+    """What a dataset tells of how it was recorded."""
+
+    friction: float  # friction, restitution: of the floor
+    restitution: float
+    floor_told: bool  # whether a dataset.json told these; else they are those of the recipes' floor
+    by_teacher: bool  # whether a dataset.json names PyBullet as the teacher has it set
+
+    @property
+    def floor(self) -> tuple[float, float]:
+        """Friction and restitution of the floor."""
+        return self.friction, self.restitution
+
+
+def conditions_of(data: Path) -> Conditions:
+    """How a dataset, a folder or one of its splits, was recorded. Raises SdfsimError where its `dataset.json` is not
+    readable, or has a floor that is none."""
+    home = home_of(data)
+    info = read_info(home) if home else {}
+    floor = floor_of(info, home or data)
+    return Conditions(*floor, floor_told=info.get("floor") is not None, by_teacher=set_as_teacher(info))
+
+
+def floor_of(info: dict, folder: Path = Path()) -> tuple[float, float]:
+    """Friction and restitution of the floor in the `dataset.json` of a folder, or the recipes' own where it tells none.
+    Raises SdfsimError where either is missing, negative or no number, or the restitution is above 1."""
+    told = info.get("floor")
+    if told is None:
+        return FLOOR
+    values: list[Any] = [told.get(name) if isinstance(told, dict) else None for name in ("friction", "restitution")]
+    friction, restitution = (float(v) if type(v) in (int, float) else np.nan for v in values)
+    if not (0.0 <= friction < np.inf and 0.0 <= restitution <= 1.0):
+        where = f"{folder / INFO}: floor: must have friction and restitution, >= 0 and 0 to 1 (got {told!r})"
+        raise SdfsimError(where, "leave it out for the floor of the recipes, {:g} and {:g}".format(*FLOOR))
+    return friction, restitution
 
 
 def ranges_of(
-    size: np.ndarray, speed: np.ndarray, mass_ratio: np.ndarray, friction: np.ndarray, restitution: np.ndarray
-) -> dict[str, list[float]]:
+    size: np.ndarray, speed: np.ndarray, mass_ratio: np.ndarray, friction: np.ndarray, restitution: np.ndarray,
+    floor: np.ndarray,
+) -> dict[str, list[float]]:  # fmt: skip
     """[low, high] of what a model has seen, SI units: sizes and speeds of the bodies that move, mass ratios within a
-    scene, and the products of two bodies' coefficients, or of a body's and the floor's."""
+    scene, and the products of two bodies' coefficients, or of a body's and those of its `floor` [F, 2]."""
 
-    def products(values: np.ndarray, floor: float) -> list[float]:
+    def products(values: np.ndarray, floors: np.ndarray) -> list[float]:
         low, high = float(values.min()), float(values.max())
-        return [low * min(low, floor), high * max(high, floor)]
+        return [low * min(low, float(floors.min())), high * max(high, float(floors.max()))]
 
     return {
         "size": [float(size.min()), float(size.max())],
         "speed": [0.0, float(np.percentile(speed, 99.9))],
         "mass_ratio": [1.0, float(mass_ratio.max())],
-        "friction": products(friction, FLOOR[0]),
-        "restitution": products(restitution, FLOOR[1]),
+        "friction": products(friction, floor[:, 0]),
+        "restitution": products(restitution, floor[:, 1]),
     }
 
 

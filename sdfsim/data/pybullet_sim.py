@@ -74,6 +74,15 @@ def engine_settings(step: float, substeps: int) -> dict:
     return ENGINE_SETTINGS | BODY_SETTINGS | MAXIMAL | {"timeStep": step / substeps}
 
 
+def set_as_teacher(info: dict) -> bool:
+    """Whether a `dataset.json` names this engine with the settings that the teacher has, at whatever inner step: its
+    recordings then have the teacher's habits, bodies larger by `MARGIN` and pushes that add to rebounds."""
+    settings, ours = info.get("engine_settings"), engine_settings(DT, SUBSTEPS)
+    if info.get("engine") != "pybullet" or not isinstance(settings, dict):
+        return False
+    return all(settings.get(name) == value for name, value in ours.items() if name != "timeStep")
+
+
 def substeps_of(step: float) -> int:
     """Inner steps in a recorded step of `step` s. Raises SdfsimError when the teacher records at no such rate."""
     for fps, substeps in RATES.items():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import cache
@@ -15,6 +14,7 @@ from torch import Tensor, nn
 
 from sdfsim.dynamics import kernels
 from sdfsim.dynamics.bodies import State
+from sdfsim.dynamics.compiling import tell_compiling
 from sdfsim.dynamics.kernels.record import Edges
 from sdfsim.dynamics.kernels.world import World
 from sdfsim.dynamics.models.contact_graph import REST_SPEED
@@ -24,13 +24,10 @@ with kernels.kept():
     from sdfsim.dynamics.kernels import impulse as compiled
 from sdfsim.dynamics.step import StepOptions
 
-_log = logging.getLogger(__name__)
-
 
 def packed(network: ImpulseNetwork, *, friction: bool) -> compiled.Weights:
     """Copies of the weights of a network."""
-    if not kernels.compiled("impulse.correct"):
-        _log.warning("compiling the network, once for this version: about half a minute")
+    tell_compiling(compiled.correct, "the network", "half a minute")
     rounds = list(cast("Iterable[Round]", network.rounds))
 
     def layer(*modules: Iterable[nn.Linear | nn.LayerNorm]) -> compiled.Layer:

@@ -212,7 +212,7 @@ class Simulator:
         self, variants: Sequence[Variant], seconds: float | None = None, steps: int | None = None
     ) -> list[Rollout]:
         """The scene from its start with some values changed, once for each variant, on all cores; the same as `run` of
-        a `Simulator` of each changed scene.
+        a `Simulator` of each changed scene with the model, device, seed, step and free flight of this one.
 
         Variants map names of bodies to changed fields: position, quat_xyzw, velocity, angular_velocity, mass, friction,
         restitution (SI units), such as {"ball": {"velocity": (1, 0, 0)}}. Raises SdfsimError for no such body or field,
@@ -220,7 +220,8 @@ class Simulator:
         """
         scenes = [varied(self.scene, variant) for variant in variants]
         pieces = np.array_split(np.arange(len(scenes)), min(CHUNKS, max(1, len(scenes))))
-        jobs = [([scenes[k] for k in piece], self.model, self._dt, seconds, steps) for piece in pieces]
+        same = {"device": str(self.device), "seed": self.seed, "dt": self._dt, "free_flight": self.rules.free_flight}
+        jobs = [([scenes[k] for k in piece], self.model, same, seconds, steps) for piece in pieces]
         found = dict(parallel(_run_each, jobs))
         return [rollout for k in range(len(jobs)) for rollout in found[k]]
 
@@ -380,6 +381,9 @@ def _changed(body: Body, fields: Mapping[str, Any]) -> Body:
             raise SdfsimError(f"{where}: must be 0 to {most:g} (got {given!r})")
         if body.motion != "dynamic" and name in ("velocity", "angular_velocity", "mass"):
             raise SdfsimError(f"variant: body {body.name!r}: is {body.motion}, so it has no {name}")
+        if body.path is not None and name in ("position", "quat_xyzw"):
+            told = f"variant: body {body.name!r}: is on a path, so its {name} cannot be changed"
+            raise SdfsimError(told, "change the path in the scene")
         new[name] = value if count else float(value)
     if "quat_xyzw" in new:
         new["quat_xyzw"] = new["quat_xyzw"] / max(np.linalg.norm(new["quat_xyzw"]), 1e-300)
@@ -392,9 +396,9 @@ def _changed(body: Body, fields: Mapping[str, Any]) -> Body:
 
 
 def _run_each(
-    scenes: list[Scene], model: Model, dt: float | None, seconds: float | None, steps: int | None
+    scenes: list[Scene], model: Model, options: dict[str, Any], seconds: float | None, steps: int | None
 ) -> list[Rollout]:
-    return [Simulator(scene, model, dt=dt).run(seconds, steps) for scene in scenes]
+    return [Simulator(scene, model, **options).run(seconds, steps) for scene in scenes]
 
 
 def check_seconds(seconds: float) -> None:

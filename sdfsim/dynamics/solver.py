@@ -12,8 +12,9 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import torch
 
-from sdfsim.dynamics import kernels, pose
+from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State, Touch
+from sdfsim.dynamics.compiling import tell_compiling
 from sdfsim.dynamics.kernels import distance as kinds
 from sdfsim.dynamics.kernels import world as compiled
 from sdfsim.dynamics.kernels.convex import BALL, BLOCK, DRUM, HULL, POINT, SEGMENT, THICKNESS, WIDTH, Convex
@@ -21,7 +22,7 @@ from sdfsim.dynamics.kernels.record import Edges
 from sdfsim.dynamics.kernels.step import step as compiled_step
 from sdfsim.dynamics.kernels.survey import Touching, touching
 from sdfsim.files import digest
-from sdfsim.shape.baked_grid import WALL, BakedGrid, baked, inwards
+from sdfsim.shape.baked_grid import BakedGrid, baked, inwards, unseen_wall
 from sdfsim.shape.convex_pieces import ConvexPiece, pieces_of
 from sdfsim.shape.sdf import ClosedForm, PlaneSdf, Sdf
 from sdfsim.shape.surface_nodes import Surface, contact_surface
@@ -50,8 +51,7 @@ class Compiled:
     """One scene, its bodies in model units, as the compiled step wants it."""
 
     def __init__(self, bodies: Bodies, state: State) -> None:
-        if not kernels.compiled():
-            _log.warning("compiling the contact step, once for this version: about two minutes")
+        tell_compiling(compiled_step, "the contact step", "two minutes")
         self.bodies = bodies
         self.shapes = compiled_shapes(bodies)
         self.place(state)
@@ -59,6 +59,8 @@ class Compiled:
     def place(self, state: State) -> None:
         """Scenery lies where `state` has it."""
         self.world = compiled_world(self.bodies, state, self.shapes)
+        self._scenery = np.flatnonzero(~(self.world.moves | self.world.scripted))
+        self._lies = self._scenery_in(state)
         n = len(self.bodies)
         self.work = compiled.Work(
             matrix=pose.to_matrix(state.orientation.cpu()).numpy(), inverse=np.zeros((n, 3, 3)),
@@ -67,6 +69,15 @@ class Compiled:
             beside=np.zeros(n, np.bool_), met=np.zeros(n, np.bool_),
             parent=np.zeros(n, np.int64), number=np.zeros(n, np.int64), latest=np.zeros(n, np.int64),
         )  # fmt: skip
+
+    def follow(self, state: State) -> None:
+        """As `place`, where scenery lies elsewhere than it did: somebody has moved it."""
+        if not np.array_equal(self._scenery_in(state), self._lies):
+            self.place(state)
+
+    def _scenery_in(self, state: State) -> np.ndarray:
+        parts = (part.cpu().numpy()[self._scenery] for part in (state.position, state.orientation))
+        return np.concatenate([*parts], 1)
 
     def run(
         self, motion: compiled.Motion, manifolds: compiled.Manifolds, rules: compiled.Rules
@@ -111,12 +122,13 @@ def taken_up(
     bodies: Bodies, state: State, scene: Compiled, rules: compiled.Rules
 ) -> tuple[compiled.Motion, compiled.Manifolds]:
     """Copies of a state as the compiled step writes to them; whoever was changed from outside is awake, and so are
-    those that slept with it or on it."""
+    those that slept with it or on it. Scenery lies where the state has it."""
     position, orientation, velocity, angular = (
         np.array(t.cpu().numpy(), dtype=np.float64, order="C")
         for t in (state.position, state.orientation, state.velocity, state.angular_velocity)
     )
     n, touch = len(position), state.touch
+    scene.follow(state)
     if touch is None:
         anchor = np.concatenate([position, orientation, position, orientation], 1)
         still, nobody = np.zeros(n, np.int64), np.full(n, -1, np.int64)
@@ -130,8 +142,6 @@ def taken_up(
     if scene.world.scripted.any():
         changed &= ~scene.world.scripted
     if changed.any():
-        if (changed & ~scene.world.moves).any():
-            scene.place(state)
         beside = touch.pair.numpy()[touch.count.numpy() > 0]
         restless = changed.copy()
         restless[beside[changed[beside[:, 1]], 0]] = True
@@ -273,11 +283,10 @@ def _geometry(nodes: np.ndarray, sdf: Sdf, pieces: Pieces, hull: np.ndarray, *, 
 def _looked_at(sdf: Sdf, nodes: np.ndarray, pieces: Pieces, hull: np.ndarray, *, surfaces: bool) -> Geometry:
     grid = None if isinstance(sdf, ClosedForm) else baked(sdf, nodes, pieces)
     extent = 0.0 if isinstance(sdf, PlaneSdf) else float(np.ptp(sdf.bounds, axis=0).max())
-    if grid and grid.thickness <= 1.001 * WALL * grid.cell:
-        told = "a shape of %.2g m has walls of at most %.2g m: things may pass through; --thicken helps"
-        _log.warning(told, extent, grid.thickness)
-    surface, cover = contact_surface(sdf, nodes if surfaces else nodes[:0], pieces, grid)
     solids = pieces_of(sdf, pieces, hull)
+    if grid and not solids and (wall := unseen_wall(sdf, grid)) is not None:
+        _log.warning("a shape of %.2g m has walls of at most %.2g m: things may pass through", extent, wall)
+    surface, cover = contact_surface(sdf, nodes if surfaces else nodes[:0], pieces, grid)
     thickness = grid.thickness if grid else 0.0 if extent == 0.0 else float(np.ptp(sdf.bounds, axis=0).min())
     inward = min(INWARD * extent, SHALLOW * thickness) * inwards(sdf, surface.nodes)
     return Geometry(grid, surface, cover, inward, _clumps(surface.nodes, surface.patch), solids)
@@ -285,7 +294,13 @@ def _looked_at(sdf: Sdf, nodes: np.ndarray, pieces: Pieces, hull: np.ndarray, *,
 
 def compiled_world(bodies: Bodies, state: State, shapes: kinds.Shapes) -> compiled.World:
     """The bodies of a scene."""
-    array = {name: value.cpu().numpy() for name, value in vars(bodies).items() if isinstance(value, torch.Tensor)}
+    names = (
+        "shape", "scale", "com", "radius", "inverse_mass", "inertia", "friction", "restitution", "moves", "group",
+        "world", "bounds",
+    )  # fmt: skip
+    # Copies: who changes a world, as a fit of coefficients does, must not change the bodies that it was made of.
+    array = {name: getattr(bodies, name).cpu().numpy().copy() for name in names}
+    array["allowed"] = bodies.allowed.cpu().numpy()  # as large as pairs of groups are many, and never changed
     bounds = np.where(np.isfinite(array["bounds"]), array["bounds"], 0.0)
     inertia = array["inertia"]
     moves = array["moves"]
@@ -318,10 +333,15 @@ def compiled_world(bodies: Bodies, state: State, shapes: kinds.Shapes) -> compil
 
 
 def _nodes_of(bodies: Bodies, k: int) -> np.ndarray:
-    """[K, 3] surface nodes of the shape of body k, at scale 1 in the shape's own frame. Rounded to 1e-12 m, so that
+    """[K, 3] surface nodes of the shape of body k, at scale 1 in the shape's own frame. Rounded to 12 digits, so that
     bodies of different scales know them as the same nodes."""
     first, last = int(bodies.node_start[k]), int(bodies.node_start[k + 1])
-    return ((bodies.node[first:last] + bodies.com[k]) / bodies.scale[k]).cpu().numpy().round(12)
+    nodes = ((bodies.node[first:last] + bodies.com[k]) / bodies.scale[k]).cpu().numpy()
+    extent = np.ptp(nodes, axis=0).max() if len(nodes) else 0.0
+    if not extent > 0.0:
+        return nodes
+    # Up to the power of ten that holds it, and no further where rounding has made it a little more than that power.
+    return nodes.round(12 - math.ceil(math.log10(extent) - 1e-9))
 
 
 def _clumps(nodes: np.ndarray, patch: np.ndarray) -> Clumps:

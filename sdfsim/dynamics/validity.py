@@ -10,6 +10,7 @@ from sdfsim.dynamics.bodies import Bodies, State, Units
 from sdfsim.dynamics.free_flight import MOST_TURN
 from sdfsim.errors import SdfsimError
 from sdfsim.scene.scene import Scene
+from sdfsim.shape.surface_nodes import check_pieces
 
 # Of |q|^2 - 1. The matrix R of a quaternion that keeps to it has |R'R - I| below 1e-5, and a positive determinant.
 UNIT = 2e-6
@@ -67,8 +68,11 @@ def check_sizes(bodies: Bodies, names: Sequence[str], metres: float) -> None:
 
 
 def check_nodes(scene: Scene) -> None:
-    """Raises SdfsimError where a dynamic body's nodes are one place or one line, and do not tell how it is turned."""
+    """Raises SdfsimError where a dynamic body's nodes are one place or one line, and do not tell how it is turned, or a
+    shape has more convex pieces than contacts can tell apart."""
     told = set()
+    for shape in scene.shapes:
+        check_pieces(f"shape {shape.name!r}", shape.pieces)
     for body in scene.bodies:
         if body.motion != "dynamic" or body.shape in told:
             continue

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -11,18 +12,30 @@ import numpy as np
 
 from sdfsim.console import columns
 from sdfsim.data.batching import batches, every, first_frames, model_units, roll_out, scene_of
-from sdfsim.data.dataset import Trajectory, engine_substep, floor_of, home_of, load_shapes, read_info, trajectory_files
-from sdfsim.data.pybullet_sim import engine_settings, import_pybullet, substeps_of
-from sdfsim.dynamics.model import Model, load_model
+from sdfsim.data.dataset import (
+    Trajectory,
+    conditions_of,
+    engine_substep,
+    floor_of,
+    home_of,
+    load_shapes,
+    read_info,
+    trajectory_files,
+)
+from sdfsim.data.pybullet_sim import MARGIN, engine_settings, import_pybullet, substeps_of
+from sdfsim.dynamics.model import SOLVER, Model, load_model
+from sdfsim.dynamics.models.contact_graph import SUBSTEPS
 from sdfsim.dynamics.simulator import pick_device
 from sdfsim.dynamics.step import FreeFlight
 from sdfsim.dynamics.training_ranges import outside_training
+from sdfsim.dynamics.units import scene_units
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation import metrics
 from sdfsim.evaluation.engines import Start, bullet, dataset_urdf
 from sdfsim.evaluation.metrics import FRAMES, HORIZONS, Motions, energy_gain, errors
 from sdfsim.evaluation.penetration import EVERY, exact_solids, penetration
 from sdfsim.parallel import Progress, parallel, silent
+from sdfsim.scene.scene import Scene
 from sdfsim.shape.shape import Shape
 from sdfsim.training.contact_cache import inner_steps
 
@@ -55,7 +68,8 @@ def evaluate(
         steps: how far; errors are reported at the horizons of `HORIZONS` and `FRAMES` up to there, and there.
         free_flight: "exact" or (networks on surface nodes) "learned".
         stride: recorded steps in a step of the model; errors are then those of every so many-th frame.
-        substeps: inner steps of the solve in a step; None for the model's, else for those of the recording engine.
+        substeps: inner steps of the solve in a step; None for the model's, else for those of the recording engine where
+            that is the teacher, and for those of `users_inner` where it is another.
         chaos_floor: also run the teacher again from starts that differ slightly (see `PERTURBATIONS`).
         errors_only: leave out penetration, energy gain and resting speed.
 
@@ -67,6 +81,10 @@ def evaluate(
         "median_survival_s": of all of them, by limit in m: until half of the bodies are farther from the recording.
         "penetration" m, "energy_gain" (a fraction), "resting_speed" m/s: of the model and of the teacher's recording.
         "engine_substep": s, the recording engine's inner step; 0 where no dataset.json tells it.
+        "floor": its "friction" and "restitution", and whether a dataset.json "told" them.
+        "as_teacher": whether the solve has the teacher's habits: only for recordings of PyBullet as the teacher is set,
+            which a dataset.json tells. All others are judged with the solve as `Simulator` runs it, on their floor.
+        "inner_steps": of the solve in a step.
         Further counts, and "ms_per_step_per_trajectory".
 
     Raises:
@@ -89,19 +107,26 @@ def evaluate(
         starts = load_recorded(data, split, as_recorded=True)[0]
         again = teacher_again(data, starts, longest * stride)
         again = {name: [every(motion, stride) for motion in motions] for name, motions in again.items()}
-    substep = engine_substep(data)
+    substep, conditions = engine_substep(data), conditions_of(data)
     contenders: dict[str, Motions] = {"model": [], "ballistic": []}
     groups = batches(recorded)
-    inner, seconds = substeps or stride * inner_steps(as_recorded[0].dt, substep), 0.0
+    scenes, seconds = [scene_of([t], [0], shapes, conditions.floor)[0] for t in recorded], 0.0
+    if substeps is not None:
+        inner = substeps
+    elif conditions.by_teacher:
+        inner = stride * inner_steps(as_recorded[0].dt, substep)
+    else:
+        inner = users_inner(recorded[0].dt, scenes) if used.kind == SOLVER else stride * SUBSTEPS
     used = replace(used, inner=substeps or used.inner)
     for k, group in enumerate(groups):
         on_progress(0.8 * k / len(groups), f"{used.name}: batch {k + 1} of {len(groups)}, {longest} steps")
         common = (used, group, shapes, longest, place)
         started = time.perf_counter()
-        contenders["model"] += roll_out(*common, free_flight, substeps=inner, as_teacher=True)
+        contenders["model"] += roll_out(
+            *common, free_flight, substeps=inner, as_teacher=conditions.by_teacher, floor=conditions.floor
+        )
         seconds += time.perf_counter() - started
         contenders["ballistic"] += roll_out(*common, contact=False)
-    scenes = [scene_of([t], [0], shapes)[0] for t in recorded]
     report = {
         "data": str(data),
         "split": split,
@@ -113,6 +138,13 @@ def evaluate(
         "steps": longest,
         "steps_asked": steps,
         "engine_substep": substep,
+        "floor": {
+            "friction": conditions.friction,
+            "restitution": conditions.restitution,
+            "told": conditions.floor_told,
+        },
+        "as_teacher": conditions.by_teacher,
+        "inner_steps": used.inner or inner,
         "outside_training": outside_training(scenes, used, model_units(used, recorded[0])),
         "ms_per_step_per_trajectory": 1e3 * seconds / longest / len(recorded),
         **{who: errors(motions, recorded) for who, motions in contenders.items()},
@@ -144,6 +176,13 @@ def evaluate(
     return report
 
 
+def users_inner(dt: float, scenes: list[Scene]) -> int:
+    """Inner steps in a step of `dt` s that are no longer than those of `Simulator` with the smallest body."""
+    solver = load_model(SOLVER)
+    longest = min(scene_units(scene, solver).time for scene in scenes) * solver.dt / SUBSTEPS
+    return max(1, math.ceil(dt / longest - 0.01))
+
+
 def load_recorded(
     data: Path, split: str, *, most: int | None = None, as_recorded: bool = False
 ) -> tuple[Motions, dict[str, Shape]]:
@@ -168,8 +207,9 @@ def teacher_again(data: Path, trajectories: Motions, steps: int, seed: int = 0) 
     absent, or the recording is not this teacher's.
     """
     import_pybullet()
-    info = read_info(home_of(data) or data.parent)
-    settings = info.get("engine_settings")
+    home = home_of(data) or data.parent
+    info = read_info(home)
+    floor, settings = floor_of(info, home), info.get("engine_settings")
     if info.get("engine") != "pybullet" or not isinstance(settings, dict):
         raise SdfsimError(f"recorded by {info.get('engine') or 'an unnamed engine'}, not by PyBullet as it is set here")
     ours = engine_settings(trajectories[0].dt, substeps_of(trajectories[0].dt))
@@ -177,7 +217,7 @@ def teacher_again(data: Path, trajectories: Motions, steps: int, seed: int = 0) 
         raise SdfsimError(f"recorded with other engine settings ({', '.join(other)})")
     urdfs = {name: dataset_urdf(data, name) for name in {str(n) for t in trajectories for n in t.shape}}
     jobs = [
-        (Start(perturbed(t, size, [seed, k]), urdfs, floor_of(info)), steps)
+        (Start(perturbed(t, size, [seed, k]), urdfs, floor), steps)
         for size in PERTURBATIONS.values()
         for k, t in enumerate(trajectories)
     ]
@@ -263,7 +303,13 @@ def quality_rows(report: dict[str, Any], *, name: str) -> Rows:
 def notes(report: dict[str, Any]) -> list[str]:
     """What has to be known beside the tables, a line each."""
     depth, floor, steps = report["penetration"], report.get("chaos_floor", {}), report["steps"]
+    ground, told = report["floor"], "as dataset.json tells" if report["floor"]["told"] else "that of our recipes"
+    how = f"The solve has the teacher's habits: bodies larger by {MARGIN:g} m, pushes that add to rebounds."
+    if not report["as_teacher"]:
+        how = f"The solve is as users run it, in {report['inner_steps']} inner steps: no dataset.json has the teacher."
     lines = [
+        f"Floor: friction {ground['friction']:g}, restitution {ground['restitution']:g}, {told}.",
+        how,
         f"Penetration: the deepest node in every {depth['every']}th frame with contact.",
         "Energy gain: the largest over the energy at the start; mean and worst of the trajectories.",
         f"Resting speed: median of the {report['resting_speed']['bodies']} bodies that rest in the recording.",

@@ -45,8 +45,8 @@ def measure(
     where: Literal["here", "cores", "fresh"] = "here",
     on_progress: Progress = silent,
 ) -> Results:
-    """The results of all jobs by (case, method): those kept in FOLDER/METHOD/CASE.json where their content is still the
-    same, new ones elsewhere.
+    """The results of all jobs by (case, method): those kept in FOLDER/METHOD/CASE.json where their content and the
+    compiled contact step are still the same, new ones elsewhere.
 
     A job that fails gives {"failed": why}. That is not kept, because an engine or memory may be there the next time.
 
@@ -54,10 +54,13 @@ def measure(
         where: "here", one after the other in this process; "cores", on all of them in the order of `jobs`; "fresh",
             each in a process of its own, whose peak memory is then the job's.
     """
+    from sdfsim.dynamics.kernels import _cache  # numba takes its time to load
+
     todo: list[tuple[Job, Path, str]] = []
+    version = [sdfsim.__version__, _cache().name]  # the name is a hash of the compiled step's source
     results: Results = {}
     for job in jobs:
-        file, mark = folder / job.method / f"{job.case}.json", digest(job.content, sdfsim.__version__)
+        file, mark = folder / job.method / f"{job.case}.json", digest(job.content, version)
         results[job.case, job.method] = kept = _kept(file, mark)
         if not kept:
             todo.append((job, file, mark))

@@ -18,7 +18,7 @@ import torch
 
 import sdfsim
 from sdfsim.data.batching import every, first_frames, roll_out, scene_of
-from sdfsim.data.dataset import FLOOR, Trajectory, check_alike, floor_of, home_of, read_info
+from sdfsim.data.dataset import Trajectory, check_alike, conditions_of
 from sdfsim.data.pybullet_sim import DT, SUBSTEP
 from sdfsim.dynamics.model import SOLVER, Model, load_model, model_names
 from sdfsim.dynamics.models.contact_graph import SUBSTEPS
@@ -80,6 +80,7 @@ class Cases:
     solids: dict[str, Solid]  # the exact geometry, by name
     floor: tuple[float, float]  # friction and restitution
     own_inertia: bool = False  # see `Start`
+    by_teacher: bool = True  # whether the recordings are the teacher's; the solve then has its habits
     length: float = 1.0  # m of the scene in one of these; recordings are 1
     time: float = 1.0  # s
 
@@ -107,13 +108,15 @@ def load_cases(data: Path, *, quick: bool) -> Cases:
     for name in shapes:
         with suppress(SdfsimError):  # the engines are points that say so
             urdfs[name] = dataset_urdf(data, name)
+    conditions = conditions_of(data)
     return Cases(
         recorded=[first_frames(t, longest + 1) for t in recorded],
         starts=[first_frames(t, longest + 1) for t in starts],
         shapes={name: replace(shape, com=np.zeros(3)) for name, shape in shapes.items()},
         urdfs=urdfs,
         solids=exact_solids(data, shapes),
-        floor=FLOOR if (home := home_of(data)) is None else floor_of(read_info(home)),
+        floor=conditions.floor,
+        by_teacher=conditions.by_teacher,
     )
 
 
@@ -141,7 +144,7 @@ def cases_of_scene(scene: Scene, model: str, folder: Path, *, quick: bool) -> Ca
     steps = max(2, min(STEPS_QUICK if quick else STEPS, round(scene.duration / units.time / DT)))
     recorded, _ = engines.bullet(replace(start, motion=replace(t, velocity=t.velocity - lead)), steps)
     solids = exact_solids(folder, shapes)
-    return Cases([recorded], [t], shapes, start.urdfs, solids, start.floor, True, units.length, units.time)
+    return Cases([recorded], [t], shapes, start.urdfs, solids, start.floor, True, True, units.length, units.time)
 
 
 def _centred(shape: Shape, name: str) -> Shape:
@@ -239,7 +242,7 @@ def measure_ours(setting: Setting, cases: Cases) -> dict[str, Any]:
         starts, steps = [every(t, setting.stride) for t in cases.starts], cases.steps // setting.stride
         motions = roll_out(
             model, starts, shapes, steps, CPU, contact=setting.contact, floor=cases.floor, substeps=setting.substeps,
-            as_teacher=setting.contact,
+            as_teacher=setting.contact and cases.by_teacher,
         )  # fmt: skip
     result = _judged(motions, cases, setting.stride) | {"prepare_s": prepared, "peak_mib": memory["mib"]}
     if result["exploded"]:

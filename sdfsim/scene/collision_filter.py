@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations_with_replacement
 
 import numpy as np
 
+from sdfsim.errors import SdfsimError
 from sdfsim.scene.scene import Body
+
+MOST = 30_000  # groups: the table of who may touch whom has a byte for each pair of them
+ROWS = 1024  # of that table that are counted at once
 
 
 @dataclass(frozen=True)
@@ -25,33 +28,92 @@ class Pairs:
 
 
 def contact_groups(bodies: Sequence[Body]) -> tuple[np.ndarray, np.ndarray]:
-    """Bodies that list the same names and are listed by the same bodies are one group: the group [N] int64 of every
-    body, and [G, G] bool, whether `collides_with` of both lets two groups touch."""
-    lists = {id(b.collides_with): set(b.collides_with) for b in bodies if b.collides_with is not None}
-    found: dict[tuple, int] = {}
-    group = np.empty(len(bodies), dtype=np.int64)
-    for k, body in enumerate(bodies):
-        own = None if body.collides_with is None else id(body.collides_with)
-        listed = frozenset(key for key, names in lists.items() if body.name in names)
-        group[k] = found.setdefault((own, listed), len(found))
-    allowed = np.array([[own is None or own in listed for _, listed in found] for own, _ in found], dtype=bool)
-    return group, (allowed & allowed.T).reshape(len(found), len(found))
+    """Bodies that may touch the same others are one group: the group [N] int64 of every body, and [G, G] bool, whether
+    `collides_with` of both lets two groups touch. Takes time with the bodies and the lengths of different lists. Raises
+    SdfsimError for more than `MOST` groups."""
+    own, listed_by = _lists(bodies)
+    kinds: dict[tuple, int] = {}
+    kind = np.array([kinds.setdefault((o, *by), len(kinds)) for o, by in zip(own, listed_by, strict=True)], np.int64)
+    many = np.bincount(kind, minlength=len(kinds))
+    partners = _partners([(o, frozenset(by)) for o, *by in kinds])
+    # Kinds become one group where they may touch the same others, and each other as well, or not. One body alone does
+    # not meet itself, so it may be taken either way; no body has others like itself in both ways.
+    keys: list[tuple[bool, frozenset]] = []
+    for k, (has, *_) in enumerate(kinds):
+        touches = has < 0 or k in partners[k]
+        keys.append((touches, partners[k] | {k if has >= 0 else -1} if touches else partners[k]))
+    alone = [k for k, (has, *_) in enumerate(kinds) if has >= 0 and many[k] == 1]
+    others = {k: (not keys[k][0], keys[k][1] ^ {k}) for k in alone}
+    classes = Counter([*keys, *others.values()])
+    for k, other in others.items():
+        if classes[keys[k]] == 1 and classes[other] > 1:
+            keys[k] = other
+    groups: dict[tuple, int] = {}
+    of_kind = np.array([groups.setdefault(key, len(groups)) for key in keys], np.int64)
+    if len(groups) > MOST:
+        told = f"bodies: collides_with parts them into {len(groups):,} groups (at most {MOST:,})"
+        raise SdfsimError(told, "let more bodies have the same list")
+    allowed = np.zeros((len(groups), len(groups)), dtype=bool)
+    for k, touched in enumerate(partners):
+        allowed[of_kind[k], of_kind[list(touched)]] = True
+    for (touches, _), g in groups.items():
+        allowed[g, g] = touches
+    free = of_kind[[k for k, (has, *_) in enumerate(kinds) if has < 0]]
+    allowed[np.ix_(free, free)] = True
+    return of_kind[kind], allowed
+
+
+def _lists(bodies: Sequence[Body]) -> tuple[list[int], list[list[int]]]:
+    """The number of every body's list (-1: it has none), and the numbers of those in which it is; equal lists have one
+    number."""
+    numbers: dict[frozenset[str], int] = {}
+    looked_at: dict[int, int] = {-1: -1}  # many bodies may share a tuple
+    own = []
+    for body in bodies:
+        which = -1 if body.collides_with is None else id(body.collides_with)
+        if which not in looked_at:
+            looked_at[which] = numbers.setdefault(frozenset(body.collides_with or ()), len(numbers))
+        own.append(looked_at[which])
+    listed_by: dict[str, list[int]] = {body.name: [] for body in bodies}
+    for names, number in numbers.items():
+        for name in names & listed_by.keys():
+            listed_by[name].append(number)
+    return own, [listed_by[body.name] for body in bodies]
+
+
+def _partners(kinds: Sequence[tuple[int, frozenset[int]]]) -> list[frozenset[int]]:
+    """The kinds that each kind of bodies may touch. Of a kind is told the list that it has (-1: none) and those that
+    name it. Kinds without a list may all touch each other, and are not among those."""
+    named: dict[int, list[int]] = {}
+    for k, (_, listed) in enumerate(kinds):
+        for number in listed:
+            named.setdefault(number, []).append(k)
+    partners: list[set[int]] = [set() for _ in kinds]
+    for k, (own, listed) in enumerate(kinds):
+        for other in named.get(own, ()):
+            if kinds[other][0] < 0:
+                partners[other].add(k)
+                partners[k].add(other)
+            elif kinds[other][0] in listed:
+                partners[k].add(other)
+    return [frozenset(some) for some in partners]
 
 
 def count_pairs(bodies: Sequence[Body]) -> Pairs:
     """Count the pairs of a scene by what lets them touch."""
     group, allowed = contact_groups(bodies)
-    each = (bodies, group.tolist())
-    kinds = Counter((g, b.motion == "dynamic", b.friction > 0, b.restitution > 0) for b, g in zip(*each, strict=True))
-    unmoved = excluded = possible = frictional = bouncy = 0
-    for (one, count), (other, more) in combinations_with_replacement(kinds.items(), 2):
-        pairs = count * (count - 1) // 2 if one == other else count * more
-        if not (one[1] or other[1]):
-            unmoved += pairs
-        elif not allowed[one[0], other[0]]:
-            excluded += pairs
-        else:
-            possible += pairs
-            frictional += pairs * (one[2] and other[2])
-            bouncy += pairs * (one[3] and other[3])
-    return Pairs(len(bodies) * (len(bodies) - 1) // 2, unmoved, excluded, possible, frictional, bouncy)
+    known = [(b.motion != "dynamic", b.friction > 0, b.restitution > 0) for b in bodies]
+    still, rough, lively = np.array(known, dtype=bool).reshape(-1, 3).T
+    sets = [which & part for which in (np.ones_like(still), rough, lively) for part in (np.ones_like(still), still)]
+    # [G, 6] how many bodies of every group: all, all that are still, those with friction, and so on
+    count = np.stack([np.bincount(group[some], minlength=len(allowed)) for some in sets], 1).astype(np.float64)
+    total = np.zeros(len(sets))
+    for start in range(0, len(allowed), ROWS):
+        rows = slice(start, start + ROWS)
+        total += (count[rows] * (allowed[rows].astype(np.float64) @ count)).sum(0)
+    # Every pair was counted twice, and every body with itself where its group touches itself.
+    touching = [int(n) for n in np.rint(0.5 * (total - count[allowed.diagonal()].sum(0)))]
+    possible, frictional, bouncy = (touching[k] - touching[k + 1] for k in (0, 2, 4))
+    many, resting = len(bodies), int(still.sum())
+    whole, unmoved = many * (many - 1) // 2, resting * (resting - 1) // 2
+    return Pairs(whole, unmoved, whole - unmoved - possible, possible, frictional, bouncy)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
+from sdfsim.files import digest
+from sdfsim.shape.sdf import ClosedForm
 from sdfsim.shape.shape import Shape
 
 Motion = Literal["static", "dynamic", "kinematic"]
@@ -113,3 +117,41 @@ class Scene:
     path: Path | None = None
     missed: tuple[str, ...] = ()
     caveats: tuple[str, ...] = ()
+
+
+def fingerprints(scene: Scene) -> dict[str, str]:
+    """What tells a scene from others with bodies of the same names: a digest each of its `shapes` (which bodies have
+    which, how large, and how they move), of what else its `bodies` are (but for paths and who may touch whom), and of
+    `gravity`. Six digits count, and of fitted shapes the mesh, so that a fit that is made again, or the last digits of
+    another machine, make no other scene of it."""
+    bodies = scene.bodies
+
+    def numbers(*names: str) -> list[np.ndarray]:
+        return [_six_digits([getattr(body, name) for body in bodies]) for name in names]
+
+    inertia = [(k, body.inertia) for k, body in enumerate(bodies) if body.inertia is not None]
+    held = [_six_digits([k for k, _ in inertia]), _six_digits([own for _, own in inertia])]
+    moving = numbers("position", "quat_xyzw", "velocity", "angular_velocity")
+    which = [[f"{body.motion} {body.name}" for body in bodies], *numbers("shape", "scale")]
+    return {
+        "shapes": digest([_described(shape) for shape in scene.shapes], which),
+        "bodies": digest(moving, numbers("mass", "friction", "restitution"), held),
+        "gravity": digest(_six_digits([scene.gravity])),
+    }
+
+
+def _described(shape: Shape) -> list:
+    if isinstance(shape.sdf, ClosedForm):
+        form = [shape.sdf.KIND, _six_digits([shape.sdf.sizes])]
+    else:
+        form = [_six_digits(shape.mesh.vertices), shape.mesh.faces.astype(np.int64)]
+    return [*form, str(shape.source.get("wall"))]
+
+
+def _six_digits(values: Sequence | np.ndarray) -> np.ndarray:
+    """[N, K] rows of numbers, rounded to 2^-20 of the largest of the row."""
+    rows = np.asarray(values, np.float64)
+    rows = rows.reshape(len(rows), math.prod(rows.shape[1:]))
+    # Just below a power of two counts as that power: rounding must not tell the two apart.
+    unit = np.ldexp(1.0, np.frexp(np.abs(rows).max(1, initial=0.0) * (1.0 + 1e-9))[1] - 20)[:, None]
+    return np.round(rows / unit) * unit + 0.0  # no negative zeros

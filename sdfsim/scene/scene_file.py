@@ -690,7 +690,7 @@ def _load_shapes(table: SceneTable, document: Document, on_progress: Progress) -
                 on_progress((i + fraction) / count, message)
 
             try:
-                shapes[key] = _load_shape(key, table.shapes[key], report)
+                shapes[key] = _load_shape(key, table.shapes[key], silent if on_progress is silent else report)
             except SdfsimError as error:
                 hint = f" ({error.hint})" if error.hint else ""
                 document.wrong(("shapes", key, table.shapes[key].kind), error.message + hint)

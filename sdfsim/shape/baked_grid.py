@@ -23,6 +23,9 @@ FINEST = 512  # likewise, where walls are thin
 PADDING = 4.0  # cells around the solid
 WALL = 2.0  # cells that a wall needs for either of its sides to be seen
 CHUNK = 2**18  # points asked at once
+SPREAD = 512  # places all over a surface
+# Of the largest extent: how near they are before, how near after so many steps towards it.
+CLOSE, REACHED, PROJECTIONS = 0.01, 1e-4, 4
 
 _log = logging.getLogger(__name__)
 
@@ -44,7 +47,10 @@ def baked(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = (), cache_
     """The grid of an SDF (or of the union of the convex pieces, vertices [V, 3] m each, that it was fitted to), baked
     on first use and then taken from the cache. The thickness of walls is measured at `nodes` [K, 3] m."""
     cache_dir = cache_dir or user_cache("baked")
-    path = cache_dir / f"{digest(sdf, [*pieces], CELLS, FINEST)}-{BAKE_VERSION}.npz"
+    # Walls at the nodes decide how fine the grid is. Nodes come from bodies of any scale: nine digits count.
+    extent = float(np.ptp(sdf.bounds, axis=0).max())
+    known = digest(sdf, np.round(np.asarray(nodes) / extent, 9) + 0.0, [*pieces], CELLS, FINEST)
+    path = cache_dir / f"{known}-{BAKE_VERSION}.npz"
     if path.is_file():
         try:
             kept = read_arrays(path, "a baked grid", "delete it")
@@ -56,7 +62,7 @@ def baked(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = (), cache_
     try:
         cache_dir.mkdir(parents=True, exist_ok=True)
         write_arrays(path, {name: np.asarray(value) for name, value in vars(grid).items()}, compressed=False)
-    except OSError as error:
+    except (SdfsimError, OSError) as error:  # a full disk; a folder that cannot be made
         _log.warning("a baked grid is not kept for the next time: %s", error)
     return grid
 
@@ -144,6 +150,25 @@ def wall_thickness(sdf: Sdf, nodes: np.ndarray) -> float:
     stops = np.argmax(np.concatenate([found < 0.4 * depth, np.ones((len(some), 1), bool)], 1), axis=1)
     reached = np.concatenate([depth[:1], depth])[stops]
     return float(2.0 * np.quantile(reached, 0.05))
+
+
+def unseen_wall(sdf: Sdf, grid: BakedGrid) -> float | None:
+    """m, the thickness of walls that are too thin for a grid to tell one side from the other; None where it has no such
+    walls. Nodes lie close along edges and at corners, where every solid is thin: what counts are places all over the
+    surface."""
+    limit = 1.001 * WALL * grid.cell
+    if grid.thickness > limit:
+        return None
+    extent = float(np.ptp(sdf.bounds, axis=0).max())
+    places = np.random.default_rng(0).uniform(*sdf.bounds, (64 * SPREAD, 3))
+    # From close by: edges are what is nearest to much of the space farther away.
+    places = places[np.abs(np.asarray(sdf(places)[0])) <= CLOSE * extent][: 2 * SPREAD]
+    for _ in range(PROJECTIONS):
+        distance, gradient = sdf(places)
+        places = places - np.asarray(distance)[:, None] * np.asarray(gradient)
+    places = places[np.abs(np.asarray(sdf(places)[0])) <= REACHED * extent][:SPREAD]
+    thickness = wall_thickness(sdf, places) if len(places) else grid.thickness
+    return thickness if thickness <= limit else None
 
 
 def interpolated(grid: BakedGrid, points: np.ndarray) -> np.ndarray:

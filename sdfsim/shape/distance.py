@@ -114,7 +114,7 @@ class PiecesDistance:
         self._boxes = np.stack([np.stack([piece.vertices.min(0), piece.vertices.max(0)]) for piece in pieces])
         # [H, 4] outward normals and offsets of each hull; inside is normal . x + offset < 0.
         hulls = [ConvexHull(piece.vertices) for piece in pieces]
-        self._planes = [np.unique(hull.equations.round(9), axis=0) for hull in hulls]
+        self._planes = [unique_planes(hull.equations, size, 9) for hull in hulls]
         self._outside = ClosestPoint(everything)
         self.surface = everything if len(pieces) == 1 else self._boundary(everything, size)
         self._inside = self._outside if len(pieces) == 1 else ClosestPoint(self.surface)
@@ -159,6 +159,13 @@ class PiecesDistance:
 
         triangles = exposed(everything.vertices[everything.faces] / size, bare)[0] * size
         return Mesh(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3))
+
+
+def unique_planes(equations: np.ndarray, size: float, digits: int) -> np.ndarray:
+    """[H, 4] the different ones of face planes [F, 4], normals and offsets in m, told apart by so many digits; those of
+    the offsets count in the `size` m of the body."""
+    unit = np.array([1.0, 1.0, 1.0, size])
+    return np.unique((equations / unit).round(digits), axis=0) * unit
 
 
 def _in_chunks(ask: Callable[[np.ndarray], Reference], points: np.ndarray) -> Reference:

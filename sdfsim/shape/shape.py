@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import secrets
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -165,7 +166,7 @@ def load_shape(folder: str | Path) -> Shape:
             pieces=tuple(piece.numpy() for piece in tensors["pieces"].split(sizes)) if sizes else (),
             skin=next(iter(skins.values()), None),
         )
-    except (SdfsimError, KeyError, TypeError, ValueError, RuntimeError) as error:
+    except (SdfsimError, LookupError, TypeError, ValueError, ArithmeticError, RuntimeError) as error:
         reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
         raise SdfsimError(f"{folder}: not a valid shape folder ({reason})") from error
 
@@ -211,6 +212,8 @@ def _sdf_from_file(description: dict[str, Any], tensors: dict[str, torch.Tensor]
         tuple(tensors[f"layer{layer}.{part}"].float() for layer in range(int(description["layers"])))
         for part in ("weight", "bias")
     )
+    if not weights:
+        raise ValueError(f"layers must be at least 1 (got {description['layers']!r})")
     rows = [len(bias) for bias in biases]
     if rows[-1] != 1 or [tuple(weight.shape) for weight in weights] != list(zip(rows, [3, *rows[:-1]], strict=True)):
         raise ValueError("the layers do not fit together")
@@ -370,12 +373,14 @@ def _cached(
             return load_shape(folder)
         except SdfsimError:
             shutil.rmtree(folder, ignore_errors=True)  # a damaged entry is only a cache miss
+    if how["on_progress"] is silent:  # nobody sees how it goes on: say at least what takes so long
+        _log.warning("making the shape %s, once for this mesh: about half a minute", name)
     if kind == "grid":
         shape = mesh_shape(mesh, name=name, kind=kind, resolution=resolution, **how)
     else:
         shape = fit_mesh(mesh, name=name, **how)
-    # A folder of its own first, so that processes fitting the same mesh never see each other's half.
-    partial = folder.with_name(f"{folder.name}.{os.getpid()}.partial")
+    # A folder of its own first, so that processes and threads fitting the same mesh never see each other's half.
+    partial = folder.with_name(f"{folder.name}.{os.getpid()}-{secrets.token_hex(4)}.partial")
     try:
         shape.save(partial)
         if not folder.is_dir():  # else another process was first: its entry is as good

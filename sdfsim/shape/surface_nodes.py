@@ -9,7 +9,7 @@ import numpy as np
 
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.baked_grid import BakedGrid, surface_samples
-from sdfsim.shape.distance import PiecesDistance
+from sdfsim.shape.distance import PiecesDistance, unique_planes
 from sdfsim.shape.mesh import Mesh, convex_hull, lattice, normal_frame
 from sdfsim.shape.primitives import spiral
 from sdfsim.shape.sdf import BoxSdf, CylinderSdf, Sdf
@@ -28,6 +28,7 @@ CHUNK = 10_000  # points looked at together
 SHARP = 0.94
 DENSEST = 4000  # nodes that a closed form has about at most
 LATTICE = 40  # of the lattice that tells the nearest patch, along the largest extent
+MOST_PATCHES = 1024  # of a shape: the contact solve tells no more of them apart
 OUTSIDE = 1e-3  # of the extent: vertices that lie deeper in the union are not on its surface
 
 
@@ -184,9 +185,10 @@ def _on_cylinder(sdf: CylinderSdf, spacing: float) -> np.ndarray:
 
 def surface_of(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray]) -> Surface:
     """The nodes that carry contact, [K, 3] m, with the vertices [V, 3] m of convex pieces, where the shape has some,
-    and their patches."""
+    and their patches. Raises SdfsimError for more than `MOST_PATCHES` pieces."""
     if len(pieces) == 0:
         return Surface(nodes, np.zeros(len(nodes), np.int64), None, np.zeros(3), 1.0)
+    check_pieces("a shape", pieces)
     extent = float(np.ptp(sdf.bounds, axis=0).max())
     vertices, union = np.concatenate(pieces), PiecesDistance([convex_hull(piece) for piece in pieces])
     bare = union(vertices).distance > -OUTSIDE * extent
@@ -206,14 +208,22 @@ def surface_of(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray]) -> Sur
     )
 
 
+def check_pieces(what: str, pieces: Sequence[np.ndarray]) -> None:
+    """Raises SdfsimError, which says `what` has them, for more than `MOST_PATCHES` convex pieces."""
+    if len(pieces) > MOST_PATCHES:
+        told = f"{what} is made of {len(pieces):,} convex pieces (at most {MOST_PATCHES:,})"
+        raise SdfsimError(told, "cut it into fewer ones, or fit its mesh without pieces")
+
+
 def _nearest_piece(pieces: Sequence[np.ndarray], places: np.ndarray) -> np.ndarray:
     """[P] int64: the convex hull whose farthest face plane is least far from a place."""
     from scipy.spatial import ConvexHull
 
     least, nearest = np.full(len(places), np.inf), np.zeros(len(places), np.int64)
+    size = float(np.ptp(np.concatenate(pieces), axis=0).max())
     for k, piece in enumerate(pieces):
         far = np.full(len(places), -np.inf)
-        for plane in np.unique(np.round(ConvexHull(piece).equations, 6), axis=0):
+        for plane in unique_planes(ConvexHull(piece).equations, size, 6):
             np.maximum(far, places @ plane[:3] + plane[3], out=far)
         nearest[far < least] = k
         np.minimum(least, far, out=least)

@@ -15,7 +15,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from sdfsim.data.dataset import Trajectory, check_alike, engine_substep, load_shapes, trajectory_files
+from sdfsim.data.dataset import (
+    INFO,
+    Trajectory,
+    check_alike,
+    conditions_of,
+    engine_substep,
+    home_of,
+    load_shapes,
+    shapes_folder,
+    trajectory_files,
+)
 from sdfsim.data.pybullet_sim import MARGIN
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.free_flight import torque_free
@@ -30,7 +40,7 @@ if TYPE_CHECKING:
     from sdfsim.dynamics.step import StepOptions
 
 STEP = 0.02  # s, the step that networks know
-FRAMES_VERSION = 8  # counts up whenever frames of the same recordings come out differently
+FRAMES_VERSION = 9  # counts up whenever frames of the same recordings come out differently
 TOGETHER = 25  # trajectories that are followed side by side
 
 
@@ -83,6 +93,7 @@ class ContactFrames:
     friction: np.ndarray
     restitution: np.ndarray
     size: np.ndarray
+    floor: np.ndarray  # [F, 2] friction and restitution of each frame's floor
     # first, second: [E] int16, bodies within the frame
     first: np.ndarray
     second: np.ndarray
@@ -136,7 +147,7 @@ def contact_frames(data: Path, split: str, how: Solved, *, on_progress: Progress
         # A machine that only trains may have been given nothing but the cache.
         return ContactFrames.load(made[0])
     files = trajectory_files(data, split)
-    cached = folder / f"{name}-{_fingerprint(data, files, how)}.npz"
+    cached = folder / f"{name}-{_fingerprint(files, how)}.npz"
     if cached.exists():
         return ContactFrames.load(cached)
     check_alike(str(data / split), map(Trajectory.load, files))
@@ -182,12 +193,12 @@ def inner_steps(dt: float, substep: float) -> int:
     return count
 
 
-def _fingerprint(data: Path, files: list[Path], how: Solved) -> str:
+def _fingerprint(files: list[Path], how: Solved) -> str:
     """Changes with the trajectories (names and sizes), the recipe, the shapes, and the way contacts are solved."""
     digest = hashlib.sha256(f"{FRAMES_VERSION} {how} {[(f.name, f.stat().st_size) for f in files]}".encode())
-    for record in (data / "dataset.json", *sorted((data / "shapes").glob("*/shape.json"))):
-        if record.exists():
-            digest.update(record.read_bytes())
+    told = [home / INFO] if (home := home_of(files[0].parent)) else []
+    for record in (*told, *sorted(shapes_folder(files[0].parent).glob("*/shape.json"))):
+        digest.update(record.read_bytes())
     return digest.hexdigest()[:12]
 
 
@@ -199,13 +210,15 @@ def _followed(files: list[Path], how: Solved) -> list[ContactFrames]:
     from sdfsim.dynamics.solver import solver_step
     from sdfsim.dynamics.step import StepOptions
 
-    substep = engine_substep(files[0].parent)
+    substep, found = engine_substep(files[0].parent), conditions_of(files[0].parent)
     group = [Trajectory.load(file) for file in files]
     shapes = load_shapes(files[0].parent, {str(n) for t in group for n in t.shape})
-    bodies, start = merged(group, [0] * len(group), shapes, Units(1.0, 1.0, 1.0), torch.device("cpu"))
+    bodies, start = merged(group, [0] * len(group), shapes, Units(1.0, 1.0, 1.0), torch.device("cpu"), found.floor)
     inner = how.inner or how.stride * inner_steps(group[0].dt, substep)
     gravity = torch.from_numpy(np.asarray(group[0].gravity, dtype=np.float64))
-    rules = StepOptions(gravity, group[0].dt * how.stride, inner, margin=MARGIN, adds=True)
+    rules = StepOptions(gravity, group[0].dt * how.stride, inner)
+    if found.by_teacher:
+        rules = replace(rules, margin=MARGIN, adds=True)
     count = min(len(t.position) for t in group)
     parts = []
     for draw in range(how.draws):
@@ -217,7 +230,7 @@ def _followed(files: list[Path], how: Solved) -> list[ContactFrames]:
             after, edges = solver_step(bodies, state, rules, memory, note=True)
             touch = after.touch
             recorded = state_at(group, [now + how.stride] * len(group), start)
-            parts += _of_step(bodies, state, after, edges, recorded, rules)
+            parts += _of_step(bodies, state, after, edges, recorded, rules, found.floor)
     return parts
 
 
@@ -240,9 +253,11 @@ def _disturbed(bodies: Bodies, state: State, how: Solved, rng: np.random.Generat
 
 
 def _of_step(
-    bodies: Bodies, state: State, after: State, edges: Edges, recorded: State, rules: StepOptions
-) -> list[ContactFrames]:
-    """The frames of a step of several trajectories, in units in which it lasts `STEP`; none where nothing touches."""
+    bodies: Bodies, state: State, after: State, edges: Edges, recorded: State, rules: StepOptions,
+    of_floor: tuple[float, float],
+) -> list[ContactFrames]:  # fmt: skip
+    """The frames of a step of several trajectories on one floor, of this friction and restitution, in units in which it
+    lasts `STEP`; none where nothing touches."""
     from sdfsim.dynamics.kernels.record import APART, ARM, AXIS, GIVEN, OTHER, WHEN
 
     if not len(edges.pair):
@@ -295,6 +310,7 @@ def _of_step(
             friction=body(bodies.friction),
             restitution=body(bodies.restitution),
             size=body(bodies.size, length),
+            floor=np.tile(np.array(of_floor, np.float32), (len(used), 1)),
             first=(first - begins).astype(np.int16),
             second=np.where(second == floor, -1, second - begins).astype(np.int16),
             arm_first=vector(ARM, length),

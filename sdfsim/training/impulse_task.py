@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sdfsim.data.dataset import FLOOR, ranges_of
+from sdfsim.data.dataset import ranges_of
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.models.contact_graph import ContactGraph, number_pairs
 from sdfsim.dynamics.models.impulse import ImpulseNetwork, Velocities
@@ -52,7 +52,7 @@ class ImpulseTask:
         lightest = np.minimum.reduceat(np.where(moving, f.mass, np.inf), f.body_start[:-1])
         speed = np.linalg.norm(f.velocity[moving], axis=-1)
         ratios = (heaviest / lightest)[heaviest > 0]
-        return ranges_of(f.size[moving], speed, ratios, f.friction, f.restitution)
+        return ranges_of(f.size[moving], speed, ratios, f.friction, f.restitution, f.floor)
 
     def draw(self, rng: np.random.Generator, count: int, team: Team = ALONE) -> Batch:
         """A batch of `count` frames, or the part of it that falls to one of a team."""
@@ -83,6 +83,12 @@ class ImpulseTask:
         def edge(array: np.ndarray) -> Tensor:
             return torch.from_numpy(array[edges]).to(self.device)
 
+        def product(own: np.ndarray, column: int) -> Tensor:
+            """[E] of the coefficients of both bodies; every frame has a floor of its own."""
+            one, other = body(own)[index]
+            floors = torch.from_numpy(f.floor[picked][edge_of, column]).to(self.device)
+            return one * torch.where(index[1] == floor, floors, other)
+
         pair, pairs = number_pairs(index[0], index[1], len(mass))
         graph = ContactGraph(
             inverse_mass=torch.where(moves, 1.0 / mass.clamp_min(1e-9), torch.zeros_like(mass)),
@@ -105,8 +111,8 @@ class ImpulseTask:
             impulse=edge(f.impulse),
             gap=edge(f.gap),
             when=edge(f.when),
-            friction=body(f.friction, FLOOR[0])[index].prod(0),
-            restitution=body(f.restitution, FLOOR[1])[index].prod(0),
+            friction=product(f.friction, 0),
+            restitution=product(f.restitution, 1),
             dt=f.dt,
         )
         truth = Velocities(body(f.end_velocity), body(f.end_angular), body(f.moved), body(f.turned))

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from sdfsim.data.batching import PLANE, merged, state_at
-from sdfsim.data.dataset import Trajectory, check_alike, load_shapes, ranges_of, trajectory_files
+from sdfsim.data.dataset import Trajectory, check_alike, conditions_of, load_shapes, ranges_of, trajectory_files
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Bodies, State, Units, largest_extent
 from sdfsim.dynamics.models.families import FAMILIES
@@ -39,7 +39,8 @@ class SurfaceTask:
     `noisy`."""
 
     def __init__(self, data: Path, split: str, plan: Preset, device: torch.device, *, noisy: bool = False) -> None:
-        self.trajectories = [Trajectory.load(f) for f in trajectory_files(data, split)]
+        files = trajectory_files(data, split)
+        self.trajectories, self.floor = [Trajectory.load(f) for f in files], conditions_of(files[0].parent).floor
         check_alike(f"{data / split}", self.trajectories)
         names = {str(n) for t in self.trajectories for n in t.shape}
         self.family, self.nodes = FAMILIES[plan.kind], plan.nodes
@@ -52,7 +53,7 @@ class SurfaceTask:
 
     def digest(self) -> str:
         """Changes with the data."""
-        digest = hashlib.sha256()
+        digest = hashlib.sha256(f"{self.floor}".encode())
         for t in self.trajectories:
             for field in fields(t):
                 digest.update(np.ascontiguousarray(getattr(t, field.name)).tobytes())
@@ -90,7 +91,7 @@ class SurfaceTask:
         noise = self._noise(picked, rng, team)
         picked, frames = picked[team.share(count)], frames[team.share(count)]
         units = Units(1.0, 1.0, 1.0)
-        bodies, state = merged(picked, frames, self.shapes, units, self.device, plane=self.plane)
+        bodies, state = merged(picked, frames, self.shapes, units, self.device, self.floor, self.plane)
         recorded = [state_at(picked, [k + offset for k in frames], state) for offset in (-2, -1, 0, 1)]
         yaw = yaw.to(self.device).expand_as(state.orientation)
         poses = [(pose.rotate(yaw, one.position), pose.multiply(yaw, one.orientation)) for one in recorded]
@@ -127,6 +128,7 @@ class SurfaceTask:
             np.array([t.mass[m].max() / t.mass[m].min() for t, m in moving]),
             np.concatenate([t.friction for t in self.trajectories]),
             np.concatenate([t.restitution for t in self.trajectories]),
+            np.array([self.floor]),
         )
 
     def _noise(self, picked: list[Trajectory], rng: np.random.Generator, team: Team) -> Tensor | None:

@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 
-from sdfsim.data.dataset import SOLID, SPLITS, read_info
+from sdfsim.data.dataset import SOLID, SPLITS, conditions_of, read_info
 from sdfsim.errors import SdfsimError, run_main
 from sdfsim.files import locked, write_text
 from sdfsim.parallel import Progress, silent
@@ -89,6 +89,8 @@ def _made(data: Path, info: dict, train: int, validation: int) -> dict[str, Any]
     here = {split: len(list((data / split).glob("*.npz"))) for split in SPLITS if (data / split).is_dir()}
     known = {k: info.get(k) for k in ("recipe", "seed", "engine", "engine_version")}
     known |= {k: info[k] for k in ("bodies", "fps") if info.get(k)}
+    conditions = conditions_of(data)
+    known |= {"floor": list(conditions.floor), "as_teacher": conditions.by_teacher}
     shapes = info.get("shapes", [])
     solids = sum(name.startswith(SOLID) for name in shapes)
     counts = {"train": train, "validation": validation} | here

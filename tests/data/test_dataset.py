@@ -1,12 +1,23 @@
 """The trajectory format: what is written comes back, faults are named, and velocities are those at the instants."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sdfsim.data.dataset import FLOOR, Trajectory, at_instants, engine_substep, floor_of, read_info, trajectory_files
-from sdfsim.data.pybullet_sim import TEACHER_VERSION
+from sdfsim.data.dataset import (
+    FLOOR,
+    Conditions,
+    Trajectory,
+    at_instants,
+    conditions_of,
+    engine_substep,
+    floor_of,
+    read_info,
+    trajectory_files,
+)
+from sdfsim.data.pybullet_sim import TEACHER_VERSION, engine_settings
 from sdfsim.errors import SdfsimError
 from sdfsim.files import write_json
 from tests.recordings import balls, trajectory
@@ -53,8 +64,26 @@ def test_whole_numbers_are_read_as_what_they_mean(tmp_path):
 def test_the_floor_is_what_the_dataset_says_else_the_recipes():
     assert floor_of({}) == floor_of({"floor": None}) == FLOOR
     assert floor_of({"floor": {"friction": 0.2, "restitution": 0}}) == (0.2, 0.0)
-    with pytest.raises(SdfsimError, match="floor: must have friction and restitution"):
-        floor_of({"floor": {"friction": 0.2}})
+    wrong = [{}, [], 0, "ice", {"friction": 0.2}, {"friction": -0.1, "restitution": 0}]
+    wrong += [{"friction": 0.2, "restitution": value} for value in (1.5, -0.1, float("nan"), "0.3", None, True)]
+    wrong += [{"friction": float("inf"), "restitution": 0.1}]
+    for told in wrong:
+        with pytest.raises(SdfsimError, match=r"^data.dataset\.json: floor: must have friction and restitution"):
+            floor_of({"floor": told}, Path("data"))
+
+
+def test_a_split_is_recorded_as_its_dataset_tells(tmp_path):
+    (tmp_path / "test").mkdir()
+    assert conditions_of(tmp_path / "test") == Conditions(*FLOOR, floor_told=False, by_teacher=False)
+    told = {"engine": "pybullet", "engine_settings": engine_settings(1 / 240, 1)}
+    write_json(tmp_path / "dataset.json", told | {"floor": {"friction": 0.7, "restitution": 0.1}})
+    found = conditions_of(tmp_path / "test")
+    assert found == conditions_of(tmp_path) == Conditions(0.7, 0.1, floor_told=True, by_teacher=True)
+    for name, value in engine_settings(0.02, 5).items():
+        if name != "timeStep":
+            settings = told["engine_settings"] | {name: not value}
+            write_json(tmp_path / "dataset.json", told | {"engine_settings": settings})
+            assert not conditions_of(tmp_path).by_teacher, name
 
 
 def test_datasets_of_another_version_of_the_teacher_are_refused_and_those_of_others_are_not(tmp_path):

@@ -4,12 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from sdfsim import SdfsimError, Simulator
+from sdfsim.dynamics import simulator as simulator_module
 from sdfsim.dynamics.simulator import varied
-from sdfsim.scene.scene import Effects, Scene
+from sdfsim.scene.scene import Effects, Scene, Waypoints
 from sdfsim.shape.shape import analytic_shape
-from tests.dynamics.conftest import make_body
+from tests.dynamics.conftest import make_body, random_model
 
 G = np.array([0.0, 0.0, -9.81])
 
@@ -164,6 +166,38 @@ def test_variants_are_what_they_would_be_alone_in_their_order():
         np.testing.assert_array_equal(rollout.position, alone.position)
     reach = [rollout.position[-1, 0, 0] for rollout in found[1:]]
     assert reach == sorted(reach) and reach[-1] > 0.1
+
+
+@pytest.mark.parametrize("free_flight", ["exact", "learned"])
+def test_variants_run_with_the_options_of_their_simulator(free_flight):
+    model = random_model("paper", width=16, steps=2)
+    model.network.target.total.fill_(1.0)
+    model.network.target.squares.fill_(1e-6)
+    sim = Simulator(small(), model, "cpu", 7, dt=0.01, free_flight=free_flight)
+    (found,) = sim.rollouts([{}], steps=4)
+    alone = sim.run(steps=4)
+    np.testing.assert_array_equal(found.position, alone.position)
+    assert found.meta == alone.meta and found.meta["free_flight"] == free_flight and found.meta["seed"] == 7
+
+
+def test_variants_run_on_the_device_of_their_simulator(monkeypatch):
+    """A machine without a GPU shows it by what the jobs are told."""
+    sim, jobs = Simulator(small()), []
+    monkeypatch.setattr(simulator_module, "parallel", lambda function, some: jobs.extend(some) or [(0, [None])])
+    sim.device = torch.device("cuda:0")
+    sim.rollouts([{}], steps=1)
+    assert jobs[0][2]["device"] == "cuda:0"
+
+
+def test_a_body_on_a_path_is_where_its_path_has_it():
+    path = Waypoints(np.array([0.0, 1.0]), np.array([[0, 0, 0.5], [1, 0, 0.5]]), np.tile([0.0, 0, 0, 1], (2, 1)))
+    scene = small()
+    led = make_body("led", 0, [0, 0, 0.5], motion="kinematic", path=path, mass=0.0)
+    scene = replace(scene, bodies=(*scene.bodies, led))
+    for name, value in (("position", (5, 5, 5)), ("quat_xyzw", (0, 0, 1, 0))):
+        with pytest.raises(SdfsimError, match=f"variant: body 'led': is on a path, so its {name} cannot be changed"):
+            Simulator(scene).rollouts([{"led": {name: value}}], steps=1)
+    assert varied(scene, {"led": {"friction": 0.1}}).bodies[2].friction == 0.1
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,9 @@ import torch
 from sdfsim.dynamics.model import SURFACE
 from sdfsim.dynamics.models.surfaces import advance, node_owner
 from sdfsim.dynamics.simulator import Simulator
-from sdfsim.scene.scene import Effects
-from tests.dynamics.conftest import angle_between, random_model
+from sdfsim.scene.scene import Effects, Scene
+from sdfsim.shape.shape import analytic_shape
+from tests.dynamics.conftest import angle_between, make_body, random_model
 
 
 @pytest.fixture(params=SURFACE)
@@ -127,3 +128,32 @@ def test_the_order_of_bodies_does_not_matter(dropped, kind):
     scenes = (replace(dropped, bodies=b) for b in (bodies, tuple(bodies[k] for k in order)))
     one, other = (next(Simulator(s, surface_model(kind), free_flight="learned").steps(1)) for s in scenes)
     torch.testing.assert_close(other.position, one.position[order], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind_of", ["paper", "impulse", "solver"])
+def test_scenery_that_was_moved_is_met_where_it_is(kind_of):
+    """A block is put under a ball that hangs in the air, after a step in which it was elsewhere; and taken away."""
+    ball, block = analytic_shape("sphere", radius=0.5), analytic_shape("box", size=(2.0, 2.0, 1.0))
+    bodies = (make_body("ball", 0, [0, 0, 1.02]), make_body("block", 1, [50, 0, 0], motion="static", mass=0.0))
+    scene = Scene((ball, block), bodies, np.zeros(3), 1.0)
+    model = surface_model() if kind_of == "paper" else random_model("impulse") if kind_of == "impulse" else "solver"
+    sim = Simulator(scene, model)
+    start = sim.state
+
+    def meets() -> bool:
+        sim["ball"].velocity = (0, 0, -0.5)
+        sim.step(4)
+        free = abs(sim["ball"].velocity[2] + 0.5) < 1e-9
+        sim["ball"].position = (0, 0, 1.02)
+        return not free
+
+    assert not meets()
+    sim["block"].position = (0, 0, 0)
+    assert meets()
+    sim["block"].position = (0, -50, 0)
+    assert not meets()
+    sim["block"].position = (0, 0, 0)
+    sim.state = replace(sim.state, touch=None)
+    assert meets()
+    sim.state = start  # where the block is elsewhere, as the contacts of that state have known it
+    assert not meets()

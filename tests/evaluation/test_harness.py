@@ -11,6 +11,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sdfsim.dynamics import kernels
 from sdfsim.dynamics.model import new_network
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.harness import Job, Line, Panel, digest, draw, front, markdown, measure, number, peak_memory
@@ -38,6 +39,15 @@ def test_results_are_made_once_and_again_when_their_content_changes(tmp_path, wh
     damaged.write_text(damaged.read_text()[:-20])
     changed = [jobs[0], replace(jobs[1], content=["other"])]
     assert measure(changed, tmp_path / "out", where=where) == first and ran.read_text().count("ran") == 4
+
+
+def test_results_are_made_again_when_the_compiled_step_is_another_one(tmp_path, monkeypatch):
+    ran = tmp_path / "ran"
+    job = Job("case", "method", [], noted, (ran, 1.0))
+    for expected, name in ((1, "one"), (1, "one"), (2, "two")):
+        monkeypatch.setattr(kernels, "_cache", lambda name=name: Path(name))
+        measure([job], tmp_path / "out")
+        assert ran.read_text().count("ran") == expected
 
 
 def test_failures_are_told_and_tried_again(tmp_path):

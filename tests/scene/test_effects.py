@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from sdfsim import SceneError, load_scene
+from sdfsim import SceneError, SdfsimError, load_scene
+from sdfsim.scene import collision_filter
 from sdfsim.scene.collision_filter import contact_groups, count_pairs
 from sdfsim.scene.effects import plan
 from sdfsim.scene.scene import Body, Effects
@@ -86,6 +88,96 @@ def test_groups_and_counts_say_what_every_single_pair_says(scene):
     counted = vars(count_pairs(bodies))
     assert found == {name: counted[name] for name in found} and found["possible"] > found["frictional"] > 0
     assert counted["total"] == counted["possible"] + counted["unmoved"] + counted["excluded"]
+
+
+def many(count: int, listed, motion=lambda k: "dynamic") -> list[Body]:
+    """Bodies b0, b1, ... on a floor, each with a list of its own, or None."""
+    floor = Body("floor", 0, "static", 1.0, *np.zeros((4, 3)), 0.0, 0.5, 0.5)
+    lists = [listed(k) for k in range(count)]
+    own = [None if names is None else tuple(names) for names in lists]
+    return [floor, *(replace(floor, name=f"b{k}", motion=motion(k), collides_with=own[k]) for k in range(count))]
+
+
+LISTS = {
+    "the floor": lambda k, n: ["floor"],
+    "the floor and oneself": lambda k, n: ["floor", f"b{k}"],
+    "the floor and the next": lambda k, n: ["floor", f"b{(k + 1) % n}"],
+    "the floor and a partner": lambda k, n: ["floor", f"b{k ^ 1}"],
+    "the floor and both neighbours": lambda k, n: ["floor", f"b{(k - 1) % n}", f"b{(k + 1) % n}"],
+    "all others of ten": lambda k, n: [f"b{j}" for j in range(k - k % 10, k - k % 10 + 10) if j != k],
+    "nobody or all": lambda k, n: [[], None][k % 2],
+    "nobody": lambda k, n: [],
+    "half have none": lambda k, n: None if k % 2 else ["floor", f"b{k + 1}"],
+}
+
+
+@pytest.mark.parametrize("name", LISTS)
+@pytest.mark.parametrize("count", [1, 2, 10, 40])
+def test_lists_of_every_kind_are_kept(name, count):
+    bodies = many(count, lambda k: LISTS[name](k, count), lambda k: ("static", "dynamic", "dynamic")[k % 3])
+    group, allowed = contact_groups(bodies)
+    counts = {"possible": 0, "unmoved": 0}
+    for i, x in enumerate(bodies):
+        for j, y in enumerate(bodies[i + 1 :], i + 1):
+            moves = "dynamic" in (x.motion, y.motion)
+            assert (moves and allowed[group[i], group[j]]) == may_touch(x, y) == (moves and allowed[group[j], group[i]])
+            counts["possible"] += may_touch(x, y)
+            counts["unmoved"] += not moves
+    counted = count_pairs(bodies)
+    assert {key: getattr(counted, key) for key in counts} == counts
+
+
+def test_random_lists_are_kept():
+    rng = np.random.default_rng(1)
+    for _ in range(60):
+        size = int(rng.integers(1, 9))
+        lists = [[f"b{j}" for j in np.flatnonzero(rng.random(size) < rng.random())] for _ in range(size)]
+        bodies = many(size, lambda k, lists=lists: None if rng.random() < 0.3 else ["floor", *lists[k]])
+        group, allowed = contact_groups(bodies)
+        for i, x in enumerate(bodies):
+            for j, y in enumerate(bodies[i + 1 :], i + 1):
+                moves = "dynamic" in (x.motion, y.motion)
+                assert (moves and bool(allowed[group[i], group[j]])) == may_touch(x, y)
+
+
+@pytest.mark.parametrize(
+    ("name", "groups"),
+    [
+        ("the floor", 2),
+        ("the floor and oneself", 2),
+        ("the floor and the next", 2),
+        ("nobody", 2),
+        ("the floor and a partner", 1001),
+        ("all others of ten", 201),
+        ("the floor and both neighbours", 2001),
+    ],
+)
+def test_two_thousand_lists_take_no_time_and_make_no_more_groups_than_they_need(name, groups):
+    bodies = many(2000, lambda k: LISTS[name](k, 2000))
+    took = []
+    for _ in range(3):
+        began = time.process_time()
+        _, allowed = contact_groups(bodies)
+        took.append(time.process_time() - began)
+    assert len(allowed) == groups and min(took) < 0.1  # quadratic in the bodies it was 1.6 s
+
+
+def test_a_hundred_thousand_lists_take_fifty_times_as_long_as_two_thousand():
+    took = {}
+    for count in (2000, 100_000):
+        bodies = many(count, lambda k, count=count: LISTS["the floor and the next"](k, count))
+        began = time.process_time()
+        assert len(contact_groups(bodies)[1]) == 2
+        pairs = count_pairs(bodies)
+        took[count] = time.process_time() - began
+        assert (pairs.possible, pairs.total) == (count, count * (count + 1) // 2)
+    assert took[100_000] < 200 * took[2000]
+
+
+def test_more_groups_than_a_table_can_hold_are_refused(monkeypatch):
+    monkeypatch.setattr(collision_filter, "MOST", 100)
+    with pytest.raises(SdfsimError, match=r"collides_with parts them into 201 groups \(at most 100\)"):
+        contact_groups(many(200, lambda k: LISTS["the floor and both neighbours"](k, 200)))
 
 
 def test_what_the_file_says_wins(scene):

@@ -1,14 +1,29 @@
 """Grids of bricks: as exact as they say, thin walls included, and kept between runs."""
 
+import errno
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from sdfsim.dynamics.kernels.collide import KEYS
 
+from sdfsim.dynamics.bodies import Units, from_scene
 from sdfsim.dynamics.kernels.distance import GRID, distance
-from sdfsim.dynamics.solver import _geometry, compiled_shapes
+from sdfsim.dynamics.simulator import Simulator
+from sdfsim.dynamics.solver import _geometry, _nodes_of, compiled_shapes
+from sdfsim.errors import SdfsimError
+from sdfsim.scene.scene import Scene
 from sdfsim.shape import baked_grid as module
-from sdfsim.shape.baked_grid import bake, baked, wall_thickness
-from sdfsim.shape.shape import analytic_shape, with_sdf
-from sdfsim.shape.surface_nodes import surface_of
+from sdfsim.shape.baked_grid import BakedGrid, bake, baked, unseen_wall, wall_thickness
+from sdfsim.shape.distance import PiecesDistance
+from sdfsim.shape.mesh import Mesh, convex_hull
+from sdfsim.shape.primitives import spiral
+from sdfsim.shape.sdf import MeshSdf
+from sdfsim.shape.shape import analytic_shape, scaled, with_sdf
+from sdfsim.shape.surface_nodes import MOST_PATCHES, Surface, edge_nodes, surface_of
+from tests.dynamics.test_laws import body
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +60,48 @@ def two_halves() -> list[np.ndarray]:
 def test_walls_that_no_grid_sees_are_told(wall, told, caplog):
     rod = with_sdf(analytic_shape("box", size=(1.0, 0.03, wall)), "mesh")
     _geometry(rod.sdf, rod.nodes, ())
-    assert ("things may pass through" in caplog.text) is told
+    assert ("things may pass through" in caplog.text) is told and "--thicken" not in caplog.text
+
+
+CONVEX = {
+    "tetrahedron": [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)],
+    "octahedron": [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)],
+    "wedge": [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0), (0, 0, 0.3), (0, 1, 0.3)],
+    "pyramid": [(-1, -1, 0), (1, -1, 0), (-1, 1, 0), (1, 1, 0), (0, 0, 0.5)],
+    "double cone": [(np.cos(a), np.sin(a), 0) for a in np.linspace(0, 6, 20)] + [(0, 0, 0.4), (0, 0, -0.4)],
+    "spike": [(np.cos(a), np.sin(a), 0) for a in np.linspace(0, 6, 20)] + [(0, 0, 5.0)],
+    "ball": spiral(300),
+}
+
+
+def finest(sdf: MeshSdf, nodes: np.ndarray) -> BakedGrid:
+    """As fine a grid as there is, without its samples."""
+    cell = float(np.ptp(sdf.bounds, axis=0).max()) / module.FINEST
+    return BakedGrid(sdf.bounds[0], cell, *(np.zeros(0),) * 3, wall_thickness(sdf, nodes), 0.0)
+
+
+@pytest.mark.parametrize("name", CONVEX)
+def test_a_solid_that_comes_to_edges_has_no_thin_walls(name):
+    """Also where its nodes are on its edges alone, where every solid is thin."""
+    mesh = convex_hull(np.array(CONVEX[name], float))
+    sdf, nodes = MeshSdf(mesh), np.concatenate([mesh.vertices, edge_nodes(mesh.vertices, 0.05)])
+    assert unseen_wall(sdf, finest(sdf, nodes)) is None
+
+
+def test_edges_are_thin():
+    mesh = convex_hull(np.array(CONVEX["wedge"], float))
+    grid = finest(MeshSdf(mesh), np.concatenate([mesh.vertices, edge_nodes(mesh.vertices, 0.05)]))
+    assert grid.thickness <= 2.001 * grid.cell  # what made walls of them
+
+
+@pytest.mark.parametrize("wall", [0.001, 0.003])
+def test_a_hollow_solid_with_thin_walls_is_told_of(wall):
+    outer = analytic_shape("box", size=(1.0, 0.8, 0.6)).mesh
+    inner = analytic_shape("box", size=(1.0 - 2 * wall, 0.8 - 2 * wall, 0.6 - 2 * wall)).mesh
+    faces = np.concatenate([outer.faces, inner.faces[:, ::-1] + len(outer.vertices)])
+    sdf = MeshSdf(Mesh(np.concatenate([outer.vertices, inner.vertices]), faces))
+    found = unseen_wall(sdf, finest(sdf, analytic_shape("box", size=(1.0, 0.8, 0.6)).nodes))
+    assert found is not None and found <= 0.004
 
 
 def test_where_pieces_are_known_the_grid_is_of_these():
@@ -86,14 +142,98 @@ def test_a_grid_is_kept(block, tmp_path, monkeypatch):
     assert again.error == first.error
 
 
+def test_a_grid_of_other_nodes_is_another_one(tmp_path):
+    """Of a thick block with a thin fin: with nodes on the fin alone the grid has to be finer."""
+    corners = np.array([[x, y, z] for x in (-1.0, 0.0) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+    parts = convex_hull(corners), convex_hull(corners * [-1.0, 1.0, 0.02])
+    pieces = tuple(part.vertices for part in parts)
+    sdf = MeshSdf(Mesh(np.concatenate(pieces), np.concatenate([parts[0].faces, parts[1].faces + 8])))
+    places = np.random.default_rng(0).uniform(-0.4, 0.4, (40, 2))
+    middles = ((-0.5, 0.5), (0.5, 0.01))
+    thick, thin = (np.column_stack([places + np.array([x, 0.0]), np.full(40, z)]) for x, z in middles)
+    first = baked(sdf, thick, pieces, cache_dir=tmp_path)
+    second = baked(sdf, thin, pieces, cache_dir=tmp_path)
+    assert first.cell == pytest.approx(2.0 / 128) and second.cell < 0.6 * first.cell
+    assert baked(sdf, thick, pieces, cache_dir=tmp_path).cell == first.cell
+    # What rounding makes of the nodes of a body of another scale is the same.
+    files = len(list(tmp_path.iterdir()))
+    assert baked(sdf, (thin * 0.3 + 0.1 - 0.1) / 0.3, pieces, cache_dir=tmp_path).cell == second.cell
+    assert len(list(tmp_path.iterdir())) == files == 2
+
+
+def test_a_full_disk_costs_only_the_cache(block, tmp_path, monkeypatch, caplog):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(module, "CELLS", 16)
+    monkeypatch.setattr(module, "FINEST", 16)
+    monkeypatch.setattr(np, "savez", full)
+    grid = baked(block.sdf, block.nodes, cache_dir=tmp_path)
+    assert grid.cell > 0 and "not kept for the next time" in caplog.text and list(tmp_path.iterdir()) == []
+    monkeypatch.undo()
+    (tmp_path / "file").write_text("in the way of a folder")
+    monkeypatch.setattr(module, "CELLS", 16)
+    monkeypatch.setattr(module, "FINEST", 16)
+    assert baked(block.sdf, block.nodes, cache_dir=tmp_path / "file" / "baked").cell == grid.cell
+
+
+@pytest.mark.parametrize("size", [1e-6, 1e-3, 1.0, 1e4])
+def test_convex_pieces_are_the_same_at_every_size(size):
+    """Distances and patches of an L of two pieces, one of them turned, in micrometres as in kilometres."""
+    corners = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-0.3, 0.3) for z in (-0.2, 0.2)])
+    turn = Rotation.from_euler("xyz", [20, 35, 50], degrees=True)
+    pieces = [corners, turn.apply(corners) + np.array([1.0, 0.6, 0.3])]
+    points = np.random.default_rng(0).uniform(-2.0, 2.5, (3000, 3))
+
+    def measured(factor: float):
+        hulls = [convex_hull(piece * factor) for piece in pieces]
+        union = PiecesDistance(hulls)
+        mesh = MeshSdf(union.surface)
+        nodes = union(points[:50] * factor).closest
+        return union(points * factor), surface_of(mesh, nodes, [hull.vertices for hull in hulls])
+
+    (found, surface), (usual, other) = measured(size), measured(1.0)
+    np.testing.assert_allclose(found.distance / size, usual.distance, atol=2e-6)
+    np.testing.assert_allclose(surface.nodes / size, other.nodes, atol=2e-6)
+    np.testing.assert_array_equal(surface.patch, other.patch)
+
+    def labels(of: Surface, factor: float) -> np.ndarray:
+        assert of.nearest is not None
+        at = np.round((np.clip(points, *union_box) * factor - of.low) / of.cell).astype(int)
+        return of.nearest[tuple(at.T)]
+
+    union_box = np.concatenate(pieces).min(0), np.concatenate(pieces).max(0)
+    # A rounding of a place to the next of the lattice may tell the other piece, where both are as near.
+    assert (labels(surface, size) == labels(other, 1.0)).mean() > 0.98
+
+
+def test_bodies_of_any_scale_know_the_same_nodes(block):
+    for factor in (1e-6, 0.01, 1.0):
+        shape = scaled(block, factor)
+        bodies = tuple(replace(body(str(k), 0, [k, 0, 0]), scale=scale) for k, scale in enumerate((1.0, 0.3, 7.0)))
+        units = Units(0.37, 1.0, 1.0)
+        made = from_scene(Scene((shape,), bodies, np.zeros(3), 1.0), units, torch.device("cpu"))[0]
+        one, *others = (_nodes_of(made, k) for k in range(3))
+        np.testing.assert_allclose(one, shape.nodes, rtol=0, atol=1e-11 * factor)
+        for other in others:
+            np.testing.assert_allclose(other, one, rtol=0, atol=1e-11 * factor)
+
+
+def test_more_pieces_than_contacts_can_tell_apart_are_refused(block):
+    assert MOST_PATCHES == KEYS
+    corner = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    shape = replace(
+        block, name="comb", pieces=tuple(corner + np.array([2.0 * k, 0, 0]) for k in range(MOST_PATCHES + 1))
+    )
+    told = r"is made of 1,025 convex pieces \(at most 1,024\)"
+    with pytest.raises(SdfsimError, match=f"^shape 'comb' {told}"):
+        Simulator(Scene((shape,), (body("a", 0, [0, 0, 0]),), np.zeros(3), 1.0))
+    with pytest.raises(SdfsimError, match=told):
+        surface_of(block.sdf, block.nodes, shape.pieces)
+
+
 @pytest.mark.parametrize("kind", ["sphere", "box", "capsule", "cylinder", "mesh"])
 def test_the_compiled_distance_is_that_of_the_shape(kind, block):
-    import torch
-
-    from sdfsim.dynamics.bodies import Units, from_scene
-    from sdfsim.scene.scene import Scene
-    from tests.dynamics.test_laws import body
-
     shape = {
         "sphere": lambda: analytic_shape("sphere", radius=0.4),
         "box": lambda: analytic_shape("box", size=(1.0, 0.6, 0.2)),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 import torch
 
 from sdfsim.errors import SdfsimError
+from sdfsim.files import replacing
 from sdfsim.shape import primitives
 from sdfsim.shape import shape as shape_module
 from sdfsim.shape.mesh import Frame, Mesh
@@ -145,3 +147,43 @@ def test_scaling_scales_everything() -> None:
     np.testing.assert_array_equal(twice.pieces[2], 2 * shape.pieces[2])
     with pytest.raises(SdfsimError, match="> 0"):
         scaled(shape, 0.0)
+
+
+@pytest.mark.parametrize("layers", [0, -1, 1, 2, 4, 10**30, "3.5", None, [3], True])
+def test_layers_that_are_not_there_are_told(tmp_path: Path, layers) -> None:
+    folder = fitted().save(tmp_path / "shape")
+    record = json.loads((folder / "shape.json").read_text())
+    record["sdf"]["layers"] = layers
+    (folder / "shape.json").write_text(json.dumps(record))
+    with pytest.raises(SdfsimError, match="shape: not a valid shape folder"):
+        load_shape(folder)
+
+
+@pytest.mark.parametrize("key", ["name", "sdf", "volume", "com", "inertia", "certificate", "source", "pieces"])
+@pytest.mark.parametrize("value", [None, [], {}, 0, -1, "x", [[]], {"kind": []}, True])
+def test_whatever_a_record_holds_is_read_or_told(tmp_path: Path, key: str, value) -> None:
+    folder = fitted().save(tmp_path / "shape")
+    record = json.loads((folder / "shape.json").read_text()) | {key: value}
+    (folder / "shape.json").write_text(json.dumps(record))
+    try:
+        load_shape(folder)
+    except SdfsimError as error:
+        assert "not a valid shape folder" in error.message
+
+
+def test_threads_that_write_one_file_leave_it_whole(tmp_path: Path) -> None:
+    """Each writes another content again and again; whoever reads finds one of them, and nothing else is left."""
+    file = tmp_path / "file"
+
+    def write(letter: str) -> None:
+        for _ in range(50):
+            with replacing(file) as partial:
+                with partial.open("w") as handle:
+                    for _ in range(20):
+                        handle.write(letter * 50)
+                        handle.flush()
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(write, "abcdefgh"))
+    content = file.read_text()
+    assert len(content) == 1000 and len(set(content)) == 1 and list(tmp_path.iterdir()) == [file]

@@ -8,12 +8,14 @@ import torch
 
 from sdfsim.data.batching import merged
 from sdfsim.data.dataset import Trajectory
+from sdfsim.data.pybullet_sim import engine_settings
 from sdfsim.dynamics import pose
 from sdfsim.dynamics.bodies import Units
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.shape import analytic_shape
-from sdfsim.training.contact_cache import STEP, Solved, _disturbed, contact_frames, inner_steps
-from tests.recordings import balls, bouncing
+from sdfsim.training.contact_cache import STEP, Solved, _disturbed, contact_frames, inner_steps, join_frames
+from sdfsim.training.impulse_task import ImpulseTask
+from tests.recordings import balls, bouncing, slab_data, sliding
 
 ONCE = Solved(draws=1)
 
@@ -103,3 +105,54 @@ def test_errors_at_a_frame_are_those_of_that_frame_alone():
     assert found["at_frame"]["translation_rmse"] == pytest.approx(0.5 * 0.3 / 2**0.5)
     assert found["translation_rmse"] == pytest.approx(((0.3**2 + 7.0**2) / (25 * 4)) ** 0.5)
     assert found["at_frame"]["rotation_error"] == 0.0
+
+
+@pytest.mark.parametrize("floor", [(0.05, 0.2), (0.2, 0.7)])
+def test_frames_and_ranges_are_those_of_the_floor_that_dataset_json_tells(tmp_path, floor):
+    told = {"engine": "mine", "floor": {"friction": floor[0], "restitution": floor[1]}}
+    frames = contact_frames(slab_data(tmp_path, "train", sliding(floor[0]), told), "train", ONCE)
+    assert len(frames) == 39
+    # In the first of five inner steps the slab only comes to bear on the floor.
+    part = (frames.velocity[:, 0] - frames.solved_velocity[:, 0]) / (10.0 * floor[0] * 0.02)
+    assert part.min() > 0.7 and part.max() < 1.01
+    task = ImpulseTask(frames, torch.device("cpu"))
+    graph = task.batch(np.arange(5)).graph
+    torch.testing.assert_close(graph.friction, torch.full_like(graph.friction, floor[0]))
+    torch.testing.assert_close(graph.restitution, torch.full_like(graph.restitution, floor[1]))
+    for name, own in zip(("friction", "restitution"), floor, strict=True):  # the slab's are 1
+        assert task.ranges()[name] == pytest.approx([own, 1.0])
+
+
+def test_sets_of_several_floors_keep_each_its_own(tmp_path):
+    sets = []
+    for name, friction in (("ice", 0.02), ("rubber", 0.9)):
+        (tmp_path / name).mkdir()
+        told = {"engine": "mine", "floor": {"friction": friction, "restitution": 0.3}}
+        sets.append(contact_frames(slab_data(tmp_path / name, "train", sliding(friction), told), "train", ONCE))
+    whole = join_frames(sets)
+    task = ImpulseTask(whole, torch.device("cpu"))
+    picked = np.array([3, len(sets[0]) + 2])
+    edges = np.diff(whole.edge_start)[picked]
+    found = task.batch(picked).graph.friction.numpy()
+    np.testing.assert_allclose(found, np.repeat([0.02, 0.9], edges))
+    assert task.ranges()["friction"] == pytest.approx([0.02, 1.0])
+
+
+def test_frames_are_made_anew_when_the_floor_is_another_one(tmp_path):
+    data = slab_data(tmp_path, "train", sliding(0.2), {"engine": "mine", "floor": {"friction": 0.2, "restitution": 0}})
+    one = contact_frames(data, "train", ONCE)
+    (data / "dataset.json").write_text('{"engine": "mine", "floor": {"friction": 0.4, "restitution": 0}}')
+    assert contact_frames(data, "train", ONCE).digest() != one.digest()
+
+
+def test_only_recordings_of_the_teacher_are_followed_with_its_habits(tmp_path):
+    """A slab that lies on the floor is pushed up by the teacher's margin."""
+    still = {"position": np.tile([0.0, 0.0, 0.1], (5, 1, 1)), "velocity": np.zeros((5, 1, 3))}
+    still |= {"quat_xyzw": np.tile([0.0, 0.0, 0.0, 1.0], (5, 1, 1)), "angular_velocity": np.zeros((5, 1, 3))}
+    up = {}
+    for name, engine in (("pybullet", engine_settings(0.02, 5)), ("mine", {})):
+        (tmp_path / name).mkdir()
+        told = {"engine": name, "engine_settings": engine}
+        frames = contact_frames(slab_data(tmp_path / name, "train", sliding(0.0, **still), told), "train", ONCE)
+        up[name] = frames.solved_moved[0, 2] * STEP
+    assert up["pybullet"] > 1e-4 and up["mine"] <= 0.0

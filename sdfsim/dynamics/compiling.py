@@ -1,0 +1,31 @@
+"""What is said before compiled code that is not there yet keeps a person waiting."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+_log = logging.getLogger(__name__)
+_said: set[str] = set()
+
+
+def tell_compiling(function: Any, what: str, takes: str) -> None:
+    """Warn, once in a process, that `what` is going to be compiled where a compiled `function` is neither in memory nor
+    kept, by this very source, where numba keeps it."""
+    if what in _said or is_compiled(function):
+        return
+    _said.add(what)
+    _log.warning("compiling %s, once for this version: about %s", what, takes)
+
+
+def is_compiled(function: Any) -> bool:
+    """Whether a function that numba compiles is there in a second; one that runs as Python needs no compiling."""
+    if not hasattr(function, "signatures"):
+        return True
+    if function.signatures:
+        return True
+    try:
+        # Of this source file as it is now; empty where it has changed since.
+        return bool(function._cache._cache_file._load_index())
+    except (AttributeError, OSError):  # nothing is kept, or nothing can be read there
+        return False
