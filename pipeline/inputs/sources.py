@@ -76,7 +76,7 @@ def find_source(given: Path, *, unpacked: bool = False) -> Source:
         told = f"{given}: not a folder, a video, a transforms.json or a zipped capture"
         raise SdfsimError(told, "give the folder that holds the photos, not a single file")
     own = photos_in(given)
-    if (place := find_capture(given, deep=len(own) < MIN_PHOTOS)) is not None:
+    if (place := find_capture(given, deep=unpacked or len(own) < MIN_PHOTOS)) is not None:
         capture, frames = read_capture(place)
         return _with_cameras(place, frames, capture)
     if unpacked and len(own) < MIN_PHOTOS and len(inside := _with_photos(given)) == 1:

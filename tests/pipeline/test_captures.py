@@ -228,7 +228,7 @@ def test_a_zip_does_not_write_outside_of_its_folder(tmp_path):
     assert not (tmp_path / "outside.txt").exists() and not (tmp_path / "out" / "outside.txt").exists()
 
 
-def wrapped(given: Path, archive: Path, above: str, separator: str = "/") -> Path:
+def wrapped(given: Path, archive: Path, above: str, separator: str = "/", previews: int = 3) -> Path:
     """A zip of a folder, or of what another zip holds, in one more folder, with what macOS and apps put beside it."""
     import zipfile
 
@@ -244,7 +244,8 @@ def wrapped(given: Path, archive: Path, above: str, separator: str = "/") -> Pat
             file.writestr(f"__MACOSX/{place.parent}/._{place.name}", b"\0\5\x16\7")
             file.writestr(str(place.with_name(f"._{place.name}")), b"\0\5\x16\7")
         file.writestr(f"{above}/.DS_Store", b"Bud1")
-        file.writestr(f"{Path(above).parts[0]}/thumbnail.jpg", b"small")
+        for number in range(previews):
+            file.writestr(f"thumbnail{number}.jpg", b"small")
     return archive
 
 
@@ -308,14 +309,14 @@ def test_the_better_cameras_of_polycam_do_not_say_how_large_their_photos_are(pho
 
 def test_a_zip_of_photos_may_hold_them_in_a_folder_and_says_where_they_are_if_there_are_several(tmp_path):
     names = [f"{k}.jpg" for k in range(3)]
-    given = wrapped(noise(tmp_path / "in", names), tmp_path / "a.zip", "holiday/day one")
+    given = wrapped(noise(tmp_path / "in", names), tmp_path / "a.zip", "holiday/day one", previews=1)
     out = tmp_path / "out"
     out.mkdir()
     assert [photo.source for photo in prepare_photos(given, out)[0]] == names
     noise(tmp_path / "in", [f"{side}/{name}" for side in ("left", "right") for name in names])
     for name in names:
         (tmp_path / "in" / name).unlink()
-    given = wrapped(tmp_path / "in", tmp_path / "b.zip", "holiday")
+    given = wrapped(tmp_path / "in", tmp_path / "b.zip", "holiday", previews=1)
     (tmp_path / "other").mkdir()
-    with pytest.raises(SdfsimError, match=r"b\.zip: photos found: 0, .* 3 in .*b\.zip/holiday/left, 3 in"):
+    with pytest.raises(SdfsimError, match=r"b\.zip: photos found: 1, .* 3 in .*b\.zip/holiday/left, 3 in"):
         prepare_photos(given, tmp_path / "other")
