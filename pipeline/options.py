@@ -65,6 +65,13 @@ class Options:
         instead = {"size": "distance", "distance": "size"}
         return replace(self, **({instead[key]: None for key in changes if key in instead} | changes))
 
+    def longer(self) -> str:
+        """What trains for longer than these options."""
+        if self.budget is not None:
+            return "train for longer (a larger --budget)"
+        better = {"quick": "standard", "standard": "fine"}.get(self.preset)
+        return f"train for longer (--preset {better})" if better else "take more and sharper photos"
+
     def fit_recipe(self) -> str:
         """The recipe of the fit, see `fit_mesh`."""
         return self.recipe or ("quick" if self.preset == "quick" else "default")

@@ -55,7 +55,7 @@ def write_report(
         report["error"] = {"stage": stage, "message": error.message, "hint": error.hint}
     if options.budget is not None and report["seconds_total"] > 1.1 * options.budget:
         report["notes"].append(f"it took {report['seconds_total']:.0f} s, the budget was {options.budget:.0f} s")
-    report["improve"] = improvements(report)
+    report["improve"] = improvements(report, options)
     write_text(folder / "report.md", page(report, folder))
     report["paths"] = {
         name: str(folder / path) for name, (path, stage) in RESULTS.items()
@@ -81,7 +81,7 @@ def photo_rows(folder: Path, stages: dict[str, dict], poses: dict) -> list[dict]
     return rows
 
 
-def improvements(report: dict) -> list[str]:
+def improvements(report: dict, options: Options) -> list[str]:
     """What to do for a better result, most useful first; one line each."""
     poses, stages = report["poses"], report["stages"]
     lines = [*poses.get("causes", [])]
@@ -91,8 +91,8 @@ def improvements(report: dict) -> list[str]:
         lines.append("keep zoom and focus fixed, and nothing moving in view: the photos agree only within "
                      f"{poses['mean_error']:.1f} px")  # fmt: skip
     if report["psnr"] is not None and report["psnr"] < LOW_PSNR:
-        lines.append(f"photos that were not trained on come out at {report['psnr']:.1f} dB only: train for longer "
-                     "(--preset standard), and keep light and exposure the same in all photos")  # fmt: skip
+        lines.append(f"photos that were not trained on come out at {report['psnr']:.1f} dB only: {options.longer()}, "
+                     "and keep light and exposure the same in all photos")  # fmt: skip
     for number, photo in enumerate(stages.get("mesh", {}).get("next_photos", []), start=1):
         place, target = (", ".join(f"{x:.2f}" for x in photo[key]) for key in ("position", "looking_at"))
         lines.append(f"{number}. of the photos that would help most: {photo['words']} (camera at {place} m, aimed at "
@@ -107,6 +107,7 @@ def notes(stages: dict[str, dict]) -> list[str]:
     poses, scene = stages.get("poses", {}), stages.get("scene", {})
     lines = [*stages.get("photos", {}).get("notes", []), *poses.get("warnings", [])]
     lines += [f"left out: {entry['photo']}: {entry['why']}" for entry in poses.get("left_out", [])[:NAMED]]
+    lines += stages.get("distill", {}).get("notes", [])
     lines += mesh_notes(stages.get("mesh", {}))
     lines += [f"usable, not exact: {caveat}" for caveat in stages.get("fit", {}).get("caveats", [])]
     lines += [f"{name}: {material_line(body)}" for name, body in scene.get("bodies", {}).items()]
@@ -127,6 +128,8 @@ def mesh_notes(mesh: dict) -> list[str]:
     how = {"masks": "split where their masks end", "shape": "split along a seam by shape; give masks to be sure"}
     lines += [f"{first} and {second} touch; {how[by]}" for first, second, by in mesh.get("touching", [])]
     lines += [f"masks of {name}: they have no surface" for name in mesh.get("masks_without_surface", [])]
+    lines += [f"{name}: its surface was not moved all the way to where the photos agree: {why}"
+              for name, why in mesh.get("unrefined", {}).items()]  # fmt: skip
     lines += [hollow_line(name, *found) for name, found in mesh.get("hollows_m", {}).items()]
     if "smallest_object_m" in mesh:
         lines.append(f"what rises less than {mesh['smallest_object_m']:.2g} m stays part of what it stands on")

@@ -16,7 +16,7 @@ from typing import Any
 from pipeline.options import COMMAND, Options, read_config, write_config
 from pipeline.progress import Progress
 from pipeline.report import write_report
-from sdfsim.errors import SdfsimError
+from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.files import CONFIG, check_own, locked, write_json
 
 # In the folder of a finished stage: fingerprint, inputs, made, seconds, report. Of one at work: its fingerprint alone.
@@ -92,11 +92,17 @@ def do_distill(run: Run, work: Path) -> dict:
 def do_mesh(run: Run, work: Path) -> dict:
     from pipeline.mesh.meshing import make_meshes
 
-    return make_meshes(
-        run.place("distill"), run.place("poses"), run.place("photos"), work, preset=run.options.preset,
-        size=run.options.size, distance=run.options.distance, crop=run.options.crop, device=run.device(),
-        on_progress=run.tell("mesh"),
-    )  # fmt: skip
+    try:
+        return make_meshes(
+            run.place("distill"), run.place("poses"), run.place("photos"), work, preset=run.options.preset,
+            size=run.options.size, distance=run.options.distance, crop=run.options.crop, device=run.device(),
+            on_progress=run.tell("mesh"),
+        )  # fmt: skip
+    except SdfsimError as error:
+        if error.exit_code != EXIT_QUALITY:
+            raise
+        hint = "; ".join(filter(None, (error.hint, run.options.longer())))
+        raise SdfsimError(error.message, hint, exit_code=EXIT_QUALITY) from error
 
 
 def do_fit(run: Run, work: Path) -> dict:
@@ -135,7 +141,7 @@ class Stage:
 
 
 STAGES = {
-    "photos": Stage(do_photos, "photos", version=3),
+    "photos": Stage(do_photos, "photos", version=4),
     "poses": Stage(do_poses, "poses", ("seed",), 3),
     "distill": Stage(do_distill, "distill", ("preset", "seed", "budget"), 4),
     "mesh": Stage(do_mesh, "mesh", ("preset", "size", "distance", "crop"), 9),
@@ -274,12 +280,14 @@ def run_one(run: Run, stage: str, *, again: bool) -> None:
 
 
 def hash_of_photos(given: Path) -> str:
-    """Hash of the names and contents of the photos (or the video), their masks and cameras."""
+    """Hash of the places and contents of the photos (or the video), their masks and cameras; a place is relative to the
+    photos: all may move together, but the folder of a mask is the name of its body."""
     from pipeline.inputs.sources import find_source
 
-    digest = hashlib.sha256()
-    for path in find_source(given).files():
-        digest.update(path.name.encode("utf-8", "surrogateescape") + b"\0")
+    digest, source = hashlib.sha256(), find_source(given)
+    for path in source.files():
+        place = Path(os.path.relpath(path.absolute(), source.folder)).as_posix()
+        digest.update(place.encode("utf-8", "surrogateescape") + b"\0")
         with open(path, "rb") as file:
             digest.update(hashlib.file_digest(file, "sha256").digest())
     return digest.hexdigest()

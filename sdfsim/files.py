@@ -48,6 +48,16 @@ def replacing(path: Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
+def visible(folder: Path) -> list[Path]:
+    """What lies in a folder, by name, without what is hidden or what macOS adds (`._NAME`, `__MACOSX`)."""
+    return sorted(path for path in folder.iterdir() if not hidden(path.name))
+
+
+def hidden(name: str) -> bool:
+    """Whether a file or folder of this name is none that a person put there."""
+    return name.startswith(".") or name == "__MACOSX"
+
+
 def write_bytes(path: Path, content: bytes) -> None:
     """A file of these bytes."""
     with replacing(path) as partial:

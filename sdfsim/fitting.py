@@ -11,7 +11,7 @@ from sdfsim.console import duration
 from sdfsim.dynamics.bodies import largest_extent
 from sdfsim.dynamics.simulator import pick_device
 from sdfsim.errors import SdfsimError
-from sdfsim.files import check_writable, locked, read_json
+from sdfsim.files import check_writable, locked, read_json, visible
 from sdfsim.parallel import Progress, parallel, silent
 from sdfsim.scene.scene_file import UNITS
 from sdfsim.shape.baked_grid import baked, grid_certificate, unseen_wall
@@ -96,7 +96,7 @@ def named_meshes(sources: list[Path]) -> dict[str, Path]:
     several files share it, the name of the folder they lie in. Raises SdfsimError for no meshes, or two of one name."""
     files: list[Path] = []
     for source in sources:
-        inside = sorted(source.iterdir()) if source.is_dir() else [source]
+        inside = visible(source) if source.is_dir() else [source]
         found = [file for file in inside if file == source or file.suffix.lower() in MESH_SUFFIXES]
         if not found:
             raise SdfsimError(f"{source}: no mesh files in this folder", "it takes " + " ".join(MESH_SUFFIXES))

@@ -77,6 +77,8 @@ def test_units_are_those_of_a_scene_file_and_odd_sizes_are_told(tmp_path: Path) 
 
 
 def test_names(meshes: Path, tmp_path: Path) -> None:
+    (meshes / "._ball.ply").write_bytes(b"\0\5\x16\7")  # of macOS
+    (meshes / "__MACOSX").mkdir()
     assert list(named_meshes([meshes])) == ["ball", "box", "holed", "torn"]
     twins = []
     for name in ("cow", "cat"):

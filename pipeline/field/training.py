@@ -347,23 +347,28 @@ class Trainer:
         write_bytes(path, safetensors.torch.save(tensors, metadata={"about": json.dumps(about)}))
 
     def load(self, path: Path) -> bool:
-        """Goes on from a checkpoint; False where there is none that fits."""
+        """Goes on from a checkpoint; False where there is none. Raises SdfsimError where there is one that cannot be
+        read or is of another field; then the training is as before its first step."""
+        if not path.exists():
+            return False
         try:
             with safe_open(str(path), "pt") as file:
                 about = json.loads(file.metadata()["about"])
                 if about["size"] != str(self.settings.size):
-                    return False
+                    raise ValueError("it is of another field")
                 tensors = {key: file.get_tensor(key).to(self.device) for key in file.keys()}
-        except (OSError, SafetensorError, KeyError, TypeError, ValueError):
-            return False
-        self.field.load_state_dict({k[6:]: v for k, v in tensors.items() if k.startswith("field.")})
-        for number, parameter in enumerate(self._parameters()):
-            names = [k for k in tensors if k.startswith(f"adam.{number}.")]
-            if names:
-                self.optimizer.state[parameter] = {k.split(".")[2]: tensors[k] for k in names}
-        self.iteration, self.iterations = about["iteration"], about["iterations"]
-        self.seconds, self.field.active = about["seconds"], about["active"]
-        self.field.view_dependence = about["view_dependence"]
+            self.field.load_state_dict({k[6:]: v for k, v in tensors.items() if k.startswith("field.")})
+            for number, parameter in enumerate(self._parameters()):
+                names = [k for k in tensors if k.startswith(f"adam.{number}.")]
+                if names:
+                    self.optimizer.state[parameter] = {k.split(".")[2]: tensors[k] for k in names}
+            self.iteration, self.iterations = int(about["iteration"]), int(about["iterations"])
+            self.seconds, self.field.active = float(about["seconds"]), int(about["active"])
+            self.field.view_dependence = float(about["view_dependence"])
+        except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
+            self.field, self.optimizer = self.fresh()
+            self.iteration, self.iterations, self.seconds = 0, self.settings.iterations, 0.0
+            raise SdfsimError(f"{path.name} cannot be read ({' '.join(str(error).split())[:80]})") from error
         self.cache = tensors.get("cache")
         self.find_filled()
         return True
@@ -440,8 +445,9 @@ def train(
     """Trains a field and writes `field.safetensors` and `field.json` to `out`; resumes from `checkpoint.safetensors`.
 
     Views and sparse points are in the world of the poses. The budget, s, includes training before a kill: the number of
-    steps is cut to what fits. Without `threads` the CPU takes what is fastest now. Raises SdfsimError where the loss is
-    no longer finite.
+    steps is cut to what fits. Without `threads` the CPU takes what is fastest now. Where the checkpoint of a killed run
+    cannot be read, training begins again, and a note of the report says so. Raises SdfsimError where the loss is no
+    longer finite.
     """
     photos = load_photos(photos_folder)
     masked = all(photo.mask for photo in photos)
@@ -458,7 +464,12 @@ def train(
     make = MlpTrainer if isinstance(settings.size, MlpSize) else Trainer
     trainer = make(settings, rays, supervision, seed, device)
     checkpoint = out / "checkpoint.safetensors"
-    resumed = trainer.load(checkpoint)
+    resumed, notes = False, []
+    try:
+        resumed = trainer.load(checkpoint)
+    except SdfsimError as error:  # Nothing else can come of what is left of the killed run.
+        notes = [f"what a killed run had trained is lost: {error.message}; training began again"]
+        on_progress(0.0, notes[0])
     per_step = calibrate(make(settings, trainer.rays, supervision, seed, device), threads)
     if budget is not None and not resumed:
         trainer.iterations = min(settings.iterations, max(FEWEST_STEPS, int(budget / per_step)))
@@ -491,7 +502,7 @@ def train(
         "iterations": trainer.iterations, "rays": len(rays), "train_seconds": round(trainer.seconds, 1),
         "seconds_before": round(before, 1), "resumed": resumed, "masked": masked, "beta": float(trainer.beta),
         "threads": torch.get_num_threads(), "losses": {k: round(v, 5) for k, v in smooth.items()}, **scores,
-        "depth": agreed,
+        "depth": agreed, "notes": notes,
     }  # fmt: skip
     trained = Trained(trainer.field.cpu(), float(trainer.beta), to_unit, report)
     save_field(trained, out)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,15 +17,17 @@ from pydantic import TypeAdapter
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from pipeline.inputs.images import read_photo, sharpness
+from pipeline.inputs.images import read_photo, sharpness, stored_size
 from pipeline.inputs.known_cameras import DepthFile, KnownCamera, lens_of, posed
 from sdfsim.errors import SdfsimError
-from sdfsim.files import read_json
+from sdfsim.files import read_json, visible
 
 CAPTURE = "capture.json"  # what `Capture` says, in the folder of the photos stage
 LARGEST = 32 << 30  # bytes of a capture
 ARCHIVES = {".r3d", ".zip"}
 MOST = 100  # frames that are used of a recording
+DEEPEST = 4  # folders below the one that was given, in which a capture or photos are looked for
+FOLDERS = 2000  # at one depth; where there are more, nobody meant to give all of them
 TRIED = 5  # frames of a stretch that are looked at for the sharpest
 TURN = 1.0  # m of way that a turn by one radian counts as, when frames are spread along it
 POLYCAM = ("corrected_cameras", "cameras")  # folders of its cameras, the better ones first
@@ -43,13 +47,40 @@ class Capture:
     up: tuple[float, float, float] | None  # [3] against gravity, in the world of its cameras; None: not said
 
 
-def find_capture(folder: Path) -> Path | None:
-    """The folder of a Record3D or Polycam export in `folder`, or None where it is none."""
-    for place in (folder, folder / "EXR_RGBD", folder / "keyframes"):
-        record3d = _metadata(place).is_file() and any((place / name).is_dir() for name in ("rgb", "rgbd"))
-        if record3d or any(any((place / kind).glob("*.json")) for kind in POLYCAM):
-            return place
+def find_capture(folder: Path, *, deep: bool = False) -> Path | None:
+    """The folder of a Record3D or Polycam export in `folder`, where `deep` also farther below; None where there is
+    none. Raises SdfsimError where there are several."""
+    near = [folder, folder / "EXR_RGBD", folder / "keyframes"]
+    for places in [*([place] for place in near), *(levels(folder) if deep else [])]:
+        found = [place for place in places if _is_capture(place)]
+        if len(found) > 1:
+            raise SdfsimError(f"{folder}: holds several captures: {found[0]}, {found[1]}", "give one of them")
+        if found:
+            return found[0]
     return None
+
+
+def _is_capture(place: Path) -> bool:
+    record3d = _metadata(place).is_file() and any((place / name).is_dir() for name in ("rgb", "rgbd"))
+    return record3d or any(_jsons(place / kind) for kind in POLYCAM)
+
+
+def _jsons(folder: Path) -> list[Path]:
+    return [path for path in visible(folder) if path.suffix == ".json"] if folder.is_dir() else []
+
+
+def levels(folder: Path) -> Iterator[list[Path]]:
+    """A folder, those in it, those in these and so on, none that are hidden or cannot be read."""
+    level = [folder]
+    for _ in range(DEEPEST + 1):
+        yield level
+        if len(level) > FOLDERS:
+            return
+        inside = []
+        for place in level:
+            with suppress(OSError):
+                inside += [path for path in visible(place) if path.is_dir() and os.access(path, os.R_OK | os.X_OK)]
+        level = inside
 
 
 def read_capture(folder: Path) -> tuple[Capture, list[KnownCamera]]:
@@ -73,7 +104,7 @@ def _record3d(folder: Path) -> list[KnownCamera]:
     `metadata` holds the matrix K by columns, and a pose a frame: the quaternion x, y, z, w of the camera in the world,
     OpenGL axes, and its position in metres.
     """
-    about: dict[str, Any] = json.loads(_metadata(folder).read_text(encoding="utf-8"))
+    about: dict[str, Any] = json.loads(_metadata(folder).read_bytes())
     same = np.reshape(about["K"], (3, 3)).T
     each = about.get("perFrameIntrinsicCoeffs")
     shape = (int(about.get("dh", 256)), int(about.get("dw", 192)))
@@ -101,19 +132,29 @@ def depth_file(path: Path, confidence: Path, shape: tuple[int, int] | None = Non
 
 
 def _polycam(folder: Path) -> list[KnownCamera]:
-    """Polycam's raw data: a JSON a camera with its matrix as t_00 to t_23 (OpenGL axes, y up), depth in millimetres."""
-    cameras = next(folder / name for name in POLYCAM if (folder / name).is_dir())
-    images = folder / cameras.name.replace("cameras", "images")
+    """Polycam's raw data: a JSON a camera with its matrix as t_00 to t_23 (OpenGL axes, y up), depth in millimetres.
+    The better cameras do not say how large their photos are."""
+    kinds = [folder / name for name in POLYCAM if _jsons(folder / name)]
+    # The better cameras are of photos of their own, which may not have been exported.
+    cameras = next((kind for kind in kinds if _images_of(kind).is_dir()), kinds[0])
+    there = visible(_images_of(cameras)) if _images_of(cameras).is_dir() else []
+    images = {path.stem: path for path in there if path.suffix.lower() in (".jpg", ".jpeg", ".png")}
     found = []
-    for path in sorted(cameras.glob("*.json")):
-        about = json.loads(path.read_text(encoding="utf-8"))
-        photo = next((p for p in sorted(images.glob(path.stem + ".*"))), images / f"{path.stem}.jpg")
+    for path in _jsons(cameras):
+        about = json.loads(path.read_bytes())
+        photo = images.get(path.stem, _images_of(cameras) / f"{path.stem}.jpg")
         pose = np.array([[about[f"t_{row}{column}"] for column in range(4)] for row in range(3)], float)
         depth = depth_file(folder / "depth" / f"{path.stem}.png", folder / "confidence" / f"{path.stem}.png")
         fx, fy, cx, cy = (float(about[key]) for key in ("fx", "fy", "cx", "cy"))
-        size = int(about["width"]), int(about["height"])
+        size = int(about.get("width", 0)), int(about.get("height", 0))
+        if not all(size) and photo.is_file():
+            size = stored_size(photo)
         found.append(posed(photo.relative_to(folder).as_posix(), size, lens_of(fx, fy, cx, cy), pose, depth=depth))
     return found
+
+
+def _images_of(cameras: Path) -> Path:
+    return cameras.with_name(cameras.name.replace("cameras", "images"))
 
 
 def unpack(archive: Path, folder: Path) -> None:
@@ -121,11 +162,11 @@ def unpack(archive: Path, folder: Path) -> None:
     or has names that lead out of the folder."""
     try:
         with zipfile.ZipFile(archive) as file:
-            entries = [entry for entry in file.infolist() if not entry.is_dir()]
+            entries = [entry for entry in file.infolist() if not entry.is_dir() and not _left_by_macos(entry.filename)]
             if sum(entry.file_size for entry in entries) > LARGEST:
                 raise SdfsimError(f"{archive}: more than {LARGEST >> 30} GiB unpacked", "export fewer frames")
             for entry in entries:
-                place = folder / entry.filename
+                place = folder / entry.filename.replace("\\", "/")  # as some programs on Windows write them
                 if not place.resolve().is_relative_to(folder.resolve()):
                     told = f"{archive}: {entry.filename} would lie outside of the capture"
                     raise SdfsimError(told, "export it again")
@@ -134,6 +175,10 @@ def unpack(archive: Path, folder: Path) -> None:
                     shutil.copyfileobj(packed, out)
     except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
         raise SdfsimError(f"{archive}: cannot be unpacked: {error}", "export the capture again") from error
+
+
+def _left_by_macos(name: str) -> bool:
+    return any(part == "__MACOSX" or part.startswith("._") for part in name.replace("\\", "/").split("/"))
 
 
 def spread(photos: Sequence[Path], cameras: dict[Path, KnownCamera], most: int = MOST) -> list[Path]:

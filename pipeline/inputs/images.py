@@ -6,19 +6,24 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from pi_heif import register_heif_opener
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
+from pipeline.inputs.deep import OTHERWISE, TIFFS, deep_header, deep_values, eight_bits
 from sdfsim.errors import SdfsimError
+
+register_heif_opener(thumbnails=False)
 
 MIN_SIDE = 64
 MAX_PIXELS = 200_000_000
 # As PIL calls them. It knows others as well, and starts a program for some of them, whatever the file's name says.
-FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP")
+FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "AVIF", "HEIF")
 # Photos with a mask are shown on this grey; it has no texture, so it adds no features.
 BACKDROP = 0.5
 # Measured on three real and four rendered sets: photos in focus have 0.19 to 0.6, blurred by 1.5 px less than 0.08.
 BLURRED = 0.1
 BLOCKS = 12  # a side, fewer of small photos
+DARK = 0.1  # of white, that a hundredth of a photo has to reach
 
 
 @dataclass(frozen=True)
@@ -59,23 +64,23 @@ def exif_focal(image: Image.Image) -> tuple[float | None, str]:
         return None, ""  # Broken EXIF is common and never worth failing for.
 
 
-def read_photo(path: Path, long_side: int, mask: Path | None = None, shape: float | None = None) -> Picture:
+def read_photo(
+    path: Path, long_side: int, mask: Path | None = None, shape: float | None = None, white: float | None = None
+) -> Picture:
     """Reads one photo upright and no larger than `long_side` px; a mask file goes before an alpha channel.
 
     Where a known camera has another `shape`, width over height, than the upright photo, the photo stays as stored.
-    Raises SdfsimError, with the file's name, where it is no image, truncated, too small or too large.
+    `white` is what a file of more than 8 bits has for white (see `common_white`), else what its own range says. Raises
+    SdfsimError, with the file's name, where it is no image, truncated, too small or too large.
     """
-    image, original, focal, camera = decoded(path, long_side)
+    image, original, focal, camera = shown(path, long_side, white)
     turned = ImageOps.exif_transpose(image)
     if shape is not None and off(turned, shape) > off(image, shape):
         turned = image
     if turned.size != image.size:
         original = original[1], original[0]
-    upright = turned
-    if turned.mode.startswith("I"):  # 16 bits a pixel, which PIL would clip to 8
-        upright = Image.fromarray((np.asarray(turned).astype(np.uint32) >> 8).astype(np.uint8))
-    has_alpha = upright.mode in ("RGBA", "LA", "PA") or "transparency" in upright.info
-    upright = upright.convert("RGBA" if has_alpha else "RGB")
+    has_alpha = turned.mode in ("RGBA", "LA", "PA") or "transparency" in turned.info
+    upright = turned.convert("RGBA" if has_alpha else "RGB")
     upright = upright.resize(reduced(upright.size, long_side), Image.Resampling.LANCZOS)
     pixels, inside = np.asarray(upright), None
     if mask is not None:
@@ -92,10 +97,12 @@ def read_photo(path: Path, long_side: int, mask: Path | None = None, shape: floa
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
-    """A mask [H, W] uint8, grey or with alpha, white is the object, at the size (width, height) of its upright photo.
-    Raises SdfsimError where it cannot be read or is not shaped like the photo."""
-    image = turned_like(decoded(path, max(size))[0], size, path)
+    """A mask [H, W] uint8, grey or with alpha, white is the object, at the size (width, height) of its upright photo;
+    of 0 and 1 alone, 1 is the object. Raises SdfsimError where it cannot be read or is not shaped like the photo."""
+    image = turned_like(shown(path, max(size))[0], size, path)
     grey = image.getchannel("A") if image.mode == "RGBA" else image.convert("L")
+    if grey.getextrema() == (0, 1):
+        grey = grey.point(lambda value: 255 * value)
     return np.asarray(grey.resize(size, Image.Resampling.BOX))
 
 
@@ -109,18 +116,47 @@ def turned_like(stored: Image.Image, size: tuple[int, int], path: Path) -> Image
     raise SdfsimError(f"{path}: a mask of {given} does not fit its photo, shaped {size[0]} x {size[1]}")
 
 
+def shown(
+    path: Path, long_side: int, white: float | None = None
+) -> tuple[Image.Image, tuple[int, int], float | None, str]:
+    """What `decoded` gives, brought to 8 bits a channel where the file has more."""
+    header = deep_header(path)
+    if header is None:
+        return decoded(path, long_side)
+    focal, camera, orientation = None, "", header.orientation
+    if header.known:
+        image, _, focal, camera = decoded(path, long_side)
+        if orientation is None:
+            orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
+    check_size(path, header.size)
+    image = Image.fromarray(eight_bits(deep_values(path, header), header, white))
+    image.getexif()[ExifTags.Base.Orientation] = orientation
+    return image, header.size, focal, camera
+
+
+def stored_size(path: Path) -> tuple[int, int]:
+    """Width and height, px, of a photo as stored. Raises OSError where it is no image."""
+    with Image.open(path, formats=FORMATS) as image:
+        return image.size
+
+
+def check_size(path: Path, size: tuple[int, int]) -> None:
+    """Raises SdfsimError for an image of a width and height, px, that is too large or too small."""
+    width, height = size
+    if width * height > MAX_PIXELS:
+        raise SdfsimError(f"{path}: too large ({width} x {height}, at most {MAX_PIXELS // 1_000_000} megapixels)")
+    if min(size) < MIN_SIDE:
+        raise SdfsimError(f"{path}: too small ({width} x {height}, at least {MIN_SIDE} px a side)")
+
+
 def decoded(path: Path, long_side: int) -> tuple[Image.Image, tuple[int, int], float | None, str]:
     """A decoded image, its size in the file, its focal length in longer sides, and its camera."""
     limit = Image.MAX_IMAGE_PIXELS
     Image.MAX_IMAGE_PIXELS = None  # Our own limit below, before anything is decoded.
     try:
         with Image.open(path, formats=FORMATS) as image:
-            width, height = size = image.size
-            if width * height > MAX_PIXELS:
-                most = f"{MAX_PIXELS // 1_000_000} megapixels"
-                raise SdfsimError(f"{path}: too large ({width} x {height}, at most {most})")
-            if min(size) < MIN_SIDE:
-                raise SdfsimError(f"{path}: too small ({width} x {height}, at least {MIN_SIDE} px a side)")
+            size = image.size
+            check_size(path, size)
             focal, camera = exif_focal(image)
             if image.format == "JPEG":
                 # The decoder may skip to a smaller size, but no smaller than twice what is wanted.
@@ -128,9 +164,16 @@ def decoded(path: Path, long_side: int) -> tuple[Image.Image, tuple[int, int], f
             image.load()
             return image, size, focal, camera
     except UnidentifiedImageError as error:
-        raise SdfsimError(f"{path}: not an image, in spite of its name", "remove it or replace it") from error
-    except (OSError, SyntaxError, ValueError, EOFError) as error:
-        what = "truncated" if "truncated" in str(error) else f"cannot be decoded ({error})"
+        with open(path, "rb") as file:
+            tiff = file.read(4) in TIFFS
+        if tiff:
+            raise SdfsimError(f"{path}: damaged, or a kind of TIFF that is not read", OTHERWISE) from error
+        told = f"{path}: not an image, in spite of its name, or cut short"
+        raise SdfsimError(told, "remove it or replace it") from error
+    except (OSError, SyntaxError, ValueError, EOFError, RuntimeError) as error:
+        why = " ".join(str(error).split())
+        cut = "truncated" in why or "end of file" in why
+        what = "truncated" if cut else f"cannot be decoded ({why})"
         raise SdfsimError(f"{path}: {what}", "copy it again from the camera, or remove it") from error
     finally:
         Image.MAX_IMAGE_PIXELS = limit
@@ -145,6 +188,13 @@ def reduced(size: tuple[int, int], long_side: int) -> tuple[int, int]:
 def off(image: Image.Image, shape: float) -> float:
     """By what share an image is wider or narrower than a shape, width over height."""
     return abs(image.width / image.height / shape - 1)
+
+
+def brightness(picture: Picture) -> float:
+    """How light the lightest hundredth of a photo is, or of its object where it has a mask; from 0 to 1."""
+    grey = picture.pixels.astype(np.float32).mean(-1) / 255
+    inside = grey if picture.mask is None else grey[picture.mask >= 128]
+    return float(np.quantile(inside, 0.99)) if inside.size else 1.0
 
 
 def block_means(values: np.ndarray, blocks: int) -> np.ndarray:

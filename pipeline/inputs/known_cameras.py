@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import codecs
 import json
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,15 +18,19 @@ from pipeline.cameras import View
 from pipeline.inputs.images import Picture
 from sdfsim.errors import SdfsimError
 
-LENSES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE")  # camera models of a transforms.json
 # COLMAP's camera models, by number: name, and the names of their parameters; none of those that OpenCV does not know.
+# A transforms.json has the same names, with fl_x and fl_y in place of f, fx and fy.
 MODELS = {
     0: ("SIMPLE_PINHOLE", "f cx cy"), 1: ("PINHOLE", "fx fy cx cy"), 2: ("SIMPLE_RADIAL", "f cx cy k1"),
     3: ("RADIAL", "f cx cy k1 k2"), 4: ("OPENCV", "fx fy cx cy k1 k2 p1 p2"),
     5: ("OPENCV_FISHEYE", "fx fy cx cy k1 k2 k3 k4"), 6: ("FULL_OPENCV", "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
     7: ("FOV", ""), 8: ("SIMPLE_RADIAL_FISHEYE", "f cx cy k1"), 9: ("RADIAL_FISHEYE", "f cx cy k1 k2"),
-    10: ("THIN_PRISM_FISHEYE", ""),
+    10: ("THIN_PRISM_FISHEYE", ""), 11: ("RAD_TAN_THIN_PRISM_FISHEYE", ""), 12: ("SIMPLE_DIVISION", ""),
+    13: ("DIVISION", ""), 14: ("SIMPLE_FISHEYE", "f cx cy"), 15: ("FISHEYE", "fx fy cx cy"), 16: ("EUCM", ""),
+    17: ("EQUIRECTANGULAR", ""),
 }  # fmt: skip
+PARAMETERS = {name: parameters.split() for name, parameters in MODELS.values() if parameters}
+STRAIGHTEN = f"allowed: {', '.join(PARAMETERS)}; `colmap image_undistorter` makes photos of any other straight"
 SQUARE = 1e-3  # pixels that differ from squares by less are squares
 # OpenCV counts pixel centres from 0.
 CENTRE = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
@@ -102,6 +108,12 @@ def posed(name: str, size: tuple[int, int], lens: Lens, pose: np.ndarray, mask: 
     return KnownCamera(name, *size, lens, rotation, -rotation @ place, mask, depth)
 
 
+def below(folder: Path, name: str) -> Path:
+    """The file of this name in a folder, though the name may have been written on Windows."""
+    place = folder / name
+    return place if place.exists() or "\\" not in name else folder / name.replace("\\", "/")
+
+
 def read_cameras(path: Path) -> list[KnownCamera]:
     """The cameras of a transforms.json or of a COLMAP model's folder, in the order of their names. Raises SdfsimError
     where it is damaged or no such file, or where a lens is not known."""
@@ -114,15 +126,15 @@ def read_cameras(path: Path) -> list[KnownCamera]:
 
 def read_transforms(path: Path) -> list[KnownCamera]:
     """Cameras of a transforms.json: camera-to-world matrices with OpenGL axes; intrinsics for all or in each frame."""
-    about = json.loads(path.read_text(encoding="utf-8"))
+    about = json.loads(path.read_bytes())  # Bytes: it knows a byte order mark.
     found = []
     for frame in about["frames"]:
         values = {**about, **frame}
         where = f"{path}: {frame['file_path']}"
-        model = values.get("camera_model", LENSES[0])
-        if model not in LENSES:
-            raise SdfsimError(f"{where}: camera_model: {model!r} is not read", f"allowed: {', '.join(LENSES)}")
-        fisheye = model == "OPENCV_FISHEYE" or bool(values.get("is_fisheye"))
+        model = str(values.get("camera_model", "OPENCV")).upper()
+        if model not in PARAMETERS:
+            raise SdfsimError(f"{where}: camera_model: {values['camera_model']!r} is not read", STRAIGHTEN)
+        fisheye = model.endswith("FISHEYE") or bool(values.get("is_fisheye"))
         width, height = int(values.get("w", 0)), int(values.get("h", 0))
         sized = width > 0 and height > 0
         known = "fl_x" in values
@@ -133,16 +145,29 @@ def read_transforms(path: Path) -> list[KnownCamera]:
         fx = float(values["fl_x"]) if known else 0.5 * width / np.tan(0.5 * float(values["camera_angle_x"]))
         fy = float(values.get("fl_y", fx))
         cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
-        pose = np.array(frame["transform_matrix"], float).reshape(4, 4)[:3]
-        # Where not of a fisheye, what others call k4 is not OpenCV's.
-        bends = values if fisheye else {**values, "k4": 0, "k5": 0, "k6": 0}
+        # What others call k4 is OpenCV's only of a fisheye and of this model.
+        bends = values if fisheye or model == "FULL_OPENCV" else {**values, "k4": 0, "k5": 0, "k6": 0}
         lens = lens_of(fx, fy, cx, cy, bends, fisheye)
+        pose = _pose(frame["transform_matrix"], where)
         # As nerfstudio, or as instant-ngp says it.
         name = values.get("depth_file_path") or values.get("depth_path")
         unit = values.get("depth_unit_scale_factor", values.get("integer_depth_scale"))
-        depth = DepthFile(path.parent / name, unit and float(unit)) if name else None
+        depth = DepthFile(below(path.parent, name), unit and float(unit)) if name else None
         found.append(posed(str(frame["file_path"]), (width, height), lens, pose, frame.get("mask_path"), depth))
     return found
+
+
+def _pose(matrix: Any, where: str) -> np.ndarray:
+    """A pose [3, 4] from the 3 or 4 rows of its matrix, one after the other or nested."""
+    values = np.array(matrix, float)
+    if values.shape not in ((4, 4), (3, 4), (16,), (12,)):
+        shape = " x ".join(map(str, values.shape))
+        raise SdfsimError(f"{where}: transform_matrix: {shape} numbers", "it takes 4 x 4, or the first 3 rows of that")
+    rows = values.reshape(-1, 4)
+    if not np.allclose(rows[3:], [0, 0, 0, 1]):
+        told = f"{where}: transform_matrix: its last row is {rows[3].tolist()}, not 0, 0, 0, 1"
+        raise SdfsimError(told, "write it by rows, camera to world, with the place of the camera in the last column")
+    return rows[:3]
 
 
 def read_model(folder: Path) -> list[KnownCamera]:
@@ -151,8 +176,14 @@ def read_model(folder: Path) -> list[KnownCamera]:
     cameras, images = (_model_binary if binary else _model_text)(folder)
     found = []
     for name, camera, quaternion, translation in images:
+        if camera not in cameras:
+            raise SdfsimError(f"{folder}: {name}: there is no camera {camera}", "write the model again")
         model, width, height, values = cameras[camera]
-        known = dict(zip(_parameters(folder, model), values, strict=True))
+        names = _parameters(folder, model)
+        if len(names) != len(values):
+            told = f"{folder}: camera {camera}: {len(values)} parameters, {model} has {len(names)} ({' '.join(names)})"
+            raise SdfsimError(told, "write the model again")
+        known = dict(zip(names, values, strict=True))
         fx = known.get("fx", known.get("f", 0.0))
         lens = lens_of(fx, known.get("fy", fx), known["cx"], known["cy"], known, model.endswith("FISHEYE"))
         rotation = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
@@ -161,11 +192,9 @@ def read_model(folder: Path) -> list[KnownCamera]:
 
 
 def _parameters(folder: Path, model: str) -> list[str]:
-    names = dict(MODELS.values()).get(model, "")
-    if not names:
-        readable = ", ".join(name for name, parameters in MODELS.values() if parameters)
-        raise SdfsimError(f"{folder}: the camera model {model} is not read", f"allowed: {readable}")
-    return names.split()
+    if model not in PARAMETERS:
+        raise SdfsimError(f"{folder}: the camera model {model} is not read", STRAIGHTEN)
+    return PARAMETERS[model]
 
 
 # Of each camera by its number: model, width, height, parameters. Of each image: name, camera, quaternion, translation.
@@ -173,19 +202,47 @@ Model = tuple[dict[int, tuple[str, int, int, list[float]]], list[tuple[str, int,
 
 
 def _model_text(folder: Path) -> Model:
-    rows = {}
-    for name in ("cameras.txt", "images.txt"):
-        lines = (folder / name).read_text(encoding="utf-8").splitlines()
-        rows[name] = [line for line in lines if not line.startswith("#")]
     cameras, images = {}, []
-    for number, model, width, height, *values in (line.split() for line in rows["cameras.txt"] if line.strip()):
-        cameras[int(number)] = model, int(width), int(height), [float(v) for v in values]
-    # Two lines an image; the second, its points, may be empty.
-    for line in filter(str.strip, rows["images.txt"][::2]):
-        _, *values, camera, name = line.split(maxsplit=9)
-        numbers = [float(v) for v in values]
-        images.append((name.strip(), int(camera), numbers[:4], numbers[4:7]))
+    for where, line in _lines(folder / "cameras.txt"):
+        try:
+            number, model, width, height, *values = line.split()
+            cameras[int(number)] = model, int(width), int(height), [float(v) for v in values]
+        except ValueError as error:
+            raise SdfsimError(f"{where}: not a camera's number, model, width, height, parameters") from error
+    before = False  # whether the last line was an image
+    for where, line in _lines(folder / "images.txt"):
+        # Two lines an image. The second, its points, may be empty, and so may lines between images.
+        if before and _are_points(line):
+            before = False
+            continue
+        try:
+            _, *values, camera, name = line.split(maxsplit=9)
+            numbers = [float(v) for v in values]
+            images.append((name, int(camera), numbers[:4], numbers[4:7]))
+            before = len(numbers) == 7
+        except ValueError:
+            before = False
+        if not before:
+            raise SdfsimError(f"{where}: not an image's number, quaternion, translation, camera, name")
     return cameras, images
+
+
+def _lines(path: Path) -> Iterator[tuple[str, str]]:
+    """Lines that are neither empty nor a comment, and where each is."""
+    data = path.read_bytes()
+    wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    for number, line in enumerate(data.decode("utf-16" if wide else "utf-8-sig").splitlines(), start=1):
+        if line.strip() and not line.lstrip().startswith("#"):
+            yield f"{path}: line {number}", line.strip()
+
+
+def _are_points(line: str) -> bool:
+    """Whether a line of images.txt has only numbers, by three: x, y and the number of a point."""
+    words = line.split()
+    try:
+        return len(words) % 3 == 0 and bool([float(word) for word in words])
+    except ValueError:
+        return False
 
 
 def _model_binary(folder: Path) -> Model:
@@ -194,7 +251,7 @@ def _model_binary(folder: Path) -> Model:
     (count,) = struct.unpack_from("<Q", data)
     for _ in range(count):
         number, model, width, height = struct.unpack_from("<IiQQ", data, at)
-        name = MODELS[model][0]
+        name = MODELS.get(model, (f"of number {model}", ""))[0]
         values = struct.unpack_from(f"<{len(_parameters(folder, name))}d", data, at + 24)
         at += 24 + 8 * len(values)
         cameras[number] = name, width, height, list(values)

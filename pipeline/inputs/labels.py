@@ -12,7 +12,7 @@ from PIL import Image
 
 from pipeline.inputs.images import decoded, read_mask, turned_like
 from sdfsim.errors import SdfsimError
-from sdfsim.files import read_json
+from sdfsim.files import read_json, visible
 
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
 FOLDER, NAMES = "labels", "names.json"  # what the photos stage writes
@@ -77,8 +77,9 @@ def find_labels(photos: list[Path]) -> Labels:
     images: dict[Path, Path] = {}
     notes: list[str] = []
     for root in _roots(photos):
-        for folder in sorted(path for path in (root / FOLDER, *(root / "masks").glob("*")) if path.is_dir()):
-            if folder in [photo.parent for photo in photos] or folder.name.startswith("."):
+        inside = visible(root / "masks") if (root / "masks").is_dir() else []
+        for folder in sorted(path for path in (root / FOLDER, *inside) if path.is_dir()):
+            if folder in [photo.parent for photo in photos]:
                 continue
             found, more = _of_photos(root, folder, photos)
             notes += more
@@ -119,7 +120,7 @@ def _of_photos(root: Path, folder: Path, photos: list[Path]) -> tuple[dict[Path,
     named like its photo, with `.png` behind it or with another suffix."""
     if not folder.is_dir():
         return {}, []
-    there = {path.name for path in folder.iterdir() if path.is_file() and path.suffix.lower() in MASK_SUFFIXES}
+    there = {path.name for path in visible(folder) if path.is_file() and path.suffix.lower() in MASK_SUFFIXES}
     found = {}
     for photo in photos:
         names = [photo.name + ".png", *(photo.stem + suffix for suffix in MASK_SUFFIXES)]

@@ -13,7 +13,8 @@ from pydantic import TypeAdapter
 
 from pipeline.cameras import View, save_views
 from pipeline.inputs.captures import CAPTURE, read_depth, spread, unpack
-from pipeline.inputs.images import BLURRED, Picture, read_photo, sharpness
+from pipeline.inputs.deep import common_white
+from pipeline.inputs.images import BLURRED, DARK, Picture, brightness, read_photo, sharpness
 from pipeline.inputs.known_cameras import KnownCamera, Lens, rectified
 from pipeline.inputs.labels import FOLDER, NAMES
 from pipeline.inputs.sources import Source, find_source
@@ -41,7 +42,7 @@ class Photo:
     camera: str  # make and model from EXIF, empty where unknown
     mask: bool  # whether a mask came with it, as alpha or as a file
     sharpness: float  # see `sharpness`; 0.2 to 0.6 for photos in focus
-    fault: str = ""  # "blurred" or nothing
+    fault: str = ""  # "too dark", "blurred" or nothing
     depth: bool = False  # whether depth came with it
 
     def prepared(self, pixels: np.ndarray, view: View) -> np.ndarray:
@@ -60,10 +61,21 @@ def prepare_photos(
     notes for the report.
     """
     source, out = find_source(given), Path(out)
+    if source.archive is None:
+        return _prepare(source, out, long_side, on_progress)
     unpacked = out / ".capture"
-    if source.archive:
-        unpack(source.archive, unpacked)
-        source = find_source(unpacked)
+    unpack(source.archive, unpacked)
+    try:
+        made = _prepare(find_source(unpacked, unpacked=True), out, long_side, on_progress)
+    except SdfsimError as error:  # which names files that nobody knows
+        told, hint = (text.replace(str(unpacked), str(source.archive)) for text in (error.message, error.hint))
+        raise SdfsimError(told, hint, exit_code=error.exit_code) from error
+    shutil.rmtree(unpacked, ignore_errors=True)
+    return made
+
+
+def _prepare(source: Source, out: Path, long_side: int, on_progress: Progress) -> tuple[list[Photo], list[str]]:
+    """What `prepare_photos` does with what is no archive."""
     if source.capture:
         source = replace(source, photos=tuple(spread(source.photos, source.frames)))
     (out / "images").mkdir(parents=True, exist_ok=True)
@@ -89,12 +101,13 @@ def prepare_photos(
         focal = None if known else picture.focal  # A known camera is no prior.
         photos.append(
             Photo(name, origin, width, height, picture.original, lens, focal, picture.camera,
-                  picture.mask is not None, sharp, depth=bool(known and known.depth))
+                  picture.mask is not None, sharp, "too dark" if brightness(picture) < DARK else "",
+                  bool(known and known.depth))
         )  # fmt: skip
         on_progress(fraction, f"{len(photos)} photos")
     # Relative to what is typical of the set: a blur that all have in common may be the scene's.
     least = max(BLURRED, 0.35 * float(np.quantile([p.sharpness for p in photos], 0.75)))
-    photos = [replace(p, fault="blurred" if p.sharpness < least else "") for p in photos]
+    photos = [replace(p, fault=p.fault or ("blurred" if p.sharpness < least else "")) for p in photos]
     if views:
         save_views(views, out / KNOWN_CAMERAS)
     if source.capture:
@@ -102,7 +115,6 @@ def prepare_photos(
     if source.labels.names:
         write_json(out / FOLDER / NAMES, {"version": 1, "names": list(source.labels.names)})
     save_photos(photos, out)
-    shutil.rmtree(unpacked, ignore_errors=True)
     return photos, [*source.notes, *notes_on(photos, len(source.masks))]
 
 
@@ -121,10 +133,11 @@ def _pictures(source: Source, long_side: int) -> Iterator[tuple[str, Picture, Kn
     lacking = [path for path in source.photos if path not in masks] if masks else []
     if any(read_photo(path, long_side).mask is None for path in lacking):
         masks = {}
+    white = common_white(source.photos)
     for index, path in enumerate(source.photos):
         camera = source.frames.get(path)
         shape = camera.width / camera.height if camera and camera.height else None
-        picture = read_photo(path, long_side, masks.get(path), shape)
+        picture = read_photo(path, long_side, masks.get(path), shape, white.get(path))
         size = picture.pixels.shape[1::-1]
         _check_shape(path, size, camera)
         picture = replace(picture, labels=source.labels.of(path, size))
@@ -145,10 +158,11 @@ def notes_on(photos: list[Photo], mask_files: int) -> list[str]:
     if masked < len(photos) and (masked or mask_files):
         notes.append(f"masks count only where every photo has one: {mask_files} mask files are ignored, and what is "
                      f"transparent in {masked} photos is grey")  # fmt: skip
-    names = [p.source for p in photos if p.fault]
-    if names:
-        named = ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
-        notes.append(f"{len(names)} of {len(photos)} photos are blurred, take them again: {named}")
+    for fault, again in (("too dark", "take them again with more light"), ("blurred", "take them again")):
+        names = [p.source for p in photos if p.fault == fault]
+        if names:
+            named = ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
+            notes.append(f"{len(names)} of {len(photos)} photos are {fault}, {again}: {named}")
     return notes
 
 

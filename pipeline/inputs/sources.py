@@ -6,14 +6,17 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pipeline.inputs.captures import ARCHIVES, Capture, find_capture, read_capture
-from pipeline.inputs.known_cameras import KnownCamera, read_cameras
+from pipeline.inputs.captures import ARCHIVES, Capture, find_capture, levels, read_capture
+from pipeline.inputs.known_cameras import KnownCamera, below, read_cameras
 from pipeline.inputs.labels import Labels, find_labels, find_masks
 from sdfsim.errors import SdfsimError
+from sdfsim.files import visible
 
 MIN_PHOTOS = 3
-SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"}
-READABLE = "photos are JPEG, PNG, TIFF, WebP or BMP; give a video itself to use it"
+SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".heic", ".heif", ".hif", ".avif"}
+READABLE = "photos are JPEG, PNG, TIFF, HEIC, AVIF, WebP or BMP; give a video itself to use it"
+ABOVE = 3  # folders above a COLMAP model in which its photos are looked for: it may be colmap/sparse/0
+NAMED = 3  # folders with photos that an error names
 VIDEOS = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"}
 
 
@@ -52,12 +55,13 @@ class Source:
         return found + [path for path in (self.video, self.archive, self.cameras) if path]
 
 
-def find_source(given: Path) -> Source:
+def find_source(given: Path, *, unpacked: bool = False) -> Source:
     """Looks at what the user gave; reads no photo yet.
 
     A folder holds photos (in it, or in its subfolder `images`), or is a COLMAP model, or a phone's capture (see
-    `find_capture`); a file is a video, a transforms.json, or a zipped capture. Masks and labels: see `find_masks` and
-    `find_labels`. Raises SdfsimError where nothing is there, of fewer than three photos, or of two cameras of a photo.
+    `find_capture`); a file is a video, a transforms.json, or a zipped capture. Of an `unpacked` archive the photos may
+    lie in any one folder. Masks and labels: see `find_masks` and `find_labels`. Raises SdfsimError where nothing is
+    there, of fewer than three photos, or of two cameras of a photo.
     """
     given = Path(given)
     if not given.exists():
@@ -71,30 +75,73 @@ def find_source(given: Path) -> Source:
     if given.is_file():
         told = f"{given}: not a folder, a video, a transforms.json or a zipped capture"
         raise SdfsimError(told, "give the folder that holds the photos, not a single file")
-    if (place := find_capture(given)) is not None:
+    own = photos_in(given)
+    if (place := find_capture(given, deep=unpacked or len(own) < MIN_PHOTOS)) is not None:
         capture, frames = read_capture(place)
         return _with_cameras(place, frames, capture)
+    if unpacked and len(own) < MIN_PHOTOS and len(inside := _with_photos(given)) == 1:
+        (given,) = inside
     photos, notes = find_photos(given)
     labels = find_labels(photos)
     return Source(tuple(photos), find_masks(photos), labels, notes=(*notes, *labels.notes))
 
 
 def find_photos(folder: Path) -> tuple[list[Path], list[str]]:
-    """The photo files of a folder, or of its subfolder `images` where all are there, in name order, and a note on what
-    was passed over. Raises SdfsimError for fewer than three."""
-    try:
-        entries = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
-    except OSError as error:
-        raise SdfsimError(f"{folder}: cannot be read ({error.strerror})") from error
-    found = [p for p in entries if p.suffix.lower() in SUFFIXES]
-    if not found and (folder / "images").is_dir():
-        return find_photos(folder / "images")
-    other = [p.name for p in entries if p not in found and p.suffix != ".json"]
-    notes = [f"{len(other)} files are not used (first: {other[0]}): {READABLE}"] if other else []
+    """The photo files of `photos_in` a folder, and a note on what was passed over. Raises SdfsimError for fewer than
+    three; it names the folders below that hold some."""
+    found = photos_in(folder)
+    place = found[0].parent if found else folder
+    notes = []
+    if place != folder and (beside := _images(folder)):
+        notes.append(f"{len(beside)} photos beside the folder {place.name} are not used (first: {beside[0].name})")
+    other = [p.name for p in _files(place) if p not in found and p.suffix != ".json"]
+    if other:
+        notes.append(f"{len(other)} files are not used (first: {other[0]}): {READABLE}")
     if len(found) < MIN_PHOTOS:
         told = f"{folder}: photos found: {len(found)}, at least {MIN_PHOTOS} are needed (20 to 60 are good)"
+        inside = _with_photos(folder)
+        if inside:
+            some = ", ".join(f"{len(photos_in(sub))} in {sub}" for sub in inside[:NAMED])
+            more = f" and {len(inside) - NAMED} more folders" if len(inside) > NAMED else ""
+            raise SdfsimError(f"{told}; below it are {some}{more}", "give the folder that holds the photos")
+        if models := [place for level in levels(folder) for place in level if is_model(place)]:
+            raise SdfsimError(f"{told}; {models[0]} holds cameras", "give that folder")
         raise SdfsimError(told, notes[0] if notes else "take photos all around, each overlapping the one before")
     return found, notes
+
+
+def photos_in(folder: Path) -> list[Path]:
+    """The photo files of a folder in name order, or those of its subfolder `images`, beside which there may be a few
+    previews. Raises SdfsimError where the folder cannot be read."""
+    own = _images(folder)
+    inner = _images(folder / "images") if (folder / "images").is_dir() else []
+
+    def size(photos: list[Path]) -> int:
+        return sum(photo.stat().st_size for photo in photos)
+
+    if not own or (len(inner) >= MIN_PHOTOS and (len(inner) >= len(own) or size(inner) >= size(own))):
+        return inner
+    return own
+
+
+def _images(folder: Path) -> list[Path]:
+    return [path for path in _files(folder) if path.suffix.lower() in SUFFIXES]
+
+
+def _files(folder: Path) -> list[Path]:
+    try:
+        return [path for path in visible(folder) if path.is_file()]
+    except OSError as error:
+        raise SdfsimError(f"{folder}: cannot be read ({error.strerror})") from error
+
+
+def _with_photos(folder: Path) -> list[Path]:
+    """Those folders below that hold enough photos and lie least deep."""
+    for level in levels(folder):
+        found = [place for place in level if place != folder and len(photos_in(place)) >= MIN_PHOTOS]
+        if found:
+            return found
+    return []
 
 
 def is_model(folder: Path) -> bool:
@@ -115,8 +162,8 @@ def _with_cameras(cameras: Path, frames: list[KnownCamera], capture: Capture | N
             both = f"{known[photo].name} and {frame.name}"
             raise SdfsimError(f"{cameras}: {both} are the same photo: {photo}", "remove one")
         known[photo] = frame
-        if frame.mask is not None and (cameras.parent / frame.mask).is_file():
-            masks[photo] = cameras.parent / frame.mask
+        if frame.mask is not None and below(cameras.parent, frame.mask).is_file():
+            masks[photo] = below(cameras.parent, frame.mask)
     notes = [f"{len(missing)} of {len(frames)} cameras have no photo (first: {missing[0]})"] if missing else []
     photos = list(known)
     if len(photos) < MIN_PHOTOS:
@@ -130,12 +177,18 @@ def _with_cameras(cameras: Path, frames: list[KnownCamera], capture: Capture | N
 
 
 def _photo_of(name: str, cameras: Path) -> Path | None:
-    """The file of a photo that a camera file names, by its path, else by its name in a folder `images`."""
-    roots = [cameras.parent] if cameras.is_file() else [cameras, cameras.parent, cameras.parent.parent]
+    """The file of a photo that a camera file names, by its path, else by its name in a folder `images`. A name that was
+    written on Windows, or with the path of another computer, counts as well."""
+    alone = cameras.is_file()
+    roots = [cameras.parent] if alone else [cameras, *list(cameras.absolute().parents)[:ABOVE]]
     suffixes = [""] if Path(name).suffix.lower() in SUFFIXES else [".png", ".jpg", ".jpeg"]
-    for root in roots:
-        for place in (root / name, root / "images" / name, root / "images" / Path(name).name):
-            for suffix in suffixes:
-                if place.with_name(place.name + suffix).is_file():
-                    return place.with_name(place.name + suffix)
+    for written in dict.fromkeys([name, name.replace("\\", "/")]):
+        for root in roots:
+            inner = root / "images"
+            # A model's names count from its folder of photos; beside that there may be previews.
+            first = (root / written, inner / written) if alone else (inner / written, root / written)
+            for place in (*first, inner / Path(written).name, root / Path(written).name):
+                for suffix in suffixes:
+                    if place.with_name(place.name + suffix).is_file():
+                        return place.with_name(place.name + suffix)
     return None

@@ -290,6 +290,7 @@ class Parts:
     touching: list[tuple[str, str, str]] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)  # names of masks whose object has no surface of its own
     noise: list[float] = field(default_factory=list)  # longest sides of what was no body, see `_are_noise`
+    unrefined: dict[str, str] = field(default_factory=dict)  # by body, why it was not moved to where the photos agree
 
 
 def split(surface: Surface, distance: Distance, finest: float, views: list[View], points: np.ndarray,
@@ -335,10 +336,12 @@ def split(surface: Surface, distance: Distance, finest: float, views: list[View]
     sampled = {body: body_mesh(body, distance, min(finest / FINER, surface.volume.cell)) for body in pieces}
     noise = _noise(sampled, points, finest)
     called = _names([body for body in pieces if body not in noise])
-    meshes, pictures = {}, load_pictures(views, photos_folder)
+    meshes, unrefined, pictures = {}, {}, load_pictures(views, photos_folder)
     for body, name in called.items():
         # Lifted clear of the surface in the way, which is sampled more coarsely.
-        mesh = refine(sampled[body], pictures, blocking, lift, finest, body.level.above, body.layer)
+        mesh, why = refine(sampled[body], pictures, blocking, lift, finest, body.level.above, body.layer)
+        if why:
+            unrefined[name] = why
         seen = look(Visibility(mesh, lift, blocking), views, photos_folder)
         known, color = seen.weight > 0, seen.color
         if known.any() and not known.all():
@@ -347,7 +350,7 @@ def split(surface: Surface, distance: Distance, finest: float, views: list[View]
     solid, shown = (None, None) if alone else scenery(surface, whole, distance)
     pairs = [(called[a], called[b], by) for a, b, by in touching if a in called and b in called]
     missing = [name for name in names if name not in meshes]
-    return Parts(solid, shown, meshes, smallest, pairs, missing, [body.size for body in noise])
+    return Parts(solid, shown, meshes, smallest, pairs, missing, [body.size for body in noise], unrefined)
 
 
 def _told_apart(surface: Surface, body: Body, votes: Votes | None, smallest: float) -> tuple[list[Part], str]:

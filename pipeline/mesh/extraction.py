@@ -71,7 +71,7 @@ class Volume:
         """The zero surface by marching cubes, faces counter-clockwise from outside. Raises SdfsimError (exit code 3)
         where the values have one sign everywhere."""
         if not self.values.min() < 0 < self.values.max():
-            raise SdfsimError("mesh: the field holds no surface", "try --preset standard", exit_code=EXIT_QUALITY)
+            raise SdfsimError("mesh: the field holds no surface", exit_code=EXIT_QUALITY)
         from skimage.measure import marching_cubes
 
         # A surface through a sample makes several vertices in one place; merged later, they would pinch a closed mesh.
@@ -193,7 +193,7 @@ def surface_of(
     shown = islands(raw, faces_seen & kept, FLOATER)
     if shown.sum() < 100:
         told = "mesh: hardly any of the surface is visible in the photos"
-        raise SdfsimError(told, "check the poses; try --preset standard", exit_code=EXIT_QUALITY)
+        raise SdfsimError(told, "check the poses", exit_code=EXIT_QUALITY)
     rgb = np.where(found.weight[:, None] > 0, found.color, 255 * field_colors(field, raw))
     return Surface(volume, replace(raw, colors=to_bytes(rgb)), seen, kept, shown, left_out)
 

@@ -91,7 +91,7 @@ def make_meshes(
         "up_confidence": placement.up_confidence, "size": placement.size_from, "objects": list(parts.bodies),
         "smallest_object_m": float(rounded(parts.smallest * metres)), "touching": parts.touching,
         "hollows_m": {name: rounded(found).tolist() for name, found in deep.items() if found is not None},
-        "masks_without_surface": parts.missing, **told,
+        "masks_without_surface": parts.missing, "unrefined": parts.unrefined, **told,
     }  # fmt: skip
 
 

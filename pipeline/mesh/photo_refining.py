@@ -42,6 +42,7 @@ NEAR, EVEN = 8, 0.3
 # Weights beside trust: of the surface's area, of its bending, and of where a vertex was.
 AREA, BENDING, STAY, PINNED = 0.2, 0.3, 0.002, 0.5
 SMOOTHED = 4  # times after each round
+STEPS = 300  # of conjugate gradients
 WALL = 0.25  # of the way to the surface opposite, inside or outside, that a vertex may move in a round
 # Within so many edges vertices need this mean trust around them, or they stay where they were.
 AROUND, TOLD = 20, 0.1 / EVERY
@@ -71,16 +72,19 @@ def load_pictures(views: list[View], photos_folder: Path) -> list[Picture]:
 
 
 def refine(mesh: Mesh, pictures: list[Picture], blocking: Caster, lift: float, finest: float,
-           height: Callable[[np.ndarray], np.ndarray], layer: float) -> Mesh:  # fmt: skip
-    """A body whose vertices lie where the photos agree; all is in the space of the views.
+           height: Callable[[np.ndarray], np.ndarray], layer: float) -> tuple[Mesh, str]:  # fmt: skip
+    """A body whose vertices lie where the photos agree, and why not all rounds of it were done, if so; all is in the
+    space of the views.
 
     Vertices are lifted by `lift` off the surface before a view looks for them, and move by cells of width `finest`.
     Below `layer` of `height`, above the plane that the body stands on, no photo tells the body from its plane; vertices
     there move along the plane only.
     """
     count = len(mesh.vertices)
-    if len(pictures) < FEWEST or count < SELDOM:
-        return mesh
+    if len(pictures) < FEWEST:
+        return mesh, f"there are only {len(pictures)} photos, it takes {FEWEST}"
+    if count < SELDOM:
+        return mesh, f"it has only {count} vertices, it takes {SELDOM}"
     edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
     links = coo_matrix((np.ones(len(edges)), edges.T), shape=(count, count)).tocsr()
     links = ((links + links.T) > 0).astype(float)
@@ -101,6 +105,8 @@ def refine(mesh: Mesh, pictures: list[Picture], blocking: Caster, lift: float, f
         score = agreement(sight.at(picked), normal[picked], pictures, moves, clear[:, picked])
         place, trust = best_places(score, moves)
         trust[low[picked]] = 0
+        if not trust.any():
+            return mesh, f"nowhere do {FEWEST} photos show it and agree"
         along = np.where(low[:, None], normal - (normal @ upright)[:, None] * upright, normal)
         wanted, weight = np.zeros(count), np.zeros(count)
         wanted[picked], weight[picked] = place, trust
@@ -113,7 +119,7 @@ def refine(mesh: Mesh, pictures: list[Picture], blocking: Caster, lift: float, f
             told = mean @ told
         told = (told[:, 0] / (TOLD * told[:, 1]).clip(1e-6)).clip(0, 1)
         stay = STAY + PINNED * (1 - told)
-        moved = settled(mesh, along, mean, wanted, weight, stay)
+        moved, converged = settled(mesh, along, mean, wanted, weight, stay)
         # What the surface around it contradicts was a mistake.
         off = np.abs(moved - wanted)
         around = np.stack([weight * off, weight], 1)
@@ -122,7 +128,10 @@ def refine(mesh: Mesh, pictures: list[Picture], blocking: Caster, lift: float, f
         most = FAR * np.median(off[weight > 0]) if (weight > 0).any() else 1.0
         usual = (around[:, 0] / around[:, 1].clip(1e-9)).clip(None, most)
         weight = weight * np.exp(-((off / (SPREAD * usual + 1e-9)) ** 2))
-        moved = settled(mesh, along, mean, wanted, weight, stay).clip(moves[0], moves[-1])
+        moved, again = settled(mesh, along, mean, wanted, weight, stay)
+        if not (converged and again):
+            return mesh, f"its equations were not solved in {STEPS} steps, in round {number + 1} of {ROUNDS}"
+        moved = moved.clip(moves[0], moves[-1])
         # The two sides of a thin wall must not pass through each other.
         caster, skin = Caster(mesh), 1e-3 * finest * normal
         inwards, outwards = (caster.hits(mesh.vertices + way * skin, way * normal)[0] for way in (-1, 1))
@@ -131,7 +140,7 @@ def refine(mesh: Mesh, pictures: list[Picture], blocking: Caster, lift: float, f
         for _ in range(SMOOTHED):
             vertices = vertices + 0.5 * (told * ~low)[:, None] * (mean @ vertices - vertices)
         mesh = replace(mesh, vertices=vertices)
-    return mesh
+    return mesh, ""
 
 
 def agreement(
@@ -228,8 +237,9 @@ def best_places(score: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def settled(mesh: Mesh, normal: np.ndarray, mean: csr_matrix, wanted: np.ndarray, trust: np.ndarray,
-            stay: np.ndarray) -> np.ndarray:  # fmt: skip
+            stay: np.ndarray) -> tuple[np.ndarray, bool]:  # fmt: skip
     """How far each vertex moves [V] along its normal [V, 3]: where it is wanted [V], by trust [V], or smooth between.
+    And whether that is solved.
 
     Normals are shorter where vertices shall move less; `mean` [V, V] takes the mean of the neighbours, `stay` [V] is
     the trust in where the vertices are.
@@ -238,4 +248,5 @@ def settled(mesh: Mesh, normal: np.ndarray, mean: csr_matrix, wanted: np.ndarray
     inwards = ((bend @ mesh.vertices) * normal).sum(1)
     matrix = diags(trust + stay) + BENDING * (bend.T @ bend) - AREA * (bend + bend.T) / 2
     right = trust * wanted - BENDING * (bend.T @ inwards) + AREA * inwards
-    return cg(matrix.tocsr(), right, rtol=1e-3, maxiter=300)[0]
+    moved, failed = cg(matrix.tocsr(), right, rtol=1e-3, maxiter=STEPS)
+    return moved, failed == 0 and bool(np.isfinite(moved).all())

@@ -136,11 +136,13 @@ def run_worker(job: dict, folder: Path, timeout: float, on_progress: Progress) -
     log = folder / "colmap.log"
     write_json(folder / "job.json", job)
     root = str(Path(__file__).resolve().parents[2])
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])}
+    # An empty entry would be the user's folder, which may hold a `pipeline` too.
+    paths = [root, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
     lines = folder / "progress.log"
     with open(log, "wb") as errors, open(lines, "wb") as output:
         child = subprocess.Popen(
-            [sys.executable, "-m", "pipeline.sfm.worker", str(folder / "job.json")],
+            [sys.executable, "-P", "-m", "pipeline.sfm.worker", str(folder / "job.json")],
             stdout=output, stderr=errors, stdin=subprocess.DEVNULL, env=environment,
         )  # fmt: skip
         started = time.monotonic()

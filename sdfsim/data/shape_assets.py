@@ -14,7 +14,7 @@ import numpy as np
 from sdfsim.data.dataset import SOLID, check_names
 from sdfsim.data.pybullet_sim import write_urdf
 from sdfsim.errors import SdfsimError
-from sdfsim.files import read_json, write_json, write_text
+from sdfsim.files import read_json, visible, write_json, write_text
 from sdfsim.parallel import Progress, parallel
 from sdfsim.shape import primitives
 from sdfsim.shape.distance import PiecesDistance
@@ -95,8 +95,8 @@ def origins(shapes: Path | None, random_solids: int = 0, *, as_is: bool = False)
         # Kubric's `dome` is scenery, not one of its eleven bodies: it has no visual geometry.
         folders = sorted(p.parent for p in shapes.glob(f"*/{COLLISION}") if (p.parent / VISUAL).exists())
         found += [Origin(f.name, f / VISUAL, f / COLLISION, as_is=as_is) for f in folders]
-        if not as_is:
-            found += [Origin(f.stem, f) for f in sorted(shapes.glob("*")) if f.suffix.lower() in MESH_SUFFIXES]
+        if not as_is and shapes.is_dir():
+            found += [Origin(f.stem, f) for f in visible(shapes) if f.suffix.lower() in MESH_SUFFIXES]
         if not found:
             also = "" if as_is else ", or mesh files"
             raise SdfsimError(f"{shapes}: no shapes found", f"expected NAME/{VISUAL} and NAME/{COLLISION}{also}")

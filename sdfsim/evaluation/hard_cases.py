@@ -26,6 +26,7 @@ from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.everyday import KINDS, ROWS, SIZES, Setting, failures
 from sdfsim.evaluation.metrics import energy
 from sdfsim.evaluation.penetration import depths
+from sdfsim.files import visible
 from sdfsim.scene.scene import Body, Effects, Scene
 from sdfsim.shape.mesh import MESH_SUFFIXES
 from sdfsim.shape.shape import Shape, analytic_shape, shape_from_mesh, shape_from_primitive
@@ -663,7 +664,7 @@ def _everyday(row: str, settings: Sequence[Setting], model: Model) -> dict[str, 
 
 
 def _meshes(folder: Path) -> dict[str, Shape]:
-    files = sorted(f for f in folder.glob("*") if f.suffix.lower() in MESH_SUFFIXES)
+    files = [f for f in visible(folder) if f.suffix.lower() in MESH_SUFFIXES] if folder.is_dir() else []
     if not files:
         raise SdfsimError(f"{folder}: no meshes found", f"expected {', '.join(sorted(MESH_SUFFIXES))}")
     extents = {file: largest_extent(shape_from_mesh(file, sdf="mesh")) for file in files}

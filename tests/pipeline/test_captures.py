@@ -21,6 +21,7 @@ from pipeline.sfm.poses import solve
 from pipeline.sfm.supervision import depth_points, depth_scale
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.mesh import Mesh
+from tests.pipeline.conftest import noise
 from tests.pipeline.photo_sets import SAMPLES, TABLE_VASE
 
 sys.path.insert(0, str(SAMPLES))
@@ -225,3 +226,97 @@ def test_a_zip_does_not_write_outside_of_its_folder(tmp_path):
     with pytest.raises(SdfsimError, match="outside of the capture"):
         prepare_photos(tmp_path / "a.zip", tmp_path / "out")
     assert not (tmp_path / "outside.txt").exists() and not (tmp_path / "out" / "outside.txt").exists()
+
+
+def wrapped(given: Path, archive: Path, above: str, separator: str = "/", previews: int = 3) -> Path:
+    """A zip of a folder, or of what another zip holds, in one more folder, with what macOS and apps put beside it."""
+    import zipfile
+
+    if given.is_dir():
+        content = {path.relative_to(given).as_posix(): path.read_bytes() for path in given.rglob("*") if path.is_file()}
+    else:
+        with zipfile.ZipFile(given) as file:
+            content = {entry.filename: file.read(entry) for entry in file.infolist() if not entry.is_dir()}
+    with zipfile.ZipFile(archive, "w") as file:
+        for name, data in content.items():
+            place = Path(above) / name
+            file.writestr(str(place).replace("/", separator), data)
+            file.writestr(f"__MACOSX/{place.parent}/._{place.name}", b"\0\5\x16\7")
+            file.writestr(str(place.with_name(f"._{place.name}")), b"\0\5\x16\7")
+        file.writestr(f"{above}/.DS_Store", b"Bud1")
+        for number in range(previews):
+            file.writestr(f"thumbnail{number}.jpg", b"small")
+    return archive
+
+
+def cameras_of(given: Path, out: Path) -> list[View]:
+    out.mkdir()
+    photos, notes = prepare_photos(given, out)
+    assert not notes and all(photo.depth for photo in photos) and load_capture(out) is not None
+    return load_views(out / KNOWN_CAMERAS)
+
+
+@pytest.mark.parametrize(
+    ("layout", "above", "separator"),
+    [("record3d", "scan", "/"), ("polycam", "scan", "/"), ("polycam", "a/b", "/"), ("polycam", "scan", "\\")],
+)
+def test_a_zip_may_hold_its_capture_in_a_folder_beside_what_macos_adds(layout, above, separator, tmp_path):
+    given = capture(layout, tmp_path, exact=True)
+    plain = cameras_of(given, tmp_path / "plain")
+    found = cameras_of(wrapped(given, tmp_path / "w.zip", above, separator), tmp_path / "found")
+    assert len(found) == len(true_poses())
+    for one, other in zip(plain, found, strict=True):
+        assert one.source.split("/")[-1] == other.source.split("/")[-1] and one.focal == other.focal
+        np.testing.assert_array_equal(one.rotation, other.rotation)
+        np.testing.assert_array_equal(one.translation, other.translation)
+
+
+def test_an_unpacked_capture_may_lie_farther_below_with_files_of_macos(tmp_path):
+    given = capture("polycam", tmp_path, exact=True)
+    plain = cameras_of(given, tmp_path / "plain")
+    for file in list((given / "keyframes").rglob("*.*")):
+        file.with_name(f"._{file.name}").write_bytes(b"\0\5\x16\7")
+    (tmp_path / "top" / "scan").mkdir(parents=True)
+    given.rename(tmp_path / "top" / "scan" / "mine")
+    (tmp_path / "top" / "__MACOSX" / "keyframes" / "cameras").mkdir(parents=True)
+    (tmp_path / "top" / "__MACOSX" / "keyframes" / "cameras" / "0.json").write_text("{}")
+    found = cameras_of(tmp_path / "top", tmp_path / "found")
+    assert [view.focal for view in found] == [view.focal for view in plain] and len(found) == len(true_poses())
+    phone.write("polycam", tmp_path / "top" / "scan" / "other", every=EVERY)
+    with pytest.raises(SdfsimError, match=r"holds several captures: .*mine.*, .*other"):
+        find_source(tmp_path / "top")
+
+
+@pytest.mark.parametrize("photos", ["their own", "none of their own"])
+def test_the_better_cameras_of_polycam_do_not_say_how_large_their_photos_are(photos, tmp_path):
+    """Their photos say it. Where these were not exported, the other cameras with theirs are taken."""
+    given = capture("polycam", tmp_path, exact=True)
+    plain = cameras_of(given, tmp_path / "plain")
+    better = given / "keyframes" / "corrected_cameras"
+    better.mkdir()
+    for file in (given / "keyframes" / "cameras").iterdir():
+        about = json.loads(file.read_text())
+        del about["width"], about["height"]
+        (better / file.name).write_text(json.dumps(about | {"fx": about["fx"] * 1.01, "fy": about["fy"] * 1.01}))
+    factor = 1.0
+    if photos == "their own":
+        (given / "keyframes" / "images").rename(given / "keyframes" / "corrected_images")
+        factor = 1.01
+    found = cameras_of(given, tmp_path / "found")
+    assert [view.focal for view in found] == pytest.approx([factor * view.focal for view in plain])
+    assert [(view.width, view.height) for view in found] == [(view.width, view.height) for view in plain]
+
+
+def test_a_zip_of_photos_may_hold_them_in_a_folder_and_says_where_they_are_if_there_are_several(tmp_path):
+    names = [f"{k}.jpg" for k in range(3)]
+    given = wrapped(noise(tmp_path / "in", names), tmp_path / "a.zip", "holiday/day one", previews=1)
+    out = tmp_path / "out"
+    out.mkdir()
+    assert [photo.source for photo in prepare_photos(given, out)[0]] == names
+    noise(tmp_path / "in", [f"{side}/{name}" for side in ("left", "right") for name in names])
+    for name in names:
+        (tmp_path / "in" / name).unlink()
+    given = wrapped(tmp_path / "in", tmp_path / "b.zip", "holiday", previews=1)
+    (tmp_path / "other").mkdir()
+    with pytest.raises(SdfsimError, match=r"b\.zip: photos found: 1, .* 3 in .*b\.zip/holiday/left, 3 in"):
+        prepare_photos(given, tmp_path / "other")

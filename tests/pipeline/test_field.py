@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors.torch
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -165,10 +166,35 @@ def test_a_resumed_run_ends_as_an_undisturbed_one(tmp_path, one_thread):
         assert torch.equal(a, b)
 
 
-def test_a_broken_checkpoint_is_ignored(tmp_path):
-    path = tmp_path / "c.safetensors"
-    path.write_bytes(b"not a checkpoint")
-    assert not trainer().load(path)
+@pytest.mark.parametrize("damage", ["no checkpoint", "cut short", "no numbers", "a tensor less", "another field"])
+def test_a_checkpoint_that_cannot_be_read_is_told_and_leaves_nothing_behind(tmp_path, damage, one_thread):
+    path, before, run, untouched = tmp_path / "c.safetensors", trainer(), trainer(), trainer()
+    before.step()
+    before.save(path)
+    with safetensors.safe_open(str(path), "pt") as file:
+        about, tensors = file.metadata(), {key: file.get_tensor(key) for key in file.keys()}
+    if damage == "no checkpoint":
+        path.write_bytes(b"not a checkpoint")
+    elif damage == "cut short":
+        path.write_bytes(path.read_bytes()[:-100])
+    elif damage == "no numbers":
+        safetensors.torch.save_file(tensors, path)
+    elif damage == "a tensor less":
+        del tensors["field.background"]
+        safetensors.torch.save_file(tensors, path, metadata=about)
+    else:
+        safetensors.torch.save_file(tensors, path, metadata={"about": about["about"].replace("levels", "heights")})
+    with pytest.raises(SdfsimError, match="cannot be read") as caught:
+        run.load(path)
+    assert "\n" not in caught.value.message
+    assert run.iteration == 0 and run.seconds == 0 and not run.optimizer.state
+    untouched.step()
+    run.step()
+    for a, b in zip(untouched.field.parameters(), run.field.parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_no_checkpoint_is_no_fault(tmp_path):
     assert not trainer().load(tmp_path / "none")
 
 

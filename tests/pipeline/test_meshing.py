@@ -13,12 +13,13 @@ from PIL import Image
 from pipeline.cameras import Similarity, Sparse, View, load_views, save_views
 from pipeline.field.training import Trained
 from pipeline.inputs.photos import Photo, save_photos
-from pipeline.mesh import meshing
+from pipeline.mesh import meshing, photo_refining
 from pipeline.mesh.extraction import sample_box
 from pipeline.mesh.meshing import make_meshes, read_parts, rounded, trust_meshes
 from pipeline.mesh.photo_refining import Picture, refine
 from pipeline.mesh.placement import load_placement
 from pipeline.mesh.trust import GUESSED
+from pipeline.report import mesh_notes
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.bvh import Caster
 from sdfsim.shape.mesh import Mesh, is_closed, load_mesh, read_attributes, read_mesh
@@ -193,7 +194,8 @@ def off_the_ball(mesh: Mesh, where: np.ndarray) -> float:
 
 def test_a_body_that_came_out_too_small_and_bumpy_moves_to_where_the_photos_agree():
     body, pictures = ball_and_photos()
-    found = refine(body, pictures, Caster(body), 0.005, 0.02, lambda points: points[:, 2] + 1, 0.03)
+    found, why = refine(body, pictures, Caster(body), 0.005, 0.02, lambda points: points[:, 2] + 1, 0.03)
+    assert not why
     up = body.vertices[:, 2] > -0.1  # No camera looks from below.
     before, after = off_the_ball(body, up), off_the_ball(found, up)
     assert before > 0.005 and after < 0.4 * before
@@ -202,6 +204,31 @@ def test_a_body_that_came_out_too_small_and_bumpy_moves_to_where_the_photos_agre
 
 def test_photos_that_something_unknown_stands_before_do_not_count():
     body, pictures = ball_and_photos(blocked=3)
-    found = refine(body, pictures, Caster(body), 0.005, 0.02, lambda points: points[:, 2] + 1, 0.03)
+    found, why = refine(body, pictures, Caster(body), 0.005, 0.02, lambda points: points[:, 2] + 1, 0.03)
+    assert not why
     side = (body.vertices[:, 0] > 0.15) & (body.vertices[:, 2] > -0.1)
     assert off_the_ball(found, side) < 0.6 * off_the_ball(body, side)
+
+
+@pytest.mark.parametrize(
+    ("case", "words"),
+    [
+        ("two photos", "only 2 photos"),
+        ("blank photos", "nowhere do 3 photos"),
+        ("hard equations", "not solved in 1 steps"),
+    ],
+)
+def test_a_body_that_cannot_be_moved_stays_and_it_is_told_why(case, words, monkeypatch):
+    body, pictures = ball_and_photos()
+    if case == "two photos":
+        pictures = pictures[:2]
+    elif case == "blank photos":
+        pictures = [replace(picture, grey=np.full_like(picture.grey, 128)) for picture in pictures]
+    else:
+        monkeypatch.setattr(photo_refining, "STEPS", 1)
+    found, why = refine(body, pictures, Caster(body), 0.005, 0.02, lambda points: points[:, 2] + 1, 0.03)
+    assert words in why
+    np.testing.assert_array_equal(found.vertices, body.vertices)
+    assert f"ball: its surface was not moved all the way to where the photos agree: {why}" in mesh_notes(
+        {"unrefined": {"ball": why}}
+    )

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import struct
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import tifffile
 from PIL import ExifTags, Image, ImageOps
 
 from pipeline.inputs.images import read_photo
@@ -197,3 +200,237 @@ def test_the_original_size_is_that_of_the_file_however_it_is_decoded(tmp_path):
     image.save(tmp_path / "a.jpg", exif=exif)
     found = read_photo(tmp_path / "a.jpg", 100)  # The decoder skips to a quarter of the size or less.
     assert found.pixels.shape[:2] == (100, 67) and found.original == (667, 1001)
+
+
+RAMP = np.stack([np.tile(np.linspace(0, 1, 120), (80, 1)), np.tile(np.linspace(0, 1, 80)[:, None], (1, 120)),
+                 np.full((80, 120), 0.5)], 2)  # fmt: skip
+EIGHT = (255 * RAMP + 0.5).astype(int)
+
+
+def png16(values: np.ndarray) -> bytes:
+    """A PNG of 16 bits a channel, written by hand: grey, grey and alpha, RGB or RGBA [H, W, C]."""
+
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    height, width, channels = values.shape
+    header = struct.pack(">IIBBBBB", width, height, 16, {1: 0, 2: 4, 3: 2, 4: 6}[channels], 0, 0, 0)
+    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in values)
+    parts = chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(rows)), chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+def shown(path: Path) -> np.ndarray:
+    return read_photo(path, 120).pixels.astype(int)
+
+
+@pytest.mark.parametrize("form", ["png", "tiff", "lzw", "big endian", "tiles"])
+@pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
+def test_ten_and_twelve_bits_in_a_file_of_sixteen_are_as_bright_as_eight(tmp_path, bits, form):
+    values = ((2**bits - 1) * RAMP + 0.5).astype(np.uint16)
+    for colour in (True, False):
+        stored = values if colour else values[..., :1]
+        path = tmp_path / f"{colour}.{'png' if form == 'png' else 'tif'}"
+        if form == "png":
+            path.write_bytes(png16(stored))
+        else:
+            how: dict[str, dict[str, Any]] = {
+                "lzw": {"compression": "lzw"},
+                "big endian": {"byteorder": ">"},
+                "tiles": {"tile": (16, 16)},
+            }
+            kind = "rgb" if colour else "minisblack"
+            tifffile.imwrite(path, np.squeeze(stored), photometric=kind, **how.get(form, {}))
+        assert np.abs(shown(path) - (EIGHT if colour else EIGHT[..., :1])).max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("values", "kind", "wanted"),
+    [
+        (RAMP.astype(np.float32), "rgb", EIGHT),
+        (RAMP, "rgb", EIGHT),
+        (RAMP[..., 0].astype(np.float32), "minisblack", EIGHT[..., :1]),
+        ((255 * RAMP).astype(np.float32), "rgb", EIGHT),
+        ((4 * RAMP).astype(np.float32), "rgb", EIGHT),
+        ((65535 * RAMP).astype(np.float32), "rgb", EIGHT),
+        ((65535 * (1 - RAMP[..., 0])).astype(np.uint16), "miniswhite", EIGHT[..., :1]),
+        ((32767 * RAMP[..., 0]).astype(np.int16), "minisblack", EIGHT[..., :1]),
+        ((2.0**32 * 0.999 * RAMP).astype(np.uint32), "rgb", EIGHT),
+        (np.where(RAMP < 0.1, np.nan, RAMP).astype(np.float32), "rgb", np.where(RAMP < 0.1, 0, EIGHT)),
+    ],
+    ids=["float", "double", "grey float", "float to 255", "float to 4", "float to 65535", "white is zero", "signed",
+         "32 bits", "no number"],
+)  # fmt: skip
+def test_other_kinds_of_tiff_are_brought_to_the_range_that_is_there(tmp_path, values, kind, wanted):
+    tifffile.imwrite(tmp_path / "a.tif", values, photometric=kind)
+    assert np.abs(shown(tmp_path / "a.tif") - wanted).max() <= 1
+
+
+REFUSED = ["planes", "float planes", "half", "below 0", "zstd", "cut", "cut float", "five", "lab"]
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_deep_files_that_cannot_be_read_right_are_refused(tmp_path, case, capfd):
+    path, deep = tmp_path / "a.tif", (65535 * RAMP).astype(np.uint16)
+    planes: dict[str, Any] = {"planarconfig": "separate", "photometric": "rgb"}
+    if case in ("planes", "float planes"):
+        values = deep if case == "planes" else RAMP.astype(np.float32)
+        tifffile.imwrite(path, np.ascontiguousarray(values.transpose(2, 0, 1)), **planes)
+    elif case == "half":
+        tifffile.imwrite(path, RAMP.astype(np.float16), photometric="rgb")
+    elif case == "below 0":
+        tifffile.imwrite(path, (2 * RAMP - 1).astype(np.float32), photometric="rgb")
+    elif case == "zstd":
+        tifffile.imwrite(path, deep, photometric="rgb", compression="zstd")
+    elif case == "five":
+        tifffile.imwrite(path, np.dstack([deep, deep[..., :2]]), photometric="rgb", planarconfig="contig",
+                         extrasamples=["unspecified"] * 2)  # fmt: skip
+    elif case == "lab":
+        tifffile.imwrite(path, deep, photometric="cielab")
+    else:
+        tifffile.imwrite(path, deep if case == "cut" else RAMP.astype(np.float32), photometric="rgb")
+        path.write_bytes(path.read_bytes()[:-20_000])
+    capfd.readouterr()
+    with pytest.raises(SdfsimError, match=r"a\.tif: ") as caught:
+        read_photo(path, 120)
+    assert "\n" not in caught.value.message and caught.value.hint
+    assert "ERROR" not in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(("bits", "opaque"), [(12, 4095), (12, 65535), (16, 65535)])
+def test_deep_alpha_is_a_mask_in_its_own_range(tmp_path, bits, opaque):
+    inside = np.zeros((80, 120, 1))
+    inside[20:] = 1
+    for name, values in (("rgba", RAMP), ("la", RAMP[..., :1])):
+        whole = np.concatenate([(2**bits - 1) * values, opaque * inside], 2).astype(np.uint16)
+        (tmp_path / f"{name}.png").write_bytes(png16(whole))
+        found = read_photo(tmp_path / f"{name}.png", 120)
+        np.testing.assert_array_equal(found.mask, 255 * inside[..., 0])
+        assert np.abs(found.pixels[20:].astype(int) - (EIGHT if name == "rgba" else EIGHT[..., :1])[20:]).max() <= 1
+    tifffile.imwrite(tmp_path / "x.tif", np.concatenate([(2**bits - 1) * RAMP, 0 * inside], 2).astype(np.uint16),
+                     photometric="rgb", extrasamples=["unspecified"])  # fmt: skip
+    found = read_photo(tmp_path / "x.tif", 120)
+    assert found.mask is None and np.abs(found.pixels.astype(int) - EIGHT).max() <= 1  # infrared, say
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("kind", ["png", "tiff", "float"])
+def test_deep_photos_are_turned_upright(tmp_path, orientation, kind):
+    deep = (4095 * RAMP).astype(np.uint16)
+    path = tmp_path / ("a.png" if kind == "png" else "a.tif")
+    if kind == "png":
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = orientation
+        body = exif.tobytes()[6:]
+        chunk = struct.pack(">I", len(body)) + b"eXIf" + body + struct.pack(">I", zlib.crc32(b"eXIf" + body))
+        data = png16(deep)
+        path.write_bytes(data[:33] + chunk + data[33:])
+    else:
+        tifffile.imwrite(path, RAMP.astype(np.float32) if kind == "float" else deep, photometric="rgb",
+                         extratags=[(274, 3, 1, orientation, True)])  # fmt: skip
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    eight = Image.fromarray(EIGHT.astype(np.uint8))
+    eight.save(tmp_path / "eight.png", exif=exif)
+    upright = np.asarray(ImageOps.exif_transpose(Image.open(tmp_path / "eight.png"))).astype(int)
+    found = read_photo(path, 120)
+    assert found.original == upright.shape[1::-1] and np.abs(found.pixels.astype(int) - upright).max() <= 1
+    as_stored = read_photo(path, 120, shape=120 / 80)  # what a known camera may ask for
+    if orientation >= 5:
+        assert np.abs(as_stored.pixels.astype(int) - EIGHT).max() <= 1
+
+
+def test_deep_photos_of_one_set_keep_their_brightness_beside_each_other(tmp_path):
+    """The second was taken with a quarter of the light, though it then needs only ten bits."""
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for name, factor in (("a", 1.0), ("b", 0.24), ("c", 1.0)):
+        (folder / f"{name}.png").write_bytes(png16((4095 * factor * RAMP).astype(np.uint16)))
+    prepare_photos(folder, tmp_path, long_side=120)
+    found = [np.asarray(Image.open(tmp_path / "images" / f"000{k}.jpg")).astype(int) for k in range(3)]
+    assert np.abs(found[0] - EIGHT).mean() < 2 and np.abs(found[1] - 0.24 * EIGHT).mean() < 2
+
+
+def test_dark_photos_are_told_apart_from_blurred_ones(tmp_path):
+    fill(tmp_path / "in")
+    for name, factor in (("dark", 0.05), ("dim", 0.4)):
+        Image.fromarray((factor * np.asarray(picture())).astype(np.uint8)).save(tmp_path / "in" / f"{name}.png")
+    picture().resize((12, 8)).resize((120, 80)).save(tmp_path / "in" / "soft.png")
+    photos, notes = prepare_photos(tmp_path / "in", tmp_path, long_side=120)
+    assert {p.source: p.fault for p in photos if p.fault} == {"dark.png": "too dark", "soft.png": "blurred"}
+    assert notes == ["1 of 6 photos are too dark, take them again with more light: dark.png",
+                     "1 of 6 photos are blurred, take them again: soft.png"]  # fmt: skip
+
+
+def test_cmyk_palette_and_grey_show_what_they_show(tmp_path):
+    image = Image.fromarray(EIGHT.astype(np.uint8))
+    ink = np.dstack([255 - EIGHT, np.zeros((80, 120))]).astype(np.uint8)
+    Image.fromarray(ink, "CMYK").save(tmp_path / "cmyk.jpg", quality=98, subsampling=0)
+    image.quantize(256).save(tmp_path / "palette.png")
+    image.convert("L").save(tmp_path / "grey.jpg", quality=98)
+    image.convert("LA").save(tmp_path / "grey.png")
+    grey = EIGHT @ [0.299, 0.587, 0.114]
+    for name, wanted, close in (("cmyk.jpg", EIGHT, 3), ("palette.png", EIGHT, 8), ("grey.jpg", grey[..., None], 3),
+                                ("grey.png", grey[..., None], 1)):  # fmt: skip
+        assert np.abs(shown(tmp_path / name) - wanted).mean() < close, name
+        assert read_photo(tmp_path / name, 120).mask is None
+
+
+@pytest.mark.parametrize("high", [1, 255, 1023, 4095, 65535])
+def test_white_of_a_mask_is_its_largest_value(tmp_path, high):
+    picture().save(tmp_path / "a.png")
+    inside = np.zeros((80, 120), bool)
+    inside[:, 50:] = True
+    Image.fromarray((high * inside).astype(np.uint8 if high < 256 else np.uint16)).save(tmp_path / "mask.png")
+    np.testing.assert_array_equal(read_photo(tmp_path / "a.png", 120, tmp_path / "mask.png").mask, 255 * inside)
+
+
+# 96 x 64 px as an iPhone writes it: turned by a quarter (in EXIF and in the file's own way), 36 mm. Its left quarter is
+# red, the rest blue. Written by pillow-heif.
+HEIC = """
+AAAAHGZ0eXBoZWljAAAAAG1pZjFoZWljbWlhZgAAAaFtZXRhAAAAAAAAACFoZGxyAAAAAAAAAABwaWN0AAAAAAAAAAAAAAAAAAAAADRpbG9jAAAAAERA
+AAIAAQAAAAABxQABAAAAAAAAAEkAAgAAAAACDgABAAAAAAAAAFQAAAA4aWluZgAAAAAAAgAAABVpbmZlAgAAAAABAABodmMxAAAAABVpbmZlAgAAAQAC
+AABFeGlmAAAAAA5waXRtAAAAAAABAAAA4GlwcnAAAADAaXBjbwAAAHhodmNDAQNwAAAAkAAAAAAAHvAA/P34+AAADwNgAAEAGEABDAH//wNwAAADAJAA
+AAMAAAMAHroCQGEAAQArQgEBA3AAAAMAkAAAAwAAAwAeoDCBBZbqSSmubgIaDAgAAAMAyAAAAwAIQGIAAQAHRAHBcrAiQAAAABNjb2xybmNseAABAA0A
+BoAAAAAUaXNwZQAAAAAAAABgAAAAQAAAABBwaXhpAAAAAAMICAgAAAAJaXJvdAMAAAAYaXBtYQAAAAAAAAABAAEFgQIDBIUAAAAaaXJlZgAAAAAAAAAO
+Y2RzYwACAAEAAQAAAKVtZGF0AAAARSgBrwngi/+rxU//Okf/5YOy98tSVQI/8G4O8n7/+bxQa4JCNzWwSDw86bFHD0YICg1JpvEHZgNoPmU3iHA1bk3L
+fdHZYAAAAAZFeGlmAABNTQAqAAAACAADAQ8AAgAAAAYAAAAyARIAAwAAAAEABgAAh2kABAAAAAEAAAA4AAAAAE1ha2VyAAABpAUAAwAAAAEAJAAAAAAA
+AA==
+"""
+
+
+@pytest.mark.parametrize("name", ["a.heic", "a.HEIF", "a.hif", "a.jpg"])
+def test_heic_is_read_upright_with_its_exif(tmp_path, name):
+    fill(tmp_path / "in", 2)
+    (tmp_path / "in" / name).write_bytes(base64.b64decode(HEIC))
+    photos, notes = prepare_photos(tmp_path / "in", tmp_path, long_side=120)
+    (photo,) = [p for p in photos if p.source == name]
+    assert not any("used" in note for note in notes)
+    assert (photo.width, photo.height) == photo.original == (64, 96)
+    assert photo.focal == pytest.approx(96.0) and photo.camera == "Maker"
+    pixels = read_photo(tmp_path / "in" / name, 120).pixels.astype(int)
+    assert np.abs(pixels[:20] - [250, 40, 40]).max() <= 4 and np.abs(pixels[28:] - [30, 60, 200]).max() <= 4
+
+
+@pytest.mark.parametrize("kind", ["AVIF", "WEBP"])
+def test_avif_and_webp_are_read(tmp_path, kind):
+    Image.fromarray(EIGHT.astype(np.uint8)).save(tmp_path / f"a.{kind.lower()}", quality=95)
+    assert np.abs(shown(tmp_path / f"a.{kind.lower()}") - EIGHT).mean() < 3
+    fill(tmp_path, 2)
+    assert len(prepare_photos(tmp_path, tmp_path / "out")[0]) == 3
+
+
+def cut(kind: str) -> bytes:
+    if kind == "heic":
+        data = base64.b64decode(HEIC)
+    else:
+        data = png16((65535 * RAMP).astype(np.uint16)) if kind == "png" else encoded(kind.upper(), 400, 300)
+    return data[: len(data) * 2 // 3]
+
+
+@pytest.mark.parametrize("kind", ["heic", "avif", "webp", "png"])
+def test_files_of_other_kinds_that_were_cut_are_one_clear_line(tmp_path, kind):
+    (tmp_path / f"a.{kind}").write_bytes(cut(kind))
+    with pytest.raises(SdfsimError, match=rf"a\.{kind}: .*(truncated|cut short|cannot be decoded)") as caught:
+        read_photo(tmp_path / f"a.{kind}", 120)
+    assert "\n" not in caught.value.message

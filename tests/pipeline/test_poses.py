@@ -171,6 +171,23 @@ def test_a_crash_of_the_child_is_one_clear_line(tmp_path):
     assert "COLMAP failed" in caught.value.message and "colmap.log" in caught.value.message
 
 
+@pytest.mark.parametrize("path", [None, "", ":"])
+def test_the_child_imports_nothing_of_the_users_folder(path, tmp_path, monkeypatch):
+    """Whatever it is called there."""
+    for name in ("pipeline", "json", "numpy"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text(f"open({str(tmp_path / 'marker')!r}, 'w')\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PYTHONPATH", raising=False)
+    if path is not None:
+        monkeypatch.setenv("PYTHONPATH", path)
+    job = {**ORDINARY, "count": 3, "exhaustive_up_to": 100, "pairs": None}
+    with pytest.raises(SdfsimError, match="COLMAP failed"):
+        run_worker(job, tmp_path / "work", 60, lambda fraction, message: None)
+    assert not (tmp_path / "marker").exists()
+    assert "KeyError" in (tmp_path / "work" / "colmap.log").read_text()  # ours ran, and the job lacks what it needs
+
+
 def test_a_child_that_hangs_is_ended(tmp_path, monkeypatch):
     script = tmp_path / "sleep.sh"
     script.write_text("#!/bin/sh\nexec sleep 60\n")

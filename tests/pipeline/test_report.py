@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from pipeline.cameras import save_views
-from pipeline.report import write_recording
+from pipeline.options import Options
+from pipeline.report import improvements, write_recording
 from pipeline.sfm.pose_checks import check, views_of
 from pipeline.stages import reconstruct
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
@@ -52,3 +53,29 @@ def test_a_run_that_stopped_says_where_and_why(photos, tmp_path, act):
     }  # fmt: skip
     assert report["poses"]["posed"] == 1 and any("too little to see" in line for line in report["improve"])
     assert "It stopped in the poses stage" in (tmp_path / "out" / "report.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (Options(preset="quick"), "--preset standard"),
+        (Options(preset="standard"), "--preset fine"),
+        (Options(preset="fine"), "more and sharper photos"),
+        (Options(preset="paper"), "more and sharper photos"),
+        (Options(preset="standard", budget=60.0), "a larger --budget"),
+    ],
+)
+def test_nobody_is_told_to_do_what_they_did(options, said, photos, tmp_path, act):
+    (line,) = improvements({"poses": {}, "stages": {}, "photos": [], "psnr": 12.0, "failed_checks": []}, options)
+    assert said in line and f"--preset {options.preset}" not in line
+
+    def failing(**places):
+        raise SdfsimError("mesh: the field holds no surface", exit_code=EXIT_QUALITY)
+
+    for stage in ("photos", "poses", "distill"):
+        act(stage, lambda run, work: {})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pipeline.mesh.meshing.make_meshes", lambda *places, **named: failing())
+        with pytest.raises(SdfsimError, match="no surface") as caught:
+            reconstruct(photos, tmp_path / "out", preset=options.preset, budget=options.budget)
+    assert said in caught.value.hint and f"--preset {options.preset}" not in caught.value.hint

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from pipeline.cameras import load_views
-from pipeline.inputs.known_cameras import read_cameras
+from pipeline.inputs.known_cameras import PARAMETERS, read_cameras
 from pipeline.inputs.photos import KNOWN_CAMERAS, load_photos, prepare_photos
 from pipeline.inputs.sources import find_source
 from sdfsim.errors import SdfsimError
@@ -284,3 +284,209 @@ def test_colmap_reads_the_model_as_we_do(tmp_path):
         np.testing.assert_allclose(one.lens.matrix, other.lens.matrix)
         np.testing.assert_allclose(one.rotation, other.rotation, atol=1e-12)
         np.testing.assert_allclose(one.translation, other.translation, atol=1e-12)
+
+
+def names_of(folder: Path) -> list[str]:
+    return [path.name for path in find_source(folder).photos]
+
+
+@pytest.mark.parametrize(("count", "size"), [(1, (64, 64)), (3, (64, 64)), (5, (64, 64)), (2, SIZE)])
+def test_previews_beside_the_folder_of_the_photos_are_passed_over(tmp_path, count, size):
+    noise(tmp_path / "images", NAMES)
+    noise(tmp_path, [f"preview{k}.jpg" for k in range(count)], size)
+    noise(tmp_path / "thumbnails", NAMES, (64, 64))
+    assert names_of(tmp_path) == NAMES and find_source(tmp_path).folder == tmp_path / "images"
+    assert "photos beside the folder images are not used" in find_source(tmp_path).notes[0]
+
+
+def test_a_few_pictures_in_a_folder_images_do_not_take_the_place_of_the_photos(tmp_path):
+    names = [f"{k}.jpg" for k in range(6)]
+    noise(tmp_path, names)
+    noise(tmp_path / "images", NAMES)
+    assert names_of(tmp_path) == names
+
+
+def test_it_is_told_where_photos_are_if_they_lie_deeper(tmp_path):
+    noise(tmp_path / "card" / "DCIM" / "100", NAMES)
+    noise(tmp_path / "card" / "DCIM" / "101" / "images", [*NAMES, "d.jpg"])
+    with pytest.raises(SdfsimError, match=r"card: photos found: 0, .*below it are 3 in .*DCIM/100, 4 in .*DCIM/101$"):
+        find_source(tmp_path / "card")
+    noise(tmp_path / "card", NAMES[:2])
+    with pytest.raises(SdfsimError, match=r"photos found: 2, .*3 in .*DCIM/100"):
+        find_source(tmp_path / "card")
+    write_text_model(tmp_path / "set" / "sparse" / "0")
+    with pytest.raises(SdfsimError, match="sparse/0 holds cameras"):
+        find_source(tmp_path / "set")
+
+
+def test_files_that_macos_adds_are_no_photos_and_no_masks(tmp_path):
+    noise(tmp_path / "in" / "images", NAMES)
+    for folder in ("masks", "masks/cup", "masks/__MACOSX"):
+        noise(tmp_path / "in" / folder, ["a.png"])
+    for file in list((tmp_path / "in").rglob("*.*")):
+        file.with_name(f"._{file.name}").write_bytes(b"\0\5\x16\7")
+    source = find_source(tmp_path / "in")
+    assert names_of(tmp_path / "in") == NAMES and source.labels.names == ("cup",) and not source.notes
+    assert not [path for path in source.files() if path.name.startswith("._")]
+
+
+def test_a_model_may_lie_in_colmap_sparse_0_beside_the_photos_and_previews(tmp_path):
+    noise(tmp_path / "images", NAMES)
+    noise(tmp_path, NAMES, (64, 64))
+    write_text_model(tmp_path / "colmap" / "sparse" / "0")
+    assert find_source(tmp_path / "colmap" / "sparse" / "0").folder == tmp_path / "images"
+
+
+@pytest.mark.parametrize("place", ["images\\left\\", ".\\images\\left\\", "C:\\Users\\me\\scan\\images\\", "/home/me/"])
+def test_names_of_windows_and_of_other_computers_find_their_photos(tmp_path, place):
+    folder = tmp_path / "images" / ("left" if "left" in place else "")
+    noise(folder, NAMES)
+    noise(tmp_path / "masks", ["a.png", "b.png", "c.png"])
+    given = write_transforms(tmp_path, [place + name for name in NAMES])
+    about = json.loads(given.read_text())
+    for frame, name in zip(about["frames"], "abc", strict=True):
+        frame["mask_path"] = f"masks\\{name}.png"
+    given.write_text(json.dumps(about))
+    source = find_source(given)
+    assert list(source.photos) == [folder / name for name in NAMES]
+    assert [source.masks[folder / name] for name in NAMES] == [tmp_path / "masks" / f"{name[0]}.png" for name in NAMES]
+    write_text_model(tmp_path / "sparse" / "0")
+    images = tmp_path / "sparse" / "0" / "images.txt"
+    images.write_text("".join(line.replace(" 1 ", f" 1 {place}") if ".jpg" in line else line
+                              for line in images.read_text().splitlines(keepends=True)))  # fmt: skip
+    assert sorted(find_source(tmp_path / "sparse" / "0").photos) == [folder / name for name in NAMES]
+
+
+def test_the_photos_of_windows_keep_their_names_where_a_file_is_called_like_that(tmp_path):
+    noise(tmp_path, ["a\\b.jpg", "c.jpg", "d.jpg"])
+    assert find_source(write_transforms(tmp_path, ["a\\b.jpg", "c.jpg", "d.jpg"])).photos[0].name == "a\\b.jpg"
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_camera_files_may_begin_with_a_byte_order_mark(tmp_path, encoding):
+    noise(tmp_path / "images", NAMES)
+    given = write_transforms(tmp_path, [f"images/{name}" for name in NAMES])
+    write_text_model(tmp_path / "sparse")
+    for file in (given, tmp_path / "sparse" / "cameras.txt", tmp_path / "sparse" / "images.txt"):
+        file.write_bytes(file.read_text().encode(encoding))
+    assert len(find_source(given).photos) == len(find_source(tmp_path / "sparse").photos) == 3
+
+
+HEADER = "# Image list with two lines of data per image:\n"
+FIRST, SECOND, THIRD = (f"{k + 1} 1 0 0 0 {k} 0 0 1 {name}" for k, name in enumerate(NAMES))
+POINTS = "1.0 2.0 -1 3.5 4.5 7"
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        [FIRST, POINTS, SECOND, POINTS, THIRD, POINTS],
+        [FIRST, "", SECOND, "", THIRD, ""],
+        [FIRST, "", SECOND, POINTS, THIRD],
+        ["", FIRST, POINTS, "", "", SECOND, "", "", THIRD, POINTS, ""],
+        [FIRST, "  ", "", SECOND, " # a remark", POINTS, "", THIRD],
+        [FIRST, SECOND, THIRD],
+    ],
+)
+def test_lines_of_images_may_be_empty(tmp_path, lines):
+    write_text_model(tmp_path / "m")
+    (tmp_path / "m" / "images.txt").write_text(HEADER + "\n".join(lines) + "\n")
+    found = read_cameras(tmp_path / "m")
+    assert [camera.name for camera in found] == NAMES
+    assert [camera.translation.tolist() for camera in found] == [[0, 0, 0], [1, 0, 0], [2, 0, 0]]
+
+
+@pytest.mark.parametrize(
+    ("line", "camera", "words"),
+    [
+        ("1 1 0 0 0 0 0 0 1", None, "images.txt: line 2: not an image's number"),
+        ("1 1 0 0 0 0 0 0 9 a.jpg", None, "a.jpg: there is no camera 9"),
+        (None, "1 SIMPLE_RADIAL 120 90 100 60 45", r"camera 1: 3 parameters, SIMPLE_RADIAL has 4 \(f cx cy k1\)"),
+        (None, "one PINHOLE 120 90 100 60 45", "cameras.txt: line 2: not a camera's number"),
+        (None, "1 EUCM 120 90 100 100 60 45 0 1", "the camera model EUCM is not read"),
+    ],
+)
+def test_what_is_wrong_in_a_text_model_is_named(tmp_path, line, camera, words):
+    write_text_model(tmp_path / "m", camera or "1 SIMPLE_PINHOLE 120 90 100 60 45")
+    if line:
+        (tmp_path / "m" / "images.txt").write_text(HEADER + line + "\n")
+    with pytest.raises(SdfsimError, match=words) as caught:
+        read_cameras(tmp_path / "m")
+    assert "\n" not in caught.value.message
+
+
+@pytest.mark.parametrize(("number", "name"), [(7, "FOV"), (11, "RAD_TAN_THIN_PRISM_FISHEYE"), (99, "of number 99")])
+def test_a_camera_model_that_is_not_read_is_named(tmp_path, number, name):
+    write_binary_model(tmp_path / "m")
+    (tmp_path / "m" / "cameras.bin").write_bytes(struct.pack("<QIiQQ3d", 1, 7, number, 120, 90, *SIMPLE))
+    with pytest.raises(SdfsimError, match=f"the camera model {name} is not read") as caught:
+        read_cameras(tmp_path / "m")
+    assert "SIMPLE_RADIAL" in caught.value.hint
+
+
+@pytest.mark.parametrize("form", ["3 x 4", "16", "12"])
+def test_a_matrix_may_have_three_rows_or_be_flat(tmp_path, form):
+    given = write_transforms(tmp_path)
+    wanted = read_cameras(given)
+    about = json.loads(given.read_text())
+    for frame in about["frames"]:
+        rows = np.array(frame["transform_matrix"])[: 4 if form == "16" else 3]
+        frame["transform_matrix"] = rows.tolist() if form == "3 x 4" else rows.ravel().tolist()
+    given.write_text(json.dumps(about))
+    for one, other in zip(wanted, read_cameras(given), strict=True):
+        np.testing.assert_array_equal(one.rotation, other.rotation)
+        np.testing.assert_array_equal(one.translation, other.translation)
+
+
+@pytest.mark.parametrize(("rows", "columns", "words"), [(4, 4, "last row"), (4, 3, "4 x 3"), (3, 3, "3 x 3")])
+def test_a_matrix_by_columns_or_of_another_shape_is_refused(tmp_path, rows, columns, words):
+    given = write_transforms(tmp_path)
+    about = json.loads(given.read_text())
+    for frame in about["frames"]:
+        frame["transform_matrix"] = np.array(frame["transform_matrix"]).T[:rows, :columns].tolist()
+    given.write_text(json.dumps(about))
+    with pytest.raises(SdfsimError, match=rf"a\.jpg: transform_matrix: .*{words}"):
+        read_cameras(given)
+
+
+CURVED = {
+    "SIMPLE_PINHOLE": [100, 60, 45], "PINHOLE": [100, 104, 60, 45], "SIMPLE_RADIAL": [100, 60, 45, -0.1],
+    "RADIAL": [100, 60, 45, -0.1, 0.02], "OPENCV": [100, 104, 60, 45, -0.1, 0.02, 0.003, -0.002],
+    "FULL_OPENCV": [100, 104, 60, 45, -0.1, 0.02, 0.003, -0.002, 0.01, 0.02, -0.01, 0.004],
+    "SIMPLE_FISHEYE": [80, 60, 45], "FISHEYE": [80, 84, 60, 45], "SIMPLE_RADIAL_FISHEYE": [80, 60, 45, 0.05],
+    "RADIAL_FISHEYE": [80, 60, 45, 0.05, -0.02], "OPENCV_FISHEYE": [80, 84, 60, 45, 0.05, -0.02, 0.004, -0.001],
+}  # fmt: skip
+LOCAL = np.random.default_rng(0).uniform([-0.5, -0.4, 1], [0.5, 0.4, 1], (20, 3))
+
+
+@pytest.fixture(scope="module")
+def projected() -> dict[str, list]:
+    """Where COLMAP puts the rays `LOCAL` in the photo of each of its lenses; in a process of its own."""
+    import subprocess
+    import sys
+
+    code = "import zlib, pycolmap, json, sys\nlenses, rays = json.loads(sys.argv[1])\n"
+    code += "put = lambda model, values: pycolmap.Camera(model=model, width=120, height=90, params=values)\n"
+    code += "print(json.dumps({m: put(m, v).img_from_cam(rays).tolist() for m, v in lenses.items()}))"
+    told = json.dumps([CURVED, LOCAL.tolist()])
+    done = subprocess.run([sys.executable, "-c", code, told], check=True, capture_output=True, text=True)
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("kind", ["transforms", "text"])
+@pytest.mark.parametrize("model", CURVED)
+def test_each_lens_is_colmaps_in_every_format(tmp_path, model, kind, projected):
+    noise(tmp_path, NAMES)
+    values = CURVED[model]
+    if kind == "text":
+        write_text_model(tmp_path / "sparse", f"1 {model} 120 90 {' '.join(map(str, values))}")
+        given = tmp_path / "sparse"
+    else:
+        names = PARAMETERS[model]
+        known = {{"f": "fl_x", "fx": "fl_x", "fy": "fl_y"}.get(n, n): v for n, v in zip(names, values, strict=True)}
+        given = write_transforms(tmp_path, camera_model=model, **known)
+    prepared, _ = prepare_photos(given, fresh(tmp_path / "out"))
+    view = load_views(tmp_path / "out" / KNOWN_CAMERAS)[0]
+    points = (LOCAL - view.translation) @ view.rotation
+    found = prepared[0].prepared(np.array(projected[model]), view)
+    np.testing.assert_allclose(found, view.project(points)[0], atol=1e-6)

@@ -19,7 +19,7 @@ from pipeline.stages import STAGES, begin, finish, reconstruct, run_stage
 from sdfsim.errors import SdfsimError
 from sdfsim.files import locked
 from tests.cli.conftest import run as command
-from tests.pipeline.conftest import RESULTS
+from tests.pipeline.conftest import RESULTS, noise
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 NAMES = list(STAGES)
@@ -74,6 +74,25 @@ def test_another_photo_changes_everything(photos, tmp_path, calls):
     Image.new("RGB", (80, 80)).save(photos / "9.png")
     reconstruct(photos, tmp_path / "out")
     assert calls == NAMES
+
+
+def test_a_mask_of_another_name_or_content_changes_everything(photos, tmp_path, calls):
+    """The name of its folder is that of its body."""
+    noise(photos / "masks" / "cup", ["0.png", "1.png", "2.png"], (80, 80))
+    reconstruct(photos, tmp_path / "out")
+    for change in (
+        lambda: (photos / "masks" / "cup").rename(photos / "masks" / "mug"),
+        lambda: (photos / "masks" / "mug" / "0.png").write_bytes((photos / "masks" / "mug" / "1.png").read_bytes()),
+        lambda: (photos / "masks" / "mug" / "2.png").unlink(),
+    ):
+        change()
+        calls.clear()
+        reconstruct(photos, tmp_path / "out")
+        assert calls == NAMES
+    calls.clear()
+    photos.rename(tmp_path / "moved")
+    reconstruct(tmp_path / "moved", tmp_path / "out")
+    assert calls == []
 
 
 def test_a_killed_stage_goes_on_in_its_own_folder(photos, tmp_path, calls, act):

@@ -16,6 +16,7 @@ from pipeline.field import training
 from pipeline.field.rendering import sdf_cache
 from pipeline.field.training import FEWEST_STEPS, HELD_OUT, PRESETS, Trainer, compare, load_rays, paced, score, train
 from pipeline.inputs.photos import save_photos
+from pipeline.report import notes
 from tests.pipeline.test_field import SMALL, posed_noise
 from tests.pipeline.test_poses import photo
 
@@ -181,3 +182,14 @@ def test_a_run_that_goes_on_has_what_is_left_of_its_budget(tmp_path, clock):
     assert report["resumed"] and report["seconds_before"] == 100.0
     assert report["train_seconds"] == pytest.approx(150.0, abs=training.PACE)
     assert report["train_seconds"] <= 150.0 and report["iterations"] == report["train_seconds"]
+
+
+def test_what_a_killed_run_had_trained_is_not_lost_in_silence(tmp_path, clock):
+    views, sparse = posed_noise(tmp_path)
+    (tmp_path / "checkpoint.safetensors").write_bytes(b"half")
+    told: list[str] = []
+    report = train(views, sparse, tmp_path, tmp_path, settings=replace(SETTINGS, iterations=20),
+                   on_progress=lambda fraction, message: told.append(message)).report  # fmt: skip
+    assert not report["resumed"] and report["iterations"] == 20
+    assert "what a killed run had trained is lost: checkpoint.safetensors cannot be read" in told[0]
+    assert notes({"distill": report}) == report["notes"] == told[:1]
