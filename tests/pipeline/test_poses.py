@@ -476,6 +476,7 @@ def test_twenty_photos_of_one_or_two_zooms_are_posed_right(tmp_path, zooms):
     assert [view.focal / focals[view.source] for view in views] == pytest.approx([1.0] * 20, abs=0.02)
     found, true = np.array([v.center for v in views]), np.array([centers[v.source] for v in views])
     move = estimate_sim3d(found, true)
+    assert move
     off = np.linalg.norm(move.scale * found @ move.rotation.matrix().T + move.translation - true, axis=1)
     assert off.max() < 0.01 * np.linalg.norm(true - true.mean(0), axis=1).mean()
 
