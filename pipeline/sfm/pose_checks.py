@@ -10,17 +10,18 @@ from scipy.sparse.csgraph import connected_components
 
 from pipeline.cameras import View, spread_angle, view_of, view_span
 from pipeline.inputs.photos import Photo
+from pipeline.sfm.agreement import ENOUGH, contradicting, excess, excess_of_photos
 
 # Field of view of the longer side, degrees: from a short telephoto to a wide angle lens.
 FOV_RANGE = (18.0, 110.0)
 MAX_MEAN_ERROR = 2.0  # px
 MIN_TRIANGULATION = 1.5  # degrees
-FEW_FEATURES, FEW_MATCHES, FEW_POINTS, FEW_PHOTOS = 150, 30, 30, 6
-# A focal length off by more than this is another lens. What the pairs say on their own is less exact: from a dozen
-# photos it was off by 1.36.
-FOCAL_OFF, PAIRS_OFF = 1.5, 1.7
-# A pair contradicts the poses where its matches lie farther (px) from their lines; right poses have 0 to 3 % of these.
-CONTRADICTION, MANY_CONTRADICTIONS = 4.0, 0.25
+FEW_FEATURES, FEW_MATCHES, FEW_POINTS, FEW_PHOTOS = 150, ENOUGH, 30, 6
+FOCAL_OFF = 1.5  # times the focal length of EXIF, and the lens is another
+MANY_CONTRADICTIONS = 0.25  # of the matches; right poses have up to 0.1, those of repeating things 0.5 and more
+# How many times farther from their lines than they have to matches may lie. Right poses have 1.0 to 1.7, those of a
+# wrong focal length 2.7 and more. Nor may more than a few of the photos lie beyond.
+MOST_EXCESS, FEW_ASTRAY = 2.1, 0.1
 STILL = 0.5  # of a pair's matches not moving: the background stands still
 ONE_SIDE = 150.0  # degrees of view points around the scene below which it is seen from one side only
 COMPONENT_NAMED = 3
@@ -62,12 +63,13 @@ def views_of(result: dict, photos: list[Photo]) -> list[View]:
     return [view_of({**view, "source": source[view["name"]]}) for view in result["views"]]
 
 
-def check(result: dict, photos: list[Photo], ordinary: dict | None = None) -> dict:
+def check(result: dict, photos: list[Photo], ordinary: dict | None = None, *, known: bool = False) -> dict:
     """Decides whether a reconstruction can be trusted, for the report: `failures` is empty when the poses may be used.
 
-    "All registered" is not "right": repeating textures give complete but wrong reconstructions, which show in the focal
-    length, the reprojection error, or in pairs that contradict the poses. `ordinary` is the result at ordinary
-    thresholds, if `result` is not: its matches tell best how the camera moved.
+    "All registered" is not "right": repeating textures and several zooms give complete but wrong reconstructions, which
+    show in matches that contradict the poses, or lie farther from their lines than they have to. `ordinary` is the
+    result at ordinary thresholds, if `result` is not: its matches tell best how the camera moved. `known` cameras may
+    be off by some pixels.
     """
     views = views_of(result, photos)
     posed = {view.name for view in views}
@@ -78,7 +80,11 @@ def check(result: dict, photos: list[Photo], ordinary: dict | None = None) -> di
         found = replace(found, still=still, turn_only=turn_only)
     together = len(found.components[0]) if found.components else len(photos)
     needed = max(3, -(-together // 2), -(-len(photos) // 3))
-    left_out = [{"photo": p.source, "why": left_out_reason(p, result, found)} for p in photos if p.name not in posed]
+    left_out = [
+        {"photo": p.source, "why": why, "hopeful": hope}
+        for p in photos if p.name not in posed for why, hope in [left_out_reason(p, result, found)]
+    ]  # fmt: skip
+    against = result.get("agreement", [])
     angle, around = (spread_angle(views), view_span(views)) if views else (0.0, 0.0)
     failures, warnings = [], []
     if len(posed) < needed:
@@ -86,8 +92,9 @@ def check(result: dict, photos: list[Photo], ordinary: dict | None = None) -> di
     else:
         if left_out:
             warnings.append(f"{len(left_out)} of {len(photos)} photos were left out")
-        check_focal(result, views, photos, failures, warnings)
-        check_errors(result, failures, warnings)
+        astray = [] if known else photos_astray(result)
+        check_focal(views, photos, bool(astray), failures, warnings)
+        check_errors(result, astray, failures, warnings)
         if angle < MIN_TRIANGULATION:
             failures.append(f"the cameras stand too close together ({angle:.1f} degrees apart as seen from the scene)")
         elif around < ONE_SIDE:
@@ -97,68 +104,72 @@ def check(result: dict, photos: list[Photo], ordinary: dict | None = None) -> di
         "photos": len(photos), "posed": len(posed), "left_out": left_out,
         "mean_error": round(result.get("mean_error", 0.0), 4), "points": result.get("points", 0),
         "field_of_view": sorted({round(view.fov, 2) for view in views}), "span_degrees": round(around, 1),
-        "contradictions": round(contradicting(result), 4), "components": [len(c) for c in found.components],
+        "cameras": [len(names) for names in result.get("cameras", [])],
+        "contradictions": round(contradicting(against), 4), "excess": round(excess(against), 3),
+        "components": [len(c) for c in found.components],
         "still_pairs": round(found.still, 3), "turn_only_pairs": round(found.turn_only, 3),
         "causes": diagnose(result, found, failures), "failures": failures, "warnings": warnings,
     }  # fmt: skip
 
 
-def check_focal(result: dict, views: list[View], photos: list[Photo], failures: list[str], warnings: list[str]) -> None:
-    """Checks the field of view, and the focal length against EXIF and against what the pairs say on their own."""
+def check_focal(
+    views: list[View], photos: list[Photo], doubtful: bool, failures: list[str], warnings: list[str]
+) -> None:
+    """Checks the field of view, and the focal length against EXIF."""
     off = [view.fov for view in views if not FOV_RANGE[0] <= view.fov <= FOV_RANGE[1]]
     if off:
         failures.append(f"implausible field of view of {off[0]:.0f} degrees: the poses are probably wrong")
-
-    def ratio(known: dict) -> float | None:
-        ratios = [view.focal / known[view.name] for view in views if known.get(view.name)]
-        return float(np.median(ratios)) if ratios else None
-
-    to_exif, to_pairs = ratio({p.name: p.focal for p in photos}), ratio(result["focal_of_pairs"])
-    agree = to_pairs is not None and 1 / PAIRS_OFF < to_pairs < PAIRS_OFF
-    if to_exif is not None and not 1 / FOCAL_OFF < to_exif < FOCAL_OFF:
+    exif = {p.name: p.focal for p in photos}
+    ratios = [view.focal / known for view in views if (known := exif[view.name])]
+    to_exif = float(np.median(ratios)) if ratios else 1.0
+    if not 1 / FOCAL_OFF < to_exif < FOCAL_OFF:
         # Photos that were cropped carry the focal length of the whole photo.
-        wrong = "EXIF" if agree else "poses"
+        wrong = "poses" if doubtful else "EXIF"
         told = f"focal length is {to_exif:.2f} times what EXIF says (cropped photos, or wrong {wrong})"
-        (warnings if agree else failures).append(told)
-    elif to_exif is None and to_pairs is not None and not agree:
-        failures.append(
-            f"focal length is {to_pairs:.2f} times what the pairs of photos say: the poses are probably wrong"
-        )
+        (failures if doubtful else warnings).append(told)
 
 
-def check_errors(result: dict, failures: list[str], warnings: list[str]) -> None:
-    """Checks the reprojection error, the points, and the pairs that contradict the poses."""
-    error, points, against = result.get("mean_error", 0.0), result.get("points", 0), contradicting(result)
+def photos_astray(result: dict) -> list[str]:
+    """The posed photos whose matches lie farther from their lines than those of right poses, if these are too many to
+    be trusted."""
+    agreement = result.get("agreement", [])
+    photos = excess_of_photos(agreement)
+    astray = [name for name, times in photos.items() if times > MOST_EXCESS]
+    return astray if excess(agreement) > MOST_EXCESS or len(astray) > FEW_ASTRAY * len(photos) else []
+
+
+def check_errors(result: dict, astray: list[str], failures: list[str], warnings: list[str]) -> None:
+    """Checks the reprojection error, the points, and the matches that contradict the poses."""
+    error, points, agreement = result.get("mean_error", 0.0), result.get("points", 0), result.get("agreement", [])
+    against, posed = contradicting(agreement), len(result["views"])
     if error > MAX_MEAN_ERROR:
         failures.append(f"mean reprojection error of {error:.1f} px (at most {MAX_MEAN_ERROR})")
     if points < FEW_POINTS:
         failures.append(f"only {points} points in common")
     if against > MANY_CONTRADICTIONS:
-        failures.append(f"{against:.0%} of the pairs of photos contradict the poses")
-    elif against > MANY_CONTRADICTIONS / 3:
-        warnings.append(f"{against:.0%} of the pairs of photos contradict the poses: a texture may repeat")
+        failures.append(f"{against:.0%} of the matches contradict the poses")
+    elif against > MANY_CONTRADICTIONS / 2:
+        warnings.append(f"{against:.0%} of the matches contradict the poses: a texture may repeat")
+    if astray:
+        failures.append(f"the matches of {len(astray)} of {posed} photos do not lie where the poses put them: "
+                        f"{excess(agreement):.1f} times as far off as they must be")  # fmt: skip
 
 
-def contradicting(result: dict) -> float:
-    """Share of pairs of posed photos that contradict the poses."""
-    pairs = result.get("contradictions", [])
-    return sum(pair["error"] > CONTRADICTION for pair in pairs) / len(pairs) if pairs else 0.0
-
-
-def left_out_reason(photo: Photo, result: dict, found: Findings) -> str:
-    """Why a photo has no pose."""
+def left_out_reason(photo: Photo, result: dict, found: Findings) -> tuple[str, bool]:
+    """Why a photo has no pose, and whether a more careful attempt may find one."""
     entry = result["counts"].get(photo.name, {})
     count, best = entry.get("features", 0), entry.get("best_matches", 0)
     if count < FEW_FEATURES:
-        return f"too few features ({count}): " + (photo.fault or "blurred, dark or without texture")
+        return f"too few features ({count}): " + (photo.fault or "blurred, dark or without texture"), False
     group = next((c for c in found.components if photo.name in c), [])
     if len(group) >= COMPONENT_NAMED and group is not found.components[0]:
-        return f"shows something else: it matches {len(group) - 1} other photos, none of them in the larger set"
+        others = f"it matches {len(group) - 1} other photos, none of them in the larger set"
+        return f"shows something else: {others}", False
     if photo.fault:
-        return f"{photo.fault} (best pair: {best} matches)"
+        return f"{photo.fault} (best pair: {best} matches)", False
     if best < FEW_MATCHES:
-        return f"too few matches with other photos (best pair: {best}): not enough overlap"
-    return f"its {best} matches do not agree with the rest of the reconstruction"
+        return f"too few matches with other photos (best pair: {best}): not enough overlap", True
+    return f"its {best} matches do not agree with the rest of the reconstruction", True
 
 
 def diagnose(result: dict, found: Findings, failures: list[str]) -> list[str]:
@@ -182,9 +193,11 @@ def diagnose(result: dict, found: Findings, failures: list[str]) -> list[str]:
         causes.append(f"{len(result['counts'])} photos are too few to be certain of anything")
     elif found.turn_only > 0.5 and found.still <= 0.5:
         causes.append("the photos seem to be taken from one spot: step sideways between photos, do not just turn")
-    elif contradicting(result) > MANY_CONTRADICTIONS / 3 or unposed:
+    elif contradicting(result.get("agreement", [])) > MANY_CONTRADICTIONS or unposed:
         causes.append("a texture that repeats makes different places look the same: cover it, or lay something unlike "
                       "on it")  # fmt: skip
+    elif photos_astray(result):
+        causes.append("the focal lengths are wrong: give photos of one zoom, or as the camera stored them, with EXIF")
     elif len(linked) < len(result["counts"]) / 2:
         causes.append("most photos overlap too little with the others")
     return causes

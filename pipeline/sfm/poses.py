@@ -28,7 +28,7 @@ ORDINARY: dict[str, Any] = {
     "moving_only": False, "min_inliers": 15, "min_inlier_ratio": 0.35, "init_inliers": 100, "init_angle": 16.0,
     "pose_inliers": 30,
 }  # fmt: skip
-# What each attempt asks of the worker, by its name. The first that gives poses to be trusted is the last.
+# What each attempt asks of the worker, by its name. The first that gives poses of all photos to be trusted is the last.
 ATTEMPTS = {
     "ordinary": ORDINARY,
     "without what stands still": {**ORDINARY, "moving_only": True},
@@ -38,7 +38,10 @@ ATTEMPTS = {
     },
 }  # fmt: skip
 
-EXHAUSTIVE_UP_TO = 150  # photos; of more, only neighbours in name order are matched
+EXHAUSTIVE_UP_TO = 150  # photos; of more, each is matched only with the PARTNERS that look most like it
+PARTNERS = 40
+WORTH = 0.05  # of the photos left out, and a careful attempt is worth its minutes
+WORSE = 1.25  # times the reprojection error: looser matches have a little more of it where poses are as good
 WIDEST_PAIR = 60.0  # degrees between the optical axes of known cameras whose photos are matched
 
 
@@ -47,6 +50,22 @@ def hopeful(name: str, first: dict) -> bool:
     that stands still, tell no more with more features."""
     still = first["still_pairs"] > 0.5
     return still if name == "without what stands still" else first["turn_only_pairs"] <= 0.9 and not still
+
+
+def worth_more(checks: dict) -> bool:
+    """Whether a more careful attempt may pose photos that the good poses found leave out: some in twenty of them, in
+    focus and of the same thing."""
+    return sum(entry["hopeful"] for entry in checks["left_out"]) > WORTH * checks["photos"]
+
+
+def better(new: dict, old: dict) -> bool:
+    """Whether an attempt's checks are better than those of one before: poses to be trusted, then more photos, unless at
+    a larger error; where nothing can be trusted, more photos and points."""
+    if bool(new["failures"]) != bool(old["failures"]):
+        return not new["failures"]
+    if new["failures"]:
+        return (new["posed"], new["points"]) > (old["posed"], old["points"])
+    return new["posed"] > old["posed"] and new["mean_error"] <= WORSE * old["mean_error"]
 
 
 def size_groups(photos: list[Photo]) -> list[dict]:
@@ -64,23 +83,26 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
           on_progress: Progress = quiet) -> dict:  # fmt: skip
     """Finds the poses of `photos` and writes `cameras.json`, `sparse.npz`, `checks.json` to `out`; returns the checks.
 
-    Makes `ATTEMPTS` until poses can be trusted, for at most `timeout` s each; each has a folder of its own, in which a
-    killed run goes on. Cameras that came with the photos are kept and checked. Raises SdfsimError (exit code 3) where
-    too few photos could be posed, or the result is not plausible.
+    Makes `ATTEMPTS` until poses of all photos can be trusted, for at most `timeout` s each; each has a folder of its
+    own, in which a killed run goes on. Cameras that came with the photos are kept and checked. Raises SdfsimError (exit
+    code 3) where too few photos could be posed, or the result is not plausible.
     """
     known = photos_folder / KNOWN_CAMERAS
     job = {
-        "version": 2,  # of what the child writes, which a run that goes on takes up
+        "version": 3,  # of what the child writes, which a run that goes on takes up
         "images": str(photos_folder / "images"), "count": len(photos), "groups": size_groups(photos), "seed": seed,
         "masks": str(photos_folder / "masks") if all(p.mask for p in photos) else "",
         "known_cameras": str(known) if known.exists() else "", "refine": load_capture(photos_folder) is not None,
-        "pairs": seen_together(load_views(known)) if known.exists() else None, "exhaustive_up_to": EXHAUSTIVE_UP_TO,
+        "pairs": seen_together(load_views(known)) if known.exists() else None,
+        "exhaustive_up_to": EXHAUSTIVE_UP_TO, "partners": PARTNERS,
     }  # fmt: skip
     tries: list[tuple[dict, Path, dict]] = []
     told: list[dict] = []
     for name, settings in ATTEMPTS.items():
         if tries and (job["known_cameras"] or not hopeful(name, tries[0][0])):
             continue
+        if any(not checks["failures"] and not worth_more(checks) for checks, _, _ in tries):
+            break
 
         folder = out / f"try_{name.replace(' ', '_')}"
         try:
@@ -91,13 +113,13 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
             # What the attempts before found out says more than that this one broke.
             told.append({"name": name, "posed": 0, "failures": [error.message]})
             continue
-        checks = check(result, photos, tries[0][2] if tries else None)
+        checks = check(result, photos, tries[0][2] if tries else None, known=bool(job["known_cameras"]))
         tries.append((checks, folder, result))
         told.append({"name": name, "posed": checks["posed"], "failures": checks["failures"]})
-        if not checks["failures"]:
-            break
-    # Best: plausible first, then the most photos and points.
-    checks, folder, result = max(tries, key=lambda t: (not t[0]["failures"], t[0]["posed"], t[0]["points"]))
+    best = tries[0]
+    for one in tries[1:]:
+        best = one if better(one[0], best[0]) else best
+    checks, folder, result = best
     checks["attempts"], checks["known_cameras"] = told, bool(job["known_cameras"])
     views = views_of(result, photos) if job["refine"] or not job["known_cameras"] else load_views(known)
     if checks["known_cameras"] and checks["failures"]:
@@ -166,13 +188,17 @@ def run_worker(job: dict, folder: Path, timeout: float, on_progress: Progress) -
 def estimate(folder: Path, lines: Path, job: dict) -> tuple[float, str]:
     """Fraction done and a message, from the child's lines and the row counts of its database."""
     count = job["count"]
-    said = dict(re.findall(r"^(phase|placed) (\w+)$", lines.read_text(errors="replace"), re.MULTILINE))
-    phase, placed = said.get("phase", "features"), int(said.get("placed", 0))
+    said = re.findall(r"^(phase|placed) (\w+)$", lines.read_text(errors="replace"), re.MULTILINE)
+    phase = dict(said).get("phase", "features")
     if phase == "mapping":
-        return 0.75 + 0.25 * min(1.0, placed / count), f"placing cameras, {placed} of {count}"
+        placed = [int(number) for word, number in said if word == "placed"] or [0]
+        # Further focal lengths start at no camera again, but what is done stays done.
+        return 0.75 + 0.25 * min(1.0, max(placed) / count), f"placing cameras, {placed[-1]} of {count}"
     table, total = "keypoints", count
     if phase == "matches":
-        pairs = count * 20 if count > job["exhaustive_up_to"] else count * (count - 1) // 2
+        pairs = count * (count - 1) // 2
+        if count > job["exhaustive_up_to"]:
+            pairs = min(pairs, count * PARTNERS * 2 // 3)  # A third or so name each other.
         table, total = "two_view_geometries", pairs if job["pairs"] is None else len(job["pairs"])
     rows = 0
     address = f"file:{folder / 'database.db'}?mode=ro"  # It may not be there yet, or be busy.

@@ -18,13 +18,19 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.cameras import View, view_of
+from pipeline.sfm.agreement import ENOUGH, agreement, contradicting, excess_of_photos, unexplained
 from sdfsim.files import write_arrays, write_json
 
 REFINE_PIXELS = (16.0, 6.0)  # that a point may be off while known cameras are refined, at first and then
 REFINE_POINTS = 30  # points that a camera needs to be moved
 SUPPORTED = 70  # that most cameras need for any to be moved: with fewer, a dozen photos came out worse than given
 TRACKED = 0.02  # m within which a phone tracks its place
+# A photo's excess (see `excess_of_photos`) from which other focal lengths are tried: right poses have 1.0 to 1.8.
+DOUBTFUL = 1.8
+HOPELESS = 0.5  # of all matches contradicting the poses: no focal length mends that
+ZOOM = 1.12  # times the focal length next to it, and a photo was taken at another zoom; of each alone, 1.05 is noise
+VOCABULARY, WORD_SAMPLES = 2048, 40  # words to look photos up by, and features that each is made of
+ABOUT = 1.03  # times as much unexplained is about the same
 
 
 def watch_parent() -> None:
@@ -62,7 +68,7 @@ def features(pycolmap, job: dict, database: Path) -> None:
 
 
 def matches(pycolmap, job: dict, database: Path) -> None:
-    """Matches the pairs of the job, else every pair, or neighbours in name order where there are too many."""
+    """Matches the pairs of the job, else every pair, or those that look alike where these are too many."""
     matching = pycolmap.FeatureMatchingOptions(
         use_gpu=False, guided_matching=job["guided"], sift={"max_ratio": job["max_ratio"]}
     )
@@ -73,29 +79,56 @@ def matches(pycolmap, job: dict, database: Path) -> None:
     )  # fmt: skip
     common = {"matching_options": matching, "verification_options": verification, "device": pycolmap.Device.cpu}
     # Small blocks only so that progress shows in the database.
-    if job["pairs"] is not None:
+    pairs = job["pairs"]
+    if pairs is None and job["count"] > job["exhaustive_up_to"]:
+        pairs = alike(pycolmap, job, database)
+    if pairs is not None:
         listed = database.with_name("pairs.txt")
-        listed.write_text("".join(f"{a} {b}\n" for a, b in job["pairs"]))
+        listed.write_text("".join(f"{a} {b}\n" for a, b in pairs))
         pairing = pycolmap.ImportedPairingOptions(block_size=100, match_list_path=listed)
         pycolmap.match_image_pairs(database, pairing_options=pairing, **common)
-    elif job["count"] <= job["exhaustive_up_to"]:
+    else:
         pairing = pycolmap.ExhaustivePairingOptions(block_size=10)
         pycolmap.match_exhaustive(database, pairing_options=pairing, **common)
-    else:
-        pairing = pycolmap.SequentialPairingOptions(overlap=20, quadratic_overlap=True)
-        pycolmap.match_sequential(database, pairing_options=pairing, **common)
 
 
-def mapping(pycolmap, job: dict, database: Path, out: Path):
-    """Reconstructions from the matches: incremental mapping, or triangulation from known cameras."""
-    shutil.rmtree(out / "colmap", ignore_errors=True)
-    (out / "colmap").mkdir()
+def alike(pycolmap, job: dict, database: Path) -> list[tuple[str, str]]:
+    """Pairs of photos to match where all are too many: each photo with the `job["partners"]` that have most in common
+    with it, whatever their names. Their features are looked up among words, which are made of the photos' own."""
+    pycolmap.set_random_seed(job["seed"])  # whatever came before
+    words = pycolmap.VisualIndex.create(128, 64)  # numbers of a descriptor, and bits of what is kept of it
+    rng = np.random.default_rng(job["seed"])
+    with pycolmap.Database.open(database) as opened:
+        images = {image.image_id: image.name for image in opened.read_all_images()}
+        found = [opened.read_descriptors(key) for key in sorted(images)]
+        each = max(1, VOCABULARY * WORD_SAMPLES // len(images))
+        some = [one.data[rng.permutation(len(one.data))[:each]] for one in found]
+        sample = pycolmap.FeatureDescriptorsFloat(type=found[0].type, data=np.concatenate(some).astype(np.float32))
+        count = min(VOCABULARY, len(sample.data) // WORD_SAMPLES)
+        if count == 0:
+            return []  # hardly a feature anywhere
+        options = pycolmap.VisualIndex.BuildOptions(
+            num_visual_words=count, num_iterations=10, num_rounds=1, num_threads=1
+        )
+        words.build(options, sample)
+        place = database.with_name("words.bin")
+        words.write(place)
+        pairing = pycolmap.VocabTreePairingOptions(num_images=job["partners"] + 1, vocab_tree_path=place)  # and itself
+        pairs = pycolmap.VocabTreePairGenerator(pairing, opened).all_pairs()
+    return sorted({(images[min(a, b)], images[max(a, b)]) for a, b in pairs if a != b})
+
+
+def from_known(pycolmap, job: dict, database: Path, out: Path):
+    """The reconstruction whose points are triangulated from known cameras."""
+    known, place = known_cameras(pycolmap, job, database), fresh(out / "colmap")
+    if job["refine"]:
+        refine(pycolmap, known, database, job, out)
     options = incremental_options(pycolmap, job)
-    if job["known_cameras"]:
-        known = known_cameras(pycolmap, job, database)
-        if job["refine"]:
-            refine(pycolmap, known, database, job, out)
-        return [pycolmap.triangulate_points(known, database, job["images"], out / "colmap", options=options)]
+    return pycolmap.triangulate_points(known, database, job["images"], place, options=options)
+
+
+def mapped(pycolmap, job: dict, database: Path, out: Path):
+    """The reconstruction with the most photos that incremental mapping finds, or None."""
     done = 0
 
     def count() -> None:
@@ -103,10 +136,89 @@ def mapping(pycolmap, job: dict, database: Path, out: Path):
         done += 1
         print(f"placed {done}", flush=True)  # for the parent, at once
 
+    print("placed 0", flush=True)
     found = pycolmap.incremental_mapping(
-        database, job["images"], out / "colmap", options=options, next_image_callback=count
-    )
-    return list(found.values())
+        database, job["images"], fresh(out / "colmap"), options=incremental_options(pycolmap, job),
+        next_image_callback=count,
+    )  # fmt: skip
+    return max(found.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
+
+
+def fresh(folder: Path) -> Path:
+    """The folder, empty."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    return folder
+
+
+def best_mapping(pycolmap, job: dict, database: Path, pairs: list, out: Path):
+    """The reconstruction that explains the matches best, or None; and the photos of each camera that it has.
+
+    Photos of one size are taken for those of one camera at first. Where the matches doubt what comes of that, every
+    photo gets a focal length of its own, then each zoom that these show. All are judged by the same matches.
+    """
+    shared = [group["names"] for group in job["groups"]]
+    tried = [(mapped(pycolmap, job, database, out), shared)]
+    first = agreement(pairs, views_in(tried[0][0]))
+    costs = [unexplained(first)]
+    copy, names = out / "zooms.db", [name for group in shared for name in group]
+    if doubtful(first):
+        with_cameras(pycolmap, database, copy, [[name] for name in names], {})
+        alone = mapped(pycolmap, job, copy, out)
+        focals = {view["name"]: view["focal"] for view in views_in(alone)}
+        zooms = [zoom for group in shared for zoom in zooms_of(group, focals)]
+        with_cameras(pycolmap, database, copy, zooms, focals)
+        tried += [(mapped(pycolmap, job, copy, out), zooms), (alone, [[name] for name in names])]
+        costs += [unexplained(agreement(pairs, views_in(model))) for model, _ in tried[1:]]
+    copy.unlink(missing_ok=True)
+    # The fewest cameras that do about as well as any.
+    return next(one for one, cost in zip(tried, costs, strict=True) if cost <= ABOUT * min(costs) + (ABOUT - 1) / 10)
+
+
+def doubtful(entries: list[dict]) -> bool:
+    """Whether other focal lengths should be tried: photos that match others are left out, or matches lie farther from
+    the lines that the poses give than they have to."""
+    posed = {entry[end] for entry in entries if entry["error"] is not None for end in "ab"}
+    linked = {entry[end] for entry in entries for end in "ab"}
+    worst = max(excess_of_photos(entries).values(), default=0.0)
+    return contradicting(entries) <= HOPELESS and (len(posed) < len(linked) or worst > DOUBTFUL)
+
+
+def zooms_of(names: list[str], focals: dict[str, float]) -> list[list[str]]:
+    """Photos of one size in groups of about the same focal length (px). One without a pose, whose focal length is not
+    known, stands alone."""
+    known = sorted((name for name in names if name in focals), key=lambda name: (focals[name], name))
+    steps = [k for k in range(1, len(known)) if focals[known[k]] > ZOOM * focals[known[k - 1]]]
+    groups = [known[start:end] for start, end in zip([0, *steps], [*steps, len(known)], strict=True)]
+    return [group for group in groups if group] + [[name] for name in names if name not in focals]
+
+
+def with_cameras(pycolmap, database: Path, copy: Path, groups: list[list[str]], focals: dict[str, float]) -> None:
+    """Copies a database, with a camera for each group of photos, that starts at the median of their focal lengths (px)
+    or at that which the photos' camera has now. The matches stay."""
+    shutil.copyfile(database, copy)
+    with pycolmap.Database.open(copy) as opened:
+        images = {image.name: image for image in opened.read_all_images()}
+        cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
+        for names in groups:
+            known = [focals[name] for name in names if name in focals]
+            before = cameras[images[names[0]].camera_id]
+            camera = pycolmap.Camera(
+                model=before.model, width=before.width, height=before.height,
+                params=[np.median(known) if known else before.params[0], *before.params[1:]],
+                has_prior_focal_length=before.has_prior_focal_length,
+            )  # fmt: skip
+            camera.camera_id = opened.write_camera(camera)
+            rig = pycolmap.Rig()
+            rig.add_ref_sensor(camera.sensor_id)
+            number = opened.write_rig(rig)
+            for name in names:
+                image = images[name]
+                image.camera_id = camera.camera_id
+                frame = pycolmap.Frame(frame_id=image.frame_id, rig_id=number)
+                frame.add_data_id(image.data_id)
+                opened.update_frame(frame)  # first: the image's new camera has to be in it
+                opened.update_image(image)
 
 
 def incremental_options(pycolmap, job: dict):
@@ -184,14 +296,19 @@ def refine(pycolmap, model, database: Path, job: dict, out: Path) -> None:
             model.frames[model.images[key].frame_id].rig_from_world = found.images[key].cam_from_world()
 
 
-def collect(reconstruction, out: Path) -> list[dict]:
-    """Writes `sparse.npz` and returns the posed views as plain values."""
-    views, index_of = [], {}
-    for image in sorted((i for i in reconstruction.images.values() if i.has_pose), key=lambda i: i.name):
+def posed_in(reconstruction) -> list:
+    """The images of a reconstruction, or of None, that have a pose, by name."""
+    images = reconstruction.images.values() if reconstruction else []
+    return sorted((image for image in images if image.has_pose), key=lambda image: image.name)
+
+
+def views_in(reconstruction) -> list[dict]:
+    """The posed views of a reconstruction, or of None, as plain values."""
+    views = []
+    for image in posed_in(reconstruction):
         camera = reconstruction.cameras[image.camera_id]
         focal, cx, cy, k = (float(value) for value in camera.params)
         pose = image.cam_from_world()
-        index_of[image.image_id] = len(views)
         views.append(
             {
                 "name": image.name, "width": camera.width, "height": camera.height,
@@ -199,6 +316,12 @@ def collect(reconstruction, out: Path) -> list[dict]:
                 "rotation": pose.rotation.matrix().tolist(), "translation": list(map(float, pose.translation)),
             }
         )  # fmt: skip
+    return views
+
+
+def save_points(reconstruction, path: Path) -> None:
+    """Writes the points of a reconstruction (`sparse.npz`), with photos numbered as in `views_in`."""
+    index_of = {image.image_id: index for index, image in enumerate(posed_in(reconstruction))}
     points = [reconstruction.points3D[key] for key in sorted(reconstruction.points3D)]
     seen = [
         (p, index_of[e.image_id]) for p, point in enumerate(points) for e in point.track.elements
@@ -212,8 +335,7 @@ def collect(reconstruction, out: Path) -> list[dict]:
         "point_of": observations[:, 0],
         "view_of": observations[:, 1],
     }
-    write_arrays(out / "sparse.npz", arrays, compressed=False)
-    return views
+    write_arrays(path, arrays, compressed=False)
 
 
 def read_pairs(pycolmap, database: Path) -> tuple[dict[str, int], list[tuple[str, str, np.ndarray, np.ndarray]]]:
@@ -239,7 +361,7 @@ def findings(job: dict, features: dict[str, int], pairs: list) -> dict:
     for a, b, first, second in pairs:
         still = float((np.linalg.norm(first - second, axis=1) < 2.0).mean())
         told.append({"a": a, "b": b, "matches": len(first), "still": round(still, 3)})
-        if len(first) >= 30 and still < 0.5 and sizes[a] is sizes[b]:
+        if len(first) >= ENOUGH and still < 0.5 and sizes[a] is sizes[b]:
             moving.append((sizes[a], first, second))
         for name in (a, b):
             result[name]["best_matches"] = max(result[name]["best_matches"], len(first))
@@ -266,50 +388,6 @@ def turn_only(pairs: list[tuple[dict, np.ndarray, np.ndarray]], least: float = 2
     return best
 
 
-def contradictions(pairs: list, views: list[dict]) -> list[dict]:
-    """Pairs of posed photos, with how far their matches are from the lines that the poses put them on. Each pair was
-    matched on its own: where poses are right nearly all agree; no poses agree with repeating things."""
-    posed = {view["name"]: view_of({**view, "source": ""}) for view in views}
-    found = []
-    for a, b, first, second in pairs:
-        if len(first) >= 30 and a in posed and b in posed:
-            error = float(np.median(epipolar_errors(posed[a], posed[b], first, second)))
-            found.append({"a": a, "b": b, "matches": len(first), "error": round(error, 3)})
-    return found
-
-
-def epipolar_errors(a: View, b: View, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Sampson distances [M], px of photo `a`, of matched pixels [M, 2] of two posed photos."""
-    turn = b.rotation @ a.rotation.T
-    x, y, z = b.translation - turn @ a.translation
-    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ turn
-    p, q = a.straight(*first.T), b.straight(*second.T)
-    forth, back = p @ essential.T, q @ essential
-    slope = (forth[:, :2] ** 2).sum(1) + (back[:, :2] ** 2).sum(1)
-    return np.abs((q * forth).sum(1)) / np.sqrt(np.maximum(slope, 1e-30)) * a.focal
-
-
-def focal_of_pairs(pycolmap, job: dict, database: Path, out: Path) -> dict[str, float]:
-    """Focal length (px) of each photo's camera from the pairs' fundamental matrices alone, where they tell it: a second
-    opinion on that of the mapping (view graph calibration, Sweeney et al., 2015)."""
-    copy = out / "focal.db"
-    shutil.copyfile(database, copy)
-    try:
-        with pycolmap.Database.open(copy) as opened:
-            before = {camera.camera_id: float(camera.params[0]) for camera in opened.read_all_cameras()}
-        options = pycolmap.ViewGraphCalibrationOptions(random_seed=job["seed"], reestimate_relative_pose=False)
-        if not pycolmap.calibrate_view_graph(copy, options):
-            return {}
-        with pycolmap.Database.open(copy) as opened:
-            after = {camera.camera_id: float(camera.params[0]) for camera in opened.read_all_cameras()}
-            return {
-                image.name: after[image.camera_id] for image in opened.read_all_images()
-                if after[image.camera_id] != before[image.camera_id]
-            }  # fmt: skip
-    finally:
-        copy.unlink(missing_ok=True)
-
-
 def main(job_path: str) -> None:
     """Runs one job file and writes `result.json` and `sparse.npz` beside it."""
     import pycolmap
@@ -326,14 +404,17 @@ def main(job_path: str) -> None:
     print("phase mapping", flush=True)
     counts, pairs = read_pairs(pycolmap, database)
     result: dict[str, Any] = {"views": [], **findings(job, counts, pairs)}
-    result["focal_of_pairs"] = {} if job["known_cameras"] else focal_of_pairs(pycolmap, job, database, out)
-    models = mapping(pycolmap, job, database, out)
-    if models:
-        best = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
-        result["views"] = collect(best, out)
-        result["contradictions"] = contradictions(pairs, result["views"])
+    if job["known_cameras"]:
+        best, cameras = from_known(pycolmap, job, database, out), []
+    else:
+        best, cameras = best_mapping(pycolmap, job, database, pairs, out)
+    if best:
+        result["views"] = views_in(best)
+        result["cameras"] = cameras
+        result["agreement"] = agreement(pairs, result["views"])
         result["mean_error"] = float(best.compute_mean_reprojection_error())
         result["points"] = int(best.num_points3D())
+        save_points(best, out / "sparse.npz")
     write_json(out / "result.json", result)
 
 

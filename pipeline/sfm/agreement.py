@@ -1,0 +1,109 @@
+"""How far poses agree with the matches between photos, of which each pair was verified on its own."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.cameras import View, view_of
+
+ENOUGH = 30  # matches of a pair that tell something
+CONTRADICTION = 4.0  # px from its line, and a match contradicts the poses; what verification allows
+FINEST = 0.1  # px; matches are not more exact than that
+
+
+def agreement(pairs: list, views: list[dict]) -> list[dict]:
+    """What the poses make of the matches (names, and pixels [M, 2] in both) of every pair with enough of them.
+
+    An entry has medians (px) of how far they lie from the lines that the poses put them on (`error`, None where one of
+    the photos has no pose) and from the best lines that there are for this pair alone (`own`); and the share that the
+    poses leave unexplained, each match by how far it lies (`cost`).
+    """
+    posed = {view["name"]: view_of({**view, "source": ""}) for view in views}
+    found = []
+    for a, b, first, second in pairs:
+        if len(first) < ENOUGH:
+            continue
+        entry = {"a": a, "b": b, "matches": len(first), "error": None, "own": None, "cost": 1.0}
+        if a in posed and b in posed:
+            errors = epipolar_errors(posed[a], posed[b], first, second)
+            own = float(np.median(own_errors(first, second)))
+            cost = float(np.minimum(errors / CONTRADICTION, 1).mean())
+            entry |= {"error": round(float(np.median(errors)), 3), "own": round(own, 3), "cost": round(cost, 4)}
+        found.append(entry)
+    return found
+
+
+def unexplained(entries: list[dict]) -> float:
+    """Share of all matches that the poses leave unexplained; lower is better, whichever photos have poses."""
+    total = sum(entry["matches"] for entry in entries)
+    return sum(entry["matches"] * entry["cost"] for entry in entries) / total if total else 1.0
+
+
+def contradicting(entries: list[dict]) -> float:
+    """Share of the matches of posed photos in pairs that contradict the poses. Pairs count by their matches: a few
+    dozen matches come about by chance, also between photos that show unlike things."""
+    posed = [entry for entry in entries if entry["error"] is not None]
+    total = sum(entry["matches"] for entry in posed)
+    return sum(e["matches"] for e in posed if e["error"] > CONTRADICTION) / total if total else 0.0
+
+
+def excess(entries: list[dict]) -> float:
+    """How many times farther from their lines the matches lie than they have to: of the pairs' medians, the median by
+    matches. A wrong focal length shows here; repeating things show in `contradicting`, too."""
+    posed = sorted((entry["error"] / max(entry["own"], FINEST), entry["matches"])
+                   for entry in entries if entry["error"] is not None)  # fmt: skip
+    half = sum(matches for _, matches in posed) / 2
+    for ratio, matches in posed:
+        half -= matches
+        if half <= 0:
+            return ratio
+    return 0.0
+
+
+def excess_of_photos(entries: list[dict]) -> dict[str, float]:
+    """The `excess` of each posed photo's pairs."""
+    own: dict[str, list[dict]] = {}
+    for entry in entries:
+        if entry["error"] is not None:
+            for end in "ab":
+                own.setdefault(entry[end], []).append(entry)
+    return {name: excess(some) for name, some in sorted(own.items())}
+
+
+def epipolar_errors(a: View, b: View, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Sampson distances [M], px, of matched pixels [M, 2] of two posed photos."""
+    turn = b.rotation @ a.rotation.T
+    x, y, z = b.translation - turn @ a.translation
+    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ turn
+    return sampson(essential, a.straight(*first.T), b.straight(*second.T), (a.focal, b.focal))[0]
+
+
+def own_errors(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Sampson distances [M], px, of matched pixels [M, 2] from the lines of the bilinear form that fits them best: what
+    no poses can beat by much, whatever the focal length. The eight-point algorithm, with weights by which distances are
+    in pixels and far matches count little."""
+
+    def normal(pixels: np.ndarray) -> np.ndarray:
+        middle = pixels.mean(0)
+        scale = np.sqrt(2) / max(float(np.linalg.norm(pixels - middle, axis=1).mean()), 1e-9)
+        return np.array([[scale, 0, 0], [0, scale, 0], [-scale * middle[0], -scale * middle[1], 1]])
+
+    p, q = (np.hstack([pixels, np.ones((len(pixels), 1))]).astype(float) for pixels in (first, second))
+    forward, backward = normal(p[:, :2]), normal(q[:, :2])
+    products = ((q @ backward)[:, :, None] * (p @ forward)[:, None, :]).reshape(len(p), 9)
+    weights, best = np.ones(len(p)), np.full(len(p), np.inf)
+    for _ in range(4):
+        form = np.linalg.eigh((products * weights[:, None]).T @ products)[1][:, 0].reshape(3, 3)
+        errors, slope = sampson(backward @ form @ forward.T, p, q)
+        best = min(best, errors, key=np.median)
+        weights = slope.mean() / slope / (1 + (errors / (3 * max(float(np.median(errors)), FINEST))) ** 2)
+    return best
+
+
+def sampson(form: np.ndarray, p: np.ndarray, q: np.ndarray, focals: tuple = (1.0, 1.0)) -> tuple:
+    """Sampson distances [M], px, of matches p, q [M, 3] (last 1) under q' form p = 0, and their squared slopes [M]; of
+    rays, with the focal lengths (px) of both photos."""
+    forth, back = p @ form.T, q @ form
+    slope = (forth[:, :2] ** 2).sum(1) / focals[1] ** 2 + (back[:, :2] ** 2).sum(1) / focals[0] ** 2
+    slope = np.maximum(slope, 1e-30)
+    return np.abs((q * forth).sum(1)) / np.sqrt(slope), slope
