@@ -1,6 +1,6 @@
 """What large scenes cost, and many scenes at once: RESULTS.md.
 
-    python benchmarks/scale.py growth -o DIR [--paper PAPER.safetensors] [--largest 512]
+    python benchmarks/scale.py growth -o DIR [--sdf-sim SDF_SIM.safetensors] [--largest 512]
         bowls of spheres, boxes far apart and knots against bodies, nodes and contacts, beside networks and two engines
     python benchmarks/scale.py large -o DIR
         heaps, shoes and knots to the end on all cores, each with a movie
@@ -10,7 +10,7 @@
         one body that moves beside static ones far away, with all that a user's step does
 
 Every case of the first runs in a process of its own on one thread; its times are those of the processor. What DIR
-holds is not measured again. The *paper* network predicts all motion of all bodies, as published.
+holds is not measured again. The *sdf-sim* network predicts all motion of all bodies, as published.
 """
 
 from __future__ import annotations
@@ -82,8 +82,8 @@ def ours(source: Path | int, steps: int, model: str, keep: float = 1.0) -> dict:
     scene = apart(source) if isinstance(source, int) else with_nodes_cut(load_scene(source), keep)
     frames, broken = [], None
     with peak_memory() as memory:
-        paper = load_model(model, weights=False).on_surfaces
-        simulator = Simulator(scene, model, free_flight="learned" if paper else "exact")
+        published = load_model(model, weights=False).on_surfaces
+        simulator = Simulator(scene, model, free_flight="learned" if published else "exact")
         frames.extend(simulator.frames(1))  # not timed: it loads what is compiled
         began = time.process_time()
         try:
@@ -122,7 +122,7 @@ def _where(scene: Scene, motion: Trajectory) -> dict[str, float]:
     }
 
 
-def jobs_of(folder: Path, paper: str | None, largest: int) -> list[Job]:
+def jobs_of(folder: Path, sdf_sim: str | None, largest: int) -> list[Job]:
     """Everything that is measured; scene files are written on first use."""
 
     def scene(name: str, count: int, nodes: int = 0) -> Path:
@@ -132,8 +132,8 @@ def jobs_of(folder: Path, paper: str | None, largest: int) -> list[Job]:
     jobs = []
     for count in (n for n in BOWLS if n <= largest):
         case = f"{count} spheres in a bowl"
-        for nodes, model in ((64, "solver"), (512, "solver"), (64, "small"), *(((64, paper),) if paper else ())):
-            steps, method = 200 if model != paper else 10, f"{Path(model).stem}, {nodes} nodes"
+        for nodes, model in ((64, "solver"), (512, "solver"), (64, "small"), *(((64, sdf_sim),) if sdf_sim else ())):
+            steps, method = 200 if model != sdf_sim else 10, f"{Path(model).stem}, {nodes} nodes"
             jobs.append(Job(case, method, [steps], ours, (scene("bowl", count, nodes), steps, model)))
         for name, run in (("PyBullet", bullet), ("MuJoCo", mujoco)):
             jobs.append(Job(case, name, [200], engine, (run, scene("bowl", count, 64), 200)))
@@ -145,9 +145,9 @@ def jobs_of(folder: Path, paper: str | None, largest: int) -> list[Job]:
     return jobs
 
 
-def growth(*, out: Path, paper: str | None = None, largest: int = 512) -> None:
+def growth(*, out: Path, sdf_sim: str | None = None, largest: int = 512) -> None:
     """Write the section and scale.png."""
-    results = measure(jobs_of(out, paper, largest), out / "results", where="fresh", on_progress=told)
+    results = measure(jobs_of(out, sdf_sim, largest), out / "results", where="fresh", on_progress=told)
     bowls = {key: found for key, found in results.items() if "bowl" in key[0]}
     panels = []
     for name in ("ms", "peak_mib"):
@@ -235,9 +235,9 @@ def scenery(*, repeats: int = 7) -> None:
             simulator.rules = replace(simulator.rules, sleep=False)
             simulator.step(2)  # not timed: it loads what is compiled
         times = np.array([[slid(simulator) for simulator in simulators] for _ in range(repeats)])
-        few, many = np.median(times, axis=0)
-        ratio = np.median(times[:, 1] / times[:, 0])
-        rows.append((f"`{model}`", number(few), number(many), f"{ratio:.1f}"))
+        ratio = times[:, 1] / times[:, 0]
+        span = f"{np.median(ratio):.1f} ({ratio.min():.1f} to {ratio.max():.1f})"
+        rows.append((f"`{model}`", *map(number, np.median(times, axis=0)), span))
     write_section("scenery", "python benchmarks/scale.py scenery", markdown(rows))
 
 
