@@ -96,6 +96,13 @@ def test_the_readmes_errors_are_the_results(row, other):
         assert degrees == pytest.approx(true_degrees, abs=0.06)
 
 
+def test_the_solvers_errors_on_other_pages_are_the_results():
+    metres, degrees, *_ = cells(section("MOVi-B", page("benchmarks/RESULTS.md")), "`solver`")
+    metres, degrees = f"{numbers(metres)[0]:.3f} m", f"{numbers(degrees)[0]:.1f}°"
+    assert f"the contact solve on the convex pieces {metres}, {degrees}" in page("docs/paper.md")
+    assert f"today's has {metres} and {degrees} on test" in page("docs/simulator.md")
+
+
 def test_errors_beside_hopnet_are_the_results():
     table = section("instants", page("benchmarks/RESULTS.md"))
     text = page("docs/simulator.md").partition("### Beside HOPNet")[2].partition("\n## ")[0]
