@@ -25,7 +25,7 @@ if __name__ == "__main__":
 import numpy as np
 
 from benchmarks.results import script, write_section
-from benchmarks.scale import apart, with_nodes_cut
+from benchmarks.scale import FAR, apart, with_far, with_nodes_cut
 from samples.large import write_scene
 from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import conditions_of
@@ -46,7 +46,6 @@ SLACK = 0.35  # of a ratio: what machines and their load make of it
 TRAJECTORIES, STEPS = 10, 100
 BALLS, FALL = (16, 512), 200
 GROWN = (256, 512)  # bodies far apart
-FAR, FAR_OFF = (10, 10_000), np.array([30.0, 30.0, 0.0])  # static ones, and where
 
 
 def solved(scene: Scene, steps: int, dt: float | None = None) -> float:
@@ -77,14 +76,6 @@ def bowl(count: int, folder: Path) -> tuple[float, float]:
     scene = load_scene(write_scene("bowl", folder / str(count), count))
     start = start_of_scene(scene, folder / "engine", scene_units(scene, load_model("solver")))
     return bullet(start, FALL)[1].wall_ms, solved(scene, FALL)
-
-
-def with_far(count: int) -> Scene:
-    """One box that slides on the floor, and static ones far away."""
-    scene = apart(count + 1)
-    mover, *others, floor = scene.bodies
-    still = [replace(b, motion="static", mass=0.0, position=b.position + FAR_OFF) for b in others]
-    return replace(scene, bodies=(replace(mover, velocity=np.array([-1.0, 0.0, 0.0])), *still, floor))
 
 
 def pairs(data: Path | None, folder: Path) -> dict[str, tuple[str, str, Callable[[], tuple[float, float]]]]:

@@ -1,10 +1,10 @@
 """What a network is worth on top of the contact solve: docs/simulator.md.
 
-    python benchmarks/network.py DATA [MORE ...] --at-frames DATA-60 -o DIR [--seeds 3] [--steps N]
+    python benchmarks/network.py DATA [MORE ...] -o DIR [--seeds 3] [--steps N]
 
 Trains the presets *alone*, *small* and *long* with every seed on the training trajectories of DATA and MORE, then rolls
-them out beside the solver with as many inner steps, on validation and test trajectories of DATA and of DATA-60 (whose
-errors are those at a frame alone). Trainings resume, and results that DIR holds are kept. Writes DIR/table.md.
+them out beside the solver with as many inner steps, on validation and test trajectories of DATA. Trainings resume, and
+results that DIR holds are kept. Writes DIR/table.md.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ from sdfsim.training.impulse_task import ImpulseTask
 from sdfsim.training.presets import PRESETS
 from sdfsim.training.train import train
 
-FRAME = "50"  # steps up to which, or at which, errors are told
+HORIZON = "50"  # steps up to which errors are told
+SPLITS = ("validation", "test")
 TIMED, STEPS_TIMED = 5, 100  # scenes, and steps of each
 
 
@@ -62,14 +63,14 @@ METHODS = {
 
 
 def judged(model: str, method: Method, data: Path, split: str, floor: bool) -> dict[str, Any]:
-    """Errors up to `FRAME` and at it alone, and how long a step takes; of the teacher run again, where asked for."""
+    """Errors up to `HORIZON`; of the teacher run again, where asked for."""
     report = evaluate(
-        data, model=model, split=split, steps=int(FRAME), stride=method.stride, substeps=method.substeps,
+        data, model=model, split=split, steps=int(HORIZON), stride=method.stride, substeps=method.substeps,
         chaos_floor=floor, errors_only=True,
     )  # fmt: skip
     found = {"model": report["model"][max(report["model"], key=int)]}
     again = report.get("chaos_floor", {}).get("perturbations", {})
-    return found | {name: errors[FRAME] for name, errors in again.items()}
+    return found | {name: errors[HORIZON] for name, errors in again.items()}
 
 
 def timed(model: str, method: Method, data: Path) -> dict[str, Any]:
@@ -131,32 +132,30 @@ def cell(found: list[dict[str, Any]]) -> str:
     return f"{np.mean(metres):.3f} m ({between}{low:.3f} to {high:.3f}), {np.mean(degrees):.1f}°"
 
 
-def main(data: list[Path], *, at_frames: Path, out: Path, seeds: int = 3, steps: int | None = None) -> None:
-    first, places = data[0], [(home, split) for home in (data[0], at_frames) for split in ("validation", "test")]
+def main(data: list[Path], *, out: Path, seeds: int = 3, steps: int | None = None) -> None:
+    first = data[0]
     jobs: list[Job] = []
     presets = dict.fromkeys(method.preset for method in METHODS.values() if method.preset)
     models = {preset: [trained(data, out, preset, seed, steps) for seed in range(seeds)] for preset in presets}
     for name, method in METHODS.items():
         for seed, model in enumerate(models[method.preset] if method.preset else [SOLVER]):
             content = [method, load_model(model).network if method.preset else None, read_info(first)]
-            for home, split in places:
-                key, floor = f"{home.name}-{split}", name == next(iter(METHODS))
-                arguments = (model, method, home, split, floor)
-                jobs.append(Job(key, f"{name}, seed {seed}", [content, key], judged, arguments))
+            for split in SPLITS:
+                arguments = (model, method, first, split, name == next(iter(METHODS)))
+                jobs.append(Job(split, f"{name}, seed {seed}", [content, split], judged, arguments))
             if seed == 0:
                 jobs.append(Job("time", name, content, timed, (model, method, first)))
     results = measure(jobs, out / "results", on_progress=told)
 
     def errors(name: str, who: str) -> list[list[dict[str, Any]]]:
-        """By place and seed, the errors of the model or of the teacher again."""
+        """By split and seed, the errors of the model or of the teacher again."""
         found = []
-        for home, split in places:
-            runs = [results.get((f"{home.name}-{split}", f"{name}, seed {seed}"), {}) for seed in range(seeds)]
-            runs = [run.get(who, run) for run in runs if who in run or "failed" in run]
-            found.append([run.get("at_frame", run) if home == at_frames else run for run in runs])
+        for split in SPLITS:
+            runs = [results.get((split, f"{name}, seed {seed}"), {}) for seed in range(seeds)]
+            found.append([run.get(who, run) for run in runs if who in run or "failed" in run])
         return found
 
-    rows: list[tuple[str, ...]] = [("", *(f"{home.name}, {split}" for home, split in places), "µs for 20 ms")]
+    rows: list[tuple[str, ...]] = [("", *SPLITS, "µs for 20 ms")]
     for name in METHODS:
         us = results["time", name].get("us", float("nan"))
         rows.append((name, *map(cell, errors(name, "model")), f"{us:.0f}"))

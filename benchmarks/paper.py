@@ -53,7 +53,7 @@ from sdfsim.training.surface_task import SurfaceTask
 from sdfsim.training.train import train
 
 NAMES = {
-    "paper": "SDF-Sim", "fignet": "FIGNet", "fignet-star": "FIGNet*", "mgn": "MGN", "mgn-large": "MGN, large radius",
+    "sdf-sim": "SDF-Sim", "fignet": "FIGNet", "fignet-star": "FIGNet*", "mgn": "MGN", "mgn-large": "MGN, large radius",
     "dpi": "DPI",
 }  # fmt: skip
 STEPS_SEEN, STEPS_TIMED = 200, 20  # recorded steps whose graphs are counted, and passed through the network
@@ -89,7 +89,7 @@ def recorded(name: str, data: Path) -> dict[str, float]:
     with one_thread(), torch.no_grad(), peak_memory() as memory:
         for k in range(STEPS_SEEN):
             bodies, state, _ = task.scenes(np.random.default_rng([0, k]), 1)
-            if name == "paper":
+            if name == "sdf-sim":
                 shared.compiled(bodies, state)  # not timed: a rollout does this once
             began = time.process_time()
             near = task.near(bodies, state, shared)
@@ -125,7 +125,7 @@ def grown(name: str, scene_file: Path) -> dict[str, float]:
 
 
 UNSIGNED = 64  # samples along each side
-COMPARED = NAMES | {"paper-unsigned": "SDF-Sim, unsigned distances"}
+COMPARED = NAMES | {"sdf-sim-unsigned": "SDF-Sim, unsigned distances"}
 
 
 def plan_of(name: str) -> Preset:

@@ -1,14 +1,16 @@
 """What large scenes cost, and many scenes at once: RESULTS.md.
 
-    python benchmarks/scale.py growth -o DIR [--paper PAPER.safetensors] [--largest 512]
+    python benchmarks/scale.py growth -o DIR [--sdf-sim SDF_SIM.safetensors] [--largest 512]
         bowls of spheres, boxes far apart and knots against bodies, nodes and contacts, beside networks and two engines
     python benchmarks/scale.py large -o DIR
         heaps, shoes and knots to the end on all cores, each with a movie
     python benchmarks/scale.py many DATA [--scenes 1000]
         scenes of a MOVi-B dataset at once, on Dask clusters of 1, 2 ... workers on this machine
+    python benchmarks/scale.py scenery [--repeats 7]
+        one body that moves beside static ones far away, with all that a user's step does
 
 Every case of the first runs in a process of its own on one thread; its times are those of the processor. What DIR
-holds is not measured again. The *paper* network predicts all motion of all bodies, as published.
+holds is not measured again. The *sdf-sim* network predicts all motion of all bodies, as published.
 """
 
 from __future__ import annotations
@@ -48,6 +50,8 @@ BOWLS = (1, 16, 64, 256, 512)
 APART = (125, 500, 2000)
 PARTS = (16, 4, 1)  # of the nodes of a knot
 DISTINCT, CHUNK, STEPS = 100, 10, 96  # scenes that differ, scenes of a job, steps of a scene
+FAR, FAR_OFF = (10, 10_000), np.array([30.0, 30.0, 0.0])  # static bodies, and where
+SLIDE = 100  # steps of what slides past them
 COLUMNS = {"ms": "ms a step", "peak_mib": "MiB", "contacts": "contacts", "depth_95": "deepest 95 %, mm", "lost": "lost"}
 
 
@@ -56,6 +60,14 @@ def apart(count: int) -> Scene:
     side = int(np.ceil(count**0.5))
     places = [[3.0 * (k % side), 3.0 * (k // side), 0.5] for k in range(count)]
     return on_floor([box(1.0)], [body(f"b{k}", 0, place) for k, place in enumerate(places)])
+
+
+def with_far(count: int) -> Scene:
+    """One box that slides on the floor, and static ones far away."""
+    scene = apart(count + 1)
+    mover, *others, floor = scene.bodies
+    still = [replace(b, motion="static", mass=0.0, position=b.position + FAR_OFF) for b in others]
+    return replace(scene, bodies=(replace(mover, velocity=np.array([-1.0, 0.0, 0.0])), *still, floor))
 
 
 def with_nodes_cut(scene: Scene, keep: float) -> Scene:
@@ -70,8 +82,8 @@ def ours(source: Path | int, steps: int, model: str, keep: float = 1.0) -> dict:
     scene = apart(source) if isinstance(source, int) else with_nodes_cut(load_scene(source), keep)
     frames, broken = [], None
     with peak_memory() as memory:
-        paper = load_model(model, weights=False).on_surfaces
-        simulator = Simulator(scene, model, free_flight="learned" if paper else "exact")
+        published = load_model(model, weights=False).on_surfaces
+        simulator = Simulator(scene, model, free_flight="learned" if published else "exact")
         frames.extend(simulator.frames(1))  # not timed: it loads what is compiled
         began = time.process_time()
         try:
@@ -110,7 +122,7 @@ def _where(scene: Scene, motion: Trajectory) -> dict[str, float]:
     }
 
 
-def jobs_of(folder: Path, paper: str | None, largest: int) -> list[Job]:
+def jobs_of(folder: Path, sdf_sim: str | None, largest: int) -> list[Job]:
     """Everything that is measured; scene files are written on first use."""
 
     def scene(name: str, count: int, nodes: int = 0) -> Path:
@@ -120,8 +132,8 @@ def jobs_of(folder: Path, paper: str | None, largest: int) -> list[Job]:
     jobs = []
     for count in (n for n in BOWLS if n <= largest):
         case = f"{count} spheres in a bowl"
-        for nodes, model in ((64, "solver"), (512, "solver"), (64, "small"), *(((64, paper),) if paper else ())):
-            steps, method = 200 if model != paper else 10, f"{Path(model).stem}, {nodes} nodes"
+        for nodes, model in ((64, "solver"), (512, "solver"), (64, "small"), *(((64, sdf_sim),) if sdf_sim else ())):
+            steps, method = 200 if model != sdf_sim else 10, f"{Path(model).stem}, {nodes} nodes"
             jobs.append(Job(case, method, [steps], ours, (scene("bowl", count, nodes), steps, model)))
         for name, run in (("PyBullet", bullet), ("MuJoCo", mujoco)):
             jobs.append(Job(case, name, [200], engine, (run, scene("bowl", count, 64), 200)))
@@ -133,9 +145,9 @@ def jobs_of(folder: Path, paper: str | None, largest: int) -> list[Job]:
     return jobs
 
 
-def growth(*, out: Path, paper: str | None = None, largest: int = 512) -> None:
+def growth(*, out: Path, sdf_sim: str | None = None, largest: int = 512) -> None:
     """Write the section and scale.png."""
-    results = measure(jobs_of(out, paper, largest), out / "results", where="fresh", on_progress=told)
+    results = measure(jobs_of(out, sdf_sim, largest), out / "results", where="fresh", on_progress=told)
     bowls = {key: found for key, found in results.items() if "bowl" in key[0]}
     panels = []
     for name in ("ms", "peak_mib"):
@@ -213,5 +225,29 @@ def many(data: Path, *, scenes: int = 1000) -> None:
     write_section("many scenes", f"python benchmarks/scale.py many DATA --scenes {scenes}", markdown(rows))
 
 
+@one_thread()
+def scenery(*, repeats: int = 7) -> None:
+    """Write the section: milliseconds of a step through `Simulator.steps` beside few and many static bodies."""
+    rows = [("a step of", *(f"ms beside {count:,}" for count in FAR), "times as long")]
+    for model in ("solver", "small"):
+        simulators = [Simulator(with_far(count), model) for count in FAR]
+        for simulator in simulators:
+            simulator.rules = replace(simulator.rules, sleep=False)
+            simulator.step(2)  # not timed: it loads what is compiled
+        times = np.array([[slid(simulator) for simulator in simulators] for _ in range(repeats)])
+        ratio = times[:, 1] / times[:, 0]
+        span = f"{np.median(ratio):.1f} ({ratio.min():.1f} to {ratio.max():.1f})"
+        rows.append((f"`{model}`", *map(number, np.median(times, axis=0)), span))
+    write_section("scenery", "python benchmarks/scale.py scenery", markdown(rows))
+
+
+def slid(simulator: Simulator) -> float:
+    """Milliseconds a step of the processor, from the start of the scene."""
+    simulator.reset()
+    began = time.process_time()
+    deque(simulator.steps(SLIDE), maxlen=0)
+    return 1e3 * (time.process_time() - began) / SLIDE
+
+
 if __name__ == "__main__":
-    script(__doc__, growth, large, many)
+    script(__doc__, growth, large, many, scenery)

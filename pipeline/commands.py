@@ -11,9 +11,9 @@ from sdfsim.commands.arguments import Budget, Cluster, Out, command, tell_failed
 from sdfsim.console import Session, duration
 from sdfsim.errors import EXIT_ERROR, EXIT_USAGE, SdfsimError
 
-Presets = Literal["quick", "standard", "fine", "paper"]
+Presets = Literal["quick", "standard", "fine", "volsdf"]
 Preset = Annotated[
-    Presets, typer.Option(help="How much time to spend; paper is the network of the VolSDF paper, for a GPU.")
+    Presets, typer.Option(help="How much time to spend; volsdf is the network of the paper of that name, for a GPU.")
 ]
 Photos = Annotated[
     Path,
@@ -153,7 +153,10 @@ def fit(
     ] = None,
     recipe: Annotated[
         Literal["quick", "default", "paper"] | None,
-        typer.Option(help="How networks are fitted (a reconstruction: as its preset says).", show_default=False),
+        typer.Option(
+            help="How networks are fitted; paper: as Rubanova et al. did (a reconstruction: as its preset says).",
+            show_default=False,
+        ),
     ] = None,
     budget: Budget = None,
     cap: Annotated[bool, typer.Option("--cap", help="Close openings of any size (with -o).")] = False,

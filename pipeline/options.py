@@ -15,7 +15,7 @@ from sdfsim.files import CONFIG, write_text
 
 COMMAND = "reconstruct"
 ALLOWED = {
-    "preset": ("quick", "standard", "fine", "paper"),
+    "preset": ("quick", "standard", "fine", "volsdf"),
     "device": ("auto", "cpu", "cuda"),
     "drop": ("box", "ball", "none"),
 }
@@ -27,7 +27,7 @@ class Options:
     """Every option of a reconstruction, as written to config.yaml."""
 
     photos: str = ""  # what the user gave, an absolute path
-    preset: str = "standard"  # quick, standard, fine, or paper
+    preset: str = "standard"  # quick, standard, fine, or volsdf
     size: float | None = None  # widest side of the scene, m; None: assumed to be 1 m
     budget: float | None = None  # s for everything; None: what the preset takes
     seed: int = 0  # of everything random

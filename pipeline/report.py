@@ -186,7 +186,8 @@ def page(report: dict, folder: Path) -> str:
         rows += [(f"attempt: {one['name']}", "; ".join(one["failures"]) or f"good, {one['posed']} posed")
                  for one in poses.get("attempts", [])]  # fmt: skip
     if report["psnr"] is not None:
-        rows.append(("photos that were not trained on", f"PSNR {report['psnr']:.1f} dB"))
+        side = stages["distill"].get("psnr_px", "a third of the trained")  # not told by runs of before
+        rows.append(("photos that were not trained on", f"PSNR {report['psnr']:.1f} dB at {side} px"))
     if mesh:
         rows += [
             ("extent", " x ".join(f"{side:.3g}" for side in mesh["extent_m"]) + " m"), ("scale", mesh["size"]),

@@ -146,6 +146,6 @@ def presets():
     """Tiny presets under names of their own."""
     tiny = Preset("impulse", {"width": 16, "rounds": 2}, steps=150, batch=16, rate=3e-3, matrix_rate=0.01)
     train_module.PRESETS["tiny"] = tiny
-    train_module.PRESETS["tiny-paper"] = Preset("paper", {"width": 16, "steps": 2}, 60, 2, 3e-3, noise=0.003)
+    train_module.PRESETS["tiny-sdf-sim"] = Preset("sdf-sim", {"width": 16, "steps": 2}, 60, 2, 3e-3, noise=0.003)
     yield
-    del train_module.PRESETS["tiny"], train_module.PRESETS["tiny-paper"]
+    del train_module.PRESETS["tiny"], train_module.PRESETS["tiny-sdf-sim"]

@@ -57,3 +57,135 @@ def test_links_lead_to_files(page):
 
 def test_the_readme_is_short():
     assert (ROOT / "README.md").stat().st_size <= 5000
+
+
+# --- numbers and names that stand in two places ---
+
+
+def page(name: str) -> str:
+    return (ROOT / name).read_text(encoding="utf-8")
+
+
+def cells(text: str, first: str) -> list[str]:
+    """The other cells of the row of a table whose first cell begins so."""
+    found = [line for line in text.splitlines() if line.startswith(f"| {first}")]
+    assert found, first
+    return [cell.strip() for cell in found[0].strip("|").split("|")[1:]]
+
+
+def section(name: str, text: str) -> str:
+    """What stands between the marks of a section."""
+    return text.partition(f"<!-- {name} -->")[2].partition(f"<!-- end of {name} -->")[0]
+
+
+def numbers(text: str) -> list[float]:
+    return [float(found.replace(",", "")) for found in re.findall(r"\d[\d,]*\.?\d*", text)]
+
+
+@pytest.mark.parametrize(
+    ("row", "other"),
+    [("`solver`", "`solver`"), ("`small`", "`small`"), ("the physics engine again", "the engine again, starts 1e-3")],
+)
+def test_the_readmes_errors_are_the_results(row, other):
+    """To the digits that the README has; it leaves out the intervals."""
+    shown = [numbers(cell) for cell in cells(page("README.md"), row)]
+    told = [numbers(cell)[0] for cell in cells(section("MOVi-B", page("benchmarks/RESULTS.md")), other)]
+    assert len(shown) == 2
+    for (metres, degrees), (true_metres, true_degrees) in zip(shown, [told[:2], told[2:]], strict=True):
+        assert metres == pytest.approx(true_metres, abs=0.0006)
+        assert degrees == pytest.approx(true_degrees, abs=0.06)
+
+
+def test_the_solvers_errors_on_other_pages_are_the_results():
+    metres, degrees, *_ = cells(section("MOVi-B", page("benchmarks/RESULTS.md")), "`solver`")
+    metres, degrees = f"{numbers(metres)[0]:.3f} m", f"{numbers(degrees)[0]:.1f}°"
+    assert f"the contact solve on the convex pieces {metres}, {degrees}" in page("docs/paper.md")
+    assert f"today's has {metres} and {degrees} on test" in page("docs/simulator.md")
+
+
+def test_errors_beside_hopnet_are_the_results():
+    table = section("instants", page("benchmarks/RESULTS.md"))
+    text = page("docs/simulator.md").partition("### Beside HOPNet")[2].partition("\n## ")[0]
+    for first in ("`solver`", "HOPNet"):
+        *_, last = cells(table, first)
+        metres, degrees = (numbers(last)[k] for k in (0, -1 if first == "`solver`" else 1))
+        assert f"{metres:g} m" in text and f"{degrees:g} degrees" in text
+    assert cells(table, "bodies that have met nothing yet")[-1] in text
+
+
+def test_what_far_scenery_costs_is_the_same_everywhere():
+    table = section("scenery", page("benchmarks/RESULTS.md"))
+    ratios = [numbers(cells(table, f"`{model}`")[-1])[0] for model in ("solver", "small")]
+    for name in ("docs/scale.md", "benchmarks/RESULTS.md"):
+        told = re.search(r"takes (\S+) times as long beside 10,000\s+static", page(name))
+        assert told and numbers(told[1]) == [round(max(ratios))]
+
+
+def test_errors_of_reconstructions_name_one_direction():
+    """*standard* has the same figures, for the same direction, on both pages."""
+    results, photos = page("benchmarks/RESULTS.md"), page("docs/photos.md")
+    assert cells(results, "error, median")[1] == cells(photos, "reconstructed surface to the true one")[2]
+    assert cells(results, "missing, median")[1] == cells(photos, "true surface to the reconstruction")[2] == ""
+    assert cells(results, "share of the true surface")[1] == cells(photos, "share of the true surface")[2]
+
+
+def test_steps_in_documents_are_those_of_the_presets():
+    from pipeline.field.training import PRESETS
+
+    text = page("benchmarks/RESULTS.md").partition("## Reconstruction\n")[2]
+    assert f"*quick*, {PRESETS['quick'].iterations:,} steps" in text
+    for name in ("benchmarks/RESULTS.md", "docs/photos.md"):
+        assert f"the preset has {PRESETS['standard'].iterations:,}" in page(name)
+    assert f"now it stops at {PRESETS['quick'].iterations:,}" in page("docs/tradeoff.md")
+    sides = [f"{PRESETS[name].long_side // 3} px" for name in ("quick", "standard")]
+    assert all(side in page("docs/tradeoff.md") for side in sides) and sides[0] in text
+
+
+def test_the_bundled_model_is_said_to_learn_from_what_it_learned_from():
+    """The tutorial's commands and the card's make as many trajectories as the file of the model knows."""
+    from sdfsim.dynamics.model import load_model
+
+    made = [known["trajectories"] for known in load_model("small").card["data"]]
+    loops = re.findall(r"for split in (.*?); do.*\n.*?-o (\S+)", page("docs/tutorial.md"))
+    tutorial = {out: dict(pair.split(":") for pair in splits.split()) for splits, out in loops}
+    card = page("sdfsim/models/small.md")
+    for counts, out, name in zip(made, ("data", "data-60", "data-v"), ("MOVI-B", "MOVI-B-60", "VARIED"), strict=True):
+        for split in ("train", "validation"):
+            assert int(tutorial[out][split]) == counts[split]
+            assert re.search(rf"-o {name} .*--trajectories {counts[split]} .*--split {split}", card)
+
+
+def test_hard_cases_are_summed_up_alike():
+    lines = re.findall(
+        r"^- .* 0 cases.*$|^- \w+: \d+ figures.*$", section("hard cases", page("benchmarks/RESULTS.md")), re.M
+    )
+    assert len(lines) == 5
+    assert all(line in section("hard cases", page("docs/stability.md")) for line in lines)
+
+
+def test_presets_and_recipes_in_documents_exist():
+    from typing import get_args
+
+    from pipeline.commands import Presets
+    from sdfsim.shape.fit import Recipe
+    from sdfsim.training.presets import PRESETS as TRAINED
+
+    known = {"reconstruct": get_args(Presets), "train": tuple(TRAINED), "fit": get_args(Recipe)}
+    named = set()
+    for file in (*PAGES, ROOT / "sdfsim" / "models" / "small.md"):
+        for line in file.read_text(encoding="utf-8").splitlines():
+            for found in re.finditer(r"(reconstruct|train|fit)\b[^`|]*?--(?:preset|recipe) ([\w-]+)", line):
+                assert found[2] in known[found[1]], f"{file.name}: {line}"
+                named.add((found[1], found[2]))
+    assert {("train", "sdf-sim"), ("reconstruct", "volsdf"), ("reconstruct", "quick"), ("train", "small")} <= named
+
+
+def test_a_thousandfold_weight_stands_as_long_as_the_table_says():
+    """Three seconds in the table of hard cases, and in the sentence about it; the README points there."""
+    text = page("docs/stability.md")
+    depth, fallen = text[text.index("| 1000 kg on 1 kg") :].splitlines()[:2]
+    assert "| fallen |" in fallen and fallen.split("|")[4].strip() == "0.0 bodies"
+    sunk = round(numbers(depth.split("|")[4])[0])
+    told = " ".join(text.split())
+    assert f"it stands for 3 s, sunk by {sunk} % of its size, but it slides off after" in told
+    assert "creeps, and slides off after seconds" in page("README.md")

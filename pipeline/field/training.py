@@ -87,7 +87,7 @@ PRESETS = {
     ),
     # The paper's (section 4, appendix B): L1 colour, eikonal 0.1, Adam 5e-4, 1024 rays of 64 samples. Its beta is
     # learned; sparse points, which the paper did without, get little weight.
-    "paper": Settings(
+    "volsdf": Settings(
         size=MlpSize(), iterations=100_000, rays=1024, samples=64, long_side=1600, rate=5e-4, eikonal=0.1,
         curvature=0.0, sparse=0.1, free=0.0, surface_points=2048,
     ),
@@ -512,8 +512,8 @@ def train(
 
 def score(views: list[View], photos_folder: Path, trainer: Trainer, out: Path, *, masked: bool,
           on_progress: Progress = quiet) -> dict:  # fmt: skip
-    """PSNR of held-out views, in normalised space, for the report, at a third of the training resolution; empty where
-    none shows anything of the unit sphere. Writes the renders to `out`/held_out."""
+    """PSNR of held-out views, in normalised space, for the report, at a third of the training resolution (`psnr_px` on
+    the long side); empty where none shows anything of the unit sphere. Writes the renders to `out`/held_out."""
     rays = load_rays(views, photos_folder, max(100, trainer.settings.long_side // 3), masks=False).to(trainer.device)
     shown: list[int] = rays.view.unique().tolist()
     if not shown:
@@ -529,6 +529,7 @@ def score(views: list[View], photos_folder: Path, trainer: Trainer, out: Path, *
     return {
         "held_out_photos": [views[number].source for number in shown],
         "psnr": round(float(np.mean(psnr)), 2), "psnr_each": [round(value, 2) for value in psnr],
+        "psnr_px": int(rays.sizes.max()),
     }  # fmt: skip
 
 

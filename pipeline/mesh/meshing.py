@@ -29,7 +29,7 @@ from sdfsim.shape.mesh import Mesh, joined, read_attributes, read_mesh, write_gl
 
 SCENERY = "scene"
 TEXTURED, NEXT = "textured.glb", "next_photos.json"
-RESOLUTION = {"quick": 192, "standard": 288, "fine": 448, "paper": 448}  # samples a side, by preset
+RESOLUTION = {"quick": 192, "standard": 288, "fine": 448, "volsdf": 448}  # samples a side, by preset
 # The picture of names: at most so many photos, their width while they are chosen and in the picture, px, and the tint.
 PICTURES, THUMB, WIDE, TINT = 4, 80, 720, 0.45
 

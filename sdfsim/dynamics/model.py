@@ -21,7 +21,7 @@ BUNDLED = Path(__file__).resolve().parent.parent / "models"
 MOST = 4096  # of any size of a network
 MODEL_VERSION = 3  # 2: networks without the contact solve; 1: of an earlier teacher
 SOLVER = "solver"
-SURFACE = ("paper", "fignet", "fignet-star", "mgn", "dpi")  # networks whose messages run between surface nodes
+SURFACE = ("sdf-sim", "fignet", "fignet-star", "mgn", "dpi")  # networks whose messages run between surface nodes
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from sdfsim.dynamics.units import scene_units
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation import metrics
 from sdfsim.evaluation.engines import Start, bullet, dataset_urdf
-from sdfsim.evaluation.metrics import FRAMES, HORIZONS, Motions, energy_gain, errors
+from sdfsim.evaluation.metrics import Motions, energy_gain, errors
 from sdfsim.evaluation.penetration import EVERY, exact_solids, penetration
 from sdfsim.parallel import Progress, parallel, silent
 from sdfsim.scene.scene import Scene
@@ -65,7 +65,7 @@ def evaluate(
 
     Args:
         model: bundled name, path or `Model`.
-        steps: how far; errors are reported at the horizons of `HORIZONS` and `FRAMES` up to there, and there.
+        steps: how far; errors are reported at the horizons of `HORIZONS` up to there, and there.
         free_flight: "exact" or (networks on surface nodes) "learned".
         stride: recorded steps in a step of the model; errors are then those of every so many-th frame.
         substeps: inner steps of the solve in a step; None for the model's, else for those of the recording engine where
@@ -243,9 +243,6 @@ def report_lines(report: dict[str, Any]) -> list[str]:
         "Translation RMSE and mean rotation error up to each horizon (95 % intervals over trajectories)",
         *columns(error_rows(report, name=name)),
         "",
-        "Errors at a frame alone: translation is the mean over trajectories of the RMSE over bodies",
-        *columns(error_rows(report, name=name, at_frame=True)),
-        "",
         *columns(quality_rows(report, name=name)),
         "",
         *notes(report),
@@ -254,21 +251,18 @@ def report_lines(report: dict[str, Any]) -> list[str]:
     ]
 
 
-def error_rows(report: dict[str, Any], *, name: str, at_frame: bool = False) -> Rows:
-    """Errors up to every horizon, or at each of `metrics.FRAMES` alone; the head first. Rows are the model, the teacher
-    again, and flight without contact. Intervals go with the horizons."""
+def error_rows(report: dict[str, Any], *, name: str) -> Rows:
+    """Errors up to every horizon, with their intervals; the head first. Rows are the model, the teacher again, and
+    flight without contact."""
     again = {f"teacher, {size} m/s off": found for size, found in _perturbed(report).items()}
-    longest = max(map(int, report["model"]))
-    shown = [h for h in report["model"] if int(h) in (FRAMES if at_frame else (*HORIZONS, longest))]
-    spans = [f"{f'frame {h}' if at_frame else f'{h} steps'} = {report['model'][h]['seconds']:.3g} s" for h in shown]
+    spans = [f"{steps} steps = {found['seconds']:.3g} s" for steps, found in report["model"].items()]
     rows: Rows = [("", *(f"{unit}, {span}" for span in spans for unit in ("m", "degrees")))]
     for who, horizons in ({name: report["model"]} | again | {"ballistic": report["ballistic"]}).items():
         cells = []
-        for steps in shown:
-            found = horizons[steps]["at_frame"] if at_frame else horizons[steps]
+        for found in horizons.values():
             for what, digits in (("translation_rmse", 3), ("rotation_error", 1)):
                 low, high = (f"{end:.{digits}f}" for end in found[f"{what}_95"])
-                cells.append(f"{found[what]:.{digits}f}" + (f" ({low} to {high})" if not at_frame else ""))
+                cells.append(f"{found[what]:.{digits}f} ({low} to {high})")
         rows.append((who, *cells))
     return rows
 

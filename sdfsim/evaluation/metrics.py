@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 from sdfsim.data.dataset import Trajectory
 
 HORIZONS = (50, 100)  # steps; errors over all steps up to there are what Rubanova et al. 2024 report
-FRAMES = (25, 50, 75, 100)  # steps; errors there are what HOPNet (Wei et al. 2025) and RigidFormer (2026) report
 REST_SPEED = 0.05  # m/s, what rests in a recording is slower than this
 REST_STEPS = 10  # the last steps, in which it has to be
 LIMITS = (0.1, 0.25, 0.5)  # m, translation errors that a body survives
@@ -22,13 +21,13 @@ def errors(motions: Motions, recorded: Motions) -> dict[str, dict]:
     Returns:
         Horizon in steps -> seconds, translation_rmse m and rotation_error degrees over all bodies and steps up to
         there, with 95 % intervals over trajectories, and `at_frame`: the same in the last of these steps alone, where
-        translation is the mean over trajectories of the root mean square over bodies.
+        translation is the mean over trajectories of the root mean square over bodies (so HOPNet, Wei et al. 2025).
     """
     longest = len(recorded[0].position) - 1
     bodies = np.array([(~t.static).sum() for t in recorded])
     share = bodies / bodies.mean()
     report = {}
-    for h in sorted({h for h in (*HORIZONS, *FRAMES) if h <= longest} | {longest}):
+    for h in sorted({h for h in HORIZONS if h <= longest} | {longest}):
         upto, there = (
             np.array([compared(motion, truth, frames) for motion, truth in zip(motions, recorded, strict=True)])
             for frames in (slice(1, h + 1), slice(h, h + 1))

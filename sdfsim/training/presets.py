@@ -9,7 +9,7 @@ from dataclasses import dataclass
 class Preset:
     """One way to train one network."""
 
-    kind: str  # "impulse", or a network on surface nodes: "paper", "fignet", "fignet-star", "mgn", "dpi"
+    kind: str  # "impulse", or a network on surface nodes: "sdf-sim", "fignet", "fignet-star", "mgn", "dpi"
     config: dict[str, int]  # sizes of the network
     steps: int  # of the optimiser
     batch: int  # contact frames (impulse) or recorded steps (others) a step
@@ -28,7 +28,7 @@ LITTLE = {"width": 32, "rounds": 4}
 PUBLISHED = {"width": 128, "steps": 10}  # sizes of SDF-Sim's network
 # The radii of MeshGraphNets and DPI are not in the texts that we have: with these, graphs of MOVi-B have about as many
 # edges between bodies as SDF-Sim's paper counts (docs/paper.md).
-RADII = {"paper": 0.1, "fignet": 0.1, "fignet-star": 0.1, "mgn": 0.02, "mgn-large": 0.38, "dpi": 0.3}
+RADII = {"sdf-sim": 0.1, "fignet": 0.1, "fignet-star": 0.1, "mgn": 0.02, "mgn-large": 0.38, "dpi": 0.3}
 
 PRESETS = {
     "small": Preset("impulse", LITTLE, steps=16_000, batch=32, rate=2e-3, matrix_rate=0.01),

@@ -11,7 +11,7 @@ from sdfsim.dynamics import step as step_module
 from sdfsim.dynamics.kernels import impulse
 from sdfsim.dynamics.models import near
 from sdfsim.dynamics.models.near import find_contacts
-from sdfsim.dynamics.models.paper import paper_graph
+from sdfsim.dynamics.models.sdf_sim import sdf_sim_graph
 from sdfsim.dynamics.models.surfaces import compact, node_owner, predict
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.scene.scene import Effects, Scene, Waypoints
@@ -141,7 +141,7 @@ def test_the_paper_network_sees_only_bodies_with_an_edge_and_answers_as_for_all(
     model = surface_model(push=1e-2)
     sim = Simulator(dropped, model)
     contacts = find_contacts(sim.bodies, sim.state, sim.rules.gravity, sim.model.reach, sim.rules.dt)
-    everything = paper_graph(sim.bodies, sim.state, contacts)
+    everything = sdf_sim_graph(sim.bodies, sim.state, contacts)
     whole = predict(model.network, everything, sim.bodies, sim.state, sim.rules.dt)  # type: ignore[arg-type]
     graphs = seen_by(model)
     rows = torch.cat([contacts.owner, contacts.body]).unique()

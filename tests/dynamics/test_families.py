@@ -123,7 +123,7 @@ def test_pairs_of_faces_are_all_that_are_nearer_than_reach(seed):
     np.testing.assert_allclose(pairs.distance[pairs.body > 0], pairs.way[pairs.body > 0].norm(dim=-1), atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", [kind for kind in FAMILIES if kind != "paper"])
+@pytest.mark.parametrize("kind", [kind for kind in FAMILIES if kind != "sdf-sim"])
 def test_the_mirrored_graph_is_the_graph_of_the_mirrored_scene(kind):
     """All but SDF-Sim, whose distances are those of shapes that nothing here mirrors."""
     bodies, state = bodies_of(kind)

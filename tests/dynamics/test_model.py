@@ -10,7 +10,7 @@ from tests.dynamics.conftest import random_model
 META = torch.device("meta")  # stands in for a GPU
 
 
-@pytest.mark.parametrize("kind", ["impulse", "paper"])
+@pytest.mark.parametrize("kind", ["impulse", "sdf-sim"])
 def test_a_model_that_goes_to_a_device_leaves_itself_behind(kind, dropped):
     model = random_model(kind)
     simulator = Simulator(dropped, model)

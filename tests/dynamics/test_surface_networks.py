@@ -19,7 +19,7 @@ def kind(request) -> str:
     return request.param
 
 
-def surface_model(kind: str = "paper", push: float = 1e-3):
+def surface_model(kind: str = "sdf-sim", push: float = 1e-3):
     """Untrained, its accelerations of the size of `push`."""
     model = random_model(kind, width=16, steps=2)
     model.network.target.total.fill_(1.0)

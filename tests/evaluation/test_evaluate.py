@@ -46,7 +46,7 @@ def with_bowl(tmp_path):
 
 def test_a_perfect_model_has_no_error_and_loses_nobody(ball_data, replayed):
     report = evaluate(ball_data, model=random_model("impulse"), split="validation")
-    assert list(report["model"]) == ["25", "39"] and report["model"]["39"]["seconds"] == pytest.approx(0.78)
+    assert list(report["model"]) == ["39"] and report["model"]["39"]["seconds"] == pytest.approx(0.78)
     assert (report["steps"], report["steps_asked"]) == (39, 100)  # the recordings are short, and that is told
     assert report["model"]["39"]["translation_rmse"] == 0.0
     assert report["model"]["39"]["rotation_error"] == pytest.approx(0.0, abs=1e-9)

@@ -1,4 +1,4 @@
-"""The README's first command does what it shows: a ball knocks the vase off the table."""
+"""The README's first command does what it shows: a true surface, and a ball that knocks the vase off the table."""
 
 import subprocess
 from pathlib import Path
@@ -8,7 +8,9 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from benchmarks.reconstruct import PHOTOS, evaluate
 from sdfsim import Rollout, load_scene
+from sdfsim.files import read_json
 
 ROOT = Path(__file__).resolve().parents[2]
 TABLE = 0.55  # m, the height of its top in samples/photos/table_vase
@@ -19,6 +21,25 @@ def demo(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("demo")
     subprocess.run(["bash", "scripts/demo.sh", str(out)], cwd=ROOT, check=True)
     return out
+
+
+@pytest.mark.gate
+def test_the_surface_is_as_near_the_truth_as_it_was(demo):
+    """Percent of the table's width, against the mesh that samples/photos/make.py rendered the photos from.
+
+    Seven runs of *quick* (docs/tradeoff.md) had a median of 0.21, with a standard deviation of 0.03, and 90 % within
+    0.79 (0.05). The limits are four and five of these away, so that other seeds and sums in another order pass, and
+    1,575 steps in place of 2,800 do not (90 % within 1.13). What is missing of the true surface is held too: today
+    0.15 in the median, and 97.2 % of it found within 1 %.
+    """
+    truth, report = evaluate(demo / "scene", PHOTOS), read_json(demo / "scene" / "report.json")
+    assert truth["poses"]["center_error_worst_percent"] < 0.5
+    assert report["psnr"] > 20
+    found = truth["surface_percent_of_table_width"]
+    assert found["surface"]["median"] < 0.33
+    assert found["surface"]["p90"] < 1.05
+    assert found["missing"]["median"] < 0.25
+    assert found["complete_percent"] > 95.5
 
 
 @pytest.mark.gate

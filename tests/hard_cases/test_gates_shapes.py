@@ -27,7 +27,7 @@ def dropped(nodes: np.ndarray, shape=gates.CUBE):
     return replace(scene, shapes=(replace(shape, nodes=nodes), *scene.shapes[1:]))
 
 
-@pytest.mark.parametrize("make", [lambda: random_model("impulse", push=0.1), surface_model], ids=["impulse", "paper"])
+@pytest.mark.parametrize("make", [lambda: random_model("impulse", push=0.1), surface_model], ids=["impulse", "sdf-sim"])
 def test_coplanar_nodes_run(make):
     rollout = Simulator(dropped(FLAT), make()).run(steps=12)
     gates.assert_sound(rollout)

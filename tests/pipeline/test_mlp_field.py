@@ -16,7 +16,7 @@ from pipeline.sfm.supervision import supervision_of
 from tests.pipeline.test_field import UNIT, one_thread, toy_rays  # noqa: F401  a fixture
 
 TINY = MlpSize(depth=4, width=32, frequencies=3, color_depth=2, view_frequencies=2, background=8)
-PAPER = PRESETS["paper"]
+VOLSDF = PRESETS["volsdf"]
 
 
 def points(count: int = 2000) -> torch.Tensor:
@@ -64,7 +64,7 @@ def test_without_gradients_nothing_is_kept():
 
 def trainer(**changes) -> MlpTrainer:
     small = {"size": TINY, "rays": 32, "samples": 16, "surface_points": 64, "iterations": 40, "rate": 2e-3}
-    settings = replace(PAPER, **{**small, **changes})
+    settings = replace(VOLSDF, **{**small, **changes})
     nothing = np.zeros((0, 3))
     sparse = Sparse(nothing, nothing.astype(np.uint8), np.zeros(0), np.zeros(0, int), np.zeros(0, int))
     supervision = supervision_of(sparse, [], UNIT)
@@ -122,5 +122,5 @@ def test_the_field_is_read_back(tmp_path):
 @pytest.mark.slow
 def test_the_papers_preset_learns_on_the_cpu():
     """The full 8 x 256 network, some hundred steps of few rays."""
-    run = trainer(size=MlpSize(), rays=32, samples=24, iterations=300, surface_points=64, rate=PAPER.rate)
+    run = trainer(size=MlpSize(), rays=32, samples=24, iterations=300, surface_points=64, rate=VOLSDF.rate)
     assert falls(run, 300, "color", 20) < 0.3

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,7 +20,6 @@ from sdfsim.files import locked
 from tests.cli.conftest import run as command
 from tests.pipeline.conftest import RESULTS, noise
 
-ROOT = Path(__file__).resolve().parent.parent.parent
 NAMES = list(STAGES)
 DEVICES = ("distill", "mesh", "fit")
 REAL = dict(STAGES)
@@ -341,19 +339,3 @@ def test_a_place_that_is_not_in_the_photos_is_refused_before_the_poses(photos, t
     monkeypatch.setattr("pipeline.sfm.poses.solve", lambda *places, **options: pytest.fail("solved"))
     with pytest.raises(SdfsimError, match=r"distance: no photo is called 'cup\.png'"):
         reconstruct(photos, tmp_path / "out", distance=["0.png:3,4", "cup.png:1,1", 0.1])
-
-
-@pytest.mark.slow
-def test_the_whole_chain_on_the_rendered_set(tmp_path):
-    sys.path.insert(0, str(ROOT))
-    from benchmarks.reconstruct import evaluate
-
-    source = ROOT / "samples" / "photos" / "table_vase"
-    report = reconstruct(source, tmp_path, preset="quick")
-    truth = evaluate(tmp_path, source)
-    assert truth["poses"]["center_error_worst_percent"] < 0.5
-    surface = truth["surface_percent_of_table_width"]["surface"]
-    assert surface["median"] <= 1.0
-    assert surface["p90"] <= 4.0
-    assert report["psnr"] > 20
-    assert (tmp_path / "scene.yaml").exists()

@@ -104,6 +104,8 @@ def test_held_out_photos_that_show_nothing_of_the_sphere_are_passed_over(tmp_pat
     ring[4] = away(ring[4])
     report = train(ring, cloud(), tmp_path, tmp_path, settings=settings, threads=1).report
     assert report["held_out_photos"] == ["IMG_12.JPG"] and len(report["psnr_each"]) == 1
+    with Image.open(tmp_path / HELD_OUT / "12.jpg") as render:
+        assert report["psnr_px"] == max(render.size)
     assert np.isfinite(report["psnr"]) and [p.name for p in (tmp_path / HELD_OUT).iterdir()] == ["12.jpg"]
     assert score([away(view) for view in views(2)], tmp_path, Ball(), tmp_path, masked=False) == {}  # type: ignore[arg-type]
 

@@ -98,8 +98,8 @@ def test_the_engines_inner_steps_are_counted():
 def test_errors_at_a_frame_are_those_of_that_frame_alone():
     from sdfsim.evaluation.metrics import errors
 
-    truth = balls(np.zeros((31, 2, 3)))
-    other = np.zeros((31, 2, 3))
+    truth = balls(np.zeros((26, 2, 3)))
+    other = np.zeros((26, 2, 3))
     other[25, 0, 0], other[10, 1, 0] = 0.3, 7.0
     found = errors([replace(truth, position=other), truth], [truth, truth])["25"]
     assert found["at_frame"]["translation_rmse"] == pytest.approx(0.5 * 0.3 / 2**0.5)

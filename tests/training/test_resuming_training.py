@@ -64,7 +64,7 @@ def test_frames_of_another_version_are_refused_where_nothing_else_tells_it(frame
     assert file.name in error.value.message and "made again" in error.value.hint
 
 
-@pytest.mark.parametrize("preset", ["tiny", "tiny-paper"])
+@pytest.mark.parametrize("preset", ["tiny", "tiny-sdf-sim"])
 def test_a_run_does_not_go_on_with_other_data(ball_data, presets, preset, tmp_path):
     other = tmp_path / "other"
     shutil.copytree(ball_data, other, ignore=shutil.ignore_patterns("frames"))

@@ -29,7 +29,7 @@ from sdfsim.training.train import train
 from tests.dynamics.conftest import contact_graph, in_single
 
 CPU = torch.device("cpu")
-PAPER = PRESETS["paper"]
+SDF_SIM = PRESETS["sdf-sim"]
 ONCE = Solved(draws=1)
 
 
@@ -74,7 +74,7 @@ def test_perfect_predictions_have_no_loss_and_free_flight_has(ball_data):
     assert float(task.loss(flying, batch)) > 0.1 * REST_SPEED
 
 
-@pytest.mark.parametrize("preset", ["tiny", "tiny-paper"])
+@pytest.mark.parametrize("preset", ["tiny", "tiny-sdf-sim"])
 def test_it_learns_and_the_model_file_gives_the_same_network(ball_data, presets, preset, tmp_path):
     place = tmp_path / "run"
     plan = train_module.PRESETS[preset]
@@ -88,7 +88,7 @@ def test_it_learns_and_the_model_file_gives_the_same_network(ball_data, presets,
     assert not list(place.glob("*.part")) and (place / "log.jsonl").exists()
 
 
-@pytest.mark.parametrize("kind", [kind for kind in SURFACE if kind != "paper"])
+@pytest.mark.parametrize("kind", [kind for kind in SURFACE if kind != "sdf-sim"])
 def test_the_baselines_learn_and_move_bodies(ball_data, kind, tmp_path):
     plan = Preset(kind, {"width": 16, "steps": 2}, steps=60, batch=2, rate=3e-3, nodes=30, noise=0.003)
     task, held_out = train_module._tasks(plan, [ball_data], CPU, lambda f, m: None)
@@ -158,7 +158,7 @@ def test_paper_targets_lead_exactly_to_the_recorded_pose(ball_data):
     )
     landed = advance(bodies, state, target_acceleration(bodies, state, *after), t.dt)
     torch.testing.assert_close(landed.position, after[0], rtol=0, atol=1e-12)
-    assert SurfaceTask(ball_data, "train", PAPER, CPU, noisy=True).dt == t.dt
+    assert SurfaceTask(ball_data, "train", SDF_SIM, CPU, noisy=True).dt == t.dt
 
 
 def test_an_unreadable_frame_cache_is_named(ball_data):

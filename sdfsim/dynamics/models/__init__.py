@@ -1,1 +1,1 @@
-"""The networks: SDF-Sim as published (`paper`), and `impulse`, which acts on top of the contact solve."""
+"""The networks: SDF-Sim as published (`sdf-sim`), and `impulse`, which acts on top of the contact solve."""

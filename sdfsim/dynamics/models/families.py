@@ -1,4 +1,4 @@
-"""The networks on surface nodes by name: SDF-Sim (*paper*) and the baselines of its paper. They differ in their graphs.
+"""The networks on surface nodes by name: SDF-Sim (*sdf-sim*) and the baselines of its paper; their graphs differ.
 
 All graphs are of a state that carries its two earlier poses. Vertices, particles and body nodes of all have the
 features of SDF-Sim's nodes, contact edges reach farther by what their ends close in during a step, and an infinite
@@ -21,7 +21,7 @@ from sdfsim.dynamics.models.fignet import FIGNET, FIGNET_STAR, fignet_graph, fig
 from sdfsim.dynamics.models.message_passing import Graph, Layout
 from sdfsim.dynamics.models.mgn import MGN, mgn_graph
 from sdfsim.dynamics.models.near import Contacts, Pairs, face_pairs, find_contacts, no_contacts, no_pairs, node_pairs
-from sdfsim.dynamics.models.paper import PAPER, paper_graph
+from sdfsim.dynamics.models.sdf_sim import SDF_SIM, sdf_sim_graph
 from sdfsim.dynamics.run_memory import Memory
 from sdfsim.shape.mesh import Mesh, convex_hull, joined
 from sdfsim.shape.sdf import PlaneSdf
@@ -90,7 +90,7 @@ class Family:
 _no_faces, _no_nodes = partial(no_pairs, corners=3), partial(no_pairs, corners=1)
 
 FAMILIES = {
-    "paper": Family(PAPER, points, find_contacts, no_contacts, paper_graph),
+    "sdf-sim": Family(SDF_SIM, points, find_contacts, no_contacts, sdf_sim_graph),
     "fignet": Family(FIGNET, vertices, face_pairs, _no_faces, fignet_graph),
     "fignet-star": Family(FIGNET_STAR, vertices, face_pairs, _no_faces, fignet_star_graph),
     "mgn": Family(MGN, vertices, node_pairs, _no_nodes, mgn_graph),

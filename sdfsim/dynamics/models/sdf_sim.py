@@ -1,4 +1,4 @@
-"""SDF-Sim as published (section 3 and appendix), the *paper* network.
+"""SDF-Sim as published (section 3 and appendix), the *sdf-sim* network.
 
 Every body has one body node and its surface nodes, joined both ways (up: to the body node). A surface node within the
 contact radius of another body joins that body's node both ways. No surface node is ever joined to another.
@@ -15,13 +15,13 @@ from sdfsim.dynamics.models.near import Contacts
 from sdfsim.dynamics.models.surfaces import NODES, STAR, motion_features, star
 
 CONTACT = Features(15, (0, 3, 6, 9))
-PAPER = Layout(
+SDF_SIM = Layout(
     NODES,
     STAR | {"contact_up": EdgeKind("node", "body", CONTACT), "contact_down": EdgeKind("body", "node", CONTACT)},
 )
 
 
-def paper_graph(bodies: Bodies, state: State, contacts: Contacts) -> Graph:
+def sdf_sim_graph(bodies: Bodies, state: State, contacts: Contacts) -> Graph:
     """The published graph."""
     features = _contact_features(bodies, state, contacts).float()
     node, body = contacts.node[:, None], contacts.body[:, None]
