@@ -161,6 +161,7 @@ def export(
     lines = [
         f"bodies {report['bodies']}, frames {report['frames']}",
         f"wrote {files[0]}" + (f" and {len(files) - 1} files beside it" if len(files) > 1 else ""),
+        *report["notes"],
         *(f"not in it: {line}" for line in report["left_out"]),
     ]
     session.report(report, lines)

@@ -11,6 +11,8 @@ from sdfsim.shape.mesh import Mesh
 
 # A single ray meets edges and vertices of plain cubes; five randomly directed ones outvote that.
 PARITY_RAYS = 5
+DIRECTIONS = np.random.default_rng(0).standard_normal((PARITY_RAYS, 3))
+DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
 
 
 class ClosestPoint:
@@ -61,6 +63,37 @@ class Winding:
             return np.zeros(0)
         local = np.ascontiguousarray((points - self._centre) / self._size, dtype=np.float64)
         return np.asarray(igl.fast_winding_number(self._vertices, self._faces, local))
+
+
+class Crossings:
+    """Winding number of a surface that is closed, by rays: how often they leave it more than they enter it. Exact but
+    where a ray meets an edge, and many times faster than `Winding`, above all where faces are long and thin. Where the
+    surface is open, rays that go through its openings are wrong."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        self._nearest = ClosestPoint(mesh)
+        normals = np.cross(*(mesh.vertices[mesh.faces[:, k]] - mesh.vertices[mesh.faces[:, 0]] for k in (1, 2)))
+        self._senses = np.sign(normals @ DIRECTIONS.T)  # [F, D]
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        """[P] float64 at `points` [P, 3] m: the median of `PARITY_RAYS`."""
+        found = np.stack([self.along(k, points) for k in range(2)])
+        unlike = np.flatnonzero(found[0] != found[1])
+        if len(unlike):
+            more = [self.along(k, points[unlike]) for k in range(2, PARITY_RAYS)]
+            found[0, unlike] = np.median(np.concatenate([found[:, unlike], more]), axis=0)
+        return found[0]
+
+    def along(self, direction: int, points: np.ndarray) -> np.ndarray:
+        """[P] what rays in one of `DIRECTIONS` say."""
+        if not len(points):
+            return np.zeros(0)
+        nearest = self._nearest
+        origins = (points - nearest.centre).astype(np.float32)
+        rays = np.concatenate([origins, np.broadcast_to(DIRECTIONS[direction], origins.shape)], 1, dtype=np.float32)
+        hits = nearest.scene.list_intersections(nearest.tensor(rays), nthreads=nearest.threads)
+        ray, face = hits["ray_ids"].numpy(), hits["primitive_ids"].numpy()
+        return np.bincount(ray, self._senses[face, direction], len(points))
 
 
 class Caster:
