@@ -89,8 +89,8 @@ def export(
     """Write a run (folder or rollout.npz), a scene.yaml or a Shape folder in the format that the ending of `out` names
     (see `FORMATS`); `scene_file` is of a run, None for the one that it was made from.
 
-    Returns a report: format, bodies, frames, files, left_out and notes. Raises SdfsimError for an unknown ending, a damaged
-    source, an extra that is not installed, a shape without convex pieces, or a file that cannot be written.
+    Returns a report: format, bodies, frames, files, left_out and notes. Raises SdfsimError for an unknown ending, a
+    damaged source, an extra that is not installed, a shape without convex pieces, or a file that cannot be written.
     """
     source, out, scene_file = Path(source), Path(out), Path(scene_file) if scene_file else None
     kind = out.suffix.lower()

@@ -86,6 +86,8 @@ def plan(
     report = planning.describe(
         scene, model=model, device=device, allow_outside=allow_outside, on_progress=session.stage_progress
     )
+    for note in report["notes"]:
+        session.say(note)
     for check in report["failed_checks"]:  # told, but a plan is as good with a shape that is less exact
         session.say(f"failed check: {check}")
     session.report(report, planning.plan_lines(report))

@@ -11,7 +11,8 @@ from sdfsim.shape.mesh import Mesh
 
 # A single ray meets edges and vertices of plain cubes; five randomly directed ones outvote that.
 PARITY_RAYS = 5
-DIRECTIONS = np.random.default_rng(0).standard_normal((PARITY_RAYS, 3))
+GEOMETRIES = 1024
+DIRECTIONS = np.random.default_rng(0).standard_normal((3, 3))
 DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
 
 
@@ -66,34 +67,40 @@ class Winding:
 
 
 class Crossings:
-    """Winding number of a surface that is closed, by rays: how often they leave it more than they enter it. Exact but
-    where a ray meets an edge, and many times faster than `Winding`, above all where faces are long and thin. Where the
-    surface is open, rays that go through its openings are wrong."""
+    """Winding number of a surface that is closed, by rays: how often they leave it more than they enter it. A hundred
+    times faster than `Winding` where faces are long and thin; wrong where a ray meets an edge, goes through an opening,
+    or meets two faces at once that the hierarchy takes for one."""
 
     def __init__(self, mesh: Mesh) -> None:
-        self._nearest = ClosestPoint(mesh)
-        normals = np.cross(*(mesh.vertices[mesh.faces[:, k]] - mesh.vertices[mesh.faces[:, 0]] for k in (1, 2)))
+        import open3d as o3d
+
+        self._tensor: Any = o3d.core.Tensor
+        self._threads = int(os.environ.get("OMP_NUM_THREADS") or 0)
+        self._scene = o3d.t.geometry.RaycastingScene(nthreads=self._threads)
+        self._centre = 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0))
+        vertices = np.ascontiguousarray(mesh.vertices - self._centre, dtype=np.float32)
+        # Open3D reports one of two hits at the same distance, unless they are of different geometries: so that faces
+        # which lie on each other are both seen, they are dealt out to many.
+        order = np.random.default_rng(0).permutation(len(mesh.faces))
+        groups = np.array_split(order, min(GEOMETRIES, len(order)))
+        for group in groups:
+            used, faces = np.unique(mesh.faces[group], return_inverse=True)
+            faces = np.ascontiguousarray(faces.reshape(-1, 3), dtype=np.uint32)
+            self._scene.add_triangles(self._tensor(vertices[used]), self._tensor(faces))
+        self._start = np.cumsum([0, *(len(group) for group in groups)])
+        corners = mesh.vertices[mesh.faces[order]]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         self._senses = np.sign(normals @ DIRECTIONS.T)  # [F, D]
 
-    def __call__(self, points: np.ndarray) -> np.ndarray:
-        """[P] float64 at `points` [P, 3] m: the median of `PARITY_RAYS`."""
-        found = np.stack([self.along(k, points) for k in range(2)])
-        unlike = np.flatnonzero(found[0] != found[1])
-        if len(unlike):
-            more = [self.along(k, points[unlike]) for k in range(2, PARITY_RAYS)]
-            found[0, unlike] = np.median(np.concatenate([found[:, unlike], more]), axis=0)
-        return found[0]
-
-    def along(self, direction: int, points: np.ndarray) -> np.ndarray:
-        """[P] what rays in one of `DIRECTIONS` say."""
+    def __call__(self, points: np.ndarray, direction: int) -> np.ndarray:
+        """[P] float64 at `points` [P, 3] m, by rays in one of `DIRECTIONS`."""
         if not len(points):
             return np.zeros(0)
-        nearest = self._nearest
-        origins = (points - nearest.centre).astype(np.float32)
-        rays = np.concatenate([origins, np.broadcast_to(DIRECTIONS[direction], origins.shape)], 1, dtype=np.float32)
-        hits = nearest.scene.list_intersections(nearest.tensor(rays), nthreads=nearest.threads)
-        ray, face = hits["ray_ids"].numpy(), hits["primitive_ids"].numpy()
-        return np.bincount(ray, self._senses[face, direction], len(points))
+        origins = points - self._centre
+        rays = np.concatenate([origins, np.broadcast_to(DIRECTIONS[direction], origins.shape)], 1).astype(np.float32)
+        hits = self._scene.list_intersections(self._tensor(rays), nthreads=self._threads)
+        face = self._start[hits["geometry_ids"].numpy()] + hits["primitive_ids"].numpy()
+        return np.bincount(hits["ray_ids"].numpy(), self._senses[face, direction], len(points))
 
 
 class Caster:

@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from sdfsim.errors import SdfsimError
-from sdfsim.shape.bvh import ClosestPoint, Crossings, Winding
+from sdfsim.shape.bvh import ClosestPoint, Winding
 from sdfsim.shape.mesh import Mesh, components, is_closed, joined
 from sdfsim.shape.watertight import Solid, exposed
 
@@ -61,7 +61,7 @@ class MeshDistance:
         self.bounds = np.stack([self.surface.vertices.min(0), self.surface.vertices.max(0)])
         # All distances to a thickened sheet are taken from the sheet.
         self._nearest = ClosestPoint(body.body if body.thickness else body.surface)
-        self._winding = Crossings(body.body) if body.closed else Winding(body.body)
+        self._winding = Winding(body.body)
 
     def __call__(self, points: np.ndarray) -> Reference:
         """Reference values at `points` [P, 3] m."""

@@ -89,7 +89,7 @@ def normal_frame(bounds: np.ndarray) -> Frame:
 
 
 def load_mesh(path: str | Path) -> Mesh:
-    """Read a triangle mesh (obj, ply, glb, gltf, stl, off), cleaned by `clean`; glTF, which has y up, is turned to z up.
+    """Read a triangle mesh (obj, ply, glb, gltf, stl, off), cleaned by `clean`; glTF has y up and is turned to z up.
     Raises SdfsimError where it is missing, cut short, no mesh, needs what is not read, or has no faces, vertices that
     are not finite, or indices out of range."""
     path = Path(path)

@@ -265,10 +265,10 @@ def read_image(content: bytes) -> np.ndarray | None:
 
 def side_file(path: Path, name: str) -> bytes:
     """What a mesh file names, from its folder. Raises ValueError where that is elsewhere, or not there."""
-    import trimesh
+    from trimesh.resolvers import FilePathResolver
 
     try:
-        return trimesh.resolvers.FilePathResolver(str(path)).get(name)
+        return FilePathResolver(str(path)).get(name)
     except OSError as error:
         raise ValueError(f"{name} is missing beside it") from error
 
@@ -477,7 +477,8 @@ def plain_stl(content: bytes) -> bytes:
 def by_trimesh(path: Path, content: bytes) -> Any:
     """A trimesh of `content`, whose side files stay in the folder of `path`."""
     import trimesh
+    from trimesh.resolvers import FilePathResolver
 
-    resolver = trimesh.resolvers.FilePathResolver(str(path))
+    resolver = FilePathResolver(str(path))
     kind = path.suffix.lower()[1:]
     return trimesh.load(io.BytesIO(content), file_type=kind, resolver=resolver, force="mesh", process=False)

@@ -93,21 +93,16 @@ def solidify(mesh: Mesh, *, name: str = "mesh", cap: bool = False, thicken: floa
         _require_tight(vertices, faces, winding, frame.scale, name)
 
     rays = Crossings(_plain(vertices, faces))
-    exact = rays if closed else winding
+
+    def around(points: np.ndarray) -> np.ndarray:
+        """Winding numbers [P]: those that three rays agree on, which is nearly all, and in doubt the exact ones."""
+        found = np.stack([rays(points, direction) for direction in range(3)])
+        value, doubt = found[0], (found != found[0]).any(0)
+        value[doubt] = winding(points[doubt])
+        return value
 
     def side(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        within, without = points - STEP * normals, points + STEP * normals
-        # Nearly all bound the solid, which two rays to each side tell in no time; the others are looked at closely.
-        plain = np.ones(len(points), dtype=bool)
-        for direction in range(2):
-            for places, expected in ((within, 1), (without, 0)):
-                plain[plain] = rays.along(direction, places[plain]) == expected
-        sides = np.ones(len(points), dtype=np.int64)
-        sides[~plain] = judged(within[~plain], without[~plain])
-        return sides
-
-    def judged(within: np.ndarray, without: np.ndarray) -> np.ndarray:
-        within, without = exact(within), exact(without)
+        within, without = around(points - STEP * normals), around(points + STEP * normals)
         layers = np.maximum(np.round(np.abs(within - without)), 1).astype(np.int64)
         return layers * ((within > 0.5).astype(np.int64) - (without > 0.5))
 

@@ -8,6 +8,7 @@ import json
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -95,7 +96,7 @@ def test_a_ply_that_is_cut_short_says_where(tmp_path: Path, cut: int) -> None:
 
 
 def text_ply(faces: str, count: int, more: str = "", colors: str = "float") -> str:
-    header = f"ply\nformat ascii 1.0\nelement vertex 8\nproperty double x\nproperty double y\nproperty double z\n"
+    header = "ply\nformat ascii 1.0\nelement vertex 8\nproperty double x\nproperty double y\nproperty double z\n"
     header += "".join(f"property {colors} {channel}\n" for channel in ("red", "green", "blue"))
     rows = "".join(f"{x} {y} {z} 1 0.5 0\n" for x, y, z in PLACES)
     return f"{header}element face {count}\nproperty list uchar int vertex_index\n{more}end_header\n{rows}{faces}"
@@ -103,10 +104,9 @@ def text_ply(faces: str, count: int, more: str = "", colors: str = "float") -> s
 
 def test_a_text_ply_with_lists_of_unlike_lengths_is_read(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
-    rows = "".join(
-        f"{len(c)} {' '.join(map(str, c))} {2 * len(c) if k % 2 else 0} {' '.join(2 * len(c) * ['0.25']) if k % 2 else ''} 3\n"
-        for k, c in enumerate(MIXED)
-    )
+    places = [2 * len(c) * ["0.25"] if k % 2 else [] for k, c in enumerate(MIXED)]
+    lists = [[str(len(c)), *map(str, c), str(len(p)), *p, "3"] for c, p in zip(MIXED, places, strict=True)]
+    rows = "".join(" ".join(row) + "\n" for row in lists)
     path.write_text(text_ply(rows, len(MIXED), "property list uchar float texcoord\nproperty int material\n"))
     mesh = load_mesh(path)
     check_block(mesh)
@@ -192,13 +192,13 @@ def test_every_kind_of_off_is_read(tmp_path: Path, text: str, color) -> None:
         ("a.off", "4OFF\n8 7 0\n", "vertices of 4OFF do not have three"),
         ("a.off", "OFF BINARY\n8 7 0\n", "binary OFF is not read"),
         ("a.off", off_text("OFF\n8 8 0"), "cut short: 7 of 8 faces"),
-        ("a.off", off_text("OFF\n8 7 0").replace("4 0 2 3 1", "4 0 2 3"), "cut short: a face has fewer corners than it announces"),
+        ("a.off", off_text("OFF\n8 7 0").replace("4 0 2 3 1", "4 0 2 3"), "cut short: a face has fewer corners"),
         ("a.off", off_text("OFF\n8 7 0").replace("4 0 2 3 1", "4 0 2 3 8"), r"out of range \(0 to 7 allowed\)"),
         ("a.ply", text_ply("", 0), "mesh has no faces"),
         ("a.ply", text_ply("", 0).split("element face")[0] + "end_header\n" + 8 * "0 1 2 0 0 0\n", "mesh has no faces"),
         ("a.ply", text_ply("3 0 1 8\n", 1), r"out of range \(0 to 7 allowed\)"),
         ("a.ply", text_ply("3 0 1 -1\n", 1), r"out of range \(0 to 7 allowed\)"),
-        ("a.ply", "ply\nformat ascii 1.0\nelement vertex 1\nproperty quark x\nend_header\n0\n", "does not know: property quark x"),
+        ("a.ply", "ply\nformat ascii 1.0\nelement a 1\nproperty quark x\nend_header\n0\n", "know: property quark x"),
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n", "mesh has no faces"),
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 -4\n", "line 4: a face has the index -4, 3 rows come before it"),
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", "line 4: a face has the index 0"),
@@ -299,7 +299,7 @@ class Gltf:
 
     def __init__(self, **header) -> None:
         self.body = b""
-        self.header = {"asset": {"version": "2.0"}, "accessors": [], "bufferViews": [], **header}
+        self.header: dict[str, Any] = {"asset": {"version": "2.0"}, "accessors": [], "bufferViews": [], **header}
 
     def view(self, data: bytes, **more) -> int:
         self.header["bufferViews"].append({"buffer": 0, "byteOffset": len(self.body), "byteLength": len(data), **more})
@@ -349,7 +349,7 @@ def test_nodes_place_their_meshes(tmp_path: Path) -> None:
     lower = {"translation": [1.0, 2.0, 3.0], "rotation": turn.inv().as_quat().tolist(), "scale": [0.5, 1.0, -1.5]}
     nodes = [{"matrix": upper.T.reshape(-1).tolist(), "children": [1]}, {"mesh": 0, **lower}, {"mesh": 0}]
     mesh = load_mesh(block(nodes=nodes).write(tmp_path / "a.gltf"))  # the third node is in no scene
-    local = turn.inv().apply(np.array(Y_UP) * [0.5, 1.0, -1.5]) + [1.0, 2.0, 3.0]
+    local = turn.inv().apply(np.array(Y_UP) * [0.5, 1.0, -1.5]) + np.array([1.0, 2.0, 3.0])
     x, y, z = (2.0 * turn.apply(local) + [5.0, 6.0, 7.0]).T
     expected = np.stack([x, -z, y], axis=1)
     np.testing.assert_allclose(np.sort(mesh.vertices, axis=0), np.sort(expected, axis=0), atol=1e-5)
@@ -417,7 +417,8 @@ def test_fans_and_strips_are_triangles(tmp_path: Path) -> None:
     points = {"attributes": fan["attributes"], "mode": 0}
     file.header["meshes"] = [{"primitives": [points, fan]}]
     mesh = load_mesh(file.write(tmp_path / "a.gltf"))
-    normal = np.cross(*(mesh.vertices[mesh.faces[:, k]] - mesh.vertices[mesh.faces[:, 0]] for k in (1, 2)))
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    normal = np.cross(b - a, c - a)
     np.testing.assert_allclose(normal, np.tile([0, 0, np.sin(np.pi / 3)], (6, 1)), atol=1e-6)
 
 
