@@ -163,7 +163,10 @@ def fit(
     thicken: Annotated[
         float | None, typer.Option(help="Thickness to give an open sheet, metres (with -o).", min=0.0)
     ] = None,
-    units: Annotated[Literal["m", "cm", "mm", "in"], typer.Option(help="Of the mesh files (with -o).")] = "m",
+    units: Annotated[
+        Literal["m", "cm", "mm", "in"] | None,
+        typer.Option(help="Of the mesh files (with -o): metres, if not said.", show_default=False),
+    ] = None,
     cluster: Cluster = None,
     device: str = "auto",
 ) -> None:
@@ -175,7 +178,7 @@ def fit(
     if out is None:
         if len(sources) > 1 or not sources[0].is_dir():
             raise SdfsimError("a mesh file needs -o SHAPE_DIR", exit_code=EXIT_USAGE)
-        if cap or thicken is not None or units != "m" or cluster is not None:
+        if cap or thicken is not None or units is not None or cluster is not None:
             raise SdfsimError("--cap, --thicken, --units and --cluster go with -o", exit_code=EXIT_USAGE)
         _stage(session, "fit", sources[0], then="scene", budget=budget, recipe=recipe, device=device)
         return

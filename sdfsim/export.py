@@ -32,7 +32,7 @@ from sdfsim.scene import written
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.scene.scene_file import load_scene
-from sdfsim.shape.gltf import Gltf
+from sdfsim.shape.gltf import Gltf, light
 from sdfsim.shape.mesh import Mesh, convex_hull, wavefront
 from sdfsim.shape.sdf import BoxSdf, CapsuleSdf, ClosedForm, CylinderSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape, own_pieces
@@ -89,8 +89,8 @@ def export(
     """Write a run (folder or rollout.npz), a scene.yaml or a Shape folder in the format that the ending of `out` names
     (see `FORMATS`); `scene_file` is of a run, None for the one that it was made from.
 
-    Returns a report: format, bodies, frames, files and left_out. Raises SdfsimError for an unknown ending, a damaged
-    source, an extra that is not installed, a shape without convex pieces, or a file that cannot be written.
+    Returns a report: format, bodies, frames, files, left_out and notes. Raises SdfsimError for an unknown ending, a
+    damaged source, an extra that is not installed, a shape without convex pieces, or a file that cannot be written.
     """
     source, out, scene_file = Path(source), Path(out), Path(scene_file) if scene_file else None
     kind = out.suffix.lower()
@@ -103,7 +103,8 @@ def export(
     out.parent.mkdir(parents=True, exist_ok=True)
     files, left_out = FORMATS[kind](take, out, on_progress)
     counts = {"bodies": len(take.names), "frames": len(take.time)}
-    return {"format": kind[1:], **counts, "files": files, "left_out": left_out}
+    notes = ["z up is turned to glTF's y up"] if kind == ".glb" else []
+    return {"format": kind[1:], **counts, "files": files, "left_out": left_out, "notes": notes}
 
 
 def _extra(module: str) -> Any:
@@ -214,12 +215,6 @@ def _wxyz(quat_xyzw: np.ndarray) -> np.ndarray:
     return np.roll(quat_xyzw, 1, axis=-1)
 
 
-def _linear(srgb: np.ndarray) -> np.ndarray:
-    """0 to 255 as light from 0 to 1, which glTF and USD count in."""
-    value = np.asarray(srgb) / 255.0
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-
-
 def _rgba(shape: Shape, color: np.ndarray) -> str:
     """For formats with one colour a mesh: the mean of its own ones, or `color`."""
     return _numbers((color if shape.mesh.colors is None else shape.mesh.colors.mean(0)) / 255.0, 1.0)
@@ -264,12 +259,12 @@ def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
             if mesh.uv is not None:
                 attributes["TEXCOORD_0"] = file.array(mesh.uv)
             if mesh.colors is not None:  # in 16 bits: 8 are too few for dark colours once they count light
-                light = np.pad(_linear(mesh.colors), ((0, 0), (0, 1)), constant_values=1.0)
-                attributes["COLOR_0"] = file.array(np.round(65535 * light), "<u2")
+                shades = np.pad(light(mesh.colors), ((0, 0), (0, 1)), constant_values=1.0)
+                attributes["COLOR_0"] = file.array(np.round(65535 * shades), "<u2")
             numbers[body.shape] = attributes, file.array(mesh.faces.reshape(-1), "<u4")
         key = take.shapes[body.shape] + ("" if own else "-{:02x}{:02x}{:02x}".format(*color))
         if key not in drawn:
-            material = file.material(key, np.ones(3) if own else _linear(color), seen.texture, rough=0.8)
+            material = file.material(key, np.ones(3) if own else light(color), seen.texture, rough=0.8)
             drawn[key] = file.mesh(key, *numbers[body.shape], material)
         place, turn = take.position[:, k], take.quat_xyzw[:, k]
         node = {"translation": place[0].tolist(), "rotation": turn[0].tolist(), "scale": [body.scale] * 3}
@@ -319,7 +314,7 @@ def _usd(take: Take, out: Path, on_progress: StageProgress) -> Written:
             place.Set(gf.Vec3d(*take.position[t, k].tolist()), code)
             turn.Set(gf.Quatd(*_wxyz(take.quat_xyzw[t, k]).tolist()), code)
         tint = geom.PrimvarsAPI(prim).CreatePrimvar("displayColor", sdf.ValueTypeNames.Color3fArray)
-        tint.Set([gf.Vec3f(*_linear(color).tolist())])
+        tint.Set([gf.Vec3f(*light(color).tolist())])
         if body.motion != "static":
             _usd_apply(prim, "PhysicsRigidBodyAPI", kinematicEnabled=body.motion == "kinematic")
         if body.motion == "dynamic":
@@ -422,7 +417,7 @@ def _usd_mesh(stage: Any, path: str, mesh: Mesh) -> Any:
     prim.SetNormalsInterpolation(geom.Tokens.vertex)
     if mesh.colors is not None:
         tint = prim.CreateDisplayColorPrimvar(geom.Tokens.vertex)
-        tint.Set(vt.Vec3fArray.FromNumpy(_linear(mesh.colors).astype(np.float32)))
+        tint.Set(vt.Vec3fArray.FromNumpy(light(mesh.colors).astype(np.float32)))
     return prim.GetPrim()
 
 

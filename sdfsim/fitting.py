@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 from sdfsim.console import duration
-from sdfsim.dynamics.bodies import largest_extent
 from sdfsim.dynamics.simulator import pick_device
 from sdfsim.errors import SdfsimError
 from sdfsim.files import check_writable, locked, read_json, visible
@@ -17,22 +16,20 @@ from sdfsim.scene.scene_file import UNITS
 from sdfsim.shape.baked_grid import baked, grid_certificate, unseen_wall
 from sdfsim.shape.fit import FIT_VERSION, Recipe, fit_mesh
 from sdfsim.shape.mesh import MESH_SUFFIXES, load_mesh
-from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape
+from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape, remarks
 
-# m, sizes that need no word.
-USUAL = (1e-3, 100.0)
 ERRORS = ("error_within_0.01", "error_within_0.1", "error_in_box", "projected_from_0.01", "sign_errors")
 
 
 @dataclass(frozen=True)
 class Options:
-    """How meshes are fitted; see `fit_mesh`. `units` are those of the mesh files, as in scene.yaml."""
+    """How meshes are fitted; see `fit_mesh`. `units` are those of the mesh files, as in scene.yaml (None: metres)."""
 
     recipe: Recipe = "default"
     budget: float | None = None
     cap: bool = False
     thicken: float | None = None
-    units: Literal["m", "cm", "mm", "in"] = "m"
+    units: Literal["m", "cm", "mm", "in"] | None = None
 
 
 def fit(mesh_file: Path, out: Path, options: Options, *, device: str, on_progress: Progress) -> dict[str, Any]:
@@ -41,7 +38,9 @@ def fit(mesh_file: Path, out: Path, options: Options, *, device: str, on_progres
     it was missed. Raises SdfsimError where the mesh cannot be used, the folder cannot be written, or another run is
     writing to it."""
     where, mesh = pick_device(device), load_mesh(mesh_file)
-    mesh = replace(mesh, vertices=mesh.vertices * UNITS[options.units])
+    metres = UNITS[options.units or "m"]
+    told = remarks(mesh_file, mesh, metres, given=options.units is not None)
+    mesh = replace(mesh, vertices=mesh.vertices * metres)
     # A mesh file names others, so its own bytes do not tell.
     request = hashlib.sha256(f"{mesh.digest()}|{options}|{FIT_VERSION}".encode()).hexdigest()
     check_writable(out)
@@ -49,7 +48,8 @@ def fit(mesh_file: Path, out: Path, options: Options, *, device: str, on_progres
     if shape is None:
         with locked(out):
             how = {key: value for key, value in vars(options).items() if key != "units"}
-            shape = fit_mesh(mesh, name=out.resolve().name, **how, on_progress=on_progress, device=where)
+            how |= {"name": out.resolve().name, "file": str(mesh_file), "device": where}
+            shape = fit_mesh(mesh, **how, on_progress=on_progress)
             certificate = shape.certificate | grid_certificate(shape.sdf, shape.nodes)
             wall = unseen_wall(shape.sdf, baked(shape.sdf, shape.nodes))
             source = shape.source | {"request": request}
@@ -59,9 +59,7 @@ def fit(mesh_file: Path, out: Path, options: Options, *, device: str, on_progres
             shape = replace(shape, source=source, certificate=certificate)
             shape.save(out)
     missed = [] if shape.certificate["passed"] else [f"fit: {shape.certificate['reason']}"]
-    notes, size = list(shape.source.get("notes", [])), largest_extent(shape)
-    if not USUAL[0] <= size <= USUAL[1]:
-        notes.append(f"it is {size:.3g} m wide; where that is wrong, --units says what the file counts in")
+    notes = [*shape.source.get("notes", []), *told]
     known = {"folder": str(out), "volume_m3": shape.volume, "nodes": len(shape.nodes), "notes": notes}
     return known | shape.certificate | {"failed_checks": missed}
 

@@ -62,6 +62,7 @@ def describe(
         "outside_training": simulator.outside_training,
         "constant_in_training": constant_in_training(simulator.model),
         "failed_checks": [f"fit of shape {told}" for told in scene.missed],
+        "notes": list(scene.notes),
     }
 
 

@@ -91,6 +91,8 @@ def simulate(
     check_own(out, "simulate", *_RESULTS)
     check_screen(viewer)
     scene = load_scene(scene_file, partial(on_progress, "shapes"), allow_outside=allow_outside)
+    for note in scene.notes:
+        say(note)
     simulator = Simulator(scene, model=model, device=device, seed=seed)
     length = scene.duration if seconds is None else seconds
     asked = model or scene.model or ""
@@ -161,6 +163,7 @@ def simulate(
             "identity": kept.identity,
             "failed_checks": [f"fit of shape {told}" for told in scene.missed],
             "caveats": [f"fit of shape {told}" for told in scene.caveats],
+            "notes": list(scene.notes),
         }
         if until_settled:
             report["settled"] = settled()

@@ -17,7 +17,7 @@ from sdfsim.parallel import cluster, parallel
 from sdfsim.shape import primitives
 from sdfsim.shape.baked_grid import baked
 from sdfsim.shape.mesh import Mesh, write_ply
-from sdfsim.shape.shape import load_shape
+from sdfsim.shape.shape import load_shape, mesh_shape, shape_from_mesh
 
 
 @pytest.fixture
@@ -66,14 +66,40 @@ def test_units_are_those_of_a_scene_file_and_odd_sizes_are_told(tmp_path: Path) 
     shape = load_shape(out)
     np.testing.assert_allclose(np.ptp(shape.mesh.vertices, axis=0), 0.01 * size)
     assert shape.volume == pytest.approx(0.024)
-    # Other options, or units, are another fit; and 400 m are hardly meant.
+    # Other options, or units, are another fit; without units, 40 m are a question.
     for options, same in ((arguments, True), ([*arguments, "--cap"], False), (arguments[:-2], False)):
         before = (out / "shape.json").stat().st_mtime_ns
         told = CliRunner().invoke(cli.app, options).stdout
         assert ((out / "shape.json").stat().st_mtime_ns == before) == same
-    assert "it is 40 m wide" not in told
+    assert "it is 40 m wide if it counts in metres: does it in millimetres? Then give --units mm" in told
+    for size, units, note in ((4.9, [], ""), (5.1, [], "it is 5.1 m wide"), (80.0, ["m"], ""), (5.1, ["mm"], "")):
+        file.write_bytes(write_ply(primitives.box((size, 1.0, 1.0))))
+        told = CliRunner().invoke(cli.app, [*arguments[:-2], *(["--units", *units] if units else [])]).stdout
+        assert ("--units" in told) == bool(note) and note in told
     file.write_bytes(write_ply(primitives.box((200.0, 300.0, 400.0))))
-    assert "it is 400 m wide; where that is wrong, --units says" in CliRunner().invoke(cli.app, arguments[:-2]).stdout
+    said = CliRunner().invoke(cli.app, [*arguments[:-2], "--units", "m"]).stdout
+    assert "it is 400 m wide; where that is wrong, --units" in said
+
+
+def test_an_error_names_the_mesh_and_not_the_folder(tmp_path: Path) -> None:
+    box = primitives.box()
+    (tmp_path / "holed.ply").write_bytes(write_ply(Mesh(box.vertices, box.faces[2:])))
+    done = CliRunner().invoke(
+        cli.app, ["fit", str(tmp_path / "holed.ply"), "-o", str(tmp_path / "out"), "--device", "cpu"]
+    )
+    assert done.exit_code == 1 and f"{tmp_path / 'holed.ply'}: not a solid" in done.stderr
+    for kind in ("grid", "mesh"):
+        with pytest.raises(SdfsimError, match=r"holed\.ply: not a solid"):
+            shape_from_mesh(tmp_path / "holed.ply", tmp_path / "cache", sdf=kind)
+
+
+def test_a_turned_gltf_is_told(tmp_path: Path) -> None:
+    mesh_shape(primitives.box((0.3, 0.2, 0.1)), name="box", kind="mesh").save(tmp_path / "box")
+    done = CliRunner().invoke(cli.app, ["export", str(tmp_path / "box"), "-o", str(tmp_path / "box.glb")])
+    assert "z up is turned to glTF's y up" in done.stdout
+    arguments = ["fit", str(tmp_path / "box.glb"), "-o", str(tmp_path / "again"), "--budget", "0.1s", "--device", "cpu"]
+    assert "glTF has y up: it is turned to z up" in CliRunner().invoke(cli.app, arguments).stdout
+    np.testing.assert_allclose(np.ptp(load_shape(tmp_path / "again").mesh.vertices, axis=0), [0.3, 0.2, 0.1], atol=1e-6)
 
 
 def test_names(meshes: Path, tmp_path: Path) -> None:

@@ -87,6 +87,8 @@ def plan(
     report = planning.describe(
         scene, model=model, device=device, allow_outside=allow_outside, on_progress=session.stage_progress
     )
+    for note in report["notes"]:
+        session.say(note)
     for check in report["failed_checks"]:  # told, but a plan is as good with a shape that is less exact
         session.say(f"failed check: {check}")
     session.report(report, planning.plan_lines(report))
@@ -162,6 +164,7 @@ def export(
     lines = [
         f"bodies {report['bodies']}, frames {report['frames']}",
         f"wrote {files[0]}" + (f" and {len(files) - 1} files beside it" if len(files) > 1 else ""),
+        *report["notes"],
         *(f"not in it: {line}" for line in report["left_out"]),
     ]
     session.report(report, lines)

@@ -104,6 +104,7 @@ class Scene:
         path: the file it came from, if any.
         missed: shapes fitted for this scene that are not usable, with the reason, one line each.
         caveats: those that are, but are not as exact as fits can be; one line each.
+        notes: what was done to meshes on reading, and sizes that may be mistaken; one line each.
     """
 
     shapes: tuple[Shape, ...]
@@ -117,6 +118,7 @@ class Scene:
     path: Path | None = None
     missed: tuple[str, ...] = ()
     caveats: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def fingerprints(scene: Scene) -> dict[str, str]:

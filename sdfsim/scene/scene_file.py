@@ -660,7 +660,8 @@ def load_scene(
             way = made.path and replace(made.path, position=made.path.position + offset)
             bodies.append(replace(made, name=name, position=made.position + offset, path=way))
     document.check()
-    fitted = [shapes[key] for key, of in table.shapes.items() if key in shapes and of.kind in _FITTED]
+    loaded = [(of, shapes[key]) for key, of in table.shapes.items() if key in shapes]
+    fitted = [shape for of, shape in loaded if of.kind in _FITTED or of.sdf == "grid"]
     return Scene(
         shapes=tuple(shapes.values()),
         bodies=tuple(bodies),
@@ -672,6 +673,7 @@ def load_scene(
         limits=Limits(**dict(table.limits)),
         path=path,
         missed=tuple(f"{s.name}: {s.certificate['reason']}" for s in fitted if s.certificate.get("reason")),
+        notes=tuple(f"{s.name}: {note}" for of, s in loaded if of.mesh for note in s.source.get("notes", [])),
         caveats=tuple(f"{s.name}: {s.certificate['caveat']}" for s in fitted if s.certificate.get("caveat")),
     )
 
@@ -705,7 +707,8 @@ def _load_shape(name: str, entry: ShapeTable, on_progress: Progress) -> Shape:
         shape = load_shape(entry.asset)
         shape = with_sdf(shape, entry.sdf, resolution=entry.resolution) if entry.sdf else shape
     elif entry.mesh:
-        made |= {"units": UNITS[entry.units], "cap": entry.cap == "on", "thicken": entry.thicken}
+        units = UNITS[entry.units] if "units" in entry.model_fields_set else None
+        made |= {"units": units, "cap": entry.cap == "on", "thicken": entry.thicken}
         shape = shape_from_mesh(entry.mesh, **made)
     elif entry.primitive:
         shape = shape_from_primitive(entry.primitive.name, entry.primitive.size, **made)

@@ -11,6 +11,9 @@ from sdfsim.shape.mesh import Mesh
 
 # A single ray meets edges and vertices of plain cubes; five randomly directed ones outvote that.
 PARITY_RAYS = 5
+GEOMETRIES = 1024
+DIRECTIONS = np.random.default_rng(0).standard_normal((3, 3))
+DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
 
 
 class ClosestPoint:
@@ -61,6 +64,43 @@ class Winding:
             return np.zeros(0)
         local = np.ascontiguousarray((points - self._centre) / self._size, dtype=np.float64)
         return np.asarray(igl.fast_winding_number(self._vertices, self._faces, local))
+
+
+class Crossings:
+    """Winding number of a surface that is closed, by rays: how often they leave it more than they enter it. A hundred
+    times faster than `Winding` where faces are long and thin; wrong where a ray meets an edge, goes through an opening,
+    or meets two faces at once that the hierarchy takes for one."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        import open3d as o3d
+
+        self._tensor: Any = o3d.core.Tensor
+        self._threads = int(os.environ.get("OMP_NUM_THREADS") or 0)
+        self._scene = o3d.t.geometry.RaycastingScene(nthreads=self._threads)
+        self._centre = 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0))
+        vertices = np.ascontiguousarray(mesh.vertices - self._centre, dtype=np.float32)
+        # Open3D reports one of two hits at the same distance, unless they are of different geometries: so that faces
+        # which lie on each other are both seen, they are dealt out to many.
+        order = np.random.default_rng(0).permutation(len(mesh.faces))
+        groups = np.array_split(order, min(GEOMETRIES, len(order)))
+        for group in groups:
+            used, faces = np.unique(mesh.faces[group], return_inverse=True)
+            faces = np.ascontiguousarray(faces.reshape(-1, 3), dtype=np.uint32)
+            self._scene.add_triangles(self._tensor(vertices[used]), self._tensor(faces))
+        self._start = np.cumsum([0, *(len(group) for group in groups)])
+        corners = mesh.vertices[mesh.faces[order]]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        self._senses = np.sign(normals @ DIRECTIONS.T)  # [F, D]
+
+    def __call__(self, points: np.ndarray, direction: int) -> np.ndarray:
+        """[P] float64 at `points` [P, 3] m, by rays in one of `DIRECTIONS`."""
+        if not len(points):
+            return np.zeros(0)
+        origins = points - self._centre
+        rays = np.concatenate([origins, np.broadcast_to(DIRECTIONS[direction], origins.shape)], 1).astype(np.float32)
+        hits = self._scene.list_intersections(self._tensor(rays), nthreads=self._threads)
+        face = self._start[hits["geometry_ids"].numpy()] + hits["primitive_ids"].numpy()
+        return np.bincount(hits["ray_ids"].numpy(), self._senses[face, direction], len(points))
 
 
 class Caster:

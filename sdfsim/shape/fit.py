@@ -30,7 +30,7 @@ Recipe = Literal["quick", "default", "paper"]
 Layers = tuple[list[torch.Tensor], list[torch.Tensor]]
 
 # Changes whenever the same mesh would come out differently; part of every cache key.
-FIT_VERSION = 7
+FIT_VERSION = 8
 
 # Points are drawn from a little beyond the box that is used: at the very edge of its data a network's slope is poor.
 MARGIN = 1.15
@@ -112,6 +112,7 @@ def fit_mesh(
     seed: int = 0,
     cap: bool = False,
     thicken: float | None = None,
+    file: str = "",
     on_progress: Progress = silent,
     device: torch.device | str = "cpu",
 ) -> Shape:
@@ -119,10 +120,10 @@ def fit_mesh(
 
     The result depends on the mesh, the recipe (see `PLANS`) and the seed only (up to rounding, which the number of
     threads and the device change), unless the budget in s cuts the training short. The shape's `certificate` tells the
-    errors and whether it is usable (`passed`), `source["notes"]` what was done to the mesh. Raises SdfsimError where
-    the mesh cannot be used or bounds no solid.
+    errors and whether it is usable (`passed`), `source["notes"]` what was done to the mesh. Raises SdfsimError, which
+    calls the mesh `file` (or else `name`), where it cannot be used or bounds no solid.
     """
-    solid = solidify(mesh, name=name, cap=cap, thicken=thicken)
+    solid = solidify(mesh, name=file or name, cap=cap, thicken=thicken)
 
     def pick(sdf: Sdf) -> np.ndarray:
         return surface_nodes(sdf, solid.surface, DEFAULT_COUNT)

@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from sdfsim.shape.bvh import Caster
 from sdfsim.shape.distance import DistanceOracle
 from sdfsim.shape.far_field import BOX
-from sdfsim.shape.mesh import normal_frame, sample_surface
-from sdfsim.shape.sdf import Sdf
+from sdfsim.shape.mesh import Mesh, normal_frame, sample_surface
+from sdfsim.shape.sdf import GridSdf, Sdf
 
 # Lengths are fractions of the shape's largest extent. EXACT is what good fits of clean meshes reach.
 EXACT = {
@@ -21,6 +22,7 @@ EXACT = {
     "projected_from_0.01": 1.0e-3,
     "projected_from_0.1": 3.0e-3,
     "sign_errors": 1.0e-3,
+    "walls_lost": 1.0e-3,
 }
 # With larger errors than these bodies rest at another height than they should by 5 % of their size, creep, or leave a
 # straight hit more than 6 degrees aside (docs/sdf.md). Distances farther away only decide where contacts are searched
@@ -31,8 +33,12 @@ USABLE = {
     "gradient_within_0.1": 2.2e-2,
     "projected_from_0.01": 3.2e-3,
     "sign_errors": 3.7e-2,
+    "walls_lost": 3.7e-2,
 }
 SIGN_FROM = 0.002
+WALL_FROM = 1e-5  # thinner walls are none
+# Of half its thickness: how deep the middle of a wall is at least, whose sides make at most 26 degrees.
+PARALLEL = 0.9
 FAR_FROM = 0.1
 FAR_HALF = 2.0  # half extent of the cube in which the far field is tested
 FAR_FROM_A_NODE = 0.1
@@ -49,9 +55,9 @@ def certify(sdf: Sdf, oracle: DistanceOracle, *, nodes: np.ndarray | None = None
     Mean absolute errors `error_within_0.01`, `error_within_0.1` and `error_in_box`; `gradient_within_0.1`, the median
     cosine distance (1 - cosine) of the gradient from the true direction; `projected_from_0.01` and
     `projected_from_0.1`, mean distance from the surface of x - f grad f / |grad f|^2; `sign_errors`, the fraction of
-    points farther than 0.002 whose sign is wrong; `far_field_ratio`, the largest f / true distance farther than 0.1,
-    out to [-2, 2]^3 (a step as long as f goes through the surface where it is above 1); `coverage` of the nodes [K, 3]
-    m, if there are any; and what `verdict` says.
+    points farther than 0.002 whose sign is wrong; `walls_lost` (see there); `far_field_ratio`, the largest f / true
+    distance farther than 0.1, out to [-2, 2]^3 (a step as long as f goes through the surface where it is above 1);
+    `coverage` of the nodes [K, 3] m, if there are any; and what `verdict` says.
     """
     # A stream of its own, so that no seed of the fit draws these points.
     rng = np.random.default_rng([1, 0xCE47])
@@ -94,6 +100,7 @@ def certify(sdf: Sdf, oracle: DistanceOracle, *, nodes: np.ndarray | None = None
             result["gradient_within_0.1"] = float(np.median(turned)) if clear.any() else math.nan
     true, value = (np.concatenate(parts) for parts in zip(*counted, strict=True))
     result["sign_errors"] = mean((value * true <= 0)[np.abs(true) > SIGN_FROM])
+    result["walls_lost"] = walls_lost(sdf, oracle)
     far.append(asked(FAR_HALF * rng.uniform(-1, 1, (points, 3)))[1:3])
     true, value = (np.concatenate(parts) for parts in zip(*far, strict=True))
     ratio = (value / np.where(true == 0, np.nan, true))[np.abs(true) > FAR_FROM]
@@ -103,6 +110,44 @@ def certify(sdf: Sdf, oracle: DistanceOracle, *, nodes: np.ndarray | None = None
     result.update(verdict(result))
     # None for what could not be measured: JSON has no NaN.
     return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in result.items()}
+
+
+def walls_lost(sdf: Sdf, oracle: DistanceOracle, *, points: int = 4000) -> float:
+    """The part of the surface, by area, behind which the solid is missing: the middle of the wall there is not inside.
+    Signs that count only from a fixed distance on say nothing of walls that are thinner.
+
+    A middle lies halfway between a surface sample and where a straight line inwards comes out again, and then twice
+    halfway between the nearest place of the surface and the place opposite. Edges, where walls run out, do not count.
+    NaN where no middle is known to be inside.
+    """
+    frame = normal_frame(oracle.bounds)
+    samples, inwards = sample_surface(oracle.surface, points, np.random.default_rng([1, 0x3A11]))
+    foot, inwards = frame.inward(samples), -inwards
+    caster = Caster(Mesh(frame.inward(oracle.surface.vertices), oracle.surface.faces))
+    for _ in range(3):
+        across = caster.hits(foot + WALL_FROM * inwards, inwards)[0] + WALL_FROM
+        through = np.isfinite(across)
+        foot, inwards, half = foot[through], inwards[through], 0.5 * across[through]
+        middle = foot + half[:, None] * inwards
+        truth = oracle(frame.outward(middle))
+        inside = (truth.distance < 0) & (truth.trusted | oracle.closed)
+        if not inside.any():
+            return math.nan
+        middle, half, depth = middle[inside], half[inside], -truth.distance[inside] / frame.scale
+        foot = frame.inward(truth.closest[inside])
+        inwards = (middle - foot) / depth[:, None]
+    lost = np.asarray(sdf(frame.outward(middle))[0]) >= 0
+    return float(np.mean(lost & (depth >= PARALLEL * half)))
+
+
+def certify_grid(grid: GridSdf, oracle: DistanceOracle) -> dict:
+    """The certificate of samples of the truth: `walls_lost`, and as of `verdict` whether it is too much. Between its
+    samples a grid knows nothing of a wall that is thinner than its cells."""
+    lost, limit = walls_lost(grid, oracle), USABLE["walls_lost"]
+    cell = 2 * BOX * grid.frame.scale / (grid.resolution - 1)
+    advice = f"its cells are {cell:.2g} m: take a higher resolution, or sdf: mesh"
+    reason = "" if lost <= limit else f"walls_lost is {lost:.2g}, allowed {limit:.2g} ({advice})"
+    return {"walls_lost": None if math.isnan(lost) else lost, "passed": not reason, "reason": reason, "caveat": ""}
 
 
 def verdict(errors: dict) -> dict:

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import logging
-import re
-import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,14 +13,27 @@ from typing import Any
 import numpy as np
 
 from sdfsim.errors import SdfsimError
-from sdfsim.shape.gltf import Gltf
+from sdfsim.shape.gltf import Gltf, read_gltf
+from sdfsim.shape.mesh_files import (
+    TEXTURES,
+    averaged,
+    by_trimesh,
+    looked_up,
+    off_surface,
+    plain_obj,
+    plain_stl,
+    ply_surface,
+    read_image,
+    read_ply,
+    side_file,
+)
 
 # trimesh logs what it passes over, some of it with tracebacks. Whoever wants to see that can still listen.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
+GLTF = (".glb", ".gltf")
 FARTHEST = 1e12  # from the origin: beyond, not even double precision tells the vertices of a room-sized mesh apart
-TEXTURES = ("JPEG", "PNG", "WEBP", "BMP", "TIFF")  # Pillow starts other programs to draw some of the other formats
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +89,9 @@ def normal_frame(bounds: np.ndarray) -> Frame:
 
 
 def load_mesh(path: str | Path) -> Mesh:
-    """Read a triangle mesh (obj, ply, glb, gltf, stl, off), cleaned by `clean`. Raises SdfsimError where it is missing,
-    cut short, no mesh, or has no faces, vertices that are not finite, or indices out of range."""
+    """Read a triangle mesh (obj, ply, glb, gltf, stl, off), cleaned by `clean`; glTF has y up and is turned to z up.
+    Raises SdfsimError where it is missing, cut short, no mesh, needs what is not read, or has no faces, vertices that
+    are not finite, or indices out of range."""
     path = Path(path)
     if not path.is_file():
         raise SdfsimError(f"{path}: no such mesh file")
@@ -88,69 +99,38 @@ def load_mesh(path: str | Path) -> Mesh:
     if suffix not in MESH_SUFFIXES:
         raise SdfsimError(f"{path}: not a mesh file ({path.suffix or 'no suffix'})", "use " + " ".join(MESH_SUFFIXES))
     try:
-        # trimesh passes over each of these in silence and would give another geometry than the file's.
-        if suffix in (".glb", ".gltf"):
-            _check_gltf(path)
-        elif suffix == ".obj":
-            _check_obj(path)
-        loaded = _read(path)
-        colors = _vertex_colors(loaded, len(loaded.vertices))
-        mesh = Mesh(np.array(loaded.vertices, dtype=np.float64).reshape(-1, 3), _faces(loaded), colors)
-        if suffix in (".off", ".ply"):
-            _check_counts(path, mesh)
+        mesh = _read(path, suffix)
     except Exception as error:  # the readers raise whatever their format made them stumble over
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise SdfsimError(f"{path}: not a readable mesh ({reason})") from error
     return clean(mesh, name=str(path))
 
 
-def _read(path: Path) -> Any:
-    import trimesh
-
-    return trimesh.load(path, force="mesh", process=False)
+def _read(path: Path, suffix: str) -> Mesh:
+    if suffix in GLTF:
+        found = read_gltf(path)
+    elif suffix == ".ply":
+        found = ply_surface(path.read_bytes())
+    elif suffix == ".off":
+        found = off_surface(path.read_bytes())
+    else:
+        plain = plain_obj if suffix == ".obj" else plain_stl
+        loaded = by_trimesh(path, plain(path.read_bytes()))
+        vertices = np.array(loaded.vertices, dtype=np.float64).reshape(-1, 3)
+        return Mesh(vertices, _faces(loaded), _vertex_colors(loaded, len(vertices)))
+    colors = found.colors
+    if found.places is not None:
+        try:
+            image = read_image(side_file(path, found.texture))
+        except ValueError:
+            image = None
+        if image is not None:
+            colors = averaged(looked_up(image, found.places), found.faces, len(found.vertices))
+    return Mesh(found.vertices, found.faces, colors)
 
 
 def _faces(loaded: Any) -> np.ndarray:
     return np.array(getattr(loaded, "faces", []), dtype=np.int64).reshape(-1, 3)
-
-
-def _check_gltf(path: Path) -> None:
-    """Refuse a glTF file whose geometry is not in its buffers: compressed, sparse, or of a length they do not have."""
-    content = path.read_bytes()
-    if path.suffix.lower() == ".glb":
-        magic, _, _, length, _ = struct.unpack("<4s4I", content[:20])
-        if magic != b"glTF":
-            raise ValueError("it does not begin with glTF")
-        content = content[20 : 20 + length]
-    header = json.loads(content)
-    views = header.get("bufferViews", [])
-    for accessor in header.get("accessors", []):
-        if "bufferView" not in accessor or "sparse" in accessor:
-            raise ValueError("compressed or sparse geometry: export it without either")
-        view = views[accessor["bufferView"]]
-        if not (0 < accessor["count"] <= view["byteLength"] and 4 <= view.get("byteStride", 4) <= 252):
-            raise ValueError("an accessor does not fit its buffer")
-
-
-def _check_obj(path: Path) -> None:
-    """Refuse faces whose indices count back from the rows before them, or are 0."""
-    text = path.read_bytes()
-    if found := re.search(rb"^f[ \t](?:[^\n]*[ \t/])?(-\d+|0+)(?![\d.])", text, re.MULTILINE):
-        number = text.count(b"\n", 0, found.start()) + 1
-        raise ValueError(f"line {number}: a face has the index {found[1].decode()}, only those above 0 are read")
-
-
-def _check_counts(path: Path, mesh: Mesh) -> None:
-    """Refuse an OFF or PLY file that has fewer vertices or faces than its header announces: it was cut short."""
-    with open(path, "rb") as file:
-        head = re.sub(rb"#.*", b"", file.read(4096))
-    if path.suffix.lower() == ".off":
-        announced = re.findall(rb"\d+", head)[:2]
-    else:
-        announced = [count for kind in (b"vertex", b"face") for count in re.findall(rb"element %b (\d+)" % kind, head)]
-    for kind, rows, wanted in zip(("vertices", "faces"), (mesh.vertices, mesh.faces), announced, strict=False):
-        if len(rows) < int(wanted):
-            raise ValueError(f"cut short: {len(rows)} of {int(wanted)} {kind}")
 
 
 def _vertex_colors(loaded: Any, count: int) -> np.ndarray | None:
@@ -192,11 +172,8 @@ def write_ply(mesh: Mesh, attributes: Mapping[str, np.ndarray] | None = None) ->
 def read_mesh(path: Path) -> Mesh:
     """The mesh of a shape folder as `write_ply` wrote it: not cleaned, not reordered. Raises SdfsimError: damaged."""
     with _reading(path):
-        loaded = _read(path)
-        visual, colors = loaded.visual, None
-        if visual.kind == "vertex":
-            colors = np.array(visual.vertex_colors)[:, :3].astype(np.uint8)
-        mesh = Mesh(np.array(loaded.vertices, dtype=np.float64), _faces(loaded), colors)
+        found = ply_surface(path.read_bytes())
+        mesh = Mesh(found.vertices, found.faces, found.colors)
         _require_whole(mesh)
     return mesh
 
@@ -205,7 +182,7 @@ def read_attributes(path: Path, names: Sequence[str]) -> list[np.ndarray]:
     """Properties of the vertices [V] of a PLY file that `write_ply` wrote, by their names. Raises SdfsimError where it
     is not readable or has no such property."""
     with _reading(path, f"damaged, or without {', '.join(names)}"):
-        vertices = _read(path).metadata["_ply_raw"]["vertex"]["data"]
+        vertices = read_ply(path.read_bytes())[0]["vertex"]
         return [np.array(vertices[name]) for name in names]
 
 
@@ -275,14 +252,25 @@ def clean(mesh: Mesh, *, name: str = "mesh") -> Mesh:
         raise SdfsimError(f"{name}: {error}") from error
     if (farthest := float(np.abs(vertices).max())) > FARTHEST:
         raise SdfsimError(f"{name}: a coordinate of {farthest:.3g} is too large (at most {FARTHEST:g})")
-    extent = float(np.ptp(vertices[np.unique(faces)], axis=0).max())
-    # Files round to about seven digits: what agrees to a millionth of the size is one vertex.
-    keys = np.round((vertices - vertices.min(0)) / max(1e-6 * extent, 1e-300)).astype(np.int64)
-    _, first, label = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    used, label = np.unique(faces, return_inverse=True)
+    faces, vertices = label.reshape(-1, 3), vertices[used]
+    colors = None if mesh.colors is None else mesh.colors[used]
+    solid = _has_area(vertices, faces)
+    if not solid.any():
+        raise SdfsimError(f"{name}: mesh has no faces with an area")
+    # Files round to about seven digits: what agrees to a millionth of the size is one vertex. A face without an area
+    # may lie anywhere, and says nothing of the size.
+    low, high = (fold(vertices[np.unique(faces[solid])], axis=0) for fold in (np.min, np.max))
+    keys = np.round((vertices - low) / max(1e-6 * float((high - low).max()), 1e-300))
+    _, first, label = np.unique(keys + 0.0, axis=0, return_index=True, return_inverse=True)
     faces = label.reshape(-1)[faces]
     vertices = vertices[first]
-    colors = None if mesh.colors is None else mesh.colors[first]
+    colors = None if colors is None else colors[first]
 
+    # Without an area it may still join its neighbours, where it has corners of theirs only.
+    held = np.zeros(len(vertices), dtype=bool)
+    held[faces[solid]] = True
+    faces = faces[solid | held[faces].all(1)]
     distinct = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     faces = faces[distinct]
     if len(faces):
@@ -294,6 +282,14 @@ def clean(mesh: Mesh, *, name: str = "mesh") -> Mesh:
     if is_closed(result) and signed_volume(result) < 0:
         result = Mesh(result.vertices, result.faces[:, ::-1].copy(), result.colors)
     return result
+
+
+def _has_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """[F] bool: whether the corners of a face are not in a line, to rounding."""
+    corners = vertices[faces]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(1)
+    twice = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    return twice > 1e-10 * longest**2
 
 
 def without_doubles(faces: np.ndarray) -> np.ndarray:

@@ -19,8 +19,20 @@ from sdfsim.files import read_json, user_cache, write_bytes, write_json
 from sdfsim.parallel import Progress, silent
 from sdfsim.shape import primitives
 from sdfsim.shape.distance import MeshDistance
+from sdfsim.shape.fit_metrics import certify_grid
 from sdfsim.shape.mass import mass_properties_of_sdf
-from sdfsim.shape.mesh import Frame, Mesh, convex_hull, lattice, load_mesh, read_glb, read_mesh, write_glb, write_ply
+from sdfsim.shape.mesh import (
+    GLTF,
+    Frame,
+    Mesh,
+    convex_hull,
+    lattice,
+    load_mesh,
+    read_glb,
+    read_mesh,
+    write_glb,
+    write_ply,
+)
 from sdfsim.shape.mlp_sdf import ACTIVATIONS, MlpSdf
 from sdfsim.shape.sdf import (
     CLOSED_FORMS,
@@ -41,6 +53,8 @@ from sdfsim.shape.watertight import solidify
 SdfKind = Literal["mlp", "grid", "mesh"]
 
 FORMAT_VERSION = 1
+# m, sizes of meshes that need no word; without known units the largest is less, for few things that move are larger.
+USUAL, LARGE = (1e-3, 100.0), 5.0
 # Samples along each side of a grid: its cells are then 0.022 of the solid's largest extent.
 DEFAULT_RESOLUTION = 64
 WEIGHTS_FILE, MESH_FILE, RECORD_FILE = "shape.safetensors", "mesh.ply", "shape.json"
@@ -61,7 +75,7 @@ class Shape:
         volume: m^3.
         com: [3] float64 m, centre of mass.
         inertia: [3, 3] float64 kg m^2 per unit density, about `com`, shape axes.
-        certificate: fit errors measured on held-out points (empty where nothing was fitted).
+        certificate: errors measured on held-out points (empty where the distance is exact).
         source: where it came from and a content hash (for caching and for the record).
         pieces: the vertices [V, 3] float64 m of each of its convex pieces, where it was made of such.
         skin: a mesh with a texture that is shown in place of `mesh`, where there is one.
@@ -266,7 +280,8 @@ def with_sdf(shape: Shape, kind: SdfKind, *, resolution: int = DEFAULT_RESOLUTIO
     """The same shape with its distances taken from another source; mesh, nodes and mass properties stay.
 
     Kinds: "mlp" (the shape as it is, which must have a network), "grid" (samples of the exact distance to the mesh, see
-    `sample_grid`) or "mesh" (that distance itself). There is no certificate then; `source` notes the kind as `sdf`.
+    `sample_grid`, with the certificate of `certify_grid`) or "mesh" (that distance itself, which needs no certificate);
+    `source` notes the kind as `sdf`.
     Raises SdfsimError where there is no network, of a plane, or of fewer than two samples a side.
     """
     if kind == "mlp":
@@ -275,18 +290,19 @@ def with_sdf(shape: Shape, kind: SdfKind, *, resolution: int = DEFAULT_RESOLUTIO
         return shape
     if isinstance(shape.sdf, PlaneSdf):
         raise SdfsimError(f"{shape.name}: a plane has no end, so no grid or mesh holds it")
-    sdf, note = sdf_of_mesh(shape.mesh, kind, resolution)
-    return replace(shape, sdf=sdf, certificate={}, source=shape.source | note)
+    sdf, note, certificate = sdf_of_mesh(shape.mesh, kind, resolution)
+    return replace(shape, sdf=sdf, certificate=certificate, source=shape.source | note)
 
 
 def sdf_of_mesh(
     mesh: Mesh, kind: Literal["grid", "mesh"], resolution: int, on_progress: Progress = silent
-) -> tuple[Sdf, dict]:
-    """A mesh's exact SDF or a grid of it, and what a shape's `source` says about it."""
+) -> tuple[Sdf, dict, dict]:
+    """A mesh's exact SDF or a grid of it, what a shape's `source` says about it, and its certificate."""
     if kind == "mesh":
-        return MeshSdf(mesh), {"sdf": "mesh"}
+        return MeshSdf(mesh), {"sdf": "mesh"}, {}
     oracle = MeshDistance(mesh)
-    return sample_grid(oracle, oracle.bounds, resolution, on_progress), {"sdf": "grid", "resolution": resolution}
+    grid = sample_grid(oracle, oracle.bounds, resolution, on_progress)
+    return grid, {"sdf": "grid", "resolution": resolution}, certify_grid(grid, oracle)
 
 
 def with_nodes(shape: Shape, grid: int) -> Shape:
@@ -309,24 +325,42 @@ def with_wall(shape: Shape, wall: float) -> Shape:
 
 
 def shape_from_mesh(
-    path: str | Path, cache_dir: str | Path | None = None, *, name: str | None = None, units: float = 1.0,
+    path: str | Path, cache_dir: str | Path | None = None, *, name: str | None = None, units: float | None = None,
     cap: bool = False, thicken: float | None = None, sdf: SdfKind = "mlp", resolution: int = DEFAULT_RESOLUTION,
     on_progress: Progress = silent,
 ) -> Shape:  # fmt: skip
     """The shape of a mesh file: made on first use, then taken from a cache (by default `sdfsim/shapes` in the user's
     cache folder) keyed by what the file describes.
 
-    `units` are metres per unit of the file, `thicken` m is a thickness for an open sheet; of `sdf`, "mlp" fits the
-    network, "grid" and "mesh" fit nothing (see `mesh_shape`). Raises SdfsimError where the mesh cannot be used.
+    `units` are metres per unit of the file (None: metres, with a doubt), `thicken` m is a thickness for an open sheet;
+    of `sdf`, "mlp" fits the network, "grid" and "mesh" fit nothing (see `mesh_shape`). `source["notes"]` tells what was
+    done to the mesh, and what `remarks` there are. Raises SdfsimError where the mesh cannot be used.
     """
     path = Path(path)
     mesh = load_mesh(path)
     # Not of the file's bytes: a glTF keeps its vertices, and an OBJ its colours, in files beside it.
     key = mesh.digest()
-    how = {"cap": cap, "thicken": None if thicken is None else thicken / units, "on_progress": on_progress}
-    shape = _cached(mesh, key, path.stem, sdf, resolution, cache_dir, **how)
-    source = {**shape.source, "file": path.name, "sha256": key}
-    return scaled(replace(shape, name=name or path.stem, source=source), units)
+    metres = 1.0 if units is None else units
+    how = {"cap": cap, "thicken": None if thicken is None else thicken / metres, "on_progress": on_progress}
+    shape = _cached(mesh, key, path.stem, sdf, resolution, cache_dir, file=str(path), **how)
+    notes = [*shape.source.get("notes", []), *remarks(path, mesh, metres, given=units is not None)]
+    source = {**shape.source, "file": path.name, "sha256": key} | ({"notes": notes} if notes else {})
+    return scaled(replace(shape, name=name or path.stem, source=source), metres)
+
+
+def remarks(path: Path, mesh: Mesh, units: float, *, given: bool) -> list[str]:
+    """What to tell of a mesh file as it was read, a line each: that glTF was turned; and its size, where that is odd
+    for the `units` (metres per unit) that are taken for its numbers. Many parts are drawn in millimetres, and few
+    files say so."""
+    notes = ["glTF has y up: it is turned to z up"] if path.suffix.lower() in GLTF else []
+    size = units * float(np.ptp(mesh.vertices, axis=0).max())
+    if not given and size > LARGE:
+        notes.append(
+            f"it is {size:.3g} m wide if it counts in metres: does it in millimetres? Then give --units mm (units: mm)"
+        )
+    elif not USUAL[0] <= size <= USUAL[1]:
+        notes.append(f"it is {size:.3g} m wide; where that is wrong, --units (units) says what the file counts in")
+    return notes
 
 
 def shape_from_primitive(
@@ -347,14 +381,15 @@ def shape_from_primitive(
 
 def mesh_shape(
     mesh: Mesh, *, name: str, kind: Literal["grid", "mesh"], cap: bool = False, thicken: float | None = None,
-    resolution: int = DEFAULT_RESOLUTION, on_progress: Progress = silent,
+    file: str = "", resolution: int = DEFAULT_RESOLUTION, on_progress: Progress = silent,
 ) -> Shape:  # fmt: skip
     """The shape of a mesh (metres) without any fit: its exact SDF or a grid of it, nodes and mass as a fit has them.
-    Raises SdfsimError where the mesh cannot be used."""
-    solid = solidify(mesh, name=name, cap=cap, thicken=thicken)
-    sdf, note = sdf_of_mesh(solid.surface, kind, resolution, on_progress)
+    Raises SdfsimError, which calls the mesh `file` (or else `name`), where it cannot be used."""
+    solid = solidify(mesh, name=file or name, cap=cap, thicken=thicken)
+    sdf, note, certificate = sdf_of_mesh(solid.surface, kind, resolution, on_progress)
     nodes = surface_nodes(sdf, solid.surface, DEFAULT_COUNT)
-    return Shape(name, solid.surface, sdf, nodes, *solid.mass_properties(), source={"kind": "mesh"} | note)
+    source = {"kind": "mesh"} | note | ({"notes": list(solid.notes)} if solid.notes else {})
+    return Shape(name, solid.surface, sdf, nodes, *solid.mass_properties(), certificate, source)
 
 
 def _cached(

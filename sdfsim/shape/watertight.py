@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from sdfsim.errors import SdfsimError
-from sdfsim.shape.bvh import ClosestPoint, Winding
+from sdfsim.shape.bvh import ClosestPoint, Crossings, Winding
 from sdfsim.shape.mass import integrals
 from sdfsim.shape.mesh import Frame, Mesh, clean, components, directed_edges, is_closed, lattice, normal_frame
 
@@ -92,8 +92,17 @@ def solidify(mesh: Mesh, *, name: str = "mesh", cap: bool = False, thicken: floa
     if not closed:
         _require_tight(vertices, faces, winding, frame.scale, name)
 
+    rays = Crossings(_plain(vertices, faces))
+
+    def around(points: np.ndarray) -> np.ndarray:
+        """Winding numbers [P]: those that three rays agree on, which is nearly all, and in doubt the exact ones."""
+        found = np.stack([rays(points, direction) for direction in range(3)])
+        value, doubt = found[0], (found != found[0]).any(0)
+        value[doubt] = winding(points[doubt])
+        return value
+
     def side(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        within, without = winding(points - STEP * normals), winding(points + STEP * normals)
+        within, without = around(points - STEP * normals), around(points + STEP * normals)
         layers = np.maximum(np.round(np.abs(within - without)), 1).astype(np.int64)
         return layers * ((within > 0.5).astype(np.int64) - (without > 0.5))
 
@@ -365,8 +374,29 @@ def no_longer_than(corners: np.ndarray, length: float) -> np.ndarray:
     while len(corners):
         short = _longest(corners) <= length
         done.append(corners[short])
-        corners = _halved(corners[~short])
+        corners = _cut(corners[~short], length)
     return np.concatenate(done)
+
+
+def _cut(corners: np.ndarray, length: float) -> np.ndarray:
+    """Smaller triangles. Needles become strips across, as many as halving would make of their long edges in the end:
+    halves of halves would be three for each of two strips. Edges are cut at the same places by either way."""
+    sides = np.linalg.norm(np.roll(corners, -1, axis=1)[..., :3] - corners[..., :3], axis=2)
+    # How often an edge must be halved; those of needles all but one more than once, and equally often.
+    times = np.ceil(np.log2(np.maximum(sides / length, 1.0))).astype(np.int64)
+    foot = times.argmin(1)
+    turn = (foot[:, None] + np.arange(3)) % 3
+    low, right, left = np.take_along_axis(times, turn, axis=1).T
+    needle = (low == 0) & (right == left) & (right > 1)
+    pieces = [_halved(corners[~needle])]
+    b, c, apex = np.moveaxis(np.take_along_axis(corners, turn[..., None], axis=1), 1, 0)
+    for count in np.unique(right[needle]):
+        some = needle & (right == count)
+        part = np.arange(2**count + 1)[:, None, None] / 2**count
+        on_b, on_c = (apex[some] + part * (end[some] - apex[some]) for end in (b, c))
+        pieces.append(np.stack([on_b[1:], on_c[1:], on_b[:-1]], axis=2).reshape(-1, 3, corners.shape[-1]))
+        pieces.append(np.stack([on_c[1:], on_c[:-1], on_b[:-1]], axis=2)[1:].reshape(-1, 3, corners.shape[-1]))
+    return np.concatenate(pieces)
 
 
 def _halved(corners: np.ndarray) -> np.ndarray:

@@ -214,7 +214,7 @@ def bowl_shapes(folder):
     mesh = primitives.bowl()
     volume, com, inertia = mass_properties(mesh)
     mesh = replace(mesh, vertices=mesh.vertices - com)
-    sdf, _ = sdf_of_mesh(mesh, "grid", 24)
+    sdf, _, _ = sdf_of_mesh(mesh, "grid", 24)
     Shape("bowl", mesh, sdf, mesh.vertices[::8], volume, com, inertia).save(folder / "bowl")
     analytic_shape("sphere", radius=0.5, name="ball").save(folder / "ball")
 

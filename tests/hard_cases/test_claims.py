@@ -140,7 +140,14 @@ def test_a_gltf_cannot_claim_what_is_not_there(tmp_path):
         del changed["accessors"][0]["bufferView"]
         changed["accessors"][0]["count"] = 10**12
 
-    refused(without_data, "compressed or sparse")
+    refused(without_data, "compressed")
+
+    def sparse(changed):
+        without_data(changed)
+        few = {"bufferView": 0, "componentType": 5121}
+        changed["accessors"][0]["sparse"] = {"count": 1, "indices": few, "values": few}
+
+    refused(sparse, "has no data")
     refused(lambda changed: changed["bufferViews"][0].update(byteStride=0), "accessor")
 
     def copied(changed):

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from sdfsim import SceneError, load_scene
+from sdfsim.shape import primitives
+from sdfsim.shape.mesh import write_ply
 from sdfsim.shape.shape import analytic_shape
 from tests.scene.conftest import HEAD, problems_of
 
@@ -160,3 +162,15 @@ def test_a_shape_that_is_not_exact_is_named(load, monkeypatch):
 def test_a_wrong_kind_of_sdf_is_one_fault_not_two(load):
     shape = "{primitive: {name: box}, sdf: voxel, resolution: 16}"
     assert len(problems_of(load, f"version: 1\nshapes:\n  b: {shape}\nbodies:\n  - {{name: a, shape: b}}\n")) == 1
+
+
+def test_a_mesh_without_units_is_asked_for_them_where_it_is_large(tmp_path):
+    (tmp_path / "part.ply").write_bytes(write_ply(primitives.box((80.0, 40.0, 5.0))))
+    for units, size, note in (("", 80.0, True), (", units: mm", 0.08, False), (", units: m", 80.0, False)):
+        (tmp_path / "scene.yaml").write_text(
+            f"version: 1\nshapes:\n  p: {{mesh: part.ply, sdf: mesh{units}}}\nbodies:\n  - {{name: a, shape: p}}\n"
+        )
+        scene = load_scene(tmp_path / "scene.yaml")
+        assert np.ptp(scene.shapes[0].mesh.vertices, axis=0).max() == pytest.approx(size)
+        told = ("p: it is 80 m wide if it counts in metres: does it in millimetres? Then give --units mm (units: mm)",)
+        assert scene.notes == (told if note else ())

@@ -9,10 +9,11 @@ from scipy.spatial import KDTree
 
 from sdfsim.shape import primitives
 from sdfsim.shape.distance import MeshDistance, PiecesDistance
-from sdfsim.shape.fit_metrics import EXACT, USABLE, certify, coverage, verdict
-from sdfsim.shape.mesh import Mesh, sample_surface
-from sdfsim.shape.sdf import BoxSdf, Sdf, SphereSdf
+from sdfsim.shape.fit_metrics import EXACT, USABLE, certify, certify_grid, coverage, verdict, walls_lost
+from sdfsim.shape.mesh import Mesh, joined, sample_surface
+from sdfsim.shape.sdf import BoxSdf, MeshSdf, Sdf, SphereSdf, sample_grid
 from sdfsim.shape.surface_nodes import sample_nodes, thin
+from sdfsim.shape.watertight import solidify
 
 CUBE = BoxSdf((0.5, 0.5, 0.5))
 
@@ -61,6 +62,47 @@ def test_the_certificate_of_the_truth_is_clean_and_json(cube: MeshDistance) -> N
     assert "coverage" not in got
     assert json.loads(json.dumps(got, allow_nan=False)) == got
     assert certify(CUBE, PiecesDistance([primitives.box()]), points=500)["passed"]
+
+
+@pytest.mark.parametrize(
+    ("solid", "wall", "most"),
+    [
+        (primitives.box((1.0, 1.0, 0.001)), 0.001, 0.99),
+        (primitives.box((1.0, 1.0, 0.005)), 0.005, 0.95),
+        (primitives.box((1.0, 1.0, 0.02)), 0.02, 0.9),
+        (primitives.cylinder(0.5, 0.002, 100), 0.002, 0.95),
+        (primitives.box((1.0, 0.002, 0.002)), 0.002, 0.85),
+        (primitives.cylinder(0.001, 1.0, 64), 0.002, 0.95),
+        (
+            joined(
+                [primitives.sphere(0.5), Mesh(primitives.sphere(0.496).vertices, primitives.sphere().faces[:, ::-1])]
+            ),
+            0.004,
+            0.95,
+        ),
+    ],
+)
+def test_a_wall_without_an_inside_does_not_pass(solid: Mesh, wall: float, most: float) -> None:
+    oracle = MeshDistance(solid)
+    # Of an odd number of samples those in the middle of a plate would see its inside.
+    exact, grid = MeshSdf(solid), sample_grid(oracle, oracle.bounds, 32)
+    got = certify(exact, oracle, points=2000)
+    assert got["walls_lost"] == 0 and got["passed"]
+    # Off by half the wall and a little, everywhere outside: no sign that counts is wrong, but the inside is gone.
+    lost = certify(Changed(exact, lambda points, d, g: (d + 0.55 * wall, g)), oracle, points=2000)
+    assert lost["walls_lost"] > most and not lost["passed"]
+    found = certify_grid(grid, oracle)
+    assert found["walls_lost"] > 0.9 * most and not found["passed"] and "take a higher resolution" in found["reason"]
+
+
+def test_walls_that_run_out_at_edges_are_not_lost() -> None:
+    for mesh in (primitives.cone(), primitives.bowl(), primitives.gear()):
+        oracle = MeshDistance(mesh)
+        assert walls_lost(sample_grid(oracle, oracle.bounds, 48), oracle) == 0
+    # A thin fin on a block, a twentieth of the surface, is told in proportion.
+    block, fin = primitives.box((1.0, 1.0, 1.0)), primitives.box((0.4, 0.4, 0.002))
+    both = MeshDistance(solidify(joined([block, Mesh(fin.vertices + np.array([0.7, 0.0, 0.0]), fin.faces)])))
+    assert walls_lost(sample_grid(both, both.bounds, 48), both) == pytest.approx(0.32 / 6.32, abs=0.012)
 
 
 def test_the_certificate_of_a_lie_is_not(cube: MeshDistance) -> None:

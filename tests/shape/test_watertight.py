@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -7,10 +8,11 @@ import pytest
 
 from sdfsim.errors import SdfsimError
 from sdfsim.shape import primitives
+from sdfsim.shape.bvh import Crossings
 from sdfsim.shape.distance import MeshDistance
 from sdfsim.shape.mesh import Mesh, is_closed, joined, load_mesh, sample_surface, signed_volume
 from sdfsim.shape.sdf import BoxSdf
-from sdfsim.shape.watertight import solidify
+from sdfsim.shape.watertight import face_areas, no_longer_than, solidify
 
 CUBE = primitives.box()
 BALL = primitives.sphere(0.5, subdivisions=4)
@@ -269,6 +271,75 @@ def test_a_thickened_sheet_is_all_within_half_its_thickness() -> None:
 def test_a_thickness_that_no_fit_resolves_is_refused(thickness: float) -> None:
     with pytest.raises(SdfsimError, match="thickness"):
         solidify(sheet((0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)), thicken=thickness)
+
+
+def prism_of(sides: int, across: float = 1.0) -> Mesh:
+    """A cylinder as CAD programs export it: two long triangles a side, and fans around the middles of its ends."""
+    turn = 2 * np.pi * np.arange(sides) / sides
+    ring = 0.5 * across * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    vertices = [np.c_[ring, np.full(sides, z)] for z in (-0.5, 0.5)]
+    k = np.arange(sides)
+    after, low, high = (k + 1) % sides, np.full(sides, 2 * sides), np.full(sides, 2 * sides + 1)
+    faces = [
+        (k, after, sides + after),
+        (k, sides + after, sides + k),
+        (low, after, k),
+        (high, sides + k, sides + after),
+    ]
+    return Mesh(
+        np.concatenate([*vertices, [[0, 0, -0.5], [0, 0, 0.5]]]), np.concatenate([np.stack(f, 1) for f in faces])
+    )
+
+
+@pytest.mark.parametrize("sides", [255, 719])
+def test_long_thin_triangles_take_no_time(sides: int) -> None:
+    mesh = prism_of(sides)
+    assert len(mesh.faces) in (1020, 2876)
+    solidify(prism_of(8))  # loads what is slow to load
+    began = time.process_time()
+    solid = solidify(mesh)
+    assert time.process_time() - began < 2.0
+    assert solid.simple and solid.notes == ()
+    assert solid.mass_properties()[0] == pytest.approx(sides / 8 * np.sin(2 * np.pi / sides))
+    # Two that cross, of which each is one surface with the other: as much as both, less what both hold.
+    other = prism_of(sides // 4, 0.5)
+    turned = Mesh(np.roll(other.vertices, 1, axis=1) * [1.5, 1.0, 1.0], other.faces)
+    began = time.process_time()
+    union = solidify(both(mesh, turned))
+    assert time.process_time() - began < 6.0
+    # A stub of radius r that sticks out of a cylinder of radius R by what its length has over the cylinder's.
+    y = np.linspace(-0.25, 0.25, 20001)[1:-1]
+    stub = np.trapezoid(2 * np.sqrt(0.0625 - y**2) * 2 * (0.75 - np.sqrt(0.25 - y**2)), y)
+    assert union.mass_properties()[0] == pytest.approx(np.pi / 4 + stub, rel=3e-3)
+    assert not union.simple and any("left out" in note for note in union.notes)
+
+
+def test_cutting_keeps_area_and_edges_that_match() -> None:
+    mesh = prism_of(40)
+    corners = mesh.vertices[mesh.faces]
+    for length in (0.3, 0.05):
+        pieces = no_longer_than(corners, length)
+        sides = np.linalg.norm(pieces - np.roll(pieces, 1, axis=1), axis=2)
+        assert sides.max() <= length
+        # Strips, where halves of halves of needles were three to the power of their halvings.
+        assert len(pieces) < len(corners) * 3 * 2 ** np.ceil(np.log2(np.sqrt(2) / length))
+        np.testing.assert_allclose(face_areas(pieces).sum(), face_areas(corners).sum())
+        _, label = np.unique(pieces.reshape(-1, 3).round(9), axis=0, return_inverse=True)
+        assert is_closed(Mesh(pieces.reshape(-1, 3), label.reshape(-1, 3)))
+
+
+def test_rays_tell_how_often_a_surface_goes_around_a_point() -> None:
+    inner = primitives.box((0.4, 0.4, 0.4))
+    nested = both(CUBE, inner, moved(prism_of(100), 0.6, 0.0, 0.0))
+    points = query()
+    truth = sum((box_distance(points, half) < 0).astype(int) for half in ((0.5, 0.5, 0.5), (0.2, 0.2, 0.2)))
+    truth += (np.hypot(points[:, 0] - 0.6, points[:, 1]) < 0.4997) & (np.abs(points[:, 2]) < 0.5)
+    for direction in range(3):
+        assert np.mean(Crossings(nested)(points, direction) != truth) < 3e-3  # between the prism's sides and the circle
+        np.testing.assert_allclose(Crossings(inverted(inner))(np.zeros((1, 3)), direction), -1)
+        # Faces on each other, which one hierarchy takes for one.
+        twice = 2 * (box_distance(points) < 0)
+        assert np.mean(Crossings(both(CUBE, finer_cube(3)))(points, direction) != twice) < 0.02
 
 
 @pytest.mark.parametrize(
