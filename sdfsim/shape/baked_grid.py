@@ -160,7 +160,8 @@ def unseen_wall(sdf: Sdf, grid: BakedGrid) -> float | None:
     if grid.thickness > limit:
         return None
     extent = float(np.ptp(sdf.bounds, axis=0).max())
-    places = np.random.default_rng(0).uniform(*sdf.bounds, (64 * SPREAD, 3))
+    low, high = sdf.bounds
+    places = np.random.default_rng(0).uniform(low, high, (64 * SPREAD, 3))
     # From close by: edges are what is nearest to much of the space farther away.
     places = places[np.abs(np.asarray(sdf(places)[0])) <= CLOSE * extent][: 2 * SPREAD]
     for _ in range(PROJECTIONS):
