@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from sdfsim.dynamics.kernels.collide import KEYS
+from sdfsim.dynamics.kernels.surface_distance import KEYS
 
 from sdfsim.dynamics.bodies import Units, from_scene
 from sdfsim.dynamics.kernels.distance import GRID, distance

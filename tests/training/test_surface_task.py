@@ -121,11 +121,11 @@ def test_trajectories_of_different_steps_are_not_trained_on_together(ball_data, 
 def test_the_floor_of_a_batch_is_the_one_that_dataset_json_tells(tmp_path):
     told = {"engine": "mine", "floor": {"friction": 0.7, "restitution": 0.1}}
     data = slab_data(tmp_path, "train", sliding(0.7), told)
-    task = SurfaceTask(data, "train", PAPER, CPU)
+    task = SurfaceTask(data, "train", SDF_SIM, CPU)
     bodies, _, _ = task.scenes(np.random.default_rng(0), 2)
     assert (float(bodies.friction[-1]), float(bodies.restitution[-1])) == (0.7, 0.1)
     assert task.ranges()["friction"] == pytest.approx([0.7, 1.0])
     before = task.digest()
     (data / "dataset.json").write_text('{"engine": "mine"}')
-    other = SurfaceTask(data, "train", PAPER, CPU)
+    other = SurfaceTask(data, "train", SDF_SIM, CPU)
     assert float(other.scenes(np.random.default_rng(0), 2)[0].friction[-1]) == 0.3 and other.digest() != before
