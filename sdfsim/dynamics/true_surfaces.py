@@ -131,7 +131,8 @@ def _of_mesh(mesh: Mesh) -> Solid:
         closest, normal = nearest(points)
         away = points - closest
         length = np.linalg.norm(away, axis=1)
-        found = np.where((away * normal).sum(1) < 0, -length, length)
+        # From within, the nearest point is in the middle of a face; from outside, no face that has it is behind.
+        found = np.where((away * normal).sum(1) < -0.5 * length, -length, length)
         near = length < 1e-6 * size
         return found, np.where(near[:, None], normal, away / np.where(near, 1.0, found)[:, None])
 
