@@ -25,6 +25,7 @@ CLUSTER = 32  # triangles that are looked at together at first
 MOST = 384  # triangles of a pair that are cut further at once; what is left out makes the answer less sure
 ROUNDS = 26  # of cutting
 FINE = 2e-4  # of the smaller thickness: how exact a distance is
+ROUGH = 4e-3  # likewise, from a body that is not convex: there bounds are weaker, and triangles many
 AROUND = 16  # corners of the circles from which round surfaces are cut further
 FLAT = 1e-9  # of a mesh's size: how far beside a face's plane a convex mesh may have a vertex
 
@@ -235,7 +236,7 @@ def gaps(solids: Sequence[Solid], first: Placed, second: Placed, most: np.ndarra
     empty = np.array([len(s.corner) == 0 for s in solids])
     # Of the two surfaces the one whose other body is convex, and which has an end.
     swap = (empty[first.solid] | (~smooth[second.solid] & smooth[first.solid])) & ~empty[second.solid]
-    fine = FINE * np.minimum(*(p.scale * np.array([s.thickness for s in solids])[p.solid] for p in (first, second)))
+    thin = np.minimum(*(p.scale * np.array([s.thickness for s in solids])[p.solid] for p in (first, second)))
     apart, surely = np.full(count, np.inf), np.full(count, -np.inf)
     point, normal, sign = np.zeros((count, 3)), np.zeros((count, 3)), np.ones(count)
 
@@ -244,7 +245,8 @@ def gaps(solids: Sequence[Solid], first: Placed, second: Placed, most: np.ndarra
             mine, other = (second, first) if flag else (first, second)
             one = rows[(backwards[rows] == flag) & ~empty[mine.solid[rows]]]
             if len(one):
-                low, at_least, where, slope = _lowest(solids, mine[one], other[one], most[one], fine[one])
+                fine = np.where(smooth[other.solid[one]], FINE, ROUGH) * thin[one]
+                low, at_least, where, slope = _lowest(solids, mine[one], other[one], most[one], fine, apart[one])
                 better = low < apart[one]
                 apart[one[better]], point[one[better]], normal[one[better]] = low[better], where[better], slope[better]
                 surely[one], sign[one[better]] = np.maximum(surely[one], at_least), -1.0 if flag else 1.0
@@ -276,11 +278,12 @@ def _holds(solids: Sequence[Solid], one: Placed, other: Placed, rows: np.ndarray
 
 
 def _lowest(
-    solids: Sequence[Solid], mine: Placed, other: Placed, most: np.ndarray, fine: np.ndarray
+    solids: Sequence[Solid], mine: Placed, other: Placed, most: np.ndarray, fine: np.ndarray, known: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The lowest distance from other bodies on the surfaces of P bodies: found, at least, where (world), gradient."""
+    """The lowest distance from other bodies on the surfaces of P bodies, where that is lower than what is `known`:
+    found, at least, where (world), gradient."""
     count = len(mine.solid)
-    best, missed = np.full(count, np.inf), np.full(count, np.inf)
+    best, missed = known.copy(), np.full(count, np.inf)
     where, slope = np.zeros((count, 3)), np.zeros((count, 3))
     smooth = np.array([s.convex for s in solids])[other.solid]
     straight = np.array([s.straight for s in solids])
