@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sdfsim.shape.bvh import ClosestPoint
-from sdfsim.shape.distance import MeshDistance, PiecesDistance
+from sdfsim.shape.bvh import Winding
+from sdfsim.shape.distance import PiecesDistance
 from sdfsim.shape.mesh import Mesh, convex_hull
 from sdfsim.shape.sdf import BoxSdf, CapsuleSdf, ClosedForm, CylinderSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.shape import Shape
@@ -61,8 +61,7 @@ def solid(shape: Shape) -> Solid:
         pieces = [convex_hull(points) for points in shape.pieces]
         if len(pieces) == 1:
             return _of_mesh(pieces[0])
-        oracle = PiecesDistance(pieces)
-        return _of_oracle(oracle.surface, oracle)
+        return _of_pieces(PiecesDistance(pieces))
     return _of_mesh(shape.mesh)
 
 
@@ -123,30 +122,45 @@ def _closed_form(sdf: ClosedForm) -> Solid:
 
 
 def _of_mesh(mesh: Mesh) -> Solid:
-    if not _is_convex(mesh):
-        oracle = MeshDistance(mesh)
-        return _of_oracle(oracle.surface, oracle)
-    nearest, size = ClosestPoint(mesh), float(np.ptp(mesh.vertices, axis=0).max())
+    import igl  # a third of what open3d takes to load, and in double precision
+
+    convex, size = _is_convex(mesh), float(np.ptp(mesh.vertices, axis=0).max())
+    vertices, faces = np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces, dtype=np.int64)
+    corner = vertices[faces]
+    across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    area = np.linalg.norm(across, axis=1)
+    normals = across / np.maximum(area, 1e-300)[:, None]
+    tree, winding = igl.AABB(), Winding(mesh)
+    tree.init(vertices, faces)
 
     def distance(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        closest, normal = nearest(points)
-        away = points - closest
-        length = np.linalg.norm(away, axis=1)
-        # From within, the nearest point is in the middle of a face; from outside, no face that has it is behind.
-        found = np.where((away * normal).sum(1) < -0.5 * length, -length, length)
-        near = length < 1e-6 * size
+        answer = tree.squared_distance(vertices, faces, np.ascontiguousarray(points))
+        squared, face, closest = (np.asarray(part) for part in answer)
+        length, normal, away = np.sqrt(squared), normals[face], points - closest
+        # From within a convex solid, and wherever the nearest point is in the middle of a face, the way there is along
+        # the normal. At edges of others the winding number tells; of convex ones no face there is behind.
+        height = (away * normal).sum(1)
+        inside = height < -0.5 * length
+        if not convex:
+            a, b, c = (corner[face, k] for k in range(3))
+            parts = [(np.cross(q - p, closest - p) * normal).sum(1) for p, q in ((a, b), (b, c), (c, a))]
+            unclear = (np.min(parts, axis=0) <= 1e-6 * area[face]) & (length > 0)
+            if unclear.any():
+                inside[unclear] = winding(points[unclear]) > 0.5
+        found = np.where(inside, -length, length)
+        near = length < 1e-9 * size
         return found, np.where(near[:, None], normal, away / np.where(near, 1.0, found)[:, None])
 
-    return _triangles(mesh, distance, convex=True)
+    return _triangles(mesh, distance, convex=convex)
 
 
-def _of_oracle(surface: Mesh, oracle: MeshDistance | PiecesDistance) -> Solid:
+def _of_pieces(oracle: PiecesDistance) -> Solid:
     def distance(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         found = oracle(points)
         away = points - found.closest
         return found.distance, away / np.where(found.distance == 0, 1.0, found.distance)[:, None]
 
-    return _triangles(surface, distance, convex=False)
+    return _triangles(oracle.surface, distance, convex=False)
 
 
 def _triangles(mesh: Mesh, distance: Distance, *, convex: bool) -> Solid:
