@@ -27,7 +27,7 @@ MADE = 0.01  # of the energy in play, beyond which what came from nothing is tol
 SHARE = 0.1  # of what lifts a body by its own size, that is in play at least
 FADE = 0.9  # of what was in play before is so much, whenever energy is lost
 PART, LEAST = 0.05, 0.1  # of a run's time that the surfaces may take, and s that they may take anyway
-FEW = 4000  # pairs that are measured together
+FEW, MANY = 32, 4096  # pairs that are measured together at first, and at most
 FEW_BODIES = 64  # that move: of more, energy is accounted for together only
 
 
@@ -270,7 +270,7 @@ def _surfaces(scene: Scene, rollout: Rollout, seconds: float, every: int) -> tup
     while done < len(frames):
         some = np.array(frames[done : done + chunk])
         before = time.perf_counter()
-        deep, wide = _measured(course, some)
+        deep, wide = _measured(course, some, started + seconds)
         done += len(some)
         if deep and (deepest is None or deep.part > deepest.part):
             deepest = deep
@@ -375,9 +375,9 @@ def near_pairs(course: _Course, frame: int, margin: np.ndarray) -> np.ndarray:
     return pair[~apart]
 
 
-def _measured(course: _Course, frames: np.ndarray) -> tuple[Near | None, Near | None]:
+def _measured(course: _Course, frames: np.ndarray, deadline: float) -> tuple[Near | None, Near | None]:
     """The deepest overlap in frames, and the widest free space of bodies that are pushed in the steps that start in
-    them."""
+    them. Pairs that are left at the `deadline` (of `time.perf_counter`) are not measured, and then no free space."""
     scene, rollout = course.scene, course.rollout
     size = np.array([course.solids[b.shape].thickness * b.scale for b in scene.bodies])
     reach = np.array([_reach(course.solids[b.shape], scene.shapes[b.shape]) * b.scale for b in scene.bodies])
@@ -401,11 +401,14 @@ def _measured(course: _Course, frames: np.ndarray) -> tuple[Near | None, Near | 
         allowance.append(np.maximum(margin[pair[:, 0]], margin[pair[:, 1]]))
         alone.append((f, np.flatnonzero(pushed)))
     row, most = np.concatenate(rows), np.concatenate(allowance)
-    parts = []
-    for first in range(0, len(row), FEW):
-        cut = slice(first, first + FEW)
+    parts, done, chunk = [], 0, FEW
+    while done < len(row) and (not parts or time.perf_counter() < deadline):
+        cut = slice(done, done + chunk)
         one, other = (placed(scene, rollout, row[cut, 0], row[cut, k]) for k in (1, 2))
         parts.append(gaps(course.solids, one, other, most[cut]))
+        done, chunk = done + chunk, min(2 * chunk, MANY)
+    if done < len(row):
+        row, alone = row[:done], []
     if parts:
         found = Gaps(*(np.concatenate(column) for column in zip(*parts, strict=True)))
         thin = np.minimum(size[row[:, 1]], size[row[:, 2]])

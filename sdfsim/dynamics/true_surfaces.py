@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sdfsim.shape.bvh import ClosestPoint
-from sdfsim.shape.distance import MeshDistance, PiecesDistance
+from sdfsim.shape.bvh import Winding
+from sdfsim.shape.distance import PiecesDistance
 from sdfsim.shape.mesh import Mesh, convex_hull
 from sdfsim.shape.sdf import BoxSdf, CapsuleSdf, ClosedForm, CylinderSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.shape import Shape
@@ -25,6 +25,7 @@ CLUSTER = 32  # triangles that are looked at together at first
 MOST = 384  # triangles of a pair that are cut further at once; what is left out makes the answer less sure
 ROUNDS = 26  # of cutting
 FINE = 2e-4  # of the smaller thickness: how exact a distance is
+ROUGH = 4e-3  # likewise, from a body that is not convex: there bounds are weaker, and triangles many
 AROUND = 16  # corners of the circles from which round surfaces are cut further
 FLAT = 1e-9  # of a mesh's size: how far beside a face's plane a convex mesh may have a vertex
 
@@ -60,8 +61,7 @@ def solid(shape: Shape) -> Solid:
         pieces = [convex_hull(points) for points in shape.pieces]
         if len(pieces) == 1:
             return _of_mesh(pieces[0])
-        oracle = PiecesDistance(pieces)
-        return _of_oracle(oracle.surface, oracle)
+        return _of_pieces(PiecesDistance(pieces))
     return _of_mesh(shape.mesh)
 
 
@@ -122,29 +122,45 @@ def _closed_form(sdf: ClosedForm) -> Solid:
 
 
 def _of_mesh(mesh: Mesh) -> Solid:
-    if not _is_convex(mesh):
-        oracle = MeshDistance(mesh)
-        return _of_oracle(oracle.surface, oracle)
-    nearest, size = ClosestPoint(mesh), float(np.ptp(mesh.vertices, axis=0).max())
+    import igl  # a third of what open3d takes to load, and in double precision
+
+    convex, size = _is_convex(mesh), float(np.ptp(mesh.vertices, axis=0).max())
+    vertices, faces = np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces, dtype=np.int64)
+    corner = vertices[faces]
+    across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    area = np.linalg.norm(across, axis=1)
+    normals = across / np.maximum(area, 1e-300)[:, None]
+    tree, winding = igl.AABB(), Winding(mesh)
+    tree.init(vertices, faces)
 
     def distance(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        closest, normal = nearest(points)
-        away = points - closest
-        length = np.linalg.norm(away, axis=1)
-        found = np.where((away * normal).sum(1) < 0, -length, length)
-        near = length < 1e-6 * size
+        answer = tree.squared_distance(vertices, faces, np.ascontiguousarray(points))
+        squared, face, closest = (np.asarray(part) for part in answer)
+        length, normal, away = np.sqrt(squared), normals[face], points - closest
+        # From within a convex solid, and wherever the nearest point is in the middle of a face, the way there is along
+        # the normal. At edges of others the winding number tells; of convex ones no face there is behind.
+        height = (away * normal).sum(1)
+        inside = height < -0.5 * length
+        if not convex:
+            a, b, c = (corner[face, k] for k in range(3))
+            parts = [(np.cross(q - p, closest - p) * normal).sum(1) for p, q in ((a, b), (b, c), (c, a))]
+            unclear = (np.min(parts, axis=0) <= 1e-6 * area[face]) & (length > 0)
+            if unclear.any():
+                inside[unclear] = winding(points[unclear]) > 0.5
+        found = np.where(inside, -length, length)
+        near = length < 1e-9 * size
         return found, np.where(near[:, None], normal, away / np.where(near, 1.0, found)[:, None])
 
-    return _triangles(mesh, distance, convex=True)
+    return _triangles(mesh, distance, convex=convex)
 
 
-def _of_oracle(surface: Mesh, oracle: MeshDistance | PiecesDistance) -> Solid:
+def _of_pieces(oracle: PiecesDistance) -> Solid:
     def distance(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         found = oracle(points)
         away = points - found.closest
         return found.distance, away / np.where(found.distance == 0, 1.0, found.distance)[:, None]
 
-    return _triangles(surface, distance, convex=False)
+    return _triangles(oracle.surface, distance, convex=False)
 
 
 def _triangles(mesh: Mesh, distance: Distance, *, convex: bool) -> Solid:
@@ -234,7 +250,7 @@ def gaps(solids: Sequence[Solid], first: Placed, second: Placed, most: np.ndarra
     empty = np.array([len(s.corner) == 0 for s in solids])
     # Of the two surfaces the one whose other body is convex, and which has an end.
     swap = (empty[first.solid] | (~smooth[second.solid] & smooth[first.solid])) & ~empty[second.solid]
-    fine = FINE * np.minimum(*(p.scale * np.array([s.thickness for s in solids])[p.solid] for p in (first, second)))
+    thin = np.minimum(*(p.scale * np.array([s.thickness for s in solids])[p.solid] for p in (first, second)))
     apart, surely = np.full(count, np.inf), np.full(count, -np.inf)
     point, normal, sign = np.zeros((count, 3)), np.zeros((count, 3)), np.ones(count)
 
@@ -243,7 +259,8 @@ def gaps(solids: Sequence[Solid], first: Placed, second: Placed, most: np.ndarra
             mine, other = (second, first) if flag else (first, second)
             one = rows[(backwards[rows] == flag) & ~empty[mine.solid[rows]]]
             if len(one):
-                low, at_least, where, slope = _lowest(solids, mine[one], other[one], most[one], fine[one])
+                fine = np.where(smooth[other.solid[one]], FINE, ROUGH) * thin[one]
+                low, at_least, where, slope = _lowest(solids, mine[one], other[one], most[one], fine, apart[one])
                 better = low < apart[one]
                 apart[one[better]], point[one[better]], normal[one[better]] = low[better], where[better], slope[better]
                 surely[one], sign[one[better]] = np.maximum(surely[one], at_least), -1.0 if flag else 1.0
@@ -275,11 +292,12 @@ def _holds(solids: Sequence[Solid], one: Placed, other: Placed, rows: np.ndarray
 
 
 def _lowest(
-    solids: Sequence[Solid], mine: Placed, other: Placed, most: np.ndarray, fine: np.ndarray
+    solids: Sequence[Solid], mine: Placed, other: Placed, most: np.ndarray, fine: np.ndarray, known: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The lowest distance from other bodies on the surfaces of P bodies: found, at least, where (world), gradient."""
+    """The lowest distance from other bodies on the surfaces of P bodies, where that is lower than what is `known`:
+    found, at least, where (world), gradient."""
     count = len(mine.solid)
-    best, missed = np.full(count, np.inf), np.full(count, np.inf)
+    best, missed = known.copy(), np.full(count, np.inf)
     where, slope = np.zeros((count, 3)), np.zeros((count, 3))
     smooth = np.array([s.convex for s in solids])[other.solid]
     straight = np.array([s.straight for s in solids])

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from sdfsim.dynamics.instruments import in_order, judged
@@ -123,6 +124,39 @@ def test_capsules_are_as_far_apart_as_their_segments():
         found = between(*rods, place, turns[1], other=turns[0])
         if wanted > -0.02:  # beyond, the deepest point of a surface is no longer on the line between the segments
             assert found.apart[0] == pytest.approx(wanted, abs=2e-5)
+
+
+def test_meshes_are_measured_as_the_closed_forms_that_they_are():
+    """Boxes, whose meshes are exact, in each other, apart and beside each other's edges."""
+    rng = np.random.default_rng(2)
+    sizes = (1.0, 0.05, 0.05), (0.3, 0.2, 0.1)
+    exact, meshes = [analytic_shape("box", size=size) for size in sizes], [mesh(primitives.box(size)) for size in sizes]
+    signs = set()
+    for k in range(60):
+        turns = Rotation.random(2, rng=rng) if k % 2 else [about("z", 90), Rotation.identity()]
+        place = rng.uniform([-0.4, -0.15, -0.15], [0.4, 0.15, 0.15]) if k % 2 else rng.uniform(-0.3, 0.3, 3)
+        wanted = between(*exact, place, turns[0], other=turns[1]).apart[0]
+        for pair in (meshes, (exact[0], meshes[1]), (meshes[0], exact[1])):
+            assert between(*pair, place, turns[0], other=turns[1]).apart[0] == pytest.approx(wanted, abs=3e-5)
+        signs.add(bool(wanted > 0))
+    assert signs == {True, False}
+
+
+def test_boxes_are_as_far_apart_as_a_solver_of_quadratic_programs_says():
+    rng = np.random.default_rng(3)
+    size = np.array([0.5, 0.025, 0.025])
+    for _ in range(12):
+        turns, place = Rotation.random(2, rng=rng), rng.uniform(-0.4, 0.4, 3)
+
+        def apart(x: np.ndarray, turns=turns, place=place) -> float:
+            return float(np.square(turns[0].apply(x[:3]) - turns[1].apply(x[3:]) - place).sum())
+
+        limits = [(-half, half) for half in (*size, *size)]
+        found = minimize(apart, np.zeros(6), bounds=limits, method="L-BFGS-B", options={"ftol": 1e-16, "gtol": 1e-12})
+        wanted = np.sqrt(found.fun)
+        if wanted > 1e-3:
+            one = between(STICK, STICK, place, turns[1], other=turns[0])
+            assert one.apart[0] == pytest.approx(wanted, abs=3e-5)
 
 
 def test_a_torus_and_a_ball_are_measured_in_the_hole_too():
