@@ -634,7 +634,11 @@ def spins(at: Setting) -> Iterator[Check]:
         ran = run(at, [Put("it", shape, [0, 0, height], w=[0, 0, w], mu=mu), floor()], 2.5)
         spin = np.abs(ran.w("it")[:, 2])
         over = np.flatnonzero(spin < 0.02 * w)
-        at_s = float(ran.seconds[over[0]]) if len(over) else inf
+        at_s = inf
+        if len(over):  # between two frames as a line between their spins has it
+            k = int(over[0])
+            share = (spin[k - 1] - 0.02 * w) / (spin[k - 1] - spin[k])
+            at_s = float(ran.seconds[k - 1] + share * (ran.seconds[k] - ran.seconds[k - 1]))
         # The arm R that makes this time: w I UNIT^2 / (mu m g t).
         return w * 0.98 * inertia / mass * UNIT**2 / (mu * G * at_s) / UNIT, ran
 
@@ -697,8 +701,9 @@ def edges(at: Setting) -> Iterator[Check]:
         upper = about("x", 45)
         # The lower edge runs along y, the upper along x; they cross at (0, y) and (x, 0).
         put = Put("upper", cube, [*place, 2 * sqrt(0.5) + 0.002], upper)
-        ran = run(at, [fixed("lower", cube, [0, 0, 0], lower), put], 0.06)
-        k = ran.when(0.05)
+        # Soon after they touch, 6 ms after the start: an edge off the middle then topples the cube.
+        ran = run(at, [fixed("lower", cube, [0, 0, 0], lower), put], 0.03)
+        k = ran.when(0.02)
         yield near(f"edge on edge at {place}: height", ran.place("upper")[k, 2], sqrt(2), 0.0, "sizes", 0.002)
         yield from laws(ran, f"edge on edge at {place}")
     ran = run(at, [floor(), Put("upper", cube, [0, 0, sqrt(0.5) + 0.002], about("x", 45))], 0.06)
@@ -802,8 +807,9 @@ def before_touch(at: Setting) -> Iterator[Check]:
     small, large = of_mesh(kind, "ball", 1.0, 4), solid("analytic", "ball", 2.1)
     bodies = [fixed("small", small, [0, 0, 0]), Put("large", large, [-3.6, 0, 0], v=[0.2, 0, 0], mu=0.0)]
     ran = run(at, bodies, 0.6, gravity=0.0)
-    # A frictionless ball without restitution that hits a fixed one centrally stops.
-    yield most("ball on a mesh ball: speed after", float(np.linalg.norm(ran.v("large")[-1])), 0.01, "m/s")
+    # A frictionless ball without restitution that hits a fixed one centrally stops, but for what the nearest corner of
+    # the mesh, up to 0.05 rad aside, lets pass: 0.01 m/s, and as much again where it then meets the next.
+    yield most("ball on a mesh ball: speed after", float(np.linalg.norm(ran.v("large")[-1])), 0.015, "m/s")
     yield from laws(ran, "ball on a mesh ball")
     ring = of_mesh(kind, "torus", 0.5, 0.1)  # a hole of radius 0.4
     rod = solid("analytic", "capsule", 0.32, 20.0)

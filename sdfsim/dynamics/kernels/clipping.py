@@ -20,7 +20,7 @@ from sdfsim.dynamics.kernels.convex import (
 )
 from sdfsim.dynamics.kernels.vectors import BARE, FAST, add, along, cross, dot, get, put, scale, turn, turn_back
 
-RIM = 16  # points of the true circle that bound the contact of a drum's end
+RIM = 24  # points of the true circle that bound the contact of a drum's end
 MOST = 160  # corners of a clipped face
 CHOSEN = 4  # of them that carry a contact
 STEEP = 0.1  # cosine between a face and the normal, below which the face does not bound the contact

@@ -14,8 +14,19 @@ from numba import njit, prange
 
 from sdfsim.dynamics.kernels.broad_phase import carried, near_pairs, swept
 from sdfsim.dynamics.kernels.clipping import CHOSEN, touching_points
-from sdfsim.dynamics.kernels.convex import BALL, Pair, closest, core, first_normal, rounding, separation
-from sdfsim.dynamics.kernels.distance import CAPSULE, GRID, KIND, PLANE, SIZE, SPHERE, distance_alone, solids
+from sdfsim.dynamics.kernels.convex import BALL, Pair, closest, farthest, first_normal, rounding, separation
+from sdfsim.dynamics.kernels.distance import (
+    BOX,
+    CAPSULE,
+    CYLINDER,
+    GRID,
+    KIND,
+    PLANE,
+    SIZE,
+    SPHERE,
+    distance_alone,
+    solids,
+)
 from sdfsim.dynamics.kernels.manifold import (
     FOUND,
     first_to_touch,
@@ -105,7 +116,10 @@ def way_of(shapes, s, t):
     first, second = start[s + 1] > start[s], start[t + 1] > start[t]
     if one or other:
         if table[s, KIND] != GRID and table[t, KIND] != GRID:
-            return ROUND
+            long = table[s, KIND] == CAPSULE or table[t, KIND] == CAPSULE
+            edged = table[s, KIND] == BOX or table[s, KIND] == CYLINDER
+            edged = edged or table[t, KIND] == BOX or table[t, KIND] == CYLINDER
+            return SOLIDS if long and edged else ROUND  # a line along a face, else places on a core
         return SOLIDS if first and second else SURFACES
     return SOLIDS if (first or table[s, KIND] == PLANE) and (second or table[t, KIND] == PLANE) else SURFACES
 
@@ -364,11 +378,16 @@ def collide_solids(shapes, world, motion, matrix, rules, manifolds, near, went, 
 
 
 @njit(**BARE)
+def _lowest_point(convex, matrix, pair, up):
+    """The point of a piece that is lowest along the normal of a plane."""
+    low = farthest(convex, pair.first, pair.size, matrix, pair.a, scale(up, -1.0))
+    return along(add(pair.offset, low), up, -pair.size * rounding(convex, pair.first))
+
+
+@njit(**BARE)
 def _above(convex, matrix, pair, up):
     """How high the lowest point of a piece is above a plane."""
-    from_piece = turn_back(matrix, pair.a, scale(up, -1.0))
-    low = add(pair.offset, turn(matrix, pair.a, scale(core(convex, pair.first, from_piece), pair.size)))
-    return dot(up, low) - pair.size * rounding(convex, pair.first)
+    return dot(up, _lowest_point(convex, matrix, pair, up))
 
 
 @njit(**BARE)
