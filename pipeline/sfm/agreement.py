@@ -8,7 +8,7 @@ from pipeline.cameras import View, view_of
 
 ENOUGH = 30  # matches of a pair that tell something
 CONTRADICTION = 4.0  # px from its line, and a match contradicts the poses; what verification allows
-FINEST = 0.1  # px; matches are not more exact than that
+FINEST = 0.2  # px; poses that put matches closer than this or so need not be better
 
 
 def agreement(pairs: list, views: list[dict]) -> list[dict]:

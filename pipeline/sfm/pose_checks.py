@@ -18,10 +18,12 @@ MAX_MEAN_ERROR = 2.0  # px
 MIN_TRIANGULATION = 1.5  # degrees
 FEW_FEATURES, FEW_MATCHES, FEW_POINTS, FEW_PHOTOS = 150, ENOUGH, 30, 6
 FOCAL_OFF = 1.5  # times the focal length of EXIF, and the lens is another
-MANY_CONTRADICTIONS = 0.25  # of the matches; right poses have up to 0.1, those of repeating things 0.5 and more
-# How many times farther from their lines than they have to matches may lie. Right poses have 1.0 to 1.7, those of a
-# wrong focal length 2.7 and more. Nor may more than a few of the photos lie beyond.
-MOST_EXCESS, FEW_ASTRAY = 2.1, 0.1
+# Of the matches. Right poses have up to 0.1, of looser matches 0.2; those of repeating things two thirds and more.
+MANY_CONTRADICTIONS = 0.35
+# How many times farther from their lines than they have to matches may lie: right poses have up to 1.4, those of a
+# wrong focal length or of two zooms taken for one 2.8 and more. Of single photos right ones have up to 1.9, and a few
+# may be off.
+MOST_EXCESS, FEW_ASTRAY = 2.0, 0.1
 STILL = 0.5  # of a pair's matches not moving: the background stands still
 ONE_SIDE = 150.0  # degrees of view points around the scene below which it is seen from one side only
 COMPONENT_NAMED = 3

@@ -19,6 +19,7 @@ from pipeline.cameras import View, load_views, save_views
 from pipeline.inputs.captures import load_capture
 from pipeline.inputs.photos import KNOWN_CAMERAS, Photo
 from pipeline.progress import Progress, quiet
+from pipeline.sfm.agreement import unexplained
 from pipeline.sfm.pose_checks import check, failure_hint, failure_message, views_of
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.files import read_json, replacing, write_json
@@ -41,7 +42,7 @@ ATTEMPTS = {
 EXHAUSTIVE_UP_TO = 150  # photos; of more, each is matched only with the PARTNERS that look most like it
 PARTNERS = 40
 WORTH = 0.05  # of the photos left out, and a careful attempt is worth its minutes
-WORSE = 1.25  # times the reprojection error: looser matches have a little more of it where poses are as good
+WORSE = 1.15  # times as much of the first attempt's matches left unexplained is more than another way to the same poses
 WIDEST_PAIR = 60.0  # degrees between the optical axes of known cameras whose photos are matched
 
 
@@ -58,14 +59,18 @@ def worth_more(checks: dict) -> bool:
     return sum(entry["hopeful"] for entry in checks["left_out"]) > WORTH * checks["photos"]
 
 
-def better(new: dict, old: dict) -> bool:
-    """Whether an attempt's checks are better than those of one before: poses to be trusted, then more photos, unless at
-    a larger error; where nothing can be trusted, more photos and points."""
-    if bool(new["failures"]) != bool(old["failures"]):
-        return not new["failures"]
-    if new["failures"]:
-        return (new["posed"], new["points"]) > (old["posed"], old["points"])
-    return new["posed"] > old["posed"] and new["mean_error"] <= WORSE * old["mean_error"]
+def better(new: tuple[dict, Path, dict], old: tuple[dict, Path, dict]) -> bool:
+    """Whether an attempt (checks, folder, result) is better than one before: poses to be trusted, then more photos,
+    unless those that both have are posed worse; where nothing can be trusted, more photos and points."""
+    checks, before = new[0], old[0]
+    if bool(checks["failures"]) != bool(before["failures"]):
+        return not checks["failures"]
+    if checks["failures"]:
+        return (checks["posed"], checks["points"]) > (before["posed"], before["points"])
+    # By the same matches, as each attempt's own are of other features.
+    both = [(a, b) for a, b in zip(new[2]["judged"], old[2]["judged"], strict=True) if a["own"] and b["own"]]
+    worse = unexplained([a for a, _ in both]) > WORSE * unexplained([b for _, b in both])
+    return checks["posed"] > before["posed"] and not worse
 
 
 def size_groups(photos: list[Photo]) -> list[dict]:
@@ -106,7 +111,8 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
 
         folder = out / f"try_{name.replace(' ', '_')}"
         try:
-            result = run_worker({**job, **settings}, folder, timeout, on_progress)
+            judge = str(tries[0][1] / "database.db") if tries else ""
+            result = run_worker({**job, **settings, "judge": judge}, folder, timeout, on_progress)
         except SdfsimError as error:
             if not tries:
                 raise
@@ -118,7 +124,7 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
         told.append({"name": name, "posed": checks["posed"], "failures": checks["failures"]})
     best = tries[0]
     for one in tries[1:]:
-        best = one if better(one[0], best[0]) else best
+        best = one if better(one, best) else best
     checks, folder, result = best
     checks["attempts"], checks["known_cameras"] = told, bool(job["known_cameras"])
     views = views_of(result, photos) if job["refine"] or not job["known_cameras"] else load_views(known)

@@ -412,6 +412,8 @@ def main(job_path: str) -> None:
         result["views"] = views_in(best)
         result["cameras"] = cameras
         result["agreement"] = agreement(pairs, result["views"])
+        judges = read_pairs(pycolmap, Path(job["judge"]))[1] if job["judge"] else pairs
+        result["judged"] = agreement(judges, result["views"])  # by the matches of the first attempt
         result["mean_error"] = float(best.compute_mean_reprojection_error())
         result["points"] = int(best.num_points3D())
         save_points(best, out / "sparse.npz")

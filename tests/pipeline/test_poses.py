@@ -44,7 +44,7 @@ def result(count: int, posed: int, *, focal: float = 600.0, error: float = 0.5, 
     agreed = [{"a": pair["a"], "b": pair["b"], "matches": matches, "error": 0.3 if k < posed - 1 else None,
                "own": 0.25, "cost": 0.1} for k, pair in enumerate(pairs)]  # fmt: skip
     return {"views": views, "counts": counts, "pairs": pairs, "agreement": agreed, "mean_error": error,
-            "points": 900, "turn_only": 0.0, "cameras": [names]}  # fmt: skip
+            "points": 900, "turn_only": 0.0, "cameras": [names], "judged": [dict(pair) for pair in agreed]}  # fmt: skip
 
 
 PHOTOS = [photo(k) for k in range(10)]
@@ -286,16 +286,23 @@ def test_the_first_good_attempt_is_the_last(monkeypatch, tmp_path):
 
 
 def test_photos_left_out_of_good_poses_get_a_careful_attempt(monkeypatch, tmp_path):
-    tried, checks = climb(monkeypatch, tmp_path, {"ordinary": result(25, 19), MORE: result(25, 25)}, 25)
+    careful = result(25, 25, error=0.75)  # of features that are found less exactly, which says nothing of the poses
+    tried, checks = climb(monkeypatch, tmp_path, {"ordinary": result(25, 19), MORE: careful}, 25)
     assert tried == ["ordinary", MORE] and checks["posed"] == 25
     assert [one["posed"] for one in checks["attempts"]] == [19, 25]
 
 
+def worse(found: dict) -> dict:
+    for pair in found["judged"]:
+        pair["cost"] *= 1.5
+    return found
+
+
 @pytest.mark.parametrize(
-    "careful", [result(25, 18), result(25, 25, error=0.7), astray(result(25, 25), 3.0), SdfsimError("stopped")]
+    "careful", [result(25, 18), worse(result(25, 25)), astray(result(25, 25), 3.0), SdfsimError("stopped")]
 )
 def test_good_poses_stay_where_the_careful_attempt_is_no_better(monkeypatch, tmp_path, careful):
-    """Fewer photos, or more of them at a larger error, or wrong ones, or none in time."""
+    """Fewer photos, or more of them but those of before farther off, or wrong ones, or none in time."""
     tried, checks = climb(monkeypatch, tmp_path, {"ordinary": result(25, 19), MORE: careful}, 25)
     assert tried == ["ordinary", MORE] and checks["posed"] == 19 and checks["failures"] == []
 
