@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from sdfsim.dynamics.kernels.surface_distance import KEYS
 
 from sdfsim.dynamics.bodies import Units, from_scene
 from sdfsim.dynamics.kernels.distance import GRID, distance
+from sdfsim.dynamics.kernels.surface_distance import KEYS
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.dynamics.solver import _geometry, _nodes_of, compiled_shapes
 from sdfsim.errors import SdfsimError

@@ -36,7 +36,7 @@ KIND, SIZE, BALL, THICKNESS, WIDTH = 0, 1, 4, 8, 9
 
 TOUCHING = 1e-7  # of the thickness: solids that are farther apart are asked as they lie
 APART = 1e-3  # of the thickness: so far apart overlapping solids are moved
-EXACT = 1e-11  # squared distances are found to this part
+EXACT = 1e-14  # squared distances are found to this part
 FEW = 48  # vertices that are looked at in turn; of more, neighbours of neighbours
 STEPS, ROUNDS = 48, 10  # of GJK, and of normals
 
@@ -145,13 +145,23 @@ def separation(convex, matrix, pair, n):
 
 
 @njit(**BARE)
-def closest(convex, matrix, pair, n, room):
+def closest(convex, matrix, pair, n, known, room):
     """Distance of two solids, the unit normal from the second to the first, and the closest point of either (on its
-    surface, from the second's origin). Solids that overlap have the least depth near the normal n."""
+    surface, from the second's origin). Solids that overlap have the least depth near the normal n.
+
+    Args:
+        known: whether they were last seen to touch along n, or nearly; of a guess they may still be apart elsewhere.
+    """
     thick = min(pair.size * convex.table[pair.first, THICKNESS], pair.other * convex.table[pair.second, THICKNESS])
     mine, theirs = pair.size * rounding(convex, pair.first), pair.other * rounding(convex, pair.second)
     own, his = pair.offset, (0.0, 0.0, 0.0)
     s = separation(convex, matrix, pair, n)
+    if not known and s <= TOUCHING * thick:
+        v, there = _gjk(convex, matrix, pair, pair.offset, n, room)
+        length = norm(v)
+        if length > TOUCHING * thick:
+            n = scale(v, 1.0 / length)
+            return length - mine - theirs, n, along(there, n, -mine), along(sub(there, v), n, theirs)
     for _ in range(ROUNDS):
         shift = 0.0 if s > TOUCHING * thick else APART * thick - s
         v, there = _gjk(convex, matrix, pair, along(pair.offset, n, shift), n, room)

@@ -362,8 +362,8 @@ def collide_solids(shapes, world, motion, matrix, rules, manifolds, near, went, 
                 gap = separation(convex, matrix, pair, n)
                 gap -= pair.size * rounding(convex, pair.first) + pair.other * rounding(convex, pair.second)
             else:
-                n = _known_normal(convex, matrix, pair, near, at, manifolds, p, key)
-                gap, n, own, his = closest(convex, matrix, pair, n, scratch.simplex)
+                known, n = _known_normal(convex, matrix, pair, near, at, manifolds, p, key)
+                gap, n, own, his = closest(convex, matrix, pair, n, known, scratch.simplex)
                 put(near.axis, at, n)
             near.away[at] = gap + went
             if gap <= look:
@@ -392,14 +392,16 @@ def _above(convex, matrix, pair, up):
 
 @njit(**BARE)
 def _known_normal(convex, matrix, pair, near, at, manifolds, p, key):
-    """The normal of a pair of pieces when it was last looked at; else that of a contact that is known, else a guess."""
+    """Whether a normal of a pair of pieces is known, and it: of when it was last looked at, or of a contact; or a
+    guess."""
     n = get(near.axis, at)
     if n[0] != 0.0 or n[1] != 0.0 or n[2] != 0.0:
-        return n
+        return True, n
     for k in range(manifolds.count[p]):
         if manifolds.point[p, k, KEY] == key:
-            return manifolds.point[p, k, NORMAL], manifolds.point[p, k, NORMAL + 1], manifolds.point[p, k, NORMAL + 2]
-    return first_normal(convex, matrix, pair)
+            point = manifolds.point[p, k]
+            return True, (point[NORMAL], point[NORMAL + 1], point[NORMAL + 2])
+    return False, first_normal(convex, matrix, pair)
 
 
 @njit(**BARE)
@@ -457,14 +459,17 @@ def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, lea
             if near.away[at] - went >= least or near.held[at]:
                 continue
             i, j = near.leaf[at] // pieces, near.leaf[at] % pieces
-            pair = Pair(convex.start[s] + i, convex.start[t] + j, 0, 1, scales[0], scales[1], offset)
+            # Numbers of one type, or all would be compiled once more.
+            one, other = np.int64(0), np.int64(1)
+            pair = Pair(convex.start[s] + i, convex.start[t] + j, one, other, scales[0], scales[1], offset)
             if plane:
                 gap = _above(convex, frame, pair, turn(frame, 1, (0.0, 0.0, 1.0)))
             else:
                 n = get(near.axis, at)
-                if n[0] == 0.0 and n[1] == 0.0 and n[2] == 0.0:
+                known = n[0] != 0.0 or n[1] != 0.0 or n[2] != 0.0
+                if not known:
                     n = first_normal(convex, frame, pair)
-                gap, n, _, _ = closest(convex, frame, pair, n, room)
+                gap, n, _, _ = closest(convex, frame, pair, n, known, room)
                 put(near.axis, at, n)
             if refresh:
                 near.away[at] = gap + went
