@@ -112,8 +112,9 @@ def roll_out(
     """Simulate one batch of trajectories of one step and one gravity from their first frames; the same bodies in the
     predicted motion, steps + 1 frames.
 
-    The recording engine makes `substeps` inner steps in one. `as_teacher` the solver takes over two habits of the
-    teacher: bodies are larger by `MARGIN` than their shapes, and what is pushed out adds to the speed of a rebound.
+    The recording engine makes `substeps` inner steps in one. `as_teacher` the solver takes over three habits of
+    the teacher: bodies are larger by `MARGIN` than their shapes, what is pushed out adds to the speed of a rebound, and
+    friction is bounded along two axes.
     "learned" free flight is for networks on surface nodes. Raises SdfsimError (exit code 3) for a state that is not
     finite.
     """

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from sdfsim.dynamics.step import StepOptions
 
 STEP = 0.02  # s, the step that networks know
-FRAMES_VERSION = 9  # counts up whenever frames of the same recordings come out differently
+FRAMES_VERSION = 10  # counts up whenever frames of the same recordings come out differently
 TOGETHER = 25  # trajectories that are followed side by side
 
 
@@ -218,7 +218,7 @@ def _followed(files: list[Path], how: Solved) -> list[ContactFrames]:
     gravity = torch.from_numpy(np.asarray(group[0].gravity, dtype=np.float64))
     rules = StepOptions(gravity, group[0].dt * how.stride, inner)
     if found.by_teacher:
-        rules = replace(rules, margin=MARGIN, adds=True)
+        rules = replace(rules, margin=MARGIN, adds=True, cone=False)
     count = min(len(t.position) for t in group)
     parts = []
     for draw in range(how.draws):

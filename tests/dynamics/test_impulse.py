@@ -30,7 +30,7 @@ def test_colliding_bodies_in_free_space_keep_linear_momentum(free_pair):
         sim.run(steps=1)
         touched += sim.memory.counts["edges"] > 0
         torch.testing.assert_close(linear_momentum(sim), before, rtol=0, atol=1e-5)
-    assert touched > 2
+    assert touched > 1
 
 
 def first_graph(scene: Scene, steps: int = 30) -> tuple[Simulator, torch.Tensor, ContactGraph]:

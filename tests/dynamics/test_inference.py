@@ -120,7 +120,7 @@ def agree(steps: list[Compared], count: int, change: float = 1e-3, rounding: flo
 def test_compiled_and_torch_agree_to_rounding(steps, name, effects):
     for seed in range(2):
         Simulator(pile(seed, **effects), model_of(name, seed)).run(steps=12)
-    assert agree(steps, 16) and max(s.edges for s in steps) > 5
+    assert agree(steps, 16) and max(s.edges for s in steps) > 4
 
 
 @pytest.mark.parametrize("push", [5.0, 50.0])

@@ -50,7 +50,7 @@ def test_cached_frames_equal_the_simulators_own_graph(ball_data, tmp_path, teach
     bodies, state = merged([first], [0], load_shapes(ball_data, {"ball"}), Units(1.0, 1.0, 1.0), CPU)
     rules = StepOptions(gravity=torch.tensor(first.gravity), dt=first.dt)
     if teacher:
-        rules = replace(rules, margin=MARGIN, adds=True)
+        rules = replace(rules, margin=MARGIN, adds=True, cone=False)
     memory, touch, found = Memory(), None, []
     for frame in range(len(first.position) - 1):
         _, state = merged([first], [frame], load_shapes(ball_data, {"ball"}), Units(1.0, 1.0, 1.0), CPU)

@@ -24,11 +24,6 @@ def _cache() -> Path:
     return home / "sdfsim" / "kernels" / told.hexdigest()[:16]
 
 
-def compiled(what: str = "step.step") -> bool:
-    """Whether the step, or another function here, was compiled before, so that it is there in a second."""
-    return any(_cache().glob(f"**/{what}-*.nbi"))
-
-
 @contextmanager
 def kept() -> Iterator[None]:
     """What is compiled of functions defined in the block is kept: modules that have some are imported in it."""

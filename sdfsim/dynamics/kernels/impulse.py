@@ -471,7 +471,7 @@ def _bound(graph, frames, added, terms):
         normal = min(max(0.0, push + added[e, 0, 0]), most)
         added[e, 0, 0] = normal - push
         if axes == 3:
-            # The solve holds its two axes of friction apart: both together may grip a little more than the cone.
+            # As the teacher has it the solve holds its two axes of friction apart: both may grip more than the cone.
             grip = math.hypot(solved[e, 1], solved[e, 2]) / max(push, 1e-12) if push > 0.0 else 0.0
             size = math.hypot(solved[e, 1] + added[e, 1, 0], solved[e, 2] + added[e, 2, 0])
             part = min(1.0, max(graph.product[e, 0], grip) * normal / max(size, 1e-12))

@@ -26,6 +26,7 @@ KEYS = 1024  # patches of a shape at most
 ROUNDS = 12  # of refinement
 NEAR = 3.0  # cells: so near to its surface a grid is fine
 FARTHER = 2.0  # cells: by so much it is too far elsewhere, at a tip
+ONTO, BESIDE = 3, 0.05  # steps back onto the own surface, and how near it they must lead, in strides
 WAYS = 8  # in which the outermost nodes of a face are looked for
 STRIDE, FINEST = 0.02, 5e-4  # of a body's size, the first step of the refinement and the last
 
@@ -221,12 +222,20 @@ def _refined(table, brick, sample, stride, s, t, w, c, k, own, p, inward):
         better = False
         while stride > least:
             q = along(p, g, -stride / slope)
-            own_d, m = distance(table, brick, sample, s, q)
-            q = along(q, m, -own_d)
+            # Back onto the own surface; beyond an edge one step does not lead there, and a place beside it is none.
+            own_d, across_own = distance(table, brick, sample, s, q)
+            for _ in range(ONTO):
+                q = along(q, across_own, -own_d)
+                own_d, across_own = distance(table, brick, sample, s, q)
+                if abs(own_d) <= BESIDE * stride:
+                    break
+            if abs(own_d) > BESIDE * stride:
+                stride *= 0.4
+                continue
             there, normal = distance(table, brick, sample, t, mapped(w, c, q))
             if there < d - 1e-9:
                 better = True
-                p, d, n = q, there, normal
+                p, d, n, m = q, there, normal, across_own
                 stride *= 1.3
                 break
             stride *= 0.4

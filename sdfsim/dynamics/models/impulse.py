@@ -187,7 +187,7 @@ def bounded(graph: ContactGraph, frames: EdgeFrames, added: Tensor, start: Tenso
     normal = torch.minimum((push + added[:, 0, 0]).clamp_min(0.0), most)
     ends = [(normal - push)[:, None]]
     if added.shape[1] == 3:
-        # The solve holds its two axes of friction apart, so that both together may grip a little more than the cone.
+        # As the teacher has it the solve holds its two axes of friction apart: both may grip more than the cone.
         grip = torch.where(push > 0.0, drag.norm(dim=-1) / push.clamp_min(1e-12), 0.0)
         hold = torch.maximum(graph.friction, grip) * normal
         total = drag + added[:, 1:, 0]
