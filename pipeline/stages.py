@@ -142,7 +142,7 @@ class Stage:
 
 STAGES = {
     "photos": Stage(do_photos, "photos", version=4),
-    "poses": Stage(do_poses, "poses", ("seed",), 3),
+    "poses": Stage(do_poses, "poses", ("seed",), 4),
     "distill": Stage(do_distill, "distill", ("preset", "seed", "budget"), 4),
     "mesh": Stage(do_mesh, "mesh", ("preset", "size", "distance", "crop"), 9),
     "fit": Stage(do_fit, "assets", ("seed", "budget", "recipe")),

@@ -1,0 +1,1 @@
+"""Readable forms of what is compiled, and truths that share no code with it."""
