@@ -196,7 +196,7 @@ def mujoco(start: Start, steps: int, substeps: int = SUBSTEPS, *, pieces: bool =
     Raises:
         SdfsimError: MuJoCo is not installed, or a shape's engine file cannot be read.
     """
-    engine = _engine("mujoco", "MuJoCo", "bench")
+    engine = engine_module("mujoco", "MuJoCo", "bench")
     t, step, spec = start.motion, start.motion.dt / substeps, engine.MjSpec()
     spec.option.timestep, spec.option.gravity = step, t.gravity
     spec.memory = 2**31
@@ -246,7 +246,7 @@ def mujoco(start: Start, steps: int, substeps: int = SUBSTEPS, *, pieces: bool =
     return _motion(t, steps, lambda: engine.mj_step(model, data, substeps), state)
 
 
-def _engine(module: str, title: str, extra: str) -> Any:
+def engine_module(module: str, title: str, extra: str) -> Any:
     """An optional package. Raises SdfsimError when it is not installed."""
     try:
         return importlib.import_module(module)
@@ -306,7 +306,7 @@ def drake(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajector
     Raises:
         SdfsimError: Drake or fTetWild are not installed, or the motion fails.
     """
-    lib = _engine("pydrake.all", "Drake", "rivals")
+    lib = engine_module("pydrake.all", "Drake", "rivals")
     t, builder = start.motion, lib.DiagramBuilder()
     settings = lib.MultibodyPlantConfig(time_step=t.dt / substeps, contact_model="hydroelastic_with_fallback")
     plant, _ = lib.AddMultibodyPlant(settings, builder)
@@ -372,7 +372,7 @@ def _tetrahedra(mesh: Mesh, beside: Path) -> str:
     """A VTK file of tetrahedra that fill a closed mesh, kept beside the shape's URDF."""
     kept = beside.with_suffix(".vtk").resolve()
     if not kept.exists():
-        filler = _engine("pytetwild", "fTetWild", "rivals")
+        filler = engine_module("pytetwild", "fTetWild", "rivals")
         with tempfile.TemporaryDirectory() as scratch, chdir(scratch):  # it leaves a file where it runs
             points, cells = filler.tetrahedralize(
                 mesh.vertices.astype(float), mesh.faces.astype(np.int32), edge_length_fac=TETRAHEDRA
@@ -400,7 +400,7 @@ def newton(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajecto
     Raises:
         SdfsimError: Newton is not installed, or the motion fails.
     """
-    warp, lib = (_engine(name, "Newton", "rivals") for name in ("warp", "newton"))
+    warp, lib = (engine_module(name, "Newton", "rivals") for name in ("warp", "newton"))
     warp.config.quiet = True
     t, builder = start.motion, lib.ModelBuilder(gravity=tuple(map(float, start.motion.gravity)))
 
