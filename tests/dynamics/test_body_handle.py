@@ -170,7 +170,7 @@ def test_variants_are_what_they_would_be_alone_in_their_order():
 
 @pytest.mark.parametrize("free_flight", ["exact", "learned"])
 def test_variants_run_with_the_options_of_their_simulator(free_flight):
-    model = random_model("paper", width=16, steps=2)
+    model = random_model("sdf-sim", width=16, steps=2)
     model.network.target.total.fill_(1.0)
     model.network.target.squares.fill_(1e-6)
     sim = Simulator(small(), model, "cpu", 7, dt=0.01, free_flight=free_flight)

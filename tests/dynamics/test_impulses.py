@@ -27,7 +27,7 @@ RULES = (
     {}, {"cone": False}, {"margin": 1e-3, "adds": True}, {"friction": False}, {"restitution": False},
     {"cone": False, "margin": 1e-3, "adds": True},
 )  # fmt: skip
-SEEDS = range(30)
+SEEDS = [seed for seed in range(31) if seed != 11]  # nothing meets in that one
 
 
 @njit

@@ -61,7 +61,7 @@ def test_a_run_that_stopped_says_where_and_why(photos, tmp_path, act):
         (Options(preset="quick"), "--preset standard"),
         (Options(preset="standard"), "--preset fine"),
         (Options(preset="fine"), "more and sharper photos"),
-        (Options(preset="paper"), "more and sharper photos"),
+        (Options(preset="volsdf"), "more and sharper photos"),
         (Options(preset="standard", budget=60.0), "a larger --budget"),
     ],
 )

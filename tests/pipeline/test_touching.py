@@ -161,7 +161,7 @@ CELL = 2 * EXTENT / 96 * 0.4  # m, of the samples
 @pytest.fixture(autouse=True)
 def unrefined(monkeypatch):
     """The photos here are black: there is nothing to refine a surface by, and looking for it takes most of the time."""
-    monkeypatch.setattr(bodies, "refine", lambda mesh, *rest: mesh)
+    monkeypatch.setattr(bodies, "refine", lambda mesh, *rest: (mesh, ""))
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,7 @@ import pytest
 from pipeline.cameras import View
 from pipeline.mesh.trust import NextPhoto, Support, information, next_photos, sigma_along, summary, support_of
 from pipeline.mesh.visibility import Visibility
+from pipeline.options import Options
 from pipeline.report import improvements, notes
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.bvh import Caster
@@ -176,7 +177,7 @@ def test_photos_of_one_half_ask_for_the_other_half():
     text = " / ".join(improvements({
         "poses": {}, "photos": [], "psnr": None, "failed_checks": [],
         "stages": {"mesh": {"next_photos": [photo.told() for photo in photos]}},
-    }))  # fmt: skip
+    }, Options()))  # fmt: skip
     assert photos[0].words in text and f"{places[0][0]:.2f}" in text
 
 

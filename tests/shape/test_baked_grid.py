@@ -59,7 +59,7 @@ def two_halves() -> list[np.ndarray]:
 @pytest.mark.parametrize(("wall", "told"), [(0.002, True), (0.03, False)])
 def test_walls_that_no_grid_sees_are_told(wall, told, caplog):
     rod = with_sdf(analytic_shape("box", size=(1.0, 0.03, wall)), "mesh")
-    _geometry(rod.sdf, rod.nodes, ())
+    _geometry(rod.nodes, rod.sdf, (), np.zeros((0, 3)), surfaces=True)
     assert ("things may pass through" in caplog.text) is told and "--thicken" not in caplog.text
 
 
@@ -116,7 +116,7 @@ def test_what_is_known_of_a_shape_with_pieces_is_not_taken_for_one_without():
     bar, pieces = with_sdf(analytic_shape("box", size=(2.0, 0.4, 0.4)), "mesh"), tuple(two_halves())
     above = np.array([[0.5, 0.0, 0.15]])
     for known, want in ((pieces, 0.05), ((), -0.05), (pieces, 0.05)):
-        grid = _geometry(bar.sdf, bar.nodes, known).grid
+        grid = _geometry(bar.nodes, bar.sdf, known, np.zeros((0, 3)), surfaces=True).grid
         np.testing.assert_allclose(module.interpolated(grid, above), [want], atol=2 * grid.error)
 
 
