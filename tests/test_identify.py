@@ -31,7 +31,7 @@ def write_scene(path: Path, box: dict, ball: dict) -> Path:
         {"name": "ball", "shape": "ball", "position": [2, 0, 1.2], "velocity": [-2, 0.1, 0], **ball},
     ]
     shapes = {"box": {"box": {"size": [1, 0.8, 0.6]}}, "ball": {"sphere": {"radius": 0.5}}}
-    data = {"version": 1, "model": "solver", "duration": 2.0, "shapes": shapes, "bodies": bodies}
+    data = {"version": 1, "model": "solver", "duration": 3.0, "shapes": shapes, "bodies": bodies}
     path.write_text(yaml.safe_dump(data))
     return path
 

