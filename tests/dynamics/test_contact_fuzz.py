@@ -161,8 +161,8 @@ def faults(case: Case) -> list[str]:
         check("gap", gap - truth if gap < truth else 0.0, tol)
     flat = np.concatenate([-a.planes[:, :3], b.planes[:, :3]])
     for face in flat[flat @ n > np.cos(0.01)]:
-        at_face = float(width(a, b, face[None])[0])
-        if at_face >= gap - 1e-9 * extent and is_sharp(a, b, face):
+        at_face, at_n = width(a, b, np.stack([face, n]))
+        if at_face >= at_n - 1e-12 * extent and is_sharp(a, b, face):
             check("normal of a face", float(np.linalg.norm(n - face)) * thick, 1e-6 * thick)
     if gap > reach:
         return found
