@@ -154,7 +154,7 @@ def _around(axis: np.ndarray) -> np.ndarray:
 def _climbed(a: Solid, b: Solid, n: np.ndarray) -> tuple[float, np.ndarray]:
     """The widest view near a normal: a search in narrowing circles."""
     best, step = float(width(a, b, n[None])[0]), 0.1
-    while step > 1e-8:
+    for _ in range(120):
         ring = step * _ring(n)
         tried = n + np.concatenate([ring, 0.5 * ring])
         tried /= np.linalg.norm(tried, axis=1, keepdims=True)
