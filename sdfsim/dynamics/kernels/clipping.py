@@ -15,6 +15,7 @@ from sdfsim.dynamics.kernels.convex import (
     POINT,
     SEGMENT,
     SIZE,
+    THICKNESS,
     outermost,
     rounding,
 )
@@ -25,8 +26,8 @@ MOST = 160  # corners of a clipped face
 CHOSEN = 4  # of them that carry a contact
 STEEP = 0.1  # cosine between a face and the normal, below which the face does not bound the contact
 LEVEL = 1e-3  # slope of a drum's end against the normal, below which its circle is cut at fixed places
-LINE = 0.02  # sine between edges that touch all along
-OUTER = 1e-3  # how much deeper one of two points must be to be preferred to the one on the outer side
+ASIDE = 0.01  # of the thickness: edges that are no farther aside touch there
+TIED = 1e-4  # of the thickness: points whose depths differ by less are equally deep
 CLOSE = 1e-3  # of the contact's extent: points that are nearer are one
 
 
@@ -137,7 +138,10 @@ def touching_points(convex, matrix, pair, plane, held, gap, n, own, his, reach, 
     """
     u, w = across(n)
     mine = pair.size * rounding(convex, pair.first)
-    theirs = 0.0 if plane else pair.other * rounding(convex, pair.second)
+    theirs, thick = 0.0, pair.size * convex.table[pair.first, THICKNESS]
+    if not plane:
+        theirs = pair.other * rounding(convex, pair.second)
+        thick = min(thick, pair.other * convex.table[pair.second, THICKNESS])
     first, m = feature(convex, pair.first, pair.size, matrix, pair.a, scale(n, -1.0), room.first)
     _project(room.first, first, pair.offset, n, u, w)
     if first > 2 and abs(dot(m, n)) < STEEP:
@@ -165,7 +169,7 @@ def touching_points(convex, matrix, pair, plane, held, gap, n, own, his, reach, 
                 room.clipped[i, 2] = _height(room.first, m, n, u, w, x, y)
                 room.gap[i] = room.clipped[i, 2] - mine - theirs - h
         elif first == 2 and second == 2:
-            count = _common(room, mine + theirs)
+            count = _common(room, mine + theirs, ASIDE * thick)
     least, kept = math.inf, 0
     for i in range(count):
         if room.gap[i] <= reach:
@@ -183,7 +187,7 @@ def touching_points(convex, matrix, pair, plane, held, gap, n, own, his, reach, 
         count += 1
         extent = _extent(room, count)
     arm = _arm(room, count, least, extent)
-    picked = _pick(room, count, extent)
+    picked = _pick(room, count, extent, least + TIED * thick)
     if picked > 1 and arm > 0.0:
         arm = _shrink(room, picked, arm)
     for i in range(count):
@@ -252,13 +256,14 @@ def _clip(room, subject, count, bounds, sides):
 
 
 @njit(**BARE)
-def _common(room, round_off):
-    """The two ends of the part that two edges have in common where they are parallel; none where they cross."""
+def _common(room, round_off, aside):
+    """The two ends of the part that two edges have in common, where they are no farther than `aside` from each other
+    across the normal; none where they only cross."""
     first, second = room.first, room.second
     dx, dy = first[1, 0] - first[0, 0], first[1, 1] - first[0, 1]
     ex, ey = second[1, 0] - second[0, 0], second[1, 1] - second[0, 1]
     long, other = math.sqrt(dx * dx + dy * dy), math.sqrt(ex * ex + ey * ey)
-    if long == 0.0 or other == 0.0 or abs(dx * ey - dy * ex) > LINE * long * other:
+    if long == 0.0 or other == 0.0:
         return 0
     # Along the first edge from 0 to 1.
     start = ((second[0, 0] - first[0, 0]) * dx + (second[0, 1] - first[0, 1]) * dy) / (long * long)
@@ -266,6 +271,15 @@ def _common(room, round_off):
     if start == end:
         return 0
     low, high = max(0.0, min(start, end)), min(1.0, max(start, end))
+    # How far the second edge is aside grows evenly along the first.
+    px, py = second[0, 0] - first[0, 0], second[0, 1] - first[0, 1]
+    off = (dx * py - dy * px) / long
+    slope = (dx * ey - dy * ex) / long / (end - start)
+    if abs(slope) * (high - low) > 1e-12 * long:
+        one, two = start + (-aside - off) / slope, start + (aside - off) / slope
+        low, high = max(low, min(one, two)), min(high, max(one, two))
+    elif abs(off) > aside:
+        return 0
     if low >= high:
         return 0
     for i in range(2):
@@ -288,15 +302,15 @@ def _extent(room, count):
 
 
 @njit(**BARE)
-def _pick(room, count, extent):
+def _pick(room, count, extent, deep):
     """The deepest point, the farthest from it, and the farthest to either side of their line; ties by place."""
     if count == 0:
         return 0
-    best, lowest = 0, math.inf
+    best, outer = 0, -math.inf
     for i in range(count):
-        score = room.gap[i] - OUTER * (0.8 * room.clipped[i, 0] + 0.6 * room.clipped[i, 1])
-        if score < lowest:
-            best, lowest = i, score
+        place = 0.8 * room.clipped[i, 0] + 0.6 * room.clipped[i, 1]
+        if room.gap[i] <= deep and place > outer:
+            best, outer = i, place
     room.picked[0] = best
     ax, ay = room.clipped[best, 0], room.clipped[best, 1]
     far, most = -1, (CLOSE * extent) ** 2
