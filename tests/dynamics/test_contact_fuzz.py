@@ -29,7 +29,7 @@ FORMS = {"sphere": SphereSdf, "capsule": CapsuleSdf, "cylinder": CylinderSdf}
 def ask(convex, matrix, pair, reach):
     """What the kernels say of two pieces at first sight: gap, normal, closest points, and the points picked."""
     polygons, n = polygons_room(), first_normal(convex, matrix, pair)
-    gap, n, own, his = closest(convex, matrix, pair, n, simplex_room())
+    gap, n, own, his = closest(convex, matrix, pair, n, False, simplex_room())
     if gap > reach:
         return gap, n, own, his, polygons.clipped[:0].copy(), polygons.gap[:0].copy()
     picked, _ = touching_points(convex, matrix, pair, False, False, gap, n, own, his, reach, polygons)
