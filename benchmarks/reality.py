@@ -317,13 +317,12 @@ def main(tosses: Path, *, out: Path, gravity: float = GRAVITY) -> None:
     off = 1e3 * np.median([start.off for start in every])
     turned_off = np.degrees(np.median([start.turned_off for start in every]))
     write_json(out / "reality.json", {"gravity": gravity, "fall": [falls, sure], "engines": _plain(result)})
-    write_section(
-        "reality",
-        "python benchmarks/reality.py TOSSES -o DIR",
+    text = (
         f"Found on {FIT} tosses, judged on {TEST} others (seed {SEED}), first {FRAMES} frames, means of tosses with "
         f"95 % intervals. Starts fit the free flight to {off:.2f} mm and {turned_off:.2f} degrees (medians of root "
-        f"mean squares); recorded cubes fall with {falls:.3f} +- {sure:.3f} m/s^2.\n\n{markdown(rows)}",
+        f"mean squares); recorded cubes fall with {falls:.3f} +- {sure:.3f} m/s^2.\n\n{markdown(rows)}"
     )
+    write_section("reality", "python benchmarks/reality.py TOSSES -o DIR", text)
 
 
 def _told(error: np.ndarray) -> str:
