@@ -115,7 +115,9 @@ def feature(convex, p, size, matrix, body, d, out):
 
 @njit(**BARE)
 def across(n):
-    """Two unit vectors that make a frame with n."""
+    """Two unit vectors across n, the same for -n: which of two bodies is the first must not matter."""
+    if n[0] < 0.0 or (n[0] == 0.0 and (n[1] < 0.0 or (n[1] == 0.0 and n[2] < 0.0))):
+        n = scale(n, -1.0)
     axis = (1.0, 0.0, 0.0) if abs(n[0]) < 0.6 else (0.0, 1.0, 0.0)
     u = cross(axis, n)
     u = scale(u, 1.0 / math.sqrt(dot(u, u)))

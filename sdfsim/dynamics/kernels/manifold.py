@@ -10,7 +10,7 @@ from numba import njit
 from sdfsim.dynamics.kernels.clipping import Polygons, polygons_room
 from sdfsim.dynamics.kernels.convex import Simplex, simplex_room
 from sdfsim.dynamics.kernels.distance import KIND, SIZE, SPHERE
-from sdfsim.dynamics.kernels.vectors import BARE, FAST, add, along, dot, get, norm, scale, sub, turn, turn_back
+from sdfsim.dynamics.kernels.vectors import BARE, FAST, add, along, dot, get, scale, sub, turn, turn_back
 from sdfsim.dynamics.kernels.world import (
     COLUMNS,
     DRAG,
@@ -167,9 +167,8 @@ def merged(rules, point, p, known, scratch, count, rounded):
     chosen, lowest = -1, 1e300
     for e in range(total):
         away[e], alike[e] = 1e300, 0
-        score = every[e, GAP] - OUTWARD * norm((every[e, 0], every[e, 1], every[e, 2]))
-        if score < lowest:
-            chosen, lowest = e, score
+        if every[e, GAP] < lowest:
+            chosen, lowest = e, every[e, GAP]
     kept = 0
     while chosen >= 0 and kept < POINTS:
         for x in range(COLUMNS):

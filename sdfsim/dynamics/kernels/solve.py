@@ -102,7 +102,8 @@ def _equations(world, work, motion, rules, manifolds):
             target, rebounds = 0.0, bounce > 0.0 and abs(approach) > rules.slow
             if rebounds:
                 # What bounces before it has touched has the speed that it will have here on its way back.
-                fall = 2.0 * dot(vector(rules.gravity), n) * max(gap, 0.0) * (1.0 - bounce * bounce)
+                pull = (dot(free_fall, n) - approach) / rules.inner
+                fall = 2.0 * pull * max(gap, 0.0) * (1.0 - bounce * bounce)
                 square = bounce * bounce * approach * approach + (fall if early else 0.0)
                 target, rebounds = -math.copysign(math.sqrt(max(square, 0.0)), approach), square > 0.0
             # An impact is over before a body has turned: what the gyroscopic torque makes of it comes after.
