@@ -121,8 +121,8 @@ def acts(c: Contact, rules) -> bool:
     # Newton's rule, v' = -e v, at each contact of an impact; what rebounds early as fast as it will come back by here.
     target, rebounds = 0.0, False
     if e > 0.0 and abs(approach) > rules.slow:
-        pull = (falling @ n - approach) / rules.inner
-        square = (e * approach) ** 2 + early * 2.0 * pull * max(gap, 0.0) * (1.0 - e * e)
+        pull = early * (falling @ n - approach) / rules.inner
+        square = (e * approach) ** 2 + 2.0 * pull * max(gap, 0.0) * (1.0 - e * e)
         rebounds = square > 0.0
         target = -np.sign(approach) * np.sqrt(max(square, 0.0))
     c.before = (falling if rebounds else then) @ n

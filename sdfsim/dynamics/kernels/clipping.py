@@ -26,7 +26,7 @@ MOST = 160  # corners of a clipped face
 CHOSEN = 4  # of them that carry a contact
 STEEP = 0.1  # cosine between a face and the normal, below which the face does not bound the contact
 LEVEL = 1e-3  # slope of a drum's end against the normal, below which its circle is cut at fixed places
-ASIDE = 0.01  # of the thickness: edges that are no farther aside touch there
+ASIDE = 0.002  # of the thickness: edges that are no farther aside touch there
 TIED = 1e-4  # of the thickness: points whose depths differ by less are equally deep
 CLOSE = 1e-3  # of the contact's extent: points that are nearer are one
 

@@ -150,18 +150,38 @@ def closest(convex, matrix, pair, n, known, room):
     surface, from the second's origin). Solids that overlap have the least depth near the normal n.
 
     Args:
-        known: whether they were last seen to touch along n, or nearly; of a guess they may still be apart elsewhere.
+        known: whether they were last seen to touch along n, or nearly. Of a guess they may still be apart elsewhere, or
+            less deep: then other normals are tried too.
     """
     thick = min(pair.size * convex.table[pair.first, THICKNESS], pair.other * convex.table[pair.second, THICKNESS])
-    mine, theirs = pair.size * rounding(convex, pair.first), pair.other * rounding(convex, pair.second)
-    own, his = pair.offset, (0.0, 0.0, 0.0)
-    s = separation(convex, matrix, pair, n)
-    if not known and s <= TOUCHING * thick:
+    if not known and separation(convex, matrix, pair, n) <= TOUCHING * thick:
         v, there = _gjk(convex, matrix, pair, pair.offset, n, room)
         length = norm(v)
         if length > TOUCHING * thick:
+            mine, theirs = pair.size * rounding(convex, pair.first), pair.other * rounding(convex, pair.second)
             n = scale(v, 1.0 / length)
             return length - mine - theirs, n, along(there, n, -mine), along(sub(there, v), n, theirs)
+        best = _least_deep(convex, matrix, pair, n, thick, room)
+        for way in range(7):
+            axis, sign = way // 2, 1.0 if way % 2 == 0 else -1.0
+            start = (sign if axis == 0 else 0.0, sign if axis == 1 else 0.0, sign if axis == 2 else 0.0)
+            if way == 6:
+                if length == 0.0:
+                    continue
+                start = scale(v, 1.0 / length)
+            found = _least_deep(convex, matrix, pair, start, thick, room)
+            if found[0] > best[0]:
+                best = found
+        return best
+    return _least_deep(convex, matrix, pair, n, thick, room)
+
+
+@njit(**BARE)
+def _least_deep(convex, matrix, pair, n, thick, room):
+    """`closest` from a normal on."""
+    mine, theirs = pair.size * rounding(convex, pair.first), pair.other * rounding(convex, pair.second)
+    own, his = pair.offset, (0.0, 0.0, 0.0)
+    s = separation(convex, matrix, pair, n)
     for _ in range(ROUNDS):
         shift = 0.0 if s > TOUCHING * thick else APART * thick - s
         v, there = _gjk(convex, matrix, pair, along(pair.offset, n, shift), n, room)
