@@ -83,7 +83,7 @@ def outermost(convex, p, d):
     """The vertex of a hull that is farthest along d: of the best of a few, always the neighbour that is farther."""
     first, last = convex.vertex_start[p], convex.vertex_start[p + 1]
     best, most = first, -math.inf
-    for v in range(first, last, 1 + (last - first) // FEW):
+    for v in range(first, last, 1 + (last - first - 1) // FEW):
         reach = convex.vertex[v, 0] * d[0] + convex.vertex[v, 1] * d[1] + convex.vertex[v, 2] * d[2]
         if reach > most:
             best, most = v, reach
@@ -129,8 +129,8 @@ class Pair(NamedTuple):
 
     first: int  # the pieces
     second: int
-    a: int  # the bodies
-    b: int
+    a: int | np.int64  # the bodies
+    b: int | np.int64
     size: float  # the scales of the bodies
     other: float
     offset: tuple  # from the origin of the second body's shape to that of the first, world axes
