@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from sdfsim.dynamics.kernels.clipping import polygons_room, touching_points
-from sdfsim.dynamics.kernels.convex import Convex, Pair, closest, first_normal, simplex_room
+from sdfsim.dynamics.kernels.convex import Convex, Pair, closest, first_normal, outermost, simplex_room
 from sdfsim.dynamics.solver import _packed
 from sdfsim.shape.convex_pieces import ConvexPiece, closed_form, hull
 from sdfsim.shape.sdf import BoxSdf, CapsuleSdf, CylinderSdf, SphereSdf
@@ -211,6 +211,22 @@ def test_no_contact_of_convex_solids_is_missed_or_wrong(block):
             wrong.append(f"{seed} {' on '.join(case.kinds)}: {fault}")
             kinds[fault.split(":")[0]] += 1
     assert not wrong, f"{len(wrong)} of {BLOCK}: {dict(kinds)}\n" + "\n".join(wrong[:20])
+
+
+@njit
+def outermost_of(convex: Convex, d: tuple[float, float, float]) -> int:
+    return outermost(convex, 0, d)
+
+
+@pytest.mark.parametrize("count", [4, 47, 48, 49, 96, 97, 300])
+def test_the_farthest_corner_of_a_hull_is_found_among_all(count):
+    draw = np.random.default_rng(count)
+    corners = draw.normal(size=(count, 3))
+    corners /= np.linalg.norm(corners, axis=1, keepdims=True)  # all of them are corners of the hull
+    convex = _packed([(hull(corners * [1.0, 0.3, 0.1]),)])
+    for d in draw.normal(size=(200, 3)):
+        found = outermost_of(convex, tuple(d.tolist()))
+        assert convex.vertex[found] @ d == pytest.approx((convex.vertex @ d).max(), abs=1e-12)
 
 
 def test_the_truth_of_overlaps_is_that_of_the_whole_difference_of_two_solids():
