@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from sdfsim.dynamics.kernels.clipping import polygons_room, touching_points
-from sdfsim.dynamics.kernels.convex import Convex, Pair, closest, first_normal, outermost, simplex_room
+from sdfsim.dynamics.kernels.convex import Convex, Pair, closest, outermost, simplex_room
 from sdfsim.dynamics.solver import _packed
 from sdfsim.shape.convex_pieces import ConvexPiece, closed_form, hull
 from sdfsim.shape.sdf import BoxSdf, CapsuleSdf, CylinderSdf, SphereSdf
@@ -28,8 +28,8 @@ FORMS = {"sphere": SphereSdf, "capsule": CapsuleSdf, "cylinder": CylinderSdf}
 @njit
 def ask(convex, matrix, pair, reach):
     """What the kernels say of two pieces at first sight: gap, normal, closest points, and the points picked."""
-    polygons, n = polygons_room(), first_normal(convex, matrix, pair)
-    gap, n, own, his = closest(convex, matrix, pair, n, False, simplex_room())
+    polygons, n = polygons_room(), (0.0, 0.0, 1.0)
+    gap, n, own, his = closest(convex, matrix, pair, n, False, np.inf, simplex_room())
     if gap > reach:
         return gap, n, own, his, polygons.clipped[:0].copy(), polygons.gap[:0].copy()
     picked, _ = touching_points(convex, matrix, pair, False, False, gap, n, own, his, reach, polygons)

@@ -145,43 +145,47 @@ def separation(convex, matrix, pair, n):
 
 
 @njit(**BARE)
-def closest(convex, matrix, pair, n, known, room):
+def closest(convex, matrix, pair, n, known, enough, room):
     """Distance of two solids, the unit normal from the second to the first, and the closest point of either (on its
     surface, from the second's origin). Solids that overlap have the least depth near the normal n.
 
     Args:
-        known: whether they were last seen to touch along n, or nearly. Of a guess they may still be apart elsewhere, or
-            less deep: then other normals are tried too.
+        known: whether they were last seen to touch along n, or nearly. If not, n does not count, and where they overlap
+            the least depth is looked for from several normals.
+        enough: two that are seen to be farther apart may get a distance that is too small, and no closest points.
     """
     thick = min(pair.size * convex.table[pair.first, THICKNESS], pair.other * convex.table[pair.second, THICKNESS])
-    if not known and separation(convex, matrix, pair, n) <= TOUCHING * thick:
-        v, there = _gjk(convex, matrix, pair, pair.offset, n, room)
-        length = norm(v)
-        if length > TOUCHING * thick:
-            mine, theirs = pair.size * rounding(convex, pair.first), pair.other * rounding(convex, pair.second)
-            n = scale(v, 1.0 / length)
-            return length - mine - theirs, n, along(there, n, -mine), along(sub(there, v), n, theirs)
-        best = _least_deep(convex, matrix, pair, n, thick, room)
-        for way in range(7):
-            axis, sign = way // 2, 1.0 if way % 2 == 0 else -1.0
-            start = (sign if axis == 0 else 0.0, sign if axis == 1 else 0.0, sign if axis == 2 else 0.0)
-            if way == 6:
-                if length == 0.0:
-                    continue
-                start = scale(v, 1.0 / length)
-            found = _least_deep(convex, matrix, pair, start, thick, room)
-            if found[0] > best[0]:
-                best = found
-        return best
-    return _least_deep(convex, matrix, pair, n, thick, room)
+    if known:
+        return _least_deep(convex, matrix, pair, n, thick, enough, room)
+    between = _middle_to_middle(convex, matrix, pair)
+    v, there = _gjk(convex, matrix, pair, pair.offset, between, room)
+    length = norm(v)
+    if length > TOUCHING * thick:
+        mine, theirs = pair.size * rounding(convex, pair.first), pair.other * rounding(convex, pair.second)
+        n = scale(v, 1.0 / length)
+        return length - mine - theirs, n, along(there, n, -mine), along(sub(there, v), n, theirs)
+    best = _least_deep(convex, matrix, pair, _along_face(convex, matrix, pair, between), thick, enough, room)
+    for way in range(7):
+        axis, sign = way // 2, 1.0 if way % 2 == 0 else -1.0
+        start = (sign if axis == 0 else 0.0, sign if axis == 1 else 0.0, sign if axis == 2 else 0.0)
+        if way == 6:
+            if length == 0.0:
+                continue
+            start = scale(v, 1.0 / length)
+        found = _least_deep(convex, matrix, pair, start, thick, enough, room)
+        if found[0] > best[0]:
+            best = found
+    return best
 
 
 @njit(**BARE)
-def _least_deep(convex, matrix, pair, n, thick, room):
+def _least_deep(convex, matrix, pair, n, thick, enough, room):
     """`closest` from a normal on."""
     mine, theirs = pair.size * rounding(convex, pair.first), pair.other * rounding(convex, pair.second)
     own, his = pair.offset, (0.0, 0.0, 0.0)
     s = separation(convex, matrix, pair, n)
+    if s - mine - theirs > enough:
+        return s - mine - theirs, n, own, his
     for _ in range(ROUNDS):
         shift = 0.0 if s > TOUCHING * thick else APART * thick - s
         v, there = _gjk(convex, matrix, pair, along(pair.offset, n, shift), n, room)
@@ -329,24 +333,31 @@ def _on_face(corner, i, j, k, weight):
 
 
 @njit(**BARE)
-def first_normal(convex, matrix, pair):
-    """Where nothing is known of two pieces, a normal along which they are apart or overlap little: from middle to
-    middle, and along the normals of faces."""
+def _middle_to_middle(convex, matrix, pair):
+    """The direction from the middle of the second piece to that of the first."""
     there = add(pair.offset, turn(matrix, pair.a, scale(get_ball(convex, pair.first), pair.size)))
     between = sub(there, turn(matrix, pair.b, scale(get_ball(convex, pair.second), pair.other)))
     length = norm(between)
-    best = (0.0, 0.0, 1.0) if length == 0.0 else scale(between, 1.0 / length)
-    most = separation(convex, matrix, pair, best)
+    return (0.0, 0.0, 1.0) if length == 0.0 else scale(between, 1.0 / length)
+
+
+@njit(**BARE)
+def _along_face(convex, matrix, pair, n):
+    """Of n and the normals of the faces of either piece the one along which the two overlap least."""
+    best, most = n, separation(convex, matrix, pair, n)
     for side in range(2):
         p, body = (pair.first, pair.a) if side == 0 else (pair.second, pair.b)
-        axes = _axes(convex, p)
-        for e in range(axes):
+        hull = convex.table[p, KIND] == HULL
+        for e in range(_axes(convex, p)):
             axis = turn(matrix, body, _axis(convex, p, e))
-            for way in (-1.0, 1.0):
-                n = scale(axis, way)
-                found = separation(convex, matrix, pair, n)
+            for way in range(2):
+                out = way == side  # normals go from the second to the first: into the one, out of the other
+                if hull and not out:
+                    continue
+                m = scale(axis, 1.0 if way == 1 else -1.0)
+                found = separation(convex, matrix, pair, m)
                 if found > most:
-                    best, most = n, found
+                    best, most = m, found
     return best
 
 

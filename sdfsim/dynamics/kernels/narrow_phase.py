@@ -14,7 +14,7 @@ from numba import njit, prange
 
 from sdfsim.dynamics.kernels.broad_phase import carried, near_pairs, swept
 from sdfsim.dynamics.kernels.clipping import CHOSEN, touching_points
-from sdfsim.dynamics.kernels.convex import BALL, Pair, closest, farthest, first_normal, rounding, separation
+from sdfsim.dynamics.kernels.convex import BALL, Pair, closest, farthest, rounding, separation
 from sdfsim.dynamics.kernels.distance import (
     BOX,
     CAPSULE,
@@ -362,8 +362,8 @@ def collide_solids(shapes, world, motion, matrix, rules, manifolds, near, went, 
                 gap = separation(convex, matrix, pair, n)
                 gap -= pair.size * rounding(convex, pair.first) + pair.other * rounding(convex, pair.second)
             else:
-                known, n = _known_normal(convex, matrix, pair, near, at, manifolds, p, key)
-                gap, n, own, his = closest(convex, matrix, pair, n, known, scratch.simplex)
+                known, n = _known_normal(near, at, manifolds, p, key)
+                gap, n, own, his = closest(convex, matrix, pair, n, known, look, scratch.simplex)
                 put(near.axis, at, n)
             near.away[at] = gap + went
             if gap <= look:
@@ -391,9 +391,8 @@ def _above(convex, matrix, pair, up):
 
 
 @njit(**BARE)
-def _known_normal(convex, matrix, pair, near, at, manifolds, p, key):
-    """Whether a normal of a pair of pieces is known, and it: of when it was last looked at, or of a contact; or a
-    guess."""
+def _known_normal(near, at, manifolds, p, key):
+    """Whether a normal of a pair of pieces is known, and it: of when it was last looked at, or of a contact."""
     n = get(near.axis, at)
     if n[0] != 0.0 or n[1] != 0.0 or n[2] != 0.0:
         return True, n
@@ -401,7 +400,7 @@ def _known_normal(convex, matrix, pair, near, at, manifolds, p, key):
         if manifolds.point[p, k, KEY] == key:
             point = manifolds.point[p, k]
             return True, (point[NORMAL], point[NORMAL + 1], point[NORMAL + 2])
-    return False, first_normal(convex, matrix, pair)
+    return False, n
 
 
 @njit(**BARE)
@@ -467,9 +466,7 @@ def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, lea
             else:
                 n = get(near.axis, at)
                 known = n[0] != 0.0 or n[1] != 0.0 or n[2] != 0.0
-                if not known:
-                    n = first_normal(convex, frame, pair)
-                gap, n, _, _ = closest(convex, frame, pair, n, known, room)
+                gap, n, _, _ = closest(convex, frame, pair, n, known, least, room)
                 put(near.axis, at, n)
             if refresh:
                 near.away[at] = gap + went
