@@ -100,6 +100,16 @@ def outermost(convex, p, d):
 
 
 @njit(**BARE)
+def outside(convex, p, place):
+    """How far a place, in its own frame, is outside of a hull at least: beyond the plane of a face."""
+    most = -math.inf
+    for f in range(convex.face_start[p], convex.face_start[p + 1]):
+        n = get(convex.face, f)
+        most = max(most, dot(n, sub(place, get(convex.vertex, convex.loop[convex.loop_start[f]]))))
+    return most
+
+
+@njit(**BARE)
 def core(convex, p, d):
     """The point of the core of piece p, in its own frame, that is farthest along d."""
     kind = convex.table[p, KIND]

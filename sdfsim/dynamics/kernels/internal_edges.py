@@ -8,11 +8,10 @@ edges by where they lie in a mesh; here tiles may be bodies of their own.)
 
 from __future__ import annotations
 
-import numpy as np
 from numba import njit
 
-from sdfsim.dynamics.kernels.convex import farthest, rounding
-from sdfsim.dynamics.kernels.distance import KIND, PLANE, distance_alone, solids
+from sdfsim.dynamics.kernels.convex import farthest, outside, rounding
+from sdfsim.dynamics.kernels.distance import CELL, GRID, KIND, PLANE, distance_alone, solids
 from sdfsim.dynamics.kernels.manifold import renewed
 from sdfsim.dynamics.kernels.narrow_phase import SOLIDS, collide_solids, origin, way_of
 from sdfsim.dynamics.kernels.surface_distance import KEYS
@@ -21,6 +20,7 @@ from sdfsim.dynamics.kernels.world import FIRST, GAP, KEY, NORMAL, SECOND, VOID
 
 ASLANT = 0.9999  # cosine between a normal and that of a support, above which the two are one
 STEEPEST = -0.1  # below it they face each other
+ROUGH = 0.5  # cells, by which a grid is off at an edge at most
 LEVEL = 4.0  # slops: so much higher than the support a body may reach and be no wall
 
 
@@ -38,6 +38,8 @@ def heed_supports(shapes, world, work, motion, rules, manifolds, near, scratch):
             for side in range(2):
                 body = manifolds.pair[p, side]
                 following[2 * p + side] = latest[body]
+                if not world.moves[body]:
+                    continue  # what does not move stands on nothing
                 several = several or latest[body] >= 0 or manifolds.point[p, 0, KEY] != 0.0
                 latest[body] = 2 * p + side
     if not several:
@@ -56,6 +58,8 @@ def _heed(shapes, world, work, motion, rules, manifolds, near, scratch, p):
         for k in range(manifolds.count[p]):
             manifolds.point[p, k, VOID] = 0.0
             for side in range(2):
+                if not world.moves[manifolds.pair[p, side]]:
+                    continue
                 found, _ = _support(shapes, world, work, motion, rules, manifolds, near, p, k, side)
                 if found:
                     manifolds.point[p, k, VOID] = 1.0
@@ -70,6 +74,8 @@ def _heed(shapes, world, work, motion, rules, manifolds, near, scratch, p):
         for k in range(manifolds.count[p]):
             if manifolds.point[p, k, KEY] == i * KEYS + j:
                 for side in range(2):
+                    if not world.moves[manifolds.pair[p, side]]:
+                        continue
                     found, n = _support(shapes, world, work, motion, rules, manifolds, near, p, k, side)
                     if found:
                         near.held[at] = again = True
@@ -88,6 +94,8 @@ def _support(shapes, world, work, motion, rules, manifolds, near, p, k, side):
     all of what it meets at point k; and this normal, towards the body."""
     body, other = manifolds.pair[p, side], manifolds.pair[p, 1 - side]
     n = _normal(manifolds, p, k, side)
+    if shapes.piece_start[world.shape[other] + 1] == shapes.piece_start[world.shape[other]]:
+        return False, n  # nobody knows how far it reaches
     key = manifolds.point[p, k, KEY]
     link = work.latest[body]
     while link >= 0:
@@ -113,7 +121,7 @@ def _support(shapes, world, work, motion, rules, manifolds, near, p, k, side):
             foot = add(get(motion.position, ground), foot)
             if _reach(shapes, world, work, motion, other, key, side, m) - dot(m, foot) > LEVEL * rules.slop:
                 continue
-            if q == p or _away(shapes, world, work, motion, ground, manifolds, p, k, side) <= rules.reach:
+            if q == p or _beside(shapes, world, work, motion, rules, ground, manifolds, p, k, side):
                 return True, m
     return False, n
 
@@ -126,24 +134,29 @@ def _normal(manifolds, p, k, side):
 
 
 @njit(**BARE)
-def _away(shapes, world, work, motion, ground, manifolds, p, k, side):
-    """How far another body is from the place where a contact touches the body that is met."""
+def _beside(shapes, world, work, motion, rules, ground, manifolds, p, k, side):
+    """Whether another body reaches to the place where a contact touches the body that is met."""
     other, column = manifolds.pair[p, 1 - side], SECOND if side == 0 else FIRST
     point = manifolds.point[p, k]
     place = turn(work.matrix, other, (point[column], point[column + 1], point[column + 2]))
     place = add(sub(get(motion.position, other), get(motion.position, ground)), place)
-    size = world.scale[ground]
+    size, t, convex = world.scale[ground], world.shape[ground], solids(shapes)
     place = scale(add(turn_back(work.matrix, ground, place), get(world.com, ground)), 1.0 / size)
-    return size * distance_alone(shapes.table, shapes.brick, shapes.sample, world.shape[ground], place)
+    first, last = convex.start[t], convex.start[t + 1]
+    if shapes.table[t, KIND] != GRID or first == last:
+        rough = ROUGH * shapes.table[t, CELL] if shapes.table[t, KIND] == GRID else 0.0
+        return size * (distance_alone(shapes.table, shapes.brick, shapes.sample, t, place) - rough) <= rules.reach
+    for piece in range(first, last):
+        if size * outside(convex, piece, place) <= rules.reach:
+            return True
+    return False
 
 
 @njit(**BARE)
 def _reach(shapes, world, work, motion, body, key, side, m):
-    """How far the piece of a body that a contact is of reaches along m; infinity for what is not convex."""
+    """How far the piece of a body that a contact is of reaches along m."""
     s, convex = world.shape[body], solids(shapes)
     pieces = convex.start[s + 1] - convex.start[s]
-    if pieces == 0:
-        return np.inf
     number = int(key) % KEYS if side == 0 else int(key) // KEYS
     piece = convex.start[s] + min(number, pieces - 1)
     place = add(

@@ -40,13 +40,13 @@ from sdfsim.dynamics.kernels.manifold import (
 from sdfsim.dynamics.kernels.surface_distance import (
     KEYS,
     beyond,
+    at_least,
     is_round,
     map_between,
     mapped,
     nodes_near,
     round_points,
     swallowed,
-    too_far,
 )
 from sdfsim.dynamics.kernels.vectors import (
     BARE,
@@ -70,6 +70,7 @@ SHARES = 16  # of the pairs, each with its own scratch, that threads take in tur
 FLAT = 0.95  # cosine between the normals of a face at least
 # The mean distance of a face from its middle, in that of its corners: 0.54 of a square, 0.67 of a disc, 0.5 of a bar.
 FACE = 0.58
+PROBES = 12  # on the way from the middle of a face to its corner
 SOLIDS, ROUND, SURFACES = range(3)  # the ways in which a pair is looked at
 
 
@@ -190,7 +191,7 @@ def _near(shapes, world, motion, matrix, pairs, ways, reach, near, p):
         at = near.start[p, side]
         for clump in range(shapes.clump_start[s], shapes.clump_start[s + 1]):
             d = distance_alone(table, brick, sample, t, mapped(w, c, get(shapes.clump_ball, clump)))
-            if k * d - own * shapes.clump_ball[clump, 3] > most:
+            if k * at_least(table, t, d) - own * shapes.clump_ball[clump, 3] > most:
                 continue
             for i in range(shapes.clump_leaf[clump], shapes.clump_leaf[clump + 1]):
                 away = beyond(shapes, t, w, c, k, own, i)
@@ -296,35 +297,51 @@ def _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, s
         count = nodes_near(shapes, world, motion, matrix, look, a, b, side, near, p, went, scratch, count)
     count = first_to_touch(rules, scratch.found, count)
     manifolds.count[p] = merged(rules, manifolds.point, p, known, scratch, count, False)
-    _tell_faces(shapes, world, motion, matrix, rules, manifolds, p)
+    _torsion_arms(shapes, world, motion, matrix, rules, manifolds, p)
 
 
 @njit(**BARE)
-def _tell_faces(shapes, world, motion, matrix, rules, manifolds, p):
-    """Whether the points of a manifold bound a face that touches all over, and is turned as a face is: its middle
-    touches then, which that of a rim or of legs does not."""
+def _torsion_arms(shapes, world, motion, matrix, rules, manifolds, p):
+    """Where friction acts of points that bound a flat manifold, in parts of the way from its middle to each: the mean
+    of what touches on this way. A full face, legs and a rim differ."""
     a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
     point, count = manifolds.point[p], manifolds.count[p]
-    middle, filled = (0.0, 0.0, 0.0), count >= 3
+    middle, flat = (0.0, 0.0, 0.0), count >= 3
     for k in range(count):
         point[k, TORSION] = 1.0
         alike = 0.0
         for x in range(3):
             alike += point[k, NORMAL + x] * point[0, NORMAL + x]
-        filled = filled and alike > FLAT and point[k, KEY] == point[0, KEY]
+        flat = flat and alike > FLAT and point[k, KEY] == point[0, KEY]
         middle = add(middle, (point[k, 0], point[k, 1], point[k, 2]))
-    if not filled:
+    if not flat:
         return
     middle = scale(middle, 1.0 / count)
-    place = add(get(motion.position, a), turn(matrix, a, middle))
+    full = _both_touch(shapes, world, motion, matrix, rules, a, b, middle)
+    for k in range(count):
+        if full:
+            point[k, TORSION] = FACE
+            continue
+        way = sub((point[k, 0], point[k, 1], point[k, 2]), middle)
+        total = weights = 0.0
+        for e in range(PROBES):
+            t = (e + 0.5) / PROBES
+            if _both_touch(shapes, world, motion, matrix, rules, a, b, along(middle, way, t)):
+                total, weights = total + t * t, weights + t
+        point[k, TORSION] = total / weights if weights > 0.0 else 1.0
+
+
+@njit(**BARE)
+def _both_touch(shapes, world, motion, matrix, rules, a, b, place):
+    """Whether a place, from the first body's centre of mass in its axes, is on the surface of either."""
+    place = add(get(motion.position, a), turn(matrix, a, place))
     for body in (a, b):
         here = turn_back(matrix, body, sub(place, get(motion.position, body)))
         here = scale(add(here, get(world.com, body)), 1.0 / world.scale[body])
         d = distance_alone(shapes.table, shapes.brick, shapes.sample, world.shape[body], here)
         if abs(d) * world.scale[body] > rules.look:
-            return
-    for k in range(count):
-        point[k, TORSION] = FACE
+            return False
+    return True
 
 
 @njit(**BARE)
@@ -498,12 +515,12 @@ def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, lea
                     continue
                 e = near.leaf[i]
                 if refresh or beyond(shapes, t, w, c, k, scales[side], e) < least:
-                    there, d, slack = get(shapes.node, shapes.leaf_node[e]), -math.inf, k * too_far(table, t)
+                    there, d = get(shapes.node, shapes.leaf_node[e]), -math.inf
                     for u in range(shapes.leaf_node[e], shapes.leaf_node[e + 1]):
                         p_u = get(shapes.node, u)
-                        if d - scales[side] * norm(sub(p_u, there)) - slack < least:  # else too near to one that is far
-                            there, d = p_u, k * distance_alone(table, brick, sample, t, mapped(w, c, p_u))
-                            least = min(least, d)
+                        if d - scales[side] * norm(sub(p_u, there)) < least:  # else too near to one that is far
+                            d = distance_alone(table, brick, sample, t, mapped(w, c, p_u))
+                            least, there, d = min(least, k * d), p_u, k * at_least(table, t, d)
                     if least < enough:
                         return least
     return least

@@ -380,18 +380,15 @@ def _relax(where, row, mass, change, c, first, last, least, most):
     u, z = (change[b, 0], change[b, 1], change[b, 2]), (change[b, 3], change[b, 4], change[b, 5])
     worst = 0.0
     for e in range(first, last):
-        axis = (row[c, e, AXIS], row[c, e, AXIS + 1], row[c, e, AXIS + 2])
-        arm = (row[c, e, ARM], row[c, e, ARM + 1], row[c, e, ARM + 2])
-        other = (row[c, e, OTHER], row[c, e, OTHER + 1], row[c, e, OTHER + 2])
-        short = row[c, e, WANTED] - dot(axis, sub(v, u)) - dot(arm, w) - dot(other, z)
+        axis = _three(row, c, e, AXIS)
+        short = row[c, e, WANTED] - _along_row(row, c, e, sub(v, u), w, z)
         total = min(max(row[c, e, IMPULSE] + short * row[c, e, MASS], least), most)
         step = total - row[c, e, IMPULSE]
         if step == 0.0:
             continue
         row[c, e, IMPULSE] = total
         v, u = along(v, axis, step * mass[a]), along(u, axis, -step * mass[b])
-        w = along(w, (row[c, e, SPIN], row[c, e, SPIN + 1], row[c, e, SPIN + 2]), step)
-        z = along(z, (row[c, e, COUNTER], row[c, e, COUNTER + 1], row[c, e, COUNTER + 2]), step)
+        w, z = along(w, _three(row, c, e, SPIN), step), along(z, _three(row, c, e, COUNTER), step)
         worst = max(worst, abs(step / row[c, e, MASS]))
     if worst > 0.0:
         for x in range(3):
@@ -403,19 +400,39 @@ def _relax(where, row, mass, change, c, first, last, least, most):
 def _rub(where, row, mass, change, c, most):
     """Bring both tangential rows of a contact to rest, as far as the cone of friction allows; returns by how much that
     changed."""
+    a, b = where[c, 2], where[c, 3]
+    v, w = (change[a, 0], change[a, 1], change[a, 2]), (change[a, 3], change[a, 4], change[a, 5])
+    u, z = (change[b, 0], change[b, 1], change[b, 2]), (change[b, 3], change[b, 4], change[b, 5])
     first, second = row[c, 1, IMPULSE], row[c, 2, IMPULSE]
     # One mass for both, so that friction ends up against the slip and not aside.
     lesser = min(row[c, 1, MASS], row[c, 2, MASS])
-    one = first + (row[c, 1, WANTED] - _speed(where, row, change, c, 1)) * lesser
-    other = second + (row[c, 2, WANTED] - _speed(where, row, change, c, 2)) * lesser
+    between = sub(v, u)
+    one = first + lesser * (row[c, 1, WANTED] - _along_row(row, c, 1, between, w, z))
+    other = second + lesser * (row[c, 2, WANTED] - _along_row(row, c, 2, between, w, z))
     share = _within(one, other, most)
     one, other = share * one, share * other
-    if one == first and other == second:
-        return 0.0
-    _apply(where, row, mass, change, c, 1, one - first)
-    _apply(where, row, mass, change, c, 2, other - second)
     row[c, 1, IMPULSE], row[c, 2, IMPULSE] = one, other
-    return max(abs(one - first), abs(other - second)) / lesser
+    one, other = one - first, other - second
+    if one == 0.0 and other == 0.0:
+        return 0.0
+    pull = add(scale(_three(row, c, 1, AXIS), one), scale(_three(row, c, 2, AXIS), other))
+    v, u = along(v, pull, mass[a]), along(u, pull, -mass[b])
+    w = along(along(w, _three(row, c, 1, SPIN), one), _three(row, c, 2, SPIN), other)
+    z = along(along(z, _three(row, c, 1, COUNTER), one), _three(row, c, 2, COUNTER), other)
+    for x in range(3):
+        change[a, x], change[a, 3 + x], change[b, x], change[b, 3 + x] = v[x], w[x], u[x], z[x]
+    return max(abs(one), abs(other)) / lesser
+
+
+@njit(**BARE)
+def _three(row, c, e, column):
+    return row[c, e, column], row[c, e, column + 1], row[c, e, column + 2]
+
+
+@njit(**BARE)
+def _along_row(row, c, e, between, w, z):
+    """The relative velocity along a row, of the difference of two bodies' velocities and of their angular ones."""
+    return dot(_three(row, c, e, AXIS), between) + dot(_three(row, c, e, ARM), w) + dot(_three(row, c, e, OTHER), z)
 
 
 @njit(**BARE)

@@ -24,7 +24,7 @@ from sdfsim.dynamics.kernels.vectors import BARE, add, along, dot, get, norm, pu
 
 KEYS = 1024  # patches of a shape at most
 ROUNDS = 12  # of refinement
-NEAR = 3.0  # cells: so near to its surface a grid is fine
+NEAR = 2.0  # cells: so near to its surface a grid is fine
 FARTHER = 2.0  # cells: by so much it is too far elsewhere, at a tip
 ONTO, BESIDE = 3, 0.05  # steps back onto the own surface, and how near it they must lead, in strides
 WAYS = 8  # in which the outermost nodes of a face are looked for
@@ -100,7 +100,7 @@ def _candidates(shapes, r, s, w, c, k, own, look, side, near, pair, went, scratc
     """The deepest node of each near leaf around which the surface may touch; how many."""
     table, brick, sample = shapes.table, shapes.brick, shapes.sample
     flat = table[s, KIND] == PLANE  # whose distance has one normal: no look from within
-    slack, kept = k * too_far(table, s), 0
+    kept, most = 0, NEAR * table[s, CELL] * k / own if table[s, KIND] == GRID else math.inf
     for at in range(near.start[pair, side], near.start[pair, side] + near.count[pair, side]):
         i = near.leaf[at]
         if near.away[at] - went <= look:
@@ -109,16 +109,19 @@ def _candidates(shapes, r, s, w, c, k, own, look, side, near, pair, went, scratc
         if near.away[at] - went > look:
             continue
         deepest, chosen, lowest = 0.0, -1, 1e300
-        facing, d, off, there = (0.0, 0.0, 0.0), -math.inf, 0.0, get(shapes.node, shapes.leaf_node[i])
+        facing, d, bound, there = (0.0, 0.0, 0.0), 0.0, -math.inf, (0.0, 0.0, 0.0)
         for u in range(shapes.leaf_node[i], shapes.leaf_node[i + 1]):
-            p, within, around = get(shapes.node, u), get(shapes.inward, u), own * shapes.cover[u]
+            p, around = get(shapes.node, u), own * shapes.cover[u]
             if flat:
                 d, n = k * (dot(w[2], p) + c[2]), (0.0, 0.0, 1.0)
-            elif d - own * (norm(sub(p, there)) + 2.0 * (norm(within) + off)) > look + around + slack:
-                continue  # too near to one that is far; a look from within is off by twice the way inwards at most
             else:
-                d, n = _gap(table, brick, sample, s, w, c, p, within)
-                there, off, d = p, norm(within), d * k
+                within, back = _within_wall(get(shapes.inward, u), most)
+                q = add(p, within)
+                if bound - own * (norm(sub(q, there)) + back) > look + around:
+                    continue  # too near to one that is far
+                d, n = distance(table, brick, sample, s, mapped(w, c, q))
+                bound, there = k * at_least(table, s, d), q
+                d = k * d - k * _along_normal(w, within, n)
             score = d - OUTWARD * own * norm(p)
             if d - around <= look and score < lowest:
                 deepest, chosen, lowest, facing = d, u, score, n
@@ -186,28 +189,32 @@ def _chosen(scratch, kept, level):
 
 
 @njit(**BARE)
-def _gap(table, brick, sample, t, w, c, p, inward):
-    """Distance of a node from shape t, and the normal there, as seen from a little within its own solid.
+def _within_wall(inward, most):
+    """The way from a node to where it looks out from, and how long it is; shorter into a much larger body.
 
-    On an edge of t its own distance has two normals, and the one that parts two stacked boxes is not always the
-    nearer. From within, only the face that is met is near.
+    On an edge of the other solid its distance has two normals, and the one that parts two stacked boxes is not always
+    the nearer. From within the own solid only the face that is met is near.
     """
-    at, back = mapped(w, c, p), (dot(w[0], inward), dot(w[1], inward), dot(w[2], inward))
-    if table[t, KIND] == GRID:
-        most, long = NEAR * table[t, CELL], dot(back, back)
-        if long > most * most:
-            back = scale(back, most / math.sqrt(long))  # of a much larger body
-    d, n = distance(table, brick, sample, t, add(at, back))
-    return d - dot(back, n), n
+    long = norm(inward)
+    return (inward, long) if long <= most else (scale(inward, most / long), most)
+
+
+@njit(**BARE)
+def _along_normal(w, within, n):
+    """How far a way of a shape goes along a normal of the other, at the other's scale."""
+    return dot((dot(w[0], within), dot(w[1], within), dot(w[2], within)), n)
 
 
 @njit(**BARE)
 def _refined(table, brick, sample, stride, s, t, w, c, k, own, p, inward):
     """From node p of shape s down the distance of t along the surface of s: place, distance, normal in t's axes."""
-    d, n = _gap(table, brick, sample, t, w, c, p, inward)
     ratio = k / own
+    within, _ = _within_wall(inward, NEAR * table[t, CELL] * ratio if table[t, KIND] == GRID else math.inf)
+    d, n = distance(table, brick, sample, t, mapped(w, c, add(p, within)))
+    d -= _along_normal(w, within, n)
     least = stride * (FINEST / STRIDE)
     _, m = distance(table, brick, sample, s, p)
+    way, was = (0.0, 0.0, 0.0), 0.0  # the last step's direction, and how steep the distance was along it
     for _ in range(ROUNDS):
         # The other's normal in own axes (w is a rotation times own / k), less its part across the own surface.
         g = (
@@ -219,9 +226,13 @@ def _refined(table, brick, sample, stride, s, t, w, c, k, own, p, inward):
         slope = norm(g)
         if slope < 0.02:
             break
-        better = False
+        # As far as the slope leads if it goes on to change as in the last step (secant), and a little at first.
+        change = was + dot(way, g)
+        if was > 0.0:
+            stride = min(stride * slope / change, 3.0 * stride) if change > 0.0 else 3.0 * stride
+        way, was, better = scale(g, -1.0 / slope), slope, False
         while stride > least:
-            q = along(p, g, -stride / slope)
+            q = along(p, way, stride)
             # Back onto the own surface; beyond an edge one step does not lead there, and a place beside it is none.
             own_d, across_own = distance(table, brick, sample, s, q)
             for _ in range(ONTO):
@@ -229,15 +240,12 @@ def _refined(table, brick, sample, stride, s, t, w, c, k, own, p, inward):
                 own_d, across_own = distance(table, brick, sample, s, q)
                 if abs(own_d) <= BESIDE * stride:
                     break
-            if abs(own_d) > BESIDE * stride:
-                stride *= 0.4
-                continue
-            there, normal = distance(table, brick, sample, t, mapped(w, c, q))
-            if there < d - 1e-9:
-                better = True
-                p, d, n, m = q, there, normal, across_own
-                stride *= 1.3
-                break
+            if abs(own_d) <= BESIDE * stride:
+                there, normal = distance(table, brick, sample, t, mapped(w, c, q))
+                if there < d - 1e-9:
+                    better = True
+                    p, d, n, m = q, there, normal, across_own
+                    break
             stride *= 0.4
         if not better:
             break
@@ -279,16 +287,19 @@ def round_points(shapes, world, motion, matrix, reach, a, b, side, found):
 
 
 @njit(**BARE)
-def too_far(table, t):
-    """By how much the distance of shape t may be more than the true one: between the corners of a grid's bricks."""
-    return FARTHER * table[t, CELL] if table[t, KIND] == GRID else 0.0
+def at_least(table, t, d):
+    """How far a place is from shape t at least, of the distance that is found there: between the corners of a grid's
+    bricks that may be too much."""
+    if table[t, KIND] != GRID or d <= NEAR * table[t, CELL]:
+        return d
+    return max(NEAR, d / table[t, CELL] - FARTHER) * table[t, CELL]
 
 
 @njit(**BARE)
 def beyond(shapes, t, w, c, k, own, e):
     """How far a leaf is from shape t at least."""
     d = distance_alone(shapes.table, shapes.brick, shapes.sample, t, mapped(w, c, get(shapes.leaf_ball, e)))
-    return k * d - own * shapes.leaf_ball[e, 3]
+    return k * at_least(shapes.table, t, d) - own * shapes.leaf_ball[e, 3]
 
 
 @njit(**BARE)
