@@ -58,6 +58,7 @@ def describe(
         "duration_s": scene.duration,
         "dt_s": simulator.dt,
         "steps": steps,
+        "substeps": simulator.rules.substeps,
         "units": {"length_m": units.length, "time_s": units.time, "mass_kg": units.mass},
         "outside_training": simulator.outside_training,
         "constant_in_training": constant_in_training(simulator.model),
@@ -80,7 +81,8 @@ def plan_lines(report: dict[str, Any]) -> list[str]:
         f"pairs of bodies: {pairs['total']}, of which {pairs['unmoved']} without a dynamic body, "
         f"{pairs['excluded']} kept apart by collides_with, {pairs['apart']} too far apart in the first step; "
         f"{pairs['near']} left",
-        f"model {report['model']} on {report['device']}: {report['steps']} steps of {report['dt_s']:.4g} s",
+        f"model {report['model']} on {report['device']}: {report['steps']} steps of {report['dt_s']:.4g} s "
+        f"with {report['substeps']} inner steps each",
         f"a step (over the first {TRIAL_STEPS}): {report['step_ms']:.2g} ms, {step['contacts']:.0f} contacts, "
         f"{step['nodes']:.0f} nodes and {step['edges']:.0f} edges in the network; {report['memory_mib']:.0f} MiB",
         f"the whole run at that pace: {duration(report['run_s'])}; more where bodies meet later on",

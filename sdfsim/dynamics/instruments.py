@@ -391,8 +391,9 @@ def _measured(course: _Course, frames: np.ndarray, deadline: float) -> tuple[Nea
         margin = np.zeros(len(size))
         if not last:
             dt = float(rollout.time[f + 1] - rollout.time[f])
-            speed = np.linalg.norm(rollout.velocity[f], axis=1)
-            turning = _turning(course, f) * np.where(np.isfinite(reach), reach, 0.0)
+            speed = np.linalg.norm(rollout.velocity[f : f + 2], axis=2).max(0)
+            turning = np.maximum(_turning(course, f), _turning(course, f + 1))
+            turning = turning * np.where(np.isfinite(reach), reach, 0.0)
             fastest = float((speed + turning).max(initial=0.0))
             thick = np.where(np.isfinite(size), size, 0.0)
             margin = pushed * (0.2 * thick + (speed + turning + fastest) * dt + strength * dt * dt)
@@ -419,7 +420,9 @@ def _measured(course: _Course, frames: np.ndarray, deadline: float) -> tuple[Nea
         k = int(share.argmax()) if len(share) else -1
         if k >= 0 and share[k] > 0:
             deepest = _near(course, row[k], float(-found.apart[k]), float(share[k]))
-        free = found.surely - np.maximum(closing, 0.0) - turned
+        # Who is hit by a third may hit the other within the same step, as fast as it is at the step's end.
+        later, turned_later = _coming(course, row, found, reach, back=-1)
+        free = found.surely - np.maximum(np.maximum(closing, later), 0.0) - np.maximum(turned, turned_later)
     else:
         thin, free, found = np.zeros(0), np.zeros(0), None
     for f, bodies in alone:
@@ -464,7 +467,7 @@ def _coming(
     course: _Course, row: np.ndarray, found: Gaps, reach: np.ndarray, back: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """[P] m, how much two bodies come nearer in a step, along the line between their nearest points, by the speeds of
-    these (so many frames `back`); and what turning and gravity may add for others of their points."""
+    these so many frames `back`; and what turning and gravity may add for others of their points."""
     rollout = course.rollout
     frame, one, other = row.T
     dt = np.diff(rollout.time, append=rollout.time[-1:])[frame]
@@ -472,13 +475,14 @@ def _coming(
     toward = found.normal * found.sign[:, None]  # from the second to the first
 
     def of(body: np.ndarray) -> np.ndarray:
-        arm, then = found.point - rollout.position[frame, body], np.maximum(frame - back, 0)
+        arm = found.point - rollout.position[frame, body]
         return rollout.velocity[then, body] + np.cross(rollout.angular_velocity[then, body], arm)
 
+    then = np.clip(frame - back, 0, len(rollout.time) - 1)
     closing = -((of(one) - of(other)) * toward).sum(1) * dt
     turning = np.zeros(len(row))
-    for f in np.unique(frame):
-        here, spin = frame == f, _turning(course, int(f))
+    for f in np.unique(then):
+        here, spin = then == f, _turning(course, int(f))
         for body in (one, other):
             turning[here] += (spin * np.where(np.isfinite(reach), reach, 0.0))[body[here]]
     return closing, turning * dt + float(np.linalg.norm(course.scene.gravity)) * dt * dt

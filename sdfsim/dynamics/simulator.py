@@ -17,12 +17,11 @@ import sdfsim
 from sdfsim.dynamics.bodies import State, from_scene
 from sdfsim.dynamics.body_handle import BodyHandle, ContactPoint
 from sdfsim.dynamics.model import Model, load_model
-from sdfsim.dynamics.models.contact_graph import SUBSTEPS
 from sdfsim.dynamics.rollout import Rollout, join
 from sdfsim.dynamics.run_memory import Memory
 from sdfsim.dynamics.step import FreeFlight, StepOptions, step
 from sdfsim.dynamics.training_ranges import deep_starts, outside_training
-from sdfsim.dynamics.units import scene_units
+from sdfsim.dynamics.units import inner_steps, scene_units
 from sdfsim.dynamics.validity import check_nodes, check_sizes, fault
 from sdfsim.errors import EXIT_QUALITY, SdfsimError, nearest
 from sdfsim.parallel import parallel
@@ -114,7 +113,7 @@ class Simulator:
             restitution=effects.restitution.on,
             rotation=effects.rotation.on,
             free_flight=free_flight,
-            substeps=self.model.inner or SUBSTEPS,
+            substeps=self.model.inner or inner_steps(scene),
             rows=None if memory is None else max(1, int(memory * 2**30 / BYTES_AN_EDGE)),
             sleep=effects.sleep.on and not self.model.on_surfaces,
         )

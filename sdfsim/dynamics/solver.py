@@ -40,6 +40,9 @@ FORMS = {
 SOLIDS = {"sphere": POINT, "capsule": SEGMENT, "box": BLOCK, "cylinder": DRUM, "hull": HULL}
 Clumps = list[list[np.ndarray]]
 LEAF, CLUMP = 16, 256  # nodes that a leaf and a clump of leaves hold at most
+# Penetration that is left as it is, so that what rests has contacts that do not come and go: model lengths, and less in
+# inner steps below the usual 4 ms, which scenes of slender bodies have.
+SLOP, SLOP_A_TIME = 5e-4, 0.125
 TOUCHING = 1e-3  # model lengths, within which a point is told as a contact
 COARSE = 0.01  # model times: in longer inner steps what is hit in their course is told to a network as well
 SLOW = 2.0  # an approach that gravity makes in so many inner steps ends at the surface without a rebound
@@ -171,7 +174,7 @@ def compiled_rules(rules: StepOptions, *, note: bool = False) -> compiled.Rules:
     return compiled.Rules(
         gravity, inner, rules.substeps, SLOW * math.hypot(*gravity) * inner, rules.friction,
         rules.restitution, rules.rotation, rules.sleep, rules.margin, rules.adds, rules.cone, note,
-        ahead=inner if note and inner > COARSE else 0.0,
+        ahead=inner if note and inner > COARSE else 0.0, slop=min(SLOP, SLOP_A_TIME * inner),
     )  # fmt: skip
 
 

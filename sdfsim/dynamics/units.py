@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from sdfsim.dynamics.bodies import Units, largest_extent
 from sdfsim.dynamics.model import Model
+from sdfsim.dynamics.models.contact_graph import SUBSTEPS
 from sdfsim.errors import SdfsimError
 from sdfsim.scene.scene import Scene
 
@@ -13,6 +16,10 @@ EARTH = 9.81  # m/s^2, sets the time scale of scenes without gravity
 # Times: how much wider a body may be than most that move. Their mean size sets the step, and one that is wider makes it
 # so long that the others turn out of all bounds in their first contact.
 MOST_WIDER = 1e4
+# A stick that tumbles moves by its length while its thickness is what must not be crossed: from this aspect on the
+# inner steps of the solve get shorter, with its root. Measured on a heap of 24 sticks 1:20 (0.75 % of their thickness
+# in each other with 10 inner steps, 3.5 % with 5).
+SLENDER, SHORTEST = 8.0, 4
 
 
 def scene_units(scene: Scene, model: Model, dt: float | None = None) -> Units:
@@ -33,6 +40,15 @@ def scene_units(scene: Scene, model: Model, dt: float | None = None) -> Units:
         length = 1.0
     mass = float(np.mean([b.mass for b in moving])) if moving else 1.0
     return Units(length=length, time=float(np.sqrt(length * model.gravity / strength)), mass=mass)
+
+
+def inner_steps(scene: Scene) -> int:
+    """How many inner steps the solve makes in a step of a scene: more where moving bodies are slender."""
+    boxes = [np.sort(np.ptp(scene.shapes[b.shape].sdf.bounds, axis=0)) for b in scene.bodies if b.motion == "dynamic"]
+    aspect = max((box[2] / max(box[0], 1e-300) for box in boxes), default=1.0)
+    if aspect <= SLENDER:
+        return SUBSTEPS
+    return min(math.ceil(SUBSTEPS * math.sqrt(aspect / 5.0)), SHORTEST * SUBSTEPS)
 
 
 def _check_sizes(names: list[str], sizes: np.ndarray) -> None:

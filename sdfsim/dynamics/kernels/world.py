@@ -121,7 +121,7 @@ class Rules(NamedTuple):
     still: float = 1e-4  # pairs that have moved by less within a step are not looked at again
     together: float = 1e-4  # points that are deeper than the deepest less this meet in one impact
     erp: float = 0.08  # the share of a penetration that an inner step resolves, through velocity
-    slop: float = 5e-4  # penetration that is left as it is, so that what rests has contacts that do not come and go
+    slop: float = 5e-4  # penetration that is left as it is
     split: float = 0.04  # deeper penetration than this is resolved without a lasting velocity
     rounds: int = 50  # of sequential impulses at most
     exact: float = 2e-5  # they end when no impulse changes a velocity by more
