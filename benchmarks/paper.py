@@ -33,20 +33,20 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.results import script, told
 from samples.large import write_scene
+from sdfsim.base.files import write_text
 from sdfsim.data.batching import batches, first_frames, roll_out
 from sdfsim.data.dataset import conditions_of, engine_substep, read_info
-from sdfsim.dynamics.model import SOLVER, Model, load_model, new_network
-from sdfsim.dynamics.run_memory import Memory
-from sdfsim.dynamics.simulator import Simulator
 from sdfsim.evaluation.evaluate import evaluate, load_recorded
 from sdfsim.evaluation.harness import Job, Panel, cells, draw, line, markdown, measure, number, one_thread, peak_memory
 from sdfsim.evaluation.metrics import errors
-from sdfsim.files import write_text
+from sdfsim.geometry.mesh import convex_hull
+from sdfsim.learned.model import SOLVER, Model, load_model, new_network
 from sdfsim.scene.scene_file import load_scene
-from sdfsim.shape.fit import PLANS, fit_pieces
-from sdfsim.shape.mesh import convex_hull
-from sdfsim.shape.sdf import sample_grid
+from sdfsim.sdf.closed_forms import sample_grid
+from sdfsim.sdf.fit.train import PLANS, fit_pieces
 from sdfsim.shape.shape import Shape, load_shape
+from sdfsim.simulate.run_memory import Memory
+from sdfsim.simulate.simulator import Simulator
 from sdfsim.training.contact_cache import inner_steps
 from sdfsim.training.presets import PRESETS, Preset
 from sdfsim.training.surface_task import SurfaceTask

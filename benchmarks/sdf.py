@@ -22,17 +22,17 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.results import script, told
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import write_text
 from sdfsim.data.public_shapes import public_folder
-from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.harness import Job, Panel, cells, draw, line, machine, markdown, measure, number
-from sdfsim.files import write_text
-from sdfsim.shape.fit import FIT_VERSION, PLANS, Recipe, fit_mesh
-from sdfsim.shape.fit_metrics import EXACT
-from sdfsim.shape.mesh import load_mesh
-from sdfsim.shape.mlp_sdf import MlpSdf
-from sdfsim.shape.sdf import MeshSdf, sample_grid
+from sdfsim.geometry.mesh import load_mesh
+from sdfsim.geometry.solidify import solidify
+from sdfsim.sdf.closed_forms import MeshSdf, sample_grid
+from sdfsim.sdf.fit.certificate import EXACT
+from sdfsim.sdf.fit.train import FIT_VERSION, PLANS, Recipe, fit_mesh
+from sdfsim.sdf.mlp import MlpSdf
 from sdfsim.shape.shape import load_shape
-from sdfsim.shape.watertight import solidify
 
 WIDTHS, BUDGETS = (32, 128), (5.0, 10.0, 20.0)  # s
 GRID, POINTS, REPEATS, CHUNK = 64, 250_000, 5, 16_384

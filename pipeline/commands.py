@@ -7,9 +7,9 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from sdfsim.base.console import Session, duration
+from sdfsim.base.errors import EXIT_ERROR, EXIT_USAGE, SdfsimError
 from sdfsim.commands.arguments import Budget, Cluster, Out, command, tell_failed
-from sdfsim.console import Session, duration
-from sdfsim.errors import EXIT_ERROR, EXIT_USAGE, SdfsimError
 
 Presets = Literal["quick", "standard", "fine", "volsdf"]
 Preset = Annotated[
@@ -182,8 +182,8 @@ def fit(
             raise SdfsimError("--cap, --thicken, --units and --cluster go with -o", exit_code=EXIT_USAGE)
         _stage(session, "fit", sources[0], then="scene", budget=budget, recipe=recipe, device=device)
         return
-    from sdfsim import fitting
-    from sdfsim.parallel import cluster as working_on
+    from sdfsim.apps import fit as fitting
+    from sdfsim.base.parallel import cluster as working_on
 
     options = fitting.Options(recipe or "default", budget, cap, thicken, units)
     if len(sources) == 1 and not sources[0].is_dir():

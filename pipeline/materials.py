@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from sdfsim.errors import SdfsimError, nearest
+from sdfsim.base.errors import SdfsimError, nearest
 from sdfsim.scene.scene_file import UNITS
 
 CRC = "CRC Handbook of Chemistry and Physics"

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sdfsim.shape.fit import fit_mesh
-from sdfsim.shape.mesh import Mesh, write_ply
-from sdfsim.shape.primitives import sphere
+from sdfsim.geometry.mesh import Mesh, write_ply
+from sdfsim.geometry.primitives import sphere
+from sdfsim.sdf.fit.train import fit_mesh
 from sdfsim.shape.shape import shape_from_primitive
 
 ROOT = Path(__file__).resolve().parents[1]

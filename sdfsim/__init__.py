@@ -11,12 +11,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sdfsim.dynamics.rollout import Rollout
-    from sdfsim.dynamics.simulator import Simulator
-    from sdfsim.errors import SceneError, SdfsimError
+    from sdfsim.base.errors import SceneError, SdfsimError
+    from sdfsim.physics.rollout import Rollout
+    from sdfsim.scene.builder import Scene
     from sdfsim.scene.scene_file import load_scene
-    from sdfsim.scene.written import Scene
     from sdfsim.shape.shape import Shape, load_shape
+    from sdfsim.simulate.simulator import Simulator
 
 # Threads of torch wait for one another by spinning, and beside other programs they take the processor from those they
 # wait for: a step then takes ten times as long. So they spin for some microseconds only, which costs little on a free
@@ -30,12 +30,12 @@ __version__ = "0.1.0"
 __all__ = ["Rollout", "Scene", "SceneError", "SdfsimError", "Shape", "Simulator", "load_scene", "load_shape"]
 
 _HOME = {
-    "Rollout": "sdfsim.dynamics.rollout",
-    "Scene": "sdfsim.scene.written",
-    "SceneError": "sdfsim.errors",
-    "SdfsimError": "sdfsim.errors",
+    "Rollout": "sdfsim.physics.rollout",
+    "Scene": "sdfsim.scene.builder",
+    "SceneError": "sdfsim.base.errors",
+    "SdfsimError": "sdfsim.base.errors",
     "Shape": "sdfsim.shape.shape",
-    "Simulator": "sdfsim.dynamics.simulator",
+    "Simulator": "sdfsim.simulate.simulator",
     "load_scene": "sdfsim.scene.scene_file",
     "load_shape": "sdfsim.shape.shape",
 }

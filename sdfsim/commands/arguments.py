@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from sdfsim.console import Session
-from sdfsim.errors import EXIT_QUALITY
+from sdfsim.base.console import Session
+from sdfsim.base.errors import EXIT_QUALITY
 
 
 def seconds_of(text: str) -> float:
@@ -48,7 +48,7 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
     def run(*, as_json: bool, device: str, verbose: bool, **options: Any) -> None:
         with Session(as_json=as_json, verbose=verbose) as session:
             if device == "cuda":
-                from sdfsim.dynamics.simulator import pick_device
+                from sdfsim.simulate.simulator import pick_device
 
                 pick_device(device)
             work(session, **options, **({"device": device} if "device" in given else {}))

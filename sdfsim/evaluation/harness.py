@@ -19,9 +19,9 @@ import numpy as np
 import torch
 
 import sdfsim
-from sdfsim.errors import SdfsimError
-from sdfsim.files import digest, read_json, replacing, write_json
-from sdfsim.parallel import Progress, parallel, silent
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import digest, read_json, replacing, write_json
+from sdfsim.base.parallel import Progress, parallel, silent
 
 Results = dict[tuple[str, str], dict[str, Any]]
 FAILURES = (SdfsimError, RuntimeError, MemoryError)
@@ -54,7 +54,7 @@ def measure(
         where: "here", one after the other in this process; "cores", on all of them in the order of `jobs`; "fresh",
             each in a process of its own, whose peak memory is then the job's.
     """
-    from sdfsim.dynamics.kernels import _cache  # numba takes its time to load
+    from sdfsim.physics.solver import _cache  # numba takes its time to load
 
     todo: list[tuple[Job, Path, str]] = []
     version = [sdfsim.__version__, _cache().name]  # the name is a hash of the compiled step's source

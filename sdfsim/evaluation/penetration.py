@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sdfsim.base.errors import SdfsimError
 from sdfsim.data.dataset import Trajectory
-from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.engines import dataset_urdf
+from sdfsim.geometry.mesh import load_pieces
 from sdfsim.scene.scene import Scene
-from sdfsim.shape.distance import PiecesDistance
-from sdfsim.shape.mesh import load_pieces
-from sdfsim.shape.mlp_sdf import MlpSdf
-from sdfsim.shape.sdf import GridSdf, MeshSdf
+from sdfsim.sdf.closed_forms import GridSdf, MeshSdf
+from sdfsim.sdf.mlp import MlpSdf
+from sdfsim.sdf.reference import PiecesDistance
 from sdfsim.shape.shape import Shape, with_sdf
 
 TOUCH = 0.01  # mean sizes of the moving bodies; a node this near to another surface is in contact

@@ -13,21 +13,21 @@ from typing import Any
 import torch
 
 import sdfsim
+from sdfsim.apps.recording import save_rollout
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import locked, write_json, write_text
+from sdfsim.base.parallel import Progress, silent
 from sdfsim.data.public_shapes import public_folder
 from sdfsim.data.pybullet_sim import DT, SUBSTEPS, TEACHER_VERSION, engine_settings, import_pybullet
-from sdfsim.dynamics.instruments import judged
-from sdfsim.dynamics.model import SOLVER, Model, load_model, model_names
-from sdfsim.dynamics.simulator import SimulationError, Simulator, pick_device
-from sdfsim.dynamics.training_ranges import constant_in_training
-from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.engines import bullet, drake, mujoco, rollout_motion, shape_urdf, start_motion, start_of_scene
 from sdfsim.evaluation.hard_cases import GROUPS, Case, Figure, Run, cases, ran_away
 from sdfsim.evaluation.harness import Job, Line, Panel, Results, draw, markdown, measure
-from sdfsim.files import locked, write_json, write_text
-from sdfsim.parallel import Progress, silent
-from sdfsim.recording import save_rollout
+from sdfsim.learned.model import SOLVER, Model, load_model, model_names
+from sdfsim.learned.training_ranges import constant_in_training
+from sdfsim.physics.instruments import judged
 from sdfsim.scene.scene import Scene
-from sdfsim.shape.sdf import PlaneSdf
+from sdfsim.sdf.closed_forms import PlaneSdf
+from sdfsim.simulate.simulator import SimulationError, Simulator, pick_device
 
 VERSION = 4  # counts up when what is measured changes, so that kept results are measured again
 TEACHER = "teacher"

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sdfsim.errors import SdfsimError
+from sdfsim.base.errors import SdfsimError
 from sdfsim.scene.scene import Body
 
 MOST = 30_000  # groups: the table of who may touch whom has a byte for each pair of them

@@ -30,10 +30,10 @@ from pydantic import (
 from pydantic import model_validator as validator_of_model
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from sdfsim.errors import SceneError, SdfsimError, nearest
-from sdfsim.parallel import Progress, silent
+from sdfsim.base.errors import SceneError, SdfsimError, nearest
+from sdfsim.base.parallel import Progress, silent
+from sdfsim.geometry.primitives import PRIMITIVES
 from sdfsim.scene.scene import Body, Effects, Limits, Motion, Scene, Switch, Waypoints
-from sdfsim.shape.primitives import PRIMITIVES
 from sdfsim.shape.shape import (
     DEFAULT_RESOLUTION,
     MESH_FILE,

@@ -14,14 +14,12 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from sdfsim.errors import SdfsimError
-from sdfsim.files import read_json, user_cache, write_bytes, write_json
-from sdfsim.parallel import Progress, silent
-from sdfsim.shape import primitives
-from sdfsim.shape.distance import MeshDistance
-from sdfsim.shape.fit_metrics import certify_grid
-from sdfsim.shape.mass import mass_properties_of_sdf
-from sdfsim.shape.mesh import (
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import read_json, user_cache, write_bytes, write_json
+from sdfsim.base.parallel import Progress, silent
+from sdfsim.geometry import primitives
+from sdfsim.geometry.mass import mass_properties_of_sdf
+from sdfsim.geometry.mesh import (
     GLTF,
     Frame,
     Mesh,
@@ -33,8 +31,8 @@ from sdfsim.shape.mesh import (
     write_glb,
     write_ply,
 )
-from sdfsim.shape.mlp_sdf import ACTIVATIONS, MlpSdf
-from sdfsim.shape.sdf import (
+from sdfsim.geometry.solidify import solidify
+from sdfsim.sdf.closed_forms import (
     CLOSED_FORMS,
     BoxSdf,
     CapsuleSdf,
@@ -47,8 +45,10 @@ from sdfsim.shape.sdf import (
     SphereSdf,
     sample_grid,
 )
+from sdfsim.sdf.fit.certificate import certify_grid
+from sdfsim.sdf.mlp import ACTIVATIONS, MlpSdf
+from sdfsim.sdf.reference import MeshDistance
 from sdfsim.shape.surface_nodes import DEFAULT_COUNT, sample_nodes, surface_nodes
-from sdfsim.shape.watertight import solidify
 
 SdfKind = Literal["mlp", "grid", "mesh"]
 
@@ -397,7 +397,7 @@ def _cached(
 ) -> Shape:
     if kind == "mesh":  # made as fast as it is read
         return mesh_shape(mesh, name=name, kind=kind, **how)
-    from sdfsim.shape.fit import FIT_VERSION, fit_mesh
+    from sdfsim.sdf.fit.train import FIT_VERSION, fit_mesh
 
     variant = "-cap" if how.get("cap") else ""
     variant += "" if how.get("thicken") is None else f"-thick{how['thicken']:g}"

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sdfsim.errors import SdfsimError
-from sdfsim.shape.baked_grid import BakedGrid, surface_samples
-from sdfsim.shape.distance import PiecesDistance, unique_planes
-from sdfsim.shape.mesh import Mesh, convex_hull, lattice, normal_frame
-from sdfsim.shape.primitives import spiral
-from sdfsim.shape.sdf import BoxSdf, CylinderSdf, Sdf
+from sdfsim.base.errors import SdfsimError
+from sdfsim.geometry.mesh import Mesh, convex_hull, lattice, normal_frame
+from sdfsim.geometry.primitives import spiral
+from sdfsim.sdf.baked_grid import BakedGrid, surface_samples
+from sdfsim.sdf.closed_forms import BoxSdf, CylinderSdf, Sdf
+from sdfsim.sdf.reference import PiecesDistance, unique_planes
 
 # The paper's sampling (section 3 and appendix): a grid over this half extent of the normalised frame, projected onto
 # the surface, points that did not reach it dropped, one point kept per voxel.

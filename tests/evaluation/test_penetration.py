@@ -7,7 +7,7 @@ import pytest
 
 from sdfsim.data.pybullet_sim import write_urdf
 from sdfsim.evaluation.penetration import Solid, deepest, exact_solids, penetration
-from sdfsim.shape import primitives
+from sdfsim.geometry import primitives
 from sdfsim.shape.shape import analytic_shape, with_sdf
 from tests.recordings import CUBE, balls
 

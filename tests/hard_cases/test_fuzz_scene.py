@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sdfsim import SceneError, load_scene
-from sdfsim.errors import printable
+from sdfsim.base.errors import printable
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.shape import analytic_shape, shape_from_mesh
 from tests.hard_cases.strangers import Spoiled, mangled_texts, scenes, spoiled_scenes, time_limit

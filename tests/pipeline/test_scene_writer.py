@@ -14,9 +14,9 @@ from pipeline.materials import ASSUMED, MATERIALS, choose
 from pipeline.mesh.placement import Placement
 from pipeline.mesh.visibility import Above
 from pipeline.scene_writer import LEVEL, choose_slab, fit_parts, scene_text, write_scene
-from sdfsim.files import write_json
+from sdfsim.base.files import write_json
+from sdfsim.geometry.mesh import Mesh, write_ply
 from sdfsim.scene.scene_file import load_scene
-from sdfsim.shape.mesh import Mesh, write_ply
 from sdfsim.shape.shape import Shape, analytic_shape
 from tests.pipeline.test_surface import cube, scenery
 
@@ -138,7 +138,7 @@ def test_every_part_is_fitted_in_its_own_frame_and_kept_when_killed(meshes, tmp_
         }
         return replace(analytic_shape("box", size=(0.2, 0.2, 0.2), name=name), mesh=solid, certificate=certificate)
 
-    monkeypatch.setattr("sdfsim.shape.fit.fit_mesh", fit_mesh)
+    monkeypatch.setattr("sdfsim.sdf.fit.train.fit_mesh", fit_mesh)
     out = tmp_path / "assets"
     out.mkdir()
     report = fit_parts(meshes, out, budget=30.0)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sdfsim import SceneError, load_scene
-from sdfsim.shape import primitives
-from sdfsim.shape.mesh import write_ply
+from sdfsim.geometry import primitives
+from sdfsim.geometry.mesh import write_ply
 from sdfsim.shape.shape import analytic_shape
 from tests.scene.conftest import HEAD, problems_of
 

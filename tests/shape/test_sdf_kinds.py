@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sdfsim.errors import SdfsimError
-from sdfsim.shape import primitives
-from sdfsim.shape.mesh import Mesh, write_ply
-from sdfsim.shape.sdf import BoxSdf, GridSdf, MeshSdf
+from sdfsim.base.errors import SdfsimError
+from sdfsim.geometry import primitives
+from sdfsim.geometry.mesh import Mesh, write_ply
+from sdfsim.sdf.closed_forms import BoxSdf, GridSdf, MeshSdf
 from sdfsim.shape.shape import (
     analytic_shape,
     load_shape,
@@ -84,7 +84,7 @@ def test_a_mesh_has_a_shape_without_any_fit(kind, member: type) -> None:
 
 
 def test_grids_are_cached_by_resolution_and_exact_meshes_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from sdfsim.shape import fit
+    from sdfsim.sdf.fit import train as fit
 
     monkeypatch.setattr(fit, "fit_mesh", lambda *args, **kwargs: pytest.fail("fitted"))
     sizes = {}

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from sdfsim import load_scene
-from sdfsim.errors import SdfsimError
-from sdfsim.shape import fit, primitives
-from sdfsim.shape import fit as fit_module
-from sdfsim.shape.mesh import write_ply
+from sdfsim.base.errors import SdfsimError
+from sdfsim.geometry import primitives
+from sdfsim.geometry.mesh import write_ply
+from sdfsim.sdf.fit import train as fit
+from sdfsim.sdf.fit import train as fit_module
 from sdfsim.shape.shape import (
     load_shape,
     shape_from_mesh,

@@ -1,0 +1,456 @@
+"""Mesh -> SDF network: recipes, the points a fit learns from, the training loop, and a certificate at its end."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.parallel import Progress, choose_threads, silent
+from sdfsim.geometry.mass import mass_properties, mass_properties_of_sdf
+from sdfsim.geometry.mesh import Mesh, clean, is_closed, normal_frame, sample_surface
+from sdfsim.geometry.solidify import solidify
+from sdfsim.sdf.closed_forms import Sdf
+from sdfsim.sdf.far_field import BOX
+from sdfsim.sdf.fit.certificate import SIGN_FROM, certify
+from sdfsim.sdf.mlp import Activation, MlpSdf, Tape, value_and_gradient
+from sdfsim.sdf.reference import DistanceOracle, MeshDistance, PiecesDistance
+from sdfsim.shape.shape import Shape
+from sdfsim.shape.surface_nodes import DEFAULT_COUNT, edge_nodes, hull_nodes, sample_nodes, surface_nodes, thin
+
+Recipe = Literal["quick", "default", "paper"]
+# Weights and biases per layer, [out, in] and [out].
+Layers = tuple[list[torch.Tensor], list[torch.Tensor]]
+
+# Changes whenever the same mesh would come out differently; part of every cache key.
+FIT_VERSION = 8
+
+# Points are drawn from a little beyond the box that is used: at the very edge of its data a network's slope is poor.
+MARGIN = 1.15
+# A solid whose distances agree with their mirror images' to this, relative to its size, is fitted on one side only.
+SAME = 1e-4
+# A fit is checked on the way on this many points of three kinds: with these spreads around the surface, and in the box.
+CHECKED = 4000
+CHECKED_SIGMAS = (0.006, 0.06)
+# Weights of the first periodic layer are uniform in +- this; it sets the finest scale that a fit starts with.
+FIRST = 8.0
+WARMUP = 50  # updates
+CHECK_EVERY = 100  # updates
+# Seconds that the certificate takes of a budget, beside a tenth.
+RESERVE = 2.0
+# Of the nodes of convex pieces: the pieces' vertices are at most this part, with points on their edges at most that.
+OWN_SHARE, EDGE_SHARE = 0.6, 0.85
+# Between points on the edges of convex pieces, relative to the size of the whole.
+EDGE_SPACING = 0.06
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One recipe; the defaults were chosen by measurement on scanned and thin-walled shapes.
+
+    Lengths are relative to the shape's largest extent. The box gets its share of points and the loss stays soft up to
+    some hundredths of the size, without which the far field is off by as much.
+    """
+
+    # of the hidden layers; "relu" is trained as the paper does: by Adam, on both sides of every mirror plane, and by
+    # signs only where the paper's rule trusts them
+    activation: Activation = "wave"
+    width: int = 64  # of the hidden layers
+    layers: int = 6  # linear layers, the last one included
+    lr: float = 1e-2  # step size
+    decay: float = 0.5  # the part of the steps over which it falls to zero, at the end (0: constant)
+    steps: int = 5000  # updates
+    batch: int = 4096  # points an update
+    # points lie this far from the surface (standard deviation, log-uniform between the two)
+    sigmas: tuple[float, float] = (0.002, 0.15)
+    near: float = 0.8  # fraction of points near the surface; the others are uniform in the box
+    resample: int = 0  # updates between fresh pools of points (0: one pool)
+    pool: int = 400_000  # points in a pool
+    soften: float | None = 0.04  # errors count with soften / (|distance| + soften); None counts all alike
+    # errors of the averaged weights at which the decay begins early, which halves them: of the distance (means within
+    # 0.01 and in the box), of the gradient (median cosine distance within 0.1) and of the sign (fraction wrong farther
+    # than 0.002). None never stops early.
+    goal: tuple[float, float, float, float] | None = (7e-4, 6e-3, 4e-3, 1.3e-3)
+    settle: int = 1000  # steps of an early decay
+
+
+PLANS = {
+    "default": Plan(),
+    # A surface from a few minutes of training is not known as exactly as a full fit would follow it.
+    "quick": Plan(steps=1500, settle=600, pool=200_000),
+    # Rubanova et al. 2024, section 3.1 and appendix: 400k updates at 1e-5, noise 0.1 drawn again every 100 updates.
+    "paper": Plan(
+        activation="relu",
+        width=128,
+        layers=8,
+        lr=1e-5,
+        decay=0.0,
+        steps=400_000,
+        sigmas=(0.1, 0.1),
+        near=1.0,
+        resample=100,
+        pool=65_536,
+        soften=None,
+        goal=None,
+    ),
+}
+
+
+def fit_mesh(
+    mesh: Mesh,
+    *,
+    name: str,
+    recipe: Recipe = "default",
+    budget: float | None = None,
+    seed: int = 0,
+    cap: bool = False,
+    thicken: float | None = None,
+    file: str = "",
+    on_progress: Progress = silent,
+    device: torch.device | str = "cpu",
+) -> Shape:
+    """Fit the compact SDF network to the solid that a triangle mesh in metres bounds, see `solidify`.
+
+    The result depends on the mesh, the recipe (see `PLANS`) and the seed only (up to rounding, which the number of
+    threads and the device change), unless the budget in s cuts the training short. The shape's `certificate` tells the
+    errors and whether it is usable (`passed`), `source["notes"]` what was done to the mesh. Raises SdfsimError, which
+    calls the mesh `file` (or else `name`), where it cannot be used or bounds no solid.
+    """
+    solid = solidify(mesh, name=file or name, cap=cap, thicken=thicken)
+
+    def pick(sdf: Sdf) -> np.ndarray:
+        return surface_nodes(sdf, solid.surface, DEFAULT_COUNT)
+
+    sdf, points, certificate = _fit(MeshDistance(solid), recipe, budget, seed, pick, on_progress, device)
+    source: dict[str, Any] = {"kind": "mesh", "recipe": recipe, "fit_version": FIT_VERSION}
+    source |= {"notes": list(solid.notes)} if solid.notes else {}
+    return Shape(name, solid.surface, sdf, points, *solid.mass_properties(), certificate, source)
+
+
+def fit_pieces(
+    pieces: list[Mesh],
+    *,
+    name: str,
+    display: Mesh | None = None,
+    nodes: int = DEFAULT_COUNT,
+) -> Shape:
+    """Fit the compact SDF network to the union of convex pieces: the body that a rigid-body engine collides.
+
+    At most `nodes` are the pieces' own vertices first (without repetitions and those inside another piece), because
+    contact with a flat floor is exact only there; then points along their sharp edges, then all over the surface. Mass
+    properties are those of the union, and so is the mesh to show unless `display` is given.
+    """
+    oracle = PiecesDistance(pieces)
+    size = float(np.ptp(oracle.bounds, axis=0).max())
+
+    def bare(points: np.ndarray) -> np.ndarray:
+        _, first = np.unique(np.round(points / (1e-4 * size)), axis=0, return_index=True)
+        points = points[np.sort(first)]
+        # Measured from the boundary of the union: a point on the seam of two pieces is deep in neither.
+        return points[oracle(points).distance >= -1e-3 * size]
+
+    vertices = bare(np.concatenate([piece.vertices for piece in pieces]))
+    edges = bare(np.concatenate([edge_nodes(piece.vertices, EDGE_SPACING * size) for piece in pieces]))
+
+    def pick(sdf: Sdf) -> np.ndarray:
+        own = hull_nodes(vertices, round(OWN_SHARE * nodes))
+        return thin(sample_nodes(sdf), nodes, keep=thin(edges, round(EDGE_SHARE * nodes), keep=own))
+
+    sdf, points, certificate = _fit(oracle, "default", None, 0, pick, silent, "cpu")
+    single = len(pieces) == 1 and is_closed(pieces[0])
+    volume, com, inertia = mass_properties(pieces[0]) if single else mass_properties_of_sdf(oracle)
+    mesh = display if display is not None else clean(oracle.surface, name=name)
+    source = {"kind": "pieces", "recipe": "default", "fit_version": FIT_VERSION}
+    hulls = tuple(piece.vertices for piece in pieces)
+    return Shape(name, mesh, sdf, points, volume, com, inertia, certificate, source, hulls)
+
+
+def _fit(
+    oracle: DistanceOracle,
+    recipe: Recipe,
+    budget: float | None,
+    seed: int,
+    pick: Callable[[Sdf], np.ndarray],
+    on_progress: Progress,
+    device: torch.device | str,
+) -> tuple[MlpSdf, np.ndarray, dict]:
+    """The network, nodes [K, 3] m as `pick` takes them from it, and the certificate."""
+    if budget is not None and not budget > 0:
+        raise SdfsimError(f"the budget of a fit must be > 0 seconds (got {budget})")
+    started, plan = time.monotonic(), PLANS[recipe]
+    on_progress(0.0, "sampling distances")
+    run = _Run(oracle, plan, seed, torch.device(device))
+    if run.device.type == "cpu":
+        choose_threads(partial(run.differentiate, torch.arange(plan.batch) % plan.pool))
+    looping = time.monotonic()
+    while run.step < run.stop:
+        run.update()
+        if run.step % CHECK_EVERY:
+            continue
+        near, far = run.judge()
+        if budget is not None:
+            left = budget - min(0.1 * budget + RESERVE, 0.5 * budget) - (time.monotonic() - started)
+            run.hurry(run.step + int(left * run.step / (time.monotonic() - looping)))
+        last = max(run.stop, 1)
+        on_progress(0.97 * run.step / last, f"step {run.step} of {last}, error {near:.2g} near, {far:.2g} in the box")
+    on_progress(0.98, "measuring")
+    sdf = run.result()
+    nodes = pick(sdf)
+    certificate = certify(sdf, oracle, nodes=nodes)
+    seconds = round(time.monotonic() - started, 2)
+    certificate.update(recipe=recipe, seed=seed, steps=min(run.step, run.stop), seconds=seconds)
+    but = certificate["reason"] or certificate["caveat"]
+    on_progress(1.0, f"fitted, but {but}" if but else "fitted")
+    return sdf, nodes, certificate
+
+
+class Pool(NamedTuple):
+    """Normalised points."""
+
+    points: torch.Tensor  # [P, 3]
+    distance: torch.Tensor  # [P] signed
+    signed: torch.Tensor  # [P] bool, whether the sign of the distance counts
+    direction: torch.Tensor  # [P, 3] unit, from the surface outwards; zero on the surface itself
+
+
+class _Run:
+    """A network in training, and samples of the solid that it learns. The decay of its steps begins at update `turn`
+    and ends at `stop`; an early stop or a short budget moves both forward."""
+
+    def __init__(self, oracle: DistanceOracle, plan: Plan, seed: int, device: torch.device) -> None:
+        self.oracle, self.plan, self.device, self._seed = oracle, plan, device, seed
+        self.frame = normal_frame(oracle.bounds)
+        self.mirrors = self._mirrors() if plan.activation == "wave" else (False, False, False)
+        self.pool = self._pool(0)
+        # Points to judge by on the way: `CHECKED` of each of three kinds.
+        sigma = np.repeat(CHECKED_SIGMAS, CHECKED)[:, None]
+        self.check = self._sample(sigma, CHECKED, np.random.default_rng([seed, 1]))
+        # Drawn on the CPU, so that points and first weights do not depend on the device.
+        self.generator = torch.Generator().manual_seed(seed)
+        self.parameters = [p.to(device) for p in _initial(plan, self.generator)]
+        for parameter in self.parameters:
+            parameter.grad = torch.zeros_like(parameter)
+        self.average = [parameter.clone() for parameter in self.parameters]
+        self.optimiser = (Soap if plan.activation == "wave" else torch.optim.Adam)(self.parameters, plan.lr)
+        self.step = 0
+        self.turn, self.stop = int(plan.steps * (1.0 - plan.decay)), plan.steps
+        self._tape = Tape(plan.activation, plan.width, plan.layers, self.parameters[0])
+
+    def _pool(self, step: int) -> Pool:
+        """Points to learn from, as drawn before update `step`."""
+        plan = self.plan
+        rng = np.random.default_rng([self._seed, 0, step] if step else [self._seed, 0])
+        near = int(plan.pool * plan.near)
+        low, high = np.log(plan.sigmas)
+        sigma = np.exp(rng.uniform(low, high, (near, 1)))
+        return self._sample(sigma, plan.pool - near, rng)
+
+    def _sample(self, sigma: np.ndarray, elsewhere: int, rng: np.random.Generator) -> Pool:
+        """Points with normal noise of `sigma` [N, 1] around the surface, then `elsewhere` points all over the box."""
+        local = self.frame.inward(sample_surface(self.oracle.surface, len(sigma), rng)[0])
+        around = local + sigma * rng.standard_normal((len(sigma), 3))
+        local = np.concatenate([around, rng.uniform(-MARGIN * BOX, MARGIN * BOX, (elsewhere, 3))])
+        local = np.clip(local, -MARGIN * BOX, MARGIN * BOX)
+        truth = self.oracle(self.frame.outward(local))
+        distance = truth.distance / self.frame.scale
+        signed = truth.trusted | (self.oracle.closed and self.plan.activation == "wave")
+        # So close to the surface the direction from it is rounding.
+        clear = np.abs(distance) > 1e-4
+        offset = local - self.frame.inward(truth.closest)
+        direction = np.where(clear[:, None], offset / np.where(clear, distance, 1.0)[:, None], 0.0)
+        # What lies on the other side of a mirror plane is learned from its image.
+        side = np.where(np.asarray(self.mirrors) & (local < 0), -1.0, 1.0)
+        where, away, along = (torch.from_numpy(x).float() for x in (local * side, distance, direction * side))
+        return Pool(*(part.to(self.device) for part in (where, away, torch.from_numpy(signed), along)))
+
+    def _mirrors(self) -> tuple[bool, bool, bool]:
+        """Across which planes of its frame the solid is its own mirror image, as far as sampled distances tell."""
+        rng = np.random.default_rng(0)
+        local = self.frame.inward(sample_surface(self.oracle.surface, 2000, rng)[0])
+        local = np.concatenate([local, local + rng.normal(0.0, 0.05, local.shape)])
+        truth = self.oracle(self.frame.outward(local)).distance
+
+        def same(axis: int) -> bool:
+            image = self.frame.outward(local * np.where(np.arange(3) == axis, -1.0, 1.0))
+            return bool(np.abs(self.oracle(image).distance - truth).max() < SAME * self.frame.scale)
+
+        return same(0), same(1), same(2)
+
+    def update(self) -> None:
+        """One step of the optimiser."""
+        plan = self.plan
+        if plan.resample and self.step and self.step % plan.resample == 0:
+            self.pool = self._pool(self.step)
+        self.differentiate(torch.randint(plan.pool, (plan.batch,), generator=self.generator))
+        factor = min(1.0, (self.step + 1) / WARMUP)
+        if plan.decay:
+            late = min(max((self.step - self.turn) / max(self.stop - self.turn, 1), 0.0), 1.0)
+            factor *= 0.5 * (1.0 + math.cos(math.pi * late))
+        if isinstance(self.optimiser, Soap):
+            self.optimiser.step(factor)
+        else:
+            self.optimiser.param_groups[0]["lr"] = plan.lr * factor
+            self.optimiser.step()
+        self.step += 1
+        for mean, parameter in zip(self.average, self.parameters, strict=True):
+            mean.lerp_(parameter, 0.02)
+
+    def differentiate(self, chosen: torch.Tensor) -> None:
+        """Weighted L1 of the signed distance, and of the unsigned one where the sign is not known, at the points of the
+        pool that are chosen [T]; fills the gradients."""
+        points, distance, signed, _ = (part[chosen.to(self.device)] for part in self.pool)
+        weights, biases = _layers(self.parameters, self.plan.activation)
+        value = self._tape.forward(weights, biases, points)
+        error = torch.where(signed, value - distance, value.abs() - distance.abs())
+        slope = error.sign() * torch.where(signed, 1.0, value.sign()) / len(chosen)
+        if self.plan.soften is not None:
+            slope = slope * (self.plan.soften / (distance.abs() + self.plan.soften))
+        gradients = [parameter.grad for parameter in self.parameters if parameter.grad is not None]
+        self._tape.parameter_gradients(weights, points, slope, *_split(gradients))
+        for gradient, scale in zip(gradients, _SCALES[self.plan.activation], strict=True):
+            gradient.mul_(scale)
+
+    def judge(self) -> tuple[float, float]:
+        """Begin the decay where the goal is met. Returns mean errors near the surface and in the box."""
+        layers = _layers(self.average, self.plan.activation)
+        value, gradient = value_and_gradient(*layers, self.plan.activation, self.check.points)
+        distance, signed = self.check.distance, self.check.signed
+        error = torch.where(signed, value - distance, value.abs() - distance.abs()).abs()
+        near, far = float(error[:CHECKED].mean()), float(error[2 * CHECKED :].mean())
+        if self.plan.goal is not None and self.step < self.turn:
+            cosine = torch.nn.functional.cosine_similarity(gradient, self.check.direction, dim=-1)
+            turned = 1.0 - float(cosine[CHECKED : 2 * CHECKED].median())
+            clear = signed & (distance.abs() > SIGN_FROM)
+            wrong = float((clear & (value * distance <= 0)).sum() / clear.sum().clamp_min(1))
+            if all(e <= most for e, most in zip((near, far, turned, wrong), self.plan.goal, strict=True)):
+                self.turn, self.stop = self.step, min(self.stop, self.step + self.plan.settle)
+        return near, far
+
+    def hurry(self, possible: int) -> None:
+        """Place decay and end so that `possible` updates in all suffice. Until the decay has begun the end moves both
+        ways, since the first steps of a busy machine tell little; after that it only comes nearer."""
+        begun = self.step >= self.turn
+        self.stop = min(self.stop if begun else self.plan.steps, max(possible, self.step))
+        if not begun:
+            self.turn = max(self.step, int(self.stop * (1.0 - self.plan.decay)))
+
+    def result(self) -> MlpSdf:
+        """The network."""
+        parts = _layers(self.parameters, self.plan.activation)
+        weights, biases = (tuple(part.cpu().clone() for part in layers) for layers in parts)
+        return MlpSdf(weights, biases, self.plan.activation, self.frame, self.oracle.bounds.copy(), self.mirrors)
+
+
+def _initial(plan: Plan, generator: torch.Generator) -> list[torch.Tensor]:
+    """First [1, W, 3], hidden [L - 2, W, W] and last [1, 1, W] weights; biases [L - 1, W, 1] and [1, 1, 1]: equal
+    layers are stacked for the optimiser. Periodic layers start with phases all around and the spread of inputs that
+    sine layers have (Sitzmann et al. 2020); ReLU layers with He's variance."""
+    width, hidden = plan.width, plan.layers - 2
+
+    def uniform(bound: float, layers: int, *shape: int) -> torch.Tensor:
+        return (2.0 * torch.rand((layers, *shape), generator=generator) - 1.0) * bound
+
+    periodic = plan.activation == "wave"
+    return [
+        uniform(FIRST if periodic else math.sqrt(2.0), 1, width, 3),
+        uniform(math.sqrt(6.0 / width), hidden, width, width),
+        uniform(math.sqrt(6.0 / width) / (10.0 if periodic else 1.0), 1, 1, width),
+        uniform(math.pi if periodic else 0.05, plan.layers - 1, width, 1),
+        uniform(0.05, 1, 1, 1),
+    ]
+
+
+# A wave of period 1 with the parameters of a sine of period 2 pi: they are trained at the sine's scale, on which
+# equal steps of the optimiser suit all layers, and multiplied by these before every use. Its height is 1/8.
+_SCALES = {"wave": (0.5 / math.pi, 4.0 / math.pi, 8.0, 0.5 / math.pi, 1.0), "relu": (1.0,) * 5}
+
+
+def _layers(parameters: list[torch.Tensor], activation: Activation) -> Layers:
+    """What the networks compute with."""
+    return _split([parameter * scale for parameter, scale in zip(parameters, _SCALES[activation], strict=True)])
+
+
+def _split(parts: list[torch.Tensor]) -> Layers:
+    first, hidden, last, biases, end = parts
+    return [first[0], *hidden.unbind(), last[0]], [*biases[..., 0].unbind(), end[0, ..., 0]]
+
+
+class Soap:
+    """SOAP (Vyas et al., "SOAP: Improving and Stabilizing Shampoo using Adam", 2024) on a small network.
+
+    For each matrix gradient G of `parameters`, each [L, rows, columns] of L equal layers, it tracks averages of G G^T
+    and G^T G, and runs Adam in the basis of their eigenvectors, which one step of orthogonal iteration follows every
+    few updates. The first step only sets up the bases. A dimension of size 1 is not rotated.
+    """
+
+    MOMENTUM, SECOND, LEAST = 0.95, 0.95, 1e-10
+    PRECONDITIONER = 0.95
+    REFRESH = 10
+
+    def __init__(self, parameters: list[torch.Tensor], lr: float) -> None:
+        self.parameters = parameters
+        self.lr = lr
+        self.count = 0
+        self.state = [self._begin(parameter) for parameter in parameters]
+
+    def _begin(self, parameter: torch.Tensor) -> dict[str, torch.Tensor]:
+        state = {"mean": torch.zeros_like(parameter), "square": torch.zeros_like(parameter)}
+        for side, size in (("left", parameter.shape[-2]), ("right", parameter.shape[-1])):
+            if size > 1:
+                eye = torch.eye(size, dtype=parameter.dtype, device=parameter.device)
+                state[f"{side}_average"] = torch.zeros_like(eye).repeat(len(parameter), 1, 1)
+                state[f"{side}_basis"] = eye.repeat(len(parameter), 1, 1)
+        return state
+
+    @torch.no_grad()
+    def step(self, factor: float) -> None:
+        """Apply the gradients; `factor` is of the learning-rate schedule."""
+        self.count += 1
+        for parameter, state in zip(self.parameters, self.state, strict=True):
+            gradient = parameter.grad
+            assert gradient is not None
+            if self.count > 1:
+                parameter -= self.lr * factor * self._direction(gradient, state)
+            self._follow(gradient, state)
+
+    def _direction(self, gradient: torch.Tensor, state: dict[str, torch.Tensor]) -> torch.Tensor:
+        """Adam's update in the rotated basis, turned back."""
+        state["mean"].lerp_(gradient, 1 - self.MOMENTUM)
+        mean, rotated = _rotate(state["mean"], state), _rotate(gradient, state)
+        state["square"].mul_(self.SECOND).addcmul_(rotated, rotated, value=1 - self.SECOND)
+        updates = self.count - 1
+        mean = mean / (1 - self.MOMENTUM**updates)
+        root = (state["square"] / (1 - self.SECOND**updates)).sqrt_().add_(self.LEAST)
+        direction = mean.div_(root)
+        if "left_basis" in state:
+            direction = state["left_basis"] @ direction
+        return direction @ state["right_basis"].mT if "right_basis" in state else direction
+
+    def _follow(self, gradient: torch.Tensor, state: dict[str, torch.Tensor]) -> None:
+        """Update the averages of G G^T and G^T G, and now and then their eigenvectors."""
+        for side, product in (("left", gradient @ gradient.mT), ("right", gradient.mT @ gradient)):
+            average = state.get(f"{side}_average")
+            if average is None:
+                continue
+            if self.count == 1:
+                average.copy_(product)
+                scale = product.diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(1e-30)[..., None, None]
+                ridge = 1e-6 * torch.eye(product.shape[-1], dtype=product.dtype, device=product.device)
+                state[f"{side}_basis"] = torch.linalg.eigh(product / scale + ridge)[1].flip(-1)
+            else:
+                average.lerp_(product, 1 - self.PRECONDITIONER)
+                if self.count % self.REFRESH == 0:
+                    state[f"{side}_basis"] = torch.linalg.qr(average @ state[f"{side}_basis"])[0]
+
+
+def _rotate(matrix: torch.Tensor, state: dict[str, torch.Tensor]) -> torch.Tensor:
+    if "left_basis" in state:
+        matrix = state["left_basis"].mT @ matrix
+    return matrix @ state["right_basis"] if "right_basis" in state else matrix
