@@ -42,8 +42,9 @@ from sdfsim.evaluation.metrics import errors
 from sdfsim.geometry.mesh import convex_hull
 from sdfsim.learned.model import SOLVER, Model, load_model, new_network
 from sdfsim.scene.scene_file import load_scene
-from sdfsim.sdf.closed_forms import sample_grid
-from sdfsim.sdf.fit.train import PLANS, fit_pieces
+from sdfsim.sdf.fit.train import PLANS
+from sdfsim.sdf.grid import sample_grid
+from sdfsim.shape.make import fit_pieces
 from sdfsim.shape.shape import Shape, load_shape
 from sdfsim.simulate.run_memory import Memory
 from sdfsim.simulate.simulator import Simulator

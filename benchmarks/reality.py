@@ -29,7 +29,7 @@ from sdfsim.evaluation.engines import engine_module
 from sdfsim.evaluation.harness import markdown, number, one_thread
 from sdfsim.evaluation.metrics import interval
 from sdfsim.scene.scene import Body, Effects, Scene
-from sdfsim.shape.shape import analytic_shape
+from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate.simulator import Simulator
 
 SIDE, MASS, INERTIA = 0.1048, 0.37, 0.00081  # m, kg, kg m2, as measured by those who tossed it

@@ -48,7 +48,8 @@ from sdfsim.physics.units import scene_units
 from sdfsim.scene.scene import Effects, Scene
 from sdfsim.scene.scene_file import load_scene
 from sdfsim.sdf.closed_forms import BoxSdf, PlaneSdf, SphereSdf
-from sdfsim.shape.shape import analytic_shape, mesh_shape, own_pieces, shape_from_mesh
+from sdfsim.shape.make import analytic_shape, mesh_shape, shape_from_mesh
+from sdfsim.shape.shape import own_pieces
 from sdfsim.simulate.simulator import Simulator
 
 ENGINES: dict[str, Engine | None] = {

@@ -28,10 +28,12 @@ from sdfsim.data.public_shapes import public_folder
 from sdfsim.evaluation.harness import Job, Panel, cells, draw, line, machine, markdown, measure, number
 from sdfsim.geometry.mesh import load_mesh
 from sdfsim.geometry.solidify import solidify
-from sdfsim.sdf.closed_forms import MeshSdf, sample_grid
 from sdfsim.sdf.fit.certificate import EXACT
-from sdfsim.sdf.fit.train import FIT_VERSION, PLANS, Recipe, fit_mesh
+from sdfsim.sdf.fit.train import FIT_VERSION, PLANS, Recipe
+from sdfsim.sdf.grid import sample_grid
+from sdfsim.sdf.mesh_sdf import MeshSdf
 from sdfsim.sdf.mlp import MlpSdf
+from sdfsim.shape.make import fit_mesh
 from sdfsim.shape.shape import load_shape
 
 WIDTHS, BUDGETS = (32, 128), (5.0, 10.0, 20.0)  # s

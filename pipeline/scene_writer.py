@@ -38,7 +38,7 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
     goes by its name, and those that are there already are kept. Returns a certificate for each of `shapes`, and
     `passed`, `reason` and `caveats` for all of them."""
     from sdfsim.sdf.baked_grid import grid_certificate
-    from sdfsim.sdf.fit.train import fit_mesh
+    from sdfsim.shape.make import fit_mesh
     from sdfsim.shape.shape import load_shape
 
     parts, skins = read_parts(mesh_folder), skins_of(mesh_folder)

@@ -47,7 +47,7 @@ class Run:
 
     def device(self) -> str:
         """Where to compute, as torch names it. Raises SdfsimError: cuda was asked for and is not there."""
-        from sdfsim.simulate.simulator import pick_device
+        from sdfsim.base.devices import pick_device
 
         return str(pick_device(self.options.device))
 

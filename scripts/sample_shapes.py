@@ -9,8 +9,7 @@ import numpy as np
 
 from sdfsim.geometry.mesh import Mesh, write_ply
 from sdfsim.geometry.primitives import sphere
-from sdfsim.sdf.fit.train import fit_mesh
-from sdfsim.shape.shape import shape_from_primitive
+from sdfsim.shape.make import fit_mesh, shape_from_primitive
 
 ROOT = Path(__file__).resolve().parents[1]
 SHAPES = {"bowl": ("bowl", 0.6), "ring": ("torus", 0.22), "can": ("cylinder", 0.14), "cone": ("cone", 0.16)}  # m

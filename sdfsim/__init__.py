@@ -10,6 +10,8 @@ import warnings
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from sdfsim.base.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from sdfsim.base.errors import SceneError, SdfsimError
     from sdfsim.physics.rollout import Rollout
@@ -26,7 +28,6 @@ os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 # Numba tells of an old TBB as it takes the next best of its threading layers, which is as good here.
 warnings.filterwarnings("ignore", message="The TBB threading layer requires TBB version")
 
-__version__ = "0.1.0"
 __all__ = ["Rollout", "Scene", "SceneError", "SdfsimError", "Shape", "Simulator", "load_scene", "load_shape"]
 
 _HOME = {

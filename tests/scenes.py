@@ -16,7 +16,7 @@ from sdfsim.physics.bodies import State
 from sdfsim.physics.solver.record import APART, ARM, AXIS, GIVEN, OTHER, WHEN, Edges
 from sdfsim.physics.solver.world import World
 from sdfsim.scene.scene import Body, Scene
-from sdfsim.shape.shape import analytic_shape
+from sdfsim.shape.make import analytic_shape
 
 kernel = inference.compiled
 POSE = ("position", "orientation", "velocity", "angular_velocity")

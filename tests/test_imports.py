@@ -46,8 +46,6 @@ FLOORS = [
 ]
 # What still goes upwards, and the circles that are left, which the stepper's redesign takes away.
 UPWARDS = {
-    ("sdfsim.geometry.mass", "sdfsim.sdf.closed_forms"),
-    ("sdfsim.geometry.mass", "sdfsim.sdf.reference"),
     ("sdfsim.learned.families", "sdfsim.simulate.run_memory"),
     ("sdfsim.learned.inference", "sdfsim.simulate.step"),
     ("sdfsim.learned.near", "sdfsim.simulate.run_memory"),
@@ -56,12 +54,8 @@ UPWARDS = {
     ("sdfsim.physics.solver.prepare", "sdfsim.simulate.run_memory"),
     ("sdfsim.physics.solver.prepare", "sdfsim.simulate.step"),
     ("sdfsim.physics.units", "sdfsim.learned.model"),
-    ("sdfsim.sdf.fit.train", "sdfsim.shape.shape"),
-    ("sdfsim.sdf.fit.train", "sdfsim.shape.surface_nodes"),
 }
 CIRCLES = [
-    {"sdfsim.geometry.mass", "sdfsim.geometry.solidify", "sdfsim.sdf.closed_forms", "sdfsim.sdf.reference"},
-    {"sdfsim.sdf.fit.train", "sdfsim.shape.shape"},
     {
         "sdfsim.learned.baselines.dpi",
         "sdfsim.learned.baselines.fignet",
@@ -76,7 +70,7 @@ CIRCLES = [
         "sdfsim.simulate.run_memory",
         "sdfsim.simulate.step",
     },
-    {"sdfsim", "sdfsim.simulate.body_handle", "sdfsim.simulate.simulator"},
+    {"sdfsim.simulate.body_handle", "sdfsim.simulate.simulator"},
 ]
 
 

@@ -30,7 +30,7 @@ from sdfsim.base.files import check_writable, write_bytes, write_text
 from sdfsim.base.parallel import StageProgress
 from sdfsim.geometry.gltf import Gltf, light
 from sdfsim.geometry.mesh import Mesh, convex_hull, wavefront
-from sdfsim.scene import builder as written
+from sdfsim.scene import builder
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.scene.scene_file import load_scene
@@ -90,7 +90,7 @@ def export(
     (see `FORMATS`); `scene_file` is of a run, None for the one that it was made from.
 
     Returns a report: format, bodies, frames, files, left_out and notes. Raises SdfsimError for an unknown ending, a
-    damaged source, an extra that is not installed, a shape without convex pieces, or a file that cannot be written.
+    damaged source, an extra that is not installed, a shape without convex pieces, or a file that cannot be builder.
     """
     source, out, scene_file = Path(source), Path(out), Path(scene_file) if scene_file else None
     kind = out.suffix.lower()
@@ -128,7 +128,7 @@ def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progres
     elif (source / RECORD_FILE).is_file():
         shape = load_shape(source)
         moves = "dynamic" if shape.volume > 0 else "static"
-        scene = written.Scene().add(shape.name, asset=source, motion=moves).load(told)
+        scene = builder.Scene().add(shape.name, asset=source, motion=moves).load(told)
     elif source.suffix.lower() in (".yaml", ".yml"):
         scene = load_scene(source, told, allow_outside=allow_outside)
     else:

@@ -8,15 +8,16 @@ from pathlib import Path
 from typing import Any, Literal
 
 from sdfsim.base.console import duration
+from sdfsim.base.devices import pick_device
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import check_writable, locked, read_json, visible
 from sdfsim.base.parallel import Progress, parallel, silent
 from sdfsim.geometry.mesh import MESH_SUFFIXES, load_mesh
 from sdfsim.scene.scene_file import UNITS
 from sdfsim.sdf.baked_grid import baked, grid_certificate, unseen_wall
-from sdfsim.sdf.fit.train import FIT_VERSION, Recipe, fit_mesh
-from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape, remarks
-from sdfsim.simulate.simulator import pick_device
+from sdfsim.sdf.fit.train import FIT_VERSION, Recipe
+from sdfsim.shape.make import fit_mesh, remarks
+from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape
 
 ERRORS = ("error_within_0.01", "error_within_0.1", "error_in_box", "projected_from_0.01", "sign_errors")
 

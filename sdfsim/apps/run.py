@@ -17,6 +17,7 @@ import yaml
 from sdfsim.apps.recording import Playback, framed, save_rollout
 from sdfsim.apps.viewer import check_screen, stream_to_viewer
 from sdfsim.base.console import columns, plain
+from sdfsim.base.devices import pick_device
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import (
     CONFIG,
@@ -39,7 +40,7 @@ from sdfsim.physics.units import EARTH
 from sdfsim.scene.scene import Scene, fingerprints
 from sdfsim.scene.scene_file import load_scene
 from sdfsim.simulate.run_memory import COUNTS, PHASES
-from sdfsim.simulate.simulator import SimulationError, Simulator, check_seconds, join, pick_device
+from sdfsim.simulate.simulator import SimulationError, Simulator, check_seconds, join
 
 Viewer = Literal["none", "file", "native", "web"]
 EVERY = 30.0  # s between two checkpoints

@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from sdfsim.base.arguments import Cluster, Model, Out, Outside, command, tell_failed
 from sdfsim.base.console import Session, columns, duration
 from sdfsim.base.errors import EXIT_USAGE, SdfsimError
-from sdfsim.commands.arguments import Cluster, Model, Out, Outside, command, tell_failed
 
 _PACKAGES = (
     *("torch", "numpy", "scipy", "open3d", "trimesh", "pycolmap", "opencv-python-headless", "rerun-sdk"),
@@ -82,16 +82,16 @@ def plan(
     session: Session, scene: SceneFile, model: Model = None, allow_outside: Outside = False, device: str = "auto"
 ) -> None:
     """Which effects are in play, why, and what a step costs."""
-    from sdfsim.apps import plan as planning
+    from sdfsim.apps import plan as room
 
-    report = planning.describe(
+    report = room.describe(
         scene, model=model, device=device, allow_outside=allow_outside, on_progress=session.stage_progress
     )
     for note in report["notes"]:
         session.say(note)
     for check in report["failed_checks"]:  # told, but a plan is as good with a shape that is less exact
         session.say(f"failed check: {check}")
-    session.report(report, planning.plan_lines(report))
+    session.report(report, room.plan_lines(report))
 
 
 @command
@@ -196,10 +196,10 @@ def info(session: Session) -> None:
 
     import torch
 
-    import sdfsim
+    from sdfsim.base.version import __version__
     from sdfsim.learned.model import model_names
 
-    versions = {"sdfsim": sdfsim.__version__, "python": platform.python_version()}
+    versions = {"sdfsim": __version__, "python": platform.python_version()}
     for name in _PACKAGES:
         try:
             versions[name] = metadata.version(name)

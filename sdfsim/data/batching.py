@@ -15,7 +15,8 @@ from sdfsim.learned.model import Model
 from sdfsim.learned.surfaces import with_history
 from sdfsim.physics.bodies import Bodies, State, Units, from_scene
 from sdfsim.scene.scene import Body, Scene
-from sdfsim.shape.shape import Shape, analytic_shape
+from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import Shape
 from sdfsim.simulate.run_memory import Memory
 from sdfsim.simulate.step import FreeFlight, StepOptions, step
 

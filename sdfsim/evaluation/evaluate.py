@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from sdfsim.base.console import columns
+from sdfsim.base.devices import pick_device
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.parallel import Progress, parallel, silent
 from sdfsim.data.batching import batches, every, first_frames, model_units, roll_out, scene_of
@@ -35,7 +36,6 @@ from sdfsim.learned.training_ranges import outside_training
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.shape import Shape
-from sdfsim.simulate.simulator import pick_device
 from sdfsim.simulate.step import FreeFlight
 from sdfsim.training.contact_cache import inner_steps
 

@@ -29,7 +29,8 @@ from sdfsim.physics.instruments import DEEP, MADE, Verdict, energies, judged, pl
 from sdfsim.physics.rollout import Rollout
 from sdfsim.physics.true_surfaces import gaps
 from sdfsim.scene.scene import Body, Effects, Scene
-from sdfsim.shape.shape import Shape, analytic_shape, mesh_shape, shape_from_primitive
+from sdfsim.shape.make import analytic_shape, mesh_shape, shape_from_primitive
+from sdfsim.shape.shape import Shape
 from sdfsim.simulate.simulator import SimulationError, Simulator
 
 G = 9.81  # m/s^2

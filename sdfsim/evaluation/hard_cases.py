@@ -29,7 +29,8 @@ from sdfsim.learned.model import Model
 from sdfsim.physics.bodies import largest_extent
 from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.scene import Body, Effects, Scene
-from sdfsim.shape.shape import Shape, analytic_shape, shape_from_mesh, shape_from_primitive
+from sdfsim.shape.make import analytic_shape, shape_from_mesh, shape_from_primitive
+from sdfsim.shape.shape import Shape
 
 G = 10.0  # m/s^2
 FRICTION, RESTITUTION = 0.8, 0.5  # of a body

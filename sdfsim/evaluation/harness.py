@@ -18,10 +18,10 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-import sdfsim
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import digest, read_json, replacing, write_json
 from sdfsim.base.parallel import Progress, parallel, silent
+from sdfsim.base.version import __version__
 
 Results = dict[tuple[str, str], dict[str, Any]]
 FAILURES = (SdfsimError, RuntimeError, MemoryError)
@@ -57,7 +57,7 @@ def measure(
     from sdfsim.physics.solver import _cache  # numba takes its time to load
 
     todo: list[tuple[Job, Path, str]] = []
-    version = [sdfsim.__version__, _cache().name]  # the name is a hash of the compiled step's source
+    version = [__version__, _cache().name]  # the name is a hash of the compiled step's source
     results: Results = {}
     for job in jobs:
         file, mark = folder / job.method / f"{job.case}.json", digest(job.content, version)

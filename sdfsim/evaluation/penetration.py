@@ -16,7 +16,8 @@ from sdfsim.data.dataset import Trajectory
 from sdfsim.evaluation.engines import dataset_urdf
 from sdfsim.geometry.mesh import load_pieces
 from sdfsim.scene.scene import Scene
-from sdfsim.sdf.closed_forms import GridSdf, MeshSdf
+from sdfsim.sdf.grid import GridSdf
+from sdfsim.sdf.mesh_sdf import MeshSdf
 from sdfsim.sdf.mlp import MlpSdf
 from sdfsim.sdf.reference import PiecesDistance
 from sdfsim.shape.shape import Shape, with_sdf

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 import torch
 
-import sdfsim
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import locked, write_json, write_text
 from sdfsim.base.parallel import StageProgress
+from sdfsim.base.version import __version__
 from sdfsim.data.batching import every, first_frames, roll_out, scene_of
 from sdfsim.data.dataset import Trajectory, check_alike, conditions_of
 from sdfsim.data.pybullet_sim import DT, SUBSTEP
@@ -35,7 +35,9 @@ from sdfsim.learned.model import SOLVER, Model, load_model, model_names
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.scene import Scene
 from sdfsim.scene.scene_file import load_scene
-from sdfsim.sdf.closed_forms import ClosedForm, GridSdf, MeshSdf, sample_grid
+from sdfsim.sdf.closed_forms import ClosedForm
+from sdfsim.sdf.grid import GridSdf, sample_grid
+from sdfsim.sdf.mesh_sdf import MeshSdf
 from sdfsim.sdf.mlp import MlpSdf
 from sdfsim.sdf.reference import MeshDistance, PiecesDistance
 from sdfsim.shape.shape import Shape, own_pieces, with_nodes, with_sdf
@@ -387,7 +389,7 @@ def tradeoff(
         report = {
             "source": str(source or "a random scene"),
             "quick": quick,
-            "sdfsim": sdfsim.__version__,
+            "sdfsim": __version__,
             "trajectories": len(cases.recorded),
             "bodies": int(sum((~t.static).sum() for t in cases.recorded)),
             "horizon_steps": int(steps),

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.mesh import Mesh, is_closed, lattice
-
-if TYPE_CHECKING:  # sdf.py measures meshes, and so imports this file
-    from sdfsim.sdf.closed_forms import Sdf
-    from sdfsim.sdf.reference import DistanceOracle
 
 
 def mass_properties(mesh: Mesh) -> tuple[float, np.ndarray, np.ndarray]:
@@ -43,15 +40,15 @@ def integrals(mesh: Mesh, weights: np.ndarray | float = 1.0) -> tuple[float, np.
 
 
 def mass_properties_of_sdf(
-    sdf: Sdf | DistanceOracle, *, cells: int = 64, wall: float = np.inf
+    distance: Callable[[np.ndarray], tuple[Any, ...]], bounds: np.ndarray, *, cells: int = 64, wall: float = np.inf
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """The integrals of `mass_properties`, taken on a grid over the inside of any bounded SDF, or of a wall, m, within
-    it.
+    """The integrals of `mass_properties`, taken on a grid over the inside of a solid within `bounds` [2, 3] m, or of a
+    wall, m, within it; by its signed distance (an Sdf or a `DistanceOracle`).
 
     A cell at distance f from the surface counts with the fraction 0.5 - f / cell (clamped), so the error is of second
-    order in the cell. Raises SdfsimError where the SDF is unbounded, or negative nowhere.
+    order in the cell. Raises SdfsimError for bounds that are infinite, or a distance that is negative nowhere.
     """
-    low, high = np.asarray(sdf.bounds, dtype=np.float64)
+    low, high = np.asarray(bounds, dtype=np.float64)
     if not np.isfinite([low, high]).all():
         raise SdfsimError("an unbounded shape has no mass properties")
     cell = float((high - low).max()) / cells
@@ -61,8 +58,8 @@ def mass_properties_of_sdf(
     volume, first, second = 0.0, np.zeros(3), np.zeros((3, 3))
     for x in axes[0]:
         points = lattice([x], axes[1], axes[2])
-        distance = np.asarray(sdf(points)[0])
-        solid, hollow = (np.clip(0.5 - depth / cell, 0.0, 1.0) for depth in (distance, distance + wall))
+        depth = np.asarray(distance(points)[0])
+        solid, hollow = (np.clip(0.5 - d / cell, 0.0, 1.0) for d in (depth, depth + wall))
         weight = (solid - hollow) * cell**3
         offset = points - start
         volume += float(weight.sum())

@@ -13,7 +13,7 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.physics import pose
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Scene, Waypoints
-from sdfsim.sdf.closed_forms import Sdf
+from sdfsim.sdf.sdf import Sdf
 from sdfsim.shape.convex_pieces import convex_vertices
 from sdfsim.shape.shape import Shape
 

@@ -34,6 +34,7 @@ from sdfsim.base.errors import SceneError, SdfsimError, nearest
 from sdfsim.base.parallel import Progress, silent
 from sdfsim.geometry.primitives import PRIMITIVES
 from sdfsim.scene.scene import Body, Effects, Limits, Motion, Scene, Switch, Waypoints
+from sdfsim.shape.make import analytic_shape, shape_from_mesh, shape_from_primitive
 from sdfsim.shape.shape import (
     DEFAULT_RESOLUTION,
     MESH_FILE,
@@ -42,10 +43,7 @@ from sdfsim.shape.shape import (
     WEIGHTS_FILE,
     SdfKind,
     Shape,
-    analytic_shape,
     load_shape,
-    shape_from_mesh,
-    shape_from_primitive,
     with_nodes,
     with_sdf,
     with_wall,

@@ -12,9 +12,9 @@ import numpy as np
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import digest, read_arrays, user_cache, write_arrays
 from sdfsim.geometry.mesh import convex_hull, lattice
-from sdfsim.sdf.closed_forms import Sdf
 from sdfsim.sdf.mlp import MlpSdf
 from sdfsim.sdf.reference import PiecesDistance
+from sdfsim.sdf.sdf import Sdf
 
 BAKE_VERSION = 2
 SIDE = 8  # cells of a brick along each side

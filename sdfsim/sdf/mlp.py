@@ -15,8 +15,8 @@ import numpy as np
 import torch
 
 from sdfsim.geometry.mesh import Frame
-from sdfsim.sdf.closed_forms import accepts_numpy
 from sdfsim.sdf.far_field import in_metres
+from sdfsim.sdf.sdf import accepts_numpy
 
 Activation = Literal["wave", "relu"]
 

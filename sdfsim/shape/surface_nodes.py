@@ -11,8 +11,9 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.mesh import Mesh, convex_hull, lattice, normal_frame
 from sdfsim.geometry.primitives import spiral
 from sdfsim.sdf.baked_grid import BakedGrid, surface_samples
-from sdfsim.sdf.closed_forms import BoxSdf, CylinderSdf, Sdf
+from sdfsim.sdf.closed_forms import BoxSdf, CylinderSdf
 from sdfsim.sdf.reference import PiecesDistance, unique_planes
+from sdfsim.sdf.sdf import Sdf
 
 # The paper's sampling (section 3 and appendix): a grid over this half extent of the normalised frame, projected onto
 # the surface, points that did not reach it dropped, one point kept per voxel.

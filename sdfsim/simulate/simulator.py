@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import platform
-import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -13,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-import sdfsim
+from sdfsim.base.devices import pick_device
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError, nearest
 from sdfsim.base.parallel import parallel
+from sdfsim.base.version import __version__
 from sdfsim.learned.contact_graph import SUBSTEPS
 from sdfsim.learned.model import Model, load_model
 from sdfsim.learned.training_ranges import deep_starts, outside_training
@@ -31,7 +31,7 @@ from sdfsim.simulate.step import FreeFlight, StepOptions, step
 
 if TYPE_CHECKING:
     from sdfsim.learned.near import Contacts, Pairs
-    from sdfsim.scene import builder as written
+    from sdfsim.scene import builder
 
 BYTES_AN_EDGE = 4096  # of the network, while it is worked on
 Variant = Mapping[str, Mapping[str, Any]]  # body -> field -> value
@@ -78,7 +78,7 @@ class Simulator:
 
     def __init__(
         self,
-        scene: Scene | written.Scene,
+        scene: Scene | builder.Scene,
         model: str | Path | Model | None = None,
         device: str = "cpu",
         seed: int | None = None,
@@ -143,7 +143,7 @@ class Simulator:
             "outside_training": self.outside_training,
             "free_flight": free_flight,
             "lift_energy": lift,
-            "sdfsim": sdfsim.__version__,
+            "sdfsim": __version__,
             "torch": torch.__version__,
             "python": platform.python_version(),
         }
@@ -405,16 +405,3 @@ def check_seconds(seconds: float) -> None:
     """Raises SdfsimError where `seconds` is no length of time."""
     if not 0.0 <= seconds < np.inf:
         raise SdfsimError(f"seconds: must be >= 0 and finite (got {seconds:g})")
-
-
-def pick_device(name: str) -> torch.device:
-    """A device: "auto", "cpu", "cuda" or "cuda:0". Raises SdfsimError for another name, or where there is no CUDA."""
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    if not re.fullmatch(r"cpu|cuda(:\d+)?", name, re.ASCII):
-        raise SdfsimError(f"device: {name!r} is not auto, cpu or cuda")
-    place = torch.device(name)
-    there = torch.cuda.is_available() and (place.index is None or place.index < torch.cuda.device_count())
-    if place.type == "cuda" and not there:
-        raise SdfsimError(f"--device {name}: no CUDA device here", "use --device cpu")
-    return place

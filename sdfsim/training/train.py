@@ -47,7 +47,7 @@ def train(
     stops early. Returns paths, losses and processor time. Raises SdfsimError for unusable data, a checkpoint in `out`
     without `resume`, another run writing to it, or diverged training.
     """
-    from sdfsim.simulate.simulator import pick_device
+    from sdfsim.base.devices import pick_device
 
     plan = PRESETS[preset] if isinstance(preset, str) else preset
     folders = [data] if isinstance(data, Path) else list(data)

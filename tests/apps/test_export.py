@@ -19,7 +19,8 @@ from sdfsim.apps.export import export
 from sdfsim.apps.identify import load_recording
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.scene.scene import Scene
-from sdfsim.shape.shape import analytic_shape, load_shape, mesh_shape
+from sdfsim.shape.make import analytic_shape, mesh_shape
+from sdfsim.shape.shape import load_shape
 
 SHAPES = Path(__file__).resolve().parents[2] / "samples" / "shapes"
 SECONDS = 1.2

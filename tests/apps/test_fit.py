@@ -17,7 +17,8 @@ from sdfsim.base.parallel import cluster, parallel
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import Mesh, write_ply
 from sdfsim.sdf.baked_grid import baked
-from sdfsim.shape.shape import load_shape, mesh_shape, shape_from_mesh
+from sdfsim.shape.make import mesh_shape, shape_from_mesh
+from sdfsim.shape.shape import load_shape
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from sdfsim.apps.render import FRAMES, SIZE, Studio, eye_of, poses_at, render
 from sdfsim.apps.run import ending_lines, summary
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.scene.scene import Scene
-from sdfsim.shape.shape import analytic_shape
+from sdfsim.shape.make import analytic_shape
 
 SKY = np.array([236, 240, 245])
 

@@ -10,8 +10,8 @@ from sdfsim import SdfsimError, Simulator, load_scene
 from sdfsim.apps import run
 from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.scene import Scene, Waypoints
-from sdfsim.sdf.closed_forms import sample_grid
-from sdfsim.shape.shape import analytic_shape
+from sdfsim.sdf.grid import sample_grid
+from sdfsim.shape.make import analytic_shape
 from tests.scenes import make_body, random_model
 
 TOWER = Path(__file__).resolve().parents[2] / "samples" / "tower.yaml"

@@ -16,7 +16,7 @@ from sdfsim.base import compiling
 from sdfsim.base.compiling import is_compiled
 from sdfsim.physics.solver import prepare as solver
 from sdfsim.scene.scene import Scene
-from sdfsim.shape.shape import analytic_shape
+from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate.simulator import Simulator
 from tests.scenes import make_body
 

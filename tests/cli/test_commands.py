@@ -17,7 +17,7 @@ import yaml
 import cli
 from sdfsim import Rollout, load_scene
 from sdfsim.apps import run as runs
-from sdfsim.commands.arguments import seconds_of
+from sdfsim.base.arguments import seconds_of
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import write_ply
 from tests.cli.conftest import SCENE, run

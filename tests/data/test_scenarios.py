@@ -31,7 +31,8 @@ from sdfsim.data.scenarios import (
 from sdfsim.data.shape_assets import Origin, prepare
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mass import mass_properties
-from sdfsim.shape.shape import Shape, analytic_shape, sdf_of_mesh
+from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import Shape, sdf_of_mesh
 from sdfsim.training.contact_cache import Solved, contact_frames
 from sdfsim.training.impulse_task import ImpulseTask
 

@@ -18,7 +18,7 @@ from sdfsim.geometry.mesh import load_pieces
 from sdfsim.learned.model import load_model
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.scene_file import load_scene
-from sdfsim.shape.shape import analytic_shape, shape_from_primitive
+from sdfsim.shape.make import analytic_shape, shape_from_primitive
 
 SCENE = """
 version: 1

@@ -8,7 +8,8 @@ import pytest
 from sdfsim.data.pybullet_sim import write_urdf
 from sdfsim.evaluation.penetration import Solid, deepest, exact_solids, penetration
 from sdfsim.geometry import primitives
-from sdfsim.shape.shape import analytic_shape, with_sdf
+from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import with_sdf
 from tests.recordings import CUBE, balls
 
 POLES = np.concatenate([np.eye(3), -np.eye(3)])

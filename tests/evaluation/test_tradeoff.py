@@ -16,7 +16,8 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.evaluation import tradeoff as study
 from sdfsim.evaluation.tradeoff import Setting, arranged, cases_of_scene, load_cases, settings
 from sdfsim.learned.model import load_model
-from sdfsim.shape.shape import analytic_shape, with_sdf
+from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import with_sdf
 from tests.evaluation.test_engines import SCENE
 
 

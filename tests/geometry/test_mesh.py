@@ -132,7 +132,7 @@ def test_round_solids_converge_to_their_closed_forms() -> None:
     ],
 )
 def test_grid_integrals_agree_with_closed_forms(sdf, volume: float, inertia) -> None:
-    got, com, moment = mass_properties_of_sdf(sdf)
+    got, com, moment = mass_properties_of_sdf(sdf, sdf.bounds)
     assert got == pytest.approx(volume, rel=5e-3)
     np.testing.assert_allclose(com, 0, atol=1e-9)
     np.testing.assert_allclose(moment, volume * np.diag(inertia), rtol=1e-2, atol=1e-9)

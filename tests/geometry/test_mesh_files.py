@@ -19,7 +19,7 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import Mesh, clean, is_closed, load_mesh, signed_volume, write_glb
 from sdfsim.geometry.solidify import solidify
-from sdfsim.shape.shape import mesh_shape
+from sdfsim.shape.make import mesh_shape
 
 # A block of 1 x 2 x 3 whose lower corner is (10, 20, 30), so that turned or mirrored axes show.
 PLACES = [(10 + x, 20 + 2 * y, 30 + 3 * z) for z in (0, 1) for y in (0, 1) for x in (0, 1)]

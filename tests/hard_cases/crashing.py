@@ -23,7 +23,7 @@ from sdfsim.data.dataset import Trajectory
 from sdfsim.geometry.mesh import write_ply
 from sdfsim.geometry.primitives import box
 from sdfsim.learned.model import Model, new_network
-from sdfsim.shape.shape import analytic_shape
+from sdfsim.shape.make import analytic_shape
 
 WRITING = ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate")
 BALL = 0.5  # m

@@ -13,7 +13,8 @@ import sdfsim
 from sdfsim.physics import pose
 from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.scene import Body, Scene
-from sdfsim.shape.shape import Shape, analytic_shape, load_shape
+from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import Shape, load_shape
 from tests.scenes import make_body
 
 SAMPLES = Path(__file__).resolve().parents[2] / "samples"

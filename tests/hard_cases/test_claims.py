@@ -17,7 +17,7 @@ from sdfsim.base import files
 from sdfsim.base.files import read_arrays
 from sdfsim.geometry.mesh import load_mesh
 from sdfsim.learned.model import Model, load_model, new_network
-from sdfsim.shape.shape import analytic_shape
+from sdfsim.shape.make import analytic_shape
 from tests.hard_cases.strangers import time_limit
 
 

@@ -17,7 +17,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from sdfsim.physics.bodies import State
-from sdfsim.shape.shape import analytic_shape
+from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate.simulator import Simulator
 from tests.hard_cases import gates
 

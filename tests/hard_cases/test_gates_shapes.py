@@ -11,7 +11,8 @@ import torch
 from sdfsim.base.errors import SdfsimError
 from sdfsim.learned.near import find_contacts
 from sdfsim.sdf.closed_forms import BoxSdf, SphereSdf
-from sdfsim.shape.shape import analytic_shape, with_sdf
+from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import with_sdf
 from sdfsim.simulate.simulator import Simulator
 from tests.hard_cases import gates
 from tests.learned.test_surface_networks import surface_model

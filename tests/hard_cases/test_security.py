@@ -17,7 +17,7 @@ from sdfsim import SceneError, SdfsimError, load_scene
 from sdfsim.geometry.mesh import load_mesh, write_ply
 from sdfsim.geometry.primitives import box
 from sdfsim.learned.model import Model, new_network
-from sdfsim.shape.shape import analytic_shape
+from sdfsim.shape.make import analytic_shape
 from tests.hard_cases.strangers import time_limit
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -12,7 +12,7 @@ from sdfsim.learned.surfaces import with_history
 from sdfsim.physics.bodies import Bodies, State, Units, from_scene
 from sdfsim.physics.pose import rotate
 from sdfsim.scene.scene import Scene
-from sdfsim.shape.shape import analytic_shape
+from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate.run_memory import Memory
 from sdfsim.simulate.step import StepOptions
 from tests.scenes import make_body

@@ -13,7 +13,7 @@ from sdfsim.learned.inference import terms_of
 from sdfsim.physics.solver.prepare import solver_step
 from sdfsim.physics.solver.record import GIVEN
 from sdfsim.scene.scene import Scene
-from sdfsim.shape.shape import analytic_shape
+from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate.simulator import Simulator
 from tests.scenes import angle_between, contact_graph, in_single, make_body, random_model
 

@@ -19,7 +19,7 @@ from sdfsim.physics import pose
 from sdfsim.physics.bodies import State
 from sdfsim.physics.solver import impulse as kernel
 from sdfsim.scene.scene import Effects, Scene
-from sdfsim.shape.shape import analytic_shape
+from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate import step as step_module
 from sdfsim.simulate.simulator import Simulator
 from sdfsim.simulate.step import StepOptions

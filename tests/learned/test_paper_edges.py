@@ -11,7 +11,7 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.learned.near import find_contacts
 from sdfsim.physics.bodies import Units, from_scene
 from sdfsim.scene.scene import Scene
-from sdfsim.shape.shape import analytic_shape
+from sdfsim.shape.make import analytic_shape
 from tests.scenes import make_body
 
 CPU = torch.device("cpu")

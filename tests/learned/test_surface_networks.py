@@ -9,7 +9,7 @@ import torch
 from sdfsim.learned.model import SURFACE
 from sdfsim.learned.surfaces import advance, node_owner
 from sdfsim.scene.scene import Effects, Scene
-from sdfsim.shape.shape import analytic_shape
+from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate.simulator import Simulator
 from tests.scenes import angle_between, make_body, random_model
 

@@ -17,7 +17,8 @@ from sdfsim.physics.instruments import in_order, judged
 from sdfsim.physics.rollout import Rollout
 from sdfsim.physics.true_surfaces import Gaps, Placed, gaps, solid
 from sdfsim.scene.scene import Body, Scene, Waypoints
-from sdfsim.shape.shape import Shape, analytic_shape, mesh_shape
+from sdfsim.shape.make import analytic_shape, mesh_shape
+from sdfsim.shape.shape import Shape
 from sdfsim.simulate.simulator import Simulator
 from tests.scenes import make_body
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import Mesh
-from sdfsim.shape.shape import mesh_shape
+from sdfsim.shape.make import mesh_shape
 
 SCENE = """
 version: 1

@@ -9,7 +9,8 @@ import torch
 
 from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.scene import Body, Scene
-from sdfsim.shape.shape import Shape, analytic_shape
+from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import Shape
 from sdfsim.simulate.simulator import Simulator
 
 G = 9.81  # m/s^2

@@ -18,7 +18,8 @@ from sdfsim.geometry.mesh import Mesh, convex_hull
 from sdfsim.physics.true_surfaces import Placed, Solid, gaps, solid
 from sdfsim.scene.scene import Scene
 from sdfsim.sdf.baked_grid import baked
-from sdfsim.shape.shape import Shape, analytic_shape, load_shape, mesh_shape, with_sdf
+from sdfsim.shape.make import analytic_shape, mesh_shape
+from sdfsim.shape.shape import Shape, load_shape, with_sdf
 from tests.learned.test_scale import SHAPES
 from tests.physics.test_laws import body
 

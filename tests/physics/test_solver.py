@@ -12,7 +12,8 @@ from sdfsim.evaluation import hard_cases
 from sdfsim.physics.rollout import Rollout
 from sdfsim.physics.solver import prepare as solver
 from sdfsim.scene.scene import Scene
-from sdfsim.shape.shape import analytic_shape, load_shape, with_sdf
+from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import load_shape, with_sdf
 from tests.apps.test_resuming import Killed, simulate
 from tests.hard_cases import gates
 from tests.learned.test_scale import SHAPES

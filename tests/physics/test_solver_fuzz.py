@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim import Rollout, Simulator
 from sdfsim.scene.scene import Scene
-from sdfsim.shape.shape import Shape, analytic_shape, load_shape
+from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import Shape, load_shape
 from tests.learned.test_scale import SHAPES
 from tests.physics.test_laws import body
 

@@ -21,7 +21,8 @@ from sdfsim.apps.recording import Playback, save_reconstruction, with_normals
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, joined, read_glb, sample_surface, vertex_normals, write_glb, write_ply
 from sdfsim.scene.scene import Body, Scene
-from sdfsim.shape.shape import analytic_shape, load_shape, scaled
+from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import load_shape, scaled
 from tests.apps.test_recording import read
 from tests.pipeline.test_surface import cube, look_at
 

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from sdfsim.scene.scene_file import load_scene
-from sdfsim.shape.shape import analytic_shape
+from sdfsim.shape.make import analytic_shape
 
 SCRIPT = Path(__file__).resolve().parents[2] / "samples" / "knock.py"
 

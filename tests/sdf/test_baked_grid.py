@@ -18,9 +18,10 @@ from sdfsim.physics.solver.surface_distance import KEYS
 from sdfsim.scene.scene import Scene
 from sdfsim.sdf import baked_grid as module
 from sdfsim.sdf.baked_grid import BakedGrid, bake, baked, unseen_wall, wall_thickness
-from sdfsim.sdf.closed_forms import MeshSdf
+from sdfsim.sdf.mesh_sdf import MeshSdf
 from sdfsim.sdf.reference import PiecesDistance
-from sdfsim.shape.shape import analytic_shape, scaled, with_sdf
+from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import scaled, with_sdf
 from sdfsim.shape.surface_nodes import MOST_PATCHES, Surface, edge_nodes, surface_of
 from sdfsim.simulate.simulator import Simulator
 from tests.physics.test_laws import body

@@ -10,9 +10,12 @@ from scipy.spatial import KDTree
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import Mesh, joined, sample_surface
 from sdfsim.geometry.solidify import solidify
-from sdfsim.sdf.closed_forms import BoxSdf, MeshSdf, Sdf, SphereSdf, sample_grid
+from sdfsim.sdf.closed_forms import BoxSdf, SphereSdf
 from sdfsim.sdf.fit.certificate import EXACT, USABLE, certify, certify_grid, coverage, verdict, walls_lost
+from sdfsim.sdf.grid import sample_grid
+from sdfsim.sdf.mesh_sdf import MeshSdf
 from sdfsim.sdf.reference import MeshDistance, PiecesDistance
+from sdfsim.sdf.sdf import Sdf
 from sdfsim.shape.surface_nodes import sample_nodes, thin
 
 CUBE = BoxSdf((0.5, 0.5, 0.5))

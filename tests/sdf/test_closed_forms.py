@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from sdfsim.sdf.closed_forms import BoxSdf, PlaneSdf, Sdf, SphereSdf
+from sdfsim.sdf.closed_forms import BoxSdf, PlaneSdf, SphereSdf
+from sdfsim.sdf.sdf import Sdf
 
 ALL = [PlaneSdf(), SphereSdf(0.4), BoxSdf((0.3, 0.5, 0.2))]
 

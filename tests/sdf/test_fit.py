@@ -13,8 +13,8 @@ from sdfsim.geometry import primitives
 from sdfsim.geometry.mass import mass_properties, mass_properties_of_sdf
 from sdfsim.geometry.mesh import Mesh, load_mesh, load_pieces
 from sdfsim.sdf.fit import train as fit_module
-from sdfsim.sdf.fit.train import fit_mesh, fit_pieces
 from sdfsim.sdf.mlp import MlpSdf
+from sdfsim.shape.make import fit_mesh, fit_pieces
 from sdfsim.shape.shape import Shape
 
 
@@ -155,4 +155,4 @@ def test_convex_pieces_of_a_real_shape(data_dir: Path) -> None:
     pieces = load_pieces(data_dir / "kubasic" / "torus" / "collision_geometry.obj")
     shape = fit_pieces(pieces, name="torus")
     assert shape.certificate["error_within_0.01"] < 8e-4
-    assert mass_properties_of_sdf(shape.sdf)[0] == pytest.approx(shape.volume, rel=0.01)
+    assert mass_properties_of_sdf(shape.sdf, shape.sdf.bounds)[0] == pytest.approx(shape.volume, rel=0.01)

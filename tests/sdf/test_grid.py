@@ -9,9 +9,10 @@ import torch
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.mesh import Frame, Mesh
 from sdfsim.geometry.primitives import box
-from sdfsim.sdf import closed_forms as sdf_module
-from sdfsim.sdf.closed_forms import BoxSdf, GridSdf, SphereSdf, sample_grid, trilinear
+from sdfsim.sdf import grid as grid_module
+from sdfsim.sdf.closed_forms import BoxSdf, SphereSdf
 from sdfsim.sdf.far_field import BOX, CAUTION
+from sdfsim.sdf.grid import GridSdf, sample_grid, trilinear
 from sdfsim.sdf.reference import MeshDistance
 from sdfsim.shape.surface_nodes import project
 
@@ -153,7 +154,7 @@ def test_empty_chunked_and_numpy_questions(monkeypatch: pytest.MonkeyPatch) -> N
     points = torch.rand(1000, 3) * 2 - 1
     whole = sdf(points)
     for chunk in (37, 500, 1000):
-        monkeypatch.setattr(sdf_module, "CHUNK", chunk)
+        monkeypatch.setattr(grid_module, "CHUNK", chunk)
         for one, other in zip(whole, replace(sdf)(points), strict=True):
             assert torch.equal(one, other)
     assert sdf(points.double().numpy())[0].dtype == np.float64

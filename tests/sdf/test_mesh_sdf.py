@@ -7,7 +7,9 @@ import torch
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.primitives import box, sphere, torus
-from sdfsim.sdf.closed_forms import BoxSdf, MeshSdf, Sdf, SphereSdf
+from sdfsim.sdf.closed_forms import BoxSdf, SphereSdf
+from sdfsim.sdf.mesh_sdf import MeshSdf
+from sdfsim.sdf.sdf import Sdf
 
 SIZE = (1.0, 0.6, 0.8)
 HALF = np.array(SIZE) / 2

@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from sdfsim.geometry.mesh import Frame
-from sdfsim.sdf import far_field
-from sdfsim.sdf import mlp as mlp_sdf
+from sdfsim.sdf import far_field, mlp
 from sdfsim.sdf.mlp import Activation, MlpSdf, Tape, value_and_gradient
 
 
@@ -76,7 +75,7 @@ def test_the_hand_written_training_sweep_is_autograd(activation: Activation, wid
 def test_memory_that_stays_does_not_leak_between_calls(monkeypatch: pytest.MonkeyPatch) -> None:
     net, points = network(1, "wave"), torch.rand(1000, 3, dtype=torch.float64) - 0.5
     whole = net(points)
-    monkeypatch.setitem(mlp_sdf.SWEPT, "cpu", 64)
+    monkeypatch.setitem(mlp.SWEPT, "cpu", 64)
     parts = net(points)
     again = [net(points[start : start + 100]) for start in range(0, 1000, 100)]
     for i in range(2):
@@ -142,7 +141,7 @@ def test_empty_chunked_and_numpy_questions(monkeypatch: pytest.MonkeyPatch) -> N
     assert sdf(torch.zeros(0, 3))[1].shape == (0, 3)
     points = torch.rand(1000, 3)
     whole = sdf(points)
-    monkeypatch.setattr(mlp_sdf, "PREPARED", 37)
+    monkeypatch.setattr(mlp, "PREPARED", 37)
     for one, other in zip(whole, replace(sdf)(points), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)
     array, _ = sdf(points.double().numpy())

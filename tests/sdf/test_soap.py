@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import torch
 
-from sdfsim.sdf.fit.train import Soap
+from sdfsim.sdf.fit.soap import Soap
 
 
 def stack(shape: tuple[int, ...], seed: int) -> torch.Tensor:

@@ -17,12 +17,8 @@ from sdfsim.geometry.mesh import Frame, Mesh
 from sdfsim.sdf.closed_forms import BoxSdf, PlaneSdf, SphereSdf
 from sdfsim.sdf.mlp import MlpSdf
 from sdfsim.shape import shape as shape_module
-from sdfsim.shape.shape import (
-    Shape,
-    analytic_shape,
-    load_shape,
-    scaled,
-)
+from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import Shape, load_shape, scaled
 
 
 def fitted() -> Shape:

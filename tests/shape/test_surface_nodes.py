@@ -6,7 +6,8 @@ from scipy.spatial import KDTree
 
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import Mesh, sample_surface
-from sdfsim.sdf.closed_forms import BoxSdf, MeshSdf, SphereSdf
+from sdfsim.sdf.closed_forms import BoxSdf, SphereSdf
+from sdfsim.sdf.mesh_sdf import MeshSdf
 from sdfsim.shape.surface_nodes import _reaching, edge_nodes, hull_nodes, sample_nodes, surface_nodes, thin
 
 

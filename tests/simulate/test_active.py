@@ -13,7 +13,7 @@ from sdfsim.learned.surfaces import compact, node_owner, predict
 from sdfsim.physics.solver import impulse
 from sdfsim.physics.solver import prepare as solver
 from sdfsim.scene.scene import Effects, Scene, Waypoints
-from sdfsim.shape.shape import analytic_shape
+from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate import step as step_module
 from sdfsim.simulate.simulator import Simulator
 from tests.learned.test_surface_networks import surface_model

@@ -8,7 +8,7 @@ import torch
 
 from sdfsim import SdfsimError, Simulator
 from sdfsim.scene.scene import Effects, Scene, Waypoints
-from sdfsim.shape.shape import analytic_shape
+from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate import simulator as simulator_module
 from sdfsim.simulate.simulator import varied
 from tests.scenes import make_body, random_model

@@ -7,7 +7,7 @@ import pytest
 
 from sdfsim import Simulator, load_shape
 from sdfsim.scene.scene import Body, Scene
-from sdfsim.shape.shape import analytic_shape
+from sdfsim.shape.make import analytic_shape
 
 EARTH = np.array([0.0, 0.0, -9.81])
 DROP = 0.1  # m, for bodies of a metre

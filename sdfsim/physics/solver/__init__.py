@@ -1,6 +1,6 @@
 """The contact solve: scenes as it wants them (`prepare`), and the step, compiled (all other files).
 
-Compiled code is kept in the user's cache folder, under a hash of the compiled files: numba looks only at the file that a
+Compiled code is kept in the user's cache folder, under a hash of the files: numba looks only at the file that a
 function is in, and would go on with what another one held when it was compiled.
 """
 

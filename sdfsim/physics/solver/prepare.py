@@ -23,7 +23,8 @@ from sdfsim.physics.solver.record import Edges
 from sdfsim.physics.solver.step import step as compiled_step
 from sdfsim.physics.solver.survey import Touching, touching
 from sdfsim.sdf.baked_grid import BakedGrid, baked, inwards, unseen_wall
-from sdfsim.sdf.closed_forms import ClosedForm, PlaneSdf, Sdf
+from sdfsim.sdf.closed_forms import ClosedForm, PlaneSdf
+from sdfsim.sdf.sdf import Sdf
 from sdfsim.shape.convex_pieces import ConvexPiece, pieces_of
 from sdfsim.shape.surface_nodes import Surface, contact_surface
 

@@ -9,9 +9,10 @@ import numpy as np
 
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, normal_frame, sample_surface
-from sdfsim.sdf.closed_forms import GridSdf, Sdf
 from sdfsim.sdf.far_field import BOX
+from sdfsim.sdf.grid import GridSdf
 from sdfsim.sdf.reference import DistanceOracle
+from sdfsim.sdf.sdf import Sdf
 
 # Lengths are fractions of the shape's largest extent. EXACT is what good fits of clean meshes reach.
 EXACT = {

@@ -1,4 +1,4 @@
-"""Mesh -> SDF network: recipes, the points a fit learns from, the training loop, and a certificate at its end."""
+"""Exact distances -> SDF network: recipes, the points a fit learns from, the training loop."""
 
 from __future__ import annotations
 
@@ -7,23 +7,20 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
 
 from sdfsim.base.errors import SdfsimError
-from sdfsim.base.parallel import Progress, choose_threads, silent
-from sdfsim.geometry.mass import mass_properties, mass_properties_of_sdf
-from sdfsim.geometry.mesh import Mesh, clean, is_closed, normal_frame, sample_surface
-from sdfsim.geometry.solidify import solidify
-from sdfsim.sdf.closed_forms import Sdf
+from sdfsim.base.parallel import Progress, choose_threads
+from sdfsim.geometry.mesh import normal_frame, sample_surface
 from sdfsim.sdf.far_field import BOX
 from sdfsim.sdf.fit.certificate import SIGN_FROM, certify
+from sdfsim.sdf.fit.soap import Soap
 from sdfsim.sdf.mlp import Activation, MlpSdf, Tape, value_and_gradient
-from sdfsim.sdf.reference import DistanceOracle, MeshDistance, PiecesDistance
-from sdfsim.shape.shape import Shape
-from sdfsim.shape.surface_nodes import DEFAULT_COUNT, edge_nodes, hull_nodes, sample_nodes, surface_nodes, thin
+from sdfsim.sdf.reference import DistanceOracle
+from sdfsim.sdf.sdf import Sdf
 
 Recipe = Literal["quick", "default", "paper"]
 # Weights and biases per layer, [out, in] and [out].
@@ -45,10 +42,6 @@ WARMUP = 50  # updates
 CHECK_EVERY = 100  # updates
 # Seconds that the certificate takes of a budget, beside a tenth.
 RESERVE = 2.0
-# Of the nodes of convex pieces: the pieces' vertices are at most this part, with points on their edges at most that.
-OWN_SHARE, EDGE_SHARE = 0.6, 0.85
-# Between points on the edges of convex pieces, relative to the size of the whole.
-EDGE_SPACING = 0.06
 
 
 @dataclass(frozen=True)
@@ -103,76 +96,7 @@ PLANS = {
 }
 
 
-def fit_mesh(
-    mesh: Mesh,
-    *,
-    name: str,
-    recipe: Recipe = "default",
-    budget: float | None = None,
-    seed: int = 0,
-    cap: bool = False,
-    thicken: float | None = None,
-    file: str = "",
-    on_progress: Progress = silent,
-    device: torch.device | str = "cpu",
-) -> Shape:
-    """Fit the compact SDF network to the solid that a triangle mesh in metres bounds, see `solidify`.
-
-    The result depends on the mesh, the recipe (see `PLANS`) and the seed only (up to rounding, which the number of
-    threads and the device change), unless the budget in s cuts the training short. The shape's `certificate` tells the
-    errors and whether it is usable (`passed`), `source["notes"]` what was done to the mesh. Raises SdfsimError, which
-    calls the mesh `file` (or else `name`), where it cannot be used or bounds no solid.
-    """
-    solid = solidify(mesh, name=file or name, cap=cap, thicken=thicken)
-
-    def pick(sdf: Sdf) -> np.ndarray:
-        return surface_nodes(sdf, solid.surface, DEFAULT_COUNT)
-
-    sdf, points, certificate = _fit(MeshDistance(solid), recipe, budget, seed, pick, on_progress, device)
-    source: dict[str, Any] = {"kind": "mesh", "recipe": recipe, "fit_version": FIT_VERSION}
-    source |= {"notes": list(solid.notes)} if solid.notes else {}
-    return Shape(name, solid.surface, sdf, points, *solid.mass_properties(), certificate, source)
-
-
-def fit_pieces(
-    pieces: list[Mesh],
-    *,
-    name: str,
-    display: Mesh | None = None,
-    nodes: int = DEFAULT_COUNT,
-) -> Shape:
-    """Fit the compact SDF network to the union of convex pieces: the body that a rigid-body engine collides.
-
-    At most `nodes` are the pieces' own vertices first (without repetitions and those inside another piece), because
-    contact with a flat floor is exact only there; then points along their sharp edges, then all over the surface. Mass
-    properties are those of the union, and so is the mesh to show unless `display` is given.
-    """
-    oracle = PiecesDistance(pieces)
-    size = float(np.ptp(oracle.bounds, axis=0).max())
-
-    def bare(points: np.ndarray) -> np.ndarray:
-        _, first = np.unique(np.round(points / (1e-4 * size)), axis=0, return_index=True)
-        points = points[np.sort(first)]
-        # Measured from the boundary of the union: a point on the seam of two pieces is deep in neither.
-        return points[oracle(points).distance >= -1e-3 * size]
-
-    vertices = bare(np.concatenate([piece.vertices for piece in pieces]))
-    edges = bare(np.concatenate([edge_nodes(piece.vertices, EDGE_SPACING * size) for piece in pieces]))
-
-    def pick(sdf: Sdf) -> np.ndarray:
-        own = hull_nodes(vertices, round(OWN_SHARE * nodes))
-        return thin(sample_nodes(sdf), nodes, keep=thin(edges, round(EDGE_SHARE * nodes), keep=own))
-
-    sdf, points, certificate = _fit(oracle, "default", None, 0, pick, silent, "cpu")
-    single = len(pieces) == 1 and is_closed(pieces[0])
-    volume, com, inertia = mass_properties(pieces[0]) if single else mass_properties_of_sdf(oracle)
-    mesh = display if display is not None else clean(oracle.surface, name=name)
-    source = {"kind": "pieces", "recipe": "default", "fit_version": FIT_VERSION}
-    hulls = tuple(piece.vertices for piece in pieces)
-    return Shape(name, mesh, sdf, points, volume, com, inertia, certificate, source, hulls)
-
-
-def _fit(
+def fit_sdf(
     oracle: DistanceOracle,
     recipe: Recipe,
     budget: float | None,
@@ -181,7 +105,8 @@ def _fit(
     on_progress: Progress,
     device: torch.device | str,
 ) -> tuple[MlpSdf, np.ndarray, dict]:
-    """The network, nodes [K, 3] m as `pick` takes them from it, and the certificate."""
+    """Fit a network to the distances of a solid within `budget` s (None: no limit). Returns it, the nodes [K, 3] m that
+    `pick` takes from it, and its certificate. Raises SdfsimError for a budget that is not positive."""
     if budget is not None and not budget > 0:
         raise SdfsimError(f"the budget of a fit must be > 0 seconds (got {budget})")
     started, plan = time.monotonic(), PLANS[recipe]
@@ -380,77 +305,3 @@ def _layers(parameters: list[torch.Tensor], activation: Activation) -> Layers:
 def _split(parts: list[torch.Tensor]) -> Layers:
     first, hidden, last, biases, end = parts
     return [first[0], *hidden.unbind(), last[0]], [*biases[..., 0].unbind(), end[0, ..., 0]]
-
-
-class Soap:
-    """SOAP (Vyas et al., "SOAP: Improving and Stabilizing Shampoo using Adam", 2024) on a small network.
-
-    For each matrix gradient G of `parameters`, each [L, rows, columns] of L equal layers, it tracks averages of G G^T
-    and G^T G, and runs Adam in the basis of their eigenvectors, which one step of orthogonal iteration follows every
-    few updates. The first step only sets up the bases. A dimension of size 1 is not rotated.
-    """
-
-    MOMENTUM, SECOND, LEAST = 0.95, 0.95, 1e-10
-    PRECONDITIONER = 0.95
-    REFRESH = 10
-
-    def __init__(self, parameters: list[torch.Tensor], lr: float) -> None:
-        self.parameters = parameters
-        self.lr = lr
-        self.count = 0
-        self.state = [self._begin(parameter) for parameter in parameters]
-
-    def _begin(self, parameter: torch.Tensor) -> dict[str, torch.Tensor]:
-        state = {"mean": torch.zeros_like(parameter), "square": torch.zeros_like(parameter)}
-        for side, size in (("left", parameter.shape[-2]), ("right", parameter.shape[-1])):
-            if size > 1:
-                eye = torch.eye(size, dtype=parameter.dtype, device=parameter.device)
-                state[f"{side}_average"] = torch.zeros_like(eye).repeat(len(parameter), 1, 1)
-                state[f"{side}_basis"] = eye.repeat(len(parameter), 1, 1)
-        return state
-
-    @torch.no_grad()
-    def step(self, factor: float) -> None:
-        """Apply the gradients; `factor` is of the learning-rate schedule."""
-        self.count += 1
-        for parameter, state in zip(self.parameters, self.state, strict=True):
-            gradient = parameter.grad
-            assert gradient is not None
-            if self.count > 1:
-                parameter -= self.lr * factor * self._direction(gradient, state)
-            self._follow(gradient, state)
-
-    def _direction(self, gradient: torch.Tensor, state: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Adam's update in the rotated basis, turned back."""
-        state["mean"].lerp_(gradient, 1 - self.MOMENTUM)
-        mean, rotated = _rotate(state["mean"], state), _rotate(gradient, state)
-        state["square"].mul_(self.SECOND).addcmul_(rotated, rotated, value=1 - self.SECOND)
-        updates = self.count - 1
-        mean = mean / (1 - self.MOMENTUM**updates)
-        root = (state["square"] / (1 - self.SECOND**updates)).sqrt_().add_(self.LEAST)
-        direction = mean.div_(root)
-        if "left_basis" in state:
-            direction = state["left_basis"] @ direction
-        return direction @ state["right_basis"].mT if "right_basis" in state else direction
-
-    def _follow(self, gradient: torch.Tensor, state: dict[str, torch.Tensor]) -> None:
-        """Update the averages of G G^T and G^T G, and now and then their eigenvectors."""
-        for side, product in (("left", gradient @ gradient.mT), ("right", gradient.mT @ gradient)):
-            average = state.get(f"{side}_average")
-            if average is None:
-                continue
-            if self.count == 1:
-                average.copy_(product)
-                scale = product.diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(1e-30)[..., None, None]
-                ridge = 1e-6 * torch.eye(product.shape[-1], dtype=product.dtype, device=product.device)
-                state[f"{side}_basis"] = torch.linalg.eigh(product / scale + ridge)[1].flip(-1)
-            else:
-                average.lerp_(product, 1 - self.PRECONDITIONER)
-                if self.count % self.REFRESH == 0:
-                    state[f"{side}_basis"] = torch.linalg.qr(average @ state[f"{side}_basis"])[0]
-
-
-def _rotate(matrix: torch.Tensor, state: dict[str, torch.Tensor]) -> torch.Tensor:
-    if "left_basis" in state:
-        matrix = state["left_basis"].mT @ matrix
-    return matrix @ state["right_basis"] if "right_basis" in state else matrix

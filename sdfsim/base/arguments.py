@@ -48,7 +48,7 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
     def run(*, as_json: bool, device: str, verbose: bool, **options: Any) -> None:
         with Session(as_json=as_json, verbose=verbose) as session:
             if device == "cuda":
-                from sdfsim.simulate.simulator import pick_device
+                from sdfsim.base.devices import pick_device
 
                 pick_device(device)
             work(session, **options, **({"device": device} if "device" in given else {}))
