@@ -37,8 +37,8 @@ from sdfsim.evaluation.harness import markdown, number
 from sdfsim.learned.model import load_model
 from sdfsim.physics.solver.prepare import Compiled, compiled_rules, taken_up
 from sdfsim.physics.units import scene_units
+from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
-from sdfsim.scene.scene_file import load_scene
 from sdfsim.simulate.simulator import Simulator
 
 RATCHET = Path(__file__).with_name("contact_step_ratchet.json")

@@ -24,8 +24,8 @@ from benchmarks.results import ROOT, script, write_section
 from sdfsim.evaluation.engines import ours
 from sdfsim.evaluation.harness import markdown, number, one_thread
 from sdfsim.physics.bodies import largest_extent
+from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
-from sdfsim.scene.scene_file import load_scene
 from sdfsim.simulate.simulator import Simulator
 
 SCENES = ("pile", "tower", "spheres_in_bowl")

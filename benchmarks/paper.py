@@ -41,7 +41,7 @@ from sdfsim.evaluation.harness import Job, Panel, cells, draw, line, markdown, m
 from sdfsim.evaluation.metrics import errors
 from sdfsim.geometry.mesh import convex_hull
 from sdfsim.learned.model import SOLVER, Model, load_model, new_network
-from sdfsim.scene.scene_file import load_scene
+from sdfsim.scene.load import load_scene
 from sdfsim.sdf.fit.train import PLANS
 from sdfsim.sdf.grid import sample_grid
 from sdfsim.shape.make import fit_pieces

@@ -45,8 +45,8 @@ from sdfsim.geometry.mesh import Mesh, clean, load_pieces, wavefront
 from sdfsim.learned.model import load_model
 from sdfsim.physics.bodies import largest_extent
 from sdfsim.physics.units import scene_units
+from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Effects, Scene
-from sdfsim.scene.scene_file import load_scene
 from sdfsim.sdf.closed_forms import BoxSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.make import analytic_shape, mesh_shape, shape_from_mesh
 from sdfsim.shape.shape import own_pieces

@@ -42,8 +42,8 @@ from sdfsim.evaluation.penetration import depths
 from sdfsim.learned.model import load_model
 from sdfsim.physics.rollout import Rollout
 from sdfsim.physics.units import scene_units
+from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
-from sdfsim.scene.scene_file import load_scene
 from sdfsim.simulate.simulator import SimulationError, Simulator, join
 
 BOWLS = (1, 16, 64, 256, 512)

@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 
 from sdfsim.base.errors import SdfsimError, nearest
-from sdfsim.scene.scene_file import UNITS
+from sdfsim.scene.schema import UNITS
 
 CRC = "CRC Handbook of Chemistry and Physics"
 TOOLBOX = "Engineering ToolBox"

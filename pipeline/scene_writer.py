@@ -19,8 +19,8 @@ from pipeline.progress import Progress, quiet, share_of
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError, nearest
 from sdfsim.base.files import write_text
 from sdfsim.geometry.mesh import Mesh, joined, load_mesh, read_glb
+from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
-from sdfsim.scene.scene_file import load_scene
 
 SCENERY_SHARE = 2  # Of a budget the scenery gets as much as this many bodies: it has more to it.
 SIDE = 0.06  # of the dropped slab, as a share of the scenery's widest side

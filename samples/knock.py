@@ -22,7 +22,7 @@ from pipeline.mesh.meshing import SCENERY, rounded
 from pipeline.mesh.visibility import Above
 from sdfsim.base.errors import run_main
 from sdfsim.base.files import write_text
-from sdfsim.scene.scene_file import load_scene
+from sdfsim.scene.load import load_scene
 from sdfsim.shape.shape import Shape, load_shape
 
 GRAVITY = 9.81  # m/s^2

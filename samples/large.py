@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim.base.errors import run_main
 from sdfsim.base.files import write_text
-from sdfsim.scene.scene_file import load_scene
+from sdfsim.scene.load import load_scene
 from sdfsim.shape.make import analytic_shape, shape_from_primitive
 from sdfsim.shape.shape import Shape, load_shape, scaled
 from sdfsim.shape.surface_nodes import sample_nodes, thin

@@ -10,7 +10,7 @@ from PIL import Image
 
 from sdfsim.apps.render import render
 from sdfsim.apps.run import ending_lines, summary
-from sdfsim.scene.scene_file import load_scene
+from sdfsim.scene.load import load_scene
 from sdfsim.simulate.simulator import Simulator
 
 ROOT = Path(__file__).resolve().parents[1]

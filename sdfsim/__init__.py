@@ -15,8 +15,8 @@ from sdfsim.base.version import __version__ as __version__
 if TYPE_CHECKING:
     from sdfsim.base.errors import SceneError, SdfsimError
     from sdfsim.physics.rollout import Rollout
-    from sdfsim.scene.builder import Scene
-    from sdfsim.scene.scene_file import load_scene
+    from sdfsim.scene.builder import SceneBuilder as Scene
+    from sdfsim.scene.load import load_scene
     from sdfsim.shape.shape import Shape, load_shape
     from sdfsim.simulate.simulator import Simulator
 
@@ -37,12 +37,13 @@ _HOME = {
     "SdfsimError": "sdfsim.base.errors",
     "Shape": "sdfsim.shape.shape",
     "Simulator": "sdfsim.simulate.simulator",
-    "load_scene": "sdfsim.scene.scene_file",
+    "load_scene": "sdfsim.scene.load",
     "load_shape": "sdfsim.shape.shape",
 }
+_THERE = {"Scene": "SceneBuilder"}  # names that differ there
 
 
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'sdfsim' has no attribute {name!r}")
-    return getattr(import_module(_HOME[name]), name)
+    return getattr(import_module(_HOME[name]), _THERE.get(name, name))

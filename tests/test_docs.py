@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sdfsim.scene.scene_file import load_scene
+from sdfsim.scene.load import load_scene
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [

@@ -30,10 +30,10 @@ from sdfsim.base.files import check_writable, write_bytes, write_text
 from sdfsim.base.parallel import StageProgress
 from sdfsim.geometry.gltf import Gltf, light
 from sdfsim.geometry.mesh import Mesh, convex_hull, wavefront
-from sdfsim.scene import builder
+from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.collision_filter import contact_groups
+from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Body, Scene
-from sdfsim.scene.scene_file import load_scene
 from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, ClosedForm, CylinderSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape, own_pieces
 
@@ -128,7 +128,7 @@ def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progres
     elif (source / RECORD_FILE).is_file():
         shape = load_shape(source)
         moves = "dynamic" if shape.volume > 0 else "static"
-        scene = builder.Scene().add(shape.name, asset=source, motion=moves).load(told)
+        scene = SceneBuilder().add(shape.name, asset=source, motion=moves).load(told)
     elif source.suffix.lower() in (".yaml", ".yml"):
         scene = load_scene(source, told, allow_outside=allow_outside)
     else:

@@ -13,7 +13,7 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import check_writable, locked, read_json, visible
 from sdfsim.base.parallel import Progress, parallel, silent
 from sdfsim.geometry.mesh import MESH_SUFFIXES, load_mesh
-from sdfsim.scene.scene_file import UNITS
+from sdfsim.scene.schema import UNITS
 from sdfsim.sdf.baked_grid import baked, grid_certificate, unseen_wall
 from sdfsim.sdf.fit.train import FIT_VERSION, Recipe
 from sdfsim.shape.make import fit_mesh, remarks

@@ -23,8 +23,8 @@ from sdfsim.learned.model import SOLVER, load_model
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import State, from_scene
 from sdfsim.physics.units import scene_units
+from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
-from sdfsim.scene.scene_file import load_scene
 from sdfsim.simulate.run_memory import Memory
 from sdfsim.simulate.step import StepOptions, step
 

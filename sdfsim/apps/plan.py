@@ -15,8 +15,8 @@ from sdfsim.base.devices import pick_device
 from sdfsim.base.parallel import StageProgress
 from sdfsim.learned.model import load_model
 from sdfsim.learned.training_ranges import constant_in_training
+from sdfsim.scene.load import load_scene
 from sdfsim.scene.plan import plan
-from sdfsim.scene.scene_file import load_scene
 from sdfsim.simulate.simulator import Simulator
 
 TRIAL_STEPS = 5

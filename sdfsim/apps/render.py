@@ -21,7 +21,7 @@ from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.scene import Scene
 
 if TYPE_CHECKING:
-    from sdfsim.scene import builder
+    from sdfsim.scene.builder import SceneBuilder
 
 Place = Sequence[float] | np.ndarray
 _Model = tuple[Mesh, np.ndarray]  # what is drawn of a body about its centre of mass, with normals [V, 3]
@@ -37,7 +37,7 @@ _GRID = np.stack(np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
 
 
 def render(
-    scene: Scene | builder.Scene, rollout: Rollout, out: Path | str, *, camera: Place | None = None,
+    scene: Scene | SceneBuilder, rollout: Rollout, out: Path | str, *, camera: Place | None = None,
     look_at: Place | None = None, at: float | None = None, on_progress: Progress = silent,
 ) -> None:  # fmt: skip
     """Write a movie (.mp4, H.264, as long as the run) or a picture (.png, `at` s, by default the end) of a run.

@@ -37,8 +37,8 @@ from sdfsim.physics.bodies import State, Touch, largest_extent
 from sdfsim.physics.instruments import LEAST, PART, judged
 from sdfsim.physics.rollout import Rollout
 from sdfsim.physics.units import EARTH
+from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene, fingerprints
-from sdfsim.scene.scene_file import load_scene
 from sdfsim.simulate.run_memory import COUNTS, PHASES
 from sdfsim.simulate.simulator import SimulationError, Simulator, check_seconds, join
 

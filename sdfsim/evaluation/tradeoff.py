@@ -33,8 +33,8 @@ from sdfsim.evaluation.penetration import Solid, exact_solids, penetration
 from sdfsim.learned.contact_graph import SUBSTEPS
 from sdfsim.learned.model import SOLVER, Model, load_model, model_names
 from sdfsim.physics.units import scene_units
+from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
-from sdfsim.scene.scene_file import load_scene
 from sdfsim.sdf.closed_forms import ClosedForm
 from sdfsim.sdf.grid import GridSdf, sample_grid
 from sdfsim.sdf.mesh_sdf import MeshSdf

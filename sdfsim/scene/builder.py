@@ -13,15 +13,16 @@ import yaml
 from sdfsim.base.errors import SceneError, nearest
 from sdfsim.base.files import write_text
 from sdfsim.base.parallel import Progress, silent
-from sdfsim.scene import scene
-from sdfsim.scene.scene_file import VERSION, BodyTable, SceneTable, ShapeTable, load_scene
+from sdfsim.scene.load import load_scene
+from sdfsim.scene.scene import Scene
+from sdfsim.scene.schema import VERSION, BodyTable, SceneTable, ShapeTable
 
 _OF_SHAPE = [key for key in ShapeTable.model_fields if key not in BodyTable.model_fields]
 _PATHS = ("asset", "mesh")
 _HERE = "<scene>"  # what messages call a scene that is in no file
 
 
-class Scene:
+class SceneBuilder:
     """A scene that is being written. `print` shows it as the file that `save` writes. Settings are keys of the file
     itself: gravity, duration, seed, model, effects, limits; raises SceneError for no such key."""
 
@@ -32,7 +33,7 @@ class Scene:
         self._shapes: dict[str, dict[str, Any]] = {}
         self._bodies: list[dict[str, Any]] = []
 
-    def add(self, name: str, **keys: Any) -> Scene:
+    def add(self, name: str, **keys: Any) -> SceneBuilder:
         """Add a body, or many copies of one, and return the scene.
 
         Keys are of the body and of its shape, which has the same name, as docs/scene.md has them, such as
@@ -49,7 +50,7 @@ class Scene:
         self._bodies.append(_plain({"name": name, **body}))
         return self
 
-    def load(self, on_progress: Progress = silent) -> scene.Scene:
+    def load(self, on_progress: Progress = silent) -> Scene:
         """What a simulator takes; `Simulator` calls it by itself. Shapes are loaded or fitted as `load_scene` does.
         Raises SceneError with one line for every fault, with the line that `print` shows it in."""
         found = load_scene(Path(_HERE), on_progress, allow_outside=True, text=str(self))

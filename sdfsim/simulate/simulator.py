@@ -31,7 +31,7 @@ from sdfsim.simulate.step import FreeFlight, StepOptions, step
 
 if TYPE_CHECKING:
     from sdfsim.learned.near import Contacts, Pairs
-    from sdfsim.scene import builder
+    from sdfsim.scene.builder import SceneBuilder
 
 BYTES_AN_EDGE = 4096  # of the network, while it is worked on
 Variant = Mapping[str, Mapping[str, Any]]  # body -> field -> value
@@ -78,7 +78,7 @@ class Simulator:
 
     def __init__(
         self,
-        scene: Scene | builder.Scene,
+        scene: Scene | SceneBuilder,
         model: str | Path | Model | None = None,
         device: str = "cpu",
         seed: int | None = None,

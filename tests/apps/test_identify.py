@@ -13,7 +13,7 @@ import yaml
 
 from sdfsim.apps.identify import COLUMNS, Windows, identify, load_recording
 from sdfsim.base.errors import SdfsimError
-from sdfsim.scene.scene_file import load_scene
+from sdfsim.scene.load import load_scene
 from sdfsim.simulate.simulator import Simulator
 
 FLOOR = {"friction": 0.6, "restitution": 0.9}

@@ -17,7 +17,7 @@ from sdfsim.evaluation.stress import TEACHER, by_engine
 from sdfsim.geometry.mesh import load_pieces
 from sdfsim.learned.model import load_model
 from sdfsim.physics.units import scene_units
-from sdfsim.scene.scene_file import load_scene
+from sdfsim.scene.load import load_scene
 from sdfsim.shape.make import analytic_shape, shape_from_primitive
 
 SCENE = """

@@ -44,7 +44,7 @@ def test_networks_and_shapes_are_what_a_setting_says(cases):
 
 
 def test_a_scene_is_judged_by_the_teacher_in_the_model_s_units(tmp_path):
-    from sdfsim.scene.scene_file import load_scene
+    from sdfsim.scene.load import load_scene
 
     (tmp_path / "scene.yaml").write_text(SCENE)
     cases = cases_of_scene(load_scene(tmp_path / "scene.yaml"), "small", tmp_path / "engine", quick=True)

@@ -16,7 +16,7 @@ from pipeline.mesh.visibility import Above
 from pipeline.scene_writer import LEVEL, choose_slab, fit_parts, scene_text, write_scene
 from sdfsim.base.files import write_json
 from sdfsim.geometry.mesh import Mesh, write_ply
-from sdfsim.scene.scene_file import load_scene
+from sdfsim.scene.load import load_scene
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import Shape
 from tests.pipeline.test_surface import cube, scenery

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from sdfsim.scene.scene_file import load_scene
+from sdfsim.scene.load import load_scene
 from sdfsim.shape.make import analytic_shape
 
 SCRIPT = Path(__file__).resolve().parents[2] / "samples" / "knock.py"

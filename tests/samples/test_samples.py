@@ -8,7 +8,7 @@ import pytest
 
 from sdfsim.apps.run import summary
 from sdfsim.physics.rollout import Rollout
-from sdfsim.scene.scene_file import load_scene, read_scene
+from sdfsim.scene.load import load_scene, read_scene
 from sdfsim.simulate.simulator import Simulator
 
 SAMPLES = Path(__file__).parents[2] / "samples"

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim.geometry.mesh import Mesh, write_ply
 from sdfsim.geometry.primitives import box
-from sdfsim.scene.scene_file import reference
+from sdfsim.scene.schema import reference
 from tests.scene.conftest import HEAD, problems_of
 
 

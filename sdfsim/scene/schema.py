@@ -1,22 +1,14 @@
-"""scene.yaml: its keys (pydantic models), its YAML with line numbers, and `load_scene`.
-
-`python -m sdfsim.scene.scene_file` writes docs/scene.md, the reference of every key.
-"""
+"""The keys of scene.yaml as pydantic models. `python -m sdfsim.scene.schema` writes docs/scene.md, their reference."""
 
 from __future__ import annotations
 
-import errno
 import itertools
 import math
-import re
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import yaml
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -30,11 +22,10 @@ from pydantic import (
 from pydantic import model_validator as validator_of_model
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from sdfsim.base.errors import SceneError, SdfsimError, nearest
-from sdfsim.base.parallel import Progress, silent
+from sdfsim.base.errors import nearest
 from sdfsim.geometry.primitives import PRIMITIVES
-from sdfsim.scene.scene import Body, Effects, Limits, Motion, Scene, Switch, Waypoints
-from sdfsim.shape.make import analytic_shape, shape_from_mesh, shape_from_primitive
+from sdfsim.scene.document import NOTHING, Loc, Numeral
+from sdfsim.scene.scene import Motion, Switch
 from sdfsim.shape.shape import (
     DEFAULT_RESOLUTION,
     MESH_FILE,
@@ -42,11 +33,6 @@ from sdfsim.shape.shape import (
     SKIN_FILE,
     WEIGHTS_FILE,
     SdfKind,
-    Shape,
-    load_shape,
-    with_nodes,
-    with_sdf,
-    with_wall,
 )
 
 VERSION = 1
@@ -54,24 +40,10 @@ UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 DEFAULT_DURATION = 4.0  # s
 DEFAULT_GRAVITY = (0.0, 0.0, -9.81)  # m/s^2
 MOST_COPIES = 100_000
-MOST_BYTES = 16 * 2**20  # of a file
-MOST_VALUES = 500_000  # of a file, each as often as an alias repeats it
 LARGEST = 1e12  # of any number: beyond it powers and products of what is legal are no longer finite
 _SHOWN = 40  # letters of a value in a message
-_LEVELS = 8  # no key lies deeper
-_NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
-_NULL = ("", "~", "null", "Null", "NULL")
-_PLAIN_TAGS = {f"tag:yaml.org,2002:{t}" for t in ("str int float bool null map seq timestamp merge value".split())}
 
-Loc = tuple[str | int, ...]  # keys and indices that lead to a value
 Fault = tuple[Loc, str]  # where below a table, and what is wrong there
-
-
-class Numeral(str):
-    """A number without quotes, as the file writes it. YAML 1.1 guesses: `1:30` would become 90, and `1e-3` a text."""
-
-
-NOTHING = object()  # what a key has that is followed by nothing, `~` or `null`
 
 
 def _shown(value: Any) -> str:
@@ -237,7 +209,7 @@ class EffectsTable(Table):
     """Which effects to compute; `auto` is on where it can change the motion, as `sdfsim plan` tells."""
 
     contact: Switch = key("bodies touch", "auto")
-    friction: Switch = key("contacts hold sideways", "auto")
+    friction: Switch = key("contacts have friction", "auto")
     restitution: Switch = key("contacts rebound", "auto")
     rotation: Switch = key("bodies turn", "auto")
     sleep: Switch = key("what rests is frozen until something disturbs it", "auto")
@@ -282,8 +254,8 @@ class PlaneShape(Table):
 
 
 _KINDS = ("asset", "mesh", "primitive", "sphere", "capsule", "cylinder", "box", "plane")
-_FITTED = ("mesh", "primitive")  # made on first use, which may take a minute
-_WITH_SDF = ("asset", *_FITTED)  # the others have an exact SDF of their own
+FITTED = ("mesh", "primitive")  # made on first use, which may take a minute
+_WITH_SDF = ("asset", *FITTED)  # the others have an exact SDF of their own
 
 
 class ShapeTable(Table):
@@ -540,220 +512,6 @@ class SceneTable(Table):
         return body.motion or ("static" if self.flat(body) else "dynamic")
 
 
-class Document:
-    """The YAML of a file, and the faults found in it, each with its line.
-
-    `data` are dicts, lists, texts and `Numeral`s; `NOTHING` where a key has no value. Raises SceneError where the file
-    is missing, too large, not UTF-8, not YAML (with the line), or empty, or its aliases multiply it.
-    """
-
-    def __init__(self, path: Path, text: str | None = None) -> None:
-        self._path = path
-        self._line: dict[Loc, int] = {}  # of every key, and of every entry of a list
-        self._found: dict[tuple[int, str], None] = {}  # in the order of the finding, each once
-        root = _compose(path, _text_of(path) if text is None else text)
-        self.data = self._read(root, (), root.start_mark.line + 1)
-
-    def wrong(self, loc: Loc, text: str, line: int | None = None) -> None:
-        """Note a fault of the value under `loc`, in its line or another."""
-        if line is None:
-            line = next(self._line[loc[:depth]] for depth in range(len(loc), -1, -1) if loc[:depth] in self._line)
-        where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc)[1:200]
-        self._found[line, f"{self._path}:{line}: {where}: {text}" if loc else f"{self._path}:{line}: {text}"] = None
-
-    def check(self) -> None:
-        """Raise SceneError with every fault, in the order of the file, if there is any."""
-        if self._found:
-            raise SceneError([text for _, text in sorted(self._found, key=lambda entry: entry[0])])
-
-    def _read(self, node: yaml.Node, loc: Loc, line: int) -> Any:
-        self._line[loc] = line
-        if len(self._line) > MOST_VALUES:
-            raise SceneError([f"{self._path}:1: with its aliases it has more than {MOST_VALUES} values"])
-        if node.tag not in _PLAIN_TAGS:
-            self.wrong(loc, f"must be plain YAML without tags (got {node.tag!r})")
-        if len(loc) > _LEVELS:
-            return "..."
-        if isinstance(node, yaml.SequenceNode):
-            return [self._read(child, (*loc, i), child.start_mark.line + 1) for i, child in enumerate(node.value)]
-        if isinstance(node, yaml.ScalarNode):
-            if node.style is not None:
-                return node.value
-            return NOTHING if node.value in _NULL else (Numeral if _NUMBER.fullmatch(node.value) else str)(node.value)
-        found: dict[str, Any] = {}
-        for key_node, child in node.value:
-            key, line = key_node.value, key_node.start_mark.line + 1
-            if not isinstance(key_node, yaml.ScalarNode) or key_node.tag not in _PLAIN_TAGS:
-                self.wrong(loc, "a key must be a text without tags", line)
-            elif key in found:
-                self.wrong((*loc, key), f"the key appears twice (first on line {self._line[*loc, key]})", line)
-            else:
-                found[key] = self._read(child, (*loc, key), line)
-        return found
-
-
-def _text_of(path: Path) -> str:
-    try:
-        if path.exists() and not path.is_dir() and not path.is_file():
-            raise OSError(errno.EINVAL, "not a file")  # a device or a pipe may have no end
-        if path.is_file() and path.stat().st_size > MOST_BYTES:
-            raise SceneError([f"{path}: too large for a scene (at most {MOST_BYTES // 2**20} MiB)"])
-        return path.read_bytes().decode("utf-8")
-    except OSError as error:
-        why = "no such file" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
-        raise SceneError([f"{path}: {why}"], "give the path of a scene.yaml") from error
-    except UnicodeDecodeError as error:
-        line = error.object[: error.start].count(b"\n") + 1
-        raise SceneError([f"{path}:{line}: not a text in UTF-8"], "a scene is a YAML text file") from error
-
-
-def _compose(path: Path, text: str) -> yaml.Node:
-    try:
-        root = yaml.compose(text, Loader=yaml.SafeLoader)
-    except (yaml.YAMLError, RecursionError) as error:
-        mark, place = getattr(error, "problem_mark", None), getattr(error, "position", None)
-        line = mark.line + 1 if mark else text[:place].count("\n") + 1 if place is not None else 1
-        why = next((told for name in ("problem", "context", "reason") if (told := getattr(error, name, None))), "")
-        raise SceneError([f"{path}:{line}: not valid YAML: {why or type(error).__name__}"]) from error
-    if root is None:
-        raise SceneError([f"{path}:1: the file is empty"], "a scene needs at least version and bodies")
-    return root
-
-
-def read_scene(path: Path, *, allow_outside: bool = False, text: str | None = None) -> tuple[SceneTable, Document]:
-    """Read and check a scene file; nothing is loaded yet. Returns what it says, and its document, to tell of faults
-    that show only later. Raises SceneError with every fault found."""
-    document, context = Document(path, text), {"folder": path.parent, "allow_outside": allow_outside}
-    try:
-        table = SceneTable.model_validate(document.data, context=context)
-    except ValidationError as error:
-        for e in error.errors(include_url=False):
-            document.wrong(e["loc"], e["msg"])
-        document.check()
-        raise
-    document.check()
-    return table, document
-
-
-def load_scene(
-    path: Path | str, on_progress: Progress = silent, *, allow_outside: bool = False, text: str | None = None
-) -> Scene:
-    """Read a scene file, and load or fit the shapes that its bodies use; the scene is in SI units.
-
-    Paths inside the file are taken from its folder; unless `allow_outside`, they may not lead out of it. `text` is what
-    is in the file, where it is not written yet. Raises SceneError with one line `FILE:LINE: FIELD: what is wrong` for
-    every fault found.
-    """
-    path = Path(path)
-    table, document = read_scene(path, allow_outside=allow_outside, text=text)
-    shapes = _load_shapes(table, document, on_progress)
-    order = {key: i for i, key in enumerate(shapes)}
-    groups = {body.name: body.names() for body in table.bodies}
-    bodies: list[Body] = []
-    for i, entry in enumerate(table.bodies):
-        made = _body(entry, order[entry.shape], table.motion_of(entry), groups)
-        if made.motion == "dynamic":
-            made = replace(made, mass=_mass(entry, shapes[entry.shape], partial(document.wrong, ("bodies", i, "name"))))
-        for name, offset in zip(entry.names(), entry.offsets(), strict=True):
-            way = made.path and replace(made.path, position=made.path.position + offset)
-            bodies.append(replace(made, name=name, position=made.position + offset, path=way))
-    document.check()
-    loaded = [(of, shapes[key]) for key, of in table.shapes.items() if key in shapes]
-    fitted = [shape for of, shape in loaded if of.kind in _FITTED or of.sdf == "grid"]
-    return Scene(
-        shapes=tuple(shapes.values()),
-        bodies=tuple(bodies),
-        gravity=np.array(table.gravity),
-        duration=table.duration,
-        seed=table.seed,
-        model=table.model,
-        effects=Effects(**dict(table.effects)),
-        limits=Limits(**dict(table.limits)),
-        path=path,
-        missed=tuple(f"{s.name}: {s.certificate['reason']}" for s in fitted if s.certificate.get("reason")),
-        notes=tuple(f"{s.name}: {note}" for of, s in loaded if of.mesh for note in s.source.get("notes", [])),
-        caveats=tuple(f"{s.name}: {s.certificate['caveat']}" for s in fitted if s.certificate.get("caveat")),
-    )
-
-
-def _load_shapes(table: SceneTable, document: Document, on_progress: Progress) -> dict[str | None, Shape]:
-    """Every shape in use, in the order of first use; None is the plane that all bodies with a `plane` share. What must
-    be fitted or sampled waits until all else is known to be right: a fit takes a minute."""
-    used = dict.fromkeys(body.shape for body in table.bodies)
-    shapes: dict[str | None, Shape] = {None: analytic_shape("plane", name="plane")}
-    slow = {key: s.kind in _FITTED or s.sdf == "grid" for key, s in table.shapes.items()}
-    for now in (False, True):
-        todo = [key for key in used if key is not None and slow[key] is now]
-        for i, key in enumerate(todo):
-
-            def report(fraction: float, message: str, i: int = i, count: int = len(todo)) -> None:
-                on_progress((i + fraction) / count, message)
-
-            try:
-                shapes[key] = _load_shape(key, table.shapes[key], silent if on_progress is silent else report)
-            except SdfsimError as error:
-                hint = f" ({error.hint})" if error.hint else ""
-                document.wrong(("shapes", key, table.shapes[key].kind), error.message + hint)
-        document.check()
-    return {key: shapes[key] for key in used}
-
-
-def _load_shape(name: str, entry: ShapeTable, on_progress: Progress) -> Shape:
-    kind: Any = entry.kind
-    made: Any = {"sdf": entry.sdf or "mlp", "resolution": entry.resolution, "on_progress": on_progress, "name": name}
-    if entry.asset:
-        shape = load_shape(entry.asset)
-        shape = with_sdf(shape, entry.sdf, resolution=entry.resolution) if entry.sdf else shape
-    elif entry.mesh:
-        units = UNITS[entry.units] if "units" in entry.model_fields_set else None
-        made |= {"units": units, "cap": entry.cap == "on", "thicken": entry.thicken}
-        shape = shape_from_mesh(entry.mesh, **made)
-    elif entry.primitive:
-        shape = shape_from_primitive(entry.primitive.name, entry.primitive.size, **made)
-    else:
-        shape = analytic_shape(kind, name=name, **dict(getattr(entry, kind)))
-    shape = with_wall(shape, entry.wall) if entry.wall else shape
-    return with_nodes(shape, entry.nodes) if entry.nodes else shape
-
-
-def _body(entry: BodyTable, shape: int, motion: Motion, groups: dict[str, list[str]]) -> Body:
-    """The first copy, without its mass."""
-    partners, path = entry.collides_with, None
-    position, quat = (np.array(entry.position), entry.rotation()) if entry.plane is None else entry.plane.pose()
-    if entry.path:
-        times, places, turns = zip(*((p.time, p.position, p.rotation()) for p in entry.path), strict=True)
-        path = Waypoints(np.array(times), np.stack(places), np.stack(turns))
-        position, quat = path.position[0], path.quat_xyzw[0]
-    return Body(
-        name=entry.name,
-        shape=shape,
-        motion=motion,
-        scale=entry.scale,
-        position=position,
-        quat_xyzw=quat,
-        velocity=np.array(entry.velocity),
-        angular_velocity=np.array(entry.angular_velocity),
-        mass=0.0,
-        friction=entry.friction,
-        restitution=entry.restitution,
-        collides_with=None if partners is None else tuple(n for p in partners for n in groups.get(p, [p])),
-        path=path,
-    )
-
-
-def _mass(entry: BodyTable, shape: Shape, wrong: Callable[[str], None]) -> float:
-    """Of a dynamic body, kg; tells `wrong` why it cannot move, if so."""
-    volume = shape.volume * entry.scale**3
-    mass = entry.density * volume if entry.mass is None else entry.mass
-    if not (np.isfinite(volume) and volume > 0):
-        wrong(f"cannot move: its shape has a volume of {volume:g} m^3; close it, or make it static")
-    elif not (np.isfinite(mass) and mass > 0):
-        wrong(f"has no usable mass: density {entry.density:g} kg/m^3 times a volume of {volume:g} m^3; give mass in kg")
-    elif not len(shape.nodes):
-        wrong("cannot move: its shape has no surface nodes to touch others with; make it static")
-    return mass
-
-
 _SECTIONS: dict[str, type[Table]] = {
     "The file": SceneTable,
     "effects": EffectsTable,
@@ -777,7 +535,7 @@ def reference() -> str:
         "# Every key of scene.yaml",
         "",
         "Lengths are in metres, z is up. Unknown keys, keys that appear twice, NaN and infinity are refused.",
-        "`python -m sdfsim.scene.scene_file > docs/scene.md` writes this page.",
+        "`python -m sdfsim.scene.schema > docs/scene.md` writes this page.",
     ]
     for title, table in _SECTIONS.items():
         schema = table.model_json_schema().get("properties", {})
