@@ -42,7 +42,7 @@ from sdfsim.evaluation.metrics import errors
 from sdfsim.geometry.mesh import convex_hull
 from sdfsim.learned.model import SOLVER, Model, load_model, new_network
 from sdfsim.scene.load import load_scene
-from sdfsim.sdf.fit.train import PLANS
+from sdfsim.sdf.fit.train import RECIPES
 from sdfsim.sdf.grid import sample_grid
 from sdfsim.shape.make import fit_pieces
 from sdfsim.shape.shape import Shape, load_shape
@@ -255,11 +255,11 @@ def rolled_out(data: Path, width: int | None, home: Path) -> dict[str, Any]:
 
 def refitted(shape: Shape, width: int, folder: Path) -> Shape:
     """The shape known by a network of so many hidden units alone, with its own nodes, fitted for a minute."""
-    usual = PLANS["default"]
+    usual = RECIPES["default"]
     if width == usual.width:
         return replace(shape, pieces=())
     if not (folder / "shape.json").exists():
-        with patch.dict(PLANS, default=replace(usual, width=width)):
+        with patch.dict(RECIPES, default=replace(usual, width=width)):
             fit_pieces([convex_hull(piece) for piece in shape.pieces], name=shape.name).save(folder)
     return replace(shape, pieces=(), sdf=load_shape(folder).sdf)
 

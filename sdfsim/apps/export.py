@@ -28,7 +28,7 @@ from sdfsim.apps.run import read_run
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import check_writable, write_bytes, write_text
 from sdfsim.base.parallel import StageProgress
-from sdfsim.geometry.gltf import Gltf, light
+from sdfsim.geometry.gltf import GltfWriter, light
 from sdfsim.geometry.mesh import Mesh, convex_hull, wavefront
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.collision_filter import contact_groups
@@ -244,7 +244,7 @@ def _missing(take: Take, *, motion: bool = False, textures: bool = False) -> lis
 
 
 def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
-    file = Gltf()
+    file = GltfWriter()
     # Bodies of one shape and colour share a mesh; of one shape they share its numbers.
     numbers: dict[int, tuple[dict[str, int], int]] = {}
     drawn: dict[str, int] = {}

@@ -29,7 +29,7 @@ from sdfsim.evaluation.evaluate import load_recorded, perturbed
 from sdfsim.evaluation.hard_cases import tossed
 from sdfsim.evaluation.harness import Job, Line, Panel, draw, front, machine, measure, number, one_thread, peak_memory
 from sdfsim.evaluation.metrics import energy_gain, errors
-from sdfsim.evaluation.penetration import Solid, exact_solids, penetration
+from sdfsim.evaluation.penetration import ExactSolid, exact_solids, penetration
 from sdfsim.learned.contact_graph import SUBSTEPS
 from sdfsim.learned.model import SOLVER, Model, load_model, model_names
 from sdfsim.physics.units import scene_units
@@ -79,7 +79,7 @@ class Cases:
     starts: list[Trajectory]  # with velocities at the instants of the positions: what ours start from
     shapes: dict[str, Shape]  # of every name in use, their origins at the centres of mass
     urdfs: dict[str, Path]  # the engines' files, by name; those that are not at hand are absent
-    solids: dict[str, Solid]  # the exact geometry, by name
+    solids: dict[str, ExactSolid]  # the exact geometry, by name
     floor: tuple[float, float]  # friction and restitution
     own_inertia: bool = False  # see `Start`
     by_teacher: bool = True  # whether the recordings are the teacher's; the solve then has its habits

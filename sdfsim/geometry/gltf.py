@@ -19,7 +19,7 @@ from urllib.parse import unquote
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sdfsim.geometry.mesh_files import Surface, looked_up, read_image, side_file, strip
+from sdfsim.geometry.mesh_files import FileMesh, looked_up, read_image, side_file, strip
 
 # What z up is to the y up of glTF: columns of a matrix [4, 4].
 _Y_UP = [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1]
@@ -39,7 +39,7 @@ SPARSE = 2**24  # rows of an accessor of which only some are in the file
 _OF_NODE = {"TRANSLATION": "translation", "ROTATION": "rotation", "SCALE": "scale"}  # instances -> nodes
 
 
-class Gltf:
+class GltfWriter:
     """A file in the making: nodes, meshes, materials and animations with keys as glTF has them. Nodes hang below one
     that turns z up to glTF's y up."""
 
@@ -125,11 +125,11 @@ def srgb(light: np.ndarray) -> np.ndarray:
     return np.round(255.0 * value).astype(np.uint8)
 
 
-def read_gltf(path: Path) -> Surface:
+def read_gltf(path: Path) -> FileMesh:
     """All triangles of the scene that a .gltf or .glb file shows, turned from glTF's y up to z up: the meshes of its
     nodes where these place them, with their colours. Raises ValueError where it is damaged, or needs an extension that
     is not read."""
-    file = _Gltf(path)
+    file = _GltfReader(path)
     parts, count = [], 0
     for node, matrix in file.placed():
         for primitive in file.header["meshes"][node["mesh"]]["primitives"]:
@@ -145,20 +145,20 @@ def read_gltf(path: Path) -> Surface:
                 faces = part.faces[:, ::-1] if mirrored else part.faces
                 parts.append(part._replace(vertices=vertices @ Z_UP.T, faces=faces))
     if not parts:
-        return Surface(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+        return FileMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     colors = None
     if any(part.colors is not None for part in parts):
         white = [np.full(part.vertices.shape, 255, np.uint8) if part.colors is None else part.colors for part in parts]
         colors = np.concatenate(white)
-    return Surface(
+    return FileMesh(
         np.concatenate([part.vertices for part in parts]),
         np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)]),
         colors,
     )
 
 
-class _Gltf:
+class _GltfReader:
     """A file that is read: its header, and its buffers as bytes. Raises ValueError where there is something wrong."""
 
     def __init__(self, path: Path) -> None:
@@ -274,7 +274,7 @@ class _Gltf:
         for row in zip(*columns.values(), strict=True):
             yield matrix @ _matrix({_OF_NODE[key]: value for key, value in zip(columns, row, strict=True)})
 
-    def part(self, primitive: dict[str, Any]) -> Surface | None:
+    def part(self, primitive: dict[str, Any]) -> FileMesh | None:
         """The triangles of a primitive in its own frame; None for points and lines."""
         mode = primitive.get("mode", TRIANGLES)
         if mode in (0, 1, 2, 3):
@@ -297,7 +297,7 @@ class _Gltf:
             faces = np.stack([np.broadcast_to(corners[:1], len(corners[2:])), corners[1:-1], corners[2:]], axis=1)
         else:
             raise ValueError(f"a primitive of mode {mode}, which glTF does not have")
-        return Surface(vertices, faces, self._colors(primitive, attributes, len(vertices)))
+        return FileMesh(vertices, faces, self._colors(primitive, attributes, len(vertices)))
 
     def _colors(self, primitive: dict[str, Any], attributes: dict[str, int], count: int) -> np.ndarray | None:
         """[V, 3] uint8: texture, colour of the material and those of the vertices, multiplied as light."""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from sdfsim.base.errors import SdfsimError
-from sdfsim.geometry.gltf import Gltf, read_gltf
+from sdfsim.geometry.gltf import GltfWriter, read_gltf
 from sdfsim.geometry.mesh_files import (
     TEXTURES,
     averaged,
@@ -191,7 +191,7 @@ def write_glb(meshes: dict[str, Mesh]) -> bytes:
 
     Vertices become single precision, textures JPEG. They hold the light of the photos: nothing else is to light them.
     """
-    file = Gltf()
+    file = GltfWriter()
     for name, mesh in meshes.items():
         assert mesh.uv is not None and mesh.texture is not None
         places = {"POSITION": file.array(mesh.vertices), "TEXCOORD_0": file.array(mesh.uv)}

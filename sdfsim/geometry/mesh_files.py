@@ -38,7 +38,7 @@ class Ragged(NamedTuple):
     values: np.ndarray  # [sum of them]
 
 
-class Surface(NamedTuple):
+class FileMesh(NamedTuple):
     """The triangles of a file, as they stand in it."""
 
     vertices: np.ndarray  # [V, 3] float64
@@ -174,7 +174,7 @@ def _element(
     return made, at
 
 
-def ply_surface(content: bytes) -> Surface:
+def ply_surface(content: bytes) -> FileMesh:
     """The triangles of a PLY file, its polygons and strips cut into such, with colours of vertices or faces."""
     elements, kinds, texture = read_ply(content)
     vertex = elements.get("vertex", {})
@@ -205,7 +205,7 @@ def ply_surface(content: bytes) -> Surface:
             places = np.stack([vertex[name] for name in names], axis=1).astype(np.float64)[faces]
         if places is not None:  # they count from the lower edge
             places = places * [1.0, -1.0] + [0.0, 1.0]
-    return Surface(vertices, faces, colors, places, texture)
+    return FileMesh(vertices, faces, colors, places, texture)
 
 
 def _strips(strips: Ragged) -> list[np.ndarray]:
@@ -362,7 +362,7 @@ def _ears(points: np.ndarray) -> np.ndarray:
     return np.array([*cut, rest], dtype=np.int64)
 
 
-def off_surface(content: bytes) -> Surface:
+def off_surface(content: bytes) -> FileMesh:
     """The triangles of an OFF file (also COFF, NOFF, STOFF and their mixtures), its polygons cut into such."""
     lines = re.sub(r"#[^\r\n]*", "", content.decode("latin-1").lstrip("\ufeff\xef\xbb\xbf")).splitlines()
     rows = [words for line in lines if (words := line.split())]
@@ -398,7 +398,7 @@ def off_surface(content: bytes) -> Surface:
         [word for n, row in zip(length.tolist(), rest, strict=True) for word in row[1 : n + 1]], dtype="U"
     )
     corners = corners.astype(np.int64) if len(corners) else np.zeros(0, dtype=np.int64)
-    return Surface(table[:, :3], corners[triangles(length, corners, table[:, :3])], colors)
+    return FileMesh(table[:, :3], corners[triangles(length, corners, table[:, :3])], colors)
 
 
 def plain_obj(content: bytes) -> bytes:

@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from sdfsim.physics.rollout import Rollout
-from sdfsim.physics.true_surfaces import Gaps, Placed, Solid, gaps, solid
+from sdfsim.physics.true_surfaces import Gaps, Placed, TrueSurface, gaps, true_surface
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.shape import Shape
@@ -248,7 +248,7 @@ class _Course:
 
     scene: Scene
     rollout: Rollout
-    solids: list[Solid]
+    solids: list[TrueSurface]
     dynamic: np.ndarray  # [N] bool
     group: np.ndarray  # [N]
     allowed: np.ndarray  # [G, G]
@@ -288,17 +288,17 @@ def _surfaces(scene: Scene, rollout: Rollout, seconds: float, every: int) -> tup
     return deepest, widest, done
 
 
-def solid_of(shape: Shape) -> Solid:
+def solid_of(shape: Shape) -> TrueSurface:
     """A shape's exact geometry, made once."""
     known = _SOLIDS.get(id(shape))
     if known is None or known[0] is not shape:
         if len(_SOLIDS) >= 256:
             _SOLIDS.clear()
-        _SOLIDS[id(shape)] = known = (shape, solid(shape))
+        _SOLIDS[id(shape)] = known = (shape, true_surface(shape))
     return known[1]
 
 
-_SOLIDS: dict[int, tuple[Shape, Solid]] = {}
+_SOLIDS: dict[int, tuple[Shape, TrueSurface]] = {}
 
 
 def _pushed(scene: Scene, rollout: Rollout, dynamic: np.ndarray) -> np.ndarray:
@@ -446,7 +446,7 @@ def _near(course: _Course, row: Sequence[int] | np.ndarray, metres: float, part:
     return Near(metres, part, *names, float(course.rollout.time[f]))
 
 
-def _reach(one: Solid, shape: Shape) -> float:
+def _reach(one: TrueSurface, shape: Shape) -> float:
     """m, how far a solid reaches from its centre of mass."""
     return float(np.linalg.norm(np.abs(one.bounds - shape.com).max(0))) if np.isfinite(one.bounds).all() else np.inf
 

@@ -33,7 +33,7 @@ Distance = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True)
-class Solid:
+class TrueSurface:
     """A shape's exact geometry in its own frame, at scale 1."""
 
     corner: np.ndarray  # [F, 3, 3] m, triangles with their corners on the surface, in clusters (none of a plane)
@@ -53,7 +53,7 @@ class Solid:
         return float(np.ptp(self.bounds, axis=0).min()) if np.isfinite(self.bounds).all() else np.inf
 
 
-def solid(shape: Shape) -> Solid:
+def true_surface(shape: Shape) -> TrueSurface:
     """The geometry that a shape stands for: its closed form, its convex pieces, or its mesh."""
     if isinstance(shape.sdf, ClosedForm):
         return _closed_form(shape.sdf)
@@ -65,7 +65,7 @@ def solid(shape: Shape) -> Solid:
     return _of_mesh(shape.mesh)
 
 
-def _closed_form(sdf: ClosedForm) -> Solid:
+def _closed_form(sdf: ClosedForm) -> TrueSurface:
     def distance(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return sdf(points)
 
@@ -75,7 +75,7 @@ def _closed_form(sdf: ClosedForm) -> Solid:
     bounds = np.asarray(sdf.bounds)
     if isinstance(sdf, PlaneSdf):
         none = np.zeros((0, 3, 3))
-        return Solid(none, np.zeros(0), np.zeros(1, int), np.zeros((0, 4)), bounds, distance, same, True, 1, 0.0)
+        return TrueSurface(none, np.zeros(0), np.zeros(1, int), np.zeros((0, 4)), bounds, distance, same, True, 1, 0.0)
     if isinstance(sdf, BoxSdf):
         corners = convex_hull(bounds[np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), -1).reshape(-1, 3), [0, 1, 2]])
         corner = corners.vertices[corners.faces]
@@ -121,7 +121,7 @@ def _closed_form(sdf: ClosedForm) -> Solid:
     return _clustered(triangles[kept], bent[kept], bounds, distance, onto, turns=turns, straight=half)
 
 
-def _of_mesh(mesh: Mesh) -> Solid:
+def _of_mesh(mesh: Mesh) -> TrueSurface:
     import igl  # a third of what open3d takes to load, and in double precision
 
     convex, size = _is_convex(mesh), float(np.ptp(mesh.vertices, axis=0).max())
@@ -154,7 +154,7 @@ def _of_mesh(mesh: Mesh) -> Solid:
     return _triangles(mesh, distance, convex=convex)
 
 
-def _of_pieces(oracle: PiecesDistance) -> Solid:
+def _of_pieces(oracle: PiecesDistance) -> TrueSurface:
     def distance(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         found = oracle(points)
         away = points - found.closest
@@ -163,7 +163,7 @@ def _of_pieces(oracle: PiecesDistance) -> Solid:
     return _triangles(oracle.surface, distance, convex=False)
 
 
-def _triangles(mesh: Mesh, distance: Distance, *, convex: bool) -> Solid:
+def _triangles(mesh: Mesh, distance: Distance, *, convex: bool) -> TrueSurface:
     corner = mesh.vertices[mesh.faces]
     bounds = np.stack([corner.min((0, 1)), corner.max((0, 1))])
     same = lambda points: points  # noqa: E731
@@ -191,7 +191,7 @@ def _is_convex(mesh: Mesh) -> bool:
 def _clustered(
     corner: np.ndarray, bend: np.ndarray, bounds: np.ndarray, distance: Distance,
     onto: Callable[[np.ndarray], np.ndarray], *, turns: int, convex: bool = True, straight: float = 0.0,
-) -> Solid:  # fmt: skip
+) -> TrueSurface:  # fmt: skip
     middle = corner.mean(1)
     parts = [np.arange(len(corner))]
     while any(len(p) > CLUSTER for p in parts):
@@ -216,7 +216,7 @@ def _clustered(
         # How far a round surface stands out beyond triangles with their corners on it.
         out = radius if not np.isfinite(curved).all() else curved.min() * (1 - np.cos(np.pi / AROUND)) * 2.5
         balls.append([*centre, radius + (out if np.isfinite(curved).any() else 0.0)])
-    return Solid(corner, bend, start, np.array(balls), bounds, distance, onto, convex, turns, straight)
+    return TrueSurface(corner, bend, start, np.array(balls), bounds, distance, onto, convex, turns, straight)
 
 
 class Gaps(NamedTuple):
@@ -242,7 +242,7 @@ class Placed:
         return Placed(self.solid[rows], self.scale[rows], self.origin[rows], self.turn[rows])
 
 
-def gaps(solids: Sequence[Solid], first: Placed, second: Placed, most: np.ndarray) -> Gaps:
+def gaps(solids: Sequence[TrueSurface], first: Placed, second: Placed, most: np.ndarray) -> Gaps:
     """How far P pairs are apart, or how deep in each other (the deepest point of either surface in the other body).
     What is farther than `most` [P] m is only known to be that."""
     count = len(first.solid)
@@ -276,7 +276,7 @@ def gaps(solids: Sequence[Solid], first: Placed, second: Placed, most: np.ndarra
     return Gaps(apart, np.where(apart > 0, np.minimum(surely, apart), apart), point, normal, sign)
 
 
-def _holds(solids: Sequence[Solid], one: Placed, other: Placed, rows: np.ndarray) -> np.ndarray:
+def _holds(solids: Sequence[TrueSurface], one: Placed, other: Placed, rows: np.ndarray) -> np.ndarray:
     """[R] whether a point of the other's surface is in the one."""
     found = np.zeros(len(rows), bool)
     for a in np.unique(one.solid[rows]):
@@ -292,7 +292,7 @@ def _holds(solids: Sequence[Solid], one: Placed, other: Placed, rows: np.ndarray
 
 
 def _lowest(
-    solids: Sequence[Solid], mine: Placed, other: Placed, most: np.ndarray, fine: np.ndarray, known: np.ndarray
+    solids: Sequence[TrueSurface], mine: Placed, other: Placed, most: np.ndarray, fine: np.ndarray, known: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The lowest distance from other bodies on the surfaces of P bodies, where that is lower than what is `known`:
     found, at least, where (world), gradient."""
@@ -397,7 +397,7 @@ def _lowest(
 
 
 def _halved(
-    solids: Sequence[Solid],
+    solids: Sequence[TrueSurface],
     mine: Placed,
     pair: np.ndarray,
     corner: np.ndarray,

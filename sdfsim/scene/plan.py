@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sdfsim.scene.collision_filter import Pairs, count_pairs
+from sdfsim.scene.collision_filter import PairCounts, count_pairs
 from sdfsim.scene.scene import Scene
 
 
@@ -35,7 +35,7 @@ class Plan:
     static: tuple[str, ...]  # names of the bodies by how they move, as the next two
     dynamic: tuple[str, ...]
     kinematic_bodies: tuple[str, ...]
-    pairs: Pairs  # which pairs of bodies may touch
+    pairs: PairCounts  # which pairs of bodies may touch
     nodes: int  # surface nodes of all bodies, the infinite planes having none
 
     def effects(self) -> dict[str, Effect]:

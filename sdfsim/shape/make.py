@@ -231,7 +231,7 @@ def fit_mesh(
 ) -> Shape:
     """Fit the compact SDF network to the solid that a triangle mesh in metres bounds, see `solidify`.
 
-    The result depends on the mesh, the recipe (see `PLANS`) and the seed only (up to rounding, which the number of
+    The result depends on the mesh, the recipe (see `RECIPES`) and the seed only (up to rounding, which the number of
     threads and the device change), unless the budget in s cuts the training short. The shape's `certificate` tells the
     errors and whether it is usable (`passed`), `source["notes"]` what was done to the mesh. Raises SdfsimError, which
     calls the mesh `file` (or else `name`), where it cannot be used or bounds no solid.

@@ -154,8 +154,8 @@ def tiny_fit() -> None:
     from sdfsim.sdf import baked_grid
     from sdfsim.sdf.fit import train as fit_module
 
-    plan = replace(fit_module.PLANS["default"], width=8, layers=3, steps=120, batch=64, pool=1000, goal=None)
-    fit_module.PLANS["default"] = fit_module.PLANS["quick"] = plan
+    plan = replace(fit_module.RECIPES["default"], width=8, layers=3, steps=120, batch=64, pool=1000, goal=None)
+    fit_module.RECIPES["default"] = fit_module.RECIPES["quick"] = plan
     fit_module.CHECK_EVERY = 20
     baked_grid.CELLS = baked_grid.FINEST = 16
 

@@ -15,7 +15,7 @@ from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.physics.instruments import in_order, judged
 from sdfsim.physics.rollout import Rollout
-from sdfsim.physics.true_surfaces import Gaps, Placed, gaps, solid
+from sdfsim.physics.true_surfaces import Gaps, Placed, gaps, true_surface
 from sdfsim.scene.scene import Body, Scene, Waypoints
 from sdfsim.shape.make import analytic_shape, mesh_shape
 from sdfsim.shape.shape import Shape
@@ -87,7 +87,7 @@ def between(
             (1, scale[1], place, turn),
         )
     ]
-    return gaps([solid(a), solid(b)], *poses, np.array([np.inf]))
+    return gaps([true_surface(a), true_surface(b)], *poses, np.array([np.inf]))
 
 
 # --- gaps and depths against closed forms ---

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from sdfsim import Simulator
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import Mesh, convex_hull
-from sdfsim.physics.true_surfaces import Placed, Solid, gaps, solid
+from sdfsim.physics.true_surfaces import Placed, TrueSurface, gaps, true_surface
 from sdfsim.scene.scene import Scene
 from sdfsim.sdf.baked_grid import baked
 from sdfsim.shape.make import analytic_shape, mesh_shape
@@ -59,8 +59,8 @@ def lump() -> Mesh:
 
 
 @cache
-def truth(kind: str) -> Solid:
-    return solid(shape(kind))
+def truth(kind: str) -> TrueSurface:
+    return true_surface(shape(kind))
 
 
 @cache

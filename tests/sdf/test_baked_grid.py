@@ -22,7 +22,7 @@ from sdfsim.sdf.mesh_sdf import MeshSdf
 from sdfsim.sdf.reference import PiecesDistance
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import scaled, with_sdf
-from sdfsim.shape.surface_nodes import MOST_PATCHES, Surface, edge_nodes, surface_of
+from sdfsim.shape.surface_nodes import MOST_PATCHES, ContactSurface, edge_nodes, surface_of
 from sdfsim.simulate.simulator import Simulator
 from tests.physics.test_laws import body
 
@@ -198,7 +198,7 @@ def test_convex_pieces_are_the_same_at_every_size(size):
     np.testing.assert_allclose(surface.nodes / size, other.nodes, atol=2e-6)
     np.testing.assert_array_equal(surface.patch, other.patch)
 
-    def labels(of: Surface, factor: float) -> np.ndarray:
+    def labels(of: ContactSurface, factor: float) -> np.ndarray:
         assert of.nearest is not None
         at = np.round((np.clip(points, *union_box) * factor - of.low) / of.cell).astype(int)
         return of.nearest[tuple(at.T)]

@@ -21,9 +21,9 @@ from sdfsim.shape.shape import Shape
 @pytest.fixture
 def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
     plan = replace(
-        fit_module.PLANS["default"], width=16, layers=4, steps=600, batch=256, pool=5000, goal=None, decay=0.5
+        fit_module.RECIPES["default"], width=16, layers=4, steps=600, batch=256, pool=5000, goal=None, decay=0.5
     )
-    monkeypatch.setitem(fit_module.PLANS, "default", plan)
+    monkeypatch.setitem(fit_module.RECIPES, "default", plan)
 
 
 def weights(shape: Shape) -> list[torch.Tensor]:
@@ -32,8 +32,8 @@ def weights(shape: Shape) -> list[torch.Tensor]:
 
 
 def test_a_torus_in_a_few_hundred_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    plan = replace(fit_module.PLANS["default"], steps=450, batch=1024, pool=60_000, goal=None)
-    monkeypatch.setitem(fit_module.PLANS, "default", plan)
+    plan = replace(fit_module.RECIPES["default"], steps=450, batch=1024, pool=60_000, goal=None)
+    monkeypatch.setitem(fit_module.RECIPES, "default", plan)
     mesh = primitives.torus(0.35, 0.15)
     shape = fit_mesh(Mesh(mesh.vertices * 0.2 + [5.0, 0.0, -3.0], mesh.faces), name="ring")
     got = shape.certificate
@@ -76,8 +76,8 @@ def test_the_same_seed_gives_the_same_weights(tiny: None) -> None:
 
 
 def test_a_budget_is_kept_and_still_ends_in_a_decay(monkeypatch: pytest.MonkeyPatch) -> None:
-    plan = replace(fit_module.PLANS["default"], width=16, layers=4, batch=256, pool=5000, goal=None, steps=10**6)
-    monkeypatch.setitem(fit_module.PLANS, "default", plan)
+    plan = replace(fit_module.RECIPES["default"], width=16, layers=4, batch=256, pool=5000, goal=None, steps=10**6)
+    monkeypatch.setitem(fit_module.RECIPES, "default", plan)
     started = time.process_time()  # a busy machine does not count
     shape = fit_mesh(primitives.box(), name="box", budget=2.0)
     assert time.process_time() - started < 6.0
@@ -88,17 +88,17 @@ def test_a_budget_is_kept_and_still_ends_in_a_decay(monkeypatch: pytest.MonkeyPa
 
 def test_a_goal_that_is_met_ends_the_fit_early(monkeypatch: pytest.MonkeyPatch) -> None:
     plan = replace(
-        fit_module.PLANS["default"], width=16, layers=4, batch=256, pool=5000, goal=(1.0,) * 4, settle=100, steps=5000
+        fit_module.RECIPES["default"], width=16, layers=4, batch=256, pool=5000, goal=(1.0,) * 4, settle=100, steps=5000
     )
-    monkeypatch.setitem(fit_module.PLANS, "default", plan)
+    monkeypatch.setitem(fit_module.RECIPES, "default", plan)
     assert fit_mesh(primitives.box(), name="box").certificate["steps"] == 200
 
 
 def test_paper_recipe_learns(monkeypatch: pytest.MonkeyPatch) -> None:
-    paper = fit_module.PLANS["paper"]
+    paper = fit_module.RECIPES["paper"]
     assert (paper.activation, paper.width, paper.layers, paper.lr, paper.steps) == ("relu", 128, 8, 1e-5, 400_000)
     plan = replace(paper, steps=150, batch=512, pool=4096, lr=1e-3)
-    monkeypatch.setitem(fit_module.PLANS, "paper", plan)
+    monkeypatch.setitem(fit_module.RECIPES, "paper", plan)
     shape = fit_mesh(primitives.sphere(), name="ball", recipe="paper")
     assert isinstance(shape.sdf, MlpSdf)
     assert [tuple(w.shape) for w in shape.sdf.weights] == [(128, 3), *[(128, 128)] * 6, (1, 128)]
@@ -107,8 +107,8 @@ def test_paper_recipe_learns(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_pieces_keep_their_own_vertices_as_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    plan = replace(fit_module.PLANS["default"], width=32, layers=5, steps=500, batch=512, pool=30_000, goal=None)
-    monkeypatch.setitem(fit_module.PLANS, "default", plan)
+    plan = replace(fit_module.RECIPES["default"], width=32, layers=5, steps=500, batch=512, pool=30_000, goal=None)
+    monkeypatch.setitem(fit_module.RECIPES, "default", plan)
     half = primitives.box((0.5, 1.0, 1.0))
     shifts = [np.array([-0.25, 0, 0]), np.array([0.25, 0, 0])]
     buried = primitives.box((0.2, 0.2, 0.2))

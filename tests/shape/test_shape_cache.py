@@ -21,8 +21,8 @@ from sdfsim.shape.shape import load_shape
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """A recipe of a second, for tests of what is around the fit."""
-    plan = replace(fit_module.PLANS["default"], width=16, layers=4, steps=100, batch=256, pool=4000)
-    monkeypatch.setitem(fit_module.PLANS, "default", plan)
+    plan = replace(fit_module.RECIPES["default"], width=16, layers=4, steps=100, batch=256, pool=4000)
+    monkeypatch.setitem(fit_module.RECIPES, "default", plan)
 
 
 def test_a_mesh_is_fitted_once_whatever_it_is_called(

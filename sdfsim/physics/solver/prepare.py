@@ -26,7 +26,7 @@ from sdfsim.sdf.baked_grid import BakedGrid, baked, inwards, unseen_wall
 from sdfsim.sdf.closed_forms import ClosedForm, PlaneSdf
 from sdfsim.sdf.sdf import Sdf
 from sdfsim.shape.convex_pieces import ConvexPiece, pieces_of
-from sdfsim.shape.surface_nodes import Surface, contact_surface
+from sdfsim.shape.surface_nodes import ContactSurface, contact_surface
 
 if TYPE_CHECKING:
     from sdfsim.simulate.run_memory import Memory
@@ -255,7 +255,7 @@ class Geometry(NamedTuple):
     """What the solve knows of a shape."""
 
     grid: BakedGrid | None  # where it has no closed form
-    surface: Surface
+    surface: ContactSurface
     cover: np.ndarray  # [K] m, how far the surface around a node goes that is nearer to it than to others
     inward: np.ndarray  # [K, 3] m, from its nodes to where they look out
     clumps: Clumps

@@ -45,7 +45,7 @@ RESERVE = 2.0
 
 
 @dataclass(frozen=True)
-class Plan:
+class FitOptions:
     """One recipe; the defaults were chosen by measurement on scanned and thin-walled shapes.
 
     Lengths are relative to the shape's largest extent. The box gets its share of points and the loss stays soft up to
@@ -74,12 +74,12 @@ class Plan:
     settle: int = 1000  # steps of an early decay
 
 
-PLANS = {
-    "default": Plan(),
+RECIPES = {
+    "default": FitOptions(),
     # A surface from a few minutes of training is not known as exactly as a full fit would follow it.
-    "quick": Plan(steps=1500, settle=600, pool=200_000),
+    "quick": FitOptions(steps=1500, settle=600, pool=200_000),
     # Rubanova et al. 2024, section 3.1 and appendix: 400k updates at 1e-5, noise 0.1 drawn again every 100 updates.
-    "paper": Plan(
+    "paper": FitOptions(
         activation="relu",
         width=128,
         layers=8,
@@ -109,28 +109,28 @@ def fit_sdf(
     `pick` takes from it, and its certificate. Raises SdfsimError for a budget that is not positive."""
     if budget is not None and not budget > 0:
         raise SdfsimError(f"the budget of a fit must be > 0 seconds (got {budget})")
-    started, plan = time.monotonic(), PLANS[recipe]
+    started, options = time.monotonic(), RECIPES[recipe]
     on_progress(0.0, "sampling distances")
-    run = _Run(oracle, plan, seed, torch.device(device))
-    if run.device.type == "cpu":
-        choose_threads(partial(run.differentiate, torch.arange(plan.batch) % plan.pool))
+    fit = _Fit(oracle, options, seed, torch.device(device))
+    if fit.device.type == "cpu":
+        choose_threads(partial(fit.differentiate, torch.arange(options.batch) % options.pool))
     looping = time.monotonic()
-    while run.step < run.stop:
-        run.update()
-        if run.step % CHECK_EVERY:
+    while fit.step < fit.stop:
+        fit.update()
+        if fit.step % CHECK_EVERY:
             continue
-        near, far = run.judge()
+        near, far = fit.judge()
         if budget is not None:
             left = budget - min(0.1 * budget + RESERVE, 0.5 * budget) - (time.monotonic() - started)
-            run.hurry(run.step + int(left * run.step / (time.monotonic() - looping)))
-        last = max(run.stop, 1)
-        on_progress(0.97 * run.step / last, f"step {run.step} of {last}, error {near:.2g} near, {far:.2g} in the box")
+            fit.hurry(fit.step + int(left * fit.step / (time.monotonic() - looping)))
+        last = max(fit.stop, 1)
+        on_progress(0.97 * fit.step / last, f"step {fit.step} of {last}, error {near:.2g} near, {far:.2g} in the box")
     on_progress(0.98, "measuring")
-    sdf = run.result()
+    sdf = fit.result()
     nodes = pick(sdf)
     certificate = certify(sdf, oracle, nodes=nodes)
     seconds = round(time.monotonic() - started, 2)
-    certificate.update(recipe=recipe, seed=seed, steps=min(run.step, run.stop), seconds=seconds)
+    certificate.update(recipe=recipe, seed=seed, steps=min(fit.step, fit.stop), seconds=seconds)
     but = certificate["reason"] or certificate["caveat"]
     on_progress(1.0, f"fitted, but {but}" if but else "fitted")
     return sdf, nodes, certificate
@@ -145,37 +145,37 @@ class Pool(NamedTuple):
     direction: torch.Tensor  # [P, 3] unit, from the surface outwards; zero on the surface itself
 
 
-class _Run:
+class _Fit:
     """A network in training, and samples of the solid that it learns. The decay of its steps begins at update `turn`
     and ends at `stop`; an early stop or a short budget moves both forward."""
 
-    def __init__(self, oracle: DistanceOracle, plan: Plan, seed: int, device: torch.device) -> None:
-        self.oracle, self.plan, self.device, self._seed = oracle, plan, device, seed
+    def __init__(self, oracle: DistanceOracle, options: FitOptions, seed: int, device: torch.device) -> None:
+        self.oracle, self.options, self.device, self._seed = oracle, options, device, seed
         self.frame = normal_frame(oracle.bounds)
-        self.mirrors = self._mirrors() if plan.activation == "wave" else (False, False, False)
+        self.mirrors = self._mirrors() if options.activation == "wave" else (False, False, False)
         self.pool = self._pool(0)
         # Points to judge by on the way: `CHECKED` of each of three kinds.
         sigma = np.repeat(CHECKED_SIGMAS, CHECKED)[:, None]
         self.check = self._sample(sigma, CHECKED, np.random.default_rng([seed, 1]))
         # Drawn on the CPU, so that points and first weights do not depend on the device.
         self.generator = torch.Generator().manual_seed(seed)
-        self.parameters = [p.to(device) for p in _initial(plan, self.generator)]
+        self.parameters = [p.to(device) for p in _initial(options, self.generator)]
         for parameter in self.parameters:
             parameter.grad = torch.zeros_like(parameter)
         self.average = [parameter.clone() for parameter in self.parameters]
-        self.optimiser = (Soap if plan.activation == "wave" else torch.optim.Adam)(self.parameters, plan.lr)
+        self.optimiser = (Soap if options.activation == "wave" else torch.optim.Adam)(self.parameters, options.lr)
         self.step = 0
-        self.turn, self.stop = int(plan.steps * (1.0 - plan.decay)), plan.steps
-        self._tape = Tape(plan.activation, plan.width, plan.layers, self.parameters[0])
+        self.turn, self.stop = int(options.steps * (1.0 - options.decay)), options.steps
+        self._tape = Tape(options.activation, options.width, options.layers, self.parameters[0])
 
     def _pool(self, step: int) -> Pool:
         """Points to learn from, as drawn before update `step`."""
-        plan = self.plan
+        options = self.options
         rng = np.random.default_rng([self._seed, 0, step] if step else [self._seed, 0])
-        near = int(plan.pool * plan.near)
-        low, high = np.log(plan.sigmas)
+        near = int(options.pool * options.near)
+        low, high = np.log(options.sigmas)
         sigma = np.exp(rng.uniform(low, high, (near, 1)))
-        return self._sample(sigma, plan.pool - near, rng)
+        return self._sample(sigma, options.pool - near, rng)
 
     def _sample(self, sigma: np.ndarray, elsewhere: int, rng: np.random.Generator) -> Pool:
         """Points with normal noise of `sigma` [N, 1] around the surface, then `elsewhere` points all over the box."""
@@ -185,7 +185,7 @@ class _Run:
         local = np.clip(local, -MARGIN * BOX, MARGIN * BOX)
         truth = self.oracle(self.frame.outward(local))
         distance = truth.distance / self.frame.scale
-        signed = truth.trusted | (self.oracle.closed and self.plan.activation == "wave")
+        signed = truth.trusted | (self.oracle.closed and self.options.activation == "wave")
         # So close to the surface the direction from it is rounding.
         clear = np.abs(distance) > 1e-4
         offset = local - self.frame.inward(truth.closest)
@@ -210,18 +210,18 @@ class _Run:
 
     def update(self) -> None:
         """One step of the optimiser."""
-        plan = self.plan
-        if plan.resample and self.step and self.step % plan.resample == 0:
+        options = self.options
+        if options.resample and self.step and self.step % options.resample == 0:
             self.pool = self._pool(self.step)
-        self.differentiate(torch.randint(plan.pool, (plan.batch,), generator=self.generator))
+        self.differentiate(torch.randint(options.pool, (options.batch,), generator=self.generator))
         factor = min(1.0, (self.step + 1) / WARMUP)
-        if plan.decay:
+        if options.decay:
             late = min(max((self.step - self.turn) / max(self.stop - self.turn, 1), 0.0), 1.0)
             factor *= 0.5 * (1.0 + math.cos(math.pi * late))
         if isinstance(self.optimiser, Soap):
             self.optimiser.step(factor)
         else:
-            self.optimiser.param_groups[0]["lr"] = plan.lr * factor
+            self.optimiser.param_groups[0]["lr"] = options.lr * factor
             self.optimiser.step()
         self.step += 1
         for mean, parameter in zip(self.average, self.parameters, strict=True):
@@ -231,63 +231,63 @@ class _Run:
         """Weighted L1 of the signed distance, and of the unsigned one where the sign is not known, at the points of the
         pool that are chosen [T]; fills the gradients."""
         points, distance, signed, _ = (part[chosen.to(self.device)] for part in self.pool)
-        weights, biases = _layers(self.parameters, self.plan.activation)
+        weights, biases = _layers(self.parameters, self.options.activation)
         value = self._tape.forward(weights, biases, points)
         error = torch.where(signed, value - distance, value.abs() - distance.abs())
         slope = error.sign() * torch.where(signed, 1.0, value.sign()) / len(chosen)
-        if self.plan.soften is not None:
-            slope = slope * (self.plan.soften / (distance.abs() + self.plan.soften))
+        if self.options.soften is not None:
+            slope = slope * (self.options.soften / (distance.abs() + self.options.soften))
         gradients = [parameter.grad for parameter in self.parameters if parameter.grad is not None]
         self._tape.parameter_gradients(weights, points, slope, *_split(gradients))
-        for gradient, scale in zip(gradients, _SCALES[self.plan.activation], strict=True):
+        for gradient, scale in zip(gradients, _SCALES[self.options.activation], strict=True):
             gradient.mul_(scale)
 
     def judge(self) -> tuple[float, float]:
         """Begin the decay where the goal is met. Returns mean errors near the surface and in the box."""
-        layers = _layers(self.average, self.plan.activation)
-        value, gradient = value_and_gradient(*layers, self.plan.activation, self.check.points)
+        layers = _layers(self.average, self.options.activation)
+        value, gradient = value_and_gradient(*layers, self.options.activation, self.check.points)
         distance, signed = self.check.distance, self.check.signed
         error = torch.where(signed, value - distance, value.abs() - distance.abs()).abs()
         near, far = float(error[:CHECKED].mean()), float(error[2 * CHECKED :].mean())
-        if self.plan.goal is not None and self.step < self.turn:
+        if self.options.goal is not None and self.step < self.turn:
             cosine = torch.nn.functional.cosine_similarity(gradient, self.check.direction, dim=-1)
             turned = 1.0 - float(cosine[CHECKED : 2 * CHECKED].median())
             clear = signed & (distance.abs() > SIGN_FROM)
             wrong = float((clear & (value * distance <= 0)).sum() / clear.sum().clamp_min(1))
-            if all(e <= most for e, most in zip((near, far, turned, wrong), self.plan.goal, strict=True)):
-                self.turn, self.stop = self.step, min(self.stop, self.step + self.plan.settle)
+            if all(e <= most for e, most in zip((near, far, turned, wrong), self.options.goal, strict=True)):
+                self.turn, self.stop = self.step, min(self.stop, self.step + self.options.settle)
         return near, far
 
     def hurry(self, possible: int) -> None:
         """Place decay and end so that `possible` updates in all suffice. Until the decay has begun the end moves both
         ways, since the first steps of a busy machine tell little; after that it only comes nearer."""
         begun = self.step >= self.turn
-        self.stop = min(self.stop if begun else self.plan.steps, max(possible, self.step))
+        self.stop = min(self.stop if begun else self.options.steps, max(possible, self.step))
         if not begun:
-            self.turn = max(self.step, int(self.stop * (1.0 - self.plan.decay)))
+            self.turn = max(self.step, int(self.stop * (1.0 - self.options.decay)))
 
     def result(self) -> MlpSdf:
         """The network."""
-        parts = _layers(self.parameters, self.plan.activation)
+        parts = _layers(self.parameters, self.options.activation)
         weights, biases = (tuple(part.cpu().clone() for part in layers) for layers in parts)
-        return MlpSdf(weights, biases, self.plan.activation, self.frame, self.oracle.bounds.copy(), self.mirrors)
+        return MlpSdf(weights, biases, self.options.activation, self.frame, self.oracle.bounds.copy(), self.mirrors)
 
 
-def _initial(plan: Plan, generator: torch.Generator) -> list[torch.Tensor]:
+def _initial(options: FitOptions, generator: torch.Generator) -> list[torch.Tensor]:
     """First [1, W, 3], hidden [L - 2, W, W] and last [1, 1, W] weights; biases [L - 1, W, 1] and [1, 1, 1]: equal
     layers are stacked for the optimiser. Periodic layers start with phases all around and the spread of inputs that
     sine layers have (Sitzmann et al. 2020); ReLU layers with He's variance."""
-    width, hidden = plan.width, plan.layers - 2
+    width, hidden = options.width, options.layers - 2
 
     def uniform(bound: float, layers: int, *shape: int) -> torch.Tensor:
         return (2.0 * torch.rand((layers, *shape), generator=generator) - 1.0) * bound
 
-    periodic = plan.activation == "wave"
+    periodic = options.activation == "wave"
     return [
         uniform(FIRST if periodic else math.sqrt(2.0), 1, width, 3),
         uniform(math.sqrt(6.0 / width), hidden, width, width),
         uniform(math.sqrt(6.0 / width) / (10.0 if periodic else 1.0), 1, 1, width),
-        uniform(math.pi if periodic else 0.05, plan.layers - 1, width, 1),
+        uniform(math.pi if periodic else 0.05, options.layers - 1, width, 1),
         uniform(0.05, 1, 1, 1),
     ]
 
