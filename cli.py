@@ -23,7 +23,7 @@ app = typer.Typer(
 
 def _tell_version(wanted: bool) -> None:
     if wanted:
-        from sdfsim import __version__
+        from sdfsim.base.version import __version__
 
         print(f"sdfsim {__version__}")
         raise typer.Exit

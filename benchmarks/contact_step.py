@@ -27,19 +27,19 @@ import numpy as np
 from benchmarks.results import script, write_section
 from benchmarks.scale import FAR, apart, with_far, with_nodes_cut
 from samples.large import write_scene
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import read_json, write_json
 from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import conditions_of
-from sdfsim.dynamics.model import load_model
-from sdfsim.dynamics.simulator import Simulator
-from sdfsim.dynamics.solver import Compiled, compiled_rules, taken_up
-from sdfsim.dynamics.units import scene_units
-from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.engines import Start, bullet, dataset_urdf, start_of_scene
 from sdfsim.evaluation.evaluate import load_recorded
 from sdfsim.evaluation.harness import markdown, number
-from sdfsim.files import read_json, write_json
+from sdfsim.learned.model import load_model
+from sdfsim.physics.solver.prepare import Compiled, compiled_rules, taken_up
+from sdfsim.physics.units import scene_units
+from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
-from sdfsim.scene.scene_file import load_scene
+from sdfsim.simulate.simulator import Simulator
 
 RATCHET = Path(__file__).with_name("contact_step_ratchet.json")
 SLACK = 0.35  # of a ratio: what machines and their load make of it

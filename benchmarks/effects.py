@@ -21,12 +21,12 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.results import ROOT, script, write_section
-from sdfsim.dynamics.bodies import largest_extent
-from sdfsim.dynamics.simulator import Simulator
 from sdfsim.evaluation.engines import ours
 from sdfsim.evaluation.harness import markdown, number, one_thread
+from sdfsim.physics.bodies import largest_extent
+from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
-from sdfsim.scene.scene_file import load_scene
+from sdfsim.simulate.simulator import Simulator
 
 SCENES = ("pile", "tower", "spheres_in_bowl")
 STEPS, REPEATS = 300, 5

@@ -17,6 +17,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.results import ROOT, script, told, write_section
+from sdfsim.base.files import read_json, write_json
 from sdfsim.evaluation.hard_cases import GROUPS
 from sdfsim.evaluation.stress import (
     ENGINES,
@@ -29,7 +30,6 @@ from sdfsim.evaluation.stress import (
     table,
     write_report,
 )
-from sdfsim.files import read_json, write_json
 
 DOCUMENT = ROOT / "docs" / "stability.md"
 RATCHET = Path(__file__).with_name("hard_cases_ratchet.json")

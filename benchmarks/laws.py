@@ -21,13 +21,13 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.results import script, write_section
-from sdfsim.dynamics.rollout import Rollout
-from sdfsim.dynamics.simulator import SimulationError, Simulator
 from sdfsim.evaluation import hard_cases
 from sdfsim.evaluation.hard_cases import PLANK, ball, box, on_floor
 from sdfsim.evaluation.harness import markdown
+from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.scene import Body, Effects
 from sdfsim.shape.shape import Shape
+from sdfsim.simulate.simulator import SimulationError, Simulator
 
 G = 9.81  # m/s^2
 SIZES = (0.02, 0.1, 1.0)  # m

@@ -21,16 +21,16 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.results import script, told
+from sdfsim.base.files import write_text
 from sdfsim.data.batching import every, scene_of
 from sdfsim.data.dataset import conditions_of, read_info
-from sdfsim.dynamics.model import SOLVER, load_model
-from sdfsim.dynamics.models.contact_graph import SUBSTEPS, ContactGraph
-from sdfsim.dynamics.models.impulse import Velocities
-from sdfsim.dynamics.simulator import Simulator
 from sdfsim.evaluation.engines import ours
 from sdfsim.evaluation.evaluate import evaluate, load_recorded
 from sdfsim.evaluation.harness import Job, markdown, measure, one_thread
-from sdfsim.files import write_text
+from sdfsim.learned.contact_graph import SUBSTEPS, ContactGraph
+from sdfsim.learned.impulse import Velocities
+from sdfsim.learned.model import SOLVER, load_model
+from sdfsim.simulate.simulator import Simulator
 from sdfsim.training.contact_cache import Solved, contact_frames, join_frames
 from sdfsim.training.impulse_task import ImpulseTask
 from sdfsim.training.presets import PRESETS

@@ -33,20 +33,21 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.results import script, told
 from samples.large import write_scene
+from sdfsim.base.files import write_text
 from sdfsim.data.batching import batches, first_frames, roll_out
 from sdfsim.data.dataset import conditions_of, engine_substep, read_info
-from sdfsim.dynamics.model import SOLVER, Model, load_model, new_network
-from sdfsim.dynamics.run_memory import Memory
-from sdfsim.dynamics.simulator import Simulator
 from sdfsim.evaluation.evaluate import evaluate, load_recorded
 from sdfsim.evaluation.harness import Job, Panel, cells, draw, line, markdown, measure, number, one_thread, peak_memory
 from sdfsim.evaluation.metrics import errors
-from sdfsim.files import write_text
-from sdfsim.scene.scene_file import load_scene
-from sdfsim.shape.fit import PLANS, fit_pieces
-from sdfsim.shape.mesh import convex_hull
-from sdfsim.shape.sdf import sample_grid
+from sdfsim.geometry.mesh import convex_hull
+from sdfsim.learned.model import SOLVER, Model, load_model, new_network
+from sdfsim.scene.load import load_scene
+from sdfsim.sdf.fit.train import RECIPES
+from sdfsim.sdf.grid import sample_grid
+from sdfsim.shape.make import fit_pieces
 from sdfsim.shape.shape import Shape, load_shape
+from sdfsim.simulate.run_memory import Memory
+from sdfsim.simulate.simulator import Simulator
 from sdfsim.training.contact_cache import inner_steps
 from sdfsim.training.presets import PRESETS, Preset
 from sdfsim.training.surface_task import SurfaceTask
@@ -254,11 +255,11 @@ def rolled_out(data: Path, width: int | None, home: Path) -> dict[str, Any]:
 
 def refitted(shape: Shape, width: int, folder: Path) -> Shape:
     """The shape known by a network of so many hidden units alone, with its own nodes, fitted for a minute."""
-    usual = PLANS["default"]
+    usual = RECIPES["default"]
     if width == usual.width:
         return replace(shape, pieces=())
     if not (folder / "shape.json").exists():
-        with patch.dict(PLANS, default=replace(usual, width=width)):
+        with patch.dict(RECIPES, default=replace(usual, width=width)):
             fit_pieces([convex_hull(piece) for piece in shape.pieces], name=shape.name).save(folder)
     return replace(shape, pieces=(), sdf=load_shape(folder).sdf)
 

@@ -22,15 +22,15 @@ from scipy.spatial.transform import Rotation
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.results import script, told, write_section
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import read_arrays, write_json
 from sdfsim.data.pybullet_sim import import_pybullet
-from sdfsim.dynamics.simulator import Simulator
-from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.engines import engine_module
 from sdfsim.evaluation.harness import markdown, number, one_thread
 from sdfsim.evaluation.metrics import interval
-from sdfsim.files import read_arrays, write_json
 from sdfsim.scene.scene import Body, Effects, Scene
-from sdfsim.shape.shape import analytic_shape
+from sdfsim.shape.make import analytic_shape
+from sdfsim.simulate.simulator import Simulator
 
 SIDE, MASS, INERTIA = 0.1048, 0.37, 0.00081  # m, kg, kg m2, as measured by those who tossed it
 GRAVITY = 9.81  # m/s^2

@@ -34,9 +34,9 @@ from pipeline.field.training import load_field
 from pipeline.mesh.meshing import read_parts
 from pipeline.mesh.placement import load_placement
 from pipeline.mesh.trust import vertex_areas
-from sdfsim.console import Session
-from sdfsim.errors import SdfsimError
-from sdfsim.shape.mesh import Mesh, load_mesh, read_attributes, read_mesh, signed_volume
+from sdfsim.base.console import Session
+from sdfsim.base.errors import SdfsimError
+from sdfsim.geometry.mesh import Mesh, load_mesh, read_attributes, read_mesh, signed_volume
 
 PHOTOS = ROOT / "samples" / "photos" / "table_vase"
 TABLE, VASE = 0.55, np.array([0.12, -0.05])  # m: the table's height, and the vase's axis

@@ -10,8 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from sdfsim.errors import run_main
-from sdfsim.files import write_text
+from sdfsim.base.errors import run_main
+from sdfsim.base.files import write_text
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = Path(__file__).with_name("RESULTS.md")

@@ -30,26 +30,27 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.results import script, told, write_section
 from samples.large import sample_shape, write_scene
+from sdfsim.apps.export import convex_pieces
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import read_arrays, write_arrays, write_text
 from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import Trajectory, conditions_of
-from sdfsim.dynamics.bodies import largest_extent
-from sdfsim.dynamics.model import load_model
-from sdfsim.dynamics.simulator import Simulator
-from sdfsim.dynamics.units import scene_units
-from sdfsim.errors import SdfsimError
 from sdfsim.evaluation import engines
 from sdfsim.evaluation.engines import Engine, in_metres, ours, rollout_motion, start_of_scene
 from sdfsim.evaluation.evaluate import load_recorded
 from sdfsim.evaluation.hard_cases import ball, body, box, on_floor
 from sdfsim.evaluation.harness import Job, Results, markdown, measure, number, one_thread, peak_memory
 from sdfsim.evaluation.penetration import depths
-from sdfsim.export import convex_pieces
-from sdfsim.files import read_arrays, write_arrays, write_text
+from sdfsim.geometry.mesh import Mesh, clean, load_pieces, wavefront
+from sdfsim.learned.model import load_model
+from sdfsim.physics.bodies import largest_extent
+from sdfsim.physics.units import scene_units
+from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Effects, Scene
-from sdfsim.scene.scene_file import load_scene
-from sdfsim.shape.mesh import Mesh, clean, load_pieces, wavefront
-from sdfsim.shape.sdf import BoxSdf, PlaneSdf, SphereSdf
-from sdfsim.shape.shape import analytic_shape, mesh_shape, own_pieces, shape_from_mesh
+from sdfsim.sdf.closed_forms import BoxSdf, PlaneSdf, SphereSdf
+from sdfsim.shape.make import analytic_shape, mesh_shape, shape_from_mesh
+from sdfsim.shape.shape import own_pieces
+from sdfsim.simulate.simulator import Simulator
 
 ENGINES: dict[str, Engine | None] = {
     "sdfsim": None,

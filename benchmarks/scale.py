@@ -31,20 +31,20 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.results import script, told, write_section
 from samples.large import HEAPS, write_scene
+from sdfsim.base.parallel import cluster, parallel
 from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import Trajectory, conditions_of
-from sdfsim.dynamics.model import load_model
-from sdfsim.dynamics.rollout import Rollout
-from sdfsim.dynamics.simulator import SimulationError, Simulator, join
-from sdfsim.dynamics.units import scene_units
 from sdfsim.evaluation.engines import Engine, bullet, in_metres, mujoco, rollout_motion, start_of_scene
 from sdfsim.evaluation.evaluate import load_recorded
 from sdfsim.evaluation.hard_cases import body, box, on_floor
 from sdfsim.evaluation.harness import Job, Panel, cells, draw, line, markdown, measure, number, one_thread, peak_memory
 from sdfsim.evaluation.penetration import depths
-from sdfsim.parallel import cluster, parallel
+from sdfsim.learned.model import load_model
+from sdfsim.physics.rollout import Rollout
+from sdfsim.physics.units import scene_units
+from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
-from sdfsim.scene.scene_file import load_scene
+from sdfsim.simulate.simulator import SimulationError, Simulator, join
 
 BOWLS = (1, 16, 64, 256, 512)
 APART = (125, 500, 2000)

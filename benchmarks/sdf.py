@@ -22,17 +22,19 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.results import script, told
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import write_text
 from sdfsim.data.public_shapes import public_folder
-from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.harness import Job, Panel, cells, draw, line, machine, markdown, measure, number
-from sdfsim.files import write_text
-from sdfsim.shape.fit import FIT_VERSION, PLANS, Recipe, fit_mesh
-from sdfsim.shape.fit_metrics import EXACT
-from sdfsim.shape.mesh import load_mesh
-from sdfsim.shape.mlp_sdf import MlpSdf
-from sdfsim.shape.sdf import MeshSdf, sample_grid
+from sdfsim.geometry.mesh import load_mesh
+from sdfsim.geometry.solidify import solidify
+from sdfsim.sdf.fit.certificate import EXACT
+from sdfsim.sdf.fit.train import FIT_VERSION, RECIPES, Recipe
+from sdfsim.sdf.grid import sample_grid
+from sdfsim.sdf.mesh_sdf import MeshSdf
+from sdfsim.sdf.mlp import MlpSdf
+from sdfsim.shape.make import fit_mesh
 from sdfsim.shape.shape import load_shape
-from sdfsim.shape.watertight import solidify
 
 WIDTHS, BUDGETS = (32, 128), (5.0, 10.0, 20.0)  # s
 GRID, POINTS, REPEATS, CHUNK = 64, 250_000, 5, 16_384
@@ -41,9 +43,9 @@ ERRORS = tuple(EXACT)
 
 def fit(file: Path, folder: Path, recipe: Recipe, budget: float, width: int | None = None) -> dict:
     """Fit a mesh, keep the shape, and tell the errors of its certificate, and the seconds that it took."""
-    plan = replace(PLANS[recipe], width=width or PLANS[recipe].width)
+    plan = replace(RECIPES[recipe], width=width or RECIPES[recipe].width)
     began = time.monotonic()
-    with patch.dict(PLANS, {recipe: plan}):
+    with patch.dict(RECIPES, {recipe: plan}):
         shape = fit_mesh(load_mesh(file), name=file.parent.name, recipe=recipe, budget=budget)
     shape.save(folder)
     found = {name: shape.certificate[name] for name in (*ERRORS, "steps")}
@@ -103,7 +105,7 @@ def main(meshes: Path, *, out: Path, seconds: float = 60.0) -> None:
     jobs = []
     for name, file in files.items():
         for method, plan in methods.items():
-            content = [FIT_VERSION, load_mesh(file), plan, PLANS[plan[0]], machine()]
+            content = [FIT_VERSION, load_mesh(file), plan, RECIPES[plan[0]], machine()]
             jobs.append(Job(name, method, content, fit, (file, out / "shapes" / method / name, *plan)))
     fits = measure(jobs, out / "results", on_progress=told)
     fitted = [out / "shapes" / method / first for method in ("ours", "paper's recipe")]

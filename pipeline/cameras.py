@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sdfsim.errors import SdfsimError
-from sdfsim.files import read_arrays, read_json, write_json
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import read_arrays, read_json, write_json
 
 # People hold cameras level to about this; where photos are turned, or all from one place, next to nothing is known.
 CAREFUL, UNKNOWN = 2.0, 30.0  # degrees

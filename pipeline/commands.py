@@ -7,9 +7,9 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from sdfsim.commands.arguments import Budget, Cluster, Out, command, tell_failed
-from sdfsim.console import Session, duration
-from sdfsim.errors import EXIT_ERROR, EXIT_USAGE, SdfsimError
+from sdfsim.base.arguments import Budget, Cluster, Out, command, tell_failed
+from sdfsim.base.console import Session, duration
+from sdfsim.base.errors import EXIT_ERROR, EXIT_USAGE, SdfsimError
 
 Presets = Literal["quick", "standard", "fine", "volsdf"]
 Preset = Annotated[
@@ -182,20 +182,20 @@ def fit(
             raise SdfsimError("--cap, --thicken, --units and --cluster go with -o", exit_code=EXIT_USAGE)
         _stage(session, "fit", sources[0], then="scene", budget=budget, recipe=recipe, device=device)
         return
-    from sdfsim import fitting
-    from sdfsim.parallel import cluster as working_on
+    from sdfsim.apps import fit as room
+    from sdfsim.base.parallel import cluster as working_on
 
-    options = fitting.Options(recipe or "default", budget, cap, thicken, units)
+    options = room.Options(recipe or "default", budget, cap, thicken, units)
     if len(sources) == 1 and not sources[0].is_dir():
-        report = fitting.fit(sources[0], out, options, device=device, on_progress=session.progress)
+        report = room.fit(sources[0], out, options, device=device, on_progress=session.progress)
     else:
-        meshes = fitting.named_meshes(sources)
+        meshes = room.named_meshes(sources)
         with working_on(cluster):
-            report = fitting.fit_many(meshes, out, options, device=device, on_progress=session.progress)
+            report = room.fit_many(meshes, out, options, device=device, on_progress=session.progress)
     tell_failed(session, report)
     if any("error" in shape for shape in report.get("shapes", {}).values()):
         session.exit_code = EXIT_ERROR
-    session.report(report, fitting.fit_lines(report))
+    session.report(report, room.fit_lines(report))
 
 
 def _stage(session: Session, name: str, folder: Path, *, then: Stage | None = None, **options: Any) -> None:

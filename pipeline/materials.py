@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from sdfsim.errors import SdfsimError, nearest
-from sdfsim.scene.scene_file import UNITS
+from sdfsim.base.errors import SdfsimError, nearest
+from sdfsim.scene.schema import UNITS
 
 CRC = "CRC Handbook of Chemistry and Physics"
 TOOLBOX = "Engineering ToolBox"

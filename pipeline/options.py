@@ -10,8 +10,8 @@ import numpy as np
 import yaml
 
 from pipeline.materials import choose
-from sdfsim.errors import SdfsimError
-from sdfsim.files import CONFIG, write_text
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import CONFIG, write_text
 
 COMMAND = "reconstruct"
 ALLOWED = {

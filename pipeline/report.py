@@ -13,8 +13,8 @@ import numpy as np
 from pipeline.cameras import Similarity, camera_up, frame_of, load_sparse, load_views
 from pipeline.inputs.photos import load_photos
 from pipeline.options import Options
-from sdfsim.errors import SdfsimError
-from sdfsim.files import read_json, write_json, write_text
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import read_json, write_json, write_text
 
 # What a person looks for, and the stage that writes it.
 RESULTS = {
@@ -224,8 +224,8 @@ def write_recording(folder: Path, done: Collection[str]) -> Path | None:
     from pipeline.field.training import load_field
     from pipeline.mesh.meshing import NEXT, TEXTURED, trust_meshes
     from pipeline.mesh.placement import load_placement
-    from sdfsim.recording import PosedPhoto, save_reconstruction
-    from sdfsim.shape.mesh import load_mesh, read_glb
+    from sdfsim.apps.recording import PosedPhoto, save_reconstruction
+    from sdfsim.geometry.mesh import load_mesh, read_glb
 
     if "poses" not in done:
         return None

@@ -16,11 +16,11 @@ from pipeline.mesh.meshing import SCENERY, TEXTURED, read_parts, rounded
 from pipeline.mesh.placement import Placement, load_placement
 from pipeline.mesh.visibility import Above
 from pipeline.progress import Progress, quiet, share_of
-from sdfsim.errors import EXIT_QUALITY, SdfsimError, nearest
-from sdfsim.files import write_text
+from sdfsim.base.errors import EXIT_QUALITY, SdfsimError, nearest
+from sdfsim.base.files import write_text
+from sdfsim.geometry.mesh import Mesh, joined, load_mesh, read_glb
+from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
-from sdfsim.scene.scene_file import load_scene
-from sdfsim.shape.mesh import Mesh, joined, load_mesh, read_glb
 
 SCENERY_SHARE = 2  # Of a budget the scenery gets as much as this many bodies: it has more to it.
 SIDE = 0.06  # of the dropped slab, as a share of the scenery's widest side
@@ -37,8 +37,8 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
     """Fits a compact SDF to the scenery and to every body within the budget, s; each is a Shape folder in `out` that
     goes by its name, and those that are there already are kept. Returns a certificate for each of `shapes`, and
     `passed`, `reason` and `caveats` for all of them."""
-    from sdfsim.shape.baked_grid import grid_certificate
-    from sdfsim.shape.fit import fit_mesh
+    from sdfsim.sdf.baked_grid import grid_certificate
+    from sdfsim.shape.make import fit_mesh
     from sdfsim.shape.shape import load_shape
 
     parts, skins = read_parts(mesh_folder), skins_of(mesh_folder)

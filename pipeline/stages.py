@@ -16,8 +16,8 @@ from typing import Any
 from pipeline.options import COMMAND, Options, read_config, write_config
 from pipeline.progress import Progress
 from pipeline.report import write_report
-from sdfsim.errors import EXIT_QUALITY, SdfsimError
-from sdfsim.files import CONFIG, check_own, locked, write_json
+from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
+from sdfsim.base.files import CONFIG, check_own, locked, write_json
 
 # In the folder of a finished stage: fingerprint, inputs, made, seconds, report. Of one at work: its fingerprint alone.
 RECORD = "stage.json"
@@ -47,7 +47,7 @@ class Run:
 
     def device(self) -> str:
         """Where to compute, as torch names it. Raises SdfsimError: cuda was asked for and is not there."""
-        from sdfsim.dynamics.simulator import pick_device
+        from sdfsim.base.devices import pick_device
 
         return str(pick_device(self.options.device))
 
@@ -258,7 +258,7 @@ def run_one(run: Run, stage: str, *, again: bool) -> None:
     values = {**asdict(run.options), "recipe": run.options.fit_recipe()}
     depends: dict[str, Any] = {key: values[key] for key in STAGES[stage].options} | {"own_budget": run.own_budget}
     if stage == "fit":
-        from sdfsim.shape.fit import FIT_VERSION
+        from sdfsim.sdf.fit.train import FIT_VERSION
 
         depends["fit_version"] = FIT_VERSION
     text = json.dumps([stage, STAGES[stage].version, inputs, depends], sort_keys=True)

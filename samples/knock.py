@@ -20,9 +20,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from pipeline.mesh.meshing import SCENERY, rounded
 from pipeline.mesh.visibility import Above
-from sdfsim.errors import run_main
-from sdfsim.files import write_text
-from sdfsim.scene.scene_file import load_scene
+from sdfsim.base.errors import run_main
+from sdfsim.base.files import write_text
+from sdfsim.scene.load import load_scene
 from sdfsim.shape.shape import Shape, load_shape
 
 GRAVITY = 9.81  # m/s^2

@@ -20,12 +20,13 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from sdfsim.dynamics.simulator import Simulator
-from sdfsim.errors import run_main
-from sdfsim.files import write_text
-from sdfsim.scene.scene_file import load_scene
-from sdfsim.shape.shape import Shape, analytic_shape, load_shape, scaled, shape_from_primitive
+from sdfsim.base.errors import run_main
+from sdfsim.base.files import write_text
+from sdfsim.scene.load import load_scene
+from sdfsim.shape.make import analytic_shape, shape_from_primitive
+from sdfsim.shape.shape import Shape, load_shape, scaled
 from sdfsim.shape.surface_nodes import sample_nodes, thin
+from sdfsim.simulate.simulator import Simulator
 
 BALL = 0.52  # m, diameter
 MOST_BALLS = 512

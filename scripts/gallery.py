@@ -8,10 +8,10 @@ from pathlib import Path
 
 from PIL import Image
 
-from sdfsim.dynamics.simulator import Simulator
-from sdfsim.render import render
-from sdfsim.run import ending_lines, summary
-from sdfsim.scene.scene_file import load_scene
+from sdfsim.apps.render import render
+from sdfsim.apps.run import ending_lines, summary
+from sdfsim.scene.load import load_scene
+from sdfsim.simulate.simulator import Simulator
 
 ROOT = Path(__file__).resolve().parents[1]
 # When, from where and at what, in s and m.

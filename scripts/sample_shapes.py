@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sdfsim.shape.fit import fit_mesh
-from sdfsim.shape.mesh import Mesh, write_ply
-from sdfsim.shape.primitives import sphere
-from sdfsim.shape.shape import shape_from_primitive
+from sdfsim.geometry.mesh import Mesh, write_ply
+from sdfsim.geometry.primitives import sphere
+from sdfsim.shape.make import fit_mesh, shape_from_primitive
 
 ROOT = Path(__file__).resolve().parents[1]
 SHAPES = {"bowl": ("bowl", 0.6), "ring": ("torus", 0.22), "can": ("cylinder", 0.14), "cone": ("cone", 0.16)}  # m

@@ -10,13 +10,15 @@ import warnings
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from sdfsim.base.version import __version__ as __version__
+
 if TYPE_CHECKING:
-    from sdfsim.dynamics.rollout import Rollout
-    from sdfsim.dynamics.simulator import Simulator
-    from sdfsim.errors import SceneError, SdfsimError
-    from sdfsim.scene.scene_file import load_scene
-    from sdfsim.scene.written import Scene
+    from sdfsim.base.errors import SceneError, SdfsimError
+    from sdfsim.physics.rollout import Rollout
+    from sdfsim.scene.builder import SceneBuilder as Scene
+    from sdfsim.scene.load import load_scene
     from sdfsim.shape.shape import Shape, load_shape
+    from sdfsim.simulate.simulator import Simulator
 
 # Threads of torch wait for one another by spinning, and beside other programs they take the processor from those they
 # wait for: a step then takes ten times as long. So they spin for some microseconds only, which costs little on a free
@@ -26,22 +28,22 @@ os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 # Numba tells of an old TBB as it takes the next best of its threading layers, which is as good here.
 warnings.filterwarnings("ignore", message="The TBB threading layer requires TBB version")
 
-__version__ = "0.1.0"
 __all__ = ["Rollout", "Scene", "SceneError", "SdfsimError", "Shape", "Simulator", "load_scene", "load_shape"]
 
 _HOME = {
-    "Rollout": "sdfsim.dynamics.rollout",
-    "Scene": "sdfsim.scene.written",
-    "SceneError": "sdfsim.errors",
-    "SdfsimError": "sdfsim.errors",
+    "Rollout": "sdfsim.physics.rollout",
+    "Scene": "sdfsim.scene.builder",
+    "SceneError": "sdfsim.base.errors",
+    "SdfsimError": "sdfsim.base.errors",
     "Shape": "sdfsim.shape.shape",
-    "Simulator": "sdfsim.dynamics.simulator",
-    "load_scene": "sdfsim.scene.scene_file",
+    "Simulator": "sdfsim.simulate.simulator",
+    "load_scene": "sdfsim.scene.load",
     "load_shape": "sdfsim.shape.shape",
 }
+_THERE = {"Scene": "SceneBuilder"}  # names that differ there
 
 
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'sdfsim' has no attribute {name!r}")
-    return getattr(import_module(_HOME[name]), name)
+    return getattr(import_module(_HOME[name]), _THERE.get(name, name))

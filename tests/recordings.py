@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sdfsim.data.dataset import Trajectory
-from sdfsim.shape.shape import analytic_shape
+from sdfsim.shape.make import analytic_shape
 from sdfsim.training import train as train_module
 from sdfsim.training.presets import Preset
 

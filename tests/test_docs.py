@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sdfsim.scene.scene_file import load_scene
+from sdfsim.scene.load import load_scene
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [
@@ -143,7 +143,7 @@ def test_steps_in_documents_are_those_of_the_presets():
 
 def test_the_bundled_model_is_said_to_learn_from_what_it_learned_from():
     """The tutorial's commands and the card's make as many trajectories as the file of the model knows."""
-    from sdfsim.dynamics.model import load_model
+    from sdfsim.learned.model import load_model
 
     made = [known["trajectories"] for known in load_model("small").card["data"]]
     loops = re.findall(r"for split in (.*?); do.*\n.*?-o (\S+)", page("docs/tutorial.md"))
@@ -167,7 +167,7 @@ def test_presets_and_recipes_in_documents_exist():
     from typing import get_args
 
     from pipeline.commands import Presets
-    from sdfsim.shape.fit import Recipe
+    from sdfsim.sdf.fit.train import Recipe
     from sdfsim.training.presets import PRESETS as TRAINED
 
     known = {"reconstruct": get_args(Presets), "train": tuple(TRAINED), "fit": get_args(Recipe)}

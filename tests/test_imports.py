@@ -1,4 +1,7 @@
-"""Imports go one way: cli -> pipeline -> sdfsim, inside sdfsim down to shape and errors; help loads nothing heavy."""
+"""Imports go one way, from floor to floor and without circles; help loads nothing heavy.
+
+`python -m tests.test_imports` prints the rooms floor by floor, the imports that go upwards, and the circles.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +9,12 @@ import ast
 import importlib.util
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-FILES = [ROOT / "cli.py", *sorted((ROOT / "sdfsim").rglob("*.py")), *sorted((ROOT / "pipeline").rglob("*.py"))]
 HEAVY = (
     "torch",
     "open3d",
@@ -26,75 +29,122 @@ HEAVY = (
     "numpy",
 )
 
-# A room may import itself and rooms further down. Rooms of one level may not import each other,
-# but the rooms of the top level share what they have to (a run writes a recording, a viewer shows one).
-LEVELS = {
-    "errors": 0,
-    "files": 1,
-    "parallel": 1,
-    "shape": 2,
-    "scene": 3,
-    "dynamics": 4,
-    "data": 6,
-    "training": 7,
-    "evaluation": 8,
-    "commands": 9,
+# The rooms of sdfsim from the ground up. A room imports itself and rooms on floors below it.
+FLOORS = [
+    ["base"],
+    ["geometry"],
+    ["sdf"],
+    ["shape"],
+    ["scene"],
+    ["physics"],
+    ["learned"],
+    ["simulate"],
+    ["data", "apps"],
+    ["training"],
+    ["evaluation"],
+    ["commands"],
+]
+# What still goes upwards, and the circles that are left, which the stepper's redesign takes away.
+UPWARDS = {
+    ("sdfsim.learned.families", "sdfsim.simulate.run_memory"),
+    ("sdfsim.learned.inference", "sdfsim.simulate.step"),
+    ("sdfsim.learned.near", "sdfsim.simulate.run_memory"),
+    ("sdfsim.learned.near", "sdfsim.simulate.step"),
+    ("sdfsim.learned.surfaces", "sdfsim.simulate.step"),
+    ("sdfsim.physics.solver.prepare", "sdfsim.simulate.run_memory"),
+    ("sdfsim.physics.solver.prepare", "sdfsim.simulate.step"),
+    ("sdfsim.physics.units", "sdfsim.learned.model"),
 }
-TOP = 5  # run, recording and the other modules directly in sdfsim
+CIRCLES = [
+    {
+        "sdfsim.learned.baselines.dpi",
+        "sdfsim.learned.baselines.fignet",
+        "sdfsim.learned.baselines.mgn",
+        "sdfsim.learned.families",
+        "sdfsim.learned.inference",
+        "sdfsim.learned.model",
+        "sdfsim.learned.near",
+        "sdfsim.learned.sdf_sim",
+        "sdfsim.learned.surfaces",
+        "sdfsim.physics.solver.prepare",
+        "sdfsim.simulate.run_memory",
+        "sdfsim.simulate.step",
+    },
+    {"sdfsim.simulate.body_handle", "sdfsim.simulate.simulator"},
+]
 
 
-def room(module: str) -> tuple[str, int]:
-    """Name and level of the room that a module of sdfsim lives in."""
-    parts = module.split(".")
-    if len(parts) == 1:
-        return "sdfsim", 0  # its names are loaded on use; the version is all that others take from it
-    return (parts[1], LEVELS[parts[1]]) if parts[1] in LEVELS else ("top", TOP)
+@cache
+def modules() -> dict[str, Path]:
+    """The files of our modules by name."""
+    files = [ROOT / "cli.py", *(ROOT / "sdfsim").rglob("*.py"), *(ROOT / "pipeline").rglob("*.py")]
+    names = [".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for file in files]
+    return dict(sorted(zip(names, files, strict=True)))
 
 
-def imported(file: Path) -> list[str]:
-    """Every module of ours that a file imports, anywhere in it, type checking blocks left out."""
-    tree = ast.parse(file.read_text(encoding="utf-8"))
-    hidden = {
-        id(inner)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
-        for inner in ast.walk(node)
+@cache
+def imports() -> dict[str, set[str]]:
+    """The modules of ours that each module imports, anywhere in its file: in functions and for types only as well."""
+    found: dict[str, set[str]] = {}
+    for module, file in modules().items():
+        found[module] = set()
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            names = []
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                assert node.level == 0, f"{file}:{node.lineno}: relative import"
+                names = [f"{node.module}.{alias.name}" for alias in node.names]
+            for name in names:
+                while name and name not in modules():  # what is imported from a module
+                    name = name.rpartition(".")[0]
+                found[module] |= {name} - {"", module}
+    return found
+
+
+def floor(module: str) -> tuple[int, str]:
+    """The floor of a module's room and the room's name. The package itself is below all: its names load on use."""
+    package, _, rest = module.partition(".")
+    if package != "sdfsim":
+        return {"pipeline": 100, "cli": 101}[package], package
+    room = rest.partition(".")[0]
+    return next((level for level, rooms in enumerate(FLOORS) if room in rooms), -1), room
+
+
+def upwards() -> set[tuple[str, str]]:
+    """The imports of a room above, or of another one on the same floor."""
+    return {
+        (module, other)
+        for module, others in imports().items()
+        for other in others
+        if module != "sdfsim" and floor(other) != floor(module) and floor(other)[0] >= floor(module)[0]
     }
-    found = []
-    for node in ast.walk(tree):
-        if id(node) in hidden:
-            continue
-        if isinstance(node, ast.Import):
-            found += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{file}:{node.lineno}: relative import"
-            found += [f"{node.module}.{a.name}" if is_package(node.module or "") else node.module for a in node.names]
-    return [name for name in found if name and name.split(".")[0] in ("cli", "pipeline", "sdfsim")]
 
 
-def is_package(module: str) -> bool:
-    return (ROOT / Path(*module.split(".")) / "__init__.py").exists()
+def circles() -> list[set[str]]:
+    """The sets of modules that import each other, directly or through others."""
+    reached: dict[str, set[str]] = {}
+    for module in modules():
+        reached[module], ahead = set(), [module]
+        while ahead:
+            fresh = imports()[ahead.pop()] - reached[module]
+            reached[module] |= fresh
+            ahead += fresh
+    rings = [frozenset(other for other in reached[m] if m in reached[other]) for m in modules() if m in reached[m]]
+    return sorted(map(set, set(rings)), key=sorted)
 
 
-@pytest.mark.parametrize("file", FILES, ids=lambda f: str(f.relative_to(ROOT)))
-def test_imports_go_one_way(file):
-    if file.name == "cli.py":
-        return
-    here = ".".join(file.relative_to(ROOT).with_suffix("").parts)
-    for name in imported(file):
-        package = name.split(".")[0]
-        assert package != "cli", f"{here} imports {name}"
-        if here.startswith("pipeline"):
-            continue
-        assert package == "sdfsim", f"{here} imports {name}"
-        (my_room, mine), (other_room, other) = room(here), room(name)
-        if here.startswith("sdfsim.") and name != "sdfsim":
-            assert other < mine or other_room == my_room, f"{here} imports {name}"
+def test_imports_go_down():
+    assert upwards() == UPWARDS
 
 
-def test_no_room_is_forgotten():
-    rooms = {p.name for p in (ROOT / "sdfsim").iterdir() if (p / "__init__.py").exists()}
-    assert rooms <= set(LEVELS) | {"models"}
+def test_there_are_no_circles():
+    assert circles() == sorted(CIRCLES, key=sorted)
+
+
+def test_every_room_has_a_floor():
+    rooms = {p.name for p in (ROOT / "sdfsim").iterdir() if any(p.glob("*.py"))}
+    assert sorted(rooms) == sorted(room for rooms in FLOORS for room in rooms)
 
 
 @pytest.mark.parametrize("command", ["--help", "simulate --help", "reconstruct --help"])
@@ -136,3 +186,12 @@ def test_what_scripts_import_is_there(folder):
                 for name in (alias.name for alias in node.names):
                     there = hasattr(module, name) or importlib.util.find_spec(f"{node.module}.{name}")
                     assert there, f"{file}: from {node.module} import {name}"
+
+
+if __name__ == "__main__":
+    for rooms in FLOORS[::-1]:
+        print("  ".join(rooms))
+    for module, other in sorted(upwards()):
+        print(f"upwards: {module} -> {other}")
+    for ring in circles():
+        print("circle:", " ".join(sorted(ring)))

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from sdfsim.dynamics import kernels
+from sdfsim.physics import solver as kernels
 
 with kernels.kept():
     from pipeline.field.trilinear import gather, gather_with_threads, scatter, scatter_with_threads

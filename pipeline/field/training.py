@@ -41,9 +41,9 @@ from pipeline.sfm.supervision import (
     supervision_of,
     unit_sphere_of,
 )
-from sdfsim.errors import SdfsimError
-from sdfsim.files import write_bytes, write_json
-from sdfsim.parallel import choose_threads
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import write_bytes, write_json
+from sdfsim.base.parallel import choose_threads
 
 # Steps between updates of the cached SDF, fewer at first; a multiple, so that both fall on the same steps.
 EARLY, EARLY_PERIOD, PERIOD = 288, 16, 48

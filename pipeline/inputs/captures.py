@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.inputs.images import read_photo, sharpness, stored_size
 from pipeline.inputs.known_cameras import DepthFile, KnownCamera, lens_of, posed
-from sdfsim.errors import SdfsimError
-from sdfsim.files import read_json, visible
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import read_json, visible
 
 CAPTURE = "capture.json"  # what `Capture` says, in the folder of the photos stage
 LARGEST = 32 << 30  # bytes of a capture

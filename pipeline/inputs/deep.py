@@ -12,7 +12,7 @@ import numpy as np
 from PIL import ExifTags
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
-from sdfsim.errors import SdfsimError
+from sdfsim.base.errors import SdfsimError
 
 PNG, TIFFS = b"\x89PNG\r\n\x1a\n", (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 OTHERWISE = "save it as PNG, or as TIFF of 8 or 16 bits, channels interleaved, uncompressed or with LZW or ZIP"

@@ -10,7 +10,7 @@ from pi_heif import register_heif_opener
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from pipeline.inputs.deep import OTHERWISE, TIFFS, deep_header, deep_values, eight_bits
-from sdfsim.errors import SdfsimError
+from sdfsim.base.errors import SdfsimError
 
 register_heif_opener(thumbnails=False)
 

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.cameras import View
 from pipeline.inputs.images import Picture
-from sdfsim.errors import SdfsimError
+from sdfsim.base.errors import SdfsimError
 
 # COLMAP's camera models, by number: name, and the names of their parameters; none of those that OpenCV does not know.
 # A transforms.json has the same names, with fl_x and fl_y in place of f, fx and fy.

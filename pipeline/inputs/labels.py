@@ -11,8 +11,8 @@ import yaml
 from PIL import Image
 
 from pipeline.inputs.images import decoded, read_mask, turned_like
-from sdfsim.errors import SdfsimError
-from sdfsim.files import read_json, visible
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import read_json, visible
 
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
 FOLDER, NAMES = "labels", "names.json"  # what the photos stage writes

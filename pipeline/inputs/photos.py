@@ -19,8 +19,8 @@ from pipeline.inputs.known_cameras import KnownCamera, Lens, rectified
 from pipeline.inputs.labels import FOLDER, NAMES
 from pipeline.inputs.sources import Source, find_source
 from pipeline.progress import Progress, quiet
-from sdfsim.errors import SdfsimError
-from sdfsim.files import read_json, write_json
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import read_json, write_json
 
 LONG_SIDE = 1600  # px; what reads the photos takes them as small as it needs
 KNOWN_CAMERAS = "known_cameras.json"  # cameras that came with the photos

@@ -9,8 +9,8 @@ from pathlib import Path
 from pipeline.inputs.captures import ARCHIVES, Capture, find_capture, levels, read_capture
 from pipeline.inputs.known_cameras import KnownCamera, below, read_cameras
 from pipeline.inputs.labels import Labels, find_labels, find_masks
-from sdfsim.errors import SdfsimError
-from sdfsim.files import visible
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import visible
 
 MIN_PHOTOS = 3
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".heic", ".heif", ".hif", ".avif"}

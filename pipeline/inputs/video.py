@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.inputs.images import reduced, sharpness
-from sdfsim.errors import EXIT_QUALITY, SdfsimError
+from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
 
 SMALL, MIDDLE = 256, 960  # px, longer side of the frames that motion and sharpness are measured on
 STEP = 0.07  # of the picture's width: motion from one chosen frame to the next

@@ -30,8 +30,8 @@ from pipeline.mesh.extraction import (
 from pipeline.mesh.photo_refining import load_pictures, refine
 from pipeline.mesh.seams import Part, Solid, Votes, count_votes, part_of_name, parts_by_shape, parts_by_votes, solid_of
 from pipeline.mesh.visibility import Visibility, look, spread_colors, to_bytes
-from sdfsim.shape.bvh import Caster
-from sdfsim.shape.mesh import Mesh, face_normals
+from sdfsim.geometry.bvh import Caster
+from sdfsim.geometry.mesh import Mesh, face_normals
 
 LEVEL_SHARE = 0.1  # of the largest level plane: what is smaller carries nothing, as the lid of a box is no table
 LEVEL_NORMAL = 0.95  # least cosine between up and the normal of a face of a level plane

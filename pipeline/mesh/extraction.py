@@ -17,8 +17,8 @@ from pipeline.cameras import View
 from pipeline.field.grid_field import Field
 from pipeline.mesh.visibility import Visibility, look, to_bytes
 from pipeline.progress import Progress, quiet
-from sdfsim.errors import EXIT_QUALITY, SdfsimError
-from sdfsim.shape.mesh import Mesh, face_normals, vertex_normals
+from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
+from sdfsim.geometry.mesh import Mesh, face_normals, vertex_normals
 
 Distance = Callable[[np.ndarray], np.ndarray]
 

@@ -22,10 +22,10 @@ from pipeline.mesh.texture import Shots, shots_of, texture_parts
 from pipeline.mesh.trust import Support, color_range, colors_of, next_photos, summary, support_of
 from pipeline.mesh.visibility import Visibility, hollow, to_bytes
 from pipeline.progress import Progress, quiet, share_of
-from sdfsim.errors import SdfsimError
-from sdfsim.files import read_json, write_bytes, write_json
-from sdfsim.shape.bvh import Caster
-from sdfsim.shape.mesh import Mesh, joined, read_attributes, read_mesh, write_glb, write_ply
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import read_json, write_bytes, write_json
+from sdfsim.geometry.bvh import Caster
+from sdfsim.geometry.mesh import Mesh, joined, read_attributes, read_mesh, write_glb, write_ply
 
 SCENERY = "scene"
 TEXTURED, NEXT = "textured.glb", "next_photos.json"

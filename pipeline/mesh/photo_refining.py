@@ -18,8 +18,8 @@ from scipy.sparse.linalg import cg
 
 from pipeline.cameras import View, frame_of
 from pipeline.mesh.visibility import Visibility
-from sdfsim.shape.bvh import Caster
-from sdfsim.shape.mesh import Mesh, vertex_normals
+from sdfsim.geometry.bvh import Caster
+from sdfsim.geometry.mesh import Mesh, vertex_normals
 
 LONG_SIDE = 640  # px; larger photos are made smaller, or the right place would lie too many pixels away
 PHOTOS, FEWEST = 5, 3  # that a patch is compared in, those that look straightest; and how many there must be

@@ -11,10 +11,10 @@ import numpy as np
 
 from pipeline.cameras import Similarity, Up, View, camera_up, frame_of
 from pipeline.inputs.photos import Photo
-from sdfsim.errors import SdfsimError
-from sdfsim.files import read_json, write_json
-from sdfsim.shape.bvh import Caster
-from sdfsim.shape.mesh import Mesh, face_normals
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import read_json, write_json
+from sdfsim.geometry.bvh import Caster
+from sdfsim.geometry.mesh import Mesh, face_normals
 
 # Degrees up to which gravity is known well, or well enough to look right: would a ball roll off a level table?
 CONFIDENT = {"high": 2.0, "medium": 6.0}

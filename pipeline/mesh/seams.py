@@ -22,7 +22,7 @@ from pipeline.cameras import View, frame_of
 from pipeline.inputs.labels import UNKNOWN, load_labels
 from pipeline.mesh.extraction import Volume
 from pipeline.mesh.visibility import Visibility
-from sdfsim.shape.mesh import Mesh, vertex_normals
+from sdfsim.geometry.mesh import Mesh, vertex_normals
 
 # A patch of one label that is smaller than this share of the label's largest is a mistake of some mask.
 STRAY = 0.1

@@ -19,8 +19,8 @@ from pipeline.inputs.photos import Photo
 from pipeline.mesh.extraction import keep_faces
 from pipeline.mesh.visibility import FLATTEST, bilinear, framed, to_bytes
 from pipeline.progress import Progress, quiet, share_of
-from sdfsim.shape.bvh import Caster
-from sdfsim.shape.mesh import Mesh, face_normals, joined, sample_surface, vertex_normals
+from sdfsim.geometry.bvh import Caster
+from sdfsim.geometry.mesh import Mesh, face_normals, joined, sample_surface, vertex_normals
 
 FACES = 40_000  # of a textured mesh: finer detail is in its texture
 PIECE = 300  # faces that xatlas gets at a time: its time grows with the square of the faces of a chart

@@ -14,8 +14,8 @@ from scipy.spatial import KDTree
 
 from pipeline.cameras import View, focus
 from pipeline.mesh.visibility import Visibility, framed
-from sdfsim.shape.bvh import Caster
-from sdfsim.shape.mesh import Mesh, face_normals, joined
+from sdfsim.geometry.bvh import Caster
+from sdfsim.geometry.mesh import Mesh, face_normals, joined
 
 FEW = 3  # photos: what fewer see is weak
 PARALLEL = 1e-12  # of lines of sight: least determinant of their information, with its trace as unit

@@ -13,8 +13,8 @@ from scipy.spatial import KDTree
 
 from pipeline.cameras import View
 from pipeline.progress import Progress, quiet
-from sdfsim.shape.bvh import Caster
-from sdfsim.shape.mesh import Mesh, vertex_normals
+from sdfsim.geometry.bvh import Caster
+from sdfsim.geometry.mesh import Mesh, vertex_normals
 
 # A point seen at a flatter angle than this (cosine) does not count as seen.
 FLATTEST = 0.08

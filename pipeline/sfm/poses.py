@@ -21,8 +21,8 @@ from pipeline.inputs.photos import KNOWN_CAMERAS, Photo
 from pipeline.progress import Progress, quiet
 from pipeline.sfm.agreement import unexplained
 from pipeline.sfm.pose_checks import check, failure_hint, failure_message, views_of
-from sdfsim.errors import EXIT_QUALITY, SdfsimError
-from sdfsim.files import read_json, replacing, write_json
+from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
+from sdfsim.base.files import read_json, replacing, write_json
 
 ORDINARY: dict[str, Any] = {
     "pixels": 1000, "max_features": 3000, "peak_threshold": 0.0066667, "max_ratio": 0.8, "guided": False,

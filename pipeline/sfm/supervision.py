@@ -13,7 +13,7 @@ from torch import Tensor
 from pipeline.cameras import Similarity, Sparse, View, nearest_to_axes
 from pipeline.field.interpolation import interpolate
 from pipeline.inputs.photos import Photo
-from sdfsim.errors import SdfsimError
+from sdfsim.base.errors import SdfsimError
 
 # Lines of sight end this far before their points, normalised units.
 GAP = 0.015

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.sfm.agreement import ENOUGH, agreement, contradicting, excess_of_photos, unexplained
-from sdfsim.files import write_arrays, write_json
+from sdfsim.base.files import write_arrays, write_json
 
 REFINE_PIXELS = (16.0, 6.0)  # that a point may be off while known cameras are refined, at first and then
 REFINE_POINTS = 30  # points that a camera needs to be moved

@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from sdfsim.commands.arguments import Cluster, Model, Out, Outside, command, tell_failed
-from sdfsim.console import Session, columns, duration
-from sdfsim.errors import EXIT_USAGE, SdfsimError
+from sdfsim.base.arguments import Cluster, Model, Out, Outside, command, tell_failed
+from sdfsim.base.console import Session, columns, duration
+from sdfsim.base.errors import EXIT_USAGE, SdfsimError
 
 _PACKAGES = (
     *("torch", "numpy", "scipy", "open3d", "trimesh", "pycolmap", "opencv-python-headless", "rerun-sdk"),
@@ -41,7 +41,7 @@ def simulate(
     device: str = "auto",
 ) -> None:
     """Scene -> motion, in a run folder."""
-    from sdfsim import run
+    from sdfsim.apps import run
 
     report = run.simulate(
         scene,
@@ -82,16 +82,16 @@ def plan(
     session: Session, scene: SceneFile, model: Model = None, allow_outside: Outside = False, device: str = "auto"
 ) -> None:
     """Which effects are in play, why, and what a step costs."""
-    from sdfsim import planning
+    from sdfsim.apps import plan as room
 
-    report = planning.describe(
+    report = room.describe(
         scene, model=model, device=device, allow_outside=allow_outside, on_progress=session.stage_progress
     )
     for note in report["notes"]:
         session.say(note)
     for check in report["failed_checks"]:  # told, but a plan is as good with a shape that is less exact
         session.say(f"failed check: {check}")
-    session.report(report, planning.plan_lines(report))
+    session.report(report, room.plan_lines(report))
 
 
 @command
@@ -105,7 +105,7 @@ def view(
     """Watch a recording, or take a picture of it."""
     if at is not None and picture is None:
         raise SdfsimError("--at goes with --screenshot", exit_code=EXIT_USAGE)
-    from sdfsim import viewer
+    from sdfsim.apps import viewer
 
     if picture is not None:
         viewer.screenshot(recording, picture, at=at)
@@ -135,8 +135,8 @@ def render(
     """Run -> movie or picture, without a screen."""
     if at is not None and out.suffix != ".png":
         raise SdfsimError("--at goes with a picture, -o FILE.png", exit_code=EXIT_USAGE)
-    from sdfsim import render as room
-    from sdfsim.run import read_run
+    from sdfsim.apps import render as room
+    from sdfsim.apps.run import read_run
 
     room.check_format(out)
     shapes, frames = partial(session.stage_progress, "shapes"), partial(session.stage_progress, "render")
@@ -157,7 +157,7 @@ def export(
     allow_outside: Outside = False,
 ) -> None:
     """Shape, scene or run -> a file of other programs (docs/export.md)."""
-    from sdfsim import export as room
+    from sdfsim.apps import export as room
 
     report = room.export(source, out, scene_file=scene, allow_outside=allow_outside, on_progress=session.stage_progress)
     files = report["files"]
@@ -180,7 +180,7 @@ def identify(
     allow_outside: Outside = False,
 ) -> None:
     """Motion -> friction, restitution and mass ratios."""
-    from sdfsim import identify as room
+    from sdfsim.apps import identify as room
 
     shapes, fit = partial(session.stage_progress, "shapes"), partial(session.stage_progress, "identify")
     motion, known = room.load_recording(recording, scene, allow_outside=allow_outside, on_progress=shapes)
@@ -196,10 +196,10 @@ def info(session: Session) -> None:
 
     import torch
 
-    import sdfsim
-    from sdfsim.dynamics.model import model_names
+    from sdfsim.base.version import __version__
+    from sdfsim.learned.model import model_names
 
-    versions = {"sdfsim": sdfsim.__version__, "python": platform.python_version()}
+    versions = {"sdfsim": __version__, "python": platform.python_version()}
     for name in _PACKAGES:
         try:
             versions[name] = metadata.version(name)
@@ -233,8 +233,8 @@ def dataset(
     cluster: Cluster = None,
 ) -> None:
     """Trajectories of the teacher (PyBullet) to learn from."""
+    from sdfsim.base.parallel import cluster as working_on
     from sdfsim.data.generate import make_dataset, report_lines
-    from sdfsim.parallel import cluster as working_on
 
     with working_on(cluster):
         report = make_dataset(

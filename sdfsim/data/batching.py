@@ -7,17 +7,18 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.data.dataset import FLOOR, Trajectory
 from sdfsim.data.pybullet_sim import MARGIN
-from sdfsim.dynamics.bodies import Bodies, State, Units, from_scene
-from sdfsim.dynamics.model import Model
-from sdfsim.dynamics.models.contact_graph import SUBSTEPS
-from sdfsim.dynamics.models.surfaces import with_history
-from sdfsim.dynamics.run_memory import Memory
-from sdfsim.dynamics.step import FreeFlight, StepOptions, step
-from sdfsim.errors import EXIT_QUALITY, SdfsimError
+from sdfsim.learned.contact_graph import SUBSTEPS
+from sdfsim.learned.model import Model
+from sdfsim.learned.surfaces import with_history
+from sdfsim.physics.bodies import Bodies, State, Units, from_scene
 from sdfsim.scene.scene import Body, Scene
-from sdfsim.shape.shape import Shape, analytic_shape
+from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import Shape
+from sdfsim.simulate.run_memory import Memory
+from sdfsim.simulate.step import FreeFlight, StepOptions, step
 
 BATCH = 50  # trajectories simulated side by side
 PLANE = analytic_shape("plane")

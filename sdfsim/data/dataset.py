@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import read_arrays, read_json, write_arrays
 from sdfsim.data.pybullet_sim import TEACHER_VERSION, set_as_teacher
-from sdfsim.errors import SdfsimError
-from sdfsim.files import read_arrays, read_json, write_arrays
 
 if TYPE_CHECKING:
     from sdfsim.shape.shape import Shape

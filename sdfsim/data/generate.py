@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import locked, write_json
+from sdfsim.base.parallel import Progress, parallel, silent
 from sdfsim.data.dataset import FLOOR, INFO, SPLITS, Trajectory, read_info
 from sdfsim.data.public_shapes import public_folder
 from sdfsim.data.pybullet_sim import FPS, RATES, TEACHER_VERSION, Teacher, engine_settings, import_pybullet
 from sdfsim.data.scenarios import RECIPES, Cast
 from sdfsim.data.shape_assets import VHACD, Origin, fit_shapes, origins, prepare, split_of
-from sdfsim.errors import SdfsimError
-from sdfsim.files import locked, write_json
-from sdfsim.parallel import Progress, parallel, silent
 
 GRAVITY = (0.0, 0.0, -10.0)  # m/s^2
 STEPS = 100

@@ -16,9 +16,9 @@ import tempfile
 import zlib
 from pathlib import Path
 
-from sdfsim.errors import SdfsimError
-from sdfsim.files import FREELY, user_cache, write_bytes
-from sdfsim.parallel import Progress, silent
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import FREELY, user_cache, write_bytes
+from sdfsim.base.parallel import Progress, silent
 
 KUBRIC = "https://storage.googleapis.com/kubric-public/assets/KuBasic"
 # One commit, so that nothing there can move.

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sdfsim.errors import SdfsimError
-from sdfsim.files import write_text
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import write_text
 
 TEACHER_VERSION = 2  # `dataset.json` tells it; datasets of another version are not used
 RATES = {50: 5, 60: 4}  # recorded frames a second -> inner steps in one

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from sdfsim.data.dataset import FLOOR
 from sdfsim.data.pybullet_sim import Teacher, TeacherBody
 from sdfsim.data.shape_assets import ShapeSource
-from sdfsim.dynamics.training_ranges import DEEPEST
+from sdfsim.learned.training_ranges import DEEPEST
 
 TRIES = 100  # places for one body before the scene is drawn again
 UP, STILL = np.array([0.0, 0.0, 1.0]), np.zeros(3)

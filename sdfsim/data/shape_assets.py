@@ -11,18 +11,17 @@ from typing import Any
 
 import numpy as np
 
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import read_json, visible, write_json, write_text
+from sdfsim.base.parallel import Progress, parallel
 from sdfsim.data.dataset import SOLID, check_names
 from sdfsim.data.pybullet_sim import write_urdf
-from sdfsim.errors import SdfsimError
-from sdfsim.files import read_json, visible, write_json, write_text
-from sdfsim.parallel import Progress, parallel
-from sdfsim.shape import primitives
-from sdfsim.shape.distance import PiecesDistance
-from sdfsim.shape.fit import fit_pieces
-from sdfsim.shape.mass import mass_properties, mass_properties_of_sdf
-from sdfsim.shape.mesh import MESH_SUFFIXES, Mesh, convex_hull, is_closed, load_mesh, load_pieces, wavefront
-from sdfsim.shape.shape import analytic_shape
-from sdfsim.shape.watertight import solidify
+from sdfsim.geometry import primitives
+from sdfsim.geometry.mass import mass_properties, mass_properties_of_sdf
+from sdfsim.geometry.mesh import MESH_SUFFIXES, Mesh, convex_hull, is_closed, load_mesh, load_pieces, wavefront
+from sdfsim.geometry.solidify import solidify
+from sdfsim.sdf.reference import PiecesDistance
+from sdfsim.shape.make import analytic_shape, fit_pieces
 
 NODES = 512  # surface nodes a shape: the vertices and edges of the pieces first, since those are what really touches
 THINNEST = 0.02  # thickness over largest extent below which a mesh is left out: no fit resolves it
@@ -166,7 +165,8 @@ def _write_pieces(origin: Origin, engine: Path) -> dict[str, Any]:
     if len(pieces) == 1 and is_closed(pieces[0]):
         volume, com, _ = mass_properties(pieces[0])
     else:
-        volume, com, _ = mass_properties_of_sdf(PiecesDistance(pieces), cells=48)
+        union = PiecesDistance(pieces)
+        volume, com, _ = mass_properties_of_sdf(union, union.bounds, cells=48)
     size = float(np.ptp(np.concatenate([piece.vertices for piece in pieces]), axis=0).max())
     write_text(file, wavefront([Mesh((piece.vertices - com) / size, piece.faces) for piece in pieces]))
     return {"volume": volume / size**3, "com": com.tolist(), "size": size}

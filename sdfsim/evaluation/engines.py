@@ -20,19 +20,19 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import write_text
 from sdfsim.data.batching import MOTION
 from sdfsim.data.dataset import Trajectory, shapes_folder
 from sdfsim.data.pybullet_sim import DT, SUBSTEPS, Teacher, TeacherBody, substeps_of, write_urdf
 from sdfsim.data.shape_assets import decompose
-from sdfsim.dynamics.bodies import Units, from_scene
-from sdfsim.dynamics.rollout import Rollout
-from sdfsim.dynamics.simulator import Simulator, join
-from sdfsim.errors import SdfsimError
-from sdfsim.files import write_text
+from sdfsim.geometry.mesh import Mesh, load_pieces, wavefront
+from sdfsim.physics.bodies import Units, from_scene
+from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.scene import Scene
-from sdfsim.shape.mesh import Mesh, load_pieces, wavefront
-from sdfsim.shape.sdf import BoxSdf, PlaneSdf, SphereSdf
+from sdfsim.sdf.closed_forms import BoxSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.shape import Shape, own_pieces
+from sdfsim.simulate.simulator import Simulator, join
 
 SAME_INERTIA = 1e-3  # relative
 SOFTEST = 3.0  # MuJoCo: time constant of a contact over the engine's step, at least 2 for it to be stable

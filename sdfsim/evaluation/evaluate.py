@@ -10,7 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from sdfsim.console import columns
+from sdfsim.base.console import columns
+from sdfsim.base.devices import pick_device
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.parallel import Progress, parallel, silent
 from sdfsim.data.batching import batches, every, first_frames, model_units, roll_out, scene_of
 from sdfsim.data.dataset import (
     Trajectory,
@@ -23,20 +26,17 @@ from sdfsim.data.dataset import (
     trajectory_files,
 )
 from sdfsim.data.pybullet_sim import MARGIN, engine_settings, import_pybullet, substeps_of
-from sdfsim.dynamics.model import SOLVER, Model, load_model
-from sdfsim.dynamics.models.contact_graph import SUBSTEPS
-from sdfsim.dynamics.simulator import pick_device
-from sdfsim.dynamics.step import FreeFlight
-from sdfsim.dynamics.training_ranges import outside_training
-from sdfsim.dynamics.units import scene_units
-from sdfsim.errors import SdfsimError
 from sdfsim.evaluation import metrics
 from sdfsim.evaluation.engines import Start, bullet, dataset_urdf
 from sdfsim.evaluation.metrics import Motions, energy_gain, errors
 from sdfsim.evaluation.penetration import EVERY, exact_solids, penetration
-from sdfsim.parallel import Progress, parallel, silent
+from sdfsim.learned.contact_graph import SUBSTEPS
+from sdfsim.learned.model import SOLVER, Model, load_model
+from sdfsim.learned.training_ranges import outside_training
+from sdfsim.physics.units import scene_units
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.shape import Shape
+from sdfsim.simulate.step import FreeFlight
 from sdfsim.training.contact_cache import inner_steps
 
 SURVIVED = "0.25"  # m, the limit whose median survival time is shown

@@ -6,7 +6,7 @@ prints a line a check: what was measured, what is wanted, and whether it holds. 
 its unit of length (that of the smallest bodies), `--yaw` turns the whole scene about the vertical, and `--kind` is what
 solids are made of: closed forms, the exact distance of a mesh, or samples of it on a grid. Lengths below are in units
 of the size, times and speeds as at 10 cm (they scale by Froude's law). Everything is judged by closed forms and by the
-instruments of `sdfsim.dynamics.instruments`, never by what the contact solve says of itself.
+instruments of `sdfsim.physics.instruments`, never by what the contact solve says of itself.
 """
 
 from __future__ import annotations
@@ -21,16 +21,17 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sdfsim.dynamics.instruments import DEEP, MADE, Verdict, energies, judged, placed, solid_of
-from sdfsim.dynamics.model import SOLVER, Model
-from sdfsim.dynamics.rollout import Rollout
-from sdfsim.dynamics.simulator import SimulationError, Simulator
-from sdfsim.dynamics.true_surfaces import gaps
-from sdfsim.files import write_text
+from sdfsim.base.files import write_text
+from sdfsim.geometry import primitives
+from sdfsim.geometry.mesh import Mesh, convex_hull, joined
+from sdfsim.learned.model import SOLVER, Model
+from sdfsim.physics.instruments import DEEP, MADE, Verdict, energies, judged, placed, solid_of
+from sdfsim.physics.rollout import Rollout
+from sdfsim.physics.true_surfaces import gaps
 from sdfsim.scene.scene import Body, Effects, Scene
-from sdfsim.shape import primitives
-from sdfsim.shape.mesh import Mesh, convex_hull, joined
-from sdfsim.shape.shape import Shape, analytic_shape, mesh_shape, shape_from_primitive
+from sdfsim.shape.make import analytic_shape, mesh_shape, shape_from_primitive
+from sdfsim.shape.shape import Shape
+from sdfsim.simulate.simulator import SimulationError, Simulator
 
 G = 9.81  # m/s^2
 UNIT = 0.1  # m, at which times and speeds are as they are written
@@ -811,7 +812,8 @@ def _momenta(ran: Ran) -> tuple[np.ndarray, np.ndarray]:
 def bullets(at: Setting) -> Iterator[Check]:
     """Small turned cubes against a plate of a sixth of their size: none passes."""
     rng = np.random.default_rng(4)
-    cube, plate = solid(at.kind, "box", 0.12, 0.12, 0.12), solid("mesh" if at.kind == "grid" else at.kind, "box", 6, 6, 0.02)
+    cube = solid(at.kind, "box", 0.12, 0.12, 0.12)
+    plate = solid("mesh" if at.kind == "grid" else at.kind, "box", 6, 6, 0.02)
     for speed in (20.0, 50.0, 200.0):
         for name, tilt in (("level", STILL), ("tilted", about("x", 20) * about("y", 10))):
             count = 36 if at.full else 12

@@ -17,19 +17,20 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import visible
 from sdfsim.data.dataset import Trajectory
 from sdfsim.data.scenarios import steady_faces
-from sdfsim.dynamics.bodies import largest_extent
-from sdfsim.dynamics.model import Model
-from sdfsim.dynamics.rollout import Rollout
-from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.everyday import KINDS, ROWS, SIZES, Setting, failures
 from sdfsim.evaluation.metrics import energy
 from sdfsim.evaluation.penetration import depths
-from sdfsim.files import visible
+from sdfsim.geometry.mesh import MESH_SUFFIXES
+from sdfsim.learned.model import Model
+from sdfsim.physics.bodies import largest_extent
+from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.scene import Body, Effects, Scene
-from sdfsim.shape.mesh import MESH_SUFFIXES
-from sdfsim.shape.shape import Shape, analytic_shape, shape_from_mesh, shape_from_primitive
+from sdfsim.shape.make import analytic_shape, shape_from_mesh, shape_from_primitive
+from sdfsim.shape.shape import Shape
 
 G = 10.0  # m/s^2
 FRICTION, RESTITUTION = 0.8, 0.5  # of a body

@@ -18,10 +18,10 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-import sdfsim
-from sdfsim.errors import SdfsimError
-from sdfsim.files import digest, read_json, replacing, write_json
-from sdfsim.parallel import Progress, parallel, silent
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import digest, read_json, replacing, write_json
+from sdfsim.base.parallel import Progress, parallel, silent
+from sdfsim.base.version import __version__
 
 Results = dict[tuple[str, str], dict[str, Any]]
 FAILURES = (SdfsimError, RuntimeError, MemoryError)
@@ -54,10 +54,10 @@ def measure(
         where: "here", one after the other in this process; "cores", on all of them in the order of `jobs`; "fresh",
             each in a process of its own, whose peak memory is then the job's.
     """
-    from sdfsim.dynamics.kernels import _cache  # numba takes its time to load
+    from sdfsim.physics.solver import _cache  # numba takes its time to load
 
     todo: list[tuple[Job, Path, str]] = []
-    version = [sdfsim.__version__, _cache().name]  # the name is a hash of the compiled step's source
+    version = [__version__, _cache().name]  # the name is a hash of the compiled step's source
     results: Results = {}
     for job in jobs:
         file, mark = folder / job.method / f"{job.case}.json", digest(job.content, version)

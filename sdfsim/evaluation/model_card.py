@@ -9,11 +9,11 @@ from typing import Annotated
 
 import typer
 
-from sdfsim.dynamics.model import BUNDLED, Model, load_model
-from sdfsim.errors import run_main
+from sdfsim.base.errors import run_main
+from sdfsim.base.files import write_text
 from sdfsim.evaluation.evaluate import error_rows, evaluate, notes, quality_rows
 from sdfsim.evaluation.harness import markdown
-from sdfsim.files import write_text
+from sdfsim.learned.model import BUNDLED, Model, load_model
 
 MODEL = "this model"  # in the tables of a card
 

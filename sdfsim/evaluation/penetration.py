@@ -11,14 +11,15 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sdfsim.base.errors import SdfsimError
 from sdfsim.data.dataset import Trajectory
-from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.engines import dataset_urdf
+from sdfsim.geometry.mesh import load_pieces
 from sdfsim.scene.scene import Scene
-from sdfsim.shape.distance import PiecesDistance
-from sdfsim.shape.mesh import load_pieces
-from sdfsim.shape.mlp_sdf import MlpSdf
-from sdfsim.shape.sdf import GridSdf, MeshSdf
+from sdfsim.sdf.grid import GridSdf
+from sdfsim.sdf.mesh_sdf import MeshSdf
+from sdfsim.sdf.mlp import MlpSdf
+from sdfsim.sdf.reference import PiecesDistance
 from sdfsim.shape.shape import Shape, with_sdf
 
 TOUCH = 0.01  # mean sizes of the moving bodies; a node this near to another surface is in contact
@@ -26,7 +27,7 @@ EVERY = 10  # frames between two that are looked at
 
 
 @dataclass(frozen=True)
-class Solid:
+class ExactSolid:
     """A shape's exact geometry about its centre of mass, at scale 1."""
 
     nodes: np.ndarray  # [K, 3] m, surface nodes
@@ -37,7 +38,7 @@ class Solid:
     kind: str
 
 
-def exact_solids(data: Path, shapes: dict[str, Shape]) -> dict[str, Solid]:
+def exact_solids(data: Path, shapes: dict[str, Shape]) -> dict[str, ExactSolid]:
     """The exact geometry of every shape of a dataset.
 
     A shape that was fitted to an engine's convex pieces is those pieces, where the dataset's engine file leads to
@@ -52,11 +53,11 @@ def exact_solids(data: Path, shapes: dict[str, Shape]) -> dict[str, Solid]:
             with suppress(SdfsimError):
                 oracle = PiecesDistance(load_pieces(dataset_urdf(data, name).with_suffix(".obj")))
                 distance = lambda points, oracle=oracle: oracle(points).distance  # noqa: E731
-                solids[name] = Solid(shape.nodes, oracle.bounds, distance, "pieces")
+                solids[name] = ExactSolid(shape.nodes, oracle.bounds, distance, "pieces")
     return solids
 
 
-def deepest(motion: Trajectory, solids: dict[str, Solid], every: int = EVERY) -> np.ndarray:
+def deepest(motion: Trajectory, solids: dict[str, ExactSolid], every: int = EVERY) -> np.ndarray:
     """[F] m, signed distance of the deepest node of any body in any other, or in the floor z = 0, every so many frames.
     Negative inside, infinite where nothing touches. Pairs of static bodies, and these in the floor, do not count."""
     kept = slice(every, None, every)
@@ -86,7 +87,7 @@ def deepest(motion: Trajectory, solids: dict[str, Solid], every: int = EVERY) ->
     return np.where(lowest <= touch, lowest, np.inf)
 
 
-def penetration(motions: list[Trajectory], solids: dict[str, Solid]) -> dict:
+def penetration(motions: list[Trajectory], solids: dict[str, ExactSolid]) -> dict:
     """Penetration m over the frames of all `motions` in which something touches: percentile_95 and worst of the depth
     of a frame's deepest node (None where nothing touches), and steps_with_contact."""
     depth = _touching(np.concatenate([deepest(motion, solids) for motion in motions]))
@@ -124,8 +125,8 @@ def _near(position: np.ndarray, turn: np.ndarray, bounds: np.ndarray, moving: np
     return (gap <= 0).all(-1) & pairs
 
 
-def _exact(shape: Shape, com: np.ndarray | float = 0.0) -> Solid:
+def _exact(shape: Shape, com: np.ndarray | float = 0.0) -> ExactSolid:
     """The geometry that a shape's distances stand for, seen from `com` [3] m."""
     sdf = with_sdf(shape, "mesh").sdf if isinstance(shape.sdf, MlpSdf | GridSdf) else shape.sdf
     kind = "mesh" if isinstance(sdf, MeshSdf) else "closed form"
-    return Solid(shape.nodes, np.asarray(sdf.bounds) - com, lambda points: np.asarray(sdf(points + com)[0]), kind)
+    return ExactSolid(shape.nodes, np.asarray(sdf.bounds) - com, lambda points: np.asarray(sdf(points + com)[0]), kind)

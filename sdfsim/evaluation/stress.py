@@ -12,22 +12,23 @@ from typing import Any
 
 import torch
 
-import sdfsim
+from sdfsim.apps.recording import save_rollout
+from sdfsim.base.devices import pick_device
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import locked, write_json, write_text
+from sdfsim.base.parallel import Progress, silent
+from sdfsim.base.version import __version__
 from sdfsim.data.public_shapes import public_folder
 from sdfsim.data.pybullet_sim import DT, SUBSTEPS, TEACHER_VERSION, engine_settings, import_pybullet
-from sdfsim.dynamics.instruments import judged
-from sdfsim.dynamics.model import SOLVER, Model, load_model, model_names
-from sdfsim.dynamics.simulator import SimulationError, Simulator, pick_device
-from sdfsim.dynamics.training_ranges import constant_in_training
-from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.engines import bullet, drake, mujoco, rollout_motion, shape_urdf, start_motion, start_of_scene
 from sdfsim.evaluation.hard_cases import GROUPS, Case, Figure, Run, cases, ran_away
 from sdfsim.evaluation.harness import Job, Line, Panel, Results, draw, markdown, measure
-from sdfsim.files import locked, write_json, write_text
-from sdfsim.parallel import Progress, silent
-from sdfsim.recording import save_rollout
+from sdfsim.learned.model import SOLVER, Model, load_model, model_names
+from sdfsim.learned.training_ranges import constant_in_training
+from sdfsim.physics.instruments import judged
 from sdfsim.scene.scene import Scene
-from sdfsim.shape.sdf import PlaneSdf
+from sdfsim.sdf.closed_forms import PlaneSdf
+from sdfsim.simulate.simulator import SimulationError, Simulator
 
 VERSION = 4  # counts up when what is measured changes, so that kept results are measured again
 TEACHER = "teacher"
@@ -299,7 +300,7 @@ def write_report(study: Study, out: Path) -> dict[str, Any]:
     broken = [(case, who, result["laws"]) for (case, who), result in study.results.items() if result["laws"]]
     parts = [
         "# Hard cases",
-        f"sdfsim {sdfsim.__version__}. Teacher: PyBullet as it made the training data.",
+        f"sdfsim {__version__}. Teacher: PyBullet as it made the training data.",
         table(study),
         plots,
         "## Blew up, or outside of training",

@@ -16,31 +16,33 @@ from typing import Any
 import numpy as np
 import torch
 
-import sdfsim
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import locked, write_json, write_text
+from sdfsim.base.parallel import StageProgress
+from sdfsim.base.version import __version__
 from sdfsim.data.batching import every, first_frames, roll_out, scene_of
 from sdfsim.data.dataset import Trajectory, check_alike, conditions_of
 from sdfsim.data.pybullet_sim import DT, SUBSTEP
-from sdfsim.dynamics.model import SOLVER, Model, load_model, model_names
-from sdfsim.dynamics.models.contact_graph import SUBSTEPS
-from sdfsim.dynamics.simulator import Simulator
-from sdfsim.dynamics.units import scene_units
-from sdfsim.errors import SdfsimError
 from sdfsim.evaluation import engines
 from sdfsim.evaluation.engines import Engine, Start, Timing, centred_mesh, dataset_urdf, start_of_scene, timed
 from sdfsim.evaluation.evaluate import load_recorded, perturbed
 from sdfsim.evaluation.hard_cases import tossed
 from sdfsim.evaluation.harness import Job, Line, Panel, draw, front, machine, measure, number, one_thread, peak_memory
 from sdfsim.evaluation.metrics import energy_gain, errors
-from sdfsim.evaluation.penetration import Solid, exact_solids, penetration
-from sdfsim.files import locked, write_json, write_text
-from sdfsim.parallel import StageProgress
+from sdfsim.evaluation.penetration import ExactSolid, exact_solids, penetration
+from sdfsim.learned.contact_graph import SUBSTEPS
+from sdfsim.learned.model import SOLVER, Model, load_model, model_names
+from sdfsim.physics.units import scene_units
+from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
-from sdfsim.scene.scene_file import load_scene
-from sdfsim.shape.distance import MeshDistance, PiecesDistance
-from sdfsim.shape.mlp_sdf import MlpSdf
-from sdfsim.shape.sdf import ClosedForm, GridSdf, MeshSdf, sample_grid
+from sdfsim.sdf.closed_forms import ClosedForm
+from sdfsim.sdf.grid import GridSdf, sample_grid
+from sdfsim.sdf.mesh_sdf import MeshSdf
+from sdfsim.sdf.mlp import MlpSdf
+from sdfsim.sdf.reference import MeshDistance, PiecesDistance
 from sdfsim.shape.shape import Shape, own_pieces, with_nodes, with_sdf
 from sdfsim.shape.surface_nodes import hull_nodes
+from sdfsim.simulate.simulator import Simulator
 
 VERSION = 2  # counts up when what is measured changes, so that kept results are measured again
 REPEATS = 7
@@ -77,7 +79,7 @@ class Cases:
     starts: list[Trajectory]  # with velocities at the instants of the positions: what ours start from
     shapes: dict[str, Shape]  # of every name in use, their origins at the centres of mass
     urdfs: dict[str, Path]  # the engines' files, by name; those that are not at hand are absent
-    solids: dict[str, Solid]  # the exact geometry, by name
+    solids: dict[str, ExactSolid]  # the exact geometry, by name
     floor: tuple[float, float]  # friction and restitution
     own_inertia: bool = False  # see `Start`
     by_teacher: bool = True  # whether the recordings are the teacher's; the solve then has its habits
@@ -387,7 +389,7 @@ def tradeoff(
         report = {
             "source": str(source or "a random scene"),
             "quick": quick,
-            "sdfsim": sdfsim.__version__,
+            "sdfsim": __version__,
             "trajectories": len(cases.recorded),
             "bodies": int(sum((~t.static).sum() for t in cases.recorded)),
             "horizon_steps": int(steps),

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sdfsim.errors import SdfsimError
+from sdfsim.base.errors import SdfsimError
 from sdfsim.scene.scene import Body
 
 MOST = 30_000  # groups: the table of who may touch whom has a byte for each pair of them
@@ -16,7 +16,7 @@ ROWS = 1024  # of that table that are counted at once
 
 
 @dataclass(frozen=True)
-class Pairs:
+class PairCounts:
     """The unordered pairs of bodies of a scene."""
 
     total: int  # all there are
@@ -99,7 +99,7 @@ def _partners(kinds: Sequence[tuple[int, frozenset[int]]]) -> list[frozenset[int
     return [frozenset(some) for some in partners]
 
 
-def count_pairs(bodies: Sequence[Body]) -> Pairs:
+def count_pairs(bodies: Sequence[Body]) -> PairCounts:
     """Count the pairs of a scene by what lets them touch."""
     group, allowed = contact_groups(bodies)
     known = [(b.motion != "dynamic", b.friction > 0, b.restitution > 0) for b in bodies]
@@ -116,4 +116,4 @@ def count_pairs(bodies: Sequence[Body]) -> Pairs:
     possible, frictional, bouncy = (touching[k] - touching[k + 1] for k in (0, 2, 4))
     many, resting = len(bodies), int(still.sum())
     whole, unmoved = many * (many - 1) // 2, resting * (resting - 1) // 2
-    return Pairs(whole, unmoved, whole - unmoved - possible, possible, frictional, bouncy)
+    return PairCounts(whole, unmoved, whole - unmoved - possible, possible, frictional, bouncy)

@@ -10,8 +10,8 @@ from typing import Literal
 
 import numpy as np
 
-from sdfsim.files import digest
-from sdfsim.shape.sdf import ClosedForm
+from sdfsim.base.files import digest
+from sdfsim.sdf.closed_forms import ClosedForm
 from sdfsim.shape.shape import Shape
 
 Motion = Literal["static", "dynamic", "kinematic"]

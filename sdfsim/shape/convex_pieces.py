@@ -8,8 +8,9 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from sdfsim.shape.mesh import Mesh
-from sdfsim.shape.sdf import BoxSdf, CapsuleSdf, CylinderSdf, Sdf, SphereSdf
+from sdfsim.geometry.mesh import Mesh
+from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, CylinderSdf, SphereSdf
+from sdfsim.sdf.sdf import Sdf
 
 FLAT = 1e-6  # faces whose unit normals differ by less are one
 DENT = 5e-4  # of the largest extent: a mesh whose dents are no deeper is convex

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sdfsim.errors import SdfsimError
-from sdfsim.shape.baked_grid import BakedGrid, surface_samples
-from sdfsim.shape.distance import PiecesDistance, unique_planes
-from sdfsim.shape.mesh import Mesh, convex_hull, lattice, normal_frame
-from sdfsim.shape.primitives import spiral
-from sdfsim.shape.sdf import BoxSdf, CylinderSdf, Sdf
+from sdfsim.base.errors import SdfsimError
+from sdfsim.geometry.mesh import Mesh, convex_hull, lattice, normal_frame
+from sdfsim.geometry.primitives import spiral
+from sdfsim.sdf.baked_grid import BakedGrid, surface_samples
+from sdfsim.sdf.closed_forms import BoxSdf, CylinderSdf
+from sdfsim.sdf.reference import PiecesDistance, unique_planes
+from sdfsim.sdf.sdf import Sdf
 
 # The paper's sampling (section 3 and appendix): a grid over this half extent of the normalised frame, projected onto
 # the surface, points that did not reach it dropped, one point kept per voxel.
@@ -122,7 +123,7 @@ def edge_nodes(piece: np.ndarray, spacing: float) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class ContactSurface:
     """Nodes of one shape and its patches, in the shape's own frame at scale 1."""
 
     nodes: np.ndarray  # [K, 3] m
@@ -135,11 +136,11 @@ class Surface:
 
 def contact_surface(
     sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray], grid: BakedGrid | None
-) -> tuple[Surface, np.ndarray]:
+) -> tuple[ContactSurface, np.ndarray]:
     """The nodes that carry contact where a shape is met as a surface, and how far the surface around each goes that is
     nearer to it than to others: [K] m. Closed forms have nodes that are as dense as the solid is thin."""
     if len(nodes) == 0:
-        return Surface(nodes, np.zeros(0, np.int64), None, np.zeros(3), 1.0), np.zeros(0)
+        return ContactSurface(nodes, np.zeros(0, np.int64), None, np.zeros(3), 1.0), np.zeros(0)
     if isinstance(sdf, BoxSdf | CylinderSdf):
         area = _area(sdf)
         spacing = max(0.5 * min(sdf.sizes), np.sqrt(area / DENSEST))
@@ -183,11 +184,11 @@ def _on_cylinder(sdf: CylinderSdf, spacing: float) -> np.ndarray:
     return np.concatenate([*side, *ends, *tips])
 
 
-def surface_of(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray]) -> Surface:
+def surface_of(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray]) -> ContactSurface:
     """The nodes that carry contact, [K, 3] m, with the vertices [V, 3] m of convex pieces, where the shape has some,
     and their patches. Raises SdfsimError for more than `MOST_PATCHES` pieces."""
     if len(pieces) == 0:
-        return Surface(nodes, np.zeros(len(nodes), np.int64), None, np.zeros(3), 1.0)
+        return ContactSurface(nodes, np.zeros(len(nodes), np.int64), None, np.zeros(3), 1.0)
     check_pieces("a shape", pieces)
     extent = float(np.ptp(sdf.bounds, axis=0).max())
     vertices, union = np.concatenate(pieces), PiecesDistance([convex_hull(piece) for piece in pieces])
@@ -199,7 +200,7 @@ def surface_of(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray]) -> Sur
     count = np.ceil((sdf.bounds[1] + cell - low) / cell).astype(int) + 1
     places = lattice(*(low[axis] + cell * np.arange(count[axis]) for axis in range(3)))
     nearest = _nearest_piece(pieces, np.concatenate([places, nodes]))
-    return Surface(
+    return ContactSurface(
         nodes=np.concatenate([vertices[bare], nodes]),
         patch=np.concatenate([owner[bare], nearest[len(places) :]]),
         nearest=nearest[: len(places)].astype(np.int16).reshape(count),

@@ -15,6 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import read_arrays, write_arrays
+from sdfsim.base.parallel import Progress, parallel, silent
 from sdfsim.data.dataset import (
     INFO,
     Trajectory,
@@ -27,17 +30,14 @@ from sdfsim.data.dataset import (
     trajectory_files,
 )
 from sdfsim.data.pybullet_sim import MARGIN
-from sdfsim.dynamics import pose
-from sdfsim.dynamics.free_flight import torque_free
-from sdfsim.dynamics.models.contact_graph import SUBSTEPS
-from sdfsim.errors import SdfsimError
-from sdfsim.files import read_arrays, write_arrays
-from sdfsim.parallel import Progress, parallel, silent
+from sdfsim.learned.contact_graph import SUBSTEPS
+from sdfsim.physics import pose
+from sdfsim.physics.free_flight import torque_free
 
 if TYPE_CHECKING:
-    from sdfsim.dynamics.bodies import Bodies, State
-    from sdfsim.dynamics.kernels.record import Edges
-    from sdfsim.dynamics.step import StepOptions
+    from sdfsim.physics.bodies import Bodies, State
+    from sdfsim.physics.solver.record import Edges
+    from sdfsim.simulate.step import StepOptions
 
 STEP = 0.02  # s, the step that networks know
 FRAMES_VERSION = 10  # counts up whenever frames of the same recordings come out differently
@@ -205,10 +205,10 @@ def _fingerprint(files: list[Path], how: Solved) -> str:
 def _followed(files: list[Path], how: Solved) -> list[ContactFrames]:
     """The frames of each draw and step: of all trajectories of a group at that step."""
     from sdfsim.data.batching import merged, state_at  # needs the SDFs, hence more than torch and numpy
-    from sdfsim.dynamics.bodies import Units
-    from sdfsim.dynamics.run_memory import Memory
-    from sdfsim.dynamics.solver import solver_step
-    from sdfsim.dynamics.step import StepOptions
+    from sdfsim.physics.bodies import Units
+    from sdfsim.physics.solver.prepare import solver_step
+    from sdfsim.simulate.run_memory import Memory
+    from sdfsim.simulate.step import StepOptions
 
     substep, found = engine_substep(files[0].parent), conditions_of(files[0].parent)
     group = [Trajectory.load(file) for file in files]
@@ -258,7 +258,7 @@ def _of_step(
 ) -> list[ContactFrames]:  # fmt: skip
     """The frames of a step of several trajectories on one floor, of this friction and restitution, in units in which it
     lasts `STEP`; none where nothing touches."""
-    from sdfsim.dynamics.kernels.record import APART, ARM, AXIS, GIVEN, OTHER, WHEN
+    from sdfsim.physics.solver.record import APART, ARM, AXIS, GIVEN, OTHER, WHEN
 
     if not len(edges.pair):
         return []

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from sdfsim.errors import SdfsimError
-from sdfsim.files import read_arrays, write_arrays
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import read_arrays, write_arrays
 from sdfsim.training.distributed import ALONE, Team
 from sdfsim.training.presets import Preset
 
@@ -34,7 +34,7 @@ class Run:
     def __init__(
         self, plan: Preset, task: Any, total: int, seed: int, device: torch.device, team: Team = ALONE
     ) -> None:
-        from sdfsim.dynamics.model import new_network
+        from sdfsim.learned.model import new_network
 
         torch.manual_seed(seed)
         self.plan, self.task, self.total, self.seed, self.device, self.team = plan, task, total, seed, device, team
@@ -119,7 +119,7 @@ class Run:
 
     def export(self, name: str, data: list[dict[str, Any]]):
         """The averaged weights as a `Model`; `data` is what its card says of the datasets."""
-        from sdfsim.dynamics.model import Model
+        from sdfsim.learned.model import Model
 
         ranges = self.task.ranges()
         card = {

@@ -12,13 +12,13 @@ from torch import Tensor
 
 from sdfsim.data.batching import PLANE, merged, state_at
 from sdfsim.data.dataset import Trajectory, check_alike, conditions_of, load_shapes, ranges_of, trajectory_files
-from sdfsim.dynamics import pose
-from sdfsim.dynamics.bodies import Bodies, State, Units, largest_extent
-from sdfsim.dynamics.models.families import FAMILIES
-from sdfsim.dynamics.models.message_passing import Graph, GraphNetwork, flipped
-from sdfsim.dynamics.models.near import Contacts, Pairs
-from sdfsim.dynamics.models.surfaces import TARGET, node_owner, target_acceleration
-from sdfsim.dynamics.run_memory import Memory
+from sdfsim.learned.families import FAMILIES
+from sdfsim.learned.message_passing import Graph, GraphNetwork, flipped
+from sdfsim.learned.near import Contacts, Pairs
+from sdfsim.learned.surfaces import TARGET, node_owner, target_acceleration
+from sdfsim.physics import pose
+from sdfsim.physics.bodies import Bodies, State, Units, largest_extent
+from sdfsim.simulate.run_memory import Memory
 from sdfsim.training.distributed import ALONE, Team
 from sdfsim.training.presets import Preset
 

@@ -15,10 +15,10 @@ from typing import Any
 
 import torch
 
+from sdfsim.base.errors import SdfsimError, run_main
+from sdfsim.base.files import locked, write_text
+from sdfsim.base.parallel import Progress, silent
 from sdfsim.data.dataset import SOLID, SPLITS, conditions_of, read_info
-from sdfsim.errors import SdfsimError, run_main
-from sdfsim.files import locked, write_text
-from sdfsim.parallel import Progress, silent
 from sdfsim.training.distributed import gather_team
 from sdfsim.training.presets import PRESETS, Preset
 from sdfsim.training.run import Run, held_out_loss
@@ -47,7 +47,7 @@ def train(
     stops early. Returns paths, losses and processor time. Raises SdfsimError for unusable data, a checkpoint in `out`
     without `resume`, another run writing to it, or diverged training.
     """
-    from sdfsim.dynamics.simulator import pick_device
+    from sdfsim.base.devices import pick_device
 
     plan = PRESETS[preset] if isinstance(preset, str) else preset
     folders = [data] if isinstance(data, Path) else list(data)

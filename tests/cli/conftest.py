@@ -7,7 +7,7 @@ import torch
 from typer.testing import CliRunner
 
 import cli
-from sdfsim.dynamics.model import Model, new_network
+from sdfsim.learned.model import Model, new_network
 
 SCENE = """
 version: 1

@@ -16,10 +16,10 @@ import yaml
 
 import cli
 from sdfsim import Rollout, load_scene
-from sdfsim import run as runs
-from sdfsim.commands.arguments import seconds_of
-from sdfsim.shape import primitives
-from sdfsim.shape.mesh import write_ply
+from sdfsim.apps import run as runs
+from sdfsim.base.arguments import seconds_of
+from sdfsim.geometry import primitives
+from sdfsim.geometry.mesh import write_ply
 from tests.cli.conftest import SCENE, run
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -167,7 +167,7 @@ def test_what_is_wrong_from_the_start_is_told_before_work_and_deletes_nothing(
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr("sdfsim.run.load_scene", lambda *a, **k: pytest.fail("worked first"))
+    monkeypatch.setattr("sdfsim.apps.run.load_scene", lambda *a, **k: pytest.fail("worked first"))
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "report.json").write_text("{}")
     done = run("simulate", scene, "-o", tmp_path / "run", "--model", model, *wrong)

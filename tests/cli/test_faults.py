@@ -9,8 +9,8 @@ from functools import partial
 import pytest
 
 from sdfsim import Rollout, SdfsimError
-from sdfsim.dynamics.simulator import SimulationError, Simulator
-from sdfsim.errors import run_main
+from sdfsim.base.errors import run_main
+from sdfsim.simulate.simulator import SimulationError, Simulator
 from tests.cli.conftest import run
 
 
@@ -52,7 +52,7 @@ def test_an_interrupt_that_a_library_turns_into_another_error_is_code_130_too(sc
         except KeyboardInterrupt:
             raise TypeError("half imported") from None
 
-    monkeypatch.setattr("sdfsim.planning.describe", interrupted)
+    monkeypatch.setattr("sdfsim.apps.plan.describe", interrupted)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background shells have it ignored
     try:
         done = run("plan", scene)
@@ -66,7 +66,7 @@ def test_tracebacks_only_with_v(scene, monkeypatch):
     def fail(*arguments, **options):
         raise ZeroDivisionError("a fault of ours")
 
-    monkeypatch.setattr("sdfsim.planning.describe", fail)
+    monkeypatch.setattr("sdfsim.apps.plan.describe", fail)
     plain, verbose = run("plan", scene), run("plan", scene, "-v")
     assert plain.exit_code == verbose.exit_code == 1
     assert "internal error: ZeroDivisionError" in plain.stderr and "Traceback" not in plain.stderr

@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import write_json
 from sdfsim.data.dataset import (
     FLOOR,
     Conditions,
@@ -18,8 +20,6 @@ from sdfsim.data.dataset import (
     trajectory_files,
 )
 from sdfsim.data.pybullet_sim import TEACHER_VERSION, engine_settings
-from sdfsim.errors import SdfsimError
-from sdfsim.files import write_json
 from tests.recordings import balls, trajectory
 
 SUBSTEP, DT, GRAVITY = 0.004, 0.02, np.array([0.0, 0.0, -10.0])

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from sdfsim.base.errors import SdfsimError
 from sdfsim.data import public_shapes
 from sdfsim.data.public_shapes import SUMS, public_folder
-from sdfsim.errors import SdfsimError
 
 VISUAL, COLLISION, SCAN = "cone/visual_geometry.obj", "cone/collision_geometry.obj", "ycb_soup_can.obj"
 CONTENT = {VISUAL: b"v 0 0 1\n", COLLISION: b"v 0 0 2\n", SCAN: b"v 0 0 3\n"}

@@ -8,6 +8,7 @@ import torch
 
 pytest.importorskip("pybullet")
 
+from sdfsim.base.errors import SdfsimError
 from sdfsim.data.dataset import SPLITS, Trajectory, trajectory_files
 from sdfsim.data.generate import GRAVITY, make_dataset, make_trajectory
 from sdfsim.data.pybullet_sim import Teacher, TeacherBody
@@ -28,10 +29,10 @@ from sdfsim.data.scenarios import (
     steady_faces,
 )
 from sdfsim.data.shape_assets import Origin, prepare
-from sdfsim.errors import SdfsimError
-from sdfsim.shape import primitives
-from sdfsim.shape.mass import mass_properties
-from sdfsim.shape.shape import Shape, analytic_shape, sdf_of_mesh
+from sdfsim.geometry import primitives
+from sdfsim.geometry.mass import mass_properties
+from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import Shape, sdf_of_mesh
 from sdfsim.training.contact_cache import Solved, contact_frames
 from sdfsim.training.impulse_task import ImpulseTask
 

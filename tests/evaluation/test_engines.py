@@ -9,16 +9,16 @@ import pytest
 
 pytest.importorskip("pybullet")
 
+from sdfsim.base.errors import SdfsimError
 from sdfsim.data.pybullet_sim import Teacher, TeacherBody
-from sdfsim.dynamics.model import load_model
-from sdfsim.dynamics.units import scene_units
-from sdfsim.errors import SdfsimError
 from sdfsim.evaluation import hard_cases
 from sdfsim.evaluation.engines import bullet, drake, mujoco, newton, shape_urdf, start_of_scene
 from sdfsim.evaluation.stress import TEACHER, by_engine
-from sdfsim.scene.scene_file import load_scene
-from sdfsim.shape.mesh import load_pieces
-from sdfsim.shape.shape import analytic_shape, shape_from_primitive
+from sdfsim.geometry.mesh import load_pieces
+from sdfsim.learned.model import load_model
+from sdfsim.physics.units import scene_units
+from sdfsim.scene.load import load_scene
+from sdfsim.shape.make import analytic_shape, shape_from_primitive
 
 SCENE = """
 version: 1

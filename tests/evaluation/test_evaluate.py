@@ -10,10 +10,11 @@ from sdfsim.data.dataset import Trajectory, trajectory_files
 from sdfsim.data.pybullet_sim import engine_settings
 from sdfsim.evaluation import evaluate as evaluate_module
 from sdfsim.evaluation.evaluate import evaluate, report_lines
-from sdfsim.shape import primitives
-from sdfsim.shape.shape import analytic_shape, with_sdf
-from tests.dynamics.conftest import random_model
+from sdfsim.geometry import primitives
+from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import with_sdf
 from tests.recordings import bouncing, slab_data, sliding
+from tests.scenes import random_model
 
 
 @pytest.fixture

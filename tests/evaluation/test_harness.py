@@ -11,11 +11,12 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sdfsim.dynamics import kernels
-from sdfsim.dynamics.model import new_network
-from sdfsim.errors import SdfsimError
+from sdfsim.base.errors import SdfsimError
 from sdfsim.evaluation.harness import Job, Line, Panel, digest, draw, front, markdown, measure, number, peak_memory
-from sdfsim.shape.shape import analytic_shape, with_sdf
+from sdfsim.learned.model import new_network
+from sdfsim.physics import solver as kernels
+from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import with_sdf
 from tests.recordings import trajectory
 
 

@@ -5,8 +5,8 @@ import pytest
 pytest.importorskip("pybullet")
 
 from sdfsim.data.generate import make_dataset
-from sdfsim.dynamics.model import load_model
 from sdfsim.evaluation.model_card import bundle
+from sdfsim.learned.model import load_model
 from sdfsim.training.train import train
 
 

@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 
 from sdfsim.data.pybullet_sim import write_urdf
-from sdfsim.evaluation.penetration import Solid, deepest, exact_solids, penetration
-from sdfsim.shape import primitives
-from sdfsim.shape.shape import analytic_shape, with_sdf
+from sdfsim.evaluation.penetration import ExactSolid, deepest, exact_solids, penetration
+from sdfsim.geometry import primitives
+from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import with_sdf
 from tests.recordings import CUBE, balls
 
 POLES = np.concatenate([np.eye(3), -np.eye(3)])
-BALL = Solid(0.5 * POLES, np.array([[-0.5] * 3, [0.5] * 3]), lambda p: np.linalg.norm(p, axis=1) - 0.5, "closed form")
+BALL = ExactSolid(
+    0.5 * POLES, np.array([[-0.5] * 3, [0.5] * 3]), lambda p: np.linalg.norm(p, axis=1) - 0.5, "closed form"
+)
 
 
 def apart(*offsets: float, **fields):

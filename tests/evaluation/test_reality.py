@@ -28,7 +28,7 @@ from benchmarks.reality import (
     recorded,
     split,
 )  # fmt: skip
-from sdfsim.errors import SdfsimError
+from sdfsim.base.errors import SdfsimError
 
 DT = 1.0 / 148.0
 VALUES = {"friction": 0.2, "restitution": 0.1, "softness": 0.01, "damping": 1.0, "height": 0.0, "side": 1.0}

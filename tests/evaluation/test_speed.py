@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("pybullet")
 
 from benchmarks.contact_step import RATCHET, slipped_back
-from sdfsim.files import read_json
+from sdfsim.base.files import read_json
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -14,15 +14,15 @@ from typer.testing import CliRunner
 
 import cli
 from benchmarks.hard_cases import accepted, slipped_back
-from sdfsim.dynamics.model import Model, new_network
-from sdfsim.errors import SdfsimError
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import write_json
 from sdfsim.evaluation import hard_cases, harness
 from sdfsim.evaluation import stress as study
 from sdfsim.evaluation.hard_cases import cases
 from sdfsim.evaluation.stress import losses, rows, table, write_report
-from sdfsim.files import write_json
-from sdfsim.shape import primitives
-from sdfsim.shape.mesh import write_ply
+from sdfsim.geometry import primitives
+from sdfsim.geometry.mesh import write_ply
+from sdfsim.learned.model import Model, new_network
 
 FEW = ("overlap-balls", "thin-5", "cuda")
 

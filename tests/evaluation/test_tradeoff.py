@@ -12,11 +12,12 @@ import torch
 
 pytest.importorskip("pybullet")
 
-from sdfsim.dynamics.model import load_model
-from sdfsim.errors import SdfsimError
+from sdfsim.base.errors import SdfsimError
 from sdfsim.evaluation import tradeoff as study
 from sdfsim.evaluation.tradeoff import Setting, arranged, cases_of_scene, load_cases, settings
-from sdfsim.shape.shape import analytic_shape, with_sdf
+from sdfsim.learned.model import load_model
+from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import with_sdf
 from tests.evaluation.test_engines import SCENE
 
 
@@ -43,7 +44,7 @@ def test_networks_and_shapes_are_what_a_setting_says(cases):
 
 
 def test_a_scene_is_judged_by_the_teacher_in_the_model_s_units(tmp_path):
-    from sdfsim.scene.scene_file import load_scene
+    from sdfsim.scene.load import load_scene
 
     (tmp_path / "scene.yaml").write_text(SCENE)
     cases = cases_of_scene(load_scene(tmp_path / "scene.yaml"), "small", tmp_path / "engine", quick=True)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.reconstruct import PHOTOS, evaluate
 from sdfsim import Rollout, load_scene
-from sdfsim.files import read_json
+from sdfsim.base.files import read_json
 
 ROOT = Path(__file__).resolve().parents[2]
 TABLE = 0.55  # m, the height of its top in samples/photos/table_vase

@@ -7,8 +7,8 @@ import pytest
 from sdfsim.data.generate import make_dataset
 from sdfsim.data.shape_assets import wavefront
 from sdfsim.evaluation.evaluate import evaluate
-from sdfsim.shape import primitives
-from sdfsim.shape.shape import analytic_shape
+from sdfsim.geometry import primitives
+from sdfsim.shape.make import analytic_shape
 
 TRAJECTORIES = 30
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sdfsim.dynamics.model import SOLVER, Model, bundled_models, load_model, model_names
+from sdfsim.learned.model import SOLVER, Model, bundled_models, load_model, model_names
 from tests.hard_cases.crashing import undisturbed, works
 
 __all__ = ["undisturbed", "works"]

@@ -20,10 +20,10 @@ import torch
 from PIL import Image
 
 from sdfsim.data.dataset import Trajectory
-from sdfsim.dynamics.model import Model, new_network
-from sdfsim.shape.mesh import write_ply
-from sdfsim.shape.primitives import box
-from sdfsim.shape.shape import analytic_shape
+from sdfsim.geometry.mesh import write_ply
+from sdfsim.geometry.primitives import box
+from sdfsim.learned.model import Model, new_network
+from sdfsim.shape.make import analytic_shape
 
 WRITING = ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate")
 BALL = 0.5  # m
@@ -123,7 +123,7 @@ def whole(folder: Path) -> None:
     """That every file under its final name can be read to its end; hidden ones are nobody's results."""
     from safetensors.numpy import load_file
 
-    from sdfsim.shape.mesh import read_mesh
+    from sdfsim.geometry.mesh import read_mesh
 
     for path in folder.rglob("*"):
         hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
@@ -151,11 +151,11 @@ def litter(folder: Path) -> list[str]:
 
 def tiny_fit() -> None:
     """Fits of 120 steps, baked coarsely."""
-    from sdfsim.shape import baked_grid
-    from sdfsim.shape import fit as fit_module
+    from sdfsim.sdf import baked_grid
+    from sdfsim.sdf.fit import train as fit_module
 
-    plan = replace(fit_module.PLANS["default"], width=8, layers=3, steps=120, batch=64, pool=1000, goal=None)
-    fit_module.PLANS["default"] = fit_module.PLANS["quick"] = plan
+    plan = replace(fit_module.RECIPES["default"], width=8, layers=3, steps=120, batch=64, pool=1000, goal=None)
+    fit_module.RECIPES["default"] = fit_module.RECIPES["quick"] = plan
     fit_module.CHECK_EVERY = 20
     baked_grid.CELLS = baked_grid.FINEST = 16
 
@@ -170,7 +170,7 @@ def tiny_train() -> None:
 
 def tiny_simulate() -> None:
     """A checkpoint after every step."""
-    from sdfsim import run
+    from sdfsim.apps import run
 
     run.EVERY = 0.0
 
@@ -195,7 +195,7 @@ def _given_poses(run: Any, work: Path) -> dict:
     """Four cameras around the origin, in place of structure from motion."""
     from pipeline.cameras import View, save_views
     from pipeline.inputs.photos import load_photos
-    from sdfsim.files import write_arrays
+    from sdfsim.base.files import write_arrays
 
     views, rng = [], np.random.default_rng(0)
     for k, photo in enumerate(load_photos(run.place("photos"))):

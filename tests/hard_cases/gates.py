@@ -10,11 +10,12 @@ import numpy as np
 import torch
 
 import sdfsim
-from sdfsim.dynamics import pose
-from sdfsim.dynamics.rollout import Rollout
+from sdfsim.physics import pose
+from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.scene import Body, Scene
-from sdfsim.shape.shape import Shape, analytic_shape, load_shape
-from tests.dynamics.conftest import make_body
+from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import Shape, load_shape
+from tests.scenes import make_body
 
 SAMPLES = Path(__file__).resolve().parents[2] / "samples"
 EARTH = np.array([0.0, 0.0, -9.81])

@@ -7,9 +7,9 @@ import torch
 import cli
 import pipeline.mesh.meshing
 import pipeline.stages
-import sdfsim.fitting
-import sdfsim.run
-import sdfsim.shape.fit
+import sdfsim.apps.fit
+import sdfsim.apps.run
+import sdfsim.sdf.fit.train
 import sdfsim.training.train
 
 torch.set_num_threads(1)  # what is forked may have no threads

@@ -12,11 +12,12 @@ import pytest
 from safetensors.torch import load_file, save_file
 
 from pipeline.inputs.images import read_photo
-from sdfsim import SdfsimError, files, load_shape
-from sdfsim.dynamics.model import Model, load_model, new_network
-from sdfsim.files import read_arrays
-from sdfsim.shape.mesh import load_mesh
-from sdfsim.shape.shape import analytic_shape
+from sdfsim import SdfsimError, load_shape
+from sdfsim.base import files
+from sdfsim.base.files import read_arrays
+from sdfsim.geometry.mesh import load_mesh
+from sdfsim.learned.model import Model, load_model, new_network
+from sdfsim.shape.make import analytic_shape
 from tests.hard_cases.strangers import time_limit
 
 

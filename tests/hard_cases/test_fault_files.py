@@ -11,11 +11,12 @@ from typer.testing import CliRunner
 
 import cli
 from sdfsim import SdfsimError, load_shape
-from sdfsim.dynamics.model import Model, new_network
-from sdfsim.files import LOCK, locked
-from sdfsim.shape.mesh import write_ply
-from sdfsim.shape.primitives import box
-from sdfsim.shape.shape import MESH_FILE, RECORD_FILE, WEIGHTS_FILE, analytic_shape, with_sdf
+from sdfsim.base.files import LOCK, locked
+from sdfsim.geometry.mesh import write_ply
+from sdfsim.geometry.primitives import box
+from sdfsim.learned.model import Model, new_network
+from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import MESH_FILE, RECORD_FILE, WEIGHTS_FILE, with_sdf
 
 SCENE = "version: 1\nduration: 0.04\nbodies: [{name: floor, plane: {}}]\n"
 

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sdfsim import SdfsimError
-from sdfsim.shape.shape import shape_from_mesh
+from sdfsim.shape.make import shape_from_mesh
 from tests.hard_cases.worker import Worker
 
 SECONDS = 20.0  # of processor time; an ordinary file of this size takes 0.1

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sdfsim import SceneError, load_scene
-from sdfsim.errors import printable
+from sdfsim.base.errors import printable
 from sdfsim.scene.scene import Scene
-from sdfsim.shape.shape import analytic_shape, shape_from_mesh
+from sdfsim.shape.make import analytic_shape, shape_from_mesh
 from tests.hard_cases.strangers import Spoiled, mangled_texts, scenes, spoiled_scenes, time_limit
 
 SECONDS = 5.0  # more than a hundred times what a scene of this size takes

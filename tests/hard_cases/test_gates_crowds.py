@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import sdfsim
-from sdfsim.dynamics.simulator import Simulator
 from sdfsim.scene.scene import Effects
-from tests.dynamics.conftest import make_body
+from sdfsim.simulate.simulator import Simulator
 from tests.hard_cases import gates
+from tests.scenes import make_body
 
 
 def total(rollout) -> np.ndarray:
@@ -111,7 +111,7 @@ def test_ten_thousand_static_bodies_cost_one_mover_what_ten_do(model):
 
 
 def test_masses_beyond_training_are_flagged(network):
-    """`simulate` and `plan` print these lines, see tests/test_planning.py."""
+    """`simulate` and `plan` print these lines, see tests/apps/test_plan.py."""
     lines = Simulator(gates.unequal(), network).outside_training
     assert [line for line in lines if line.startswith("heaviest to lightest body: 1e+03 to 1e+03 here")]
     scene = gates.placed(gates.CUBE, [(0, 0, 0.5), (0.1, 0, 1.55)], floor=True)

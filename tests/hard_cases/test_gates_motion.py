@@ -1,6 +1,6 @@
 """Rows 1 to 5, 7 and 8: what every run of every bundled model keeps to, whatever it has learned.
 
-Of untrained networks the same is tested in tests/dynamics (test_free_flight.py, test_impulse.py).
+Of untrained networks the same is tested in tests/physics/test_free_flight.py and tests/learned/test_impulse.py.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from sdfsim.dynamics.bodies import State
-from sdfsim.dynamics.simulator import Simulator
-from sdfsim.shape.shape import analytic_shape
+from sdfsim.physics.bodies import State
+from sdfsim.shape.make import analytic_shape
+from sdfsim.simulate.simulator import Simulator
 from tests.hard_cases import gates
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -144,7 +144,7 @@ def test_units_do_not_matter(model, size, strength):
 
 SCRIPT = """
 import sys, numpy as np, torch
-from sdfsim.dynamics.simulator import Simulator
+from sdfsim.simulate.simulator import Simulator
 from tests.hard_cases import gates
 torch.set_num_threads(int(sys.argv[1]))
 r = Simulator(gates.mixed(), sys.argv[2], seed=3).run(steps=25)

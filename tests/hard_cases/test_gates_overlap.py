@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sdfsim.dynamics.simulator import Simulator
+from sdfsim.simulate.simulator import Simulator
 from tests.hard_cases import gates
 
 SHAPES = {"ball": gates.BALL, "cube": gates.CUBE}

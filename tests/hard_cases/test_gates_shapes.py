@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from sdfsim.dynamics.models.near import find_contacts
-from sdfsim.dynamics.simulator import Simulator
-from sdfsim.errors import SdfsimError
-from sdfsim.shape.sdf import BoxSdf, SphereSdf
-from sdfsim.shape.shape import analytic_shape, with_sdf
-from tests.dynamics.conftest import random_model
-from tests.dynamics.test_surface_networks import surface_model
+from sdfsim.base.errors import SdfsimError
+from sdfsim.learned.near import find_contacts
+from sdfsim.sdf.closed_forms import BoxSdf, SphereSdf
+from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import with_sdf
+from sdfsim.simulate.simulator import Simulator
 from tests.hard_cases import gates
+from tests.learned.test_surface_networks import surface_model
+from tests.scenes import random_model
 
 LINE = np.linspace(-0.5, 0.5, 6)[:, None] * [1.0, 0.5, 0.0]
 FLAT = np.stack(np.meshgrid([-0.5, 0.0, 0.5], [-0.5, 0.5], [0.0]), -1).reshape(-1, 3)

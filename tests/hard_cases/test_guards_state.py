@@ -13,10 +13,10 @@ from typer.testing import CliRunner
 
 import cli
 from sdfsim import Rollout, SdfsimError
-from sdfsim.dynamics.kernels import impulse
-from sdfsim.dynamics.simulator import SimulationError, Simulator
-from tests.dynamics.conftest import random_model
+from sdfsim.physics.solver import impulse
+from sdfsim.simulate.simulator import SimulationError, Simulator
 from tests.hard_cases import gates
+from tests.scenes import random_model
 
 BROKEN = {
     "nan": ("velocity", torch.nan),

@@ -14,10 +14,10 @@ from typer.testing import CliRunner
 
 import cli
 from sdfsim import SceneError, SdfsimError, load_scene
-from sdfsim.dynamics.model import Model, new_network
-from sdfsim.shape.mesh import load_mesh, write_ply
-from sdfsim.shape.primitives import box
-from sdfsim.shape.shape import analytic_shape
+from sdfsim.geometry.mesh import load_mesh, write_ply
+from sdfsim.geometry.primitives import box
+from sdfsim.learned.model import Model, new_network
+from sdfsim.shape.make import analytic_shape
 from tests.hard_cases.strangers import time_limit
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -189,8 +189,8 @@ def listening(port: int) -> list[str]:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="/proc/net, which tells who listens where, exists on Linux only")
 def test_the_live_viewer_listens_on_this_machine_only(home, monkeypatch):
-    from sdfsim import viewer
-    from sdfsim.recording import Playback
+    from sdfsim.apps import viewer
+    from sdfsim.apps.recording import Playback
 
     monkeypatch.setattr(viewer, "_has_screen", lambda: False)
     playback = Playback(load_scene(scene_in(home, "")))
@@ -202,7 +202,7 @@ def test_the_live_viewer_listens_on_this_machine_only(home, monkeypatch):
 
 @pytest.mark.parametrize("web", [False, True])
 def test_every_viewer_is_told_where_to_listen(tmp_path, monkeypatch, web):
-    from sdfsim import viewer
+    from sdfsim.apps import viewer
 
     (tmp_path / "a.rrd").write_bytes(b"RRF2")
     told = tmp_path / "told"

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any
 
-from sdfsim.errors import SdfsimError
+from sdfsim.base.errors import SdfsimError
 
 MEMORY = 12 * 2**30  # bytes of address space: libraries reserve some without using them
 

@@ -19,8 +19,8 @@ from pipeline.inputs.sources import find_source
 from pipeline.mesh.placement import Up, place
 from pipeline.sfm.poses import solve
 from pipeline.sfm.supervision import depth_points, depth_scale
-from sdfsim.errors import SdfsimError
-from sdfsim.shape.mesh import Mesh
+from sdfsim.base.errors import SdfsimError
+from sdfsim.geometry.mesh import Mesh
 from tests.pipeline.conftest import noise
 from tests.pipeline.photo_sets import SAMPLES, TABLE_VASE
 

@@ -11,7 +11,7 @@ import pytest
 from pipeline.cameras import load_sparse, load_views
 from pipeline.inputs.photos import load_photos, prepare_photos
 from pipeline.sfm.poses import solve
-from sdfsim.errors import EXIT_QUALITY, SdfsimError
+from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
 from tests.pipeline import photo_sets
 
 pytestmark = pytest.mark.slow

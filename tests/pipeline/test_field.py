@@ -27,7 +27,7 @@ from pipeline.field.rendering import choose_samples, sdf_cache, sphere_interval
 from pipeline.field.training import PRESETS, Rays, Trained, Trainer, camera_rays, load_rays, save_field, train
 from pipeline.inputs.photos import save_photos
 from pipeline.sfm.supervision import supervision_of
-from sdfsim.errors import SdfsimError
+from sdfsim.base.errors import SdfsimError
 
 SMALL = FieldSize((8, 16), (2, 2), 16, 8)
 UNIT = Similarity(1.0, np.eye(3), np.zeros(3))

@@ -11,7 +11,7 @@ from PIL import ExifTags, Image
 from pipeline.inputs.labels import UNKNOWN, load_labels, load_names
 from pipeline.inputs.photos import prepare_photos
 from pipeline.inputs.sources import find_source
-from sdfsim.errors import SdfsimError
+from sdfsim.base.errors import SdfsimError
 from tests.pipeline.conftest import noise
 from tests.pipeline.test_sources import write_transforms
 

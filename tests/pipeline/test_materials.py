@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.materials import MATERIALS, choose
 from pipeline.options import Options, read_config
-from sdfsim.errors import SdfsimError
+from sdfsim.base.errors import SdfsimError
 from tests.cli.conftest import run as command
 
 ROOT = Path(__file__).parents[2]

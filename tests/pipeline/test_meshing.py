@@ -20,9 +20,9 @@ from pipeline.mesh.photo_refining import Picture, refine
 from pipeline.mesh.placement import load_placement
 from pipeline.mesh.trust import GUESSED
 from pipeline.report import mesh_notes
-from sdfsim.errors import SdfsimError
-from sdfsim.shape.bvh import Caster
-from sdfsim.shape.mesh import Mesh, is_closed, load_mesh, read_attributes, read_mesh
+from sdfsim.base.errors import SdfsimError
+from sdfsim.geometry.bvh import Caster
+from sdfsim.geometry.mesh import Mesh, is_closed, load_mesh, read_attributes, read_mesh
 from tests.pipeline.test_objects import TABLE, TOP, both, box
 from tests.pipeline.test_surface import look_at
 

@@ -10,9 +10,9 @@ import pytest
 
 from pipeline.mesh.bodies import Parts, find_levels, split
 from pipeline.mesh.extraction import EXTENT, Surface, ball, sample_volume
-from sdfsim.shape.bvh import Winding
-from sdfsim.shape.mass import mass_properties
-from sdfsim.shape.mesh import Mesh, is_closed, signed_volume
+from sdfsim.geometry.bvh import Winding
+from sdfsim.geometry.mass import mass_properties
+from sdfsim.geometry.mesh import Mesh, is_closed, signed_volume
 
 FINEST = 0.02
 TABLE = (0.5, 0.35, 0.05)  # half sides of the top and half its thickness

@@ -16,7 +16,7 @@ from PIL import ExifTags, Image, ImageOps
 
 from pipeline.inputs.images import read_photo
 from pipeline.inputs.photos import load_photos, prepare_photos
-from sdfsim.errors import EXIT_ERROR, SdfsimError
+from sdfsim.base.errors import EXIT_ERROR, SdfsimError
 from tests.pipeline.conftest import noise
 
 

@@ -17,8 +17,8 @@ from pipeline.sfm import poses
 from pipeline.sfm.agreement import agreement, contradicting, epipolar_errors, excess, excess_of_photos, unexplained
 from pipeline.sfm.pose_checks import check, failure_message, find, views_of
 from pipeline.sfm.poses import ORDINARY, run_worker, size_groups, solve
-from sdfsim.errors import EXIT_QUALITY, SdfsimError
-from sdfsim.files import write_arrays, write_json
+from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
+from sdfsim.base.files import write_arrays, write_json
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 TABLE_VASE = ROOT / "samples" / "photos" / "table_vase"

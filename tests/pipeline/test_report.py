@@ -12,8 +12,8 @@ from pipeline.options import Options
 from pipeline.report import improvements, write_recording
 from pipeline.sfm.pose_checks import check, views_of
 from pipeline.stages import reconstruct
-from sdfsim.errors import EXIT_QUALITY, SdfsimError
-from sdfsim.files import write_arrays
+from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
+from sdfsim.base.files import write_arrays
 from tests.pipeline.test_poses import photo, result
 
 

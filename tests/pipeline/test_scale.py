@@ -11,9 +11,9 @@ from pipeline.cameras import View
 from pipeline.inputs.known_cameras import Lens
 from pipeline.inputs.photos import Photo
 from pipeline.mesh.placement import check_distance, measured_scale
-from sdfsim.errors import SdfsimError
-from sdfsim.shape.bvh import Caster
-from sdfsim.shape.mesh import joined
+from sdfsim.base.errors import SdfsimError
+from sdfsim.geometry.bvh import Caster
+from sdfsim.geometry.mesh import joined
 from tests.pipeline.test_surface import cube, ring
 
 METRES = 3.0  # a unit of normalised space in the world that the photos were taken in

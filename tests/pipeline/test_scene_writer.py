@@ -14,10 +14,11 @@ from pipeline.materials import ASSUMED, MATERIALS, choose
 from pipeline.mesh.placement import Placement
 from pipeline.mesh.visibility import Above
 from pipeline.scene_writer import LEVEL, choose_slab, fit_parts, scene_text, write_scene
-from sdfsim.files import write_json
-from sdfsim.scene.scene_file import load_scene
-from sdfsim.shape.mesh import Mesh, write_ply
-from sdfsim.shape.shape import Shape, analytic_shape
+from sdfsim.base.files import write_json
+from sdfsim.geometry.mesh import Mesh, write_ply
+from sdfsim.scene.load import load_scene
+from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import Shape
 from tests.pipeline.test_surface import cube, scenery
 
 PLACEMENT = Placement(Similarity(1.0, np.eye(3), np.zeros(3)), "plane", "assumed: widest side = 1 m")
@@ -138,7 +139,7 @@ def test_every_part_is_fitted_in_its_own_frame_and_kept_when_killed(meshes, tmp_
         }
         return replace(analytic_shape("box", size=(0.2, 0.2, 0.2), name=name), mesh=solid, certificate=certificate)
 
-    monkeypatch.setattr("sdfsim.shape.fit.fit_mesh", fit_mesh)
+    monkeypatch.setattr("sdfsim.shape.make.fit_mesh", fit_mesh)
     out = tmp_path / "assets"
     out.mkdir()
     report = fit_parts(meshes, out, budget=30.0)

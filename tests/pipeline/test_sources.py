@@ -14,7 +14,7 @@ from pipeline.cameras import load_views
 from pipeline.inputs.known_cameras import PARAMETERS, read_cameras
 from pipeline.inputs.photos import KNOWN_CAMERAS, load_photos, prepare_photos
 from pipeline.inputs.sources import find_source
-from sdfsim.errors import SdfsimError
+from sdfsim.base.errors import SdfsimError
 from tests.pipeline.conftest import noise
 
 SIZE = (120, 90)

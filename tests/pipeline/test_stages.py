@@ -15,8 +15,8 @@ from PIL import Image
 from pipeline import stages
 from pipeline.options import Options, read_config
 from pipeline.stages import STAGES, begin, finish, reconstruct, run_stage
-from sdfsim.errors import SdfsimError
-from sdfsim.files import locked
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import locked
 from tests.cli.conftest import run as command
 from tests.pipeline.conftest import RESULTS, noise
 
@@ -284,7 +284,7 @@ def asked(calls, monkeypatch) -> dict[str, dict]:
     note("pipeline.field.training.train", "distill", SimpleNamespace(report={}))
     note("pipeline.mesh.meshing.make_meshes", "mesh", RESULTS["mesh"])
     note("pipeline.scene_writer.fit_parts", "fit", {})
-    monkeypatch.setattr("sdfsim.parallel.choose_threads", lambda work, repeat: 0.0)
+    monkeypatch.setattr("sdfsim.base.parallel.choose_threads", lambda work, repeat: 0.0)
     monkeypatch.setattr("pipeline.cameras.load_views", lambda folder: [])
     monkeypatch.setattr("pipeline.cameras.load_sparse", lambda folder: None)
     return found

@@ -10,8 +10,8 @@ from pipeline.mesh.extraction import belonging, components, islands, sample_box,
 from pipeline.mesh.placement import find_up, load_placement, place, plane_up, resting_height
 from pipeline.mesh.visibility import Visibility, bilinear, spread_colors
 from pipeline.sfm.supervision import unit_sphere_of
-from sdfsim.shape.bvh import Caster
-from sdfsim.shape.mesh import Mesh, is_closed, joined, signed_volume, vertex_normals
+from sdfsim.geometry.bvh import Caster
+from sdfsim.geometry.mesh import Mesh, is_closed, joined, signed_volume, vertex_normals
 
 
 def ball(center=(0.0, 0, 0), radius: float = 0.5):

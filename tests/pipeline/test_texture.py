@@ -17,13 +17,14 @@ from pipeline.mesh.extraction import components
 from pipeline.mesh.texture import BLOCK, Shots, fewer, rasterise, shots_of, textured, unfold
 from pipeline.mesh.visibility import Visibility, bilinear, look, to_bytes
 from pipeline.scene_writer import skins_of
-from sdfsim.recording import Playback, save_reconstruction, with_normals
+from sdfsim.apps.recording import Playback, save_reconstruction, with_normals
+from sdfsim.geometry.bvh import Caster
+from sdfsim.geometry.mesh import Mesh, joined, read_glb, sample_surface, vertex_normals, write_glb, write_ply
 from sdfsim.scene.scene import Body, Scene
-from sdfsim.shape.bvh import Caster
-from sdfsim.shape.mesh import Mesh, joined, read_glb, sample_surface, vertex_normals, write_glb, write_ply
-from sdfsim.shape.shape import analytic_shape, load_shape, scaled
+from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import load_shape, scaled
+from tests.apps.test_recording import read
 from tests.pipeline.test_surface import cube, look_at
-from tests.test_recording import read
 
 GREY, RED = np.array([90.0, 90, 90]), np.array([250.0, 20, 20])
 

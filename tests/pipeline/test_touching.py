@@ -18,8 +18,8 @@ from pipeline.mesh.bodies import Parts, split
 from pipeline.mesh.extraction import EXTENT, Surface, Volume, ball, sample_volume
 from pipeline.mesh.visibility import hollow
 from pipeline.report import hollow_line
-from sdfsim.files import write_json
-from sdfsim.shape.mesh import Mesh, is_closed, signed_volume
+from sdfsim.base.files import write_json
+from sdfsim.geometry.mesh import Mesh, is_closed, signed_volume
 from tests.pipeline import photo_sets
 
 FINEST = 0.0157  # as of the quick preset

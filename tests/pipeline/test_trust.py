@@ -13,9 +13,9 @@ from pipeline.mesh.trust import NextPhoto, Support, information, next_photos, si
 from pipeline.mesh.visibility import Visibility
 from pipeline.options import Options
 from pipeline.report import improvements, notes
-from sdfsim.errors import SdfsimError
-from sdfsim.shape.bvh import Caster
-from sdfsim.shape.mesh import Mesh, joined, load_mesh, read_attributes, write_ply
+from sdfsim.base.errors import SdfsimError
+from sdfsim.geometry.bvh import Caster
+from sdfsim.geometry.mesh import Mesh, joined, load_mesh, read_attributes, write_ply
 from tests.pipeline.photo_sets import orbit, still_life, studio
 from tests.pipeline.test_surface import cube, look_at
 from tests.pipeline.test_texture import plate

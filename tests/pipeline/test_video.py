@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.inputs.photos import prepare_photos
 from pipeline.inputs.video import FEWEST, choose, follow, frames_of
-from sdfsim.errors import EXIT_QUALITY, SdfsimError
+from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
 from tests.pipeline.photo_sets import TABLE_VASE
 
 WIDTH, HEIGHT = 320, 240

@@ -12,7 +12,7 @@ import pytest
 from sdfsim import SceneError, SdfsimError, load_scene
 from sdfsim.scene import collision_filter
 from sdfsim.scene.collision_filter import contact_groups, count_pairs
-from sdfsim.scene.effects import plan
+from sdfsim.scene.plan import plan
 from sdfsim.scene.scene import Body, Effects
 
 TEXT = """

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sdfsim.scene.scene_file import reference
-from sdfsim.shape.mesh import Mesh, write_ply
-from sdfsim.shape.primitives import box
+from sdfsim.geometry.mesh import Mesh, write_ply
+from sdfsim.geometry.primitives import box
+from sdfsim.scene.schema import reference
 from tests.scene.conftest import HEAD, problems_of
 
 

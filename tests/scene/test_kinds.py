@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 
 from sdfsim import Simulator
+from sdfsim.geometry.mesh import write_ply
 from sdfsim.scene.scene import Scene
-from sdfsim.shape.mesh import write_ply
-from sdfsim.shape.sdf import BoxSdf, GridSdf, MeshSdf
-from sdfsim.shape.shape import analytic_shape, with_sdf
+from sdfsim.sdf.closed_forms import BoxSdf
+from sdfsim.sdf.grid import GridSdf
+from sdfsim.sdf.mesh_sdf import MeshSdf
+from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import with_sdf
 from tests.scene.test_load import problems_of
 
 CRATE = {
@@ -36,7 +39,7 @@ bodies:
 
 @pytest.fixture
 def no_fit(monkeypatch):
-    monkeypatch.setattr("sdfsim.shape.fit.fit_mesh", lambda *args, **kwargs: pytest.fail("fitted"))
+    monkeypatch.setattr("sdfsim.shape.make.fit_mesh", lambda *args, **kwargs: pytest.fail("fitted"))
 
 
 def heights(scene: Scene) -> np.ndarray:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from sdfsim import SceneError, load_scene
-from sdfsim.shape import primitives
-from sdfsim.shape.mesh import write_ply
-from sdfsim.shape.shape import analytic_shape
+from sdfsim.geometry import primitives
+from sdfsim.geometry.mesh import write_ply
+from sdfsim.shape.make import analytic_shape
 from tests.scene.conftest import HEAD, problems_of
 
 BODY = [
@@ -154,7 +154,7 @@ def test_a_shape_that_is_not_exact_is_named(load, monkeypatch):
         ({"passed": False, "reason": "thin walls", "caveat": ""}, (("b: thin walls",), ())),
     ):
         shape = replace(analytic_shape("box", size=(1, 1, 1), name="b"), certificate=certificate)
-        monkeypatch.setattr("sdfsim.scene.scene_file.shape_from_primitive", lambda *a, shape=shape, **k: shape)
+        monkeypatch.setattr("sdfsim.scene.load.shape_from_primitive", lambda *a, shape=shape, **k: shape)
         scene = load(text)
         assert (scene.missed, scene.caveats) == told
 

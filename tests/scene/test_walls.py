@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sdfsim.dynamics.bodies import Units, from_scene
+from sdfsim.physics.bodies import Units, from_scene
 from sdfsim.scene.scene import Scene
 
 

@@ -7,7 +7,7 @@ import pytest
 
 import sdfsim
 from sdfsim import SceneError
-from sdfsim.scene.scene_file import load_scene
+from sdfsim.scene.load import load_scene
 
 ROOT = Path(__file__).parents[2]
 

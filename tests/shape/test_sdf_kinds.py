@@ -8,19 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sdfsim.errors import SdfsimError
-from sdfsim.shape import primitives
-from sdfsim.shape.mesh import Mesh, write_ply
-from sdfsim.shape.sdf import BoxSdf, GridSdf, MeshSdf
-from sdfsim.shape.shape import (
-    analytic_shape,
-    load_shape,
-    mesh_shape,
-    scaled,
-    shape_from_mesh,
-    shape_from_primitive,
-    with_sdf,
-)
+from sdfsim.base.errors import SdfsimError
+from sdfsim.geometry import primitives
+from sdfsim.geometry.mesh import Mesh, write_ply
+from sdfsim.sdf.closed_forms import BoxSdf
+from sdfsim.sdf.grid import GridSdf
+from sdfsim.sdf.mesh_sdf import MeshSdf
+from sdfsim.shape.make import analytic_shape, mesh_shape, shape_from_mesh, shape_from_primitive
+from sdfsim.shape.shape import load_shape, scaled, with_sdf
 from tests.shape.test_shape import fitted
 
 OTHERS = [("grid", GridSdf), ("mesh", MeshSdf)]
@@ -84,9 +79,9 @@ def test_a_mesh_has_a_shape_without_any_fit(kind, member: type) -> None:
 
 
 def test_grids_are_cached_by_resolution_and_exact_meshes_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from sdfsim.shape import fit
+    from sdfsim.shape import make
 
-    monkeypatch.setattr(fit, "fit_mesh", lambda *args, **kwargs: pytest.fail("fitted"))
+    monkeypatch.setattr(make, "fit_mesh", lambda *args, **kwargs: pytest.fail("fitted"))
     sizes = {}
     for resolution in (8, 12):
         shape = shape_from_primitive("torus", 0.3, tmp_path, sdf="grid", resolution=resolution)
@@ -98,5 +93,5 @@ def test_grids_are_cached_by_resolution_and_exact_meshes_not(tmp_path: Path, mon
     path.write_bytes(write_ply(primitives.cone(segments=12)))
     assert isinstance(shape_from_mesh(path, tmp_path / "none", units=0.01, sdf="mesh").sdf, MeshSdf)
     assert not (tmp_path / "none").exists()
-    monkeypatch.setattr("sdfsim.shape.shape.mesh_shape", lambda *args, **kwargs: pytest.fail("sampled again"))
+    monkeypatch.setattr("sdfsim.shape.make.mesh_shape", lambda *args, **kwargs: pytest.fail("sampled again"))
     assert shape_from_primitive("torus", 0.6, tmp_path, sdf="grid", resolution=8).volume > 0

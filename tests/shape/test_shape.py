@@ -10,19 +10,15 @@ import numpy as np
 import pytest
 import torch
 
-from sdfsim.errors import SdfsimError
-from sdfsim.files import replacing
-from sdfsim.shape import primitives
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import replacing
+from sdfsim.geometry import primitives
+from sdfsim.geometry.mesh import Frame, Mesh
+from sdfsim.sdf.closed_forms import BoxSdf, PlaneSdf, SphereSdf
+from sdfsim.sdf.mlp import MlpSdf
 from sdfsim.shape import shape as shape_module
-from sdfsim.shape.mesh import Frame, Mesh
-from sdfsim.shape.mlp_sdf import MlpSdf
-from sdfsim.shape.sdf import BoxSdf, PlaneSdf, SphereSdf
-from sdfsim.shape.shape import (
-    Shape,
-    analytic_shape,
-    load_shape,
-    scaled,
-)
+from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import Shape, load_shape, scaled
 
 
 def fitted() -> Shape:

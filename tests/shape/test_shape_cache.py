@@ -9,22 +9,20 @@ import numpy as np
 import pytest
 
 from sdfsim import load_scene
-from sdfsim.errors import SdfsimError
-from sdfsim.shape import fit, primitives
-from sdfsim.shape import fit as fit_module
-from sdfsim.shape.mesh import write_ply
-from sdfsim.shape.shape import (
-    load_shape,
-    shape_from_mesh,
-    shape_from_primitive,
-)
+from sdfsim.base.errors import SdfsimError
+from sdfsim.geometry import primitives
+from sdfsim.geometry.mesh import write_ply
+from sdfsim.sdf.fit import train as fit_module
+from sdfsim.shape import make
+from sdfsim.shape.make import shape_from_mesh, shape_from_primitive
+from sdfsim.shape.shape import load_shape
 
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """A recipe of a second, for tests of what is around the fit."""
-    plan = replace(fit_module.PLANS["default"], width=16, layers=4, steps=100, batch=256, pool=4000)
-    monkeypatch.setitem(fit_module.PLANS, "default", plan)
+    plan = replace(fit_module.RECIPES["default"], width=16, layers=4, steps=100, batch=256, pool=4000)
+    monkeypatch.setitem(fit_module.RECIPES, "default", plan)
 
 
 def test_a_mesh_is_fitted_once_whatever_it_is_called(
@@ -39,7 +37,7 @@ def test_a_mesh_is_fitted_once_whatever_it_is_called(
     assert told == sorted(told)
     assert told[-1] == 1.0
 
-    monkeypatch.setattr(fit, "fit_mesh", lambda *args, **kwargs: pytest.fail("fitted again"))
+    monkeypatch.setattr(make, "fit_mesh", lambda *args, **kwargs: pytest.fail("fitted again"))
     two = shape_from_mesh(second, tmp_path / "cache", units=0.01, name="Mug")
     assert (one.name, two.name) == ("cup", "Mug")
     np.testing.assert_allclose(two.nodes, 0.01 * one.nodes)

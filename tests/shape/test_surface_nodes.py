@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from sdfsim.shape import primitives
-from sdfsim.shape.mesh import Mesh, sample_surface
-from sdfsim.shape.sdf import BoxSdf, MeshSdf, SphereSdf
+from sdfsim.geometry import primitives
+from sdfsim.geometry.mesh import Mesh, sample_surface
+from sdfsim.sdf.closed_forms import BoxSdf, SphereSdf
+from sdfsim.sdf.mesh_sdf import MeshSdf
 from sdfsim.shape.surface_nodes import _reaching, edge_nodes, hull_nodes, sample_nodes, surface_nodes, thin
 
 

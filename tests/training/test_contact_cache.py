@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from sdfsim.base.errors import SdfsimError
 from sdfsim.data.batching import merged
 from sdfsim.data.dataset import Trajectory
 from sdfsim.data.pybullet_sim import engine_settings
-from sdfsim.dynamics import pose
-from sdfsim.dynamics.bodies import Units
-from sdfsim.errors import SdfsimError
-from sdfsim.shape.shape import analytic_shape
+from sdfsim.physics import pose
+from sdfsim.physics.bodies import Units
+from sdfsim.shape.make import analytic_shape
 from sdfsim.training.contact_cache import STEP, Solved, _disturbed, contact_frames, inner_steps, join_frames
 from sdfsim.training.impulse_task import ImpulseTask
 from tests.recordings import balls, bouncing, slab_data, sliding

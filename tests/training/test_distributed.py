@@ -26,7 +26,7 @@ def test_the_parts_losses_add_up_to_the_whole_batchs_loss(ball_data):
     task = ImpulseTask(contact_frames(ball_data, "train", Solved()), torch.device("cpu"))
 
     def flying(g, mirrored):
-        from sdfsim.dynamics.models.impulse import Velocities
+        from sdfsim.learned.impulse import Velocities
 
         return Velocities(g.free_velocity, g.free_angular, g.mean_velocity, g.mean_angular)
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from sdfsim.dynamics.model import load_model
-from sdfsim.errors import SdfsimError
+from sdfsim.base.errors import SdfsimError
+from sdfsim.learned.model import load_model
 from sdfsim.training import contact_cache
 from sdfsim.training.contact_cache import Solved, contact_frames
 from sdfsim.training.train import train

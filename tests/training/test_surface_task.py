@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 import torch
 
+from sdfsim.base.errors import SdfsimError
 from sdfsim.data.batching import merged, roll_out, scene_of
 from sdfsim.data.dataset import Trajectory, load_shapes
-from sdfsim.dynamics.bodies import Units
-from sdfsim.dynamics.simulator import Simulator
-from sdfsim.errors import SdfsimError
+from sdfsim.physics.bodies import Units
+from sdfsim.simulate.simulator import Simulator
 from sdfsim.training.contact_cache import Solved, contact_frames
 from sdfsim.training.distributed import Team
 from sdfsim.training.presets import PRESETS
 from sdfsim.training.surface_task import SurfaceTask
-from tests.dynamics.conftest import random_model
 from tests.recordings import bouncing, slab_data, sliding
+from tests.scenes import random_model
 
 CPU = torch.device("cpu")
 SDF_SIM = PRESETS["sdf-sim"]

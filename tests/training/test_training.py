@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 import torch
 
+from sdfsim.base.errors import SdfsimError
 from sdfsim.data.batching import merged
 from sdfsim.data.pybullet_sim import MARGIN, engine_settings
-from sdfsim.dynamics.bodies import Units
-from sdfsim.dynamics.inference import terms_of
-from sdfsim.dynamics.model import SURFACE, load_model
-from sdfsim.dynamics.models.contact_graph import REST_SPEED
-from sdfsim.dynamics.models.impulse import Velocities
-from sdfsim.dynamics.run_memory import Memory
-from sdfsim.dynamics.solver import solver_step
-from sdfsim.dynamics.step import StepOptions
-from sdfsim.errors import SdfsimError
 from sdfsim.evaluation.evaluate import evaluate
+from sdfsim.learned.contact_graph import REST_SPEED
+from sdfsim.learned.impulse import Velocities
+from sdfsim.learned.inference import terms_of
+from sdfsim.learned.model import SURFACE, load_model
+from sdfsim.physics.bodies import Units
+from sdfsim.physics.solver.prepare import solver_step
+from sdfsim.simulate.run_memory import Memory
+from sdfsim.simulate.step import StepOptions
 from sdfsim.training import contact_cache
 from sdfsim.training import train as train_module
 from sdfsim.training.contact_cache import Solved, contact_frames, join_frames
@@ -27,7 +27,7 @@ from sdfsim.training.presets import PRESETS, Preset
 from sdfsim.training.run import Run, held_out_loss
 from sdfsim.training.surface_task import SurfaceTask
 from sdfsim.training.train import train
-from tests.dynamics.conftest import contact_graph, in_single
+from tests.scenes import contact_graph, in_single
 
 CPU = torch.device("cpu")
 SDF_SIM = PRESETS["sdf-sim"]
@@ -147,7 +147,7 @@ def test_a_checkpoint_of_another_run_is_refused(ball_data, presets, tmp_path):
 def test_paper_targets_lead_exactly_to_the_recorded_pose(ball_data):
     """Advancing by the target acceleration lands on the next recorded frame, noise or not."""
     from sdfsim.data.dataset import Trajectory, load_shapes
-    from sdfsim.dynamics.models.surfaces import advance, target_acceleration
+    from sdfsim.learned.surfaces import advance, target_acceleration
 
     t = Trajectory.load(ball_data / "train" / "0.npz")
     bodies, state = merged([t], [5], load_shapes(ball_data, {"ball"}), Units(1.0, 1.0, 1.0), CPU)

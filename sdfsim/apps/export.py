@@ -1,0 +1,608 @@
+"""`export`: a shape, a scene or a run becomes a file that other programs open.
+
+Pose frames are the shapes' own origins in every format. What a format cannot hold is told in the report's `left_out`;
+docs/export.md says it of each format.
+"""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import io
+import re
+import tempfile
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sdfsim.apps.identify import COLUMNS
+from sdfsim.apps.recording import body_colors, framed, shown, with_normals
+from sdfsim.apps.run import read_run
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import check_writable, write_bytes, write_text
+from sdfsim.base.parallel import StageProgress
+from sdfsim.geometry.gltf import GltfWriter, light
+from sdfsim.geometry.mesh import Mesh, convex_hull, wavefront
+from sdfsim.scene.builder import SceneBuilder
+from sdfsim.scene.collision_filter import contact_groups
+from sdfsim.scene.load import load_scene
+from sdfsim.scene.scene import Body, Scene
+from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, ClosedForm, CylinderSdf, PlaneSdf, SphereSdf
+from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape, own_pieces
+
+# Concavity relative to the size; and a search a third as long as CoACD's own, which finds pieces as good.
+COACD = {"threshold": 0.05, "mcts_iterations": 60, "mcts_nodes": 10, "resolution": 1000, "seed": 0}
+RATE = 60.0  # USD time codes in a second; programs step through the whole ones
+STEP = 0.001  # s, of MuJoCo
+SOFT = 4.0  # steps, over 2 pi: the time in which a contact of MuJoCo swings
+MOST_PAIRS = 1000  # of geoms whose coefficients are written one by one
+MOST_GROUPS = 31  # MuJoCo's bit masks
+RESERVED = ("world", "root", "physics", "materials", "shapes", "groups")  # names of ours, or of MuJoCo's own
+XML = ElementTree.Element
+
+
+@dataclass(frozen=True)
+class Take:
+    """What is exported: N bodies at T times."""
+
+    scene: Scene  # the bodies as they are at the start
+    names: list[str]  # [N] unique names of ASCII letters, digits and underscores
+    shapes: list[str]  # names of the scene's shapes, likewise
+    colors: np.ndarray  # [N, 3] uint8 sRGB, for bodies whose mesh has no colours
+    time: np.ndarray  # [T] s
+    position: np.ndarray  # [T, N, 3] m, of the shapes' own origins
+    quat_xyzw: np.ndarray  # [T, N, 4], the nearer of the two signs from one time to the next
+
+    @property
+    def moving(self) -> bool:
+        """Whether there is motion: more than one time."""
+        return len(self.time) > 1
+
+    def each(self) -> Iterable[tuple[str, Body, Shape, np.ndarray]]:
+        """Name, body, shape and colour of every body."""
+        shapes = [self.scene.shapes[body.shape] for body in self.scene.bodies]
+        return zip(self.names, self.scene.bodies, shapes, self.colors, strict=True)
+
+    def plane_size(self) -> float:
+        """m to each side, of the sheet that is shown for a plane."""
+        return 6.0 * framed(self.scene)[1]
+
+
+Written = tuple[list[Path], list[str]]  # the files of an export, and what they do not hold, one line each
+
+
+def export(
+    source: Path | str,
+    out: Path | str,
+    *,
+    scene_file: Path | str | None = None,
+    allow_outside: bool = False,
+    on_progress: StageProgress = lambda stage, fraction, message: None,
+) -> dict[str, Any]:
+    """Write a run (folder or rollout.npz), a scene.yaml or a Shape folder in the format that the ending of `out` names
+    (see `FORMATS`); `scene_file` is of a run, None for the one that it was made from.
+
+    Returns a report: format, bodies, frames, files, left_out and notes. Raises SdfsimError for an unknown ending, a
+    damaged source, an extra that is not installed, a shape without convex pieces, or a file that cannot be builder.
+    """
+    source, out, scene_file = Path(source), Path(out), Path(scene_file) if scene_file else None
+    kind = out.suffix.lower()
+    if kind not in FORMATS:
+        raise SdfsimError(f"{out}: unknown format {out.suffix or '(no ending)'}", "end it in " + " ".join(FORMATS))
+    if FORMATS[kind] is _usd:
+        _extra("pxr.Usd")  # before shapes are fitted for minutes
+    check_writable(out.parent)
+    take = _read(source, scene_file, allow_outside, on_progress)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    files, left_out = FORMATS[kind](take, out, on_progress)
+    counts = {"bodies": len(take.names), "frames": len(take.time)}
+    notes = ["z up is turned to glTF's y up"] if kind == ".glb" else []
+    return {"format": kind[1:], **counts, "files": files, "left_out": left_out, "notes": notes}
+
+
+def _extra(module: str) -> Any:
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        package = {"pxr": "usd-core"}.get(module.partition(".")[0], module)
+        raise SdfsimError(f"{package} is not installed", "pip install 'sdfsim[export]'") from error
+
+
+# --- the source ---
+
+
+def _read(source: Path, scene_file: Path | None, allow_outside: bool, on_progress: StageProgress) -> Take:
+    told = partial(on_progress, "shapes")
+    run = None
+    if source.suffix == ".npz" or (source / "rollout.npz").is_file():
+        scene, run = read_run(source, scene_file, allow_outside=allow_outside, on_progress=told)
+    elif scene_file is not None:
+        raise SdfsimError(f"{source}: only a run has a scene beside it", "leave --scene away")
+    elif (source / RECORD_FILE).is_file():
+        shape = load_shape(source)
+        moves = "dynamic" if shape.volume > 0 else "static"
+        scene = SceneBuilder().add(shape.name, asset=source, motion=moves).load(told)
+    elif source.suffix.lower() in (".yaml", ".yml"):
+        scene = load_scene(source, told, allow_outside=allow_outside)
+    else:
+        raise SdfsimError(f"{source}: not a run folder, a rollout.npz, a scene.yaml or a Shape folder")
+    if run is not None:
+        time, turn = run.time, run.orientation.copy()
+        turn[1:] *= np.cumprod(np.where((turn[1:] * turn[:-1]).sum(-1) < 0, -1.0, 1.0), axis=0)[..., None]
+        com = np.array([body.scale * scene.shapes[body.shape].com for body in scene.bodies])
+        offset = Rotation.from_quat(turn.reshape(-1, 4)).apply(np.tile(com, (len(turn), 1)))
+        place = run.position - offset.reshape(run.position.shape)
+    else:
+        time, turn = np.zeros(1), np.array([[body.quat_xyzw for body in scene.bodies]])
+        place = np.array([[body.position for body in scene.bodies]])
+    names, shapes = (_plain_names([one.name for one in ones]) for ones in (scene.bodies, scene.shapes))
+    return Take(scene, names, shapes, np.array(body_colors(scene), dtype=np.uint8), time, place, turn)
+
+
+def _plain_names(names: list[str]) -> list[str]:
+    """Unique names that every format takes, in place of `names`."""
+    used: set[str] = set(RESERVED)
+    plain = []
+    for name in names:
+        stem = re.sub(r"\W", "_", name, flags=re.ASCII) or "_"
+        stem = f"_{stem}" if stem[0].isdigit() else stem
+        # Files of one name but for their case would be one file on some systems.
+        choice = next(c for k in range(len(used) + 1) if (c := f"{stem}_{k}" if k else stem).lower() not in used)
+        used.add(choice.lower())
+        plain.append(choice)
+    return plain
+
+
+# --- what several formats need ---
+
+
+def _inertia(body: Body, shape: Shape) -> np.ndarray:
+    """[3, 3] kg m^2 of a dynamic body about its centre of mass, shape axes."""
+    return body.inertia if body.inertia is not None else body.mass / shape.volume * body.scale**2 * shape.inertia
+
+
+def convex_pieces(shape: Shape) -> list[Mesh]:
+    """Convex pieces [m]: the shape's own, or those of CoACD. Raises SdfsimError where there are none."""
+    if own := own_pieces(shape):
+        return own
+    import open3d  # noqa: F401  (it cannot be loaded after CoACD)
+
+    coacd = _extra("coacd")
+    coacd.set_log_level("off")
+    try:
+        found = coacd.run_coacd(coacd.Mesh(shape.mesh.vertices, shape.mesh.faces), **COACD)
+        return [convex_hull(np.asarray(vertices)) for vertices, _ in found]
+    except (RuntimeError, ValueError, SdfsimError) as error:
+        raise SdfsimError(f"shape {shape.name}: CoACD cannot cut it into convex pieces ({error})") from error
+
+
+def _write_assets(
+    take: Take, out: Path, cuts: Callable[[Body], bool], on_progress: StageProgress
+) -> tuple[dict[int, Path], dict[int, list[Path]]]:
+    """OBJ files in `NAME_assets/`, by the index of each shape without a closed form: what is shown of it, and its
+    convex pieces where a body `cuts` it."""
+    folder, shapes = out.with_name(f"{out.stem}_assets"), take.scene.shapes
+
+    def obj(name: str, mesh: Mesh) -> Path:
+        folder.mkdir(exist_ok=True)
+        write_text(folder / f"{name}.obj", wavefront([mesh]))
+        return folder / f"{name}.obj"
+
+    used = sorted({body.shape for body in take.scene.bodies})
+    drawn = [k for k in used if not isinstance(shapes[k].sdf, ClosedForm)]
+    wanted = {body.shape for body in take.scene.bodies if cuts(body)}
+    seen, cut = {}, {}
+    for done, k in enumerate(drawn):
+        on_progress("convex pieces", done / len(drawn), f"of {shapes[k].name}")
+        seen[k] = obj(take.shapes[k], shapes[k].mesh)
+        pieces = convex_pieces(shapes[k]) if k in wanted else []
+        cut[k] = [obj(f"{take.shapes[k]}-{i}", piece) for i, piece in enumerate(pieces)]
+    return seen, cut
+
+
+def _numbers(*values: Any) -> str:
+    return " ".join(f"{value + 0.0:.9g}" for value in np.concatenate([np.ravel(value) for value in values]))
+
+
+def _wxyz(quat_xyzw: np.ndarray) -> np.ndarray:
+    return np.roll(quat_xyzw, 1, axis=-1)
+
+
+def _rgba(shape: Shape, color: np.ndarray) -> str:
+    """For formats with one colour a mesh: the mean of its own ones, or `color`."""
+    return _numbers((color if shape.mesh.colors is None else shape.mesh.colors.mean(0)) / 255.0, 1.0)
+
+
+def _add(parent: XML, tag: str, **attributes: str) -> XML:
+    return ElementTree.SubElement(parent, tag, {key.rstrip("_"): value for key, value in attributes.items()})
+
+
+def _write_xml(path: Path, root: XML) -> None:
+    ElementTree.indent(root)
+    write_text(path, ElementTree.tostring(root, encoding="unicode") + "\n")
+
+
+def _missing(take: Take, *, motion: bool = False, textures: bool = False) -> list[str]:
+    """What a format leaves out that has no motion, or no textures."""
+    led = any(body.motion == "kinematic" for body in take.scene.bodies)
+    told = {
+        "the motion: the scene is as it is at the start": take.moving and not motion,
+        "the paths of kinematic bodies: they stand where they start": led and not (take.moving and motion),
+        "textures": not textures and any(shape.skin is not None for shape in take.scene.shapes),
+    }
+    return [line for line, missing in told.items() if missing]
+
+
+# --- glTF ---
+
+
+def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
+    file = GltfWriter()
+    # Bodies of one shape and colour share a mesh; of one shape they share its numbers.
+    numbers: dict[int, tuple[dict[str, int], int]] = {}
+    drawn: dict[str, int] = {}
+    time = file.array(take.time) if take.moving else 0
+    samplers, channels = [], []
+    for k, (name, body, shape, color) in enumerate(take.each()):
+        seen = shown(shape, take.plane_size())
+        own = seen.colors is not None or seen.texture is not None
+        if body.shape not in numbers:
+            mesh, normals = with_normals(seen)
+            attributes = {"POSITION": file.array(mesh.vertices), "NORMAL": file.array(normals)}
+            if mesh.uv is not None:
+                attributes["TEXCOORD_0"] = file.array(mesh.uv)
+            if mesh.colors is not None:  # in 16 bits: 8 are too few for dark colours once they count light
+                shades = np.pad(light(mesh.colors), ((0, 0), (0, 1)), constant_values=1.0)
+                attributes["COLOR_0"] = file.array(np.round(65535 * shades), "<u2")
+            numbers[body.shape] = attributes, file.array(mesh.faces.reshape(-1), "<u4")
+        key = take.shapes[body.shape] + ("" if own else "-{:02x}{:02x}{:02x}".format(*color))
+        if key not in drawn:
+            material = file.material(key, np.ones(3) if own else light(color), seen.texture, rough=0.8)
+            drawn[key] = file.mesh(key, *numbers[body.shape], material)
+        place, turn = take.position[:, k], take.quat_xyzw[:, k]
+        node = {"translation": place[0].tolist(), "rotation": turn[0].tolist(), "scale": [body.scale] * 3}
+        file.nodes.append({"name": name, "mesh": drawn[key], **node})
+        if take.moving and body.motion != "static":
+            for path, values in (("translation", place), ("rotation", turn)):
+                channels.append({"sampler": len(samplers), "target": {"node": k, "path": path}})
+                samplers.append({"input": time, "output": file.array(values), "interpolation": "LINEAR"})
+    if channels:
+        file.animations.append({"name": "run", "samplers": samplers, "channels": channels})
+    write_bytes(out, file.to_bytes())
+    return [out], ["masses, friction and all else that is not seen", *_missing(take, motion=True, textures=True)]
+
+
+# --- USD ---
+
+
+def _usd(take: Take, out: Path, on_progress: StageProgress) -> Written:
+    names = ("Gf", "Sdf", "Usd", "UsdGeom", "UsdPhysics", "UsdShade")
+    gf, sdf, usd, geom, physics, shade = (_extra(f"pxr.{name}") for name in names)
+    stage = usd.Stage.CreateInMemory()
+    geom.SetStageMetersPerUnit(stage, 1.0)
+    geom.SetStageUpAxis(stage, geom.Tokens.z)
+    physics.SetStageKilogramsPerUnit(stage, 1.0)
+    stage.SetDefaultPrim(geom.Xform.Define(stage, "/World").GetPrim())
+    for group in ("materials", "shapes"):
+        stage.DefinePrim(f"/World/{group}", "Scope")
+    strength = float(np.linalg.norm(take.scene.gravity))
+    gravity = physics.Scene.Define(stage, "/World/physics")
+    gravity.CreateGravityDirectionAttr(gf.Vec3f(*(take.scene.gravity / strength if strength else (0.0, 0.0, -1.0))))
+    gravity.CreateGravityMagnitudeAttr(strength)
+    if take.moving:
+        stage.SetTimeCodesPerSecond(RATE)
+        stage.SetFramesPerSecond(RATE)
+        stage.SetStartTimeCode(RATE * float(take.time[0]))
+        stage.SetEndTimeCode(RATE * float(take.time[-1]))
+
+    drawn: dict[tuple[int, bool], str] = {}
+    materials: dict[tuple[float, float], Any] = {}
+    for k, (name, body, shape, color) in enumerate(take.each()):
+        prim = geom.Xform.Define(stage, f"/World/{name}").GetPrim()
+        place = geom.Xformable(prim).AddTranslateOp()
+        turn = geom.Xformable(prim).AddOrientOp(geom.XformOp.PrecisionDouble)
+        animated = take.moving and body.motion != "static"
+        for t in range(len(take.time) if animated else 1):
+            code = usd.TimeCode(RATE * float(take.time[t])) if animated else usd.TimeCode.Default()
+            place.Set(gf.Vec3d(*take.position[t, k].tolist()), code)
+            turn.Set(gf.Quatd(*_wxyz(take.quat_xyzw[t, k]).tolist()), code)
+        tint = geom.PrimvarsAPI(prim).CreatePrimvar("displayColor", sdf.ValueTypeNames.Color3fArray)
+        tint.Set([gf.Vec3f(*light(color).tolist())])
+        if body.motion != "static":
+            _usd_apply(prim, "PhysicsRigidBodyAPI", kinematicEnabled=body.motion == "kinematic")
+        if body.motion == "dynamic":
+            spin = np.rad2deg(body.angular_velocity)
+            velocities = {"velocity": gf.Vec3f(*body.velocity.tolist()), "angularVelocity": gf.Vec3f(*spin.tolist())}
+            _usd_apply(prim, "PhysicsRigidBodyAPI", **velocities)
+            diagonal, axes = np.linalg.eigh(_inertia(body, shape))
+            axes[:, 2] *= np.sign(np.linalg.det(axes))
+            com, turned = body.scale * shape.com, _wxyz(Rotation.from_matrix(axes).as_quat())
+            masses = {"mass": body.mass, "centerOfMass": gf.Vec3f(*com.tolist())}
+            masses |= {"diagonalInertia": gf.Vec3f(*diagonal.tolist()), "principalAxes": gf.Quatf(*turned.tolist())}
+            _usd_apply(prim, "PhysicsMassAPI", **masses)
+        surface = (body.friction, body.restitution)
+        if surface not in materials:
+            materials[surface] = shade.Material.Define(stage, f"/World/materials/surface_{len(materials)}")
+            made, (friction, restitution) = materials[surface].GetPrim(), surface
+            told = {"staticFriction": friction, "dynamicFriction": friction, "restitution": restitution}
+            _usd_apply(made, "PhysicsMaterialAPI", **told)
+            # PhysX takes the mean of two bodies' coefficients unless told. Its schema is not part of OpenUSD.
+            made.AddAppliedSchema("PhysxMaterialAPI")
+            for what in ("friction", "restitution"):
+                made.CreateAttribute(f"physxMaterial:{what}CombineMode", sdf.ValueTypeNames.Token).Set("multiply")
+        shade.MaterialBindingAPI.Apply(prim).Bind(materials[surface], materialPurpose="physics")
+
+        of = (body.shape, body.motion == "dynamic")
+        if of not in drawn:
+            drawn[of] = f"/World/shapes/{take.shapes[body.shape]}" + ("" if of[1] else "_fixed")
+            stage.CreateClassPrim(drawn[of])
+            _usd_geometry(take, shape, of[1], stage, drawn[of])
+        solid = geom.Xform.Define(stage, f"/World/{name}/geometry")
+        solid.GetPrim().GetReferences().AddInternalReference(drawn[of])
+        solid.AddScaleOp().Set(gf.Vec3f(body.scale))
+
+    group, allowed = contact_groups(take.scene.bodies)
+    for g in range(len(allowed) if not allowed.all() else 0):
+        made = physics.CollisionGroup.Define(stage, f"/World/groups/group_{g}")
+        for k in np.flatnonzero(group == g):
+            made.GetCollidersCollectionAPI().IncludePath(f"/World/{take.names[k]}")
+        for other in np.flatnonzero(~allowed[g]):
+            made.CreateFilteredGroupsRel().AddTarget(f"/World/groups/group_{other}")
+
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / f"stage{out.suffix.lower()}"  # the ending tells OpenUSD what to write
+        if not stage.GetRootLayer().Export(str(file)):
+            raise SdfsimError(f"{file}: OpenUSD cannot write it")
+        write_bytes(out, file.read_bytes())
+    return [out], _missing(take, motion=True)
+
+
+def _usd_apply(prim: Any, schema: str, **values: Any) -> None:
+    """Give a prim a schema of UsdPhysics, and values for its attributes."""
+    prim.ApplyAPI(schema)
+    for name, value in values.items():
+        prim.GetAttribute(f"physics:{name}").Set(value)
+
+
+def _usd_geometry(take: Take, shape: Shape, dynamic: bool, stage: Any, path: str) -> None:
+    """Prims below `path` that are seen and collide."""
+    gf, geom = _extra("pxr.Gf"), _extra("pxr.UsdGeom")
+    form, solid = shape.sdf, f"{path}/solid"
+    if isinstance(form, ClosedForm):
+        if isinstance(form, SphereSdf):
+            sizes: dict[str, Any] = {"radius": form.radius}
+        elif isinstance(form, BoxSdf):
+            sizes = {"size": 2.0}
+        elif isinstance(form, CapsuleSdf | CylinderSdf):
+            sizes = {"axis": "Z", "radius": form.radius, "height": 2.0 * form.half}
+        else:
+            sizes = {"axis": "Z", "width": 2.0 * take.plane_size(), "length": 2.0 * take.plane_size()}
+        prim = stage.DefinePrim(solid, "Cube" if isinstance(form, BoxSdf) else form.KIND.title())
+        for name, value in sizes.items():
+            prim.GetAttribute(name).Set(value)
+        if isinstance(form, BoxSdf):
+            geom.Xformable(prim).AddScaleOp().Set(gf.Vec3f(*form.half))
+        _usd_apply(prim, "PhysicsCollisionAPI")
+        return
+    seen = _usd_mesh(stage, solid, shape.mesh)
+    pieces = own_pieces(shape) if dynamic else []
+    # Engines collide moving bodies as convex pieces, and cut them themselves where there are none.
+    colliders = [(seen, "convexDecomposition" if dynamic else "none")]
+    if pieces:
+        colliders = [(_usd_mesh(stage, f"{path}/piece_{k}", piece), "convexHull") for k, piece in enumerate(pieces)]
+    for collider, approximation in colliders:
+        if pieces:
+            geom.Imageable(collider).CreatePurposeAttr(geom.Tokens.guide)
+        _usd_apply(collider, "PhysicsCollisionAPI")
+        _usd_apply(collider, "PhysicsMeshCollisionAPI", approximation=approximation)
+
+
+def _usd_mesh(stage: Any, path: str, mesh: Mesh) -> Any:
+    geom, vt = _extra("pxr.UsdGeom"), _extra("pxr.Vt")
+    mesh, normals = with_normals(mesh)
+    prim = geom.Mesh.Define(stage, path)
+    prim.CreatePointsAttr(vt.Vec3fArray.FromNumpy(mesh.vertices.astype(np.float32)))
+    prim.CreateFaceVertexCountsAttr(vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, dtype=np.int32)))
+    prim.CreateFaceVertexIndicesAttr(vt.IntArray.FromNumpy(mesh.faces.reshape(-1).astype(np.int32)))
+    prim.CreateSubdivisionSchemeAttr(geom.Tokens.none)
+    prim.CreateDoubleSidedAttr(True)
+    prim.CreateNormalsAttr(vt.Vec3fArray.FromNumpy(normals.astype(np.float32)))
+    prim.SetNormalsInterpolation(geom.Tokens.vertex)
+    if mesh.colors is not None:
+        tint = prim.CreateDisplayColorPrimvar(geom.Tokens.vertex)
+        tint.Set(vt.Vec3fArray.FromNumpy(light(mesh.colors).astype(np.float32)))
+    return prim.GetPrim()
+
+
+# --- MuJoCo ---
+
+
+def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
+    scene, left_out = take.scene, _missing(take)
+    seen, cut = _write_assets(take, out, lambda body: True, on_progress)
+    root = XML("mujoco", model=_plain_names([out.stem])[0])
+    folder = out.with_name(f"{out.stem}_assets").name
+    _add(root, "compiler", angle="radian", meshdir=folder, balanceinertia="true")
+    _add(root, "option", timestep=_numbers(STEP), gravity=_numbers(scene.gravity), cone="elliptic", impratio="10")
+    _add(root, "size", memory="512M")  # of address space; contacts of many pieces need more than is the default
+    asset, world = _add(root, "asset"), _add(root, "worldbody")
+    _add(world, "light", directional="true", castshadow="false", pos="0 0 10", dir="-0.4 0.3 -0.9")
+    group, allowed = contact_groups(scene.bodies)
+    if len(allowed) > MOST_GROUPS:
+        left_out.append(f"collides_with: {len(allowed)} groups of bodies (MuJoCo knows {MOST_GROUPS})")
+        group, allowed = np.zeros_like(group), np.ones((1, 1), dtype=bool)
+    meshes: set[str] = set()
+    geoms: list[list[str]] = []
+    places, speeds = [], []
+
+    def mesh_of(file: Path, scale: float) -> str:
+        name = file.stem + ("" if scale == 1.0 else f"-x{scale:.9g}")
+        if name not in meshes:
+            meshes.add(name)
+            # "convex" and "shell" ask for no volume inside, which what is only shown need not have.
+            inertia = "convex" if "-" in file.stem else "shell"
+            _add(asset, "mesh", name=name, file=file.name, scale=_numbers([scale] * 3), inertia=inertia)
+        return name
+
+    for k, (name, body, shape, color) in enumerate(take.each()):
+        quat = body.quat_xyzw
+        node = _add(world, "body", name=name, pos=_numbers(body.position), quat=_numbers(_wxyz(quat)))
+        if body.motion == "kinematic":
+            node.set("mocap", "true")
+        elif body.motion == "dynamic":
+            _add(node, "freejoint", name=f"{name}_free")
+            com, tensor = body.scale * shape.com, _inertia(body, shape)
+            full = _numbers(tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
+            _add(node, "inertial", pos=_numbers(com), mass=_numbers(body.mass), fullinertia=full)
+            turn = Rotation.from_quat(quat)
+            # Of the body's own origin, in world axes; and of its turning, in its own axes.
+            speed = body.velocity - np.cross(body.angular_velocity, turn.apply(com))
+            places.append(_numbers(body.position, _wxyz(quat)))
+            speeds.append(_numbers(speed, turn.inv().apply(body.angular_velocity)))
+        rgba = _rgba(shape, color)
+        if body.shape in seen:
+            mesh = mesh_of(seen[body.shape], body.scale)
+            _add(node, "geom", type="mesh", mesh=mesh, rgba=rgba, group="2", contype="0", conaffinity="0")
+            solids = [{"type": "mesh", "mesh": mesh_of(file, body.scale), "group": "3"} for file in cut[body.shape]]
+        else:
+            form: Any = shape.sdf
+            sizes = (take.plane_size(),) * 3 if isinstance(form, PlaneSdf) else form.scaled(body.scale).sizes
+            solids = [{"type": form.KIND, "size": _numbers(sizes), "rgba": rgba}]
+        mates = sum(1 << g for g in np.flatnonzero(allowed[group[k]]))
+        surface = {"condim": "3", "contype": f"{1 << group[k]}", "conaffinity": f"{mates}"}
+        surface |= _mjcf_surface(body.friction**2, body.restitution**2)
+        geoms.append([f"{name}-{i}" for i in range(len(solids))])
+        for solid, label in zip(solids, geoms[-1], strict=True):
+            _add(node, "geom", name=label, **solid, **surface)
+
+    # Between bodies of one material the square is the product. Other pairs are told one by one, while they are few:
+    # those of few geoms first, since the floor is one.
+    pairs = []
+    surfaces = [(b.friction, b.restitution) for b in scene.bodies]
+    order = sorted(range(len(geoms)), key=lambda k: len(geoms[k])) if len(set(surfaces)) > 1 else []
+    for i, j in combinations(order, 2):
+        one, other = scene.bodies[i], scene.bodies[j]
+        if surfaces[i] == surfaces[j] or "dynamic" not in (one.motion, other.motion) or not allowed[group[i], group[j]]:
+            continue
+        if len(pairs) + len(geoms[i]) * len(geoms[j]) > MOST_PAIRS:
+            left_out.append("friction and restitution of some unlike bodies: the larger friction of the two counts")
+            break
+        surface = _mjcf_surface(one.friction * other.friction, one.restitution * other.restitution, pair=True)
+        pairs += [{"geom1": a, "geom2": b, "condim": "3", **surface} for a in geoms[i] for b in geoms[j]]
+    contact = _add(root, "contact") if pairs else root
+    for pair in pairs:
+        _add(contact, "pair", **pair)
+    if places:
+        _add(_add(root, "keyframe"), "key", name="start", qpos=" ".join(places), qvel=" ".join(speeds))
+    _write_xml(out, root)
+    return [out, *seen.values(), *(file for files in cut.values() for file in files)], left_out
+
+
+def _mjcf_surface(friction: float, restitution: float, *, pair: bool = False) -> dict[str, str]:
+    """Friction, and a contact as stiff as the step allows, damped so that bodies part at this part of their speed.
+
+    MuJoCo has no restitution. A spring that only pushes, its damping relative to the critical one z, gives back
+    exp(-z arccos(2 z^2 - 1) / sqrt(1 - z^2)) of the speed; also above 1, where arccos and root are imaginary.
+    """
+    damping = (np.arange(1000) + 0.5) * SOFT / 2000  # up to where MuJoCo takes it as it is
+    turned = np.emath.arccos(2.0 * damping**2 - 1.0) / np.emath.sqrt(1.0 - damping**2)
+    back = np.exp(-damping * np.abs(turned))
+    found = np.interp(-restitution, -back, damping)
+    sliding = [friction, friction, 0.005, 0.0001, 0.0001] if pair else [friction, 0.005, 0.0001]
+    return {"friction": _numbers(sliding), "solref": _numbers(SOFT * STEP / found, found)}
+
+
+# --- URDF ---
+
+
+def _urdf(take: Take, out: Path, on_progress: StageProgress) -> Written:
+    seen, cut = _write_assets(take, out, lambda body: body.motion != "static", on_progress)
+    files: list[Path] = []
+    single = len(take.names) == 1 and take.scene.path is None
+    for name, body, shape, color in take.each():
+        root = XML("robot", name=name)
+        link = _add(root, "link", name=name)
+        surface = _add(link, "contact")
+        _add(surface, "lateral_friction", value=_numbers(body.friction))
+        _add(surface, "restitution", value=_numbers(body.restitution))
+        moves = body.motion == "dynamic"
+        inertial = _add(link, "inertial")
+        _add(inertial, "origin", xyz=_numbers(body.scale * shape.com), rpy="0 0 0")
+        _add(inertial, "mass", value=_numbers(body.mass if moves else 0.0))
+        tensor = _inertia(body, shape) if moves else np.zeros((3, 3))
+        sides = {f"i{'xyz'[a]}{'xyz'[b]}": _numbers(tensor[a, b]) for a in range(3) for b in range(a, 3)}
+        _add(inertial, "inertia", **sides)
+
+        def mesh(element: XML, file: Path, scale: float = body.scale) -> None:
+            path = f"{file.parent.name}/{file.name}"
+            _add(_add(element, "geometry"), "mesh", filename=path, scale=_numbers([scale] * 3))
+
+        visual = _add(link, "visual")
+        if body.shape not in seen:
+            if isinstance(shape.sdf, PlaneSdf):  # PyBullet draws none
+                _add(visual, "origin", xyz="0 0 -0.001", rpy="0 0 0")
+                _add(_add(visual, "geometry"), "box", size=_numbers([2.0 * take.plane_size()] * 2, 0.002))
+            else:
+                _urdf_form(_add(visual, "geometry"), shape.sdf, body.scale)
+            _urdf_form(_add(_add(link, "collision"), "geometry"), shape.sdf, body.scale)
+        else:
+            mesh(visual, seen[body.shape])
+            if body.motion == "static":  # triangles as they are, which PyBullet knows of what never moves
+                mesh(_add(link, "collision", concave="yes"), seen[body.shape])
+            for file in cut[body.shape] if body.motion != "static" else []:
+                mesh(_add(link, "collision"), file)
+        rgba = _rgba(shape, color)
+        _add(_add(visual, "material", name=f"{name}_color"), "color", rgba=rgba)
+        files.append(out if single else out.with_name(f"{out.stem}.{name}.urdf"))
+        _write_xml(files[-1], root)
+    assets = [*seen.values(), *(file for found in cut.values() for file in found)]
+    if single:
+        return [*files, *assets], []
+    poses = out.with_suffix(".csv")
+    start = replace(take, time=take.time[:1], position=take.position[:1], quat_xyzw=take.quat_xyzw[:1])
+    _csv(start, poses, on_progress)
+    left_out = ["where the bodies are: that is in the CSV", "gravity, velocities and collides_with", *_missing(take)]
+    return [*files, poses, *assets], left_out
+
+
+def _urdf_form(geometry: XML, form: Any, scale: float) -> None:
+    form = form.scaled(scale)
+    if isinstance(form, PlaneSdf):
+        _add(geometry, "plane", normal="0 0 1")
+    elif isinstance(form, SphereSdf):
+        _add(geometry, "sphere", radius=_numbers(form.radius))
+    elif isinstance(form, BoxSdf):
+        _add(geometry, "box", size=_numbers(2.0 * np.array(form.half)))
+    else:
+        _add(geometry, form.KIND, radius=_numbers(form.radius), length=_numbers(2.0 * form.half))
+
+
+# --- poses ---
+
+
+def _csv(take: Take, out: Path, on_progress: StageProgress) -> Written:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for t, time in enumerate(take.time):
+        for k, body in enumerate(take.scene.bodies):
+            pose = np.concatenate([take.position[t, k], take.quat_xyzw[t, k]])
+            writer.writerow([f"{time:.9g}", body.name, *(f"{value:.12g}" for value in pose)])
+    write_text(out, text.getvalue())
+    return [out], ["everything but poses"]
+
+
+FORMATS: dict[str, Callable[[Take, Path, StageProgress], Written]] = {
+    ".glb": _glb,
+    **dict.fromkeys((".usd", ".usda", ".usdc"), _usd),
+    **dict.fromkeys((".xml", ".mjcf"), _mjcf),
+    ".urdf": _urdf,
+    ".csv": _csv,
+}

@@ -1,0 +1,389 @@
+"""Rollout -> rerun. A live run and a file go through the same calls: a live step is a chunk of one frame."""
+
+from __future__ import annotations
+
+import colorsys
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import cycle
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from PIL import Image
+
+from sdfsim.base.files import write_bytes
+from sdfsim.geometry.mesh import Mesh, face_normals, vertex_normals
+from sdfsim.geometry.primitives import plane
+from sdfsim.physics.rollout import Rollout
+from sdfsim.scene.scene import Scene
+from sdfsim.shape.shape import Shape
+from sdfsim.simulate.run_memory import PHASES
+
+if TYPE_CHECKING:
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+WORLD = "world"
+CONTACTS = "world/contacts"
+# What is plotted: the counters of a view by their legends.
+VIEWS = {
+    "kinetic energy (J)": {"kinetic_energy": "kinetic energy (J)"},
+    "worst penetration (m)": {"worst_penetration": "worst penetration (m)"},
+    "contacts": {"contacts": "contacts", "pairs": "near pairs of bodies"},
+    "bodies": {"free": "free", "active": "active", "asleep": "asleep"},
+    "network": {"nodes": "nodes", "edges": "edges"},
+    "milliseconds": {"step_ms": "step", **PHASES},
+}
+PLOTS = {key: legend for view in VIEWS.values() for key, legend in view.items()}
+STATIC_COLOR = (150, 150, 155)
+HUES = 32  # colours of bodies that move
+_NODE_COLOR = (20, 20, 20)
+_CONTACT_COLOR = (255, 40, 40)
+_PHOTO_PIXELS = 320
+_TEXTURE_PIXELS = 2048
+MANY = 24  # bodies of one shape that do not stay put, from which on they are a crowd
+COLORS = 4  # copies share their mesh's colour, so a crowd is split to be told apart
+_CREASE = np.cos(np.radians(40.0))
+_MOST_CORNER_PAIRS = 1_000_000  # more, about 10,000 vertices, and a mesh counts as smooth: splitting triples its size
+FARTHEST = 1.0  # what leaves the scene for good must not make it a dot
+
+
+class Playback:
+    """One recording of one scene, to be written to a file, or streamed to a viewer. Its first view shows all of the
+    scene, and where the motion is known already all of that."""
+
+    def __init__(self, scene: Scene, motion: Rollout | None = None) -> None:
+        import rerun as rr
+
+        self._rr = rr
+        self._scene = scene
+        self._centre, self._radius = framed(scene, motion)
+        self._step = 0
+        self._com = [b.scale * scene.shapes[b.shape].com for b in scene.bodies]
+        self._crowds = _crowds(scene)
+        crowded = {int(k) for crowd in self._crowds for k in crowd.bodies}
+        paths = [f"{WORLD}/{rr.escape_entity_path_part(body.name)}" for body in scene.bodies]
+        self._alone = [(k, path) for k, path in enumerate(paths) if k not in crowded]
+        self.stream = rr.RecordingStream("sdfsim")
+
+    def blueprint(self) -> rrb.Blueprint:
+        """The layout: the scene on the left, plots of the counters on the right; nodes and contact points hidden."""
+        import rerun.blueprint as rrb
+
+        hidden = [CONTACTS, *(f"{path}/nodes" for _, path in self._alone)]
+        view = rrb.Spatial3DView(
+            origin=WORLD,
+            name="scene",
+            overrides={path: rrb.EntityBehavior(visible=False) for path in hidden},
+            eye_controls=_controls(eye_around(self._centre, self._radius, -self._scene.gravity)),
+            line_grid=False,
+        )
+        plots = [
+            rrb.TimeSeriesView(origin="plots", contents=[f"plots/{key}" for key in keys], name=name)
+            for name, keys in VIEWS.items()
+        ]
+        return rrb.Blueprint(
+            rrb.Horizontal(view, rrb.Vertical(*plots), column_shares=[3, 1]),
+            rrb.TimePanel(timeline="time", state="collapsed"),
+            rrb.BlueprintPanel(state="collapsed"),
+            rrb.SelectionPanel(state="collapsed"),
+            auto_views=False,
+        )
+
+    def log_static(self) -> None:
+        """Everything that does not change: meshes, surface nodes, and the names of the plots."""
+        rr, scene = self._rr, self._scene
+        self.stream.send_blueprint(self.blueprint())
+        self.stream.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        colors = body_colors(scene)
+        for crowd in self._crowds:
+            shape = scene.shapes[crowd.shape]
+            mesh = replace(shape.shown, vertices=shape.shown.vertices - shape.com)
+            self.stream.log(crowd.path, _shaded(rr, mesh, colors[crowd.bodies[0]]), static=True)
+            scales = np.repeat([[scene.bodies[k].scale] for k in crowd.bodies], 3, 1)
+            self.stream.log(crowd.path, rr.InstancePoses3D.from_fields(scales=scales), static=True)
+        for k, path in self._alone:
+            body, com = scene.bodies[k], self._com[k]
+            shape = scene.shapes[body.shape]
+            mesh = shown(shape, 6 * self._radius)
+            placed = replace(mesh, vertices=mesh.vertices * body.scale - com)
+            self.stream.log(f"{path}/mesh", _shaded(rr, placed, colors[k]), static=True)
+            if len(shape.nodes):
+                nodes = rr.Points3D(shape.nodes * body.scale - com, colors=_NODE_COLOR, radii=rr.Radius.ui_points(2))
+                self.stream.log(f"{path}/nodes", nodes, static=True)
+            if body.motion == "static":  # it has one pose for good
+                centre = body.position + _turned(com, body.quat_xyzw)
+                pose = rr.Transform3D(translation=centre, quaternion=rr.Quaternion(xyzw=body.quat_xyzw))
+                self.stream.log(path, pose, static=True)
+        style = rr.Points3D.from_fields(colors=_CONTACT_COLOR, radii=rr.Radius.ui_points(4))
+        self.stream.log(CONTACTS, style, static=True)
+        for key, name in PLOTS.items():
+            self.stream.log(f"plots/{key}", rr.SeriesLines(names=name), static=True)
+
+    def log_steps(self, chunk: Rollout) -> None:
+        """Poses, contact points and counters of the frames of `chunk`, which follow the frames logged before."""
+        rr, frames = self._rr, len(chunk.time)
+        steps = np.arange(self._step, self._step + frames)
+        self._step += frames
+        times = [rr.TimeColumn("time", duration=chunk.time), rr.TimeColumn("step", sequence=steps)]
+        for crowd in self._crowds:
+            places, turns = (getattr(chunk, k)[:, crowd.bodies] for k in ("position", "orientation"))
+            poses = rr.InstancePoses3D.columns(
+                translations=places.reshape(-1, 3).astype(np.float32),
+                quaternions=turns.reshape(-1, 4).astype(np.float32),
+            )
+            self.stream.send_columns(crowd.path, times, poses.partition(np.full(frames, len(crowd.bodies))))
+        for i, path in self._alone:
+            if self._scene.bodies[i].motion != "static":
+                motion = rr.Transform3D.columns(translation=chunk.position[:, i], quaternion=chunk.orientation[:, i])
+                self.stream.send_columns(path, times, motion)
+        points = rr.Points3D.columns(positions=chunk.contact_point).partition(chunk.contact_count)
+        self.stream.send_columns(CONTACTS, times, points)
+        for key in PLOTS:
+            if key in chunk.counters:
+                values = np.asarray(chunk.counters[key], dtype=np.float64)
+                self.stream.send_columns(f"plots/{key}", times, rr.Scalars.columns(scalars=values))
+
+
+class Crowd(NamedTuple):
+    """Bodies drawn as copies of one mesh, whose poses at a step are one row."""
+
+    path: str  # entity path
+    shape: int  # index into `Scene.shapes`
+    bodies: np.ndarray  # [C] int64, which
+
+
+def _crowds(scene: Scene) -> list[Crowd]:
+    """The crowds of a scene; bodies in none of them are drawn one by one."""
+    import rerun as rr
+
+    found = []
+    shape = np.array([b.shape if b.motion != "static" else -1 for b in scene.bodies])
+    for number, name in enumerate(s.name for s in scene.shapes):
+        members = np.flatnonzero(shape == number)
+        for k in range(COLORS if len(members) >= MANY else 0):
+            called = rr.escape_entity_path_part(f"{number}_{name}")
+            found.append(Crowd(f"{WORLD}/crowds/{called}/{k}", number, members[k::COLORS]))
+    return found
+
+
+def save_rollout(scene: Scene, rollout: Rollout, path: Path) -> None:
+    """Write `rollout` as a rerun recording. Raises SdfsimError where the file cannot be written."""
+    playback = Playback(scene, rollout)
+    encoded = playback.stream.binary_stream()  # since rerun's own sink only logs a full disk
+    playback.log_static()
+    playback.log_steps(rollout)
+    write_bytes(path, encoded.read() or b"")
+
+
+@dataclass(frozen=True)
+class PosedPhoto:
+    """One camera of a reconstruction."""
+
+    name: str  # what the viewer calls it
+    image: Path | None  # photo file, or None to show the camera alone
+    focal: float  # px
+    principal: tuple[float, float]  # (cx, cy) px
+    size: tuple[int, int]  # (width, height) px
+    rotation: np.ndarray  # [3, 3] world to camera (x right, y down, z forward)
+    translation: np.ndarray  # [3] m, world to camera
+    color: tuple[int, int, int] | None = None  # RGB of its frame, or None for the viewer's own
+
+
+def save_reconstruction(
+    path: Path, photos: list[PosedPhoto], points: np.ndarray, colors: np.ndarray | None, mesh: Mesh | None,
+    skins: Mapping[str, Mesh] = MappingProxyType({}), trust: Mapping[str, Mesh] = MappingProxyType({}),
+) -> None:  # fmt: skip
+    """Write cameras with their photos, sparse points [P, 3] m with colours [P, 3] uint8, and the surface as one rerun
+    recording; raises SdfsimError where it cannot be written.
+
+    Parts with textures (`skins`, by name) are shown in place of the mesh. With `trust`, parts in colours that tell how
+    far each place can be trusted, the viewer has a second tab that shows these.
+    """
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    stream = rr.RecordingStream("sdfsim-reconstruct")
+    encoded = stream.binary_stream()
+    rotations = [np.asarray(photo.rotation) for photo in photos]
+    centres = [-turn.T @ photo.translation for turn, photo in zip(rotations, photos, strict=True)]
+    # Cameras surround what matters; sparse points also lie on whatever is behind it.
+    around = np.concatenate([np.reshape(centres, (-1, 3)), points[:0] if mesh is None else mesh.vertices])
+    low, high = (around.min(0), around.max(0)) if len(around) else (-np.ones(3), np.ones(3))
+    centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2 or 1.0
+    # Before there is a surface, z need not be up: photographers mostly hold the camera level.
+    up = -np.sum([turn[1] for turn in rotations], axis=0) if mesh is None and photos else np.array([0.0, 0.0, 1.0])
+    hidden = {"reconstruction": "trust"} | ({"trust": "surface"} if trust else {})
+    tabs = [
+        rrb.Spatial3DView(
+            origin=WORLD, name=name, eye_controls=_controls(eye_around(centre, radius, up)), line_grid=False,
+            contents=["+ $origin/**", f"- $origin/{other}/**"],
+        )
+        for name, other in hidden.items()
+    ]  # fmt: skip
+    stream.send_blueprint(rrb.Blueprint(rrb.Tabs(*tabs), collapse_panels=True, auto_views=False))
+    stream.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    stream.log(f"{WORLD}/points", rr.Points3D(points, colors=colors, radii=rr.Radius.ui_points(1.5)), static=True)
+    surfaces = {} if mesh is None else {f"{WORLD}/surface": mesh}
+    if skins:
+        surfaces = {f"{WORLD}/surface/{rr.escape_entity_path_part(name)}": skin for name, skin in skins.items()}
+    surfaces |= {f"{WORLD}/trust/{rr.escape_entity_path_part(name)}": part for name, part in trust.items()}
+    for entity, surface in surfaces.items():
+        stream.log(entity, _shaded(rr, surface, (200, 190, 175)), static=True)
+    for photo, turn, centre_of in zip(photos, rotations, centres, strict=True):
+        entity = f"{WORLD}/cameras/{rr.escape_entity_path_part(photo.name)}"
+        stream.log(entity, rr.Transform3D(translation=centre_of, mat3x3=turn.T), static=True)
+        shrink = min(1.0, _PHOTO_PIXELS / max(photo.size))
+        pinhole = rr.Pinhole(
+            focal_length=photo.focal * shrink,
+            principal_point=np.array(photo.principal) * shrink,
+            resolution=[max(1, round(s * shrink)) for s in photo.size],
+            image_plane_distance=0.1 * radius,
+            color=photo.color,
+        )
+        stream.log(entity, pinhole, static=True)
+        if photo.image is not None and photo.image.exists():
+            image = rr.Image(_reduced(Image.open(photo.image), _PHOTO_PIXELS))
+            stream.log(entity, image.compress(jpeg_quality=80), static=True)
+    write_bytes(path, encoded.read() or b"")
+
+
+@dataclass(frozen=True)
+class Eye:
+    """From where a view looks."""
+
+    position: np.ndarray  # [3] m
+    target: np.ndarray  # [3] m, the point in the middle
+    up: np.ndarray  # [3] unit vector
+
+
+def _controls(eye: Eye) -> rrb.EyeControls3D:
+    import rerun.blueprint as rrb
+
+    return rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=eye.position, look_target=eye.target, eye_up=eye.up)
+
+
+def eye_around(centre: np.ndarray, radius: float, up: np.ndarray) -> Eye:
+    """An eye from which a ball is in sight."""
+    length = np.linalg.norm(up)
+    up = up / length if length > 0 else np.array([0.0, 0.0, 1.0])
+    side = np.cross(up, [0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0])
+    side /= np.linalg.norm(side)
+    away = 1.6 * np.cross(up, side) + 1.1 * side + 0.9 * up
+    return Eye(centre + radius * away, centre, up)
+
+
+def body_colors(scene: Scene) -> list[tuple[int, ...]]:
+    """An RGB colour (0 to 255) for every body: grey where it stays put, else one of `HUES`, in turn."""
+    hues = map(_color, cycle(range(HUES)))
+    return [STATIC_COLOR if body.motion == "static" else next(hues) for body in scene.bodies]
+
+
+def _color(number: int) -> tuple[int, ...]:
+    """RGB (0 to 255), the hues of one number and the next a golden angle apart."""
+    rgb = colorsys.hsv_to_rgb((0.58 + number * 0.61803398875) % 1.0, 0.62, 0.9 if number % 2 == 0 else 0.75)
+    return tuple(round(255 * c) for c in rgb)
+
+
+def framed(scene: Scene, motion: Rollout | None = None) -> tuple[np.ndarray, float]:
+    """Centre [3] m and radius m of what the first view has to show.
+
+    The bodies at the start, planes left out, and the places on planes that they are over, as what is held up by
+    nothing falls there; and, where the motion is known, their way. What flies farther than `FARTHEST` times the size
+    of all this is followed so far only.
+    """
+    boxes: dict[int, np.ndarray] = {}
+    planes = []
+    for k, body in enumerate(scene.bodies):
+        shape = scene.shapes[body.shape]
+        if is_infinite(shape):
+            planes.append((body.position, _turned(np.array([0.0, 0.0, 1.0]), body.quat_xyzw)))
+        elif len(shape.mesh.vertices):
+            box = np.stack([shape.mesh.vertices.min(0), shape.mesh.vertices.max(0)]) * body.scale
+            corners = np.stack(np.meshgrid(*box.T), -1).reshape(-1, 3)
+            boxes[k] = body.position + _turned(corners, body.quat_xyzw)
+    if not boxes:
+        return np.zeros(3), 1.0
+    start = np.concatenate(list(boxes.values()))
+    below = [start - ((start - at) @ normal)[:, None] * normal for at, normal in planes]
+    shown = np.concatenate([start, *below])
+    low, high = shown.min(0), shown.max(0)
+    if motion is not None:
+        size = float((high - low).max())
+        for k, corners in boxes.items():
+            half = np.linalg.norm(np.ptp(corners, axis=0)) / 2 if scene.bodies[k].motion != "static" else 0.0
+            way = np.clip(motion.position[:, k], low - FARTHEST * size, high + FARTHEST * size)
+            low, high = np.minimum(low, way.min(0) - half), np.maximum(high, way.max(0) + half)
+    return (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
+
+
+def _turned(vectors: np.ndarray, quat_xyzw: np.ndarray) -> np.ndarray:
+    """Vectors [..., 3] turned by a unit quaternion [4]."""
+    axis, real = quat_xyzw[:3], quat_xyzw[3]  # by hand, because scipy's Rotation takes a fifth of a second to load
+    across = 2.0 * np.cross(axis, vectors)
+    return vectors + real * across + np.cross(axis, across)
+
+
+def _shaded(rr: Any, mesh: Mesh, color: tuple[int, ...]) -> rr.Mesh3D:
+    """With its own texture or colours, or `color` where it has neither."""
+    mesh, normals = with_normals(mesh)
+    return rr.Mesh3D(
+        vertex_positions=mesh.vertices,
+        triangle_indices=mesh.faces,
+        vertex_normals=normals,
+        vertex_colors=mesh.colors,
+        vertex_texcoords=mesh.uv,
+        albedo_texture=None if mesh.texture is None else _reduced(Image.fromarray(mesh.texture), _TEXTURE_PIXELS),
+        albedo_factor=color if mesh.colors is None and mesh.texture is None else None,
+    )
+
+
+def _reduced(image: Image.Image, longest: int) -> np.ndarray:
+    """Pixels [H, W, 3] small enough for a recording, which holds every one of them."""
+    image = image.convert("RGB")
+    image.thumbnail((longest, longest))
+    return np.asarray(image)
+
+
+def is_infinite(shape: Shape) -> bool:
+    """Whether it is a plane."""
+    return not np.isfinite(shape.sdf.bounds).all()
+
+
+def shown(shape: Shape, half: float) -> Mesh:
+    """The mesh that is shown at scale 1; of a plane a square, `half` m to each side."""
+    return plane(half) if is_infinite(shape) else shape.shown
+
+
+def with_normals(mesh: Mesh) -> tuple[Mesh, np.ndarray]:
+    """The mesh with normals [V, 3]: smooth, its vertices split along creases so that boxes keep their edges."""
+    if mesh.uv is not None:  # its vertices are doubled where its texture is cut, and that is no crease
+        _, first, label = np.unique(mesh.vertices, axis=0, return_index=True, return_inverse=True)
+        return mesh, vertex_normals(Mesh(mesh.vertices[first], label.reshape(-1)[mesh.faces]))[label.reshape(-1)]
+    normals = _corner_normals(mesh)
+    if normals is None:
+        return mesh, vertex_normals(mesh)
+    colors = None if mesh.colors is None else mesh.colors[mesh.faces].reshape(-1, 3)
+    vertices = mesh.vertices[mesh.faces].reshape(-1, 3)
+    return Mesh(vertices, np.arange(len(vertices)).reshape(-1, 3), colors), normals
+
+
+def _corner_normals(mesh: Mesh) -> np.ndarray | None:
+    """[3 F, 3] for every face corner the mean of the faces at its vertex that bend less than the crease angle. None for
+    a mesh so fine that it may pass as smooth."""
+    owner = mesh.faces.reshape(-1)
+    order = np.argsort(owner, kind="stable")
+    valence = np.bincount(owner, minlength=len(mesh.vertices))
+    if (valence**2).sum() > _MOST_CORNER_PAIRS:
+        return None
+    start = np.cumsum(valence) - valence
+    repeats = valence[owner]
+    first = np.repeat(np.arange(len(owner)), repeats)
+    second = order[np.repeat(start[owner] - (np.cumsum(repeats) - repeats), repeats) + np.arange(repeats.sum())]
+    unit, area = face_normals(mesh)
+    near = (unit[first // 3] * unit[second // 3]).sum(1) >= _CREASE
+    total = np.zeros((len(owner), 3))
+    np.add.at(total, first[near], (area[:, None] * unit)[second[near] // 3])
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)

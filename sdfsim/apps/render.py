@@ -1,0 +1,216 @@
+"""A run as a movie or a picture without a screen or a graphics driver: rays are cast on the processor."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sdfsim.apps.recording import Eye, body_colors, eye_around, framed, is_infinite, shown, with_normals
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import replacing
+from sdfsim.base.parallel import Progress, silent
+from sdfsim.geometry.bvh import Caster
+from sdfsim.geometry.mesh import Mesh
+from sdfsim.physics.rollout import Rollout
+from sdfsim.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from sdfsim.scene.builder import SceneBuilder
+
+Place = Sequence[float] | np.ndarray
+_Model = tuple[Mesh, np.ndarray]  # what is drawn of a body about its centre of mass, with normals [V, 3]
+SIZE = (960, 540)  # px, width and height
+FRAMES = 30  # a second
+FORMATS = (".mp4", ".png")
+_TALL = np.tan(np.radians(20.0))  # half of the field of view's height, at distance 1
+_SUN = np.array([0.35, -0.5, 0.8]) / np.linalg.norm([0.35, -0.5, 0.8])  # in a frame whose z is up
+_SKY = np.array([236.0, 240.0, 245.0], np.float32)  # what nothing is in front of
+_SHADE = 0.45  # light where the sun does not shine
+_SUB = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]])  # px, where edges are looked at again
+_GRID = np.stack(np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5), -1).reshape(-1, 2)  # px
+
+
+def render(
+    scene: Scene | SceneBuilder, rollout: Rollout, out: Path | str, *, camera: Place | None = None,
+    look_at: Place | None = None, at: float | None = None, on_progress: Progress = silent,
+) -> None:  # fmt: skip
+    """Write a movie (.mp4, H.264, as long as the run) or a picture (.png, `at` s, by default the end) of a run.
+
+    Camera and what it looks at, [3] m each, are as in `eye_of`. Raises SdfsimError for another ending, a time outside
+    of the run, a camera where it looks at, or a file that cannot be builder.
+    """
+    out, scene = Path(out), scene if isinstance(scene, Scene) else scene.load()
+    check_format(out)
+    if at is not None and not rollout.time[0] <= at <= rollout.time[-1] + rollout.meta["dt"]:
+        raise SdfsimError(f"--at {at:g}: the run holds {rollout.time[0]:g} to {rollout.time[-1]:g} s")
+    studio = Studio(scene, eye_of(scene, rollout, camera, look_at), framed(scene, rollout)[1])
+    if out.suffix == ".png":
+        from PIL import Image
+
+        pixels = studio.picture(*poses_at(rollout, rollout.time[-1] if at is None else at))
+        with replacing(out) as partial:
+            Image.fromarray(pixels).save(partial, format="PNG")
+        return
+    count = max(1, round(float(rollout.time[-1] - rollout.time[0]) * FRAMES) + 1)
+
+    def pictures() -> Iterator[np.ndarray]:
+        for k in range(count):
+            yield studio.picture(*poses_at(rollout, rollout.time[0] + k / FRAMES))
+            on_progress((k + 1) / count, f"frame {k + 1} of {count}")
+
+    write_movie(out, pictures())
+
+
+def eye_of(
+    scene: Scene, motion: Rollout | None = None, camera: Place | None = None, look_at: Place | None = None
+) -> Eye:
+    """From where a scene is looked at; of the eye and what it looks at, [3] m each, what is not given is chosen so that
+    all of the scene is in sight. Raises SdfsimError where the eye is where it looks at, or not at a finite place."""
+    centre, radius = framed(scene, motion)
+    given = eye_around(centre if look_at is None else np.array(look_at, dtype=float), radius, -scene.gravity)
+    eye = given if camera is None else replace(given, position=np.array(camera, dtype=float))
+    sight = eye.target - eye.position
+    if not np.isfinite(sight).all() or np.linalg.norm(sight) < 1e-9:
+        raise SdfsimError("--camera and --look-at: must be two different points")
+    if np.linalg.norm(np.cross(sight, eye.up)) < 1e-3 * np.linalg.norm(sight):  # straight down, up has no place there
+        aside = np.cross(eye.up, eye.up[[1, 2, 0]] + [0.1, 0.2, 0.3])
+        eye = replace(eye, position=eye.position + 1e-3 * np.linalg.norm(sight) * aside)
+    return eye
+
+
+def check_format(out: Path) -> None:
+    """Raises SdfsimError where the ending of a file says neither movie nor picture."""
+    if out.suffix not in FORMATS:
+        raise SdfsimError(f"{out}: must end with {' or '.join(FORMATS)}")
+
+
+def write_movie(out: Path, pictures: Iterator[np.ndarray]) -> None:
+    """Write RGB pictures of `SIZE` [H, W, 3] uint8, `FRAMES` a second, as H.264."""
+    import av
+
+    with replacing(out) as partial, av.open(str(partial), "w", format="mp4") as movie:
+        stream: Any = movie.add_stream("libx264", rate=Fraction(FRAMES), options={"crf": "20", "preset": "fast"})
+        (stream.width, stream.height), stream.pix_fmt = SIZE, "yuv420p"
+        for pixels in pictures:
+            movie.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+        movie.mux(stream.encode())
+
+
+def poses_at(rollout: Rollout, time: float) -> tuple[np.ndarray, np.ndarray]:
+    """Positions [N, 3] m of the centres of mass and orientations [N, 4] xyzw, between frames as if moved evenly."""
+    after = int(np.clip(np.searchsorted(rollout.time, time), min(1, len(rollout)), len(rollout)))
+    before = max(after - 1, 0)
+    span = rollout.time[after] - rollout.time[before]
+    part = float(np.clip((time - rollout.time[before]) / span, 0.0, 1.0)) if span > 0 else 1.0
+    one, other = rollout.orientation[before], rollout.orientation[after]
+    nearer = np.where((one * other).sum(-1, keepdims=True) < 0.0, -other, other)
+    turned = (1.0 - part) * one + part * nearer
+    place = (1.0 - part) * rollout.position[before] + part * rollout.position[after]
+    return place, turned / np.linalg.norm(turned, axis=-1, keepdims=True)
+
+
+class _Cast:
+    """The triangles of all bodies, each a mesh about its centre of mass with normals [V, 3], at places [N, 3] m and
+    turns [N, 3, 3]; `body` [F] is which one a face is of."""
+
+    def __init__(self, models: list[_Model], places: np.ndarray, turns: np.ndarray) -> None:
+        self._meshes = [mesh for mesh, _ in models]
+        self._starts = np.cumsum([0, *(len(m.vertices) for m in self._meshes)])
+        vertices = np.concatenate([m.vertices @ r.T + t for m, r, t in zip(self._meshes, turns, places, strict=True)])
+        normals = [normals @ r.T for (_, normals), r in zip(models, turns, strict=True)]
+        self._normals = np.concatenate(normals, dtype=np.float32)
+        self._colors = np.concatenate([np.asarray(m.colors, dtype=np.float32) for m in self._meshes])
+        self._faces = np.concatenate([m.faces + start for m, start in zip(self._meshes, self._starts, strict=False)])
+        self.body = np.repeat(np.arange(len(models)), [len(m.faces) for m in self._meshes])
+        self.caster = Caster(Mesh(vertices, self._faces))
+
+    def surface(self, face: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Normals [R, 3] and colours [R, 3] at places of faces."""
+        share = np.stack([1.0 - uv[:, 0] - uv[:, 1], uv[:, 0], uv[:, 1]], -1)
+        corners = self._faces[face]
+        normal, color = (np.einsum("rk,rkc->rc", share, of[corners]) for of in (self._normals, self._colors))
+        for body, mesh in enumerate(self._meshes):
+            if mesh.uv is not None and mesh.texture is not None:
+                on = np.flatnonzero(self.body[face] == body)
+                size = np.array(mesh.texture.shape[1::-1])
+                at = np.einsum("rk,rkc->rc", share[on], mesh.uv[corners[on] - self._starts[body]]) * size
+                column, row = np.clip(at, 0, size - 1).astype(int).T
+                color[on] = mesh.texture[row, column]
+        length = np.sqrt(np.einsum("rc,rc->r", normal, normal))
+        return normal / np.maximum(length, 1e-9)[:, None], color
+
+
+class Studio:
+    """A scene with a camera and a sun, of which pictures are taken; `radius` m is that of all that is shown. `axes` [3,
+    3] are unit vectors right and down in the picture, and into it; `sun` [3] is one towards the sun."""
+
+    def __init__(self, scene: Scene, eye: Eye, radius: float) -> None:
+        self._eye, self._radius = eye, radius
+        shapes = [scene.shapes[b.shape] for b in scene.bodies]
+        self._floors = np.array([is_infinite(shape) for shape in shapes])
+        self._models: list[_Model] = []
+        for body, shape, color in zip(scene.bodies, shapes, body_colors(scene), strict=True):
+            mesh, normals = with_normals(shown(shape, 40.0 * radius))
+            colors = np.broadcast_to(color, mesh.vertices.shape) if mesh.colors is None else mesh.colors
+            vertices = body.scale * (mesh.vertices - shape.com)
+            self._models.append((replace(mesh, vertices=vertices, colors=colors), normals))
+        forward = (eye.target - eye.position) / np.linalg.norm(eye.target - eye.position)
+        right = np.cross(forward, eye.up)
+        right /= np.linalg.norm(right)
+        self.axes = np.stack([right, np.cross(forward, right), forward])
+        self.sun = _SUN @ np.stack([right, np.cross(eye.up, right), eye.up])
+        self._through = self._rays(_GRID)
+
+    def picture(self, position: np.ndarray, orientation: np.ndarray) -> np.ndarray:
+        """[H, W, 3] uint8 of bodies with these centres of mass [N, 3] m and orientations [N, 4]."""
+        cast = _Cast(self._models, position, Rotation.from_quat(orientation).as_matrix())
+        wide, tall = SIZE
+        pixels, label = self._look(cast, self._through)
+        pixels, label = pixels.reshape(tall, wide, 3), label.reshape(tall, wide)
+        edge = np.zeros((tall, wide), bool)
+        for axis in (0, 1):
+            differs = np.diff(label, axis=axis) != 0
+            edge[: tall - (axis == 0), : wide - (axis == 1)] |= differs
+            edge[axis == 0 :, axis == 1 :] |= differs
+        if edge.any():
+            again, _ = self._look(cast, self._rays((_GRID[edge.reshape(-1)][:, None] + _SUB).reshape(-1, 2)))
+            pixels[edge] = again.reshape(-1, len(_SUB), 3).mean(1)
+        return np.clip(pixels + 0.5, 0, 255).astype(np.uint8)
+
+    def _rays(self, at: np.ndarray) -> np.ndarray:
+        """[R, 6] float32 origins and unit directions through places [R, 2] px of the picture."""
+        flat = (at - np.array(SIZE) / 2) / (SIZE[1] / 2) * _TALL
+        direction = np.concatenate([flat, np.ones((len(at), 1))], 1) @ self.axes
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        return np.concatenate([np.broadcast_to(self._eye.position, direction.shape), direction], 1, dtype=np.float32)
+
+    def _look(self, cast: _Cast, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Colours [R, 3] along rays [R, 6], and numbers [R] by which bodies, light and shade differ."""
+        away, face, uv = cast.caster.cast(rays)
+        there = np.flatnonzero(np.isfinite(away))
+        away, face, direction = away[there, None], face[there], rays[there, 3:]
+        body = cast.body[face]
+        normal, color = cast.surface(face, uv[there])
+        facing = np.where(np.einsum("rc,rc->r", normal, direction)[:, None] > 0.0, -normal, normal)
+        point, toward = rays[there, :3] + away * direction, facing @ self.sun.astype(np.float32)
+        # Infinite planes are checked, so that motion over them is seen.
+        floor = np.flatnonzero(self._floors[body])
+        square = np.floor(point[floor] / 10.0 ** np.floor(np.log10(self._radius)) + 1e-4).sum(1)
+        color[floor[square % 2 != 0]] *= 0.93
+        start = point + 1e-3 * self._radius * facing
+        to_sun = np.concatenate([start, np.broadcast_to(self.sun, start.shape)], 1, dtype=np.float32)
+        dark = (toward <= 0.0) | cast.caster.anything(to_sun)
+        light = _SHADE + 0.1 * (facing @ self._eye.up.astype(np.float32)) + np.where(dark, 0.0, (1.0 - _SHADE) * toward)
+        # Far away the floor goes over into the sky.
+        clear = 2.0 * (self._radius + float(np.linalg.norm(self._eye.target - self._eye.position)))
+        fog = np.clip((away / clear - 1.0) / 2.0, 0.0, 1.0)
+        pixels, label = np.tile(_SKY, (len(rays), 1)), np.full(len(rays), -1)
+        pixels[there] = (1.0 - fog) * np.clip(light, 0.0, 1.1)[:, None] * color + fog * _SKY
+        label[there] = 2 * body + dark
+        return pixels, label

@@ -1,0 +1,376 @@
+"""`simulate`: a scene file becomes a run folder; and what is kept there so that a killed run goes on."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import fields, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+import yaml
+
+from sdfsim.apps.recording import Playback, framed, save_rollout
+from sdfsim.apps.viewer import check_screen, stream_to_viewer
+from sdfsim.base.console import columns, plain
+from sdfsim.base.devices import pick_device
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import (
+    CONFIG,
+    check_own,
+    check_writable,
+    digest,
+    locked,
+    read_arrays,
+    read_json,
+    write_arrays,
+    write_json,
+    write_text,
+)
+from sdfsim.base.parallel import Progress, StageProgress, silent
+from sdfsim.learned.model import load_model
+from sdfsim.physics.bodies import State, Touch, largest_extent
+from sdfsim.physics.instruments import LEAST, PART, judged
+from sdfsim.physics.rollout import Rollout
+from sdfsim.physics.units import EARTH
+from sdfsim.scene.load import load_scene
+from sdfsim.scene.scene import Scene, fingerprints
+from sdfsim.simulate.run_memory import COUNTS, PHASES
+from sdfsim.simulate.simulator import SimulationError, Simulator, check_seconds, join
+
+Viewer = Literal["none", "file", "native", "web"]
+EVERY = 30.0  # s between two checkpoints
+SETTLED = 25  # steps for which everything has to rest
+STILL = 0.01  # see `resting`
+TOLD = 12  # bodies, up to which each has a line at the end
+FAR = 10.0  # times the size of the scene: who is farther away in the end has left it
+_REPORT = "report.json"
+_RESULTS = (_REPORT, "rollout.npz", "rollout.rrd")
+_STATE = "state.npz"
+_ANEW = "leave --resume away to start anew"
+_OTHER = "is of another scene, model or seed"
+
+
+def simulate(
+    scene_file: Path,
+    out: Path,
+    *,
+    model: str | None,
+    seconds: float | None,
+    seed: int | None,
+    viewer: Viewer,
+    device: str,
+    on_progress: StageProgress,
+    say: Callable[[str], None],
+    allow_outside: bool = False,
+    until_settled: bool = False,
+    resume: bool = False,
+) -> dict[str, Any]:
+    """Simulate a scene and write config.yaml, report.json, rollout.npz and (unless `viewer` is none) rollout.rrd; an
+    earlier run in `out` is replaced. Returns the report; of the shapes that were fitted for this scene, `failed_checks`
+    names those that are not usable, and `caveats` those that are not exact.
+
+    What is None is as the scene says: model, `seconds` of simulated time, seed. `until_settled` ends the run as soon as
+    everything rests. `resume` goes on with the run in `out` that was interrupted, from the start where there is none; a
+    finished one is left as it is, and its report is returned. `say` is called with lines for the person.
+
+    Raises SdfsimError for bad input, an output that cannot be written, another run that writes to the same folder, or a
+    finished run to resume that is another one than this; SimulationError where the state broke, and KeyboardInterrupt:
+    what was computed before is in the folder.
+    """
+    # Everything that can be wrong from the start, before shapes are fitted for minutes or earlier results are deleted.
+    pick_device(device)
+    if seconds is not None:
+        check_seconds(seconds)
+    if model:
+        load_model(model, weights=False)
+    check_writable(out)
+    check_own(out, "simulate", *_RESULTS)
+    check_screen(viewer)
+    scene = load_scene(scene_file, partial(on_progress, "shapes"), allow_outside=allow_outside)
+    for note in scene.notes:
+        say(note)
+    simulator = Simulator(scene, model=model, device=device, seed=seed)
+    length = scene.duration if seconds is None else seconds
+    asked = model or scene.model or ""
+    config = {
+        "command": "simulate",
+        "scene": str(scene_file.resolve()),
+        "model": str(Path(asked).resolve()) if asked.endswith(".safetensors") else simulator.model.name,
+        "seconds": float(length),
+        "seed": int(simulator.seed),
+        "viewer": viewer,
+        "allow_outside": allow_outside,
+        "until_settled": until_settled,
+        "device": str(simulator.device),
+    }
+    out.mkdir(parents=True, exist_ok=True)
+    with locked(out):
+        kept = Checkpoint(out / "checkpoint", simulator)
+        steps = simulator.steps_in(length)
+        if resume and (done := finished(out / _REPORT, kept.identity, steps, until_settled=until_settled)):
+            kept.clear()  # where it was killed between its last file and its end
+            say(f"{out}: finished already")
+            return done
+        frames = kept.restore() if resume else []
+        if not frames and any((out / name).exists() for name in _RESULTS):
+            say(f"replaced the earlier run in {out}")
+        for name in _RESULTS:
+            (out / name).unlink(missing_ok=True)
+        if not frames:
+            kept.clear()
+            frames = [simulator.initial_rollout()]
+            kept.add(frames[0])
+        write_text(out / CONFIG, yaml.safe_dump(config, sort_keys=False))
+        live = Playback(scene) if viewer in ("native", "web") else None
+        if live:
+            if address := stream_to_viewer(live, viewer):
+                say(f"watch it at {address}")
+            live.log_static()
+            live.log_steps(join(frames))
+
+        started, broken = time.monotonic(), None
+        still = [row.all() for row in resting(scene, join(frames))]  # by frame, whether everything rests
+
+        def settled() -> bool:
+            return until_settled and len(still) > SETTLED and all(still[-SETTLED - 1 :])
+
+        try:
+            for frame in simulator.frames(0 if settled() else steps - simulator.steps_done):
+                frames.append(frame)
+                kept.add(frame)
+                if live:
+                    live.log_steps(frame)
+                now = float(frame.time[-1])
+                on_progress("simulate", now / length, f"{now:.2f} of {length:g} s simulated")
+                if until_settled:
+                    still += [row.all() for row in resting(scene, frame)]
+                if settled():
+                    break
+        except (SimulationError, KeyboardInterrupt) as error:
+            broken = error
+            kept.save()
+        rollout = join(frames)
+        rollout = replace(rollout, meta=rollout.meta | {"scene": fingerprints(scene)})
+        on_progress("simulate", 1.0, f"{len(rollout)} steps" + (" (stopped early)" if broken else ""))
+
+        report = summary(scene, rollout, time.monotonic() - started) | {
+            "status": "done" if broken is None else "failed" if isinstance(broken, SdfsimError) else "interrupted",
+            "folder": out,
+            "identity": kept.identity,
+            "failed_checks": [f"fit of shape {told}" for told in scene.missed],
+            "caveats": [f"fit of shape {told}" for told in scene.caveats],
+            "notes": list(scene.notes),
+        }
+        if until_settled:
+            report["settled"] = settled()
+        if isinstance(broken, SdfsimError):
+            report["error"] = broken.message
+        rollout.save(out / "rollout.npz")
+        if viewer != "none":
+            save_rollout(scene, rollout, out / "rollout.rrd")
+            report["recording"] = out / "rollout.rrd"
+        report = plain(report)
+        write_json(out / _REPORT, report)
+        if not isinstance(broken, KeyboardInterrupt):
+            kept.clear()
+        if isinstance(broken, SimulationError):
+            broken.rollout, broken.hint = rollout, f"what was computed is in {out}; {broken.hint}"
+        if broken is not None:
+            raise broken
+        return report
+
+
+def read_run(
+    path: Path, scene_file: Path | None = None, *, allow_outside: bool = False, on_progress: Progress = silent
+) -> tuple[Scene, Rollout]:
+    """A finished or interrupted run, by its folder or `rollout.npz`, and its scene: a scene file, or that the run was
+    made from. Raises SdfsimError for no run, no scene, or one that is not that of the run: of a scene that is given,
+    bodies and shapes count; where none is given, that its file was edited since."""
+    file = path / "rollout.npz" if path.is_dir() else path
+    rollout = Rollout.load(file)
+    compared = ("shapes",) if scene_file is not None else ("shapes", "bodies", "gravity")
+    if scene_file is None:
+        try:
+            scene_file = Path(yaml.safe_load((file.parent / CONFIG).read_text(encoding="utf-8"))["scene"])
+        except (OSError, ValueError, yaml.YAMLError, KeyError, TypeError) as error:
+            told = f"{file.parent}: not the folder of a simulation ({error})"
+            raise SdfsimError(told, "give its scene: --scene") from error
+    scene = load_scene(scene_file, on_progress, allow_outside=allow_outside)
+    if tuple(body.name for body in scene.bodies) != rollout.names:
+        raise SdfsimError(f"{file}: its bodies are not those of {scene.path}", "give its scene: --scene")
+    known, now = rollout.meta.get("scene", {}), fingerprints(scene)
+    if other := [what for what in compared if known.get(what, now[what]) != now[what]]:
+        told = f"{file}: {scene.path} is not the scene that it was made of: other {' and '.join(other)}"
+        raise SdfsimError(told, "simulate it anew, or give the scene as it was: --scene")
+    return scene, rollout
+
+
+def resting(scene: Scene, rollout: Rollout) -> np.ndarray:
+    """[T+1, D] bool: which of the D dynamic bodies rest. They move by less than `STILL` of their size in the time that
+    they take to fall that far."""
+    rows = _dynamic(scene)
+    extents = [largest_extent(shape) for shape in scene.shapes]
+    size = np.array([scene.bodies[k].scale * extents[scene.bodies[k].shape] for k in rows])
+    speed, spin = (np.linalg.norm(v[:, rows], axis=-1) for v in (rollout.velocity, rollout.angular_velocity))
+    strength = float(np.linalg.norm(scene.gravity)) or EARTH
+    return speed + 0.5 * size * spin < STILL * np.sqrt(strength * size)
+
+
+def _dynamic(scene: Scene) -> list[int]:
+    return [k for k, body in enumerate(scene.bodies) if body.motion == "dynamic"]
+
+
+def summary(scene: Scene, rollout: Rollout, wall: float) -> dict[str, Any]:
+    """The numbers of a run that a person looks at first. `cost` is what every counter and phase of the step took;
+    `ended` says where the bodies that move by themselves are in the end, and which of them `left` the scene for good;
+    `broken_laws` is what instruments say that do not use the contact solve (see `sdfsim.physics.instruments`), in a
+    twentieth of the run's time."""
+    counters = rollout.counters
+    rows, (centre, radius) = _dynamic(scene), framed(scene)
+    place, speed = rollout.position[-1, rows], np.linalg.norm(rollout.velocity[-1, rows], axis=-1)
+    left = np.linalg.norm(place - centre, axis=-1) > FAR * radius
+    told = zip(rows, place, speed, resting(scene, rollout)[-1], left, strict=True)
+    costs = {name: counters[name][1:] for name in (*COUNTS, *PHASES, "step_ms")}
+    return {
+        "model": rollout.meta["model"],
+        "steps": len(rollout),
+        "dt_s": rollout.meta["dt"],
+        "simulated_s": float(rollout.time[-1]),
+        "wall_s": round(wall, 3),
+        "step_ms_median": float(np.median(counters["step_ms"][1:])) if len(rollout) else None,
+        "contacts_mean": float(counters["contacts"].mean()),
+        "worst_penetration_m": float(counters["worst_penetration"].max()),
+        "kinetic_energy_J": counters["kinetic_energy"][[0, -1]].tolist(),
+        **judged(scene, rollout, seconds=max(LEAST, PART * wall)).report(),
+        "outside_training": rollout.meta["outside_training"],
+        "cost": {name: {"sum": v.sum(), "most": v.max()} for name, v in costs.items() if len(v)},
+        "finite": bool(np.isfinite(rollout.position).all() and np.isfinite(rollout.orientation).all()),
+        "ended": [
+            {"name": scene.bodies[k].name, "centre_m": at, "speed_m_s": fast, "rests": rests, "left": gone}
+            for k, at, fast, rests, gone in told
+        ],
+        "meta": rollout.meta,
+    }
+
+
+def ending_lines(report: dict[str, Any]) -> list[str]:
+    """Where bodies ended, and which rest."""
+    bodies, lines = report["ended"], []
+    if 0 < len(bodies) <= TOLD:
+        places = ["({:.3f}, {:.3f}, {:.3f}) m".format(*body["centre_m"]) for body in bodies]
+        moves = ["at rest" if body["rests"] else f"{body['speed_m_s']:.2g} m/s" for body in bodies]
+        lines += columns([(f"  {body['name']}", *rest) for body, *rest in zip(bodies, places, moves, strict=True)])
+    moving = [body["name"] for body in bodies if not body["rests"] and not body["left"]]
+    left = [body["name"] for body in bodies if body["left"]]
+    lines.append(f"{sum(body['rests'] for body in bodies)} of {len(bodies)} bodies rest")
+    for what, names in (("move", moving), ("left the scene", left)):
+        if names:
+            lines.append(f"{what}: {', '.join(names[:3])}" + (f" and {len(names) - 3} more" if len(names) > 3 else ""))
+    return lines
+
+
+class Checkpoint:
+    """What is kept of one run in a folder: its `identity`, its frames in parts, and the state that the last part leads
+    to."""
+
+    def __init__(self, folder: Path, simulator: Simulator) -> None:
+        self._folder = folder
+        self._simulator = simulator
+        self.identity = identity(simulator)
+        self._fresh: list[tuple[Rollout, State, int]] = []  # one entry a step: an interruption splits none
+        self._parts = 0
+        self._saved = time.monotonic()
+
+    def restore(self) -> list[Rollout]:
+        """The frames so far, the simulator's state brought to the last of them; none where nothing was kept. Raises
+        SdfsimError where that is of another scene, model or seed, or damaged."""
+        file = self._folder / _STATE
+        if not file.exists():
+            return []
+        kept = read_arrays(file, "a checkpoint", _ANEW)
+        try:
+            if str(kept["identity"]) != self.identity:
+                raise SdfsimError(f"{self._folder}: {_OTHER}", _ANEW)
+            self._parts = int(kept["parts"])
+            self._simulator.state = _state(kept, self._simulator.device)
+            self._simulator.steps_done = int(kept["steps_done"])
+            self._simulator.initial_rollout()  # told already; what is taken up here was given by nobody
+        except (KeyError, TypeError, ValueError) as error:
+            raise SdfsimError(f"{file}: not a checkpoint of this version ({error})", _ANEW) from error
+        return [Rollout.load(self._part(k)) for k in range(self._parts)]
+
+    def add(self, frame: Rollout) -> None:
+        """Keep a frame and the state it tells of; on disk when the last time is long enough ago."""
+        self._fresh.append((frame, self._simulator.state, self._simulator.steps_done))
+        if time.monotonic() - self._saved > EVERY:
+            self.save()
+
+    def save(self) -> None:
+        """Bring what is new to the disk; the state comes last, so that it never tells of a part that is not there."""
+        if self._fresh:
+            self._folder.mkdir(exist_ok=True)
+            _, state, steps = self._fresh[-1]
+            join([frame for frame, *_ in self._fresh]).save(self._part(self._parts))
+            done = {"identity": self.identity, "parts": self._parts + 1, "steps_done": steps}
+            write_arrays(self._folder / _STATE, done | _arrays(state), compressed=False)
+            self._fresh = []  # not before: Ctrl-C amid this saves once more, and must write the same part again
+            self._parts += 1
+        self._saved = time.monotonic()
+
+    def clear(self) -> None:
+        """Nothing is to be gone on with. The state goes first: parts that a kill leaves are nothing without it."""
+        (self._folder / _STATE).unlink(missing_ok=True)
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _part(self, number: int) -> Path:
+        return self._folder / f"part_{number:04}.npz"
+
+
+def finished(report_file: Path, identity: str, steps: int, *, until_settled: bool) -> dict[str, Any] | None:
+    """The report of a run that is finished; None where it was interrupted or is not there. Raises SdfsimError where it
+    is another run, of another length (unless it ended `until_settled`), or its state broke."""
+    if not report_file.exists():
+        return None
+    report, folder = read_json(report_file, _ANEW), report_file.parent
+    if report["status"] == "interrupted":
+        return None
+    if report.get("identity") != identity:
+        raise SdfsimError(f"{folder}: {_OTHER}", _ANEW)
+    if report["status"] == "failed":
+        raise SdfsimError(f"{folder}: this run has ended: {report['error']}", _ANEW)
+    settled = until_settled and report.get("settled") and report["steps"] < steps
+    if report["steps"] != steps and not settled:
+        told = f"{report['steps']} steps, {report['simulated_s']:.4g} s"
+        raise SdfsimError(f"{folder}: finished after {told}; its length cannot be changed", "choose a new -o")
+    return report
+
+
+def identity(simulator: Simulator) -> str:
+    """A hash of all that decides how a run goes: bodies with their paths and distances, start, rules, units, model."""
+    s = simulator
+    model = (s.model.kind, s.model.reach, s.model.network)
+    return digest(s.dt, s.seed, replace(s.rules, rows=None), s.units, s.bodies, s.state, model)
+
+
+def _arrays(state: State) -> dict[str, np.ndarray]:
+    """Every array of a state and of what touches in it, by name."""
+    found = {"time": np.array(state.time)}
+    for prefix, part in (("", state), ("touch.", state.touch)):
+        for name, value in vars(part).items() if part is not None else ():
+            if isinstance(value, torch.Tensor):
+                found[prefix + name] = value.cpu().numpy()
+    return found
+
+
+def _state(arrays: dict[str, np.ndarray], device: torch.device) -> State:
+    def tensors(kind: type, prefix: str) -> dict[str, torch.Tensor]:
+        names = {f.name: prefix + f.name for f in fields(kind) if f.name != "time"}
+        return {k: torch.as_tensor(arrays[name], device=device) for k, name in names.items() if name in arrays}
+
+    touch = tensors(Touch, "touch.")
+    return State(**tensors(State, ""), touch=Touch(**touch) if touch else None, time=float(arrays["time"]))

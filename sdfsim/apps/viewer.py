@@ -1,0 +1,163 @@
+"""The rerun viewer: live streams, recordings on disk, and pictures taken without a screen."""
+
+from __future__ import annotations
+
+import atexit
+import os
+import signal
+import socket
+import subprocess
+import sys
+import sysconfig
+import time
+import webbrowser
+from pathlib import Path
+from shutil import which
+
+from sdfsim.apps.recording import Playback
+from sdfsim.base.errors import SdfsimError
+
+WINDOW = "1600x900"
+LOOPBACK = "127.0.0.1"  # where viewers listen; their own default would let the whole network in
+_GRPC_PORT, _WEB_PORT = 9876, 9090
+_START_SECONDS = 60.0
+_TOAST_SECONDS = 10.0  # the notices of the start cover the plots until they fade
+_NO_GRAPHICS = "it needs a Vulkan driver: apt-get install mesa-vulkan-drivers"
+
+
+def stream_to_viewer(playback: Playback, kind: str) -> str:
+    """Send everything that `playback` logs from now on to a viewer: a window (`native`), or a page (`web`) that is
+    there for as long as this process runs, whose address is returned. Raises SdfsimError where it does not start."""
+    port, page_port = _free_port(_GRPC_PORT), _free_port(_WEB_PORT)
+    web = ["--serve-web", "--web-viewer-port", str(page_port)]
+    viewer = _launch(port, web if kind == "web" else ["--expect-data-soon", "--hide-welcome-screen"])
+    started = time.monotonic()
+    while not _answers(port):
+        if viewer.poll() is not None or time.monotonic() - started > _START_SECONDS:
+            _end(viewer)
+            raise SdfsimError("the rerun viewer does not start", "use --viewer file")
+        time.sleep(0.1)
+    playback.stream.connect_grpc(_address(port))
+    if kind == "native":
+        return ""
+    atexit.register(_end, viewer)
+    page = f"http://localhost:{page_port}?url=rerun%2Bhttp://localhost:{port}/proxy"
+    if _has_screen():
+        webbrowser.open(page)
+    return page
+
+
+def _address(port: int) -> str:
+    return f"rerun+http://{LOOPBACK}:{port}/proxy"
+
+
+def _command(port: int, options: list[str]) -> list[str]:
+    return [_executable(), *options, "--bind", LOOPBACK, "--port", str(port)]
+
+
+def _launch(port: int, options: list[str]) -> subprocess.Popen:
+    """A viewer in a group of its own: `rerun` is a script that starts the real one, and both have to go together."""
+    quiet = subprocess.DEVNULL
+    return subprocess.Popen(_command(port, options), stdout=quiet, stderr=quiet, start_new_session=True)
+
+
+def check_screen(kind: str) -> None:
+    """Raises SdfsimError when a window (`native`) is wanted where there is no screen."""
+    if kind == "native" and not _has_screen():
+        raise SdfsimError("--viewer native: there is no screen here", "use --viewer web, or --viewer file")
+
+
+def _has_screen() -> bool:
+    return bool(sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def show(recording: Path, *, web: bool = False) -> None:
+    """Open a recording, and wait until the viewer is closed. Raises SdfsimError for no such recording, or where it
+    fails."""
+    _check_recording(recording)
+    options = ["--web-viewer", "--web-viewer-port", str(_free_port(_WEB_PORT))] if web else []
+    code = subprocess.run(_command(_free_port(_GRPC_PORT), [str(recording), *options]), check=False).returncode
+    if code not in (0, -signal.SIGINT, 130):
+        raise SdfsimError(f"the rerun viewer ended with code {code}", "without a screen: sdfsim view --web")
+
+
+def screenshot(recording: Path, picture: Path, *, at: float | None = None) -> None:
+    """Write what the viewer shows of a recording `at` a time in s (default: the end) as a PNG, without a screen. Raises
+    SdfsimError for no such recording or time, no graphics driver, or a file that cannot be written."""
+    _check_recording(recording)
+    if not picture.parent.is_dir() or not os.access(picture.parent, os.W_OK):
+        raise SdfsimError(f"{picture}: the folder is missing or not writable")
+    port = _free_port()
+    viewer = _launch(port, ["--headless", "--window-size", WINDOW, str(recording.resolve())])
+    try:
+        _picture(viewer, _address(port), picture, at)
+    except ConnectionError as error:
+        raise SdfsimError(f"{recording}: no picture: {str(error).splitlines()[0]}", _NO_GRAPHICS) from error
+    finally:
+        _end(viewer)
+
+
+def _picture(viewer: subprocess.Popen, address: str, picture: Path, at: float | None) -> None:
+    from rerun.experimental import ViewerClient
+
+    started = time.monotonic()
+    while True:
+        try:
+            client = ViewerClient.connect(address)
+            state = client.get_state()
+            if state.active_recording and not state.loading:
+                break
+        except ConnectionError:
+            pass
+        if viewer.poll() is not None or time.monotonic() - started > _START_SECONDS:
+            raise ConnectionError("the viewer did not start")
+        time.sleep(0.2)
+    timelines = {t.name: t for recording in state.recordings for t in recording.timelines}
+    if time_line := timelines.get("time"):
+        first, last = (time_line.start or 0) * 1e-9, (time_line.end or 0) * 1e-9
+        # A run is a whole number of steps, so it ends up to one before the time that was asked for: its end too.
+        step = (last - first) / max(timelines["step"].end or 0, 1) if "step" in timelines else 0.0
+        if at is not None and not first <= at <= last + max(step, 1e-6):
+            raise SdfsimError(f"--at {at:g}: the recording holds {first:g} to {last:g} s")
+        client.set_time("time", duration=last if at is None else min(at, last), play_state="paused")
+    time.sleep(_TOAST_SECONDS)
+    client.save_screenshot(str(picture.resolve()))
+    if not picture.exists():
+        raise SdfsimError(f"{picture}: cannot be written")
+
+
+def _end(process: subprocess.Popen) -> None:
+    try:
+        os.killpg(process.pid, signal.SIGTERM)
+        process.wait(timeout=10)
+    except ProcessLookupError:
+        pass
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+
+
+def _check_recording(file: Path) -> None:
+    if not file.is_file() or file.open("rb").read(3) != b"RRF":
+        raise SdfsimError(f"{file}: no such recording", "give a rollout.rrd that simulate has written")
+
+
+def _executable() -> str:
+    """The `rerun` of this environment, which may not be on the PATH."""
+    found = which("rerun", path=sysconfig.get_path("scripts")) or which("rerun")
+    if not found:
+        raise SdfsimError("the rerun program is missing", "pip install rerun-sdk")
+    return found
+
+
+def _answers(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex((LOOPBACK, port)) == 0
+
+
+def _free_port(wanted: int = 0) -> int:
+    """`wanted` if nothing listens there, else any free port."""
+    if wanted and not _answers(wanted):
+        return wanted
+    with socket.socket() as probe:
+        probe.bind((LOOPBACK, 0))
+        return probe.getsockname()[1]

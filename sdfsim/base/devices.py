@@ -1,0 +1,26 @@
+"""Where to compute."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING
+
+from sdfsim.base.errors import SdfsimError
+
+if TYPE_CHECKING:
+    import torch
+
+
+def pick_device(name: str) -> torch.device:
+    """A device: "auto", "cpu", "cuda" or "cuda:0". Raises SdfsimError for another name, or where there is no CUDA."""
+    import torch
+
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", name, re.ASCII):
+        raise SdfsimError(f"device: {name!r} is not auto, cpu or cuda")
+    place = torch.device(name)
+    there = torch.cuda.is_available() and (place.index is None or place.index < torch.cuda.device_count())
+    if place.type == "cuda" and not there:
+        raise SdfsimError(f"--device {name}: no CUDA device here", "use --device cpu")
+    return place

@@ -1,0 +1,194 @@
+"""Files that are whole or absent: written under a temporary name, then renamed. Arrays without pickle. Digests."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import os
+import secrets
+import tempfile
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sdfsim.base.errors import SdfsimError
+
+LOCK = ".lock"
+# What a run was asked for, the command first.
+CONFIG = "config.yaml"
+# What an archive may unpack to: so many bytes, or so many times its own size.
+FREELY, MOST_GROWTH = 2**30, 100
+
+
+def user_cache(name: str) -> Path:
+    """The folder `sdfsim/NAME` in the user's cache folder."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sdfsim" / name
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary path beside `path` to write to; it takes the final name when the block ends without an error. Raises
+    SdfsimError where the disk is full or the folder not writable."""
+    # Unique also among the threads of a worker, and the hosts that share a folder.
+    partial = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.part")
+    try:
+        yield partial
+        os.replace(partial, path)
+    except OSError as error:
+        raise SdfsimError(
+            f"{path}: cannot be written: {error.strerror or error}", "free some space or choose another folder"
+        ) from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def visible(folder: Path) -> list[Path]:
+    """What lies in a folder, by name, without what is hidden or what macOS adds (`._NAME`, `__MACOSX`)."""
+    return sorted(path for path in folder.iterdir() if not hidden(path.name))
+
+
+def hidden(name: str) -> bool:
+    """Whether a file or folder of this name is none that a person put there."""
+    return name.startswith(".") or name == "__MACOSX"
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """A file of these bytes."""
+    with replacing(path) as partial:
+        partial.write_bytes(content)
+
+
+def write_text(path: Path, text: str) -> None:
+    """A UTF-8 text file."""
+    write_bytes(path, text.encode("utf-8"))
+
+
+def write_json(path: Path, content: Any) -> None:
+    """A JSON file, indented. NaN and infinity are refused: they are not JSON."""
+    write_text(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
+
+
+def read_json(path: Path, hint: str = "") -> Any:
+    """The content of a JSON file. Raises SdfsimError when it is absent or not JSON."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise SdfsimError(f"{path}: cannot be read: {error}", hint) from error
+
+
+def write_arrays(path: Path, arrays: dict[str, Any], *, compressed: bool = True) -> None:
+    """An `.npz` file."""
+    with replacing(path) as partial, open(partial, "wb") as handle:
+        (np.savez_compressed if compressed else np.savez)(handle, **arrays)
+
+
+def read_arrays(path: Path, what: str, hint: str = "") -> dict[str, np.ndarray]:
+    """All arrays of an `.npz` file; `what` says in the message what it should have been. Raises SdfsimError where it is
+    absent, cut short, no such file, or claims an absurd size."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            unpacked = sum(member.file_size for member in archive.infolist())
+        if unpacked > max(FREELY, MOST_GROWTH * path.stat().st_size):
+            raise ValueError(f"it would unpack to {unpacked / 2**30:.1f} GiB")
+        with np.load(path, allow_pickle=False) as data:
+            return {name: data[name] for name in data.files}
+    except Exception as error:  # the readers raise whatever a damaged file made them stumble over
+        raise SdfsimError(f"{path}: cannot be read as {what}: {error}", hint) from error
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Make a folder, keep other runs out of it inside the block, and clear away what a killed one left half-written.
+
+    The system lifts the lock when this process ends, however it ends. A folder made here goes again if nothing came
+    into it. Raises SdfsimError where another run is in there, or the folder cannot be written.
+    """
+    path, made = folder / LOCK, not folder.exists()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = open(path, "a")
+    except OSError as error:
+        raise SdfsimError(f"{folder}: cannot be written: {error.strerror}", "choose another folder") from error
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            alone = os.path.samestat(os.fstat(file.fileno()), path.stat())
+        except (BlockingIOError, FileNotFoundError):  # the latter: another run has just ended and removed its lock
+            alone = False
+        if not alone:
+            raise SdfsimError(
+                f"{folder}: another run is writing to this folder", "wait until it ends, or choose another folder"
+            )
+        for left in folder.glob(".*.part"):
+            if left.is_file():
+                left.unlink(missing_ok=True)
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
+            if made:
+                with suppress(OSError):  # not empty: something came of it
+                    folder.rmdir()
+
+
+def check_writable(folder: Path) -> None:
+    """That a folder can be made and written to, without making it. Raises SdfsimError otherwise."""
+    there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    try:
+        with tempfile.TemporaryFile(dir=there):
+            pass
+    except OSError as error:
+        raise SdfsimError(f"{folder}: cannot be written: {error.strerror}", "choose another -o") from error
+
+
+def check_own(folder: Path, command: str, *names: str) -> None:
+    """Raises SdfsimError where what a run replaces in a folder, config.yaml and the files `names`, does not come from
+    an earlier run of the same command."""
+    import yaml  # here, for training needs torch and numpy only
+
+    there = [name for name in (CONFIG, *names) if os.path.lexists(folder / name)]
+    if not there:
+        return
+    try:
+        config = yaml.safe_load((folder / CONFIG).read_text(encoding="utf-8"))
+    except (OSError, ValueError, yaml.YAMLError):
+        config = None
+    if not isinstance(config, dict) or config.get("command") != command:
+        raise SdfsimError(
+            f"{folder / there[0]}: in the way, and not replaced: not from an earlier `sdfsim {command}`",
+            "choose another folder to write to, or move it away",
+        )
+
+
+def digest(*parts: Any) -> str:
+    """Changes with the content of `parts`: arrays, tensors, networks, dataclasses, and what Python has of its own."""
+    told = hashlib.sha256()
+    _feed(told, parts)
+    return told.hexdigest()[:32]
+
+
+def _feed(told: Any, value: Any) -> None:
+    if hasattr(value, "state_dict"):  # a network
+        value = [type(value).__name__, dict(value.state_dict())]
+    elif hasattr(value, "detach"):  # a tensor
+        value = value.detach().cpu().numpy()
+    if isinstance(value, np.ndarray):
+        told.update(f"{value.dtype}{value.shape}".encode() + np.ascontiguousarray(value).tobytes())
+    elif isinstance(value, dict):
+        _feed(told, [[str(key), value[key]] for key in sorted(value, key=str)])
+    elif isinstance(value, list | tuple):
+        told.update(f"{len(value)}[".encode())
+        for item in value:
+            _feed(told, item)
+    elif is_dataclass(value) and not isinstance(value, type):
+        _feed(told, [type(value).__name__, *([field.name, getattr(value, field.name)] for field in fields(value))])
+    elif value is None or isinstance(value, str | int | float | bool | np.generic | Path):
+        told.update(repr(value).encode() + b";")
+    else:
+        raise TypeError(f"no digest of a {type(value).__name__}")

@@ -1,0 +1,96 @@
+"""Work on all cores, in processes that stop when the caller does, or unchanged on a cluster; and how many threads."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from timeit import timeit
+from typing import Any
+
+import torch
+
+from sdfsim.base.errors import SdfsimError
+
+Progress = Callable[[float, str], None]  # called with the fraction of the work that is done, and a message
+StageProgress = Callable[[str, float, str], None]  # the same, behind the name of one stage of several
+
+TIMED = 3  # calls, after one that is not timed
+SCHEDULER_ANSWERS = 10.0  # s, within which
+
+
+def silent(fraction: float, message: str) -> None:
+    """Progress that nobody is told."""
+
+
+_most = torch.get_num_threads()  # Before anything here has changed it.
+
+
+def parallel(function: Callable[..., Any], jobs: Sequence[tuple]) -> Iterator[tuple[int, Any]]:
+    """Call `function(*job)` for every job; yield (index of the job, result) as they end.
+
+    The work goes to processes of this machine, one a core and of one thread each, or to whatever engine
+    `joblib.parallel_config` names around the call (see `cluster`). The first error, or Ctrl-C, cancels what has not
+    begun and is raised.
+    """
+    from joblib import Parallel, delayed
+
+    if not jobs:
+        return
+    calls = (delayed(_one)(function, index, job, os.getpid()) for index, job in enumerate(jobs))
+    ended: Any = Parallel(n_jobs=-1, return_as="generator_unordered")(calls)
+    yield from ended
+
+
+def _one(function: Callable[..., Any], index: int, job: tuple, caller: int) -> tuple[int, Any]:
+    """In a worker: one thread, and Ctrl-C is the caller's business. On a single core the caller works itself."""
+    global _most
+    if os.getpid() != caller:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+        _most = 1
+        torch.set_num_threads(1)
+    return index, function(*job)
+
+
+@contextmanager
+def cluster(address: str | None) -> Iterator[None]:
+    """Let `parallel` work on the Dask cluster of a scheduler, such as tcp://host:8786, inside the block; None leaves it
+    on this machine.
+
+    Its workers need this package, and see the files of a job under the same paths. Raises SdfsimError where Dask is not
+    installed, or no scheduler answers.
+    """
+    if address is None:
+        yield
+        return
+    from joblib import parallel_config
+
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise SdfsimError("a cluster needs Dask", "pip install -e '.[cluster]'") from error
+    try:
+        client = Client(address, timeout=SCHEDULER_ANSWERS)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise SdfsimError(f"{address}: no scheduler of a Dask cluster answers there") from error
+    with client, parallel_config(backend="dask"):
+        yield
+
+
+def choose_threads(work: Callable[[], object], threads: int | None = None) -> float:
+    """Time `work`, typically of tens of milliseconds, with one thread and with all; leave torch set to the faster (or
+    to `threads`), and return the seconds that one call takes.
+
+    On a busy machine a second thread slows a computation down by up to ten times.
+    """
+    took = {}
+    for count in {threads} if threads else {1, _most}:
+        torch.set_num_threads(count)
+        work()
+        took[count] = timeit(work, number=TIMED) / TIMED
+    best = min(took, key=lambda count: took[count])
+    torch.set_num_threads(best)
+    return took[best]

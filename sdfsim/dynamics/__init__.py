@@ -1,1 +1,0 @@
-"""Motion: free flight, contacts, the two networks, the step."""

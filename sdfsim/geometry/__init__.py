@@ -1,0 +1,1 @@
+"""Triangles: meshes and their files, solids, hierarchies over faces, mass, procedural shapes."""

@@ -1,0 +1,374 @@
+"""glTF 2.0, by hand. What trimesh writes has textures in JPEG of quality 75, and no motion; it reads normalised and
+sparse numbers, instances and fans as if they were something else.
+
+glTF has y up and we have z up. A file that we write has one node above all others that turns it, so that its meshes
+and motions hold our own numbers; what we read is turned back (a file of ours comes out as it was).
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sdfsim.geometry.mesh_files import FileMesh, looked_up, read_image, side_file, strip
+
+# What z up is to the y up of glTF: columns of a matrix [4, 4].
+_Y_UP = [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1]
+_COMPONENTS = {"<f4": 5126, "<u4": 5125, "<u2": 5123}
+_UNLIT = "KHR_materials_unlit"
+Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # and back
+INSTANCES = "EXT_mesh_gpu_instancing"
+# Extensions that a file may need: those that are read, and those of how surfaces look, which change no geometry.
+HONOURED = {"KHR_mesh_quantization", INSTANCES, "KHR_texture_transform", "EXT_texture_webp"}
+OF_LOOKS = ("KHR_materials_", "EXT_materials_", "KHR_lights_", "EXT_lights_", "KHR_xmp")
+TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+TRIANGLES, TRIANGLE_STRIP, TRIANGLE_FAN = 4, 5, 6
+MOST = 500_000_000  # vertices and corners
+WHITE = [1.0, 1.0, 1.0]
+SPARSE = 2**24  # rows of an accessor of which only some are in the file
+_OF_NODE = {"TRANSLATION": "translation", "ROTATION": "rotation", "SCALE": "scale"}  # instances -> nodes
+
+
+class GltfWriter:
+    """A file in the making: nodes, meshes, materials and animations with keys as glTF has them. Nodes hang below one
+    that turns z up to glTF's y up."""
+
+    def __init__(self) -> None:
+        self.nodes: list[dict[str, Any]] = []
+        self.meshes: list[dict[str, Any]] = []
+        self.materials: list[dict[str, Any]] = []
+        self.animations: list[dict[str, Any]] = []
+        self._images: list[dict[str, Any]] = []
+        self._accessors: list[dict[str, Any]] = []
+        self._views: list[dict[str, Any]] = []
+        self._content = bytearray()
+
+    def _view(self, data: bytes) -> int:
+        self._views.append({"buffer": 0, "byteOffset": len(self._content), "byteLength": len(data)})
+        self._content.extend(data + bytes(-len(data) % 4))
+        return len(self._views) - 1
+
+    def array(self, values: np.ndarray, kind: str = "<f4") -> int:
+        """An accessor of values [K] or [K, 2 to 4]; whole numbers of 16 bits are fractions of 65535."""
+        values = np.ascontiguousarray(values, kind)
+        rows = values.reshape(len(values), -1)
+        told = {"bufferView": self._view(values.tobytes()), "componentType": _COMPONENTS[kind], "count": len(values)}
+        told |= {"type": "SCALAR" if rows.shape[1] == 1 else f"VEC{rows.shape[1]}"}
+        told |= {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()}
+        self._accessors.append(told | ({"normalized": True} if kind == "<u2" else {}))
+        return len(self._accessors) - 1
+
+    def material(self, name: str, color: np.ndarray, texture: np.ndarray | None = None, rough: float = 1.0) -> int:
+        """A surface of a colour [3], as light, or with a texture [H, W, 3] uint8, which needs no other light."""
+        surface: dict[str, Any] = {"baseColorFactor": [*map(float, color), 1.0]}
+        made: dict[str, Any] = {"name": name, "pbrMetallicRoughness": surface, "doubleSided": True}
+        surface |= {"metallicFactor": 0.0, "roughnessFactor": rough}
+        if texture is not None:
+            from PIL import Image
+
+            file = io.BytesIO()
+            Image.fromarray(texture).save(file, "JPEG", quality=92, subsampling=0)
+            self._images.append({"bufferView": self._view(file.getvalue()), "mimeType": "image/jpeg"})
+            surface["baseColorTexture"] = {"index": len(self._images) - 1}
+            made["extensions"] = {_UNLIT: {}}
+        self.materials.append(made)
+        return len(self.materials) - 1
+
+    def mesh(self, name: str, attributes: dict[str, int], corners: int, material: int) -> int:
+        """A mesh of accessors: attributes of its vertices, and the corners of its faces."""
+        drawn = {"attributes": attributes, "indices": corners, "material": material}
+        self.meshes.append({"name": name, "primitives": [drawn]})
+        return len(self.meshes) - 1
+
+    def to_bytes(self) -> bytes:
+        """The file."""
+        count = len(self.nodes)
+        lists = {"meshes": self.meshes, "materials": self.materials, "images": self._images}
+        lists |= {"accessors": self._accessors, "bufferViews": self._views, "animations": self.animations}
+        lists |= {"textures": [{"source": k} for k in range(len(self._images))]}
+        lists |= {"extensionsUsed": [_UNLIT] if self._images else []}
+        header = {
+            "asset": {"version": "2.0", "generator": "sdfsim"},
+            "scene": 0,
+            "scenes": [{"nodes": [count]}],
+            "nodes": [*self.nodes, {"name": "root", "children": list(range(count)), "matrix": _Y_UP}],
+            "buffers": [{"byteLength": len(self._content)}],
+            **{name: entries for name, entries in lists.items() if entries},
+        }
+        text = json.dumps(header).encode()
+        text += b" " * (-len(text) % 4)
+        parts = struct.pack("<2I", len(text), 0x4E4F534A) + text
+        parts += struct.pack("<2I", len(self._content), 0x004E4942) + self._content
+        return struct.pack("<4s2I", b"glTF", 2, 12 + len(parts)) + parts
+
+
+def light(srgb: np.ndarray) -> np.ndarray:
+    """0 to 255 as light from 0 to 1, which glTF and USD count in."""
+    value = np.asarray(srgb) / 255.0
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def srgb(light: np.ndarray) -> np.ndarray:
+    """Light from 0 to 1 as uint8."""
+    value = np.clip(light, 0.0, 1.0)
+    value = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
+    return np.round(255.0 * value).astype(np.uint8)
+
+
+def read_gltf(path: Path) -> FileMesh:
+    """All triangles of the scene that a .gltf or .glb file shows, turned from glTF's y up to z up: the meshes of its
+    nodes where these place them, with their colours. Raises ValueError where it is damaged, or needs an extension that
+    is not read."""
+    file = _GltfReader(path)
+    parts, count = [], 0
+    for node, matrix in file.placed():
+        for primitive in file.header["meshes"][node["mesh"]]["primitives"]:
+            part = file.part(primitive)
+            if part is None:
+                continue
+            for place in file.copies(node, matrix):
+                count += len(part.vertices) + part.faces.size
+                if count > MOST:
+                    raise ValueError(f"with all copies more than {MOST:,} vertices and corners")
+                vertices = part.vertices @ place[:3, :3].T + place[:3, 3]
+                mirrored = np.linalg.det(place[:3, :3]) < 0
+                faces = part.faces[:, ::-1] if mirrored else part.faces
+                parts.append(part._replace(vertices=vertices @ Z_UP.T, faces=faces))
+    if not parts:
+        return FileMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    colors = None
+    if any(part.colors is not None for part in parts):
+        white = [np.full(part.vertices.shape, 255, np.uint8) if part.colors is None else part.colors for part in parts]
+        colors = np.concatenate(white)
+    return FileMesh(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)]),
+        colors,
+    )
+
+
+class _GltfReader:
+    """A file that is read: its header, and its buffers as bytes. Raises ValueError where there is something wrong."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        content = path.read_bytes()
+        own = None
+        if path.suffix.lower() == ".glb" or content[:4] == b"glTF":
+            content, own = _chunks(content)
+        self.header: dict[str, Any] = json.loads(content.decode("utf-8-sig"))
+        version = str(self.header["asset"]["version"])
+        if not version.startswith("2."):
+            raise ValueError(f"glTF {version}, only 2.0 is read")
+        for name in self.header.get("extensionsRequired", []):
+            if name not in HONOURED and not str(name).startswith(OF_LOOKS):
+                raise ValueError(f"it needs the extension {name}, which is not read: export it without")
+        self.buffers = [self._bytes(entry, own if k == 0 else None) for k, entry in enumerate(self._list("buffers"))]
+        self._arrays: dict[int, np.ndarray] = {}
+        self._images: dict[int, np.ndarray | None] = {}
+
+    def _list(self, name: str) -> list[dict[str, Any]]:
+        return self.header.get(name, [])
+
+    def _bytes(self, entry: dict[str, Any], own: bytes | None = None) -> bytes | None:
+        """What a buffer or an image holds that is not in a view; None where it is nowhere."""
+        uri = entry.get("uri")
+        if uri is None:
+            return own
+        if uri.startswith("data:"):
+            return base64.b64decode(uri.partition(",")[2])
+        return side_file(self.path, unquote(uri))
+
+    def _view(self, number: int) -> bytes:
+        view = self.header["bufferViews"][_index(number)]
+        buffer = self.buffers[_index(view["buffer"])]
+        start, length = view.get("byteOffset", 0), view["byteLength"]
+        if buffer is None:
+            packed = next((name for name in view.get("extensions", {}) if "compression" in name), "")
+            raise ValueError(
+                f"it needs the extension {packed}: export it without" if packed else "a buffer has no data"
+            )
+        if start < 0 or not 0 < length <= len(buffer) - start:
+            raise ValueError(f"cut short: a view of {length} bytes does not fit its buffer of {len(buffer)}")
+        return buffer[start : start + length]
+
+    def array(self, number: int) -> np.ndarray:
+        """The rows [N, K] of an accessor: fractions as float64 where it is normalised, else as they are."""
+        if number not in self._arrays:
+            self._arrays[number] = self._array(self.header["accessors"][_index(number)])
+        return self._arrays[number]
+
+    def _array(self, told: dict[str, Any]) -> np.ndarray:
+        kind, width, count = np.dtype(TYPES[told["componentType"]]), WIDTHS[told["type"]], told["count"]
+        if "bufferView" in told:
+            stride = self.header["bufferViews"][told["bufferView"]].get("byteStride")
+            rows = self._rows(told, kind, width, count, stride)
+        elif "sparse" in told:
+            if not 0 < count <= SPARSE:
+                raise ValueError(f"an accessor of {count} rows has no data")
+            rows = np.zeros((count, width), kind)
+        else:
+            raise ValueError("an accessor has no data: compressed geometry is not read, export it without")
+        if "sparse" in told:
+            few = told["sparse"]
+            where = self._rows(few["indices"], np.dtype(TYPES[few["indices"]["componentType"]]), 1, few["count"])[:, 0]
+            if where.max() >= count:
+                raise ValueError("an index of a sparse accessor is out of range")
+            rows = rows.copy()
+            rows[where] = self._rows(few["values"], kind, width, few["count"])
+        if told.get("normalized"):
+            rows = np.maximum(rows / np.iinfo(kind).max, -1.0)
+        return rows
+
+    def _rows(
+        self, place: dict[str, Any], kind: np.dtype, width: int, count: int, stride: int | None = None
+    ) -> np.ndarray:
+        data, start, row = self._view(place["bufferView"]), place.get("byteOffset", 0), width * kind.itemsize
+        stride = row if stride is None else stride
+        if count < 1 or start < 0 or not row <= stride <= 252 or start + (count - 1) * stride + row > len(data):
+            raise ValueError("an accessor does not fit its buffer")
+        return np.ndarray((count, width), kind, data, start, (stride, kind.itemsize))
+
+    def placed(self) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
+        """Nodes with a mesh, and where they are [4, 4]."""
+        nodes = self._list("nodes")
+        if scenes := self._list("scenes"):
+            roots = scenes[_index(self.header.get("scene", 0))].get("nodes", [])
+        else:
+            roots = sorted(set(range(len(nodes))) - {child for node in nodes for child in node.get("children", [])})
+        todo = [(_index(root), np.eye(4)) for root in reversed(roots)]
+        seen: set[int] = set()
+        while todo:
+            number, above = todo.pop()
+            if number in seen:
+                raise ValueError(f"node {number} hangs in two places")
+            seen.add(number)
+            node = nodes[number]
+            matrix = above @ _matrix(node)
+            todo += [(_index(child), matrix) for child in reversed(node.get("children", []))]
+            if "mesh" in node:
+                yield node, matrix
+
+    def copies(self, node: dict[str, Any], matrix: np.ndarray) -> Iterator[np.ndarray]:
+        """Where each instance of a node's mesh is [4, 4]."""
+        instances = node.get("extensions", {}).get(INSTANCES)
+        if instances is None:
+            yield matrix
+            return
+        columns = {
+            key: self.array(k).astype(np.float64) for key, k in instances["attributes"].items() if key in _OF_NODE
+        }
+        if len({len(column) for column in columns.values()}) != 1:
+            raise ValueError(f"the attributes of {INSTANCES} do not have one length")
+        for row in zip(*columns.values(), strict=True):
+            yield matrix @ _matrix({_OF_NODE[key]: value for key, value in zip(columns, row, strict=True)})
+
+    def part(self, primitive: dict[str, Any]) -> FileMesh | None:
+        """The triangles of a primitive in its own frame; None for points and lines."""
+        mode = primitive.get("mode", TRIANGLES)
+        if mode in (0, 1, 2, 3):
+            return None
+        attributes = primitive["attributes"]
+        vertices = self.array(attributes["POSITION"]).astype(np.float64)
+        if "indices" in primitive:
+            corners = self.array(primitive["indices"])[:, 0].astype(np.int64)
+            if corners.max() >= len(vertices):
+                raise ValueError(f"face indices out of range (0 to {len(vertices) - 1} allowed)")
+        else:
+            corners = np.arange(len(vertices))
+        if mode == TRIANGLES:
+            if len(corners) % 3:
+                raise ValueError(f"{len(corners)} corners make no triangles")
+            faces = corners.reshape(-1, 3)
+        elif mode == TRIANGLE_STRIP:
+            faces = strip(corners)
+        elif mode == TRIANGLE_FAN:
+            faces = np.stack([np.broadcast_to(corners[:1], len(corners[2:])), corners[1:-1], corners[2:]], axis=1)
+        else:
+            raise ValueError(f"a primitive of mode {mode}, which glTF does not have")
+        return FileMesh(vertices, faces, self._colors(primitive, attributes, len(vertices)))
+
+    def _colors(self, primitive: dict[str, Any], attributes: dict[str, int], count: int) -> np.ndarray | None:
+        """[V, 3] uint8: texture, colour of the material and those of the vertices, multiplied as light."""
+        factors = []
+        if "material" in primitive:
+            surface = self.header["materials"][_index(primitive["material"])].get("pbrMetallicRoughness", {})
+            if surface.get("baseColorFactor", WHITE)[:3] != WHITE:
+                factors.append(np.tile(np.array(surface["baseColorFactor"], dtype=np.float64)[:3], (count, 1)))
+            told = surface.get("baseColorTexture", {})
+            moved = told.get("extensions", {}).get("KHR_texture_transform", {})
+            places = f"TEXCOORD_{moved.get('texCoord', told.get('texCoord', 0))}"
+            image = self._image(told["index"]) if told and not moved.get("rotation") else None
+            if image is not None and places in attributes:
+                uv = self.array(attributes[places]).astype(np.float64)[:, :2]
+                uv = uv * moved.get("scale", [1.0, 1.0]) + moved.get("offset", [0.0, 0.0])
+                factors.append(light(looked_up(image, uv)))
+        if "COLOR_0" in attributes:
+            factors.append(self.array(attributes["COLOR_0"]).astype(np.float64)[:, :3])
+        factors = [factor for factor in factors if factor.shape == (count, 3)]
+        return srgb(np.nan_to_num(np.prod(factors, axis=0))) if factors else None
+
+    def _image(self, texture: int) -> np.ndarray | None:
+        """[H, W, 3] uint8 of a texture, None where it is of a kind that is not read."""
+        entry = self.header["textures"][_index(texture)]
+        number = entry.get("extensions", {}).get("EXT_texture_webp", entry).get("source")
+        if number is None:
+            return None
+        if number not in self._images:
+            image = self.header["images"][_index(number)]
+            content = self._view(image["bufferView"]) if "bufferView" in image else self._bytes(image)
+            self._images[number] = None if content is None else read_image(content)
+        return self._images[number]
+
+
+def _index(number: int) -> int:
+    """A place in one of the header's lists; below 0 Python would count from their ends."""
+    if not isinstance(number, int) or number < 0:
+        raise ValueError(f"{number!r} is no place in a list")
+    return number
+
+
+def _matrix(node: dict[str, Any]) -> np.ndarray:
+    """[4, 4] of a node, in the frame of the one above it."""
+    if "matrix" in node:
+        return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
+    matrix = np.eye(4)
+    turn = Rotation.from_quat(np.array(node.get("rotation", (0.0, 0.0, 0.0, 1.0)), dtype=np.float64)).as_matrix()
+    matrix[:3, :3] = turn * np.array(node.get("scale", (1.0, 1.0, 1.0)), dtype=np.float64)
+    matrix[:3, 3] = node.get("translation", (0.0, 0.0, 0.0))
+    return matrix
+
+
+def _chunks(content: bytes) -> tuple[bytes, bytes | None]:
+    """The JSON of a binary file, and its buffer where it has one."""
+    if content[:4] != b"glTF":
+        raise ValueError("it does not begin with glTF")
+    if len(content) < 20:
+        raise ValueError("cut short in its header")
+    version, length = struct.unpack("<2I", content[4:12])
+    if version != 2:
+        raise ValueError(f"glTF {version}, only 2.0 is read")
+    if len(content) < length:
+        raise ValueError(f"cut short: {len(content)} of {length} bytes")
+    found: dict[bytes, bytes] = {}
+    start = 12
+    while start + 8 <= length:
+        size, kind = struct.unpack("<I4s", content[start : start + 8])
+        if start + 8 + size > length:
+            raise ValueError("cut short: a chunk reaches beyond the file")
+        found.setdefault(kind, content[start + 8 : start + 8 + size])
+        start += 8 + size
+    if b"JSON" not in found:
+        raise ValueError("it has no JSON")
+    return found[b"JSON"], found.get(b"BIN\0")

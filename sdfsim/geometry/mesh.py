@@ -1,0 +1,441 @@
+"""Triangle meshes: reading and writing files, cleaning, convex hulls, normals, and points on surfaces."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sdfsim.base.errors import SdfsimError
+from sdfsim.geometry.gltf import GltfWriter, read_gltf
+from sdfsim.geometry.mesh_files import (
+    TEXTURES,
+    averaged,
+    by_trimesh,
+    looked_up,
+    off_surface,
+    plain_obj,
+    plain_stl,
+    ply_surface,
+    read_image,
+    read_ply,
+    side_file,
+)
+
+# trimesh logs what it passes over, some of it with tracebacks. Whoever wants to see that can still listen.
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
+
+MESH_SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
+GLTF = (".glb", ".gltf")
+FARTHEST = 1e12  # from the origin: beyond, not even double precision tells the vertices of a room-sized mesh apart
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A triangle mesh.
+
+    Attributes:
+        vertices: [V, 3] float64 m.
+        faces: [F, 3] int64 vertex indices, counter-clockwise seen from outside.
+        colors: [V, 3] uint8 RGB, or None.
+        uv: [V, 2] place of each vertex in the texture, from its upper left (0, 0) to its lower right (1, 1), or None.
+        texture: [H, W, 3] uint8 RGB, or None.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    colors: np.ndarray | None = None
+    uv: np.ndarray | None = None
+    texture: np.ndarray | None = None
+
+    def digest(self) -> str:
+        """SHA-256 of vertices, faces and colours, in hexadecimal."""
+        digest = hashlib.sha256()
+        for array in (self.vertices, self.faces, self.colors):
+            if array is not None:
+                digest.update(f"{array.dtype}{array.shape}".encode() + np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The normalised frame of a shape: `normalised = (metres - centre) / scale`, the solid within [-0.5, 0.5]."""
+
+    centre: np.ndarray  # [3] float64 m, centre of the bounding box
+    scale: float  # m, its largest extent
+
+    def inward(self, points: np.ndarray) -> np.ndarray:
+        """Metres -> normalised, [P, 3]."""
+        return (points - self.centre) / self.scale
+
+    def outward(self, points: np.ndarray) -> np.ndarray:
+        """Normalised -> metres, [P, 3]."""
+        return points * self.scale + self.centre
+
+
+def normal_frame(bounds: np.ndarray) -> Frame:
+    """The frame in which a box `bounds` [2, 3] m becomes [-0.5, 0.5] along its largest extent. Raises SdfsimError where
+    it has no extent or is not finite."""
+    extent = float((bounds[1] - bounds[0]).max())
+    if not np.isfinite(extent) or extent <= 0:
+        raise SdfsimError("the shape has no extent", "all of its vertices are at one point")
+    return Frame(centre=bounds.mean(0), scale=extent)
+
+
+def load_mesh(path: str | Path) -> Mesh:
+    """Read a triangle mesh (obj, ply, glb, gltf, stl, off), cleaned by `clean`; glTF has y up and is turned to z up.
+    Raises SdfsimError where it is missing, cut short, no mesh, needs what is not read, or has no faces, vertices that
+    are not finite, or indices out of range."""
+    path = Path(path)
+    if not path.is_file():
+        raise SdfsimError(f"{path}: no such mesh file")
+    suffix = path.suffix.lower()
+    if suffix not in MESH_SUFFIXES:
+        raise SdfsimError(f"{path}: not a mesh file ({path.suffix or 'no suffix'})", "use " + " ".join(MESH_SUFFIXES))
+    try:
+        mesh = _read(path, suffix)
+    except Exception as error:  # the readers raise whatever their format made them stumble over
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise SdfsimError(f"{path}: not a readable mesh ({reason})") from error
+    return clean(mesh, name=str(path))
+
+
+def _read(path: Path, suffix: str) -> Mesh:
+    if suffix in GLTF:
+        found = read_gltf(path)
+    elif suffix == ".ply":
+        found = ply_surface(path.read_bytes())
+    elif suffix == ".off":
+        found = off_surface(path.read_bytes())
+    else:
+        plain = plain_obj if suffix == ".obj" else plain_stl
+        loaded = by_trimesh(path, plain(path.read_bytes()))
+        vertices = np.array(loaded.vertices, dtype=np.float64).reshape(-1, 3)
+        return Mesh(vertices, _faces(loaded), _vertex_colors(loaded, len(vertices)))
+    colors = found.colors
+    if found.places is not None:
+        try:
+            image = read_image(side_file(path, found.texture))
+        except ValueError:
+            image = None
+        if image is not None:
+            colors = averaged(looked_up(image, found.places), found.faces, len(found.vertices))
+    return Mesh(found.vertices, found.faces, colors)
+
+
+def _faces(loaded: Any) -> np.ndarray:
+    return np.array(getattr(loaded, "faces", []), dtype=np.int64).reshape(-1, 3)
+
+
+def _vertex_colors(loaded: Any, count: int) -> np.ndarray | None:
+    """[V, 3] uint8 when the file carries colours; a texture is looked up at each vertex."""
+    visual: Any = getattr(loaded, "visual", None)
+    if getattr(visual, "kind", None) == "texture":
+        image = getattr(visual.material, "image", None) or getattr(visual.material, "baseColorTexture", None)
+        if image is None or image.format not in TEXTURES or visual.uv is None:
+            return None
+        visual = visual.to_color()
+    elif getattr(visual, "kind", None) not in ("vertex", "face"):
+        return None
+    colors = np.asarray(visual.vertex_colors)
+    return colors[:, :3].astype(np.uint8) if colors.shape[:1] == (count,) else None
+
+
+def write_ply(mesh: Mesh, attributes: Mapping[str, np.ndarray] | None = None) -> bytes:
+    """A mesh as binary PLY, vertices in double precision: what is read back is what was written, to the last bit.
+    `attributes` are more properties of the vertices by name, [V] int32 or float32; most programs pass over them."""
+    columns = [(axis, "<f8", "double") for axis in "xyz"]
+    values = list(mesh.vertices.T)
+    if mesh.colors is not None:
+        columns += [(channel, "u1", "uchar") for channel in ("red", "green", "blue")]
+        values += list(mesh.colors.T)
+    for name, column in (attributes or {}).items():
+        columns.append((name, column.dtype.newbyteorder("<").str, {"i": "int", "f": "float"}[column.dtype.kind]))
+        values.append(column)
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(mesh.vertices)}"]
+    header += [f"property {kind} {name}" for name, _, kind in columns]
+    header += [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices", "end_header", ""]
+    vertices = np.empty(len(mesh.vertices), dtype=[(name, kind) for name, kind, _ in columns])
+    for (name, _, _), column in zip(columns, values, strict=True):
+        vertices[name] = column
+    faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("corner", "<i4", 3)])
+    faces["count"], faces["corner"] = 3, mesh.faces
+    return "\n".join(header).encode() + vertices.tobytes() + faces.tobytes()
+
+
+def read_mesh(path: Path) -> Mesh:
+    """The mesh of a shape folder as `write_ply` wrote it: not cleaned, not reordered. Raises SdfsimError: damaged."""
+    with _reading(path):
+        found = ply_surface(path.read_bytes())
+        mesh = Mesh(found.vertices, found.faces, found.colors)
+        _require_whole(mesh)
+    return mesh
+
+
+def read_attributes(path: Path, names: Sequence[str]) -> list[np.ndarray]:
+    """Properties of the vertices [V] of a PLY file that `write_ply` wrote, by their names. Raises SdfsimError where it
+    is not readable or has no such property."""
+    with _reading(path, f"damaged, or without {', '.join(names)}"):
+        vertices = read_ply(path.read_bytes())[0]["vertex"]
+        return [np.array(vertices[name]) for name in names]
+
+
+def write_glb(meshes: dict[str, Mesh]) -> bytes:
+    """Meshes with textures as binary glTF: a node each by its name, all below one that turns them to glTF's y up.
+
+    Vertices become single precision, textures JPEG. They hold the light of the photos: nothing else is to light them.
+    """
+    file = GltfWriter()
+    for name, mesh in meshes.items():
+        assert mesh.uv is not None and mesh.texture is not None
+        places = {"POSITION": file.array(mesh.vertices), "TEXCOORD_0": file.array(mesh.uv)}
+        corners = file.array(mesh.faces.reshape(-1), "<u4")
+        drawn = file.mesh(name, places, corners, file.material(name, np.ones(3), mesh.texture))
+        file.nodes.append({"name": name, "mesh": drawn})
+    return file.to_bytes()
+
+
+def read_glb(path: Path) -> dict[str, Mesh]:
+    """The meshes that `write_glb` wrote, z up, by their names. Raises SdfsimError: not readable."""
+    import trimesh
+
+    found = {}
+    with _reading(path):
+        loaded: Any = trimesh.load_scene(path, process=False)
+        for name, drawn in loaded.geometry.items():
+            image = drawn.visual.material.baseColorTexture
+            if image.format != "JPEG":
+                raise ValueError("a texture that is no JPEG")
+            # trimesh counts up from the lower edge of a texture.
+            uv = np.asarray(drawn.visual.uv) * [1.0, -1.0] + [0.0, 1.0]
+            mesh = Mesh(np.array(drawn.vertices), _faces(drawn), None, uv, np.asarray(image.convert("RGB")))
+            _require_whole(mesh)
+            found[str(name)] = mesh
+    return found
+
+
+@contextmanager
+def _reading(path: Path, told: str = "damaged or cut short") -> Iterator[None]:
+    """Turn whatever a reader stumbles over into an SdfsimError."""
+    try:
+        yield
+    except Exception as error:
+        raise SdfsimError(f"{path}: {told} ({error})") from error
+
+
+def _require_whole(mesh: Mesh) -> None:
+    """Raise ValueError where numbers are missing or faces have corners that are not there."""
+    if not np.isfinite(mesh.vertices).all() or (mesh.uv is not None and not np.isfinite(mesh.uv).all()):
+        raise ValueError("vertices that are not finite")
+    if len(mesh.faces) and (mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices)):
+        raise ValueError(f"face indices out of range (0 to {len(mesh.vertices) - 1} allowed)")
+
+
+def clean(mesh: Mesh, *, name: str = "mesh") -> Mesh:
+    """Merge equal vertices, drop degenerate and doubled faces and unused vertices, turn a closed mesh right side out.
+
+    Of two faces back to back none stays where the rest is closed without them (a wall between touching cells). Raises
+    SdfsimError where there are no faces, vertices that are not finite or absurdly far, or indices out of range.
+    """
+    vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
+    if len(faces) == 0:
+        raise SdfsimError(f"{name}: mesh has no faces", "a point cloud is not enough: export triangles")
+    try:
+        _require_whole(mesh)
+    except ValueError as error:
+        raise SdfsimError(f"{name}: {error}") from error
+    if (farthest := float(np.abs(vertices).max())) > FARTHEST:
+        raise SdfsimError(f"{name}: a coordinate of {farthest:.3g} is too large (at most {FARTHEST:g})")
+    used, label = np.unique(faces, return_inverse=True)
+    faces, vertices = label.reshape(-1, 3), vertices[used]
+    colors = None if mesh.colors is None else mesh.colors[used]
+    solid = _has_area(vertices, faces)
+    if not solid.any():
+        raise SdfsimError(f"{name}: mesh has no faces with an area")
+    # Files round to about seven digits: what agrees to a millionth of the size is one vertex. A face without an area
+    # may lie anywhere, and says nothing of the size.
+    low, high = (fold(vertices[np.unique(faces[solid])], axis=0) for fold in (np.min, np.max))
+    keys = np.round((vertices - low) / max(1e-6 * float((high - low).max()), 1e-300))
+    _, first, label = np.unique(keys + 0.0, axis=0, return_index=True, return_inverse=True)
+    faces = label.reshape(-1)[faces]
+    vertices = vertices[first]
+    colors = None if colors is None else colors[first]
+
+    # Without an area it may still join its neighbours, where it has corners of theirs only.
+    held = np.zeros(len(vertices), dtype=bool)
+    held[faces[solid]] = True
+    faces = faces[solid | held[faces].all(1)]
+    distinct = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    faces = faces[distinct]
+    if len(faces):
+        faces = without_doubles(faces)
+    if len(faces) == 0:
+        raise SdfsimError(f"{name}: mesh has no faces with an area")
+    used, label = np.unique(faces, return_inverse=True)
+    result = Mesh(vertices[used], label.reshape(-1, 3), None if colors is None else colors[used])
+    if is_closed(result) and signed_volume(result) < 0:
+        result = Mesh(result.vertices, result.faces[:, ::-1].copy(), result.colors)
+    return result
+
+
+def _has_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """[F] bool: whether the corners of a face are not in a line, to rounding."""
+    corners = vertices[faces]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(1)
+    twice = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    return twice > 1e-10 * longest**2
+
+
+def without_doubles(faces: np.ndarray) -> np.ndarray:
+    """One face [F', 3] for each set of three corners in `faces` [F, 3].
+
+    Two faces back to back are either a wall between two touching cells, which is inside the solid, or a surface that
+    was drawn from both sides. Without a wall the rest is still closed; then both go. Otherwise one stays.
+    """
+    order = np.argsort(faces, axis=1)
+    # The sorted corners' permutation is even exactly when its inversions are.
+    odd = ((order[:, 0] > order[:, 1]) ^ (order[:, 0] > order[:, 2]) ^ (order[:, 1] > order[:, 2])).astype(bool)
+    _, first, label = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_inverse=True)
+    label = label.reshape(-1)
+    both = (np.bincount(label, weights=odd) > 0) & (np.bincount(label, weights=~odd) > 0)
+    kept = np.sort(first)
+    single, wall = faces[kept], both[label[kept]]
+    if not wall.any():
+        return single
+    edge, _ = directed_edges(single)
+    component = components(single)
+    uneven = np.bincount(edge[~np.tile(wall, 3)], minlength=edge.max() + 1) % 2 == 1
+    broken = np.zeros(component.max() + 1, dtype=bool)
+    broken[np.tile(component, 3)[uneven[edge]]] = True
+    emptied = np.bincount(component[~wall], minlength=component.max() + 1) == 0
+    return single[~(wall & ~(broken | emptied)[component])]
+
+
+def is_closed(mesh: Mesh) -> bool:
+    """Whether every directed edge has its opposite: watertight, with one winding, so that winding numbers are whole."""
+    edge, sign = directed_edges(mesh.faces)
+    return not np.bincount(edge, weights=sign).any()
+
+
+def signed_volume(mesh: Mesh) -> float:
+    """Volume enclosed, m^3; negative when the faces are wound inwards. Meaningful for closed meshes only."""
+    corners = mesh.vertices[mesh.faces] - mesh.vertices.mean(0)
+    return float(np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6.0)
+
+
+def components(faces: np.ndarray) -> np.ndarray:
+    """[F] labels: faces that share an edge, with whatever others, are of one component."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    edge, _ = directed_edges(faces)
+    face = np.tile(np.arange(len(faces)), 3)
+    links = coo_matrix((np.ones(len(edge)), (face, len(faces) + edge)), shape=(len(faces) + edge.max() + 1,) * 2)
+    _, label = np.unique(connected_components(links, directed=False)[1][: len(faces)], return_inverse=True)
+    return label
+
+
+def directed_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """For the 3 F directed edges (first ones, second, third): the undirected edge's number, and its sense +1 or -1."""
+    start = np.concatenate([faces[:, 0], faces[:, 1], faces[:, 2]]).astype(np.int64)
+    end = np.concatenate([faces[:, 1], faces[:, 2], faces[:, 0]]).astype(np.int64)
+    key = np.minimum(start, end) * (int(faces.max()) + 1) + np.maximum(start, end)
+    _, edge = np.unique(key, return_inverse=True)
+    return edge, np.where(start < end, 1, -1)
+
+
+def load_pieces(path: str | Path) -> list[Mesh]:
+    """The convex pieces of a collision geometry in Wavefront OBJ: the convex hull of each `o` group's vertices. Raises
+    SdfsimError where it cannot be read, has no pieces, or a piece is flat."""
+    path = Path(path)
+    if not path.is_file():
+        raise SdfsimError(f"{path}: no such mesh file")
+    groups: list[list[list[float]]] = [[]]
+    with _reading(path, "not a readable OBJ file"):
+        for line in path.read_text(encoding="utf-8").splitlines():
+            key, _, rest = line.strip().partition(" ")
+            if key == "o":
+                groups.append([])
+            elif key == "v":
+                groups[-1].append([float(number) for number in rest.split()[:3]])
+    if not any(groups):
+        raise SdfsimError(f"{path}: no vertices, so no convex pieces")
+    try:
+        return [convex_hull(np.array(group)) for group in groups if group]
+    except (SdfsimError, ValueError) as error:
+        raise SdfsimError(f"{path}: {error}") from error
+
+
+def wavefront(pieces: list[Mesh]) -> str:
+    """Wavefront OBJ with one `o` group a piece."""
+    lines, before = [], 1
+    for number, piece in enumerate(pieces):
+        lines.append(f"o piece_{number}")
+        lines += ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in piece.vertices]
+        lines += ["f {} {} {}".format(*(face + before)) for face in piece.faces]
+        before += len(piece.vertices)
+    return "\n".join(lines) + "\n"
+
+
+def convex_hull(points: np.ndarray) -> Mesh:
+    """Convex hull of `points` [P, 3] m, outward faces. Raises SdfsimError for fewer than four points, or where they are
+    not finite or all in one plane."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    if len(points) < 4 or not np.isfinite(points).all():
+        raise SdfsimError("a convex piece needs four finite points")
+    try:
+        hull = ConvexHull(points)
+    except QhullError as error:
+        raise SdfsimError("a convex piece is flat") from error
+    faces = hull.simplices.astype(np.int64)
+    inward = np.einsum("fi,fi->f", face_normals(Mesh(points, faces))[0], hull.equations[:, :3]) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    used, label = np.unique(faces, return_inverse=True)
+    return Mesh(np.asarray(points, dtype=np.float64)[used], label.reshape(-1, 3))
+
+
+def face_normals(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Unit normals [F, 3] and areas [F]."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    cross = np.cross(b - a, c - a)
+    double = np.linalg.norm(cross, axis=1)
+    return cross / np.maximum(double, 1e-30)[:, None], double / 2
+
+
+def vertex_normals(mesh: Mesh) -> np.ndarray:
+    """Area-weighted unit normals [V, 3]."""
+    normals, areas = face_normals(mesh)
+    total = np.zeros_like(mesh.vertices)
+    for k in range(3):
+        np.add.at(total, mesh.faces[:, k], normals * areas[:, None])
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
+
+
+def joined(meshes: Sequence[Mesh]) -> Mesh:
+    """Several meshes as one, without colours."""
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
+    return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))
+
+
+def lattice(*axes: Sequence[float] | np.ndarray) -> np.ndarray:
+    """All places [P, 3] with a coordinate of each of three axes, z running fastest."""
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Points spread evenly by area: [P, 3] m, with the unit normals [P, 3] of their faces."""
+    normal, area = face_normals(mesh)
+    face = rng.choice(len(area), size=count, p=area / area.sum())
+    u, v = rng.random((2, count, 1))
+    flip = u + v > 1
+    u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
+    first, second, third = (mesh.vertices[mesh.faces[face, k]] for k in range(3))
+    return first + u * (second - first) + v * (third - first), normal[face]

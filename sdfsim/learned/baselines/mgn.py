@@ -1,0 +1,30 @@
+"""MeshGraphNets (Pfaff et al., 2021, arXiv 2010.03409) for rigid bodies, as SDF-Sim's paper compares it.
+
+Nodes are the vertices of meshes. Mesh edges join neighbours, world edges join vertices of different bodies within a
+radius: a small one in *mgn*, a large one in *mgn-large*. There are no body nodes; shape matching makes motions rigid.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from sdfsim.learned.message_passing import EdgeKind, Edges, Features, Graph, Layout, both_ways
+from sdfsim.learned.near import Pairs
+from sdfsim.learned.surfaces import MESH, NODE, mesh_edges, motion_features
+from sdfsim.physics.bodies import Bodies, State
+
+WORLD = Features(4, (0,))
+MGN = Layout({"node": NODE}, {"mesh": MESH, "world": EdgeKind("node", "node", WORLD)})
+
+
+def mgn_graph(bodies: Bodies, state: State, pairs: Pairs) -> Graph:
+    """Of MeshGraphNets."""
+    nodes = {"node": motion_features(bodies, state)["node"]}
+    return Graph(nodes, {"mesh": mesh_edges(bodies, state), "world": world_edges(pairs)})
+
+
+def world_edges(pairs: Pairs) -> Edges:
+    """Edges both ways between nodes of different bodies: from sender to receiver, and how far."""
+    length = pairs.way.norm(dim=-1, keepdim=True)
+    forth, back = torch.cat([pairs.way, length], -1), torch.cat([-pairs.way, length], -1)
+    return both_ways(forth, back, pairs.first, pairs.second)

@@ -1,0 +1,98 @@
+"""The networks on surface nodes by name: SDF-Sim (*sdf-sim*) and the baselines of its paper; their graphs differ.
+
+All graphs are of a state that carries its two earlier poses. Vertices, particles and body nodes of all have the
+features of SDF-Sim's nodes, contact edges reach farther by what their ends close in during a step, and an infinite
+floor is one node below whatever is near it. The papers of the baselines do otherwise, or do not say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from torch import Tensor, device
+
+from sdfsim.geometry.mesh import Mesh, convex_hull, joined
+from sdfsim.learned.baselines.dpi import DPI, dpi_graph
+from sdfsim.learned.baselines.fignet import FIGNET, FIGNET_STAR, fignet_graph, fignet_star_graph
+from sdfsim.learned.baselines.mgn import MGN, mgn_graph
+from sdfsim.learned.message_passing import Graph, Layout
+from sdfsim.learned.near import Contacts, Pairs, face_pairs, find_contacts, no_contacts, no_pairs, node_pairs
+from sdfsim.learned.sdf_sim import SDF_SIM, sdf_sim_graph
+from sdfsim.physics.bodies import Bodies, State
+from sdfsim.sdf.closed_forms import PlaneSdf
+from sdfsim.shape.shape import Shape
+from sdfsim.simulate.run_memory import Memory
+
+
+def points(shape: Shape, count: int | None) -> Shape:
+    """The shape with the first `count` of its nodes (None: all): those that reach farthest, then the most spread."""
+    return replace(shape, nodes=shape.nodes[:count])
+
+
+def particles(shape: Shape, count: int | None) -> Shape:
+    """As `points`; an infinite plane is one node, so that edges have an end there."""
+    return replace(points(shape, count), nodes=np.zeros((1, 3))) if _endless(shape) else points(shape, count)
+
+
+def vertices(shape: Shape, count: int | None) -> Shape:
+    """The shape with the vertices of a mesh as nodes, about `count` at most; an infinite plane is one node and one
+    face.
+
+    The mesh is that of the hulls of the convex pieces, where a shape was made of such and they have no more vertices
+    than wanted: what the teacher collides, and as many vertices as the published graphs have (their sizes fit 440 a
+    body). Else it is the shown mesh, reduced by quadric error to 2 `count` - 4 faces: 76 hulls have no mesh of 64
+    vertices, and what the reduction takes off a body (up to 5 cm of the shapes of MOVi-B at 64) its mesh lacks.
+    """
+    if _endless(shape):
+        return replace(shape, nodes=np.zeros((1, 3)), faces=np.zeros((1, 3), dtype=np.int64))
+    hulls = [convex_hull(piece) for piece in shape.pieces]
+    if hulls and (count is None or sum(len(hull.vertices) for hull in hulls) <= count):
+        mesh = joined(hulls)
+    else:
+        mesh = _reduced(shape.mesh, count)
+    return replace(shape, nodes=mesh.vertices, faces=mesh.faces)
+
+
+def _reduced(mesh: Mesh, count: int | None) -> Mesh:
+    """The mesh with doubled vertices joined and at most `count` of them, about."""
+    import open3d as o3d
+
+    given = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.faces.astype(np.int32))
+    ).remove_duplicated_vertices()
+    if count is not None and len(given.vertices) > count:
+        given = given.simplify_quadric_decimation(2 * count - 4)
+    given = given.remove_degenerate_triangles().remove_unreferenced_vertices()
+    return Mesh(np.asarray(given.vertices), np.asarray(given.triangles).astype(np.int64))
+
+
+def _endless(shape: Shape) -> bool:
+    return isinstance(shape.sdf, PlaneSdf)
+
+
+@dataclass(frozen=True)
+class Family:
+    """What is a network's own beside its weights."""
+
+    layout: Layout  # of its graphs
+    # a shape, with the nodes (at most so many, None for all) that the network works on
+    surface: Callable[[Shape, int | None], Shape]
+    # what of the bodies is near what, for bodies, state, gravity, reach, time step and what the run remembers
+    near: Callable[[Bodies, State, Tensor, float, float, Memory], Contacts | Pairs]
+    none: Callable[[device], Contacts | Pairs]  # the same of bodies that are near nothing
+    graph: Callable[[Bodies, State, Any], Graph]  # the graph of bodies, their state and what is near
+
+
+_no_faces, _no_nodes = partial(no_pairs, corners=3), partial(no_pairs, corners=1)
+
+FAMILIES = {
+    "sdf-sim": Family(SDF_SIM, points, find_contacts, no_contacts, sdf_sim_graph),
+    "fignet": Family(FIGNET, vertices, face_pairs, _no_faces, fignet_graph),
+    "fignet-star": Family(FIGNET_STAR, vertices, face_pairs, _no_faces, fignet_star_graph),
+    "mgn": Family(MGN, vertices, node_pairs, _no_nodes, mgn_graph),
+    "dpi": Family(DPI, particles, node_pairs, _no_nodes, dpi_graph),
+}

@@ -1,0 +1,261 @@
+"""The *impulse* network: message passing between bodies over contact edges, on top of the contact solve.
+
+What it decodes are impulses. They act on both bodies of an edge, equal and opposite, at the contact point, with their
+true mass and inertia. So linear momentum is conserved exactly, angular momentum exactly at the instant the impulses
+act, and the step turns with the scene, whatever the weights are.
+
+The rounds start from what the solve makes of the step, and what they add is held to a trust region (`bounded`).
+
+This form is for training and to be read. `kernels.impulse` is the same, compiled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+
+from sdfsim.learned.contact_graph import EDGE_FEATURES, ContactGraph, EdgeFrames, edge_frames
+
+# Model units, relative speeds of two surfaces before the step: up to the first what they do is left to the solve, from
+# the second on the network has its full say. So what rests, rolls or stands in a tower does what the solve knows.
+CALM, LIVELY = 0.05, 0.5
+
+
+@dataclass(frozen=True)
+class ImpulseConfig:
+    """Sizes of the network."""
+
+    width: int = 64  # of every latent and hidden layer
+    rounds: int = 6  # of message passing, each with weights of its own
+    # 1 for a network that is given where contacts are but not what the solve makes of them, and that nothing bounds:
+    # what learning alone gives, for comparison
+    alone: int = 0
+
+    def __post_init__(self) -> None:
+        if min(self.width, self.rounds) < 1:
+            raise ValueError(f"width and rounds must be at least 1 (got {self.width} and {self.rounds})")
+
+
+@dataclass(frozen=True)
+class Velocities:
+    """What the network predicts for N bodies, model units, world frame."""
+
+    # velocity, angular: [N, 3] at the end of the step
+    velocity: Tensor
+    angular: Tensor
+    # mean_velocity, mean_angular: [N, 3] over the step: they move position and orientation
+    mean_velocity: Tensor
+    mean_angular: Tensor
+
+
+def mlp(inputs: int, width: int, outputs: int) -> nn.Sequential:
+    """Two hidden layers."""
+    return nn.Sequential(
+        nn.Linear(inputs, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, outputs)
+    )
+
+
+class Round(nn.Module):
+    """One round: edges read both bodies and the current relative velocities, then push and inform them."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.normalise = nn.LayerNorm(width)
+        self.edge = nn.Sequential(nn.Linear(3 * width + 6, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU())
+        self.latent = nn.Linear(width, width)
+        self.message = nn.Linear(width, 2 * width)
+        self.body = mlp(2 * width, width, width)
+        self.attention = nn.Linear(width, 1)
+        self.normal_impulse = nn.Linear(width, 2)
+        self.tangent_impulse = nn.Linear(width, 4)
+        for head in (self.normal_impulse, self.tangent_impulse):
+            nn.init.normal_(head.weight, std=0.01)
+            nn.init.zeros_(head.bias)
+
+    def read(self, body: Tensor, edge: Tensor, first: Tensor, second: Tensor, relative: Tensor) -> Tensor:
+        """[E, width] of the edges' own latents, those of their bodies, and [E, 6] what is seen of their motion."""
+        return self.edge(torch.cat([self.normalise(edge), body[first], body[second], relative], -1))
+
+    def impulse(self, hidden: Tensor, friction: bool) -> Tensor:
+        """[E, axis, end | mean] changes of velocity; without friction the normal is the only axis."""
+        change = self.normal_impulse(hidden)[:, None]
+        if not friction:
+            return change
+        return torch.cat([change, self.tangent_impulse(hidden).reshape(-1, 2, 2).mT], 1)
+
+    def update(
+        self, edge: Tensor, body: Tensor, hidden: Tensor, weight: Tensor, graph: ContactGraph
+    ) -> tuple[Tensor, Tensor]:
+        """Latents of edges and bodies for the next round."""
+        to_first, to_second = (self.message(hidden) * weight).chunk(2, -1)
+        received = torch.zeros_like(body).index_add_(0, graph.first, to_first).index_add_(0, graph.second, to_second)
+        body = body + self.body(torch.cat([body, received], -1))
+        # Scenery carries no message from one body to another.
+        return edge + self.latent(hidden), body * (graph.inverse_mass > 0)[:, None]
+
+
+class ImpulseNetwork(nn.Module):
+    """Encode edges, then `rounds` of pushing; see the module's docstring."""
+
+    def __init__(self, config: ImpulseConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.encode = mlp(EDGE_FEATURES, config.width, config.width)
+        self.rounds = nn.ModuleList(Round(config.width) for _ in range(config.rounds))
+
+    def forward(
+        self,
+        graph: ContactGraph,
+        *,
+        friction: bool = True,
+        mirrored: bool = False,
+        trust: float = 1.0,
+    ) -> Velocities:
+        """Velocities after the contacts have acted; `mirrored` as for `edge_frames`. At a `trust` of 0 the solve stands
+        alone."""
+        alone = bool(self.config.alone)
+        graph = without_solve(graph) if alone else graph
+        frames = edge_frames(graph, mirrored=mirrored)
+        edge = self.encode(frames.start)
+        body = edge.new_zeros(len(graph.inverse_mass), self.config.width)
+        end = torch.cat([graph.solved_velocity, graph.solved_angular], -1)
+        mean = torch.cat([graph.mean_velocity, graph.mean_angular], -1)
+        start = twist = torch.stack([end, mean], -1)
+        added = edge.new_zeros(len(edge), 3 if friction else 1, 2)
+        for number, layer in enumerate(cast("Iterable[Round]", self.rounds), start=1):
+            seen = (relative(graph, frames, twist) / frames.speed[..., None]).mT.flatten(1)
+            hidden = layer.read(body, edge, graph.first, graph.second, seen)
+            weight = _share_of_pair(layer.attention(hidden)[:, 0], graph)[:, None]
+            change = layer.impulse(hidden, friction) * weight[..., None]
+            added = added + change * (frames.speed * frames.mass[:, : added.shape[1]])[..., None]
+            twist = pushed(graph, frames, added, start)
+            if number < len(self.rounds):  # nobody reads what comes after the last round
+                edge, body = layer.update(edge, body, hidden, weight, graph)
+        if not alone:
+            twist = pushed(graph, frames, bounded(graph, frames, added, start, trust), start)
+        end, mean = twist.unbind(-1)
+        return Velocities(end[:, :3], end[:, 3:], mean[:, :3], mean[:, 3:])
+
+
+def without_solve(graph: ContactGraph) -> ContactGraph:
+    """The graph with free flight in place of what the solve makes of the step."""
+    return replace(
+        graph,
+        solved_velocity=graph.free_velocity,
+        solved_angular=graph.free_angular,
+        mean_velocity=0.5 * (graph.velocity + graph.free_velocity),
+        mean_angular=0.5 * (graph.angular + graph.free_angular),
+        impulse=torch.zeros_like(graph.impulse),
+    )
+
+
+def relative(graph: ContactGraph, frames: EdgeFrames, twist: Tensor) -> Tensor:
+    """[E, 3, K] relative velocities at the contact points along the edges' axes, for twists [N, 6, K]."""
+    return frames.jacobian_first @ twist[graph.first] - frames.jacobian_second @ twist[graph.second]
+
+
+def pushed(graph: ContactGraph, frames: EdgeFrames, impulse: Tensor, twist: Tensor) -> Tensor:
+    """Twists [N, 6, K] after impulses [E, axis, K] on the first bodies, opposite on the second."""
+    axes = impulse.shape[1]
+    twist = twist.index_add(0, graph.first, frames.response_first[..., :axes] @ impulse)
+    return twist.index_add(0, graph.second, frames.response_second[..., :axes] @ impulse)
+
+
+def bounded(graph: ContactGraph, frames: EdgeFrames, added: Tensor, start: Tensor, trust: float) -> Tensor:
+    """What may be added to the solve, of what the network would add: impulses [E, axis, 2] at the end of the step, and
+    those that move bodies in it. `start` are twists [N, 6, 2] from the solve, `trust` is 0 to 1.
+
+    - Only where surfaces moved against each other before the step, see `CALM`.
+
+    - Solve and network together never pull, push no more than twice as hard as the solve, or than it takes to part
+    surfaces that would be inside each other at the end of the step as restitution allows, and keep to the friction
+    cone.
+
+    - No more kinetic energy than the solve took, island by island.
+    """
+    lively = ((frames.slip.norm(dim=-1) - CALM) / (LIVELY - CALM)).clamp(0.0, 1.0) * trust
+    added = added * lively[:, None, None]
+    seen = relative(graph, frames, start)
+    push, drag = frames.solved[:, 0], frames.solved[:, 1:]
+    left = graph.gap + seen[:, 0, 1] * (1.0 - graph.when) * graph.dt
+    parting = (-left / graph.dt).clamp_min(0.0) + (1.0 + graph.restitution) * (-seen[:, 0, 0]).clamp_min(0.0)
+    most = 2.0 * push + frames.mass[:, 0] * torch.where(left < 0.0, parting, torch.zeros_like(parting))
+    normal = torch.minimum((push + added[:, 0, 0]).clamp_min(0.0), most)
+    ends = [(normal - push)[:, None]]
+    if added.shape[1] == 3:
+        # As the teacher has it the solve holds its two axes of friction apart: both may grip more than the cone.
+        grip = torch.where(push > 0.0, drag.norm(dim=-1) / push.clamp_min(1e-12), 0.0)
+        hold = torch.maximum(graph.friction, grip) * normal
+        total = drag + added[:, 1:, 0]
+        ends.append(_shortened(total, hold) - drag)
+    end = torch.cat(ends, 1)
+    end = end * _energy_share(graph, frames, end, seen[..., 0], start)[:, None]
+    return torch.stack([end, _shortened(added[..., 1], most)], -1)
+
+
+def _shortened(vector: Tensor, most: Tensor) -> Tensor:
+    """[E, K] vectors no longer than `most` [E]."""
+    length = vector.square().sum(-1).clamp_min(1e-24).sqrt()
+    return vector * (most / length).clamp_max(1.0)[:, None]
+
+
+def _energy_share(graph: ContactGraph, frames: EdgeFrames, end: Tensor, seen: Tensor, start: Tensor) -> Tensor:
+    """[E] the share of impulses `end` [E, axis] that adds no more energy to an island than the solve took from it. The
+    work of an impulse is its product with the mean of the relative velocities before and after it."""
+    with torch.no_grad():
+        free = torch.cat([graph.free_velocity, graph.free_angular], -1)
+        taken = kinetic(graph, free) - kinetic(graph, start[..., 0])
+        nothing = torch.zeros_like(start[..., :1])
+        change = relative(graph, frames, pushed(graph, frames, end[..., None], nothing))[..., 0]
+        axes, label = end.shape[1], islands(graph)
+        of_edge = torch.where(graph.inverse_mass[graph.first] > 0, label[graph.first], label[graph.second])
+
+        def total(values: Tensor, index: Tensor) -> Tensor:
+            zero = torch.zeros(len(label), dtype=values.dtype, device=values.device)
+            return zero.index_add_(0, index, values)
+
+        least = total(taken, label).clamp_min(0.0)
+        linear = total((end * seen[:, :axes]).sum(-1), of_edge)
+        square = total(0.5 * (end * change[:, :axes]).sum(-1), of_edge)
+        root = (linear.square() + 4.0 * square * least).clamp_min(0.0).sqrt()
+        share = torch.where(linear + square <= least, 1.0, (root - linear) / (2.0 * square).clamp_min(1e-30))
+        return share.clamp(0.0, 1.0)[of_edge]
+
+
+def kinetic(graph: ContactGraph, twist: Tensor) -> Tensor:
+    """[N] kinetic energy of the bodies that move, for twists [N, 6]."""
+    moves = graph.inverse_mass > 0
+    turns = (graph.inverse_inertia.diagonal(dim1=-2, dim2=-1) > 0).all(-1)
+    unit = torch.eye(3, dtype=twist.dtype, device=twist.device)
+    inertia = torch.linalg.inv(torch.where(turns[:, None, None], graph.inverse_inertia, unit))
+    turning = (twist[:, 3:] * (inertia @ twist[:, 3:, None])[..., 0]).sum(-1) * turns
+    mass = torch.where(moves, 1.0 / graph.inverse_mass.clamp_min(1e-12), 0.0)
+    return 0.5 * (mass * twist[:, :3].square().sum(-1) + turning * moves)
+
+
+def islands(graph: ContactGraph) -> Tensor:
+    """[N] the least number of the bodies that move and are joined to this one by edges."""
+    moves = graph.inverse_mass > 0
+    label = torch.arange(len(moves), device=moves.device)
+    one = torch.where(moves[graph.first], graph.first, graph.second)
+    other = torch.where(moves[graph.second], graph.second, graph.first)
+    while True:
+        least = torch.minimum(label[one], label[other])
+        lower = label.scatter_reduce(0, one, least, "amin").scatter_reduce(0, other, least, "amin")
+        lower = lower[lower]
+        if torch.equal(lower, label):
+            return label
+        label = lower
+
+
+def _share_of_pair(logit: Tensor, graph: ContactGraph) -> Tensor:
+    """[E] softmax over the edges of each pair, so that more nodes do not mean more push."""
+    top = torch.full((graph.pairs,), -torch.inf, dtype=logit.dtype, device=logit.device)
+    top = top.scatter_reduce(0, graph.pair, logit.detach(), "amax")
+    raised = (logit - top[graph.pair]).exp()
+    total = torch.zeros(graph.pairs, dtype=logit.dtype, device=logit.device).index_add(0, graph.pair, raised)
+    return raised / total[graph.pair]

@@ -1,0 +1,143 @@
+"""A trained model: network, the units it was trained in, and the ranges it has seen; its file."""
+
+from __future__ import annotations
+
+import json
+import math
+from copy import deepcopy
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import replacing
+from sdfsim.learned.impulse import ImpulseConfig, ImpulseNetwork
+from sdfsim.shape.shape import Shape
+
+BUNDLED = Path(__file__).resolve().parent.parent / "models"
+MOST = 4096  # of any size of a network
+MODEL_VERSION = 3  # 2: networks without the contact solve; 1: of an earlier teacher
+SOLVER = "solver"
+SURFACE = ("sdf-sim", "fignet", "fignet-star", "mgn", "dpi")  # networks whose messages run between surface nodes
+
+
+@dataclass(frozen=True)
+class Model:
+    """Weights with everything needed to use them."""
+
+    name: str  # bundled name or file stem
+    kind: str  # "solver", "impulse" or one of `SURFACE`
+    network: nn.Module  # in evaluation mode; the solver has none
+    dt: float  # s, the step of the training data, or of the solver for bodies of `length` at `gravity`
+    gravity: float  # m/s^2, its magnitude in the training data
+    # m, the middle of the range of training bodies' largest extents; other scenes are rescaled to it. The solver is
+    # rescaled to the smallest body that moves.
+    length: float
+    reach: float  # m, contact radius D
+    nodes: int | None = None  # surface nodes a body it was trained with, see `surface`; None for all
+    # inner steps of the solve in a step; 0 for those of the recording engine (5 where none has recorded)
+    inner: int = 0
+    # name -> [low, high] of what training saw (friction, restitution, mass_ratio, speed, size)
+    ranges: dict[str, list[float]] = field(default_factory=dict)
+    card: dict[str, Any] = field(default_factory=dict)  # training record (data, steps, seconds, errors)
+
+    @property
+    def on_surfaces(self) -> bool:
+        """Whether it predicts motions of surface nodes, as the published networks do."""
+        return self.kind in SURFACE
+
+    def surface(self, shape: Shape) -> Shape:
+        """The shape with the surface nodes, and the faces between them, that the model works on."""
+        if not self.on_surfaces:
+            return shape
+        from sdfsim.learned.families import FAMILIES
+
+        return FAMILIES[self.kind].surface(shape, self.nodes)
+
+    def to(self, device: torch.device) -> Model:
+        """The same model with its weights on `device`: this one, or a copy where they are elsewhere."""
+        there = {weight.device for weight in self.network.state_dict().values()}
+        if all(at.type == device.type and device.index in (None, at.index) for at in there):
+            return self
+        return replace(self, network=deepcopy(self.network).to(device))
+
+    def save(self, path: Path) -> None:
+        """Write a `.safetensors` file whose metadata holds all that is not weights (temporary name, then renamed)."""
+        from safetensors.torch import save
+
+        info = {
+            "version": MODEL_VERSION,
+            "kind": self.kind,
+            "config": asdict(self.network.config),  # type: ignore[call-overload]
+            **{k: getattr(self, k) for k in ("dt", "gravity", "length", "reach", "nodes", "inner", "ranges", "card")},
+        }
+        weights = {k: v.detach().cpu().contiguous() for k, v in self.network.state_dict().items()}
+        with replacing(path) as partial:
+            # Bytes, not the library's own file: a full disk is then an OSError like any other.
+            partial.write_bytes(save(weights, metadata={"sdfsim_model": json.dumps(info)}))
+
+
+def new_network(kind: str, config: dict[str, Any]) -> nn.Module:
+    """An untrained network of `kind` ("impulse" or one of `SURFACE`). Raises KeyError for another."""
+    if kind == "impulse":
+        return ImpulseNetwork(ImpulseConfig(**config))
+    from sdfsim.learned.families import FAMILIES
+    from sdfsim.learned.message_passing import GraphConfig, GraphNetwork
+
+    return GraphNetwork(FAMILIES[kind].layout, GraphConfig(**config))
+
+
+def bundled_models() -> list[str]:
+    """Names of the networks that come with the package."""
+    return sorted(p.stem for p in BUNDLED.glob("*.safetensors"))
+
+
+def model_names() -> list[str]:
+    """What a model may be called: the solver, and the bundled networks."""
+    return [SOLVER, *bundled_models()]
+
+
+def load_model(name: str | Path | None = None, *, weights: bool = True) -> Model:
+    """A bundled model by name (None: the solver), or any model file by path; without `weights` its network is empty.
+    Raises SdfsimError for an unknown name, or an unreadable or foreign file."""
+    from safetensors import SafetensorError, safe_open
+
+    if name is None or name == SOLVER:
+        return Model(SOLVER, SOLVER, nn.Module().eval(), dt=0.02, gravity=10.0, length=1.4, reach=0.02)
+    path = Path(name) if str(name).endswith(".safetensors") else BUNDLED / f"{name}.safetensors"
+    if not path.exists():
+        raise SdfsimError(
+            f"model {str(name)!r} not found", f"there are {', '.join(model_names())}; or the path of a .safetensors"
+        )
+    try:
+        with safe_open(path, framework="pt") as file:
+            info = json.loads((file.metadata() or {})["sdfsim_model"])
+            if info.pop("version", 1) != MODEL_VERSION:
+                raise ValueError("it is of an earlier version; train it again")
+            config = info.pop("config")
+            if weights:
+                _check_size(info["kind"], config, {k: file.get_slice(k).get_shape() for k in file.keys()})
+            network = nn.Module() if not weights else new_network(info["kind"], config)
+            network.load_state_dict({k: file.get_tensor(k) for k in file.keys()} if weights else {})
+        model = Model(name=path.stem, network=network, **info)
+        for key in ("dt", "gravity", "length", "reach"):
+            if not 0 < float(getattr(model, key)) < math.inf:
+                raise ValueError(f"{key} must be > 0")
+    except (OSError, SafetensorError, LookupError, ValueError, TypeError, RuntimeError, AttributeError) as error:
+        raise SdfsimError(f"{path}: not a model of this version of sdfsim: {error}") from error
+    network.eval().requires_grad_(False)
+    return model
+
+
+def _check_size(kind: str, config: dict[str, Any], found: dict[str, list[int]]) -> None:
+    """Raise ValueError where the weights of a file are not those of its network: before memory is taken for it."""
+    if any(isinstance(value, int) and not 0 <= value <= MOST for value in config.values()):
+        raise ValueError(f"sizes of its network must be 0 to {MOST} (got {config})")
+    with torch.device("meta"):
+        wanted = {name: list(weight.shape) for name, weight in new_network(kind, config).state_dict().items()}
+    if wanted != found:
+        odd = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name))
+        raise ValueError(f"the weights are not those of its network: {odd[0]} and {len(odd) - 1} others")

@@ -1,0 +1,295 @@
+"""Where surfaces of two bodies are near each other: SDF-Sim's edges, and pairs of nodes and of faces for the baselines.
+
+What counts is d - (closing speed) dt <= reach. A fixed threshold would let a fast body bounce inside one step without
+ever having had an edge. SDF-Sim asks the distances of other bodies at its nodes (`find_contacts`). For the baselines
+boxes around bodies and then around their nodes or faces are compared, then true distances are taken. An infinite plane
+has one node and one face, which lie wherever they are closest to the other's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from sdfsim.learned.surfaces import expanded, node_owner
+from sdfsim.physics import pose
+from sdfsim.physics.bodies import Bodies, State
+from sdfsim.physics.solver.edges import nodes_within
+from sdfsim.physics.solver.prepare import compiled_rules, taken_up
+from sdfsim.simulate.run_memory import Memory
+from sdfsim.simulate.step import StepOptions
+
+PIERCING = 1e-9  # relative: areas and denominators below count as none
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """E contact edges, each from a surface node to the closest point on another body; model units, world frame."""
+
+    owner: Tensor  # [E] int64, the body whose node it is
+    node: Tensor  # [E] int64, index into `Bodies.node`
+    body: Tensor  # [E] int64, the body it meets
+    seen: Tensor  # [E, 3] float64, the node from the centre of mass of `body`
+    distance: Tensor  # [E] float64, signed distance of the node from `body`
+    normal: Tensor  # [E, 3] float64, unit outward normal of `body` at the closest point
+
+    def __len__(self) -> int:
+        return len(self.owner)
+
+    def renumbered(self, body: Tensor, node: Tensor) -> Contacts:
+        """The same among other bodies: `body` [N] and `node` [M] give their new numbers."""
+        return replace(self, owner=body[self.owner], body=body[self.body], node=node[self.node])
+
+
+def no_contacts(device: torch.device) -> Contacts:
+    """None at all."""
+    nobody = torch.zeros(0, dtype=torch.int64, device=device)
+    nothing = torch.zeros(0, 3, dtype=torch.float64, device=device)
+    return Contacts(nobody, nobody, nobody, nothing, nothing[:, 0], nothing)
+
+
+def find_contacts(
+    bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, memory: Memory | None = None
+) -> Contacts:
+    """All contact edges of a state within `reach`, the contact radius D, under gravity [3]; all in model units."""
+    scene = (memory or Memory()).compiled(bodies, state)
+    rules = compiled_rules(StepOptions(gravity, dt, 1))._replace(reach=reach)
+    motion, _ = taken_up(bodies, state, scene, rules)
+    found = nodes_within(
+        scene.shapes, scene.world, scene.work, motion, rules, bodies.node.cpu().numpy(), bodies.node_start.cpu().numpy()
+    )
+    index, value = (torch.from_numpy(array).to(bodies.device) for array in found)
+    owner, node, body = index.unbind(1)
+    return Contacts(owner, node, body, seen=value[:, 4:], distance=value[:, 0], normal=value[:, 1:4])
+
+
+def where(state: State, bodies: Bodies, contacts: Contacts | Pairs) -> Tensor:
+    """[E, 3] where the nodes of contact edges are in a state, world."""
+    turned = pose.rotate(state.orientation[contacts.owner], bodies.node[contacts.node])
+    return state.position[contacts.owner] + turned
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """E pairs of nodes (C = 1) or faces (C = 3) of two bodies, each pair once; model units, world frame."""
+
+    # owner, body: [E] int64, the bodies of the first and of the second; a plane is always a second
+    owner: Tensor
+    body: Tensor
+    # first, second: [E, C] int64, indices into `Bodies.node`; corners of faces by distance to the closest point
+    first: Tensor
+    second: Tensor
+    distance: Tensor  # [E] float64; negative only behind a plane
+    way: Tensor  # [E, 3] float64, from the closest point of the first to that of the second
+    # from_first, from_second: [E, C, 3] float64, corners from their own closest point (0 for a plane)
+    from_first: Tensor
+    from_second: Tensor
+    # normal_first, normal_second: [E, 3] float64, unit normals of the faces; 0 for nodes
+    normal_first: Tensor
+    normal_second: Tensor
+
+    def __len__(self) -> int:
+        return len(self.owner)
+
+    @property
+    def node(self) -> Tensor:
+        """[E] int64, the node of the first body that stands for the pair in recordings."""
+        return self.first[:, 0]
+
+    def renumbered(self, body: Tensor, node: Tensor) -> Pairs:
+        """The same among other bodies: `body` [N] and `node` [M] give their new numbers."""
+        ends = {"owner": body[self.owner], "body": body[self.body]}
+        return replace(self, **ends, first=node[self.first], second=node[self.second])
+
+
+def no_pairs(device: torch.device, corners: int) -> Pairs:
+    """None at all of nodes (one corner) or of faces (three)."""
+    nobody = torch.zeros(0, dtype=torch.int64, device=device)
+    parts, way = nobody.reshape(0, 1).expand(-1, corners), torch.zeros(0, 3, dtype=torch.float64, device=device)
+    arms = torch.zeros(0, corners, 3, dtype=torch.float64, device=device)
+    return Pairs(nobody, nobody, parts, parts, way[:, 0], way, arms, arms, way, way)
+
+
+def node_pairs(
+    bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, memory: Memory | None = None
+) -> Pairs:
+    """All pairs of nodes of different bodies within `reach` (model length) during a step, as `find_contacts` has it."""
+    single = torch.arange(len(bodies.node), device=bodies.device)[:, None]
+    return _pairs(bodies, state, gravity, reach, dt, single)
+
+
+def face_pairs(
+    bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, memory: Memory | None = None
+) -> Pairs:
+    """All pairs of faces of different bodies within `reach` (model length) during a step, as `find_contacts` has it."""
+    return _pairs(bodies, state, gravity, reach, dt, bodies.face)
+
+
+def _pairs(bodies: Bodies, state: State, gravity: Tensor, reach: float, dt: float, part: Tensor) -> Pairs:
+    """Pairs of `part` [K, C]: nodes or faces, those of a body in a row."""
+    owner = node_owner(bodies)
+    velocity = state.velocity + gravity * dt * bodies.moves[:, None]
+    arm = pose.rotate(state.orientation[owner], bodies.node)
+    # Differences of places alone matter; about the mean they keep their precision far from the origin.
+    place = (state.position - state.position[bodies.moves].mean(0))[owner] + arm if bodies.moves.any() else arm
+    speed = velocity[owner] + torch.linalg.cross(state.angular_velocity[owner], arm)
+    first, second = _near(bodies, part, owner, place, speed.norm(dim=-1) * dt + 0.5 * reach)
+    a, b = part[first], part[second]
+    endless = ~bodies.size[owner[b[:, 0]]].isfinite()
+    one, other = place[a], place[b]
+    mean, turn = place[b[:, 0]], state.orientation[owner[b[:, 0]]]
+    up = pose.rotate(turn, torch.tensor([0.0, 0.0, 1.0], dtype=place.dtype, device=place.device).expand_as(mean))
+    on_first, on_second = one[:, 0], other[:, 0]
+    normal_first, normal_second = torch.zeros_like(up), torch.where(endless[:, None], up, 0.0)
+    if part.shape[1] == 3:
+        flat = ~endless
+        normal_first, normal_second[flat] = _normals(one), _normals(other[flat])
+        on_first, on_second = on_first.clone(), on_second.clone()
+        on_first[flat], on_second[flat] = closest_points(one[flat], other[flat])
+        height = ((one - mean[:, None]) * up[:, None]).sum(-1)
+        lowest = one.gather(1, height.argmin(1)[:, None, None].expand(-1, 1, 3))[:, 0]
+        on_first = torch.where(endless[:, None], lowest, on_first)
+    below = ((on_first - mean) * up).sum(-1)
+    on_second = torch.where(endless[:, None], on_first - below[:, None] * up, on_second)
+    way = on_second - on_first
+    distance = torch.where(endless, below, way.norm(dim=-1))
+    # Where surfaces cross there is no way between them; whatever moves there is near enough.
+    along = torch.where(endless[:, None], -up, way / distance.abs().clamp_min(1e-12)[:, None])
+    approach = _speed_at(bodies, state, velocity, owner[a[:, 0]], on_first - _centre(place, arm, a))
+    approach = approach - _speed_at(bodies, state, velocity, owner[b[:, 0]], on_second - _centre(place, arm, b))
+    near = distance - (approach * along).sum(-1).clamp_min(0.0) * dt <= reach
+    a, from_first = _by_distance(a[near], (one - on_first[:, None])[near])
+    b, from_second = _by_distance(b[near], torch.where(endless[:, None, None], 0.0, other - on_second[:, None])[near])
+    values = (distance, way, normal_first, normal_second)
+    distance, way, normal_first, normal_second = (value[near] for value in values)
+    return Pairs(
+        owner[a[:, 0]], owner[b[:, 0]], a, b, distance, way, from_first, from_second, normal_first, normal_second
+    )
+
+
+def _centre(place: Tensor, arm: Tensor, part: Tensor) -> Tensor:
+    """[E, 3] centres of mass of the bodies of `part` [E, C]."""
+    return place[part[:, 0]] - arm[part[:, 0]]
+
+
+def _speed_at(bodies: Bodies, state: State, velocity: Tensor, body: Tensor, arm: Tensor) -> Tensor:
+    """[E, 3] velocity of bodies [E] at `arm` [E, 3]; the speed of a plane is that of all of it."""
+    turning = torch.linalg.cross(state.angular_velocity[body], arm)
+    return velocity[body] + torch.where(bodies.size[body].isfinite()[:, None], turning, 0.0)
+
+
+def _by_distance(part: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
+    """Corners [E, C] and their offsets [E, C, 3], the nearest first: their order in the mesh says nothing."""
+    order = offset.square().sum(-1).argsort(dim=1, stable=True)
+    return part.gather(1, order), offset.gather(1, order[..., None].expand_as(offset))
+
+
+def _normals(triangle: Tensor) -> Tensor:
+    """[E, 3] unit normals of triangles [E, 3, 3]; 0 for those without an area."""
+    normal = torch.linalg.cross(triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0])
+    return normal / normal.norm(dim=-1, keepdim=True).clamp_min(1e-12)
+
+
+def _near(bodies: Bodies, part: Tensor, owner: Tensor, place: Tensor, margin: Tensor) -> tuple[Tensor, Tensor]:
+    """Pairs (first, second) of parts [K, C] of bodies that may touch whose boxes, wider by `margin` [M], overlap."""
+    of_part = owner[part[:, 0]]
+    wide = margin[part].amax(1)[:, None]
+    low, high = place[part].amin(1) - wide, place[part].amax(1) + wide
+    start = torch.searchsorted(of_part, torch.arange(len(bodies) + 1, device=of_part.device))
+    endless = ~bodies.size.isfinite()
+    low[endless[of_part]], high[endless[of_part]] = -torch.inf, torch.inf  # each is compared by its height alone
+    index = of_part[:, None].expand_as(low)
+    empty = torch.full((len(bodies), 3), torch.inf, dtype=low.dtype, device=low.device)
+    lowest, highest = empty.scatter_reduce(0, index, low, "amin"), (-empty).scatter_reduce(0, index, high, "amax")
+    one, other = torch.triu_indices(len(bodies), len(bodies), 1, device=low.device)
+    one, other = torch.where(endless[one], other, one), torch.where(endless[one], one, other)
+    meet = ((lowest[one] <= highest[other]) & (highest[one] >= lowest[other])).all(-1) & bodies.may_meet(one, other)
+    one, other = one[meet], other[meet]
+    # Of each body only what is in the box of the other; then all of these against all of those.
+    pair, first = _inside(start, one, low, high, lowest[other], highest[other])
+    number, second = _inside(start, other, low, high, lowest[one], highest[one])
+    begins = torch.searchsorted(number, torch.arange(len(one) + 1, device=number.device))
+    row, column = expanded(begins[pair], begins[pair + 1])
+    first, second = first[row], second[column]
+    near = ((low[first] <= high[second]) & (high[first] >= low[second])).all(-1)
+    return first[near], second[near]
+
+
+def _inside(
+    start: Tensor, body: Tensor, low: Tensor, high: Tensor, lowest: Tensor, highest: Tensor
+) -> tuple[Tensor, Tensor]:
+    """For bodies [P] and boxes [P, 3], which parts of each overlap its box: the number of the pair and the part."""
+    pair, part = expanded(start[body], start[body + 1])
+    inside = ((low[part] <= highest[pair]) & (high[part] >= lowest[pair])).all(-1)
+    return pair[inside], part[inside]
+
+
+def closest_points(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
+    """Closest points [E, 3] on either of pairs of triangles, [E, 3, 3] float64 with corners in rows.
+
+    They are a corner and a point inside the other triangle, or points on two sides; where the triangles cross, a point
+    that a side of one has in common with the other.
+    """
+    side_one, side_other = one.roll(-1, 1) - one, other.roll(-1, 1) - other
+    firsts, seconds, distances = [], [], []
+
+    def add(first: Tensor, second: Tensor, known: Tensor | None = None) -> None:
+        """Candidates [E, K, 3]; those that are not `known` [E, K] do not count."""
+        far = (first - second).norm(dim=-1)
+        firsts.append(first)
+        seconds.append(second)
+        distances.append(far if known is None else torch.where(known, far, torch.inf))
+
+    add(*_on_sides(one, side_one, other, side_other))
+    above, foot, inside = _feet(one, other)
+    add(one, foot, inside)
+    crossing, known = _crossing(one, side_one, above, other)
+    add(crossing, crossing, known)
+    above, foot, inside = _feet(other, one)
+    add(foot, other, inside)
+    crossing, known = _crossing(other, side_other, above, one)
+    add(crossing, crossing, known)
+    best = torch.cat(distances, 1).argmin(1)[:, None, None].expand(-1, 1, 3)
+    return torch.cat(firsts, 1).gather(1, best)[:, 0], torch.cat(seconds, 1).gather(1, best)[:, 0]
+
+
+def _feet(corner: Tensor, triangle: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Heights [E, 3] of corners above a triangle's plane, their feet there [E, 3, 3], whether these are inside it."""
+    normal = _normals(triangle)[:, None]
+    above = ((corner - triangle[:, :1]) * normal).sum(-1)
+    foot = corner - above[..., None] * normal
+    return above, foot, _within(foot, triangle)
+
+
+def _within(point: Tensor, triangle: Tensor) -> Tensor:
+    """[E, K] whether points [E, K, 3] of a triangle's plane are inside it; none where it has no area."""
+    u, v = (triangle[:, k] - triangle[:, 0] for k in (1, 2))
+    w = point - triangle[:, :1]
+    uu, uv, vv = (u * u).sum(-1), (u * v).sum(-1), (v * v).sum(-1)
+    wu, wv = (w * u[:, None]).sum(-1), (w * v[:, None]).sum(-1)
+    area = (uu * vv - uv * uv)[:, None]
+    s, t = vv[:, None] * wu - uv[:, None] * wv, uu[:, None] * wv - uv[:, None] * wu
+    return (area > PIERCING * (uu * vv)[:, None]) & (s >= 0) & (t >= 0) & (s + t <= area)
+
+
+def _crossing(corner: Tensor, side: Tensor, above: Tensor, triangle: Tensor) -> tuple[Tensor, Tensor]:
+    """Where sides [E, 3, 3] from corners, at heights `above` [E, 3], meet a triangle's plane, and whether inside it."""
+    end = above.roll(-1, 1)
+    met = corner + (above / torch.where(above == end, 1.0, above - end))[..., None] * side
+    return met, (above * end < 0) & _within(met, triangle)
+
+
+def _on_sides(one: Tensor, u: Tensor, other: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+    """Closest points [E, 9, 3] of every side of one triangle and every side of the other."""
+    p, u = (x[:, :, None].expand(-1, 3, 3, 3).flatten(1, 2) for x in (one, u))
+    q, v = (x[:, None].expand(-1, 3, 3, 3).flatten(1, 2) for x in (other, v))
+    w = p - q
+    uu, uv, vv = (u * u).sum(-1), (u * v).sum(-1), (v * v).sum(-1)
+    uw, vw = (u * w).sum(-1), (v * w).sum(-1)
+    square = uu * vv - uv * uv
+    s = torch.where(square > PIERCING * uu * vv, (uv * vw - vv * uw) / square.clamp_min(1e-30), 0.0).clamp(0.0, 1.0)
+    t = ((uv * s + vw) / vv.clamp_min(1e-30)).clamp(0.0, 1.0)
+    s = ((uv * t - uw) / uu.clamp_min(1e-30)).clamp(0.0, 1.0)
+    return p + s[..., None] * u, q + t[..., None] * v

@@ -1,0 +1,41 @@
+"""SDF-Sim as published (section 3 and appendix), the *sdf-sim* network.
+
+Every body has one body node and its surface nodes, joined both ways (up: to the body node). A surface node within the
+contact radius of another body joins that body's node both ways. No surface node is ever joined to another.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from sdfsim.learned.message_passing import EdgeKind, Edges, Features, Graph, Layout
+from sdfsim.learned.near import Contacts
+from sdfsim.learned.surfaces import NODES, STAR, motion_features, star
+from sdfsim.physics.bodies import Bodies, State
+
+CONTACT = Features(15, (0, 3, 6, 9))
+SDF_SIM = Layout(
+    NODES,
+    STAR | {"contact_up": EdgeKind("node", "body", CONTACT), "contact_down": EdgeKind("body", "node", CONTACT)},
+)
+
+
+def sdf_sim_graph(bodies: Bodies, state: State, contacts: Contacts) -> Graph:
+    """The published graph."""
+    features = _contact_features(bodies, state, contacts).float()
+    node, body = contacts.node[:, None], contacts.body[:, None]
+    edges = {"contact_up": Edges(features, node, body), "contact_down": Edges(features, body, node)}
+    return Graph(motion_features(bodies, state), star(bodies, state) | edges)
+
+
+def _contact_features(bodies: Bodies, state: State, contacts: Contacts) -> Tensor:
+    """[E, 15]: node to closest point, normal, both seen from the other body's centre, distances. An infinite floor has
+    no centre: its body node stands in for the closest point."""
+    c = contacts
+    to_closest = -c.distance[:, None] * c.normal
+    bounded = bodies.size[c.body].isfinite()[:, None]
+    seen = torch.where(bounded, c.seen, -to_closest)
+    closest = seen + to_closest
+    lengths = [c.distance, seen.norm(dim=-1), closest.norm(dim=-1)]
+    return torch.cat([to_closest, c.normal, seen, closest, torch.stack(lengths, -1)], -1)

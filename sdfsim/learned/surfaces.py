@@ -1,0 +1,205 @@
+"""What all networks on surface nodes share: features of nodes and of edges within bodies, targets, the step to poses.
+
+A network gives every surface node an acceleration; shape matching turns those of a body into its next pose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sdfsim.learned.matching import match_shapes
+from sdfsim.learned.message_passing import EdgeKind, Edges, Features, Graph, GraphNetwork
+from sdfsim.physics import pose
+from sdfsim.physics.bodies import Bodies, State
+from sdfsim.simulate.step import StepOptions, fly
+
+NODE = Features(13, (0, 3, 6))  # of surface nodes and of body nodes
+INTRA = Features(8, (0, 4))  # of edges within a body
+NODES = {"body": NODE, "node": NODE}
+STAR = {"intra_up": EdgeKind("node", "body", INTRA), "intra_down": EdgeKind("body", "node", INTRA)}
+MESH = EdgeKind("node", "node", INTRA)
+TARGET = Features(3, (0,))  # of accelerations
+_NOT_PER_BODY = ("pieces", "hulls", "node", "node_start", "face", "allowed", "sdfs", "tracks")
+
+
+def node_owner(bodies: Bodies) -> Tensor:
+    """[M] int64, the body of every surface node."""
+    count = bodies.node_start[1:] - bodies.node_start[:-1]
+    return torch.repeat_interleave(torch.arange(len(bodies), device=bodies.device), count)
+
+
+def compact(bodies: Bodies, state: State, contacts: Any, rows: Tensor) -> tuple[Bodies, State, Any]:
+    """The bodies `rows` [A] alone, in ascending order, with their states and all the contacts
+    (`Contacts` or `Pairs`), which are among them."""
+    if len(rows) == len(bodies):
+        return bodies, state, contacts
+    owner, node = expanded(bodies.node_start[rows], bodies.node_start[rows + 1])
+    number = _numbers(rows, len(bodies))
+    place = _numbers(node, len(bodies.node))
+    ends = torch.bincount(owner, minlength=len(rows)).cumsum(0)
+    start = torch.cat([ends.new_zeros(1), ends])
+    per_body = [f.name for f in fields(bodies) if f.name not in _NOT_PER_BODY]
+    face = place[bodies.face]
+    some = replace(
+        bodies, **{k: getattr(bodies, k)[rows] for k in per_body}, node=bodies.node[node], node_start=start,
+        face=face[(face >= 0).all(-1)], tracks=None,
+    )  # fmt: skip
+    earlier_position, earlier_orientation = _history(state)
+    moved = State(
+        *(v[rows] for v in (state.position, state.orientation, state.velocity, state.angular_velocity)),
+        earlier_position=earlier_position[:, rows],
+        earlier_orientation=earlier_orientation[:, rows],
+    )
+    return some, moved, contacts.renumbered(number, place)
+
+
+def _numbers(kept: Tensor, count: int) -> Tensor:
+    """[count] int64, the place of each of `count` things among the `kept` ones; -1 for the others."""
+    number = torch.full((count,), -1, dtype=torch.int64, device=kept.device)
+    number[kept] = torch.arange(len(kept), device=kept.device)
+    return number
+
+
+def expanded(start: Tensor, stop: Tensor) -> tuple[Tensor, Tensor]:
+    """For ranges start[k] : stop[k], the range index and the value of every element, in order."""
+    count = stop - start
+    which = torch.repeat_interleave(torch.arange(len(count), device=count.device), count)
+    first = torch.repeat_interleave(count.cumsum(0) - count, count)
+    return which, start[which] + torch.arange(len(which), device=count.device) - first
+
+
+def motion_features(bodies: Bodies, state: State) -> dict[str, Tensor]:
+    """Features of body nodes [N, 13] and surface nodes [M, 13], the same for every network.
+
+    Displacement over each of the last two steps, displacement of the body's centre over the last, inverse mass,
+    friction, restitution, and whether the body is static. Displacements are differences of poses in float64, never of
+    large float32 positions.
+    """
+    earlier_position, earlier_orientation = _history(state)
+    owner = node_owner(bodies)
+    turns = [pose.to_matrix(q) for q in (*earlier_orientation, state.orientation)]
+    places = [*earlier_position, state.position]
+
+    def moved(k: int) -> Tensor:
+        """[M, 3] displacement of nodes from pose k to pose k + 1."""
+        return pose.apply((turns[k + 1] - turns[k])[owner], bodies.node) + (places[k + 1] - places[k])[owner]
+
+    travel = [places[1] - places[0], places[2] - places[1]]
+    fixed = (~bodies.moves).to(bodies.friction.dtype)
+    material = torch.stack([bodies.inverse_mass, bodies.friction, bodies.restitution, fixed], -1)
+    body = torch.cat([travel[1], travel[0], travel[1], material], -1)
+    node = torch.cat([moved(1), moved(0), travel[1][owner], material[owner]], -1)
+    return {"body": body.float(), "node": node.float()}
+
+
+def star(bodies: Bodies, state: State) -> dict[str, Edges]:
+    """Edges between the surface nodes and their body's node, up and down: the node from the centre, now and at rest."""
+    owner = node_owner(bodies)
+    features = _now_and_at_rest(_arms(bodies, state), bodies.node)
+    node, body = torch.arange(len(owner), device=owner.device)[:, None], owner[:, None]
+    return {"intra_up": Edges(features, node, body), "intra_down": Edges(features, body, node)}
+
+
+def mesh_edges(bodies: Bodies, state: State) -> Edges:
+    """Edges along the sides of the mesh's faces, each once a direction: sender from receiver, now and at rest."""
+    sides = torch.cat([bodies.face[:, [0, 1]], bodies.face[:, [1, 2]], bodies.face[:, [2, 0]]])
+    sides = sides[sides[:, 0] != sides[:, 1]]  # those of the plane's one node
+    count = len(bodies.node)
+    # `unique` takes 50 times as long for rows as for numbers.
+    key = torch.unique(torch.cat([sides, sides.flip(1)]) @ sides.new_tensor([count, 1]))
+    sender, receiver = key // count, key % count
+    arm = _arms(bodies, state)
+    features = _now_and_at_rest(arm[sender] - arm[receiver], bodies.node[sender] - bodies.node[receiver])
+    return Edges(features, sender[:, None], receiver[:, None])
+
+
+def _now_and_at_rest(now: Tensor, rest: Tensor) -> Tensor:
+    """[E, 8] float32: a vector [E, 3] as it is in the world and as it is in the body's axes, and its lengths."""
+    return torch.cat([now, now.norm(dim=-1, keepdim=True), rest, rest.norm(dim=-1, keepdim=True)], -1).float()
+
+
+def _arms(bodies: Bodies, state: State) -> Tensor:
+    """[M, 3] nodes from their body's centre of mass, world axes."""
+    return pose.apply(pose.to_matrix(state.orientation)[node_owner(bodies)], bodies.node)
+
+
+def advance(bodies: Bodies, state: State, acceleration: Tensor, dt: float) -> State:
+    """The next state when every node of a body accelerates by `acceleration` [M, 3] (displacement a step, twice)."""
+    earlier_position, earlier_orientation = _history(state)
+    owner = node_owner(bodies)
+    now, before = pose.to_matrix(state.orientation), pose.to_matrix(earlier_orientation[1])
+    # Relative to each body's own centre, so that a far origin costs no precision.
+    step = (state.position - earlier_position[1])[owner] + pose.apply((now - before)[owner], bodies.node)
+    moved = pose.apply(now[owner], bodies.node) + step + acceleration
+    offset, orientation = match_shapes(bodies.node, moved, owner, state.orientation)
+    still = ~bodies.moves[:, None]
+    offset = torch.where(still, torch.zeros_like(offset), offset)
+    orientation = torch.where(still, state.orientation, orientation)
+    turn = pose.to_rotvec(pose.multiply(orientation, pose.conjugate(state.orientation)))
+    return State(
+        position=state.position + offset,
+        orientation=orientation,
+        velocity=offset / dt,
+        angular_velocity=turn / dt,
+    )
+
+
+def predict(
+    network: GraphNetwork, graph: Graph, bodies: Bodies, state: State, dt: float, rows: int | None = None
+) -> State:
+    """One step of the published simulators, the network working on at most `rows` edges at once."""
+    return advance(bodies, state, network.target.undo(network(graph, rows=rows)).double(), dt)
+
+
+def target_acceleration(bodies: Bodies, state: State, position: Tensor, orientation: Tensor) -> Tensor:
+    """[M, 3] accelerations that would take `state` to the poses `position` [N, 3], `orientation` [N, 4]."""
+    earlier_position, earlier_orientation = _history(state)
+    owner = node_owner(bodies)
+    turns = [pose.to_matrix(q) for q in (earlier_orientation[1], state.orientation, orientation)]
+    curl = pose.apply((turns[2] - 2 * turns[1] + turns[0])[owner], bodies.node)
+    return (position - 2 * state.position + earlier_position[1])[owner] + curl
+
+
+def _history(state: State) -> tuple[Tensor, Tensor]:
+    if state.earlier_position is None or state.earlier_orientation is None:
+        raise ValueError("a network on surface nodes needs the two earlier poses")
+    return state.earlier_position, state.earlier_orientation
+
+
+def with_history(state: State, bodies: Bodies, rules: StepOptions) -> State:
+    """The same state with the two poses that it would have come from in free flight."""
+    position, orientation = _flown_back(state, bodies, rules)
+    return replace(state, earlier_position=position, earlier_orientation=orientation)
+
+
+def history_told(state: State, before: State, bodies: Bodies, rules: StepOptions) -> State:
+    """A state from outside, with earlier poses that go with it.
+
+    Those that it shares with the state `before` are of that one's motion: bodies that were changed since get the poses
+    that their velocities lead from. A state with earlier poses of its own, such as a restored one, keeps them.
+    """
+    if state.earlier_position is None or state.earlier_orientation is None:
+        return with_history(state, bodies, rules)
+    if state.earlier_position is not before.earlier_position:
+        return state
+    changed = torch.zeros_like(bodies.moves)
+    for name in ("position", "orientation", "velocity", "angular_velocity"):
+        changed |= (getattr(state, name) != getattr(before, name)).any(-1)
+    position, orientation = _flown_back(state, bodies, rules)
+    return replace(
+        state,
+        earlier_position=torch.where(changed[:, None], position, state.earlier_position),
+        earlier_orientation=torch.where(changed[:, None], orientation, state.earlier_orientation),
+    )
+
+
+def _flown_back(state: State, bodies: Bodies, rules: StepOptions) -> tuple[Tensor, Tensor]:
+    """Positions [2, N, 3] and orientations [2, N, 4] two steps and one step before, in free flight."""
+    back = replace(rules, dt=-rules.dt)
+    one = fly(bodies, state, back)
+    two = fly(bodies, one, back)
+    return torch.stack([two.position, one.position]), torch.stack([two.orientation, one.orientation])

@@ -1,0 +1,112 @@
+"""Where scenes leave what a model has seen in training: its predictions are then extrapolation, and are flagged."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+import torch
+
+from sdfsim.learned.contact_graph import SUBSTEPS, number_pairs
+from sdfsim.learned.model import SOLVER, Model
+from sdfsim.physics.bodies import Bodies, State, Units, largest_extent
+from sdfsim.scene.scene import Scene
+
+LABELS = {
+    "size": "largest side of a body, m",
+    "speed": "speed at the start, m/s",
+    "mass_ratio": "heaviest to lightest body",
+    "friction": "friction of two bodies, multiplied",
+    "restitution": "restitution of two bodies, multiplied",
+}
+LONGEST = 0.01  # s, an inner step of the contact solve
+# Part of its largest side by which bodies start inside one another in the training data at most.
+DEEPEST = 0.16
+SLACK = 0.05  # relative: rounding, and fits that end a little beyond the solid
+
+
+def outside_training(scenes: Sequence[Scene], model: Model, units: Units) -> list[str]:
+    """One line for every quantity of `scenes` that lies outside the ranges of `model`; empty when it knows them all.
+
+    Sizes and speeds are compared in model units, so that a small or slow scene is not by itself unknown. Scenery is
+    not compared in size: what matters of it is the surface near a contact. The contact solve has seen no training; it
+    is told where its inner step is longer than any that its laws were checked with.
+    """
+    inner = model.dt * units.time / (model.inner or SUBSTEPS)
+    if model.kind == SOLVER and inner > LONGEST:
+        return [f"inner step: {1e3 * inner:.3g} ms here, checked up to {1e3 * LONGEST:g} ms (small bodies shorten it)"]
+    if not model.ranges:
+        return []
+    found = [_values(scene, units) for scene in scenes]
+    si = {"size": units.length, "speed": units.velocity}
+    lines = []
+    if any(b.motion == "kinematic" for scene in scenes for b in scene.bodies):
+        lines.append(f"bodies on a path: {model.name} has seen none in training")
+    for name, label in LABELS.items():
+        values = [value for some in found for value in some.get(name, [])]
+        if not values or name not in model.ranges:
+            continue
+        low, high = model.ranges[name]
+        slack = SLACK * (high - low)
+        if min(values) < low - slack or max(values) > high + slack:
+            unit = si.get(name, 1.0)
+            lines.append(
+                f"{label}: {min(values) * unit:.3g} to {max(values) * unit:.3g} here, "
+                f"{model.name} was trained on {low * unit:.3g} to {high * unit:.3g}"
+            )
+    return lines
+
+
+def _values(scene: Scene, units: Units) -> dict[str, list[float]]:
+    """What a scene has of each quantity of `LABELS`; nothing where nothing moves by itself."""
+    moving = [b for b in scene.bodies if b.motion == "dynamic"]
+    if not moving:
+        return {}
+    return {
+        "size": [largest_extent(scene.shapes[b.shape]) * b.scale / units.length for b in moving],
+        "speed": [float(np.linalg.norm(b.velocity)) / units.velocity for b in moving],
+        "mass_ratio": [max(b.mass for b in moving) / min(b.mass for b in moving)],
+        "friction": _products(scene, "friction"),
+        "restitution": _products(scene, "restitution"),
+    }
+
+
+def constant_in_training(model: Model) -> list[str]:
+    """The quantities that never varied in training: the model cannot know what they change."""
+    return [name for name, (low, high) in model.ranges.items() if high - low <= 1e-9]
+
+
+def _products(scene: Scene, name: str) -> list[float]:
+    """Products of a coefficient of pairs with a dynamic body, the smallest and the largest of all such among them."""
+    moving, others = (
+        sorted(getattr(b, name) for b in scene.bodies if (b.motion == "dynamic") == moves) for moves in (True, False)
+    )
+    # A product is extreme where both of its factors are, and two dynamic bodies cannot both be the same one.
+    ends = moving[:2] + moving[2:][-2:]
+    return [a * b for a, b in combinations(ends, 2)] + [a * b for a in ends for b in (*others[:1], *others[-1:])]
+
+
+def deep_starts(bodies: Bodies, state: State, names: Sequence[str], metres: float) -> list[str]:
+    """A line where pairs are deeper inside one another than any that models were trained on; empty where none is.
+    Bodies have `names` [N]; a model unit is so many `metres`."""
+    from sdfsim.learned.near import find_contacts  # numba takes its time to load
+
+    nothing = torch.zeros(3, dtype=torch.float64, device=bodies.device)
+    inside = find_contacts(bodies, state, nothing, reach=0.0, dt=0.0)
+    if not len(inside):
+        return []
+    # Of the two the smaller one that moves is what the way out is long or short for.
+    size = torch.where(bodies.moves, bodies.size, torch.inf)
+    part = -inside.distance / torch.minimum(size[inside.owner], size[inside.body])
+    deep = part > DEEPEST
+    if not bool(deep.any()):
+        return []
+    pairs = number_pairs(inside.owner[deep], inside.body[deep], len(bodies))[1]
+    worst = int(part.argmax())
+    owner, body = (names[int(i[worst])] for i in (inside.owner, inside.body))
+    return [
+        f"pairs that start inside one another: {pairs} here, {owner!r} in {body!r} by "
+        f"{-float(inside.distance[worst]) * metres:.3g} m, {float(part[worst]):.0%} of a body's size; "
+        f"trained on up to {DEEPEST:.0%}"
+    ]

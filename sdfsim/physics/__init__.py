@@ -1,0 +1,1 @@
+"""Rigid motion: bodies and states, free flight, the contact solve, and what judges a motion."""

@@ -1,0 +1,488 @@
+"""What judges a motion, whatever made it: overlap and free space of true surfaces, and an account of energy.
+
+Nothing here uses the contact search, baked grids or the solver's own penetration: only poses, velocities, shapes'
+closed forms and meshes.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from sdfsim.physics.rollout import Rollout
+from sdfsim.physics.true_surfaces import Gaps, Placed, TrueSurface, gaps, true_surface
+from sdfsim.scene.collision_filter import contact_groups
+from sdfsim.scene.scene import Scene
+from sdfsim.shape.shape import Shape
+
+DEEP = 0.01  # of the smaller thickness of two bodies: who is deeper in another is told
+FREE = 0.005  # likewise, of free space around a body that something pushes or holds up
+MADE = 0.01  # of the energy in play, beyond which what came from nothing is told
+SHARE = 0.1  # of what lifts a body by its own size, that is in play at least
+FADE = 0.9  # of what was in play before is so much, whenever energy is lost
+PART, LEAST = 0.05, 0.1  # of a run's time that the surfaces may take, and s that they may take anyway
+FEW, MANY = 32, 4096  # pairs that are measured together at first, and at most
+FEW_BODIES = 64  # that move: of more, energy is accounted for together only
+
+
+@dataclass(frozen=True)
+class Energy:
+    """Energy that came from nothing: mechanical energy may be lost, and only pulls and bodies on paths may add to it.
+
+    Attributes:
+        sum_J: all steps in which it grew.
+        worst: the largest of a step, as a part of what was in play then.
+        steps_above_1_percent: the part of the steps that made more than 0.01 of that.
+        climb_J: the most by which the energy of the scene, or of one body while it touched no other that moves, ever
+            stood above an earlier time.
+        climb: likewise, the most as a part of what was in play at that earlier time: kinetic energy, what it gained in
+            falling since, and a tenth of what lifts the body by its own size.
+        body: whose that is; empty for the scene.
+        at_s: when.
+    """
+
+    sum_J: float
+    worst: float
+    steps_above_1_percent: float
+    climb_J: float
+    climb: float
+    body: str
+    at_s: float
+
+
+class Near(NamedTuple):
+    """Two bodies that are in each other, or that are apart while something acts."""
+
+    metres: float  # how deep, or how far apart
+    part: float  # of the smaller thickness of the two
+    first: str
+    second: str  # empty where nothing is near
+    at_s: float
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the instruments say of a motion.
+
+    Attributes:
+        energy: see `Energy`.
+        overlap: the deepest of bodies in each other, as a part of the smaller thickness; None where there is none.
+        floating: the widest free space around a body that was pushed or held up all the same; None where there is none.
+        frames: how many frames the surfaces were measured in.
+        broken: a line for each law that is broken.
+    """
+
+    energy: Energy
+    overlap: Near | None
+    floating: Near | None
+    frames: int
+    broken: tuple[str, ...]
+
+    def report(self) -> dict[str, Any]:
+        """As plain numbers, for report.json."""
+        return {
+            "energy_from_nothing": vars(self.energy),
+            "overlap": None if self.overlap is None else self.overlap._asdict(),
+            "floating": None if self.floating is None else self.floating._asdict(),
+            "frames_measured": self.frames,
+            "broken_laws": list(self.broken),
+        }
+
+
+def judged(scene: Scene, rollout: Rollout, *, seconds: float = np.inf, every: int = 1) -> Verdict:
+    """What a motion of a scene breaks of the laws that hold of all rigid bodies.
+
+    Surfaces are measured in every so many frames; where they would take longer than `seconds`, in fewer, spread evenly,
+    the last always among them.
+    """
+    energy = energy_account(scene, rollout)
+    overlap, floating, frames = _surfaces(scene, rollout, seconds, every)
+    broken = []
+    if overlap is not None and overlap.part > DEEP:
+        broken.append(
+            f"overlap: {overlap.first!r} and {overlap.second!r} are {overlap.metres:.2g} m in each other at "
+            f"{overlap.at_s:.2f} s, {100 * overlap.part:.2g} % of the thinner's thickness"
+        )
+    if floating is not None:
+        beside = f"{floating.second!r} is {floating.metres:.2g} m away" if floating.second else "nothing is near it"
+        broken.append(f"floating: {floating.first!r} is held or pushed at {floating.at_s:.2f} s, and {beside}")
+    if energy.climb > MADE or energy.worst > MADE:
+        whose = f" of {energy.body!r}" if energy.body else ""
+        steps = f"{100 * energy.steps_above_1_percent:.1f} % of the steps made more than 1 % of what was in play"
+        broken.append(
+            f"energy from nothing: {energy.climb_J:.3g} J{whose} by {energy.at_s:.2f} s, {100 * energy.climb:.2g} % of "
+            f"what was in play; {steps}, the worst {100 * energy.worst:.2g} %"
+        )
+    return Verdict(energy, overlap, floating, frames, tuple(broken))
+
+
+# --- energy ---
+
+
+def energies(scene: Scene, rollout: Rollout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of every body, 0 unless it is dynamic: kinetic and potential energy [T+1, N] J, the latter from its first frame
+    on, and what lifts it by its own size [N] J."""
+    shape = rollout.position.shape[:2]
+    kinetic, potential, lift = np.zeros(shape), np.zeros(shape), np.zeros(shape[1])
+    strength = float(np.linalg.norm(scene.gravity))
+    for k, body in enumerate(scene.bodies):
+        if body.motion != "dynamic":
+            continue
+        own = scene.shapes[body.shape]
+        inertia = body.inertia
+        if inertia is None:
+            inertia = own.inertia * (body.mass / own.volume * body.scale**2)
+        local = Rotation.from_quat(rollout.orientation[:, k]).inv().apply(rollout.angular_velocity[:, k])
+        spin = np.einsum("ti,ij,tj->t", local, inertia, local)
+        kinetic[:, k] = 0.5 * body.mass * np.square(rollout.velocity[:, k]).sum(1) + 0.5 * spin
+        potential[:, k] = -body.mass * (rollout.position[:, k] - rollout.position[0, k]) @ scene.gravity
+        lift[k] = body.mass * strength * body.scale * float(np.ptp(own.sdf.bounds, axis=0).max())
+    return kinetic, potential, lift
+
+
+def energy_account(scene: Scene, rollout: Rollout) -> Energy:
+    """By how much mechanical energy has grown, step by step and in all. What pulls and pushes give (the
+    counter `energy_given`) is taken off; steps in which a body on a path touches something may gain what they like."""
+    kinetic, potential, lift = energies(scene, rollout)
+    steps, count = len(rollout), len(scene.bodies)
+    dynamic = np.array([b.motion == "dynamic" for b in scene.bodies])
+    driven = np.array([b.motion == "kinematic" for b in scene.bodies])
+    work = rollout.counters.get("energy_given", np.zeros(steps + 1))
+    alone = 1 < dynamic.sum() and (dynamic | driven).sum() <= FEW_BODIES
+    beside = _beside(scene, rollout) if alone or driven.any() else np.zeros((steps + 1, count, count), bool)
+    led = np.asarray(beside[:, driven].any((1, 2)))
+    total = (kinetic + potential).sum(1)
+    change = np.diff(total) - work[1:]
+    change[led[1:]] = np.minimum(change[led[1:]], 0.0)
+    change[np.abs(change) < 1e-12 * (np.abs(potential).max(initial=0.0) + kinetic.max(initial=0.0))] = 0.0
+    course = np.concatenate([[0.0], np.cumsum(change)])
+    floor = SHARE * float(lift.sum())
+    climb_J, climb, when = _climb(course[:, None], kinetic.sum(1)[:, None], np.array([floor]), None)
+    best = (float(climb_J[0]), float(climb[0]), "", float(rollout.time[when[0]]))
+    if alone:
+        rows = np.flatnonzero(dynamic)
+        shared = beside.any(2) | np.asarray(work != 0)[:, None]
+        climbs = _climb((kinetic + potential)[:, rows], kinetic[:, rows], SHARE * lift[rows], shared[:, rows])
+        k = int(climbs[1].argmax())
+        if climbs[1][k] > best[1]:
+            name = scene.bodies[rows[k]].name
+            best = (float(climbs[0][k]), float(climbs[1][k]), name, float(rollout.time[climbs[2][k]]))
+    gain = change.clip(min=0.0)
+    in_play = np.maximum.accumulate(kinetic.sum(1))[:-1] + float(lift.sum())
+    part = np.divide(gain, in_play, out=np.zeros_like(gain), where=in_play > 0)
+    return Energy(float(gain.sum()), float(part.max(initial=0.0)), float((part > MADE).mean()) if steps else 0.0, *best)
+
+
+def _beside(scene: Scene, rollout: Rollout) -> np.ndarray:
+    """[T+1, N, N] whether a dynamic body could touch another that moves, by the balls around them, in the step that
+    led to a frame."""
+    mover = np.array([b.motion != "static" for b in scene.bodies])
+    dynamic = np.array([b.motion == "dynamic" for b in scene.bodies])
+    group, allowed = contact_groups(scene.bodies)
+    may = (mover[:, None] & mover) & (dynamic[:, None] | dynamic) & allowed[group][:, group]
+    np.fill_diagonal(may, False)
+    reach = np.array([_reach(solid_of(scene.shapes[b.shape]), scene.shapes[b.shape]) * b.scale for b in scene.bodies])
+    reach = np.where(np.isfinite(reach), reach, 0.0)
+    found = np.zeros((len(rollout.time), len(mover), len(mover)), bool)
+    for t in range(1, len(rollout.time)):
+        move = np.linalg.norm(rollout.position[t] - rollout.position[t - 1], axis=1)
+        ball = 1.05 * (reach + 2 * move)
+        away = np.linalg.norm(rollout.position[t, :, None] - rollout.position[t, None], axis=2)
+        found[t] = may & (away <= ball[:, None] + ball)
+    return found
+
+
+def _climb(
+    course: np.ndarray, kinetic: np.ndarray, floor: np.ndarray, anew: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of K courses of energy [T+1, K] J the highest rise above an earlier time in J, and as a part of what was in play
+    since then, with the frame of the latter, [K] each. An account starts `anew` [T+1, K] with such frames."""
+    low, play = course[0].copy(), kinetic[0].copy()
+    most, part, when = np.zeros(len(low)), np.zeros(len(low)), np.zeros(len(low), int)
+    for t in range(1, len(course)):
+        now = course[t]
+        fresh = now < low
+        if anew is not None:
+            fresh = fresh | anew[t]
+        low = np.where(fresh, now, low)
+        rise = now - low
+        # What was there already of the motion that there is now. An impact stays in play for a while.
+        play = np.maximum(np.where(fresh, FADE * play, play), kinetic[t] - rise)
+        whole = play + floor
+        share = np.divide(rise, whole, out=np.zeros_like(rise), where=whole > 0)
+        higher = share > part
+        part, when = np.where(higher, share, part), np.where(higher, t, when)
+        most = np.maximum(most, rise)
+    return most, part, when
+
+
+# --- surfaces ---
+
+
+def in_order(count: int) -> Iterator[int]:
+    """The last of so many frames, the first, the middle, the quarters, ...: each once."""
+    seen = set()
+    for value in (count - 1, 0):
+        if 0 <= value < count and value not in seen:
+            seen.add(value)
+            yield value
+    step = 1
+    while step < count:
+        step *= 2
+        for odd in range(1, step, 2):
+            value = (count - 1) * odd // step
+            if value not in seen:
+                seen.add(value)
+                yield value
+
+
+@dataclass(frozen=True)
+class _Course:
+    """A motion and its bodies' geometry."""
+
+    scene: Scene
+    rollout: Rollout
+    solids: list[TrueSurface]
+    dynamic: np.ndarray  # [N] bool
+    group: np.ndarray  # [N]
+    allowed: np.ndarray  # [G, G]
+    pushed: np.ndarray  # [T+1, N] bool: whether something else than gravity acted in the step that led here
+
+
+def _surfaces(scene: Scene, rollout: Rollout, seconds: float, every: int) -> tuple[Near | None, Near | None, int]:
+    started = time.perf_counter()
+    solids = [solid_of(shape) for shape in scene.shapes]
+    dynamic = np.array([b.motion == "dynamic" for b in scene.bodies])
+    group, allowed = contact_groups(scene.bodies)
+    course = _Course(scene, rollout, solids, dynamic, group, allowed, _pushed(scene, rollout, dynamic))
+    deepest: Near | None = None
+    widest: Near | None = None
+    done, chunk = 0, 1
+    frames = [every * k if k else 0 for k in in_order(-(-len(rollout.time) // every))]
+    if frames and frames[0] != len(rollout.time) - 1:
+        frames.insert(0, len(rollout.time) - 1)
+    while done < len(frames):
+        some = np.array(frames[done : done + chunk])
+        before = time.perf_counter()
+        deep, wide = _measured(course, some, started + seconds)
+        done += len(some)
+        if deep and (deepest is None or deep.part > deepest.part):
+            deepest = deep
+        if wide and (widest is None or wide.part > widest.part):
+            widest = wide
+        took, now = time.perf_counter() - before, time.perf_counter() - started
+        # As many frames at once as fit into half of the time that is left.
+        left = seconds - now
+        if left <= 0:
+            break
+        pace = took / len(some)
+        chunk = int(min(max(1.0, 0.5 * left / max(pace, 1e-6)), 4 * chunk))
+        if pace > left:
+            break
+    return deepest, widest, done
+
+
+def solid_of(shape: Shape) -> TrueSurface:
+    """A shape's exact geometry, made once."""
+    known = _SOLIDS.get(id(shape))
+    if known is None or known[0] is not shape:
+        if len(_SOLIDS) >= 256:
+            _SOLIDS.clear()
+        _SOLIDS[id(shape)] = known = (shape, true_surface(shape))
+    return known[1]
+
+
+_SOLIDS: dict[int, tuple[Shape, TrueSurface]] = {}
+
+
+def _pushed(scene: Scene, rollout: Rollout, dynamic: np.ndarray) -> np.ndarray:
+    """[T+1, N] whether the change of a velocity is not gravity's, where nothing pulls."""
+    dt = np.diff(rollout.time)[:, None, None]
+    change = np.diff(rollout.velocity, axis=0) - scene.gravity * dt
+    fast = np.linalg.norm(rollout.velocity, axis=2)
+    least = 0.02 * np.linalg.norm(scene.gravity) * dt[..., 0] + 1e-6 * np.maximum(fast[1:], fast[:-1]) + 1e-9
+    pushed = np.zeros(fast.shape, bool)
+    pushed[1:] = (np.linalg.norm(change, axis=2) > least) & dynamic
+    if "energy_given" in rollout.counters:
+        pushed &= np.asarray(rollout.counters["energy_given"] == 0)[:, None]
+    if rollout.meta.get("free_flight") == "learned":
+        pushed[:] = False
+    return pushed
+
+
+def placed(course_scene: Scene, rollout: Rollout, frame: np.ndarray, body: np.ndarray) -> Placed:
+    """Bodies [K] in frames [K], their solids called by their shapes' numbers."""
+    turn = Rotation.from_quat(rollout.orientation[frame, body]).as_matrix()
+    shape = np.array([b.shape for b in course_scene.bodies])[body]
+    scale = np.array([b.scale for b in course_scene.bodies])[body]
+    com = np.stack([s.com for s in course_scene.shapes])[shape] * scale[:, None]
+    origin = rollout.position[frame, body] - np.einsum("kij,kj->ki", turn, com)
+    return Placed(shape, scale, origin, turn)
+
+
+def near_pairs(course: _Course, frame: int, margin: np.ndarray) -> np.ndarray:
+    """[P, 2] bodies, one of them dynamic, whose boxes come within the larger of their `margin`s [N] m in a frame."""
+    scene, rollout = course.scene, course.rollout
+    count = len(scene.bodies)
+    every = np.arange(count)
+    at = placed(scene, rollout, np.full(count, frame), every)
+    bounds = np.stack([s.bounds for s in course.solids])[at.solid] * at.scale[:, None, None]
+    endless = np.asarray(~np.isfinite(bounds).all((1, 2)))
+    bounds = np.where(endless[:, None, None], 0.0, bounds)
+    middle = at.origin + np.einsum("kij,kj->ki", at.turn, bounds.mean(1))
+    half = 0.5 * np.ptp(bounds, axis=1)
+    radius = np.linalg.norm(half, axis=1) + margin
+    wide = endless | (radius > 4 * np.median(radius[~endless]) if (~endless).any() else True)
+    found = []
+    small = every[~wide]
+    if len(small) > 1:
+        close = KDTree(middle[small]).query_pairs(2 * float(radius[small].max()), output_type="ndarray")
+        found.append(small[close])
+    for k in every[wide]:
+        others = every[(every != k) & ~(wide & (every < k))]
+        found.append(np.column_stack([np.full(len(others), k), others]))
+    pair = np.concatenate([*found, np.zeros((0, 2), int)]).astype(int)
+    one, other = pair.T
+    kept = (course.dynamic[one] | course.dynamic[other]) & course.allowed[course.group[one], course.group[other]]
+    kept &= ~(endless[one] & endless[other])
+    pair = pair[kept]
+    one, other = pair.T
+    slack = np.maximum(margin[one], margin[other])
+    # Along the axes of both boxes and their products no gap may show.
+    axes = np.concatenate([at.turn[one], at.turn[other]], 2).swapaxes(1, 2)
+    across = np.cross(at.turn[one].swapaxes(1, 2)[:, :, None], at.turn[other].swapaxes(1, 2)[:, None]).reshape(-1, 9, 3)
+    length = np.linalg.norm(across, axis=2, keepdims=True)
+    across = np.where(length > 1e-6, across / np.maximum(length, 1e-6), 0.0)
+    axes = np.concatenate([axes, across], 1)
+    reach = sum(
+        np.einsum("pi,pai->pa", half[k], np.abs(np.einsum("paj,pji->pai", axes, at.turn[k]))) for k in (one, other)
+    )
+    gap = np.abs(np.einsum("pai,pi->pa", axes, middle[one] - middle[other])) - reach
+    apart = gap.max(1) > slack
+    plane = endless[one] | endless[other]
+    if plane.any():
+        flat, solid_body = np.where(endless[one], one, other)[plane], np.where(endless[one], other, one)[plane]
+        up = at.turn[flat, :, 2]
+        low = ((middle[solid_body] - at.origin[flat]) * up).sum(1)
+        low -= (half[solid_body] * np.abs(np.einsum("pj,pji->pi", up, at.turn[solid_body]))).sum(1)
+        apart[plane] = low > slack[plane]
+    return pair[~apart]
+
+
+def _measured(course: _Course, frames: np.ndarray, deadline: float) -> tuple[Near | None, Near | None]:
+    """The deepest overlap in frames, and the widest free space of bodies that are pushed in the steps that start in
+    them. Pairs that are left at the `deadline` (of `time.perf_counter`) are not measured, and then no free space."""
+    scene, rollout = course.scene, course.rollout
+    size = np.array([course.solids[b.shape].thickness * b.scale for b in scene.bodies])
+    reach = np.array([_reach(course.solids[b.shape], scene.shapes[b.shape]) * b.scale for b in scene.bodies])
+    strength = float(np.linalg.norm(scene.gravity))
+    deepest: Near | None = None
+    widest: Near | None = None
+    rows, allowance, alone = [], [], []
+    for f in frames.tolist():
+        last = f == len(rollout.time) - 1
+        pushed = np.zeros(len(size), bool) if last else course.pushed[f + 1]
+        margin = np.zeros(len(size))
+        if not last:
+            dt = float(rollout.time[f + 1] - rollout.time[f])
+            speed = np.linalg.norm(rollout.velocity[f : f + 2], axis=2).max(0)
+            turning = np.maximum(_turning(course, f), _turning(course, f + 1))
+            turning = turning * np.where(np.isfinite(reach), reach, 0.0)
+            fastest = float((speed + turning).max(initial=0.0))
+            thick = np.where(np.isfinite(size), size, 0.0)
+            margin = pushed * (0.2 * thick + (speed + turning + fastest) * dt + strength * dt * dt)
+        pair = near_pairs(course, f, margin)
+        rows.append(np.column_stack([np.full(len(pair), f), pair]))
+        allowance.append(np.maximum(margin[pair[:, 0]], margin[pair[:, 1]]))
+        alone.append((f, np.flatnonzero(pushed)))
+    row, most = np.concatenate(rows), np.concatenate(allowance)
+    parts, done, chunk = [], 0, FEW
+    while done < len(row) and (not parts or time.perf_counter() < deadline):
+        cut = slice(done, done + chunk)
+        one, other = (placed(scene, rollout, row[cut, 0], row[cut, k]) for k in (1, 2))
+        parts.append(gaps(course.solids, one, other, most[cut]))
+        done, chunk = done + chunk, min(2 * chunk, MANY)
+    if done < len(row):
+        row, alone = row[:done], []
+    if parts:
+        found = Gaps(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        thin = np.minimum(size[row[:, 1]], size[row[:, 2]])
+        closing, turned = _coming(course, row, found, reach)
+        # An impact is noticed within a step; a body may go that far into the other before it is stopped.
+        before, _ = _coming(course, row, found, reach, back=1)
+        share = (-found.apart - np.maximum(np.abs(closing), np.abs(before))) / thin
+        k = int(share.argmax()) if len(share) else -1
+        if k >= 0 and share[k] > 0:
+            deepest = _near(course, row[k], float(-found.apart[k]), float(share[k]))
+        # Who is hit by a third may hit the other within the same step, as fast as it is at the step's end.
+        later, turned_later = _coming(course, row, found, reach, back=-1)
+        free = found.surely - np.maximum(np.maximum(closing, later), 0.0) - np.maximum(turned, turned_later)
+    else:
+        thin, free, found = np.zeros(0), np.zeros(0), None
+    for f, bodies in alone:
+        here = row[:, 0] == f
+        for body in bodies.tolist():
+            mine = np.flatnonzero(here & ((row[:, 1] == body) | (row[:, 2] == body)))
+            if (free[mine] <= FREE * thin[mine]).any():
+                continue
+            if not len(mine):
+                metres, part, second = np.inf, np.inf, -1
+            else:
+                k = mine[free[mine].argmin()]
+                metres, part = float(found.surely[k]), float(free[k] / thin[k])  # type: ignore[union-attr]
+                second = int(row[k, 1] + row[k, 2] - body)
+            if widest is None or part > widest.part:
+                other = scene.bodies[second].name if second >= 0 else ""
+                widest = Near(metres, part, scene.bodies[body].name, other, float(rollout.time[f]))
+    return deepest, widest
+
+
+def _near(course: _Course, row: Sequence[int] | np.ndarray, metres: float, part: float) -> Near:
+    f, one, other = (int(v) for v in row)
+    names = course.scene.bodies[one].name, course.scene.bodies[other].name
+    return Near(metres, part, *names, float(course.rollout.time[f]))
+
+
+def _reach(one: TrueSurface, shape: Shape) -> float:
+    """m, how far a solid reaches from its centre of mass."""
+    return float(np.linalg.norm(np.abs(one.bounds - shape.com).max(0))) if np.isfinite(one.bounds).all() else np.inf
+
+
+def _turning(course: _Course, frame: int) -> np.ndarray:
+    """[N] rad/s, of turns that move a body's surface to where it was not."""
+    spin = course.rollout.angular_velocity[frame]
+    kind = np.array([course.solids[b.shape].turns_into_itself for b in course.scene.bodies])
+    axis = Rotation.from_quat(course.rollout.orientation[frame]).as_matrix()[:, :, 2]
+    across = np.linalg.norm(np.cross(spin, axis), axis=1)
+    return np.select([kind == 2, kind == 1], [np.zeros(len(kind)), across], np.linalg.norm(spin, axis=1))
+
+
+def _coming(
+    course: _Course, row: np.ndarray, found: Gaps, reach: np.ndarray, back: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """[P] m, how much two bodies come nearer in a step, along the line between their nearest points, by the speeds of
+    these so many frames `back`; and what turning and gravity may add for others of their points."""
+    rollout = course.rollout
+    frame, one, other = row.T
+    dt = np.diff(rollout.time, append=rollout.time[-1:])[frame]
+    dt[frame == len(rollout.time) - 1] = float(np.diff(rollout.time).max(initial=0.0))
+    toward = found.normal * found.sign[:, None]  # from the second to the first
+
+    def of(body: np.ndarray) -> np.ndarray:
+        arm = found.point - rollout.position[frame, body]
+        return rollout.velocity[then, body] + np.cross(rollout.angular_velocity[then, body], arm)
+
+    then = np.clip(frame - back, 0, len(rollout.time) - 1)
+    closing = -((of(one) - of(other)) * toward).sum(1) * dt
+    turning = np.zeros(len(row))
+    for f in np.unique(then):
+        here, spin = then == f, _turning(course, int(f))
+        for body in (one, other):
+            turning[here] += (spin * np.where(np.isfinite(reach), reach, 0.0))[body[here]]
+    return closing, turning * dt + float(np.linalg.norm(course.scene.gravity)) * dt * dt

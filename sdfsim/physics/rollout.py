@@ -1,0 +1,95 @@
+"""A finished (or partial) simulation as arrays, and its file."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+
+import numpy as np
+
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import read_arrays, write_arrays
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """T steps of N bodies; entry 0 of every array is the initial state.
+
+    Attributes:
+        time: [T+1] s.
+        position: [T+1, N, 3] float64 m, centres of mass.
+        orientation: [T+1, N, 4] float64 xyzw, shape axes -> world.
+        velocity: [T+1, N, 3] m/s.
+        angular_velocity: [T+1, N, 3] rad/s, world frame.
+        contact_count: [T+1] int64, contact edges that acted in the step that led here (0 where none did).
+        contact_point: [sum(contact_count), 3] float64 m, world, in step order: the points of their owners on which
+            the edges acted, with the bodies as they are in this entry.
+        contact_body: [sum(contact_count), 2] int64, (owner of the node, body it meets).
+        counters: name -> [T+1] array: `kinetic_energy` J, `potential_energy` J, `energy_given` J (by pulls, pushes and
+            whoever set a state, since the frame before), `contacts`, `worst_penetration` m, `step_ms`, and what else
+            the simulator counts. The penetration is how deep the deepest of an entry's
+            contact points lies within the body it meets, by that body's distances; 0 where none does.
+        names: N body names.
+        meta: model, seed, versions, dt s.
+    """
+
+    time: np.ndarray
+    position: np.ndarray
+    orientation: np.ndarray
+    velocity: np.ndarray
+    angular_velocity: np.ndarray
+    contact_count: np.ndarray
+    contact_point: np.ndarray
+    contact_body: np.ndarray
+    counters: dict[str, np.ndarray] = field(default_factory=dict)
+    names: tuple[str, ...] = ()
+    meta: dict = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        """Number of steps, T."""
+        return len(self.time) - 1
+
+    def frames(self, start: int, stop: int) -> Rollout:
+        """Entries `start` to `stop` (exclusive) of every array, contacts included."""
+        ends = np.concatenate([[0], np.cumsum(self.contact_count)])
+        rows = slice(int(ends[start]), int(ends[stop]))
+        cut = slice(start, stop)
+        return replace(
+            self,
+            **{f: getattr(self, f)[cut] for f in _PER_FRAME},
+            contact_point=self.contact_point[rows],
+            contact_body=self.contact_body[rows],
+            counters={k: v[cut] for k, v in self.counters.items()},
+        )
+
+    def save(self, path: Path | str) -> None:
+        """Write `rollout.npz`."""
+        arrays = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("counters", "names", "meta")}
+        arrays |= {f"counter_{k}": v for k, v in self.counters.items()}
+        arrays |= {"names": np.array(self.names, dtype=str), "meta": np.array(json.dumps(self.meta))}
+        write_arrays(Path(path), arrays)
+
+    @classmethod
+    def load(cls, path: Path | str) -> Rollout:
+        """Read a `rollout.npz`. Raises SdfsimError when it is missing or not one of ours."""
+        arrays = read_arrays(Path(path), "a rollout")
+        try:
+            counters = {k.removeprefix("counter_"): arrays.pop(k) for k in list(arrays) if k.startswith("counter_")}
+            names = tuple(str(n) for n in arrays.pop("names"))
+            meta = json.loads(str(arrays.pop("meta")))
+            return cls(**arrays, counters=counters, names=names, meta=meta)
+        except (KeyError, TypeError, ValueError) as error:
+            raise SdfsimError(f"{path}: not a rollout of sdfsim ({error})") from error
+
+
+_PER_FRAME = ("time", "position", "orientation", "velocity", "angular_velocity", "contact_count")
+
+
+def join(frames: list[Rollout]) -> Rollout:
+    """One rollout out of consecutive pieces."""
+    return replace(
+        frames[0],
+        **{k: np.concatenate([getattr(f, k) for f in frames]) for k in (*_PER_FRAME, "contact_point", "contact_body")},
+        counters={k: np.concatenate([f.counters[k] for f in frames]) for k in frames[0].counters},
+    )

@@ -1,0 +1,394 @@
+"""Convex solids, compiled: their supports, how far apart two are, and along which normal.
+
+Closest points by GJK (Gilbert, Johnson and Keerthi 1988). Solids that overlap are moved apart along the normal that is
+known, and the closest points of the two as they then lie give the next one. Each round is a full answer for its normal,
+and rounds end where the overlap is least nearby: so a contact keeps the side that it came from.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from sdfsim.physics.solver.vectors import (
+    BARE,
+    FAST,
+    add,
+    along,
+    cross,
+    dot,
+    get,
+    norm,
+    put,
+    scale,
+    sub,
+    turn,
+    turn_back,
+)
+
+POINT, SEGMENT, BLOCK, DRUM, HULL = range(5)
+# Columns of the table of convex pieces: kind; sizes (point: radius; segment: radius, half length; block: half extents;
+# drum: radius, half height); a ball around all of it; its thickness, the least distance of two parallel planes.
+KIND, SIZE, BALL, THICKNESS, WIDTH = 0, 1, 4, 8, 9
+
+TOUCHING = 1e-7  # of the thickness: solids that are farther apart are asked as they lie
+APART = 1e-3  # of the thickness: so far apart overlapping solids are moved
+EXACT = 1e-14  # squared distances are found to this part
+FEW = 48  # vertices that are looked at in turn; of more, neighbours of neighbours
+STEPS, ROUNDS = 48, 10  # of GJK, and of normals
+
+
+class Convex(NamedTuple):
+    """The convex pieces of S shapes; arrays end to end."""
+
+    start: np.ndarray  # [S + 1] int64, shape s has pieces start[s] : start[s + 1]; none where it is not convex
+    table: np.ndarray  # [P, WIDTH] float64
+    vertex_start: np.ndarray  # [P + 1] int64
+    vertex: np.ndarray  # [V, 3] float64, of hulls, in the shape's frame
+    face_start: np.ndarray  # [P + 1] int64
+    face: np.ndarray  # [F, 3] float64, outward unit normals
+    loop_start: np.ndarray  # [F + 1] int64
+    loop: np.ndarray  # [L] int64, the vertices of a face in turn
+    beside_start: np.ndarray  # [V + 1] int64
+    beside: np.ndarray  # int64, the vertices at the other ends of a vertex's edges
+    around_start: np.ndarray  # [V + 1] int64
+    around: np.ndarray  # int64, the faces that meet in a vertex
+
+
+class Simplex(NamedTuple):
+    """Room for GJK: up to four corners of the difference of two solids, and where each comes from."""
+
+    corner: np.ndarray  # [4, 3] of the first less the second
+    own: np.ndarray  # [4, 3] of the first
+    weight: np.ndarray  # [4]
+    trial: np.ndarray  # [4]
+
+
+@njit(**FAST)
+def simplex_room():
+    return Simplex(np.zeros((4, 3)), np.zeros((4, 3)), np.zeros(4), np.zeros(4))
+
+
+@njit(**BARE)
+def rounding(convex, p):
+    """By how much a piece is larger than its core on all sides."""
+    return convex.table[p, SIZE] if convex.table[p, KIND] <= SEGMENT else 0.0
+
+
+@njit(**BARE)
+def outermost(convex, p, d):
+    """The vertex of a hull that is farthest along d: of the best of a few, always the neighbour that is farther."""
+    first, last = convex.vertex_start[p], convex.vertex_start[p + 1]
+    best, most = first, -math.inf
+    for v in range(first, last, 1 + (last - first - 1) // FEW):
+        reach = convex.vertex[v, 0] * d[0] + convex.vertex[v, 1] * d[1] + convex.vertex[v, 2] * d[2]
+        if reach > most:
+            best, most = v, reach
+    while last - first > FEW:
+        start = best
+        for e in range(convex.beside_start[start], convex.beside_start[start + 1]):
+            v = convex.beside[e]
+            reach = convex.vertex[v, 0] * d[0] + convex.vertex[v, 1] * d[1] + convex.vertex[v, 2] * d[2]
+            if reach > most:
+                best, most = v, reach
+        if best == start:
+            break
+    return best
+
+
+@njit(**BARE)
+def outside(convex, p, place):
+    """How far a place, in its own frame, is outside of a hull at least: beyond the plane of a face."""
+    most = -math.inf
+    for f in range(convex.face_start[p], convex.face_start[p + 1]):
+        n = get(convex.face, f)
+        most = max(most, dot(n, sub(place, get(convex.vertex, convex.loop[convex.loop_start[f]]))))
+    return most
+
+
+@njit(**BARE)
+def core(convex, p, d):
+    """The point of the core of piece p, in its own frame, that is farthest along d."""
+    kind = convex.table[p, KIND]
+    if kind == HULL:
+        return get(convex.vertex, outermost(convex, p, d))
+    if kind == POINT:
+        return 0.0, 0.0, 0.0
+    a, b, c = convex.table[p, SIZE], convex.table[p, SIZE + 1], convex.table[p, SIZE + 2]
+    if kind == SEGMENT:
+        return 0.0, 0.0, math.copysign(b, d[2])
+    if kind == BLOCK:
+        return math.copysign(a, d[0]), math.copysign(b, d[1]), math.copysign(c, d[2])
+    r = math.sqrt(d[0] * d[0] + d[1] * d[1])
+    if r < 1e-300:
+        return 0.0, 0.0, math.copysign(b, d[2])
+    return a * d[0] / r, a * d[1] / r, math.copysign(b, d[2])
+
+
+@njit(**BARE)
+def farthest(convex, p, size, matrix, body, d):
+    """The point of the core of a body's piece that is farthest along d; both along world axes, from its origin."""
+    return turn(matrix, body, scale(core(convex, p, turn_back(matrix, body, d)), size))
+
+
+class Pair(NamedTuple):
+    """Two pieces as they lie."""
+
+    first: int  # the pieces
+    second: int
+    a: int | np.int64  # the bodies
+    b: int | np.int64
+    size: float  # the scales of the bodies
+    other: float
+    offset: tuple  # from the origin of the second body's shape to that of the first, world axes
+
+
+@njit(**BARE)
+def separation(convex, matrix, pair, n):
+    """How far two cores are apart along the unit vector n, from the second to the first; below 0 where they overlap."""
+    mine = farthest(convex, pair.first, pair.size, matrix, pair.a, scale(n, -1.0))
+    theirs = farthest(convex, pair.second, pair.other, matrix, pair.b, n)
+    return dot(n, sub(add(pair.offset, mine), theirs))
+
+
+@njit(**BARE)
+def closest(convex, matrix, pair, n, known, enough, room):
+    """Distance of two solids, the unit normal from the second to the first, and the closest point of either (on its
+    surface, from the second's origin). Solids that overlap have the least depth near the normal n.
+
+    Args:
+        known: whether they were last seen to touch along n, or nearly. If not, n does not count, and where they overlap
+            the least depth is looked for from several normals.
+        enough: two that are seen to be farther apart may get a distance that is too small, and no closest points.
+    """
+    thick = min(pair.size * convex.table[pair.first, THICKNESS], pair.other * convex.table[pair.second, THICKNESS])
+    if known:
+        return _least_deep(convex, matrix, pair, n, thick, enough, room)
+    between = _middle_to_middle(convex, matrix, pair)
+    v, there = _gjk(convex, matrix, pair, pair.offset, between, room)
+    length = norm(v)
+    if length > TOUCHING * thick:
+        mine, theirs = pair.size * rounding(convex, pair.first), pair.other * rounding(convex, pair.second)
+        n = scale(v, 1.0 / length)
+        return length - mine - theirs, n, along(there, n, -mine), along(sub(there, v), n, theirs)
+    best = _least_deep(convex, matrix, pair, _along_face(convex, matrix, pair, between), thick, enough, room)
+    for way in range(7):
+        axis, sign = way // 2, 1.0 if way % 2 == 0 else -1.0
+        start = (sign if axis == 0 else 0.0, sign if axis == 1 else 0.0, sign if axis == 2 else 0.0)
+        if way == 6:
+            if length == 0.0:
+                continue
+            start = scale(v, 1.0 / length)
+        found = _least_deep(convex, matrix, pair, start, thick, enough, room)
+        if found[0] > best[0]:
+            best = found
+    return best
+
+
+@njit(**BARE)
+def _least_deep(convex, matrix, pair, n, thick, enough, room):
+    """`closest` from a normal on."""
+    mine, theirs = pair.size * rounding(convex, pair.first), pair.other * rounding(convex, pair.second)
+    own, his = pair.offset, (0.0, 0.0, 0.0)
+    s = separation(convex, matrix, pair, n)
+    if s - mine - theirs > enough:
+        return s - mine - theirs, n, own, his
+    for _ in range(ROUNDS):
+        shift = 0.0 if s > TOUCHING * thick else APART * thick - s
+        v, there = _gjk(convex, matrix, pair, along(pair.offset, n, shift), n, room)
+        length = norm(v)
+        if length == 0.0:
+            break
+        m, was = scale(v, 1.0 / length), s
+        own, his = along(there, n, -shift), sub(there, v)
+        if shift == 0.0:
+            n, s = m, length
+            break
+        found = separation(convex, matrix, pair, m)
+        if found > s:
+            n, s = m, found
+        if found <= was + 1e-9 * thick:
+            break
+    return s - mine - theirs, n, along(own, n, -mine), along(his, n, theirs)
+
+
+@njit(**BARE)
+def _gjk(convex, matrix, pair, offset, v, room):
+    """The shortest vector from the second solid's core to the first's, which lies by `offset` from it, and where it
+    ends on the first; v is a guess of its direction. Zero where the cores overlap."""
+    corner, own, weight = room.corner, room.own, room.weight
+    count, there, least = 0, (0.0, 0.0, 0.0), math.inf
+    for step in range(STEPS):
+        a = add(offset, farthest(convex, pair.first, pair.size, matrix, pair.a, scale(v, -1.0)))
+        w = sub(a, farthest(convex, pair.second, pair.other, matrix, pair.b, v))
+        if step > 0:
+            if least - dot(v, w) <= EXACT * least:
+                break
+            known = False
+            for i in range(count):
+                known = known or (corner[i, 0] == w[0] and corner[i, 1] == w[1] and corner[i, 2] == w[2])
+            if known:
+                break
+        put(corner, count, w)
+        put(own, count, a)
+        count = _nearest_part(corner, own, weight, room.trial, count + 1)
+        if count == 0:
+            return (0.0, 0.0, 0.0), a
+        new, on = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+        for i in range(count):
+            new, on = along(new, get(corner, i), weight[i]), along(on, get(own, i), weight[i])
+        length = dot(new, new)
+        if length >= least:  # rounding has the better of it
+            break
+        v, there, least = new, on, length
+    return v, there
+
+
+@njit(**BARE)
+def _nearest_part(corner, own, weight, trial, count):
+    """Leave of a simplex the corners between which the place nearest to the origin lies, with their weights; how many
+    these are. None where the origin is inside."""
+    if count == 1:
+        weight[0] = 1.0
+        return 1
+    for i in range(4):
+        weight[i] = 0.0
+    if count == 2:
+        _on_line(corner, 0, 1, weight)
+    elif count == 3:
+        _on_face(corner, 0, 1, 2, weight)
+    elif _inside(corner):
+        return 0
+    else:
+        least = math.inf
+        for left_out in range(4):
+            i, j, k = (left_out + 1) % 4, (left_out + 2) % 4, (left_out + 3) % 4
+            for x in range(4):
+                trial[x] = 0.0
+            _on_face(corner, i, j, k, trial)
+            at = (0.0, 0.0, 0.0)
+            for x in range(4):
+                at = along(at, get(corner, x), trial[x])
+            if dot(at, at) < least:
+                least = dot(at, at)
+                for x in range(4):
+                    weight[x] = trial[x]
+    kept = 0
+    for i in range(count):
+        if weight[i] > 0.0:
+            weight[kept] = weight[i]
+            put(corner, kept, get(corner, i))
+            put(own, kept, get(own, i))
+            kept += 1
+    return kept
+
+
+@njit(**BARE)
+def _inside(corner):
+    """Whether the origin is inside a tetrahedron; a flat one has no inside."""
+    a, b, c, d = get(corner, 0), get(corner, 1), get(corner, 2), get(corner, 3)
+    volume = dot(cross(sub(b, a), sub(c, a)), sub(d, a))
+    if volume == 0.0:
+        return False
+    sign = math.copysign(1.0, volume)
+    return (
+        sign * dot(cross(b, c), d) > 0.0
+        and -sign * dot(cross(a, c), d) > 0.0
+        and sign * dot(cross(a, b), d) > 0.0
+        and -sign * dot(cross(a, b), c) > 0.0
+    )
+
+
+@njit(**BARE)
+def _on_line(corner, i, j, weight):
+    """Weights of two corners for the place between them that is nearest to the origin."""
+    a, b = get(corner, i), get(corner, j)
+    side = sub(b, a)
+    way, square = -dot(a, side), dot(side, side)
+    if way <= 0.0 or square == 0.0:
+        weight[i], weight[j] = 1.0, 0.0
+    elif way >= square:
+        weight[i], weight[j] = 0.0, 1.0
+    else:
+        weight[i], weight[j] = 1.0 - way / square, way / square
+
+
+@njit(**BARE)
+def _on_face(corner, i, j, k, weight):
+    """Weights of three corners for the place between them that is nearest to the origin."""
+    a, b, c = get(corner, i), get(corner, j), get(corner, k)
+    n = cross(sub(b, a), sub(c, a))
+    square = dot(n, n)
+    u, v, w = dot(n, cross(b, c)), dot(n, cross(c, a)), dot(n, cross(a, b))
+    if square > 0.0 and u > 0.0 and v > 0.0 and w > 0.0:
+        total = u + v + w
+        weight[i], weight[j], weight[k] = u / total, v / total, w / total
+        return
+    # Beyond an edge: the nearest place is on one of the three.
+    least, first, second, share = math.inf, i, j, 0.0
+    for e in range(3):
+        p, q = (i, j) if e == 0 else ((j, k) if e == 1 else (k, i))
+        start = get(corner, p)
+        side = sub(get(corner, q), start)
+        way, long = -dot(start, side), dot(side, side)
+        t = 0.0 if way <= 0.0 or long == 0.0 else min(way / long, 1.0)
+        at = along(start, side, t)
+        if dot(at, at) < least:
+            least, first, second, share = dot(at, at), p, q, t
+    weight[i] = weight[j] = weight[k] = 0.0
+    weight[first], weight[second] = 1.0 - share, share
+
+
+@njit(**BARE)
+def _middle_to_middle(convex, matrix, pair):
+    """The direction from the middle of the second piece to that of the first."""
+    there = add(pair.offset, turn(matrix, pair.a, scale(get_ball(convex, pair.first), pair.size)))
+    between = sub(there, turn(matrix, pair.b, scale(get_ball(convex, pair.second), pair.other)))
+    length = norm(between)
+    return (0.0, 0.0, 1.0) if length == 0.0 else scale(between, 1.0 / length)
+
+
+@njit(**BARE)
+def _along_face(convex, matrix, pair, n):
+    """Of n and the normals of the faces of either piece the one along which the two overlap least."""
+    best, most = n, separation(convex, matrix, pair, n)
+    for side in range(2):
+        p, body = (pair.first, pair.a) if side == 0 else (pair.second, pair.b)
+        hull = convex.table[p, KIND] == HULL
+        for e in range(_axes(convex, p)):
+            axis = turn(matrix, body, _axis(convex, p, e))
+            for way in range(2):
+                out = way == side  # normals go from the second to the first: into the one, out of the other
+                if hull and not out:
+                    continue
+                m = scale(axis, 1.0 if way == 1 else -1.0)
+                found = separation(convex, matrix, pair, m)
+                if found > most:
+                    best, most = m, found
+    return best
+
+
+@njit(**BARE)
+def get_ball(convex, p):
+    """The middle of the ball around a piece, in its own frame."""
+    return convex.table[p, BALL], convex.table[p, BALL + 1], convex.table[p, BALL + 2]
+
+
+@njit(**BARE)
+def _axes(convex, p):
+    kind = convex.table[p, KIND]
+    if kind == HULL:
+        return min(convex.face_start[p + 1] - convex.face_start[p], 64)
+    return 3 if kind == BLOCK or kind == DRUM else 0
+
+
+@njit(**BARE)
+def _axis(convex, p, e):
+    """The normal of a face; of a drum also two directions across it."""
+    if convex.table[p, KIND] == HULL:
+        faces = convex.face_start[p + 1] - convex.face_start[p]
+        return get(convex.face, convex.face_start[p] + e * max(1, faces // 64))
+    return (1.0 if e == 0 else 0.0, 1.0 if e == 1 else 0.0, 1.0 if e == 2 else 0.0)

@@ -1,0 +1,166 @@
+"""Edges inside of a surface that several bodies or pieces make up, compiled: they are no walls.
+
+What slides over a floor of tiles meets the side of the next tile, deeper sideways than it has sunk in, or has a gap to
+its edge that closes. That side is covered. A body cannot be a wall where all of it lies below the plane on which one
+stands: it can only support along that plane's normal, and this is what such contacts get. (Jolt and Box3D remove such
+edges by where they lie in a mesh; here tiles may be bodies of their own.)
+"""
+
+from __future__ import annotations
+
+from numba import njit
+
+from sdfsim.physics.solver.convex import farthest, outside, rounding
+from sdfsim.physics.solver.distance import CELL, GRID, KIND, PLANE, distance_alone, solids
+from sdfsim.physics.solver.manifold import renewed
+from sdfsim.physics.solver.narrow_phase import SOLIDS, collide_solids, origin, way_of
+from sdfsim.physics.solver.surface_distance import KEYS
+from sdfsim.physics.solver.vectors import BARE, add, dot, get, put, scale, sub, turn, turn_back
+from sdfsim.physics.solver.world import FIRST, GAP, KEY, NORMAL, SECOND, VOID
+
+ASLANT = 0.9999  # cosine between a normal and that of a support, above which the two are one
+STEEPEST = -0.1  # below it they face each other
+ROUGH = 0.5  # cells, by which a grid is off at an edge at most
+LEVEL = 4.0  # slops: so much higher than the support a body may reach and be no wall
+
+
+@njit(**BARE)
+def heed_supports(shapes, world, work, motion, rules, manifolds, near, scratch):
+    """Give contacts with what lies below a support, and beside it, the support's normal, or void them."""
+    latest, following = work.latest, near.following
+    pairs = len(near.start)
+    several = False
+    for p in range(pairs):
+        for side in range(2):
+            latest[manifolds.pair[p, side]] = -1
+    for p in range(pairs):
+        if manifolds.count[p] > 0:
+            for side in range(2):
+                body = manifolds.pair[p, side]
+                following[2 * p + side] = latest[body]
+                if not world.moves[body]:
+                    continue  # what does not move stands on nothing
+                several = several or latest[body] >= 0 or manifolds.point[p, 0, KEY] != 0.0
+                latest[body] = 2 * p + side
+    if not several:
+        return
+    for p in range(pairs):
+        if manifolds.count[p] > 0:
+            _heed(shapes, world, work, motion, rules, manifolds, near, scratch, p)
+
+
+@njit(**BARE)
+def _heed(shapes, world, work, motion, rules, manifolds, near, scratch, p):
+    a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
+    s, t = world.shape[a], world.shape[b]
+    pieces = max(1, shapes.piece_start[t + 1] - shapes.piece_start[t])
+    if way_of(shapes, s, t) != SOLIDS:
+        for k in range(manifolds.count[p]):
+            manifolds.point[p, k, VOID] = 0.0
+            for side in range(2):
+                if not world.moves[manifolds.pair[p, side]]:
+                    continue
+                found, _ = _support(shapes, world, work, motion, rules, manifolds, near, p, k, side)
+                if found:
+                    manifolds.point[p, k, VOID] = 1.0
+        return
+    if shapes.table[t, KIND] == PLANE:
+        return
+    again = False
+    for at in range(near.start[p, 0], near.start[p, 0] + near.count[p, 0]):
+        if near.held[at]:
+            continue
+        i, j = near.leaf[at] // pieces, near.leaf[at] % pieces
+        for k in range(manifolds.count[p]):
+            if manifolds.point[p, k, KEY] == i * KEYS + j:
+                for side in range(2):
+                    if not world.moves[manifolds.pair[p, side]]:
+                        continue
+                    found, n = _support(shapes, world, work, motion, rules, manifolds, near, p, k, side)
+                    if found:
+                        near.held[at] = again = True
+                        put(near.axis, at, n if side == 0 else scale(n, -1.0))
+                        break
+                break
+    if again:
+        went = work.gone[a] + work.gone[b]
+        count = collide_solids(shapes, world, motion, work.matrix, rules, manifolds, near, went, scratch, p)
+        manifolds.count[p] = renewed(rules, manifolds.point, p, manifolds.count[p], scratch, count)
+
+
+@njit(**BARE)
+def _support(shapes, world, work, motion, rules, manifolds, near, p, k, side):
+    """Whether the body that is first (side 0) or second (1) of pair p stands on something with another normal, above
+    all of what it meets at point k; and this normal, towards the body."""
+    body, other = manifolds.pair[p, side], manifolds.pair[p, 1 - side]
+    n = _normal(manifolds, p, k, side)
+    if shapes.piece_start[world.shape[other] + 1] == shapes.piece_start[world.shape[other]]:
+        return False, n  # nobody knows how far it reaches
+    key = manifolds.point[p, k, KEY]
+    link = work.latest[body]
+    while link >= 0:
+        q, own = link // 2, link % 2
+        link = near.following[link]
+        for e in range(manifolds.count[q]):
+            if q == p and manifolds.point[q, e, KEY] == key:
+                continue
+            m = _normal(manifolds, q, e, own)
+            facing = dot(n, m)
+            if facing > ASLANT or facing < STEEPEST or manifolds.point[q, e, GAP] > rules.slop:
+                continue
+            # The plane of the support, and how far the other body's piece reaches above it.
+            ground = manifolds.pair[q, 1 - own]
+            column = SECOND if own == 0 else FIRST
+            foot = turn(
+                work.matrix, ground,
+                (
+                    manifolds.point[q, e, column], manifolds.point[q, e, column + 1],
+                    manifolds.point[q, e, column + 2],
+                ),
+            )  # fmt: skip
+            foot = add(get(motion.position, ground), foot)
+            if _reach(shapes, world, work, motion, other, key, side, m) - dot(m, foot) > LEVEL * rules.slop:
+                continue
+            if q == p or _beside(shapes, world, work, motion, rules, ground, manifolds, p, k, side):
+                return True, m
+    return False, n
+
+
+@njit(**BARE)
+def _normal(manifolds, p, k, side):
+    """The normal of a contact towards the first (side 0) or second (1) of its bodies."""
+    sign, point = 1.0 if side == 0 else -1.0, manifolds.point[p, k]
+    return sign * point[NORMAL], sign * point[NORMAL + 1], sign * point[NORMAL + 2]
+
+
+@njit(**BARE)
+def _beside(shapes, world, work, motion, rules, ground, manifolds, p, k, side):
+    """Whether another body reaches to the place where a contact touches the body that is met."""
+    other, column = manifolds.pair[p, 1 - side], SECOND if side == 0 else FIRST
+    point = manifolds.point[p, k]
+    place = turn(work.matrix, other, (point[column], point[column + 1], point[column + 2]))
+    place = add(sub(get(motion.position, other), get(motion.position, ground)), place)
+    size, t, convex = world.scale[ground], world.shape[ground], solids(shapes)
+    place = scale(add(turn_back(work.matrix, ground, place), get(world.com, ground)), 1.0 / size)
+    first, last = convex.start[t], convex.start[t + 1]
+    if shapes.table[t, KIND] != GRID or first == last:
+        rough = ROUGH * shapes.table[t, CELL] if shapes.table[t, KIND] == GRID else 0.0
+        return size * (distance_alone(shapes.table, shapes.brick, shapes.sample, t, place) - rough) <= rules.reach
+    for piece in range(first, last):
+        if size * outside(convex, piece, place) <= rules.reach:
+            return True
+    return False
+
+
+@njit(**BARE)
+def _reach(shapes, world, work, motion, body, key, side, m):
+    """How far the piece of a body that a contact is of reaches along m."""
+    s, convex = world.shape[body], solids(shapes)
+    pieces = convex.start[s + 1] - convex.start[s]
+    number = int(key) % KEYS if side == 0 else int(key) // KEYS
+    piece = convex.start[s] + min(number, pieces - 1)
+    place = add(
+        origin(motion.position, work.matrix, world.com, body),
+        farthest(convex, piece, world.scale[body], work.matrix, body, m),
+    )
+    return dot(m, place) + world.scale[body] * rounding(convex, piece)

@@ -1,0 +1,526 @@
+"""Where bodies that are near each other touch, compiled.
+
+Three ways, by what the two shapes are: solids that are convex, or made of convex pieces, as such (`convex`); round ones
+by the distance at their core; all others by the surface of either in the distances of the other.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit, prange
+
+from sdfsim.physics.solver.broad_phase import carried, near_pairs, swept
+from sdfsim.physics.solver.clipping import CHOSEN, touching_points
+from sdfsim.physics.solver.convex import BALL, Pair, closest, farthest, rounding, separation
+from sdfsim.physics.solver.distance import (
+    BOX,
+    CAPSULE,
+    CYLINDER,
+    GRID,
+    KIND,
+    PLANE,
+    SIZE,
+    SPHERE,
+    distance_alone,
+    solids,
+)
+from sdfsim.physics.solver.manifold import (
+    FOUND,
+    first_to_touch,
+    merged,
+    moved,
+    renewed,
+    scratch_room,
+    thinned,
+    write,
+)
+from sdfsim.physics.solver.surface_distance import (
+    KEYS,
+    at_least,
+    beyond,
+    is_round,
+    map_between,
+    mapped,
+    nodes_near,
+    round_points,
+    swallowed,
+)
+from sdfsim.physics.solver.vectors import (
+    BARE,
+    FAST,
+    add,
+    along,
+    dot,
+    get,
+    norm,
+    put,
+    scale,
+    sub,
+    turn,
+    turn_back,
+    vector,
+)
+from sdfsim.physics.solver.world import COLUMNS, KEY, NORMAL, PUSH, TORSION
+
+MANY = 192  # pairs from which on threads are worth their while, also beside other programs
+SHARES = 16  # of the pairs, each with its own scratch, that threads take in turn
+FLAT = 0.95  # cosine between the normals of a face at least
+# The mean distance of a face from its middle, in that of its corners: 0.54 of a square, 0.67 of a disc, 0.5 of a bar.
+FACE = 0.58
+PROBES = 12  # on the way from the middle of a face to its corner
+SOLIDS, ROUND, SURFACES = range(3)  # the ways in which a pair is looked at
+
+
+class Near(NamedTuple):
+    """What of the bodies of P pairs may touch, until bodies are looked for again."""
+
+    # start, count: [P, 2] the place of the first and how many are near: of solids pairs of pieces (side 0), of surfaces
+    # the leaves of nodes of either body
+    start: np.ndarray
+    count: np.ndarray
+    leaf: np.ndarray  # [L] which
+    away: np.ndarray  # [L] how far each is at least, once the ways of both bodies since then are taken off
+    axis: np.ndarray  # [L, 3] the normal of a pair of pieces, from the second to the first; 0 where it is not known
+    looked: np.ndarray  # [P] the ways of both bodies when new points were last looked for; -inf for never
+    away_all: np.ndarray  # [P] the least of `away`; -inf where it is not known
+    held: np.ndarray  # [L] bool, whether a pair of pieces has the normal of what supports, see `internal_edges`
+    following: np.ndarray  # [2 P] int64 for finding the contacts of a body
+
+
+@njit(**FAST)
+def look_around(shapes, world, work, motion, rules, span, old):
+    """Pairs of bodies that may touch within `span` of time, and which of their parts are near.
+
+    Of `work` it sets how far each body may go until it must be looked around again, and who has somebody near.
+
+    Returns:
+        The manifolds of these pairs, with the points of `old`, and those of bodies that sleep; what is near.
+    """
+    swept(world, work, motion, rules, span)
+    pairs = near_pairs(world, motion, work.low, work.high)
+    manifolds = carried(world, motion, pairs, old)
+    near = near_parts(shapes, world, motion, work.matrix, pairs, work.ways, rules.reach)
+    for p in range(len(pairs)):
+        if near.count[p, 0] + near.count[p, 1] > 0:
+            work.beside[pairs[p, 0]] = work.beside[pairs[p, 1]] = True
+    return manifolds, near
+
+
+@njit(**BARE)
+def way_of(shapes, s, t):
+    """How two shapes are looked at."""
+    table, start = shapes.table, shapes.piece_start
+    one, other = is_round(table, s), is_round(table, t)
+    first, second = start[s + 1] > start[s], start[t + 1] > start[t]
+    if one or other:
+        if table[s, KIND] != GRID and table[t, KIND] != GRID:
+            long = table[s, KIND] == CAPSULE or table[t, KIND] == CAPSULE
+            edged = table[s, KIND] == BOX or table[s, KIND] == CYLINDER
+            edged = edged or table[t, KIND] == BOX or table[t, KIND] == CYLINDER
+            return SOLIDS if long and edged else ROUND  # a line along a face, else places on a core
+        return SOLIDS if first and second else SURFACES
+    return SOLIDS if (first or table[s, KIND] == PLANE) and (second or table[t, KIND] == PLANE) else SURFACES
+
+
+@njit(**FAST)
+def near_parts(shapes, world, motion, matrix, pairs, ways, reach):
+    """What of P pairs is nearer than the bodies may go; [N] `ways` of each."""
+    count = len(pairs)
+    start = np.zeros((count, 2), np.int64)
+    total = 0
+    for p in range(count):
+        s, t = world.shape[pairs[p, 0]], world.shape[pairs[p, 1]]
+        way = way_of(shapes, s, t)
+        for side in range(2):
+            start[p, side] = total
+            own = s if side == 0 else t
+            if way == SURFACES and not is_round(shapes.table, own):
+                total += shapes.clump_leaf[shapes.clump_start[own + 1]] - shapes.clump_leaf[shapes.clump_start[own]]
+            elif way == SOLIDS and side == 0:
+                pieces = shapes.piece_start[s + 1] - shapes.piece_start[s]
+                total += pieces * max(1, shapes.piece_start[t + 1] - shapes.piece_start[t])
+    near = Near(
+        start, np.zeros((count, 2), np.int64), np.empty(total, np.int32), np.empty(total), np.zeros((total, 3)),
+        np.full(count, -math.inf), np.full(count, -math.inf), np.zeros(total, np.bool_), np.zeros(2 * count, np.int64),
+    )  # fmt: skip
+    if count >= MANY:
+        _near_many(shapes, world, motion, matrix, pairs, ways, reach, near)
+    else:
+        for p in range(count):
+            _near(shapes, world, motion, matrix, pairs, ways, reach, near, p)
+    return near
+
+
+@njit(parallel=True, **FAST)
+def _near_many(shapes, world, motion, matrix, pairs, ways, reach, near):
+    for i in prange(len(pairs)):
+        p = np.int64(i)  # that of a parallel loop is unsigned, for which all would be compiled once more
+        _near(shapes, world, motion, matrix, pairs, ways, reach, near, p)
+
+
+@njit(**BARE)
+def _near(shapes, world, motion, matrix, pairs, ways, reach, near, p):
+    table, brick, sample = shapes.table, shapes.brick, shapes.sample
+    a, b = pairs[p, 0], pairs[p, 1]
+    most = ways[a] + ways[b] + reach
+    way = way_of(shapes, world.shape[a], world.shape[b])
+    if way == SOLIDS:
+        _near_pieces(shapes, world, motion, matrix, a, b, most, near, p)
+        return
+    if way == ROUND:
+        # One query tells whether the ball around either may touch the other; 1 stands for yes.
+        one = a if is_round(shapes.table, world.shape[a]) else b
+        other = b if one == a else a
+        w, c = map_between(motion.position, matrix, world.scale, world.com, one, other)
+        k = world.scale[other]
+        d = distance_alone(table, brick, sample, world.shape[other], mapped(w, c, (0.0, 0.0, 0.0)))
+        s = world.shape[one]
+        size = (shapes.table[s, SIZE] + shapes.table[s, SIZE + 1]) * world.scale[one]
+        near.count[p, 0] = 1 if d * k - size <= most else 0
+        return
+    for side in range(2):
+        one, other = pairs[p, side], pairs[p, 1 - side]
+        s, t = world.shape[one], world.shape[other]
+        if is_round(table, s):
+            continue  # the other's surface is met by its distance, which is exact wherever it is asked
+        w, c = map_between(motion.position, matrix, world.scale, world.com, one, other)
+        k, own = world.scale[other], world.scale[one]
+        at = near.start[p, side]
+        for clump in range(shapes.clump_start[s], shapes.clump_start[s + 1]):
+            d = distance_alone(table, brick, sample, t, mapped(w, c, get(shapes.clump_ball, clump)))
+            if k * at_least(table, t, d) - own * shapes.clump_ball[clump, 3] > most:
+                continue
+            for i in range(shapes.clump_leaf[clump], shapes.clump_leaf[clump + 1]):
+                away = beyond(shapes, t, w, c, k, own, i)
+                if away <= most:
+                    near.leaf[at], near.away[at] = i, away
+                    at += 1
+        near.count[p, side] = at - near.start[p, side]
+
+
+@njit(**BARE)
+def origin(position, matrix, coms, body):
+    """The origin of a body's shape."""
+    return sub(get(position, body), turn(matrix, body, get(coms, body)))
+
+
+@njit(**BARE)
+def _near_pieces(shapes, world, motion, matrix, a, b, most, near, p):
+    """The pairs of convex pieces whose balls are near each other."""
+    convex = solids(shapes)
+    s, t = world.shape[a], world.shape[b]
+    offset = sub(origin(motion.position, matrix, world.com, a), origin(motion.position, matrix, world.com, b))
+    plane, up = shapes.table[t, KIND] == PLANE, turn(matrix, b, (0.0, 0.0, 1.0))
+    at, pieces = near.start[p, 0], convex.start[t + 1] - convex.start[t]
+    whole = add(get(motion.position, b), turn(matrix, b, get(world.centre, b)))
+    whole = sub(whole, origin(motion.position, matrix, world.com, b))
+    for i in range(convex.start[s], convex.start[s + 1]):
+        ball = (convex.table[i, BALL], convex.table[i, BALL + 1], convex.table[i, BALL + 2])
+        middle = add(offset, turn(matrix, a, scale(ball, world.scale[a])))
+        radius = world.scale[a] * convex.table[i, BALL + 3]
+        first = i - convex.start[s]
+        if plane:
+            away = dot(up, middle) - radius
+            if away <= most:
+                near.leaf[at], near.away[at] = first, away
+                at += 1
+            continue
+        if norm(sub(middle, whole)) - radius - norm(get(world.half, b)) > most:
+            continue
+        for j in range(convex.start[t], convex.start[t + 1]):
+            ball = (convex.table[j, BALL], convex.table[j, BALL + 1], convex.table[j, BALL + 2])
+            there = turn(matrix, b, scale(ball, world.scale[b]))
+            away = norm(sub(middle, there)) - radius - world.scale[b] * convex.table[j, BALL + 3]
+            if away <= most:
+                near.leaf[at], near.away[at] = first * pieces + j - convex.start[t], away
+                at += 1
+    near.count[p, 0] = at - near.start[p, 0]
+
+
+@njit(**FAST)
+def collide(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch):
+    """Bring all manifolds up to the present poses: old points moved along or dropped, new ones found.
+
+    `gone` [N] is how far any point of a body may have moved since `near` was made.
+    """
+    if len(near.start) >= MANY:
+        _collide_many(shapes, world, motion, matrix, rules, manifolds, near, gone)
+    else:
+        for p in range(len(near.start)):
+            _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, p)
+
+
+@njit(parallel=True, **FAST)
+def _collide_many(shapes, world, motion, matrix, rules, manifolds, near, gone):
+    for i in prange(SHARES):
+        t, scratch = np.int64(i), scratch_room()
+        for p in range(t, len(near.start), SHARES):
+            _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, p)
+
+
+@njit(**BARE)
+def _collide_pair(shapes, world, motion, matrix, rules, manifolds, near, gone, scratch, p):
+    a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
+    if near.count[p, 0] + near.count[p, 1] == 0:
+        manifolds.count[p] = 0
+        return
+    way = way_of(shapes, world.shape[a], world.shape[b])
+    if way == ROUND:
+        _collide_round(shapes, world, motion, matrix, rules, manifolds, scratch, p)
+        return
+    went = gone[a] + gone[b]
+    if went - near.looked[p] < rules.still:
+        manifolds.count[p] = moved(shapes, world, motion, matrix, rules, manifolds, p, manifolds.count[p])
+        return
+    near.looked[p], near.away_all[p] = went, math.inf
+    if way == SOLIDS:
+        known = manifolds.count[p]
+        for at in range(near.start[p, 0], near.start[p, 0] + near.count[p, 0]):
+            near.held[at] = False
+        count = collide_solids(shapes, world, motion, matrix, rules, manifolds, near, went, scratch, p)
+        if known == 0:
+            count = first_to_touch(rules, scratch.found, count)
+        manifolds.count[p] = renewed(rules, manifolds.point, p, known, scratch, count)
+        return
+    known = moved(shapes, world, motion, matrix, rules, manifolds, p, manifolds.count[p])
+    manifolds.count[p] = known
+    count, look = 0, rules.look + 2.0 * rules.margin + _nearer(world, motion, rules, a, b)
+    for side in range(2):
+        if swallowed(shapes, world, motion, matrix, a, b, side, scratch.found):
+            manifolds.count[p] = merged(rules, manifolds.point, p, 0, scratch, 1, False)
+            near.away_all[p] = -math.inf
+            return
+    for side in range(2):
+        count = nodes_near(shapes, world, motion, matrix, look, a, b, side, near, p, went, scratch, count)
+    count = first_to_touch(rules, scratch.found, count)
+    manifolds.count[p] = merged(rules, manifolds.point, p, known, scratch, count, False)
+    _torsion_arms(shapes, world, motion, matrix, rules, manifolds, p)
+
+
+@njit(**BARE)
+def _torsion_arms(shapes, world, motion, matrix, rules, manifolds, p):
+    """Where friction acts of points that bound a flat manifold, in parts of the way from its middle to each: the mean
+    of what touches on this way. A full face, legs and a rim differ."""
+    a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
+    point, count = manifolds.point[p], manifolds.count[p]
+    middle, flat = (0.0, 0.0, 0.0), count >= 3
+    for k in range(count):
+        point[k, TORSION] = 1.0
+        alike = 0.0
+        for x in range(3):
+            alike += point[k, NORMAL + x] * point[0, NORMAL + x]
+        flat = flat and alike > FLAT and point[k, KEY] == point[0, KEY]
+        middle = add(middle, (point[k, 0], point[k, 1], point[k, 2]))
+    if not flat:
+        return
+    middle = scale(middle, 1.0 / count)
+    full = _both_touch(shapes, world, motion, matrix, rules, a, b, middle)
+    for k in range(count):
+        if full:
+            point[k, TORSION] = FACE
+            continue
+        way = sub((point[k, 0], point[k, 1], point[k, 2]), middle)
+        total = weights = 0.0
+        for e in range(PROBES):
+            t = (e + 0.5) / PROBES
+            if _both_touch(shapes, world, motion, matrix, rules, a, b, along(middle, way, t)):
+                total, weights = total + t * t, weights + t
+        point[k, TORSION] = total / weights if weights > 0.0 else 1.0
+
+
+@njit(**BARE)
+def _both_touch(shapes, world, motion, matrix, rules, a, b, place):
+    """Whether a place, from the first body's centre of mass in its axes, is on the surface of either."""
+    place = add(get(motion.position, a), turn(matrix, a, place))
+    for body in (a, b):
+        here = turn_back(matrix, body, sub(place, get(motion.position, body)))
+        here = scale(add(here, get(world.com, body)), 1.0 / world.scale[body])
+        d = distance_alone(shapes.table, shapes.brick, shapes.sample, world.shape[body], here)
+        if abs(d) * world.scale[body] > rules.look:
+            return False
+    return True
+
+
+@njit(**BARE)
+def _nearer(world, motion, rules, a, b):
+    """How much farther than usual a pair looks for points: as far as any of its points may come nearer."""
+    if rules.ahead == 0.0:
+        return 0.0
+    speed = norm(sub(get(motion.velocity, a), get(motion.velocity, b))) + norm(vector(rules.gravity)) * rules.ahead
+    for body in (a, b):
+        if world.radius[body] < math.inf:
+            speed += norm(get(motion.angular, body)) * world.radius[body]
+    return speed * rules.ahead
+
+
+@njit(**BARE)
+def collide_solids(shapes, world, motion, matrix, rules, manifolds, near, went, scratch, p):
+    """The points at which the convex pieces of two bodies touch or may soon; how many."""
+    convex, found, polygons = solids(shapes), scratch.found, scratch.polygons
+    a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
+    s, t = world.shape[a], world.shape[b]
+    offset = sub(origin(motion.position, matrix, world.com, a), origin(motion.position, matrix, world.com, b))
+    look = rules.reach + 2.0 * rules.margin + _nearer(world, motion, rules, a, b)
+    plane, pieces = shapes.table[t, KIND] == PLANE, max(1, convex.start[t + 1] - convex.start[t])
+    up, count = turn(matrix, b, (0.0, 0.0, 1.0)), 0
+    for at in range(near.start[p, 0], near.start[p, 0] + near.count[p, 0]):
+        if near.away[at] - went <= look:
+            i, j = near.leaf[at] // pieces, near.leaf[at] % pieces
+            key = i * KEYS + j
+            pair = Pair(convex.start[s] + i, convex.start[t] + j, a, b, world.scale[a], world.scale[b], offset)
+            own = his = (0.0, 0.0, 0.0)
+            if plane:
+                gap, n = _above(convex, matrix, pair, up), up
+            elif near.held[at]:
+                n = get(near.axis, at)
+                gap = separation(convex, matrix, pair, n)
+                gap -= pair.size * rounding(convex, pair.first) + pair.other * rounding(convex, pair.second)
+            else:
+                known, n = _known_normal(near, at, manifolds, p, key)
+                gap, n, own, his = closest(convex, matrix, pair, n, known, look, scratch.simplex)
+                put(near.axis, at, n)
+            near.away[at] = gap + went
+            if gap <= look:
+                if count + CHOSEN > FOUND:
+                    count = thinned(scratch, count)
+                picked, arm = touching_points(
+                    convex, matrix, pair, plane, near.held[at], gap, n, own, his, look, polygons
+                )
+                count = _write_points(world, matrix, pair, n, picked, arm, key, polygons, found, count)
+        near.away_all[p] = min(near.away_all[p], near.away[at])
+    return count
+
+
+@njit(**BARE)
+def _lowest_point(convex, matrix, pair, up):
+    """The point of a piece that is lowest along the normal of a plane."""
+    low = farthest(convex, pair.first, pair.size, matrix, pair.a, scale(up, -1.0))
+    return along(add(pair.offset, low), up, -pair.size * rounding(convex, pair.first))
+
+
+@njit(**BARE)
+def _above(convex, matrix, pair, up):
+    """How high the lowest point of a piece is above a plane."""
+    return dot(up, _lowest_point(convex, matrix, pair, up))
+
+
+@njit(**BARE)
+def _known_normal(near, at, manifolds, p, key):
+    """Whether a normal of a pair of pieces is known, and it: of when it was last looked at, or of a contact."""
+    n = get(near.axis, at)
+    if n[0] != 0.0 or n[1] != 0.0 or n[2] != 0.0:
+        return True, n
+    for k in range(manifolds.count[p]):
+        if manifolds.point[p, k, KEY] == key:
+            point = manifolds.point[p, k]
+            return True, (point[NORMAL], point[NORMAL + 1], point[NORMAL + 2])
+    return False, n
+
+
+@njit(**BARE)
+def _write_points(world, matrix, pair, n, picked, arm, key, polygons, found, count):
+    """The picked corners of a contact as points of a manifold."""
+    a, b = pair.a, pair.b
+    for k in range(picked):
+        corner = polygons.picked[k]
+        mine = get(polygons.clipped, corner)
+        theirs = along(mine, n, -polygons.gap[corner])
+        first = sub(turn_back(matrix, a, sub(mine, pair.offset)), get(world.com, a))
+        second = sub(turn_back(matrix, b, theirs), get(world.com, b))
+        write(found, count, 0, first, second, n, polygons.gap[corner], key)
+        found[count, TORSION] = arm
+        count += 1
+    return count
+
+
+@njit(**BARE)
+def _collide_round(shapes, world, motion, matrix, rules, manifolds, scratch, p):
+    """The manifold of a pair with a sphere or a capsule."""
+    a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
+    first, second = shapes.table[world.shape[a], KIND], shapes.table[world.shape[b], KIND]
+    one, other = is_round(shapes.table, world.shape[a]), is_round(shapes.table, world.shape[b])
+    known, found, point = manifolds.count[p], scratch.found, manifolds.point
+    reach = rules.reach + _nearer(world, motion, rules, a, b)
+    count = round_points(shapes, world, motion, matrix, reach, a, b, 0 if one else 1, found)
+    if count == 1 and first == SPHERE and second == SPHERE:
+        for x in range(COLUMNS):
+            if known == 0 or x < PUSH or x >= KEY:
+                point[p, 0, x] = found[0, x]
+        manifolds.count[p] = 1
+        return
+    if (one and other) or (first if one else second) != SPHERE:
+        known = 0
+    known = moved(shapes, world, motion, matrix, rules, manifolds, p, known)
+    if count + known > 0:
+        known = merged(rules, point, p, known, scratch, count, True)
+    manifolds.count[p] = known
+
+
+@njit(**BARE)
+def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, least, enough, refresh, room):
+    """The least distance of pair p with its two bodies at `place` and `frame`, of the parts that were near; `least`
+    where all are farther, and any that is less than `enough`. `went` is how much nearer two points may have come since
+    `near` was made; whether the poses are those of the bodies, so that `near` may take up how far parts are
+    (`refresh`)."""
+    table, brick, sample, convex = shapes.table, shapes.brick, shapes.sample, solids(shapes)
+    s, t = shape[pairs[p, 0]], shape[pairs[p, 1]]
+    way = way_of(shapes, s, t)
+    if way == SOLIDS:
+        offset = sub(origin(place, frame, coms, 0), origin(place, frame, coms, 1))
+        plane, pieces = table[t, KIND] == PLANE, max(1, convex.start[t + 1] - convex.start[t])
+        for at in range(near.start[p, 0], near.start[p, 0] + near.count[p, 0]):
+            if near.away[at] - went >= least or near.held[at]:
+                continue
+            i, j = near.leaf[at] // pieces, near.leaf[at] % pieces
+            # Numbers of one type, or all would be compiled once more.
+            one, other = np.int64(0), np.int64(1)
+            pair = Pair(convex.start[s] + i, convex.start[t] + j, one, other, scales[0], scales[1], offset)
+            if plane:
+                gap = _above(convex, frame, pair, turn(frame, 1, (0.0, 0.0, 1.0)))
+            else:
+                n = get(near.axis, at)
+                known = n[0] != 0.0 or n[1] != 0.0 or n[2] != 0.0
+                gap, n, _, _ = closest(convex, frame, pair, n, known, least, room)
+                put(near.axis, at, n)
+            if refresh:
+                near.away[at] = gap + went
+            least = min(least, gap)
+            if least < enough:
+                return least
+        return least
+    for side in range(2):
+        s, t = shape[pairs[p, side]], shape[pairs[p, 1 - side]]
+        w, c = map_between(place, frame, scales, coms, side, 1 - side)
+        k = scales[1 - side]
+        if is_round(table, s) and way == ROUND:
+            half = table[s, SIZE + 1] if table[s, KIND] == CAPSULE else 0.0
+            for e in range(-2, 3):
+                d = distance_alone(table, brick, sample, t, mapped(w, c, (0.0, 0.0, 0.5 * e * half)))
+                least = min(least, k * d - scales[side] * table[s, SIZE])
+        elif near.count[p, side] > 0 and not is_round(table, s):
+            first, last = near.start[p, side], near.start[p, side] + near.count[p, side]
+            front = first
+            if refresh:
+                for i in range(first, last):
+                    if near.away[i] - went < least:
+                        near.away[i] = went + beyond(shapes, t, w, c, k, scales[side], near.leaf[i])
+                        front = i if near.away[i] < near.away[front] else front
+            # The nearest leaf first: the others are then seldom near enough to be looked into.
+            for n in range(first - 1, last):
+                i = front if n < first else n
+                if n == front or near.away[i] - went >= least:
+                    continue
+                e = near.leaf[i]
+                if refresh or beyond(shapes, t, w, c, k, scales[side], e) < least:
+                    there, d = get(shapes.node, shapes.leaf_node[e]), -math.inf
+                    for u in range(shapes.leaf_node[e], shapes.leaf_node[e + 1]):
+                        p_u = get(shapes.node, u)
+                        if d - scales[side] * norm(sub(p_u, there)) < least:  # else too near to one that is far
+                            d = distance_alone(table, brick, sample, t, mapped(w, c, p_u))
+                            least, there, d = min(least, k * d), p_u, k * at_least(table, t, d)
+                    if least < enough:
+                        return least
+    return least

@@ -1,0 +1,457 @@
+"""Sequential impulses, compiled: what contacts do to velocities in one inner step, island by island."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit, prange
+
+from sdfsim.physics.solver.vectors import BARE, FAST, add, along, cross, dot, get, norm, scale, sub, turn, vector
+from sdfsim.physics.solver.world import DRAG, FIRST, GAP, KEY, NORMAL, PUSH, SECOND, TORSION, VOID
+
+# Columns of a row: its direction, how it turns the first and the second body, what a unit of impulse makes of their
+# angular velocities, the inverse of what it makes of the relative velocity, the wanted change, the impulse so far.
+AXIS, ARM, OTHER, SPIN, COUNTER, MASS, WANTED, IMPULSE, WIDTH = 0, 3, 6, 9, 12, 15, 16, 17, 18
+TOUCH = 1e-6  # model lengths: nearer is touching, so that rounding does not decide when what starts in contact is met
+AT_REST = 1e-9  # squared: slower tangential motion has no direction
+# No island may gain more energy than so many times what its pushes out of penetration would give each contact alone,
+# this share of what its contacts bring with them, and what lifts it by so many slops: a stack lifts all that is above.
+SPARE, ROUNDING, LIFT = 4.0, 0.01, 10.0
+# What comes nearer than this part of a thickness in an inner step bounces before it has touched, else after: thin
+# things would be deep in each other.
+THIN = 0.005
+MANY = 64  # islands of contacts from which on threads are worth their while
+
+
+class System(NamedTuple):
+    """The equations of C contact points."""
+
+    where: np.ndarray  # [C, 4] int64: manifold, point, first and second body
+    row: np.ndarray  # [C, 3, WIDTH]: along the normal and two tangents
+    grip: np.ndarray  # [C] product of friction
+    wanted: np.ndarray  # [C] speed that resolves penetration and is then forgotten
+    pushed: np.ndarray  # [C] impulse that has given it so far
+    # [C, 3]: the change that is wanted along the normal if nothing rebounds and no penetration is resolved; the
+    # speed along it without contact; and the speed that resolves penetration and stays
+    calm: np.ndarray
+    start: np.ndarray  # [I + 1] int64, island i has the contacts order[start[i] : start[i + 1]]
+    order: np.ndarray  # [C] int64
+
+
+@njit(**FAST)
+def respond(world, work, motion, rules, manifolds):
+    """Solve for the impulses of all contacts; they go to the manifolds, and to `change` and `shift` of `work`.
+
+    Returns:
+        The equations that were solved.
+    """
+    change, shift = work.change, work.shift
+    system = _equations(world, work, motion, rules, manifolds)
+    islands = len(system.start) - 1
+    if islands >= MANY:
+        _solve_many(world, rules, system, change, shift)
+    else:
+        for i in range(islands):
+            _solve(world, rules, system, change, shift, i)
+    for c in range(len(system.where)):
+        point = manifolds.point[system.where[c, 0], system.where[c, 1]]
+        point[PUSH] = system.row[c, 0, IMPULSE]
+        for x in range(3):
+            one, other = system.row[c, 1], system.row[c, 2]
+            point[DRAG + x] = one[IMPULSE] * one[AXIS + x] + other[IMPULSE] * other[AXIS + x]
+    return system
+
+
+@njit(**FAST)
+def _equations(world, work, motion, rules, manifolds):
+    matrix, inverse, free = work.matrix, work.inverse, work.free
+    most = manifolds.count.sum()
+    where = np.empty((most, 4), np.int64)
+    row = np.zeros((most, 3, WIDTH))
+    grip, wanted, pushed, calm = np.empty(most), np.empty(most), np.zeros(most), np.empty((most, 3))
+    count = 0
+    for m in range(len(manifolds.count)):
+        a, b = manifolds.pair[m, 0], manifolds.pair[m, 1]
+        if motion.island[a] >= 0 and (motion.island[b] >= 0 or not world.moves[b]):
+            continue
+        friction = world.friction[a] * world.friction[b] if rules.friction else 0.0
+        bounce = world.restitution[a] * world.restitution[b] if rules.restitution else 0.0
+        margin = rules.margin * ((world.radius[a] < math.inf) + (world.radius[b] < math.inf))
+        between = sub(get(motion.position, a), get(motion.position, b))
+        thin = THIN * min(world.thickness[a], world.thickness[b])
+        for k in range(manifolds.count[m]):
+            point = manifolds.point[m, k]
+            n = (point[NORMAL], point[NORMAL + 1], point[NORMAL + 2])
+            arm = turn(matrix, a, (point[0], point[1], point[2]))
+            other = turn(matrix, b, (point[3], point[4], point[5]))
+            arm, other = met_half_way(between, arm, other)
+            now = _relative(motion.velocity, motion.angular, a, b, arm, other)
+            free_fall = add(now, _coming(free, a, b, arm, other))
+            then = add(free_fall, _turning(free, a, b, arm, other))
+            approach = dot(now, n)
+            gap = point[GAP] - margin
+            way = -dot(then, n) * rules.inner
+            early = not rules.adds and way > thin
+            if point[VOID] > 0.0 or (gap > TOUCH and ((-approach > rules.slow and not early) or gap > way)):
+                point[PUSH] = point[DRAG] = point[DRAG + 1] = point[DRAG + 2] = 0.0
+                continue
+            _row(world.inverse_mass, inverse, a, b, arm, other, n, row, count, 0)
+            # Newton's rule for all that meets in one impact: without friction, and with e = 1, energy is kept.
+            target, rebounds = 0.0, bounce > 0.0 and abs(approach) > rules.slow
+            if rebounds:
+                # What bounces before it has touched has the speed that it will have here on its way back.
+                pull = (dot(free_fall, n) - approach) / rules.inner
+                fall = 2.0 * pull * max(gap, 0.0) * (1.0 - bounce * bounce)
+                square = bounce * bounce * approach * approach + (fall if early else 0.0)
+                target, rebounds = -math.copysign(math.sqrt(max(square, 0.0)), approach), square > 0.0
+            # An impact is over before a body has turned: what the gyroscopic torque makes of it comes after.
+            before = dot(free_fall, n) if rebounds else dot(then, n)
+            deep = push = rest = 0.0
+            if gap > TOUCH:
+                rest = -gap / rules.inner
+                target = target if rebounds else rest
+            elif gap > -rules.split:
+                if gap < -rules.slop:
+                    push = (-gap - rules.slop) * rules.erp / rules.inner
+                    target = max(push, min(target + push, -approach) if rules.adds else target)
+            else:
+                deep = -gap * rules.erp / rules.inner
+            row[count, 0, WANTED] = target - before
+            row[count, 0, IMPULSE] = point[PUSH]
+            wanted[count] = deep
+            calm[count, 0], calm[count, 1], calm[count, 2] = rest - before, before, push
+            grip[count] = friction
+            if friction > 0.0:
+                if point[TORSION] < 1.0:
+                    arm, other = _drawn_in(matrix, manifolds.point, m, manifolds.count[m], k, a, b, between)
+                    then = add(
+                        _relative(motion.velocity, motion.angular, a, b, arm, other), _coming(free, a, b, arm, other)
+                    )
+                    then = add(then, _turning(free, a, b, arm, other))
+                slip = along(then, n, -dot(then, n))
+                one = _tangent(n, slip, vector(rules.gravity))
+                two = cross(n, one)
+                _row(world.inverse_mass, inverse, a, b, arm, other, one, row, count, 1)
+                _row(world.inverse_mass, inverse, a, b, arm, other, two, row, count, 2)
+                row[count, 1, WANTED] = -dot(then, one)
+                row[count, 2, WANTED] = -dot(then, two)
+                drag = (point[DRAG], point[DRAG + 1], point[DRAG + 2])
+                most_drag = friction * point[PUSH]
+                first, second = dot(drag, one), dot(drag, two)
+                if rules.cone:
+                    share = _within(first, second, most_drag)
+                    row[count, 1, IMPULSE], row[count, 2, IMPULSE] = share * first, share * second
+                else:
+                    row[count, 1, IMPULSE] = min(max(first, -most_drag), most_drag)
+                    row[count, 2, IMPULSE] = min(max(second, -most_drag), most_drag)
+            where[count, 0], where[count, 1], where[count, 2], where[count, 3] = m, k, a, b
+            count += 1
+    start, order = _islands(world, work.parent, work.number, where[:count])
+    return System(where[:count], row[:count], grip[:count], wanted[:count], pushed[:count], calm[:count], start, order)
+
+
+@njit(**BARE)
+def met_half_way(between, arm, other):
+    """Both ends of a contact moved half way to one another: an impulse at one place keeps angular momentum."""
+    apart = add(between, sub(arm, other))
+    return along(arm, apart, -0.5), along(other, apart, 0.5)
+
+
+@njit(**BARE)
+def _drawn_in(matrix, point, m, count, k, a, b, between):
+    """Where friction acts of a point that bounds a face: nearer to the middle of those of the same two patches."""
+    middle, opposite, alike = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0
+    for e in range(count):
+        if point[m, e, KEY] == point[m, k, KEY]:
+            middle = add(middle, (point[m, e, FIRST], point[m, e, FIRST + 1], point[m, e, FIRST + 2]))
+            opposite = add(opposite, (point[m, e, SECOND], point[m, e, SECOND + 1], point[m, e, SECOND + 2]))
+            alike += 1
+    own, share = point[m, k], point[m, k, TORSION]
+    arm = along(scale(middle, (1.0 - share) / alike), (own[FIRST], own[FIRST + 1], own[FIRST + 2]), share)
+    other = along(scale(opposite, (1.0 - share) / alike), (own[SECOND], own[SECOND + 1], own[SECOND + 2]), share)
+    return met_half_way(between, turn(matrix, a, arm), turn(matrix, b, other))
+
+
+@njit(**BARE)
+def _within(one, other, most):
+    """By which factor a tangential impulse is to be shortened to lie within the cone of friction."""
+    length = math.sqrt(one * one + other * other)
+    return 1.0 if length <= most else most / length
+
+
+@njit(**BARE)
+def _relative(velocity, angular, a, b, arm, other):
+    """How fast the point of the first body moves from that of the second."""
+    one = add(get(velocity, a), cross(get(angular, a), arm))
+    two = add(get(velocity, b), cross(get(angular, b), other))
+    return sub(one, two)
+
+
+@njit(**BARE)
+def _coming(free, a, b, arm, other):
+    one = add((free[a, 0], free[a, 1], free[a, 2]), cross((free[a, 3], free[a, 4], free[a, 5]), arm))
+    two = add((free[b, 0], free[b, 1], free[b, 2]), cross((free[b, 3], free[b, 4], free[b, 5]), other))
+    return sub(one, two)
+
+
+@njit(**BARE)
+def _turning(free, a, b, arm, other):
+    """What the gyroscopic torque adds to the relative velocity."""
+    return sub(cross((free[a, 6], free[a, 7], free[a, 8]), arm), cross((free[b, 6], free[b, 7], free[b, 8]), other))
+
+
+@njit(**BARE)
+def _tangent(n, slip, gravity):
+    """The first direction of friction: along the slip, else along gravity's tangential part, else any."""
+    length = dot(slip, slip)
+    if length < AT_REST:
+        slip = along(gravity, n, -dot(gravity, n))
+        length = dot(slip, slip)
+        if length < 1e-6 * dot(gravity, gravity) + 1e-30:
+            axis = (1.0, 0.0, 0.0) if abs(n[0]) < 0.7 else (0.0, 1.0, 0.0)
+            slip = cross(n, axis)
+            length = dot(slip, slip)
+    return scale(slip, 1.0 / math.sqrt(length))
+
+
+@njit(**BARE)
+def _row(inverse_mass, inverse, a, b, arm, other, axis, row, c, e):
+    lever = cross(arm, axis)
+    counter = cross(axis, other)
+    spin = turn(inverse, a, lever)
+    back = turn(inverse, b, counter)
+    for x in range(3):
+        row[c, e, AXIS + x], row[c, e, ARM + x], row[c, e, OTHER + x] = axis[x], lever[x], counter[x]
+        row[c, e, SPIN + x], row[c, e, COUNTER + x] = spin[x], back[x]
+    row[c, e, MASS] = 1.0 / (inverse_mass[a] + inverse_mass[b] + dot(lever, spin) + dot(counter, back))
+
+
+@njit(**BARE)
+def root(parent, b):
+    while parent[b] != b:
+        parent[b] = parent[parent[b]]
+        b = parent[b]
+    return b
+
+
+@njit(**BARE)
+def join(parent, a, b):
+    """Bodies a and b belong together."""
+    one, other = root(parent, a), root(parent, b)
+    parent[max(one, other)] = min(one, other)
+
+
+@njit(**FAST)
+def _islands(world, parent, number, where):
+    """Contacts ordered by island: bodies that move, joined by contacts."""
+    for c in range(len(where)):
+        for e in range(2, 4):
+            parent[where[c, e]], number[where[c, e]] = where[c, e], -1
+    for c in range(len(where)):
+        a, b = where[c, 2], where[c, 3]
+        if world.moves[a] and world.moves[b]:
+            join(parent, a, b)
+    islands = 0
+    label = np.empty(len(where), np.int64)
+    for c in range(len(where)):
+        a = root(parent, where[c, 2])
+        if number[a] < 0:
+            number[a] = islands
+            islands += 1
+        label[c] = number[a]
+    start = np.zeros(islands + 1, np.int64)
+    for c in range(len(where)):
+        start[label[c] + 1] += 1
+    for i in range(islands):
+        start[i + 1] += start[i]
+    fill = start[:-1].copy()
+    order = np.empty(len(where), np.int64)
+    for c in range(len(where)):
+        order[fill[label[c]]] = c
+        fill[label[c]] += 1
+    return start, order
+
+
+@njit(parallel=True, **FAST)
+def _solve_many(world, rules, system, change, shift):
+    for i in prange(len(system.start) - 1):
+        _solve(world, rules, system, change, shift, np.int64(i))
+
+
+@njit(**BARE)
+def _solve(world, rules, system, change, shift, island):
+    """One island; where it would gain energy from nothing, again with half of what rebounds and pushes, then without.
+
+    Contacts that contradict each other, as of bodies that are wedged into one another, would else throw them apart.
+    """
+    where, row, mass, order = system.where, system.row, world.inverse_mass, system.order
+    lively = deep = False
+    for o in range(system.start[island], system.start[island + 1]):
+        c = order[o]
+        deep = deep or system.wanted[c] > 0.0
+        lively = lively or row[c, 0, WANTED] > system.calm[c, 0]
+        for e in range(3 if system.grip[c] > 0.0 else 1):
+            if row[c, e, IMPULSE] != 0.0:
+                _apply(where, row, mass, change, c, e, row[c, e, IMPULSE])
+    if deep:
+        _part(mass, rules, system, shift, island)
+    _balance(mass, rules, system, change, island)
+    for share in (0.5, 0.0):
+        if not lively or not _gains(rules, system, change, island):
+            return
+        for o in range(system.start[island], system.start[island + 1]):
+            c = order[o]
+            for x in range(6):
+                change[where[c, 2], x] = change[where[c, 3], x] = 0.0
+            for e in range(3):
+                row[c, e, IMPULSE] = 0.0
+            # The first time half of the difference is left, then none.
+            row[c, 0, WANTED] = system.calm[c, 0] + share * (row[c, 0, WANTED] - system.calm[c, 0])
+            if system.calm[c, 2] > 0.0:
+                system.wanted[c] = (1.0 - share) * system.calm[c, 2]
+        _part(mass, rules, system, shift, island)
+        _balance(mass, rules, system, change, island)
+
+
+@njit(**BARE)
+def _gains(rules, system, change, island):
+    """Whether contacts have given an island more energy than they may: impulses times mean velocities, added up."""
+    where, row = system.where, system.row
+    work = spare = 0.0
+    lift = 2.0 * norm(vector(rules.gravity)) * LIFT * rules.slop
+    for o in range(system.start[island], system.start[island + 1]):
+        c = system.order[o]
+        before, push = system.calm[c, 1], system.calm[c, 2]
+        spare += 0.5 * row[c, 0, MASS] * (SPARE * push * push + ROUNDING * before * before + lift)
+        work += row[c, 0, IMPULSE] * (before + 0.5 * _speed(where, row, change, c, 0))
+        for e in range(1, 3 if system.grip[c] > 0.0 else 1):
+            work += row[c, e, IMPULSE] * (0.5 * _speed(where, row, change, c, e) - row[c, e, WANTED])
+    return work > spare
+
+
+@njit(**BARE)
+def _part(mass, rules, system, shift, island):
+    """Part what is deep in each other, by velocities that move bodies once and are forgotten."""
+    where, row, order = system.where, system.row, system.order
+    for _ in range(rules.rounds):
+        worst = 0.0
+        for o in range(system.start[island], system.start[island + 1]):
+            c = order[o]
+            if system.wanted[c] > 0.0:
+                short = system.wanted[c] - _speed(where, row, shift, c, 0)
+                total = max(system.pushed[c] + short * row[c, 0, MASS], 0.0)
+                step = total - system.pushed[c]
+                system.pushed[c] = total
+                _apply(where, row, mass, shift, c, 0, step)
+                worst = max(worst, abs(step / row[c, 0, MASS]))
+        if worst <= rules.exact:
+            break
+
+
+@njit(**BARE)
+def _balance(mass, rules, system, change, island):
+    """All normals, then all friction, until no impulse changes a velocity by more than `exact`."""
+    where, row, order, grip = system.where, system.row, system.order, system.grip
+    first, last = system.start[island], system.start[island + 1]
+    for _ in range(rules.rounds):
+        worst = 0.0
+        for o in range(first, last):
+            c = order[o]
+            worst = max(worst, _relax(where, row, mass, change, c, 0, 1, 0.0, math.inf))
+        for o in range(first, last):
+            c = order[o]
+            if grip[c] > 0.0:
+                most = grip[c] * row[c, 0, IMPULSE]
+                if rules.cone:
+                    worst = max(worst, _rub(where, row, mass, change, c, most))
+                else:
+                    worst = max(worst, _relax(where, row, mass, change, c, 1, 3, -most, most))
+        if worst <= rules.exact:
+            break
+
+
+@njit(**BARE)
+def _relax(where, row, mass, change, c, first, last, least, most):
+    """Bring rows of a contact to their wanted velocities, as far as limits allow; returns by how much that changed."""
+    a, b = where[c, 2], where[c, 3]
+    v, w = (change[a, 0], change[a, 1], change[a, 2]), (change[a, 3], change[a, 4], change[a, 5])
+    u, z = (change[b, 0], change[b, 1], change[b, 2]), (change[b, 3], change[b, 4], change[b, 5])
+    worst = 0.0
+    for e in range(first, last):
+        axis = _three(row, c, e, AXIS)
+        short = row[c, e, WANTED] - _along_row(row, c, e, sub(v, u), w, z)
+        total = min(max(row[c, e, IMPULSE] + short * row[c, e, MASS], least), most)
+        step = total - row[c, e, IMPULSE]
+        if step == 0.0:
+            continue
+        row[c, e, IMPULSE] = total
+        v, u = along(v, axis, step * mass[a]), along(u, axis, -step * mass[b])
+        w, z = along(w, _three(row, c, e, SPIN), step), along(z, _three(row, c, e, COUNTER), step)
+        worst = max(worst, abs(step / row[c, e, MASS]))
+    if worst > 0.0:
+        for x in range(3):
+            change[a, x], change[a, 3 + x], change[b, x], change[b, 3 + x] = v[x], w[x], u[x], z[x]
+    return worst
+
+
+@njit(**BARE)
+def _rub(where, row, mass, change, c, most):
+    """Bring both tangential rows of a contact to rest, as far as the cone of friction allows; returns by how much that
+    changed."""
+    a, b = where[c, 2], where[c, 3]
+    v, w = (change[a, 0], change[a, 1], change[a, 2]), (change[a, 3], change[a, 4], change[a, 5])
+    u, z = (change[b, 0], change[b, 1], change[b, 2]), (change[b, 3], change[b, 4], change[b, 5])
+    first, second = row[c, 1, IMPULSE], row[c, 2, IMPULSE]
+    # One mass for both, so that friction ends up against the slip and not aside.
+    lesser = min(row[c, 1, MASS], row[c, 2, MASS])
+    between = sub(v, u)
+    one = first + lesser * (row[c, 1, WANTED] - _along_row(row, c, 1, between, w, z))
+    other = second + lesser * (row[c, 2, WANTED] - _along_row(row, c, 2, between, w, z))
+    share = _within(one, other, most)
+    one, other = share * one, share * other
+    row[c, 1, IMPULSE], row[c, 2, IMPULSE] = one, other
+    one, other = one - first, other - second
+    if one == 0.0 and other == 0.0:
+        return 0.0
+    pull = add(scale(_three(row, c, 1, AXIS), one), scale(_three(row, c, 2, AXIS), other))
+    v, u = along(v, pull, mass[a]), along(u, pull, -mass[b])
+    w = along(along(w, _three(row, c, 1, SPIN), one), _three(row, c, 2, SPIN), other)
+    z = along(along(z, _three(row, c, 1, COUNTER), one), _three(row, c, 2, COUNTER), other)
+    for x in range(3):
+        change[a, x], change[a, 3 + x], change[b, x], change[b, 3 + x] = v[x], w[x], u[x], z[x]
+    return max(abs(one), abs(other)) / lesser
+
+
+@njit(**BARE)
+def _three(row, c, e, column):
+    return row[c, e, column], row[c, e, column + 1], row[c, e, column + 2]
+
+
+@njit(**BARE)
+def _along_row(row, c, e, between, w, z):
+    """The relative velocity along a row, of the difference of two bodies' velocities and of their angular ones."""
+    return dot(_three(row, c, e, AXIS), between) + dot(_three(row, c, e, ARM), w) + dot(_three(row, c, e, OTHER), z)
+
+
+@njit(**BARE)
+def _speed(where, row, change, c, e):
+    """What `change` makes of the relative velocity along a row."""
+    a, b = where[c, 2], where[c, 3]
+    total = 0.0
+    for x in range(3):
+        total += row[c, e, AXIS + x] * (change[a, x] - change[b, x])
+        total += row[c, e, ARM + x] * change[a, 3 + x] + row[c, e, OTHER + x] * change[b, 3 + x]
+    return total
+
+
+@njit(**BARE)
+def _apply(where, row, mass, change, c, e, impulse):
+    a, b = where[c, 2], where[c, 3]
+    one, other = impulse * mass[a], impulse * mass[b]
+    for x in range(3):
+        change[a, x] += one * row[c, e, AXIS + x]
+        change[b, x] -= other * row[c, e, AXIS + x]
+        change[a, 3 + x] += impulse * row[c, e, SPIN + x]
+        change[b, 3 + x] += impulse * row[c, e, COUNTER + x]

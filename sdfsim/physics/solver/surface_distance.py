@@ -1,0 +1,347 @@
+"""Distances met by surfaces, compiled: the nodes of one body in the distances of another, refined along its surface."""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from sdfsim.physics.solver.clipping import across
+from sdfsim.physics.solver.distance import (
+    CAPSULE,
+    CELL,
+    GRID,
+    KIND,
+    PLANE,
+    SIZE,
+    SPHERE,
+    distance,
+    distance_alone,
+    patch_of,
+)
+from sdfsim.physics.solver.manifold import ALIKE, CANDIDATES, FOUND, OUTWARD, SIDE, write
+from sdfsim.physics.solver.vectors import BARE, add, along, dot, get, norm, put, scale, sub, turn, turn_back
+
+KEYS = 1024  # patches of a shape at most
+ROUNDS = 12  # of refinement
+NEAR = 2.0  # cells: so near to its surface a grid is fine
+FARTHER = 2.0  # cells: by so much it is too far elsewhere, at a tip
+ONTO, BESIDE = 3, 0.05  # steps back onto the own surface, and how near it they must lead, in strides
+WAYS = 8  # in which the outermost nodes of a face are looked for
+STRIDE, FINEST = 0.02, 5e-4  # of a body's size, the first step of the refinement and the last
+
+
+@njit(**BARE)
+def map_between(position, matrix, scales, coms, a, b):
+    """Rows of W and the vector c: a point p of shape a is at W p + c of shape b (both at scale 1)."""
+    ratio = scales[a] / scales[b]
+    x = turn_back(matrix, b, (matrix[a, 0, 0], matrix[a, 1, 0], matrix[a, 2, 0]))
+    y = turn_back(matrix, b, (matrix[a, 0, 1], matrix[a, 1, 1], matrix[a, 2, 1]))
+    z = turn_back(matrix, b, (matrix[a, 0, 2], matrix[a, 1, 2], matrix[a, 2, 2]))
+    w = (
+        (x[0] * ratio, y[0] * ratio, z[0] * ratio),
+        (x[1] * ratio, y[1] * ratio, z[1] * ratio),
+        (x[2] * ratio, y[2] * ratio, z[2] * ratio),
+    )
+    shift = turn_back(matrix, b, sub(get(position, a), get(position, b)))
+    com = get(coms, a)
+    own = (
+        x[0] * com[0] + y[0] * com[1] + z[0] * com[2],
+        x[1] * com[0] + y[1] * com[1] + z[1] * com[2],
+        x[2] * com[0] + y[2] * com[1] + z[2] * com[2],
+    )
+    return w, scale(sub(add(shift, get(coms, b)), own), 1.0 / scales[b])
+
+
+@njit(**BARE)
+def mapped(w, c, p):
+    return dot(w[0], p) + c[0], dot(w[1], p) + c[1], dot(w[2], p) + c[2]
+
+
+@njit(**BARE)
+def is_round(table, s):
+    """Whether a shape is all within a radius of a line."""
+    return table[s, KIND] == SPHERE or table[s, KIND] == CAPSULE
+
+
+@njit(**BARE)
+def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went, scratch, count):
+    """Where the surface of one body is near another: from the deepest nodes of its near leaves down the other's
+    distance; added to what is found."""
+    if near.count[pair, side] == 0:
+        return count
+    one, other = (a, b) if side == 0 else (b, a)
+    r, s = world.shape[one], world.shape[other]
+    w, c = map_between(motion.position, matrix, world.scale, world.com, one, other)
+    k, own = world.scale[other], world.scale[one]
+    stride = STRIDE * shapes.clump_ball[shapes.clump_start[r], 3]
+    kept = _candidates(shapes, r, s, w, c, k, own, look, side, near, pair, went, scratch)
+    chosen = _chosen(scratch, kept, look)
+    for e in range(chosen):
+        if count == FOUND:
+            break
+        u, key = scratch.node[scratch.pick[e]], scratch.key[scratch.pick[e]]
+        p, d, n = _refined(
+            shapes.table, shapes.brick, shapes.sample, stride, r, s, w, c, k, own, get(shapes.node, u),
+            get(shapes.inward, u),
+        )  # fmt: skip
+        if d > look:
+            continue
+        # p of shape `one` -> about its centre of mass; its foot on the other, likewise.
+        mine = sub(scale(p, own), get(world.com, one))
+        theirs = sub(along(scale(mapped(w, c, p), k), n, -d), get(world.com, other))
+        write(scratch.found, count, side, mine, theirs, turn(matrix, other, n), d, key)
+        count += 1
+    return count
+
+
+@njit(**BARE)
+def _candidates(shapes, r, s, w, c, k, own, look, side, near, pair, went, scratch):
+    """The deepest node of each near leaf around which the surface may touch; how many."""
+    table, brick, sample = shapes.table, shapes.brick, shapes.sample
+    flat = table[s, KIND] == PLANE  # whose distance has one normal: no look from within
+    kept, most = 0, NEAR * table[s, CELL] * k / own if table[s, KIND] == GRID else math.inf
+    for at in range(near.start[pair, side], near.start[pair, side] + near.count[pair, side]):
+        i = near.leaf[at]
+        if near.away[at] - went <= look:
+            near.away[at] = beyond(shapes, s, w, c, k, own, i) + went
+        near.away_all[pair] = min(near.away_all[pair], near.away[at])
+        if near.away[at] - went > look:
+            continue
+        deepest, chosen, lowest = 0.0, -1, 1e300
+        facing, d, bound, there = (0.0, 0.0, 0.0), 0.0, -math.inf, (0.0, 0.0, 0.0)
+        for u in range(shapes.leaf_node[i], shapes.leaf_node[i + 1]):
+            p, around = get(shapes.node, u), own * shapes.cover[u]
+            if flat:
+                d, n = k * (dot(w[2], p) + c[2]), (0.0, 0.0, 1.0)
+            else:
+                within, back = _within_wall(get(shapes.inward, u), most)
+                q = add(p, within)
+                if bound - own * (norm(sub(q, there)) + back) > look + around:
+                    continue  # too near to one that is far
+                d, n = distance(table, brick, sample, s, mapped(w, c, q))
+                bound, there = k * at_least(table, s, d), q
+                d = k * d - k * _along_normal(w, within, n)
+            score = d - OUTWARD * own * norm(p)
+            if d - around <= look and score < lowest:
+                deepest, chosen, lowest, facing = d, u, score, n
+        if chosen < 0:
+            continue
+        if kept == CANDIDATES:
+            worst = 0
+            for e in range(kept):
+                worst = e if scratch.depth[e] > scratch.depth[worst] else worst
+            if scratch.depth[worst] <= deepest:
+                continue
+        else:
+            worst = kept
+            kept += 1
+        place = mapped(w, c, get(shapes.node, chosen))
+        patch, there = shapes.leaf_patch[i], patch_of(table, shapes.label, s, place)
+        scratch.depth[worst], scratch.node[worst] = deepest, chosen
+        scratch.key[worst] = patch * KEYS + there if side == 0 else there * KEYS + patch
+        put(scratch.normal, worst, facing)
+        put(scratch.place, worst, scale(place, k))
+    return kept
+
+
+@njit(**BARE)
+def _chosen(scratch, kept, level):
+    """Of candidates that face the same way the deepest, and of those that are about as deep the outermost to all sides:
+    the corners of a face, in whatever order its leaves are. How many, to scratch.pick."""
+    depth, key, normal, place, pick, used = (
+        scratch.depth, scratch.key, scratch.normal, scratch.place, scratch.pick, scratch.used,
+    )  # fmt: skip
+    for e in range(kept):
+        used[e] = 0
+    chosen = 0
+    while chosen < SIDE:
+        first = -1
+        for e in range(kept):
+            if used[e] == 0 and (first < 0 or depth[e] < depth[first]):
+                first = e
+        if first < 0:
+            break
+        n = get(normal, first)
+        u, v = across(n)
+        start = chosen
+        pick[chosen] = first
+        chosen += 1
+        for way in range(WAYS):
+            angle = 2.0 * math.pi * way / WAYS
+            d = add(scale(u, math.cos(angle)), scale(v, math.sin(angle)))
+            outer, most = -1, -math.inf
+            for e in range(kept):
+                if used[e] != 1 and key[e] == key[first] and dot(n, get(normal, e)) > ALIKE:
+                    used[e] = 2
+                    if depth[e] <= depth[first] + level and dot(d, get(place, e)) > most:
+                        outer, most = e, dot(d, get(place, e))
+            known = outer < 0
+            for e in range(start, chosen):
+                known = known or pick[e] == outer
+            if not known and chosen < SIDE:
+                pick[chosen] = outer
+                chosen += 1
+        for e in range(kept):
+            used[e] = 1 if used[e] == 2 else used[e]
+        used[first] = 1
+    return chosen
+
+
+@njit(**BARE)
+def _within_wall(inward, most):
+    """The way from a node to where it looks out from, and how long it is; shorter into a much larger body.
+
+    On an edge of the other solid its distance has two normals, and the one that parts two stacked boxes is not always
+    the nearer. From within the own solid only the face that is met is near.
+    """
+    long = norm(inward)
+    return (inward, long) if long <= most else (scale(inward, most / long), most)
+
+
+@njit(**BARE)
+def _along_normal(w, within, n):
+    """How far a way of a shape goes along a normal of the other, at the other's scale."""
+    return dot((dot(w[0], within), dot(w[1], within), dot(w[2], within)), n)
+
+
+@njit(**BARE)
+def _refined(table, brick, sample, stride, s, t, w, c, k, own, p, inward):
+    """From node p of shape s down the distance of t along the surface of s: place, distance, normal in t's axes."""
+    ratio = k / own
+    within, _ = _within_wall(inward, NEAR * table[t, CELL] * ratio if table[t, KIND] == GRID else math.inf)
+    d, n = distance(table, brick, sample, t, mapped(w, c, add(p, within)))
+    d -= _along_normal(w, within, n)
+    least = stride * (FINEST / STRIDE)
+    _, m = distance(table, brick, sample, s, p)
+    way, was = (0.0, 0.0, 0.0), 0.0  # the last step's direction, and how steep the distance was along it
+    for _ in range(ROUNDS):
+        # The other's normal in own axes (w is a rotation times own / k), less its part across the own surface.
+        g = (
+            (w[0][0] * n[0] + w[1][0] * n[1] + w[2][0] * n[2]) * ratio,
+            (w[0][1] * n[0] + w[1][1] * n[1] + w[2][1] * n[2]) * ratio,
+            (w[0][2] * n[0] + w[1][2] * n[1] + w[2][2] * n[2]) * ratio,
+        )
+        g = along(g, m, -dot(g, m))
+        slope = norm(g)
+        if slope < 0.02:
+            break
+        # As far as the slope leads if it goes on to change as in the last step (secant), and a little at first.
+        change = was + dot(way, g)
+        if was > 0.0:
+            stride = min(stride * slope / change, 3.0 * stride) if change > 0.0 else 3.0 * stride
+        way, was, better = scale(g, -1.0 / slope), slope, False
+        while stride > least:
+            q = along(p, way, stride)
+            # Back onto the own surface; beyond an edge one step does not lead there, and a place beside it is none.
+            own_d, across_own = distance(table, brick, sample, s, q)
+            for _ in range(ONTO):
+                q = along(q, across_own, -own_d)
+                own_d, across_own = distance(table, brick, sample, s, q)
+                if abs(own_d) <= BESIDE * stride:
+                    break
+            if abs(own_d) <= BESIDE * stride:
+                there, normal = distance(table, brick, sample, t, mapped(w, c, q))
+                if there < d - 1e-9:
+                    better = True
+                    p, d, n, m = q, there, normal, across_own
+                    break
+            stride *= 0.4
+        if not better:
+            break
+    return p, k * d, n
+
+
+@njit(**BARE)
+def round_points(shapes, world, motion, matrix, reach, a, b, side, found):
+    """A sphere or capsule against anything: the distance at its core, less its radius."""
+    table, brick, sample = shapes.table, shapes.brick, shapes.sample
+    one, other = (a, b) if side == 0 else (b, a)
+    s, t = world.shape[one], world.shape[other]
+    w, c = map_between(motion.position, matrix, world.scale, world.com, one, other)
+    k, own = world.scale[other], world.scale[one]
+    radius = shapes.table[s, SIZE]
+    tried = 1
+    half = 0.0
+    heights = (0.0, 0.0, 0.0)
+    if shapes.table[s, KIND] == CAPSULE:
+        half = shapes.table[s, SIZE + 1]
+        tried = 3
+        between = half if shapes.table[t, KIND] == PLANE else _lowest(table, brick, sample, t, w, c, half)
+        heights = (-half, half, between)
+    count = 0
+    for e in range(tried):
+        if e == 2 and half - abs(heights[2]) < 0.05 * half:
+            continue
+        core = (0.0, 0.0, heights[e])
+        d, n = distance(table, brick, sample, t, mapped(w, c, core))
+        gap = k * d - own * radius
+        if gap > reach:
+            continue
+        mine = turn_back(matrix, one, turn(matrix, other, scale(n, -own * radius)))
+        mine = sub(add(scale(core, own), mine), get(world.com, one))
+        theirs = sub(along(scale(mapped(w, c, core), k), n, -k * d), get(world.com, other))
+        write(found, count, side, mine, theirs, turn(matrix, other, n), gap, 0)
+        count += 1
+    return count
+
+
+@njit(**BARE)
+def at_least(table, t, d):
+    """How far a place is from shape t at least, of the distance that is found there: between the corners of a grid's
+    bricks that may be too much."""
+    if table[t, KIND] != GRID or d <= NEAR * table[t, CELL]:
+        return d
+    return max(NEAR, d / table[t, CELL] - FARTHER) * table[t, CELL]
+
+
+@njit(**BARE)
+def beyond(shapes, t, w, c, k, own, e):
+    """How far a leaf is from shape t at least."""
+    d = distance_alone(shapes.table, shapes.brick, shapes.sample, t, mapped(w, c, get(shapes.leaf_ball, e)))
+    return k * at_least(shapes.table, t, d) - own * shapes.leaf_ball[e, 3]
+
+
+@njit(**BARE)
+def _lowest(table, brick, sample, t, w, c, half):
+    """Where between -half and half of its axis a capsule is nearest to shape t: golden section."""
+    low, high = -half, half
+    one, other = high - 0.6180339887498949 * (high - low), low + 0.6180339887498949 * (high - low)
+    f = distance_alone(table, brick, sample, t, mapped(w, c, (0.0, 0.0, one)))
+    g = distance_alone(table, brick, sample, t, mapped(w, c, (0.0, 0.0, other)))
+    for _ in range(30):
+        if f <= g:
+            high, other, g = other, one, f
+            one = high - 0.6180339887498949 * (high - low)
+            f = distance_alone(table, brick, sample, t, mapped(w, c, (0.0, 0.0, one)))
+        else:
+            low, one, f = one, other, g
+            other = low + 0.6180339887498949 * (high - low)
+            g = distance_alone(table, brick, sample, t, mapped(w, c, (0.0, 0.0, other)))
+    return 0.5 * (low + high)
+
+
+@njit(**BARE)
+def swallowed(shapes, world, motion, matrix, a, b, side, found):
+    """Whether the centre of one body is inside both solids (that of a ring on a peg is not inside the ring).
+
+    The nearest surface is then the wrong way out for the nodes beyond the other's middle. The pair has one contact
+    instead, at this centre, along the other's normal there.
+    """
+    one, other = (a, b) if side == 0 else (b, a)
+    away = norm(sub(get(motion.position, one), get(motion.position, other)))
+    if not world.moves[one] or not away < world.radius[other] < math.inf:
+        return False
+    table, brick, sample = shapes.table, shapes.brick, shapes.sample
+    k, centre = world.scale[other], scale(get(world.com, one), 1.0 / world.scale[one])
+    own = distance_alone(table, brick, sample, world.shape[one], centre)
+    if own >= 0.0:
+        return False
+    w, c = map_between(motion.position, matrix, world.scale, world.com, one, other)
+    there = mapped(w, c, centre)
+    d, n = distance(table, brick, sample, world.shape[other], there)
+    if d >= 0.0:
+        return False
+    theirs = sub(along(scale(there, k), n, -k * d), get(world.com, other))
+    write(found, 0, side, (0.0, 0.0, 0.0), theirs, turn(matrix, other, n), k * d, 0)
+    return True

@@ -1,0 +1,75 @@
+"""What a run looks at after every step, compiled: whether the state can be, its energy, and where bodies touch."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from sdfsim.physics.solver.vectors import ENTRY, add, dot, get, put, rotated, scale, sub, turn, vector
+from sdfsim.physics.solver.world import DRAG, GAP, NORMAL, PUSH
+
+
+class Touching(NamedTuple):
+    """E places where bodies touch, model units."""
+
+    pair: np.ndarray  # [E, 2] int64, the two bodies
+    point: np.ndarray  # [E, 3] on the first, world
+    normal: np.ndarray  # [E, 3] from the second to the first
+    impulse: np.ndarray  # [E, 3] on the first in the last inner step
+    gap: np.ndarray  # [E] below 0 where they are in each other
+
+
+@njit(**ENTRY)
+def first_fault(looked_at, position, orientation, velocity, angular, before, dt, unit, most):
+    """The first of the bodies `looked_at` [N] bool whose state cannot be, -1 where all are sound; and what is wrong.
+
+    What is wrong: 0 where |q|^2 is away from 1 by more than `unit`; 1 to 4 where the position, velocity, angular
+    velocity or the way since `before` [N, 3] over `dt` is longer than `most` [5] allows, or not a number.
+    """
+    for b in range(len(looked_at)):
+        if not looked_at[b]:
+            continue
+        x, y, z, w = orientation[b]
+        if not abs(x * x + y * y + z * z + w * w - 1.0) <= unit:
+            return b, 0
+        way = scale(sub(get(position, b), get(before, b)), 1.0 / dt)
+        for k, v in enumerate((get(position, b), get(velocity, b), get(angular, b), way)):
+            if not dot(v, v) <= most[k + 1] * most[k + 1]:
+                return b, k + 1
+    return -1, 0
+
+
+@njit(**ENTRY)
+def energies(mass, inertia, gravity, position, orientation, velocity, angular):
+    """Kinetic and potential energy of all bodies with a mass."""
+    kinetic = potential = 0.0
+    for b in range(len(mass)):
+        if mass[b] > 0.0:
+            v, spin = get(velocity, b), rotated(orientation, b, get(angular, b), -1.0)
+            kinetic += 0.5 * (mass[b] * dot(v, v) + dot(spin, turn(inertia, b, spin)))
+            potential -= mass[b] * dot(vector(gravity), get(position, b))
+    return kinetic, potential
+
+
+@njit(**ENTRY)
+def touching(manifolds, position, orientation, within):
+    """The contacts of bodies that are no farther apart than `within`."""
+    most = manifolds.count.sum()
+    pair, gap = np.empty((most, 2), np.int64), np.empty(most)
+    place, normal, impulse = np.empty((most, 3)), np.empty((most, 3)), np.empty((most, 3))
+    e = 0
+    for m in range(len(manifolds.pair)):
+        first = manifolds.pair[m, 0]
+        for k in range(manifolds.count[m]):
+            point = manifolds.point[m, k]
+            if point[GAP] <= within:
+                n = (point[NORMAL], point[NORMAL + 1], point[NORMAL + 2])
+                drag = (point[DRAG], point[DRAG + 1], point[DRAG + 2])
+                pair[e], gap[e] = manifolds.pair[m], point[GAP]
+                put(place, e, add(get(position, first), rotated(orientation, first, vector(point), 1.0)))
+                put(normal, e, n)
+                put(impulse, e, add(scale(n, point[PUSH]), drag))
+                e += 1
+    return Touching(pair[:e], place[:e], normal[:e], impulse[:e], gap[:e])

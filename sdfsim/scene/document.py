@@ -1,0 +1,108 @@
+"""The YAML of a scene file with its line numbers, and the faults that are found in it."""
+
+from __future__ import annotations
+
+import errno
+import re
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sdfsim.base.errors import SceneError
+
+MOST_BYTES = 16 * 2**20  # of a file
+MOST_VALUES = 500_000  # of a file, each as often as an alias repeats it
+_LEVELS = 8  # no key lies deeper
+_NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
+_NULL = ("", "~", "null", "Null", "NULL")
+_PLAIN_TAGS = {f"tag:yaml.org,2002:{t}" for t in ("str int float bool null map seq timestamp merge value".split())}
+
+Loc = tuple[str | int, ...]  # keys and indices that lead to a value
+
+
+class Numeral(str):
+    """A number without quotes, as the file writes it. YAML 1.1 guesses: `1:30` would become 90, and `1e-3` a text."""
+
+
+NOTHING = object()  # what a key has that is followed by nothing, `~` or `null`
+
+
+class Document:
+    """The YAML of a file, and the faults found in it, each with its line.
+
+    `data` are dicts, lists, texts and `Numeral`s; `NOTHING` where a key has no value. Raises SceneError where the file
+    is missing, too large, not UTF-8, not YAML (with the line), or empty, or its aliases multiply it.
+    """
+
+    def __init__(self, path: Path, text: str | None = None) -> None:
+        self._path = path
+        self._line: dict[Loc, int] = {}  # of every key, and of every entry of a list
+        self._found: dict[tuple[int, str], None] = {}  # in the order of the finding, each once
+        root = _compose(path, _text_of(path) if text is None else text)
+        self.data = self._read(root, (), root.start_mark.line + 1)
+
+    def wrong(self, loc: Loc, text: str, line: int | None = None) -> None:
+        """Note a fault of the value under `loc`, in its line or another."""
+        if line is None:
+            line = next(self._line[loc[:depth]] for depth in range(len(loc), -1, -1) if loc[:depth] in self._line)
+        where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc)[1:200]
+        self._found[line, f"{self._path}:{line}: {where}: {text}" if loc else f"{self._path}:{line}: {text}"] = None
+
+    def check(self) -> None:
+        """Raise SceneError with every fault, in the order of the file, if there is any."""
+        if self._found:
+            raise SceneError([text for _, text in sorted(self._found, key=lambda entry: entry[0])])
+
+    def _read(self, node: yaml.Node, loc: Loc, line: int) -> Any:
+        self._line[loc] = line
+        if len(self._line) > MOST_VALUES:
+            raise SceneError([f"{self._path}:1: with its aliases it has more than {MOST_VALUES} values"])
+        if node.tag not in _PLAIN_TAGS:
+            self.wrong(loc, f"must be plain YAML without tags (got {node.tag!r})")
+        if len(loc) > _LEVELS:
+            return "..."
+        if isinstance(node, yaml.SequenceNode):
+            return [self._read(child, (*loc, i), child.start_mark.line + 1) for i, child in enumerate(node.value)]
+        if isinstance(node, yaml.ScalarNode):
+            if node.style is not None:
+                return node.value
+            return NOTHING if node.value in _NULL else (Numeral if _NUMBER.fullmatch(node.value) else str)(node.value)
+        found: dict[str, Any] = {}
+        for key_node, child in node.value:
+            key, line = key_node.value, key_node.start_mark.line + 1
+            if not isinstance(key_node, yaml.ScalarNode) or key_node.tag not in _PLAIN_TAGS:
+                self.wrong(loc, "a key must be a text without tags", line)
+            elif key in found:
+                self.wrong((*loc, key), f"the key appears twice (first on line {self._line[*loc, key]})", line)
+            else:
+                found[key] = self._read(child, (*loc, key), line)
+        return found
+
+
+def _text_of(path: Path) -> str:
+    try:
+        if path.exists() and not path.is_dir() and not path.is_file():
+            raise OSError(errno.EINVAL, "not a file")  # a device or a pipe may have no end
+        if path.is_file() and path.stat().st_size > MOST_BYTES:
+            raise SceneError([f"{path}: too large for a scene (at most {MOST_BYTES // 2**20} MiB)"])
+        return path.read_bytes().decode("utf-8")
+    except OSError as error:
+        why = "no such file" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
+        raise SceneError([f"{path}: {why}"], "give the path of a scene.yaml") from error
+    except UnicodeDecodeError as error:
+        line = error.object[: error.start].count(b"\n") + 1
+        raise SceneError([f"{path}:{line}: not a text in UTF-8"], "a scene is a YAML text file") from error
+
+
+def _compose(path: Path, text: str) -> yaml.Node:
+    try:
+        root = yaml.compose(text, Loader=yaml.SafeLoader)
+    except (yaml.YAMLError, RecursionError) as error:
+        mark, place = getattr(error, "problem_mark", None), getattr(error, "position", None)
+        line = mark.line + 1 if mark else text[:place].count("\n") + 1 if place is not None else 1
+        why = next((told for name in ("problem", "context", "reason") if (told := getattr(error, name, None))), "")
+        raise SceneError([f"{path}:{line}: not valid YAML: {why or type(error).__name__}"]) from error
+    if root is None:
+        raise SceneError([f"{path}:1: the file is empty"], "a scene needs at least version and bodies")
+    return root

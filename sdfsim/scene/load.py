@@ -1,0 +1,154 @@
+"""`load_scene`: a scene file is read and checked, and becomes a `Scene` with its shapes made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.parallel import Progress, silent
+from sdfsim.scene.document import Document
+from sdfsim.scene.scene import Body, Effects, Limits, Motion, Scene, Waypoints
+from sdfsim.scene.schema import FITTED, UNITS, BodyTable, SceneTable, ShapeTable
+from sdfsim.shape.make import analytic_shape, shape_from_mesh, shape_from_primitive
+from sdfsim.shape.shape import Shape, load_shape, with_nodes, with_sdf, with_wall
+
+
+def read_scene(path: Path, *, allow_outside: bool = False, text: str | None = None) -> tuple[SceneTable, Document]:
+    """Read and check a scene file; nothing is loaded yet. Returns what it says, and its document, to tell of faults
+    that show only later. Raises SceneError with every fault found."""
+    document, context = Document(path, text), {"folder": path.parent, "allow_outside": allow_outside}
+    try:
+        table = SceneTable.model_validate(document.data, context=context)
+    except ValidationError as error:
+        for e in error.errors(include_url=False):
+            document.wrong(e["loc"], e["msg"])
+        document.check()
+        raise
+    document.check()
+    return table, document
+
+
+def load_scene(
+    path: Path | str, on_progress: Progress = silent, *, allow_outside: bool = False, text: str | None = None
+) -> Scene:
+    """Read a scene file, and load or fit the shapes that its bodies use; the scene is in SI units.
+
+    Paths inside the file are taken from its folder; unless `allow_outside`, they may not lead out of it. `text` is what
+    is in the file, where it is not written yet. Raises SceneError with one line `FILE:LINE: FIELD: what is wrong` for
+    every fault found.
+    """
+    path = Path(path)
+    table, document = read_scene(path, allow_outside=allow_outside, text=text)
+    shapes = _load_shapes(table, document, on_progress)
+    order = {key: i for i, key in enumerate(shapes)}
+    groups = {body.name: body.names() for body in table.bodies}
+    bodies: list[Body] = []
+    for i, entry in enumerate(table.bodies):
+        made = _body(entry, order[entry.shape], table.motion_of(entry), groups)
+        if made.motion == "dynamic":
+            made = replace(made, mass=_mass(entry, shapes[entry.shape], partial(document.wrong, ("bodies", i, "name"))))
+        for name, offset in zip(entry.names(), entry.offsets(), strict=True):
+            way = made.path and replace(made.path, position=made.path.position + offset)
+            bodies.append(replace(made, name=name, position=made.position + offset, path=way))
+    document.check()
+    loaded = [(of, shapes[key]) for key, of in table.shapes.items() if key in shapes]
+    fitted = [shape for of, shape in loaded if of.kind in FITTED or of.sdf == "grid"]
+    return Scene(
+        shapes=tuple(shapes.values()),
+        bodies=tuple(bodies),
+        gravity=np.array(table.gravity),
+        duration=table.duration,
+        seed=table.seed,
+        model=table.model,
+        effects=Effects(**dict(table.effects)),
+        limits=Limits(**dict(table.limits)),
+        path=path,
+        missed=tuple(f"{s.name}: {s.certificate['reason']}" for s in fitted if s.certificate.get("reason")),
+        notes=tuple(f"{s.name}: {note}" for of, s in loaded if of.mesh for note in s.source.get("notes", [])),
+        caveats=tuple(f"{s.name}: {s.certificate['caveat']}" for s in fitted if s.certificate.get("caveat")),
+    )
+
+
+def _load_shapes(table: SceneTable, document: Document, on_progress: Progress) -> dict[str | None, Shape]:
+    """Every shape in use, in the order of first use; None is the plane that all bodies with a `plane` share. What must
+    be fitted or sampled waits until all else is known to be right: a fit takes a minute."""
+    used = dict.fromkeys(body.shape for body in table.bodies)
+    shapes: dict[str | None, Shape] = {None: analytic_shape("plane", name="plane")}
+    slow = {key: s.kind in FITTED or s.sdf == "grid" for key, s in table.shapes.items()}
+    for now in (False, True):
+        todo = [key for key in used if key is not None and slow[key] is now]
+        for i, key in enumerate(todo):
+
+            def report(fraction: float, message: str, i: int = i, count: int = len(todo)) -> None:
+                on_progress((i + fraction) / count, message)
+
+            try:
+                shapes[key] = _load_shape(key, table.shapes[key], silent if on_progress is silent else report)
+            except SdfsimError as error:
+                hint = f" ({error.hint})" if error.hint else ""
+                document.wrong(("shapes", key, table.shapes[key].kind), error.message + hint)
+        document.check()
+    return {key: shapes[key] for key in used}
+
+
+def _load_shape(name: str, entry: ShapeTable, on_progress: Progress) -> Shape:
+    kind: Any = entry.kind
+    made: Any = {"sdf": entry.sdf or "mlp", "resolution": entry.resolution, "on_progress": on_progress, "name": name}
+    if entry.asset:
+        shape = load_shape(entry.asset)
+        shape = with_sdf(shape, entry.sdf, resolution=entry.resolution) if entry.sdf else shape
+    elif entry.mesh:
+        units = UNITS[entry.units] if "units" in entry.model_fields_set else None
+        made |= {"units": units, "cap": entry.cap == "on", "thicken": entry.thicken}
+        shape = shape_from_mesh(entry.mesh, **made)
+    elif entry.primitive:
+        shape = shape_from_primitive(entry.primitive.name, entry.primitive.size, **made)
+    else:
+        shape = analytic_shape(kind, name=name, **dict(getattr(entry, kind)))
+    shape = with_wall(shape, entry.wall) if entry.wall else shape
+    return with_nodes(shape, entry.nodes) if entry.nodes else shape
+
+
+def _body(entry: BodyTable, shape: int, motion: Motion, groups: dict[str, list[str]]) -> Body:
+    """The first copy, without its mass."""
+    partners, path = entry.collides_with, None
+    position, quat = (np.array(entry.position), entry.rotation()) if entry.plane is None else entry.plane.pose()
+    if entry.path:
+        times, places, turns = zip(*((p.time, p.position, p.rotation()) for p in entry.path), strict=True)
+        path = Waypoints(np.array(times), np.stack(places), np.stack(turns))
+        position, quat = path.position[0], path.quat_xyzw[0]
+    return Body(
+        name=entry.name,
+        shape=shape,
+        motion=motion,
+        scale=entry.scale,
+        position=position,
+        quat_xyzw=quat,
+        velocity=np.array(entry.velocity),
+        angular_velocity=np.array(entry.angular_velocity),
+        mass=0.0,
+        friction=entry.friction,
+        restitution=entry.restitution,
+        collides_with=None if partners is None else tuple(n for p in partners for n in groups.get(p, [p])),
+        path=path,
+    )
+
+
+def _mass(entry: BodyTable, shape: Shape, wrong: Callable[[str], None]) -> float:
+    """Of a dynamic body, kg; tells `wrong` why it cannot move, if so."""
+    volume = shape.volume * entry.scale**3
+    mass = entry.density * volume if entry.mass is None else entry.mass
+    if not (np.isfinite(volume) and volume > 0):
+        wrong(f"cannot move: its shape has a volume of {volume:g} m^3; close it, or make it static")
+    elif not (np.isfinite(mass) and mass > 0):
+        wrong(f"has no usable mass: density {entry.density:g} kg/m^3 times a volume of {volume:g} m^3; give mass in kg")
+    elif not len(shape.nodes):
+        wrong("cannot move: its shape has no surface nodes to touch others with; make it static")
+    return mass

@@ -1,0 +1,565 @@
+"""The keys of scene.yaml as pydantic models. `python -m sdfsim.scene.schema` writes docs/scene.md, their reference."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    WrapValidator,
+)
+from pydantic import model_validator as validator_of_model
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+from sdfsim.base.errors import nearest
+from sdfsim.geometry.primitives import PRIMITIVES
+from sdfsim.scene.document import NOTHING, Loc, Numeral
+from sdfsim.scene.scene import Motion, Switch
+from sdfsim.shape.shape import (
+    DEFAULT_RESOLUTION,
+    MESH_FILE,
+    RECORD_FILE,
+    SKIN_FILE,
+    WEIGHTS_FILE,
+    SdfKind,
+)
+
+VERSION = 1
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+DEFAULT_DURATION = 4.0  # s
+DEFAULT_GRAVITY = (0.0, 0.0, -9.81)  # m/s^2
+MOST_COPIES = 100_000
+LARGEST = 1e12  # of any number: beyond it powers and products of what is legal are no longer finite
+_SHOWN = 40  # letters of a value in a message
+
+Fault = tuple[Loc, str]  # where below a table, and what is wrong there
+
+
+def _shown(value: Any) -> str:
+    """What the file says, for a message."""
+    if isinstance(value, str):
+        text = str(value) if isinstance(value, Numeral) else repr(value)
+        return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
+    return "nothing" if value is NOTHING else "a list" if isinstance(value, list) else "a mapping"
+
+
+def _problem(text: str) -> PydanticCustomError:
+    return PydanticCustomError("value", "{text}", {"text": text})
+
+
+def _told(error: Any, table: type[Table]) -> str:
+    """What pydantic found in a table, in our words."""
+    kind, known = error["type"], table.model_fields
+    if kind == "value":
+        return error["msg"]
+    if kind == "missing":
+        return "is required"
+    key = error["loc"][0]
+    if kind == "extra_forbidden":
+        return f"unknown key{nearest(key, known) or '; known here: ' + (', '.join(known) or 'none')}"
+    extra, limits = known[key].json_schema_extra, error.get("ctx", {})
+    unit = extra.get("unit", "") if isinstance(extra, dict) else ""
+    got, allowed = _shown(error["input"]), limits.get("expected", "").replace("'", "").replace(" or ", ", ")
+    if kind.startswith("int_"):
+        return f"must be a whole number (got {got})"
+    texts = {
+        "number": f"must be a number{unit and ' in '}{unit} (got {got})",
+        "greater_than": f"must be > {limits.get('gt', 0):g} (got {got}{unit and ' '}{unit})",
+        "greater_than_equal": f"must be >= {limits.get('ge', 0):g} (got {got}{unit and ' '}{unit})",
+        "less_than_equal": f"must be <= {limits.get('le', 0):g} (got {got}{unit and ' '}{unit})",
+        "too_short": f"must have a length of at least {limits.get('min_length')} (got {limits.get('actual_length')})",
+        "too_long": f"must have a length of at most {limits.get('max_length')} (got {limits.get('actual_length')})",
+        "literal_error": f"must be one of {allowed} (got {got})",
+        "list_type": f"must be a list (got {got})",
+        "dict_type": f"must be a mapping (got {got})",
+    }
+    return texts.get(kind, f"must be a text (got {got})")
+
+
+def _numeral(value: Any) -> Any:
+    if not isinstance(value, Numeral):
+        raise PydanticCustomError("number", "not a number")
+    return value
+
+
+def _unit(values: list[float]) -> np.ndarray:
+    """A direction, made one long."""
+    largest = np.abs(values).max()
+    if largest < 1e-9:
+        raise _problem("must not be zero")
+    made = np.array(values) / largest  # first, so that the length of huge numbers does not overflow
+    return made / np.linalg.norm(made)
+
+
+def _partners(value: Any, handler: Callable[[Any], list[str]]) -> list[str] | None:
+    if not isinstance(value, list) and value != "all":
+        raise _problem(f"must be all, or a list of names (got {_shown(value)})")
+    return None if value == "all" else handler(value)
+
+
+def _find(text: str, info: ValidationInfo) -> Path:
+    """The place that a path of the file names, whether something is there or not."""
+    context: Any = info.context
+    home: Path = context["folder"]
+    place = home / text
+    try:
+        # Where it leads when every link is followed; of a folder, also where the files of a shape lead.
+        inside = (WEIGHTS_FILE, MESH_FILE, RECORD_FILE, SKIN_FILE) if place.is_dir() else ()
+        ends = [place.resolve(), *((place / name).resolve() for name in inside)]
+        outside = not all(end.is_relative_to(home.resolve()) for end in ends)
+    except (OSError, RuntimeError, ValueError) as error:  # a loop of links, too long a name, a zero byte
+        raise _problem(f"cannot be looked up: {place} ({getattr(error, 'strerror', None) or error})") from None
+    if outside and not context["allow_outside"]:
+        advice = "copy it there, or allow it with --allow-outside, in Python allow_outside=True"
+        raise _problem(f"leads out of the scene's folder: {place} ({advice})")
+    return place
+
+
+def _there(text: str, info: ValidationInfo) -> str:
+    """An `asset` is a folder, a `mesh` a file."""
+    place, what = _find(text, info), "folder" if info.field_name == "asset" else "file"
+    if not (place.is_dir() if what == "folder" else place.is_file()):
+        raise _problem(f"no such {what}: {place}")
+    return str(place)
+
+
+def _model(text: str, info: ValidationInfo) -> str:
+    """A bundled model's name, or the path of a file, taken from the scene's folder."""
+    return str(_find(text, info)) if text.endswith(".safetensors") else text
+
+
+def _primitive(name: str) -> str:
+    if name not in PRIMITIVES:
+        raise _problem(f"no such primitive: {name!r}{nearest(name, PRIMITIVES)}; there are {', '.join(PRIMITIVES)}")
+    return name
+
+
+def _version(number: int) -> int:
+    if number != VERSION:
+        raise _problem(f"must be {VERSION} (got {number})")
+    return number
+
+
+def key(what: str, default: Any = ..., unit: str = "", **limits: float) -> Any:
+    """A key of a table: what it says, its unit, and what is allowed."""
+    return Field(default, description=what, json_schema_extra={"unit": unit}, **limits)  # type: ignore[arg-type]
+
+
+_THREE = Field(min_length=3, max_length=3)
+Text = Annotated[str, Field(pattern=r"\S")]
+Number = Annotated[float, BeforeValidator(_numeral), Field(ge=-LARGEST, le=LARGEST)]
+Whole = Annotated[int, BeforeValidator(_numeral), Field(le=10**18)]
+Vector = Annotated[list[Number], _THREE]
+Direction = Annotated[Vector, AfterValidator(_unit)]
+Quaternion = Annotated[list[Number], Field(min_length=4, max_length=4), AfterValidator(_unit)]
+
+
+class Table(BaseModel):
+    """A mapping of the file. All of its faults are found at once."""
+
+    model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True, extra="forbid")
+
+    @validator_of_model(mode="wrap")
+    @classmethod
+    def _find_all(cls, data: Any, handler: Any) -> Any:
+        data = {} if data is NOTHING else data
+        if not isinstance(data, dict):
+            raise _problem(f"must be a mapping (got {_shown(data)})")
+        found, made = list(cls.check_keys(data)), None
+        try:
+            made = handler(data)
+            found += made.check_values()
+        except ValidationError as error:
+            found += [(e["loc"], _told(e, cls)) for e in error.errors(include_url=False)]
+        if found:
+            details = [InitErrorDetails(type=_problem(text), loc=loc, input=None) for loc, text in found]
+            raise ValidationError.from_exception_data(cls.__name__, details)
+        return made
+
+    @classmethod
+    def check_keys(cls, data: dict) -> Iterator[Fault]:
+        """Which keys go together; asked of what the file says, whether its values are right or not."""
+        yield from ()
+
+    def check_values(self) -> Iterator[Fault]:
+        """Which values go together; asked once each is right by itself."""
+        yield from ()
+
+
+def _one_of(data: dict, keys: Iterable[str], *, required: bool = False) -> Iterator[Fault]:
+    there = [key for key in data if key in keys]
+    if len(there) > 1:
+        yield (there[1],), f"give only one of {', '.join(keys)} (got {' and '.join(there)})"
+    if not there and required:
+        yield (), f"one of {', '.join(keys)} is required"
+
+
+class EffectsTable(Table):
+    """Which effects to compute; `auto` is on where it can change the motion, as `sdfsim plan` tells."""
+
+    contact: Switch = key("bodies touch", "auto")
+    friction: Switch = key("contacts have friction", "auto")
+    restitution: Switch = key("contacts rebound", "auto")
+    rotation: Switch = key("bodies turn", "auto")
+    sleep: Switch = key("what rests is frozen until something disturbs it", "auto")
+
+
+class LimitsTable(Table):
+    """What a run must keep to."""
+
+    memory_gib: Number | None = key(
+        "memory that one step may take for distances and edges; no limit without it", None, "GiB", gt=0
+    )
+
+
+class Primitive(Table):
+    """A procedural shape."""
+
+    name: Annotated[Text, AfterValidator(_primitive)] = key(f"one of {', '.join(PRIMITIVES)}")
+    size: Number = key("largest extent", 1.0, "m", gt=0)
+
+
+class Sphere(Table):
+    """An exact sphere about the origin."""
+
+    radius: Number = key("radius", unit="m", gt=0)
+
+
+class Upright(Table):
+    """An exact capsule or cylinder along z, about the origin."""
+
+    radius: Number = key("radius", unit="m", gt=0)
+    height: Number = key("along z; of a capsule with its caps, so above twice the radius", unit="m", gt=0)
+
+
+class Box(Table):
+    """An exact box about the origin."""
+
+    size: Annotated[list[Annotated[Number, Field(gt=0)]], _THREE] = key("extents along x, y, z", unit="m")
+
+
+class PlaneShape(Table):
+    """z = 0, infinite. It takes no keys: tilt it by the body's pose, or give the body its own `plane`."""
+
+
+_KINDS = ("asset", "mesh", "primitive", "sphere", "capsule", "cylinder", "box", "plane")
+FITTED = ("mesh", "primitive")  # made on first use, which may take a minute
+_WITH_SDF = ("asset", *FITTED)  # the others have an exact SDF of their own
+
+
+class ShapeTable(Table):
+    """One shape: exactly one of `asset` to `plane`, and how its distances and surface nodes are made."""
+
+    asset: Annotated[Text, AfterValidator(_there)] | None = key(
+        "folder that `reconstruct` or `fit` has written, from the scene's folder", None
+    )
+    mesh: Annotated[Text, AfterValidator(_there)] | None = key(
+        "mesh file, from the scene's folder; fitted on first use, then taken from a cache", None
+    )
+    primitive: Primitive | None = key("a procedural shape, fitted on first use", None)
+    sphere: Sphere | None = key("an exact sphere", None)
+    capsule: Upright | None = key("an exact capsule", None)
+    cylinder: Upright | None = key("an exact cylinder", None)
+    box: Box | None = key("an exact box", None)
+    plane: PlaneShape | None = key("an infinite plane", None)
+    units: Literal["m", "cm", "mm", "in"] = key("of the numbers in a mesh file", "m")
+    cap: Literal["on", "off"] = key("close the openings of a mesh", "off")
+    thicken: Number | None = key("thickness that an open sheet of a mesh gets", None, "m", gt=0)
+    sdf: SdfKind | None = key(
+        "where distances come from: a fitted network, samples on a grid, or the mesh itself; without it "
+        "an asset keeps its own and others are fitted",
+        None,
+    )
+    resolution: Whole = key("samples along each side, with `sdf: grid`", DEFAULT_RESOLUTION, ge=8, le=512)
+    nodes: Whole | None = key(
+        "N of the N^3 grid whose points become surface nodes; without it a shape keeps its own", None, ge=3, le=128
+    )
+    wall: Number | None = key(
+        "makes the shape hollow: only what lies within this of its surface has mass", None, "m", gt=0
+    )
+
+    @classmethod
+    def check_keys(cls, data: dict) -> Iterator[Fault]:
+        yield from _one_of(data, _KINDS, required=True)
+        kind = next((key for key in data if key in _KINDS), None)
+        for key in ("units", "cap", "thicken"):
+            if key in data and kind not in ("mesh", None):
+                yield (key,), f"goes with mesh only (this is a {kind})"
+        if "sdf" in data and kind not in (*_WITH_SDF, None):
+            yield ("sdf",), f"goes with {', '.join(_WITH_SDF)} only (a {kind} has its exact SDF)"
+        if "resolution" in data and data.get("sdf") in (None, "mlp", "mesh"):
+            yield ("resolution",), "goes with sdf: grid only"
+        for key in ("nodes", "wall"):
+            if key in data and kind == "plane":
+                yield (key,), "goes with bodies only (a plane has no nodes and no mass)"
+
+    def check_values(self) -> Iterator[Fault]:
+        if self.capsule and self.capsule.height <= 2 * self.capsule.radius:
+            got = f"(got {self.capsule.height:g} m)"
+            yield ("capsule", "height"), f"must be above twice the radius, its caps included {got}"
+
+    @property
+    def kind(self) -> str:
+        """The one of `_KINDS` that is given."""
+        return next(kind for kind in _KINDS if getattr(self, kind) is not None)
+
+
+_ROTATIONS = ("quat_xyzw", "quat_wxyz", "euler_xyz_deg")
+
+
+class Turned(Table):
+    """What has an orientation, given by at most one of three keys."""
+
+    quat_xyzw: Quaternion | None = key("orientation as a quaternion, scalar last; of any length", None)
+    quat_wxyz: Quaternion | None = key("the same with its scalar first", None)
+    euler_xyz_deg: Vector | None = key("the same as turns about the fixed x, then y, then z", None, "degrees")
+
+    @classmethod
+    def check_keys(cls, data: dict) -> Iterator[Fault]:
+        yield from _one_of(data, _ROTATIONS)
+
+    def rotation(self) -> np.ndarray:
+        """[4] unit quaternion xyzw."""
+        if self.quat_wxyz is not None:
+            return np.roll(self.quat_wxyz, -1)
+        if self.euler_xyz_deg is not None:
+            from scipy.spatial.transform import Rotation  # slow to import
+
+            return Rotation.from_euler("xyz", self.euler_xyz_deg, degrees=True).as_quat()
+        return np.array([0.0, 0.0, 0.0, 1.0] if self.quat_xyzw is None else self.quat_xyzw)
+
+
+class Waypoint(Turned):
+    """One pose of a path. In between a body goes straight and turns evenly; before and after it rests."""
+
+    time: Number = key("when; later than the pose before it", unit="s", ge=0)
+    position: Vector = key("of the shape's own origin", unit="m")
+
+
+class Plane(Table):
+    """The points x with normal . x = offset, of a body without a shape."""
+
+    normal: Direction = key("the direction it faces; of any length", (0.0, 0.0, 1.0))
+    offset: Number = key("distance from the origin along the normal", 0.0, "m")
+
+    def pose(self) -> tuple[np.ndarray, np.ndarray]:
+        """Position [3] m and quaternion [4] xyzw that carry z = 0 onto the plane."""
+        normal = np.array(self.normal)
+        # The shortest turn from z; straight down has none of its own, so turn about x.
+        quat = np.array([-normal[1], normal[0], 0.0, 1.0 + normal[2]])
+        quat = np.array([1.0, 0.0, 0.0, 0.0]) if np.linalg.norm(quat) < 1e-9 else quat / np.linalg.norm(quat)
+        return normal * self.offset, quat
+
+
+class Arrange(Table):
+    """Copies on a grid, centred on the position in x and y, its lowest layer at the position."""
+
+    grid: Annotated[list[Annotated[Whole, Field(ge=1)]], _THREE] = key("copies along x, y, z")
+    spacing: Number = key("from one to the next", unit="m", gt=0)
+
+
+_NOT_WITH_PATH = ("position", *_ROTATIONS, "velocity", "angular_velocity", "mass", "density")
+_NOT_WITH_PLANE = ("shape", "scale", *_NOT_WITH_PATH, "count", "arrange")
+_ORIGIN = (0.0, 0.0, 0.0)
+
+
+class BodyTable(Turned):
+    """One body, or many copies of it: either a `shape` or a `plane` of its own."""
+
+    name: Text = key("unique; copies are called name[0], name[1], ...")
+    shape: Text | None = key("a name under `shapes`", None)
+    plane: Plane | None = key("makes it an infinite static plane", None)
+    motion: Motion | None = key(
+        "kinematic bodies follow their `path`, whatever they meet; dynamic without it, planes static", None
+    )
+    path: Annotated[list[Waypoint], Field(min_length=1)] | None = key("poses of a kinematic body", None)
+    scale: Number = key("factor on the size of the shape", 1.0, gt=0)
+    position: Vector = key("of the shape's own origin", _ORIGIN, "m")
+    velocity: Vector = key("of the centre of mass", _ORIGIN, "m/s")
+    angular_velocity: Vector = key("in world axes", _ORIGIN, "rad/s")
+    mass: Number | None = key("without it the density counts", None, "kg", gt=0)
+    density: Number = key("not together with mass", 1000.0, "kg/m^3", gt=0)
+    friction: Number = key("Coulomb coefficient; two bodies' product counts", 0.5, ge=0, le=1000)
+    restitution: Number = key("two bodies' product counts", 0.5, ge=0, le=1)
+    collides_with: Annotated[list[Text] | None, WrapValidator(_partners)] = key(
+        "`all`, or a list of names: two bodies touch where each lists the other", None
+    )
+    count: Whole | None = key("how many copies; without it, as many as the grid has places", None, ge=1)
+    arrange: Arrange | None = key("where the copies are", None)
+
+    @classmethod
+    def check_keys(cls, data: dict) -> Iterator[Fault]:
+        for key in _NOT_WITH_PLANE if "plane" in data else ():
+            if key in data:
+                yield (key,), "does not go with plane: a plane is static and has its pose from normal and offset"
+        if "plane" in data and data.get("motion", "static") != "static":
+            yield ("motion",), "a plane must be static"
+        if "plane" not in data:
+            yield from _one_of(data, ("shape", "plane"), required=True)
+            yield from super().check_keys(data)
+            yield from _one_of(data, ("mass", "density"))
+        if data.get("motion") == "kinematic":
+            for key in _NOT_WITH_PATH:
+                if key in data:
+                    yield (key,), "does not go with motion: kinematic: its path says where it is"
+            if "path" not in data:
+                yield ("path",), "is required: a kinematic body follows timed poses"
+        elif "path" in data:
+            yield ("path",), "goes with motion: kinematic only"
+
+    def check_values(self) -> Iterator[Fault]:
+        for i, (before, pose) in enumerate(itertools.pairwise(self.path or []), 1):
+            if pose.time <= before.time:
+                got = f"(got {pose.time:g} s after {before.time:g} s)"
+                yield ("path", i), f"must be later than the pose before it {got}"
+        if self.arrange is None and self.copies > 1:
+            advice = "needs arrange: {grid: [nx, ny, nz], spacing: metres}"
+            yield ("count",), f"{advice} (got {self.copies} at one place)"
+        elif self.copies > self.places:
+            yield ("count",), f"must be <= {self.places}, the places of the grid (got {self.copies})"
+
+    @property
+    def places(self) -> int:
+        """Of the grid, or the one of a body alone."""
+        return 1 if self.arrange is None else math.prod(self.arrange.grid)
+
+    @property
+    def copies(self) -> int:
+        """How many bodies it stands for."""
+        return self.count or self.places
+
+    def names(self) -> list[str]:
+        """`balls[0]`, `balls[1]` ... where there is a count or a grid, be it of one; else its own name."""
+        grouped = self.count is not None or self.arrange is not None
+        return [f"{self.name}[{i}]" for i in range(self.copies)] if grouped else [self.name]
+
+    def offsets(self) -> np.ndarray:
+        """[copies, 3] m, added to the position."""
+        if self.arrange is None:
+            return np.zeros((1, 3))
+        nx, ny, _ = self.arrange.grid
+        index = np.arange(self.copies)
+        cells = np.stack([index % nx, index // nx % ny, index // (nx * ny)], axis=1).astype(np.float64)
+        return (cells - [(nx - 1) / 2, (ny - 1) / 2, 0.0]) * self.arrange.spacing
+
+
+class SceneTable(Table):
+    """The whole file."""
+
+    version: Annotated[Whole, AfterValidator(_version)] = key(f"always {VERSION}")
+    model: Annotated[Text, AfterValidator(_model)] | None = key(
+        "bundled model, or a .safetensors file in the scene's folder; it owns its time step", None
+    )
+    duration: Number = key("simulated time", DEFAULT_DURATION, "s", gt=0)
+    seed: Whole = key("of the run's random numbers", 0, ge=0)
+    gravity: Vector = key("pull on every free body", DEFAULT_GRAVITY, "m/s^2")
+    effects: EffectsTable = key("which effects to compute", EffectsTable())
+    limits: LimitsTable = key("what a run must keep to", LimitsTable())
+    shapes: dict[str, ShapeTable] = key("shapes by name", {})
+    bodies: Annotated[list[BodyTable], Field(min_length=1)] = key("all bodies")
+
+    @classmethod
+    def check_keys(cls, data: dict) -> Iterator[Fault]:
+        shapes = data["shapes"] if isinstance(data.get("shapes"), dict) else {}
+        listed = data["bodies"] if isinstance(data.get("bodies"), list) else []
+        first: dict[str, int] = {}
+        for i, entry in enumerate(listed):
+            said = [entry.get(key) for key in ("name", "shape")] if isinstance(entry, dict) else ["", ""]
+            name, shape = (text if isinstance(text, str) else "" for text in said)  # else a fault of its own
+            if name.strip() and first.setdefault(name, i) != i:
+                yield ("bodies", i, "name"), f"two bodies are called {name!r} (the first is bodies[{first[name]}])"
+            if shape.strip() and shape not in shapes:
+                there = f"; shapes are {', '.join([*shapes][:20])}" if shapes else "; the file has no shapes"
+                yield ("bodies", i, "shape"), f"no shape is called {shape!r}{nearest(shape, shapes) or there}"
+
+    def check_values(self) -> Iterator[Fault]:
+        first = {body.name: i for i, body in enumerate(self.bodies)}
+        for i, copies in enumerate(itertools.accumulate(body.copies for body in self.bodies)):
+            if copies > MOST_COPIES:
+                yield ("bodies", i), f"one too many: a scene has at most {MOST_COPIES} bodies, copies included"
+                return
+        copies = {name: i for i, body in enumerate(self.bodies) for name in body.names() if name != body.name}
+        for name in copies.keys() & first.keys():
+            yield ("bodies", first[name], "name"), f"two bodies are called {name!r} (see bodies[{copies[name]}])"
+        for i, body in enumerate(self.bodies):
+            if body.shape and self.flat(body) and body.motion not in (None, "static"):
+                yield ("bodies", i, "motion"), "a plane must be static"
+            for key in ("velocity", "angular_velocity") if self.motion_of(body) == "static" else ():
+                if np.any(getattr(body, key)):
+                    yield ("bodies", i, key), "must be zero: a static body does not move"
+            for k, partner in enumerate(body.collides_with or []):
+                if partner not in first and partner not in copies:
+                    yield ("bodies", i, "collides_with", k), f"no body is called {partner!r}{nearest(partner, first)}"
+
+    def flat(self, body: BodyTable) -> bool:
+        """Whether it is a plane."""
+        shape = self.shapes.get(body.shape or "")
+        return body.plane is not None or (shape is not None and shape.plane is not None)
+
+    def motion_of(self, body: BodyTable) -> Motion:
+        """As it says, else static for planes and dynamic for others."""
+        return body.motion or ("static" if self.flat(body) else "dynamic")
+
+
+_SECTIONS: dict[str, type[Table]] = {
+    "The file": SceneTable,
+    "effects": EffectsTable,
+    "limits": LimitsTable,
+    "shapes: NAME": ShapeTable,
+    "shapes: NAME: primitive": Primitive,
+    "shapes: NAME: sphere": Sphere,
+    "shapes: NAME: capsule, cylinder": Upright,
+    "shapes: NAME: box": Box,
+    "shapes: NAME: plane": PlaneShape,
+    "bodies[]": BodyTable,
+    "bodies[]: plane": Plane,
+    "bodies[]: arrange": Arrange,
+    "bodies[]: path[]": Waypoint,
+}
+
+
+def reference() -> str:
+    """docs/scene.md: every key with its unit, what is allowed and its default."""
+    lines = [
+        "# Every key of scene.yaml",
+        "",
+        "Lengths are in metres, z is up. Unknown keys, keys that appear twice, NaN and infinity are refused.",
+        "`python -m sdfsim.scene.schema > docs/scene.md` writes this page.",
+    ]
+    for title, table in _SECTIONS.items():
+        schema = table.model_json_schema().get("properties", {})
+        lines += ["", f"## {title}", "", table.__doc__ or ""]
+        lines += ["", "| key | what | unit | allowed | default |", "| --- | --- | --- | --- | --- |"] if schema else []
+        for key, field in table.model_fields.items():
+            told = {**next(iter(schema[key].get("anyOf", [])), {}), **schema[key]}
+            default = "required" if field.is_required() else told.get("default")
+            default = "" if default is None or isinstance(default, dict) else str(default)
+            cells = (f"`{key}`", told["description"], told["unit"], _allowed(told), default)
+            lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _allowed(schema: dict) -> str:
+    """The values that a schema allows; bounds that every number has are not told."""
+    limits = []
+    for sign, native, other in ((">", "exclusiveMinimum", "gt"), (">=", "minimum", "ge"), ("<=", "maximum", "le")):
+        limit = schema.get(native, schema.get(other, np.inf))
+        limits += [f"{sign} {limit:g}"] if abs(limit) < LARGEST else []
+    if "maxItems" in schema:
+        return ", each ".join(part for part in (f"{schema['maxItems']} numbers", _allowed(schema["items"])) if part)
+    return ", ".join(schema.get("enum", [])) or " and ".join(limits)
+
+
+if __name__ == "__main__":
+    print(reference(), end="")

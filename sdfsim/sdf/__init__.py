@@ -1,0 +1,1 @@
+"""Signed distances: closed forms, networks, grids, and the true distance of meshes."""

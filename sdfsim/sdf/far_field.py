@@ -1,0 +1,93 @@
+"""Signed distances that are known in a box around a solid, made sane everywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from sdfsim.geometry.mesh import Frame
+
+# Half extent of the box, in the normalised frame, on which distances are fitted or sampled (the paper's sampling box).
+BOX = 0.7
+# Gradients are returned no shorter and no longer than this. A network's slope is within it almost everywhere near the
+# surface, but rounds off the ridge in the middle of a thin wall, where x - f grad f / |grad f|^2 would fly off.
+SLOPE = (0.9, 1.1)
+# Beyond the box distances are returned smaller by this part, which makes up for feet that are not quite the nearest;
+# the full part from `FADE` on, so that nothing jumps at the box.
+CAUTION, FADE = 0.03, 0.1
+
+# Points [P, 3] in the box -> value [P], gradient [P, 3].
+Inner = Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
+
+
+def in_metres(
+    inner: Inner, frame: Frame, bounds: np.ndarray, points: torch.Tensor, chunk: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Distance [P] m and gradient [P, 3] at `points` [P, 3] m; computed in float32, `chunk` at once, and cast back.
+    `inner` is what is known in the box of the normalised `frame`; `bounds` [2, 3] m are the solid's."""
+    centre = torch.from_numpy(frame.centre).to(points)
+    half = torch.from_numpy(np.abs(bounds - frame.centre).max(0) / frame.scale).to(points.device, torch.float32)
+    distance, gradient = [], []
+    for part in points.split(chunk):
+        # The centre leaves in the precision of the points, before the cast.
+        value, slope = everywhere(inner, ((part - centre) / frame.scale).float(), half)
+        distance.append(value.to(points.dtype) * frame.scale)
+        gradient.append(slope.to(points.dtype))
+    return torch.cat(distance), torch.cat(gradient)
+
+
+def everywhere(inner: Inner, points: torch.Tensor, half: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Value [P] and gradient [P, 3] at normalised points [P, 3], inside the box and beyond it.
+
+    The length of the gradient is kept within `SLOPE`; where it vanishes, it points away from the centre. Outside the
+    solid's bounding box, of half extents `half` [3], the distance to that box is a lower bound that no error of the fit
+    may undercut.
+    """
+    clamped = points.clamp(-BOX, BOX)
+    value, gradient = inner(clamped)
+    norm = gradient.norm(dim=-1, keepdim=True)
+    away = clamped + clamped.new_tensor([0.0, 0.0, 1e-6])
+    unit = torch.where(norm > 1e-6, gradient / norm.clamp_min(1e-6), away / away.norm(dim=-1, keepdim=True))
+    gradient = unit * norm.clamp(*SLOPE)
+    outside = (points != clamped).any(-1).nonzero()[:, 0]
+    if len(outside):
+        first = clamped[outside] - value[outside].clamp_min(0)[:, None] * unit[outside]
+        value[outside], gradient[outside] = _beyond(inner, points[outside], first)
+    beyond = (points.abs() - half).clamp_min(0)
+    least = beyond.norm(dim=-1)
+    short = (least > 0) & (least > value)
+    straight = beyond.copysign(points) / least.clamp_min(1e-12)[:, None]
+    return torch.where(short, least, value), torch.where(short[:, None], straight, gradient)
+
+
+def _beyond(inner: Inner, points: torch.Tensor, first: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Distance and gradient at points [P, 3] outside the box, where `first` [P, 3] are feet from its nearest points.
+
+    From a point q of the box with value f and direction g the nearest surface is at its foot c = q - f g. No |x - c| is
+    shorter than the distance, so the shortest of several is taken: `first`, the foot from where the segment from x to
+    that one enters the box, and the same two from where the segment from x to the middle enters it. The gradient
+    points from the foot to x; so far out this is better than the fitted one.
+    """
+
+    def feet_towards(*goals: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """A foot for each goal, of one query."""
+        way = points - torch.stack(goals)
+        # Of the sides of the box that lie between, the segment passes the one it comes to last.
+        passed = ((points.abs() - BOX) / way.abs().clamp_min(1e-12)).clamp(0, 1).amax(-1, keepdim=True)
+        entry = (points - passed * way).clamp(-BOX, BOX)
+        value, gradient = inner(entry.flatten(0, 1))
+        unit = gradient / gradient.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+        foot = entry - (value.clamp_min(0)[:, None] * unit).view_as(entry)
+        return foot.clamp(-BOX, BOX).unbind()
+
+    first = first.clamp(-BOX, BOX)
+    nearer, middle = feet_towards(first, torch.zeros_like(points))
+    (through,) = feet_towards(middle)
+    ways = points - torch.stack([first, nearer, middle, through])
+    shortest, which = ways.norm(dim=-1).min(0)
+    ray = ways[which, torch.arange(len(points), device=points.device)]
+    out = (points.abs() - BOX).amax(-1)
+    value = shortest * (1.0 - CAUTION * (out / FADE).clamp(0.0, 1.0))
+    return value, ray / shortest.clamp_min(1e-6)[:, None]

@@ -1,0 +1,1 @@
+"""SDF networks from exact distances: training, and the certificate at its end."""

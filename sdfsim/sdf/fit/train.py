@@ -1,0 +1,307 @@
+"""Exact distances -> SDF network: recipes, the points a fit learns from, the training loop."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.parallel import Progress, choose_threads
+from sdfsim.geometry.mesh import normal_frame, sample_surface
+from sdfsim.sdf.far_field import BOX
+from sdfsim.sdf.fit.certificate import SIGN_FROM, certify
+from sdfsim.sdf.fit.soap import Soap
+from sdfsim.sdf.mlp import Activation, MlpSdf, Tape, value_and_gradient
+from sdfsim.sdf.reference import DistanceOracle
+from sdfsim.sdf.sdf import Sdf
+
+Recipe = Literal["quick", "default", "paper"]
+# Weights and biases per layer, [out, in] and [out].
+Layers = tuple[list[torch.Tensor], list[torch.Tensor]]
+
+# Changes whenever the same mesh would come out differently; part of every cache key.
+FIT_VERSION = 8
+
+# Points are drawn from a little beyond the box that is used: at the very edge of its data a network's slope is poor.
+MARGIN = 1.15
+# A solid whose distances agree with their mirror images' to this, relative to its size, is fitted on one side only.
+SAME = 1e-4
+# A fit is checked on the way on this many points of three kinds: with these spreads around the surface, and in the box.
+CHECKED = 4000
+CHECKED_SIGMAS = (0.006, 0.06)
+# Weights of the first periodic layer are uniform in +- this; it sets the finest scale that a fit starts with.
+FIRST = 8.0
+WARMUP = 50  # updates
+CHECK_EVERY = 100  # updates
+# Seconds that the certificate takes of a budget, beside a tenth.
+RESERVE = 2.0
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """One recipe; the defaults were chosen by measurement on scanned and thin-walled shapes.
+
+    Lengths are relative to the shape's largest extent. The box gets its share of points and the loss stays soft up to
+    some hundredths of the size, without which the far field is off by as much.
+    """
+
+    # of the hidden layers; "relu" is trained as the paper does: by Adam, on both sides of every mirror plane, and by
+    # signs only where the paper's rule trusts them
+    activation: Activation = "wave"
+    width: int = 64  # of the hidden layers
+    layers: int = 6  # linear layers, the last one included
+    lr: float = 1e-2  # step size
+    decay: float = 0.5  # the part of the steps over which it falls to zero, at the end (0: constant)
+    steps: int = 5000  # updates
+    batch: int = 4096  # points an update
+    # points lie this far from the surface (standard deviation, log-uniform between the two)
+    sigmas: tuple[float, float] = (0.002, 0.15)
+    near: float = 0.8  # fraction of points near the surface; the others are uniform in the box
+    resample: int = 0  # updates between fresh pools of points (0: one pool)
+    pool: int = 400_000  # points in a pool
+    soften: float | None = 0.04  # errors count with soften / (|distance| + soften); None counts all alike
+    # errors of the averaged weights at which the decay begins early, which halves them: of the distance (means within
+    # 0.01 and in the box), of the gradient (median cosine distance within 0.1) and of the sign (fraction wrong farther
+    # than 0.002). None never stops early.
+    goal: tuple[float, float, float, float] | None = (7e-4, 6e-3, 4e-3, 1.3e-3)
+    settle: int = 1000  # steps of an early decay
+
+
+RECIPES = {
+    "default": FitOptions(),
+    # A surface from a few minutes of training is not known as exactly as a full fit would follow it.
+    "quick": FitOptions(steps=1500, settle=600, pool=200_000),
+    # Rubanova et al. 2024, section 3.1 and appendix: 400k updates at 1e-5, noise 0.1 drawn again every 100 updates.
+    "paper": FitOptions(
+        activation="relu",
+        width=128,
+        layers=8,
+        lr=1e-5,
+        decay=0.0,
+        steps=400_000,
+        sigmas=(0.1, 0.1),
+        near=1.0,
+        resample=100,
+        pool=65_536,
+        soften=None,
+        goal=None,
+    ),
+}
+
+
+def fit_sdf(
+    oracle: DistanceOracle,
+    recipe: Recipe,
+    budget: float | None,
+    seed: int,
+    pick: Callable[[Sdf], np.ndarray],
+    on_progress: Progress,
+    device: torch.device | str,
+) -> tuple[MlpSdf, np.ndarray, dict]:
+    """Fit a network to the distances of a solid within `budget` s (None: no limit). Returns it, the nodes [K, 3] m that
+    `pick` takes from it, and its certificate. Raises SdfsimError for a budget that is not positive."""
+    if budget is not None and not budget > 0:
+        raise SdfsimError(f"the budget of a fit must be > 0 seconds (got {budget})")
+    started, options = time.monotonic(), RECIPES[recipe]
+    on_progress(0.0, "sampling distances")
+    fit = _Fit(oracle, options, seed, torch.device(device))
+    if fit.device.type == "cpu":
+        choose_threads(partial(fit.differentiate, torch.arange(options.batch) % options.pool))
+    looping = time.monotonic()
+    while fit.step < fit.stop:
+        fit.update()
+        if fit.step % CHECK_EVERY:
+            continue
+        near, far = fit.judge()
+        if budget is not None:
+            left = budget - min(0.1 * budget + RESERVE, 0.5 * budget) - (time.monotonic() - started)
+            fit.hurry(fit.step + int(left * fit.step / (time.monotonic() - looping)))
+        last = max(fit.stop, 1)
+        on_progress(0.97 * fit.step / last, f"step {fit.step} of {last}, error {near:.2g} near, {far:.2g} in the box")
+    on_progress(0.98, "measuring")
+    sdf = fit.result()
+    nodes = pick(sdf)
+    certificate = certify(sdf, oracle, nodes=nodes)
+    seconds = round(time.monotonic() - started, 2)
+    certificate.update(recipe=recipe, seed=seed, steps=min(fit.step, fit.stop), seconds=seconds)
+    but = certificate["reason"] or certificate["caveat"]
+    on_progress(1.0, f"fitted, but {but}" if but else "fitted")
+    return sdf, nodes, certificate
+
+
+class Pool(NamedTuple):
+    """Normalised points."""
+
+    points: torch.Tensor  # [P, 3]
+    distance: torch.Tensor  # [P] signed
+    signed: torch.Tensor  # [P] bool, whether the sign of the distance counts
+    direction: torch.Tensor  # [P, 3] unit, from the surface outwards; zero on the surface itself
+
+
+class _Fit:
+    """A network in training, and samples of the solid that it learns. The decay of its steps begins at update `turn`
+    and ends at `stop`; an early stop or a short budget moves both forward."""
+
+    def __init__(self, oracle: DistanceOracle, options: FitOptions, seed: int, device: torch.device) -> None:
+        self.oracle, self.options, self.device, self._seed = oracle, options, device, seed
+        self.frame = normal_frame(oracle.bounds)
+        self.mirrors = self._mirrors() if options.activation == "wave" else (False, False, False)
+        self.pool = self._pool(0)
+        # Points to judge by on the way: `CHECKED` of each of three kinds.
+        sigma = np.repeat(CHECKED_SIGMAS, CHECKED)[:, None]
+        self.check = self._sample(sigma, CHECKED, np.random.default_rng([seed, 1]))
+        # Drawn on the CPU, so that points and first weights do not depend on the device.
+        self.generator = torch.Generator().manual_seed(seed)
+        self.parameters = [p.to(device) for p in _initial(options, self.generator)]
+        for parameter in self.parameters:
+            parameter.grad = torch.zeros_like(parameter)
+        self.average = [parameter.clone() for parameter in self.parameters]
+        self.optimiser = (Soap if options.activation == "wave" else torch.optim.Adam)(self.parameters, options.lr)
+        self.step = 0
+        self.turn, self.stop = int(options.steps * (1.0 - options.decay)), options.steps
+        self._tape = Tape(options.activation, options.width, options.layers, self.parameters[0])
+
+    def _pool(self, step: int) -> Pool:
+        """Points to learn from, as drawn before update `step`."""
+        options = self.options
+        rng = np.random.default_rng([self._seed, 0, step] if step else [self._seed, 0])
+        near = int(options.pool * options.near)
+        low, high = np.log(options.sigmas)
+        sigma = np.exp(rng.uniform(low, high, (near, 1)))
+        return self._sample(sigma, options.pool - near, rng)
+
+    def _sample(self, sigma: np.ndarray, elsewhere: int, rng: np.random.Generator) -> Pool:
+        """Points with normal noise of `sigma` [N, 1] around the surface, then `elsewhere` points all over the box."""
+        local = self.frame.inward(sample_surface(self.oracle.surface, len(sigma), rng)[0])
+        around = local + sigma * rng.standard_normal((len(sigma), 3))
+        local = np.concatenate([around, rng.uniform(-MARGIN * BOX, MARGIN * BOX, (elsewhere, 3))])
+        local = np.clip(local, -MARGIN * BOX, MARGIN * BOX)
+        truth = self.oracle(self.frame.outward(local))
+        distance = truth.distance / self.frame.scale
+        signed = truth.trusted | (self.oracle.closed and self.options.activation == "wave")
+        # So close to the surface the direction from it is rounding.
+        clear = np.abs(distance) > 1e-4
+        offset = local - self.frame.inward(truth.closest)
+        direction = np.where(clear[:, None], offset / np.where(clear, distance, 1.0)[:, None], 0.0)
+        # What lies on the other side of a mirror plane is learned from its image.
+        side = np.where(np.asarray(self.mirrors) & (local < 0), -1.0, 1.0)
+        where, away, along = (torch.from_numpy(x).float() for x in (local * side, distance, direction * side))
+        return Pool(*(part.to(self.device) for part in (where, away, torch.from_numpy(signed), along)))
+
+    def _mirrors(self) -> tuple[bool, bool, bool]:
+        """Across which planes of its frame the solid is its own mirror image, as far as sampled distances tell."""
+        rng = np.random.default_rng(0)
+        local = self.frame.inward(sample_surface(self.oracle.surface, 2000, rng)[0])
+        local = np.concatenate([local, local + rng.normal(0.0, 0.05, local.shape)])
+        truth = self.oracle(self.frame.outward(local)).distance
+
+        def same(axis: int) -> bool:
+            image = self.frame.outward(local * np.where(np.arange(3) == axis, -1.0, 1.0))
+            return bool(np.abs(self.oracle(image).distance - truth).max() < SAME * self.frame.scale)
+
+        return same(0), same(1), same(2)
+
+    def update(self) -> None:
+        """One step of the optimiser."""
+        options = self.options
+        if options.resample and self.step and self.step % options.resample == 0:
+            self.pool = self._pool(self.step)
+        self.differentiate(torch.randint(options.pool, (options.batch,), generator=self.generator))
+        factor = min(1.0, (self.step + 1) / WARMUP)
+        if options.decay:
+            late = min(max((self.step - self.turn) / max(self.stop - self.turn, 1), 0.0), 1.0)
+            factor *= 0.5 * (1.0 + math.cos(math.pi * late))
+        if isinstance(self.optimiser, Soap):
+            self.optimiser.step(factor)
+        else:
+            self.optimiser.param_groups[0]["lr"] = options.lr * factor
+            self.optimiser.step()
+        self.step += 1
+        for mean, parameter in zip(self.average, self.parameters, strict=True):
+            mean.lerp_(parameter, 0.02)
+
+    def differentiate(self, chosen: torch.Tensor) -> None:
+        """Weighted L1 of the signed distance, and of the unsigned one where the sign is not known, at the points of the
+        pool that are chosen [T]; fills the gradients."""
+        points, distance, signed, _ = (part[chosen.to(self.device)] for part in self.pool)
+        weights, biases = _layers(self.parameters, self.options.activation)
+        value = self._tape.forward(weights, biases, points)
+        error = torch.where(signed, value - distance, value.abs() - distance.abs())
+        slope = error.sign() * torch.where(signed, 1.0, value.sign()) / len(chosen)
+        if self.options.soften is not None:
+            slope = slope * (self.options.soften / (distance.abs() + self.options.soften))
+        gradients = [parameter.grad for parameter in self.parameters if parameter.grad is not None]
+        self._tape.parameter_gradients(weights, points, slope, *_split(gradients))
+        for gradient, scale in zip(gradients, _SCALES[self.options.activation], strict=True):
+            gradient.mul_(scale)
+
+    def judge(self) -> tuple[float, float]:
+        """Begin the decay where the goal is met. Returns mean errors near the surface and in the box."""
+        layers = _layers(self.average, self.options.activation)
+        value, gradient = value_and_gradient(*layers, self.options.activation, self.check.points)
+        distance, signed = self.check.distance, self.check.signed
+        error = torch.where(signed, value - distance, value.abs() - distance.abs()).abs()
+        near, far = float(error[:CHECKED].mean()), float(error[2 * CHECKED :].mean())
+        if self.options.goal is not None and self.step < self.turn:
+            cosine = torch.nn.functional.cosine_similarity(gradient, self.check.direction, dim=-1)
+            turned = 1.0 - float(cosine[CHECKED : 2 * CHECKED].median())
+            clear = signed & (distance.abs() > SIGN_FROM)
+            wrong = float((clear & (value * distance <= 0)).sum() / clear.sum().clamp_min(1))
+            if all(e <= most for e, most in zip((near, far, turned, wrong), self.options.goal, strict=True)):
+                self.turn, self.stop = self.step, min(self.stop, self.step + self.options.settle)
+        return near, far
+
+    def hurry(self, possible: int) -> None:
+        """Place decay and end so that `possible` updates in all suffice. Until the decay has begun the end moves both
+        ways, since the first steps of a busy machine tell little; after that it only comes nearer."""
+        begun = self.step >= self.turn
+        self.stop = min(self.stop if begun else self.options.steps, max(possible, self.step))
+        if not begun:
+            self.turn = max(self.step, int(self.stop * (1.0 - self.options.decay)))
+
+    def result(self) -> MlpSdf:
+        """The network."""
+        parts = _layers(self.parameters, self.options.activation)
+        weights, biases = (tuple(part.cpu().clone() for part in layers) for layers in parts)
+        return MlpSdf(weights, biases, self.options.activation, self.frame, self.oracle.bounds.copy(), self.mirrors)
+
+
+def _initial(options: FitOptions, generator: torch.Generator) -> list[torch.Tensor]:
+    """First [1, W, 3], hidden [L - 2, W, W] and last [1, 1, W] weights; biases [L - 1, W, 1] and [1, 1, 1]: equal
+    layers are stacked for the optimiser. Periodic layers start with phases all around and the spread of inputs that
+    sine layers have (Sitzmann et al. 2020); ReLU layers with He's variance."""
+    width, hidden = options.width, options.layers - 2
+
+    def uniform(bound: float, layers: int, *shape: int) -> torch.Tensor:
+        return (2.0 * torch.rand((layers, *shape), generator=generator) - 1.0) * bound
+
+    periodic = options.activation == "wave"
+    return [
+        uniform(FIRST if periodic else math.sqrt(2.0), 1, width, 3),
+        uniform(math.sqrt(6.0 / width), hidden, width, width),
+        uniform(math.sqrt(6.0 / width) / (10.0 if periodic else 1.0), 1, 1, width),
+        uniform(math.pi if periodic else 0.05, options.layers - 1, width, 1),
+        uniform(0.05, 1, 1, 1),
+    ]
+
+
+# A wave of period 1 with the parameters of a sine of period 2 pi: they are trained at the sine's scale, on which
+# equal steps of the optimiser suit all layers, and multiplied by these before every use. Its height is 1/8.
+_SCALES = {"wave": (0.5 / math.pi, 4.0 / math.pi, 8.0, 0.5 / math.pi, 1.0), "relu": (1.0,) * 5}
+
+
+def _layers(parameters: list[torch.Tensor], activation: Activation) -> Layers:
+    """What the networks compute with."""
+    return _split([parameter * scale for parameter, scale in zip(parameters, _SCALES[activation], strict=True)])
+
+
+def _split(parts: list[torch.Tensor]) -> Layers:
+    first, hidden, last, biases, end = parts
+    return [first[0], *hidden.unbind(), last[0]], [*biases[..., 0].unbind(), end[0, ..., 0]]

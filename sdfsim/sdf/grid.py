@@ -1,0 +1,107 @@
+"""Signed distances sampled on a grid, trilinear in between."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.parallel import Progress, silent
+from sdfsim.geometry.mesh import Frame, lattice, normal_frame
+from sdfsim.sdf.far_field import BOX, in_metres
+from sdfsim.sdf.sdf import accepts_numpy
+
+# Points of a grid evaluated at once: eight indices and corners with what is made of them, about 250 bytes a point.
+CHUNK = 262_144
+
+
+def trilinear(values: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Value [P] and gradient [P, 3] of a grid [R, R, R] over [-BOX, BOX]^3 at points [P, 3] in it; NaN for NaN. The
+    gradient is the exact one of the interpolant, so that the step x - f grad f leads to the level that the value has;
+    it jumps from cell to cell."""
+    side = values.shape[-1]
+    per_cell = (side - 1) / (2 * BOX)
+    place = (points + BOX) * per_cell
+    # Cut to the grid as integers, so that not even a NaN reads beside it; the far faces belong to the last cell.
+    cell = place.long().clamp_(0, side - 2)
+    across, along, up = (place - cell).unbind(1)
+    first = (cell[:, 0] * side + cell[:, 1]) * side + cell[:, 2]
+    bit = torch.arange(2, device=points.device)
+    corner = ((bit[:, None, None] * side + bit[:, None]) * side + bit).view(8, 1)
+    # Three times as fast on a CPU as brackets are, here.
+    found = values.reshape(-1).index_select(0, (first + corner).view(-1)).view(2, 2, 2, -1)
+    rise_x = found[1] - found[0]
+    face = found[0] + across * rise_x
+    rise_y = face[1] - face[0]
+    edge = face[0] + along * rise_y
+    rise_z = edge[1] - edge[0]
+    slope_x = rise_x[0] + along * (rise_x[1] - rise_x[0])
+    gradient = [slope_x[0] + up * (slope_x[1] - slope_x[0]), rise_y[0] + up * (rise_y[1] - rise_y[0]), rise_z]
+    return edge[0] + up * rise_z, torch.stack(gradient, dim=1) * per_cell
+
+
+@dataclass(frozen=True, eq=False)
+class GridSdf:
+    """A signed distance sampled on the box [-0.7, 0.7]^3 of the normalised frame, trilinear between the samples."""
+
+    # [R, R, R] float32 normalised distances at R >= 2 evenly spaced places along x, y and z, the outermost on the faces
+    # of the box
+    values: torch.Tensor
+    frame: Frame  # metres <-> normalised
+    bounds: np.ndarray  # [2, 3] float64 m, the box that holds the solid
+
+    def __post_init__(self) -> None:
+        shape = tuple(self.values.shape)
+        if len(shape) != 3 or len(set(shape)) != 1 or shape[0] < 2:
+            raise ValueError(f"a grid must have as many samples along x, y and z, two or more (got {shape})")
+
+    @property
+    def device(self) -> torch.device:
+        return self.values.device
+
+    @property
+    def resolution(self) -> int:
+        """Samples along each side."""
+        return self.values.shape[0]
+
+    def to(self, device: torch.device | str) -> GridSdf:
+        """The same grid on `device`."""
+        return replace(self, values=self.values.to(device))
+
+    def scaled(self, factor: float) -> GridSdf:
+        """The solid `factor` times as large."""
+        frame = Frame(self.frame.centre * factor, self.frame.scale * factor)
+        return replace(self, frame=frame, bounds=self.bounds * factor)
+
+    @accepts_numpy
+    def __call__(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Distance [P] m and gradient [P, 3] at `points` [P, 3] m; interpolated in float32 (see `trilinear`), cast
+        back. See `everywhere` for what is far."""
+        return in_metres(partial(trilinear, self.values), self.frame, self.bounds, points, CHUNK)
+
+
+def sample_grid(
+    distance: Callable[[np.ndarray], tuple[Any, ...]],
+    bounds: np.ndarray,
+    resolution: int,
+    on_progress: Progress = silent,
+) -> GridSdf:
+    """Sample a signed distance (a `DistanceOracle` or an Sdf) of a solid within `bounds` [2, 3] m at `resolution`^3
+    places over a cube 1.4 times as wide as the solid. Raises SdfsimError for fewer than two samples a side, or bounds
+    without extent or not finite."""
+    if resolution < 2:
+        raise SdfsimError(f"a grid needs at least two samples along each side (got {resolution})")
+    frame = normal_frame(bounds)
+    axis = np.linspace(-BOX, BOX, resolution)
+    values = np.empty((resolution, resolution, resolution), dtype=np.float32)
+    for k, x in enumerate(axis):
+        on_progress(k / resolution, "sampling the distance")
+        found = np.asarray(distance(frame.outward(lattice([x], axis, axis)))[0])
+        values[k] = (found / frame.scale).reshape(resolution, resolution)
+    on_progress(1.0, "sampled")
+    return GridSdf(torch.from_numpy(values), frame, np.asarray(bounds, dtype=np.float64))

@@ -1,0 +1,52 @@
+"""Signed distances: what all of them are, and how they take NumPy arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+
+
+@runtime_checkable
+class Sdf(Protocol):
+    """A signed distance with its gradient: positive outside, negative inside, metres, the shape's own frame.
+
+    Its members, `MlpSdf`, the closed forms, `GridSdf` and `MeshSdf`, also have `to(device)` and `scaled(factor)`.
+
+    Attributes:
+        bounds: [2, 3] float64 m, the axis-aligned box that holds the solid (infinite for a plane).
+    """
+
+    @property
+    def bounds(self) -> np.ndarray: ...
+
+    def __call__(self, points: Any, /) -> tuple[Any, Any]:
+        """Distance [P] m and gradient [P, 3] (unit length where the SDF is exact) at `points` [P, 3] m.
+
+        The result has the dtype and device of `points`. Never NaN: where the gradient is undefined (medial axis, an
+        edge) any valid one-sided gradient is returned. The members also take a NumPy array, and then return some.
+        """
+        ...
+
+
+def accepts_numpy(call: Callable[..., tuple[torch.Tensor, torch.Tensor]]) -> Callable[..., tuple[Any, Any]]:
+    """Let an Sdf's `__call__` also take what makes a NumPy array [P, 3] (whole numbers become float64), and then answer
+    in NumPy. Raises ValueError for other shapes."""
+
+    @wraps(call)
+    def wrapper(self: Any, points: Any) -> tuple[Any, Any]:
+        given = points if isinstance(points, torch.Tensor) else np.asarray(points)
+        if given.ndim != 2 or given.shape[1] != 3:
+            raise ValueError(f"points must be [P, 3], got {list(given.shape)}")
+        if isinstance(given, torch.Tensor):
+            return call(self, given)
+        if not np.issubdtype(given.dtype, np.floating):
+            given = given.astype(np.float64)
+        tensor = torch.from_numpy(np.ascontiguousarray(given)).to(getattr(self, "device", "cpu"))
+        distance, gradient = call(self, tensor)
+        return distance.cpu().numpy(), gradient.cpu().numpy()
+
+    return wrapper

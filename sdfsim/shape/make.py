@@ -1,0 +1,285 @@
+"""Makes shapes: closed forms; of meshes, by a fit (cached) or without one; of convex pieces."""
+
+from __future__ import annotations
+
+import logging
+import os
+import secrets
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import user_cache
+from sdfsim.base.parallel import Progress, silent
+from sdfsim.geometry import primitives
+from sdfsim.geometry.mass import mass_properties, mass_properties_of_sdf
+from sdfsim.geometry.mesh import GLTF, Mesh, clean, convex_hull, is_closed, lattice, load_mesh
+from sdfsim.geometry.solidify import solidify
+from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, SphereSdf
+from sdfsim.sdf.fit.train import FIT_VERSION, Recipe, fit_sdf
+from sdfsim.sdf.reference import MeshDistance, PiecesDistance
+from sdfsim.sdf.sdf import Sdf
+from sdfsim.shape.shape import DEFAULT_RESOLUTION, FORMAT_VERSION, SdfKind, Shape, load_shape, scaled, sdf_of_mesh
+from sdfsim.shape.surface_nodes import DEFAULT_COUNT, edge_nodes, hull_nodes, sample_nodes, surface_nodes, thin
+
+# m, sizes of meshes that need no word; without known units the largest is less, for few things that move are larger.
+USUAL, LARGE = (1e-3, 100.0), 5.0
+# Of the nodes of convex pieces: the pieces' vertices are at most this part, with points on their edges at most that.
+OWN_SHARE, EDGE_SHARE = 0.6, 0.85
+# Between points on the edges of convex pieces, relative to the size of the whole.
+EDGE_SPACING = 0.06
+
+_log = logging.getLogger(__name__)
+
+
+def analytic_shape(
+    kind: Literal["plane", "sphere", "capsule", "cylinder", "box"],
+    *,
+    radius: float = 0.0,
+    height: float = 0.0,
+    size: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
+    name: str | None = None,
+) -> Shape:
+    """A shape with an exact SDF, about the origin: "plane" (z = 0, +z outside, infinite), "sphere", "capsule",
+    "cylinder" or "box".
+
+    Radius and height (along z, of a capsule with its caps) are in m, and so is the box's size, full extents along x, y,
+    z. Mass properties are exact (of the plane 0); the plane shows a 20 m square and has no nodes. Raises SdfsimError
+    for a size that is missing or not positive.
+    """
+    volume, inertia, nodes = 0.0, np.zeros((3, 3)), np.zeros((0, 3))
+    if kind == "plane":
+        sdf, mesh = PlaneSdf(), primitives.plane(10.0)
+    elif kind == "sphere":
+        sdf = SphereSdf(float(radius))
+        volume = 4.0 / 3.0 * np.pi * sdf.radius**3
+        inertia = 0.4 * volume * sdf.radius**2 * np.eye(3)
+        mesh, nodes = primitives.sphere(sdf.radius), sdf.radius * primitives.spiral(128)
+    elif kind == "box":
+        x, y, z = (0.5 * float(value) for value in size)
+        sdf = BoxSdf((x, y, z))
+        volume = 8.0 * x * y * z
+        inertia = volume / 3.0 * np.diag([y * y + z * z, z * z + x * x, x * x + y * y])
+        mesh, nodes = primitives.box((2 * x, 2 * y, 2 * z)), _box_nodes(np.array([x, y, z]))
+    else:
+        caps = kind == "capsule"
+        half = 0.5 * (float(height) - 2.0 * radius * caps)
+        sdf = (CapsuleSdf if caps else CylinderSdf)(float(radius), half)
+        volume, inertia = _round_mass(sdf.radius, half, caps=caps)
+        nodes = _round_nodes(sdf.radius, half, caps=caps)
+        mesh = convex_hull(_round_nodes(sdf.radius, half, caps=caps, around=48))
+    return Shape(name or kind, mesh, sdf, nodes, float(volume), np.zeros(3), inertia, source={"kind": kind})
+
+
+def _round_mass(radius: float, half: float, *, caps: bool) -> tuple[float, np.ndarray]:
+    """Volume m^3 and inertia [3, 3] m^5 (per unit density) of a cylinder about z, with half balls at its ends."""
+    trunk = 2.0 * np.pi * radius**2 * half
+    across, about = trunk * (radius**2 / 4.0 + half**2 / 3.0), trunk * radius**2 / 2.0
+    if caps:
+        balls = 4.0 / 3.0 * np.pi * radius**3
+        # Half balls whose flat sides lie at +-half, their middles 3/8 of the radius beyond.
+        across += balls * (0.4 * radius**2 + half**2 + 0.75 * half * radius)
+        about += 0.4 * balls * radius**2
+        trunk += balls
+    return trunk, np.diag([across, across, about])
+
+
+def _round_nodes(radius: float, half: float, *, caps: bool, around: int = 16) -> np.ndarray:
+    """Rings about z on the surface of a capsule or cylinder: [K, 3] m, those of the ends first."""
+    turns = 2.0 * np.pi * np.arange(around) / around
+    circle = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    rings = [(radius, half * z) for z in (-1.0, 1.0)]
+    if caps:
+        tilts = np.arange(1, 4) * np.pi / 8.0
+        rings += [(radius * np.cos(t), z * (half + radius * np.sin(t))) for t in tilts for z in (-1.0, 1.0)]
+    else:
+        rings += [(0.5 * radius, half * z) for z in (-1.0, 1.0)]
+    rings += [(radius, half * z) for z in (-0.5, 0.0, 0.5)]
+    tips = np.array([[0.0, 0.0, z * (half + (radius if caps else 0.0))] for z in (-1.0, 1.0)])
+    placed = [np.column_stack([r * circle, np.full(around, z)]) for r, z in rings]
+    return np.concatenate([*placed, tips])
+
+
+def _box_nodes(half: np.ndarray) -> np.ndarray:
+    """Corners, edges and faces of a 5 x 5 x 5 lattice on the box: [98, 3] m, the corners first."""
+    axis = np.linspace(-1.0, 1.0, 5)
+    places = lattice(axis, axis, axis)
+    sides = (np.abs(places) == 1.0).sum(1)
+    order = np.argsort(-sides, kind="stable")
+    return (places * half)[order[sides[order] > 0]]
+
+
+def shape_from_primitive(
+    kind: str, size: float = 1.0, cache_dir: str | Path | None = None, *, name: str | None = None,
+    sdf: SdfKind = "mlp", resolution: int = DEFAULT_RESOLUTION, on_progress: Progress = silent,
+) -> Shape:  # fmt: skip
+    """The shape of a procedural mesh of `primitives.PRIMITIVES`, its largest extent `size` m, made on first use and
+    cached; other arguments as of `shape_from_mesh`. Raises SdfsimError for no such primitive."""
+    if kind not in primitives.PRIMITIVES:
+        raise SdfsimError(f"no primitive called {kind!r}", "there are " + ", ".join(primitives.PRIMITIVES))
+    mesh = primitives.PRIMITIVES[kind]()
+    unit = Mesh(mesh.vertices / float(np.ptp(mesh.vertices, axis=0).max()), mesh.faces)
+    # Rounded, since sines and cosines differ in their last digit from machine to machine.
+    key = Mesh(unit.vertices.round(9), unit.faces).digest()
+    shape = _cached(unit, key, kind, sdf, resolution, cache_dir, on_progress=on_progress)
+    return scaled(replace(shape, name=name or kind, source={**shape.source, "primitive": kind}), size)
+
+
+def shape_from_mesh(
+    path: str | Path, cache_dir: str | Path | None = None, *, name: str | None = None, units: float | None = None,
+    cap: bool = False, thicken: float | None = None, sdf: SdfKind = "mlp", resolution: int = DEFAULT_RESOLUTION,
+    on_progress: Progress = silent,
+) -> Shape:  # fmt: skip
+    """The shape of a mesh file: made on first use, then taken from a cache (by default `sdfsim/shapes` in the user's
+    cache folder) keyed by what the file describes.
+
+    `units` are metres per unit of the file (None: metres, with a doubt), `thicken` m is a thickness for an open sheet;
+    of `sdf`, "mlp" fits the network, "grid" and "mesh" fit nothing (see `mesh_shape`). `source["notes"]` tells what was
+    done to the mesh, and what `remarks` there are. Raises SdfsimError where the mesh cannot be used.
+    """
+    path = Path(path)
+    mesh = load_mesh(path)
+    # Not of the file's bytes: a glTF keeps its vertices, and an OBJ its colours, in files beside it.
+    key = mesh.digest()
+    metres = 1.0 if units is None else units
+    how = {"cap": cap, "thicken": None if thicken is None else thicken / metres, "on_progress": on_progress}
+    shape = _cached(mesh, key, path.stem, sdf, resolution, cache_dir, file=str(path), **how)
+    notes = [*shape.source.get("notes", []), *remarks(path, mesh, metres, given=units is not None)]
+    source = {**shape.source, "file": path.name, "sha256": key} | ({"notes": notes} if notes else {})
+    return scaled(replace(shape, name=name or path.stem, source=source), metres)
+
+
+def remarks(path: Path, mesh: Mesh, units: float, *, given: bool) -> list[str]:
+    """What to tell of a mesh file as it was read, a line each: that glTF was turned; and its size, where that is odd
+    for the `units` (metres per unit) that are taken for its numbers. Many parts are drawn in millimetres, and few
+    files say so."""
+    notes = ["glTF has y up: it is turned to z up"] if path.suffix.lower() in GLTF else []
+    size = units * float(np.ptp(mesh.vertices, axis=0).max())
+    if not given and size > LARGE:
+        notes.append(
+            f"it is {size:.3g} m wide if it counts in metres: does it in millimetres? Then give --units mm (units: mm)"
+        )
+    elif not USUAL[0] <= size <= USUAL[1]:
+        notes.append(f"it is {size:.3g} m wide; where that is wrong, --units (units) says what the file counts in")
+    return notes
+
+
+def mesh_shape(
+    mesh: Mesh, *, name: str, kind: Literal["grid", "mesh"], cap: bool = False, thicken: float | None = None,
+    file: str = "", resolution: int = DEFAULT_RESOLUTION, on_progress: Progress = silent,
+) -> Shape:  # fmt: skip
+    """The shape of a mesh (metres) without any fit: its exact SDF or a grid of it, nodes and mass as a fit has them.
+    Raises SdfsimError, which calls the mesh `file` (or else `name`), where it cannot be used."""
+    solid = solidify(mesh, name=file or name, cap=cap, thicken=thicken)
+    sdf, note, certificate = sdf_of_mesh(solid.surface, kind, resolution, on_progress)
+    nodes = surface_nodes(sdf, solid.surface, DEFAULT_COUNT)
+    source = {"kind": "mesh"} | note | ({"notes": list(solid.notes)} if solid.notes else {})
+    return Shape(name, solid.surface, sdf, nodes, *solid.mass_properties(), certificate, source)
+
+
+def _cached(
+    mesh: Mesh, key: str, name: str, kind: SdfKind, resolution: int, cache_dir: str | Path | None, **how: Any
+) -> Shape:
+    if kind == "mesh":  # made as fast as it is read
+        return mesh_shape(mesh, name=name, kind=kind, **how)
+    variant = "-cap" if how.get("cap") else ""
+    variant += "" if how.get("thicken") is None else f"-thick{how['thicken']:g}"
+    variant += f"-grid{resolution}" if kind == "grid" else ""
+    folder = Path(cache_dir or user_cache("shapes")) / f"{key[:24]}{variant}-{FIT_VERSION}.{FORMAT_VERSION}"
+    if folder.is_dir():
+        try:
+            return load_shape(folder)
+        except SdfsimError:
+            shutil.rmtree(folder, ignore_errors=True)  # a damaged entry is only a cache miss
+    if how["on_progress"] is silent:  # nobody sees how it goes on: say at least what takes so long
+        _log.warning("making the shape %s, once for this mesh: about half a minute", name)
+    if kind == "grid":
+        shape = mesh_shape(mesh, name=name, kind=kind, resolution=resolution, **how)
+    else:
+        shape = fit_mesh(mesh, name=name, **how)
+    # A folder of its own first, so that processes and threads fitting the same mesh never see each other's half.
+    partial = folder.with_name(f"{folder.name}.{os.getpid()}-{secrets.token_hex(4)}.partial")
+    try:
+        shape.save(partial)
+        if not folder.is_dir():  # else another process was first: its entry is as good
+            partial.rename(folder)
+    except (SdfsimError, OSError) as error:
+        _log.warning("the shape %s is not kept for the next time: %s", name, error)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return shape
+
+
+def fit_mesh(
+    mesh: Mesh,
+    *,
+    name: str,
+    recipe: Recipe = "default",
+    budget: float | None = None,
+    seed: int = 0,
+    cap: bool = False,
+    thicken: float | None = None,
+    file: str = "",
+    on_progress: Progress = silent,
+    device: torch.device | str = "cpu",
+) -> Shape:
+    """Fit the compact SDF network to the solid that a triangle mesh in metres bounds, see `solidify`.
+
+    The result depends on the mesh, the recipe (see `RECIPES`) and the seed only (up to rounding, which the number of
+    threads and the device change), unless the budget in s cuts the training short. The shape's `certificate` tells the
+    errors and whether it is usable (`passed`), `source["notes"]` what was done to the mesh. Raises SdfsimError, which
+    calls the mesh `file` (or else `name`), where it cannot be used or bounds no solid.
+    """
+    solid = solidify(mesh, name=file or name, cap=cap, thicken=thicken)
+
+    def pick(sdf: Sdf) -> np.ndarray:
+        return surface_nodes(sdf, solid.surface, DEFAULT_COUNT)
+
+    sdf, points, certificate = fit_sdf(MeshDistance(solid), recipe, budget, seed, pick, on_progress, device)
+    source: dict[str, Any] = {"kind": "mesh", "recipe": recipe, "fit_version": FIT_VERSION}
+    source |= {"notes": list(solid.notes)} if solid.notes else {}
+    return Shape(name, solid.surface, sdf, points, *solid.mass_properties(), certificate, source)
+
+
+def fit_pieces(
+    pieces: list[Mesh],
+    *,
+    name: str,
+    display: Mesh | None = None,
+    nodes: int = DEFAULT_COUNT,
+) -> Shape:
+    """Fit the compact SDF network to the union of convex pieces: the body that a rigid-body engine collides.
+
+    At most `nodes` are the pieces' own vertices first (without repetitions and those inside another piece), because
+    contact with a flat floor is exact only there; then points along their sharp edges, then all over the surface. Mass
+    properties are those of the union, and so is the mesh to show unless `display` is given.
+    """
+    oracle = PiecesDistance(pieces)
+    size = float(np.ptp(oracle.bounds, axis=0).max())
+
+    def bare(points: np.ndarray) -> np.ndarray:
+        _, first = np.unique(np.round(points / (1e-4 * size)), axis=0, return_index=True)
+        points = points[np.sort(first)]
+        # Measured from the boundary of the union: a point on the seam of two pieces is deep in neither.
+        return points[oracle(points).distance >= -1e-3 * size]
+
+    vertices = bare(np.concatenate([piece.vertices for piece in pieces]))
+    edges = bare(np.concatenate([edge_nodes(piece.vertices, EDGE_SPACING * size) for piece in pieces]))
+
+    def pick(sdf: Sdf) -> np.ndarray:
+        own = hull_nodes(vertices, round(OWN_SHARE * nodes))
+        return thin(sample_nodes(sdf), nodes, keep=thin(edges, round(EDGE_SHARE * nodes), keep=own))
+
+    sdf, points, certificate = fit_sdf(oracle, "default", None, 0, pick, silent, "cpu")
+    single = len(pieces) == 1 and is_closed(pieces[0])
+    volume, com, inertia = mass_properties(pieces[0]) if single else mass_properties_of_sdf(oracle, oracle.bounds)
+    mesh = display if display is not None else clean(oracle.surface, name=name)
+    source = {"kind": "pieces", "recipe": "default", "fit_version": FIT_VERSION}
+    hulls = tuple(piece.vertices for piece in pieces)
+    return Shape(name, mesh, sdf, points, volume, com, inertia, certificate, source, hulls)

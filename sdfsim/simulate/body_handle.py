@@ -1,0 +1,174 @@
+"""Bodies of a running simulation by name, and where they touch: metres, kilograms and seconds, NumPy arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from sdfsim.base.errors import SdfsimError
+from sdfsim.physics import pose
+
+if TYPE_CHECKING:
+    from sdfsim.simulate.simulator import Simulator
+
+Numbers = Sequence[float] | np.ndarray
+
+
+@dataclass(frozen=True)
+class ContactPoint:
+    """One place where two bodies touch.
+
+    Attributes:
+        first, second: names of the bodies.
+        point: [3] m, world, on the surface of the first.
+        normal: [3] unit vector from the second to the first.
+        impulse: [3] N s on the first in the last inner step of the contact solve, opposite on the second.
+        penetration: m, how deep they are in each other; below 0 where they are still apart.
+    """
+
+    first: str
+    second: str
+    point: np.ndarray
+    normal: np.ndarray
+    impulse: np.ndarray
+    penetration: float
+
+
+class BodyHandle:
+    """One body of a simulator, by its `name`: read it, set it, push and pull it. What is set counts from the next step
+    on."""
+
+    __slots__ = ("_row", "_simulator", "name")  # so that a name that is misspelt is no new attribute
+
+    def __init__(self, simulator: Simulator, row: int) -> None:
+        self._simulator, self._row = simulator, row
+        self.name = simulator.scene.bodies[row].name
+
+    @property
+    def centre(self) -> np.ndarray:
+        """[3] m, the centre of mass, world."""
+        return self._of("position") * self._simulator.units.length
+
+    @property
+    def position(self) -> np.ndarray:
+        """[3] m, the origin of the body's shape, as a scene file has it."""
+        return self.centre - self._arm(self._of("orientation"))
+
+    @position.setter
+    def position(self, place: Numbers) -> None:
+        arm = self._arm(self._of("orientation"))
+        self._set("position", (_vector("position", place) + arm) / self._simulator.units.length)
+
+    @property
+    def quat_xyzw(self) -> np.ndarray:
+        """[4] unit quaternion, the shape's axes -> world; setting it turns the body about its centre of mass."""
+        return self._of("orientation")
+
+    @quat_xyzw.setter
+    def quat_xyzw(self, quat: Numbers) -> None:
+        turned = _vector("quat_xyzw", quat, 4)
+        length = np.linalg.norm(turned)
+        if not length > 0:
+            raise SdfsimError("quat_xyzw: must not be zero")
+        self._set("orientation", turned / length)
+
+    @property
+    def velocity(self) -> np.ndarray:
+        """[3] m/s, of the centre of mass."""
+        return self._of("velocity") * self._simulator.units.velocity
+
+    @velocity.setter
+    def velocity(self, velocity: Numbers) -> None:
+        self._set("velocity", _vector("velocity", velocity) / self._simulator.units.velocity)
+
+    @property
+    def angular_velocity(self) -> np.ndarray:
+        """[3] rad/s, world."""
+        return self._of("angular_velocity") / self._simulator.units.time
+
+    @angular_velocity.setter
+    def angular_velocity(self, angular: Numbers) -> None:
+        self._set("angular_velocity", _vector("angular_velocity", angular) * self._simulator.units.time)
+
+    @property
+    def mass(self) -> float:
+        """kg; 0 for a body that does not move by itself."""
+        return float(self._simulator.bodies.mass[self._row]) * self._simulator.units.mass
+
+    @property
+    def asleep(self) -> bool:
+        """Whether it rests and is left out until something disturbs it."""
+        touch = self._simulator.state.touch
+        return touch is not None and bool(touch.island[self._row] >= 0)
+
+    def push(self, impulse: Numbers, at: Numbers | None = None) -> None:
+        """Change its velocities by an impulse [3] N s, now, that acts `at` [3] m, world, or at the centre of mass.
+        Raises SdfsimError where the body does not move by itself."""
+        self._must_move("be pushed")
+        given = _vector("impulse", impulse)
+        self.velocity = self.velocity + given / self.mass
+        if at is not None and self._simulator.rules.rotation:
+            sim, row = self._simulator, self._row
+            turn = np.cross(_vector("at", at) - self.centre, given)
+            axes = pose.to_matrix(sim.state.orientation[row]).cpu().numpy()
+            inertia = axes @ sim.bodies.inertia[row].cpu().numpy() @ axes.T * sim.units.mass * sim.units.length**2
+            self.angular_velocity = self.angular_velocity + np.linalg.solve(inertia, turn)
+
+    def pull(self, force: Numbers, at: Numbers | None = None, torque: Numbers = (0.0, 0.0, 0.0)) -> None:
+        """Let a force [3] N and a torque [3] N m act from now on, in world axes, until the next call or `reset`; zero
+        ends them.
+
+        The force acts `at` [3] m, world, now, or at the centre of mass. Its moment about the centre of mass stays as it
+        is, however the body moves: pull again after a step to follow the point. The torque comes on top of it. Raises
+        SdfsimError where the body does not move by itself, or the model is a network on surface nodes.
+        """
+        self._must_move("be pulled")
+        sim = self._simulator
+        if sim.model.on_surfaces:
+            raise SdfsimError("the paper network knows no forces", "take the solver, or a network on top of it")
+        given, moment = _vector("force", force), _vector("torque", torque)
+        if at is not None:
+            moment = moment + np.cross(_vector("at", at) - self.centre, given)
+        u, state = sim.units, sim.state
+        load = torch.zeros(len(sim.bodies), 6, dtype=torch.float64) if state.load is None else state.load.clone()
+        load[self._row, :3] = torch.from_numpy(given / (u.mass * u.acceleration))
+        load[self._row, 3:] = torch.from_numpy(moment / u.energy)
+        touch = state.touch
+        if touch is not None:  # what the last step left is another state than this, so that who sleeps wakes up
+            held = touch.held.clone()
+            held[self._row] = torch.nan
+            touch = replace(touch, held=held)
+        sim.state = replace(state, load=load if bool(load.any()) else None, touch=touch)
+
+    def _of(self, name: str) -> np.ndarray:
+        return getattr(self._simulator.state, name)[self._row].cpu().numpy().copy()
+
+    def _arm(self, quat: np.ndarray) -> np.ndarray:
+        """[3] m from the shape's origin to the centre of mass, world."""
+        sim = self._simulator
+        com = sim.bodies.com[self._row].cpu()
+        return pose.rotate(torch.from_numpy(quat), com).numpy() * sim.units.length
+
+    def _set(self, name: str, value: np.ndarray) -> None:
+        sim = self._simulator
+        if sim.scene.bodies[self._row].motion == "kinematic" or "velocity" in name:
+            self._must_move(f"be given a {name.replace('_', ' ')}")
+        tensor = getattr(sim.state, name).clone()
+        tensor[self._row] = torch.from_numpy(value).to(tensor)
+        sim.state = replace(sim.state, **{name: tensor})
+
+    def _must_move(self, what: str) -> None:
+        motion = self._simulator.scene.bodies[self._row].motion
+        if motion != "dynamic":
+            raise SdfsimError(f"body {self.name!r}: is {motion}, so it cannot {what}")
+
+
+def _vector(name: str, values: Numbers, length: int = 3) -> np.ndarray:
+    found = np.asarray(values, dtype=np.float64)
+    if found.shape != (length,) or not np.isfinite(found).all():
+        raise SdfsimError(f"{name}: must be {length} finite numbers (got {values!r})")
+    return found

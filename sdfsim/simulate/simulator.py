@@ -1,0 +1,406 @@
+"""`Simulator`: a scene and a model in, a rollout out."""
+
+from __future__ import annotations
+
+import platform
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from sdfsim.base.devices import pick_device
+from sdfsim.base.errors import EXIT_QUALITY, SdfsimError, nearest
+from sdfsim.base.parallel import parallel
+from sdfsim.base.version import __version__
+from sdfsim.learned.model import Model, load_model
+from sdfsim.learned.training_ranges import deep_starts, outside_training
+from sdfsim.physics.bodies import State, from_scene
+from sdfsim.physics.rollout import Rollout, join
+from sdfsim.physics.units import inner_steps, scene_units
+from sdfsim.physics.validity import check_nodes, check_sizes, fault
+from sdfsim.scene.plan import plan
+from sdfsim.scene.scene import Body, Scene
+from sdfsim.simulate.body_handle import BodyHandle, ContactPoint
+from sdfsim.simulate.run_memory import Memory
+from sdfsim.simulate.step import FreeFlight, StepOptions, step
+
+if TYPE_CHECKING:
+    from sdfsim.learned.near import Contacts, Pairs
+    from sdfsim.scene.builder import SceneBuilder
+
+BYTES_AN_EDGE = 4096  # of the network, while it is worked on
+Variant = Mapping[str, Mapping[str, Any]]  # body -> field -> value
+# what a variant may change: how many numbers a vector has (0: a number), and the most that a number may be
+VARIED = {
+    "position": (3, np.inf), "quat_xyzw": (4, np.inf), "velocity": (3, np.inf), "angular_velocity": (3, np.inf),
+    "mass": (0, np.inf), "friction": (0, np.inf), "restitution": (0, 1.0),
+}  # fmt: skip
+CHUNKS = 16  # pieces that variants are cut into at most, so that cores end together
+
+
+class SimulationError(SdfsimError):
+    """The state broke: the message names the step and the body, `rollout` has everything up to the last good state."""
+
+    def __init__(self, message: str, rollout: Rollout) -> None:
+        super().__init__(
+            message, "try another model, or look for bodies that overlap at the start", exit_code=EXIT_QUALITY
+        )
+        self.rollout = rollout
+
+
+class Simulator:
+    """Simulates one scene.
+
+    Args:
+        scene: bodies, shapes, gravity; one written in Python is loaded first.
+        model: bundled name, path or `Model`; None takes the scene's, else the default one.
+        device: "cpu", "cuda" or "auto".
+        seed: of torch's generator (nothing in a step draws from it today; it is recorded).
+        dt: s, the step; None lets the size of the bodies decide (the model owns the step in its own units).
+        free_flight: "exact", or "learned" for the own formulation of networks on surface nodes.
+
+    Attributes:
+        state: bodies and how they move, model units. Give it another one to start from there, or to change a body:
+            `simulator.state = replace(simulator.state, velocity=...)`; its tensors are not to be written into.
+        dt: s, the step in the scene's units.
+        units: metres, seconds and kilograms per model unit.
+        outside_training: what of the scene the model has not seen in training, one line each.
+
+    Raises:
+        SdfsimError: no such model or device, a step that is none, a body that moves without mass or without nodes
+            that tell how it turns, one that is too large, too far away or too fast.
+    """
+
+    def __init__(
+        self,
+        scene: Scene | SceneBuilder,
+        model: str | Path | Model | None = None,
+        device: str = "cpu",
+        seed: int | None = None,
+        *,
+        dt: float | None = None,
+        free_flight: FreeFlight = "exact",
+    ) -> None:
+        scene = scene if isinstance(scene, Scene) else scene.load()
+        self.scene = scene
+        self.device = pick_device(device)
+        effects = plan(scene)
+        model = model if model is not None else scene.model
+        asked = effects.contact.on or free_flight == "learned"
+        self.model = model if isinstance(model, Model) else load_model(model, weights=asked)
+        if not self.model.on_surfaces:
+            self.device = torch.device("cpu")  # the compiled step and network have no other
+        self.model = self.model.to(self.device)
+        if free_flight == "learned" and not self.model.on_surfaces:
+            raise SdfsimError(
+                "free_flight 'learned' exists for networks on surface nodes only", "give a model of that kind"
+            )
+        self.seed = scene.seed if seed is None else seed
+        self.units, self._dt = scene_units(scene, self.model, dt), dt
+        self.dt = self.model.dt * self.units.time
+        self.outside_training = outside_training([scene], self.model, self.units)
+        gravity = torch.tensor(scene.gravity / self.units.acceleration, dtype=torch.float64, device=self.device)
+        memory = scene.limits.memory_gib
+        self.rules = StepOptions(
+            gravity=gravity,
+            dt=self.model.dt,
+            contact=effects.contact.on,
+            friction=effects.friction.on,
+            restitution=effects.restitution.on,
+            rotation=effects.rotation.on,
+            free_flight=free_flight,
+            substeps=self.model.inner or inner_steps(scene),
+            rows=None if memory is None else max(1, int(memory * 2**30 / BYTES_AN_EDGE)),
+            sleep=effects.sleep.on and not self.model.on_surfaces,
+        )
+        worked_on = replace(scene, shapes=tuple(self.model.surface(shape) for shape in scene.shapes))
+        check_nodes(worked_on)
+        self.bodies, self.state = from_scene(worked_on, self.units, self.device)
+        self._names = tuple(b.name for b in scene.bodies)
+        check_sizes(self.bodies, self._names, self.units.length)
+        if effects.contact.on and self.model.ranges:
+            self.outside_training += deep_starts(self.bodies, self.state, self._names, self.units.length)
+        if self.outside_training:
+            self.rules = replace(self.rules, trust=0.0)
+        if self.model.on_surfaces:
+            from sdfsim.learned.surfaces import with_history
+
+            self.state = with_history(self.state, self.bodies, self.rules)
+        self.memory = Memory()
+        dynamic = self.bodies.moves
+        weight = self.bodies.mass[dynamic] * self.rules.gravity.norm()
+        lift = float((weight * self.bodies.size[dynamic]).sum()) * self.units.energy
+        self._meta = {
+            "model": self.model.name,
+            "seed": self.seed,
+            "dt": self.dt,
+            "device": str(self.device),
+            "outside_training": self.outside_training,
+            "free_flight": free_flight,
+            "lift_energy": lift,
+            "sdfsim": __version__,
+            "torch": torch.__version__,
+            "python": platform.python_version(),
+        }
+        self.contacts: Contacts | Pairs | None = None
+        self.steps_done = 0
+        self._given = 0.0  # model energy that came from outside since the last frame
+        if broken := self._fault(self.state):
+            raise SdfsimError(broken)
+        self._good = self._start = self.state
+
+    def steps(self, count: int) -> Iterator[State]:
+        """Advance by `count` steps, yielding the state after each (SI units). Raises SimulationError for a state that
+        cannot be; its `rollout` is one frame here, the last good state."""
+        for _ in range(count):
+            self._step()
+            yield self.si_state()
+
+    def frames(self, count: int) -> Iterator[Rollout]:
+        """Advance by `count` steps, yielding a rollout of one frame after each; raises as `steps` does."""
+        for _ in range(count):
+            started = time.perf_counter()
+            self._step()
+            yield self._frame(1e3 * (time.perf_counter() - started))
+
+    def step(self, count: int = 1) -> State:
+        """Advance by `count` steps; the state after them (SI units). Raises as `steps` does."""
+        for _ in range(count):
+            self._step()
+        return self.si_state()
+
+    def reset(self) -> None:
+        """Go back to the start of the scene."""
+        self.state = self._good = self._start
+        self.memory, self.contacts, self.steps_done, self._given = Memory(), None, 0, 0.0
+
+    def __getitem__(self, name: str) -> BodyHandle:
+        """A body by its name. Raises SdfsimError where there is none of that name."""
+        if name not in self._names:
+            told = nearest(name, self._names)
+            raise SdfsimError(f"there is no body {name!r}{told}", f"there are {', '.join(self._names[:20])}")
+        return BodyHandle(self, self._names.index(name))
+
+    def contact_points(self) -> list[ContactPoint]:
+        """Where bodies touch in the present state, as the last step of the contact solve has left it. Raises
+        SdfsimError for networks on surface nodes, which know no impulses."""
+        if self.model.on_surfaces:
+            raise SdfsimError(
+                "networks on surface nodes tell no impulses", "take the solver, or a network on top of it"
+            )
+        from sdfsim.physics.solver.prepare import contact_points
+
+        found, u = contact_points(self.state), self.units
+        return [
+            ContactPoint(
+                first=self._names[found.pair[k, 0]],
+                second=self._names[found.pair[k, 1]],
+                point=found.point[k] * u.length,
+                normal=found.normal[k],
+                impulse=found.impulse[k] * u.mass * u.velocity,
+                penetration=-float(found.gap[k]) * u.length,
+            )
+            for k in range(len(found.pair))
+        ]
+
+    def rollouts(
+        self, variants: Sequence[Variant], seconds: float | None = None, steps: int | None = None
+    ) -> list[Rollout]:
+        """The scene from its start with some values changed, once for each variant, on all cores; the same as `run` of
+        a `Simulator` of each changed scene with the model, device, seed, step and free flight of this one.
+
+        Variants map names of bodies to changed fields: position, quat_xyzw, velocity, angular_velocity, mass, friction,
+        restitution (SI units), such as {"ball": {"velocity": (1, 0, 0)}}. Raises SdfsimError for no such body or field,
+        or a value that it cannot have; SimulationError where a state broke.
+        """
+        scenes = [varied(self.scene, variant) for variant in variants]
+        pieces = np.array_split(np.arange(len(scenes)), min(CHUNKS, max(1, len(scenes))))
+        same = {"device": str(self.device), "seed": self.seed, "dt": self._dt, "free_flight": self.rules.free_flight}
+        jobs = [([scenes[k] for k in piece], self.model, same, seconds, steps) for piece in pieces]
+        found = dict(parallel(_run_each, jobs))
+        return [rollout for k in range(len(jobs)) for rollout in found[k]]
+
+    def run(self, seconds: float | None = None, steps: int | None = None) -> Rollout:
+        """Simulate for so many seconds (default: the scene's duration; see `steps_in`) or steps, and keep everything.
+
+        Raises SdfsimError for a length of time that is negative or not finite; SimulationError where the state broke,
+        with what was computed in its `rollout`.
+        """
+        if steps is None:
+            steps = self.steps_in(self.scene.duration if seconds is None else seconds)
+        frames = [self.initial_rollout()]
+        try:
+            for frame in self.frames(steps):
+                frames.append(frame)
+        except SimulationError as error:
+            raise SimulationError(error.message, join(frames)) from None
+        return join(frames)
+
+    def steps_in(self, seconds: float) -> int:
+        """The number of steps that comes nearest to `seconds`: none for 0 s, else at least one. Raises SdfsimError
+        where that is negative or not finite."""
+        check_seconds(seconds)
+        return max(1, round(seconds / self.dt)) if seconds else 0
+
+    def initial_rollout(self) -> Rollout:
+        """The present state as a rollout of one frame; raises as `steps` does."""
+        self._accept()
+        return self._frame(0.0)
+
+    def si_state(self) -> State:
+        """The present state in metres and seconds, on the CPU."""
+        s, u = self.state, self.units
+        return State(
+            position=(s.position * u.length).cpu(),
+            orientation=s.orientation.cpu(),
+            velocity=(s.velocity * u.velocity).cpu(),
+            angular_velocity=(s.angular_velocity / u.time).cpu(),
+            time=s.time * u.time,
+        )
+
+    def _step(self) -> None:
+        self._accept()
+        after, contacts = step(self.model, self.bodies, self.state, self.rules, self.memory)
+        awake = self.bodies.moves.cpu().numpy()
+        if after.touch is not None:
+            awake = awake & (after.touch.island.numpy() < 0)
+        if broken := self._fault(after, awake, self.state):
+            raise self._broke(broken)
+        if (load := self.state.load) is not None:
+            force, torque = load.split(3, 1)
+            turning = 0.5 * self.rules.dt * (self.state.angular_velocity + after.angular_velocity)
+            self._given += float((force * (after.position - self.state.position)).sum() + (torque * turning).sum())
+        self.state, self.contacts = after, contacts
+        self._good = after
+        self.steps_done += 1
+
+    def _accept(self) -> None:
+        """A state that came from outside is looked at before anything is computed from it."""
+        if self.state is self._good:
+            return
+        broken = self._fault(self.state)
+        if broken is None and not np.isfinite(self.state.time):
+            broken = "time is not finite"
+        if broken:
+            self.state = self._good
+            raise self._broke(broken)
+        if self.model.on_surfaces:
+            from sdfsim.learned.surfaces import history_told
+
+            self.state = history_told(self.state, self._good, self.bodies, self.rules)
+        self._given += sum(self._energies(self.state)) - sum(self._energies(self._good))
+        self._good = self.state
+
+    def _fault(self, state: State, rows: np.ndarray | None = None, before: State | None = None) -> str | None:
+        found = fault(state, self.rules.dt, self.units, rows, before)
+        return None if found is None else f"body {self._names[found[0]]!r}: {found[1]}"
+
+    def _broke(self, what: str) -> SimulationError:
+        last = f"the last good state is that of step {self.steps_done}, t = {self.steps_done * self.dt:.4g} s"
+        return SimulationError(f"step {self.steps_done + 1}: {what}; {last}", self.initial_rollout())
+
+    def _frame(self, milliseconds: float) -> Rollout:
+        state, u = self.si_state(), self.units
+        points, pairs, depth = self._touching()
+        kinetic, potential = self._energies(self.state)
+        given, self._given = self._given, 0.0
+        counters = {
+            "kinetic_energy": kinetic * u.energy,
+            "potential_energy": potential * u.energy,
+            "energy_given": given * u.energy,
+            "contacts": float(len(pairs)),
+            "worst_penetration": depth * u.length,
+            **self.memory.counts,
+            "step_ms": milliseconds,
+        }
+        return Rollout(
+            time=np.array([self.steps_done * self.dt]),
+            position=state.position.numpy()[None],
+            orientation=state.orientation.numpy()[None],
+            velocity=state.velocity.numpy()[None],
+            angular_velocity=state.angular_velocity.numpy()[None],
+            contact_count=np.array([len(pairs)]),
+            contact_point=points * u.length,
+            contact_body=pairs,
+            counters={k: np.array([v]) for k, v in counters.items()},
+            names=self._names,
+            meta=self._meta,
+        )
+
+    def _touching(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """Points [C, 3] where bodies touch, pairs of bodies [C, 2], and the deepest penetration; model units."""
+        near = self.contacts
+        if near is not None and len(near):
+            from sdfsim.learned.near import where
+
+            # The edges were found at the start of the step; their points are told where this frame has the bodies.
+            points = where(self.state, self.bodies, near).cpu().numpy()
+            pairs = torch.stack([near.owner, near.body], -1).cpu().numpy()
+            return points, pairs, float((-near.distance).clamp_min(0.0).max())
+        if self.state.touch is None:
+            return np.zeros((0, 3)), np.zeros((0, 2), dtype=np.int64), 0.0
+        from sdfsim.physics.solver.prepare import contact_points
+
+        found = contact_points(self.state)
+        return found.point, found.pair, float((-found.gap).max(initial=0.0))
+
+    def _energies(self, s: State) -> tuple[float, float]:
+        """Kinetic and potential energy of all dynamic bodies in a state, model units."""
+        from sdfsim.physics.solver.survey import energies
+
+        b = self.bodies
+        known = (b.mass, b.inertia, self.rules.gravity, s.position, s.orientation, s.velocity, s.angular_velocity)
+        return energies(*(t.cpu().numpy() for t in known))
+
+
+def varied(scene: Scene, variant: Variant) -> Scene:
+    """The scene with some values changed, of the fields of `VARIED` in SI units. An inertia of its own grows with the
+    mass. Raises SdfsimError for no such body or field, or a value that it cannot have."""
+    known = {body.name for body in scene.bodies}
+    for name in variant:
+        if name not in known:
+            raise SdfsimError(f"variant: there is no body {name!r}{nearest(name, known)}")
+    return replace(scene, bodies=tuple(_changed(body, variant.get(body.name, {})) for body in scene.bodies))
+
+
+def _changed(body: Body, fields: Mapping[str, Any]) -> Body:
+    new: dict[str, Any] = {}
+    for name, given in fields.items():
+        where = f"variant: body {body.name!r}: {name}"
+        if name not in VARIED:
+            raise SdfsimError(f"{where}: no such field{nearest(name, VARIED)}; there are {', '.join(VARIED)}")
+        value, (count, most) = np.asarray(given, dtype=np.float64), VARIED[name]
+        if value.shape != ((count,) if count else ()) or not np.isfinite(value).all():
+            raise SdfsimError(f"{where}: must be {count or 1} finite numbers (got {given!r})")
+        if not count and not 0.0 <= value <= most:
+            raise SdfsimError(f"{where}: must be 0 to {most:g} (got {given!r})")
+        if body.motion != "dynamic" and name in ("velocity", "angular_velocity", "mass"):
+            raise SdfsimError(f"variant: body {body.name!r}: is {body.motion}, so it has no {name}")
+        if body.path is not None and name in ("position", "quat_xyzw"):
+            told = f"variant: body {body.name!r}: is on a path, so its {name} cannot be changed"
+            raise SdfsimError(told, "change the path in the scene")
+        new[name] = value if count else float(value)
+    if "quat_xyzw" in new:
+        new["quat_xyzw"] = new["quat_xyzw"] / max(np.linalg.norm(new["quat_xyzw"]), 1e-300)
+    if "mass" in new:
+        if not new["mass"] > 0:
+            raise SdfsimError(f"variant: body {body.name!r}: mass: must be > 0")
+        if body.inertia is not None:
+            new["inertia"] = body.inertia * (new["mass"] / body.mass)
+    return replace(body, **new)
+
+
+def _run_each(
+    scenes: list[Scene], model: Model, options: dict[str, Any], seconds: float | None, steps: int | None
+) -> list[Rollout]:
+    return [Simulator(scene, model, **options).run(seconds, steps) for scene in scenes]
+
+
+def check_seconds(seconds: float) -> None:
+    """Raises SdfsimError where `seconds` is no length of time."""
+    if not 0.0 <= seconds < np.inf:
+        raise SdfsimError(f"seconds: must be >= 0 and finite (got {seconds:g})")

@@ -1,0 +1,72 @@
+"""`plan` explains a scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from sdfsim.apps.plan import describe, plan_lines
+from sdfsim.learned.model import Model, load_model, new_network
+
+SCENE = """
+version: 1
+duration: 0.2
+effects: {restitution: off}
+limits: {memory_gib: 0.5}
+shapes:
+  ball: {sphere: {radius: 0.5}}
+bodies:
+  - {name: floor, plane: {}}
+  - {name: ball, shape: ball, position: [0, 0, 0.5]}
+  - {name: ghost, shape: ball, position: [2, 0, 0.5], collides_with: [floor]}
+  - {name: far, shape: ball, position: [0, 0, 50], restitution: 0.1}
+  - {name: lift, shape: ball, motion: kinematic, path: [{time: 0, position: [9, 0, 0]}]}
+"""
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory) -> str:
+    path = tmp_path_factory.mktemp("model") / "untrained.safetensors"
+    torch.manual_seed(0)
+    ranges = {"friction": [0.2, 0.3], "restitution": [0.25, 0.25]}
+    network = new_network("impulse", {"width": 8, "rounds": 1})
+    Model("untrained", "impulse", network, 0.02, 10.0, 1.0, 0.1, ranges=ranges).save(path)
+    return str(path)
+
+
+@pytest.fixture
+def scene(tmp_path) -> Path:
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    return tmp_path / "scene.yaml"
+
+
+def told(scene: Path, model: str) -> dict:
+    return describe(scene, model=model, device="cpu", on_progress=lambda *_: None)
+
+
+def test_plan_tells_all_there_is_to_know(scene, model):
+    report = told(scene, model)
+    assert [name for name, e in report["effects"].items() if not e["on"]] == ["restitution"]
+    assert (report["static"], report["kinematic"]) == (["floor"], ["lift"]) and len(report["dynamic"]) == 3
+    # 10 pairs: floor-lift is not driven, ghost meets the floor alone, and a plane is near to everybody.
+    pairs = {name: report["pairs"][name] for name in ("total", "unmoved", "excluded", "possible", "near", "apart")}
+    assert pairs == {"total": 10, "unmoved": 1, "excluded": 3, "possible": 6, "near": 3, "apart": 3}
+    assert report["step"]["contacts"] > 0 and report["step"]["edges"] == 0  # outside of training the solve stands alone
+    assert report["memory_mib"] > 0 and report["step_ms"] > 0 and report["units"]["length_m"] == 1.0
+    assert report["constant_in_training"] == ["restitution"]
+    assert any("path" in line for line in report["outside_training"])
+    assert any(line.startswith("friction") for line in report["outside_training"]) is False  # 0.25 is in its range
+    lines = "\n".join(plan_lines(report))
+    for word in ("off saves nothing", "[effects.sleep]", "kept apart by collides_with", "so not learned: restitution"):
+        assert word in lines
+
+
+def test_plan_reads_no_weights_where_the_run_would_not(scene, model, monkeypatch):
+    scene.write_text(SCENE.replace("restitution: off", "contact: off"))
+    monkeypatch.setattr("sdfsim.learned.model.new_network", lambda *_: pytest.fail("weights were read"))
+    report = told(scene, model)
+    assert not report["effects"]["contact"]["on"] and report["effects"]["friction"]["why"] == "contact is off"
+    assert report["step"]["edges"] == report["step"]["contacts"] == 0
+    assert not load_model(model, weights=False).network.state_dict()

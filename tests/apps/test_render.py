@@ -1,0 +1,121 @@
+"""Movies and pictures: where things appear, how large, in what light; and what the end of a run says."""
+
+from dataclasses import replace
+
+import av
+import numpy as np
+import pytest
+
+import sdfsim
+from sdfsim import Simulator
+from sdfsim.apps.recording import framed
+from sdfsim.apps.render import FRAMES, SIZE, Studio, eye_of, poses_at, render
+from sdfsim.apps.run import ending_lines, summary
+from sdfsim.geometry.mesh import Mesh
+from sdfsim.scene.scene import Scene
+from sdfsim.shape.make import analytic_shape
+
+SKY = np.array([236, 240, 245])
+
+
+def falling(**keys) -> tuple[Scene, sdfsim.Rollout]:
+    scene = sdfsim.Scene(duration=0.5, gravity=(0, 0, -9.81)).add("ball", sphere={"radius": 0.1}, mass=1, **keys).load()
+    return scene, Simulator(scene).run()
+
+
+def seen(scene: Scene, rollout: sdfsim.Rollout, camera, look_at, time=0.0) -> np.ndarray:
+    """[H, W] bool: pixels that are not sky."""
+    studio = Studio(scene, eye_of(scene, None, camera, look_at), framed(scene)[1])
+    return np.abs(studio.picture(*poses_at(rollout, time)).astype(int) - SKY).max(-1) > 8
+
+
+def test_a_ball_is_a_disc_of_the_right_size_in_the_middle():
+    scene, rollout = falling(position=(1.0, 2.0, 3.0))
+    picture = seen(scene, rollout, (1.0, 1.0, 3.0), (1.0, 2.0, 3.0))
+    radius = np.tan(np.arcsin(0.1)) / np.tan(np.radians(20.0)) * SIZE[1] / 2
+    assert picture.sum() == pytest.approx(np.pi * radius**2, rel=0.03)
+    row, column = (axis.mean() + 0.5 for axis in np.nonzero(picture))
+    assert (column, row) == pytest.approx((SIZE[0] / 2, SIZE[1] / 2), abs=1.0)
+
+
+@pytest.mark.parametrize(("place", "where"), [((0.3, 0, 0), (1, 0)), ((0, 0, 0.2), (0, -1)), ((-0.3, 0.0, 0), (-1, 0))])
+def test_right_is_right_and_up_is_up(place, where):
+    """Seen along y, x goes to the right and z up, which is towards the first rows."""
+    scene, rollout = falling(position=place)
+    row, column = (axis.mean() for axis in np.nonzero(seen(scene, rollout, (0, -2, 0), (0, 0, 0))))
+    pixel = SIZE[1] / 2 / np.tan(np.radians(20.0)) / 2  # at 2 m, so many pixels are a metre
+    wanted = (SIZE[0] / 2 + where[0] * 0.3 * pixel, SIZE[1] / 2 + where[1] * 0.2 * pixel)
+    assert (column, row) == pytest.approx(wanted, abs=2.0)
+
+
+def test_what_is_between_the_floor_and_the_sun_throws_a_shadow():
+    scene = sdfsim.Scene().add("floor", plane={}).add("box", box={"size": (0.4, 0.4, 0.1)}, position=(0, 0, 1.5)).load()
+    eye = eye_of(scene, None, (0.0, -4.0, 6.0), (0, 0, 0))
+    studio = Studio(scene, eye, 1.0)
+    picture = studio.picture(*poses_at(Simulator(scene).initial_rollout(), 0.0)).astype(int)
+
+    def at(point: np.ndarray) -> int:
+        """Brightness of a point of the floor."""
+        x, y, z = studio.axes @ (point - eye.position)
+        column, row = np.array([x, y]) / z / np.tan(np.radians(20.0)) * SIZE[1] / 2 + np.array(SIZE) / 2
+        return picture[int(row), int(column)].sum()
+
+    middle = np.array([0, 0, 1.5]) - studio.sun * 1.5 / studio.sun[2]
+    inside = [at(middle + np.array([x, y, 0])) for x in (-0.15, 0.15) for y in (-0.15, 0.15)]
+    outside = [at(middle + np.array([x, y, 0])) for x in (-0.25, 0.25) for y in (-0.25, 0.25)]
+    assert studio.sun[2] > 0.5 and max(inside) < 0.7 * min(outside)
+
+
+def test_a_texture_is_seen_where_its_places_are():
+    corners = np.array([[x, 0.0, z] for z in (-1, 1) for x in (-1, 1)], dtype=float)
+    uv = np.array([[0.0, 1.0], [1.0, 1.0], [0.0, 0.0], [1.0, 0.0]])  # its upper left is at -x, +z
+    texture = np.zeros((2, 2, 3), np.uint8)
+    texture[0, 0], texture[0, 1], texture[1, 0], texture[1, 1] = (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 0)
+    sheet = Mesh(corners, np.array([[0, 1, 2], [1, 3, 2]]), uv=uv, texture=texture)
+    shape = replace(analytic_shape("box", size=(2.0, 0.1, 2.0)), skin=sheet)
+    scene, rollout = falling(position=(0, 0, 0))
+    scene = replace(scene, shapes=(shape,))
+    picture = Studio(scene, eye_of(scene, None, (0, -6, 0), (0, 0, 0)), 1.0).picture(*poses_at(rollout, 0.0))
+    middle, off = np.array(SIZE[::-1]) // 2, 60
+    for (row, column), color in np.ndenumerate(np.array([["r", "g"], ["b", "y"]])):
+        seen = picture[middle[0] + off * (2 * row - 1), middle[1] + off * (2 * column - 1)].astype(int)
+        strong = {"r": [1, 0, 0], "g": [0, 1, 0], "b": [0, 0, 1], "y": [1, 1, 0]}[str(color)]
+        assert ((seen > 60) == np.array(strong, bool)).all()
+
+
+def test_poses_between_two_frames_are_on_the_way():
+    _, rollout = falling(position=(0, 0, 1), velocity=(1, 0, 0), angular_velocity=(0, 0, 3))
+    for time in (0.0, 0.123, 0.4, rollout.time[-1], 9.0):
+        place, turn = poses_at(rollout, time)
+        time = min(time, rollout.time[-1])
+        assert place[0] == pytest.approx((time, 0, 1 - 0.5 * 9.81 * time**2), abs=1e-3)
+        assert turn[0] == pytest.approx((0, 0, np.sin(1.5 * time), np.cos(1.5 * time)), abs=1e-4)
+
+
+def test_a_movie_has_its_frames_and_ends_as_the_picture_of_the_end(tmp_path):
+    scene, rollout = falling(position=(0, 0, 1))
+    render(scene, rollout, tmp_path / "fall.mp4")
+    render(scene, rollout, tmp_path / "fall.png")
+    with av.open(str(tmp_path / "fall.mp4")) as movie:
+        stream = movie.streams.video[0]
+        assert stream.codec_context.name == "h264" and stream.average_rate == FRAMES
+        frames = [frame.to_ndarray(format="rgb24") for frame in movie.decode(stream)]
+    assert len(frames) == round(rollout.time[-1] * FRAMES) + 1
+    from PIL import Image
+
+    last = np.asarray(Image.open(tmp_path / "fall.png"), dtype=float)
+    assert np.abs(frames[-1] - last).mean() < 3.0 < np.abs(frames[0].astype(float) - frames[-1]).max()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["fall.mp4", "fall.png"]
+
+
+def test_the_end_of_a_run_tells_who_rests_who_moves_and_who_is_gone():
+    scene = sdfsim.Scene(duration=2.5).add("slope", plane={"normal": (0.1, 0, 1)}, friction=1.0)
+    scene.add("block", box={"size": (0.1, 0.1, 0.05)}, position=(0, 0, 0.03), friction=0.8, restitution=0.0)
+    scene.add("ball", sphere={"radius": 0.05}, position=(0, 0.4, 0.06), friction=0.8, restitution=0.0)
+    scene.add("lost", shape="ball", position=(0, -0.4, 0.2), collides_with=[], velocity=(0, 0, -5))
+    scene = scene.load()
+    report = summary(scene, Simulator(scene).run(), 1.0)
+    assert [(body["rests"], body["left"]) for body in report["ended"]] == [(True, False), (False, False), (False, True)]
+    lines = ending_lines(report)
+    assert "at rest" in lines[0] and "m/s" in lines[1] and "m/s" in lines[2]
+    assert lines[3:] == ["1 of 3 bodies rest", "move: ball", "left the scene: lost"]

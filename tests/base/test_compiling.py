@@ -1,0 +1,90 @@
+"""What is compiled is told before it is waited for: once, where it is not kept, and nothing else is said."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sdfsim.base import compiling
+from sdfsim.base.compiling import is_compiled
+from sdfsim.physics.solver import prepare as solver
+from sdfsim.scene.scene import Scene
+from sdfsim.shape.make import analytic_shape
+from sdfsim.simulate.simulator import Simulator
+from tests.scenes import make_body
+
+SOURCE = "from numba import njit\n\n\n@njit(cache=True)\ndef double(x):\n    return 2 * x\n"
+
+
+def loaded(file: Path):
+    spec = importlib.util.spec_from_file_location("doubling", file)
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.double
+
+
+def test_a_function_is_compiled_where_numba_keeps_it_by_its_own_source(tmp_path, monkeypatch):
+    from numba.core import config
+
+    file = tmp_path / "doubling.py"
+    file.write_text(SOURCE)
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "one"))
+    first = loaded(file)
+    assert not is_compiled(first)
+    assert first(3) == 6 and is_compiled(first)
+    again = loaded(file)
+    assert not again.signatures and is_compiled(again)
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "other"))
+    assert not is_compiled(loaded(file))
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "one"))
+    copy = tmp_path / "elsewhere" / "doubling.py"
+    copy.parent.mkdir()
+    copy.write_text(SOURCE)
+    assert not is_compiled(loaded(copy))
+    file.write_text(SOURCE + "# another version\n")
+    os.utime(file, (1, 1))
+    assert not is_compiled(loaded(file))
+    assert is_compiled(loaded(copy).py_func)  # runs as Python
+
+
+def test_it_is_said_once_for_all_scenes_of_a_process(monkeypatch, caplog):
+    monkeypatch.setattr(compiling, "_said", set())
+    monkeypatch.setattr(solver, "compiled_step", SimpleNamespace(signatures=[]))
+    ball = make_body("ball", 0, [0, 0, 1])
+    for _ in range(3):
+        sim = Simulator(Scene((analytic_shape("sphere", radius=0.5),), (ball,), np.zeros(3), 1.0))
+        sim.memory.compiled(sim.bodies, sim.state)
+    assert caplog.text.count("compiling the contact step, once for this version") == 1
+
+
+def test_a_run_says_nothing_of_threading_layers():
+    """In a process of its own, whose filters of warnings are Python's."""
+    code = (
+        "import sdfsim, warnings\n"
+        "from numba.core.errors import NumbaWarning\n"
+        "warnings.warn('The TBB threading layer requires TBB version 2021 update 6 or later', NumbaWarning)\n"
+        "warnings.warn('something else', NumbaWarning)\n"
+        "scene = sdfsim.Scene().add('floor', plane={}).add('ball', sphere={'radius': 0.1}, position=(0, 0, 0.1))\n"
+        "sdfsim.Simulator(scene, 'small').step(2)\n"
+        "import numba; numba.set_num_threads(1)\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "TBB" not in ended.stderr and "something else" in ended.stderr
+
+
+def test_what_is_compiled_already_is_not_told(caplog):
+    assert pytest.importorskip("numba")
+    sim = Simulator(Scene((analytic_shape("sphere", radius=0.5),), (make_body("a", 0, [0, 0, 1]),), np.zeros(3), 1.0))
+    sim.step(1)
+    caplog.clear()
+    compiling._said.clear()
+    Simulator(sim.scene).step(1)
+    assert "compiling" not in caplog.text

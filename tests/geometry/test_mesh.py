@@ -1,0 +1,177 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sdfsim.base.errors import SdfsimError
+from sdfsim.geometry import primitives
+from sdfsim.geometry.mass import mass_properties, mass_properties_of_sdf
+from sdfsim.geometry.mesh import (
+    Mesh,
+    clean,
+    convex_hull,
+    is_closed,
+    load_mesh,
+    load_pieces,
+    normal_frame,
+    sample_surface,
+    signed_volume,
+    write_ply,
+)
+from sdfsim.sdf.closed_forms import BoxSdf, SphereSdf
+
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+
+def rotation(seed: int) -> np.ndarray:
+    q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    q = q * np.sign(np.diag(r))
+    return q * np.linalg.det(q)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("points.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no faces"),
+        ("nan.obj", "v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "not finite"),
+        ("range.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", ""),
+        ("notes.txt", TETRAHEDRON, "not a mesh file"),
+    ],
+)
+def test_a_bad_file_is_one_clear_line_with_its_name(tmp_path: Path, name: str, content: str, message: str) -> None:
+    path = tmp_path / name
+    path.write_text(content)
+    with pytest.raises(SdfsimError) as error:
+        load_mesh(path)
+    assert name in str(error.value)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("suffix", ["obj", "stl", "glb", "ply"])
+def test_every_format_gives_the_same_closed_solid(tmp_path: Path, suffix: str) -> None:
+    import trimesh
+
+    solid = primitives.torus(segments=16, sides=8)
+    path = tmp_path / f"torus.{suffix}"
+    if suffix == "ply":
+        path.write_bytes(write_ply(solid))
+    else:
+        trimesh.Trimesh(solid.vertices, solid.faces, process=False).export(path)
+    loaded = load_mesh(path)
+    assert is_closed(loaded)
+    assert len(loaded.vertices) == len(solid.vertices)
+    assert mass_properties(loaded)[0] == pytest.approx(mass_properties(solid)[0], rel=1e-5)
+
+
+def test_cleaning_merges_drops_and_turns_right_side_out() -> None:
+    solid = primitives.box((1.0, 2.0, 3.0))
+    soup = solid.vertices[solid.faces].reshape(-1, 3)
+    faces = np.arange(len(soup)).reshape(-1, 3)[:, ::-1]
+    faces = np.concatenate([faces, faces[:4], [[0, 0, 1]]])
+    result = clean(Mesh(np.concatenate([soup, [[9.0, 9.0, 9.0]]]), faces))
+    assert result.vertices.shape == (8, 3)
+    assert result.faces.shape == (12, 3)
+    assert is_closed(result)
+    assert signed_volume(result) == pytest.approx(6.0)
+
+
+def test_of_faces_back_to_back_a_wall_goes_and_a_double_sided_one_stays_once() -> None:
+    half = primitives.box((0.5, 1.0, 1.0))
+    halves = [Mesh(half.vertices + np.array([x, 0, 0]), half.faces) for x in (-0.25, 0.25)]
+    cells = np.concatenate([mesh.vertices for mesh in halves])
+    doubled = half.vertices + np.array([3.0, 0, 0])
+    faces = [half.faces, half.faces + 8, half.faces + 16, half.faces[:, ::-1] + 16]
+    result = clean(Mesh(np.concatenate([cells, doubled]), np.concatenate(faces)))
+    assert is_closed(result)
+    assert len(result.faces) == 20 + 12
+    assert signed_volume(result) == pytest.approx(1.5)
+
+
+def test_cleaning_keeps_colours_with_their_vertices() -> None:
+    solid = primitives.box()
+    colors = np.arange(24, dtype=np.uint8).reshape(8, 3)
+    result = clean(Mesh(solid.vertices, solid.faces, colors))
+    assert result.colors is not None
+    for vertex, color in zip(result.vertices, result.colors, strict=True):
+        original = int(np.abs(solid.vertices - vertex).sum(1).argmin())
+        assert (color == colors[original]).all()
+
+
+def test_box_mass_properties_are_exact_wherever_it_is() -> None:
+    size, turn, shift = np.array([0.3, 1.1, 2.0]), rotation(3), np.array([1e4, -2e3, 50.0])
+    solid = primitives.box(tuple(size))
+    volume, com, inertia = mass_properties(Mesh(solid.vertices @ turn.T + shift, solid.faces))
+    expected = size.prod() / 12 * np.diag((size**2).sum() - size**2)
+    assert volume == pytest.approx(size.prod(), rel=1e-9)
+    np.testing.assert_allclose(com, shift, atol=1e-8)
+    np.testing.assert_allclose(inertia, turn @ expected @ turn.T, atol=1e-8)
+
+
+def test_round_solids_converge_to_their_closed_forms() -> None:
+    volume, com, inertia = mass_properties(primitives.sphere(0.7, subdivisions=5))
+    assert volume == pytest.approx(4 / 3 * np.pi * 0.7**3, rel=2e-3)
+    np.testing.assert_allclose(com, 0, atol=1e-12)
+    np.testing.assert_allclose(inertia, 0.4 * volume * 0.49 * np.eye(3), rtol=3e-3, atol=1e-9)
+    major, minor = 0.4, 0.1
+    volume, _, inertia = mass_properties(primitives.torus(major, minor, 256, 128))
+    assert volume == pytest.approx(2 * np.pi**2 * major * minor**2, rel=1e-3)
+    assert inertia[2, 2] == pytest.approx(volume * (major**2 + 0.75 * minor**2), rel=2e-3)
+    volume, com, _ = mass_properties(primitives.cone(0.5, 1.0, 512))
+    assert volume == pytest.approx(np.pi * 0.25 / 3, rel=1e-3)
+    assert com[2] == pytest.approx(-0.25, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("sdf", "volume", "inertia"),
+    [
+        (SphereSdf(0.3), 4 / 3 * np.pi * 0.027, [0.4 * 0.09] * 3),
+        (BoxSdf((0.1, 0.4, 0.2)), 0.064, np.array([0.2, 0.05, 0.17]) / 3),
+    ],
+)
+def test_grid_integrals_agree_with_closed_forms(sdf, volume: float, inertia) -> None:
+    got, com, moment = mass_properties_of_sdf(sdf, sdf.bounds)
+    assert got == pytest.approx(volume, rel=5e-3)
+    np.testing.assert_allclose(com, 0, atol=1e-9)
+    np.testing.assert_allclose(moment, volume * np.diag(inertia), rtol=1e-2, atol=1e-9)
+
+
+def test_normal_frame_takes_the_longest_side_to_one() -> None:
+    bounds = np.array([[1.0, 2.0, 3.0], [2.0, 6.0, 5.0]])
+    frame = normal_frame(bounds)
+    np.testing.assert_allclose(frame.inward(bounds), [[-0.125, -0.5, -0.25], [0.125, 0.5, 0.25]])
+    np.testing.assert_allclose(frame.outward(frame.inward(bounds)), bounds)
+    with pytest.raises(SdfsimError, match="no extent"):
+        normal_frame(np.zeros((2, 3)))
+
+
+def test_surface_samples_lie_on_faces_in_proportion_to_area() -> None:
+    points, normals = sample_surface(primitives.box((1.0, 1.0, 4.0)), 20_000, np.random.default_rng(0))
+    half = np.array([0.5, 0.5, 2.0])
+    np.testing.assert_allclose(np.abs(np.abs(points) - half).min(1), 0, atol=1e-12)
+    assert (np.einsum("pi,pi->p", points, normals) > 0).all()
+    assert np.mean(np.abs(normals[:, 2]) > 0.5) == pytest.approx(2 / 18, abs=0.01)
+
+
+def test_pieces_are_the_hulls_of_the_groups(tmp_path: Path) -> None:
+    cube = primitives.box().vertices
+    lines = []
+    for name, shift in (("a", 0.0), ("b", 5.0)):
+        lines.append(f"o {name}")
+        lines += [f"v {x + shift} {y} {z}" for x, y, z in [*cube, (0.0, 0.0, 0.0)]]
+    path = tmp_path / "pieces.obj"
+    path.write_text("\n".join(lines))
+    pieces = load_pieces(path)
+    assert len(pieces) == 2
+    for piece, shift in zip(pieces, (0.0, 5.0), strict=True):
+        volume, com, _ = mass_properties(piece)
+        assert volume == pytest.approx(1.0)
+        np.testing.assert_allclose(com, [shift, 0, 0], atol=1e-12)
+
+
+def test_hull_faces_point_outwards() -> None:
+    hull = convex_hull(np.random.default_rng(1).normal(size=(50, 3)))
+    assert is_closed(hull)
+    assert signed_volume(hull) > 0

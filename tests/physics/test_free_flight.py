@@ -1,0 +1,81 @@
+"""Free flight against closed forms and conservation laws."""
+
+import numpy as np
+import torch
+
+from sdfsim.learned import inference
+from sdfsim.physics import pose
+from sdfsim.physics.free_flight import torque_free
+from sdfsim.scene.scene import Scene
+from sdfsim.simulate.simulator import Simulator
+from tests.scenes import angle_between, make_body, random_model
+
+TOP = torch.diag(torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))[None]
+
+
+def spin_state(angular: list[float]) -> tuple[torch.Tensor, torch.Tensor]:
+    return torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64), torch.tensor([angular], dtype=torch.float64)
+
+
+def momentum_and_energy(q: torch.Tensor, w: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    rotation = pose.to_matrix(q)
+    momentum = (rotation @ TOP @ rotation.mT @ w[..., None])[..., 0]
+    return momentum, 0.5 * (momentum * w).sum(-1)
+
+
+def test_ten_seconds_of_projectile_equal_the_closed_form(box_shape):
+    velocity = np.array([3.0, -2.0, 8.0])
+    body = make_body("thrown", 0, [1.0, 2.0, 3.0], velocity=velocity)
+    gravity = np.array([0.0, 0.0, -9.81])
+    scene = Scene((box_shape,), (body,), gravity=gravity, duration=10.0)
+    rollout = Simulator(scene, random_model("impulse")).run()
+    t = rollout.time[:, None]
+    expected = body.position + velocity * t + 0.5 * gravity * t**2
+    np.testing.assert_allclose(rollout.position[:, 0], expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(rollout.velocity[:, 0], velocity + gravity * t, rtol=1e-9, atol=1e-9)
+
+
+def test_symmetric_top_precesses_as_in_closed_form():
+    """Of an axisymmetric body the symmetry axis turns about the angular momentum at |L| / I1."""
+    inertia = torch.diag(torch.tensor([1.0, 1.0, 2.0], dtype=torch.float64))[None]
+    q, w = spin_state([0.6, 0.0, 1.5])
+    momentum = torch.tensor([0.6, 0.0, 3.0], dtype=torch.float64)
+    for _ in range(100):
+        q, w = torque_free(q, w, inertia, 0.02)
+    about = momentum / momentum.norm()
+    turn = pose.from_rotvec(about * momentum.norm() * 2.0)[None]
+    expected = pose.rotate(turn, torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64))
+    axis = pose.rotate(q, torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64))
+    torch.testing.assert_close(axis, expected, rtol=0, atol=1e-7)
+
+
+def test_intermediate_axis_flips_and_conserves():
+    q, w = spin_state([1e-3, 5.0, 1e-3])
+    momentum, energy = momentum_and_energy(q, w)
+    flips, side = 0, 1.0
+    for _ in range(1000):  # 20 s
+        q, w = torque_free(q, w, TOP, 0.02)
+        along = float((pose.to_matrix(q).mT @ w[..., None])[0, 1, 0])
+        if along * side < 0:
+            flips, side = flips + 1, -side
+    after, energy_after = momentum_and_energy(q, w)
+    assert flips >= 2
+    torch.testing.assert_close(after, momentum, rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(energy_after, energy, rtol=1e-6, atol=0)
+
+
+def test_a_rotation_in_single_precision_is_one_in_double_after_a_step():
+    """A quaternion that is long by rounding would stay so: products of quaternions keep the product of lengths."""
+    q, w = spin_state([0.3, -1.2, 0.4])
+    long = q * (1.0 + 1e-7)
+    after, _ = torque_free(long, w, TOP, 0.02)
+    assert abs(float(after.norm()) - 1.0) < 1e-15
+    assert float(angle_between(after, torque_free(q, w, TOP, 0.02)[0])) < 1e-7
+
+
+def test_a_scene_without_contacts_never_calls_the_network(dropped, monkeypatch):
+    model = random_model("impulse")
+    monkeypatch.setattr(inference, "corrected", lambda *a, **k: (_ for _ in ()).throw(AssertionError("network called")))
+    high = Scene(dropped.shapes, (dropped.bodies[0], dropped.bodies[3]), dropped.gravity, 1.0)
+    rollout = Simulator(high, model).run(seconds=1.0)
+    assert (rollout.contact_count == 0).all()

@@ -1,0 +1,84 @@
+"""Compiled code does not check its indices; the same functions as plain Python do."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from sdfsim.geometry import primitives
+from sdfsim.geometry.mesh import Mesh
+from sdfsim.shape.make import mesh_shape
+
+SCENE = """
+version: 1
+model: solver
+duration: 1.0
+shapes:
+  ring: {asset: %(shapes)s/ring}
+  bowl: {asset: %(shapes)s/bowl}
+  ball: {sphere: {radius: 0.1}}
+  pill: {capsule: {radius: 0.05, height: 0.2}}
+  brick: {box: {size: [0.2, 0.15, 0.1]}}
+  tile: {box: {size: [0.5, 0.5, 0.1]}}
+  drum: {cylinder: {radius: 0.06, height: 0.1}}
+  gem: {mesh: gem.obj, sdf: mesh}
+  cross: {asset: cross}
+bodies:
+  - {name: floor, motion: static, plane: {normal: [0, 0, 1], offset: 0.0}}
+  - {name: bowl, shape: bowl, scale: 1.1, motion: static, position: [0, 0, 0.3]}
+  - {name: ring, shape: ring, scale: 0.8, position: [0.02, 0, 0.9], velocity: [0, 0, -6], mass: 1}
+  - {name: brick, shape: brick, position: [0, 0.05, 1.4], velocity: [0, 0, -9], mass: 1}
+  - {name: ball, shape: ball, position: [1.5, 0, 0.09], velocity: [3, 0, 0], mass: 1}
+  - {name: pill, shape: pill, position: [1.9, 0, 0.2], angular_velocity: [0, 5, 0], mass: 1}
+  - {name: left, shape: tile, motion: static, position: [-2.25, 0, 0.05]}
+  - {name: right, shape: tile, motion: static, position: [-1.75, 0, 0.05]}
+  - {name: slider, shape: brick, position: [-2.05, 0, 0.149], velocity: [1, 0.2, 0], mass: 1}
+  - {name: drum, shape: drum, position: [-1.75, 0.1, 0.157], euler_xyz_deg: [6, 0, 0], velocity: [0, 0, -1], mass: 1}
+  - {name: gem, shape: gem, position: [-2.0, 0.01, 0.29], velocity: [0, 0, -2], mass: 1}
+  - {name: cross, shape: cross, position: [-2.33, 0.02, 0.15], velocity: [0.5, 0, -1], mass: 1}
+"""
+RUN = """
+import json, sys
+import sdfsim
+simulator = sdfsim.Simulator(sdfsim.load_scene(sys.argv[1], allow_outside=True))
+state = simulator.step(int(sys.argv[2]))
+touching = sorted({name for point in simulator.contact_points() for name in (point.first, point.second)})
+print(json.dumps([state.position.tolist(), state.velocity.tolist(), touching]))
+"""
+
+
+def ran(scene: Path, steps: int, **environment: str) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    found = subprocess.run(
+        [sys.executable, "-c", RUN, str(scene), str(steps)],
+        env=os.environ | environment, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    position, velocity, touching = json.loads(found.stdout.splitlines()[-1])
+    return np.array(position), np.array(velocity), touching
+
+
+def write_shapes(folder: Path) -> None:
+    """A ball of 162 corners, and a cross of two convex pieces."""
+    ball = primitives.sphere(0.06, 2)
+    lines = [f"v {x} {y} {z}" for x, y, z in ball.vertices] + [f"f {a} {b} {c}" for a, b, c in ball.faces + 1]
+    (folder / "gem.obj").write_text("\n".join(lines))
+    bars = [primitives.box((0.3, 0.06, 0.06)), primitives.box((0.06, 0.3, 0.06))]
+    both = Mesh(np.concatenate([bar.vertices for bar in bars]), np.concatenate([bars[0].faces, bars[1].faces + 8]))
+    cross = mesh_shape(both, name="cross", kind="mesh")
+    replace(cross, pieces=tuple(bar.vertices for bar in bars)).save(folder / "cross")
+
+
+def test_uncompiled_kernels_stay_within_their_arrays_and_come_to_the_same(tmp_path):
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(SCENE % {"shapes": Path(__file__).resolve().parents[2] / "samples" / "shapes"})
+    write_shapes(tmp_path)
+    compiled, plain = ran(scene, 40), ran(scene, 40, NUMBA_DISABLE_JIT="1")
+    assert {"ring", "bowl", "slider", "drum", "gem", "cross", "left", "right"} <= set(compiled[2]) and plain[
+        2
+    ] == compiled[2]
+    # The solve ends where impulses change little: rounding decides in which round.
+    np.testing.assert_allclose(plain[0], compiled[0], atol=1e-6)
+    np.testing.assert_allclose(plain[1], compiled[1], atol=1e-4)

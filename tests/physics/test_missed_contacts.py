@@ -1,0 +1,141 @@
+"""Pairs of bodies that just touch, put into scenes of two: does a step tell the contact?
+
+Where they touch is found on their true surfaces alone (`true_surfaces`), which know nothing of the contact search.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from itertools import combinations_with_replacement
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sdfsim import Simulator
+from sdfsim.geometry import primitives
+from sdfsim.geometry.mesh import Mesh, convex_hull
+from sdfsim.physics.true_surfaces import Placed, TrueSurface, gaps, true_surface
+from sdfsim.scene.scene import Scene
+from sdfsim.sdf.baked_grid import baked
+from sdfsim.shape.make import analytic_shape, mesh_shape
+from sdfsim.shape.shape import Shape, load_shape, with_sdf
+from tests.learned.test_scale import SHAPES
+from tests.physics.test_laws import body
+
+CONVEX = ("box", "stick", "plate", "sphere", "capsule", "cylinder", "disc", "hull", "cube mesh", "ball mesh")
+HOLLOW = ("ring", "bowl", "can", "torus mesh", "gear mesh", "bowl mesh")
+AGAINST = ("sphere", "capsule", "box", "stick", "cylinder")
+FEW, MANY = 4, 150  # pairs of two kinds, in the fast suite and in the slow one
+DEPTH = 2e-3  # of the smaller one's thickness: how deep they are in each other
+
+
+@cache
+def shape(kind: str) -> Shape:
+    """One of each kind, about 1 m wide."""
+    if kind in ("ring", "bowl", "can"):
+        return with_sdf(load_shape(SHAPES / kind), "mesh")
+    sizes = {"box": (1.0, 0.7, 0.5), "stick": (1.0, 0.05, 0.05), "plate": (1.0, 0.7, 0.02)}
+    if kind in sizes:
+        return analytic_shape("box", size=sizes[kind])
+    if kind == "sphere":
+        return analytic_shape("sphere", radius=0.5)
+    if kind == "capsule":
+        return analytic_shape("capsule", radius=0.15, height=0.7)
+    if kind == "cylinder":
+        return analytic_shape("cylinder", radius=0.2, height=1.0)
+    if kind == "disc":
+        return analytic_shape("cylinder", radius=0.5, height=0.05)
+    meshes = {
+        "cube mesh": primitives.box, "ball mesh": lambda: primitives.sphere(0.5, 2), "torus mesh": primitives.torus,
+        "gear mesh": primitives.gear, "bowl mesh": primitives.bowl, "hull": lump,
+    }  # fmt: skip
+    return mesh_shape(meshes[kind](), name=kind, kind="mesh")
+
+
+def lump() -> Mesh:
+    points = np.random.default_rng(5).normal(size=(24, 3))
+    return convex_hull(0.5 * points / np.linalg.norm(points, axis=1, keepdims=True) * [1.0, 0.6, 0.4])
+
+
+@cache
+def truth(kind: str) -> TrueSurface:
+    return true_surface(shape(kind))
+
+
+@cache
+def bake_error(kind: str) -> float:
+    """m, how wrong the distances of a shape are that is met as a surface."""
+    return baked(shape(kind).sdf, shape(kind).nodes).error if kind in HOLLOW else 0.0
+
+
+def touching(kinds: tuple[str, str], count: int, seed: int) -> tuple[Placed, Placed, np.ndarray]:
+    """Pairs that are a little in each other, somewhere on their surfaces; and how deep they are [P] m."""
+    draw, solids = np.random.default_rng(seed), [truth(kind) for kind in kinds]
+    more = 3 * count + 16
+    scale = np.stack([np.ones(more), 10.0 ** draw.uniform(-1.3 if kinds[0] in CONVEX else -0.7, 0.3, more)], 1)
+    turn = Rotation.random(2 * more, random_state=draw).as_matrix().reshape(more, 2, 3, 3)
+    extent = np.ptp(solids[0].bounds, axis=0)
+    scale[:, 1] *= extent.max() / np.ptp(solids[1].bounds, axis=0).max()
+    place = solids[0].bounds.mean(0) + draw.uniform(-0.9, 0.9, (more, 3)) * extent
+    first = Placed(np.zeros(more, int), scale[:, 0], np.zeros((more, 3)), turn[:, 0])
+    second = Placed(np.ones(more, int), scale[:, 1], np.einsum("pij,pj->pi", turn[:, 0], place), turn[:, 1])
+    thick = np.minimum(solids[0].thickness, solids[1].thickness * scale[:, 1])
+    depth = np.maximum(DEPTH * thick, 2.0 * bake_error(kinds[0]))
+    most = np.full(more, np.inf)
+    # Those that are apart come nearer along the shortest way, until they touch.
+    found = gaps(solids, first, second, most)
+    rows = np.flatnonzero((found.apart > 0) & (found.surely > 0) & (depth < 0.1 * thick))[: count + 2]
+    first, second, depth = first[rows], second[rows], depth[rows]
+    for k in range(8):
+        found = gaps(solids, first, second, most[: len(rows)])
+        wanted = -depth if k > 5 else 0.0 * depth
+        way = found.normal * (found.sign * (found.apart - wanted))[:, None]
+        second = Placed(second.solid, second.scale, second.origin + way, second.turn)
+    deep = -gaps(solids, first, second, most[: len(rows)]).apart
+    good = np.flatnonzero(np.abs(deep - depth) < 0.5 * depth)[:count]
+    return first[good], second[good], deep[good]
+
+
+def told(kinds: tuple[str, str], first: Placed, second: Placed, k: int) -> float | None:
+    """How deep the two bodies of a scene are in each other, as a step tells it; None without a contact."""
+    bodies = [
+        body(name, n, p.origin[k], 1.0, scale=float(p.scale[k]), quat_xyzw=Rotation.from_matrix(p.turn[k]).as_quat(),
+             restitution=0.0, motion="static" if n == 0 else "dynamic")
+        for n, (name, p) in enumerate((("first", first), ("second", second)))
+    ]  # fmt: skip
+    simulator = Simulator(Scene(tuple(map(shape, kinds)), tuple(bodies), np.zeros(3), 1.0), "solver")
+    simulator.step()
+    found = [point.penetration for point in simulator.contact_points()]
+    return max(found) if found else None
+
+
+PAIRS = [*combinations_with_replacement(CONVEX, 2), *((one, other) for one in HOLLOW for other in AGAINST)]
+
+
+def missed(kinds: tuple[str, str], count: int, seed: int) -> tuple[int, list[str]]:
+    """How many pairs were asked, and those without a contact, or with one that is far from the truth."""
+    first, second, deep = touching(kinds, count, seed)
+    wrong = []
+    for k in range(len(deep)):
+        found = told(kinds, first, second, k)
+        thick = min(truth(kinds[0]).thickness, float(second.scale[k]) * truth(kinds[1]).thickness)
+        place = f"pair {k} of {kinds}, seed {seed}, scale {second.scale[k]:.3g}"
+        if found is None:
+            wrong.append(f"{place}: missed")
+        elif not abs(found - deep[k]) < deep[k] + 5e-3 * thick:  # crossing edges have no point that is as deep
+            wrong.append(f"{place}: {found / thick:.3g} of the thickness deep, truth {deep[k] / thick:.3g}")
+    return len(deep), wrong
+
+
+@pytest.mark.parametrize("kinds", PAIRS, ids=" on ".join)
+def test_a_step_tells_every_contact(kinds):
+    asked, wrong = missed(kinds, FEW, seed=0)
+    assert asked > 0 and not wrong, f"{len(wrong)} of {asked}:\n" + "\n".join(wrong[:10])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kinds", PAIRS, ids=" on ".join)
+def test_a_step_tells_every_contact_of_many(kinds):
+    asked, wrong = missed(kinds, MANY, seed=1)
+    assert asked > FEW and not wrong, f"{len(wrong)} of {asked}:\n" + "\n".join(wrong[:10])

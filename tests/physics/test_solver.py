@@ -1,0 +1,189 @@
+"""The contact solve as a simulator's model: scaling, places, sleep, going on after a kill, crowds."""
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from sdfsim import Simulator
+from sdfsim.evaluation import hard_cases
+from sdfsim.physics.rollout import Rollout
+from sdfsim.physics.solver import prepare as solver
+from sdfsim.scene.scene import Scene
+from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import load_shape, with_sdf
+from tests.apps.test_resuming import Killed, simulate
+from tests.hard_cases import gates
+from tests.learned.test_scale import SHAPES
+from tests.physics.test_laws import ball, body, cube
+
+
+def heap(seed: int, count: int = 6, weight: float = 9.81) -> Scene:
+    """Boxes, balls and capsules that fall on each other, each turned somehow."""
+    draw = np.random.default_rng(seed)
+    shapes = (cube(1.0), ball(1.0), analytic_shape("capsule", radius=0.2, height=1.0), analytic_shape("plane"))
+    bodies = []
+    for k in range(count):
+        quat = draw.normal(size=4)
+        bodies.append(
+            body(
+                str(k), int(draw.integers(3)), [*draw.uniform(-0.8, 0.8, 2), 1.0 + 1.8 * k], draw.uniform(0.5, 5.0),
+                quat_xyzw=quat / np.linalg.norm(quat), velocity=draw.normal(size=3),
+                angular_velocity=draw.normal(size=3),
+                friction=draw.uniform(0, 1), restitution=draw.uniform(0, 0.5),
+            )
+        )  # fmt: skip
+    floor = body("floor", 3, [0, 0, 0], 0.0, motion="static", friction=0.8, restitution=1.0)
+    return Scene(shapes, (*bodies, floor), np.array([0.0, 0.0, -weight]), 1.0)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_energy_never_grows_and_nothing_sinks(seed):
+    motion = Simulator(heap(seed), "solver").run(2.0)
+    gates.assert_sound(motion)
+    energy = motion.counters["kinetic_energy"] + motion.counters["potential_energy"]
+    assert np.diff(energy).max() <= 0.01 * motion.counters["kinetic_energy"].max()
+    assert motion.position[:, :-1, 2].min() > 0.0
+
+
+def test_momentum_stays_without_a_floor():
+    scene = heap(3, weight=0.0)
+    drawn = [replace(b, velocity=-2.0 * (b.position - [0, 0, 5.0]) / 5.0) for b in scene.bodies[:-1]]
+    motion = Simulator(replace(scene, bodies=tuple(drawn)), "solver").run(3.0)
+    assert motion.contact_count.sum() > 0
+    momentum = (np.array([b.mass for b in drawn])[:, None] * motion.velocity).sum(1)
+    assert np.abs(momentum - momentum[0]).max() < 1e-9
+
+
+@pytest.mark.parametrize("size", [0.01, 100.0])
+def test_size_and_planet_only_change_the_units(size):
+    scene = gates.mixed()
+    time = np.sqrt(size * 9.81 / 1.62)
+    bodies = tuple(
+        replace(
+            b, scale=b.scale * size, position=b.position * size, velocity=b.velocity * size / time,
+            angular_velocity=b.angular_velocity / time,
+        )
+        for b in scene.bodies
+    )  # fmt: skip
+    there = replace(scene, gravity=np.array([0.0, 0.0, -1.62]), bodies=bodies)
+    here = replace(scene, gravity=np.array([0.0, 0.0, -9.81]))
+    one, other = (Simulator(s, "solver").run(steps=25) for s in (here, there))
+    assert np.abs(other.position / size - one.position).max() <= 1e-4
+
+
+@pytest.mark.parametrize("distance", [1.7, 1e3, 1e6])
+def test_where_it_happens_does_not_matter(distance):
+    shift = distance * np.array([1.0, -1.0, 0.5])
+    scene = gates.mixed()
+    far = replace(scene, bodies=tuple(replace(b, position=b.position + shift) for b in scene.bodies))
+    one, other = (Simulator(s, "solver").run(steps=25) for s in (scene, far))
+    assert np.abs(other.position - shift - one.position).max() <= 1e-4
+
+
+def test_a_run_is_the_same_again():
+    one, again = (Simulator(heap(5), "solver").run(1.0) for _ in range(2))
+    for name in ("position", "orientation", "velocity", "angular_velocity"):
+        assert getattr(one, name).tobytes() == getattr(again, name).tobytes(), name
+
+
+def test_a_killed_run_goes_on_to_the_last_bit(tmp_path, monkeypatch):
+    from sdfsim.apps import run
+
+    path = tmp_path / "scene.yaml"
+    path.write_text(
+        "version: 1\nmodel: solver\nshapes: {ball: {sphere: {radius: 0.5}}, box: {box: {size: [1, 1, 1]}}}\nbodies:\n"
+        "  - {name: floor, plane: {}}\n  - {name: ball, shape: ball, position: [0.1, 0, 2.6]}\n"
+        "  - {name: box, shape: box, position: [0, 0, 0.6]}\n"
+    )
+    monkeypatch.setattr(run, "EVERY", 0.0)
+    with pytest.raises(Killed):
+        simulate(path, tmp_path / "run", stop=0.5, kind=Killed, seconds=1.0)
+    simulate(path, tmp_path / "run", resume=True, seconds=1.0)
+    simulate(path, tmp_path / "whole", seconds=1.0)
+    resumed, whole = (Rollout.load(tmp_path / name / "rollout.npz") for name in ("run", "whole"))
+    for name in ("time", "position", "orientation", "velocity", "contact_point", "contact_count"):
+        np.testing.assert_array_equal(getattr(resumed, name), getattr(whole, name), err_msg=name)
+
+
+def test_what_rests_sleeps_and_wakes_when_it_is_hit_or_changed():
+    boxes = [body(str(k), 0, [0, 0, k + 0.5]) for k in range(3)]
+    far = body("ball", 1, [0, 0, 40.0])
+    floor = body("floor", 2, [0, 0, 0], 0.0, motion="static")
+    scene = Scene((cube(1.0), ball(1.0), analytic_shape("plane")), (*boxes, far, floor), np.array([0, 0, -9.81]), 4.0)
+    sim = Simulator(scene, "solver")
+    motion = sim.run(2.0)
+    assert motion.counters["asleep"][-1] == 3
+    assert (motion.position[-1, :3] == motion.position[-10, :3]).all() and not motion.velocity[-1, :3].any()
+    kept = sim.state
+    sim.state = replace(kept, velocity=kept.velocity.clone().index_fill_(0, torch.tensor([1]), 0.5))
+    assert sim.run(steps=1).counters["asleep"][-1] == 0
+    sim.state = kept
+    hit = sim.run(1.5)
+    assert hit.counters["asleep"].min() == 0  # the ball comes down on them
+
+
+def test_thousands_of_static_bodies_far_away_make_no_pairs():
+    one = body("mover", 0, [0, 0, 0.7], velocity=[1.0, 0, 0])
+    floor = body("floor", 1, [0, 0, 0], 0.0, motion="static")
+    pairs = []
+    for count in (10, 2000):
+        rows = [
+            body(f"s{k}", 0, [40.0 + 2 * (k % 50), 2.0 * (k // 50), 0.5], 0.0, motion="static") for k in range(count)
+        ]
+        scene = Scene((cube(1.0), analytic_shape("plane")), (one, floor, *rows), np.array([0, 0, -9.81]), 1.0)
+        pairs.append(Simulator(scene, "solver").run(steps=20).counters["pairs"])
+    np.testing.assert_array_equal(*pairs)
+
+
+def test_effects_that_are_off_do_not_act():
+    scene = heap(1)
+    base = Simulator(scene, "solver")
+    flat = Simulator(scene, "solver")
+    flat.rules = replace(base.rules, rotation=False, friction=False)
+    motion = flat.run(1.0)
+    assert not motion.angular_velocity[1:, :-1].any()
+    sim = Simulator(scene, "solver")
+    sim.rules = replace(base.rules, restitution=False, sleep=False)
+    assert sim.run(steps=5).position.shape == base.run(steps=5).position.shape
+
+
+def test_a_long_inner_step_is_told():
+    """4 ms are for bodies of 1.4 m: at nine metres it is 10 ms."""
+
+    def lines(size: float) -> list[str]:
+        shapes = (cube(size), analytic_shape("plane"))
+        bodies = (body("one", 0, [0, 0, size]), body("floor", 1, [0, 0, 0], 0.0, motion="static"))
+        return Simulator(Scene(shapes, bodies, np.array([0.0, 0.0, -9.81]), 1.0), "solver").outside_training
+
+    assert lines(4.0) == []
+    (line,) = lines(40.0)
+    assert line.startswith("inner step: ") and "checked up to 10 ms" in line
+
+
+@pytest.mark.parametrize("wide", [0.3, 1.5, 9.0])
+@pytest.mark.parametrize("name", ["can", "ring"])
+def test_a_fitted_shape_rests_on_a_large_box_as_on_a_plane(name, wide):
+    """A node of a large body sees another's grid from no farther than the grid is fine."""
+    shape = load_shape(SHAPES / name)
+    bottom = shape.sdf.bounds[0, 2]
+    thing = body("thing", 0, [0.03, 0.0, -bottom], 0.2, restitution=0.0)
+    table = body("table", 1, [0, 0, -0.02], 0.0, motion="static", restitution=0.0)
+    top = analytic_shape("box", size=(wide, wide, 0.04))
+    sim = Simulator(Scene((shape, top), (thing, table), np.array([0.0, 0.0, -9.81]), 1.0))
+    rollout = sim.run(1.5)
+    moved = np.abs(rollout.position[:, 0] - rollout.position[0, 0])
+    assert moved.max() < 3e-3 * float(np.ptp(shape.sdf.bounds, axis=0).max())
+    assert sim["thing"].asleep
+
+
+def test_a_copy_of_a_scene_is_not_baked_again(monkeypatch):
+    """Workers get copies of scenes: their shapes are known by what they hold."""
+    shape = with_sdf(analytic_shape("box", size=(1.0, 0.7, 0.3)), "grid", resolution=16)
+    scene = hard_cases.on_floor([shape], [hard_cases.body("b", 0, [0, 0, 1.0])])
+    first = Simulator(scene, "solver").run(steps=5)
+    monkeypatch.setattr(solver, "baked", None)
+    again = Simulator(pickle.loads(pickle.dumps(scene)), "solver").run(steps=5)
+    np.testing.assert_array_equal(first.position, again.position)

@@ -1,0 +1,179 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from sdfsim.base.errors import SdfsimError
+from sdfsim.geometry.mesh import Frame, Mesh
+from sdfsim.geometry.primitives import box
+from sdfsim.sdf import grid as grid_module
+from sdfsim.sdf.closed_forms import BoxSdf, SphereSdf
+from sdfsim.sdf.far_field import BOX, CAUTION
+from sdfsim.sdf.grid import GridSdf, sample_grid, trilinear
+from sdfsim.sdf.reference import MeshDistance
+from sdfsim.shape.surface_nodes import project
+
+BOUNDS = np.array([[-0.5] * 3, [0.5] * 3])
+
+
+def ball(resolution: int, radius: float = 0.5) -> GridSdf:
+    sdf = SphereSdf(radius)
+    return sample_grid(sdf, sdf.bounds, resolution)
+
+
+def around(count: int, reach: float, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-reach, reach, (count, 3))
+
+
+def test_a_linear_field_comes_back_exactly() -> None:
+    slope = np.array([0.3, -0.5, 0.8])
+
+    def tilted(points: np.ndarray) -> tuple[np.ndarray]:
+        return (points @ slope + 0.9,)
+
+    sdf = sample_grid(tilted, BOUNDS, 9)
+    points = around(500, 0.5)
+    distance, gradient = sdf(points)
+    np.testing.assert_allclose(distance, points @ slope + 0.9, atol=1e-6)
+    np.testing.assert_allclose(gradient, np.tile(slope, (500, 1)), atol=1e-5)
+
+
+def test_samples_are_met_on_the_grid_and_on_the_faces_of_the_box() -> None:
+    sdf = ball(12)
+    axis = np.linspace(-BOX, BOX, 12)
+    points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    np.testing.assert_allclose(sdf(points)[0], np.linalg.norm(points, axis=1) - 0.5, atol=1e-6)
+
+
+@pytest.mark.parametrize("which", ["values", "gradients"])
+def test_errors_shrink_with_the_cells(which: str) -> None:
+    """Twice the samples: a quarter of the error in the distance, half of that in the gradient."""
+    points = around(20_000, 0.6)
+    points = points[np.linalg.norm(points, axis=1) > 0.25]
+    exact = SphereSdf(0.5)(points)
+    errors = []
+    for resolution in (29, 57, 113):
+        found = ball(resolution)(points)
+        errors.append(np.abs(found[which == "gradients"] - exact[which == "gradients"]).max())
+    order = 2.0 if which == "values" else 1.0
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.25)
+    assert np.log2(errors[1] / errors[2]) == pytest.approx(order, abs=0.25)
+
+
+def test_a_box_is_met_but_for_its_edges() -> None:
+    truth = BoxSdf((0.5, 0.3, 0.4))
+    sdf = sample_grid(truth, truth.bounds, 71)  # 0.02 a cell: faces run along samples
+    points = around(5000, 0.6)
+    distance, gradient = sdf(points)
+    exact = truth(points)
+    assert np.abs(distance - exact[0]).max() < 0.02
+    # A face, away from the others by a cell: the distance is linear there.
+    near = (np.abs(points[:, 0]) > 0.45) & (np.abs(points[:, 1]) < 0.22) & (np.abs(points[:, 2]) < 0.32)
+    assert near.sum() > 100
+    np.testing.assert_allclose(distance[near], exact[0][near], atol=1e-6)
+    np.testing.assert_allclose(gradient[near], exact[1][near], atol=1e-4)
+
+
+def test_the_gradient_is_that_of_the_value() -> None:
+    """In double precision: against autograd, and against differences within a cell, where they are exact."""
+    values = torch.from_numpy(np.random.default_rng(0).normal(size=(6, 6, 6)))
+    cell = 2 * BOX / 5
+    points = (torch.randint(5, (300, 3)) + 0.2 + 0.6 * torch.rand(300, 3, dtype=torch.float64)) * cell - BOX
+    points.requires_grad_()
+    value, gradient = trilinear(values, points)
+    (slope,) = torch.autograd.grad(value.sum(), points)
+    torch.testing.assert_close(gradient.detach(), slope, rtol=1e-9, atol=1e-9)
+    for axis in range(3):
+        step = torch.zeros(3, dtype=torch.float64)
+        step[axis] = 0.1 * cell
+        ahead, behind = trilinear(values, points.detach() + step), trilinear(values, points.detach() - step)
+        torch.testing.assert_close((ahead[0] - behind[0]) / (0.2 * cell), gradient[:, axis].detach())
+
+
+def test_metres_far_from_the_origin() -> None:
+    sdf = ball(32)
+    moved = GridSdf(sdf.values, Frame(np.array([1e6, 0.0, -1e6]), 3.0), 3.0 * sdf.bounds + [1e6, 0.0, -1e6])
+    points = around(200, 0.9)
+    distance, gradient = moved(3.0 * points + [1e6, 0.0, -1e6])
+    np.testing.assert_allclose(distance, 3.0 * sdf(points)[0], atol=1e-5)
+    np.testing.assert_allclose(gradient, sdf(points)[1], atol=1e-3)
+
+
+def test_beyond_the_box_the_distance_goes_on() -> None:
+    sdf = ball(64)
+    direction = around(300, 1.0)
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    on_box = direction * (BOX / np.abs(direction).max(1, keepdims=True))
+    inner, outer = sdf(on_box * (1 - 1e-6)), sdf(on_box * (1 + 1e-6))
+    np.testing.assert_allclose(inner[0], outer[0], atol=1e-5)
+    for reach in (1.1, 3.0, 100.0):
+        distance, gradient = sdf(reach * on_box)
+        over = distance / (np.linalg.norm(reach * on_box, axis=1) - 0.5) - 1
+        assert over.min() > -CAUTION - 0.003 and over.max() < 0.02
+        assert (gradient * direction).sum(1).min() > 0.95
+
+
+@pytest.mark.parametrize("resolution", [2, 15, 16])
+def test_never_nan_and_never_beside_the_grid(resolution: int) -> None:
+    sdf = ball(resolution)
+    points = np.array([[0.0, 0, 0], [BOX] * 3, [-BOX] * 3, [1e15, -1e15, 1e15], [0.0, 0.0, 0.5]])
+    for part in sdf(points):
+        assert np.isfinite(part).all()
+    # What is not a number stays none, rather than reading beside the grid.
+    assert np.isnan(sdf(np.array([[np.nan, 0.0, 0.0]]))[0]).all()
+
+
+def test_projecting_by_value_and_gradient_reaches_the_surface() -> None:
+    points = around(500, 0.6)
+    points = points[np.linalg.norm(points, axis=1) > 0.2]
+    reached = project(ball(64), points)
+    np.testing.assert_allclose(np.linalg.norm(reached, axis=1), 0.5, atol=5e-4)
+
+
+def test_an_oracle_and_an_sdf_can_be_sampled() -> None:
+    cube = box()
+    offset = np.array([3.0, 0.0, 0.0])
+    oracle = MeshDistance(Mesh(cube.vertices * 0.2 + offset, cube.faces))
+    told: list[float] = []
+    sdf = sample_grid(oracle, oracle.bounds, 20, lambda fraction, _: told.append(fraction))
+    assert told[0] == 0.0 and told[-1] == 1.0
+    np.testing.assert_allclose(sdf.bounds, oracle.bounds)
+    points = around(300, 0.13) + offset
+    np.testing.assert_allclose(sdf(points)[0], oracle(points).distance, atol=0.006)
+    again = BoxSdf((0.1, 0.1, 0.1))
+    whole = sample_grid(again, again.bounds, 20).values
+    np.testing.assert_allclose(whole.numpy(), sdf.values.numpy(), atol=1e-6)
+
+
+def test_empty_chunked_and_numpy_questions(monkeypatch: pytest.MonkeyPatch) -> None:
+    sdf = ball(20)
+    assert sdf(torch.zeros(0, 3))[1].shape == (0, 3)
+    points = torch.rand(1000, 3) * 2 - 1
+    whole = sdf(points)
+    for chunk in (37, 500, 1000):
+        monkeypatch.setattr(grid_module, "CHUNK", chunk)
+        for one, other in zip(whole, replace(sdf)(points), strict=True):
+            assert torch.equal(one, other)
+    assert sdf(points.double().numpy())[0].dtype == np.float64
+
+
+def test_grids_that_cannot_be_are_refused() -> None:
+    with pytest.raises(SdfsimError, match="two samples"):
+        ball(1)
+    with pytest.raises(SdfsimError, match="no extent"):
+        sample_grid(SphereSdf(0.5), np.array([[-np.inf] * 3, [np.inf] * 3]), 8)
+    for shape in ((4, 4, 5), (4, 4), (1, 1, 1)):
+        with pytest.raises(ValueError, match="as many samples"):
+            GridSdf(torch.zeros(shape), Frame(np.zeros(3), 1.0), BOUNDS)
+
+
+@pytest.mark.gpu
+def test_cuda_gives_what_the_cpu_gives() -> None:
+    sdf, points = ball(40), torch.rand(5000, 3) * 2 - 1
+    here, there = sdf(points), sdf.to("cuda")(points.cuda())
+    assert there[0].is_cuda
+    torch.testing.assert_close(here[0], there[0].cpu(), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(here[1], there[1].cpu(), rtol=1e-3, atol=1e-3)

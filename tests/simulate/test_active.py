@@ -1,0 +1,243 @@
+"""Only what is in play is computed: stages that are off are never entered, and the network sees what touches."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from sdfsim.learned import inference, near
+from sdfsim.learned.near import find_contacts
+from sdfsim.learned.sdf_sim import sdf_sim_graph
+from sdfsim.learned.surfaces import compact, node_owner, predict
+from sdfsim.physics.solver import impulse
+from sdfsim.physics.solver import prepare as solver
+from sdfsim.scene.scene import Effects, Scene, Waypoints
+from sdfsim.shape.make import analytic_shape
+from sdfsim.simulate import step as step_module
+from sdfsim.simulate.simulator import Simulator
+from tests.learned.test_surface_networks import surface_model
+from tests.scenes import make_body, random_model
+
+
+def same(one, other) -> bool:
+    names = ("position", "orientation", "velocity", "angular_velocity", "contact_count", "contact_point")
+    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in names)
+
+
+@pytest.fixture
+def forbid(monkeypatch):
+    """Make functions raise when they are called."""
+
+    def refuse(*_, **__):
+        raise AssertionError("a stage that is off was entered")
+
+    def forbidden(module, *names: str):
+        for name in names:
+            monkeypatch.setattr(module, name, refuse)
+
+    return forbidden
+
+
+def test_contact_off_looks_for_nothing_and_equals_bodies_that_may_not_touch(dropped, forbid):
+    alone = replace(dropped, bodies=tuple(replace(b, collides_with=()) for b in dropped.bodies))
+    forbid(step_module, "_solved_step")
+    forbid(solver, "_geometry")
+    forbid(inference, "corrected")
+    model = random_model("impulse")
+    assert Simulator(alone, model).bodies.shape.tolist() == [-1] * 4  # there is no SDF to ask
+    off = Simulator(replace(dropped, effects=Effects(contact="off")), model).run(steps=6)
+    assert same(off, Simulator(alone, model).run(steps=6))
+
+
+def test_no_weights_are_read_that_nothing_asks(dropped, tmp_path):
+    file = tmp_path / "random.safetensors"
+    random_model("impulse").save(file)
+    off = Simulator(replace(dropped, effects=Effects(contact="off")), file)
+    assert not off.model.network.state_dict() and off.dt > 0
+    off.run(steps=2)
+    assert Simulator(dropped, file).model.network.state_dict()
+
+
+def test_the_network_is_not_asked_before_a_pair_is_near(dropped, forbid):
+    far = replace(dropped, bodies=(dropped.bodies[0], dropped.bodies[3]))
+    forbid(inference, "corrected")
+    sim = Simulator(far, random_model("impulse"))
+    sim.run(steps=10)
+    assert sim.memory.counts["edges"] == 0 and sim.memory.counts["free"] == 1
+
+
+def test_without_a_dynamic_body_nothing_flies(dropped, forbid):
+    forbid(step_module, "ballistic", "torque_free")
+    still = tuple(replace(b, motion="static", mass=0.0, velocity=np.zeros(3)) for b in dropped.bodies)
+    rollout = Simulator(replace(dropped, bodies=still), random_model("impulse")).run(steps=3)
+    assert (rollout.position == rollout.position[0]).all()
+
+
+@pytest.mark.parametrize("effect", ["friction", "restitution"])
+def test_an_effect_that_is_off_equals_a_scene_without_it(dropped, effect):
+    model = random_model("impulse")
+    bare = tuple(replace(b, **{effect: 0.0}) for b in dropped.bodies)
+    off = Simulator(replace(dropped, effects=replace(Effects(), **{effect: "off"})), model).run(steps=8)
+    assert same(off, Simulator(replace(dropped, bodies=bare), model).run(steps=8))
+    assert not same(off, Simulator(dropped, model).run(steps=8)) and off.contact_count.sum() > 0
+
+
+def with_scenery(scene: Scene, count: int) -> Scene:
+    far = tuple(
+        make_body(f"far{k}", 0, [1000 + 3 * k, 5 * (k % 7), 1], motion="static", mass=0.0) for k in range(count)
+    )
+    return replace(scene, bodies=scene.bodies + far)
+
+
+@pytest.mark.parametrize("make", [lambda: random_model("impulse"), surface_model])
+def test_scenery_far_away_is_never_asked(dropped, make):
+    few, many = Simulator(with_scenery(dropped, 3), make()), Simulator(with_scenery(dropped, 400), make())
+    one, other = few.run(steps=8), many.run(steps=8)
+    assert (one.position[:, :4] == other.position[:, :4]).all()
+    for name in ("pairs", "contacts", "nodes", "edges", "active", "free"):
+        assert (one.counters[name] == other.counters[name]).all(), name
+    assert one.counters["edges"].sum() > 0
+
+
+def seen_by(model) -> list:
+    """The graphs that a network in torch is given."""
+    graphs, real = [], model.network.forward
+    model.network.forward = lambda graph, **options: graphs.append(graph) or real(graph, **options)
+    return graphs
+
+
+@pytest.fixture
+def graphs(monkeypatch) -> list[impulse.Graph]:
+    """The graphs that the compiled network is given."""
+    found, compiled = [], impulse.correct
+
+    def correct(weights, *rest):
+        found.append(impulse._graph(*rest))
+        compiled(weights, *rest)
+
+    monkeypatch.setattr(impulse, "correct", correct)
+    return found
+
+
+def test_the_impulse_network_sees_only_bodies_that_met_somebody(dropped, graphs):
+    sim = Simulator(dropped, random_model("impulse"))
+    met = 0
+    for _ in range(8):
+        before = len(graphs)
+        sim.run(steps=1)
+        counts = sim.memory.counts
+        assert len(graphs) - before == (counts["edges"] > 0)
+        if len(graphs) > before:
+            graph = graphs[-1]
+            assert counts["nodes"] == len(graph.inverse_mass) < len(dropped.bodies)
+            assert counts["edges"] == len(graph.pair)
+            assert set(graph.pair.ravel().tolist()) == set(range(len(graph.inverse_mass)))
+            met += 1
+    assert met > 0
+
+
+def test_the_paper_network_sees_only_bodies_with_an_edge_and_answers_as_for_all(dropped):
+    model = surface_model(push=1e-2)
+    sim = Simulator(dropped, model)
+    contacts = find_contacts(sim.bodies, sim.state, sim.rules.gravity, sim.model.reach, sim.rules.dt)
+    everything = sdf_sim_graph(sim.bodies, sim.state, contacts)
+    whole = predict(model.network, everything, sim.bodies, sim.state, sim.rules.dt)  # type: ignore[arg-type]
+    graphs = seen_by(model)
+    rows = torch.cat([contacts.owner, contacts.body]).unique()
+    sim.run(steps=1)
+    assert 0 < len(graphs[0].nodes["body"]) == len(rows) < len(dropped.bodies)
+    assert len(graphs[0].nodes["node"]) == sum(
+        len(dropped.shapes[dropped.bodies[k].shape].nodes) for k in rows.tolist()
+    )
+    moving = rows[sim.bodies.moves[rows]]
+    torch.testing.assert_close(sim.state.position[moving], whole.position[moving], rtol=0, atol=1e-7)
+    torch.testing.assert_close(sim.state.angular_velocity[moving], whole.angular_velocity[moving], rtol=0, atol=1e-4)
+
+
+def test_with_everything_active_nothing_is_copied(dropped):
+    sim = Simulator(dropped, surface_model())
+    contacts = find_contacts(sim.bodies, sim.state, sim.rules.gravity, sim.model.reach, sim.rules.dt)
+    made = compact(sim.bodies, sim.state, contacts, torch.arange(len(sim.bodies)))
+    assert made[0] is sim.bodies and made[1] is sim.state and made[2] is contacts
+    some = compact(sim.bodies, sim.state, contacts, torch.cat([contacts.owner, contacts.body]).unique())
+    place = node_owner(some[0])[some[2].node]
+    assert torch.equal(place, some[2].owner)
+    assert torch.equal(some[0].node[some[2].node], sim.bodies.node[contacts.node])
+
+
+def test_learned_free_flight_needs_no_search_with_contact_off(dropped, forbid):
+    forbid(near, "nodes_within")
+    sim = Simulator(replace(dropped, effects=Effects(contact="off")), surface_model(), free_flight="learned")
+    rollout = sim.run(steps=3)
+    assert rollout.counters["active"][1:].tolist() == [3, 3, 3] and rollout.contact_count.sum() == 0
+
+
+def test_every_dynamic_body_is_counted_once_while_it_flies_touches_and_falls_asleep(dropped):
+    found = Simulator(replace(dropped, effects=Effects(sleep="on"), bodies=dropped.bodies[:3]), "solver").run(steps=250)
+    free, active, asleep = (found.counters[name][1:] for name in ("free", "active", "asleep"))
+    assert (free + active + asleep == 2).all() and min(free.min(), active.min(), asleep.min()) == 0
+    assert free.max() > 0 and active.max() > 0 and asleep[-1] == 2
+
+
+STILL = np.array([0.0, 0.0, 0.0, 1.0])
+TURNED = np.array([0.0, 0.0, np.sin(0.4), np.cos(0.4)])
+
+
+def paddle(scene: Scene) -> Scene:
+    """A box that sweeps through `low` of the dropped scene while it turns."""
+    path = Waypoints(
+        np.array([0.0, 0.1, 0.2]),
+        np.array([[-1.0, 0, 0.6], [0.5, 0, 0.6], [0.5, 1, 0.6]]),
+        np.stack([STILL, TURNED, STILL]),
+    )
+    body = make_body("paddle", 0, [-1, 0, 0.6], motion="kinematic", mass=0.0, path=path)
+    return replace(scene, bodies=(*scene.bodies, body))
+
+
+@pytest.mark.parametrize("make", [lambda: random_model("impulse", push=0.1), surface_model])
+def test_a_body_on_a_path_pushes_and_is_not_pushed(dropped, make):
+    sim = Simulator(paddle(dropped), make())
+    rollout = sim.run(steps=max(4, round(0.25 / sim.dt)))
+    want = np.stack(
+        [np.interp(rollout.time, [0.0, 0.1, 0.2], [p[k] for p in [(-1, 0), (0.5, 0), (0.5, 1)]]) for k in (0, 1)], -1
+    )
+    np.testing.assert_allclose(rollout.position[:, 4, :2], want, atol=1e-9)
+    half = np.interp(rollout.time, [0.0, 0.1, 0.2], [0.0, 0.8, 0.0])
+    np.testing.assert_allclose(
+        2 * np.arctan2(rollout.orientation[:, 4, 2], rollout.orientation[:, 4, 3]), half, atol=1e-9
+    )
+    met = (rollout.contact_body == [1, 4]).all(1) | (rollout.contact_body == [4, 1]).all(1)
+    assert met.any()
+    # What the bodies beside it do is another motion than without it.
+    without = Simulator(dropped, sim.model).run(steps=len(rollout))
+    assert np.abs(rollout.position[-1, 1] - without.position[-1, 1]).max() > 1e-4
+
+
+def test_a_body_on_a_path_meets_others_with_the_velocity_of_its_path(dropped, graphs):
+    sim = Simulator(paddle(dropped), random_model("impulse"))
+    sim.run(steps=2)
+    state = sim.state
+    speed = 15.0 / sim.units.velocity
+    assert torch.allclose(state.velocity[4], torch.tensor([speed, 0, 0], dtype=torch.float64), atol=1e-6)
+    assert torch.allclose(
+        state.angular_velocity[4, 2] / sim.units.time, torch.tensor(8.0, dtype=torch.float64), atol=1e-6
+    )
+    fixed = graphs[-1].twist[graphs[-1].inverse_mass == 0]
+    velocity, mean = (fixed[:, column : column + 3] for column in (impulse.START, impulse.MEAN))
+    assert (np.linalg.norm(velocity, axis=-1) > 1).any()
+    np.testing.assert_allclose(velocity, mean, atol=1e-9)
+
+
+def test_scripted_bodies_do_not_meet_scenery(forbid):
+    shapes = (analytic_shape("box", size=(1.0, 1.0, 1.0)),)
+    path = Waypoints(np.array([0.0]), np.zeros((1, 3)), STILL[None])
+    bodies = (
+        make_body("block", 0, [0.5, 0, 0], motion="static", mass=0.0),
+        make_body("script", 0, [0, 0, 0], motion="kinematic", mass=0.0, path=path),
+        make_body("free", 0, [0, 0, 9]),
+    )
+    forbid(inference, "corrected")
+    sim = Simulator(Scene(shapes, bodies, np.zeros(3), 1.0), random_model("impulse"))
+    sim.run(steps=3)
+    assert sim.memory.counts["pairs"] == 0 and (sim.state.position[1] == 0).all()

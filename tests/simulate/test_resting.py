@@ -1,0 +1,65 @@
+"""What solve and network must hold: what is dropped comes to rest and stays there, and a tower stands."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sdfsim import Simulator, load_shape
+from sdfsim.scene.scene import Body, Scene
+from sdfsim.shape.make import analytic_shape
+
+EARTH = np.array([0.0, 0.0, -9.81])
+DROP = 0.1  # m, for bodies of a metre
+SETTLED = 6.0  # s, after which they are to stay where they are for SECONDS
+SECONDS = 5.0
+
+
+def body(name: str, shape: int, position, motion: str = "dynamic") -> Body:
+    return Body(
+        name, shape, motion, position=np.asarray(position, dtype=float), quat_xyzw=np.array([0.0, 0.0, 0.0, 1.0]),
+        velocity=np.zeros(3), angular_velocity=np.zeros(3), scale=1.0, friction=0.5, restitution=0.5,
+        mass=1.0 if motion == "dynamic" else 0.0,
+    )  # fmt: skip
+
+
+def on_floor(shape, heights) -> Scene:
+    bodies = [body("floor", 0, [0, 0, 0], "static"), *(body(str(k), 1, [0, 0, z]) for k, z in enumerate(heights))]
+    return Scene((analytic_shape("plane"), shape), tuple(bodies), gravity=EARTH, duration=1.0)
+
+
+SHAPES = {
+    "box": lambda: analytic_shape("box", size=(1.0, 1.0, 1.0)),
+    "sphere": lambda: analytic_shape("sphere", radius=0.5),
+    "can": lambda: load_shape(Path(__file__).parents[2] / "samples" / "shapes" / "can"),
+}
+
+
+def creep(model: str, name: str, drop: float) -> float:
+    """How far the shape goes in SECONDS once it should rest, over its size, when dropped from `drop` times DROP."""
+    shape = SHAPES[name]()
+    size = np.ptp(shape.nodes, axis=0).max()
+    lowest = (shape.nodes - shape.com)[:, 2].min()
+    rollout = Simulator(on_floor(shape, [drop * DROP * size - lowest]), model).run(seconds=SETTLED + SECONDS)
+    after = rollout.position[rollout.time >= SETTLED][:, 1]
+    return float(np.linalg.norm(after - after[0], axis=1).max() / size)
+
+
+@pytest.mark.parametrize("name", ["box", "can"])
+@pytest.mark.parametrize(("model", "most"), [("solver", 1e-12), pytest.param("small", 0.03, marks=pytest.mark.slow)])
+def test_what_falls_ten_centimetres_comes_to_rest_and_stays(model, most, name):
+    """2.2 % for the can with `small`: a network alone does not know that what lies stays."""
+    assert creep(model, name, 1.0) < most
+
+
+@pytest.mark.parametrize(("model", "most"), [("solver", 1e-12), pytest.param("small", 0.002, marks=pytest.mark.slow)])
+def test_a_sphere_comes_to_rest_and_stays_too(model, most):
+    """From whichever height, since a sphere that was once set rolling rolls on."""
+    assert max(creep(model, "sphere", drop) for drop in (1.0, 1.02, 1.03)) < most
+
+
+@pytest.mark.parametrize(("model", "most"), [("solver", 0.001), ("small", 0.1)])
+def test_a_tower_of_three_boxes_stands_three_seconds(model, most):
+    rollout = Simulator(on_floor(SHAPES["box"](), [0.5, 1.5, 2.5]), model).run(seconds=3.0)
+    moved = np.linalg.norm(rollout.position[:, 1:] - rollout.position[0, 1:], axis=2)
+    assert moved.max() < most

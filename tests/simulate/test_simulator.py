@@ -1,0 +1,70 @@
+"""What a `Simulator` takes from its caller, and what it refuses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from sdfsim import SdfsimError, Simulator
+from sdfsim.scene.scene import Scene
+from sdfsim.simulate.simulator import SimulationError
+from tests.scenes import make_body, random_model
+
+
+def test_a_run_takes_the_steps_that_its_time_is(free_pair):
+    simulator = Simulator(free_pair, model=random_model("impulse"))
+    step = simulator.dt
+    for seconds, steps in ((0, 0), (0.1 * step, 1), (2.4 * step, 2), (2.6 * step, 3)):
+        assert len(simulator.run(seconds=seconds)) == steps
+    for seconds in (-1.0, -1e-9, float("nan"), float("inf")):
+        with pytest.raises(SdfsimError, match="seconds: must be >= 0"):
+            simulator.run(seconds=seconds)
+    assert simulator.steps_done == 6
+
+
+@pytest.mark.parametrize("motion", ["dynamic", "static"])
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_a_body_of_an_absurd_size_is_the_one_that_is_named(box_shape, motion, place):
+    bodies = [make_body(name, 0, [9.0 * k, 0, 0]) for k, name in enumerate(("one", "two", "three"))]
+    bodies[place] = replace(bodies[place], scale=1e10, motion=motion)
+    with pytest.raises(SdfsimError, match=f"^body {bodies[place].name!r}: 1e[+]10 m wide"):
+        Simulator(Scene((box_shape,), tuple(bodies), np.array([0.0, 0.0, -9.81]), 1.0), random_model("impulse"))
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1e9])
+def test_of_two_bodies_the_less_ordinary_size_is_named(box_shape, scale):
+    bodies = make_body("usual", 0, [0, 0, 0]), make_body("absurd", 0, [9, 0, 0], scale=scale)
+    with pytest.raises(SdfsimError, match=r"^body 'absurd': .* beside body 'usual' of 1 m "):
+        Simulator(Scene((box_shape,), bodies, np.zeros(3), 1.0), random_model("impulse"))
+    alone = Simulator(
+        Scene((box_shape,), (replace(bodies[1], position=np.zeros(3)),), np.zeros(3), 1.0), random_model("impulse")
+    )
+    assert alone.units.length == pytest.approx(scale)
+
+
+WAYS = {
+    "initial_rollout": lambda simulator: simulator.initial_rollout(),
+    "no steps": lambda simulator: simulator.run(steps=0),
+    "run": lambda simulator: simulator.run(steps=1),
+    "steps": lambda simulator: next(simulator.steps(1)),
+    "frames": lambda simulator: next(simulator.frames(1)),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("name", ["position", "velocity", "time"])
+def test_a_state_of_the_caller_that_is_no_number_is_refused_in_every_way(free_pair, way, name):
+    simulator = Simulator(free_pair, model=random_model("impulse"))
+    good = simulator.state
+    if name == "time":
+        broken, told = float("nan"), "time is not finite"
+    else:
+        broken, told = getattr(good, name).clone(), f"body 'right': {name} is not finite"
+        broken[1, 2] = torch.nan
+    simulator.state = replace(good, **{name: broken})
+    with pytest.raises(SimulationError, match=f"step 1: {told}"):
+        WAYS[way](simulator)
+    assert simulator.state is good
