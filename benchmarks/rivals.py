@@ -48,7 +48,7 @@ from sdfsim.files import read_arrays, write_arrays, write_text
 from sdfsim.scene.scene import Effects, Scene
 from sdfsim.scene.scene_file import load_scene
 from sdfsim.shape.mesh import Mesh, clean, load_pieces, wavefront
-from sdfsim.shape.sdf import BoxSdf, PlaneSdf, SphereSdf
+from sdfsim.shape.sdf import ClosedForm
 from sdfsim.shape.shape import analytic_shape, mesh_shape, own_pieces, shape_from_mesh
 
 ENGINES: dict[str, Engine | None] = {
@@ -190,10 +190,10 @@ SHAPES = ["MOVi-B", *(case for case in CASES if case not in LARGE)]
 
 
 def in_pieces(scene: Scene, folder: Path) -> Scene:
-    """The scene with convex pieces for every shape but spheres and boxes, kept in a folder."""
+    """The scene with convex pieces for every shape but closed forms, kept in a folder."""
     shapes = []
     for shape in scene.shapes:
-        if not isinstance(shape.sdf, SphereSdf | BoxSdf | PlaneSdf) and not own_pieces(shape):
+        if not isinstance(shape.sdf, ClosedForm) and not own_pieces(shape):
             file = folder / f"{shape.mesh.digest()[:16]}.obj"
             if not file.exists():
                 write_text(file, wavefront(convex_pieces(shape)))

@@ -23,7 +23,7 @@ from sdfsim.dynamics.bodies import largest_extent
 from sdfsim.dynamics.model import Model
 from sdfsim.dynamics.rollout import Rollout
 from sdfsim.errors import SdfsimError
-from sdfsim.evaluation.everyday import KINDS, ROWS, SIZES, Setting, failures
+from sdfsim.evaluation.everyday import KINDS, ROWS, SIZES, Setting, failures, solved
 from sdfsim.evaluation.metrics import energy
 from sdfsim.evaluation.penetration import depths
 from sdfsim.files import visible
@@ -660,7 +660,7 @@ def _of_kind(kind: str) -> Setting:
 
 
 def _everyday(row: str, settings: Sequence[Setting], model: Model) -> dict[str, float]:
-    return failures(row, [replace(at, model=model) for at in settings])
+    return failures(row, [replace(at, by=partial(solved, model=model)) for at in settings])
 
 
 def _meshes(folder: Path) -> dict[str, Shape]:

@@ -29,7 +29,7 @@ from sdfsim.recording import save_rollout
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.sdf import PlaneSdf
 
-VERSION = 4  # counts up when what is measured changes, so that kept results are measured again
+VERSION = 5  # counts up when what is measured changes, so that kept results are measured again
 TEACHER = "teacher"
 ENGINES = {TEACHER: bullet, "MuJoCo": mujoco, "Drake": drake}
 OUTSIDE = "†"
