@@ -4,8 +4,8 @@
 
 The scenes and checks are those of `python -m sdfsim.evaluation.everyday` at 10 cm, of closed forms where a shape has
 one. Engines take inner steps of 4 ms (of bodies of a metre; smaller ones in proportion to the root of their size), ours
-its default, which is the same. Closed forms and boxes are native to each engine; meshes are given as their convex
-parts, or as pieces of CoACD's where these are not convex. Engines do not sleep. What an engine cannot express, or takes
+its default, which is the same. Closed forms and boxes are native to each engine; meshes that are not convex
+are given in pieces of CoACD's. Engines do not sleep. What an engine cannot express, or takes
 longer than a minute for, is not run, and no check of it counts. DIR keeps results.
 """
 
@@ -40,9 +40,8 @@ from sdfsim.evaluation.everyday import ROWS, Check, Runner, Setting, checks, sol
 from sdfsim.evaluation.harness import Job, Results, markdown, measure, one_thread
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.convex_pieces import convex_vertices
-from sdfsim.shape.mesh import Mesh, components
 from sdfsim.shape.sdf import ClosedForm
-from sdfsim.shape.shape import Shape, own_pieces
+from sdfsim.shape.shape import own_pieces
 
 OURS, DRAKE = "sdfsim", "Drake"
 ENGINES: dict[str, tuple[str, Engine | None]] = {  # their package, and how they run
@@ -117,26 +116,16 @@ def unknown_to(name: str, scene: Scene) -> str:
 
 
 def in_parts(scene: Scene, folder: Path) -> Scene:
-    """The scene with convex pieces for shapes without a closed form: their connected parts where these are convex,
-    else those that `in_pieces` finds, kept in a folder."""
+    """The scene with convex pieces for shapes without a closed form: their own vertices where they are convex, else
+    those that `in_pieces` finds, kept in a folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    shapes = tuple(replace(s, pieces=convex_parts(s)) if not is_known(s) else s for s in scene.shapes)
-    return in_pieces(replace(scene, shapes=shapes), folder)
-
-
-def is_known(shape: Shape) -> bool:
-    return isinstance(shape.sdf, ClosedForm) or bool(own_pieces(shape))
-
-
-def convex_parts(shape: Shape) -> tuple[np.ndarray, ...]:
-    """Vertices [V, 3] m of the connected parts of a mesh; none where one is not convex."""
-    part = components(shape.mesh.faces)
-    parts = []
-    for k in np.unique(part):
-        faces = shape.mesh.faces[part == k]
-        used, numbered = np.unique(faces, return_inverse=True)
-        parts.append(convex_vertices(Mesh(shape.mesh.vertices[used], numbered.reshape(faces.shape))))
-    return tuple(parts) if all(len(vertices) for vertices in parts) else ()
+    shapes = []
+    for shape in scene.shapes:
+        if not isinstance(shape.sdf, ClosedForm) and not own_pieces(shape):
+            whole = convex_vertices(shape.mesh)
+            shape = replace(shape, pieces=(whole,) if len(whole) else ())
+        shapes.append(shape)
+    return in_pieces(replace(scene, shapes=tuple(shapes)), folder)
 
 
 def still(scene: Scene, seconds: float) -> Rollout:
@@ -157,8 +146,9 @@ def judged(row: str, at: Setting, run: Runner) -> Iterator[tuple[str, Check, str
     def watched(scene: Scene, seconds: float) -> tuple[Rollout, str]:
         nonlocal seen
         if seen:  # a check is of the scenes that were run since the checks before it
-            absent.clear(), broken.clear()
             seen = False
+            absent.clear()
+            broken.clear()
         try:
             rollout, broke = run(scene, seconds)
         except NotRun as error:
@@ -194,15 +184,17 @@ def is_installed(name: str) -> bool:
 
 
 def share(result: dict[str, Any] | None) -> float:
-    """The part of the checks that hold; NaN where none was run."""
-    run = len(result["held"]) + len(result["missed"]) if result and "held" in result else 0
-    return len(result["held"]) / run if result and run else np.nan
+    """The part of the checks that hold, of a row that failed none; NaN where no scene was run."""
+    if result is None:
+        return np.nan
+    held, run = len(result.get("held", ())), len(result.get("held", ())) + len(result.get("missed", ()))
+    return 0.0 if "failed" in result else held / run if run else np.nan
 
 
 def behind(results: Results, row: str) -> float:
     """By how much of the checks ours is behind the best other engine in a row; below 0 where it is ahead."""
-    others = [share(results.get((row, name))) for name in ENGINES if name != OURS]
-    return float(np.nanmax([*others, 0.0])) - share(results[row, OURS])
+    ours, *others = (share(results.get((row, name))) for name in ENGINES)
+    return float(np.nanmax([*others, 0.0]) - ours)
 
 
 def cell(result: dict[str, Any] | None) -> str:

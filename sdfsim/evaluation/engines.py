@@ -163,11 +163,19 @@ def motion_rollout(scene: Scene, motion: Trajectory, units: Units = SI) -> Rollo
     for k, plane in zip(np.flatnonzero(~solid), planes, strict=True):
         arrays["position"][:, k], arrays["quat_xyzw"][:, k] = plane.position, plane.quat_xyzw
         arrays["position"][:, solid, 2] += plane.position[2]
-    dt, none = float(motion.dt) * units.time, np.zeros(steps, np.int64)
-    places = (arrays[name] for name in MOTION)
-    contacts = none, np.zeros((0, 3)), np.zeros((0, 2), np.int64)
-    names = tuple(b.name for b in scene.bodies)
-    return Rollout(dt * np.arange(steps), *places, *contacts, names=names, meta={"dt": dt})
+    dt = float(motion.dt) * units.time
+    return Rollout(
+        time=dt * np.arange(steps),
+        position=arrays["position"],
+        orientation=arrays["quat_xyzw"],
+        velocity=arrays["velocity"],
+        angular_velocity=arrays["angular_velocity"],
+        contact_count=np.zeros(steps, np.int64),
+        contact_point=np.zeros((0, 3)),
+        contact_body=np.zeros((0, 2), np.int64),
+        names=tuple(b.name for b in scene.bodies),
+        meta={"dt": dt},
+    )
 
 
 def _solid(scene: Scene) -> np.ndarray:
@@ -507,17 +515,15 @@ def shape_urdf(shape: Shape, folder: Path) -> Path:
     Raises:
         SdfsimError: the shape's mesh cannot be cut into convex pieces.
     """
-    sdf, sizes = shape.sdf, {}
-    if isinstance(sdf, BoxSdf):
-        sizes = {"size": " ".join(f"{2.0 * half:.9g}" for half in sdf.half)}
-    elif isinstance(sdf, SphereSdf | CylinderSdf | CapsuleSdf):
-        sizes = {"radius": f"{sdf.radius:.9g}"}
-        if not isinstance(sdf, SphereSdf):
-            sizes["length"] = f"{2.0 * sdf.half:.9g}"
-    if sizes:
-        urdf = folder / f"{sdf.KIND}-{' '.join(sizes.values()).replace(' ', '-')}.urdf"
+    sdf = shape.sdf
+    if isinstance(sdf, SphereSdf | BoxSdf | CylinderSdf | CapsuleSdf):
+        sizes = {"size": [2.0 * half for half in sdf.half]} if isinstance(sdf, BoxSdf) else {"radius": [sdf.radius]}
+        if isinstance(sdf, CylinderSdf | CapsuleSdf):
+            sizes["length"] = [2.0 * sdf.half]
+        told = {name: " ".join(f"{value:.9g}" for value in values) for name, values in sizes.items()}
+        urdf = folder / f"{sdf.KIND}-{'-'.join(told.values()).replace(' ', '-')}.urdf"
         folder.mkdir(parents=True, exist_ok=True)
-        attributes = " ".join(f'{name}="{value}"' for name, value in sizes.items())
+        attributes = " ".join(f'{name}="{value}"' for name, value in told.items())
         return urdf if urdf.exists() else write_urdf(f"<{sdf.KIND} {attributes}/>", urdf)
     urdf = folder / f"pieces-{shape.mesh.digest()[:16]}.urdf"
     if not urdf.exists():
