@@ -34,7 +34,7 @@ from sdfsim.dynamics.rollout import Rollout, join
 from sdfsim.dynamics.simulator import Simulator
 from sdfsim.dynamics.units import scene_units
 from sdfsim.errors import SdfsimError
-from sdfsim.evaluation import engines
+from sdfsim.evaluation import engines, everyday
 from sdfsim.evaluation.engines import LONGEST, Engine, NotInstalled, TooSlow, motion_rollout, start_of_scene
 from sdfsim.evaluation.everyday import ROWS, Check, Runner, Setting, checks, solved
 from sdfsim.evaluation.harness import Job, Results, markdown, measure, one_thread
@@ -234,9 +234,10 @@ def table(results: Results) -> str:
 
 def compared(rows: list[str], at: Setting, out: Path) -> Results:
     """Every installed engine's results of rows."""
-    content = [at.full, str(at), USUAL, LONGEST]
+    content = [at.full, str(at), USUAL, LONGEST, inspect.getsource(everyday)]
+    how = {name: inspect.getsource(engines) if name != OURS else "" for name in ENGINES}
     jobs = [
-        Job(row, name, [content, inspect.getsource(ROWS[row])], counted, (row, at, name, out / "scenes"))
+        Job(row, name, [content, how[name]], counted, (row, at, name, out / "scenes"))
         for name in ENGINES
         if is_installed(name)
         for row in rows
@@ -244,7 +245,7 @@ def compared(rows: list[str], at: Setting, out: Path) -> Results:
     return measure(jobs, out / "results", on_progress=told)
 
 
-def everyday(*, out: Path, full: bool = False) -> None:
+def scenes(*, out: Path, full: bool = False) -> None:
     """Everyday scenes with every engine that is installed."""
     results = compared(list(ROWS), Setting(full=full), out)
     for name in ENGINES:
@@ -254,4 +255,4 @@ def everyday(*, out: Path, full: bool = False) -> None:
 
 
 if __name__ == "__main__":
-    script(__doc__, everyday)
+    script(__doc__, scenes)

@@ -36,7 +36,7 @@ from sdfsim.shape.sdf import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, SphereSd
 from sdfsim.shape.shape import Shape, own_pieces
 
 SAME_INERTIA = 1e-3  # relative
-SOFTEST = 3.0  # MuJoCo: time constant of a contact over the engine's step, at least 2 for it to be stable
+SOFTEST = 3.0  # MuJoCo: time in which a contact swings over 2 pi, in steps of the engine; it is stable from 2 on
 MODULUS = 1e7  # Pa, of Drake's compliant bodies: its own default
 TETRAHEDRA = 0.05  # their edges over the diagonal of a shape's box
 ITERATIONS = 10  # of Newton's XPBD in an inner step
@@ -233,7 +233,7 @@ def mujoco(
     contacts are soft: the restitution wanted is that of a damped spring.
 
     Raises:
-        SdfsimError: MuJoCo is not installed, or a shape's engine file cannot be read.
+        SdfsimError: MuJoCo is not installed, a shape's engine file cannot be read, or the motion is unstable.
     """
     engine = engine_module("mujoco", "MuJoCo", "bench")
     t, step, spec = start.motion, start.motion.dt / substeps, engine.MjSpec()
@@ -273,8 +273,8 @@ def mujoco(
                 geom.priority = int(t.static[i])
                 geom.condim, geom.friction[0] = 3, t.friction[i] * other[0]
                 bounce = float(np.clip(t.restitution[i] * other[1], 1e-3, 1.0))
-                damping = -np.log(bounce) / np.hypot(np.pi, np.log(bounce))
-                geom.solref = [SOFTEST * step, max(damping, 1e-3)]
+                damping = max(-np.log(bounce) / np.hypot(np.pi, np.log(bounce)), 1e-3)
+                geom.solref = [SOFTEST * step / damping, damping]  # its frequency is one over their product
     model = spec.compile()
     data: Any = engine.MjData(model)
     moving = np.flatnonzero(~t.static)
@@ -287,7 +287,16 @@ def mujoco(
         quat = np.roll(place[:, 3:], -1, axis=-1)
         return place[:, :3].copy(), quat, speed[:, :3].copy(), Rotation.from_quat(quat).apply(speed[:, 3:])
 
-    return _motion(t, steps, lambda: engine.mj_step(model, data, substeps), state)
+    engine.set_mju_user_warning(lambda message: None)  # it would write them to a file where it runs
+    kinds = engine.mjtWarning
+    unstable = [data.warning[int(kind)] for kind in (kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC)]
+
+    def advance() -> None:
+        engine.mj_step(model, data, substeps)
+        if any(warning.number for warning in unstable):
+            raise SdfsimError("MuJoCo found the motion unstable, and put it back to its start")
+
+    return _motion(t, steps, advance, state)
 
 
 def engine_module(module: str, title: str, extra: str) -> Any:
