@@ -14,13 +14,26 @@ pytest.importorskip("pybullet")
 pytest.importorskip("mujoco")
 
 from benchmarks import everyday as bench
-from benchmarks.everyday import ENGINES, OURS, NotRun, counted, in_parts, judged, moved, runner, table, unknown_to
+from benchmarks.everyday import (
+    ENGINES,
+    OURS,
+    NotRun,
+    counted,
+    in_parts,
+    is_installed,
+    judged,
+    moved,
+    runner,
+    table,
+    unknown_to,
+)
 from sdfsim.errors import SdfsimError
 from sdfsim.evaluation import engines, everyday
 from sdfsim.evaluation.everyday import UNIT, Check, G, Put, Setting, about, fixed, floor, of_mesh, run, solid
 from sdfsim.scene.scene import Scene
 
 FAST = ["PyBullet", "MuJoCo"]
+INSTALLED = [name for name in ENGINES if name != OURS and is_installed(name)]
 CUBE, BALL = solid("analytic", "box", 1, 1, 1), solid("analytic", "ball", 0.5)
 
 
@@ -36,7 +49,7 @@ def scene_of(*bodies: Put) -> Scene:
     return seen[0]
 
 
-@pytest.mark.parametrize("name", FAST)
+@pytest.mark.parametrize("name", INSTALLED)
 @pytest.mark.parametrize(("size", "yaw"), [(0.1, 0.0), (0.02, 37.0), (1.0, 121.0)])
 def test_a_thrown_body_flies_and_turns(tmp_path, name, size, yaw):
     put = Put("it", CUBE, [1, 2, 50], v=[1, 0, 2], w=[0, 0, 3])
@@ -53,7 +66,7 @@ def test_a_thrown_body_flies_and_turns(tmp_path, name, size, yaw):
     assert not ran.verdict.broken
 
 
-@pytest.mark.parametrize("name", FAST)
+@pytest.mark.parametrize("name", INSTALLED)
 @pytest.mark.parametrize("ground", [floor(), fixed("box", solid("analytic", "box", 40, 20, 1), [0, 0, -0.5])])
 @pytest.mark.parametrize("mu", [0.3, 0.5])
 def test_friction_is_the_product_on_floors_and_on_static_bodies(tmp_path, name, ground, mu):
