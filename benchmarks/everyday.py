@@ -183,18 +183,17 @@ def is_installed(name: str) -> bool:
 # --- the table ---
 
 
-def share(result: dict[str, Any] | None) -> float:
-    """The part of the checks that hold, of a row that failed none; NaN where no scene was run."""
-    if result is None:
-        return np.nan
-    held, run = len(result.get("held", ())), len(result.get("held", ())) + len(result.get("missed", ()))
-    return 0.0 if "failed" in result else held / run if run else np.nan
+def held_by(results: Results, row: str, check: str) -> list[str]:
+    """The other engines that hold a check."""
+    return [n for n in ENGINES if n != OURS and check in results.get((row, n), {}).get("held", ())]
 
 
-def behind(results: Results, row: str) -> float:
-    """By how much of the checks ours is behind the best other engine in a row; below 0 where it is ahead."""
-    ours, *others = (share(results.get((row, name))) for name in ENGINES)
-    return float(np.nanmax([*others, 0.0]) - ours)
+def losses(results: Results, row: str) -> tuple[float, float]:
+    """How many checks ours misses in a row that another engine holds, and how many it misses."""
+    ours = results[row, OURS]
+    if "failed" in ours:
+        return np.inf, np.inf
+    return sum(bool(held_by(results, row, check)) for check in ours["missed"]), len(ours["missed"])
 
 
 def cell(result: dict[str, Any] | None) -> str:
@@ -208,9 +207,10 @@ def cell(result: dict[str, Any] | None) -> str:
 
 
 def table(results: Results) -> str:
-    """A row a kind of scene, those first in which ours is most behind; what ours misses and others do not; and what was
+    """A row a kind of scene, those first in which ours misses most of what others hold; what ours misses, and what was
     not run."""
-    rows = sorted({row for row, _ in results}, key=lambda row: (-behind(results, row), list(ROWS).index(row)))
+    there = [row for row in ROWS if (row, OURS) in results]
+    rows = sorted(there, key=lambda row: losses(results, row), reverse=True)
     lines = [("checks that hold, of those run", *ENGINES)]
     lines += [(f"`{row}`", *(cell(results.get((row, name))) for name in ENGINES)) for row in rows]
     sums: dict[str, dict[str, Any]] = {}
@@ -222,9 +222,10 @@ def table(results: Results) -> str:
     lines.append(("all", *(cell(sums.get(name)) for name in ENGINES)))
     parts = [markdown(lines)]
     lost = []
-    for check in sums[OURS]["missed"]:
-        by = [name for name in sums if name != OURS and check in sums[name]["held"]]
-        lost.append(f"- {check.rpartition(' [')[0]}: {'held by ' + ', '.join(by) if by else 'missed by all'}")
+    for row in rows:
+        for check in results[row, OURS].get("missed", ()):
+            by = held_by(results, row, check)
+            lost.append(f"- {check.rpartition(' [')[0]}: held by {', '.join(by) or 'none'}")
     parts.append("\n".join(["What ours misses:", "", *(lost or ["- nothing"])]) + "\n")
     absent = [f"- {name}: {why}, {n} checks" for name, one in sums.items() for why, n in one["not_run"].items()]
     if absent:

@@ -207,6 +207,8 @@ def test_the_table_has_our_losses_first_and_tells_what_is_absent():
     results = {
         ("slender", OURS): found(["x"], []),
         ("slender", "PyBullet"): found([], ["x"]),
+        ("heaps", OURS): found(["z"], ["w"]),
+        ("heaps", "PyBullet"): found(["z"], ["w"]),
         ("edges", OURS): found([a], [b, c]),
         ("edges", "PyBullet"): found([a, b], [c], slow=2),
         ("slabs", OURS): {"failed": "no memory"},
@@ -214,10 +216,10 @@ def test_the_table_has_our_losses_first_and_tells_what_is_absent():
     }
     lines = table(results).splitlines()
     rows = [line.split("|")[1].strip() for line in lines if line.startswith("| `")]
-    assert rows == ["`slabs`", "`edges`", "`slender`"]
+    assert rows == ["`slabs`", "`edges`", "`heaps`", "`slender`"]
     assert "| `edges` | 1 / 3 | 2 / 3, 2 not run | not installed here | not installed here |" in lines
-    assert "| all | 2 / 4 | 3 / 5, 2 not run | not installed here | not installed here |" in lines
-    assert "- edges: b: held by PyBullet" in lines and "- edges: c: missed by all" in lines
+    assert "| all | 3 / 6 | 4 / 7, 2 not run | not installed here | not installed here |" in lines
+    assert "- edges: b: held by PyBullet" in lines and "- edges: c: held by none" in lines
     assert "- PyBullet: slow, 2 checks" in lines
 
 
