@@ -47,7 +47,7 @@ from sdfsim.physics.bodies import largest_extent
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Effects, Scene
-from sdfsim.sdf.closed_forms import BoxSdf, PlaneSdf, SphereSdf
+from sdfsim.sdf.closed_forms import ClosedForm
 from sdfsim.shape.make import analytic_shape, mesh_shape, shape_from_mesh
 from sdfsim.shape.shape import own_pieces
 from sdfsim.simulate.simulator import Simulator
@@ -191,10 +191,10 @@ SHAPES = ["MOVi-B", *(case for case in CASES if case not in LARGE)]
 
 
 def in_pieces(scene: Scene, folder: Path) -> Scene:
-    """The scene with convex pieces for every shape but spheres and boxes, kept in a folder."""
+    """The scene with convex pieces for every shape but closed forms, kept in a folder."""
     shapes = []
     for shape in scene.shapes:
-        if not isinstance(shape.sdf, SphereSdf | BoxSdf | PlaneSdf) and not own_pieces(shape):
+        if not isinstance(shape.sdf, ClosedForm) and not own_pieces(shape):
             file = folder / f"{shape.mesh.digest()[:16]}.obj"
             if not file.exists():
                 write_text(file, wavefront(convex_pieces(shape)))

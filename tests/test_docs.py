@@ -121,6 +121,12 @@ def test_what_far_scenery_costs_is_the_same_everywhere():
         assert told and numbers(told[1]) == [round(max(ratios))]
 
 
+def test_how_many_everyday_checks_hold_is_the_same_everywhere():
+    held = cells(section("everyday", page("benchmarks/RESULTS.md")), "all")[0]
+    told = re.search(r"(\d+) of (\d+) checks hold", page("docs/stability.md"))
+    assert told and held == f"{told[1]} / {told[2]}"
+
+
 def test_errors_of_reconstructions_name_one_direction():
     """*standard* has the same figures, for the same direction, on both pages."""
     results, photos = page("benchmarks/RESULTS.md"), page("docs/photos.md")

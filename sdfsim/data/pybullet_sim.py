@@ -121,8 +121,9 @@ class Teacher:
     def add(self, body: TeacherBody, position: Vector = FAR, quat: Vector = UNTURNED) -> int:
         """Add a body with its centre of mass at `position` [3] m, orientation `quat` [4] xyzw; returns its index."""
         # Far away first and moved then: the engine's order of pairs depends on it.
-        flags = {"basePosition": FAR, "globalScaling": body.scale, "useFixedBase": int(body.mass == 0)}
-        handle = self._call("loadURDF", str(body.urdf), **flags, **MAXIMAL)
+        given = {"basePosition": FAR, "globalScaling": body.scale, "useFixedBase": int(body.mass == 0)}
+        # Cylinders are round, and not prisms of 32 sides.
+        handle = self._call("loadURDF", str(body.urdf), flags=self.pb.URDF_USE_IMPLICIT_CYLINDER, **given, **MAXIMAL)
         surface = {"lateralFriction": body.friction, "restitution": body.restitution}
         self._call("changeDynamics", handle, -1, mass=body.mass, **surface, **BODY_SETTINGS)
         self.bodies.append(handle)

@@ -1,7 +1,8 @@
 """PyBullet (the teacher), MuJoCo, Drake and Newton, run from one start: of a recording, or of a scene.
 
 Each takes the geometry that it is made for: PyBullet and MuJoCo convex pieces, MuJoCo also a mesh as an SDF (its own
-octree), Drake tetrahedra and Newton triangles. Spheres and boxes are exact in all of them.
+octree), Drake tetrahedra and Newton triangles. Spheres and boxes are exact in all of them, and so are cylinders and
+capsules but in Newton.
 """
 
 from __future__ import annotations
@@ -30,18 +31,26 @@ from sdfsim.geometry.mesh import Mesh, load_pieces, wavefront
 from sdfsim.physics.bodies import Units, from_scene
 from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.scene import Scene
-from sdfsim.sdf.closed_forms import BoxSdf, PlaneSdf, SphereSdf
+from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.shape import Shape, own_pieces
 from sdfsim.simulate.simulator import Simulator, join
 
 SAME_INERTIA = 1e-3  # relative
-SOFTEST = 3.0  # MuJoCo: time constant of a contact over the engine's step, at least 2 for it to be stable
+SOFTEST = 3.0  # MuJoCo: time in which a contact swings over 2 pi, in steps of the engine; it is stable from 2 on
 MODULUS = 1e7  # Pa, of Drake's compliant bodies: its own default
 TETRAHEDRA = 0.05  # their edges over the diagonal of a shape's box
 ITERATIONS = 10  # of Newton's XPBD in an inner step
 LONGEST = 60.0  # s of the processor that an engine may take for a motion
 
 SI = Units(1.0, 1.0, 1.0)
+
+
+class NotInstalled(SdfsimError):
+    """An engine, or a package that it needs for a shape, is not installed."""
+
+
+class TooSlow(SdfsimError):
+    """An engine that was stopped because a motion took longer than `LONGEST`."""
 
 
 @dataclass(frozen=True)
@@ -143,6 +152,32 @@ def rollout_motion(scene: Scene, rollout: Rollout) -> Trajectory:
     return replace(start_motion(scene), **found, dt=float(rollout.meta["dt"]))
 
 
+def motion_rollout(scene: Scene, motion: Trajectory, units: Units = SI) -> Rollout:
+    """An engine's motion from a `start_of_scene` in `units` as a rollout of the scene in SI units, without contacts."""
+    steps, solid = len(motion.position), _solid(scene)
+    arrays = {name: np.zeros((steps, len(solid), 4 if name == "quat_xyzw" else 3)) for name in MOTION}
+    planes = [b for b in scene.bodies if isinstance(scene.shapes[b.shape].sdf, PlaneSdf)]
+    own = {"position": units.length, "velocity": units.velocity, "angular_velocity": 1.0 / units.time}
+    for name, values in arrays.items():
+        values[:, solid] = own.get(name, 1.0) * getattr(motion, name)
+    for k, plane in zip(np.flatnonzero(~solid), planes, strict=True):
+        arrays["position"][:, k], arrays["quat_xyzw"][:, k] = plane.position, plane.quat_xyzw
+        arrays["position"][:, solid, 2] += plane.position[2]
+    dt = float(motion.dt) * units.time
+    return Rollout(
+        time=dt * np.arange(steps),
+        position=arrays["position"],
+        orientation=arrays["quat_xyzw"],
+        velocity=arrays["velocity"],
+        angular_velocity=arrays["angular_velocity"],
+        contact_count=np.zeros(steps, np.int64),
+        contact_point=np.zeros((0, 3)),
+        contact_body=np.zeros((0, 2), np.int64),
+        names=tuple(b.name for b in scene.bodies),
+        meta={"dt": dt},
+    )
+
+
 def _solid(scene: Scene) -> np.ndarray:
     """[N] bool: which bodies are no planes."""
     return np.array([not isinstance(scene.shapes[b.shape].sdf, PlaneSdf) for b in scene.bodies])
@@ -186,23 +221,30 @@ def bullet(start: Start, steps: int, substeps: int | None = None) -> tuple[Traje
 # --- MuJoCo ---
 
 
-def mujoco(start: Start, steps: int, substeps: int = SUBSTEPS, *, pieces: bool = True) -> tuple[Trajectory, Timing]:
-    """MuJoCo's motion of the same masses, inertias and starts; of the same convex pieces, or of meshes as SDFs.
+def mujoco(
+    start: Start, steps: int, substeps: int = SUBSTEPS, *, pieces: bool = True, elliptic: bool = False
+) -> tuple[Trajectory, Timing]:
+    """MuJoCo's motion of the same masses, inertias and starts; of the same convex pieces, or of meshes as SDFs; with
+    its usual pyramid of friction, or with a cone.
 
     It takes the larger of two coefficients of friction where the teacher multiplies. So geoms that meet the floor carry
-    the product with the floor's, and those that meet other bodies carry their square: exact for bodies of one material.
-    Its contacts are soft: the restitution wanted is that of a damped spring.
+    the product with the floor's, and those that meet other bodies carry their square. Those of static bodies have the
+    say, and carry the product with the median body's: all exact where all bodies that move are of one material. Its
+    contacts are soft: the restitution wanted is that of a damped spring.
 
     Raises:
-        SdfsimError: MuJoCo is not installed, or a shape's engine file cannot be read.
+        SdfsimError: MuJoCo is not installed, a shape's engine file cannot be read, or the motion is unstable.
     """
     engine = engine_module("mujoco", "MuJoCo", "bench")
     t, step, spec = start.motion, start.motion.dt / substeps, engine.MjSpec()
     spec.option.timestep, spec.option.gravity = step, t.gravity
     spec.memory = 2**31
+    if elliptic:
+        spec.option.cone = engine.mjtCone.mjCONE_ELLIPTIC
     if start.floor:
         ground = spec.worldbody.add_geom(type=engine.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1.0])
         ground.contype, ground.conaffinity, ground.friction[0], ground.solmix = 0, 1, 0.0, 1e-6
+    usual = tuple(np.median(values[~t.static]) if (~t.static).any() else 1.0 for values in (t.friction, t.restitution))
     forms = {name: _forms(engine, urdf, None if pieces else start.meshes[name]) for name, urdf in start.urdfs.items()}
     for i, name in enumerate(t.shape):
         body = spec.worldbody.add_body(name=f"b{i}")
@@ -212,6 +254,7 @@ def mujoco(start: Start, steps: int, substeps: int = SUBSTEPS, *, pieces: bool =
             body.add_freejoint()
             body.explicitinertial = True
             body.mass, body.inertia, body.ipos = float(t.mass[i]), t.inertia[i], np.zeros(3)
+        met = usual if t.static[i] else (t.friction[i], t.restitution[i])
         for k, (kind, form) in enumerate(forms[str(name)]):
             shape: dict[str, Any] = {"type": kind}
             if not isinstance(form, dict):
@@ -222,15 +265,16 @@ def mujoco(start: Start, steps: int, substeps: int = SUBSTEPS, *, pieces: bool =
                     scaled = {"uservert": (form["uservert"] * t.scale[i]).ravel()}
                     spec.add_mesh(name=shape["meshname"], **form | scaled)
             # One geom that meets the floor, and one that meets bodies.
-            for kinds, other in (((1, 0), start.floor), ((2, 2), (t.friction[i], t.restitution[i]))):
+            for kinds, other in (((1, 0), start.floor), ((2, 2), met)):
                 if other is None:
                     continue
                 geom = body.add_geom(**shape)
                 geom.contype, geom.conaffinity = kinds
+                geom.priority = int(t.static[i])
                 geom.condim, geom.friction[0] = 3, t.friction[i] * other[0]
                 bounce = float(np.clip(t.restitution[i] * other[1], 1e-3, 1.0))
-                damping = -np.log(bounce) / np.hypot(np.pi, np.log(bounce))
-                geom.solref = [SOFTEST * step, max(damping, 1e-3)]
+                damping = max(-np.log(bounce) / np.hypot(np.pi, np.log(bounce)), 1e-3)
+                geom.solref = [SOFTEST * step / damping, damping]  # its frequency is one over their product
     model = spec.compile()
     data: Any = engine.MjData(model)
     moving = np.flatnonzero(~t.static)
@@ -243,15 +287,24 @@ def mujoco(start: Start, steps: int, substeps: int = SUBSTEPS, *, pieces: bool =
         quat = np.roll(place[:, 3:], -1, axis=-1)
         return place[:, :3].copy(), quat, speed[:, :3].copy(), Rotation.from_quat(quat).apply(speed[:, 3:])
 
-    return _motion(t, steps, lambda: engine.mj_step(model, data, substeps), state)
+    engine.set_mju_user_warning(lambda message: None)  # it would write them to a file where it runs
+    kinds = engine.mjtWarning
+    unstable = [data.warning[int(kind)] for kind in (kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC)]
+
+    def advance() -> None:
+        engine.mj_step(model, data, substeps)
+        if any(warning.number for warning in unstable):
+            raise SdfsimError("MuJoCo found the motion unstable, and put it back to its start")
+
+    return _motion(t, steps, advance, state)
 
 
 def engine_module(module: str, title: str, extra: str) -> Any:
-    """An optional package. Raises SdfsimError when it is not installed."""
+    """An optional package. Raises NotInstalled."""
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise SdfsimError(f"{title} is not installed", f"pip install 'sdfsim[{extra}]'") from error
+        raise NotInstalled(f"{title} is not installed", f"pip install 'sdfsim[{extra}]'") from error
 
 
 def _motion(
@@ -260,7 +313,7 @@ def _motion(
     """The motion of an engine of `steps` calls of `advance`, and its time.
 
     `state` gives positions [M, 3] m, quaternions [M, 4] xyzw and velocities [M, 3] m/s and rad/s of the bodies that
-    move, in the frame of the world. Raises SdfsimError where the motion is not finite, or takes longer than `LONGEST`.
+    move, in the frame of the world. Raises SdfsimError where the motion is not finite, and TooSlow.
     """
     began = time.process_time()
     frames = [state()]
@@ -272,7 +325,7 @@ def _motion(
             if not np.isfinite(frames[-1][0]).all():
                 raise SdfsimError(f"a position is not finite after {len(frames) - 1} steps")
             if time.process_time() - began > LONGEST:
-                raise SdfsimError(f"{len(frames) - 1} of {steps} steps in {LONGEST:g} s")
+                raise TooSlow(f"{len(frames) - 1} of {steps} steps in {LONGEST:g} s")
 
     timing = timed(advanced, steps)
     motion = {name: np.repeat(getattr(start, name)[:1], steps + 1, axis=0) for name in MOTION}
@@ -288,6 +341,9 @@ def _forms(engine: Any, urdf: Path, mesh: Mesh | None) -> list[tuple[Any, np.nda
         return [(engine.mjtGeom.mjGEOM_SPHERE, np.array([*sizes, 0.0, 0.0]))]
     if kind == "box":
         return [(engine.mjtGeom.mjGEOM_BOX, 0.5 * sizes)]
+    if kind in ("cylinder", "capsule"):
+        round_about = engine.mjtGeom.mjGEOM_CYLINDER if kind == "cylinder" else engine.mjtGeom.mjGEOM_CAPSULE
+        return [(round_about, np.array([sizes[0], 0.5 * sizes[1], 0.0]))]
     if mesh is not None:
         return [(engine.mjtGeom.mjGEOM_SDF, {"uservert": mesh.vertices, "userface": mesh.faces.ravel()})]
     pieces = load_pieces(urdf.with_suffix(".obj"))
@@ -301,7 +357,9 @@ def drake(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajector
     """Drake's motion with hydroelastic contact: bodies that move are compliant tetrahedra, others rigid triangles.
 
     It combines two coefficients of friction by their harmonic mean, where the teacher multiplies. So every body carries
-    its own square, and the floor what suits the median body: exact where all have one friction. Restitution is 0.
+    its own square (one that moves alone, its product with the roughest thing that it may meet), and floor and static
+    bodies what suits the median body: exact where all that move have one friction, of at least half of the others'.
+    Restitution is 0.
 
     Raises:
         SdfsimError: Drake or fTetWild are not installed, or the motion fails.
@@ -321,11 +379,16 @@ def drake(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajector
             lib.AddRigidHydroelasticProperties(0.25 * size, found)
         return found
 
-    own = t.friction**2
+    moving = ~t.static if (~t.static).any() else t.static
+    others = [*t.friction[t.static], *(start.floor or ())[:1]]
+    own = t.friction * (max(others, default=1.0) if (~t.static).sum() == 1 else t.friction)
+
+    def beside(friction: float) -> float:
+        wanted = friction * t.friction[moving]
+        return float(np.median(wanted * own[moving] / np.maximum(2.0 * own[moving] - wanted, 1e-3)))
+
     if start.floor:
-        wanted = start.floor[0] * t.friction
-        friction = float(np.median(wanted * own / np.maximum(2.0 * own - wanted, 1e-3)))
-        world = (plant.world_body(), lib.RigidTransform())
+        world, friction = (plant.world_body(), lib.RigidTransform()), beside(start.floor[0])
         plant.RegisterCollisionGeometry(*world, lib.HalfSpace(), "floor", surface(friction, False, 1.0))
     bodies = []
     with tempfile.TemporaryDirectory() as scratch:  # files are read when the simulator is made
@@ -339,9 +402,10 @@ def drake(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajector
                     write_text(file, _tetrahedra(mesh, start.urdfs[name]) if moves else wavefront([mesh]))
                 form, smallest = lib.Mesh(str(file), scale), np.ptp(mesh.vertices, axis=0).min()
             else:
-                form = lib.Sphere(scale * sizes[0]) if kind == "sphere" else lib.Box(*(scale * sizes))
-                smallest = sizes.min()
-            properties = surface(float(own[i]), moves, scale * float(smallest))
+                known = {"sphere": lib.Sphere, "box": lib.Box, "cylinder": lib.Cylinder, "capsule": lib.Capsule}
+                form, smallest = known[kind](*(scale * sizes)), sizes.min()
+            friction = float(own[i]) if moves else beside(float(t.friction[i]))
+            properties = surface(friction, moves, scale * float(smallest))
             if not moves:
                 plant.RegisterCollisionGeometry(plant.world_body(), place, form, f"g{i}", properties)
                 continue
@@ -455,19 +519,21 @@ def newton(start: Start, steps: int, substeps: int = SUBSTEPS) -> tuple[Trajecto
 
 
 def shape_urdf(shape: Shape, folder: Path) -> Path:
-    """The URDF of a shape, written into `folder` unless it is there: exact spheres and boxes, convex pieces of others.
+    """The URDF of a shape, written into `folder` unless it is there: exact closed forms, convex pieces of others.
 
     Raises:
         SdfsimError: the shape's mesh cannot be cut into convex pieces.
     """
     sdf = shape.sdf
-    if isinstance(sdf, SphereSdf | BoxSdf):
-        sphere = isinstance(sdf, SphereSdf)
-        sizes = " ".join(f"{s:.9g}" for s in ([sdf.radius] if sphere else [2.0 * half for half in sdf.half]))
-        geometry = f'<sphere radius="{sizes}"/>' if sphere else f'<box size="{sizes}"/>'
-        urdf = folder / f"{'sphere' if sphere else 'box'}-{sizes.replace(' ', '-')}.urdf"
+    if isinstance(sdf, SphereSdf | BoxSdf | CylinderSdf | CapsuleSdf):
+        sizes = {"size": [2.0 * half for half in sdf.half]} if isinstance(sdf, BoxSdf) else {"radius": [sdf.radius]}
+        if isinstance(sdf, CylinderSdf | CapsuleSdf):
+            sizes["length"] = [2.0 * sdf.half]
+        told = {name: " ".join(f"{value:.9g}" for value in values) for name, values in sizes.items()}
+        urdf = folder / f"{sdf.KIND}-{'-'.join(told.values()).replace(' ', '-')}.urdf"
         folder.mkdir(parents=True, exist_ok=True)
-        return urdf if urdf.exists() else write_urdf(geometry, urdf)
+        attributes = " ".join(f'{name}="{value}"' for name, value in told.items())
+        return urdf if urdf.exists() else write_urdf(f"<{sdf.KIND} {attributes}/>", urdf)
     urdf = folder / f"pieces-{shape.mesh.digest()[:16]}.urdf"
     if not urdf.exists():
         folder.mkdir(parents=True, exist_ok=True)
@@ -486,6 +552,10 @@ def dataset_urdf(data: Path, shape: str) -> Path:
 
 
 def form_of(urdf: Path) -> tuple[str, np.ndarray]:
-    """What a URDF of ours collides: "sphere" and its radius, "box" and its extents [3] m, or "mesh", its pieces."""
-    found = re.search(r'<(sphere|box) (?:radius|size)="([^"]*)"', urdf.read_text(encoding="utf-8"))
-    return (found[1], np.array(found[2].split(), dtype=float)) if found else ("mesh", np.zeros(0))
+    """What a URDF of ours collides: "sphere" and its radius, "box" and its extents [3] m, "cylinder" or "capsule", its
+    radius and the length of its straight side, or "mesh", its pieces."""
+    found = re.search(r"<(sphere|box|cylinder|capsule) ([^>]*)/>", urdf.read_text(encoding="utf-8"))
+    if found is None:
+        return "mesh", np.zeros(0)
+    sizes = " ".join(re.findall(r'"([^"]*)"', found[2]))
+    return found[1], np.array(sizes.split(), dtype=float)

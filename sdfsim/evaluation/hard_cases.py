@@ -21,7 +21,7 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import visible
 from sdfsim.data.dataset import Trajectory
 from sdfsim.data.scenarios import steady_faces
-from sdfsim.evaluation.everyday import KINDS, ROWS, SIZES, Setting, failures
+from sdfsim.evaluation.everyday import KINDS, ROWS, SIZES, Setting, failures, solved
 from sdfsim.evaluation.metrics import energy
 from sdfsim.evaluation.penetration import depths
 from sdfsim.geometry.mesh import MESH_SUFFIXES
@@ -661,7 +661,7 @@ def _of_kind(kind: str) -> Setting:
 
 
 def _everyday(row: str, settings: Sequence[Setting], model: Model) -> dict[str, float]:
-    return failures(row, [replace(at, model=model) for at in settings])
+    return failures(row, [replace(at, by=partial(solved, model=model)) for at in settings])
 
 
 def _meshes(folder: Path) -> dict[str, Shape]:

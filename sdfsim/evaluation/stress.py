@@ -30,7 +30,7 @@ from sdfsim.scene.scene import Scene
 from sdfsim.sdf.closed_forms import PlaneSdf
 from sdfsim.simulate.simulator import SimulationError, Simulator
 
-VERSION = 4  # counts up when what is measured changes, so that kept results are measured again
+VERSION = 5  # counts up when what is measured changes, so that kept results are measured again
 TEACHER = "teacher"
 ENGINES = {TEACHER: bullet, "MuJoCo": mujoco, "Drake": drake}
 OUTSIDE = "†"

@@ -1,0 +1,259 @@
+"""Everyday scenes with our solver and with other engines, held to the same checks: RESULTS.md.
+
+    python benchmarks/everyday.py -o DIR [--full]
+
+The scenes and checks are those of `python -m sdfsim.evaluation.everyday` at 10 cm, of closed forms where a shape has
+one. Engines take inner steps of 4 ms (of bodies of a metre; smaller ones in proportion to the root of their size), ours
+its default, which is the same. Closed forms are native to each engine; meshes that are not convex are given in pieces
+of CoACD's (tetrahedra in Drake). Engines do not sleep. What an engine cannot express, or takes longer than a minute
+for, is not run, and no check of it counts. DIR keeps results. All takes five minutes of a core.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.results import script, told, write_section
+from benchmarks.rivals import USUAL, in_pieces
+from sdfsim.base.errors import SdfsimError
+from sdfsim.data.pybullet_sim import DT
+from sdfsim.evaluation import engines, everyday
+from sdfsim.evaluation.engines import LONGEST, Engine, NotInstalled, TooSlow, motion_rollout, start_of_scene
+from sdfsim.evaluation.everyday import ROWS, Check, Runner, Setting, checks, solved
+from sdfsim.evaluation.harness import Job, Results, markdown, measure, one_thread
+from sdfsim.learned.model import SOLVER, load_model
+from sdfsim.physics.rollout import Rollout, join
+from sdfsim.physics.units import scene_units
+from sdfsim.scene.scene import Scene
+from sdfsim.sdf.closed_forms import ClosedForm
+from sdfsim.shape.convex_pieces import convex_vertices
+from sdfsim.shape.shape import own_pieces
+from sdfsim.simulate.simulator import Simulator
+
+OURS, DRAKE = "sdfsim", "Drake"
+ENGINES: dict[str, tuple[str, Engine | None]] = {  # their package, and how they run
+    OURS: ("sdfsim", None),
+    "PyBullet": ("pybullet", engines.bullet),
+    "MuJoCo": ("mujoco", partial(engines.mujoco, elliptic=True)),
+    DRAKE: ("pydrake", engines.drake),
+}
+
+
+class NotRun(SdfsimError):
+    """A scene that an engine cannot express, or takes too long for."""
+
+
+# --- running ---
+
+
+def runner(name: str, folder: Path) -> Runner:
+    """Who runs scenes with an engine, its files in `folder`. It raises NotRun, and tells of motions that broke."""
+
+    def timely(scene: Scene, seconds: float) -> tuple[Rollout, str]:
+        began = time.process_time()
+        try:
+            found = moved(name, scene, seconds, folder)
+        except TooSlow:
+            raise NotRun("too slow") from None
+        if time.process_time() - began > LONGEST:
+            raise NotRun("too slow")
+        return found
+
+    return timely
+
+
+def moved(name: str, scene: Scene, seconds: float, folder: Path) -> tuple[Rollout, str]:
+    """A scene's motion by an engine: see `Runner`. Raises NotRun and TooSlow."""
+    engine = ENGINES[name][1]
+    if engine is None:
+        return solved(scene, seconds)
+    if why := unknown_to(name, scene):
+        raise NotRun(why)
+    units = scene_units(scene, load_model(SOLVER))
+    try:
+        start = start_of_scene(in_parts(scene, folder / "pieces"), folder / "engine", units)
+    except SdfsimError as error:
+        raise NotRun(error.message) from error
+    try:
+        motion, _ = engine(start, max(1, round(seconds / (DT * units.time))), USUAL)
+    except NotInstalled as error:
+        raise NotRun(error.message) from error
+    except TooSlow:
+        raise
+    except SdfsimError as error:
+        return still(scene, seconds), error.message
+    rollout = motion_rollout(scene, motion, units)
+    finite = np.isfinite(rollout.position).all() and np.isfinite(rollout.velocity).all()
+    return (rollout, "") if finite else (still(scene, seconds), "a position is not finite")
+
+
+def unknown_to(name: str, scene: Scene) -> str:
+    """Which coefficients of a scene an engine has no way to say; empty where it has."""
+    moving = [b for b in scene.bodies if b.motion == "dynamic"]
+    others = [b for b in scene.bodies if b.motion == "static"]
+    if name in ("MuJoCo", DRAKE) and len({(b.friction, b.restitution) for b in moving}) > 1:
+        return "coefficients of pairs of several materials"
+    bounces = [one.restitution * other.restitution for one in moving[:1] for other in (*others, *moving[1:])]
+    if name == DRAKE and any(bounces):
+        return "restitution"
+    # Of two coefficients the harmonic mean is less than twice the smaller one.
+    if name == DRAKE and len(moving) > 1 and any(b.friction > 2.0 * moving[0].friction for b in others):
+        return "friction of two materials that are so different"
+    return ""
+
+
+def in_parts(scene: Scene, folder: Path) -> Scene:
+    """The scene with convex pieces for shapes without a closed form: their own vertices where they are convex, else
+    those that `in_pieces` finds, kept in a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    shapes = []
+    for shape in scene.shapes:
+        if not isinstance(shape.sdf, ClosedForm) and not own_pieces(shape):
+            whole = convex_vertices(shape.mesh)
+            shape = replace(shape, pieces=(whole,) if len(whole) else ())
+        shapes.append(shape)
+    return in_pieces(replace(scene, shapes=tuple(shapes)), folder)
+
+
+def still(scene: Scene, seconds: float) -> Rollout:
+    """The start of a scene, and the same after so many seconds: what checks read where there is no motion."""
+    first = Simulator(scene, SOLVER).initial_rollout()
+    return join([first, replace(first, time=first.time + seconds)])
+
+
+# --- judging ---
+
+
+def judged(row: str, at: Setting, run: Runner) -> Iterator[tuple[str, Check, str, str]]:
+    """Every check of a row with its full name; why one of the scenes that it is of was not run, and why one broke."""
+    absent: list[str] = []
+    broken: list[str] = []
+    seen = False
+
+    def watched(scene: Scene, seconds: float) -> tuple[Rollout, str]:
+        nonlocal seen
+        if seen:  # a check is of the scenes that were run since the checks before it
+            seen = False
+            absent.clear()
+            broken.clear()
+        try:
+            rollout, broke = run(scene, seconds)
+        except NotRun as error:
+            absent.append(error.message)
+            return still(scene, seconds), ""
+        broken.extend([broke] if broke else [])
+        return rollout, broke
+
+    for name, check in checks(row, replace(at, by=watched)):
+        seen = True
+        yield name, check, "".join(absent[:1]), "".join(broken[:1])
+
+
+@one_thread()
+def counted(row: str, at: Setting, name: str, folder: Path) -> dict[str, Any]:
+    """Of an engine in a row: the names of checks that hold and of those that do not, and how many were not run by the
+    reason. Where a motion breaks, nothing holds of it."""
+    held, missed, absent = [], [], Counter()
+    began = time.process_time()
+    for full, check, why, broke in judged(row, at, runner(name, folder)):
+        if why:
+            absent[why] += 1
+        else:
+            (held if check.holds and not broke else missed).append(full)
+    return {"held": held, "missed": missed, "not_run": dict(absent), "s": time.process_time() - began}
+
+
+def is_installed(name: str) -> bool:
+    return importlib.util.find_spec(ENGINES[name][0]) is not None
+
+
+# --- the table ---
+
+
+def held_by(results: Results, row: str, check: str) -> list[str]:
+    """The other engines that hold a check."""
+    return [n for n in ENGINES if n != OURS and check in results.get((row, n), {}).get("held", ())]
+
+
+def losses(results: Results, row: str) -> tuple[float, float]:
+    """How many checks ours misses in a row that another engine holds, and how many it misses."""
+    ours = results[row, OURS]
+    if "failed" in ours:
+        return np.inf, np.inf
+    return sum(bool(held_by(results, row, check)) for check in ours["missed"]), len(ours["missed"])
+
+
+def cell(result: dict[str, Any] | None) -> str:
+    if result is None:
+        return "not installed here"
+    if "failed" in result:
+        return result["failed"]
+    run, absent = len(result["held"]) + len(result["missed"]), sum(result["not_run"].values())
+    shown = f"{len(result['held'])} / {run}" if run else ""
+    return ", ".join(filter(None, [shown, f"{absent} not run" if absent else ""]))
+
+
+def table(results: Results) -> str:
+    """A row a kind of scene, those first in which ours misses most of what others hold; what ours misses, and what was
+    not run."""
+    there = [row for row in ROWS if (row, OURS) in results]
+    rows = sorted(there, key=lambda row: losses(results, row), reverse=True)
+    lines = [("checks that hold, of those run", *ENGINES)]
+    lines += [(f"`{row}`", *(cell(results.get((row, name))) for name in ENGINES)) for row in rows]
+    sums: dict[str, dict[str, Any]] = {}
+    for name in ENGINES:
+        mine = [found for row in rows if "held" in (found := results.get((row, name)) or {})]
+        if mine:
+            kept = {key: [one for found in mine for one in found[key]] for key in ("held", "missed")}
+            sums[name] = kept | {"not_run": sum((Counter(found["not_run"]) for found in mine), Counter())}
+    lines.append(("all", *(cell(sums.get(name)) for name in ENGINES)))
+    parts = [markdown(lines)]
+    lost = []
+    for row in rows:
+        for check in results[row, OURS].get("missed", ()):
+            by = held_by(results, row, check)
+            lost.append(f"- {check.rpartition(' [')[0]}: held by {', '.join(by) or 'none'}")
+    parts.append("\n".join(["What ours misses:", "", *(lost or ["- nothing"])]) + "\n")
+    absent = [f"- {name}: {why}, {n} checks" for name, one in sums.items() for why, n in one["not_run"].items()]
+    if absent:
+        parts.append("\n".join(["Not run:", "", *absent]) + "\n")
+    return "\n".join(parts)
+
+
+def compared(rows: list[str], at: Setting, out: Path) -> Results:
+    """Every installed engine's results of rows."""
+    content = [at.full, str(at), USUAL, LONGEST, inspect.getsource(everyday)]
+    how = {name: inspect.getsource(engines) if name != OURS else "" for name in ENGINES}
+    jobs = [
+        Job(row, name, [content, how[name]], counted, (row, at, name, out / "scenes"))
+        for name in ENGINES
+        if is_installed(name)
+        for row in rows
+    ]
+    return measure(jobs, out / "results", on_progress=told)
+
+
+def scenes(*, out: Path, full: bool = False) -> None:
+    """Everyday scenes with every engine that is installed."""
+    results = compared(list(ROWS), Setting(full=full), out)
+    for name in ENGINES:
+        took = sum(found.get("s", 0.0) for (_, other), found in results.items() if other == name)
+        print(f"{name}: {took:.0f} s of the processor")
+    write_section("everyday", f"python benchmarks/everyday.py -o DIR{' --full' if full else ''}", table(results))
+
+
+if __name__ == "__main__":
+    script(__doc__, scenes)
