@@ -27,9 +27,10 @@ from sdfsim.data.dataset import conditions_of, read_info
 from sdfsim.evaluation.engines import ours
 from sdfsim.evaluation.evaluate import evaluate, load_recorded
 from sdfsim.evaluation.harness import Job, markdown, measure, one_thread
-from sdfsim.learned.contact_graph import SUBSTEPS, ContactGraph
+from sdfsim.learned.contact_graph import ContactGraph
 from sdfsim.learned.impulse import Velocities
 from sdfsim.learned.model import SOLVER, load_model
+from sdfsim.physics.options import SUBSTEPS
 from sdfsim.simulate.simulator import Simulator
 from sdfsim.training.contact_cache import Solved, contact_frames, join_frames
 from sdfsim.training.impulse_task import ImpulseTask

@@ -47,12 +47,8 @@ FLOORS = [
 # What still goes upwards, and the circles that are left, which the stepper's redesign takes away.
 UPWARDS = {
     ("sdfsim.learned.families", "sdfsim.simulate.run_memory"),
-    ("sdfsim.learned.inference", "sdfsim.simulate.step"),
     ("sdfsim.learned.near", "sdfsim.simulate.run_memory"),
-    ("sdfsim.learned.near", "sdfsim.simulate.step"),
-    ("sdfsim.learned.surfaces", "sdfsim.simulate.step"),
     ("sdfsim.physics.solver.prepare", "sdfsim.simulate.run_memory"),
-    ("sdfsim.physics.solver.prepare", "sdfsim.simulate.step"),
     ("sdfsim.physics.units", "sdfsim.learned.model"),
 }
 CIRCLES = [
@@ -61,13 +57,10 @@ CIRCLES = [
         "sdfsim.learned.baselines.fignet",
         "sdfsim.learned.baselines.mgn",
         "sdfsim.learned.families",
-        "sdfsim.learned.inference",
         "sdfsim.learned.model",
         "sdfsim.learned.near",
         "sdfsim.learned.sdf_sim",
         "sdfsim.learned.surfaces",
-        "sdfsim.physics.solver.prepare",
-        "sdfsim.simulate.run_memory",
         "sdfsim.simulate.step",
     },
     {"sdfsim.simulate.body_handle", "sdfsim.simulate.simulator"},

@@ -22,11 +22,12 @@ from sdfsim.base.parallel import Progress, silent
 from sdfsim.learned.model import SOLVER, load_model
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import State, from_scene
+from sdfsim.physics.options import StepOptions
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
 from sdfsim.simulate.run_memory import Memory
-from sdfsim.simulate.step import StepOptions, step
+from sdfsim.simulate.step import step
 
 WINDOW, EVERY = 0.15, 0.06  # model units of time, about seconds for bodies of a metre: length and spacing of windows
 SMOOTH = 4.0  # times gravity: a recording of poses tells no velocity where it accelerates more than that

@@ -10,15 +10,15 @@ import torch
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.data.dataset import FLOOR, Trajectory
 from sdfsim.data.pybullet_sim import MARGIN
-from sdfsim.learned.contact_graph import SUBSTEPS
 from sdfsim.learned.model import Model
 from sdfsim.learned.surfaces import with_history
 from sdfsim.physics.bodies import Bodies, State, Units, from_scene
+from sdfsim.physics.options import SUBSTEPS, FreeFlight, StepOptions
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import Shape
 from sdfsim.simulate.run_memory import Memory
-from sdfsim.simulate.step import FreeFlight, StepOptions, step
+from sdfsim.simulate.step import step
 
 BATCH = 50  # trajectories simulated side by side
 PLANE = analytic_shape("plane")

@@ -30,13 +30,12 @@ from sdfsim.evaluation import metrics
 from sdfsim.evaluation.engines import Start, bullet, dataset_urdf
 from sdfsim.evaluation.metrics import Motions, energy_gain, errors
 from sdfsim.evaluation.penetration import EVERY, exact_solids, penetration
-from sdfsim.learned.contact_graph import SUBSTEPS
 from sdfsim.learned.model import SOLVER, Model, load_model
 from sdfsim.learned.training_ranges import outside_training
+from sdfsim.physics.options import SUBSTEPS, FreeFlight
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.shape import Shape
-from sdfsim.simulate.step import FreeFlight
 from sdfsim.training.contact_cache import inner_steps
 
 SURVIVED = "0.25"  # m, the limit whose median survival time is shown

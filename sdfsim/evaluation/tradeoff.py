@@ -30,8 +30,8 @@ from sdfsim.evaluation.hard_cases import tossed
 from sdfsim.evaluation.harness import Job, Line, Panel, draw, front, machine, measure, number, one_thread, peak_memory
 from sdfsim.evaluation.metrics import energy_gain, errors
 from sdfsim.evaluation.penetration import ExactSolid, exact_solids, penetration
-from sdfsim.learned.contact_graph import SUBSTEPS
 from sdfsim.learned.model import SOLVER, Model, load_model, model_names
+from sdfsim.physics.options import SUBSTEPS
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene

@@ -13,7 +13,6 @@ from torch import Tensor
 
 REST_SPEED = 0.2  # model units: what gravity adds to a speed in one step of training; slower counts as resting
 EDGE_FEATURES = 30
-SUBSTEPS = 5  # inner steps in one step of the engine that the training data come from; some recordings have fewer
 
 
 @dataclass(frozen=True)

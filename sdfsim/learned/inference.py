@@ -22,7 +22,7 @@ from sdfsim.physics.solver.world import World
 
 with kernels.kept():
     from sdfsim.physics.solver import impulse as compiled
-from sdfsim.simulate.step import StepOptions
+from sdfsim.physics.options import StepOptions
 
 
 def packed(network: ImpulseNetwork, *, friction: bool) -> compiled.Weights:

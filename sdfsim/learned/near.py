@@ -16,10 +16,10 @@ from torch import Tensor
 from sdfsim.learned.surfaces import expanded, node_owner
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State
+from sdfsim.physics.options import StepOptions
 from sdfsim.physics.solver.edges import nodes_within
 from sdfsim.physics.solver.prepare import compiled_rules, taken_up
 from sdfsim.simulate.run_memory import Memory
-from sdfsim.simulate.step import StepOptions
 
 PIERCING = 1e-9  # relative: areas and denominators below count as none
 

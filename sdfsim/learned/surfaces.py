@@ -15,7 +15,8 @@ from sdfsim.learned.matching import match_shapes
 from sdfsim.learned.message_passing import EdgeKind, Edges, Features, Graph, GraphNetwork
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State
-from sdfsim.simulate.step import StepOptions, fly
+from sdfsim.physics.options import StepOptions
+from sdfsim.simulate.step import fly
 
 NODE = Features(13, (0, 3, 6))  # of surface nodes and of body nodes
 INTRA = Features(8, (0, 4))  # of edges within a body

@@ -8,9 +8,10 @@ from itertools import combinations
 import numpy as np
 import torch
 
-from sdfsim.learned.contact_graph import SUBSTEPS, number_pairs
+from sdfsim.learned.contact_graph import number_pairs
 from sdfsim.learned.model import SOLVER, Model
 from sdfsim.physics.bodies import Bodies, State, Units, largest_extent
+from sdfsim.physics.options import SUBSTEPS
 from sdfsim.scene.scene import Scene
 
 LABELS = {

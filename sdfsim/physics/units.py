@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from sdfsim.base.errors import SdfsimError
-from sdfsim.learned.contact_graph import SUBSTEPS
 from sdfsim.learned.model import Model
 from sdfsim.physics.bodies import Units, largest_extent
+from sdfsim.physics.options import SUBSTEPS
 from sdfsim.scene.scene import Scene
 
 EARTH = 9.81  # m/s^2, sets the time scale of scenes without gravity

@@ -15,9 +15,9 @@ from sdfsim.learned.impulse import ImpulseNetwork
 from sdfsim.physics.bodies import Bodies, State
 
 if TYPE_CHECKING:
+    from sdfsim.physics.options import StepOptions
     from sdfsim.physics.solver.impulse import Weights
     from sdfsim.physics.solver.prepare import Compiled
-    from sdfsim.simulate.step import StepOptions
 
 COUNTS = {
     "pairs": "pairs of bodies that the broad phase let through",

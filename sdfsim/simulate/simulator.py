@@ -19,6 +19,7 @@ from sdfsim.base.version import __version__
 from sdfsim.learned.model import Model, load_model
 from sdfsim.learned.training_ranges import deep_starts, outside_training
 from sdfsim.physics.bodies import State, from_scene
+from sdfsim.physics.options import FreeFlight, StepOptions
 from sdfsim.physics.rollout import Rollout, join
 from sdfsim.physics.units import inner_steps, scene_units
 from sdfsim.physics.validity import check_nodes, check_sizes, fault
@@ -26,7 +27,7 @@ from sdfsim.scene.plan import plan
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.simulate.body_handle import BodyHandle, ContactPoint
 from sdfsim.simulate.run_memory import Memory
-from sdfsim.simulate.step import FreeFlight, StepOptions, step
+from sdfsim.simulate.step import step
 
 if TYPE_CHECKING:
     from sdfsim.learned.near import Contacts, Pairs

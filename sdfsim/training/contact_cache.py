@@ -30,14 +30,14 @@ from sdfsim.data.dataset import (
     trajectory_files,
 )
 from sdfsim.data.pybullet_sim import MARGIN
-from sdfsim.learned.contact_graph import SUBSTEPS
 from sdfsim.physics import pose
 from sdfsim.physics.free_flight import torque_free
+from sdfsim.physics.options import SUBSTEPS
 
 if TYPE_CHECKING:
     from sdfsim.physics.bodies import Bodies, State
+    from sdfsim.physics.options import StepOptions
     from sdfsim.physics.solver.record import Edges
-    from sdfsim.simulate.step import StepOptions
 
 STEP = 0.02  # s, the step that networks know
 FRAMES_VERSION = 10  # counts up whenever frames of the same recordings come out differently
@@ -206,9 +206,9 @@ def _followed(files: list[Path], how: Solved) -> list[ContactFrames]:
     """The frames of each draw and step: of all trajectories of a group at that step."""
     from sdfsim.data.batching import merged, state_at  # needs the SDFs, hence more than torch and numpy
     from sdfsim.physics.bodies import Units
+    from sdfsim.physics.options import StepOptions
     from sdfsim.physics.solver.prepare import solver_step
     from sdfsim.simulate.run_memory import Memory
-    from sdfsim.simulate.step import StepOptions
 
     substep, found = engine_substep(files[0].parent), conditions_of(files[0].parent)
     group = [Trajectory.load(file) for file in files]

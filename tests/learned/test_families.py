@@ -10,11 +10,11 @@ from sdfsim.learned.families import FAMILIES, vertices
 from sdfsim.learned.near import closest_points, face_pairs, node_pairs
 from sdfsim.learned.surfaces import with_history
 from sdfsim.physics.bodies import Bodies, State, Units, from_scene
+from sdfsim.physics.options import StepOptions
 from sdfsim.physics.pose import rotate
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate.run_memory import Memory
-from sdfsim.simulate.step import StepOptions
 from tests.scenes import make_body
 
 CPU = torch.device("cpu")

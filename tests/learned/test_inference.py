@@ -17,12 +17,12 @@ from sdfsim.learned.contact_graph import ContactGraph
 from sdfsim.learned.model import Model, load_model, new_network
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import State
+from sdfsim.physics.options import StepOptions
 from sdfsim.physics.solver import impulse as kernel
 from sdfsim.scene.scene import Effects, Scene
 from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate import step as step_module
 from sdfsim.simulate.simulator import Simulator
-from sdfsim.simulate.step import StepOptions
 from tests.physics.test_laws import cube
 from tests.scenes import POSE, contact_graph, make_body, random_model
 

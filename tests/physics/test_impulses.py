@@ -9,12 +9,12 @@ from numba import njit
 from scipy.spatial.transform import Rotation
 
 from sdfsim.physics.bodies import Units, from_scene
+from sdfsim.physics.options import StepOptions
 from sdfsim.physics.solver.prepare import Compiled, compiled_rules, taken_up
 from sdfsim.physics.solver.solve import respond
 from sdfsim.physics.solver.world import DRAG, FIRST, GAP, KEY, NORMAL, PUSH, SECOND, TORSION, VOID
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.make import analytic_shape
-from sdfsim.simulate.step import StepOptions
 from tests.physics.test_laws import body
 from tests.reference import impulses
 

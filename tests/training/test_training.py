@@ -16,9 +16,9 @@ from sdfsim.learned.impulse import Velocities
 from sdfsim.learned.inference import terms_of
 from sdfsim.learned.model import SURFACE, load_model
 from sdfsim.physics.bodies import Units
+from sdfsim.physics.options import StepOptions
 from sdfsim.physics.solver.prepare import solver_step
 from sdfsim.simulate.run_memory import Memory
-from sdfsim.simulate.step import StepOptions
 from sdfsim.training import contact_cache
 from sdfsim.training import train as train_module
 from sdfsim.training.contact_cache import Solved, contact_frames, join_frames

@@ -29,8 +29,8 @@ from sdfsim.shape.convex_pieces import ConvexPiece, pieces_of
 from sdfsim.shape.surface_nodes import ContactSurface, contact_surface
 
 if TYPE_CHECKING:
+    from sdfsim.physics.options import StepOptions
     from sdfsim.simulate.run_memory import Memory
-    from sdfsim.simulate.step import StepOptions
 
 _log = logging.getLogger(__name__)
 MOST_KEPT = 64  # shapes whose geometry stays at hand after their scenes are gone
