@@ -48,6 +48,7 @@ FLOORS = [
 UPWARDS = {
     ("sdfsim.learned.families", "sdfsim.simulate.run_memory"),
     ("sdfsim.learned.near", "sdfsim.simulate.run_memory"),
+    ("sdfsim.learned.surfaces", "sdfsim.simulate.step"),
     ("sdfsim.physics.solver.prepare", "sdfsim.simulate.run_memory"),
     ("sdfsim.physics.units", "sdfsim.learned.model"),
 }
