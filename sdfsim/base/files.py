@@ -5,11 +5,12 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import json
+import logging
 import os
 import secrets
 import tempfile
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ import numpy as np
 
 from sdfsim.base.errors import SdfsimError
 
+_log = logging.getLogger(__name__)
 LOCK = ".lock"
 # What a run was asked for, the command first.
 CONFIG = "config.yaml"
@@ -100,6 +102,23 @@ def read_arrays(path: Path, what: str, hint: str = "") -> dict[str, np.ndarray]:
             return {name: data[name] for name in data.files}
     except Exception as error:  # the readers raise whatever a damaged file made them stumble over
         raise SdfsimError(f"{path}: cannot be read as {what}: {error}", hint) from error
+
+
+def cached_arrays(path: Path, what: str, make: Callable[[], dict[str, Any]]) -> dict[str, np.ndarray]:
+    """The arrays of a cache file, or made and kept there. A damaged file is made again; where none can be written, as
+    on a full disk, a warning says so and the arrays are made the next time too."""
+    if path.is_file():
+        try:
+            return read_arrays(path, what, "delete it")
+        except SdfsimError:
+            path.unlink(missing_ok=True)
+    arrays = {name: np.asarray(value) for name, value in make().items()}
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_arrays(path, arrays, compressed=False)
+    except (SdfsimError, OSError) as error:
+        _log.warning("%s is not kept for the next time: %s", what, error)
+    return arrays
 
 
 @contextmanager

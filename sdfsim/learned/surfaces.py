@@ -24,7 +24,7 @@ NODES = {"body": NODE, "node": NODE}
 STAR = {"intra_up": EdgeKind("node", "body", INTRA), "intra_down": EdgeKind("body", "node", INTRA)}
 MESH = EdgeKind("node", "node", INTRA)
 TARGET = Features(3, (0,))  # of accelerations
-_NOT_PER_BODY = ("pieces", "hulls", "node", "node_start", "face", "allowed", "sdfs", "tracks")
+_NOT_PER_BODY = ("contact", "node", "node_start", "face", "allowed", "sdfs", "tracks")
 
 
 def node_owner(bodies: Bodies) -> Tensor:

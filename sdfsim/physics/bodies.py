@@ -14,7 +14,7 @@ from sdfsim.physics import pose
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Scene, Waypoints
 from sdfsim.sdf.sdf import Sdf
-from sdfsim.shape.convex_pieces import convex_vertices
+from sdfsim.shape.contact_geometry import ContactGeometry
 from sdfsim.shape.shape import Shape
 
 
@@ -99,10 +99,7 @@ class Bodies:
     allowed: Tensor  # [G, G] bool, whether bodies of two groups may touch
     world: Tensor  # [N] int64: bodies of two worlds never meet; -1 is in all of them
     sdfs: tuple[Sdf, ...]  # signed distances of the shapes that may be touched
-    # of each of these the vertices of its convex pieces, shape frame in m; none of most
-    pieces: tuple[tuple[np.ndarray, ...], ...] = ()
-    # likewise the vertices [V, 3] of the whole, where a shape is convex; none of most
-    hulls: tuple[np.ndarray, ...] = ()
+    contact: tuple[ContactGeometry, ...] = ()  # of each of these
     tracks: Tracks | None = None  # the paths of kinematic bodies, None where there are none
 
     def __len__(self) -> int:
@@ -213,8 +210,7 @@ def from_scene(scene: Scene, units: Units, device: torch.device) -> tuple[Bodies
         allowed=tensor(allowed, torch.bool),
         world=torch.zeros(len(scene.bodies), dtype=torch.int64, device=device),
         sdfs=tuple(scene.shapes[k].sdf for k in touched),
-        pieces=tuple(scene.shapes[k].pieces for k in touched),
-        hulls=tuple(convex_vertices(scene.shapes[k].mesh) for k in touched),
+        contact=tuple(scene.shapes[k].contact for k in touched),
         tracks=_tracks(paths, com, length=units.length, time=units.time, device=device),
     )
     orientation = tensor([b.quat_xyzw for b in scene.bodies])

@@ -10,7 +10,7 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.physics.bodies import Bodies, State, Units
 from sdfsim.physics.free_flight import MOST_TURN
 from sdfsim.scene.scene import Scene
-from sdfsim.shape.surface_nodes import check_pieces
+from sdfsim.shape.contact_geometry import check_pieces
 
 # Of |q|^2 - 1. The matrix R of a quaternion that keeps to it has |R'R - I| below 1e-5, and a positive determinant.
 UNIT = 2e-6

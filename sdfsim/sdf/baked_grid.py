@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from sdfsim.base.errors import SdfsimError
-from sdfsim.base.files import digest, read_arrays, user_cache, write_arrays
+from sdfsim.base.files import cached_arrays, digest, user_cache
 from sdfsim.geometry.mesh import convex_hull, lattice
 from sdfsim.sdf.mlp import MlpSdf
 from sdfsim.sdf.reference import PiecesDistance
@@ -26,8 +24,6 @@ CHUNK = 2**18  # points asked at once
 SPREAD = 512  # places all over a surface
 # Of the largest extent: how near they are before, how near after so many steps towards it.
 CLOSE, REACHED, PROJECTIONS = 0.01, 1e-4, 4
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,20 +47,9 @@ def baked(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = (), cache_
     extent = float(np.ptp(sdf.bounds, axis=0).max())
     known = digest(sdf, np.round(np.asarray(nodes) / extent, 9) + 0.0, [*pieces], CELLS, FINEST)
     path = cache_dir / f"{known}-{BAKE_VERSION}.npz"
-    if path.is_file():
-        try:
-            kept = read_arrays(path, "a baked grid", "delete it")
-            cell, thickness, error = (float(kept[name]) for name in ("cell", "thickness", "error"))
-            return BakedGrid(kept["low"], cell, kept["coarse"], kept["brick"], kept["fine"], thickness, error)
-        except (SdfsimError, KeyError):
-            path.unlink(missing_ok=True)  # a damaged entry is only a cache miss
-    grid = bake(sdf, nodes, pieces)
-    try:
-        cache_dir.mkdir(parents=True, exist_ok=True)
-        write_arrays(path, {name: np.asarray(value) for name, value in vars(grid).items()}, compressed=False)
-    except (SdfsimError, OSError) as error:  # a full disk; a folder that cannot be made
-        _log.warning("a baked grid is not kept for the next time: %s", error)
-    return grid
+    kept = cached_arrays(path, "a baked grid", lambda: vars(bake(sdf, nodes, pieces)))
+    cell, thickness, error = (float(kept[name]) for name in ("cell", "thickness", "error"))
+    return BakedGrid(kept["low"], cell, kept["coarse"], kept["brick"], kept["fine"], thickness, error)
 
 
 def grid_certificate(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray] = ()) -> dict[str, float]:

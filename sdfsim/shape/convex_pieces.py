@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from weakref import WeakKeyDictionary
 
@@ -55,21 +54,23 @@ def hull(vertices: np.ndarray) -> ConvexPiece:
     corners = vertices[found.vertices]
     number = np.full(len(vertices), -1)
     number[found.vertices] = np.arange(len(corners))
-    normals, loops = [], []
-    left, owner = np.ones(len(found.simplices), bool), np.zeros(len(found.simplices), np.int64)
-    for k in range(len(found.simplices)):
+    normals, loops, triangles = [], [], number[found.simplices]
+    sides = np.diff(corners[triangles], axis=1)
+    facing = (np.cross(sides[:, 0], sides[:, 1]) * found.equations[:, :3]).sum(1) > 0.0
+    triangles[~facing] = triangles[~facing][:, ::-1]
+    left, owner = np.ones(len(triangles), bool), np.zeros(len(triangles), np.int64)
+    for k, normal in enumerate(found.equations[:, :3]):
         if not left[k]:
             continue
-        normal = found.equations[k, :3]
-        alike = left & (np.linalg.norm(found.equations[:, :3] - normal, axis=1) < FLAT)
+        alike = left & (np.abs(found.equations[:, :3] - normal).sum(1) < FLAT)
         left &= ~alike
         owner[alike] = len(normals)
         normals.append(normal)
-        loops.append(_around(corners, np.unique(number[found.simplices[alike]]), normal))
+        several = np.count_nonzero(alike) > 1
+        loops.append(_around(corners, np.unique(triangles[alike]), normal) if several else triangles[k])
     widths = [np.ptp(corners @ normal) for normal in normals]
     middle = 0.5 * (corners.min(0) + corners.max(0))
     ball = np.array([*middle, np.linalg.norm(corners - middle, axis=1).max()])
-    triangles = number[found.simplices]
     sides = np.concatenate([triangles[:, [i, j]] for i, j in ((0, 1), (1, 2), (2, 0), (1, 0), (2, 1), (0, 2))])
     beside = _grouped(sides[:, 0], sides[:, 1], len(corners))
     around = _grouped(triangles.reshape(-1), np.repeat(owner, 3), len(corners))
@@ -121,14 +122,3 @@ def _is_convex(mesh: Mesh) -> bool:
     planes, deep = np.unique(found.equations.round(9), axis=0), DENT * np.ptp(mesh.vertices, axis=0).max()
     parts = np.array_split(places, max(1, len(places) * len(planes) // 2**22))
     return all((part @ planes[:, :3].T + planes[:, 3]).max(1).min() >= -deep for part in parts)
-
-
-def pieces_of(sdf: Sdf, pieces: Sequence[np.ndarray], whole: np.ndarray) -> tuple[ConvexPiece, ...]:
-    """What a shape collides as: its convex pieces (the vertices [V, 3] m of each), its closed form, or its own hull
-    (`whole`, vertices [V, 3] m; none of what is not convex); nothing for a plane, and for what is none of these."""
-    if len(pieces):
-        return tuple(hull(piece) for piece in pieces)
-    found = closed_form(sdf)
-    if found is not None:
-        return (found,)
-    return (hull(whole),) if len(whole) else ()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,6 +31,7 @@ from sdfsim.sdf.mesh_sdf import MeshSdf
 from sdfsim.sdf.mlp import ACTIVATIONS, MlpSdf
 from sdfsim.sdf.reference import MeshDistance
 from sdfsim.sdf.sdf import Sdf
+from sdfsim.shape.contact_geometry import ContactGeometry
 from sdfsim.shape.surface_nodes import sample_nodes
 
 SdfKind = Literal["mlp", "grid", "mesh"]
@@ -77,6 +79,11 @@ class Shape:
     def shown(self) -> Mesh:
         """What to draw."""
         return self.mesh if self.skin is None else self.skin
+
+    @cached_property
+    def contact(self) -> ContactGeometry:
+        """What contacts ask of it."""
+        return ContactGeometry(self.sdf, self.nodes, self.pieces, self.mesh)
 
     def save(self, folder: str | Path) -> Path:
         """Write the shape folder and return it. Each file appears complete or not at all, and shape.json last, beside

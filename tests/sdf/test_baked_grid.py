@@ -13,16 +13,18 @@ from sdfsim.geometry.mesh import Mesh, convex_hull
 from sdfsim.geometry.primitives import spiral
 from sdfsim.physics.bodies import Units, from_scene
 from sdfsim.physics.solver.distance import GRID, distance
-from sdfsim.physics.solver.prepare import _geometry, _nodes_of, compiled_shapes
+from sdfsim.physics.solver.prepare import compiled_shapes
 from sdfsim.physics.solver.surface_distance import KEYS
 from sdfsim.scene.scene import Scene
 from sdfsim.sdf import baked_grid as module
 from sdfsim.sdf.baked_grid import BakedGrid, bake, baked, unseen_wall, wall_thickness
 from sdfsim.sdf.mesh_sdf import MeshSdf
 from sdfsim.sdf.reference import PiecesDistance
+from sdfsim.shape import contact_geometry
+from sdfsim.shape.contact_geometry import MOST_PATCHES, ContactGeometry, patches_of
 from sdfsim.shape.make import analytic_shape
-from sdfsim.shape.shape import scaled, with_sdf
-from sdfsim.shape.surface_nodes import MOST_PATCHES, ContactSurface, edge_nodes, surface_of
+from sdfsim.shape.shape import with_sdf
+from sdfsim.shape.surface_nodes import edge_nodes, project
 from sdfsim.simulate.simulator import Simulator
 from tests.physics.test_laws import body
 
@@ -50,6 +52,9 @@ def test_thin_walls_are_measured_and_get_finer_grids(wall):
         assert bake(plate.sdf, plate.nodes).cell <= 0.5 * 1.4 * wall
 
 
+NOTHING = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+
+
 def two_halves() -> list[np.ndarray]:
     """A bar of two convex pieces with a step between them."""
     corners = analytic_shape("box", size=(1.0, 0.4, 0.4)).mesh.vertices
@@ -60,7 +65,7 @@ def two_halves() -> list[np.ndarray]:
 @pytest.mark.parametrize(("wall", "told"), [(0.002, True), (0.03, False)])
 def test_walls_that_no_grid_sees_are_told(wall, told, caplog):
     rod = with_sdf(analytic_shape("box", size=(1.0, 0.03, wall)), "mesh")
-    _geometry(rod.nodes, rod.sdf, (), np.zeros((0, 3)), surfaces=True)
+    assert ContactGeometry(rod.sdf, rod.nodes, (), NOTHING).grid is not None
     assert ("things may pass through" in caplog.text) is told and "--thicken" not in caplog.text
 
 
@@ -117,7 +122,8 @@ def test_what_is_known_of_a_shape_with_pieces_is_not_taken_for_one_without():
     bar, pieces = with_sdf(analytic_shape("box", size=(2.0, 0.4, 0.4)), "mesh"), tuple(two_halves())
     above = np.array([[0.5, 0.0, 0.15]])
     for known, want in ((pieces, 0.05), ((), -0.05), (pieces, 0.05)):
-        grid = _geometry(bar.nodes, bar.sdf, known, np.zeros((0, 3)), surfaces=True).grid
+        grid = replace(bar, pieces=known).contact.grid
+        assert grid is not None
         np.testing.assert_allclose(module.interpolated(grid, above), [want], atol=2 * grid.error)
 
 
@@ -125,14 +131,36 @@ def test_the_surface_of_pieces_has_a_patch_for_each():
     pieces = two_halves()
     bar = with_sdf(analytic_shape("box", size=(2.0, 0.4, 0.4)), "mesh")
     nodes = np.array([[-0.9, 0.0, 0.25], [0.4, 0.02, 0.08]])  # beside the surface, as those of a fitted SDF are
-    surface = surface_of(bar.sdf, nodes, pieces)
-    vertices = surface.nodes[:-2]
+    surface = patches_of(bar.sdf, nodes, pieces)
+    vertices = surface["node"][:-2]
     assert {tuple(v) for v in vertices.round(9)} == {tuple(v) for v in np.concatenate(pieces).round(9)}
-    np.testing.assert_allclose(surface.nodes[-2:], [[-0.9, 0.0, 0.2], [0.4, 0.02, 0.1]], atol=1e-6)
-    np.testing.assert_array_equal(surface.patch, [0] * 8 + [1] * 8 + [0, 1])
-    assert surface.nearest is not None
-    at = np.round((np.array([[-0.8, 0.0, 0.2], [0.8, 0.0, 0.2]]) - surface.low) / surface.cell).astype(int)
-    assert [int(surface.nearest[tuple(k)]) for k in at] == [0, 1]
+    np.testing.assert_allclose(surface["node"][-2:], [[-0.9, 0.0, 0.2], [0.4, 0.02, 0.1]], atol=1e-6)
+    np.testing.assert_array_equal(surface["patch"], [0] * 8 + [1] * 8 + [0, 1])
+    places = np.array([[-0.8, 0.0, 0.2], [0.8, 0.0, 0.2]])
+    at = np.round((places - surface["label_low"]) / surface["label_cell"]).astype(int)
+    assert [int(surface["label"][tuple(k)]) for k in at] == [0, 1]
+
+
+def test_the_balls_of_leaves_hold_the_whole_surface(block):
+    """Each place on a fitted surface is in the ball of a leaf, and of a clump: what is far from all balls is far."""
+    shape = with_sdf(block, "mesh")
+    surface = ContactGeometry(shape.sdf, shape.nodes[::7], (), NOTHING).surface
+    assert surface.leaf_node[-1] == len(surface.node) and surface.clump_leaf[-1] == len(surface.leaf_ball)
+    places = project(shape.sdf, np.random.default_rng(0).uniform(*shape.sdf.bounds, (20_000, 3)))
+    for balls in (surface.leaf_ball, surface.clump_ball):
+        away = np.linalg.norm(places[:, None] - balls[None, :, :3], axis=2) - balls[:, 3]
+        assert away.min(1).max() <= 1e-9
+
+
+def test_copies_and_processes_share_one_geometry(block, monkeypatch, tmp_path):
+    """The surface comes from the disk the second time, as it was."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    shape = with_sdf(block, "mesh")
+    first = ContactGeometry(shape.sdf, shape.nodes, (), NOTHING).surface
+    monkeypatch.setattr(contact_geometry, "in_leaves", None)
+    again = ContactGeometry(shape.sdf, shape.nodes, (), NOTHING).surface
+    for name, values in vars(first).items():
+        np.testing.assert_array_equal(getattr(again, name), values)
 
 
 def test_a_grid_is_kept(block, tmp_path, monkeypatch):
@@ -191,33 +219,26 @@ def test_convex_pieces_are_the_same_at_every_size(size):
         union = PiecesDistance(hulls)
         mesh = MeshSdf(union.surface)
         nodes = union(points[:50] * factor).closest
-        return union(points * factor), surface_of(mesh, nodes, [hull.vertices for hull in hulls])
+        return union(points * factor), patches_of(mesh, nodes, [hull.vertices for hull in hulls])
 
     (found, surface), (usual, other) = measured(size), measured(1.0)
     np.testing.assert_allclose(found.distance / size, usual.distance, atol=2e-6)
-    np.testing.assert_allclose(surface.nodes / size, other.nodes, atol=2e-6)
-    np.testing.assert_array_equal(surface.patch, other.patch)
+    np.testing.assert_allclose(surface["node"] / size, other["node"], atol=2e-6)
+    np.testing.assert_array_equal(surface["patch"], other["patch"])
 
-    def labels(of: ContactSurface, factor: float) -> np.ndarray:
-        assert of.nearest is not None
-        at = np.round((np.clip(points, *union_box) * factor - of.low) / of.cell).astype(int)
-        return of.nearest[tuple(at.T)]
+    def labels(of: dict[str, np.ndarray], factor: float) -> np.ndarray:
+        at = np.round((np.clip(points, *union_box) * factor - of["label_low"]) / of["label_cell"]).astype(int)
+        return of["label"][tuple(at.T)]
 
     union_box = np.concatenate(pieces).min(0), np.concatenate(pieces).max(0)
     # A rounding of a place to the next of the lattice may tell the other piece, where both are as near.
     assert (labels(surface, size) == labels(other, 1.0)).mean() > 0.98
 
 
-def test_bodies_of_any_scale_know_the_same_nodes(block):
-    for factor in (1e-6, 0.01, 1.0):
-        shape = scaled(block, factor)
-        bodies = tuple(replace(body(str(k), 0, [k, 0, 0]), scale=scale) for k, scale in enumerate((1.0, 0.3, 7.0)))
-        units = Units(0.37, 1.0, 1.0)
-        made = from_scene(Scene((shape,), bodies, np.zeros(3), 1.0), units, torch.device("cpu"))[0]
-        one, *others = (_nodes_of(made, k) for k in range(3))
-        np.testing.assert_allclose(one, shape.nodes, rtol=0, atol=1e-11 * factor)
-        for other in others:
-            np.testing.assert_allclose(other, one, rtol=0, atol=1e-11 * factor)
+def test_bodies_of_any_scale_share_one_geometry(block):
+    bodies = tuple(replace(body(str(k), 0, [k, 0, 0]), scale=scale) for k, scale in enumerate((1.0, 0.3, 7.0)))
+    made = from_scene(Scene((block,), bodies, np.zeros(3), 1.0), Units(0.37, 1.0, 1.0), torch.device("cpu"))[0]
+    assert made.contact == (block.contact,)
 
 
 def test_more_pieces_than_contacts_can_tell_apart_are_refused(block):
@@ -230,7 +251,7 @@ def test_more_pieces_than_contacts_can_tell_apart_are_refused(block):
     with pytest.raises(SdfsimError, match=f"^shape 'comb' {told}"):
         Simulator(Scene((shape,), (body("a", 0, [0, 0, 0]),), np.zeros(3), 1.0))
     with pytest.raises(SdfsimError, match=told):
-        surface_of(block.sdf, block.nodes, shape.pieces)
+        patches_of(block.sdf, block.nodes, shape.pieces)
 
 
 @pytest.mark.parametrize("kind", ["sphere", "box", "capsule", "cylinder", "mesh"])

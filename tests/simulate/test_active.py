@@ -42,7 +42,7 @@ def forbid(monkeypatch):
 def test_contact_off_looks_for_nothing_and_equals_bodies_that_may_not_touch(dropped, forbid):
     alone = replace(dropped, bodies=tuple(replace(b, collides_with=()) for b in dropped.bodies))
     forbid(step_module, "_solved_step")
-    forbid(solver, "_geometry")
+    forbid(solver, "compiled_shapes")
     forbid(inference, "corrected")
     model = random_model("impulse")
     assert Simulator(alone, model).bodies.shape.tolist() == [-1] * 4  # there is no SDF to ask

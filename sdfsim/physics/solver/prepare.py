@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import logging
 import math
-from collections import OrderedDict
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
-from weakref import WeakKeyDictionary
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from sdfsim.base.compiling import tell_compiling
-from sdfsim.base.files import digest
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State, Touch
 from sdfsim.physics.solver import distance as kinds
@@ -22,33 +18,25 @@ from sdfsim.physics.solver.convex import BALL, BLOCK, DRUM, HULL, POINT, SEGMENT
 from sdfsim.physics.solver.record import Edges
 from sdfsim.physics.solver.step import step as compiled_step
 from sdfsim.physics.solver.survey import Touching, touching
-from sdfsim.sdf.baked_grid import BakedGrid, baked, inwards, unseen_wall
-from sdfsim.sdf.closed_forms import ClosedForm, PlaneSdf
-from sdfsim.sdf.sdf import Sdf
-from sdfsim.shape.convex_pieces import ConvexPiece, pieces_of
-from sdfsim.shape.surface_nodes import ContactSurface, contact_surface
+from sdfsim.sdf.closed_forms import ClosedForm
+from sdfsim.shape.contact_geometry import NO_SURFACE, ContactSurface
+from sdfsim.shape.convex_pieces import ConvexPiece
 
 if TYPE_CHECKING:
     from sdfsim.physics.options import StepOptions
     from sdfsim.simulate.run_memory import Memory
 
-_log = logging.getLogger(__name__)
-MOST_KEPT = 64  # shapes whose geometry stays at hand after their scenes are gone
 FORMS = {
     "plane": kinds.PLANE, "sphere": kinds.SPHERE, "capsule": kinds.CAPSULE, "box": kinds.BOX,
     "cylinder": kinds.CYLINDER,
 }  # fmt: skip
 SOLIDS = {"sphere": POINT, "capsule": SEGMENT, "box": BLOCK, "cylinder": DRUM, "hull": HULL}
-Clumps = list[list[np.ndarray]]
-LEAF, CLUMP = 16, 256  # nodes that a leaf and a clump of leaves hold at most
 # Penetration that is left as it is, so that what rests has contacts that do not come and go: model lengths, and less in
 # inner steps below the usual 4 ms, which scenes of slender bodies have.
 SLOP, SLOP_A_TIME = 5e-4, 0.125
 TOUCHING = 1e-3  # model lengths, within which a point is told as a contact
 COARSE = 0.01  # model times: in longer inner steps what is hit in their course is told to a network as well
 SLOW = 2.0  # an approach that gravity makes in so many inner steps ends at the surface without a rebound
-# Of a solid's largest extent, from where its nodes look out, and of its thickness: not out of the other side of a wall.
-INWARD, SHALLOW = 0.004, 0.4
 
 
 class Compiled:
@@ -191,24 +179,22 @@ def _manifolds(touch: Touch | None) -> compiled.Manifolds:
 def compiled_shapes(bodies: Bodies) -> kinds.Shapes:
     """The shapes of a scene, baked where they have no closed form."""
     table = np.zeros((len(bodies.sdfs), kinds.FIELDS))
-    table[:, kinds.THICKNESS], table[:, kinds.CELL], table[:, kinds.PATCH] = np.inf, 1.0, -1.0
+    table[:, kinds.CELL], table[:, kinds.PATCH] = 1.0, -1.0
     brick, sample, label = [np.zeros(0, np.int64)], [np.zeros(0, np.float32)], [np.zeros(0, np.int16)]
-    owner = {int(s): k for k, s in reversed(list(enumerate(bodies.shape.tolist()))) if s >= 0}
-    every = list(zip(bodies.sdfs, bodies.pieces, bodies.hulls, strict=True))
     # Where all shapes are convex, or made of convex pieces, none is met as a surface.
-    surfaces = any(not (isinstance(sdf, ClosedForm) or len(pieces) or len(hull)) for sdf, pieces, hull in every)
-    known = [_geometry(_nodes_of(bodies, owner[s]), *some, surfaces=surfaces) for s, some in enumerate(every)]
-    for row, sdf, (grid, surface, *_) in zip(table, bodies.sdfs, known, strict=True):
-        if surface.nearest is not None:
-            row[kinds.PATCH_LOW : kinds.PATCH_LOW + 3], row[kinds.PATCH_CELL] = surface.low, surface.cell
-            row[kinds.PATCHES : kinds.PATCHES + 3], row[kinds.PATCH] = surface.nearest.shape, sum(map(len, label))
-            label.append(surface.nearest.reshape(-1))
-        if isinstance(sdf, ClosedForm):
-            row[kinds.KIND], row[kinds.SIZE : kinds.SIZE + len(sdf.sizes)] = FORMS[sdf.KIND], sdf.sizes
-            if sdf.sizes:
-                row[kinds.THICKNESS] = np.ptp(sdf.bounds, axis=0).min()
-        elif grid is not None:
-            row[kinds.KIND], row[kinds.THICKNESS], row[kinds.CELL] = kinds.GRID, grid.thickness, grid.cell
+    met = any(not (isinstance(shape.sdf, ClosedForm) or shape.solids) for shape in bodies.contact)
+    surfaces = [shape.surface if met else NO_SURFACE for shape in bodies.contact]
+    for row, shape, surface in zip(table, bodies.contact, surfaces, strict=True):
+        row[kinds.THICKNESS] = shape.thickness
+        if surface.label.size:
+            row[kinds.PATCH_LOW : kinds.PATCH_LOW + 3], row[kinds.PATCH_CELL] = surface.label_low, surface.label_cell
+            row[kinds.PATCHES : kinds.PATCHES + 3], row[kinds.PATCH] = surface.label.shape, sum(map(len, label))
+            label.append(surface.label.reshape(-1))
+        if isinstance(shape.sdf, ClosedForm):
+            sizes = shape.sdf.sizes
+            row[kinds.KIND], row[kinds.SIZE : kinds.SIZE + len(sizes)] = FORMS[shape.sdf.KIND], sizes
+        elif (grid := shape.grid) is not None:
+            row[kinds.KIND], row[kinds.CELL] = kinds.GRID, grid.cell
             row[kinds.LOW : kinds.LOW + 3], row[kinds.BRICKS : kinds.BRICKS + 3] = grid.low, grid.brick.shape
             row[kinds.COARSE], row[kinds.BRICK] = sum(map(len, sample)), sum(map(len, brick))
             sample.append(grid.coarse.reshape(-1))
@@ -216,12 +202,28 @@ def compiled_shapes(bodies: Bodies) -> kinds.Shapes:
             brick.append(np.where(grid.brick >= 0, grid.brick.astype(np.int64) * size + first, -1).reshape(-1))
             sample.append(grid.fine.reshape(-1))
     arrays = (np.concatenate(parts) for parts in (brick, sample))
-    solids = [g.solids for g in known]
-    for row, pieces in zip(table, solids, strict=True):
-        if pieces and row[kinds.KIND] == kinds.GRID:
-            row[kinds.THICKNESS] = min(piece.thickness for piece in pieces)
-    parts = (table, *arrays, *_joined(known), np.concatenate(label), *_packed(solids))
+    solids = [shape.solids for shape in bodies.contact]
+    parts = (table, *arrays, *_joined(surfaces), np.concatenate(label), *_packed(solids))
     return kinds.Shapes(*parts)
+
+
+def _joined(surfaces: list[ContactSurface]) -> tuple[np.ndarray, ...]:
+    """The node arrays of `kinds.Shapes`."""
+
+    def ends(name: str) -> np.ndarray:
+        """Where parts begin, as if all lay end to end."""
+        parts = [getattr(surface, name) for surface in surfaces]
+        first = np.cumsum([0, *(part[-1] for part in parts)])
+        return np.concatenate([[0], *(part[1:] + at for part, at in zip(parts, first, strict=False))]).astype(np.int64)
+
+    def whole(name: str) -> np.ndarray:
+        return np.concatenate([getattr(surface, name) for surface in [NO_SURFACE, *surfaces]])
+
+    clumps = np.cumsum([0, *(len(surface.clump_ball) for surface in surfaces)])
+    return (
+        whole("node"), whole("cover"), whole("inward"), ends("leaf_node"), whole("leaf_ball"), clumps,
+        ends("clump_leaf"), whole("clump_ball"), whole("leaf_patch"),
+    )  # fmt: skip
 
 
 def _packed(solids: list[tuple[ConvexPiece, ...]]) -> Convex:
@@ -252,48 +254,6 @@ def _packed(solids: list[tuple[ConvexPiece, ...]]) -> Convex:
         beside_start=ends([len(one) for one in beside]), beside=joined(beside, whole),
         around_start=ends([len(one) for one in around]), around=joined(around, whole),
     )  # fmt: skip
-
-
-class Geometry(NamedTuple):
-    """What the solve knows of a shape."""
-
-    grid: BakedGrid | None  # where it has no closed form
-    surface: ContactSurface
-    cover: np.ndarray  # [K] m, how far the surface around a node goes that is nearer to it than to others
-    inward: np.ndarray  # [K, 3] m, from its nodes to where they look out
-    clumps: Clumps
-    solids: tuple[ConvexPiece, ...]  # what it collides as, where it is convex or made of convex pieces
-
-
-Pieces = tuple[np.ndarray, ...]
-# With the nodes, the convex pieces and the hull that it is for.
-_of_sdf: WeakKeyDictionary[Sdf, tuple[np.ndarray, Pieces, np.ndarray, bool, Geometry]] = WeakKeyDictionary()
-_of_content: OrderedDict[str, Geometry] = OrderedDict()  # of the latest: workers get copies of shapes
-
-
-def _geometry(nodes: np.ndarray, sdf: Sdf, pieces: Pieces, hull: np.ndarray, *, surfaces: bool) -> Geometry:
-    """Made once for all scenes of a process; with a surface where a scene has some."""
-    known, split, solid, met, kept = _of_sdf.get(sdf, (nodes, pieces, hull, surfaces, None))
-    same = split is pieces and solid is hull and met >= surfaces and np.array_equal(known, nodes)
-    if kept is None or not same:
-        content = digest(sdf, nodes, pieces, hull, surfaces)
-        kept = _of_content.pop(content, None) or _looked_at(sdf, nodes, pieces, hull, surfaces=surfaces)
-        _of_sdf[sdf], _of_content[content] = (nodes, pieces, hull, surfaces, kept), kept
-        if len(_of_content) > MOST_KEPT:
-            _of_content.popitem(last=False)
-    return kept
-
-
-def _looked_at(sdf: Sdf, nodes: np.ndarray, pieces: Pieces, hull: np.ndarray, *, surfaces: bool) -> Geometry:
-    grid = None if isinstance(sdf, ClosedForm) else baked(sdf, nodes, pieces)
-    extent = 0.0 if isinstance(sdf, PlaneSdf) else float(np.ptp(sdf.bounds, axis=0).max())
-    solids = pieces_of(sdf, pieces, hull)
-    if grid and not solids and (wall := unseen_wall(sdf, grid)) is not None:
-        _log.warning("a shape of %.2g m has walls of at most %.2g m: things may pass through", extent, wall)
-    surface, cover = contact_surface(sdf, nodes if surfaces else nodes[:0], pieces, grid)
-    thickness = grid.thickness if grid else 0.0 if extent == 0.0 else float(np.ptp(sdf.bounds, axis=0).min())
-    inward = min(INWARD * extent, SHALLOW * thickness) * inwards(sdf, surface.nodes)
-    return Geometry(grid, surface, cover, inward, _clumps(surface.nodes, surface.patch), solids)
 
 
 def compiled_world(bodies: Bodies, state: State, shapes: kinds.Shapes) -> compiled.World:
@@ -334,72 +294,3 @@ def compiled_world(bodies: Bodies, state: State, shapes: kinds.Shapes) -> compil
         going=np.flatnonzero(moves | scripted), plane=plane, still=still[order],
         low=low, high=high, reach=np.maximum.accumulate(high[:, axis]) if len(still) else np.zeros(0), axis=axis,
     )  # fmt: skip
-
-
-def _nodes_of(bodies: Bodies, k: int) -> np.ndarray:
-    """[K, 3] surface nodes of the shape of body k, at scale 1 in the shape's own frame. Rounded to 12 digits, so that
-    bodies of different scales know them as the same nodes."""
-    first, last = int(bodies.node_start[k]), int(bodies.node_start[k + 1])
-    nodes = ((bodies.node[first:last] + bodies.com[k]) / bodies.scale[k]).cpu().numpy()
-    extent = np.ptp(nodes, axis=0).max() if len(nodes) else 0.0
-    if not extent > 0.0:
-        return nodes
-    # Up to the power of ten that holds it, and no further where rounding has made it a little more than that power.
-    return nodes.round(12 - math.ceil(math.log10(extent) - 1e-9))
-
-
-def _clumps(nodes: np.ndarray, patch: np.ndarray) -> Clumps:
-    """In clumps of leaves the numbers of the nodes that lie together; a leaf has nodes of one patch only."""
-    if not len(nodes):
-        return []
-    clumps = _split(nodes, np.arange(len(nodes)), CLUMP)
-    return [
-        [leaf for p in np.unique(patch[clump]) for leaf in _split(nodes, clump[patch[clump] == p], LEAF)]
-        for clump in clumps
-    ]
-
-
-def _split(nodes: np.ndarray, chosen: np.ndarray, most: int) -> list[np.ndarray]:
-    """Halved along the longest side until no part has more than `most`."""
-    if len(chosen) <= most:
-        return [chosen]
-    places = nodes[chosen]
-    axis = int(np.argmax(np.ptp(places, axis=0)))
-    order = chosen[np.argsort(places[:, axis], kind="stable")]
-    middle = len(order) // 2
-    return _split(nodes, order[:middle], most) + _split(nodes, order[middle:], most)
-
-
-def _joined(known: list[Geometry]) -> tuple[np.ndarray, ...]:
-    """The node arrays of `kinds.Shapes`."""
-    node, inward, leaf_ball, clump_ball = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros((0, 4))], [np.zeros((0, 4))]
-    cover = [np.zeros(0)]
-    leaf_node, clump_start, clump_leaf, leaf_patch = [0], [0], [0], []
-    for _, surface, around, within, clumps, _ in known:
-        for leaves in clumps:
-            for leaf in leaves:
-                node.append(surface.nodes[leaf])
-                cover.append(around[leaf])
-                inward.append(within[leaf])
-                leaf_node.append(leaf_node[-1] + len(leaf))
-                leaf_ball.append(_ball(surface.nodes[leaf], around[leaf]))
-                leaf_patch.append(surface.patch[leaf[0]])
-            clump_leaf.append(clump_leaf[-1] + len(leaves))
-            every = np.concatenate(leaves)
-            clump_ball.append(_ball(surface.nodes[every], around[every]))
-        clump_start.append(len(clump_leaf) - 1)
-
-    def whole(numbers: list[int]) -> np.ndarray:
-        return np.array(numbers, dtype=np.int64)
-
-    return (
-        np.concatenate(node), np.concatenate(cover), np.concatenate(inward), whole(leaf_node),
-        np.concatenate(leaf_ball), whole(clump_start), whole(clump_leaf), np.concatenate(clump_ball),
-        whole(leaf_patch),
-    )  # fmt: skip
-
-
-def _ball(places: np.ndarray, around: np.ndarray) -> np.ndarray:
-    """[1, 4] middle and radius of a ball around the surface that nodes stand for."""
-    middle = 0.5 * (places.min(0) + places.max(0))
-    return np.array([[*middle, (np.linalg.norm(places - middle, axis=1) + around).max()]])

@@ -1,0 +1,242 @@
+"""What contacts ask of a shape, in its own frame at scale 1: made once, and kept beside the baked grids on disk.
+
+A shape is met as convex solids where it is one or made of such, and as a surface in the distances of others elsewhere.
+A thousand bodies of one shape share one geometry.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import cached_arrays, digest, user_cache
+from sdfsim.geometry.mesh import Mesh, convex_hull, lattice
+from sdfsim.sdf.baked_grid import BakedGrid, baked, inwards, surface_samples, unseen_wall
+from sdfsim.sdf.closed_forms import BoxSdf, ClosedForm, CylinderSdf, PlaneSdf
+from sdfsim.sdf.reference import PiecesDistance, unique_planes
+from sdfsim.sdf.sdf import Sdf
+from sdfsim.shape.convex_pieces import ConvexPiece, closed_form, convex_vertices, hull
+
+VERSION = 1  # of what is kept on disk
+DENSEST = 4000  # nodes that a closed form has about at most
+LATTICE = 40  # of the lattice that says which patch is nearest, along the largest extent
+MOST_PATCHES = 1024  # of a shape: the contact solve tells no more of them apart
+OUTSIDE = 1e-3  # of the extent: vertices that lie deeper in the union are not on its surface
+LEAF, CLUMP = 16, 256  # nodes that a leaf and a clump of leaves hold at most
+# Of a solid's largest extent, from where its nodes look out, and of its thickness: not out of the other side of a wall.
+INWARD, SHALLOW = 0.004, 0.4
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class ContactSurface:
+    """The surface of a shape as K nodes in L leaves, and these in C clumps: what lies together is asked together.
+
+    Leaves and clumps have balls that hold the surface around their nodes, not the nodes alone: what is farther from a
+    ball than a contact may be cannot touch, whatever the shape and however few its nodes are.
+    """
+
+    node: np.ndarray  # [K, 3] m, leaf by leaf
+    cover: np.ndarray  # [K] m, how far the surface around a node goes that is nearer to it than to others
+    inward: np.ndarray  # [K, 3] m, from each a little into the solid, away from all faces that meet there
+    leaf_node: np.ndarray  # [L + 1] int64, leaf l holds nodes leaf_node[l] : leaf_node[l + 1]
+    leaf_ball: np.ndarray  # [L, 4] m, centre and radius
+    leaf_patch: np.ndarray  # [L] int64, the patch of the surface that a leaf's nodes are of
+    clump_leaf: np.ndarray  # [C + 1] int64, clump c holds leaves clump_leaf[c] : clump_leaf[c + 1]
+    clump_ball: np.ndarray  # [C, 4] m
+    # [X, Y, Z] int16, the patch that is nearest to the places of a lattice; of no places for a single patch
+    label: np.ndarray
+    label_low: np.ndarray  # [3] m, the first of these places
+    label_cell: np.ndarray  # [] m between two
+
+
+NO_LABELS = {"label": np.zeros((0, 0, 0), np.int16), "label_low": np.zeros(3), "label_cell": np.ones(())}
+
+
+class ContactGeometry:
+    """Of one shape; each part is made when it is first asked for."""
+
+    def __init__(self, sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray], mesh: Mesh) -> None:
+        self.sdf, self._nodes, self._pieces, self._mesh = sdf, nodes, pieces, mesh
+
+    @cached_property
+    def grid(self) -> BakedGrid | None:
+        """The distance for where there is no closed form. A wall too thin for it is warned of."""
+        if isinstance(self.sdf, ClosedForm):
+            return None
+        grid = baked(self.sdf, self._nodes, self._pieces)
+        if not self.solids and (wall := unseen_wall(self.sdf, grid)) is not None:
+            extent = np.ptp(self.sdf.bounds, axis=0).max()
+            _log.warning("a shape of %.2g m has walls of at most %.2g m: things may pass through", extent, wall)
+        return grid
+
+    @cached_property
+    def solids(self) -> tuple[ConvexPiece, ...]:
+        """What the shape collides as: its convex pieces, its closed form, or its own hull; nothing for a plane, and for
+        what is none of these."""
+        if self._pieces:
+            return tuple(hull(piece) for piece in self._pieces)
+        if isinstance(self.sdf, ClosedForm):
+            found = closed_form(self.sdf)
+            return () if found is None else (found,)
+        whole = convex_vertices(self._mesh)
+        return (hull(whole),) if len(whole) else ()
+
+    @property
+    def thickness(self) -> float:
+        """m, of the thinnest walls, or of the thinnest solid; infinite for a plane."""
+        if isinstance(self.sdf, PlaneSdf):
+            return np.inf
+        if self.grid is None:
+            return float(np.ptp(self.sdf.bounds, axis=0).min())
+        return min(piece.thickness for piece in self.solids) if self.solids else self.grid.thickness
+
+    @cached_property
+    def surface(self) -> ContactSurface:
+        """Of a plane without nodes. Raises SdfsimError for more than `MOST_PATCHES` pieces."""
+        if isinstance(self.sdf, ClosedForm):
+            return ContactSurface(**self._surface())
+        known = digest(self.sdf, self._nodes, [*self._pieces], LEAF, CLUMP, INWARD, SHALLOW)
+        path = user_cache("contact") / f"{known}-{VERSION}.npz"
+        return ContactSurface(**cached_arrays(path, "the contact surface of a shape", self._surface))
+
+    def _surface(self) -> dict[str, np.ndarray]:
+        sdf, grid = self.sdf, self.grid
+        if isinstance(sdf, BoxSdf | CylinderSdf) and len(self._nodes):
+            spacing = max(0.5 * min(sdf.sizes), np.sqrt(_area(sdf) / DENSEST))
+            nodes = _on_box(np.array(sdf.half), spacing) if isinstance(sdf, BoxSdf) else _on_cylinder(sdf, spacing)
+            patches, cover = patches_of(sdf, nodes, ()), np.full(len(nodes), 0.75 * spacing)
+        else:
+            patches = patches_of(sdf, self._nodes, self._pieces)
+            cover = np.zeros(len(patches["node"]))
+            if grid is not None and len(cover):
+                from scipy.spatial import KDTree
+
+                away, nearest = KDTree(patches["node"]).query(surface_samples(grid))
+                np.maximum.at(cover, nearest, away)
+                cover += grid.cell
+        node, patch = patches.pop("node"), patches.pop("patch")
+        extent = 0.0 if isinstance(sdf, PlaneSdf) else float(np.ptp(sdf.bounds, axis=0).max())
+        shallow = self.grid.thickness if self.grid else self.thickness
+        inward = min(INWARD * extent, SHALLOW * shallow) * inwards(sdf, node)
+        return {**in_leaves(node, patch, cover, inward), **patches}
+
+
+def patches_of(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
+    """The `node`s that carry contact, with the vertices [V, 3] m of convex pieces, where the shape has some, the
+    `patch` of each, and the labels of a `ContactSurface`. Raises SdfsimError for more than `MOST_PATCHES` pieces."""
+    if len(pieces) == 0:
+        return {"node": nodes, "patch": np.zeros(len(nodes), np.int64), **NO_LABELS}
+    check_pieces("a shape", pieces)
+    extent = float(np.ptp(sdf.bounds, axis=0).max())
+    vertices, union = np.concatenate(pieces), PiecesDistance([convex_hull(piece) for piece in pieces])
+    bare = union(vertices).distance > -OUTSIDE * extent
+    nodes = union(nodes).closest  # those of a fitted surface lie beside it
+    owner = np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
+    cell = extent / LATTICE
+    low = sdf.bounds[0] - cell
+    count = np.ceil((sdf.bounds[1] + cell - low) / cell).astype(int) + 1
+    places = lattice(*(low[axis] + cell * np.arange(count[axis]) for axis in range(3)))
+    nearest = _nearest_piece(pieces, np.concatenate([places, nodes]))
+    return {
+        "node": np.concatenate([vertices[bare], nodes]),
+        "patch": np.concatenate([owner[bare], nearest[len(places) :]]),
+        "label": nearest[: len(places)].astype(np.int16).reshape(count),
+        "label_low": low,
+        "label_cell": np.array(cell),
+    }
+
+
+def check_pieces(what: str, pieces: Sequence[np.ndarray]) -> None:
+    """Raises SdfsimError, which says `what` has them, for more than `MOST_PATCHES` convex pieces."""
+    if len(pieces) > MOST_PATCHES:
+        told = f"{what} is made of {len(pieces):,} convex pieces (at most {MOST_PATCHES:,})"
+        raise SdfsimError(told, "cut it into fewer ones, or fit its mesh without pieces")
+
+
+def _nearest_piece(pieces: Sequence[np.ndarray], places: np.ndarray) -> np.ndarray:
+    """[P] int64: the convex hull whose farthest face plane is least far from a place."""
+    from scipy.spatial import ConvexHull
+
+    least, nearest = np.full(len(places), np.inf), np.zeros(len(places), np.int64)
+    size = float(np.ptp(np.concatenate(pieces), axis=0).max())
+    for k, piece in enumerate(pieces):
+        far = np.full(len(places), -np.inf)
+        for plane in unique_planes(ConvexHull(piece).equations, size, 6):
+            np.maximum(far, places @ plane[:3] + plane[3], out=far)
+        nearest[far < least] = k
+        np.minimum(least, far, out=least)
+    return nearest
+
+
+def in_leaves(node: np.ndarray, patch: np.ndarray, cover: np.ndarray, inward: np.ndarray) -> dict[str, np.ndarray]:
+    """Nodes [K, 3] in the order of leaves, and these in clumps; a leaf has nodes of one patch only."""
+    leaves: list[np.ndarray] = []
+    clump_leaf, clump_ball = [0], [np.zeros((0, 4))]
+    for clump in _split(node, np.arange(len(node)), CLUMP) if len(node) else []:
+        leaves += [leaf for p in np.unique(patch[clump]) for leaf in _split(node, clump[patch[clump] == p], LEAF)]
+        clump_leaf.append(len(leaves))
+        clump_ball.append(_ball(node[clump], cover[clump]))
+    order = np.concatenate([np.zeros(0, np.int64), *leaves])
+    return {
+        "node": node[order], "cover": cover[order], "inward": inward[order],
+        "leaf_node": np.cumsum([0, *map(len, leaves)], dtype=np.int64),
+        "leaf_ball": np.concatenate([np.zeros((0, 4)), *(_ball(node[leaf], cover[leaf]) for leaf in leaves)]),
+        "leaf_patch": np.array([patch[leaf[0]] for leaf in leaves], dtype=np.int64),
+        "clump_leaf": np.array(clump_leaf, dtype=np.int64), "clump_ball": np.concatenate(clump_ball),
+    }  # fmt: skip
+
+
+NO_SURFACE = ContactSurface(
+    **in_leaves(np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3))), **NO_LABELS
+)
+
+
+def _split(nodes: np.ndarray, chosen: np.ndarray, most: int) -> list[np.ndarray]:
+    """Halved along the longest side until no part has more than `most`."""
+    if len(chosen) <= most:
+        return [chosen]
+    places = nodes[chosen]
+    axis = int(np.argmax(np.ptp(places, axis=0)))
+    order = chosen[np.argsort(places[:, axis], kind="stable")]
+    middle = len(order) // 2
+    return _split(nodes, order[:middle], most) + _split(nodes, order[middle:], most)
+
+
+def _ball(places: np.ndarray, around: np.ndarray) -> np.ndarray:
+    """[1, 4] middle and radius of a ball around the surface that nodes stand for."""
+    middle = 0.5 * (places.min(0) + places.max(0))
+    return np.array([[*middle, (np.linalg.norm(places - middle, axis=1) + around).max()]])
+
+
+def _area(sdf: BoxSdf | CylinderSdf) -> float:
+    if isinstance(sdf, BoxSdf):
+        a, b, c = sdf.half
+        return 8.0 * (a * b + b * c + c * a)
+    return 2.0 * np.pi * sdf.radius * (sdf.radius + 2.0 * sdf.half)
+
+
+def _on_box(half: np.ndarray, spacing: float) -> np.ndarray:
+    """Points all over a box at most `spacing` m apart along its sides, corners and edges among them."""
+    axes = [np.linspace(-h, h, 1 + max(1, int(np.ceil(2.0 * h / spacing)))) for h in half]
+    points = [axes[0][[0, -1]], axes[1][[0, -1]], axes[2][[0, -1]]]
+    sides = [lattice(*(points[k] if k == axis else axes[k] for k in range(3))) for axis in range(3)]
+    return np.unique(np.concatenate(sides), axis=0)
+
+
+def _on_cylinder(sdf: CylinderSdf, spacing: float) -> np.ndarray:
+    """Points all over a cylinder at most `spacing` m apart, its rims among them."""
+    around = 2.0 * np.pi * np.arange(count := max(8, int(np.ceil(2.0 * np.pi * sdf.radius / spacing)))) / count
+    circle = np.stack([np.cos(around), np.sin(around)], axis=1)
+    heights = np.linspace(-sdf.half, sdf.half, 1 + max(1, int(np.ceil(2.0 * sdf.half / spacing))))
+    radii = np.linspace(0.0, sdf.radius, 1 + max(1, int(np.ceil(sdf.radius / spacing))))[:-1]
+    side = [np.column_stack([sdf.radius * circle, np.full(count, z)]) for z in heights]
+    ends = [np.column_stack([r * circle, np.full(count, z)]) for z in (-sdf.half, sdf.half) for r in radii[1:]]
+    tips = [np.array([[0.0, 0.0, -sdf.half], [0.0, 0.0, sdf.half]])]
+    return np.concatenate([*side, *ends, *tips])
