@@ -33,7 +33,7 @@ logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
 GLTF = (".glb", ".gltf")
-FARTHEST = 1e12  # from the origin: beyond, not even double precision tells the vertices of a room-sized mesh apart
+FARTHEST = 1e12  # from the origin: beyond, double precision cannot separate the vertices of a room-sized mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,7 +211,7 @@ def read_glb(path: Path) -> dict[str, Mesh]:
         for name, drawn in loaded.geometry.items():
             image = drawn.visual.material.baseColorTexture
             if image.format != "JPEG":
-                raise ValueError("a texture that is no JPEG")
+                raise ValueError("a texture that is not a JPEG")
             # trimesh counts up from the lower edge of a texture.
             uv = np.asarray(drawn.visual.uv) * [1.0, -1.0] + [0.0, 1.0]
             mesh = Mesh(np.array(drawn.vertices), _faces(drawn), None, uv, np.asarray(image.convert("RGB")))
@@ -221,12 +221,12 @@ def read_glb(path: Path) -> dict[str, Mesh]:
 
 
 @contextmanager
-def _reading(path: Path, told: str = "damaged or cut short") -> Iterator[None]:
+def _reading(path: Path, fault: str = "damaged or cut short") -> Iterator[None]:
     """Turn whatever a reader stumbles over into an SdfsimError."""
     try:
         yield
     except Exception as error:
-        raise SdfsimError(f"{path}: {told} ({error})") from error
+        raise SdfsimError(f"{path}: {fault} ({error})") from error
 
 
 def _require_whole(mesh: Mesh) -> None:
@@ -259,7 +259,7 @@ def clean(mesh: Mesh, *, name: str = "mesh") -> Mesh:
     if not solid.any():
         raise SdfsimError(f"{name}: mesh has no faces with an area")
     # Files round to about seven digits: what agrees to a millionth of the size is one vertex. A face without an area
-    # may lie anywhere, and says nothing of the size.
+    # may lie anywhere, so it does not count for the size.
     low, high = (fold(vertices[np.unique(faces[solid])], axis=0) for fold in (np.min, np.max))
     keys = np.round((vertices - low) / max(1e-6 * float((high - low).max()), 1e-300))
     _, first, label = np.unique(keys + 0.0, axis=0, return_index=True, return_inverse=True)

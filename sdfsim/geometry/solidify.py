@@ -1,4 +1,4 @@
-"""Any triangle mesh -> the solid it stands for, or one line saying why it stands for none.
+"""Any triangle mesh -> the solid that it bounds, or one line why it bounds none.
 
 Vertices [V, 3 + K] and corners of triangles [F, 3, 3 + K] hold coordinates, and K columns (colours) that new vertices
 get by the same averages.
@@ -179,7 +179,7 @@ def _outwards(vertices: np.ndarray, faces: np.ndarray, patch: np.ndarray) -> np.
 def _close(
     vertices: np.ndarray, faces: np.ndarray, limit: float, area: float, scale: float, notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Close openings by fans around their middle, smallest first, up to `limit` in all (normalised area), and say so. A
+    """Close openings by fans around their middle, smallest first, up to `limit` in all (normalised area); note it. A
     fan is right for any flat loop, though it may lie over itself: what it covers twice cancels in winding numbers."""
     fans = []
     for loop in openings(faces):

@@ -128,12 +128,12 @@ def load_shape(folder: str | Path) -> Shape:
         raise SdfsimError(f"{folder}: no such shape folder")
     for name in (RECORD_FILE, WEIGHTS_FILE, MESH_FILE):
         if not (folder / name).is_file():
-            raise SdfsimError(f"{folder}: {name} is missing, so this is no complete shape folder")
+            raise SdfsimError(f"{folder}: {name} is missing, so this is not a complete shape folder")
     record = read_json(folder / RECORD_FILE, "fit the mesh again")
     version = record.get("version") if isinstance(record, dict) else None
     if version != FORMAT_VERSION:
-        told = f"shape format version {version!r}, this program reads {FORMAT_VERSION}"
-        raise SdfsimError(f"{folder / RECORD_FILE}: {told}", "fit the mesh again")
+        fault = f"shape format version {version!r}, this program reads {FORMAT_VERSION}"
+        raise SdfsimError(f"{folder / RECORD_FILE}: {fault}", "fit the mesh again")
     try:
         tensors = from_bytes((folder / WEIGHTS_FILE).read_bytes())
     except (SafetensorError, OSError) as error:
@@ -275,7 +275,7 @@ def with_sdf(shape: Shape, kind: SdfKind, *, resolution: int = DEFAULT_RESOLUTIO
 def sdf_of_mesh(
     mesh: Mesh, kind: Literal["grid", "mesh"], resolution: int, on_progress: Progress = silent
 ) -> tuple[Sdf, dict, dict]:
-    """A mesh's exact SDF or a grid of it, what a shape's `source` says about it, and its certificate."""
+    """A mesh's exact SDF or a grid of it, its entries of a shape's `source`, and its certificate."""
     if kind == "mesh":
         return MeshSdf(mesh), {"sdf": "mesh"}, {}
     oracle = MeshDistance(mesh)

@@ -28,8 +28,8 @@ CHUNK = 10_000  # points looked at together
 # Faces that meet at less than this cosine (20 degrees) make an edge worth nodes of its own.
 SHARP = 0.94
 DENSEST = 4000  # nodes that a closed form has about at most
-LATTICE = 40  # of the lattice that tells the nearest patch, along the largest extent
-MOST_PATCHES = 1024  # of a shape: the contact solve tells no more of them apart
+LATTICE = 40  # of the lattice that holds the nearest patch, along the largest extent
+MOST_PATCHES = 1024  # of a shape: the most that the contact solve distinguishes
 OUTSIDE = 1e-3  # of the extent: vertices that lie deeper in the union are not on its surface
 
 
@@ -210,10 +210,10 @@ def surface_of(sdf: Sdf, nodes: np.ndarray, pieces: Sequence[np.ndarray]) -> Con
 
 
 def check_pieces(what: str, pieces: Sequence[np.ndarray]) -> None:
-    """Raises SdfsimError, which says `what` has them, for more than `MOST_PATCHES` convex pieces."""
+    """Raises SdfsimError, which names `what`, for more than `MOST_PATCHES` convex pieces."""
     if len(pieces) > MOST_PATCHES:
-        told = f"{what} is made of {len(pieces):,} convex pieces (at most {MOST_PATCHES:,})"
-        raise SdfsimError(told, "cut it into fewer ones, or fit its mesh without pieces")
+        fault = f"{what} is made of {len(pieces):,} convex pieces (at most {MOST_PATCHES:,})"
+        raise SdfsimError(fault, "cut it into fewer ones, or fit its mesh without pieces")
 
 
 def _nearest_piece(pieces: Sequence[np.ndarray], places: np.ndarray) -> np.ndarray:
