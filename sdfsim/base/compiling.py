@@ -1,4 +1,4 @@
-"""A warning before the first compilation keeps a person waiting."""
+"""Warns before a compilation that takes long."""
 
 from __future__ import annotations
 
