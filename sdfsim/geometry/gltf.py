@@ -19,7 +19,7 @@ from urllib.parse import unquote
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sdfsim.geometry.mesh_files import FileMesh, looked_up, read_image, side_file, strip
+from sdfsim.geometry.mesh_formats import FileMesh, looked_up, read_image, side_file, strip
 
 # What z up is to the y up of glTF: columns of a matrix [4, 4].
 _Y_UP = [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1]

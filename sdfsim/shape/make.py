@@ -19,7 +19,8 @@ from sdfsim.base.files import user_cache
 from sdfsim.base.parallel import Progress, silent
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mass import mass_properties, mass_properties_of_sdf
-from sdfsim.geometry.mesh import GLTF, Mesh, clean, convex_hull, is_closed, lattice, load_mesh
+from sdfsim.geometry.mesh import Mesh, clean, convex_hull, is_closed, lattice
+from sdfsim.geometry.mesh_io import GLTF, load_mesh
 from sdfsim.geometry.solidify import solidify
 from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, SphereSdf
 from sdfsim.sdf.fit.train import FIT_VERSION, Recipe, fit_sdf

@@ -14,15 +14,8 @@ from sdfsim.base.files import read_json, write_bytes, write_json
 from sdfsim.base.parallel import Progress, silent
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mass import mass_properties_of_sdf
-from sdfsim.geometry.mesh import (
-    Frame,
-    Mesh,
-    convex_hull,
-    read_glb,
-    read_mesh,
-    write_glb,
-    write_ply,
-)
+from sdfsim.geometry.mesh import Frame, Mesh, convex_hull
+from sdfsim.geometry.mesh_io import read_glb, read_mesh, write_glb, write_ply
 from sdfsim.sdf.closed_forms import CLOSED_FORMS, ClosedForm, PlaneSdf
 from sdfsim.sdf.fit.certificate import certify_grid
 from sdfsim.sdf.grid import GridSdf, sample_grid

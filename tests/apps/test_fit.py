@@ -15,7 +15,8 @@ from sdfsim.apps.fit import named_meshes
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.parallel import cluster, parallel
 from sdfsim.geometry import primitives
-from sdfsim.geometry.mesh import Mesh, write_ply
+from sdfsim.geometry.mesh import Mesh
+from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.sdf.baked_grid import baked
 from sdfsim.shape.make import mesh_shape, shape_from_mesh
 from sdfsim.shape.shape import load_shape

@@ -19,7 +19,7 @@ from sdfsim import Rollout, load_scene
 from sdfsim.apps import run as runs
 from sdfsim.base.arguments import seconds_of
 from sdfsim.geometry import primitives
-from sdfsim.geometry.mesh import write_ply
+from sdfsim.geometry.mesh_io import write_ply
 from tests.cli.conftest import SCENE, run
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -9,7 +9,7 @@ import pytest
 
 from sdfsim import SceneError, load_scene
 from sdfsim.geometry import primitives
-from sdfsim.geometry.mesh import write_ply
+from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.shape.make import analytic_shape
 from tests.scene.conftest import HEAD, problems_of
 
