@@ -36,7 +36,8 @@ from pipeline.mesh.placement import load_placement
 from pipeline.mesh.trust import vertex_areas
 from sdfsim.base.console import Session
 from sdfsim.base.errors import SdfsimError
-from sdfsim.geometry.mesh import Mesh, load_mesh, read_attributes, read_mesh, signed_volume
+from sdfsim.geometry.mesh import Mesh, signed_volume
+from sdfsim.geometry.mesh_io import load_mesh, read_attributes, read_mesh
 
 PHOTOS = ROOT / "samples" / "photos" / "table_vase"
 TABLE, VASE = 0.55, np.array([0.12, -0.05])  # m: the table's height, and the vase's axis

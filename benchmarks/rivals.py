@@ -41,7 +41,8 @@ from sdfsim.evaluation.evaluate import load_recorded
 from sdfsim.evaluation.hard_cases import ball, body, box, on_floor
 from sdfsim.evaluation.harness import Job, Results, markdown, measure, number, one_thread, peak_memory
 from sdfsim.evaluation.penetration import depths
-from sdfsim.geometry.mesh import Mesh, clean, load_pieces, wavefront
+from sdfsim.geometry.mesh import Mesh, clean
+from sdfsim.geometry.mesh_io import load_pieces, wavefront
 from sdfsim.learned.model import load_model
 from sdfsim.physics.bodies import largest_extent
 from sdfsim.physics.units import scene_units

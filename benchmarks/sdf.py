@@ -26,7 +26,7 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import write_text
 from sdfsim.data.public_shapes import public_folder
 from sdfsim.evaluation.harness import Job, Panel, cells, draw, line, machine, markdown, measure, number
-from sdfsim.geometry.mesh import load_mesh
+from sdfsim.geometry.mesh_io import load_mesh
 from sdfsim.geometry.solidify import solidify
 from sdfsim.sdf.fit.certificate import EXACT
 from sdfsim.sdf.fit.train import FIT_VERSION, RECIPES, Recipe

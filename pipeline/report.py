@@ -225,7 +225,7 @@ def write_recording(folder: Path, done: Collection[str]) -> Path | None:
     from pipeline.mesh.meshing import NEXT, TEXTURED, trust_meshes
     from pipeline.mesh.placement import load_placement
     from sdfsim.apps.recording import PosedPhoto, save_reconstruction
-    from sdfsim.geometry.mesh import load_mesh, read_glb
+    from sdfsim.geometry.mesh_io import load_mesh, read_glb
 
     if "poses" not in done:
         return None

@@ -18,7 +18,8 @@ from pipeline.mesh.visibility import Above
 from pipeline.progress import Progress, quiet, share_of
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError, nearest
 from sdfsim.base.files import write_text
-from sdfsim.geometry.mesh import Mesh, joined, load_mesh, read_glb
+from sdfsim.geometry.mesh import Mesh, joined
+from sdfsim.geometry.mesh_io import load_mesh, read_glb
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
 

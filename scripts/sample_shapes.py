@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sdfsim.geometry.mesh import Mesh, write_ply
+from sdfsim.geometry.mesh import Mesh
+from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.geometry.primitives import sphere
 from sdfsim.shape.make import fit_mesh, shape_from_primitive
 

@@ -64,6 +64,7 @@ CIRCLES = [
         "sdfsim.learned.surfaces",
         "sdfsim.simulate.step",
     },
+    {"sdfsim.physics.solver.prepare", "sdfsim.simulate.run_memory"},
     {"sdfsim.simulate.body_handle", "sdfsim.simulate.simulator"},
 ]
 
@@ -97,10 +98,11 @@ def imports() -> dict[str, set[str]]:
 
 
 def floor(module: str) -> tuple[int, str]:
-    """The floor of a module's room and the room's name. The package itself is below all: its names load on use."""
+    """The floor and the name of a module's room. `pipeline` is beside `commands`, `cli` above. The package itself is
+    below all: its names load on use."""
     package, _, rest = module.partition(".")
     if package != "sdfsim":
-        return {"pipeline": 100, "cli": 101}[package], package
+        return len(FLOORS) - (package == "pipeline"), package
     room = rest.partition(".")[0]
     return next((level for level, rooms in enumerate(FLOORS) if room in rooms), -1), room
 

@@ -25,7 +25,8 @@ from pipeline.progress import Progress, quiet, share_of
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_json, write_bytes, write_json
 from sdfsim.geometry.bvh import Caster
-from sdfsim.geometry.mesh import Mesh, joined, read_attributes, read_mesh, write_glb, write_ply
+from sdfsim.geometry.mesh import Mesh, joined
+from sdfsim.geometry.mesh_io import read_attributes, read_mesh, write_glb, write_ply
 
 SCENERY = "scene"
 TEXTURED, NEXT = "textured.glb", "next_photos.json"

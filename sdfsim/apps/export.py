@@ -29,7 +29,8 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import check_writable, write_bytes, write_text
 from sdfsim.base.parallel import StageProgress
 from sdfsim.geometry.gltf import GltfWriter, light
-from sdfsim.geometry.mesh import Mesh, convex_hull, wavefront
+from sdfsim.geometry.mesh import Mesh, convex_hull
+from sdfsim.geometry.mesh_io import wavefront
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.load import load_scene

@@ -12,7 +12,7 @@ from sdfsim.base.devices import pick_device
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import check_writable, locked, read_json, visible
 from sdfsim.base.parallel import Progress, parallel, silent
-from sdfsim.geometry.mesh import MESH_SUFFIXES, load_mesh
+from sdfsim.geometry.mesh_io import MESH_SUFFIXES, load_mesh
 from sdfsim.scene.schema import UNITS
 from sdfsim.sdf.baked_grid import baked, grid_certificate, unseen_wall
 from sdfsim.sdf.fit.train import FIT_VERSION, Recipe

@@ -1,1 +1,1 @@
-"""What every room uses: errors, files, work on all cores, and how a command speaks."""
+"""What every room uses: errors, files, work on all cores, options and output of commands."""

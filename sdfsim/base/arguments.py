@@ -1,4 +1,4 @@
-"""Arguments that several commands take, and what they all do with a report."""
+"""Arguments that several commands share, and how a command runs."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ Cluster = Annotated[
 
 def command(work: Callable[..., None]) -> Callable[..., None]:
     """A command: `work` with a `Session` made for it, and with the options --json, --device and -v. Work that does not
-    compute takes no `device`; that it is there is checked all the same."""
+    compute takes no `device`; it is checked all the same."""
     given = inspect.signature(work, eval_str=True).parameters
 
     @wraps(work)
@@ -56,14 +56,14 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
     own = [parameter for name, parameter in given.items() if name not in ("session", "device")]
     shared = (("as_json", Json, False), ("device", Device, "auto"), ("verbose", Verbose, False))
     added = [inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY, default=d, annotation=a) for n, a, d in shared]
-    told: Any = run
-    told.__signature__ = inspect.Signature([*own, *added])
-    told.__annotations__ = work.__annotations__ | {name: kind for name, kind, _ in shared}
+    described: Any = run
+    described.__signature__ = inspect.Signature([*own, *added])
+    described.__annotations__ = work.__annotations__ | {name: kind for name, kind, _ in shared}
     return run
 
 
 def tell_failed(session: Session, report: dict) -> None:
-    """Say every failed check; there being one is the exit code."""
+    """Print every failed check; with one or more the exit code is 3."""
     for check in report["failed_checks"]:
         session.exit_code = EXIT_QUALITY
         session.say(f"failed check: {check}")

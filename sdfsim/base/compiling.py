@@ -1,4 +1,4 @@
-"""What is said before compiled code that is not there yet keeps a person waiting."""
+"""Warns before a compilation that takes long."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ _said: set[str] = set()
 
 
 def tell_compiling(function: Any, what: str, takes: str) -> None:
-    """Warn, once in a process, that `what` is going to be compiled where a compiled `function` is neither in memory nor
-    kept, by this very source, where numba keeps it."""
+    """Warn, once in a process, that `what` is about to be compiled: where the compiled `function` is neither in memory
+    nor in numba's cache for this source."""
     if what in _said or is_compiled(function):
         return
     _said.add(what)
@@ -19,7 +19,7 @@ def tell_compiling(function: Any, what: str, takes: str) -> None:
 
 
 def is_compiled(function: Any) -> bool:
-    """Whether a function that numba compiles is there in a second; one that runs as Python needs no compiling."""
+    """Whether a function of numba is ready within a second; one that runs as Python needs no compiling."""
     if not hasattr(function, "signatures"):
         return True
     if function.signatures:

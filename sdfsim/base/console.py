@@ -1,4 +1,4 @@
-"""What a command says: progress and errors on stderr, its report on stdout, and its exit code."""
+"""How a command reports: progress and errors on stderr, the result on stdout, and its exit code."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Session:
         raise SystemExit(self.exit_code) from None
 
     def _explain(self, error: BaseException) -> None:
-        """Tell the error; what it is decides the exit code."""
+        """Print the error; its type decides the exit code."""
         hint, self.exit_code, more = "", EXIT_ERROR, {}
         if isinstance(error, SdfsimError):
             message, hint, self.exit_code = error.message, error.hint, error.exit_code
@@ -93,11 +93,11 @@ class Session:
         self.say("\n".join(f"error: {line}" for line in message.splitlines()))
         if hint:
             self.say(f"hint: {hint}")
-        told = {"error": message, "hint": hint, "exit_code": self.exit_code}
-        self._result = (self._result or {}) | told | more
+        failure = {"error": message, "hint": hint, "exit_code": self.exit_code}
+        self._result = (self._result or {}) | failure | more
 
     def _print(self, text: str) -> None:
-        """Print on stdout. Whoever read it and closed the pipe, such as `head`, has seen enough."""
+        """Print on stdout. A reader that has closed the pipe, such as `head`, is not an error."""
         try:
             print(text, flush=True)
         except OSError as error:
@@ -128,7 +128,7 @@ class _Bar:
         self._progress: Any = None
         self._task: Any = None
         self._stage: str | None = None
-        self._told = 0.0
+        self._printed = 0.0
         self._ended = False
 
     def update(self, stage: str, fraction: float, message: str) -> None:
@@ -139,8 +139,8 @@ class _Bar:
             self._draw(fresh, fraction, title)
             return
         ended = fraction >= 1 and (fresh or not self._ended)
-        if fresh or ended or (fraction < 1 and now - self._told >= _PLAIN_SECONDS):
-            self._told, self._ended = now, fraction >= 1
+        if fresh or ended or (fraction < 1 and now - self._printed >= _PLAIN_SECONDS):
+            self._printed, self._ended = now, fraction >= 1
             self.say(f"[{fraction:4.0%}] {title}")
 
     def _draw(self, fresh: bool, fraction: float, title: str) -> None:

@@ -22,7 +22,7 @@ from sdfsim.base.errors import SdfsimError
 
 _log = logging.getLogger(__name__)
 LOCK = ".lock"
-# What a run was asked for, the command first.
+# The options of a run, the command first.
 CONFIG = "config.yaml"
 # What an archive may unpack to: so many bytes, or so many times its own size.
 FREELY, MOST_GROWTH = 2**30, 100
@@ -51,12 +51,12 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def visible(folder: Path) -> list[Path]:
-    """What lies in a folder, by name, without what is hidden or what macOS adds (`._NAME`, `__MACOSX`)."""
+    """Files and folders in a folder, by name, without hidden ones and those that macOS adds (`._NAME`, `__MACOSX`)."""
     return sorted(path for path in folder.iterdir() if not hidden(path.name))
 
 
 def hidden(name: str) -> bool:
-    """Whether a file or folder of this name is none that a person put there."""
+    """Whether the system made a file or folder of this name, not a person."""
     return name.startswith(".") or name == "__MACOSX"
 
 
@@ -91,7 +91,7 @@ def write_arrays(path: Path, arrays: dict[str, Any], *, compressed: bool = True)
 
 
 def read_arrays(path: Path, what: str, hint: str = "") -> dict[str, np.ndarray]:
-    """All arrays of an `.npz` file; `what` says in the message what it should have been. Raises SdfsimError where it is
+    """All arrays of an `.npz` file; messages call it `what`. Raises SdfsimError where it is
     absent, cut short, no such file, or claims an absurd size."""
     try:
         with zipfile.ZipFile(path) as archive:
@@ -186,28 +186,28 @@ def check_own(folder: Path, command: str, *names: str) -> None:
 
 
 def digest(*parts: Any) -> str:
-    """Changes with the content of `parts`: arrays, tensors, networks, dataclasses, and what Python has of its own."""
-    told = hashlib.sha256()
-    _feed(told, parts)
-    return told.hexdigest()[:32]
+    """A hash of the content of `parts`: arrays, tensors, networks, dataclasses and Python's own types."""
+    hashed = hashlib.sha256()
+    _feed(hashed, parts)
+    return hashed.hexdigest()[:32]
 
 
-def _feed(told: Any, value: Any) -> None:
+def _feed(hashed: Any, value: Any) -> None:
     if hasattr(value, "state_dict"):  # a network
         value = [type(value).__name__, dict(value.state_dict())]
     elif hasattr(value, "detach"):  # a tensor
         value = value.detach().cpu().numpy()
     if isinstance(value, np.ndarray):
-        told.update(f"{value.dtype}{value.shape}".encode() + np.ascontiguousarray(value).tobytes())
+        hashed.update(f"{value.dtype}{value.shape}".encode() + np.ascontiguousarray(value).tobytes())
     elif isinstance(value, dict):
-        _feed(told, [[str(key), value[key]] for key in sorted(value, key=str)])
+        _feed(hashed, [[str(key), value[key]] for key in sorted(value, key=str)])
     elif isinstance(value, list | tuple):
-        told.update(f"{len(value)}[".encode())
+        hashed.update(f"{len(value)}[".encode())
         for item in value:
-            _feed(told, item)
+            _feed(hashed, item)
     elif is_dataclass(value) and not isinstance(value, type):
-        _feed(told, [type(value).__name__, *([field.name, getattr(value, field.name)] for field in fields(value))])
+        _feed(hashed, [type(value).__name__, *([field.name, getattr(value, field.name)] for field in fields(value))])
     elif value is None or isinstance(value, str | int | float | bool | np.generic | Path):
-        told.update(repr(value).encode() + b";")
+        hashed.update(repr(value).encode() + b";")
     else:
         raise TypeError(f"no digest of a {type(value).__name__}")

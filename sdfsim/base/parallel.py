@@ -22,7 +22,7 @@ SCHEDULER_ANSWERS = 10.0  # s, within which
 
 
 def silent(fraction: float, message: str) -> None:
-    """Progress that nobody is told."""
+    """Progress that is not shown."""
 
 
 _most = torch.get_num_threads()  # Before anything here has changed it.

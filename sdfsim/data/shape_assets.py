@@ -18,7 +18,8 @@ from sdfsim.data.dataset import SOLID, check_names
 from sdfsim.data.pybullet_sim import write_urdf
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mass import mass_properties, mass_properties_of_sdf
-from sdfsim.geometry.mesh import MESH_SUFFIXES, Mesh, convex_hull, is_closed, load_mesh, load_pieces, wavefront
+from sdfsim.geometry.mesh import Mesh, convex_hull, is_closed
+from sdfsim.geometry.mesh_io import MESH_SUFFIXES, load_mesh, load_pieces, wavefront
 from sdfsim.geometry.solidify import solidify
 from sdfsim.sdf.reference import PiecesDistance
 from sdfsim.shape.make import analytic_shape, fit_pieces

@@ -27,7 +27,8 @@ from sdfsim.data.batching import MOTION
 from sdfsim.data.dataset import Trajectory, shapes_folder
 from sdfsim.data.pybullet_sim import DT, SUBSTEPS, Teacher, TeacherBody, substeps_of, write_urdf
 from sdfsim.data.shape_assets import decompose
-from sdfsim.geometry.mesh import Mesh, load_pieces, wavefront
+from sdfsim.geometry.mesh import Mesh
+from sdfsim.geometry.mesh_io import load_pieces, wavefront
 from sdfsim.physics.bodies import Units, from_scene
 from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.scene import Scene

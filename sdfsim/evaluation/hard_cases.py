@@ -24,7 +24,7 @@ from sdfsim.data.scenarios import steady_faces
 from sdfsim.evaluation.everyday import KINDS, ROWS, SIZES, Setting, failures, solved
 from sdfsim.evaluation.metrics import energy
 from sdfsim.evaluation.penetration import depths
-from sdfsim.geometry.mesh import MESH_SUFFIXES
+from sdfsim.geometry.mesh_io import MESH_SUFFIXES
 from sdfsim.learned.model import Model
 from sdfsim.physics.bodies import largest_extent
 from sdfsim.physics.rollout import Rollout

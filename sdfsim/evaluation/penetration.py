@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from sdfsim.base.errors import SdfsimError
 from sdfsim.data.dataset import Trajectory
 from sdfsim.evaluation.engines import dataset_urdf
-from sdfsim.geometry.mesh import load_pieces
+from sdfsim.geometry.mesh_io import load_pieces
 from sdfsim.scene.scene import Scene
 from sdfsim.sdf.grid import GridSdf
 from sdfsim.sdf.mesh_sdf import MeshSdf

@@ -46,7 +46,7 @@ class ClosestPoint:
 
 class Winding:
     """Generalized winding number (Jacobson et al. 2013; fast form: Barill et al. 2018), to about 0.01 a layer: how
-    often the surface goes around a point, by the solid angle that is seen of it where it is open. Some ten times slower
+    often the surface goes around a point, by the solid angle that it covers where it is open. Some ten times slower
     than ray parity."""
 
     def __init__(self, mesh: Mesh) -> None:

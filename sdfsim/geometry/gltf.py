@@ -19,7 +19,7 @@ from urllib.parse import unquote
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sdfsim.geometry.mesh_files import FileMesh, looked_up, read_image, side_file, strip
+from sdfsim.geometry.mesh_formats import FileMesh, looked_up, read_image, side_file, strip
 
 # What z up is to the y up of glTF: columns of a matrix [4, 4].
 _Y_UP = [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1]
@@ -62,10 +62,14 @@ class GltfWriter:
         """An accessor of values [K] or [K, 2 to 4]; whole numbers of 16 bits are fractions of 65535."""
         values = np.ascontiguousarray(values, kind)
         rows = values.reshape(len(values), -1)
-        told = {"bufferView": self._view(values.tobytes()), "componentType": _COMPONENTS[kind], "count": len(values)}
-        told |= {"type": "SCALAR" if rows.shape[1] == 1 else f"VEC{rows.shape[1]}"}
-        told |= {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()}
-        self._accessors.append(told | ({"normalized": True} if kind == "<u2" else {}))
+        accessor = {
+            "bufferView": self._view(values.tobytes()),
+            "componentType": _COMPONENTS[kind],
+            "count": len(values),
+        }
+        accessor |= {"type": "SCALAR" if rows.shape[1] == 1 else f"VEC{rows.shape[1]}"}
+        accessor |= {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()}
+        self._accessors.append(accessor | ({"normalized": True} if kind == "<u2" else {}))
         return len(self._accessors) - 1
 
     def material(self, name: str, color: np.ndarray, texture: np.ndarray | None = None, rough: float = 1.0) -> int:
@@ -209,25 +213,25 @@ class _GltfReader:
             self._arrays[number] = self._array(self.header["accessors"][_index(number)])
         return self._arrays[number]
 
-    def _array(self, told: dict[str, Any]) -> np.ndarray:
-        kind, width, count = np.dtype(TYPES[told["componentType"]]), WIDTHS[told["type"]], told["count"]
-        if "bufferView" in told:
-            stride = self.header["bufferViews"][told["bufferView"]].get("byteStride")
-            rows = self._rows(told, kind, width, count, stride)
-        elif "sparse" in told:
+    def _array(self, accessor: dict[str, Any]) -> np.ndarray:
+        kind, width, count = np.dtype(TYPES[accessor["componentType"]]), WIDTHS[accessor["type"]], accessor["count"]
+        if "bufferView" in accessor:
+            stride = self.header["bufferViews"][accessor["bufferView"]].get("byteStride")
+            rows = self._rows(accessor, kind, width, count, stride)
+        elif "sparse" in accessor:
             if not 0 < count <= SPARSE:
                 raise ValueError(f"an accessor of {count} rows has no data")
             rows = np.zeros((count, width), kind)
         else:
             raise ValueError("an accessor has no data: compressed geometry is not read, export it without")
-        if "sparse" in told:
-            few = told["sparse"]
+        if "sparse" in accessor:
+            few = accessor["sparse"]
             where = self._rows(few["indices"], np.dtype(TYPES[few["indices"]["componentType"]]), 1, few["count"])[:, 0]
             if where.max() >= count:
                 raise ValueError("an index of a sparse accessor is out of range")
             rows = rows.copy()
             rows[where] = self._rows(few["values"], kind, width, few["count"])
-        if told.get("normalized"):
+        if accessor.get("normalized"):
             rows = np.maximum(rows / np.iinfo(kind).max, -1.0)
         return rows
 
@@ -306,10 +310,10 @@ class _GltfReader:
             surface = self.header["materials"][_index(primitive["material"])].get("pbrMetallicRoughness", {})
             if surface.get("baseColorFactor", WHITE)[:3] != WHITE:
                 factors.append(np.tile(np.array(surface["baseColorFactor"], dtype=np.float64)[:3], (count, 1)))
-            told = surface.get("baseColorTexture", {})
-            moved = told.get("extensions", {}).get("KHR_texture_transform", {})
-            places = f"TEXCOORD_{moved.get('texCoord', told.get('texCoord', 0))}"
-            image = self._image(told["index"]) if told and not moved.get("rotation") else None
+            texture = surface.get("baseColorTexture", {})
+            moved = texture.get("extensions", {}).get("KHR_texture_transform", {})
+            places = f"TEXCOORD_{moved.get('texCoord', texture.get('texCoord', 0))}"
+            image = self._image(texture["index"]) if texture and not moved.get("rotation") else None
             if image is not None and places in attributes:
                 uv = self.array(attributes[places]).astype(np.float64)[:, :2]
                 uv = uv * moved.get("scale", [1.0, 1.0]) + moved.get("offset", [0.0, 0.0])

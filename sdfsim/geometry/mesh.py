@@ -1,39 +1,16 @@
-"""Triangle meshes: reading and writing files, cleaning, convex hulls, normals, and points on surfaces."""
+"""Triangle meshes: cleaning, convex hulls, normals, and points on surfaces."""
 
 from __future__ import annotations
 
 import hashlib
-import logging
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sdfsim.base.errors import SdfsimError
-from sdfsim.geometry.gltf import GltfWriter, read_gltf
-from sdfsim.geometry.mesh_files import (
-    TEXTURES,
-    averaged,
-    by_trimesh,
-    looked_up,
-    off_surface,
-    plain_obj,
-    plain_stl,
-    ply_surface,
-    read_image,
-    read_ply,
-    side_file,
-)
 
-# trimesh logs what it passes over, some of it with tracebacks. Whoever wants to see that can still listen.
-logging.getLogger("trimesh").addHandler(logging.NullHandler())
-
-MESH_SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
-GLTF = (".glb", ".gltf")
-FARTHEST = 1e12  # from the origin: beyond, not even double precision tells the vertices of a room-sized mesh apart
+FARTHEST = 1e12  # from the origin: beyond, double precision cannot separate the vertices of a room-sized mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,148 +65,7 @@ def normal_frame(bounds: np.ndarray) -> Frame:
     return Frame(centre=bounds.mean(0), scale=extent)
 
 
-def load_mesh(path: str | Path) -> Mesh:
-    """Read a triangle mesh (obj, ply, glb, gltf, stl, off), cleaned by `clean`; glTF has y up and is turned to z up.
-    Raises SdfsimError where it is missing, cut short, no mesh, needs what is not read, or has no faces, vertices that
-    are not finite, or indices out of range."""
-    path = Path(path)
-    if not path.is_file():
-        raise SdfsimError(f"{path}: no such mesh file")
-    suffix = path.suffix.lower()
-    if suffix not in MESH_SUFFIXES:
-        raise SdfsimError(f"{path}: not a mesh file ({path.suffix or 'no suffix'})", "use " + " ".join(MESH_SUFFIXES))
-    try:
-        mesh = _read(path, suffix)
-    except Exception as error:  # the readers raise whatever their format made them stumble over
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise SdfsimError(f"{path}: not a readable mesh ({reason})") from error
-    return clean(mesh, name=str(path))
-
-
-def _read(path: Path, suffix: str) -> Mesh:
-    if suffix in GLTF:
-        found = read_gltf(path)
-    elif suffix == ".ply":
-        found = ply_surface(path.read_bytes())
-    elif suffix == ".off":
-        found = off_surface(path.read_bytes())
-    else:
-        plain = plain_obj if suffix == ".obj" else plain_stl
-        loaded = by_trimesh(path, plain(path.read_bytes()))
-        vertices = np.array(loaded.vertices, dtype=np.float64).reshape(-1, 3)
-        return Mesh(vertices, _faces(loaded), _vertex_colors(loaded, len(vertices)))
-    colors = found.colors
-    if found.places is not None:
-        try:
-            image = read_image(side_file(path, found.texture))
-        except ValueError:
-            image = None
-        if image is not None:
-            colors = averaged(looked_up(image, found.places), found.faces, len(found.vertices))
-    return Mesh(found.vertices, found.faces, colors)
-
-
-def _faces(loaded: Any) -> np.ndarray:
-    return np.array(getattr(loaded, "faces", []), dtype=np.int64).reshape(-1, 3)
-
-
-def _vertex_colors(loaded: Any, count: int) -> np.ndarray | None:
-    """[V, 3] uint8 when the file carries colours; a texture is looked up at each vertex."""
-    visual: Any = getattr(loaded, "visual", None)
-    if getattr(visual, "kind", None) == "texture":
-        image = getattr(visual.material, "image", None) or getattr(visual.material, "baseColorTexture", None)
-        if image is None or image.format not in TEXTURES or visual.uv is None:
-            return None
-        visual = visual.to_color()
-    elif getattr(visual, "kind", None) not in ("vertex", "face"):
-        return None
-    colors = np.asarray(visual.vertex_colors)
-    return colors[:, :3].astype(np.uint8) if colors.shape[:1] == (count,) else None
-
-
-def write_ply(mesh: Mesh, attributes: Mapping[str, np.ndarray] | None = None) -> bytes:
-    """A mesh as binary PLY, vertices in double precision: what is read back is what was written, to the last bit.
-    `attributes` are more properties of the vertices by name, [V] int32 or float32; most programs pass over them."""
-    columns = [(axis, "<f8", "double") for axis in "xyz"]
-    values = list(mesh.vertices.T)
-    if mesh.colors is not None:
-        columns += [(channel, "u1", "uchar") for channel in ("red", "green", "blue")]
-        values += list(mesh.colors.T)
-    for name, column in (attributes or {}).items():
-        columns.append((name, column.dtype.newbyteorder("<").str, {"i": "int", "f": "float"}[column.dtype.kind]))
-        values.append(column)
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(mesh.vertices)}"]
-    header += [f"property {kind} {name}" for name, _, kind in columns]
-    header += [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices", "end_header", ""]
-    vertices = np.empty(len(mesh.vertices), dtype=[(name, kind) for name, kind, _ in columns])
-    for (name, _, _), column in zip(columns, values, strict=True):
-        vertices[name] = column
-    faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("corner", "<i4", 3)])
-    faces["count"], faces["corner"] = 3, mesh.faces
-    return "\n".join(header).encode() + vertices.tobytes() + faces.tobytes()
-
-
-def read_mesh(path: Path) -> Mesh:
-    """The mesh of a shape folder as `write_ply` wrote it: not cleaned, not reordered. Raises SdfsimError: damaged."""
-    with _reading(path):
-        found = ply_surface(path.read_bytes())
-        mesh = Mesh(found.vertices, found.faces, found.colors)
-        _require_whole(mesh)
-    return mesh
-
-
-def read_attributes(path: Path, names: Sequence[str]) -> list[np.ndarray]:
-    """Properties of the vertices [V] of a PLY file that `write_ply` wrote, by their names. Raises SdfsimError where it
-    is not readable or has no such property."""
-    with _reading(path, f"damaged, or without {', '.join(names)}"):
-        vertices = read_ply(path.read_bytes())[0]["vertex"]
-        return [np.array(vertices[name]) for name in names]
-
-
-def write_glb(meshes: dict[str, Mesh]) -> bytes:
-    """Meshes with textures as binary glTF: a node each by its name, all below one that turns them to glTF's y up.
-
-    Vertices become single precision, textures JPEG. They hold the light of the photos: nothing else is to light them.
-    """
-    file = GltfWriter()
-    for name, mesh in meshes.items():
-        assert mesh.uv is not None and mesh.texture is not None
-        places = {"POSITION": file.array(mesh.vertices), "TEXCOORD_0": file.array(mesh.uv)}
-        corners = file.array(mesh.faces.reshape(-1), "<u4")
-        drawn = file.mesh(name, places, corners, file.material(name, np.ones(3), mesh.texture))
-        file.nodes.append({"name": name, "mesh": drawn})
-    return file.to_bytes()
-
-
-def read_glb(path: Path) -> dict[str, Mesh]:
-    """The meshes that `write_glb` wrote, z up, by their names. Raises SdfsimError: not readable."""
-    import trimesh
-
-    found = {}
-    with _reading(path):
-        loaded: Any = trimesh.load_scene(path, process=False)
-        for name, drawn in loaded.geometry.items():
-            image = drawn.visual.material.baseColorTexture
-            if image.format != "JPEG":
-                raise ValueError("a texture that is no JPEG")
-            # trimesh counts up from the lower edge of a texture.
-            uv = np.asarray(drawn.visual.uv) * [1.0, -1.0] + [0.0, 1.0]
-            mesh = Mesh(np.array(drawn.vertices), _faces(drawn), None, uv, np.asarray(image.convert("RGB")))
-            _require_whole(mesh)
-            found[str(name)] = mesh
-    return found
-
-
-@contextmanager
-def _reading(path: Path, told: str = "damaged or cut short") -> Iterator[None]:
-    """Turn whatever a reader stumbles over into an SdfsimError."""
-    try:
-        yield
-    except Exception as error:
-        raise SdfsimError(f"{path}: {told} ({error})") from error
-
-
-def _require_whole(mesh: Mesh) -> None:
+def require_whole(mesh: Mesh) -> None:
     """Raise ValueError where numbers are missing or faces have corners that are not there."""
     if not np.isfinite(mesh.vertices).all() or (mesh.uv is not None and not np.isfinite(mesh.uv).all()):
         raise ValueError("vertices that are not finite")
@@ -247,7 +83,7 @@ def clean(mesh: Mesh, *, name: str = "mesh") -> Mesh:
     if len(faces) == 0:
         raise SdfsimError(f"{name}: mesh has no faces", "a point cloud is not enough: export triangles")
     try:
-        _require_whole(mesh)
+        require_whole(mesh)
     except ValueError as error:
         raise SdfsimError(f"{name}: {error}") from error
     if (farthest := float(np.abs(vertices).max())) > FARTHEST:
@@ -259,7 +95,7 @@ def clean(mesh: Mesh, *, name: str = "mesh") -> Mesh:
     if not solid.any():
         raise SdfsimError(f"{name}: mesh has no faces with an area")
     # Files round to about seven digits: what agrees to a millionth of the size is one vertex. A face without an area
-    # may lie anywhere, and says nothing of the size.
+    # may lie anywhere, so it does not count for the size.
     low, high = (fold(vertices[np.unique(faces[solid])], axis=0) for fold in (np.min, np.max))
     keys = np.round((vertices - low) / max(1e-6 * float((high - low).max()), 1e-300))
     _, first, label = np.unique(keys + 0.0, axis=0, return_index=True, return_inverse=True)
@@ -348,39 +184,6 @@ def directed_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     key = np.minimum(start, end) * (int(faces.max()) + 1) + np.maximum(start, end)
     _, edge = np.unique(key, return_inverse=True)
     return edge, np.where(start < end, 1, -1)
-
-
-def load_pieces(path: str | Path) -> list[Mesh]:
-    """The convex pieces of a collision geometry in Wavefront OBJ: the convex hull of each `o` group's vertices. Raises
-    SdfsimError where it cannot be read, has no pieces, or a piece is flat."""
-    path = Path(path)
-    if not path.is_file():
-        raise SdfsimError(f"{path}: no such mesh file")
-    groups: list[list[list[float]]] = [[]]
-    with _reading(path, "not a readable OBJ file"):
-        for line in path.read_text(encoding="utf-8").splitlines():
-            key, _, rest = line.strip().partition(" ")
-            if key == "o":
-                groups.append([])
-            elif key == "v":
-                groups[-1].append([float(number) for number in rest.split()[:3]])
-    if not any(groups):
-        raise SdfsimError(f"{path}: no vertices, so no convex pieces")
-    try:
-        return [convex_hull(np.array(group)) for group in groups if group]
-    except (SdfsimError, ValueError) as error:
-        raise SdfsimError(f"{path}: {error}") from error
-
-
-def wavefront(pieces: list[Mesh]) -> str:
-    """Wavefront OBJ with one `o` group a piece."""
-    lines, before = [], 1
-    for number, piece in enumerate(pieces):
-        lines.append(f"o piece_{number}")
-        lines += ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in piece.vertices]
-        lines += ["f {} {} {}".format(*(face + before)) for face in piece.faces]
-        before += len(piece.vertices)
-    return "\n".join(lines) + "\n"
 
 
 def convex_hull(points: np.ndarray) -> Mesh:

@@ -1,4 +1,4 @@
-"""Procedural watertight meshes, metres, about 1 m wide unless told, and the convex pieces of those that have them."""
+"""Procedural watertight meshes, metres, about 1 m wide by default, and the convex pieces of those that have them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Any triangle mesh -> the solid it stands for, or one line saying why it stands for none.
+"""Any triangle mesh -> the solid that it bounds, or one line why it bounds none.
 
 Vertices [V, 3 + K] and corners of triangles [F, 3, 3 + K] hold coordinates, and K columns (colours) that new vertices
 get by the same averages.
@@ -179,7 +179,7 @@ def _outwards(vertices: np.ndarray, faces: np.ndarray, patch: np.ndarray) -> np.
 def _close(
     vertices: np.ndarray, faces: np.ndarray, limit: float, area: float, scale: float, notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Close openings by fans around their middle, smallest first, up to `limit` in all (normalised area), and say so. A
+    """Close openings by fans around their middle, smallest first, up to `limit` in all (normalised area); note it. A
     fan is right for any flat loop, though it may lie over itself: what it covers twice cancels in winding numbers."""
     fans = []
     for loop in openings(faces):
@@ -331,11 +331,11 @@ def openings(faces: np.ndarray) -> list[np.ndarray]:
 
 def face_areas(corners: np.ndarray) -> np.ndarray:
     """[F] areas of triangles [F, 3, 3 + K]."""
-    return 0.5 * np.linalg.norm(face_normals(corners), axis=1)
+    return 0.5 * np.linalg.norm(area_vectors(corners), axis=1)
 
 
-def face_normals(corners: np.ndarray) -> np.ndarray:
-    """[F, 3] normals of triangles [F, 3, 3 + K], as long as twice their area."""
+def area_vectors(corners: np.ndarray) -> np.ndarray:
+    """[F, 3] along the normals of triangles [F, 3, 3 + K], twice their area long."""
     points = corners[..., :3]
     return np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
 
@@ -364,7 +364,7 @@ def exposed(corners: np.ndarray, side: Side) -> tuple[np.ndarray, np.ndarray]:
 
 def centres_and_normals(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Centroids and unit normals [F, 3] of triangles [F, 3, 3 + K]."""
-    normals = face_normals(corners)
+    normals = area_vectors(corners)
     return corners[..., :3].mean(1), normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
 
 

@@ -51,8 +51,8 @@ def contact_groups(bodies: Sequence[Body]) -> tuple[np.ndarray, np.ndarray]:
     groups: dict[tuple, int] = {}
     of_kind = np.array([groups.setdefault(key, len(groups)) for key in keys], np.int64)
     if len(groups) > MOST:
-        told = f"bodies: collides_with parts them into {len(groups):,} groups (at most {MOST:,})"
-        raise SdfsimError(told, "let more bodies have the same list")
+        fault = f"bodies: collides_with splits them into {len(groups):,} groups (at most {MOST:,})"
+        raise SdfsimError(fault, "let more bodies have the same list")
     allowed = np.zeros((len(groups), len(groups)), dtype=bool)
     for k, touched in enumerate(partners):
         allowed[of_kind[k], of_kind[list(touched)]] = True
@@ -82,8 +82,8 @@ def _lists(bodies: Sequence[Body]) -> tuple[list[int], list[list[int]]]:
 
 
 def _partners(kinds: Sequence[tuple[int, frozenset[int]]]) -> list[frozenset[int]]:
-    """The kinds that each kind of bodies may touch. Of a kind is told the list that it has (-1: none) and those that
-    name it. Kinds without a list may all touch each other, and are not among those."""
+    """The kinds that each kind of bodies may touch. A kind is the list that it has (-1: none), and the lists that name
+    it. Kinds without a list may all touch each other; these pairs are left out."""
     named: dict[int, list[int]] = {}
     for k, (_, listed) in enumerate(kinds):
         for number in listed:

@@ -101,7 +101,7 @@ def _compose(path: Path, text: str) -> yaml.Node:
     except (yaml.YAMLError, RecursionError) as error:
         mark, place = getattr(error, "problem_mark", None), getattr(error, "position", None)
         line = mark.line + 1 if mark else text[:place].count("\n") + 1 if place is not None else 1
-        why = next((told for name in ("problem", "context", "reason") if (told := getattr(error, name, None))), "")
+        why = next((found for name in ("problem", "context", "reason") if (found := getattr(error, name, None))), "")
         raise SceneError([f"{path}:{line}: not valid YAML: {why or type(error).__name__}"]) from error
     if root is None:
         raise SceneError([f"{path}:1: the file is empty"], "a scene needs at least version and bodies")

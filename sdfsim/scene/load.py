@@ -21,7 +21,7 @@ from sdfsim.shape.shape import Shape, load_shape, with_nodes, with_sdf, with_wal
 
 
 def read_scene(path: Path, *, allow_outside: bool = False, text: str | None = None) -> tuple[SceneTable, Document]:
-    """Read and check a scene file; nothing is loaded yet. Returns what it says, and its document, to tell of faults
+    """Read and check a scene file; nothing is loaded yet. Returns its tables, and the document, which takes faults
     that show only later. Raises SceneError with every fault found."""
     document, context = Document(path, text), {"folder": path.parent, "allow_outside": allow_outside}
     try:
@@ -142,7 +142,7 @@ def _body(entry: BodyTable, shape: int, motion: Motion, groups: dict[str, list[s
 
 
 def _mass(entry: BodyTable, shape: Shape, wrong: Callable[[str], None]) -> float:
-    """Of a dynamic body, kg; tells `wrong` why it cannot move, if so."""
+    """Mass of a dynamic body, kg; calls `wrong` with the reason where it cannot move."""
     volume = shape.volume * entry.scale**3
     mass = entry.density * volume if entry.mass is None else entry.mass
     if not (np.isfinite(volume) and volume > 0):

@@ -54,8 +54,8 @@ def plan(scene: Scene) -> Plan:
         "the file says off": asked.contact == "off",
     }
     against = next((why for why, holds in reasons_against.items() if holds), None)
-    told = against or f"{pairs.possible} pairs of bodies may touch"
-    contact = Effect(against is None, told, "effects.contact, bodies[].collides_with, bodies[].motion")
+    why = against or f"{pairs.possible} pairs of bodies may touch"
+    contact = Effect(against is None, why, "effects.contact, bodies[].collides_with, bodies[].motion")
 
     def of_kind(kind: str, what: str) -> Effect:
         count = len(names[kind])
@@ -68,8 +68,8 @@ def plan(scene: Scene) -> Plan:
             return Effect(False, "contact is off", field)
         if choice != "auto":
             return Effect(choice == "on", f"the file says {choice}{note}", field)
-        told = f"{count} pairs have {name} above zero" if count else f"no pair has {name} above zero"
-        return Effect(count > 0, told + note, field)
+        why = f"{count} pairs have {name} above zero" if count else f"no pair has {name} above zero"
+        return Effect(count > 0, why + note, field)
 
     sleep = "the file says off" if asked.sleep == "off" else "what rests freezes until something disturbs it"
     turning = "the file says off: bodies translate only" if asked.rotation == "off" else "only the file can say off"

@@ -1,4 +1,4 @@
-"""What a scene file becomes: plain immutable data, everything resolved to SI units."""
+"""A scene as immutable data in SI units: what a scene file becomes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Effects:
 
 @dataclass(frozen=True)
 class Limits:
-    """What a run must keep to: `memory_gib`, GiB that one step may take for distances and edges; None for no limit."""
+    """Limits of a run: `memory_gib`, GiB that one step may take for distances and edges; None for no limit."""
 
     memory_gib: float | None = None
 
@@ -99,8 +99,8 @@ class Scene:
         duration: s.
         seed: random seed of the run.
         model: bundled model name or path, None for the default.
-        effects: what the file asked for.
-        limits: what a run must keep to.
+        effects: the switches of the file.
+        limits: of the run.
         path: the file it came from, if any.
         missed: shapes fitted for this scene that are not usable, with the reason, one line each.
         caveats: those that are, but are not as exact as fits can be; one line each.
@@ -122,7 +122,7 @@ class Scene:
 
 
 def fingerprints(scene: Scene) -> dict[str, str]:
-    """What tells a scene from others with bodies of the same names: a digest each of its `shapes` (which bodies have
+    """Tell a scene from others with bodies of the same names: a digest each of its `shapes` (which bodies have
     which, how large, and how they move), of what else its `bodies` are (but for paths and who may touch whom), and of
     `gravity`. Six digits count, and of fitted shapes the mesh, so that a fit that is made again, or the last digits of
     another machine, make no other scene of it."""
@@ -154,6 +154,6 @@ def _six_digits(values: Sequence | np.ndarray) -> np.ndarray:
     """[N, K] rows of numbers, rounded to 2^-20 of the largest of the row."""
     rows = np.asarray(values, np.float64)
     rows = rows.reshape(len(rows), math.prod(rows.shape[1:]))
-    # Just below a power of two counts as that power: rounding must not tell the two apart.
+    # Just below a power of two counts as that power: rounding must not separate the two.
     unit = np.ldexp(1.0, np.frexp(np.abs(rows).max(1, initial=0.0) * (1.0 + 1e-9))[1] - 20)[:, None]
     return np.round(rows / unit) * unit + 0.0  # no negative zeros

@@ -47,7 +47,7 @@ Fault = tuple[Loc, str]  # where below a table, and what is wrong there
 
 
 def _shown(value: Any) -> str:
-    """What the file says, for a message."""
+    """A value of the file, for a message."""
     if isinstance(value, str):
         text = str(value) if isinstance(value, Numeral) else repr(value)
         return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
@@ -152,7 +152,7 @@ def _version(number: int) -> int:
 
 
 def key(what: str, default: Any = ..., unit: str = "", **limits: float) -> Any:
-    """A key of a table: what it says, its unit, and what is allowed."""
+    """A key of a table: its meaning, default, unit and limits."""
     return Field(default, description=what, json_schema_extra={"unit": unit}, **limits)  # type: ignore[arg-type]
 
 
@@ -189,11 +189,11 @@ class Table(BaseModel):
 
     @classmethod
     def check_keys(cls, data: dict) -> Iterator[Fault]:
-        """Which keys go together; asked of what the file says, whether its values are right or not."""
+        """Faults in which keys are given together; checked whether their values are right or not."""
         yield from ()
 
     def check_values(self) -> Iterator[Fault]:
-        """Which values go together; asked once each is right by itself."""
+        """Faults in values that do not fit each other; checked once each is right by itself."""
         yield from ()
 
 
@@ -206,7 +206,7 @@ def _one_of(data: dict, keys: Iterable[str], *, required: bool = False) -> Itera
 
 
 class EffectsTable(Table):
-    """Which effects to compute; `auto` is on where it can change the motion, as `sdfsim plan` tells."""
+    """Which effects to compute; `auto` is on where it can change the motion. `sdfsim plan` shows the decisions."""
 
     contact: Switch = key("bodies touch", "auto")
     friction: Switch = key("contacts have friction", "auto")
@@ -216,7 +216,7 @@ class EffectsTable(Table):
 
 
 class LimitsTable(Table):
-    """What a run must keep to."""
+    """Limits of a run."""
 
     memory_gib: Number | None = key(
         "memory that one step may take for distances and edges; no limit without it", None, "GiB", gt=0
@@ -412,7 +412,7 @@ class BodyTable(Turned):
         if data.get("motion") == "kinematic":
             for key in _NOT_WITH_PATH:
                 if key in data:
-                    yield (key,), "does not go with motion: kinematic: its path says where it is"
+                    yield (key,), "does not go with motion: kinematic: its path decides where it is"
             if "path" not in data:
                 yield ("path",), "is required: a kinematic body follows timed poses"
         elif "path" in data:
@@ -465,7 +465,7 @@ class SceneTable(Table):
     seed: Whole = key("of the run's random numbers", 0, ge=0)
     gravity: Vector = key("pull on every free body", DEFAULT_GRAVITY, "m/s^2")
     effects: EffectsTable = key("which effects to compute", EffectsTable())
-    limits: LimitsTable = key("what a run must keep to", LimitsTable())
+    limits: LimitsTable = key("limits of a run", LimitsTable())
     shapes: dict[str, ShapeTable] = key("shapes by name", {})
     bodies: Annotated[list[BodyTable], Field(min_length=1)] = key("all bodies")
 
@@ -475,8 +475,8 @@ class SceneTable(Table):
         listed = data["bodies"] if isinstance(data.get("bodies"), list) else []
         first: dict[str, int] = {}
         for i, entry in enumerate(listed):
-            said = [entry.get(key) for key in ("name", "shape")] if isinstance(entry, dict) else ["", ""]
-            name, shape = (text if isinstance(text, str) else "" for text in said)  # else a fault of its own
+            texts = [entry.get(key) for key in ("name", "shape")] if isinstance(entry, dict) else ["", ""]
+            name, shape = (text if isinstance(text, str) else "" for text in texts)  # else a fault of its own
             if name.strip() and first.setdefault(name, i) != i:
                 yield ("bodies", i, "name"), f"two bodies are called {name!r} (the first is bodies[{first[name]}])"
             if shape.strip() and shape not in shapes:
@@ -508,7 +508,7 @@ class SceneTable(Table):
         return body.plane is not None or (shape is not None and shape.plane is not None)
 
     def motion_of(self, body: BodyTable) -> Motion:
-        """As it says, else static for planes and dynamic for others."""
+        """As the file has it; by default planes are static and others dynamic."""
         return body.motion or ("static" if self.flat(body) else "dynamic")
 
 
@@ -542,16 +542,16 @@ def reference() -> str:
         lines += ["", f"## {title}", "", table.__doc__ or ""]
         lines += ["", "| key | what | unit | allowed | default |", "| --- | --- | --- | --- | --- |"] if schema else []
         for key, field in table.model_fields.items():
-            told = {**next(iter(schema[key].get("anyOf", [])), {}), **schema[key]}
-            default = "required" if field.is_required() else told.get("default")
+            known = {**next(iter(schema[key].get("anyOf", [])), {}), **schema[key]}
+            default = "required" if field.is_required() else known.get("default")
             default = "" if default is None or isinstance(default, dict) else str(default)
-            cells = (f"`{key}`", told["description"], told["unit"], _allowed(told), default)
+            cells = (f"`{key}`", known["description"], known["unit"], _allowed(known), default)
             lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
 
 def _allowed(schema: dict) -> str:
-    """The values that a schema allows; bounds that every number has are not told."""
+    """The values that a schema allows; bounds that all numbers share are left out."""
     limits = []
     for sign, native, other in ((">", "exclusiveMinimum", "gt"), (">=", "minimum", "ge"), ("<=", "maximum", "le")):
         limit = schema.get(native, schema.get(other, np.inf))

@@ -1,4 +1,4 @@
-"""A signed distance baked to a grid of bricks, a hundred times faster to ask than a network: for the contact solve."""
+"""A signed distance baked to a grid of bricks, a hundred times faster than a network: for the contact solve."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CELLS = 128  # along the largest extent of a solid
 FINEST = 512  # likewise, where walls are thin
 PADDING = 4.0  # cells around the solid
 WALL = 2.0  # cells that a wall needs for either of its sides to be seen
-CHUNK = 2**18  # points asked at once
+CHUNK = 2**18  # points evaluated at once
 SPREAD = 512  # places all over a surface
 # Of the largest extent: how near they are before, how near after so many steps towards it.
 CLOSE, REACHED, PROJECTIONS = 0.01, 1e-4, 4
@@ -138,7 +138,7 @@ def wall_thickness(sdf: Sdf, nodes: np.ndarray) -> float:
 
 
 def unseen_wall(sdf: Sdf, grid: BakedGrid) -> float | None:
-    """m, the thickness of walls that are too thin for a grid to tell one side from the other; None where it has no such
+    """m, the thickness of walls that are too thin for the cells of a grid; None where it has no such
     walls. Nodes lie close along edges and at corners, where every solid is thin: what counts are places all over the
     surface."""
     limit = 1.001 * WALL * grid.cell

@@ -20,8 +20,8 @@ class ClosedForm:
     def __post_init__(self) -> None:
         sizes = np.array(self.sizes, dtype=np.float64)
         if self.bounds.shape != (2, 3) or not (np.isfinite(sizes) & (sizes > 0)).all():
-            told = ", ".join(f"{name} {value}" for name, value in vars(self).items())
-            raise SdfsimError(f"the sizes of a {self.KIND} must be > 0 (got {told})")
+            given = ", ".join(f"{name} {value}" for name, value in vars(self).items())
+            raise SdfsimError(f"the sizes of a {self.KIND} must be > 0 (got {given})")
 
     @property
     def sizes(self) -> tuple[float, ...]:

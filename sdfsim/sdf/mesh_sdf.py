@@ -14,11 +14,10 @@ from sdfsim.sdf.reference import MeshDistance
 from sdfsim.sdf.sdf import accepts_numpy
 
 # All lengths of `MeshSdf` are relative to the mesh's largest extent. The hierarchy works in float32, so closest points
-# are off by some 1e-7: nearer than this the offset to them says little about the direction, and differences over the
-# step say it better.
+# are off by some 1e-7: nearer than this the offset to them gives no direction, and differences over the step do.
 NEAR = 1e-5
 STEP = 1e-4
-# Farther out float32 runs out of range (at 1e19), so such points ask for the point on this box in their place. What
+# Farther out float32 runs out of range (at 1e19), so such points are moved to this box. What
 # is nearest to that one is as near as makes no difference.
 FAR = 1e3
 # A difference quotient shorter than this is no direction: a crack, a sheet without thickness.
@@ -29,7 +28,7 @@ UP = (0.0, 0.0, 1.0)
 @dataclass(frozen=True, eq=False)
 class MeshSdf:
     """The signed distance of a triangle mesh, with the sign of `MeshDistance`, good to about 1e-7 of the mesh's size.
-    It is asked on the CPU, wherever the points are. Raises SdfsimError where the mesh has no faces."""
+    It is evaluated on the CPU, wherever the points are. Raises SdfsimError where the mesh has no faces."""
 
     mesh: Mesh  # metres
 
@@ -49,7 +48,7 @@ class MeshSdf:
 
     @cached_property
     def _oracle(self) -> MeshDistance:
-        # Built on the first question: a scene that merely holds such a shape needs no open3d.
+        # Built on first use: a scene that merely holds such a shape needs no open3d.
         return MeshDistance(self.mesh)
 
     def to(self, device: torch.device | str) -> MeshSdf:
@@ -70,10 +69,10 @@ class MeshSdf:
     def _exact(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         low, high = self.bounds
         size = float((high - low).max())
-        asked = np.clip(points, low - FAR * size, high + FAR * size)
-        truth = self._oracle(asked)
+        near = np.clip(points, low - FAR * size, high + FAR * size)
+        truth = self._oracle(near)
         offset = points - truth.closest
-        distance = np.where((points == asked).all(1), truth.distance, np.linalg.norm(offset, axis=1))
+        distance = np.where((points == near).all(1), truth.distance, np.linalg.norm(offset, axis=1))
         here = np.abs(distance) <= NEAR * size
         # A touch on either side of zero has a direction too; only zero itself has none.
         gradient = offset / np.where(distance == 0, 1.0, distance)[:, None]

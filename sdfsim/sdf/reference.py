@@ -14,7 +14,7 @@ from sdfsim.geometry.solidify import Solid, exposed
 
 # The paper trusts a sign only where the offset to the surface is less than 75 degrees from the normal's line.
 TRUSTED_COSINE = float(np.cos(np.radians(75.0)))
-# How far from a half a winding number must be to tell the side of a surface that does not quite close.
+# How far from a half a winding number must be to decide the side of a surface that does not quite close.
 CLEAR = 0.2
 CHUNK = 200_000
 # Points tested together against the convex pieces.
@@ -33,7 +33,7 @@ class DistanceOracle(Protocol):
     """Something that knows true distances: what the fit learns from."""
 
     surface: Mesh  # the boundary as triangles, for sampling points on it
-    closed: bool  # whether signs are reliable everywhere, not only where `Reference.trusted` says so
+    closed: bool  # whether signs are reliable everywhere, not only where `Reference.trusted`
     bounds: np.ndarray  # [2, 3] float64 m, the box of the surface
 
     def __call__(self, points: np.ndarray) -> Reference: ...
@@ -44,7 +44,7 @@ class MeshDistance:
     inside. Raises SdfsimError where the mesh has no faces.
 
     The sign is that of the solid's winding number: inside where the surface goes around a point more than half a time.
-    Where a single clean surface bounds the solid, ray parity says the same and is faster. `trusted` follows the paper
+    Where a single clean surface bounds the solid, ray parity gives the same and is faster. `trusted` follows the paper
     (appendix on SDF training): the angle between (point - closest) and the face normal is below 75 or above 105
     degrees; where the surface does not quite close, the winding number must also be clear.
     """
@@ -162,7 +162,7 @@ class PiecesDistance:
 
 
 def unique_planes(equations: np.ndarray, size: float, digits: int) -> np.ndarray:
-    """[H, 4] the different ones of face planes [F, 4], normals and offsets in m, told apart by so many digits; those of
+    """[H, 4] the different ones of face planes [F, 4], normals and offsets in m, rounded to so many digits; those of
     the offsets count in the `size` m of the body."""
     unit = np.array([1.0, 1.0, 1.0, size])
     return np.unique((equations / unit).round(digits), axis=0) * unit

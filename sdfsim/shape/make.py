@@ -19,7 +19,8 @@ from sdfsim.base.files import user_cache
 from sdfsim.base.parallel import Progress, silent
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mass import mass_properties, mass_properties_of_sdf
-from sdfsim.geometry.mesh import GLTF, Mesh, clean, convex_hull, is_closed, lattice, load_mesh
+from sdfsim.geometry.mesh import Mesh, clean, convex_hull, is_closed, lattice
+from sdfsim.geometry.mesh_io import GLTF, load_mesh
 from sdfsim.geometry.solidify import solidify
 from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, SphereSdf
 from sdfsim.sdf.fit.train import FIT_VERSION, Recipe, fit_sdf
@@ -140,7 +141,7 @@ def shape_from_mesh(
     cache folder) keyed by what the file describes.
 
     `units` are metres per unit of the file (None: metres, with a doubt), `thicken` m is a thickness for an open sheet;
-    of `sdf`, "mlp" fits the network, "grid" and "mesh" fit nothing (see `mesh_shape`). `source["notes"]` tells what was
+    of `sdf`, "mlp" fits the network, "grid" and "mesh" fit nothing (see `mesh_shape`). `source["notes"]` lists what was
     done to the mesh, and what `remarks` there are. Raises SdfsimError where the mesh cannot be used.
     """
     path = Path(path)
@@ -156,17 +157,15 @@ def shape_from_mesh(
 
 
 def remarks(path: Path, mesh: Mesh, units: float, *, given: bool) -> list[str]:
-    """What to tell of a mesh file as it was read, a line each: that glTF was turned; and its size, where that is odd
+    """Notes on a mesh file as it was read, a line each: that glTF was turned; and its size, where that is odd
     for the `units` (metres per unit) that are taken for its numbers. Many parts are drawn in millimetres, and few
-    files say so."""
+    files state it."""
     notes = ["glTF has y up: it is turned to z up"] if path.suffix.lower() in GLTF else []
     size = units * float(np.ptp(mesh.vertices, axis=0).max())
     if not given and size > LARGE:
-        notes.append(
-            f"it is {size:.3g} m wide if it counts in metres: does it in millimetres? Then give --units mm (units: mm)"
-        )
+        notes.append(f"it is {size:.3g} m wide in metres; if its unit is millimetres, give --units mm (units: mm)")
     elif not USUAL[0] <= size <= USUAL[1]:
-        notes.append(f"it is {size:.3g} m wide; where that is wrong, --units (units) says what the file counts in")
+        notes.append(f"it is {size:.3g} m wide; if that is wrong, give the file's unit with --units (units)")
     return notes
 
 
@@ -197,7 +196,7 @@ def _cached(
             return load_shape(folder)
         except SdfsimError:
             shutil.rmtree(folder, ignore_errors=True)  # a damaged entry is only a cache miss
-    if how["on_progress"] is silent:  # nobody sees how it goes on: say at least what takes so long
+    if how["on_progress"] is silent:  # no progress is shown: warn at least what takes so long
         _log.warning("making the shape %s, once for this mesh: about half a minute", name)
     if kind == "grid":
         shape = mesh_shape(mesh, name=name, kind=kind, resolution=resolution, **how)
@@ -232,7 +231,7 @@ def fit_mesh(
     """Fit the compact SDF network to the solid that a triangle mesh in metres bounds, see `solidify`.
 
     The result depends on the mesh, the recipe (see `RECIPES`) and the seed only (up to rounding, which the number of
-    threads and the device change), unless the budget in s cuts the training short. The shape's `certificate` tells the
+    threads and the device change), unless the budget in s cuts the training short. The shape's `certificate` has the
     errors and whether it is usable (`passed`), `source["notes"]` what was done to the mesh. Raises SdfsimError, which
     calls the mesh `file` (or else `name`), where it cannot be used or bounds no solid.
     """

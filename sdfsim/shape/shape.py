@@ -15,15 +15,8 @@ from sdfsim.base.files import read_json, write_bytes, write_json
 from sdfsim.base.parallel import Progress, silent
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mass import mass_properties_of_sdf
-from sdfsim.geometry.mesh import (
-    Frame,
-    Mesh,
-    convex_hull,
-    read_glb,
-    read_mesh,
-    write_glb,
-    write_ply,
-)
+from sdfsim.geometry.mesh import Frame, Mesh, convex_hull
+from sdfsim.geometry.mesh_io import read_glb, read_mesh, write_glb, write_ply
 from sdfsim.sdf.closed_forms import CLOSED_FORMS, ClosedForm, PlaneSdf
 from sdfsim.sdf.fit.certificate import certify_grid
 from sdfsim.sdf.grid import GridSdf, sample_grid
@@ -135,12 +128,12 @@ def load_shape(folder: str | Path) -> Shape:
         raise SdfsimError(f"{folder}: no such shape folder")
     for name in (RECORD_FILE, WEIGHTS_FILE, MESH_FILE):
         if not (folder / name).is_file():
-            raise SdfsimError(f"{folder}: {name} is missing, so this is no complete shape folder")
+            raise SdfsimError(f"{folder}: {name} is missing, so this is not a complete shape folder")
     record = read_json(folder / RECORD_FILE, "fit the mesh again")
     version = record.get("version") if isinstance(record, dict) else None
     if version != FORMAT_VERSION:
-        told = f"shape format version {version!r}, this program reads {FORMAT_VERSION}"
-        raise SdfsimError(f"{folder / RECORD_FILE}: {told}", "fit the mesh again")
+        fault = f"shape format version {version!r}, this program reads {FORMAT_VERSION}"
+        raise SdfsimError(f"{folder / RECORD_FILE}: {fault}", "fit the mesh again")
     try:
         tensors = from_bytes((folder / WEIGHTS_FILE).read_bytes())
     except (SafetensorError, OSError) as error:
@@ -282,7 +275,7 @@ def with_sdf(shape: Shape, kind: SdfKind, *, resolution: int = DEFAULT_RESOLUTIO
 def sdf_of_mesh(
     mesh: Mesh, kind: Literal["grid", "mesh"], resolution: int, on_progress: Progress = silent
 ) -> tuple[Sdf, dict, dict]:
-    """A mesh's exact SDF or a grid of it, what a shape's `source` says about it, and its certificate."""
+    """A mesh's exact SDF or a grid of it, its entries of a shape's `source`, and its certificate."""
     if kind == "mesh":
         return MeshSdf(mesh), {"sdf": "mesh"}, {}
     oracle = MeshDistance(mesh)

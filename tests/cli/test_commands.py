@@ -19,7 +19,7 @@ from sdfsim import Rollout, load_scene
 from sdfsim.apps import run as runs
 from sdfsim.base.arguments import seconds_of
 from sdfsim.geometry import primitives
-from sdfsim.geometry.mesh import write_ply
+from sdfsim.geometry.mesh_io import write_ply
 from tests.cli.conftest import SCENE, run
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -178,8 +178,8 @@ def test_what_is_wrong_from_the_start_is_told_before_work_and_deletes_nothing(
 def test_a_fit_that_missed_its_certificate_is_code_3_and_the_run_still_whole(scene, model, tmp_path, monkeypatch):
     real = load_scene
     missed = ("ball: thin walls",)
-    for module in ("run", "planning"):
-        monkeypatch.setattr(f"sdfsim.{module}.load_scene", lambda *a, **k: replace(real(*a, **k), missed=missed))
+    for module in ("run", "plan"):
+        monkeypatch.setattr(f"sdfsim.apps.{module}.load_scene", lambda *a, **k: replace(real(*a, **k), missed=missed))
     done = run("simulate", scene, "-o", tmp_path / "run", "--model", model)
     assert done.exit_code == 3 and "failed check: fit of shape ball: thin walls" in done.stderr
     report = json.loads((tmp_path / "run" / "report.json").read_text())

@@ -12,7 +12,8 @@ from sdfsim.data import shape_assets
 from sdfsim.data.pybullet_sim import Teacher, TeacherBody
 from sdfsim.data.shape_assets import COLLISION, VISUAL, decompose, origins, prepare, split_of, wavefront
 from sdfsim.geometry import primitives
-from sdfsim.geometry.mesh import Mesh, signed_volume, write_ply
+from sdfsim.geometry.mesh import Mesh, signed_volume
+from sdfsim.geometry.mesh_io import write_ply
 
 NAMES = [f"shape {k}" for k in range(2000)]
 

@@ -14,7 +14,7 @@ from sdfsim.data.pybullet_sim import Teacher, TeacherBody
 from sdfsim.evaluation import hard_cases
 from sdfsim.evaluation.engines import bullet, drake, mujoco, newton, shape_urdf, start_of_scene
 from sdfsim.evaluation.stress import TEACHER, by_engine
-from sdfsim.geometry.mesh import load_pieces
+from sdfsim.geometry.mesh_io import load_pieces
 from sdfsim.learned.model import load_model
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.load import load_scene

@@ -21,7 +21,7 @@ from sdfsim.evaluation import stress as study
 from sdfsim.evaluation.hard_cases import cases
 from sdfsim.evaluation.stress import losses, rows, table, write_report
 from sdfsim.geometry import primitives
-from sdfsim.geometry.mesh import write_ply
+from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.learned.model import Model, new_network
 
 FEW = ("overlap-balls", "thin-5", "cuda")

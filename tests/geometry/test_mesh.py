@@ -8,18 +8,8 @@ import pytest
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mass import mass_properties, mass_properties_of_sdf
-from sdfsim.geometry.mesh import (
-    Mesh,
-    clean,
-    convex_hull,
-    is_closed,
-    load_mesh,
-    load_pieces,
-    normal_frame,
-    sample_surface,
-    signed_volume,
-    write_ply,
-)
+from sdfsim.geometry.mesh import Mesh, clean, convex_hull, is_closed, normal_frame, sample_surface, signed_volume
+from sdfsim.geometry.mesh_io import load_mesh, load_pieces, write_ply
 from sdfsim.sdf.closed_forms import BoxSdf, SphereSdf
 
 TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"

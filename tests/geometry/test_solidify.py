@@ -9,7 +9,8 @@ import pytest
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry import primitives
 from sdfsim.geometry.bvh import Crossings
-from sdfsim.geometry.mesh import Mesh, is_closed, joined, load_mesh, sample_surface, signed_volume
+from sdfsim.geometry.mesh import Mesh, is_closed, joined, sample_surface, signed_volume
+from sdfsim.geometry.mesh_io import load_mesh
 from sdfsim.geometry.solidify import face_areas, no_longer_than, solidify
 from sdfsim.sdf.closed_forms import BoxSdf
 from sdfsim.sdf.reference import MeshDistance

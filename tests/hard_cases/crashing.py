@@ -20,7 +20,7 @@ import torch
 from PIL import Image
 
 from sdfsim.data.dataset import Trajectory
-from sdfsim.geometry.mesh import write_ply
+from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.geometry.primitives import box
 from sdfsim.learned.model import Model, new_network
 from sdfsim.shape.make import analytic_shape
@@ -123,7 +123,7 @@ def whole(folder: Path) -> None:
     """That every file under its final name can be read to its end; hidden ones are nobody's results."""
     from safetensors.numpy import load_file
 
-    from sdfsim.geometry.mesh import read_mesh
+    from sdfsim.geometry.mesh_io import read_mesh
 
     for path in folder.rglob("*"):
         hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)

@@ -15,7 +15,7 @@ from pipeline.inputs.images import read_photo
 from sdfsim import SdfsimError, load_shape
 from sdfsim.base import files
 from sdfsim.base.files import read_arrays
-from sdfsim.geometry.mesh import load_mesh
+from sdfsim.geometry.mesh_io import load_mesh
 from sdfsim.learned.model import Model, load_model, new_network
 from sdfsim.shape.make import analytic_shape
 from tests.hard_cases.strangers import time_limit

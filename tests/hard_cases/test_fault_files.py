@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 import cli
 from sdfsim import SdfsimError, load_shape
 from sdfsim.base.files import LOCK, locked
-from sdfsim.geometry.mesh import write_ply
+from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.geometry.primitives import box
 from sdfsim.learned.model import Model, new_network
 from sdfsim.shape.make import analytic_shape

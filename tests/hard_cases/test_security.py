@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 import cli
 from sdfsim import SceneError, SdfsimError, load_scene
-from sdfsim.geometry.mesh import load_mesh, write_ply
+from sdfsim.geometry.mesh_io import load_mesh, write_ply
 from sdfsim.geometry.primitives import box
 from sdfsim.learned.model import Model, new_network
 from sdfsim.shape.make import analytic_shape

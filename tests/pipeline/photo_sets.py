@@ -284,7 +284,8 @@ def shoot_labels(make: ModuleType, parts: list, poses: list[np.ndarray], count: 
 def shoot_bodies(folder: Path, build: Callable[[ModuleType], tuple[list, list[str]]], count: int = 48,
                  radius: float = 1.25) -> None:  # fmt: skip
     """A set with truth: `images`, `masks/NAME` of each body where a photo shows it, and `truth/NAME.ply`."""
-    from sdfsim.geometry.mesh import Mesh, write_ply
+    from sdfsim.geometry.mesh import Mesh
+    from sdfsim.geometry.mesh_io import write_ply
 
     make = studio(640, 480, 620.0)
     parts, names = build(make)

@@ -22,7 +22,8 @@ from pipeline.mesh.trust import GUESSED
 from pipeline.report import mesh_notes
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.bvh import Caster
-from sdfsim.geometry.mesh import Mesh, is_closed, load_mesh, read_attributes, read_mesh
+from sdfsim.geometry.mesh import Mesh, is_closed
+from sdfsim.geometry.mesh_io import load_mesh, read_attributes, read_mesh
 from tests.pipeline.test_objects import TABLE, TOP, both, box
 from tests.pipeline.test_surface import look_at
 

@@ -15,7 +15,8 @@ from pipeline.mesh.placement import Placement
 from pipeline.mesh.visibility import Above
 from pipeline.scene_writer import LEVEL, choose_slab, fit_parts, scene_text, write_scene
 from sdfsim.base.files import write_json
-from sdfsim.geometry.mesh import Mesh, write_ply
+from sdfsim.geometry.mesh import Mesh
+from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.scene.load import load_scene
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import Shape

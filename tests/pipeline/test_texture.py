@@ -19,7 +19,8 @@ from pipeline.mesh.visibility import Visibility, bilinear, look, to_bytes
 from pipeline.scene_writer import skins_of
 from sdfsim.apps.recording import Playback, save_reconstruction, with_normals
 from sdfsim.geometry.bvh import Caster
-from sdfsim.geometry.mesh import Mesh, joined, read_glb, sample_surface, vertex_normals, write_glb, write_ply
+from sdfsim.geometry.mesh import Mesh, joined, sample_surface, vertex_normals
+from sdfsim.geometry.mesh_io import read_glb, write_glb, write_ply
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import load_shape, scaled

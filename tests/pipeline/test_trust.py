@@ -15,7 +15,8 @@ from pipeline.options import Options
 from pipeline.report import improvements, notes
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.bvh import Caster
-from sdfsim.geometry.mesh import Mesh, joined, load_mesh, read_attributes, write_ply
+from sdfsim.geometry.mesh import Mesh, joined
+from sdfsim.geometry.mesh_io import load_mesh, read_attributes, write_ply
 from tests.pipeline.photo_sets import orbit, still_life, studio
 from tests.pipeline.test_surface import cube, look_at
 from tests.pipeline.test_texture import plate

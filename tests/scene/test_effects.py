@@ -176,7 +176,7 @@ def test_a_hundred_thousand_lists_take_fifty_times_as_long_as_two_thousand():
 
 def test_more_groups_than_a_table_can_hold_are_refused(monkeypatch):
     monkeypatch.setattr(collision_filter, "MOST", 100)
-    with pytest.raises(SdfsimError, match=r"collides_with parts them into 201 groups \(at most 100\)"):
+    with pytest.raises(SdfsimError, match=r"collides_with splits them into 201 groups \(at most 100\)"):
         contact_groups(many(200, lambda k: LISTS["the floor and both neighbours"](k, 200)))
 
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sdfsim.geometry.mesh import Mesh, write_ply
+from sdfsim.geometry.mesh import Mesh
+from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.geometry.primitives import box
 from sdfsim.scene.schema import reference
 from tests.scene.conftest import HEAD, problems_of

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sdfsim import Simulator
-from sdfsim.geometry.mesh import write_ply
+from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.scene.scene import Scene
 from sdfsim.sdf.closed_forms import BoxSdf
 from sdfsim.sdf.grid import GridSdf

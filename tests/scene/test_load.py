@@ -9,7 +9,7 @@ import pytest
 
 from sdfsim import SceneError, load_scene
 from sdfsim.geometry import primitives
-from sdfsim.geometry.mesh import write_ply
+from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.shape.make import analytic_shape
 from tests.scene.conftest import HEAD, problems_of
 
@@ -172,5 +172,5 @@ def test_a_mesh_without_units_is_asked_for_them_where_it_is_large(tmp_path):
         )
         scene = load_scene(tmp_path / "scene.yaml")
         assert np.ptp(scene.shapes[0].mesh.vertices, axis=0).max() == pytest.approx(size)
-        told = ("p: it is 80 m wide if it counts in metres: does it in millimetres? Then give --units mm (units: mm)",)
+        told = ("p: it is 80 m wide in metres; if its unit is millimetres, give --units mm (units: mm)",)
         assert scene.notes == (told if note else ())

@@ -11,7 +11,8 @@ import torch
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mass import mass_properties, mass_properties_of_sdf
-from sdfsim.geometry.mesh import Mesh, load_mesh, load_pieces
+from sdfsim.geometry.mesh import Mesh
+from sdfsim.geometry.mesh_io import load_mesh, load_pieces
 from sdfsim.sdf.fit import train as fit_module
 from sdfsim.sdf.mlp import MlpSdf
 from sdfsim.shape.make import fit_mesh, fit_pieces

@@ -10,7 +10,8 @@ import pytest
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry import primitives
-from sdfsim.geometry.mesh import Mesh, write_ply
+from sdfsim.geometry.mesh import Mesh
+from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.sdf.closed_forms import BoxSdf
 from sdfsim.sdf.grid import GridSdf
 from sdfsim.sdf.mesh_sdf import MeshSdf

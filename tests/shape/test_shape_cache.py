@@ -11,7 +11,7 @@ import pytest
 from sdfsim import load_scene
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry import primitives
-from sdfsim.geometry.mesh import write_ply
+from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.sdf.fit import train as fit_module
 from sdfsim.shape import make
 from sdfsim.shape.make import shape_from_mesh, shape_from_primitive

@@ -34,7 +34,9 @@ POINT, SEGMENT, BLOCK, DRUM, HULL = range(5)
 # drum: radius, half height); a ball around all of it; its thickness, the least distance of two parallel planes.
 KIND, SIZE, BALL, THICKNESS, WIDTH = 0, 1, 4, 8, 9
 
-TOUCHING = 1e-4  # of the thickness: only solids that are farther apart are asked as they lie, else rounding turns normals
+TOUCHING = (
+    1e-4  # of the thickness: only solids that are farther apart are asked as they lie, else rounding turns normals
+)
 APART = 1e-3  # of the thickness: so far apart overlapping solids are moved
 EXACT = 1e-14  # squared distances are found to this part
 FEW = 48  # vertices that are looked at in turn; of more, neighbours of neighbours

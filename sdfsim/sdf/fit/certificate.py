@@ -58,13 +58,13 @@ def certify(sdf: Sdf, oracle: DistanceOracle, *, nodes: np.ndarray | None = None
     `projected_from_0.1`, mean distance from the surface of x - f grad f / |grad f|^2; `sign_errors`, the fraction of
     points farther than 0.002 whose sign is wrong; `walls_lost` (see there); `far_field_ratio`, the largest f / true
     distance farther than 0.1, out to [-2, 2]^3 (a step as long as f goes through the surface where it is above 1);
-    `coverage` of the nodes [K, 3] m, if there are any; and what `verdict` says.
+    `coverage` of the nodes [K, 3] m, if there are any; and the result of `verdict`.
     """
     # A stream of its own, so that no seed of the fit draws these points.
     rng = np.random.default_rng([1, 0xCE47])
     frame = normal_frame(oracle.bounds)
 
-    def asked(local: np.ndarray) -> tuple[np.ndarray, ...]:
+    def evaluate(local: np.ndarray) -> tuple[np.ndarray, ...]:
         """Metres, true and given distance, nearest place and gradient at normalised points whose sign is known."""
         metres = frame.outward(local)
         truth = oracle(metres)
@@ -84,7 +84,7 @@ def certify(sdf: Sdf, oracle: DistanceOracle, *, nodes: np.ndarray | None = None
             local = np.clip(local + rng.normal(0.0, width, local.shape), -BOX, BOX)
         else:
             local = rng.uniform(-BOX, BOX, (points, 3))
-        found = asked(local)
+        found = evaluate(local)
         far.append(found[1:3])
         # What lies beyond a kind's limit does not count.
         metres, true, value, closest, gradient = (part[np.abs(found[1]) <= limit] for part in found)
@@ -102,7 +102,7 @@ def certify(sdf: Sdf, oracle: DistanceOracle, *, nodes: np.ndarray | None = None
     true, value = (np.concatenate(parts) for parts in zip(*counted, strict=True))
     result["sign_errors"] = mean((value * true <= 0)[np.abs(true) > SIGN_FROM])
     result["walls_lost"] = walls_lost(sdf, oracle)
-    far.append(asked(FAR_HALF * rng.uniform(-1, 1, (points, 3)))[1:3])
+    far.append(evaluate(FAR_HALF * rng.uniform(-1, 1, (points, 3)))[1:3])
     true, value = (np.concatenate(parts) for parts in zip(*far, strict=True))
     ratio = (value / np.where(true == 0, np.nan, true))[np.abs(true) > FAR_FROM]
     result["far_field_ratio"] = float(ratio.max()) if len(ratio) else math.nan
@@ -115,7 +115,7 @@ def certify(sdf: Sdf, oracle: DistanceOracle, *, nodes: np.ndarray | None = None
 
 def walls_lost(sdf: Sdf, oracle: DistanceOracle, *, points: int = 4000) -> float:
     """The part of the surface, by area, behind which the solid is missing: the middle of the wall there is not inside.
-    Signs that count only from a fixed distance on say nothing of walls that are thinner.
+    Signs that count only from a fixed distance on do not show thinner walls.
 
     A middle lies halfway between a surface sample and where a straight line inwards comes out again, and then twice
     halfway between the nearest place of the surface and the place opposite. Edges, where walls run out, do not count.

@@ -196,7 +196,7 @@ class _Fit:
         return Pool(*(part.to(self.device) for part in (where, away, torch.from_numpy(signed), along)))
 
     def _mirrors(self) -> tuple[bool, bool, bool]:
-        """Across which planes of its frame the solid is its own mirror image, as far as sampled distances tell."""
+        """Across which planes of its frame the solid is its own mirror image, by sampled distances."""
         rng = np.random.default_rng(0)
         local = self.frame.inward(sample_surface(self.oracle.surface, 2000, rng)[0])
         local = np.concatenate([local, local + rng.normal(0.0, 0.05, local.shape)])
@@ -260,7 +260,7 @@ class _Fit:
 
     def hurry(self, possible: int) -> None:
         """Place decay and end so that `possible` updates in all suffice. Until the decay has begun the end moves both
-        ways, since the first steps of a busy machine tell little; after that it only comes nearer."""
+        ways, since the first steps of a busy machine predict little; after that it only comes nearer."""
         begun = self.step >= self.turn
         self.stop = min(self.stop if begun else self.options.steps, max(possible, self.step))
         if not begun:

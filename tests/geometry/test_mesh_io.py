@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 from sdfsim.apps.export import export
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry import primitives
-from sdfsim.geometry.mesh import Mesh, clean, is_closed, load_mesh, signed_volume, write_glb
+from sdfsim.geometry.mesh import Mesh, clean, is_closed, signed_volume
+from sdfsim.geometry.mesh_io import load_mesh, write_glb
 from sdfsim.geometry.solidify import solidify
 from sdfsim.shape.make import mesh_shape
 

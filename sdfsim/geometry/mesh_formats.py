@@ -1,4 +1,4 @@
-"""What mesh files say: PLY and OFF as arrays, and OBJ and STL as trimesh reads them without mistakes.
+"""The contents of mesh files: PLY and OFF as arrays, and OBJ and STL in a form that trimesh reads correctly.
 
 trimesh refuses a binary PLY whose faces differ in their number of corners, and an OFF with its counts on the first
 line; Open3D, which reads both, gives up a whole file for one polygon with three corners in a line. So these two are
@@ -54,7 +54,7 @@ Element = dict[str, Any]  # columns [N] by their names, or `Ragged`
 
 def read_ply(content: bytes) -> tuple[dict[str, Element], dict[str, dict[str, str]], str]:
     """Elements of a PLY file by their names; the kinds of their columns, as NumPy has them; and the name of a texture
-    file, where a comment tells it."""
+    file, where a comment names it."""
     first = re.match(rb"ply[ \t]*(\r\n|\n|\r)", content)
     line = re.escape(first[1]) if first else b""
     end = re.search(line + rb"end_header[ \t]*(?:" + line + rb"|\Z)", content)
