@@ -195,17 +195,12 @@ def _square(n: np.ndarray) -> np.ndarray:
     return np.stack([u + w, w - u, -u - w, u - w])
 
 
-# Known faults: on rims of cylinders GJK may end before the normal is found, about once in 3,000 pairs; the gap is then
-# wrong by some thousandths of the thickness.
-RIMS: set[int] = set()
-
-
 @pytest.mark.parametrize(
     "block", [pytest.param(k, marks=[pytest.mark.slow] if k >= BLOCKS else []) for k in range(MANY)]
 )
 def test_no_contact_of_convex_solids_is_missed_or_wrong(block):
     wrong, kinds = [], Counter()
-    for seed in sorted({*range(block * BLOCK, (block + 1) * BLOCK)} - RIMS):
+    for seed in range(block * BLOCK, (block + 1) * BLOCK):
         case = drawn(seed)
         for fault in faults(case):
             wrong.append(f"{seed} {' on '.join(case.kinds)}: {fault}")
