@@ -30,10 +30,7 @@ from pipeline.field.rendering import (
     sdf_cache,
     sphere_interval,
 )
-from pipeline.inputs.images import BACKDROP, reduced
-from pipeline.inputs.photos import load_photos
-from pipeline.progress import Progress, quiet, share_of
-from pipeline.sfm.supervision import (
+from pipeline.field.supervision import (
     FreeSpace,
     Supervision,
     depth_points,
@@ -41,6 +38,9 @@ from pipeline.sfm.supervision import (
     supervision_of,
     unit_sphere_of,
 )
+from pipeline.inputs.images import BACKDROP, reduced
+from pipeline.inputs.photos import load_photos
+from pipeline.progress import Progress, quiet, share_of
 from sdfsim.errors import SdfsimError
 from sdfsim.files import write_bytes, write_json
 from sdfsim.parallel import choose_threads

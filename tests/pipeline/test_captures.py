@@ -12,13 +12,13 @@ import pytest
 from PIL import Image
 
 from pipeline.cameras import Similarity, Sparse, View, load_views
+from pipeline.field.supervision import depth_points, depth_scale
 from pipeline.inputs.captures import UP, DepthFile, load_capture, read_depth, spread
 from pipeline.inputs.known_cameras import lens_of, posed
 from pipeline.inputs.photos import KNOWN_CAMERAS, Photo, load_photos, prepare_photos
 from pipeline.inputs.sources import find_source
 from pipeline.mesh.placement import Up, place
 from pipeline.sfm.poses import solve
-from pipeline.sfm.supervision import depth_points, depth_scale
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.mesh import Mesh
 from tests.pipeline.conftest import noise

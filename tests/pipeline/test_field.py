@@ -24,9 +24,9 @@ from pipeline.field.grid_field import (
 )
 from pipeline.field.interpolation import by_rows, interpolate
 from pipeline.field.rendering import choose_samples, sdf_cache, sphere_interval
+from pipeline.field.supervision import supervision_of
 from pipeline.field.training import PRESETS, Rays, Trained, Trainer, camera_rays, load_rays, save_field, train
 from pipeline.inputs.photos import save_photos
-from pipeline.sfm.supervision import supervision_of
 from sdfsim.errors import SdfsimError
 
 SMALL = FieldSize((8, 16), (2, 2), 16, 8)

@@ -9,7 +9,7 @@ import torch
 from pipeline.cameras import Sparse
 from pipeline.field.grid_field import FieldSize, GridField, laplace_density
 from pipeline.field.rendering import EPSILON, bounded_samples, draw, nearest, opacity_bound, sdf_cache, worst
-from pipeline.sfm.supervision import (
+from pipeline.field.supervision import (
     CLEARANCE,
     FILLED,
     GAP,

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from pipeline.cameras import CAREFUL, UNKNOWN, Similarity, Sparse, View, camera_up, nearest_to_axes
+from pipeline.field.supervision import unit_sphere_of
 from pipeline.mesh.extraction import belonging, components, islands, sample_box, sample_volume, trusted_vertices
 from pipeline.mesh.placement import find_up, load_placement, place, plane_up, resting_height
 from pipeline.mesh.visibility import Visibility, bilinear, spread_colors
-from pipeline.sfm.supervision import unit_sphere_of
 from sdfsim.shape.bvh import Caster
 from sdfsim.shape.mesh import Mesh, is_closed, joined, signed_volume, vertex_normals
 
