@@ -6,7 +6,6 @@ import re
 from dataclasses import dataclass
 
 from sdfsim.errors import SdfsimError, nearest
-from sdfsim.scene.scene_file import UNITS
 
 CRC = "CRC Handbook of Chemistry and Physics"
 TOOLBOX = "Engineering ToolBox"
@@ -15,6 +14,7 @@ EUROCODE = "EN 1991-1-1"
 ROUGH = "rough"
 UNMOVED = ("floor", "scene")  # bodies whose mass never counts
 _WALL = re.compile(r"(\d+\.?\d*|\.\d+)(mm|cm|m)", re.ASCII)
+_METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def choose(given: dict[str, str]) -> dict[str, Choice]:
         if colon and body in UNMOVED:
             raise SdfsimError(f"material: {body}: takes no thickness: it does not move, so its mass never counts")
         match = _WALL.fullmatch(thickness)
-        wall = float(match[1]) * UNITS[match[2]] if match else None
+        wall = float(match[1]) * _METRES[match[2]] if match else None
         if colon and not wall:
             told = f"material: {body}: {thickness!r} is not the thickness of a wall"
             raise SdfsimError(told, "give one such as 4mm or 0.4cm")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from contextlib import suppress
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +44,8 @@ def write_report(
         with suppress(SdfsimError):
             poses = read_json(folder / ".poses.part" / "checks.json")
     report: dict[str, Any] = {
-        "version": 1, "options": asdict(options), "seconds": seconds, "seconds_total": round(sum(seconds.values()), 1),
+        "version": 1, "options": options.model_dump(mode="json"), "seconds": seconds,
+        "seconds_total": round(sum(seconds.values()), 1),
         "psnr": stages.get("distill", {}).get("psnr"), "stages": stages, "poses": poses, "notes": notes(stages),
         "photos": photo_rows(folder, stages, poses),
         "failed_checks": [f"fit: {fit.get('reason') or 'certificate missed'}"] if fit.get("passed") is False else [],

@@ -9,11 +9,11 @@ import shutil
 import time
 import uuid
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pipeline.options import COMMAND, Options, read_config, write_config
+from pipeline.options import COMMAND, Options, options_of, read_config, write_config
 from pipeline.progress import Progress
 from pipeline.report import write_report
 from sdfsim.errors import EXIT_QUALITY, SdfsimError
@@ -94,8 +94,7 @@ def do_mesh(run: Run, work: Path) -> dict:
 
     try:
         return make_meshes(
-            run.place("distill"), run.place("poses"), run.place("photos"), work, preset=run.options.preset,
-            size=run.options.size, distance=run.options.distance, crop=run.options.crop, device=run.device(),
+            run.place("distill"), run.place("poses"), run.place("photos"), work, run.options, device=run.device(),
             on_progress=run.tell("mesh"),
         )  # fmt: skip
     except SdfsimError as error:
@@ -135,18 +134,17 @@ class Stage:
 
     run: Callable[[Run, Path], dict]
     folder: str  # where the result lies in that of the run
-    options: tuple[str, ...] = ()  # that the result depends on
     # Raise it with every change after which the stage makes something else of the same; those after it follow.
     version: int = 1
 
 
 STAGES = {
     "photos": Stage(do_photos, "photos", version=4),
-    "poses": Stage(do_poses, "poses", ("seed",), 4),
-    "distill": Stage(do_distill, "distill", ("preset", "seed", "budget"), 4),
-    "mesh": Stage(do_mesh, "mesh", ("preset", "size", "distance", "crop"), 9),
-    "fit": Stage(do_fit, "assets", ("seed", "budget", "recipe")),
-    "scene": Stage(do_scene, "scene", ("seed", "drop", "material"), 3),
+    "poses": Stage(do_poses, "poses", version=4),
+    "distill": Stage(do_distill, "distill", version=4),
+    "mesh": Stage(do_mesh, "mesh", version=9),
+    "fit": Stage(do_fit, "assets"),
+    "scene": Stage(do_scene, "scene", version=3),
 }
 
 
@@ -161,8 +159,7 @@ def reconstruct(
     run, and goes on with a killed one. Photos (see `find_source`) are never written to. Raises SdfsimError for bad
     photos or options (exit code 1), or where poses or surface are not good enough (3).
     """
-    resolved = Options(str(Path(photos).absolute()), **options)
-    resolved.check()
+    resolved = options_of(photos=str(Path(photos).absolute()), **options)
     names = list(STAGES)
     first = _number(from_stage) if from_stage else len(names)
     last = _number(until_stage) if until_stage else len(names) - 1
@@ -177,7 +174,7 @@ def find_poses(photos: str | Path, out: str | Path, *, progress: Callable[[str, 
                **changes: Any) -> dict:  # fmt: skip
     """Photos -> camera poses: the first two stages, as `reconstruct` does them; options that are not given (None) are
     those of the folder's config.yaml, where there is one."""
-    kept = asdict(read_config(Path(out))) if (Path(out) / CONFIG).exists() else {}
+    kept = read_config(Path(out)).model_dump() if (Path(out) / CONFIG).exists() else {}
     given = {key: value for key, value in changes.items() if value is not None}
     return reconstruct(**{**kept, **given, "photos": photos}, out=out, until_stage="poses", progress=progress)
 
@@ -189,9 +186,10 @@ def run_stage(
     Options that are given (not None) are kept in the folder's config.yaml; a budget is that of this call alone."""
     number, kept = _number(name), read_config(Path(folder))
     known = {key: value for key, value in changes.items() if value is not None}
-    options = kept.changed(known)
-    options.check()
-    run = Run(Path(folder), replace(options, budget=kept.budget), progress, known.get("budget"))
+    options = kept.changed(known)  # also checks the budget, which is not kept
+    run = Run(
+        Path(folder), options.changed({"budget": kept.budget}), progress, options.budget if "budget" in known else None
+    )
     done = current(run.folder)
     for before in list(STAGES)[:number]:
         if before not in done:
@@ -255,8 +253,7 @@ def run_one(run: Run, stage: str, *, again: bool) -> None:
     place, work = run.place(stage), run.folder / f".{stage}.part"
     before = read_record(run.place(list(STAGES)[_number(stage) - 1])) if stage != "photos" else None
     inputs = before["made"] if before else hash_of_photos(Path(run.options.photos))
-    values = {**asdict(run.options), "recipe": run.options.fit_recipe()}
-    depends: dict[str, Any] = {key: values[key] for key in STAGES[stage].options} | {"own_budget": run.own_budget}
+    depends = run.options.of_stage(stage) | {"own_budget": run.own_budget}
     if stage == "fit":
         from sdfsim.shape.fit import FIT_VERSION
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from pipeline.mesh.placement import GRAVITY, Placement, Up, measured_scale, plac
 from pipeline.mesh.texture import Shots, shots_of, texture_parts
 from pipeline.mesh.trust import Support, color_range, colors_of, next_photos, summary, support_of
 from pipeline.mesh.visibility import Visibility, hollow, to_bytes
+from pipeline.options import Options
 from pipeline.progress import Progress, quiet, share_of
 from sdfsim.errors import SdfsimError
 from sdfsim.files import read_json, write_bytes, write_json
@@ -35,13 +35,12 @@ PICTURES, THUMB, WIDE, TINT = 4, 80, 720, 0.45
 
 
 def make_meshes(
-    distill: Path, poses: Path, photos: Path, out: Path, *, preset: str, size: float | None = None,
-    distance: Sequence | None = None, crop: Sequence[float] | None = None, device: str = "cpu",
+    distill: Path, poses: Path, photos: Path, out: Path, options: Options, *, device: str = "cpu",
     on_progress: Progress = quiet,
 ) -> dict:  # fmt: skip
-    """Writes the files that docs/objects.md lists and returns the stage's report; `size`, `distance` and `crop` as in
-    `Options`. Vertices in the PLY files have `views` and `uncertainty`, see `Support`. Raises SdfsimError (exit code 3)
-    where there is no surface worth the name, or (1) of a distance or box that makes no sense."""
+    """Writes the files that docs/objects.md lists and returns the stage's report. Vertices in the PLY files have
+    `views` and `uncertainty`, see `Support`. Raises SdfsimError (exit code 3) where there is no surface worth the name,
+    or (1) of a distance or box that makes no sense."""
     trained = load_field(distill)
     field, to_unit = trained.field.to(device), trained.to_unit
     views = [to_unit.view(view) for view in load_views(poses)]
@@ -49,17 +48,19 @@ def make_meshes(
     alone = bool(trained.report["masked"])
     inner, limit = field_distance(field), ball
     inside = lambda p: np.maximum(inner(p), limit(p))  # noqa: E731
-    volume = sample_volume(inside, RESOLUTION[preset], on_progress=share_of(on_progress, 0.0, 0.25))
+    volume = sample_volume(inside, RESOLUTION[options.preset], on_progress=share_of(on_progress, 0.0, 0.25))
     surface = surface_of(volume, field, views, points, photos, limit, on_progress=share_of(on_progress, 0.25, 0.25))
-    scale = measured_scale(distance, views, load_photos(photos), Caster(surface.raw)) if distance else None
+    scale = None
+    if options.distance is not None:
+        scale = measured_scale(options.distance, views, load_photos(photos), Caster(surface.raw))
     capture, up = load_capture(photos), None
     if capture is not None and capture.up is not None:
         up = Up(to_unit.rotation @ capture.up, f"gravity of {capture.app}", GRAVITY)
-    if capture is not None and scale is None and size is None:
+    if capture is not None and scale is None and options.size is None:
         scale = 1 / to_unit.scale, f"metres of {capture.app}"
-    placement = place(surface.visible, views, scale, size=size, alone=alone, up=up)
-    if crop is not None:
-        limit = box_of(placement, np.reshape(crop, (2, 3)))
+    placement = place(surface.visible, views, scale, size=options.size, alone=alone, up=up)
+    if options.crop is not None:
+        limit = box_of(placement, np.reshape(options.crop, (2, 3)))
         volume = volume.limited(limit)
         if not (volume.values < 0).any():
             raise SdfsimError("crop: the box holds nothing", "corners are in metres, as in a mesh/mesh.ply without it")

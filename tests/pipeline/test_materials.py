@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.materials import MATERIALS, choose
-from pipeline.options import Options, read_config
+from pipeline.options import options_of, read_config
 from sdfsim.errors import SdfsimError
 from tests.cli.conftest import run as command
 
@@ -65,7 +65,7 @@ def test_a_material_may_have_the_thickness_of_a_wall(text, wall):
 )
 def test_what_is_no_material_is_refused_before_any_work(body, text, message):
     with pytest.raises(SdfsimError) as caught:
-        Options(material={body: text}).check()
+        options_of(material={body: text})
     assert caught.value.message == f"material: {message}" and caught.value.exit_code == 1
 
 

@@ -19,6 +19,7 @@ from pipeline.mesh.meshing import make_meshes, read_parts, rounded, trust_meshes
 from pipeline.mesh.photo_refining import Picture, refine
 from pipeline.mesh.placement import load_placement
 from pipeline.mesh.trust import GUESSED
+from pipeline.options import options_of
 from pipeline.report import mesh_notes
 from sdfsim.errors import SdfsimError
 from sdfsim.shape.bvh import Caster
@@ -90,7 +91,7 @@ def mesh(run: Path, tmp_path: Path, monkeypatch):
 
     def make(**options) -> tuple[dict, Path]:
         places = run / "distill", run / "poses", run / "photos"
-        return make_meshes(*places, tmp_path, preset="quick", **options), tmp_path
+        return make_meshes(*places, tmp_path, options_of(preset="quick", **options)), tmp_path
 
     return make
 

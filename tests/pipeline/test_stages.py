@@ -323,7 +323,7 @@ def test_poses_of_a_folder_in_work_keep_its_other_options(photos, tmp_path, call
     monkeypatch.setattr("pipeline.report.write_recording", lambda folder, done: None)
     out = tmp_path / "out"
     assert command("poses", photos, "-o", out).exit_code == 0
-    assert read_config(out) == Options(str(photos))
+    assert read_config(out) == Options(photos=str(photos))
     reconstruct(photos, out, preset="quick", seed=7, size=2.5, drop="ball", budget=900.0)
     before = read_config(out)
     calls.clear()
